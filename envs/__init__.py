@@ -9,16 +9,9 @@ import gymnasium as gym
 
 from dynslam_bench.contracts import TrackerContractError
 from dynslam_bench.core.arguments import names_wrong_arguments
-from dynslam_bench.envs.arguments import resolve_device
-from dynslam_bench.envs.control_benchmarks import (
-    CONTROL_BENCHMARKS,
-    ControlBenchmark,
-    control_benchmark,
-    make_control,
-)
-from dynslam_bench.envs.episode import Episode, FrameOutcome
-from dynslam_bench.envs.rewards import REWARDS, AccuracyMinusCost, NegWindowError
-from dynslam_bench.envs.slam_env import EpisodeState, SlamEnv
+from dynslam_bench.envs.control_benchmarks import CONTROL_BENCHMARKS, ControlBenchmark, control_benchmark, make_control
+from dynslam_bench.envs.episode import REWARDS, AccuracyMinusCost, Episode, FrameOutcome, NegWindowError
+from dynslam_bench.envs.slam_env import EpisodeState, SlamEnv, resolve_device
 from dynslam_bench.envs.spaces import KEYPOINT_LAYOUT, PRIVILEGED_LAYOUT, STATS_LAYOUT, ActionMap
 from dynslam_bench.envs.wrappers import (
     Degradation,

@@ -11,7 +11,7 @@ import gymnasium as gym
 
 from dynslam_bench.core import SettingsError
 from dynslam_bench.core.arguments import names_wrong_arguments
-from dynslam_bench.envs.rewards import AccuracyMinusCost
+from dynslam_bench.envs.episode import AccuracyMinusCost
 from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.envs.wrappers import DiscreteActions, SequenceSampler
 

@@ -1,17 +1,21 @@
-"""The frames of an episode so far, and the ``info`` of one."""
+"""The frames of an episode so far, the ``info`` of one, and its reward, by name or as a callable of the user's."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+import operator
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Trajectory
-from dynslam_bench.core import EvaluationError
+from dynslam_bench.core import EvaluationError, SettingsError
+from dynslam_bench.core.arguments import names_wrong_arguments
 from dynslam_bench.evaluation import OnlineSample, Protocol, evaluate
 from dynslam_bench.geometry import se3
 
@@ -120,11 +124,9 @@ def fixed_info(info: Mapping[str, Any], protocol: Protocol) -> dict[str, Any]:
         info: Of a step.
         protocol: Whose metrics are those of the episode.
     """
-    fixed = dict(info) | {"protocol": protocol.id}
     missing: dict[str, Any] = {"pose": np.zeros(7)} | dict.fromkeys(_ERRORS, 0.0)
-    metrics = info.get("episode_metrics", {})
-    fixed["episode_metrics"] = _flagged(metrics, dict.fromkeys(metric_names(protocol), 0.0))
-    return fixed | _flagged(info, missing)
+    metrics = _flagged(info.get("episode_metrics", {}), dict.fromkeys(metric_names(protocol), 0.0))
+    return {**info, "protocol": protocol.id, "episode_metrics": metrics} | _flagged(info, missing)
 
 
 def _flagged(given: Mapping[str, Any], missing: Mapping[str, Any]) -> dict[str, Any]:
@@ -140,11 +142,124 @@ def metric_names(protocol: Protocol) -> tuple[str, ...]:
     moving = np.concatenate([np.stack([np.cos(stamps), np.sin(stamps), stamps], axis=1) * 40.0, turns], axis=1)
     names = ["coverage", "frames", "tracked_frames"]
     for twists in (moving, np.zeros_like(moving)):
-        poses = se3.exp(twists)
-        try:
-            names += evaluate(
-                Trajectory(stamps, poses), Trajectory(stamps, poses), protocol, input_timestamps=stamps
-            ).metrics
-        except EvaluationError:  # the protocol cannot align a camera that stands still
-            continue
+        path = Trajectory(stamps, se3.exp(twists))
+        with suppress(EvaluationError):  # the protocol cannot align a camera that stands still
+            names += evaluate(path, path, protocol, input_timestamps=stamps).metrics
     return tuple(dict.fromkeys(names))
+
+
+# Rewards: what the newest frame of an episode earns.
+
+Reward = Callable[[Episode], float]
+Cost = Literal["network_calls", "keypoints", "processor_s"]
+RewardKind = Literal["neg_rpe", "neg_pose_error", "neg_window_error", "accuracy_minus_cost"]
+
+
+def neg_rpe(episode: Episode) -> float:
+    """Minus the translational error of the motion since the previous frame, metres."""
+    error = episode.outcomes[-1].error
+    if error is None:
+        return 0.0
+    moved = error.frame_trans_m or 0.0
+    return -max(moved - error.lost_way_m, 0.0) if error.tracked else -2.0 * moved
+
+
+def neg_pose_error(episode: Episode) -> float:
+    """Minus the causal translational pose error, at most the length of the true path so far, metres."""
+    error = episode.outcomes[-1].error
+    if error is None:
+        return 0.0
+    return -min(error.trans_m, error.way_m) if error.tracked else -error.way_m
+
+
+@names_wrong_arguments
+@dataclass(frozen=True)
+class NegWindowError:
+    """Minus the translational error of the motion over the last `frames` frames, metres.
+
+    Drift that hides in the noise of one frame shows. Both ends need ground truth; the window is shorter where the
+    episode is. A frame without a tracked pose counts as standing at the last one.
+
+    Attributes:
+        frames: Length of the window.
+    """
+
+    frames: int = 30
+
+    def __post_init__(self) -> None:
+        if operator.index(self.frames) < 1:
+            raise SettingsError(f"a window has {self.frames} frames", "give 1 or more")
+
+    def __call__(self, episode: Episode) -> float:
+        """What the newest frame earns."""
+        now, before = episode.outcomes[-1].error, episode.outcomes[-1 - self.frames :][0].error
+        if now is None or before is None:
+            return 0.0
+        moved = se3.inverse(before.T_world_true) @ now.T_world_true
+        estimated = se3.inverse(before.T_world_held) @ now.T_world_held
+        return -float(np.linalg.norm((se3.inverse(moved) @ estimated)[:3, 3]))
+
+
+@names_wrong_arguments
+@dataclass(frozen=True)
+class AccuracyMinusCost:
+    """``neg_rpe`` minus what the frame cost.
+
+    Attributes:
+        weight: Metres that one unit of the cost counts as on the episode's first frame.
+        cost: ``network_calls``: 1 where the segmentation network ran (``segmented`` of the tracker's stats);
+            ``keypoints``: thousands of extracted keypoints (``keypoints``), which processor time grows with; both are
+            the same on every machine. ``processor_s``: seconds of processor time, which differ from run to run.
+        growth: Share of `weight` that is added to it with every frame: the budget of a frame falls.
+    """
+
+    weight: float = 0.001
+    cost: Cost = "network_calls"
+    growth: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.cost not in get_args(Cost):
+            raise SettingsError(f"unknown cost '{self.cost}'", f"choose {', '.join(get_args(Cost))}")
+        if not math.isfinite(self.weight * self.growth):
+            raise SettingsError(f"weight {self.weight} and growth {self.growth} are no finite numbers")
+
+    def __call__(self, episode: Episode) -> float:
+        """What the newest frame earns."""
+        return neg_rpe(episode) - self.charge(episode.outcomes[-1])
+
+    def charge(self, outcome: FrameOutcome) -> float:
+        """Metres that a frame's cost counts as."""
+        return self.weight * (1.0 + self.growth * outcome.index) * self.cost_of(outcome)
+
+    def cost_of(self, outcome: FrameOutcome) -> float:
+        """What a frame cost, in units of the cost."""
+        costs: dict[Cost, float] = {
+            "network_calls": outcome.stats.get("segmented", 0.0),
+            "keypoints": outcome.stats.get("keypoints", 0.0) / 1000.0,
+            "processor_s": outcome.timings.get("processor", 0.0),
+        }
+        return costs[self.cost]
+
+
+REWARDS: dict[str, Reward] = {
+    "neg_rpe": neg_rpe,
+    "neg_pose_error": neg_pose_error,
+    "neg_window_error": NegWindowError(),
+    "accuracy_minus_cost": AccuracyMinusCost(),
+}
+"""Reward in metres of a frame that has ground truth, by name; other frames earn 0.
+
+- ``neg_rpe``: minus the translational error of the motion since the previous frame; needs no alignment and adds up.
+  A frame without a tracked pose costs twice the true motion: it did not move, and it has to catch up. The first tracked
+  pose after it is a jump from the last one (see `OnlineError`), which costs only the error beyond the charged path. So
+  reporting a loss never earns more than repeating the last pose, and staying lost never more than recovering.
+- ``neg_pose_error``: minus the causal translational pose error, at most the length of the true path so far (an error of
+  100 %). A frame without a tracked pose earns minus that length: no pose, however far it has drifted, earns less, so
+  that getting lost pays only before the first tracked pose, which begins the episode's frame of reference.
+- ``neg_window_error``: see `NegWindowError`; a loss earns what repeating the last pose does.
+- ``accuracy_minus_cost``: see `AccuracyMinusCost`; 1 mm for every frame on which the segmentation network ran.
+
+A callable takes the `Episode` after each frame; ``episode.outcomes[-1]`` is the frame's `FrameOutcome`.
+
+The sum over an episode is not the ATE, which the last step's ``episode_metrics`` give under the protocol.
+"""

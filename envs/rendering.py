@@ -47,7 +47,9 @@ class Canvas:
         self._width = 2 * round(sequence.camera.width * self._scale / 2)
         self._title = f"{label}  |  {sequence.id}"
         self._frames = len(sequence)
-        self._truth = _truth_from_first(sequence)
+        truth = truths_at(sequence.ground_truth, sequence.timestamps)
+        origin = se3.inverse(next(iter(truth.values()), np.eye(4)))
+        self._truth = {index: origin @ pose for index, pose in truth.items()}
         positions = np.array([pose[:3, 3] for pose in self._truth.values()]).reshape(-1, 3)
         self._view = main_view(positions)
         self._truth_path = positions @ VIEWS[self._view].T
@@ -130,13 +132,11 @@ def annotated(rgb: Image, result: TrackResult, width: int) -> Image:
         image[mask] = (0.6 * image[mask] + 0.4 * np.array(MASK)).astype(np.uint8)
         outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
         cv2.drawContours(image, outlines, -1, MASK, 1, cv2.LINE_AA)
-    size = (width, round(image.shape[0] * scale))
+    size, radius = (width, round(image.shape[0] * scale)), max(round(width / 320), 1)
     image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     if result.keypoints_xy is not None:
         points = np.asarray(result.keypoints_xy, dtype=np.float64).reshape(-1, 2)
-        kept = result.keypoints_keep
-        kept = np.ones(len(points), bool) if kept is None else np.asarray(kept, dtype=bool)
-        radius = max(round(width / 320), 1)
+        kept = np.ones(len(points), bool) if result.keypoints_keep is None else np.asarray(result.keypoints_keep, bool)
         for (x, y), static in zip((points * scale).round().astype(int).tolist(), kept.tolist(), strict=True):
             if static:
                 cv2.circle(image, (x, y), radius, KEPT, -1, cv2.LINE_AA)
@@ -157,15 +157,6 @@ def main_view(positions: Array) -> str:
     """The view in which positions ``[N, 3]`` spread most; that from above for fewer than two, and for a tie."""
     spread = positions.std(axis=0) if len(positions) > 1 else np.zeros(3)
     return max(VIEWS, key=lambda view: float(np.round((np.abs(VIEWS[view]) @ spread).sum(), 9)))
-
-
-def _truth_from_first(sequence: Sequence) -> dict[int, Array]:
-    """Ground truth of the frames, in the frame of the first of them."""
-    poses = truths_at(sequence.ground_truth, sequence.timestamps)
-    if not poses:
-        return {}
-    origin = se3.inverse(next(iter(poses.values())))
-    return {i: origin @ pose for i, pose in poses.items()}
 
 
 def align_to_truth(episode: Episode, truth: dict[int, Array]) -> tuple[Array, list[slice], float | None]:
@@ -208,8 +199,7 @@ def _nice_length(metres: float) -> float:
 
 
 def _grid(plot: Image, centre: Array, metres_a_pixel: float) -> None:
-    step = _nice_length(metres_a_pixel * HEIGHT / 4)
-    half = HEIGHT / 2 * metres_a_pixel
+    step, half = _nice_length(metres_a_pixel * HEIGHT / 4), HEIGHT / 2 * metres_a_pixel
     for axis, sign in ((0, 1), (1, -1)):
         first = np.ceil((centre[axis] - half) / step) * step
         for value in np.arange(first, centre[axis] + half, step):
@@ -225,8 +215,7 @@ def _scale_bar(plot: Image, metres_a_pixel: float) -> None:
     cv2.line(plot, (16, y), (16 + pixels, y), _INK, 2)
     for x in (16, 16 + pixels):
         cv2.line(plot, (x, y - 4), (x, y + 4), _INK, 2)
-    name = f"{length:g} m" if length >= 1 else f"{100 * length:g} cm"
-    _text(plot, name, (16, y - 10), _INK, 0.45)
+    _text(plot, f"{length:g} m" if length >= 1 else f"{100 * length:g} cm", (16, y - 10), _INK, 0.45)
 
 
 def _text(

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 import operator
+import re
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, SupportsFloat, cast
 
@@ -17,7 +20,15 @@ from gymnasium.utils import EzPickle
 from numpy.typing import NDArray
 
 import dynslam_bench
-from dynslam_bench.contracts import Frame, Tracker, TrackerContext, TrackerSpec, TrackResult, Trajectory, exact_stamps
+from dynslam_bench.contracts import (
+    Frame,
+    Tracker,
+    TrackerContext,
+    TrackerSpec,
+    Trajectory,
+    exact_stamps,
+    timestamps_ns,
+)
 from dynslam_bench.contracts import Sequence as FrameSequence
 from dynslam_bench.contracts.checks import check_frame, check_result, check_sensors, check_trajectory, tracker_code
 from dynslam_bench.core import (
@@ -33,25 +44,29 @@ from dynslam_bench.core.fingerprint import content_digest
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.seeding import derive_seed
 from dynslam_bench.core.settings import Reconfigurable, Settings, apply_overrides
-from dynslam_bench.envs.arguments import (
-    Frames,
-    check_frames,
-    open_frames,
-    parse_window,
-    preprocessing_of,
-    resolve_device,
+from dynslam_bench.envs.episode import (
+    REWARDS,
+    Episode,
+    FrameOutcome,
+    FrameState,
+    Reward,
+    RewardKind,
+    fixed_info,
+    frame_info,
 )
-from dynslam_bench.envs.episode import Episode, FrameOutcome, FrameState, fixed_info, frame_info
-from dynslam_bench.envs.rewards import REWARDS, Reward, RewardKind
+from dynslam_bench.envs.rendering import Canvas
 from dynslam_bench.envs.spaces import ActionMap, observation_parts, observation_space, observe
 from dynslam_bench.evaluation import OnlineError, Protocol, evaluate, get_protocol
 from dynslam_bench.evaluation.comparison import tracked_frames
+from dynslam_bench.geometry import refuse_close
 from dynslam_bench.segmentation.build_segmenter import segmentation_source
-from dynslam_bench.sequences import SequenceView
+from dynslam_bench.sequences import PreprocessingSettings, SequenceView, open_sequence
+from dynslam_bench.sequences.catalogue import parse_frames
 from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_settings
 
-RENDER_MODES = ("rgb_array",)
 FrameTransform = Callable[[Frame], Frame]
+Frames = Sequence[int | None] | str | None
+"""Part of a sequence: ``(start, stop)``, ``"start:stop"`` with either end open, or None for all."""
 _OF_AN_EPISODE = (
     *("_tracker", "_errors", "episode", "frame", "result", "_final", "settings", "_actions", "window"),
     *("_np_random", "_np_random_seed"),
@@ -134,12 +149,11 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         DynslamError: Unknown or unfit sequence, tracker, setting, reward, protocol or device, or fewer than 2 frames.
     """
 
-    metadata: dict[str, Any] = {"render_modes": [*RENDER_MODES], "render_fps": 30}  # noqa: RUF012
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
     sequence: FrameSequence
     """The frames of the episode."""
     window: tuple[int, int]
     """Which frames of `sequence`, as it was opened, they are: the first and one past the last."""
-    _whole: FrameSequence
 
     @names_wrong_arguments
     def __init__(
@@ -167,8 +181,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     ) -> None:
         given = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
         EzPickle.__init__(self, given.pop("sequence"), given.pop("tracker"), **given)
-        if render_mode not in (None, *RENDER_MODES):
-            raise SettingsError(f"unknown render mode '{render_mode}'", f"choose {' or '.join(RENDER_MODES)}")
+        if render_mode not in (None, "rgb_array"):
+            raise SettingsError(f"unknown render mode '{render_mode}'", "choose rgb_array")
         if not callable(reward) and reward not in REWARDS:
             raise SettingsError(f"unknown reward '{reward}'", f"choose {' or '.join(REWARDS)}, or give a callable")
         for title, number, least in (("lost_after", lost_after, 1), ("threads", threads, 1), ("window", window, 2)):
@@ -179,16 +193,17 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self.tracker_spec = TRACKERS.get(tracker) if isinstance(tracker, str) else tracker
         self.frame_transforms: list[FrameTransform] = []
         """Applied in order to every frame before the tracker sees it; wrappers add to it."""
-        self._observation = observation
+        self._observation, self._parts = observation, observation_parts(observation)
         self._reward: Reward = reward if callable(reward) else REWARDS[reward]
         self._length = window
         self._fixed_info = fixed_info
-        self._memory_map = memory_map
         self._lost_after = lost_after
         self.device = resolve_device(device)
         self._threads = threads
         self._cache = str(stage_cache_folder()) if cache else None
-        self._part = (data_root, camera, frames, stride)
+        self._open = partial(
+            open_frames, data_root=data_root, camera=camera, frames=frames, stride=stride, memory_map=memory_map
+        )
         self._control = tuple(control) if not isinstance(control, str) else control
         self._tracker: Tracker | None = None
         self._use_settings(settings)
@@ -198,7 +213,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self.observation_space = observation_space(observation, self.sequence.camera)
         self.episode = Episode()
         self._final: Trajectory | None = None
-        self._canvas: Any = None
+        self._canvas: Canvas | None = None
 
     @property
     def neutral_action(self) -> Any:
@@ -287,7 +302,6 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         }
         try:
             self._apply_options(options or {})
-            self._begin_window((options or {}).get("window"))
             tracker = self._ready_tracker()
             with tracker_code():
                 if self._actions.parameters:  # before the reset: whatever that copies is then the episode's own
@@ -402,25 +416,23 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         there is ground truth and the protocol finds something to evaluate.
         """
         final = self.final_trajectory() if self.protocol.trajectory == "final" else None
-        trajectory = final if final is not None else self.online_trajectory()
+        trajectory = self.online_trajectory() if final is None else final
         due = self.sequence.timestamps if self.episode.over else self.sequence.timestamps[: self.episode.next_index]
-        try:
+        tracked = 0
+        with suppress(EvaluationError):  # a final trajectory whose stamps are of no frame
             tracked = int(tracked_frames(trajectory, due).sum())
-        except EvaluationError:  # a final trajectory whose stamps are of no frame
-            tracked = 0
         counts = {
             "coverage": tracked / len(due) if len(due) else 0.0,
             "frames": float(len(due)),
             "tracked_frames": float(tracked),
         }
-        truth = self.sequence.ground_truth if self.tracker_spec.metric or self.protocol.finds_scale else None
-        if truth is None:
+        truth = self.sequence.ground_truth
+        if truth is None or not (self.tracker_spec.metric or self.protocol.finds_scale):
             return counts
-        try:
+        with suppress(EvaluationError):  # too little was tracked; the coverage says so
             metrics = evaluate(trajectory, truth, self.protocol, input_timestamps=due).metrics
-        except EvaluationError:  # too little was tracked; the coverage says so
-            return counts
-        return counts | {name: float(value) for name, value in metrics.items() if math.isfinite(value)}
+            counts |= {name: float(value) for name, value in metrics.items() if math.isfinite(value)}
+        return counts
 
     def render(self) -> NDArray[np.uint8] | None:
         """The current frame with its features and masks beside the trajectory, uint8 ``[H, W, 3]``."""
@@ -430,11 +442,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         if not self.episode.outcomes:
             raise DynslamError("render() was called before reset()")
         if self._canvas is None:
-            from dynslam_bench.envs.rendering import Canvas
-
             self._canvas = Canvas(self.sequence, self.tracker_spec.label)
-        image: NDArray[np.uint8] = self._canvas.draw(self.frame, self.result, self.episode)
-        return image
+        return self._canvas.draw(self.frame, self.result, self.episode)
 
     def close(self) -> None:
         """Close the tracker; the environment may be reset again."""
@@ -460,8 +469,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     def _copied(self, parts: Mapping[str, Any], memo: dict[int, Any]) -> dict[str, Any]:
         """Deep copies of attributes, which share what is never changed."""
         shared = (self.sequence, self._whole, self._source, self.tracker_spec, self.protocol, self.settings)
-        for value in (*shared, self.sequence.ground_truth):
-            memo[id(value)] = value
+        memo |= {id(value): value for value in (*shared, self.sequence.ground_truth)}
         try:
             deepcopy(parts["_tracker"], memo)
         except Exception as error:
@@ -473,58 +481,36 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     @names_wrong_arguments
     def _use_settings(self, settings: Mapping[str, Any] | Settings | None, before: Settings | None = None) -> None:
-        if before is not None and not isinstance(settings, Settings):
-            settings = apply_overrides(before, settings or {})
-        if isinstance(settings, Settings):
-            if not isinstance(settings, self.tracker_spec.settings):
-                raise SettingsError(
-                    f"tracker '{self.tracker_spec.id}' takes {self.tracker_spec.settings.__name__}, "
-                    f"not {type(settings).__name__}"
-                )
-            settings.verify()
-            self.settings: Settings = settings
-        else:
-            self.settings = resolve_settings(self.tracker_spec, settings)
+        if not isinstance(settings, Settings):
+            spec = self.tracker_spec
+            settings = resolve_settings(spec, settings) if before is None else apply_overrides(before, settings or {})
+        if not isinstance(settings, self.tracker_spec.settings):
+            raise SettingsError(
+                f"tracker '{self.tracker_spec.id}' takes {self.tracker_spec.settings.__name__}, "
+                f"not {type(settings).__name__}"
+            )
+        settings.verify()
+        self.settings: Settings = settings
         self._actions = ActionMap(self.settings, self._control)
 
     @names_wrong_arguments
     def _use_sequence(self, sequence: str | FrameSequence) -> None:
-        opened = open_frames(sequence, *self._part, preprocessing_of(self.settings), memory_map=self._memory_map)
+        opened = self._open(sequence, preprocessing=preprocessing_of(self.settings))
         check_frames(opened)
         self.protocol.check_sequence(opened.id)
         check_sensors(self.tracker_spec, opened)
-        self._check_window(opened)
+        if self._length is not None and self._length > len(opened):
+            raise SettingsError(
+                f"a window of {self._length} frames is longer than '{opened.id}', which has {len(opened)} here",
+                f"give window={len(opened)} or less",
+            )
         self.sequence = self._whole = opened
         self.window = (0, len(opened))
         self._source = sequence
 
-    def _check_window(self, sequence: FrameSequence) -> None:
-        if self._length is not None and self._length > len(sequence):
-            raise SettingsError(
-                f"a window of {self._length} frames is longer than '{sequence.id}', which has {len(sequence)} here",
-                f"give window={len(sequence)} or less",
-            )
-
-    def _begin_window(self, given: Frames) -> None:
-        """Cut the episode's part out of the sequence."""
-        count = len(self._whole)
-        if given is not None:
-            window = parse_window(given, self._whole)
-        elif self._length is not None:
-            first = int(self.np_random.integers(count - self._length + 1))
-            window = (first, first + self._length)
-        else:
-            window = (0, count)
-        if window == self.window:
-            return
-        if self._whole.masks is not None:
-            self.close()  # the tracker may hold the exact masks, which are numbered as the frames
-        self.sequence, self.window = _part(self._whole, window), window
-
     def _apply_options(self, options: Mapping[str, Any]) -> None:
-        unknown = sorted(set(options) - {"sequence", "settings", "window"})
-        if unknown:
-            raise SettingsError(f"unknown reset option '{unknown[0]}'", "known: sequence, settings, window")
+        for unknown in sorted(set(options) - {"sequence", "settings", "window"}):
+            raise SettingsError(f"unknown reset option '{unknown}'", "known: sequence, settings, window")
         if {"sequence", "settings"} & set(options):
             self.close()  # the next tracker is built for other settings or another sequence
         preprocessing, camera = preprocessing_of(self.settings), self.sequence.camera
@@ -535,8 +521,18 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         if "sequence" in options:
             self._use_sequence(options["sequence"])
             size, new_size = ((c.width, c.height) for c in (camera, self.sequence.camera))
-            if {"rgb", "depth"} & set(observation_parts(self._observation)) and size != new_size:
+            if {"rgb", "depth"} & set(self._parts) and size != new_size:
                 raise SequenceError(f"images of {new_size} pixels do not fit the observation space of {size}")
+        window = (0, len(self._whole))
+        if options.get("window") is not None:
+            window = parse_window(options["window"], self._whole)
+        elif self._length is not None:
+            first = int(self.np_random.integers(window[1] - self._length + 1))
+            window = (first, first + self._length)
+        if window != self.window:
+            if self._whole.masks is not None:
+                self.close()  # the tracker may hold the exact masks, which are numbered as the frames
+            self.sequence, self.window = _part(self._whole, window), window
 
     def _ready_tracker(self) -> Tracker:
         """The tracker for the current settings and sequence."""
@@ -566,13 +562,31 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         return self._tracker
 
     def _track_next(self, tracker: Tracker) -> None:
-        index, self._final = len(self.episode.outcomes), None
-        frame, result, timings = track_one(tracker, self.tracker_spec.id, self.sequence, index, self.frame_transforms)
+        """Read the next frame, track it, and append what came of it.
+
+        Raises:
+            SequenceError: The frame cannot be read, or does not fit the sequence's camera.
+            TrackerContractError: The tracker broke its contract.
+        """
+        index, self._final, began = self.episode.next_index, None, time.perf_counter()
+        frame = _read_frame(self.sequence, index)
+        for transform in self.frame_transforms:
+            frame = transform(frame)
+        read, processor_began = time.perf_counter(), time.process_time()
+        with tracker_code():
+            result = tracker.track(frame)
+        total, processor = time.perf_counter() - read, time.process_time() - processor_began
+        result = check_result(result, frame, self.tracker_spec.id)
+        if result.stats.get("cached_stages"):  # the stages report their times without the cache
+            inside = (seconds for stage, seconds in result.timings.items() if stage != "detector")  # which works beside
+            uncached = max(total, sum(inside))
+            total, processor = uncached, processor + uncached - total
+        timings = {"read": read - began, "total": total, "processor": processor}
+        timings |= {stage: float(seconds) for stage, seconds in result.timings.items() if stage not in timings}
         self.frame, self.result = frame, result
         pose = np.array(result.T_world_cam, dtype=np.float64) if result.state == "ok" else None
         error = self._errors.update(frame.timestamp, pose)
-        outcome = FrameOutcome(index, frame.timestamp, result.state, pose, result.stats, timings, error)
-        self._add(self.episode, outcome)
+        self._add(self.episode, FrameOutcome(index, frame.timestamp, result.state, pose, result.stats, timings, error))
 
     def _add(self, episode: Episode, outcome: FrameOutcome) -> float:
         """Append a frame's outcome with what it earns, which is returned."""
@@ -589,8 +603,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     def _observe(self) -> Any:
         progress = self.episode.outcomes[-1].index / max(len(self.sequence.timestamps) - 1, 1)
-        parts = observation_parts(self._observation)
-        observed = observe(parts, self.frame, self.result, self.episode, progress)
+        observed = observe(self._parts, self.frame, self.result, self.episode, progress)
         return observed["stats"] if self._observation == "stats" else observed
 
     def _info(self) -> dict[str, Any]:
@@ -603,43 +616,6 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 def _part(whole: FrameSequence, window: tuple[int, int]) -> FrameSequence:
     """The frames of a window."""
     return whole if window == (0, len(whole)) else cast("FrameSequence", SequenceView(whole, *window))
-
-
-def track_one(
-    tracker: Tracker, name: str, sequence: FrameSequence, index: int, transforms: Iterable[FrameTransform]
-) -> tuple[Frame, TrackResult, dict[str, float]]:
-    """Read a frame and track it.
-
-    Args:
-        tracker: The tracker.
-        name: Its id, for messages.
-        sequence: Where the frame comes from.
-        index: Which one.
-        transforms: Applied in order before the tracker gets it.
-
-    Returns:
-        The transformed frame, the checked result, and the times (see `FrameOutcome.timings`).
-
-    Raises:
-        SequenceError: The frame cannot be read, or does not fit the sequence's camera.
-        TrackerContractError: The tracker broke its contract.
-    """
-    began = time.perf_counter()
-    frame = _read_frame(sequence, index)
-    for transform in transforms:
-        frame = transform(frame)
-    read, processor_began = time.perf_counter(), time.process_time()
-    with tracker_code():
-        result = tracker.track(frame)
-    total, processor = time.perf_counter() - read, time.process_time() - processor_began
-    result = check_result(result, frame, name)
-    if result.stats.get("cached_stages"):  # the stages report their times without the cache
-        inside = (seconds for stage, seconds in result.timings.items() if stage != "detector")  # which works beside
-        uncached = max(total, sum(inside))
-        total, processor = uncached, processor + uncached - total
-    stages = {stage: float(seconds) for stage, seconds in result.timings.items()}
-    measured = {"read": read - began, "total": total, "processor": processor}
-    return frame, result, measured | {name: value for name, value in stages.items() if name not in measured}
 
 
 def _read_frame(sequence: FrameSequence, index: int) -> Frame:
@@ -655,3 +631,119 @@ def _read_frame(sequence: FrameSequence, index: int) -> Frame:
         hint = getattr(error, "hint", "") if ours else ""
         raise SequenceError(f"frame {index} of '{sequence.id}' cannot be read: {fault}", hint) from error
     return frame
+
+
+# What an environment, and a run, is made of: the sequence and its part, and the device.
+
+
+def open_frames(
+    sequence: str | FrameSequence,
+    data_root: str | Path | None,
+    camera: str | Path | None,
+    frames: Frames,
+    stride: int,
+    preprocessing: PreprocessingSettings | None = None,
+    *,
+    memory_map: bool = False,
+) -> FrameSequence:
+    """The sequence, preprocessed and cut to the chosen frames.
+
+    Args:
+        sequence: An id, a folder, or a sequence object.
+        data_root: Folder of the sequences.
+        camera: Camera of a folder that does not name its own.
+        frames: Part of the sequence.
+        stride: Take every so many frames.
+        preprocessing: Applied to every frame.
+        memory_map: Whether the frames are decoded once, see `sequences.decoded.Decoded`.
+
+    Raises:
+        SequenceError: Unknown, missing or damaged sequence, or no frames are left.
+    """
+    start, stop = parse_frames(frames)
+    if isinstance(sequence, str | Path):
+        sequence = open_sequence(sequence, data_root=data_root, camera=camera, preprocessing=preprocessing)
+    elif preprocessing is not None and preprocessing.changes_images:
+        from dynslam_bench.sequences.preprocessing import Preprocessed
+
+        sequence = cast("FrameSequence", Preprocessed(sequence, preprocessing))
+    if (start, stop, stride) != (0, None, 1):
+        sequence = cast("FrameSequence", SequenceView(sequence, start, stop, stride))
+    if memory_map:
+        from dynslam_bench.sequences.decoded import Decoded
+
+        sequence = cast("FrameSequence", Decoded(sequence))
+    return sequence
+
+
+def parse_window(window: Frames, sequence: FrameSequence) -> tuple[int, int]:
+    """First frame of a window and one past its last.
+
+    Raises:
+        SequenceError: It does not lie within the sequence, or has fewer than two frames.
+    """
+    first, stop = parse_frames(window)
+    stop = len(sequence) if stop is None else stop
+    if not 0 <= first < stop - 1 < len(sequence):
+        raise SequenceError(
+            f"the window {first}:{stop} is no part of '{sequence.id}', which has {len(sequence)} frames here",
+            f"give two frames or more within 0:{len(sequence)}",
+        )
+    return first, stop
+
+
+def check_frames(sequence: FrameSequence) -> None:
+    """Refuse a sequence that is too short for an episode, or whose stamps do not tell its frames or true poses apart.
+
+    Raises:
+        SequenceError: It has fewer than two frames, stamps that do not increase, or two frames or true poses less than
+            1 us apart.
+    """
+    if len(sequence) < 2:
+        raise SequenceError(f"'{sequence.id}' has {len(sequence)} frames here, an episode needs 2 or more")
+    stamps = np.asarray(sequence.timestamps, dtype=np.float64)
+    wrong = np.flatnonzero(~(np.diff(stamps) > 0))
+    if len(wrong):
+        at = int(wrong[0]) + 1
+        raise SequenceError(
+            f"'{sequence.id}' has {len(wrong)} of {len(stamps)} stamps that are not later than the one before, first "
+            f"that of frame {at}: {stamps[at]} after {stamps[at - 1]} s",
+            "each frame has a stamp of its own, in seconds, ascending",
+        )
+    refuse_close(timestamps_ns(sequence), f"frames of '{sequence.id}'", SequenceError)
+    if sequence.ground_truth is not None:
+        refuse_close(sequence.ground_truth.timestamps_ns, f"ground truth of '{sequence.id}'", SequenceError)
+
+
+def preprocessing_of(settings: Settings) -> PreprocessingSettings | None:
+    """The group ``preprocessing`` of a tracker's settings; None for trackers without one."""
+    group = getattr(settings, "preprocessing", None)
+    return group if isinstance(group, PreprocessingSettings) else None
+
+
+@names_wrong_arguments
+def resolve_device(device: str = "auto") -> str:
+    """``cpu`` or ``cuda:N`` for ``auto``, ``cpu``, ``cuda`` or ``cuda:N``.
+
+    ``auto`` is the first CUDA device, or the CPU where there is none. Torch is imported only if a driver is present.
+
+    Raises:
+        SettingsError: The name is not understood, or the machine has no such device.
+    """
+    if device == "cpu":
+        return "cpu"
+    if device != "auto" and not re.fullmatch(r"cuda(:\d+)?", device):
+        raise SettingsError(f"unknown device '{device}'", "write auto, cpu, cuda or cuda:N")
+    count = 0
+    if any(Path(node).exists() for node in ("/dev/nvidiactl", "/dev/dxg", "/dev/kfd")):
+        import torch
+
+        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if device == "auto":
+        return "cuda:0" if count else "cpu"
+    index = int(device.partition(":")[2] or 0)
+    if index >= count:
+        raise SettingsError(
+            f"device '{device}' was asked for, this machine has {count} CUDA devices", "use --device cpu"
+        )
+    return f"cuda:{index}"

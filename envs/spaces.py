@@ -2,6 +2,7 @@
 
 import math
 import reprlib
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from operator import attrgetter
 from typing import Any
@@ -76,14 +77,14 @@ class ActionMap:
         Raises:
             SettingsError: The action is none of the space: not 0, of another shape, no numbers, or NaN.
         """
-        if not self.parameters:
-            if not self.space().contains(action):
-                raise SettingsError(
-                    f"the action {reprlib.repr(action)} is not in Discrete(1)",
-                    "without control the only action is 0; name settings in control to change them",
-                )
-            return self.base
-        return apply_overrides(self.base, self.values(action))
+        if self.parameters:
+            return apply_overrides(self.base, self.values(action))
+        if not self.space().contains(action):
+            raise SettingsError(
+                f"the action {reprlib.repr(action)} is not in Discrete(1)",
+                "without control the only action is 0; name settings in control to change them",
+            )
+        return self.base
 
     def values(self, action: object) -> dict[str, Scalar]:
         """Dotted name to value of the controlled settings under an action."""
@@ -129,16 +130,15 @@ def _select(settings: Settings, control: Sequence[str]) -> tuple[Parameter, ...]
     chosen = []
     for name in control:
         if name not in online:
-            if name in flatten(settings):
-                raise SettingsError(f"setting '{name}' may not change in mid-episode", did_you_mean(name, online))
-            hint = did_you_mean(name, online) or "this tracker has no online settings"
-            raise SettingsError(f"unknown setting '{name}' in control", hint)
-        parameter, value = online[name], attrgetter(name)(settings)
+            fixed = f"setting '{name}' may not change in mid-episode"
+            fault = fixed if name in flatten(settings) else f"unknown setting '{name}' in control"
+            raise SettingsError(fault, did_you_mean(name, online) or "this tracker has no online settings")
+        parameter = online[name]
         if parameter in chosen:
             raise SettingsError(f"setting '{name}' is given twice in control")
         if reason := why_unused(settings, name):
             raise SettingsError(f"setting '{name}' in control has no effect: {reason}", "leave it out of control")
-        _check_range(parameter, value, f"setting '{name}' in control")
+        _check_range(parameter, attrgetter(name)(settings), f"setting '{name}' in control")
         chosen.append(parameter)
     return tuple(chosen)
 
@@ -152,9 +152,8 @@ def _check_range(parameter: Parameter, value: Any, title: str) -> None:
 
 
 def _decode(parameter: Parameter, share: float) -> Scalar:
-    if parameter.kind in ("bool", "categorical"):
+    if parameter.low is None or parameter.high is None:
         return parameter.choices[min(int(share * len(parameter.choices)), len(parameter.choices) - 1)]
-    assert parameter.low is not None and parameter.high is not None
     low, high = float(parameter.low), float(parameter.high)
     value = low * (high / low) ** share if parameter.scale == "log" else low + share * (high - low)
     value = min(max(value, low), high)  # rounding may put a power slightly beyond its end
@@ -162,9 +161,8 @@ def _decode(parameter: Parameter, share: float) -> Scalar:
 
 
 def _encode(parameter: Parameter, value: Scalar) -> float:
-    if parameter.kind in ("bool", "categorical"):
+    if parameter.low is None or parameter.high is None:
         return (parameter.choices.index(value) + 0.5) / len(parameter.choices)
-    assert parameter.low is not None and parameter.high is not None
     low, high, x = float(parameter.low), float(parameter.high), float(value)
     if parameter.scale == "log":
         return math.log(max(x, low) / low) / math.log(high / low)
@@ -296,12 +294,10 @@ def observe(parts: Iterable[str], frame: Frame, result: TrackResult, episode: Ep
     return observed
 
 
-def _estimated_motion(episode: Episode) -> NDArray[np.float64] | None:
-    """Twist ``[6]`` of the estimated motion since the previous frame; None if either has no pose."""
-    poses = [outcome.T_world_cam for outcome in episode.outcomes[-2:]]
-    if len(poses) < 2 or poses[0] is None or poses[1] is None:
-        return None
-    return se3.log(se3.inverse(poses[0]) @ poses[1])
+def _estimated_motion(episode: Episode) -> NDArray[np.float64]:
+    """Twist ``[6]`` of the estimated motion since the previous frame; 0 if either has no pose."""
+    poses = [outcome.T_world_cam for outcome in episode.outcomes[-2:] if outcome.T_world_cam is not None]
+    return se3.log(se3.inverse(poses[0]) @ poses[1]) if len(poses) == 2 else np.zeros(6)
 
 
 def keypoint_tokens(frame: Frame, result: TrackResult) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
@@ -310,13 +306,10 @@ def keypoint_tokens(frame: Frame, result: TrackResult) -> tuple[NDArray[np.float
     Returns:
         float32 ``[N, 5]`` (`KEYPOINT_LAYOUT`), rows beyond the keypoints 0, and int8 ``[N]``, 1 where there is one.
     """
-    tokens = np.zeros((MOST_KEYPOINTS, len(KEYPOINT_LAYOUT)), np.float32)
-    mask = np.zeros(MOST_KEYPOINTS, np.int8)
+    tokens, mask = np.zeros((MOST_KEYPOINTS, len(KEYPOINT_LAYOUT)), np.float32), np.zeros(MOST_KEYPOINTS, np.int8)
     xy = np.zeros((0, 2)) if result.keypoints_xy is None else np.asarray(result.keypoints_xy)
     keep = np.ones(len(xy)) if result.keypoints_keep is None else np.asarray(result.keypoints_keep)
-    rows = np.arange(len(xy))
-    if len(xy) > MOST_KEYPOINTS:
-        rows = np.linspace(0, len(xy) - 1, MOST_KEYPOINTS).astype(np.intp)
+    rows = np.linspace(0, len(xy) - 1, min(len(xy), MOST_KEYPOINTS)).astype(np.intp)
     height, width = frame.depth.shape
     x, y = xy[rows].T
     at = np.rint(y).astype(np.intp).clip(0, height - 1), np.rint(x).astype(np.intp).clip(0, width - 1)
@@ -333,16 +326,15 @@ def privileged_observation(episode: Episode) -> NDArray[np.float32]:
     now = episode.outcomes[-1].error
     before = episode.outcomes[-2].error if len(episode.outcomes) > 1 else None
     if now is not None:
-        frame_trans, frame_rot = now.frame_trans_m or 0.0, now.frame_rot_deg or 0.0
         values[:3] = 1.0, now.trans_m / (now.trans_m + 1.0), now.rot_deg / 180.0
-        values[3:5] = np.tanh(frame_trans / 0.1), frame_rot / 180.0
+        values[3:5] = np.tanh((now.frame_trans_m or 0.0) / 0.1), (now.frame_rot_deg or 0.0) / 180.0
     if now is not None and before is not None:
         values[5:] = np.tanh(se3.log(se3.inverse(before.T_world_true) @ now.T_world_true) / 0.1)
     return values.astype(np.float32)
 
 
 def stats_observation(
-    frame: Frame, result: TrackResult, *, progress: float, lost_streak: int, motion: NDArray[np.float64] | None
+    frame: Frame, result: TrackResult, *, progress: float, lost_streak: int, motion: NDArray[np.float64]
 ) -> NDArray[np.float32]:
     """The vector of `STATS_LAYOUT` for one tracked frame; finite whatever the tracker reports.
 
@@ -351,13 +343,10 @@ def stats_observation(
         result: What the tracker gave for it.
         progress: Index of the frame, over that of the sequence's last one.
         lost_streak: Frames lost in a row, this one included.
-        motion: Twist ``[6]`` of the estimated motion since the previous frame; None if either frame has no pose.
+        motion: Twist ``[6]`` of the estimated motion since the previous frame; 0 if either frame has no pose.
     """
-    stats = result.stats
-    keypoints = _stat(stats, "keypoints")
-    culled = _stat(stats, "culled")
-    matches = _stat(stats, "matches")
-    motion = np.zeros(6) if motion is None else np.tanh(motion / 0.1)
+    stats = defaultdict(float, {name: float(value) for name, value in result.stats.items() if np.isfinite(value)})
+    keypoints, matches = stats["keypoints"], stats["matches"]
     gray = frame.rgb[::4, ::4].mean(axis=2, dtype=np.float32)
     depth = frame.depth[::4, ::4]
     valid = depth[(depth > 0) & np.isfinite(depth)]
@@ -368,26 +357,21 @@ def stats_observation(
         _saturate(lost_streak, 10.0),
         progress,
         _saturate(keypoints, 1000.0),
-        _ratio(culled, keypoints),
-        _ratio(matches, keypoints - culled),
-        _ratio(_stat(stats, "inliers"), matches),
-        _saturate(_stat(stats, "residual_px"), 1.0),
-        _stat(stats, "mask_fraction"),
-        _saturate(_stat(stats, "map_points"), 5000.0),
-        _saturate(_stat(stats, "keyframes"), 100.0),
-        float(_stat(stats, "keyframe") > 0),
-        *motion,
+        _ratio(stats["culled"], keypoints),
+        _ratio(matches, keypoints - stats["culled"]),
+        _ratio(stats["inliers"], matches),
+        _saturate(stats["residual_px"], 1.0),
+        stats["mask_fraction"],
+        _saturate(stats["map_points"], 5000.0),
+        _saturate(stats["keyframes"], 100.0),
+        float(stats["keyframe"] > 0),
+        *np.tanh(motion / 0.1),
         float(gray.mean()) / 255.0,
         float(gray.std()) / 128.0,
         valid.size / max(depth.size, 1),
         _saturate(float(np.median(valid)), 3.0) if valid.size else 0.0,
     ]
     return np.clip(np.asarray(values, dtype=np.float32), np.where(_SIGNED, -1.0, 0.0), 1.0).astype(np.float32)
-
-
-def _stat(stats: Mapping[str, float], name: str) -> float:
-    value = float(stats.get(name, 0.0))
-    return value if np.isfinite(value) else 0.0
 
 
 def _saturate(value: float, scale: float) -> float:

@@ -60,13 +60,7 @@ class RecordTimings(SlamWrapper):
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Step, with the frame's times in ``info``."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        return (
-            observation,
-            reward,
-            terminated,
-            truncated,
-            info | {"timings": self._base.timings[-1]},
-        )
+        return observation, reward, terminated, truncated, info | {"timings": self._base.timings[-1]}
 
     def summary(self) -> dict[str, dict[str, float]]:
         """``median`` and ``p95`` of every stage over the episode so far, seconds (0 where a stage did not run)."""
@@ -87,8 +81,7 @@ class RecordTrajectory(SlamWrapper):
 
     def __init__(self, env: gym.Env[Any, Any], path: str | Path) -> None:
         super().__init__(env, path=str(path))
-        self._pattern = str(path)
-        self._episode = -1
+        self._pattern, self._episode = str(path), -1
         self.written: list[Path] = []
         """The files so far, in order."""
 
@@ -105,10 +98,9 @@ class RecordTrajectory(SlamWrapper):
         """
         outcome = self.env.step(action)
         if outcome[2] or outcome[3]:
-            path = Path(self._pattern.replace("{episode}", str(self._episode)))
+            self.written.append(Path(self._pattern.replace("{episode}", str(self._episode))))
             comment = f"{self._base.tracker_spec.id} on {self._base.sequence.id}, online"
-            write_tum(path, self._base.online_trajectory(), comment=comment)
-            self.written.append(path)
+            write_tum(self.written[-1], self._base.online_trajectory(), comment=comment)
         return outcome
 
 
@@ -138,9 +130,7 @@ class SequenceSampler(SlamWrapper):
         super().__init__(env, sequences=list(sequences), mode=mode)
         if mode not in ("round_robin", "random"):
             raise SettingsError(f"unknown mode '{mode}'", "known: round_robin, random")
-        self._sequences = tuple(sequences)
-        self._mode = mode
-        self._next = 0
+        self._sequences, self._mode, self._next = tuple(sequences), mode, 0
         self._rng = gym.utils.seeding.np_random(None)[0]
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
@@ -151,8 +141,10 @@ class SequenceSampler(SlamWrapper):
         if seed is not None:
             self._next = seed
             self._rng = stream(seed, "sequences")  # apart from the environment's own numbers
-        chosen = self._draw()
-        options = {"sequence": chosen} | (options or {})
+        count = len(self._sequences)
+        number = self._next % count if self._mode == "round_robin" else int(self._rng.integers(count))
+        self._next += 1
+        options = {"sequence": self._sequences[number]} | (options or {})
         self._shown = str(options["sequence"])
         observation, info = self.env.reset(seed=seed, options=options)
         return observation, info | {"sequence": self._shown}
@@ -161,13 +153,6 @@ class SequenceSampler(SlamWrapper):
         """Step, with the sequence in ``info`` as after `reset`."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         return observation, reward, terminated, truncated, info | {"sequence": self._shown}
-
-    def _draw(self) -> str:
-        if self._mode == "random":
-            return self._sequences[int(self._rng.integers(len(self._sequences)))]
-        chosen = self._sequences[self._next % len(self._sequences)]
-        self._next += 1
-        return chosen
 
 
 @names_wrong_arguments
@@ -228,8 +213,10 @@ class SmallImages(SlamWrapper, gym.ObservationWrapper[Any, Any, Any]):
         if min(width, height) < 1:
             raise SettingsError(f"an image of {width} x {height} pixels has none")
         self._size = (width, height)
-        images = {"rgb": spaces.Box(0, 255, (height, width, 3), np.uint8)}
-        images["depth"] = spaces.Box(0, 255, (height, width, 1), np.uint8)
+        images = {
+            "rgb": spaces.Box(0, 255, (height, width, 3), np.uint8),
+            "depth": spaces.Box(0, 255, (height, width, 1), np.uint8),
+        }
         self.observation_space = spaces.Dict({**space.spaces, **images})
 
     def observation(self, observation: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -392,12 +379,13 @@ class DropFrames(SlamWrapper):
         seed: int = 0,
     ) -> None:
         super().__init__(env, speed=speed, frame_time_s=frame_time_s, share=share, seed=seed)
-        if not speed > 0:
-            raise SettingsError(f"speed is {speed}, expected a number > 0")
-        if frame_time_s is not None and not frame_time_s >= 0:
-            raise SettingsError(f"frame_time_s is {frame_time_s}, expected seconds >= 0")
-        if share is not None and not 0 <= share < 1:
-            raise SettingsError(f"share is {share}, expected a probability in [0, 1)")
+        for name, value, fits, expected in (
+            ("speed", speed, speed > 0, "a number > 0"),
+            ("frame_time_s", frame_time_s, frame_time_s is None or frame_time_s >= 0, "seconds >= 0"),
+            ("share", share, share is None or 0 <= share < 1, "a probability in [0, 1)"),
+        ):
+            if not fits:
+                raise SettingsError(f"{name} is {value}, expected {expected}")
         self._speed, self._frame_time_s, self._share, self._seed = speed, frame_time_s, share, seed
         self._live = share is None and frame_time_s is None
         self._warm = not self._live
@@ -410,19 +398,22 @@ class DropFrames(SlamWrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; the clock starts when frame 0 arrives, and the tracker is warm then."""
+        base = self._base
         if not self._warm:
-            self._warm_up(options)
-            self._warm = True
+            numbers = base.np_random
+            base.reset(seed=0, options=options)
+            while not base.episode.over and base.episode.next_index < WARM_UP_FRAMES:
+                base.step(base.neutral_action)
+            base.np_random, self._warm = numbers, True  # the random numbers go on from where they were
         outcome = self.env.reset(seed=seed, options=options)
-        self._base.episode.free_at = self._arrivals()[0] + self._busy_s()
+        base.episode.free_at = self._arrivals()[0] + self._busy_s()
         return outcome
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Drop what the tracker missed, then track the next frame."""
         episode = self._base.episode
-        index = episode.next_index
-        target = self._next_frame(index)
-        charged = self._base.drop_frames(target - index)
+        target = self._next_frame(episode.next_index)
+        charged = self._base.drop_frames(target - episode.next_index)
         idle_s = max(self._arrivals()[target] - episode.free_at, 0.0)
         if self._live:
             time.sleep(max(idle_s - self._overhead_s, 0.0))
@@ -432,22 +423,10 @@ class DropFrames(SlamWrapper):
         episode.free_at += idle_s + self._busy_s()
         return observation, float(reward) + charged, terminated, truncated, info
 
-    def _warm_up(self, options: dict[str, Any] | None) -> None:
-        """Track the first frames; the environment's random numbers are afterwards where they were."""
-        base = self._base
-        numbers = base.np_random
-        base.reset(seed=0, options=options)
-        while not base.episode.over and base.episode.next_index < WARM_UP_FRAMES:
-            base.step(base.neutral_action)
-        base.np_random = numbers
-
     def _next_frame(self, index: int) -> int:
-        last = len(self._base.sequence) - 1
-        if self._share is not None:
-            target = index
-            while target < last and stream(self._seed, "drop", target).random() < self._share:
-                target += 1
-            return target
+        last, share = len(self._base.sequence) - 1, self._share
+        if share is not None:
+            return next((i for i in range(index, last) if stream(self._seed, "drop", i).random() >= share), last)
         newest = int(np.searchsorted(self._arrivals(), self._base.episode.free_at, side="right")) - 1
         return min(max(newest, index), last)
 

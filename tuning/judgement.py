@@ -32,8 +32,7 @@ from dynslam_bench.tuning.objectives import (
     together,
     violations,
 )
-from dynslam_bench.tuning.plan import held_settings
-from dynslam_bench.tuning.splits import seen_note, splits_seen
+from dynslam_bench.tuning.plan import held_settings, seen_note, splits_seen
 from dynslam_bench.tuning.storage import Importance, best_trials, count_states, importances, scene_ratios
 from dynslam_bench.tuning.study import StoredStudy, Study
 from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec
@@ -200,7 +199,7 @@ class StudySummary(Record):
         confirm: Those of the choice.
         held_out: Those that judged it.
         recorded: Recordings that it was checked on.
-        seen: Splits with scenes that the network behind the masks was trained on, see `splits.seen_note`.
+        seen: Splits with scenes that the network behind the masks was trained on, see `plan.seen_note`.
     """
 
     name: str
@@ -332,12 +331,12 @@ def beside_default(baseline: str, shipped: Mapping[str, Ratio], best: Candidate 
         shipped: The default settings beside it, by split.
         best: The best candidate.
     """
-    split = next((split for split in ("held_out", "confirm") if split in shipped), None)
-    mine = None if best is None or split is None else getattr(best, split)
-    if split is None or mine is None:
+    split = "held_out" if "held_out" in shipped else "confirm"
+    default, mine = shipped.get(split), getattr(best, split, None)
+    if default is None or mine is None:
         return ""
-    keep = ", so keep them" if shipped[split].ratio <= mine.ratio else ""
-    return f" Ratios are to {baseline}; the default settings have {shipped[split]} there{keep}."
+    keep = ", so keep them" if default.ratio <= mine.ratio else ""
+    return f" Ratios are to {baseline}; the default settings have {default} there{keep}."
 
 
 def _unsettled(best: Candidate) -> str:
@@ -388,22 +387,21 @@ def finish(tuner: Study, on_note: Callable[[str], None] | None = None, *, jobs: 
     if not finished:
         raise StudyError(f"study '{spec.name}' has no finished trial", "run it first, or see why its trials failed")
     is_rival = tuner.baseline.tracker != spec.tracker  # then trial 0, the default settings, is a candidate too
-    best = [trial for trial in finished if trial.number > 0 or is_rival][: spec.top]
     margin, shipped = spec.ate_margin if spec.at_equal_accuracy else None, dict[str, Ratio]()
     candidates = [
         Candidate(trial=trial.number, params=trial.params, values=list(trial.values or ()), ate_margin=margin)
-        for trial in best
-    ]
-    if best and design.confirm:
-        note(f"the baseline and {len(best)} trials on {len(design.confirm)} instances that no trial has seen")
+        for trial in finished
+        if trial.number > 0 or is_rival
+    ][: spec.top]
+    if candidates and design.confirm:
+        note(f"the baseline and {len(candidates)} trials on {len(design.confirm)} instances that no trial has seen")
     candidates = _judge(tuner, "confirm", candidates, jobs, shipped)
     candidates.sort(key=lambda candidate: (candidate.bound, bool(candidate.failed), not candidate.feasible))
     if candidates and design.confirm and not candidates[0].failed:
         note(f"trial {candidates[0].trial} on the held-out instances")
         for split in ("held_out", "recorded"):
             candidates[:1] = _judge(tuner, split, candidates[:1], jobs, shipped)
-    ratios = scene_ratios(tuner.study)
-    p_value = spread_test(list(ratios.values()))
+    p_value = spread_test(list(scene_ratios(tuner.study).values()))
     reasons = [trial.user_attrs.get("reason", "") for trial in tuner.study.get_trials(states=(TrialState.FAIL,))]
     verdict, conclusion = judge(candidates, p_value, reasons)
     conclusion += beside_default(spec.baseline, shipped, candidates[0] if candidates else None)
@@ -425,7 +423,7 @@ def finish(tuner: Study, on_note: Callable[[str], None] | None = None, *, jobs: 
         tune=list(map(str, design.tune)),
         seen=splits_seen(tuner.defaults, design),
     )
-    text = preset_text(
+    preset = preset_text(
         spec,
         summary.best.params if summary.best else {},
         " ".join(filter(None, (conclusion, seen_note(summary.seen)))),
@@ -433,7 +431,7 @@ def finish(tuner: Study, on_note: Callable[[str], None] | None = None, *, jobs: 
         tuned_on=[*summary.tune, *summary.confirm],
         judged_on=[*summary.held_out, *summary.recorded],
     )
-    write_atomic(tuner.folder / "best.toml", text)
+    write_atomic(tuner.folder / "best.toml", preset)
     write_atomic(tuner.folder / "summary.json", summary.to_json())
     return summary
 
@@ -461,8 +459,9 @@ def _judge(
         if not isinstance(outcomes, InstanceFailedError):
             update = {split: compared(outcomes, baseline, objective=objective, candidates=len(candidates))}
             if split != "recorded":
-                both = (ACCURACY, SPEED)
-                update[f"on_{split}"] = {one.name: compared(outcomes, baseline, objective=one) for one in both}
+                update[f"on_{split}"] = {
+                    one.name: compared(outcomes, baseline, objective=one) for one in (ACCURACY, SPEED)
+                }
             if split == "confirm":
                 update["feasible"] = all(value <= 0 for value in violations(tuner.spec, outcomes).values())
         judged.append(candidate.model_copy(update=update))
@@ -525,12 +524,10 @@ def preset_text(
         f"Judged on {_listed(judged_on)}.": judged_on,
         f"Fixed in that study, not part of these settings: {', '.join(_lines(fixed))}.": fixed,
     }
-    shown = (line for text, holds in remarks.items() if holds for line in textwrap.wrap(text, 100))
-    head = [f"settings of {spec.tracker}", *shown]
+    shown = [f"# {line}" for text, holds in remarks.items() if holds for line in textwrap.wrap(text, 100)]
     settings = {name: value for name, value in {**held_settings(spec), **tuned}.items() if name not in fixed}
-    return "\n".join(
-        [*(f"# {line}" for line in head), "", f"status = {json.dumps(status)}", "", "[settings]", *_lines(settings), ""]
-    )
+    head = [f"# settings of {spec.tracker}", *shown, "", f"status = {json.dumps(status)}", "", "[settings]"]
+    return "\n".join([*head, *_lines(settings), ""])
 
 
 def _lines(settings: Mapping[str, Any]) -> list[str]:

@@ -84,16 +84,15 @@ def outcome(
     total, elsewhere = record.timings["total"], record.device.startswith("cuda") or FOREIGN in record.timings
     processor = total if elsewhere else record.timings.get("processor", total)
     period = record.sequence.duration_s / max(record.sequence.frames - 1, 1)
-    times = (total.mean_s, processor.mean_s, period / total.mean_s)
-    return Outcome(instance, record.run_id, ate, record.coverage or 0.0, *times)
+    rtf = period / total.mean_s
+    return Outcome(instance, record.run_id, ate, record.coverage or 0.0, total.mean_s, processor.mean_s, rtf)
 
 
 def held_protocol(protocol: Protocol | str) -> Protocol:
     """The protocol with lost frames held at the last pose, so that losing track never pays."""
     protocol = get_protocol(protocol)
-    if protocol.lost_frames == "hold":
-        return protocol
-    return protocol.model_copy(update={"id": f"{protocol.id}+hold", "lost_frames": "hold"})
+    held = protocol.model_copy(update={"id": f"{protocol.id}+hold", "lost_frames": "hold"})
+    return protocol if protocol.lost_frames == "hold" else held
 
 
 @lru_cache(maxsize=256)
@@ -247,9 +246,7 @@ def violations(spec: StudySpec, outcomes: Outcomes, baseline: Outcomes | None = 
         outcomes: Of a configuration.
         baseline: Outcomes of the baseline at the same places, for that ratio; None to leave it out.
     """
-    values = {}
-    if spec.min_coverage is not None:
-        values["coverage"] = spec.min_coverage - coverage(outcomes)
+    values = {} if spec.min_coverage is None else {"coverage": spec.min_coverage - coverage(outcomes)}
     if spec.min_fps is not None:
         values["fps"] = (spec.min_fps - fps(outcomes)) / spec.min_fps
     if baseline is not None and spec.at_equal_accuracy and len(spec.objectives) == 1:
@@ -371,15 +368,13 @@ def spread_test(trials: Sequence[Mapping[str, float]]) -> float | None:
         return None
     rows, columns, values = (np.array(column) for column in zip(*cells, strict=True))
     by_scene, by_trial = np.eye(len(names))[columns], np.eye(len(trials))[rows]
-    left = [
+    left, chance = (
         float(np.square(values - model @ np.linalg.lstsq(model, values)[0]).sum())
         for model in (by_scene, np.hstack([by_scene, by_trial]))
-    ]
-    explained = max(0.0, left[0] - left[1]) / (len(trials) - 1)
-    chance = left[1] / free
-    if explained < _SAME:
-        return 1.0
-    return float(stats.f.sf(explained / max(chance, _SAME), len(trials) - 1, free))
+    )
+    explained = max(0.0, left - chance) / (len(trials) - 1)
+    ratio = explained / max(chance / free, _SAME)
+    return 1.0 if explained < _SAME else float(stats.f.sf(ratio, len(trials) - 1, free))
 
 
 _SAME = 1e-18

@@ -1,7 +1,6 @@
 """The page of a study: verdict, what was tried, confirmed and held out, settings, Optuna's plots, all trials."""
 
 import math
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,9 +18,8 @@ from dynslam_bench.reports.html.page import Block, Section, figure_blocks, write
 from dynslam_bench.reports.model.row import SEEN, command_line
 from dynslam_bench.reports.tables.table import Column, Table, TableCell, number, numbers, to_csv
 from dynslam_bench.tuning.judgement import Candidate, Ratio, StudySummary, Verdict
-from dynslam_bench.tuning.samplers import is_feasible
-from dynslam_bench.tuning.splits import FEWEST_STARTS, Design, seen_note
-from dynslam_bench.tuning.storage import EARLIER, FEWEST_TRIALS
+from dynslam_bench.tuning.plan import FEWEST_STARTS, Design, seen_note
+from dynslam_bench.tuning.storage import EARLIER, FEWEST_TRIALS, is_feasible, quiet
 from dynslam_bench.tuning.study import Study
 from dynslam_bench.tuning.study_file import scenes
 
@@ -43,8 +41,8 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
     """
     spec = tuner.spec
     candidates, trials = _candidates(summary), _trials(tuner, summary)
-    proven = summary.verdict == Verdict.PROVEN
-    settings = settings_table(tuner.space, tuner.base, summary.best.params if summary.best else {}, proven)
+    params, proven = summary.best.params if summary.best else {}, summary.verdict == Verdict.PROVEN
+    settings = settings_table(tuner.space, tuner.base, params, proven)
     for table in (candidates, trials, settings):
         write_atomic(tuner.folder / "csv" / f"{table.id}.csv", to_csv(table))
     caption = (
@@ -72,10 +70,9 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
         footer=f"Sampler {spec.sampler}, pruner {spec.pruner}, Optuna {optuna.__version__}. "
         f"Reproduce: {command_line(tuner.study.user_attrs.get('command', []))}",
     )
-    path = tuner.folder / "index.html"
     write_assets(tuner.folder)
-    write_atomic(path, html)
-    return path
+    write_atomic(tuner.folder / "index.html", html)
+    return tuner.folder / "index.html"
 
 
 def _asked(tuner: Study, summary: StudySummary) -> str:
@@ -89,10 +86,9 @@ def _asked(tuner: Study, summary: StudySummary) -> str:
     )
     limits = {"coverage": tuner.spec.min_coverage, "frames a second": tuner.spec.min_fps}
     named = ", ".join(f"{name} of {least:g} or more" for name, least in limits.items() if least is not None)
-    constraints = f" Constraints: {named}." if named else ""
     return (
         f"Do other values of {len(tuner.space)} settings give {tuner.spec.tracker} less {goals} than "
-        f"{summary.baseline}? Trials: {trials}. Runs: {sizes}.{constraints}"
+        f"{summary.baseline}? Trials: {trials}. Runs: {sizes}." + (f" Constraints: {named}." if named else "")
     )
 
 
@@ -104,8 +100,7 @@ def _plots(tuner: Study, summary: StudySummary) -> list[Block]:
     target: dict[str, Any] = {"target": lambda trial: math.exp(trial.values[0]), "target_name": names[0]}
     important = list(summary.importances)
     params = important or [parameter.name for parameter in tuner.space]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # experimental; of trials that pruning never saw
+    with quiet():
         figures = {
             "History": visualization.plot_optimization_history(tuner.study, **target),
             "Parallel coordinates": visualization.plot_parallel_coordinate(tuner.study, **target),
@@ -137,11 +132,11 @@ def _plots(tuner: Study, summary: StudySummary) -> list[Block]:
 def _preset(tuner: Study, summary: StudySummary, settings: Table) -> list[Block]:
     """The best settings with their status, and how to use them only if they are proven."""
     shown, text = Block(table=settings), read_text(tuner.folder / "best.toml")
-    if summary.verdict != Verdict.PROVEN or summary.keeps_default:
-        why = "the default settings are as good" if summary.keeps_default else summary.verdict.value
-        return [shown, Block(title=f"best.toml, not recommended: {why}", text=text)]
-    command = f"dynslam-bench run {tuner.spec.tracker} SEQUENCE --settings best.toml"
-    return [shown, Block(text=text), Block(title="Use them", text=command)]
+    if summary.verdict == Verdict.PROVEN and not summary.keeps_default:
+        command = f"dynslam-bench run {tuner.spec.tracker} SEQUENCE --settings best.toml"
+        return [shown, Block(text=text), Block(title="Use them", text=command)]
+    why = "the default settings are as good" if summary.keeps_default else summary.verdict.value
+    return [shown, Block(title=f"best.toml, not recommended: {why}", text=text)]
 
 
 def _importance_note(summary: StudySummary) -> str:
@@ -153,16 +148,13 @@ def _importance_note(summary: StudySummary) -> str:
 
 def _funnel_figure(tuner: Study, summary: StudySummary) -> go.Figure:
     """Ratios of all trials, of the confirmed candidates, and of the choice where it is judged."""
-    tried = [
-        (trial.number, math.exp(trial.values[0]))
-        for trial in tuner.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-    ]
+    tried = tuner.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     spread = 0.5 * (np.random.default_rng(0).random(len(tried)) - 0.5)
     stages = [f"tried: {len(tried)} whole trials"]
     traces = [
         go.Scatter(
-            x=spread, y=[ratio for _, ratio in tried], mode="markers", name="trials",
-            text=[f"trial {trial}" for trial, _ in tried], marker={"color": NEUTRAL, "opacity": 0.7, "size": 7},
+            x=spread, y=[math.exp(trial.values[0]) for trial in tried], mode="markers", name="trials",
+            text=[f"trial {trial.number}" for trial in tried], marker={"color": NEUTRAL, "opacity": 0.7, "size": 7},
             hovertemplate="%{text}: %{y:.3f}<extra></extra>",
         )
     ]  # fmt: skip
@@ -258,9 +250,11 @@ def _candidates(summary: StudySummary) -> Table:
     tune, confirm, held_out = _marked(
         summary, ("in the trial", "tune"), ("unseen instances", "confirm"), ("held-out", "held_out")
     )
-    columns = [Column("trial"), Column(tune, meaning=optimistic), *numbers(confirm)]
-    columns += [Column("upper bound", meaning=widened), *numbers(held_out, "recorded", "processor time")]
-    columns += [Column("constraints hold", numeric=False)]
+    columns = [
+        *(Column("trial"), Column(tune, meaning=optimistic), *numbers(confirm)),
+        *(Column("upper bound", meaning=widened), *numbers(held_out, "recorded", "processor time")),
+        Column("constraints hold", numeric=False),
+    ]
     return Table("candidates", "The best trials, judged again", caption, columns, rows)
 
 

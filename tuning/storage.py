@@ -10,8 +10,8 @@ import socket
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import cache, wraps
 from pathlib import Path
 from typing import Any
@@ -22,19 +22,30 @@ import optuna
 import pandas as pd
 import psutil
 from optuna.exceptions import StorageInternalError, UpdateFinishedTrialError
-from optuna.storages import BaseStorage, RDBStorage
-from optuna.storages.journal import JournalFileBackend
+from optuna.storages import BaseStorage, RDBStorage, journal
 from optuna.trial import FrozenTrial, TrialState, create_trial
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 
 from dynslam_bench.core import HIDDEN, StudyError, raising, read_json, repeating, without_passwords
 from dynslam_bench.core.records import Record, validated
 from dynslam_bench.tuning.objectives import centre
-from dynslam_bench.tuning.samplers import is_feasible
 from dynslam_bench.tuning.study_file import StudySpec
 
 EARLIER = "earlier"
 """User attribute of trials that an earlier study made: which, and whether by other code. They are no candidates."""
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """No warnings while the block lasts: Optuna calls much experimental, and has something to say of equal trials."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def is_feasible(trial: FrozenTrial) -> bool:
+    """Whether a trial fulfils all constraints."""
+    return all(value <= 0 for value in trial.constraints.values())
 
 
 def best_trials(study: optuna.Study, count: int) -> list[FrozenTrial]:
@@ -49,11 +60,10 @@ def best_trials(study: optuna.Study, count: int) -> list[FrozenTrial]:
     pruned = [trial for trial in trials if trial.state == TrialState.PRUNED and trial.user_attrs.get("scenes")]
     candidates.sort(key=lambda trial: sum(trial.values))
     pruned.sort(key=lambda trial: (-len(trial.user_attrs["instances"]), centre(trial.user_attrs["scenes"].values())))
-    distinct: list[FrozenTrial] = []
+    distinct: dict[tuple[Any, ...], FrozenTrial] = {}
     for trial in [*candidates, *pruned]:
-        if all(trial.params != other.params for other in distinct):
-            distinct.append(trial)
-    return distinct[:count]
+        distinct.setdefault(tuple(sorted(trial.params.items())), trial)
+    return list(distinct.values())[:count]
 
 
 def count_states(study: optuna.Study) -> dict[str, int]:
@@ -86,9 +96,11 @@ def trials_frame(spec: StudySpec, study: optuna.Study) -> pd.DataFrame:
     """
     trials = study.get_trials(deepcopy=False)
     objectives = [f"value_{objective}" for objective in spec.objectives]
-    kinds = {"trial": "Int64", "state": "string"} | dict.fromkeys([*objectives, "ratio"], "Float64")
-    kinds |= {"duration_s": "Float64", "coverage": "Float64", "fps": "Float64"}
-    kinds |= {"runs": "Int64", "feasible": "boolean", "reason": "string", EARLIER: "string"}
+    kinds = {
+        **{"trial": "Int64", "state": "string"},
+        **dict.fromkeys([*objectives, "ratio", "duration_s", "coverage", "fps"], "Float64"),
+        **{"runs": "Int64", "feasible": "boolean", "reason": "string", EARLIER: "string"},
+    }
     frame = pd.DataFrame([_row(spec, trial) for trial in trials], columns=list(kinds)).astype(kinds)
     for name in sorted({name for trial in trials for name in trial.params}):
         frame[f"params.{name}"] = pd.array([trial.params.get(name) for trial in trials])
@@ -141,12 +153,14 @@ def importances(study: optuna.Study) -> dict[str, Importance]:
         Shares that add up to 1; empty below `FEWEST_TRIALS` complete or pruned trials, or where their values are equal.
     """
     trials = study.get_trials(deepcopy=False)
-    judged = [(trials[number], centre(ratios.values())) for number, ratios in scene_ratios(study).items()]
-    if len(judged) < FEWEST_TRIALS or len({value for _, value in judged}) < 2:
-        return {}
     copies = [
-        create_trial(params=trial.params, distributions=trial.distributions, value=value) for trial, value in judged
+        create_trial(
+            params=trials[number].params, distributions=trials[number].distributions, value=centre(ratios.values())
+        )
+        for number, ratios in scene_ratios(study).items()
     ]
+    if len(copies) < FEWEST_TRIALS or len({copy.value for copy in copies}) < 2:
+        return {}
     rng = np.random.default_rng(0)
     whole, *resampled = [
         _shares([copies[index] for index in chosen])
@@ -162,8 +176,7 @@ def importances(study: optuna.Study) -> dict[str, Importance]:
 def _shares(trials: Sequence[FrozenTrial]) -> dict[str, float]:
     study = optuna.create_study()
     study.add_trials(trials)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # experimental; of resampled trials that are all equal
+    with quiet():
         evaluator = optuna.importance.PedAnovaImportanceEvaluator()
         return optuna.importance.get_param_importances(study, evaluator=evaluator)
 
@@ -171,7 +184,6 @@ def _shares(trials: Sequence[FrozenTrial]) -> dict[str, float]:
 SCHEMES = ("sqlite", "postgresql", "mysql", "mariadb", "oracle", "mssql", "grpc")
 """SQL databases (also with a driver: ``postgresql+psycopg``) and Optuna's gRPC proxy. They hold data, never code;
 Optuna unpickles what Redis holds."""
-_ATTEMPTS = 10
 _BEING_MADE = ("already exists", "duplicate", "unique constraint", "is locked")
 """What drivers say where another worker makes the tables at the same time."""
 
@@ -254,16 +266,16 @@ def open_database(url: str) -> BaseStorage:
     Raises:
         Exception: What the database's driver raises.
     """
-    for attempt in range(_ATTEMPTS):
-        try:
-            how = {"pool_pre_ping": True, "pool_size": 1}  # a server takes few connections, e.g. 100
-            return optuna.storages.get_storage(PatientStorage(url, engine_kwargs=how))
+    deadline = time.monotonic() + BEGINNING_S
+    while True:
+        try:  # a server takes few connections, e.g. 100
+            storage = PatientStorage(url, engine_kwargs={"pool_pre_ping": True, "pool_size": 1})
+            return optuna.storages.get_storage(storage)
         except (DBAPIError, StorageInternalError) as error:
             cause = str(error.__cause__ or error).lower()
-            if attempt + 1 == _ATTEMPTS or not any(words in cause for words in _BEING_MADE):
+            if time.monotonic() > deadline or not any(words in cause for words in _BEING_MADE):
                 raise
-            time.sleep(random.uniform(0.05, 0.5))
-    raise AssertionError("unreachable")
+        time.sleep(random.uniform(0.05, 0.5))
 
 
 class PatientStorage(RDBStorage):
@@ -274,7 +286,7 @@ class PatientStorage(RDBStorage):
     """
 
 
-PATIENCE_S = 60.0
+BEGINNING_S, PATIENCE_S = 5.0, 60.0
 _NO_ANSWER = (OperationalError, InterfaceError)
 
 
@@ -312,12 +324,10 @@ for _name, _method in inspect.getmembers(RDBStorage, inspect.isfunction):
 
 def without_password(text: str, address: str) -> str:
     """A text, for example a driver's message, without the password that an address holds."""
-    try:
+    with suppress(ValueError):  # no address
         password = urlsplit(address).password or ""
-    except ValueError:
-        password = ""
-    for secret in {password, unquote(password)} - {""}:
-        text = text.replace(secret, HIDDEN)
+        for secret in {password, unquote(password)} - {""}:
+            text = text.replace(secret, HIDDEN)
     return without_passwords(text)
 
 
@@ -361,9 +371,9 @@ class Heartbeats:
         """Whether the worker of a running trial has ended; of a trial that has not been given its name, all others."""
         if worker := trial.user_attrs.get("worker"):
             return self._has_ended(worker)
-        alive = [key.removeprefix(_ALIVE) for key in self._study.user_attrs if key.startswith(_ALIVE)]
-        others_ended = all(map(self._has_ended, set(alive) - {self._name}))
-        return self._stands_still(f"trial {trial.number}", None) > NAMELESS_S and others_ended
+        alive = {key.removeprefix(_ALIVE) for key in self._study.user_attrs if key.startswith(_ALIVE)}
+        waited_s = self._stands_still(f"trial {trial.number}", None)
+        return waited_s > NAMELESS_S and all(map(self._has_ended, alive - {self._name}))
 
     def _has_ended(self, name: str) -> bool:
         machine, _, pid = name.rpartition(":")
@@ -392,9 +402,8 @@ class Heartbeats:
         silent = {name for name in workers.values() if name.rpartition(":")[0] != _machine()}
         while silent and time.monotonic() < deadline:
             time.sleep(0.2)
-            silent -= {
-                name for name in silent if self._study.user_attrs.get(_ALIVE + name) != counts.get(_ALIVE + name)
-            }
+            now = self._study.user_attrs
+            silent = {name for name in silent if now.get(_ALIVE + name) == counts.get(_ALIVE + name)}
         return {
             number: f"{name}, {'silent' if name in silent else 'dead' if self._has_ended(name) else 'alive'}"
             for number, name in workers.items()
@@ -415,7 +424,7 @@ class Heartbeats:
         return repeating(HEARTBEAT_S, beat)
 
 
-class JournalFile(JournalFileBackend):
+class JournalFile(journal.JournalFileBackend):
     """Optuna's journal file, to which whole lines are appended or nothing.
 
     A line that a killed process left unfinished is cut off before the next one is written: Optuna appends to it, and

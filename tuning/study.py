@@ -7,20 +7,21 @@ import math
 import sys
 import threading
 import time
-import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import optuna
+from optuna.distributions import BaseDistribution
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
 from dynslam_bench.core import StudyError, read_settings, storable, words_without_passwords, write_atomic
 from dynslam_bench.core.records import digest, validated
+from dynslam_bench.core.seeding import stream
 from dynslam_bench.core.settings import Scalar
 from dynslam_bench.runs import RunEvent, run_many
 from dynslam_bench.runs.identity import resolve
@@ -42,9 +43,7 @@ from dynslam_bench.tuning.objectives import (
     together,
     violations,
 )
-from dynslam_bench.tuning.plan import Plan, distributions, starting_point
-from dynslam_bench.tuning.samplers import StreamedSampler, build_pruner
-from dynslam_bench.tuning.splits import design_of
+from dynslam_bench.tuning.plan import Plan, design_of, distributions, starting_point
 from dynslam_bench.tuning.storage import (
     EARLIER,
     SPEC_FILE,
@@ -53,13 +52,14 @@ from dynslam_bench.tuning.storage import (
     extension_of,
     load_study,
     open_storage,
+    quiet,
     read_stored,
     study_folder,
     trials_frame,
     without_password,
     worker_name,
 )
-from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec, read_study
+from dynslam_bench.tuning.study_file import ProblemInstance, PrunerName, SamplerName, StudySpec, read_study
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -147,8 +147,8 @@ class Study(Plan):
         if objectives is not None:
             changes["objectives"] = tuple(objective.name for objective in objectives)
         if base is None or changes:
-            values = {} if base is None else base.model_dump()
-            base = validated(StudySpec, {"name": "study", **values, **changes}, "the study", StudyError)
+            values = {"name": "study"} if base is None else base.model_dump()
+            base = validated(StudySpec, values | changes, "the study", StudyError)
         super().__init__(base, results, objectives=objectives)
         self._callbacks = tuple(callbacks)
         self.store.prepare()
@@ -214,19 +214,18 @@ class Study(Plan):
                 for callback in self._callbacks:
                     callback(self.study, self.study.get_trials(deepcopy=False)[trial.number])
 
-        with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-tune") as pool, self._ending_all():
-            for future in [pool.submit(work) for _ in range(jobs)]:
-                future.result()
+        self._in_threads(jobs, work, [()] * jobs)
         return self
 
-    @contextmanager
-    def _ending_all(self) -> Iterator[None]:
-        """Whatever interrupts the waiting ends the runs of all threads at once."""
-        try:
-            yield
-        except BaseException:
-            self._interrupted.set()
-            raise
+    def _in_threads(self, jobs: int, work: Callable[..., None], tasks: Iterable[tuple[Any, ...]]) -> None:
+        """Do work several tasks at a time; whatever interrupts the waiting ends the runs of all threads at once."""
+        with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-tune") as pool:
+            try:
+                for future in [pool.submit(work, *task) for task in tasks]:
+                    future.result()
+            except BaseException:
+                self._interrupted.set()
+                raise
 
     def reference(self, on_event: OnEvent | None = None, jobs: int = 1) -> dict[ProblemInstance, Outcome]:
         """The baseline's outcomes on the tune split, to which every trial is compared.
@@ -237,8 +236,7 @@ class Study(Plan):
         missing = [instance for instance in self.design.reference if instance not in self._reference]
         if on_event is not None and missing:
             on_event(StudyEvent("reference", 0, len(missing), "the baseline"))
-        outcomes, _ = self.evaluate_beside([], missing, jobs=jobs, cache=self.spec.cache)
-        self._reference |= outcomes
+        self._reference |= self.evaluate_beside([], missing, jobs=jobs, cache=self.spec.cache)[0]
         return self._reference
 
     def outcomes(
@@ -264,12 +262,11 @@ class Study(Plan):
             DynslamError: Settings or an instance are unknown or unfit.
         """
         spec, results = self.spec, dict[ProblemInstance, Outcome]()
-        how = {"threads": spec.threads, "cache": spec.cache if cache is None else cache, "data_root": spec.data_root}
         protocol, interrupted = held_protocol(spec.protocol), self._interrupted.is_set
         for instance in instances:
             if interrupted():
                 raise CancelledError(f"interrupted before {instance}")
-            run = instance.run_spec(tracker or spec.tracker, settings=dict(settings), study=spec.name, **how)
+            run = self.run_spec(instance, Configuration(tracker or spec.tracker, settings), cache=cache)
             (record,) = run_many(
                 [run], results=self.store, protocol=protocol, cancelled=interrupted, on_event=self.on_run
             )
@@ -315,9 +312,7 @@ class Study(Plan):
                         ) from error
                     results[number] = error
 
-        with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-beside") as pool, self._ending_all():
-            for future in [pool.submit(one, *task) for task in product(instances, range(len(several)))]:
-                future.result()
+        self._in_threads(jobs, one, product(instances, range(len(several))))
         baseline, *others = results
         assert isinstance(baseline, dict)
         return baseline, others
@@ -373,11 +368,11 @@ class Study(Plan):
                         break
             except (CancelledError, InstanceFailedError) as error:
                 return Evaluation(TrialState.FAIL, CRASHED_WORKER if isinstance(error, CancelledError) else str(error))
-        trial.set_user_attr("coverage", coverage(outcomes))
-        trial.set_user_attr("fps", fps(outcomes))
-        trial.set_user_attr("scenes", together(self.objectives).ratios(outcomes, reference))
         rows = [[str(place), run.run_id, run.ate_m, run.coverage, run.frame_s] for place, run in outcomes.items()]
-        trial.set_user_attr("instances", rows)
+        scenes = together(self.objectives).ratios(outcomes, reference)
+        facts = {"coverage": coverage(outcomes), "fps": fps(outcomes), "scenes": scenes, "instances": rows}
+        for name, fact in facts.items():
+            trial.set_user_attr(name, fact)
         if pruned:
             return Evaluation(TrialState.PRUNED, f"pruned after {len(outcomes)} of {len(self.design.tune)} instances")
         values = [objective.value(outcomes, reference) for objective in self.objectives]
@@ -386,8 +381,9 @@ class Study(Plan):
             trial.set_constraint(name, value)
         ratios = zip(self.objectives, values, strict=True)
         text = ", ".join(f"{objective.what} x {math.exp(value):.3f}" for objective, value in ratios)
-        broken = [name for name, value in violated.items() if value > 0]
-        return Evaluation(TrialState.COMPLETE, text + (f", violates {' and '.join(broken)}" if broken else ""), values)
+        if broken := " and ".join(name for name, value in violated.items() if value > 0):
+            text += f", violates {broken}"
+        return Evaluation(TrialState.COMPLETE, text, values)
 
     def _prune(self, trial: optuna.Trial, outcomes: Outcomes, last: ProblemInstance) -> bool:
         """Report a trial's value after its last instance, and ask Optuna's pruner, which takes one objective.
@@ -399,8 +395,7 @@ class Study(Plan):
         if self.spec.pruner == "none" or len(self.objectives) > 1 or not objective.counts(last):
             return False
         if self.spec.pruner == "wilcoxon":
-            (value,) = objective.by_start({last: outcomes[last]}, reference)
-            trial.report(value, len(outcomes))
+            trial.report(*objective.by_start({last: outcomes[last]}, reference), step=len(outcomes))
         elif max(violations(self.spec, outcomes, reference).values(), default=0) <= 0:
             trial.report(objective.value(outcomes, reference), len(outcomes))
         return 0 < trial.number and len(outcomes) < len(self.design.tune) and trial.should_prune()
@@ -415,18 +410,19 @@ class Study(Plan):
     def _more(self) -> bool:
         """Whether another trial is wanted; running ones count, those of dead workers are marked as failed."""
         with self._lock:
-            lost = set()
-            trials = self.study.get_trials(deepcopy=False)
-            for trial in trials:
-                if trial.state == TrialState.RUNNING and self._heartbeats.is_dead(trial):
-                    lost.add(trial.number)
+            for trial in self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
+                if self._heartbeats.is_dead(trial):
                     with suppress(RuntimeError):  # another worker has done so meanwhile
                         self.study._storage.set_trial_user_attr(trial._trial_id, "reason", CRASHED_WORKER)
                         self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
-                crashed = trial.user_attrs.get("reason") == CRASHED_WORKER
-                if trial.state == TrialState.WAITING or crashed or EARLIER in trial.user_attrs:
-                    lost.add(trial.number)
-            return len(trials) - len(lost) < self.trials
+            own = [
+                trial
+                for trial in self.study.get_trials(deepcopy=False)
+                if trial.state != TrialState.WAITING
+                and trial.user_attrs.get("reason") != CRASHED_WORKER
+                and EARLIER not in trial.user_attrs
+            ]
+            return len(own) < self.trials
 
     def _others_run(self) -> bool:
         """Whether workers of other processes run trials."""
@@ -464,8 +460,8 @@ class Study(Plan):
     ) -> optuna.Study:
         """The stored study, or a new one whose first trial is the baseline, whatever is enqueued later."""
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        how: dict[str, Any] = {"sampler": sampler, "pruner": build_pruner(self.spec.pruner)}
-        how |= {"storage": open_storage(self.results, self.spec), "study_name": self.spec.name}
+        storage, pruner = open_storage(self.results, self.spec), build_pruner(self.spec.pruner)
+        how: Any = {"storage": storage, "study_name": self.spec.name, "sampler": sampler, "pruner": pruner}
         try:
             study = optuna.create_study(directions=["minimize"] * len(self.objectives), **how)
             self._begin(study, beginnings)
@@ -483,8 +479,7 @@ class Study(Plan):
         """What a new study begins with; the identity comes last, other workers wait for it."""
         study.set_user_attr("spec", self.spec.for_others())
         study.set_user_attr("command", words_without_passwords(storable(sys.argv)))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        with quiet():
             study.set_metric_names(list(self.spec.objectives))
         study.enqueue_trial({parameter.name: self.base[parameter.name] for parameter in self.space})
         for beginning in beginnings:
@@ -522,8 +517,7 @@ class Study(Plan):
         identity = spec.model_dump(mode="json", exclude={"trials", "top", "storage", "start", "baseline"})
         instances = spec.instances(*spec.tune, *spec.confirm, *spec.held_out)
         for sequence, instance in {instance.sequence: instance for instance in reversed(instances)}.items():
-            how = {"data_root": spec.data_root, "threads": spec.threads, "settings": dict(self.held)}
-            run = resolve(instance.run_spec(spec.tracker, **how)).identity
+            run = resolve(self.run_spec(instance, Configuration(spec.tracker, self.held), cache=False)).identity
             identity[f"content of {sequence}"] = digest([run["content"], run["camera"]])
             identity |= program_of(run) | {"device": run["device"]}
         identity["baseline settings"] = [self.baseline.tracker, dict(self.baseline.settings)]
@@ -620,5 +614,75 @@ def run_study(
         tuner.reference(on_event, jobs)
         for line in tuner.preview(jobs).proposal:
             on_event(StudyEvent("preview", 0, tuner.trials, line))
-    tuner.run(jobs=jobs, on_event=on_event)
-    return tuner
+    return tuner.run(jobs=jobs, on_event=on_event)
+
+
+# Samplers and pruners by name. All trials meet the same growing sets of instances, on which Optuna's pruners end the
+# worse ones early: asynchronous successive halving (Li et al. 2020) or Wilcoxon's signed-rank test against the best
+# trial. Optuna prunes no trials of several objectives.
+
+_STARTUP_TRIALS = 8
+
+
+class StreamedSampler(optuna.samplers.BaseSampler):
+    """Makes a sampler for each trial, seeded by the study's seed and the trial's number.
+
+    Numbers are given out by the storage, so no two workers, and no worker that goes on later, draw from one stream, and
+    a study with one worker gives the same trials again. `Study.ask` draws all settings of a trial before the next.
+
+    Args:
+        spec: The study; what a sampler knows of earlier trials it reads from Optuna's study.
+    """
+
+    def __init__(self, spec: StudySpec) -> None:
+        self._spec = spec
+
+    def before_trial(self, study: optuna.Study, trial: FrozenTrial) -> None:
+        """Make the trial's sampler."""
+        seed = int(stream(self._spec.sampler_seed, "sampler", trial.number).integers(2**31))
+        with quiet():
+            self._sampler = _SAMPLERS[self._spec.sampler](self._spec, seed)
+        self._sampler.before_trial(study, trial)
+
+    def infer_relative_search_space(self, study: optuna.Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
+        """See Optuna."""
+        return self._sampler.infer_relative_search_space(study, trial)
+
+    def sample_relative(
+        self, study: optuna.Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
+    ) -> dict[str, Any]:
+        """See Optuna."""
+        return self._sampler.sample_relative(study, trial, search_space)
+
+    def sample_independent(
+        self, study: optuna.Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
+    ) -> Any:
+        """See Optuna."""
+        return self._sampler.sample_independent(study, trial, param_name, param_distribution)
+
+
+_SAMPLERS: dict[SamplerName, Callable[[StudySpec, int], optuna.samplers.BaseSampler]] = {
+    "random": lambda spec, seed: optuna.samplers.RandomSampler(seed=seed),
+    "tpe": lambda spec, seed: optuna.samplers.TPESampler(
+        n_startup_trials=min(_STARTUP_TRIALS, spec.trials // 2), constant_liar=True, seed=seed
+    ),
+    "nsga2": lambda spec, seed: optuna.samplers.NSGAIISampler(population_size=max(8, spec.trials // 5), seed=seed),
+    "gp": lambda spec, seed: optuna.samplers.GPSampler(n_startup_trials=_STARTUP_TRIALS, seed=seed),
+}
+
+
+FIRST_STEP = 3
+"""Instances that every trial runs on before it may be pruned."""
+WILCOXON_LEVEL = 0.1
+
+_PRUNERS: dict[PrunerName, Callable[[], optuna.pruners.BasePruner]] = {
+    "halving": lambda: optuna.pruners.SuccessiveHalvingPruner(min_resource=FIRST_STEP, reduction_factor=2),
+    "wilcoxon": lambda: optuna.pruners.WilcoxonPruner(p_threshold=WILCOXON_LEVEL, n_startup_steps=FIRST_STEP),
+    "none": optuna.pruners.NopPruner,
+}
+
+
+def build_pruner(name: PrunerName) -> optuna.pruners.BasePruner:
+    """Optuna's pruner of that name."""
+    with quiet():
+        return _PRUNERS[name]()

@@ -56,8 +56,7 @@ class ProblemInstance:
     def __str__(self) -> str:
         """The text that `parse_instances` reads as this instance alone."""
         name, _, query = self.sequence.partition("?")
-        first, last = self.frames or (0, None)
-        part = "" if self.frames is None else f"[{first}:{'' if last is None else last}]"
+        part = "" if self.frames is None else f"[{':'.join('' if end is None else str(end) for end in self.frames)}]"
         degradation = ",".join(f"{kind}:{strength:g}" for kind, strength in self.degradation)
         options = (
             query,
@@ -130,43 +129,39 @@ def parse_instances(
     match = _TEXT.fullmatch(text)
     if match is None:
         raise StudyError(f"'{text}' names no instances", _FORM)
-    name, query = match["name"], match["query"] or ""
-    rendered = name.startswith("synthetic/")
-    options = _options(query, text)
+    name, options = match["name"], _options(match["query"] or "", text)
     try:
         frames = None if match["frames"] in (None, ":") else parse_frames(match["frames"])
     except SequenceError as error:
         raise StudyError(f"'{text}': {error.args[0]}", error.hint) from error
     names = [name]
-    if rendered:
-        scenes_named: list[Any] = _numbers(options.pop("scene", ""), text) or [""]
+    if name.startswith("synthetic/"):
+        scene = [f"scene={number}" for number in _numbers(options.pop("scene", ""), text)] or [""]
         rest = [f"{key}={options.pop(key)}" for key in ("frames", "noise") if key in options]
-        queries = ["&".join([*([] if number == "" else [f"scene={number}"]), *rest]) for number in scenes_named]
+        queries = ["&".join(filter(None, [named, *rest])) for named in scene]
         names = [f"{name}?{query}" if query else name for query in queries]
     elif frames is None and "frames" in options:
         frames = (0, int(options.pop("frames")))
     for option in options.keys() & {"scene", "noise", "frames"}:
         raise StudyError(f"'{text}' may not have a {option}", _FORM)
-    starts = _numbers(options.get("offsets", ""), text) or offsets
-    seeds = _numbers(options.get("seeds", ""), text) or seeds
+    starts, draws = (_numbers(options.get(key, ""), text) for key in ("offsets", "seeds"))
     stride, strengths = int(options.get("stride", 1)), _strengths(options.get("degrade", ""), text)
     return tuple(
         ProblemInstance(name, frames, offset, stride, strengths, seed)
-        for name, offset, seed in product(names, starts, seeds)
+        for name, offset, seed in product(names, starts or offsets, draws or seeds)
     )
 
 
 def scene_of(name: str) -> str:
-    """What a sequence's name stands for, as far as the name alone tells (see `splits` for the content).
+    """What a sequence's name stands for, as far as the name alone tells (see `plan.check_splits` for the content).
 
     The frames that are taken of a sequence, and the draw of its noise, make no other scene.
     """
     if name.startswith("synthetic/"):
         try:
-            parsed = parse_synthetic_id(name)
+            return replace(parse_synthetic_id(name), noise=None).whole
         except SequenceError:
             return name  # refused with a did-you-mean where it is opened
-        return replace(parsed, noise=None).whole
     entry = entry_of(name)
     return entry.id if entry is not None else str(Path(name).expanduser().resolve())
 
@@ -211,13 +206,13 @@ def further_scenes(
 
 def stretches_behind(instances: Iterable[ProblemInstance], data_root: str | None) -> list[ProblemInstance]:
     """The parts of recordings moved behind the last frame that is named of each, as far as the recording goes."""
-    parts: dict[str, list[tuple[ProblemInstance, int, int]]] = {}
-    for instance in instances:
-        first, last = instance.frames or (0, None)
-        if last is not None and not instance.sequence.startswith("synthetic/"):
-            parts.setdefault(instance.sequence, []).append((instance, first, last))
+    parts = [
+        (instance, *instance.frames)
+        for instance in instances
+        if instance.frames and instance.frames[1] is not None and not instance.sequence.startswith("synthetic/")
+    ]
     moved = []
-    for sequence, group in parts.items():
+    for sequence, group in grouped(parts, lambda part: part[0].sequence).items():
         shift = max(last for _, _, last in group) - min(first for _, first, _ in group)
         length = len(open_sequence(sequence, data_root=data_root))
         moved += [
@@ -258,12 +253,11 @@ def _strengths(text: str, whole: str) -> tuple[tuple[str, float], ...]:
     from dynslam_bench.envs import Degradation
 
     kinds = [name for name in Degradation.__dataclass_fields__ if name != "seed"]
-    strengths = dict(piece.split(":") for piece in text.split(",") if piece)
+    strengths = {kind: float(strength) for kind, strength in (piece.split(":") for piece in text.split(",") if piece)}
     for kind in strengths.keys() - set(kinds):
         raise StudyError(f"'{whole}': unknown degradation '{kind}'", did_you_mean(kind, kinds))
-    given = sorted((kind, float(strength)) for kind, strength in strengths.items())
-    Degradation(**dict(given))  # type: ignore[arg-type]  # refuses a strength out of range
-    return tuple(given)
+    Degradation(**strengths)  # type: ignore[arg-type]  # refuses a strength out of range
+    return tuple(sorted(strengths.items()))
 
 
 SamplerName = Literal["tpe", "random", "nsga2", "gp"]

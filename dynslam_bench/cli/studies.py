@@ -168,7 +168,7 @@ class StudyBar:
 
 def show_summary(tuner: tuning.Study, summary: tuning.StudySummary, page: Path) -> None:
     """The conclusion, the best settings and the paths of page and preset."""
-    from dynslam_bench.tuning.splits import seen_note
+    from dynslam_bench.tuning.plan import seen_note
 
     preset = tuner.folder / "best.toml"
     lines = [summary.conclusion, *filter(None, [seen_note(summary.seen)]), ""]

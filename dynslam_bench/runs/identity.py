@@ -24,7 +24,7 @@ from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import Settings, flatten, named
 from dynslam_bench.core.version import release
 from dynslam_bench.envs import Degradation
-from dynslam_bench.envs.arguments import check_frames, open_frames, preprocessing_of, resolve_device
+from dynslam_bench.envs.slam_env import check_frames, open_frames, preprocessing_of, resolve_device
 from dynslam_bench.features.registry import FEATURES
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.flow.registry import FLOWS

@@ -1,6 +1,7 @@
 """A small world for the tests of environments and runs: a textured plane in TUM layout, and simple trackers."""
 
 import ctypes
+import itertools
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -25,10 +26,7 @@ STEP_M = 0.01
 def truth(frames: int) -> np.ndarray:
     """Camera-to-world poses ``[N, 4, 4]``: a straight walk along x with a slow turn about y."""
     step = se3.exp(np.array([STEP_M, 0, 0.002, 0, np.deg2rad(0.3), 0]))
-    poses = [np.eye(4)]
-    for _ in range(frames - 1):
-        poses.append(poses[-1] @ step)
-    return np.array(poses)
+    return np.array(list(itertools.accumulate([np.eye(4), *[step] * (frames - 1)], np.matmul)))
 
 
 class ToyMasks:
@@ -86,8 +84,7 @@ def write_sequence(folder: Path, sequence: Sequence) -> Path:
     lists: dict[str, list[str]] = {"rgb": [], "depth": []}
     for kind in lists:
         (folder / kind).mkdir(parents=True)
-    for index in range(len(sequence)):
-        frame = sequence[index]
+    for frame in map(sequence.__getitem__, range(len(sequence))):
         name = f"{frame.timestamp:.6f}.png"
         cv2.imwrite(str(folder / "rgb" / name), frame.rgb[:, :, ::-1])
         cv2.imwrite(str(folder / "depth" / name), np.round(frame.depth * 5000).astype(np.uint16))

@@ -9,7 +9,7 @@ from reports_browser import Browser, needs_browser
 from reports_fake_store import add_frames, add_run, fill
 from reports_rows import page_data
 
-from dynslam_bench.envs.arguments import open_frames
+from dynslam_bench.envs.slam_env import open_frames
 from dynslam_bench.reports import build_report, compare
 from dynslam_bench.sequences.view import part_of
 

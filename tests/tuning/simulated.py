@@ -17,7 +17,7 @@ from dynslam_bench.core.records import digest
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.tuning import Study, StudySpec
 from dynslam_bench.tuning.objectives import Outcome
-from dynslam_bench.tuning.splits import Design, design_of
+from dynslam_bench.tuning.plan import Design, design_of
 from dynslam_bench.tuning.storage import open_storage
 from dynslam_bench.tuning.study_file import ProblemInstance
 
@@ -47,15 +47,8 @@ def make_spec(**changes: object) -> StudySpec:
 
 def toy_spec(**changes: object) -> StudySpec:
     """A study of a few real runs on recordings, each from one start."""
-    values = {
-        "name": "toy",
-        "trials": 2,
-        "held_out": [],
-        "space": {"include": ["gain"]},
-        "offsets": [0],
-        "pruner": "none",
-    }
-    return make_spec(**values | changes)
+    values = {"name": "toy", "trials": 2, "held_out": [], "offsets": [0], "pruner": "none"}
+    return make_spec(**values | {"space": {"include": ["gain"]}} | changes)
 
 
 def nothing(settings: Mapping[str, Any]) -> float:
@@ -107,12 +100,7 @@ class SimulatedTuner(Study):
         return {"code": "simulated"}  # looking it up takes longer than a study here
 
     def outcomes(
-        self,
-        settings: Mapping[str, Any],
-        instances: Sequence[ProblemInstance],
-        *,
-        tracker: str = "",
-        cache: bool | None = None,
+        self, settings: Mapping[str, Any], instances: Sequence[ProblemInstance], **how: Any
     ) -> dict[ProblemInstance, Outcome]:
         who = digest({**self.base, **settings})
         self._made |= {(who, instance) for instance in instances}

@@ -12,6 +12,7 @@ from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.core.settings import Settings, tunable
 from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.sequences.cameras import write_camera
 from dynslam_bench.trackers import TrackerSpec
 
 
@@ -45,18 +46,16 @@ SPEC = TrackerSpec(id="toy", entry_point=f"{__file__}:Toy", label="Toy", setting
 def make_sequence(folder: Path, phase: float, frames: int = 12) -> Path:
     """A folder in TUM layout of 16x12 images whose camera swings along x."""
     lists: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
-    for kind in ("rgb", "depth"):
-        (folder / kind).mkdir(parents=True)
     for i in range(frames):
-        x = 0.2 * np.sin(0.7 * i + phase)
-        stamp = 100 + i / 30
-        cv2.imwrite(str(folder / "rgb" / f"{i}.png"), np.full((12, 16, 3), 10 * i, np.uint8))
-        cv2.imwrite(str(folder / "depth" / f"{i}.png"), np.full((12, 16), round(5000 * (1 + x)), np.uint16))
-        for kind in ("rgb", "depth"):
+        x, stamp = 0.2 * np.sin(0.7 * i + phase), 100 + i / 30
+        images = {"rgb": np.full((12, 16, 3), 10 * i, np.uint8)}
+        images["depth"] = np.full((12, 16), round(5000 * (1 + x)), np.uint16)
+        for kind, image in images.items():
+            (folder / kind).mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(folder / kind / f"{i}.png"), image)
             lists[kind].append(f"{stamp:.6f} {kind}/{i}.png")
         lists["groundtruth"].append(f"{stamp:.6f} {x:.6f} 0 0 0 0 0 1")
     for name, lines in lists.items():
         (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
-    camera = ["width = 16", "height = 12", "fx = 15.0", "fy = 15.0", "cx = 7.5", "cy = 5.5"]
-    (folder / "camera.toml").write_text("\n".join(camera) + "\n")
+    write_camera(folder / "camera.toml", Camera(16, 12, 15.0, 15.0, 7.5, 5.5))
     return folder

@@ -15,7 +15,7 @@ from dynslam_bench.core import DynslamError, RunError, atomic_folder, did_you_me
 from dynslam_bench.core.fingerprint import versions
 from dynslam_bench.core.records import Record, digest
 from dynslam_bench.core.version import version
-from dynslam_bench.envs.arguments import Frames, open_frames
+from dynslam_bench.envs.slam_env import Frames, open_frames
 from dynslam_bench.evaluation.comparison import STAMP_TOLERANCE
 from dynslam_bench.geometry import (
     Array,
