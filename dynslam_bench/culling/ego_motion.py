@@ -169,6 +169,9 @@ def _compared(
 def prior_information(state: FilterState, T_prev_cur: NDArray[np.float64]) -> NDArray[np.float64]:
     """Information of the motion model on the motion since the previous frame.
 
+    The model's rotation error r turns the world-to-camera rotation from the left, in the camera frame. To first order
+    it is the twist ``((R r) x t, -R r)`` of the motion (R, t) from this camera frame to the previous one.
+
     Args:
         state: With the covariance of the predicted motion.
         T_prev_cur: The predicted motion.
@@ -179,10 +182,11 @@ def prior_information(state: FilterState, T_prev_cur: NDArray[np.float64]) -> ND
     """
     if state.motion_covariance is None or state.T_world_prev is None:
         return NO_PRIOR
-    rotation = np.zeros((6, 6))
-    rotation[:3, :3] = state.T_world_prev[:3, :3].T
-    rotation[3:, 3:] = T_prev_cur[:3, :3]
-    covariance = rotation @ state.motion_covariance @ rotation.T + 1e-12 * np.eye(6)
+    jacobian = np.zeros((6, 6))
+    jacobian[:3, :3] = state.T_world_prev[:3, :3].T
+    jacobian[3:, 3:] = -T_prev_cur[:3, :3]
+    jacobian[:3, 3:] = se3.hat(T_prev_cur[:3, 3]) @ jacobian[3:, 3:]
+    covariance = jacobian @ state.motion_covariance @ jacobian.T + 1e-12 * np.eye(6)
     return np.asarray(CORRELATION * np.linalg.inv(covariance))
 
 

@@ -17,10 +17,12 @@ from dynslam_bench.core.compiled import kernel
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.gauss_newton import apply_twist, cholesky_solve, moved_point
 from dynslam_bench.slam.map import Array, Map, Slots
-from dynslam_bench.slam.pose_optimisation import CHI2_DEPTH, CHI2_MONO, cauchy_width, observation_chi2
+from dynslam_bench.slam.pose_optimisation import CHI2_DEPTH, CHI2_MONO, MEDIAN_CHI2, cauchy_width, observation_chi2
 
 FIXED_KEYFRAMES = 6
 """Further keyframes that observe the same points and stay where they are."""
+DEPTH_SHARE = MEDIAN_CHI2 / 2.366
+"""Median of chi-square with two degrees of freedom over that with three, which observations with depth have."""
 MAX_OBSERVATIONS = 6000
 """Observations used at most: the budget that bounds the time of a keyframe."""
 
@@ -207,7 +209,7 @@ def _adjust(
     iterations: int, chi2: Array,
 ) -> tuple[Array, Array, float]:  # fmt: skip
     _cost(poses, points, obs_pose, obs_point, uv, right, info, info_right, fx, fy, cx, cy, bf, 1.0, chi2)
-    width = cauchy_width(chi2)
+    width = cauchy_width(np.where(info_right > 0.0, chi2 * DEPTH_SHARE, chi2))
     cost = _cost(poses, points, obs_pose, obs_point, uv, right, info, info_right, fx, fy, cx, cy, bf, width, chi2)
     damping = 1e-5
     trial = np.empty_like(chi2)

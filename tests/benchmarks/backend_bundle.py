@@ -17,7 +17,7 @@ import numpy as np
 from command_line import parser_of
 
 from dynslam_bench.geometry import Camera, se3
-from dynslam_bench.slam.bundle_adjustment import BundleProblem, BundleResult, adjust_bundle
+from dynslam_bench.slam.bundle_adjustment import DEPTH_SHARE, BundleProblem, BundleResult, adjust_bundle
 from dynslam_bench.slam.pose_optimisation import cauchy_width
 
 FIXED_SIGMA = 1e-5
@@ -59,7 +59,7 @@ def adjust_bundle_gtsam(problem: BundleProblem, iterations: int) -> BundleResult
             graph.add(gtsam.PriorFactorPose3(pose_keys[i], gtsam.Pose3(pose), prior))
     for key, point in zip(point_keys, problem.points, strict=True):
         values.insert(key, point)
-    width = cauchy_width(adjust_bundle(problem, 0).chi2)
+    width = cauchy_width(adjust_bundle(problem, 0).chi2 * DEPTH_SHARE)
     cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(float(np.sqrt(width)))
     noise = gtsam.noiseModel.Robust.Create(cauchy, gtsam.noiseModel.Isotropic.Sigma(3, 1.0))
     for k, (u, v) in enumerate(problem.uv):

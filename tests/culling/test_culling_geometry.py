@@ -40,6 +40,7 @@ from dynslam_bench.culling.settings import (
     RigidMotionSettings,
 )
 from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.gauss_newton import twist_of
 from dynslam_bench.trackers import TRACKERS
 
 FORWARD = se3.exp(np.array([0, 0, 0.05, 0, 0, 0]))
@@ -223,6 +224,21 @@ def test_information_is_rotated_with_the_camera() -> None:
     np.testing.assert_allclose(np.diag(information)[:3], expected, rtol=1e-6)
     assert information == pytest.approx(information.T)
     assert not prior_information(FilterState(CAMERA, np.ones(0, bool)), np.eye(4)).any()
+
+
+def test_covariance_of_the_motion_is_that_of_sampled_motions() -> None:
+    rng = np.random.default_rng(0)
+    before, motion = se3.exp(rng.normal(size=6)), se3.exp(rng.normal(size=6))
+    root = 1e-3 * rng.normal(size=(6, 6))  # of (position in the world, rotation in the camera frame)
+    state = FilterState(CAMERA, np.ones(0, bool), T_world_prev=before, motion_covariance=root @ root.T)
+    twists = []
+    for shift, turn in (rng.normal(size=(4_000, 6)) @ root.T).reshape(-1, 2, 3):
+        pose = before @ motion
+        pose[:3, :3] = pose[:3, :3] @ se3.exp(np.append(np.zeros(3), turn))[:3, :3].T
+        pose[:3, 3] += shift
+        twists.append(twist_of(se3.inverse(before) @ pose @ se3.inverse(motion)))
+    covariance = CORRELATION * np.linalg.inv(prior_information(state, motion))
+    np.testing.assert_allclose(np.cov(np.array(twists).T), covariance, atol=0.1 * np.abs(covariance).max())
 
 
 def test_epipolar_distance_agrees_with_the_definition() -> None:
