@@ -94,10 +94,6 @@ class CatalogueEntry(Settings):
             return f"{self.size_bytes / 1e9:.2f} GB"
         return self.size_stated or "size unknown"
 
-    def intrinsics(self) -> Camera | None:
-        """The camera; None where only the sequence's own files state it."""
-        return CAMERAS[self.camera] if self.camera else None
-
 
 @cache
 def catalogue() -> dict[str, CatalogueEntry]:
@@ -366,7 +362,7 @@ def describe(name: str, *, data_root: str | Path | None = None, camera: str | Pa
             "not published: the first fetch takes it, every later one has to bring the same",
             "citation": entry.citation, "tags": list(entry.tags), "split": entry.split,
             "ground_truth": "public" if entry.ground_truth else "not public",
-            "camera": repr(entry.intrinsics() or "as its files or its layout state"),
+            "camera": repr(CAMERAS.get(entry.camera, "as its files or its layout state")),
             "layout": f"{entry.layout}: {'' if entry.verified else 'not '}verified on the publisher's files",
             "remark": entry.remark,
         }  # fmt: skip
@@ -374,8 +370,7 @@ def describe(name: str, *, data_root: str | Path | None = None, camera: str | Pa
             return facts | {"here": False, "fetch": entry.how_to_get()}
     sequence = open_sequence(name, data_root=data_root, camera=camera)
     truth = sequence.ground_truth
-    dropped, folder = getattr(sequence, "dropped", None), getattr(sequence, "folder", None)
-    stamps = sequence.timestamps
+    folder, stamps = getattr(sequence, "folder", None), sequence.timestamps
     return facts | {
         "id": sequence.id,
         "here": True,
@@ -389,7 +384,7 @@ def describe(name: str, *, data_root: str | Path | None = None, camera: str | Pa
         "masks": "exact" if sequence.masks is not None else "none",
         "license": sequence.license,
         "citation": sequence.citation,
-        "association": None if dropped is None else dropped.describe(),
+        "association": getattr(sequence, "dropped", None),
         "digest": sequence.digest(),
     }
 

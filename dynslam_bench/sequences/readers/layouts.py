@@ -27,11 +27,12 @@ from dynslam_bench.geometry import (
 from dynslam_bench.sequences.readers.lists import (
     Contents,
     ImageList,
+    checked_camera,
     find_names,
     list_folder,
-    pinhole,
     read_associations,
     read_image_list,
+    size_of_first,
     stamped,
 )
 from dynslam_bench.sequences.readers.tables import (
@@ -102,7 +103,7 @@ def read_eth3d(folder: Path, fps: float | None) -> Contents:
         )
     colour, depth = read_associations(pairs)
     fx, fy, cx, cy = read_table(folder / "calibration.txt", 4, "fx fy cx cy")[0].tolist()
-    camera = pinhole(folder, colour.files[0], fx, fy, cx, cy, 5000.0)
+    camera = checked_camera(folder / "calibration.txt", size_of_first(folder, colour), (fx, fy), (cx, cy), 5000.0)
     truth, dropped = _tum_truth(folder)
     return Contents(colour, depth, True, truth, dropped, camera, fps or 27.1)
 
@@ -211,7 +212,7 @@ def read_openloris(folder: Path, fps: float | None) -> Contents:
     sensors, transforms = folder / "sensors.yaml", folder / "trans_matrix.yaml"
     sensor = section(read_yaml(sensors), _LORIS_CAMERA, str(sensors))
     fx, cx, fy, cy = numbers(sensor, "intrinsics", 4, str(sensors))
-    camera = pinhole(folder, colour.files[0], fx, fy, cx, cy, MILLIMETRES)
+    camera = checked_camera(sensors, size_of_first(folder, colour), (fx, fy), (cx, cy), MILLIMETRES)
     base, dropped = _tum_truth(folder)
     if base is None:
         return Contents(colour, depth, camera=camera, fps=fps)
@@ -248,15 +249,14 @@ def read_vslam_lab(folder: Path, fps: float | None) -> Contents:
     stated = next((entry for entry in entries if entry.get("cam_name") == "rgb_0"), None)
     if stated is None:
         raise SequenceError(f"{where} describes no camera 'rgb_0'")
-    width, height = numbers(stated, "image_dimension", 2, where)
-    fx, fy = numbers(stated, "focal_length", 2, where)
-    cx, cy = numbers(stated, "principal_point", 2, where)
+    names = ("image_dimension", "focal_length", "principal_point")
+    size, focal, centre = (numbers(stated, name, 2, where) for name in names)
     (factor,) = numbers(stated, "depth_factor", 1, where)
     kind = stated.get("distortion_type")
     if kind not in (None, "radtan4", "radtan5"):
         raise SequenceError(f"{where}: the distortion '{str(kind)[:40]}' is not read, only radtan4 and radtan5")
     k = [] if kind is None else numbers(stated, "distortion_coefficients", 4 if kind == "radtan4" else 5, where)
-    camera = _camera_of(where, width, height, fx, fy, cx, cy, k, factor)
+    camera = checked_camera(where, size, focal, centre, factor, k)
     truth = read_pose_table(poses, camera_on_body(stated, where)) if poses.is_file() else None
     return Contents(colour, depth, True, truth, camera=camera, fps=fps or _frame_rate(stated.get("fps")))
 
@@ -276,12 +276,11 @@ def read_euroc(folder: Path, fps: float | None) -> Contents:
     colour, depth = _euroc_images(folder, f"{base}cam0"), _euroc_images(folder, f"{base}depth0")
     where, depth_file = str(folder / base / "cam0" / "sensor.yaml"), folder / base / "depth0" / "sensor.yaml"
     sensor = read_yaml(Path(where))
-    width, height = numbers(sensor, "resolution", 2, where)
-    fx, fy, cx, cy = numbers(sensor, "intrinsics", 4, where)
+    size, intrinsics = numbers(sensor, "resolution", 2, where), numbers(sensor, "intrinsics", 4, where)
     k = numbers(sensor, "distortion_coefficients", 4, where)
     depth_sensor = {"depth_factor": MILLIMETRES, **(read_yaml(depth_file) if depth_file.is_file() else {})}
     (factor,) = numbers(depth_sensor, "depth_factor", 1, str(depth_file))
-    camera = _camera_of(where, width, height, fx, fy, cx, cy, k, factor)
+    camera = checked_camera(where, size, intrinsics[:2], intrinsics[2:], factor, k)
     poses = folder / base / "state_groundtruth_estimate0" / "data.csv"
     truth = read_pose_table(poses, camera_on_body(sensor, where)) if poses.is_file() else None
     return Contents(colour, depth, truth=truth, camera=camera, fps=fps or _frame_rate(sensor.get("rate_hz")))
@@ -293,14 +292,6 @@ def _euroc_images(folder: Path, name: str) -> ImageList:
     if len(heading) < 2:
         raise SequenceError(f"{path} has one column, expected a stamp and a file name")
     return stamped([f"{name}/data/{row[1]}" for row in rows], nanoseconds([row[0] for row in rows], path), str(path))
-
-
-def _camera_of(where: str, width: float, height: float, fx: float, fy: float, cx: float, cy: float,
-               distortion: list[float], depth_factor: float) -> Camera:  # fmt: skip
-    if min(width, height, fx, fy, depth_factor) <= 0:
-        raise SequenceError(f"{where}: size, focal lengths and depth_factor have to be above 0")
-    k1, k2, p1, p2, k3 = (*distortion, *[0.0] * 5)[:5]
-    return Camera(int(width), int(height), fx, fy, cx, cy, (k1, k2, p1, p2, k3), depth_factor)
 
 
 def _frame_rate(value: object) -> float | None:

@@ -1,6 +1,7 @@
 """Recorded RGB-D sequences of every layout: frames that are decoded when asked for."""
 
 import os
+from collections import Counter
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +17,7 @@ from dynslam_bench.core.images import read_image
 from dynslam_bench.core.records import digest
 from dynslam_bench.geometry import Camera, associate, nearest_gap
 from dynslam_bench.geometry.rigs import in_camera_axes
-from dynslam_bench.sequences.readers.lists import Contents, Dropped, ImageList
+from dynslam_bench.sequences.readers.lists import Contents, ImageList
 from dynslam_bench.sequences.view import Masks
 
 GROUND_TRUTH_DT_S = 0.02
@@ -55,7 +56,7 @@ class RecordedSequence:
         ground_truth: Camera-to-world poses in the frame of the motion capture, at their own stamps; None without any.
         masks: Exact masks of people where the folder lists them (`PEOPLE_LIST`), else None.
         fps: Nominal frame rate in Hz; where none is stated, the inverse of the median interval (30 for one frame).
-        dropped: What was not used, and why.
+        dropped: One line on the frames, and on all that was not used or not taken as it stands.
 
     Raises:
         SequenceError: Its images are missing, damaged, of the wrong kind, or lie outside.
@@ -86,11 +87,9 @@ class RecordedSequence:
         people = contents.people
         for file in (*colour.files, *depth.files, *(people.files if people else ())):
             inside(folder, file, where=f"a list of images in {folder}", kind=SequenceError)
-        listed = len(colour) + len(depth)
         paired = contents.paired and not camera.depth_delay_s
         tolerated = 0.0 if paired else MISSING_TOLERATED
         colour, depth = _existing(folder, colour, "colour", tolerated), _existing(folder, depth, "depth", tolerated)
-        absent = listed - len(colour) - len(depth)
         order = np.arange(len(colour))
         index = (order, order) if paired else associate(colour.stamps, depth.stamps, max_time_difference_s)
         if not len(index[0]):
@@ -110,7 +109,7 @@ class RecordedSequence:
         self._depth = [depth.files[i] for i in index[1]]
         self._people: list[str] = []
         if people is not None:
-            people = _existing(folder, people, "mask", tolerated=0.0)
+            people = _existing(folder, people, "mask", 0.0)
             at = np.searchsorted(people.stamps_ns, self.timestamps_ns).clip(max=len(people) - 1)
             unmasked = int(np.count_nonzero(people.stamps_ns[at] != self.timestamps_ns))
             if unmasked:
@@ -121,35 +120,32 @@ class RecordedSequence:
         if contents.truth is not None and R_body_cam is not None:
             poses = in_camera_axes(contents.truth.T_world_cam, R_body_cam)
             self.ground_truth = contents.truth.with_poses(poses)
-        self.dropped = self._count(colour, depth, absent, max_time_difference_s, contents.truth_dropped)
+        counts = {
+            "colour images without depth": len(colour) - len(self),
+            "depth images unused": len(depth) - len(self),
+            **(colour.irregular + depth.irregular),
+            **self._count_poses(),
+        }
+        parts = [
+            f"{len(self)} frames of {len(colour)} colour and {len(depth)} depth images "
+            f"(|dt| < {max_time_difference_s:g} s)",
+            *(f"{count} {what}" for what, count in counts.items() if count),
+            "" if self.ground_truth else "no ground truth",
+            contents.truth_dropped,
+        ]
+        self.dropped = "; ".join(part for part in parts if part)
         self[0]
 
-    def _count(
-        self, colour: ImageList, depth: ImageList, absent: int, max_time_difference_s: float, truth_dropped: str
-    ) -> Dropped:
+    def _count_poses(self) -> dict[str, int]:
+        """How many poses the ground truth has, and how many frames have none."""
         stamps, truth = self.timestamps, self.ground_truth
-        without, hole = 0, 0.0
-        if truth is not None:
-            without = int(np.count_nonzero(nearest_gap(stamps, truth.timestamps) >= GROUND_TRUTH_DT_S))
-            within = truth.timestamps[(truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])]
-            hole = float(np.diff(np.concatenate([stamps[:1], within, stamps[-1:]])).max(initial=0.0))
-        return Dropped(
-            colour_listed=len(colour),
-            depth_listed=len(depth),
-            pairs=len(stamps),
-            colour_unpaired=len(colour) - len(stamps),
-            depth_unpaired=len(depth) - len(stamps),
-            bad_stamps=colour.bad_stamps + depth.bad_stamps,
-            duplicate_stamps=colour.duplicate_stamps + depth.duplicate_stamps,
-            unsorted=colour.unsorted + depth.unsorted,
-            unnamed=colour.unnamed + depth.unnamed,
-            absent=absent,
-            max_time_difference_s=max_time_difference_s,
-            ground_truth_poses=0 if truth is None else len(truth),
-            ground_truth_dropped=truth_dropped,
-            frames_without_ground_truth=without,
-            largest_hole_s=hole,
-        )
+        if truth is None:
+            return {}
+        without = int(np.count_nonzero(nearest_gap(stamps, truth.timestamps) >= GROUND_TRUTH_DT_S))
+        within = truth.timestamps[(truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])]
+        hole = float(np.diff(np.concatenate([stamps[:1], within, stamps[-1:]])).max(initial=0.0))
+        gap = f"frames without ground truth within {GROUND_TRUTH_DT_S:g} s (largest hole {hole:.2f} s)"
+        return {"ground-truth poses": len(truth), gap: without}
 
     @property
     def colour_files(self) -> dict[float, str]:
@@ -179,8 +175,7 @@ class RecordedSequence:
         return len(self._colour)
 
     def __getitem__(self, index: int) -> Frame:
-        index = range(len(self))[index]
-        size = (self.camera.width, self.camera.height)
+        index, size = range(len(self))[index], (self.camera.width, self.camera.height)
         expected = f"{size[0]}x{size[1]}"
         rgb = read_colour(
             self.folder / self._colour[index], size=size, mismatch=f"but the camera of {self.id} is {expected}"
@@ -219,8 +214,8 @@ def _check_unit(folder: Path, stamps: NDArray[np.float64]) -> None:
     )
 
 
-def _existing(folder: Path, images: ImageList, kind: str, tolerated: float = MISSING_TOLERATED) -> ImageList:
-    """The images whose files are there; a few may be missing, as in some published sequences, and none empty."""
+def _existing(folder: Path, images: ImageList, kind: str, tolerated: float) -> ImageList:
+    """The images whose files are there; a share may be missing, as in some published sequences, and none empty."""
     sizes = [path.stat().st_size if path.is_file() else None for path in (folder / file for file in images.files)]
     for state, size_then, allowed in (("missing", None, tolerated), ("empty (0 bytes)", 0, 0.0)):
         at_fault = [file for file, size in zip(images.files, sizes, strict=True) if size == size_then]
@@ -230,7 +225,8 @@ def _existing(folder: Path, images: ImageList, kind: str, tolerated: float = MIS
                 "fetch the sequence again, or remove their lines from the list",
             )
     there = [i for i, size in enumerate(sizes) if size is not None]
-    return replace(images, stamps_ns=images.stamps_ns[there], files=tuple(images.files[i] for i in there))
+    missing = Counter({"listed files that do not exist": len(images) - len(there)})
+    return ImageList(images.stamps_ns[there], tuple(images.files[i] for i in there), images.irregular + missing)
 
 
 # Decoding of colour and depth images.
