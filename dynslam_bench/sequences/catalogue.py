@@ -241,14 +241,13 @@ def open_folder(
 def _open_whole(
     name: str, data_root: Path, camera: str | Path | Camera | None, settings: PreprocessingSettings
 ) -> Sequence:
-    path = Path(name).expanduser()
-    entry = None if _is_path(name) else entry_of(name)
+    path, is_path = Path(name).expanduser(), name.startswith((".", "/", "~", "\\"))
+    entry = None if is_path else entry_of(name)
     if entry is not None:
         return open_public(entry.id, data_root=data_root, camera=camera, settings=settings)
-    prefix = name.partition("/")[0]
-    datasets = {dataset.spec.id: dataset.spec for dataset in DATASETS.all()}
-    public = {entry.dataset for entry in catalogue().values()}
-    if not _is_path(name) and "/" in name and prefix in datasets and prefix not in public:
+    prefix, public = name.partition("/")[0], {entry.dataset for entry in catalogue().values()}
+    datasets = {dataset.spec.id: dataset.spec for dataset in DATASETS.all() if dataset.spec.id not in public}
+    if not is_path and "/" in name and prefix in datasets:
         if camera is not None:
             raise SequenceError(f"sequence '{name}' brings its own camera", "leave out --camera")
         return cast("Sequence", load_object(datasets[prefix].entry_point)(name, data_root=data_root))
@@ -256,16 +255,12 @@ def _open_whole(
         raise SequenceError(f"{path} is a bag", f"unpack it first: dynslam-bench sequences unpack {path} FOLDER")
     if path.is_dir():
         return open_folder(path, camera=camera, settings=settings)
-    if _is_path(name):
+    if is_path:
         raise SequenceError(
             f"there is no sequence folder {path.absolute()}", "a path names a folder, see docs/reference/sequences.md"
         )
     near = did_you_mean(name, [*sequence_ids(), *by_folder()])
     raise SequenceError(f"unknown sequence '{name}', and there is no such folder", near)
-
-
-def _is_path(name: str) -> bool:
-    return name.startswith((".", "/", "~", "\\"))
 
 
 def parse_frames(frames: Iterable[int | None] | str | None) -> tuple[int, int | None]:

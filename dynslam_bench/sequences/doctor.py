@@ -6,6 +6,7 @@ import itertools
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal
@@ -68,14 +69,14 @@ class Diagnosis:
     @property
     def verdict(self) -> str:
         """A phrase for the first line of a report; every note stands for a comparison that was not made."""
-        faults = sum(map(is_fault, self.findings))
-        if faults:
-            return f"{faults} fault{'s' * (faults != 1)}"
-        if not self.findings:
-            return "no fault found"
-        if any(finding.id == "no-truth" for finding in self.findings):
-            return "no fault found in the images; there is no ground truth to compare"
-        return "no fault found in the images, but the ground truth could not be compared"
+        faults, ids = sum(map(is_fault, self.findings)), {finding.id for finding in self.findings}
+        cases = (
+            (faults, f"{faults} fault{'s' * (faults != 1)}"),
+            (not ids, "no fault found"),
+            ("no-truth" in ids, "no fault found in the images; there is no ground truth to compare"),
+            (True, "no fault found in the images, but the ground truth could not be compared"),
+        )
+        return next(verdict for holds, verdict in cases if holds)
 
 
 def diagnose(
@@ -120,11 +121,12 @@ def examine(
     with_depth = bool(getattr(sequence, "has_depth", True))
     for stretch in indices:
         frames = []
-        for done, index in enumerate(stretch, done + 1):
+        for index in stretch:
             try:
                 frames.append(sequence[index])
             except _UNREADABLE as error:
                 unreadable.append(f"frame {index}: {_message(error)}")
+            done += 1
             progress(done, todo)
         if frames:
             streams.add(frames)
@@ -173,6 +175,9 @@ def _message(error: Exception) -> str:
 # are synchronous.
 
 
+Severity = Literal["fault", "note"]
+
+
 @dataclass(frozen=True)
 class Finding:
     """One thing that a check of a recording found.
@@ -187,7 +192,7 @@ class Finding:
     """
 
     id: str
-    severity: Literal["fault", "note"]
+    severity: Severity
     value: float | None
     unit: str
     text: str
@@ -399,7 +404,8 @@ _NOTES = {"too-short", "no-depth", "no-truth", "motion-unmeasured", "motion-unme
 def finding_of(case: str, value: float | None, **facts: Any) -> Finding:
     """A row of `_FINDINGS`, with the numbers filled in."""
     (unit, text, cure), facts = _FINDINGS[case], {"value": value, **facts}
-    number, severity = None if value is None else float(value), "note" if case in _NOTES else "fault"
+    severity: Severity = "note" if case in _NOTES else "fault"
+    number = None if value is None else float(value)
     return Finding(case.partition("/")[0], severity, number, unit, text.format(**facts), cure.format(**facts))
 
 
@@ -881,8 +887,22 @@ def _fitted(pairs: list[RgbdPair], relative: Array, camera: Camera) -> list[Find
         return []
     if size < _LIMITS[name] or not any(size >= sigmas * sigma and left <= share for sigmas, share in rules):
         return []
-    errors = f"reprojection errors {before.residual_px:.1f} px -> {fit.residual_px:.1f} px"
-    return [_described(name, fit, size, sigma, errors, camera)]
+    focal, dx, dy, scale = (float(fit.value[part][0]) for part in ("focal", "cx", "cy", "scale"))
+    by, depth, turn = np.exp(focal), np.exp(scale), se3.exp(np.concatenate([np.zeros(3), fit.value["turn"]]))[:3, :3]
+    case, value = {
+        "focal": ("camera-focal-length", by),
+        "centre": ("camera-principal-point", size),
+        "scale": ("depth-factor", depth),
+        "turn": ("truth-axes/fit", np.degrees(size)),
+        "lever": ("truth-lever-arm", size),
+    }[name]
+    facts = {
+        "sigma": sigma, "percent": 100 * sigma, "fx": camera.fx * by, "fy": camera.fy * by, "dx": dx, "dy": dy,
+        "cx": camera.cx + dx, "cy": camera.cy + dy, "new": camera.depth_factor / depth, "old": camera.depth_factor,
+        "matrix": _turn(turn), "lever": ", ".join(f"{metres:+.3f}" for metres in fit.value["lever"]),
+        "errors": f"reprojection errors {before.residual_px:.1f} px -> {fit.residual_px:.1f} px",
+    }  # fmt: skip
+    return [finding_of(case, value, **facts)]  # each case takes what it needs of all facts
 
 
 _GROUPS = {"focal": ("focal",), "centre": ("cx", "cy"), "scale": ("scale",), "turn": ("turn",), "lever": ("lever",)}
@@ -895,24 +915,6 @@ _EXPLAINED_BY_LEVER = ((5, 0.62),)
 """People who walk past can feign one: 0.68 remained then."""
 _DEPTH_FOR_LEVER = 0.5
 """Part of the image that has depth. With less, the corners may lie on moving people alone: 0.61 remained then."""
-
-
-def _described(name: str, fit: Fit, size: float, sigma: float, errors: str, camera: Camera) -> Finding:
-    """The finding of a group of `_GROUPS`; each takes what it needs of all values."""
-    focal, dx, dy, scale = (float(fit.value[part][0]) for part in ("focal", "cx", "cy", "scale"))
-    by, depth, turn = np.exp(focal), np.exp(scale), se3.exp(np.concatenate([np.zeros(3), fit.value["turn"]]))[:3, :3]
-    case, value = {
-        "focal": ("camera-focal-length", by),
-        "centre": ("camera-principal-point", size),
-        "scale": ("depth-factor", depth),
-        "turn": ("truth-axes/fit", np.degrees(size)),
-        "lever": ("truth-lever-arm", size),
-    }[name]
-    return finding_of(
-        case, value, sigma=sigma, percent=100 * sigma, errors=errors, fx=camera.fx * by, fy=camera.fy * by,
-        dx=dx, dy=dy, cx=camera.cx + dx, cy=camera.cy + dy, new=camera.depth_factor / depth, old=camera.depth_factor,
-        matrix=_turn(turn), lever=", ".join(f"{metres:+.3f}" for metres in fit.value["lever"]),
-    )  # fmt: skip
 
 
 # Focal length, principal point, depth scale, axes and lever arm at which a truth fits the images best.
@@ -988,6 +990,9 @@ def fit_camera(pairs: list[RgbdPair], relative: Array, camera: Camera, free: tup
         for name in ("pixels_first", "depth_first", "pixels_second")
     )
     number, back = np.repeat(np.arange(len(pairs)), [len(index) for index in chosen]), se3.inverse(relative)
+    errors = partial(
+        _reprojection_errors, camera=camera, pair=number, first=first, depth=depth, second=second, back=back
+    )
     index = [number for name in free for number in np.arange(10)[_PARAMETERS[name]].tolist()]
 
     def filled(part: Array) -> Array:
@@ -995,18 +1000,14 @@ def fit_camera(pairs: list[RgbdPair], relative: Array, camera: Camera, free: tup
         x[index] = part
         return x
 
-    def errors(x: Array) -> Array:
-        return _reprojection_errors(x, camera, number, first, depth, second, back)
-
     def robust(part: Array) -> Array:
         raw = errors(filled(part)) / _OUTLIER_PX
         square = (raw**2).sum(axis=1, keepdims=True)
         shrunk = raw * np.sqrt(2 * (np.sqrt(1 + square) - 1) / np.maximum(square, 1e-12))
         return np.concatenate([shrunk.ravel(), filled(part) / _PRIOR])
 
-    part = np.zeros(len(index))
-    if len(index):
-        part = np.asarray(least_squares(robust, part, x_scale=_SCALES[index]).x, np.float64)
+    start = np.zeros(len(index))
+    part = np.asarray(least_squares(robust, start, x_scale=_SCALES[index]).x, np.float64) if index else start
     x, left = filled(part), errors(filled(part))
     # Standard deviations by a sandwich estimate, each pair of frames being one observation.
     weight = 1 / np.sqrt(1 + ((left / _OUTLIER_PX) ** 2).sum(axis=1))

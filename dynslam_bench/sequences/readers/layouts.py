@@ -62,28 +62,30 @@ def read_tum(folder: Path, fps: float | None) -> Contents:
     `fps` makes stamps of images that are named by frame numbers.
     """
     truth, dropped = _tum_truth(folder)
-    if not (folder / "rgb.txt").is_file() and not (folder / "depth.txt").is_file():
-        for name in ("associations.txt", "associated.txt", "associate.txt", "association.txt"):
-            if (folder / name).is_file():
-                colour, depth = read_associations(folder / name)
-                return Contents(colour, depth, paired=True, truth=truth, truth_dropped=dropped)
+    pairs = _first_file(folder, "associations.txt", "associated.txt", "associate.txt", "association.txt")
+    if pairs is not None and _first_file(folder, "rgb.txt", "depth.txt") is None:
+        return Contents(*read_associations(pairs), True, truth, dropped)
     people = read_image_list(folder / PEOPLE_LIST) if (folder / PEOPLE_LIST).is_file() else None
-    colour, depth = _tum_list(folder, "rgb", fps), _tum_list(folder, "depth", fps)
+    colour, depth = (
+        read_image_list(folder / f"{name}.txt")
+        if (folder / f"{name}.txt").is_file()
+        else list_folder(folder, name, fps)
+        for name in ("rgb", "depth")
+    )
     return Contents(colour, depth, False, truth, dropped, people=people)
 
 
-def _tum_list(folder: Path, name: str, fps: float | None) -> ImageList:
-    file = folder / f"{name}.txt"
-    return read_image_list(file) if file.is_file() else list_folder(folder, name, fps)
+def _first_file(folder: Path, *names: str) -> Path | None:
+    return next((folder / name for name in names if (folder / name).is_file()), None)
 
 
 def _tum_truth(folder: Path) -> tuple[Trajectory | None, str]:
     """The ground truth, None if there is no file, and one phrase on the lines that were not taken as they stand."""
-    for name in ("groundtruth.txt", "pose.txt"):
-        if (folder / name).is_file():
-            file = load_tum(folder / name)
-            return file.trajectory, _not_taken(file)
-    return None, ""
+    path = _first_file(folder, "groundtruth.txt", "pose.txt")
+    if path is None:
+        return None, ""
+    file = load_tum(path)
+    return file.trajectory, _not_taken(file)
 
 
 def _not_taken(file: TumFile) -> str:
@@ -222,12 +224,14 @@ def read_openloris(folder: Path, fps: float | None) -> Contents:
             f"the ground truth of {folder} is never nearer than {gap:.3f} s to an image",
             "stamps of OpenLORIS carry a bias of their own in every sequence: are both files of the same one?",
         )
-    for entry in _mappings(section(read_yaml(transforms), "trans_matrix", str(transforms))):
-        if (entry.get("parent_frame"), entry.get("child_frame")) == (_LORIS_BASE, _LORIS_CAMERA):
-            T_base_cam = rigid(numbers(entry, "matrix", 16, str(transforms)), str(transforms))
-            truth = base.with_poses(base.T_world_cam @ T_base_cam)
-            return Contents(colour, depth, truth=truth, truth_dropped=dropped, camera=camera, fps=fps)
-    raise SequenceError(f"{transforms} holds no rigid transformation from {_LORIS_BASE} to {_LORIS_CAMERA}")
+    entries = _mappings(section(read_yaml(transforms), "trans_matrix", str(transforms)))
+    ends = {"parent_frame": _LORIS_BASE, "child_frame": _LORIS_CAMERA}
+    entry = next((entry for entry in entries if all(entry.get(key) == frame for key, frame in ends.items())), None)
+    if entry is None:
+        raise SequenceError(f"{transforms} holds no rigid transformation from {_LORIS_BASE} to {_LORIS_CAMERA}")
+    matrix = numbers(entry, "matrix", 16, str(transforms))
+    truth = base.with_poses(base.T_world_cam @ rigid(matrix, str(transforms)))
+    return Contents(colour, depth, truth=truth, truth_dropped=dropped, camera=camera, fps=fps)
 
 
 def _mappings(value: object) -> list[dict[str, object]]:
@@ -249,8 +253,8 @@ def read_vslam_lab(folder: Path, fps: float | None) -> Contents:
     stated = next((entry for entry in entries if entry.get("cam_name") == "rgb_0"), None)
     if stated is None:
         raise SequenceError(f"{where} describes no camera 'rgb_0'")
-    names = ("image_dimension", "focal_length", "principal_point")
-    size, focal, centre = (numbers(stated, name, 2, where) for name in names)
+    pairs = ("image_dimension", "focal_length", "principal_point")
+    size, focal, centre = (numbers(stated, name, 2, where) for name in pairs)
     (factor,) = numbers(stated, "depth_factor", 1, where)
     kind = stated.get("distortion_type")
     if kind not in (None, "radtan4", "radtan5"):

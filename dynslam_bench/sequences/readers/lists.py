@@ -225,8 +225,8 @@ def checked_camera(
             f"{where}: size {size[0]:g}x{size[1]:g}, focal lengths {focal[0]:g} and {focal[1]:g} and {depth_factor:g} "
             "depth units a metre have to be above 0"
         )
-    k1, k2, p1, p2, k3 = (*distortion, *[0.0] * 5)[:5]
-    return Camera(int(size[0]), int(size[1]), *focal, *centre, (k1, k2, p1, p2, k3), depth_factor)
+    (width, height), (fx, fy), (cx, cy), (k1, k2, p1, p2, k3) = size, focal, centre, (*distortion, *[0.0] * 5)[:5]
+    return Camera(int(width), int(height), fx, fy, cx, cy, (k1, k2, p1, p2, k3), depth_factor)
 
 
 def size_of_first(folder: Path, images: ImageList) -> tuple[int, int]:
