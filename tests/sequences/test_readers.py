@@ -116,7 +116,7 @@ BROKEN = {
     ],
     "tartanair-shibuya": [
         ("times.txt", "0.0", "3 colour images, 3 depth arrays, 1 stamps and 3 poses"),
-        ("depth_0/000000.npy", "not an array", "is no .npy file"),
+        ("depth_0/000000.npy", "not an array", "is it an .npy file"),
         ("gt_pose.txt", "1 2 3", "3 values, not the 7"),
     ],
     "openloris": [

@@ -17,7 +17,7 @@ from sequence_folders import SHARED, Altered, frame_hash, make_folder, needs_sha
 
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.geometry import Camera, Trajectory, se3
-from dynslam_bench.sequences import Frame, FrameMasks, PreprocessingSettings, open_sequence
+from dynslam_bench.sequences import Frame, FrameMasks, PreprocessingSettings, SequenceView, open_sequence
 from dynslam_bench.sequences.calibration import Window, adjust, calibrate
 from dynslam_bench.sequences.cameras import read_camera, write_camera
 from dynslam_bench.sequences.compose import compose
@@ -52,7 +52,7 @@ def diagnosed(sound, pairs):
     @cache
     def found(name):
         if "truth" not in FAULTS[name]:
-            return examine(Altered(sound, **FAULTS[name]))
+            return examine(SequenceView(Altered(sound, **FAULTS[name]), 0, 60))
         truth = FAULTS[name]["truth"](sound.ground_truth)
         return Diagnosis(sound.id, FRAMES, tuple(truth_findings(sound.timestamps, truth, sound.camera, pairs)))
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, FrameMasks, MaskSource
-from dynslam_bench.core import SequenceError, inside
+from dynslam_bench.core import SequenceError, inside, raising
 from dynslam_bench.core.fingerprint import contents_digest
 from dynslam_bench.core.images import read_image
 from dynslam_bench.core.records import digest
@@ -80,33 +80,29 @@ class RecordedSequence:
     ) -> None:
         self.folder, self.id, self.camera = folder, id, camera
         self.license, self.citation, self.tags, self.split = license, citation, tags, split
-        self._any_depth_size = any_depth_size
-        self._furthest_m = contents.furthest_m
+        self._any_depth_size, self._furthest_m = any_depth_size, contents.furthest_m
         delayed = contents.depth.stamps_ns + round(1e9 * camera.depth_delay_s)
-        colour, depth = contents.colour, replace(contents.depth, stamps_ns=delayed)
-        people = contents.people
+        colour, depth, people = contents.colour, replace(contents.depth, stamps_ns=delayed), contents.people
         for file in (*colour.files, *depth.files, *(people.files if people else ())):
             inside(folder, file, where=f"a list of images in {folder}", kind=SequenceError)
         paired = contents.paired and not camera.depth_delay_s
         tolerated = 0.0 if paired else MISSING_TOLERATED
         colour, depth = _existing(folder, colour, "colour", tolerated), _existing(folder, depth, "depth", tolerated)
-        order = np.arange(len(colour))
-        index = (order, order) if paired else associate(colour.stamps, depth.stamps, max_time_difference_s)
-        if not len(index[0]):
+        every = np.arange(len(colour))
+        first, second = (every, every) if paired else associate(colour.stamps, depth.stamps, max_time_difference_s)
+        if not len(first):
             gap = float(nearest_gap(colour.stamps, depth.stamps).min())
             raise SequenceError(
                 f"none of the {len(colour)} colour images of {folder} has a depth image within "
                 f"{max_time_difference_s:g} s (closest: {gap:.3f} s)",
                 "do both lists use the same clock?",
             )
-        self.timestamps_ns = colour.stamps_ns[index[0]]
-        self.timestamps = colour.stamps[index[0]]
+        self.timestamps_ns, self.timestamps = colour.stamps_ns[first], colour.stamps[first]
         self.timestamps_ns.flags.writeable = self.timestamps.flags.writeable = False
         _check_unit(folder, self.timestamps)
-        self.fps = fps or (float(1 / np.median(np.diff(self.timestamps))) if len(index[0]) > 1 else 30.0)
-        self.depth_timestamps = depth.stamps[index[1]]
-        self._colour = [colour.files[i] for i in index[0]]
-        self._depth = [depth.files[i] for i in index[1]]
+        self.fps = fps or (float(1 / np.median(np.diff(self.timestamps))) if len(first) > 1 else 30.0)
+        self.depth_timestamps = depth.stamps[second]
+        self._colour, self._depth = [colour.files[i] for i in first], [depth.files[i] for i in second]
         self._people: list[str] = []
         if people is not None:
             people = _existing(folder, people, "mask", 0.0)
@@ -316,13 +312,10 @@ def read_metres(path: Path, *, size: tuple[int, int] | None = None, mismatch: st
     Raises:
         SequenceError: The file is missing, damaged, of another size, or holds something else.
     """
-    try:
+    # a damaged header makes numpy's reader raise whatever it likes
+    with raising(SequenceError, f"depth array {path} cannot be read", "is it an .npy file?", of=Exception):
         values = np.load(path, mmap_mode="r", allow_pickle=False)
         shape, kind = values.shape, values.dtype
-    except OSError as error:
-        raise SequenceError(f"cannot read {path}: {error.strerror or error}") from error
-    except Exception as error:  # a damaged header makes numpy's reader raise whatever it likes
-        raise SequenceError(f"depth array {path} cannot be read", "it is no .npy file") from error
     if len(shape) != 2 or kind.kind != "f":
         raise SequenceError(f"depth array {path} is {kind} of shape {str(shape)[:60]}, expected rows of metres")
     if size is not None and shape != size[::-1]:
