@@ -193,10 +193,9 @@ def _choose(sequence: Sequence, length: int) -> list[int]:
     starts = list(range(0, len(sequence) - length + 1, length // 2))
     if len(starts) <= MOST_WINDOWS:
         return starts
-    if len(starts) > CANDIDATES:
-        starts = [starts[i] for i in np.unique(np.linspace(0, len(starts) - 1, CANDIDATES).round().astype(int))]
-    change = [_change(sequence, first, first + length - 2) for first in starts]
-    return sorted(starts[i] for i in np.argsort(change)[::-1][:MOST_WINDOWS])
+    spread = np.linspace(0, len(starts) - 1, min(len(starts), CANDIDATES)).round().astype(int).tolist()
+    change = [_change(sequence, starts[i], starts[i] + length - 2) for i in spread]
+    return sorted(starts[spread[i]] for i in np.argsort(change)[::-1][:MOST_WINDOWS])
 
 
 def _change(sequence: Sequence, first: int, last: int) -> float:
@@ -309,11 +308,12 @@ def _delay(estimate: Estimate, camera: Camera) -> Quantity:
     """The stamps that the reader gives have the camera's own delay added already."""
     value, half, own = estimate.value, estimate.half, camera.depth_delay_s
     beyond = f"beyond +- {1e3 * LARGEST_DELAY_S:g} ms: do colour and depth use the same clock?"
-    none, side = value - half <= 0 <= value + half or abs(value) < SMALLEST_DELAY_S, "later" if value > 0 else "earlier"
+    synchronous = value - half <= 0 <= value + half or abs(value) < SMALLEST_DELAY_S
+    side = "later" if value > 0 else "earlier"
     return _judged("depth_delay_s", (own + value, own + (value - half), own + (value + half)), (
         (not estimate.resolved, False, None, _too_wide(estimate, "too slow a motion")),
         (abs(value) > LARGEST_DELAY_S, False, None, beyond),
-        (none, True, None, "colour and depth are exposed as their stamps say, to a sixth of a frame"),
+        (synchronous, True, None, "colour and depth are exposed as their stamps say, to a sixth of a frame"),
         (True, True, round(own + value, 4), f"depth is exposed {side} than its stamps say"),
     ))  # fmt: skip
 

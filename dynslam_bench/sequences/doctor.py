@@ -157,8 +157,8 @@ def _unopened(error: Exception) -> Finding:
     if other_size:
         columns, rows, width, height = map(int, other_size.groups())
         return finding_of("depth-size", columns / width, columns=columns, rows=rows, width=width, height=height)
-    cases = {"nor a folder depth": "no-depth/opening", "depth image ": "depth-format"}
-    case = next((case for words, case in cases.items() if words in text), "unreadable/opening")
+    cases = {"nor a folder depth$": "no-depth/opening", "^depth image ": "depth-format"}
+    case = next((case for pattern, case in cases.items() if re.search(pattern, text)), "unreadable/opening")
     usual = RESAVE if isinstance(error, TrajectoryError) else "docs/reference/sequences.md says what a folder holds"
     return finding_of(case, None, text=text, cure=cure or usual)
 
@@ -773,9 +773,8 @@ def _misread(motions: Motions, readings: dict[str, TruthMotion], stated: Match, 
     if best.reading != READINGS[0]:
         findings.append(finding_of(_MISREAD[best.reading], best.total, **shares))
     if abs(shift) >= LEAST_TIME_S:
-        findings.append(
-            finding_of(f"truth-time-shift/{'late' if shift > 0 else 'early'}", shift, s=abs(shift), **shares)
-        )
+        case = "truth-time-shift/late" if shift > 0 else "truth-time-shift/early"
+        findings.append(finding_of(case, shift, s=abs(shift), **shares))
     return findings
 
 
@@ -818,8 +817,7 @@ def _degrees(X: Array) -> float:
 
 
 def _axes(X: Array, alike: float, stated: Match) -> Finding:
-    angle = _degrees(X)
-    return finding_of("truth-axes", angle, then=100 * alike, now=100 * stated.rotation, matrix=_turn(X))
+    return finding_of("truth-axes", _degrees(X), then=100 * alike, now=100 * stated.rotation, matrix=_turn(X))
 
 
 def _turn(R_body_cam: Array) -> str:

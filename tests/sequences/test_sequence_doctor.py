@@ -159,6 +159,7 @@ DAMAGES = {
     "unreadable": lambda folder: (folder / "rgb" / "2.png").write_bytes(b"no image"),
     "unreadable, truth": lambda folder: (folder / "groundtruth.txt").write_text("1 2 3\n"),
     "unreadable, missing": shutil.rmtree,
+    "unreadable, other clock": lambda folder: rewrite(folder / "depth.txt", lambda rows: [f"9{row}" for row in rows]),
     "depth-size": lambda folder: fill(folder, "depth", np.full((12, 16), 9000, np.uint16)),
     "depth-format": lambda folder: fill(folder, "depth", np.full((24, 32), 90, np.uint8)),
     "no-depth": lambda folder: [(folder / "depth.txt").unlink(), shutil.rmtree(folder / "depth")],
