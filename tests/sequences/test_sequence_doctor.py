@@ -271,25 +271,18 @@ def test_exact_points_give_back_readout_and_delay(readout_s, delay_s):
         assert abs(estimate.value - true) < min(error, estimate.half) and estimate.half < 0.004
 
 
-@pytest.fixture(scope="module")
-def fast(tmp_path_factory):
-    sequence = open_synthetic("synthetic/fast_desk@0?frames=26", tmp_path_factory.mktemp("rendered"))
-    truth, camera = scaled(sequence.ground_truth, 2.0), replace(sequence.camera, readout_s=0.0)
-    return calibrate(sequence), calibrate(Altered(sequence, truth=lambda _: truth, camera=lambda _: camera))
-
-
-def test_a_rendered_rolling_shutter_is_measured(fast):
-    readout, delay, factor = fast[0].quantities
+def test_a_rendered_rolling_shutter_is_measured_and_what_differs_is_to_be_written(tmp_path):
+    sequence = open_synthetic("synthetic/fast_desk@0?frames=26", tmp_path)
+    stated = calibrate(sequence)
+    readout, delay, factor = stated.quantities
     assert readout.value == pytest.approx(0.026, abs=0.003)
     assert readout.low < 0.026 < readout.high and delay.low < 0.0 < delay.high and factor.low < 5000 < factor.high
-    assert readout.observable and readout.written is None, "it is what the camera states"
-    assert not fast[0].measured
-
-
-def test_what_differs_from_the_camera_is_to_be_written(fast):
-    readout, _, factor = fast[1].quantities
-    assert fast[1].camera.readout_s == readout.written == pytest.approx(0.026, abs=0.003)
-    assert factor.low < 2500 < factor.high and fast[1].measured
+    assert readout.observable and not stated.measured, "it is what the camera states"
+    truth, camera = scaled(sequence.ground_truth, 2.0), replace(sequence.camera, readout_s=0.0)
+    other = calibrate(Altered(sequence, truth=lambda _: truth, camera=lambda _: camera))
+    readout, _, factor = other.quantities
+    assert other.camera.readout_s == readout.written == pytest.approx(0.026, abs=0.003)
+    assert factor.low < 2500 < factor.high and other.measured
 
 
 def test_a_camera_file_keeps_the_delay_and_pairs_by_it(tmp_path):
@@ -393,12 +386,12 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def host(folder):
-    return open_sequence(str(folder / "host"))
+    return open_sequence(folder / "host")
 
 
 @pytest.fixture
 def people(folder):
-    return open_sequence(str(folder / "people"))
+    return open_sequence(folder / "people")
 
 
 def test_only_people_and_their_shadow_differ_from_the_host(host, folder):
