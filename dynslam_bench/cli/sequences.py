@@ -124,7 +124,7 @@ def verify(
         verdict = "ok" if report.ok else f"{len(report.faults)} fault{'s' * (len(report.faults) != 1)}"
         how = "every file as fetched" if report.manifest else "not fetched by this program, frames decoded only"
         lines.append(f"{report.id}: {verdict}, {report.frames} frames, {how}")
-        lines += [f"  {report.dropped.describe()}"] if report.dropped is not None else []
+        lines += [f"  {report.dropped}"] if report.dropped else []
         lines += [f"  {fault}" for fault in report.faults]
     present([{**asdict(report), "ok": report.ok} for report in reports], *lines)
     if not all(report.ok for report in reports):

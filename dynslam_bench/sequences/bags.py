@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core import SequenceError, atomic_folder, raising
+from dynslam_bench.core import SequenceError, atomic_folder, raising, write_lines
 from dynslam_bench.geometry import Camera, parse_ns
 from dynslam_bench.sequences.cameras import CAMERA_FILE, write_camera
 from dynslam_bench.sequences.catalogue import open_folder
@@ -86,17 +86,14 @@ def unpack_bag(
             }
             write_camera(work / CAMERA_FILE, topics.camera(chosen_colour))
             if chosen_truth:
-                lines = [pose_line(message) for message in _read(reader, topics.connections[chosen_truth])]
-                (work / "groundtruth.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+                poses = _read(reader, topics.connections[chosen_truth])
+                write_lines(work / "groundtruth.txt", map(pose_line, poses))
             count = len(open_folder(work))
-    notes = []
-    if frames["colour"] != frames["depth"]:
-        notes.append(
-            f"depth is in the frame '{frames['depth']}', colour in '{frames['colour']}': is {chosen_depth} registered?"
-        )
-    if chosen_truth:
-        notes.append(f"the poses of {chosen_truth} are taken for the colour camera's")
-    return Unpacked(target, chosen_colour, chosen_depth, chosen_truth, count, tuple(notes))
+    apart = f"depth is in the frame '{frames['depth']}', colour in '{frames['colour']}': is {chosen_depth} registered?"
+    notes = {apart: frames["colour"] != frames["depth"],
+             f"the poses of {chosen_truth} are taken for the colour camera's": bool(chosen_truth)}  # fmt: skip
+    said = tuple(note for note, holds in notes.items() if holds)
+    return Unpacked(target, chosen_colour, chosen_depth, chosen_truth, count, said)
 
 
 def read_bag_poses(bag: str | Path, topic: str | None = None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -113,7 +110,7 @@ def read_bag_poses(bag: str | Path, topic: str | None = None) -> tuple[NDArray[n
     with _opened(source) as reader:
         topics = _Topics(reader, source)
         chosen = topics.pose(topic, "--topic")
-        lines = [pose_line(message) for message in _read(reader, topics.connections[chosen])] if chosen else []
+        lines = [*map(pose_line, _read(reader, topics.connections[chosen]))] if chosen else []
     table = np.array([line.split() for line in lines], dtype=np.float64).reshape(-1, 8)
     if not np.isfinite(table).all():
         raise SequenceError(f"{source} holds poses that are not finite")
@@ -168,14 +165,13 @@ class _Topics:
 def _write_images(reader: Any, connections: list[Any], work: Path, name: str) -> str:
     """Write the images of a topic and their list; the frame that the first one names."""
     (work / name).mkdir()
-    rows, frame = [], ""
+    rows, frame, encode = [], "", colour_file if name == "rgb" else depth_file
     for index, message in enumerate(_read(reader, connections)):
-        where, encode = f"image {index} of {connections[0].topic}", colour_file if name == "rgb" else depth_file
-        suffix, data = encode(message, where)
+        suffix, data = encode(message, f"image {index} of {connections[0].topic}")
         (work / name / f"{index:06d}{suffix}").write_bytes(data)
         rows.append(f"{stamp_text(message)} {name}/{index:06d}{suffix}")
         frame = frame or str(message.header.frame_id)
-    (work / f"{name}.txt").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    write_lines(work / f"{name}.txt", rows)
     return frame
 
 
@@ -297,8 +293,8 @@ def camera_of(message: Any, where: str) -> Camera:
 
 def pose_line(message: Any) -> str:
     """A line ``timestamp tx ty tz qx qy qz qw`` of a stamped pose, transformation or odometry."""
-    inner = getattr(message, "pose", None) or message.transform
-    inner = getattr(inner, "pose", inner)  # with covariance
+    outer = getattr(message, "pose", None) or message.transform
+    inner = getattr(outer, "pose", outer)  # with covariance
     position = getattr(inner, "position", None) or inner.translation
     rotation = getattr(inner, "orientation", None) or inner.rotation
     values = (position.x, position.y, position.z, rotation.x, rotation.y, rotation.z, rotation.w)

@@ -14,8 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import pairwise, product
+from itertools import pairwise, permutations, product
 from typing import Any
 
 import cv2
@@ -99,7 +98,7 @@ class Calibration:
         return any(quantity.written is not None for quantity in self.quantities)
 
 
-def calibrate(sequence: Sequence, *, progress: Callable[[int, int], None] | None = None) -> Calibration:
+def calibrate(sequence: Sequence, *, progress: Callable[[int, int], None] = lambda done, total: None) -> Calibration:
     """Measure the readout time of the colour camera, the delay of its depth images, and the depth factor.
 
     The readout time and the delay use images and stamps alone. The depth factor is compared with the ground truth,
@@ -131,8 +130,7 @@ def calibrate(sequence: Sequence, *, progress: Callable[[int, int], None] | None
             windows.append(window_of(sequence, first, length))
         except Unusable as fault:
             faults.append(str(fault))
-        if progress is not None:
-            progress(done + 1, len(starts))
+        progress(done + 1, len(starts))
     if len(windows) < LEAST_WINDOWS:
         common = max(set(faults), key=faults.count)
         raise SequenceError(
@@ -145,11 +143,9 @@ def calibrate(sequence: Sequence, *, progress: Callable[[int, int], None] | None
         readout, delay = adjust(windows)
     camera = sequence.camera
     quantities = _readout(readout, windows, camera), _delay(delay, camera), _factor(windows, sequence)
-    values: dict[str, Any] = {
-        quantity.name: quantity.written for quantity in quantities if quantity.written is not None
-    }
+    written: dict[str, Any] = {one.name: one.written for one in quantities if one.written is not None}
     noise = float(np.median([window.noise[0] for window in windows]))
-    return Calibration(replace(camera, **values), quantities, len(windows), length, noise)
+    return Calibration(replace(camera, **written), quantities, len(windows), length, noise)
 
 
 def window_of(sequence: Sequence, first: int, length: int) -> Window:
@@ -197,28 +193,25 @@ def _choose(sequence: Sequence, length: int) -> list[int]:
     starts = list(range(0, len(sequence) - length + 1, length // 2))
     if len(starts) <= MOST_WINDOWS:
         return starts
-    if len(starts) > CANDIDATES:
-        starts = [starts[i] for i in np.unique(np.linspace(0, len(starts) - 1, CANDIDATES).round().astype(int))]
-    change = [_change(sequence, first, first + length - 2) for first in starts]
-    return sorted(starts[i] for i in np.argsort(change)[::-1][:MOST_WINDOWS])
+    spread = np.linspace(0, len(starts) - 1, min(len(starts), CANDIDATES)).round().astype(int).tolist()
+    change = [_change(sequence, starts[i], starts[i] + length - 2) for i in spread]
+    return sorted(starts[spread[i]] for i in np.argsort(change)[::-1][:MOST_WINDOWS])
 
 
 def _change(sequence: Sequence, first: int, last: int) -> float:
     """Pixels a frame by which the image's velocity changes between two frames, less where few corners are followed."""
     flows = []
     for i in (first, last):
-        now, later = (
-            cv2.resize(cv2.cvtColor(sequence[j].rgb, cv2.COLOR_RGB2GRAY), None, fx=0.5, fy=0.5) for j in (i, i + 1)
-        )
-        start_pixels = corners(np.asarray(now, np.uint8), np.ones(now.shape, np.uint8), np.zeros((0, 2)), 40)
-        if len(start_pixels) < LEAST_POINTS:
+        grey = (cv2.cvtColor(sequence[j].rgb, cv2.COLOR_RGB2GRAY) for j in (i, i + 1))
+        now, later = (np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5), np.uint8) for image in grey)
+        start = corners(now, np.ones(now.shape, np.uint8), np.zeros((0, 2)), 40)
+        if len(start) < LEAST_POINTS:
             return 0.0
-        start = start_pixels.reshape(-1, 1, 2)
         there, status, _ = cv2.calcOpticalFlowPyrLK(now, later, start, start.copy(), winSize=(21, 21), maxLevel=3)
         good = status[:, 0] > 0
         if good.sum() < LEAST_POINTS:
             return 0.0
-        flows.append(np.median(there[good, 0] - start_pixels[good], axis=0))
+        flows.append(np.median(there[good] - start[good], axis=0))
     return float(np.linalg.norm(flows[1] - flows[0]))
 
 
@@ -249,33 +242,28 @@ def adjust(windows: list[Window]) -> tuple[Estimate, Estimate]:
     Returns:
         Readout time and delay in seconds.
     """
-    shared = np.array([0.0, _coarse_delay(windows)])
+    grid = np.linspace(-LARGEST_DELAY_S, LARGEST_DELAY_S, 21).tolist()
+    costs = [np.sum([window.depth_cost(delay) for window in windows], axis=0) for delay in grid]
+    shared = np.array([0.0, grid[int(np.argmin([cost / max(count, 1) for cost, count in costs]))]])
     for turn in range(ROUNDS):
         parts = []
         for window in windows:
             window.move_depth(*shared)
             if turn < 4:
                 window.measure_noise(shared[0])
-            equations = window.normal_equations(shared[0])
-            parts.append((equations, *equations.shared()))
-        information, slopes = np.array([part[1] for part in parts]), np.array([part[2] for part in parts])
+            parts.append(window.normal_equations(shared[0]))
+        information, slopes = (np.array([getattr(part, name) for part in parts]) for name in ("information", "slope"))
         step = np.clip(-np.linalg.lstsq(information.sum(0), slopes.sum(0), rcond=None)[0], -0.02, 0.02)
-        for window, (equations, _, _, response) in zip(windows, parts, strict=True):
-            window.update(*equations.steps(step, response))
+        for window, part in zip(windows, parts, strict=True):
+            window.update(*part.steps(step))
         shared = shared + step
         if turn >= 4 and np.abs(step).max() < 1e-5:
             break
     slopes = slopes + information @ step
     own = np.maximum(np.diagonal(information, axis1=1, axis2=2), 1e-12)
     values = shared - slopes / own
-    return _over_windows(windows, values[:, 0], own[:, 0]), _over_windows(windows, values[:, 1], own[:, 1])
-
-
-def _coarse_delay(windows: list[Window]) -> float:
-    """The delay of least robust cost of the depth images, on a grid."""
-    grid = np.linspace(-LARGEST_DELAY_S, LARGEST_DELAY_S, 21).tolist()
-    costs = [np.sum([window.depth_cost(delay) for window in windows], axis=0) for delay in grid]
-    return float(grid[int(np.argmin([cost / max(count, 1) for cost, count in costs]))])
+    readout, delay = (_over_windows(windows, values[:, i], own[:, i]) for i in (0, 1))
+    return readout, delay
 
 
 def _over_windows(
@@ -302,40 +290,44 @@ def _over_windows(
 
 def _readout(estimate: Estimate, windows: list[Window], camera: Camera) -> Quantity:
     interval_s = float(np.median([np.median(np.diff(window.stamps)) for window in windows]))
-    low, high = estimate.value - estimate.half, estimate.value + estimate.half
-    measured = partial(Quantity, "readout_s", estimate.value, low, high)
-    if not estimate.resolved:
-        change = float(np.median([window.turning_change() for window in windows]))
-        return measured(
-            reason=f"interval of +- {1e3 * estimate.half:.1f} ms, wanted +- {1e3 * RESOLVED_S:g} ms: the turning rate "
-            f"changes by {change:.2f} rad/s within a window; turn the camera to and fro faster",
-        )
-    if high < 0 or estimate.value > interval_s + RESOLVED_S:
-        return measured(reason=f"outside of 0 to {1e3 * interval_s:.0f} ms, a frame's interval: check the stamps")
-    if low <= 0:
-        agrees = "the interval contains 0: a global shutter, or as good as one"
-        return measured(written=0.0 if camera.readout_s > high else None, observable=True, reason=agrees)
-    if low <= camera.readout_s <= high:
-        return measured(observable=True, reason=f"agrees with the camera's {1e3 * camera.readout_s:g} ms")
-    return measured(written=round(estimate.value, 4), observable=True, reason="a rolling shutter")
+    change = float(np.median([window.turning_change() for window in windows]))
+    value, low, high = estimate.value, estimate.value - estimate.half, estimate.value + estimate.half
+    slow = f"the turning rate changes by {change:.2f} rad/s within a window; turn the camera to and fro faster"
+    outside = f"outside of 0 to {1e3 * interval_s:.0f} ms, a frame's interval: check the stamps"
+    return _judged("readout_s", (value, low, high), (
+        (not estimate.resolved, False, None, _too_wide(estimate, slow)),
+        (high < 0 or value > interval_s + RESOLVED_S, False, None, outside),
+        (low <= 0, True, 0.0 if camera.readout_s > high else None,
+         "the interval contains 0: a global shutter, or as good as one"),
+        (low <= camera.readout_s <= high, True, None, f"agrees with the camera's {1e3 * camera.readout_s:g} ms"),
+        (True, True, round(value, 4), "a rolling shutter"),
+    ))  # fmt: skip
 
 
 def _delay(estimate: Estimate, camera: Camera) -> Quantity:
     """The stamps that the reader gives have the camera's own delay added already."""
-    low, high, own = estimate.value - estimate.half, estimate.value + estimate.half, camera.depth_delay_s
-    measured = partial(Quantity, "depth_delay_s", own + estimate.value, own + low, own + high)
-    if not estimate.resolved:
-        return measured(
-            reason=f"interval of +- {1e3 * estimate.half:.1f} ms, wanted +- {1e3 * RESOLVED_S:g} ms: too slow a motion",
-        )
-    if abs(estimate.value) > LARGEST_DELAY_S:
-        return measured(reason=f"beyond +- {1e3 * LARGEST_DELAY_S:g} ms: do colour and depth use the same clock?")
-    if low <= 0 <= high or abs(estimate.value) < SMALLEST_DELAY_S:
-        return measured(
-            observable=True, reason="colour and depth are exposed as their stamps say, to a sixth of a frame"
-        )
-    reason = f"depth is exposed {'later' if estimate.value > 0 else 'earlier'} than its stamps say"
-    return measured(written=round(own + estimate.value, 4), observable=True, reason=reason)
+    value, half, own = estimate.value, estimate.half, camera.depth_delay_s
+    beyond = f"beyond +- {1e3 * LARGEST_DELAY_S:g} ms: do colour and depth use the same clock?"
+    synchronous = value - half <= 0 <= value + half or abs(value) < SMALLEST_DELAY_S
+    side = "later" if value > 0 else "earlier"
+    return _judged("depth_delay_s", (own + value, own + (value - half), own + (value + half)), (
+        (not estimate.resolved, False, None, _too_wide(estimate, "too slow a motion")),
+        (abs(value) > LARGEST_DELAY_S, False, None, beyond),
+        (synchronous, True, None, "colour and depth are exposed as their stamps say, to a sixth of a frame"),
+        (True, True, round(own + value, 4), f"depth is exposed {side} than its stamps say"),
+    ))  # fmt: skip
+
+
+def _too_wide(estimate: Estimate, why: str) -> str:
+    return f"interval of +- {1e3 * estimate.half:.1f} ms, wanted +- {1e3 * RESOLVED_S:g} ms: {why}"
+
+
+def _judged(
+    name: str, interval: tuple[float, float, float], cases: tuple[tuple[bool, bool, float | None, str], ...]
+) -> Quantity:
+    """A quantity with its value and interval, by the first of the cases (holds, observable, written, reason)."""
+    _, observable, written, reason = next(case for case in cases if case[0])
+    return Quantity(name, *interval, written, observable, reason)
 
 
 def _factor(windows: list[Window], sequence: Sequence) -> Quantity:
@@ -393,9 +385,8 @@ def track(images: list[NDArray[np.uint8]], allowed: list[NDArray[np.uint8]]) -> 
         alive = np.isfinite(tracks[:, i, 0])
         if alive.sum() < POINTS and i < n - 3:
             fresh = corners(images[i], allowed[i], tracks[alive, i], POINTS - int(alive.sum()))
-            new = np.full((len(fresh), n, 2), np.nan)
-            new[:, i] = fresh
-            tracks = np.concatenate([tracks, new])
+            tracks = np.pad(tracks, ((0, len(fresh)), (0, 0), (0, 0)), constant_values=np.nan)
+            tracks[len(alive) :, i] = fresh
             alive = np.isfinite(tracks[:, i, 0])
         here = tracks[alive, i].astype(np.float32)
         if not len(here):
@@ -477,12 +468,10 @@ class Window:
     def __init__(
         self, camera: Camera, stamps: Array, pixels: Array, depth: NDArray[np.float32], offsets: Array
     ) -> None:
-        self.camera, self.depth, self.offsets = camera, depth, offsets
+        self.camera, self.depth, self.offsets, self.raw = camera, depth, offsets, pixels
         self.start, self.stamps = float(stamps[0]), stamps - stamps[len(stamps) // 2]
-        self.raw = pixels
         self.xy = camera.undistort_points(pixels).reshape(pixels.shape)
         self.inverse_depth = np.stack([inverse_depth(image, pixels[:, i]) for i, image in enumerate(depth)], axis=1)
-        self.depth_drift = np.zeros(pixels.shape[:2])
         self.R, self.centre = self._chain()
         with np.errstate(divide="ignore", invalid="ignore"):
             points = camera.unproject(self.xy, 1 / self.inverse_depth)
@@ -492,14 +481,13 @@ class Window:
         if keep.sum() < LEAST_POINTS:
             raise Unusable("too few points with depth can be followed")
         self.raw, self.xy, self.inverse_depth = self.raw[keep], self.xy[keep], self.inverse_depth[keep]
-        self.depth_drift = self.depth_drift[keep]
+        self.depth_drift = np.zeros(self.raw.shape[:2])
         self.points = np.nanmedian(world[keep], axis=1)
         self.late = np.nan_to_num((self.raw[..., 1] + 0.5) / camera.height - 0.5)
         self.noise = 1.0, 0.01
         self.measure_noise(0.0)
         for _ in range(4):
-            equations = self.normal_equations(0.0)
-            self.update(*equations.steps(np.zeros(2), equations.shared()[2]))
+            self.update(*self.normal_equations(0.0).steps(np.zeros(2)))
         self.measure_noise(0.0)
         if not self.noise[0] < LARGEST_NOISE_PX:
             raise Unusable(f"the points fit one rigid scene to {self.noise[0]:.1f} px only")
@@ -531,17 +519,15 @@ class Window:
 
     def _at(self, offset: Array) -> _Moment:
         """The camera at times `offset` ``[L, n]`` seconds after the frames' stamps."""
-        n = len(self.stamps)
-        times = self.stamps + offset
+        n, times = len(self.stamps), self.stamps + offset
         nearest = np.searchsorted((self.stamps[1:] + self.stamps[:-1]) / 2, times)
         nodes = np.clip(np.arange(n) - STENCIL // 2, 0, n - STENCIL)[:, None] + np.arange(STENCIL)
         spread = self.stamps[nodes] - self.stamps[:, None]
         turns = _rotvec(self.R[nodes] @ np.swapaxes(self.R, 1, 2)[:, None])
         weights, slopes = _lagrange(spread[nearest], times - self.stamps[nearest])
         turn, centres = turns[nearest], self.centre[nodes][nearest]
-        R = _matrix((weights[..., None, :] @ turn)[..., 0, :]) @ self.R[nearest]
         return _Moment(
-            R=R,
+            R=_matrix((weights[..., None, :] @ turn)[..., 0, :]) @ self.R[nearest],
             centre=(weights[..., None, :] @ centres)[..., 0, :],
             turning=(slopes[..., None, :] @ turn)[..., 0, :],
             velocity=(slopes[..., None, :] @ centres)[..., 0, :],
@@ -614,12 +600,10 @@ class Window:
         residuals = self._residuals(points)
         pixels, depth = self.noise
         error = np.hypot(residuals[..., 0], residuals[..., 1]) / pixels
-        weight = np.empty((L, n, 3))
-        weight[..., :2] = (1 / (pixels * np.sqrt(1 + (error / CAUCHY) ** 2)))[..., None]
-        weight[..., 2] = 1 / (depth * np.sqrt(1 + (residuals[..., 2] / depth / CAUCHY) ** 2))
-        weight = np.nan_to_num(weight)
-        x, y, z = np.moveaxis(points, -1, 0)
-        z = np.maximum(z, 1e-3)
+        by_pixels = 1 / (pixels * np.sqrt(1 + (error / CAUCHY) ** 2))
+        by_depth = 1 / (depth * np.sqrt(1 + (residuals[..., 2] / depth / CAUCHY) ** 2))
+        weight = np.nan_to_num(np.stack([by_pixels, by_pixels, by_depth], axis=-1))
+        x, y, z = points[..., 0], points[..., 1], np.maximum(points[..., 2], 1e-3)
         by_point = np.zeros((L, n, 3, 3))
         by_point[..., 0, 0], by_point[..., 0, 2] = self.camera.fx / z, -self.camera.fx * x / z**2
         by_point[..., 1, 1], by_point[..., 1, 2] = self.camera.fy / z, -self.camera.fy * y / z**2
@@ -687,36 +671,29 @@ class _Reduced:
         r: Residuals ``[L, k]``, weighted.
 
     Attributes:
-        H: ``[m + 2, m + 2]``.
-        b: ``[m + 2]``.
-        inverse: ``[L, 3, 3]`` of the points' own blocks.
-        mixed: ``[L, 3, m + 2]``.
-        slope: ``[L, 3]``.
+        information: Of readout and delay, the poses eliminated, ``[2, 2]``.
+        slope: Of the cost by readout and delay alike ``[2]``.
     """
 
     def __init__(self, J: Array, by_point: Array, r: Array) -> None:
         turned = np.swapaxes(by_point, 1, 2)
         own = turned @ by_point
         own += (1e-6 * np.trace(own, axis1=1, axis2=2)[:, None, None] + 1e-9) * np.eye(3)
-        self.inverse, self.mixed, self.slope = np.linalg.inv(own), turned @ J, (turned @ r[..., None])[..., 0]
-        flat, m = J.reshape(-1, J.shape[-1]), J.shape[-1]
-        carried = (self.inverse @ self.mixed).reshape(-1, m)
-        self.H = flat.T @ flat - self.mixed.reshape(-1, m).T @ carried
-        self.b = flat.T @ r.ravel() - carried.T @ self.slope.ravel()
+        self._inverse, self._mixed, self._pull = np.linalg.inv(own), turned @ J, (turned @ r[..., None])[..., 0]
+        columns = J.shape[-1]
+        flat, carried = J.reshape(-1, columns), (self._inverse @ self._mixed).reshape(-1, columns)
+        H = flat.T @ flat - self._mixed.reshape(-1, columns).T @ carried
+        b, m = flat.T @ r.ravel() - carried.T @ self._pull.ravel(), columns - 2
+        damped = H[:m, :m] + 1e-9 * np.trace(H[:m, :m]) / m * np.eye(m)
+        self._response = np.linalg.solve(damped, np.column_stack([H[:m, m:], b[:m]]))  # of the poses
+        self.information = H[m:, m:] - H[m:, :m] @ self._response[:, :2]
+        self.slope = b[m:] - H[m:, :m] @ self._response[:, 2]
 
-    def shared(self) -> tuple[Array, Array, Array]:
-        """Information ``[2, 2]`` and slope ``[2]`` of readout and delay, the poses eliminated; the poses' response."""
-        m = len(self.b) - 2
-        damped = self.H[:m, :m] + 1e-9 * np.trace(self.H[:m, :m]) / m * np.eye(m)
-        response = np.linalg.solve(damped, np.column_stack([self.H[:m, m:], self.b[:m]]))
-        information = self.H[m:, m:] - self.H[m:, :m] @ response[:, :2]
-        return information, self.b[m:] - self.H[m:, :m] @ response[:, 2], response
-
-    def steps(self, shared: Array, response: Array) -> tuple[Array, Array]:
+    def steps(self, shared: Array) -> tuple[Array, Array]:
         """Steps of the poses ``[n - 1, 6]`` and the points ``[L, 3]`` that go with steps ``[2]`` of what is shared."""
-        poses = -response[:, 2] - response[:, :2] @ shared
-        change = self.slope + self.mixed @ np.concatenate([poses, shared])
-        return poses.reshape(-1, 6), -(self.inverse @ change[..., None])[..., 0]
+        poses = -self._response[:, 2] - self._response[:, :2] @ shared
+        change = self._pull + self._mixed @ np.concatenate([poses, shared])
+        return poses.reshape(-1, 6), -(self._inverse @ change[..., None])[..., 0]
 
 
 def _matrix(turns: Array) -> Array:
@@ -729,12 +706,9 @@ def _rotvec(R: Array) -> Array:
 
 def _lagrange(nodes: Array, at: Array) -> tuple[Array, Array]:
     """Weights ``[..., k]`` of the nodes ``[..., k]`` of the interpolating polynomial at ``[...]``, and their slopes."""
-    k = nodes.shape[-1]
     weights, slopes = np.ones_like(nodes), np.zeros_like(nodes)
-    for j in range(k):
-        for m in range(k):
-            if m != j:
-                span = nodes[..., j] - nodes[..., m]
-                slopes[..., j] = (slopes[..., j] * (at - nodes[..., m]) + weights[..., j]) / span
-                weights[..., j] *= (at - nodes[..., m]) / span
+    for j, m in permutations(range(nodes.shape[-1]), 2):
+        span = nodes[..., j] - nodes[..., m]
+        slopes[..., j] = (slopes[..., j] * (at - nodes[..., m]) + weights[..., j]) / span
+        weights[..., j] *= (at - nodes[..., m]) / span
     return weights, slopes

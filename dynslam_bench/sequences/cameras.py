@@ -161,7 +161,7 @@ def write_camera(path: Path, camera: Camera, *, fps: float | None = None) -> Non
     lines = [f"width = {int(camera.width)}", f"height = {int(camera.height)}"]
     keys = ("fx", "fy", "cx", "cy", "depth_factor", "baseline_m", "readout_s", "depth_delay_s")
     lines += [f"{key} = {float(getattr(camera, key))!r}" for key in keys]
-    lines.append(f"distortion = [{', '.join(repr(float(value)) for value in camera.distortion)}]")
+    lines += [f"distortion = {[float(value) for value in camera.distortion]}"]
     lines += [] if fps is None else [f"fps = {float(fps)!r}"]
     write_atomic(path, "\n".join(lines) + "\n")
 
@@ -180,10 +180,8 @@ def chosen_camera(folder: Path, choice: str | Path | Camera | None = None) -> tu
         return choice, None
     if choice is None and not (folder / CAMERA_FILE).is_file():
         return None
-    if str(choice) in CAMERAS:
-        return CAMERAS[str(choice)], None
     path = folder / CAMERA_FILE if choice is None else Path(choice).expanduser()
-    if path.suffix.lower() != ".toml" and not path.is_file():
+    if str(choice) in CAMERAS or (path.suffix.lower() != ".toml" and not path.is_file()):
         return known_camera(str(choice)), None
     file = read_camera(path)
     return file.camera(), file.fps

@@ -94,10 +94,6 @@ class CatalogueEntry(Settings):
             return f"{self.size_bytes / 1e9:.2f} GB"
         return self.size_stated or "size unknown"
 
-    def intrinsics(self) -> Camera | None:
-        """The camera; None where only the sequence's own files state it."""
-        return CAMERAS[self.camera] if self.camera else None
-
 
 @cache
 def catalogue() -> dict[str, CatalogueEntry]:
@@ -245,14 +241,13 @@ def open_folder(
 def _open_whole(
     name: str, data_root: Path, camera: str | Path | Camera | None, settings: PreprocessingSettings
 ) -> Sequence:
-    path = Path(name).expanduser()
-    entry = None if _is_path(name) else entry_of(name)
+    path, is_path = Path(name).expanduser(), name.startswith((".", "/", "~", "\\"))
+    entry = None if is_path else entry_of(name)
     if entry is not None:
         return open_public(entry.id, data_root=data_root, camera=camera, settings=settings)
-    prefix = name.partition("/")[0]
-    datasets = {dataset.spec.id: dataset.spec for dataset in DATASETS.all()}
-    public = {entry.dataset for entry in catalogue().values()}
-    if not _is_path(name) and "/" in name and prefix in datasets and prefix not in public:
+    prefix, public = name.partition("/")[0], {entry.dataset for entry in catalogue().values()}
+    datasets = {dataset.spec.id: dataset.spec for dataset in DATASETS.all() if dataset.spec.id not in public}
+    if not is_path and "/" in name and prefix in datasets:
         if camera is not None:
             raise SequenceError(f"sequence '{name}' brings its own camera", "leave out --camera")
         return cast("Sequence", load_object(datasets[prefix].entry_point)(name, data_root=data_root))
@@ -260,16 +255,12 @@ def _open_whole(
         raise SequenceError(f"{path} is a bag", f"unpack it first: dynslam-bench sequences unpack {path} FOLDER")
     if path.is_dir():
         return open_folder(path, camera=camera, settings=settings)
-    if _is_path(name):
+    if is_path:
         raise SequenceError(
             f"there is no sequence folder {path.absolute()}", "a path names a folder, see docs/reference/sequences.md"
         )
     near = did_you_mean(name, [*sequence_ids(), *by_folder()])
     raise SequenceError(f"unknown sequence '{name}', and there is no such folder", near)
-
-
-def _is_path(name: str) -> bool:
-    return name.startswith((".", "/", "~", "\\"))
 
 
 def parse_frames(frames: Iterable[int | None] | str | None) -> tuple[int, int | None]:
@@ -366,7 +357,7 @@ def describe(name: str, *, data_root: str | Path | None = None, camera: str | Pa
             "not published: the first fetch takes it, every later one has to bring the same",
             "citation": entry.citation, "tags": list(entry.tags), "split": entry.split,
             "ground_truth": "public" if entry.ground_truth else "not public",
-            "camera": repr(entry.intrinsics() or "as its files or its layout state"),
+            "camera": repr(CAMERAS.get(entry.camera, "as its files or its layout state")),
             "layout": f"{entry.layout}: {'' if entry.verified else 'not '}verified on the publisher's files",
             "remark": entry.remark,
         }  # fmt: skip
@@ -374,8 +365,7 @@ def describe(name: str, *, data_root: str | Path | None = None, camera: str | Pa
             return facts | {"here": False, "fetch": entry.how_to_get()}
     sequence = open_sequence(name, data_root=data_root, camera=camera)
     truth = sequence.ground_truth
-    dropped, folder = getattr(sequence, "dropped", None), getattr(sequence, "folder", None)
-    stamps = sequence.timestamps
+    folder, stamps = getattr(sequence, "folder", None), sequence.timestamps
     return facts | {
         "id": sequence.id,
         "here": True,
@@ -389,7 +379,7 @@ def describe(name: str, *, data_root: str | Path | None = None, camera: str | Pa
         "masks": "exact" if sequence.masks is not None else "none",
         "license": sequence.license,
         "citation": sequence.citation,
-        "association": None if dropped is None else dropped.describe(),
+        "association": getattr(sequence, "dropped", None),
         "digest": sequence.digest(),
     }
 

@@ -55,19 +55,8 @@ _SHADOW_BASELINE_M = 0.075
 _FURTHEST_SHADOW_PX = 80
 
 
-@dataclass(frozen=True)
-class Cutout:
-    """A person in one frame of a fixed camera.
-
-    Attributes:
-        rgb: uint8 ``[H, W, 3]``.
-        depth: The person's, float32 ``[H, W]`` in metres, continued around the mask.
-        mask: bool ``[H, W]``, the person.
-    """
-
-    rgb: NDArray[np.uint8]
-    depth: NDArray[np.float32]
-    mask: NDArray[np.bool_]
+Cutout = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]
+"""A person in one frame: colours ``[H, W, 3]``, the person's depth in metres ``[H, W]`` and mask ``[H, W]``."""
 
 
 @dataclass(frozen=True)
@@ -126,28 +115,24 @@ def compose(
     rng = np.random.default_rng(instance)
     T_world_cam = _poses(host.ground_truth, host.timestamps)
     actors = [_Actor(cutouts, people.fps, host, T_world_cam, rng) for _ in range(1 + instance % _MOST_PEOPLE)]
-    shares = []
+    shares, lists = [], {"rgb": "rgb.txt", "depth": "depth.txt", "people": PEOPLE_LIST}
     with atomic_folder(target) as work:
-        for kind in ("rgb", "depth", "people"):
+        for kind, listed in lists.items():
             (work / kind).mkdir()
+            lines = [f"{stamp:.6f} {kind}/{stamp:.6f}.png\n" for stamp in host.timestamps.tolist()]
+            write_atomic(work / listed, "".join(lines))
         for i in range(len(host)):
             frame = host[i]
             gain = np.clip(frame.rgb.reshape(-1, 3).mean(axis=0) / cutouts.tone, 0.4, 1.6)
             colour, z, ids = _nearest([actor.draw(i, host.camera) for actor in actors])
             rgb, depth, shown = paste(frame.rgb, frame.depth, colour * gain.astype(np.float32), z, host.camera)
-            name = f"{frame.timestamp:.6f}.png"
             raw = np.rint(depth * host.camera.depth_factor).clip(0, 65535).astype(np.uint16)
-            for kind, image in (
-                ("rgb", rgb[..., ::-1]),
-                ("depth", raw),
-                ("people", np.where(shown, ids, 0).astype(np.uint8)),
-            ):
-                write_atomic(work / kind / name, cv2.imencode(".png", image)[1].tobytes())
+            images = (rgb[..., ::-1], raw, np.where(shown, ids, 0).astype(np.uint8))
+            for kind, image in zip(lists, images, strict=True):
+                data = cv2.imencode(".png", image)[1].tobytes()
+                write_atomic(work / kind / f"{frame.timestamp:.6f}.png", data)
             shares.append(shown.mean())
             progress(i + 1, len(host))
-        for kind in ("rgb", "depth", "people"):
-            lines = [f"{stamp:.6f} {kind}/{stamp:.6f}.png\n" for stamp in host.timestamps.tolist()]
-            write_atomic(work / (PEOPLE_LIST if kind == "people" else f"{kind}.txt"), "".join(lines))
         write_tum(work / "groundtruth.txt", host.ground_truth, comment=f"of {host.id}")
         write_camera(work / "camera.toml", host.camera, fps=host.fps)
         if not max(shares):
@@ -208,7 +193,7 @@ class Cutouts:
         at, packed = self._masks[index]
         frame = self._people[at]
         mask = np.unpackbits(packed, count=frame.depth.size).reshape(frame.depth.shape).astype(bool)
-        return Cutout(frame.rgb, self._depth(frame, mask), mask)
+        return frame.rgb, self._depth(frame, mask), mask
 
     def _nearer(self, frame: Frame) -> NDArray[np.bool_]:
         least = np.maximum(_NEARER_M, _NEARER_SHARE * self._background)
@@ -368,19 +353,20 @@ def _nearest(
 
 def _upsampled(cutout: Cutout, times: int) -> tuple[NDArray[np.float32], Array, NDArray[np.float32]]:
     """Colours ``[N, 3]``, pixels ``[N, 2]`` and depths ``[N]`` of a cutout at several times its resolution."""
-    rows, columns = np.nonzero(cutout.mask)
+    rgb, depth, person = cutout
+    rows, columns = np.nonzero(person)
     top, left = max(rows.min() - 1, 0), max(columns.min() - 1, 0)
     part = np.s_[top : rows.max() + 2, left : columns.max() + 2]
-    mask, depth = cutout.mask[part].astype(np.float32), cutout.depth[part]
+    mask, depth = person[part].astype(np.float32), depth[part]
     size = (times * mask.shape[1], times * mask.shape[0])
     weight = cv2.resize(mask, size, interpolation=cv2.INTER_LINEAR)
     smooth, nearest = (cv2.resize(depth, size, interpolation=way) for way in (cv2.INTER_LINEAR, cv2.INTER_NEAREST))
     edge = (cv2.dilate(depth, _SQUARE) - cv2.erode(depth, _SQUARE) > _EDGE_M).astype(np.uint8)
     stepped = cv2.resize(edge, size, interpolation=cv2.INTER_NEAREST) > 0
-    rgb = cv2.resize(cutout.rgb[part].astype(np.float32), size, interpolation=cv2.INTER_CUBIC)
+    colours = cv2.resize(rgb[part].astype(np.float32), size, interpolation=cv2.INTER_CUBIC)
     inside = np.nonzero(weight > 0.5)
     pixels = (np.stack(inside[::-1], axis=1) + 0.5) / times - 0.5 + (left, top)
-    return rgb[inside].clip(0, 255), pixels, np.where(stepped, nearest, smooth)[inside]
+    return colours[inside].clip(0, 255), pixels, np.where(stepped, nearest, smooth)[inside]
 
 
 def _closed(colour: NDArray[np.float32], z: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

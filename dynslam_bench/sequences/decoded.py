@@ -62,11 +62,10 @@ def _mapped(sequence: Sequence) -> NDArray[np.void]:
 
 def _read(path: Path) -> NDArray[np.void] | None:
     """The mapped array of a file; None if it is not there, or damaged."""
-    try:
+    with contextlib.suppress(FileNotFoundError, EOFError, ValueError):
         frames: NDArray[np.void] = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (FileNotFoundError, EOFError, ValueError):
-        return None
-    return frames
+        return frames
+    return None
 
 
 def _write(sequence: Sequence, path: Path, max_bytes: int) -> None:

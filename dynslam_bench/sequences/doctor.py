@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal
@@ -15,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from dynslam_bench.contracts import Frame, Sequence
-from dynslam_bench.core import DynslamError, SequenceError, TrajectoryError
+from dynslam_bench.core import DynslamError, TrajectoryError
 from dynslam_bench.geometry import Array, Camera, Trajectory, nearest_gap, se3
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.sequences.rgbd_motion import (
@@ -33,7 +35,6 @@ from dynslam_bench.sequences.rgbd_motion import (
     rotation_between,
     weighted_mean,
 )
-from dynslam_bench.sequences.settings import PreprocessingSettings
 
 MOST_FRAMES = 240
 FEWEST = 10
@@ -41,6 +42,7 @@ FEWEST = 10
 STRETCH = 40
 """Frames that are read one after the other: more than a second, for delays and shifts in time."""
 
+Progress = Callable[[int, int], None]
 _UNREADABLE = (DynslamError, OSError, ValueError)
 """What a recording raises that cannot be read."""
 
@@ -62,19 +64,19 @@ class Diagnosis:
     @property
     def ok(self) -> bool:
         """Whether no fault was found."""
-        return not any(finding.severity == "fault" for finding in self.findings)
+        return not any(map(is_fault, self.findings))
 
     @property
     def verdict(self) -> str:
         """A phrase for the first line of a report; every note stands for a comparison that was not made."""
-        faults = sum(finding.severity == "fault" for finding in self.findings)
-        if faults:
-            return f"{faults} fault{'s' * (faults != 1)}"
-        if not self.findings:
-            return "no fault found"
-        if any(finding.id == "no-truth" for finding in self.findings):
-            return "no fault found in the images; there is no ground truth to compare"
-        return "no fault found in the images, but the ground truth could not be compared"
+        faults, ids = sum(map(is_fault, self.findings)), {finding.id for finding in self.findings}
+        cases = (
+            (faults, f"{faults} fault{'s' * (faults != 1)}"),
+            (not ids, "no fault found"),
+            ("no-truth" in ids, "no fault found in the images; there is no ground truth to compare"),
+            (True, "no fault found in the images, but the ground truth could not be compared"),
+        )
+        return next(verdict for holds, verdict in cases if holds)
 
 
 def diagnose(
@@ -83,7 +85,7 @@ def diagnose(
     data_root: str | Path | None = None,
     camera: str | Path | Camera | None = None,
     most_frames: int = MOST_FRAMES,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = lambda done, total: None,
 ) -> Diagnosis:
     """Check a recording: never raises for what is wrong with it.
 
@@ -97,12 +99,12 @@ def diagnose(
     try:
         sequence = open_sequence(name, data_root=data_root, camera=camera)
     except _UNREADABLE as error:
-        return Diagnosis(str(name), 0, (_unopened(name, data_root, camera, error),))
+        return Diagnosis(str(name), 0, (_unopened(error),))
     return replace(examine(sequence, most_frames=most_frames, progress=progress), id=str(name))
 
 
 def examine(
-    sequence: Sequence, *, most_frames: int = MOST_FRAMES, progress: Callable[[int, int], None] | None = None
+    sequence: Sequence, *, most_frames: int = MOST_FRAMES, progress: Progress = lambda done, total: None
 ) -> Diagnosis:
     """The same of an opened sequence.
 
@@ -111,41 +113,32 @@ def examine(
         most_frames: Frames that are read at most.
         progress: Called with the frames done and the frames to do.
     """
-    starts = stretches(len(sequence), most_frames)
-    todo = sum(stop - start for start, stop in starts)
-    intervals = np.diff(sequence.timestamps)
-    streams = Streams(sequence.camera.depth_factor, float(np.median(intervals)) if len(intervals) else 1 / 30)
-    pairs: list[RgbdPair] = []
-    unreadable: list[str] = []
+    indices = [range(*stretch) for stretch in stretches(len(sequence), most_frames)]
+    done, todo = 0, sum(map(len, indices))
+    interval_s = np.median(np.diff(sequence.timestamps)) if len(sequence) > 1 else 1 / 30
+    streams = Streams(sequence.camera.depth_factor, float(interval_s))
+    pairs, unreadable = list[RgbdPair](), list[str]()
     with_depth = bool(getattr(sequence, "has_depth", True))
-    done = 0
-    for start, stop in starts:
-        frames: list[Frame] = []
-        for index in range(start, stop):
+    for stretch in indices:
+        frames = []
+        for index in stretch:
             try:
                 frames.append(sequence[index])
             except _UNREADABLE as error:
                 unreadable.append(f"frame {index}: {_message(error)}")
             done += 1
-            if progress is not None:
-                progress(done, todo)
+            progress(done, todo)
         if frames:
             streams.add(frames)
-            if with_depth:
-                pairs.extend(rgbd_pairs(frames, sequence.camera))
-    findings = []
-    if unreadable:
-        findings.append(fault("unreadable", len(unreadable), todo=todo, first=unreadable[0]))
-    if not streams.frames:
-        return Diagnosis(sequence.id, 0, tuple(findings))
-    if streams.frames < FEWEST:
-        findings.append(note("too-short", streams.frames))
-    in_streams = stream_findings(streams, with_depth)
-    findings += in_streams
-    if streams.frames >= FEWEST and not any(finding.severity == "fault" for finding in in_streams):
-        findings += truth_findings(sequence.timestamps, sequence.ground_truth, sequence.camera, pairs)
-    findings.sort(key=lambda finding: finding.severity != "fault")
-    return Diagnosis(sequence.id, streams.frames, tuple(findings))
+            pairs += rgbd_pairs(frames, sequence.camera) if with_depth else ()
+    findings = [finding_of("unreadable", len(unreadable), todo=todo, first=unreadable[0])] if unreadable else []
+    if streams.frames:
+        findings += [finding_of("too-short", streams.frames)] if streams.frames < FEWEST else []
+        in_streams = stream_findings(streams, with_depth)
+        findings += in_streams
+        if streams.frames >= FEWEST and not any(map(is_fault, in_streams)):
+            findings += truth_findings(sequence.timestamps, sequence.ground_truth, sequence.camera, pairs)
+    return Diagnosis(sequence.id, streams.frames, tuple(sorted(findings, key=is_fault, reverse=True)))
 
 
 def stretches(frames: int, most: int) -> list[tuple[int, int]]:
@@ -157,25 +150,17 @@ def stretches(frames: int, most: int) -> list[tuple[int, int]]:
     return [(int(start), int(start) + length) for start in starts]
 
 
-def _unopened(
-    name: str | Path, data_root: str | Path | None, camera: str | Path | Camera | None, error: Exception
-) -> Finding:
-    """Why a recording cannot be opened: depth of another size is a fault of its own, the rest is said as it is."""
-    any_size = PreprocessingSettings(width=64, height=48)
-    try:
-        loose: Any = open_sequence(name, data_root=data_root, camera=camera, preprocessing=any_size)
-        frame = getattr(loose, "base", loose)[0]
-    except _UNREADABLE:
-        text, cure = _message(error), getattr(error, "hint", "")
-        if isinstance(error, TrajectoryError):
-            return fault("unreadable/opening", None, text=text, cure=cure or RESAVE)
-        cure = cure or "docs/reference/sequences.md says what a folder holds"
-        if isinstance(error, SequenceError) and text.startswith("depth image"):
-            return fault("depth-format", None, text=text, cure=cure)
-        return fault("no-depth/opening" if text.endswith("nor a folder depth") else "unreadable/opening", None,
-                     text=text, cure=cure)  # fmt: skip
-    (height, width), (rows, columns) = frame.rgb.shape[:2], frame.depth.shape
-    return fault("depth-size", columns / width, columns=columns, rows=rows, width=width, height=height)
+def _unopened(error: Exception) -> Finding:
+    """Why a recording cannot be opened: no depth, or depth of another size or form; the rest is said as it is."""
+    text, cure = _message(error), getattr(error, "hint", "")
+    other_size = re.search(r"is (\d+)x(\d+), but its colour image is (\d+)x(\d+)", text)
+    if other_size:
+        columns, rows, width, height = map(int, other_size.groups())
+        return finding_of("depth-size", columns / width, columns=columns, rows=rows, width=width, height=height)
+    cases = {"nor a folder depth$": "no-depth/opening", "^depth image ": "depth-format"}
+    case = next((case for pattern, case in cases.items() if re.search(pattern, text)), "unreadable/opening")
+    usual = RESAVE if isinstance(error, TrajectoryError) else "docs/reference/sequences.md says what a folder holds"
+    return finding_of(case, None, text=text, cure=cure or usual)
 
 
 def _message(error: Exception) -> str:
@@ -188,6 +173,9 @@ def _message(error: Exception) -> str:
 # Contours of depth are contours in the colour image, too, at the same place and time. Their correlation over shifts,
 # mirrorings and delays says whether the depth is registered, which way up the images are, and whether the two streams
 # are synchronous.
+
+
+Severity = Literal["fault", "note"]
 
 
 @dataclass(frozen=True)
@@ -204,7 +192,7 @@ class Finding:
     """
 
     id: str
-    severity: Literal["fault", "note"]
+    severity: Severity
     value: float | None
     unit: str
     text: str
@@ -408,16 +396,22 @@ _FINDINGS: dict[str, tuple[str, str, str]] = {
 """Unit, text and cure of every finding, by its id and, where an id has several texts, what it was found by."""
 
 
-def fault(case: str, value: float | None, **facts: Any) -> Finding:
-    """A finding that makes results on the recording wrong: a row of `_FINDINGS`, with the numbers filled in."""
-    unit, text, cure = _FINDINGS[case]
-    number, facts = None if value is None else float(value), {"value": value, **facts}
-    return Finding(case.partition("/")[0], "fault", number, unit, text.format(**facts), cure.format(**facts))
+_NOTES = {"too-short", "no-depth", "no-truth", "motion-unmeasured", "motion-unmeasured/small", "no-motion",
+          "truth-unclear"}  # fmt: skip
+"""The cases that are good to know and no faults."""
 
 
-def note(case: str, value: float | None, **facts: Any) -> Finding:
-    """A finding that is good to know."""
-    return replace(fault(case, value, **facts), severity="note")
+def finding_of(case: str, value: float | None, **facts: Any) -> Finding:
+    """A row of `_FINDINGS`, with the numbers filled in."""
+    (unit, text, cure), facts = _FINDINGS[case], {"value": value, **facts}
+    severity: Severity = "note" if case in _NOTES else "fault"
+    number = None if value is None else float(value)
+    return Finding(case.partition("/")[0], severity, number, unit, text.format(**facts), cure.format(**facts))
+
+
+def is_fault(finding: Finding) -> bool:
+    """Whether results on the recording are wrong until it is mended."""
+    return finding.severity == "fault"
 
 
 Map = NDArray[np.float32]
@@ -482,11 +476,8 @@ class Streams:
 
 def _longest_run(images: list[NDArray[Any]]) -> int:
     """Most equal images in a row."""
-    longest = run = 1
-    for before, after in itertools.pairwise(images):
-        run = run + 1 if np.array_equal(before, after) else 1
-        longest = max(longest, run)
-    return longest
+    repeated = itertools.groupby(np.array_equal(before, after) for before, after in itertools.pairwise(images))
+    return 1 + max((len([*run]) for equal, run in repeated if equal), default=0)
 
 
 def _correlation(colour: Map, depth: Map) -> Map:
@@ -569,13 +560,13 @@ def stream_findings(streams: Streams, with_depth: bool = True) -> list[Finding]:
         finding = check(streams)
         if finding is not None and (with_depth or finding.id == "colour-blank"):
             return [finding]
-    return [] if with_depth else [note("no-depth", None)]
+    return [] if with_depth else [finding_of("no-depth", None)]
 
 
 def _empty(streams: Streams) -> Finding | None:
     for id, count in (("colour-blank", streams.dark), ("depth-empty", streams.empty)):
         if count >= 0.5 * streams.frames:
-            return fault(id, count / streams.frames, count=count, frames=streams.frames)
+            return finding_of(id, count / streams.frames, count=count, frames=streams.frames)
     return None
 
 
@@ -583,14 +574,14 @@ def _frozen(streams: Streams) -> Finding | None:
     colour, depth = streams.colour_run >= FROZEN_FRAMES, streams.depth_run >= FROZEN_FRAMES
     if colour == depth:  # a rendered camera at rest repeats both; the truth says whether it rests
         return None
-    return fault("colour-frozen", streams.colour_run) if colour else fault("depth-frozen", streams.depth_run)
+    return finding_of("colour-frozen", streams.colour_run) if colour else finding_of("depth-frozen", streams.depth_run)
 
 
 def _swapped(streams: Streams) -> Finding | None:
     stated, swapped = np.nanmedian(np.array(streams.rough or [(np.nan, np.nan)]), axis=0)
     if not swapped < stated / 3:
         return None
-    return fault("depth-byte-order", stated, stated=100 * stated, swapped=100 * swapped)
+    return finding_of("depth-byte-order", stated, stated=100 * stated, swapped=100 * swapped)
 
 
 def _units(streams: Streams) -> Finding | None:
@@ -598,7 +589,7 @@ def _units(streams: Streams) -> Finding | None:
     if DEPTH_RANGE_M[0] <= median <= DEPTH_RANGE_M[1]:
         return None
     likely = next((f for f in (1.0, 100.0, 1000.0, 5000.0) if 0.4 < median * factor / f < 8), factor)
-    return fault("depth-units", median, factor=factor, likely=likely)
+    return finding_of("depth-units", median, factor=factor, likely=likely)
 
 
 def _flipped(streams: Streams) -> Finding | None:
@@ -609,7 +600,7 @@ def _flipped(streams: Streams) -> Finding | None:
     best = max(peaks, key=lambda name: peaks[name])
     if best == "" or peaks[best] < CLEAR_PEAK or peaks[best] < 1.4 * peaks[""]:
         return None
-    return fault("colour-flipped", peaks[best], how=best, stored=peaks[""])
+    return finding_of("colour-flipped", peaks[best], how=best, stored=peaks[""])
 
 
 def _asynchronous(streams: Streams) -> Finding | None:
@@ -635,7 +626,7 @@ def _asynchronous(streams: Streams) -> Finding | None:
         delay += float((around[0] - around[2]) / (2 * (around[0] - 2 * around[1] + around[2])))
     seconds, better = delay * streams.seconds_a_frame, mean[column] / max(mean[MOST_DELAY], 0.01)
     side, change = ("before", "earlier") if delay > 0 else ("after", "later")
-    return fault("depth-delay", seconds, delay=abs(delay), s=abs(seconds), side=side, change=change, better=better)
+    return finding_of("depth-delay", seconds, delay=abs(delay), s=abs(seconds), side=side, change=change, better=better)
 
 
 def _agreements(colour_maps: Map, depth_maps: Map) -> NDArray[np.float64]:
@@ -665,7 +656,7 @@ def _shifted(streams: Streams) -> Finding | None:
     rolled = np.roll(middle, (2, 2), (1, 2))[:, :5, :5]
     if size < LEAST_SHIFT_PX or clear < CLEAR_PEAK or surface[row, column] < 1.4 * rolled.max():
         return None
-    return fault("depth-not-registered", size, right=-right * streams.cell_px, down=-down * streams.cell_px)
+    return finding_of("depth-not-registered", size, right=-right * streams.cell_px, down=-down * streams.cell_px)
 
 
 def _peak(surface: Map, reach: int) -> tuple[float, tuple[int, int]]:
@@ -721,20 +712,20 @@ def truth_findings(stamps: Array, truth: Trajectory | None, camera: Camera, pair
         pairs: Pairs of frames and their motions.
     """
     if truth is None:
-        return [note("no-truth", None)]
+        return [finding_of("no-truth", None)]
     begin, end = truth.timestamps[[0, -1]]
     apart = max(begin - stamps[-1], stamps[0] - end)
     if apart > 0:
-        return [fault("truth-other-sequence/time", apart, begin=begin, end=end, first=stamps[0], last=stamps[-1])]
+        return [finding_of("truth-other-sequence/time", apart, begin=begin, end=end, first=stamps[0], last=stamps[-1])]
     covered = int((nearest_gap(stamps, truth.timestamps) < SAME_FRAME_S).sum())
     if covered < max(LEAST_COVERAGE * len(stamps), 3):
-        return [fault("truth-sparse", covered, frames=len(stamps), within=SAME_FRAME_S)]
+        return [finding_of("truth-sparse", covered, frames=len(stamps), within=SAME_FRAME_S)]
     usable = [pair for pair in pairs if pair.T_first_second is not None and pair.inliers.mean() >= 0.5]
     displacement = float(np.median([pair.displacement_px for pair in usable])) if usable else np.inf
     if displacement < REST_PX and len(usable) >= 3:
         return [_at_rest(TruthMotion(truth), camera, motions_of(usable, stamps), displacement)]
     if len(usable) < LEAST_PAIRS:
-        return [note("motion-unmeasured", len(usable), pairs=len(pairs), least=LEAST_PAIRS)]
+        return [finding_of("motion-unmeasured", len(usable), pairs=len(pairs), least=LEAST_PAIRS)]
     return _compared(stamps, truth, camera, [pair for pair in usable if pair.displacement_px >= REST_PX], len(pairs))
 
 
@@ -744,8 +735,8 @@ def _at_rest(truth: TruthMotion, camera: Camera, motions: Motions, displacement:
     moves = np.linalg.norm(turns, axis=1) + np.linalg.norm(relative[:, :3, 3], axis=1) / motions.depth_m
     expected = camera.fx * float(np.median(moves[valid])) if valid.any() else 0.0
     if expected > 10 * REST_PX:
-        return fault("truth-other-sequence/rest", expected, displacement=displacement)
-    return note("no-motion", displacement)
+        return finding_of("truth-other-sequence/rest", expected, displacement=displacement)
+    return finding_of("no-motion", displacement)
 
 
 def _compared(stamps: Array, truth: Trajectory, camera: Camera, pairs: list[RgbdPair], tried: int) -> list[Finding]:
@@ -757,7 +748,7 @@ def _compared(stamps: Array, truth: Trajectory, camera: Camera, pairs: list[Rgbd
     matches = [candidate for candidate in every if candidate.share >= 0.5]
     near = [one for one in matches if one.reading == READINGS[0] and abs(one.shift_s) < LEAST_TIME_S]
     if not near or sum(near[0].weights) < 0.4:
-        return [note("motion-unmeasured/small", len(pairs))]
+        return [finding_of("motion-unmeasured/small", len(pairs))]
     stated, best = max(near, key=total), max(matches, key=total)
     unshifted = min(near, key=lambda one: abs(one.shift_s))
     if unshifted.total > stated.total - 0.02:
@@ -780,9 +771,10 @@ def _misread(motions: Motions, readings: dict[str, TruthMotion], stated: Match, 
     shift = max(fine, key=total).shift_s
     shares = {"then": 100 * best.clearest, "now": 100 * stated.clearest}
     if best.reading != READINGS[0]:
-        findings.append(fault(_MISREAD[best.reading], best.total, **shares))
+        findings.append(finding_of(_MISREAD[best.reading], best.total, **shares))
     if abs(shift) >= LEAST_TIME_S:
-        findings.append(fault(f"truth-time-shift/{'late' if shift > 0 else 'early'}", shift, s=abs(shift), **shares))
+        case = "truth-time-shift/late" if shift > 0 else "truth-time-shift/early"
+        findings.append(finding_of(case, shift, s=abs(shift), **shares))
     return findings
 
 
@@ -805,8 +797,8 @@ def _otherwise(
     enough = stated.weights[0] >= 0.5 and len(motions.start) >= LEAST_UNLIKE and len(motions.start) >= 0.5 * tried
     if enough and closest < UNRELATED:
         facts = {"share": 100 * closest, "pairs": len(motions.start), "limit": LARGEST_SHIFT_S}
-        return [fault("truth-other-sequence", closest, **facts)]
-    return [note("truth-unclear", stated.total, share=100 * stated.total)]
+        return [finding_of("truth-other-sequence", closest, **facts)]
+    return [finding_of("truth-unclear", stated.total, share=100 * stated.total)]
 
 
 def _turned(motions: Motions, truth: TruthMotion, stated: Match, best: Match) -> Finding | None:
@@ -825,8 +817,7 @@ def _degrees(X: Array) -> float:
 
 
 def _axes(X: Array, alike: float, stated: Match) -> Finding:
-    angle = _degrees(X)
-    return fault("truth-axes", angle, then=100 * alike, now=100 * stated.rotation, matrix=_turn(X))
+    return finding_of("truth-axes", _degrees(X), then=100 * alike, now=100 * stated.rotation, matrix=_turn(X))
 
 
 def _turn(R_body_cam: Array) -> str:
@@ -862,9 +853,9 @@ def _scale(factor: float, camera: Camera, motions: Motions) -> Finding:
     """The true translations are `factor` times the measured ones."""
     if factor > 30 and 0.15 < motions.depth_m < 20:
         unit, divisor = ("millimetres", 1000) if factor > 300 else ("centimetres", 100)
-        return fault("truth-scale", factor, depth_m=motions.depth_m, unit=unit, divisor=divisor)
+        return finding_of("truth-scale", factor, depth_m=motions.depth_m, unit=unit, divisor=divisor)
     new, old = camera.depth_factor / factor, camera.depth_factor
-    return fault("depth-factor/translations", factor, depth_m=motions.depth_m, new=new, old=old)
+    return finding_of("depth-factor/translations", factor, depth_m=motions.depth_m, new=new, old=old)
 
 
 def _positions(steps: Array, R_world_first: Array, true_steps: Array, stated: Match) -> list[Finding]:
@@ -877,7 +868,7 @@ def _positions(steps: Array, R_world_first: Array, true_steps: Array, stated: Ma
         if alike >= GOOD and alike > stated.translation + 0.2 and (np.linalg.det(W) < 0 or angle > 15):
             how = "mirrored" if np.linalg.det(W) < 0 else f"turned by {angle:.0f} degrees"
             shares = {"then": 100 * alike, "now": 100 * stated.translation}
-            return [fault("truth-axes/positions", angle, how=how, where=where, **shares)]
+            return [finding_of("truth-axes/positions", angle, how=how, where=where, **shares)]
     return []
 
 
@@ -894,8 +885,22 @@ def _fitted(pairs: list[RgbdPair], relative: Array, camera: Camera) -> list[Find
         return []
     if size < _LIMITS[name] or not any(size >= sigmas * sigma and left <= share for sigmas, share in rules):
         return []
-    errors = f"reprojection errors {before.residual_px:.1f} px -> {fit.residual_px:.1f} px"
-    return [_described(name, fit, size, sigma, errors, camera)]
+    focal, dx, dy, scale = (float(fit.value[part][0]) for part in ("focal", "cx", "cy", "scale"))
+    by, depth, turn = np.exp(focal), np.exp(scale), se3.exp(np.concatenate([np.zeros(3), fit.value["turn"]]))[:3, :3]
+    case, value = {
+        "focal": ("camera-focal-length", by),
+        "centre": ("camera-principal-point", size),
+        "scale": ("depth-factor", depth),
+        "turn": ("truth-axes/fit", np.degrees(size)),
+        "lever": ("truth-lever-arm", size),
+    }[name]
+    facts = {
+        "sigma": sigma, "percent": 100 * sigma, "fx": camera.fx * by, "fy": camera.fy * by, "dx": dx, "dy": dy,
+        "cx": camera.cx + dx, "cy": camera.cy + dy, "new": camera.depth_factor / depth, "old": camera.depth_factor,
+        "matrix": _turn(turn), "lever": ", ".join(f"{metres:+.3f}" for metres in fit.value["lever"]),
+        "errors": f"reprojection errors {before.residual_px:.1f} px -> {fit.residual_px:.1f} px",
+    }  # fmt: skip
+    return [finding_of(case, value, **facts)]  # each case takes what it needs of all facts
 
 
 _GROUPS = {"focal": ("focal",), "centre": ("cx", "cy"), "scale": ("scale",), "turn": ("turn",), "lever": ("lever",)}
@@ -908,24 +913,6 @@ _EXPLAINED_BY_LEVER = ((5, 0.62),)
 """People who walk past can feign one: 0.68 remained then."""
 _DEPTH_FOR_LEVER = 0.5
 """Part of the image that has depth. With less, the corners may lie on moving people alone: 0.61 remained then."""
-
-
-def _described(name: str, fit: Fit, size: float, sigma: float, errors: str, camera: Camera) -> Finding:
-    """The finding of a group of `_GROUPS`; each takes what it needs of all values."""
-    focal, dx, dy, scale = (float(fit.value[part][0]) for part in ("focal", "cx", "cy", "scale"))
-    by, depth, turn = np.exp(focal), np.exp(scale), se3.exp(np.concatenate([np.zeros(3), fit.value["turn"]]))[:3, :3]
-    case, value = {
-        "focal": ("camera-focal-length", by),
-        "centre": ("camera-principal-point", size),
-        "scale": ("depth-factor", depth),
-        "turn": ("truth-axes/fit", np.degrees(size)),
-        "lever": ("truth-lever-arm", size),
-    }[name]
-    return fault(
-        case, value, sigma=sigma, percent=100 * sigma, errors=errors, fx=camera.fx * by, fy=camera.fy * by,
-        dx=dx, dy=dy, cx=camera.cx + dx, cy=camera.cy + dy, new=camera.depth_factor / depth, old=camera.depth_factor,
-        matrix=_turn(turn), lever=", ".join(f"{metres:+.3f}" for metres in fit.value["lever"]),
-    )  # fmt: skip
 
 
 # Focal length, principal point, depth scale, axes and lever arm at which a truth fits the images best.
@@ -1001,6 +988,9 @@ def fit_camera(pairs: list[RgbdPair], relative: Array, camera: Camera, free: tup
         for name in ("pixels_first", "depth_first", "pixels_second")
     )
     number, back = np.repeat(np.arange(len(pairs)), [len(index) for index in chosen]), se3.inverse(relative)
+    errors = partial(
+        _reprojection_errors, camera=camera, pair=number, first=first, depth=depth, second=second, back=back
+    )
     index = [number for name in free for number in np.arange(10)[_PARAMETERS[name]].tolist()]
 
     def filled(part: Array) -> Array:
@@ -1008,18 +998,14 @@ def fit_camera(pairs: list[RgbdPair], relative: Array, camera: Camera, free: tup
         x[index] = part
         return x
 
-    def errors(x: Array) -> Array:
-        return _reprojection_errors(x, camera, number, first, depth, second, back)
-
     def robust(part: Array) -> Array:
         raw = errors(filled(part)) / _OUTLIER_PX
         square = (raw**2).sum(axis=1, keepdims=True)
         shrunk = raw * np.sqrt(2 * (np.sqrt(1 + square) - 1) / np.maximum(square, 1e-12))
         return np.concatenate([shrunk.ravel(), filled(part) / _PRIOR])
 
-    part = np.zeros(len(index))
-    if len(index):
-        part = np.asarray(least_squares(robust, part, x_scale=_SCALES[index]).x, np.float64)
+    start = np.zeros(len(index))
+    part = np.asarray(least_squares(robust, start, x_scale=_SCALES[index]).x, np.float64) if index else start
     x, left = filled(part), errors(filled(part))
     # Standard deviations by a sandwich estimate, each pair of frames being one observation.
     weight = 1 / np.sqrt(1 + ((left / _OUTLIER_PX) ** 2).sum(axis=1))

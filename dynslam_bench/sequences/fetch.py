@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import gzip
 import hashlib
+import os
 import shutil
 import struct
 import tarfile
@@ -23,7 +24,9 @@ from dynslam_bench.core import (
     did_you_mean,
     find_data_root,
     is_inside,
+    raising,
     read_text,
+    temporary_folder,
     without_passwords,
     write_atomic,
 )
@@ -32,7 +35,6 @@ from dynslam_bench.core.records import Record, schema
 from dynslam_bench.sequences.cameras import chosen_camera, find_camera
 from dynslam_bench.sequences.catalogue import CatalogueEntry, catalogue, entry_of, open_folder, open_sequence
 from dynslam_bench.sequences.readers.layouts import TUM, find_layout, layout_of
-from dynslam_bench.sequences.readers.lists import Dropped
 
 RECEIPT = "fetched.json"
 MANIFEST = "manifest.sha256"
@@ -70,7 +72,7 @@ class Verification:
         frames: Frames that were decoded.
         faults: One line a fault; empty if all is sound.
         manifest: Whether every file was compared with the checksum taken when it was fetched.
-        dropped: What was not used on opening; None if the sequence cannot be opened.
+        dropped: What was not used on opening; empty if the sequence cannot be opened.
     """
 
     id: str
@@ -78,7 +80,7 @@ class Verification:
     frames: int
     faults: tuple[str, ...]
     manifest: bool
-    dropped: Dropped | None
+    dropped: str
 
     @property
     def ok(self) -> bool:
@@ -107,7 +109,7 @@ def fetch(
     name: str,
     *,
     data_root: str | Path | None = None,
-    progress: Report | None = None,
+    progress: Report = lambda state: None,
     checksum: bool = True,
     keep_archive: bool = False,
     url: str | None = None,
@@ -156,10 +158,9 @@ def fetch(
             timeout_s=timeout_s, progress=progress,
         )  # fmt: skip
         parts.append(Download(address, archive, sha256))
-    unstated = parts if entry.sha256 is None else parts[1:]
+    place, unstated = entry.folders(root)[0], parts if entry.sha256 is None else parts[1:]
     for part in unstated if checksum else ():
         _compare_checksum(root, part)
-    place = entry.folders(root)[0]
     _install(entry, place, parts, checksum and entry.sha256 is not None, progress)
     for part in unstated:  # only of archives whose sequence could be opened
         write_atomic(_checksum_file(root, part), f"{part.sha256}  {without_passwords(part.address)}\n")
@@ -168,61 +169,43 @@ def fetch(
     return place
 
 
-def _install(entry: CatalogueEntry, place: Path, parts: list[Download], checked: bool, progress: Report | None) -> None:
+def _install(entry: CatalogueEntry, place: Path, parts: list[Download], checked: bool, progress: Report) -> None:
     """Let the sequence appear if it can be opened; a faulty archive is deleted, so that the next call fetches it."""
-    first = parts[0].archive
-    try:
-        with atomic_folder(place) as work:
-            unpacked = work / ".unpacked"
-            unpacked.mkdir()
-            sums = _unpack(parts, unpacked, progress)
-            top = _top(unpacked, entry, first)
-            files = {
-                (unpacked / name).relative_to(top).as_posix(): value
-                for name, value in sums.items()
-                if (unpacked / name).is_relative_to(top)
-            }
-            for path in list(top.iterdir()):
-                path.rename(work / path.name)
-            shutil.rmtree(unpacked)
-            receipt = Receipt(
-                id=entry.id,
-                url=parts[0].address,
-                sha256=parts[0].sha256,
-                size_bytes=first.stat().st_size,
-                checked=checked,
-                files=len(files),
-            )
-            write_atomic(work / RECEIPT, receipt.to_json())
-            write_atomic(work / MANIFEST, "".join(f"{value}  {name}\n" for name, value in sorted(files.items())))
-            open_folder(work, entry=entry)
-    except OSError as error:
-        if error.errno not in DISK_FULL:
-            raise SequenceError(f"cannot extract {first.name} into {place.parent}: {error.strerror}") from error
-        raise SequenceError(
-            f"no room to extract {first.name} ({first.stat().st_size / 1e9:.2f} GB) into {place.parent}",
-            "make room and run the same command again, the archive is kept",
-        ) from error
-    except SequenceError:
-        for part in parts:
-            part.archive.unlink(missing_ok=True)
-        raise
+    first, size = parts[0].archive, parts[0].archive.stat().st_size
+    fault = f"cannot extract {first.name} ({size / 1e9:.2f} GB) into {place.parent}"
+    hint = "make room or check the permissions and run the same command again, the archive is kept"
+    with raising(SequenceError, fault, hint):
+        try:
+            with atomic_folder(place) as work:
+                unpacked = work / ".unpacked"
+                sums = _unpack(parts, unpacked, progress)
+                top = _top(unpacked, entry, first)
+                inner = "" if top == unpacked else f"{top.relative_to(unpacked).as_posix()}/"
+                files = {name.removeprefix(inner): value for name, value in sums.items() if name.startswith(inner)}
+                shutil.copytree(top, work, copy_function=os.replace, dirs_exist_ok=True)
+                shutil.rmtree(unpacked)
+                receipt = Receipt(
+                    id=entry.id, url=parts[0].address, sha256=parts[0].sha256, size_bytes=size, checked=checked,
+                    files=len(files),
+                )  # fmt: skip
+                write_atomic(work / RECEIPT, receipt.to_json())
+                write_atomic(work / MANIFEST, "".join(f"{value}  {name}\n" for name, value in sorted(files.items())))
+                open_folder(work, entry=entry)
+        except SequenceError:
+            for part in parts:
+                part.archive.unlink(missing_ok=True)
+            raise
 
 
-def _unpack(parts: list[Download], work: Path, progress: Report | None) -> dict[str, str]:
+def _unpack(parts: list[Download], target: Path, progress: Report) -> dict[str, str]:
     """Unpack archives over one another; SHA-256 of each file by its path. What two of them hold has to be the same."""
-    sums = extract(parts[0].archive, work, progress)
-    for part in parts[1:]:
-        beside = work / ".part"
-        beside.mkdir()
-        for name, value in extract(part.archive, beside, progress).items():
-            if name in sums and sums[name] != value:
-                raise SequenceError(f"{part.archive.name} holds another {name} than the first archive, refused")
-            if name not in sums:
-                (work / name).parent.mkdir(parents=True, exist_ok=True)
-                (beside / name).rename(work / name)
-                sums[name] = value
-        shutil.rmtree(beside)
+    sums: dict[str, str] = {}
+    for part in parts:
+        with temporary_folder(target) as beside:
+            for name, value in extract(part.archive, beside, progress).items():
+                if sums.setdefault(name, value) != value:
+                    raise SequenceError(f"{part.archive.name} holds another {name} than the first archive, refused")
+            shutil.copytree(beside, target, copy_function=os.replace, dirs_exist_ok=True)
     return sums
 
 
@@ -231,7 +214,7 @@ def verify(
     *,
     data_root: str | Path | None = None,
     camera: str | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Verification:
     """Decode every frame, and compare every file with the checksum taken when it was fetched.
 
@@ -254,21 +237,20 @@ def verify(
     try:
         sequence = open_folder(folder, entry=entry, camera=camera)
     except DynslamError as error:
-        return Verification(name, folder, 0, (str(error),), False, None)
+        return Verification(name, folder, 0, (str(error),), False, "")
     faults = []
     for index in range(len(sequence)):
         try:
             sequence[index]
         except SequenceError as error:
             faults.append(f"frame {index}: {error}")
-        if progress is not None:
-            progress(index + 1, len(sequence))
+        progress(index + 1, len(sequence))
     manifest = folder / MANIFEST
     try:
         faults += compare_sums(folder, manifest, SequenceError) if manifest.is_file() else []
     except SequenceError as error:
         faults.append(str(error))
-    dropped = getattr(sequence, "dropped", None)
+    dropped = getattr(sequence, "dropped", "")
     return Verification(sequence.id, folder, len(sequence), tuple(faults), manifest.is_file(), dropped)
 
 
@@ -326,7 +308,7 @@ _DAMAGE = (tarfile.TarError, zipfile.BadZipFile, zlib.error, struct.error, OSErr
            ValueError, TypeError, LookupError, NotImplementedError, RuntimeError, OverflowError)  # fmt: skip
 
 
-def extract(archive: Path, target: Path, progress: Report | None = None) -> dict[str, str]:
+def extract(archive: Path, target: Path, progress: Report = lambda state: None) -> dict[str, str]:
     """Extract all regular files of a ``.tgz``, ``.tar`` or ``.zip`` into a folder.
 
     Args:
@@ -342,8 +324,7 @@ def extract(archive: Path, target: Path, progress: Report | None = None) -> dict
             too many files, far more data than its size allows.
         OSError: The disk is full, or the target cannot be written.
     """
-    sums: dict[str, str] = {}
-    done = 0
+    sums, done = dict[str, str](), 0
     try:
         for name, stream in (_zip_members if zipfile.is_zipfile(archive) else _tar_members)(archive):
             path = target / safe_name(archive, name)
@@ -355,8 +336,7 @@ def extract(archive: Path, target: Path, progress: Report | None = None) -> dict
                     checksum.update(block)
                     done += len(block)
             sums[path.relative_to(target).as_posix()] = checksum.hexdigest()
-            if progress is not None:
-                progress(Progress("extract", done, None))
+            progress(Progress("extract", done, None))
     except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
         raise SequenceError(f"{archive.name} holds one name twice: {error.filename}, refused") from error
     except _DAMAGE as error:

@@ -3,7 +3,7 @@
 The motion is measured by tracked corners and their depth. A truth is read in several conventions and shifted in time.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,7 +56,7 @@ class RgbdPair:
     depth_share: float
 
 
-def rgbd_pairs(frames: Iterable[Frame], camera: Camera) -> Iterator[RgbdPair]:
+def rgbd_pairs(frames: Sequence[Frame], camera: Camera) -> Iterator[RgbdPair]:
     """Pairs of frames of one stretch, each as far apart as the corners need to move by `FAR_ENOUGH_PX`.
 
     Corners of Shi and Tomasi (CVPR 1994) are tracked by pyramidal Lucas-Kanade, there and back; the motion is found by
@@ -64,30 +64,26 @@ def rgbd_pairs(frames: Iterable[Frame], camera: Camera) -> Iterator[RgbdPair]:
     `MOST_FRAMES_APART` frames, or with the stretch; the next one begins there.
 
     Args:
-        frames: Consecutive frames, all of the camera's size.
+        frames: Consecutive frames, at least one, all of the camera's size.
         camera: Its intrinsics; the motion holds in their units.
     """
-    key: Frame | None = None
-    gray_last = np.zeros((0, 0), np.uint8)
     start: Pixels = np.zeros((0, 2), np.float32)
-    points, frame = start, None
+    key, last, points = frames[0], np.zeros((0, 0), np.uint8), start
     for frame in frames:
-        gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
-        if key is not None and len(points):
-            tracked, good = follow_corners(gray_last, gray, points, points, _BACK_AND_FORTH_PX)
+        gray, due = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8), True
+        if len(points):
+            tracked, good = follow_corners(last, gray, points, points, _BACK_AND_FORTH_PX)
             start, points = start[good], tracked[good]
             moved = float(np.median(np.linalg.norm(points - start, axis=1))) if len(points) else 0.0
             due = frame.index - key.index >= MOST_FRAMES_APART or moved >= FAR_ENOUGH_PX
             if len(points) >= LEAST_INLIERS and due:
                 yield measure_pair(key, frame, start, points, camera)
-            if len(points) < LEAST_INLIERS or due:
-                key = None
-        if key is None or not len(points):
-            key = frame
-            start = points = _corners(gray, frame.depth)
-        gray_last = gray
-    if key is not None and frame is not None and frame.index - key.index > 1 and len(points) >= LEAST_INLIERS:
-        yield measure_pair(key, frame, start, points, camera)
+        if len(points) < LEAST_INLIERS or due:
+            key, start = frame, _corners(gray, frame.depth)
+            points = start
+        last = gray
+    if frames[-1].index - key.index > 1 and len(points) >= LEAST_INLIERS:
+        yield measure_pair(key, frames[-1], start, points, camera)
 
 
 def measure_pair(first: Frame, second: Frame, start: Pixels, end: Pixels, camera: Camera) -> RgbdPair:

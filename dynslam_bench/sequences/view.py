@@ -133,7 +133,12 @@ def part_of(sequence: Sequence, offset: int = 0) -> Part:
         sequence: The opened sequence, cut and preprocessed or not.
         offset: How many leading frames of the named part were dropped to get it.
     """
-    base, frames = _unwrapped(sequence)
+    base: Any = sequence
+    frames = range(len(sequence))
+    while isinstance(base, Wrapped):
+        if isinstance(base, SequenceView):
+            frames = base.range[frames.start : frames.stop : frames.step]
+        base = base.base
     noise: int | None = getattr(base, "noise", None)
     scene_digest = getattr(base, "scene_digest", None)
     scene = base.digest() if scene_digest is None else str(scene_digest())
@@ -147,13 +152,3 @@ def part_of(sequence: Sequence, offset: int = 0) -> Part:
         stride=frames.step,
         noise=noise,
     )
-
-
-def _unwrapped(sequence: Any) -> tuple[Any, range]:
-    """The sequence below all views and preprocessing, and which of its frames are seen."""
-    frames = range(len(sequence))
-    while isinstance(sequence, Wrapped):
-        if isinstance(sequence, SequenceView):
-            frames = sequence.range[frames.start : frames.stop : frames.step]
-        sequence = sequence.base
-    return sequence, frames

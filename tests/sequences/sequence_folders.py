@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.geometry import se3
+from dynslam_bench.geometry import Camera, se3
+from dynslam_bench.sequences.cameras import write_camera
 from dynslam_bench.sequences.synthetic import CAMERA
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
@@ -29,10 +30,7 @@ def make_folder(folder, *, frames=4, width=32, height=24, rate=30, fps=30.0, sta
         (folder / f"{kind}.txt").write_text("".join(f"{stamp!r} {kind}/{i}.png\n" for i, stamp in enumerate(stamps)))
     poses = (f"{stamp!r} {i * 0.01} 0 0 0 0 0 1\n" for i, stamp in enumerate(stamps))
     (folder / "groundtruth.txt").write_text("".join(poses))
-    camera = [f"width = {width}", f"height = {height}", "fx = 30.0", "fy = 30.5", "cx = 15.5", "cy = 11.5"]
-    if fps is not None:
-        camera.append(f"fps = {fps}")
-    (folder / "camera.toml").write_text("\n".join(camera) + "\n")
+    write_camera(folder / "camera.toml", Camera(width, height, 30.0, 30.5, 15.5, 11.5), fps=fps)
     return folder, rgb, depth
 
 

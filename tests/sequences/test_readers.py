@@ -1,18 +1,17 @@
 """Every layout that is read, against a writer of its published format: poses, cameras, traps, and wrong folders."""
 
 import gzip
-import io
 import resource
 import shutil
 import struct
-import subprocess
-import sys
 import tarfile
 import tempfile
 import zipfile
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from unittest.mock import Mock
 
 import cv2
@@ -21,18 +20,18 @@ import pytest
 from published_folders import WRITERS, image, lines, random_poses, write_seven_scenes
 from sequence_folders import SHARED, make_folder, needs_shared, rewrite
 
-from dynslam_bench.core import STAGES_VARIABLE, DynslamError, SequenceError, TrajectoryError
+from dynslam_bench.core import STAGES_VARIABLE, DynslamError, SequenceError
 from dynslam_bench.core.images import read_image
 from dynslam_bench.core.stage_cache import StageCache
 from dynslam_bench.envs import SlamEnv
-from dynslam_bench.geometry import Camera, load_tum, read_tum, se3
-from dynslam_bench.sequences import PreprocessingSettings, Sequence, SequenceView, fetch, open_sequence
+from dynslam_bench.geometry import Camera, load_tum, read_tum, se3, trajectory_files
+from dynslam_bench.sequences import PreprocessingSettings, Sequence, SequenceView, decoded, fetch, open_sequence
 from dynslam_bench.sequences.bags import unpack_bag
+from dynslam_bench.sequences.cameras import CAMERAS
 from dynslam_bench.sequences.catalogue import catalogue
 from dynslam_bench.sequences.decoded import Decoded
-from dynslam_bench.sequences.readers import recorded
+from dynslam_bench.sequences.readers import lists, recorded
 from dynslam_bench.sequences.readers.layouts import LAYOUTS, find_layout, layout_of
-from dynslam_bench.sequences.readers.lists import read_image_list
 from dynslam_bench.testing import CornerSequence, check_sequence
 
 OTHERS = [layout.name for layout in LAYOUTS if layout.name != "tum"]
@@ -69,8 +68,8 @@ def test_a_folder_in_the_published_format_is_read(written, name):
     assert find_layout(root / name).name == name
     camera = sequence.camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == FOCAL[name]
-    frame = sequence[len(sequence) - 1]
-    assert np.median(frame.depth) == 2.0 and (frame.rgb == 90).all()
+    frame, missing = sequence[len(sequence) - 1], 1 if name == "tartanair-shibuya" else 0  # its first row is sky
+    assert (frame.depth[missing:] == 2.0).all() and not frame.depth[:missing].any() and (frame.rgb == 90).all()
     assert len(sequence) == (4 if name == "icl-nuim" else 3)
     truth = sequence.ground_truth
     assert np.abs(truth.T_world_cam - poses).max() < 1e-12
@@ -87,25 +86,18 @@ def test_seven_scenes_to_the_last_bit_with_missing_depth_and_frames_that_kinectf
     lines(tmp_path / "seq-01" / "frame-000002.pose.txt", ["-1.#IND -1.#IND -1.#IND -1.#IND"] * 4)
     sequence = open_sequence(tmp_path / "seq-01")
     assert np.array_equal(sequence.ground_truth.T_world_cam, np.delete(poses, 2, axis=0))
-    assert "1 of 40 poses lost" in sequence.dropped.describe()
+    assert "1 of 40 poses lost" in sequence.dropped
     assert (sequence[1].depth == 0).all() and (sequence[0].depth == 2.0).all()
-
-
-def test_the_sky_of_a_rendered_depth_is_missing(written):
-    depth = open_sequence(written[0] / "tartanair-shibuya")[0].depth
-    assert (depth[0] == 0).all() and (depth[1:] == 2.0).all()
 
 
 def test_frame_0_of_icl_has_no_pose_and_its_view_is_mirrored_back(written):
     """A point that the published camera (fy = -480) sees at a pixel is seen there by ours."""
     sequence = open_sequence(written[0] / "icl-nuim")
-    assert sequence.dropped.frames_without_ground_truth == 1
+    assert "1 frames without ground truth" in sequence.dropped
     pose, mirror = sequence.ground_truth.T_world_cam[1], np.diag([1.0, -1.0, 1.0, 1.0])
-    published = mirror @ pose @ mirror
-    point = np.array([0.3, 0.4, 2.0, 1.0])
-    pixel = np.array([481.2 * 0.3 / 2 + 319.5, -480.0 * 0.4 / 2 + 239.5])
-    world = mirror @ (published @ point)
-    seen = np.linalg.inv(pose) @ world
+    published, point = mirror @ pose @ mirror, np.array([0.3, 0.4, 2.0, 1.0])
+    seen = np.linalg.inv(pose) @ mirror @ published @ point
+    pixel = 481.2 * 0.3 / 2 + 319.5, -480.0 * 0.4 / 2 + 239.5
     assert np.allclose(sequence.camera.project(seen[:3]), pixel, atol=1e-9)
 
 
@@ -124,7 +116,7 @@ BROKEN = {
     ],
     "tartanair-shibuya": [
         ("times.txt", "0.0", "3 colour images, 3 depth arrays, 1 stamps and 3 poses"),
-        ("depth_0/000000.npy", "not an array", "is no .npy file"),
+        ("depth_0/000000.npy", "not an array", "is it an .npy file"),
         ("gt_pose.txt", "1 2 3", "3 values, not the 7"),
     ],
     "openloris": [
@@ -171,7 +163,7 @@ def test_every_catalogued_sequence_opens_once_it_lies_where_it_belongs(tmp_path)
     """Nothing is listed that cannot be opened: the reader named reads a folder of the published layout."""
     entries, root, first = catalogue(), tmp_path / "root", {}
     for entry in entries.values():
-        made, camera = tmp_path / f"{entry.layout} {entry.camera}", entry.intrinsics()
+        made, camera = tmp_path / f"{entry.layout} {entry.camera}", CAMERAS.get(entry.camera)
         if not made.exists():
             size = {} if camera is None else {"size": (camera.width, camera.height)}
             WRITERS[entry.layout](made, random_poses(5), **size)
@@ -199,7 +191,7 @@ def test_a_folder_of_ones_own_with_one_image_more(tmp_path):
 
 
 def test_reads_what_was_written(tmp_path):
-    folder, rgb, depth = make_folder(tmp_path / "seq", frames=4)
+    folder, rgb, depth = make_folder(tmp_path / "seq")
     sequence = open_sequence(folder)
     assert isinstance(sequence, Sequence) and sequence.id == "folder/seq"
     assert (sequence.camera.width, sequence.camera.height) == (32, 24)
@@ -213,9 +205,7 @@ def test_reads_what_was_written(tmp_path):
         sequence[4]
     assert np.array_equal(sequence.ground_truth.timestamps, sequence.timestamps)
     assert sequence.fps == 30 and sequence.masks is None
-    assert (
-        sequence.dropped.describe() == "4 frames of 4 colour and 4 depth images (|dt| < 0.02 s); 4 ground-truth poses"
-    )
+    assert sequence.dropped == "4 frames of 4 colour and 4 depth images (|dt| < 0.02 s); 4 ground-truth poses"
 
 
 @pytest.mark.parametrize(("frames", "fps"), [(5, 10), (1, 30)])
@@ -258,7 +248,7 @@ def test_frames_and_stride(tmp_path):
     assert len(view) == 3 and [view[i].index for i in range(3)] == [0, 1, 2]
     assert view.fps == open_sequence(folder).fps / 2
     assert (view[1].rgb == rgb[3]).all()
-    assert view.dropped.pairs == 7
+    assert view.dropped.startswith("7 frames")
     assert len(open_sequence(folder, frames=(2, None))) == 5
     wrong = [({"frames": frames}, "no range") for frames in ("3", "a:b", "5:5", "-2:")]
     for part, words in (*wrong, ({"frames": "7:9"}, "hold none of the 7 frames"), ({"stride": 0}, "stride is 0")):
@@ -269,20 +259,19 @@ def test_frames_and_stride(tmp_path):
 def test_ground_truth_hole_and_bad_lines_are_counted(tmp_path):
     folder, *_ = make_folder(tmp_path / "seq", frames=30)
     rewrite(folder / "groundtruth.txt", lambda lines: [*lines[:11], "100.4 nan 0 0 0 0 0 1", *lines[21:]])
-    dropped = open_sequence(folder).dropped.describe()
+    dropped = open_sequence(folder).dropped
     assert "1 of 21 lines skipped: not finite" in dropped
     assert "10 frames without ground truth within 0.02 s (largest hole 0.37 s)" in dropped
 
 
 def test_pairing_is_strict_one_to_one_and_counted(tmp_path):
     folder, *_ = make_folder(tmp_path / "seq", frames=5)
-    stamps = [100.0, 100.1, 100.2, 100.3, 100.4]
     shifted = [100.019, 100.121, 100.1999, 100.2001, 100.4]  # near, too far, near, spare, equal
-    rewrite(folder / "rgb.txt", lambda _: [f"{s:.4f} rgb/{i}.png" for i, s in enumerate(stamps)])
-    rewrite(folder / "depth.txt", lambda _: [f"{s:.4f} depth/{i}.png" for i, s in enumerate(shifted)])
+    for kind, stamps in (("rgb", [100.0, 100.1, 100.2, 100.3, 100.4]), ("depth", shifted)):
+        lines(folder / f"{kind}.txt", [f"{s:.4f} {kind}/{i}.png" for i, s in enumerate(stamps)])
     sequence = open_sequence(folder)
     assert sequence.timestamps.tolist() == [100.0, 100.2, 100.4]
-    assert "2 colour images without depth; 2 depth images unused" in sequence.dropped.describe()
+    assert "2 colour images without depth; 2 depth images unused" in sequence.dropped
 
 
 def test_disordered_lists_are_put_in_order_and_counted(tmp_path):
@@ -299,7 +288,7 @@ def test_disordered_lists_are_put_in_order_and_counted(tmp_path):
     assert (sequence[0].rgb == rgb[0]).all()
     assert (sequence[3].rgb == rgb[0]).all()  # the last of two equal stamps wins, as in TUM's associate.py
     counts = "1 stamps not finite; 1 duplicate stamps; 2 stamps out of order; 1 lines without a file name"
-    assert counts in sequence.dropped.describe()
+    assert counts in sequence.dropped
 
 
 @pytest.mark.parametrize(
@@ -347,10 +336,9 @@ def test_associations_file(tmp_path):
     folder, rgb, _ = make_folder(tmp_path / "seq", frames=3)
     for name in ("rgb.txt", "depth.txt"):
         (folder / name).unlink()
-    rows = [f"{100 + i} rgb/{i}.png {107 + i} depth/{i}.png" for i in (2, 0, 1)]
-    (folder / "associations.txt").write_text("\n".join(rows))
+    lines(folder / "associations.txt", [f"{100 + i} rgb/{i}.png {107 + i} depth/{i}.png" for i in (2, 0, 1)])
     sequence = open_sequence(folder)
-    assert sequence.timestamps.tolist() == [100, 101, 102] and sequence.dropped.unsorted == 1
+    assert sequence.timestamps.tolist() == [100, 101, 102] and "1 stamps out of order" in sequence.dropped
     assert (sequence[0].rgb == rgb[0]).all()
     (folder / "associations.txt").write_text("100 rgb/0.png depth/0.png")
     with pytest.raises(SequenceError, match="has 3 parts, expected 4"):
@@ -390,7 +378,7 @@ def test_few_missing_files_are_tolerated_and_counted(tmp_path):
     (folder / "depth" / "17.png").unlink()
     sequence = open_sequence(folder)
     assert len(sequence) == 59
-    assert "1 colour images without depth; 1 listed files that do not exist" in sequence.dropped.describe()
+    assert "1 colour images without depth; 1 listed files that do not exist" in sequence.dropped
     (folder / "depth" / "18.png").unlink()
     with pytest.raises(SequenceError, match="2 of 60 depth images"):
         open_sequence(folder)
@@ -432,34 +420,28 @@ class Bag:
     def make(self, name, **fields):
         return self.types.types[name](**fields)
 
-    def header(self, i, frame):
+    def add(self, topic, name, i, frame="camera", **fields):
         stamp = self.make("builtin_interfaces/msg/Time", sec=START, nanosec=i * 33_333_333)
-        extra = {"seq": i} if self.one else {}
-        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame, **extra)
-
-    def add(self, topic, name, i, message):
+        header = self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame, **({"seq": i} if self.one else {}))
         if topic not in self.connections:
             self.connections[topic] = self.writer.add_connection(topic, name, typestore=self.types)
-        raw = (self.types.serialize_ros1 if self.one else self.types.serialize_cdr)(message, name)
+        serialize = self.types.serialize_ros1 if self.one else self.types.serialize_cdr
+        raw = serialize(self.make(name, header=header, **fields), name)
         self.writer.write(self.connections[topic], 10**18 + i, raw)
 
     def image(self, topic, i, pixels, encoding, frame="camera", padding=0):
         rows = np.pad(pixels.reshape(len(pixels), -1).view(np.uint8), ((0, 0), (0, padding)))
-        message = self.make(
-            "sensor_msgs/msg/Image", header=self.header(i, frame), height=12, width=16, encoding=encoding,
-            is_bigendian=0, step=rows.shape[1], data=rows.ravel(),
-        )  # fmt: skip
-        self.add(topic, "sensor_msgs/msg/Image", i, message)
+        fields = {"encoding": encoding, "is_bigendian": 0, "step": rows.shape[1], "data": rows.ravel()}
+        self.add(topic, "sensor_msgs/msg/Image", i, frame, height=12, width=16, **fields)
 
     def info(self, topic, model="plumb_bob"):
         k = np.array([300.0, 0, 8, 0, 301.0, 6, 0, 0, 1])
         fields = {"d": np.array([0.1, -0.2, 1e-3, 2e-3, 0.3]), "k": k, "r": np.eye(3).ravel(), "p": np.zeros(12)}
         roi = self.make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
-        message = self.make(
-            "sensor_msgs/msg/CameraInfo", header=self.header(0, "camera"), height=12, width=16, distortion_model=model,
-            binning_x=0, binning_y=0, roi=roi, **{(key.upper() if self.one else key): v for key, v in fields.items()},
+        self.add(
+            topic, "sensor_msgs/msg/CameraInfo", 0, height=12, width=16, distortion_model=model, binning_x=0,
+            binning_y=0, roi=roi, **{(key.upper() if self.one else key): v for key, v in fields.items()},
         )  # fmt: skip
-        self.add(topic, "sensor_msgs/msg/CameraInfo", 0, message)
 
     def pose(self, topic, i, pose):
         (x, y, z), (qx, qy, qz, qw) = (part.tolist() for part in se3.to_quaternion(pose))
@@ -468,8 +450,7 @@ class Bag:
             position=self.make("geometry_msgs/msg/Point", x=x, y=y, z=z),
             orientation=self.make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
         )
-        name = "geometry_msgs/msg/PoseStamped"
-        self.add(topic, name, i, self.make(name, header=self.header(i, "map"), pose=inner))
+        self.add(topic, "geometry_msgs/msg/PoseStamped", i, "map", pose=inner)
 
 
 @pytest.fixture
@@ -548,14 +529,6 @@ def folder(tmp_path: Path) -> Path:
     return make_folder(tmp_path / "recording", frames=6)[0]
 
 
-@pytest.fixture
-def reads(monkeypatch: pytest.MonkeyPatch) -> Mock:
-    """Counts the colour images that are decoded."""
-    counted = Mock(wraps=recorded.read_colour)
-    monkeypatch.setattr(recorded, "read_colour", counted)
-    return counted
-
-
 def files(cache: StageCache) -> list[Path]:
     return sorted(cache.folder.rglob("*.*"))
 
@@ -568,12 +541,11 @@ def same(one: Sequence, other: Sequence) -> bool:
     )
 
 
-def test_frames_are_the_same_and_decoded_once(folder: Path, reads: Mock, cache: StageCache) -> None:
-    plain = open_sequence(folder)
+def test_frames_are_the_same_and_decoded_once(folder: Path, cache: StageCache, monkeypatch: pytest.MonkeyPatch) -> None:
+    plain, reads = open_sequence(folder), Mock(wraps=recorded.read_colour)
     mapped = Decoded(plain)
-    reads.reset_mock()
-    again = Decoded(open_sequence(folder))
-    assert same(mapped, again) and reads.call_count == 1, "opening decodes the first frame"
+    monkeypatch.setattr(recorded, "read_colour", reads)
+    assert same(mapped, Decoded(open_sequence(folder))) and reads.call_count == 1, "opening decodes the first frame"
     assert same(mapped, plain) and mapped[-1].index == 5
     assert (mapped.id, mapped.digest(), mapped.camera) == (plain.id, plain.digest(), plain.camera)
     assert mapped[0].rgb.dtype == np.uint8 and mapped[0].depth.dtype == np.float32
@@ -596,26 +568,18 @@ def test_other_frames_are_another_file(folder: Path, cache: StageCache) -> None:
     variants = [whole, SequenceView(whole, 1), SequenceView(whole, 0, None, 2), smaller]
     for count, variant in enumerate(variants, 1):
         assert same(Decoded(variant), variant) and len(files(cache)) == count
-    image = sorted((folder / "rgb").iterdir())[3]
-    cv2.imwrite(str(image), 255 - cv2.imread(str(image)))
+    cv2.imwrite(str(folder / "rgb" / "3.png"), 255 - whole[3].rgb)
     changed = open_sequence(folder)
     assert same(Decoded(changed), changed) and len(files(cache)) == 5
     assert not same(Decoded(changed), Decoded(whole))
 
 
-def test_of_several_processes_one_decodes(folder: Path, cache: StageCache) -> None:
-    code = (
-        "import sys\n"
-        "from dynslam_bench.sequences import decoded, open_sequence\n"
-        "write, count = decoded._write, []\n"
-        "decoded._write = lambda *a: (count.append(1), write(*a))\n"
-        "decoded.Decoded(open_sequence(sys.argv[1]))\n"
-        "print(len(count))\n"
-    )
-    command = [sys.executable, "-c", code, str(folder)]
-    started = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(3)]
-    assert sorted(process.communicate()[0].strip() for process in started) == ["0", "0", "1"]
-    assert len(files(cache)) == 1
+def test_of_several_at_once_one_decodes(folder: Path, cache: StageCache, monkeypatch: pytest.MonkeyPatch) -> None:
+    written = Mock(wraps=decoded._write)
+    monkeypatch.setattr(decoded, "_write", written)
+    with ThreadPoolExecutor(3) as pool:
+        assert {len(made) for made in pool.map(decoded.Decoded, [open_sequence(folder)] * 3)} == {6}
+    assert written.call_count == 1 and len(files(cache)) == 1
 
 
 def test_a_full_disk_is_one_line_and_leaves_nothing(folder: Path, cache: StageCache) -> None:
@@ -639,18 +603,16 @@ def test_more_frames_than_the_cache_holds_are_refused(folder: Path, monkeypatch:
 
 
 def test_a_damaged_image_is_named(folder: Path, cache: StageCache) -> None:
-    image = sorted((folder / "depth").iterdir())[3]
     sequence = open_sequence(folder)
-    image.write_bytes(image.read_bytes()[:40])
-    with pytest.raises(SequenceError, match=image.name):
+    (folder / "depth" / "3.png").write_bytes(b"damaged")
+    with pytest.raises(SequenceError, match=r"3\.png"):
         Decoded(sequence)
     assert files(cache) == []
 
 
-@pytest.mark.parametrize("tracker", ["orb-slam2", "emfoa-oft?masks=none", "opencv-odometry", "mask-rcnn"])
+@pytest.mark.parametrize("tracker", ["emfoa-oft?masks=none", "opencv-odometry"])
 def test_an_episode_is_the_same_to_the_bit(tracker: str) -> None:
-    sequence = "synthetic/walking_xyz?scene=0&frames=6" if tracker == "mask-rcnn" else CornerSequence(6)
-    episodes = []
+    sequence, episodes = CornerSequence(6), []
     for memory_map in (False, True):
         env = SlamEnv(sequence, tracker, observation=["stats", "rgb", "depth", "gray"], memory_map=memory_map)
         steps = [env.reset(seed=0)[0]] + [env.step(0)[0] for _ in range(5)]
@@ -683,9 +645,8 @@ def test_an_image_that_claims_to_be_huge_costs_nothing(tmp_path: Path, kind: str
 
 
 def test_a_png_whose_chunk_claims_gigabytes_is_refused(tmp_path: Path) -> None:
-    data = lying_png(16, 12)
-    at = data.index(b"IDAT") - 4
-    (tmp_path / "1.png").write_bytes(data[:at] + b"\xff\xff\xff\xff" + data[at + 4 :])
+    header, chunk, rest = lying_png(16, 12).partition(b"IDAT")
+    (tmp_path / "1.png").write_bytes(header[:-4] + b"\xff\xff\xff\xff" + chunk + rest)
     with pytest.raises(SequenceError, match="is truncated"):
         read_image(tmp_path / "1.png", kind=SequenceError)
 
@@ -707,13 +668,12 @@ def test_a_manifest_that_leads_outside_is_a_fault(tmp_path: Path) -> None:
         assert "does not lie in" in fault or "is not a text file" in fault
 
 
-def test_ten_million_lines_are_refused_early_and_cheaply(tmp_path: Path) -> None:
-    path = tmp_path / "poses.txt"
-    path.write_bytes(b"#\n" * 4_000_001)
-    with pytest.raises(TrajectoryError, match="has more than 4000000 lines"):
-        load_tum(path)
-    with pytest.raises(SequenceError, match="has more than 1000000 lines"):
-        read_image_list(path)
+@pytest.mark.parametrize("module", [lists, trajectory_files])
+def test_millions_of_lines_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: ModuleType) -> None:
+    monkeypatch.setattr(module, "MOST_LINES", 1000)
+    (tmp_path / "seq.txt").write_bytes(b"#\n" * 1001)
+    with pytest.raises(DynslamError, match="has more than 1000 lines"):
+        (lists.read_image_list if module is lists else load_tum)(tmp_path / "seq.txt")
 
 
 def refuses(archive: Path, words: str) -> None:
@@ -721,12 +681,18 @@ def refuses(archive: Path, words: str) -> None:
         fetch.extract(archive, Path(target))
 
 
-def test_a_bomb_is_refused(tmp_path: Path) -> None:
-    archive = tmp_path / "bomb.zip"
-    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file, file.open("zeros", "w", force_zip64=True) as out:
-        for _ in range(150):
-            out.write(bytes(1_000_000))
-    refuses(archive, "unpacks to more than")
+@pytest.mark.parametrize(
+    ("method", "size", "words"),
+    [
+        (zipfile.ZIP_DEFLATED, 2_000_000, "unpacks to more than"),
+        (zipfile.ZIP_LZMA, 1, "compressed in a way that is not unpacked here"),  # it takes the memory the file asks for
+    ],
+)
+def test_bombs_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: int, size: int, words: str) -> None:
+    monkeypatch.setattr(fetch, "MAX_SLACK", 1_000_000)
+    with zipfile.ZipFile(tmp_path / "bomb.zip", "w", method) as file:
+        file.writestr("zeros", bytes(size))
+    refuses(tmp_path / "bomb.zip", words)
 
 
 def tar_header(name: bytes, size: int, kind: bytes) -> bytes:
@@ -757,18 +723,8 @@ def test_a_million_empty_files_are_refused(tmp_path: Path, monkeypatch: pytest.M
         refuses(archive, "holds more than 20 files, refused")
 
 
-def test_zeros_after_the_end_of_an_archive_are_counted(tmp_path: Path) -> None:
-    buffer = io.BytesIO()
-    with tarfile.open(fileobj=buffer, mode="w") as tar:
-        tar.addfile(tarfile.TarInfo("seq/rgb.txt"))
-    archive = tmp_path / "a.tgz"
-    archive.write_bytes(gzip.compress(buffer.getvalue(), 1) + gzip.compress(bytes(140_000_000), 9))
-    refuses(archive, r"unpacks to more than 0\.1 GB")
-
-
-def test_other_compressions_are_refused(tmp_path: Path) -> None:
-    """LZMA takes as much memory as the file asks for."""
-    archive = tmp_path / "a.zip"
-    with zipfile.ZipFile(archive, "w", zipfile.ZIP_LZMA) as made:
-        made.writestr("seq/rgb.txt", "x")
-    refuses(archive, "compressed in a way that is not unpacked here")
+def test_zeros_after_the_end_of_an_archive_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fetch, "MAX_SLACK", 1_000_000)
+    empty = tarfile.TarInfo("seq/rgb.txt").tobuf() + bytes(1024)
+    (tmp_path / "a.tgz").write_bytes(gzip.compress(empty, 1) + gzip.compress(bytes(4_000_000), 9))
+    refuses(tmp_path / "a.tgz", r"unpacks to more than 0\.0 GB")

@@ -5,7 +5,7 @@ import shutil
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from weakref import finalize
+from weakref import ref
 
 import cv2
 import numpy as np
@@ -17,13 +17,13 @@ from sequence_folders import SHARED, Altered, frame_hash, make_folder, needs_sha
 
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.geometry import Camera, Trajectory, se3
-from dynslam_bench.sequences import Frame, FrameMasks, PreprocessingSettings, Sequence, open_sequence
+from dynslam_bench.sequences import Frame, FrameMasks, PreprocessingSettings, SequenceView, open_sequence
 from dynslam_bench.sequences.calibration import Window, adjust, calibrate
 from dynslam_bench.sequences.cameras import read_camera, write_camera
 from dynslam_bench.sequences.compose import compose
 from dynslam_bench.sequences.doctor import Diagnosis, Finding, _turn, diagnose, examine, stretches, truth_findings
 from dynslam_bench.sequences.preprocessing import Preprocessed, normalise
-from dynslam_bench.sequences.rgbd_motion import READINGS, read_as, rgbd_pairs
+from dynslam_bench.sequences.rgbd_motion import rgbd_pairs
 from dynslam_bench.sequences.synthetic import RenderSettings, open_synthetic
 from dynslam_bench.sequences.view import Part, Wrapped, part_of
 
@@ -52,7 +52,7 @@ def diagnosed(sound, pairs):
     @cache
     def found(name):
         if "truth" not in FAULTS[name]:
-            return examine(Altered(sound, **FAULTS[name]))
+            return examine(SequenceView(Altered(sound, **FAULTS[name]), 0, 60))
         truth = FAULTS[name]["truth"](sound.ground_truth)
         return Diagnosis(sound.id, FRAMES, tuple(truth_findings(sound.timestamps, truth, sound.camera, pairs)))
 
@@ -86,6 +86,7 @@ FAULTS = {
     "truth-scale": {"truth": lambda truth: scaled(truth, 1000.0)},
     "truth-inverted": {"truth": of_poses(se3.inverse)},
     "truth-quaternion-order": {"truth": written_w_first},
+    "truth-quaternion-order, inverted": {"truth": lambda truth: written_w_first(of_poses(se3.inverse)(truth))},
     "truth-axes": {"truth": of_a_body(BODY)},
     "truth-lever-arm": {"truth": of_a_body(LEVER)},
     "truth-sparse": {"truth": lambda truth: Trajectory(truth.timestamps[::20], truth.T_world_cam[::20])},
@@ -113,36 +114,23 @@ VALUES = {"truth-time-shift": 0.2, "truth-scale": 1000.0, "depth-factor": 5.0, "
 
 
 def test_a_sound_recording_has_no_fault(sound):
-    diagnosis = examine(sound)
-    assert diagnosis.ok and diagnosis.findings == () and diagnosis.frames == FRAMES
+    assert examine(sound) == Diagnosis(sound.id, FRAMES, ())
 
 
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_is_named_and_measured(diagnosed, name):
     diagnosis = diagnosed(name)
     (fault,) = (finding for finding in diagnosis.findings if finding.severity == "fault")
-    assert fault.id == name and not diagnosis.ok
+    assert fault.id == name.partition(",")[0] and not diagnosis.ok
     assert all(finding.text and finding.cure for finding in diagnosis.findings)
     if name in VALUES:
         assert diagnosis.findings == (fault,) and fault.value == pytest.approx(VALUES[name], rel=0.1)
 
 
 def test_an_unrelated_truth_is_named_or_said_to_be_unclear(sound, pairs):
-    truths = [wander(seed)(sound.ground_truth) for seed in (0, 1, 2)]
+    truths = [wander(seed)(sound.ground_truth) for seed in (0, 1)]
     ids = [finding.id for truth in truths for finding in truth_findings(sound.timestamps, truth, sound.camera, pairs)]
-    assert ids == ["truth-unclear", "truth-other-sequence", "truth-unclear"]
-
-
-def test_readings_undo_each_convention(sound):
-    poses, inverted = sound.ground_truth.T_world_cam, of_poses(se3.inverse)(sound.ground_truth)
-    written = {
-        "inverted": inverted,
-        "w first": written_w_first(sound.ground_truth),
-        "w first, inverted": written_w_first(inverted),
-    }
-    for reading, file in written.items():
-        np.testing.assert_allclose(read_as(file.T_world_cam, reading), poses, atol=1e-9)
-    assert set(written) < set(READINGS)
+    assert ids == ["truth-unclear", "truth-other-sequence"]
 
 
 REST = {"frame": lambda frame, base: (base[0].rgb, base[0].depth)}
@@ -171,6 +159,7 @@ DAMAGES = {
     "unreadable": lambda folder: (folder / "rgb" / "2.png").write_bytes(b"no image"),
     "unreadable, truth": lambda folder: (folder / "groundtruth.txt").write_text("1 2 3\n"),
     "unreadable, missing": shutil.rmtree,
+    "unreadable, other clock": lambda folder: rewrite(folder / "depth.txt", lambda rows: [f"9{row}" for row in rows]),
     "depth-size": lambda folder: fill(folder, "depth", np.full((12, 16), 9000, np.uint16)),
     "depth-format": lambda folder: fill(folder, "depth", np.full((24, 32), 90, np.uint8)),
     "no-depth": lambda folder: [(folder / "depth.txt").unlink(), shutil.rmtree(folder / "depth")],
@@ -205,16 +194,13 @@ def matrix_of(text):
     return np.array([[float(value) for value in row.split(",")] for row in text.split(";")])
 
 
-def test_the_cure_of_turned_axes_is_their_inverse(diagnosed):
+def test_the_cure_of_turned_axes_is_their_inverse_and_a_rotation(diagnosed):
     (finding,) = diagnosed("truth-axes").findings
     cure = matrix_of(re.search(r"\[(.*)\]", finding.cure).group(1))
     np.testing.assert_allclose(BODY[:3, :3] @ cure, np.eye(3), atol=0.02)
-
-
-@pytest.mark.parametrize("angle", [30, 40, 50, 85])
-def test_the_cure_of_turned_axes_is_a_rotation(angle):
-    cure = matrix_of(_turn(Rotation.from_euler("x", angle, degrees=True).as_matrix()))
-    np.testing.assert_allclose(cure @ cure.T, np.eye(3), atol=0.005)
+    for angle in (30, 40, 50, 85):
+        cure = matrix_of(_turn(Rotation.from_euler("x", angle, degrees=True).as_matrix()))
+        np.testing.assert_allclose(cure @ cure.T, np.eye(3), atol=0.005)
 
 
 def test_stretches_cover_a_short_recording_and_sample_a_long_one():
@@ -285,32 +271,24 @@ def test_exact_points_give_back_readout_and_delay(readout_s, delay_s):
         assert abs(estimate.value - true) < min(error, estimate.half) and estimate.half < 0.004
 
 
-@pytest.fixture(scope="module")
-def fast(tmp_path_factory):
-    sequence = open_synthetic("synthetic/fast_desk@0?frames=26", tmp_path_factory.mktemp("rendered"))
-    truth, camera = scaled(sequence.ground_truth, 2.0), replace(sequence.camera, readout_s=0.0)
-    return calibrate(sequence), calibrate(Altered(sequence, truth=lambda _: truth, camera=lambda _: camera))
-
-
-def test_a_rendered_rolling_shutter_is_measured(fast):
-    readout, delay, factor = fast[0].quantities
+def test_a_rendered_rolling_shutter_is_measured_and_what_differs_is_to_be_written(tmp_path):
+    sequence = open_synthetic("synthetic/fast_desk@0?frames=26", tmp_path)
+    stated = calibrate(sequence)
+    readout, delay, factor = stated.quantities
     assert readout.value == pytest.approx(0.026, abs=0.003)
     assert readout.low < 0.026 < readout.high and delay.low < 0.0 < delay.high and factor.low < 5000 < factor.high
-    assert readout.observable and readout.written is None, "it is what the camera states"
-    assert not fast[0].measured
-
-
-def test_what_differs_from_the_camera_is_to_be_written(fast):
-    readout, _, factor = fast[1].quantities
-    assert fast[1].camera.readout_s == readout.written == pytest.approx(0.026, abs=0.003)
-    assert factor.low < 2500 < factor.high and fast[1].measured
+    assert readout.observable and not stated.measured, "it is what the camera states"
+    truth, camera = scaled(sequence.ground_truth, 2.0), replace(sequence.camera, readout_s=0.0)
+    other = calibrate(Altered(sequence, truth=lambda _: truth, camera=lambda _: camera))
+    readout, _, factor = other.quantities
+    assert other.camera.readout_s == readout.written == pytest.approx(0.026, abs=0.003)
+    assert factor.low < 2500 < factor.high and other.measured
 
 
 def test_a_camera_file_keeps_the_delay_and_pairs_by_it(tmp_path):
     folder, _, raw = make_folder(tmp_path / "own")
     file = folder / "camera.toml"
-    write_camera(file, replace(read_camera(file).camera(), depth_delay_s=1 / 30, readout_s=0.02), fps=30.0)
-    assert read_camera(file).camera().depth_delay_s == 1 / 30
+    write_camera(file, replace(read_camera(file).camera(), depth_delay_s=1 / 30), fps=30.0)
     sequence = open_sequence(folder)
     assert len(sequence) == 3
     np.testing.assert_array_equal(sequence[0].depth, raw[0].astype(np.float32) / np.float32(5000))
@@ -384,20 +362,16 @@ class Watched(Wrapped):
     """The same; `most` counts the largest number of its images that existed at once."""
 
     def __init__(self, base):
-        self.base, self.now, self.most = base, 0, 0
+        self.base, self.images, self.most = base, [], 0
 
     def __len__(self):
         return len(self.base)
 
     def __getitem__(self, index):
         frame = self.base[index]
-        self.now += 1
-        self.most = max(self.most, self.now)
-        finalize(frame.rgb, self.released)
+        self.images.append(ref(frame.rgb))
+        self.most = max(self.most, sum(image() is not None for image in self.images))
         return frame
-
-    def released(self):
-        self.now -= 1
 
 
 @pytest.fixture(scope="module")
@@ -412,12 +386,12 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def host(folder):
-    return open_sequence(str(folder / "host"))
+    return open_sequence(folder / "host")
 
 
 @pytest.fixture
 def people(folder):
-    return open_sequence(str(folder / "people"))
+    return open_sequence(folder / "people")
 
 
 def test_only_people_and_their_shadow_differ_from_the_host(host, folder):
@@ -449,7 +423,7 @@ def test_an_instance_repeats_and_another_one_differs(host, people, folder, tmp_p
 
 
 def test_images_are_not_held(host, tmp_path):
-    people = Watched(Room("people", 30, walker=True))
+    people = Watched(Room("people", 22, walker=True))
     compose(host, people, tmp_path / "made", 2)
     assert people.most < 20
 
@@ -505,8 +479,9 @@ def test_a_folder_that_exists_is_left_alone(host, people, tmp_path):
 
 @needs_shared
 def test_a_real_person_is_pasted_into_a_real_recording(tmp_path):
-    host = open_sequence(str(SHARED / "data/tum/rgbd_dataset_freiburg1_rpy"), frames="0:4")
-    made = compose(host, open_sequence(str(SHARED / "data/fixed_camera/man_130")), tmp_path / "made", 5)
+    host = open_sequence(str(SHARED / "data/tum/rgbd_dataset_freiburg1_rpy"), frames="0:3")
+    people = open_sequence(str(SHARED / "data/fixed_camera/man_130"), frames="0:60", stride=3)
+    made = compose(host, people, tmp_path / "made", 3)
     composed = open_sequence(str(tmp_path / "made"))
     assert 0.1 < made.share < 0.7 and composed.camera == host.camera
     person = composed.masks[2].instances > 0
@@ -516,25 +491,20 @@ def test_a_real_person_is_pasted_into_a_real_recording(tmp_path):
 LENS = Camera(160, 120, 130.0, 131.0, 80.5, 58.0, (0.26, -0.95, -0.005, 0.003, 1.16))
 
 
-class Memory:
-    """One frame in memory, with masks."""
+class Memory(list):
+    """Frames in memory, with masks."""
 
-    id, license, citation, fps, ground_truth = "memory", "", "", 30.0, None
-    camera = LENS
-
-    def __init__(self, rgb, depth):
-        self._frame = Frame(0, 1.0, rgb, depth)
-        self.timestamps = np.array([1.0])
-        self.masks = [FrameMasks((depth > 2).astype(np.int32), {1: "person"}, frozenset({1}))]
+    id, license, citation, fps, ground_truth, camera = "memory", "", "", 30.0, None, LENS
 
     def digest(self):
         return "d"
 
-    def __len__(self):
-        return 1
 
-    def __getitem__(self, index):
-        return self._frame
+def preprocessed(rgb, depth, **settings):
+    """One frame with masks, preprocessed."""
+    memory = Memory([Frame(0, 1.0, rgb, depth)])
+    memory.masks = [FrameMasks((depth > 2).astype(np.int32), {1: "person"}, frozenset({1}))]
+    return Preprocessed(memory, PreprocessingSettings(**settings))
 
 
 def dots(points):
@@ -556,9 +526,7 @@ def test_undistortion_moves_points_where_the_camera_model_says():
     ideal = np.array([[30.0, 25.0], [120.0, 30.0], [40.0, 95.0], [125.0, 90.0], [80.0, 60.0]])
     distorted = LENS.distort_points(ideal)
     assert np.abs(distorted - ideal).max() > 1  # the lens matters here
-    sequence = Preprocessed(
-        Memory(dots(distorted), np.ones((120, 160), np.float32)), PreprocessingSettings(undistort=True)
-    )
+    sequence = preprocessed(dots(distorted), np.ones((120, 160), np.float32), undistort=True)
     assert not sequence.camera.is_distorted and sequence.camera.fx == LENS.fx
     for point in ideal:
         assert np.abs(centroid(sequence[0].rgb, point) - point).max() < 0.1
@@ -567,8 +535,7 @@ def test_undistortion_moves_points_where_the_camera_model_says():
 @pytest.mark.parametrize(("width", "height"), [(80, 60), (320, 240), (100, 90)])
 def test_resize_scales_the_intrinsics_along(width, height):
     points = np.array([[30.0, 25.0], [121.0, 31.0], [40.0, 95.0]])
-    settings = PreprocessingSettings(width=width, height=height)
-    sequence = Preprocessed(Memory(dots(points), np.full((120, 160), 2.0, np.float32)), settings)
+    sequence = preprocessed(dots(points), np.full((120, 160), 2.0, np.float32), width=width, height=height)
     frame, camera = sequence[0], sequence.camera
     assert frame.rgb.shape == (height, width, 3) and frame.depth.shape == (height, width)
     for point in points:
@@ -579,22 +546,12 @@ def test_resize_scales_the_intrinsics_along(width, height):
 def test_depth_and_masks_are_never_averaged():
     depth = np.where(np.mgrid[:120, :160][1] < 77, 1.0, 4.0).astype(np.float32)
     depth[10:20, 10:20] = 0
-    settings = PreprocessingSettings(width=100, height=70, undistort=True)
-    sequence = Preprocessed(Memory(dots([]), depth), settings)
+    sequence = preprocessed(dots([]), depth, width=100, height=70, undistort=True)
     frame, masks = sequence[0], sequence.masks[0]
     assert set(np.unique(frame.depth)) == {0.0, 1.0, 4.0}
     assert masks.instances.shape == (70, 100) and masks.instances.dtype == np.int32
     assert ((masks.instances == 1) == (frame.depth > 2)).all()
     assert masks.moving == {1}
-
-
-def test_digest_depends_on_the_settings():
-    memory = Memory(dots([]), np.ones((120, 160), np.float32))
-    digests = {
-        Preprocessed(memory, PreprocessingSettings(undistort=u, clahe_clip=c)).digest() for u in (0, 1) for c in (1, 2)
-    }
-    assert len(digests) == 4
-    assert isinstance(Preprocessed(memory, PreprocessingSettings(undistort=True)), Sequence)
 
 
 def test_mean_std_reaches_its_target():

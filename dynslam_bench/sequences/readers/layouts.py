@@ -27,11 +27,12 @@ from dynslam_bench.geometry import (
 from dynslam_bench.sequences.readers.lists import (
     Contents,
     ImageList,
+    checked_camera,
     find_names,
     list_folder,
-    pinhole,
     read_associations,
     read_image_list,
+    size_of_first,
     stamped,
 )
 from dynslam_bench.sequences.readers.tables import (
@@ -61,28 +62,30 @@ def read_tum(folder: Path, fps: float | None) -> Contents:
     `fps` makes stamps of images that are named by frame numbers.
     """
     truth, dropped = _tum_truth(folder)
-    if not (folder / "rgb.txt").is_file() and not (folder / "depth.txt").is_file():
-        for name in ("associations.txt", "associated.txt", "associate.txt", "association.txt"):
-            if (folder / name).is_file():
-                colour, depth = read_associations(folder / name)
-                return Contents(colour, depth, paired=True, truth=truth, truth_dropped=dropped)
+    pairs = _first_file(folder, "associations.txt", "associated.txt", "associate.txt", "association.txt")
+    if pairs is not None and _first_file(folder, "rgb.txt", "depth.txt") is None:
+        return Contents(*read_associations(pairs), True, truth, dropped)
     people = read_image_list(folder / PEOPLE_LIST) if (folder / PEOPLE_LIST).is_file() else None
-    colour, depth = _tum_list(folder, "rgb", fps), _tum_list(folder, "depth", fps)
+    colour, depth = (
+        read_image_list(folder / f"{name}.txt")
+        if (folder / f"{name}.txt").is_file()
+        else list_folder(folder, name, fps)
+        for name in ("rgb", "depth")
+    )
     return Contents(colour, depth, False, truth, dropped, people=people)
 
 
-def _tum_list(folder: Path, name: str, fps: float | None) -> ImageList:
-    file = folder / f"{name}.txt"
-    return read_image_list(file) if file.is_file() else list_folder(folder, name, fps)
+def _first_file(folder: Path, *names: str) -> Path | None:
+    return next((folder / name for name in names if (folder / name).is_file()), None)
 
 
 def _tum_truth(folder: Path) -> tuple[Trajectory | None, str]:
     """The ground truth, None if there is no file, and one phrase on the lines that were not taken as they stand."""
-    for name in ("groundtruth.txt", "pose.txt"):
-        if (folder / name).is_file():
-            file = load_tum(folder / name)
-            return file.trajectory, _not_taken(file)
-    return None, ""
+    path = _first_file(folder, "groundtruth.txt", "pose.txt")
+    if path is None:
+        return None, ""
+    file = load_tum(path)
+    return file.trajectory, _not_taken(file)
 
 
 def _not_taken(file: TumFile) -> str:
@@ -102,7 +105,7 @@ def read_eth3d(folder: Path, fps: float | None) -> Contents:
         )
     colour, depth = read_associations(pairs)
     fx, fy, cx, cy = read_table(folder / "calibration.txt", 4, "fx fy cx cy")[0].tolist()
-    camera = pinhole(folder, colour.files[0], fx, fy, cx, cy, 5000.0)
+    camera = checked_camera(folder / "calibration.txt", size_of_first(folder, colour), (fx, fy), (cx, cy), 5000.0)
     truth, dropped = _tum_truth(folder)
     return Contents(colour, depth, True, truth, dropped, camera, fps or 27.1)
 
@@ -211,7 +214,7 @@ def read_openloris(folder: Path, fps: float | None) -> Contents:
     sensors, transforms = folder / "sensors.yaml", folder / "trans_matrix.yaml"
     sensor = section(read_yaml(sensors), _LORIS_CAMERA, str(sensors))
     fx, cx, fy, cy = numbers(sensor, "intrinsics", 4, str(sensors))
-    camera = pinhole(folder, colour.files[0], fx, fy, cx, cy, MILLIMETRES)
+    camera = checked_camera(sensors, size_of_first(folder, colour), (fx, fy), (cx, cy), MILLIMETRES)
     base, dropped = _tum_truth(folder)
     if base is None:
         return Contents(colour, depth, camera=camera, fps=fps)
@@ -221,12 +224,14 @@ def read_openloris(folder: Path, fps: float | None) -> Contents:
             f"the ground truth of {folder} is never nearer than {gap:.3f} s to an image",
             "stamps of OpenLORIS carry a bias of their own in every sequence: are both files of the same one?",
         )
-    for entry in _mappings(section(read_yaml(transforms), "trans_matrix", str(transforms))):
-        if (entry.get("parent_frame"), entry.get("child_frame")) == (_LORIS_BASE, _LORIS_CAMERA):
-            T_base_cam = rigid(numbers(entry, "matrix", 16, str(transforms)), str(transforms))
-            truth = base.with_poses(base.T_world_cam @ T_base_cam)
-            return Contents(colour, depth, truth=truth, truth_dropped=dropped, camera=camera, fps=fps)
-    raise SequenceError(f"{transforms} holds no rigid transformation from {_LORIS_BASE} to {_LORIS_CAMERA}")
+    entries = _mappings(section(read_yaml(transforms), "trans_matrix", str(transforms)))
+    ends = {"parent_frame": _LORIS_BASE, "child_frame": _LORIS_CAMERA}
+    entry = next((entry for entry in entries if all(entry.get(key) == frame for key, frame in ends.items())), None)
+    if entry is None:
+        raise SequenceError(f"{transforms} holds no rigid transformation from {_LORIS_BASE} to {_LORIS_CAMERA}")
+    matrix = numbers(entry, "matrix", 16, str(transforms))
+    truth = base.with_poses(base.T_world_cam @ rigid(matrix, str(transforms)))
+    return Contents(colour, depth, truth=truth, truth_dropped=dropped, camera=camera, fps=fps)
 
 
 def _mappings(value: object) -> list[dict[str, object]]:
@@ -248,15 +253,14 @@ def read_vslam_lab(folder: Path, fps: float | None) -> Contents:
     stated = next((entry for entry in entries if entry.get("cam_name") == "rgb_0"), None)
     if stated is None:
         raise SequenceError(f"{where} describes no camera 'rgb_0'")
-    width, height = numbers(stated, "image_dimension", 2, where)
-    fx, fy = numbers(stated, "focal_length", 2, where)
-    cx, cy = numbers(stated, "principal_point", 2, where)
+    pairs = ("image_dimension", "focal_length", "principal_point")
+    size, focal, centre = (numbers(stated, name, 2, where) for name in pairs)
     (factor,) = numbers(stated, "depth_factor", 1, where)
     kind = stated.get("distortion_type")
     if kind not in (None, "radtan4", "radtan5"):
         raise SequenceError(f"{where}: the distortion '{str(kind)[:40]}' is not read, only radtan4 and radtan5")
     k = [] if kind is None else numbers(stated, "distortion_coefficients", 4 if kind == "radtan4" else 5, where)
-    camera = _camera_of(where, width, height, fx, fy, cx, cy, k, factor)
+    camera = checked_camera(where, size, focal, centre, factor, k)
     truth = read_pose_table(poses, camera_on_body(stated, where)) if poses.is_file() else None
     return Contents(colour, depth, True, truth, camera=camera, fps=fps or _frame_rate(stated.get("fps")))
 
@@ -276,12 +280,11 @@ def read_euroc(folder: Path, fps: float | None) -> Contents:
     colour, depth = _euroc_images(folder, f"{base}cam0"), _euroc_images(folder, f"{base}depth0")
     where, depth_file = str(folder / base / "cam0" / "sensor.yaml"), folder / base / "depth0" / "sensor.yaml"
     sensor = read_yaml(Path(where))
-    width, height = numbers(sensor, "resolution", 2, where)
-    fx, fy, cx, cy = numbers(sensor, "intrinsics", 4, where)
+    size, intrinsics = numbers(sensor, "resolution", 2, where), numbers(sensor, "intrinsics", 4, where)
     k = numbers(sensor, "distortion_coefficients", 4, where)
     depth_sensor = {"depth_factor": MILLIMETRES, **(read_yaml(depth_file) if depth_file.is_file() else {})}
     (factor,) = numbers(depth_sensor, "depth_factor", 1, str(depth_file))
-    camera = _camera_of(where, width, height, fx, fy, cx, cy, k, factor)
+    camera = checked_camera(where, size, intrinsics[:2], intrinsics[2:], factor, k)
     poses = folder / base / "state_groundtruth_estimate0" / "data.csv"
     truth = read_pose_table(poses, camera_on_body(sensor, where)) if poses.is_file() else None
     return Contents(colour, depth, truth=truth, camera=camera, fps=fps or _frame_rate(sensor.get("rate_hz")))
@@ -293,14 +296,6 @@ def _euroc_images(folder: Path, name: str) -> ImageList:
     if len(heading) < 2:
         raise SequenceError(f"{path} has one column, expected a stamp and a file name")
     return stamped([f"{name}/data/{row[1]}" for row in rows], nanoseconds([row[0] for row in rows], path), str(path))
-
-
-def _camera_of(where: str, width: float, height: float, fx: float, fy: float, cx: float, cy: float,
-               distortion: list[float], depth_factor: float) -> Camera:  # fmt: skip
-    if min(width, height, fx, fy, depth_factor) <= 0:
-        raise SequenceError(f"{where}: size, focal lengths and depth_factor have to be above 0")
-    k1, k2, p1, p2, k3 = (*distortion, *[0.0] * 5)[:5]
-    return Camera(int(width), int(height), fx, fy, cx, cy, (k1, k2, p1, p2, k3), depth_factor)
 
 
 def _frame_rate(value: object) -> float | None:

@@ -1,7 +1,9 @@
 """What a folder of images holds: stamped lists of files, their pairs, and counts of all that was not used."""
 
 import math
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -24,18 +26,12 @@ class ImageList:
     Attributes:
         stamps_ns: Nanoseconds, int64 ``[N]``, strictly increasing.
         files: Paths relative to the sequence's folder.
-        bad_stamps: Lines whose stamp was not finite; dropped.
-        duplicate_stamps: Lines whose stamp occurred again later; dropped, as the last one wins in TUM's tools.
-        unsorted: Lines whose stamp was below the one before; put in order.
-        unnamed: Lines without a file name; dropped.
+        irregular: How many lines of the list were dropped or moved, by the reason.
     """
 
     stamps_ns: NDArray[np.int64]
     files: tuple[str, ...]
-    bad_stamps: int = 0
-    duplicate_stamps: int = 0
-    unsorted: int = 0
-    unnamed: int = 0
+    irregular: Counter[str] = field(default_factory=Counter)
 
     @cached_property
     def stamps(self) -> NDArray[np.float64]:
@@ -115,7 +111,6 @@ def make_image_list(rows: list[tuple[int | None, str]], *, described: str) -> Im
     """
     named = [(stamp, name) for stamp, name in rows if name]
     finite = [(stamp, name) for stamp, name in named if stamp is not None]
-    stamps = [stamp for stamp, _ in finite]
     unique = dict(finite)  # the last of several equal stamps wins, as in TUM's associate.py
     if not unique:
         raise SequenceError(
@@ -123,14 +118,13 @@ def make_image_list(rows: list[tuple[int | None, str]], *, described: str) -> Im
         )
     order = np.array(sorted(unique), dtype=np.int64)
     refuse_close(order, described, SequenceError)
-    return ImageList(
-        order,
-        tuple(unique[stamp] for stamp in order.tolist()),
-        bad_stamps=len(named) - len(finite),
-        duplicate_stamps=len(finite) - len(unique),
-        unsorted=sum(later < earlier for earlier, later in pairwise(stamps)),
-        unnamed=len(rows) - len(named),
-    )
+    irregular = {
+        "stamps not finite": len(named) - len(finite),
+        "duplicate stamps": len(finite) - len(unique),
+        "stamps out of order": sum(later < earlier for earlier, later in pairwise(stamp for stamp, _ in finite)),
+        "lines without a file name": len(rows) - len(named),
+    }
+    return ImageList(order, tuple(unique[stamp] for stamp in order.tolist()), Counter(irregular))
 
 
 def read_stamped_lines(path: Path) -> list[tuple[int | None, list[str]]]:
@@ -186,72 +180,6 @@ class Contents:
     people: ImageList | None = None
 
 
-# Entries of list files that did not become frames, and why.
-
-
-@dataclass(frozen=True)
-class Dropped:
-    """Counts of one sequence's opening.
-
-    Attributes:
-        colour_listed: Usable entries of ``rgb.txt``.
-        depth_listed: Usable entries of ``depth.txt``.
-        pairs: Frames: colour images with a depth image.
-        colour_unpaired: Colour images without a depth image within the tolerance.
-        depth_unpaired: Depth images that no colour image took.
-        bad_stamps: Entries whose stamp was not finite.
-        duplicate_stamps: Entries whose stamp came again later.
-        unsorted: Entries whose stamp lay before the one above it; put in order.
-        unnamed: Entries without a file name.
-        absent: Entries whose file does not exist (tolerated up to 2 % of a list).
-        max_time_difference_s: The tolerance of the pairing, seconds.
-        ground_truth_poses: Usable poses of ``groundtruth.txt``; 0 where there is none.
-        ground_truth_dropped: Lines of ``groundtruth.txt`` that hold no usable pose, with the reasons.
-        frames_without_ground_truth: Frames with no pose within 0.02 s.
-        largest_hole_s: Longest time between consecutive poses within the frames' span, seconds; 0 without poses.
-    """
-
-    colour_listed: int
-    depth_listed: int
-    pairs: int
-    colour_unpaired: int
-    depth_unpaired: int
-    bad_stamps: int = 0
-    duplicate_stamps: int = 0
-    unsorted: int = 0
-    unnamed: int = 0
-    absent: int = 0
-    max_time_difference_s: float = 0.02
-    ground_truth_poses: int = 0
-    ground_truth_dropped: str = ""
-    frames_without_ground_truth: int = 0
-    largest_hole_s: float = 0.0
-
-    def describe(self) -> str:
-        """One line: the frames, and all counts that are not zero."""
-        counts = {
-            "colour images without depth": self.colour_unpaired,
-            "depth images unused": self.depth_unpaired,
-            "stamps not finite": self.bad_stamps,
-            "duplicate stamps": self.duplicate_stamps,
-            "stamps out of order": self.unsorted,
-            "lines without a file name": self.unnamed,
-            "listed files that do not exist": self.absent,
-            "ground-truth poses": self.ground_truth_poses,
-            f"frames without ground truth within 0.02 s (largest hole {self.largest_hole_s:.2f} s)": (
-                self.frames_without_ground_truth
-            ),
-        }
-        parts = [
-            f"{self.pairs} frames of {self.colour_listed} colour and {self.depth_listed} depth images "
-            f"(|dt| < {self.max_time_difference_s:g} s)",
-            *(f"{count} {what}" for what, count in counts.items() if count),
-            "" if self.ground_truth_poses else "no ground truth",
-            self.ground_truth_dropped,
-        ]
-        return "; ".join(part for part in parts if part)
-
-
 # Images of folders without lists: found by their names, sized by their headers.
 
 
@@ -283,17 +211,32 @@ def stamped(files: list[str], stamps: NDArray[np.int64], where: str) -> ImageLis
     return ImageList(ordered, tuple(files[i] for i in order))
 
 
-def pinhole(folder: Path, first: str, fx: float, fy: float, cx: float, cy: float, depth_factor: float) -> Camera:
-    """A camera without distortion; its size is that of the first colour image.
+def checked_camera(
+    where: object, size: Sequence[float], focal: Sequence[float], centre: Sequence[float], depth_factor: float,
+    distortion: Sequence[float] = (),
+) -> Camera:  # fmt: skip
+    """A camera by its size, focal lengths and principal point in pixels, and up to five coefficients of distortion.
 
     Raises:
-        SequenceError: The image has no size, or a focal length is not positive.
+        SequenceError: Size, focal length or depth factor is not positive.
     """
-    size = image_size(read_bytes(folder / first, limit=512 * MEGABYTE, kind=SequenceError))
-    if size is None:
-        raise SequenceError(f"image {folder / first} is no PNG, JPEG, TIFF, BMP or PNM")
-    if not (fx > 0 and fy > 0 and depth_factor > 0):
+    if not all(value > 0 for value in (*size, *focal, depth_factor)):
         raise SequenceError(
-            f"the camera of {folder} has the focal lengths {fx:g} and {fy:g} and {depth_factor:g} depth units a metre"
+            f"{where}: size {size[0]:g}x{size[1]:g}, focal lengths {focal[0]:g} and {focal[1]:g} and {depth_factor:g} "
+            "depth units a metre have to be above 0"
         )
-    return Camera(*size, fx, fy, cx, cy, depth_factor=depth_factor)
+    (width, height), (fx, fy), (cx, cy), (k1, k2, p1, p2, k3) = size, focal, centre, (*distortion, *[0.0] * 5)[:5]
+    return Camera(int(width), int(height), fx, fy, cx, cy, (k1, k2, p1, p2, k3), depth_factor)
+
+
+def size_of_first(folder: Path, images: ImageList) -> tuple[int, int]:
+    """Width and height of the first image.
+
+    Raises:
+        SequenceError: It cannot be read, or has no size.
+    """
+    path = folder / images.files[0]
+    size = image_size(read_bytes(path, limit=512 * MEGABYTE, kind=SequenceError))
+    if size is None:
+        raise SequenceError(f"image {path} is no PNG, JPEG, TIFF, BMP or PNM")
+    return size

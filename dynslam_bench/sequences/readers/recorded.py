@@ -1,6 +1,7 @@
 """Recorded RGB-D sequences of every layout: frames that are decoded when asked for."""
 
 import os
+from collections import Counter
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -10,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, FrameMasks, MaskSource
-from dynslam_bench.core import SequenceError, inside
+from dynslam_bench.core import SequenceError, inside, raising
 from dynslam_bench.core.fingerprint import contents_digest
 from dynslam_bench.core.images import read_image
 from dynslam_bench.core.records import digest
 from dynslam_bench.geometry import Camera, associate, nearest_gap
 from dynslam_bench.geometry.rigs import in_camera_axes
-from dynslam_bench.sequences.readers.lists import Contents, Dropped, ImageList
+from dynslam_bench.sequences.readers.lists import Contents, ImageList
 from dynslam_bench.sequences.view import Masks
 
 GROUND_TRUTH_DT_S = 0.02
@@ -55,7 +56,7 @@ class RecordedSequence:
         ground_truth: Camera-to-world poses in the frame of the motion capture, at their own stamps; None without any.
         masks: Exact masks of people where the folder lists them (`PEOPLE_LIST`), else None.
         fps: Nominal frame rate in Hz; where none is stated, the inverse of the median interval (30 for one frame).
-        dropped: What was not used, and why.
+        dropped: One line on the frames, and on all that was not used or not taken as it stands.
 
     Raises:
         SequenceError: Its images are missing, damaged, of the wrong kind, or lie outside.
@@ -79,38 +80,32 @@ class RecordedSequence:
     ) -> None:
         self.folder, self.id, self.camera = folder, id, camera
         self.license, self.citation, self.tags, self.split = license, citation, tags, split
-        self._any_depth_size = any_depth_size
-        self._furthest_m = contents.furthest_m
+        self._any_depth_size, self._furthest_m = any_depth_size, contents.furthest_m
         delayed = contents.depth.stamps_ns + round(1e9 * camera.depth_delay_s)
-        colour, depth = contents.colour, replace(contents.depth, stamps_ns=delayed)
-        people = contents.people
+        colour, depth, people = contents.colour, replace(contents.depth, stamps_ns=delayed), contents.people
         for file in (*colour.files, *depth.files, *(people.files if people else ())):
             inside(folder, file, where=f"a list of images in {folder}", kind=SequenceError)
-        listed = len(colour) + len(depth)
         paired = contents.paired and not camera.depth_delay_s
         tolerated = 0.0 if paired else MISSING_TOLERATED
         colour, depth = _existing(folder, colour, "colour", tolerated), _existing(folder, depth, "depth", tolerated)
-        absent = listed - len(colour) - len(depth)
-        order = np.arange(len(colour))
-        index = (order, order) if paired else associate(colour.stamps, depth.stamps, max_time_difference_s)
-        if not len(index[0]):
+        every = np.arange(len(colour))
+        first, second = (every, every) if paired else associate(colour.stamps, depth.stamps, max_time_difference_s)
+        if not len(first):
             gap = float(nearest_gap(colour.stamps, depth.stamps).min())
             raise SequenceError(
                 f"none of the {len(colour)} colour images of {folder} has a depth image within "
                 f"{max_time_difference_s:g} s (closest: {gap:.3f} s)",
                 "do both lists use the same clock?",
             )
-        self.timestamps_ns = colour.stamps_ns[index[0]]
-        self.timestamps = colour.stamps[index[0]]
+        self.timestamps_ns, self.timestamps = colour.stamps_ns[first], colour.stamps[first]
         self.timestamps_ns.flags.writeable = self.timestamps.flags.writeable = False
         _check_unit(folder, self.timestamps)
-        self.fps = fps or (float(1 / np.median(np.diff(self.timestamps))) if len(index[0]) > 1 else 30.0)
-        self.depth_timestamps = depth.stamps[index[1]]
-        self._colour = [colour.files[i] for i in index[0]]
-        self._depth = [depth.files[i] for i in index[1]]
+        self.fps = fps or (float(1 / np.median(np.diff(self.timestamps))) if len(first) > 1 else 30.0)
+        self.depth_timestamps = depth.stamps[second]
+        self._colour, self._depth = [colour.files[i] for i in first], [depth.files[i] for i in second]
         self._people: list[str] = []
         if people is not None:
-            people = _existing(folder, people, "mask", tolerated=0.0)
+            people = _existing(folder, people, "mask", 0.0)
             at = np.searchsorted(people.stamps_ns, self.timestamps_ns).clip(max=len(people) - 1)
             unmasked = int(np.count_nonzero(people.stamps_ns[at] != self.timestamps_ns))
             if unmasked:
@@ -121,35 +116,32 @@ class RecordedSequence:
         if contents.truth is not None and R_body_cam is not None:
             poses = in_camera_axes(contents.truth.T_world_cam, R_body_cam)
             self.ground_truth = contents.truth.with_poses(poses)
-        self.dropped = self._count(colour, depth, absent, max_time_difference_s, contents.truth_dropped)
+        counts = {
+            "colour images without depth": len(colour) - len(self),
+            "depth images unused": len(depth) - len(self),
+            **(colour.irregular + depth.irregular),
+            **self._count_poses(),
+        }
+        parts = [
+            f"{len(self)} frames of {len(colour)} colour and {len(depth)} depth images "
+            f"(|dt| < {max_time_difference_s:g} s)",
+            *(f"{count} {what}" for what, count in counts.items() if count),
+            "" if self.ground_truth else "no ground truth",
+            contents.truth_dropped,
+        ]
+        self.dropped = "; ".join(part for part in parts if part)
         self[0]
 
-    def _count(
-        self, colour: ImageList, depth: ImageList, absent: int, max_time_difference_s: float, truth_dropped: str
-    ) -> Dropped:
+    def _count_poses(self) -> dict[str, int]:
+        """How many poses the ground truth has, and how many frames have none."""
         stamps, truth = self.timestamps, self.ground_truth
-        without, hole = 0, 0.0
-        if truth is not None:
-            without = int(np.count_nonzero(nearest_gap(stamps, truth.timestamps) >= GROUND_TRUTH_DT_S))
-            within = truth.timestamps[(truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])]
-            hole = float(np.diff(np.concatenate([stamps[:1], within, stamps[-1:]])).max(initial=0.0))
-        return Dropped(
-            colour_listed=len(colour),
-            depth_listed=len(depth),
-            pairs=len(stamps),
-            colour_unpaired=len(colour) - len(stamps),
-            depth_unpaired=len(depth) - len(stamps),
-            bad_stamps=colour.bad_stamps + depth.bad_stamps,
-            duplicate_stamps=colour.duplicate_stamps + depth.duplicate_stamps,
-            unsorted=colour.unsorted + depth.unsorted,
-            unnamed=colour.unnamed + depth.unnamed,
-            absent=absent,
-            max_time_difference_s=max_time_difference_s,
-            ground_truth_poses=0 if truth is None else len(truth),
-            ground_truth_dropped=truth_dropped,
-            frames_without_ground_truth=without,
-            largest_hole_s=hole,
-        )
+        if truth is None:
+            return {}
+        without = int(np.count_nonzero(nearest_gap(stamps, truth.timestamps) >= GROUND_TRUTH_DT_S))
+        within = truth.timestamps[(truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])]
+        hole = float(np.diff(np.concatenate([stamps[:1], within, stamps[-1:]])).max(initial=0.0))
+        gap = f"frames without ground truth within {GROUND_TRUTH_DT_S:g} s (largest hole {hole:.2f} s)"
+        return {"ground-truth poses": len(truth), gap: without}
 
     @property
     def colour_files(self) -> dict[float, str]:
@@ -179,8 +171,7 @@ class RecordedSequence:
         return len(self._colour)
 
     def __getitem__(self, index: int) -> Frame:
-        index = range(len(self))[index]
-        size = (self.camera.width, self.camera.height)
+        index, size = range(len(self))[index], (self.camera.width, self.camera.height)
         expected = f"{size[0]}x{size[1]}"
         rgb = read_colour(
             self.folder / self._colour[index], size=size, mismatch=f"but the camera of {self.id} is {expected}"
@@ -219,8 +210,8 @@ def _check_unit(folder: Path, stamps: NDArray[np.float64]) -> None:
     )
 
 
-def _existing(folder: Path, images: ImageList, kind: str, tolerated: float = MISSING_TOLERATED) -> ImageList:
-    """The images whose files are there; a few may be missing, as in some published sequences, and none empty."""
+def _existing(folder: Path, images: ImageList, kind: str, tolerated: float) -> ImageList:
+    """The images whose files are there; a share may be missing, as in some published sequences, and none empty."""
     sizes = [path.stat().st_size if path.is_file() else None for path in (folder / file for file in images.files)]
     for state, size_then, allowed in (("missing", None, tolerated), ("empty (0 bytes)", 0, 0.0)):
         at_fault = [file for file, size in zip(images.files, sizes, strict=True) if size == size_then]
@@ -230,7 +221,8 @@ def _existing(folder: Path, images: ImageList, kind: str, tolerated: float = MIS
                 "fetch the sequence again, or remove their lines from the list",
             )
     there = [i for i, size in enumerate(sizes) if size is not None]
-    return replace(images, stamps_ns=images.stamps_ns[there], files=tuple(images.files[i] for i in there))
+    missing = Counter({"listed files that do not exist": len(images) - len(there)})
+    return ImageList(images.stamps_ns[there], tuple(images.files[i] for i in there), images.irregular + missing)
 
 
 # Decoding of colour and depth images.
@@ -320,13 +312,10 @@ def read_metres(path: Path, *, size: tuple[int, int] | None = None, mismatch: st
     Raises:
         SequenceError: The file is missing, damaged, of another size, or holds something else.
     """
-    try:
+    # a damaged header makes numpy's reader raise whatever it likes
+    with raising(SequenceError, f"depth array {path} cannot be read", "is it an .npy file?", of=Exception):
         values = np.load(path, mmap_mode="r", allow_pickle=False)
         shape, kind = values.shape, values.dtype
-    except OSError as error:
-        raise SequenceError(f"cannot read {path}: {error.strerror or error}") from error
-    except Exception as error:  # a damaged header makes numpy's reader raise whatever it likes
-        raise SequenceError(f"depth array {path} cannot be read", "it is no .npy file") from error
     if len(shape) != 2 or kind.kind != "f":
         raise SequenceError(f"depth array {path} is {kind} of shape {str(shape)[:60]}, expected rows of metres")
     if size is not None and shape != size[::-1]:
