@@ -335,7 +335,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         outcomes = self.episode.outcomes
         reward = outcomes[-1].reward
         terminated = self._lost_after is not None and self.episode.lost_streak >= self._lost_after
-        truncated = len(outcomes) == len(self.sequence.timestamps)
+        truncated = len(outcomes) == self._count
         if terminated:
             rest = Episode(list(outcomes))
             reward += sum(self._add_untracked(rest, "lost") for _ in self.sequence.timestamps[len(outcomes) :])
@@ -355,7 +355,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             DynslamError: The episode is not running, or fewer frames are left.
         """
         self._running_tracker()
-        left = len(self.sequence) - 1 - self.episode.next_index
+        left = self._count - 1 - self.episode.next_index
         if not 0 <= count <= left:
             raise DynslamError(f"cannot drop {count} frames, {left} are left before the last one")
         return sum(self._add_untracked(self.episode, "dropped") for _ in range(count))
@@ -601,8 +601,13 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         stamp = float(self.sequence.timestamps[index])
         return self._add(episode, FrameOutcome(index, stamp, state, None, {}, {}, self._errors.update(stamp, None)))
 
+    @property
+    def _count(self) -> int:
+        """Frames of the episode."""
+        return self.window[1] - self.window[0]
+
     def _observe(self) -> Any:
-        progress = self.episode.outcomes[-1].index / max(len(self.sequence.timestamps) - 1, 1)
+        progress = self.episode.outcomes[-1].index / max(self._count - 1, 1)
         observed = observe(self._parts, self.frame, self.result, self.episode, progress)
         return observed["stats"] if self._observation == "stats" else observed
 

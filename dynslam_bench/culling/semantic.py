@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.culling import Rule
 from dynslam_bench.geometry import inside
-from dynslam_bench.segmentation.postprocess import dynamic_mask, select
+from dynslam_bench.segmentation.postprocess import dynamic_mask, dynamic_objects, select
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 
@@ -25,7 +25,7 @@ class SemanticFilter(Rule[SegmentationSettings]):
         """Drop what lies on the masks; without a segmenter, keep all."""
         if frame.instances is None or not frame.instances.class_names:
             return self.verdict(np.ones(len(frame.xy), bool))
-        objects = len(select(frame.instances, self.settings).class_names)
+        objects = np.count_nonzero(dynamic_objects(frame.instances, self.settings))
         mask = dynamic_mask(frame.instances, self.settings, frame.depth) if frame.mask is None else frame.mask
         return self.verdict(~inside(mask, frame.keypoints.xy), mask, objects=objects, mask_fraction=mask.mean())
 

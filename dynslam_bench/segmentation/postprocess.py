@@ -18,13 +18,20 @@ def boxes_of(masks: NDArray[np.bool_]) -> NDArray[np.float32]:
     return boxes
 
 
-def select(instances: Instances, settings: SegmentationSettings, also: frozenset[str] = frozenset()) -> Instances:
-    """The objects that count: confident, and of a dynamic class or one of `also`, or known to move."""
+def dynamic_objects(
+    instances: Instances, settings: SegmentationSettings, also: frozenset[str] = frozenset()
+) -> NDArray[np.bool_]:
+    """Which objects count, ``[K]``: confident, and of a dynamic class or one of `also`, or known to move."""
     names = expand_classes(settings.classes) | also
     wanted = np.array([name in names for name in instances.class_names], dtype=bool)
     if instances.moving is not None:
         wanted |= instances.moving
-    return instances.select(wanted & (instances.scores >= settings.confidence))
+    return np.asarray(wanted & (instances.scores >= settings.confidence))
+
+
+def select(instances: Instances, settings: SegmentationSettings, also: frozenset[str] = frozenset()) -> Instances:
+    """The objects that count, see `dynamic_objects`."""
+    return instances.select(dynamic_objects(instances, settings, also))
 
 
 def dynamic_mask(
@@ -40,10 +47,10 @@ def dynamic_mask(
     Returns:
         Bool ``[H, W]``; all false without dynamic objects.
     """
-    chosen = select(instances, settings)
-    union = chosen.masks.any(axis=0)
-    if settings.repair == "depth" and chosen.class_names:
-        union = np.any([repair(mask, depth, settings.repair_depth_m) for mask in chosen.masks], axis=0)
+    masks = instances.masks[dynamic_objects(instances, settings)]
+    if settings.repair == "depth" and len(masks):
+        masks = np.array([repair(mask, depth, settings.repair_depth_m) for mask in masks])
+    union = masks.any(axis=0)
     return dilate(np.asarray(union), settings.dilation_px)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from point_world import make_backend, observed, track_all, without_depth
 from scipy.optimize import least_squares
+from scipy.stats import chi2
 
 from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.slam import tracking
@@ -184,10 +185,13 @@ def test_bundle_adjustment_agrees_with_general_least_squares(with_depth):
         return np.where([True, True, False], True, has_depth[:, None]) * (measured(*moved(x)) - values)
 
     def residuals(x):
-        chi2 = (errors(x) ** 2).sum(axis=1, keepdims=True)
-        return (errors(x) * np.sqrt(width * np.log1p(chi2 / width) / chi2)).ravel()  # their squares are Cauchy's costs
+        squared = (errors(x) ** 2).sum(axis=1, keepdims=True)
+        return (
+            errors(x) * np.sqrt(width * np.log1p(squared / width) / squared)
+        ).ravel()  # their squares are Cauchy's costs
 
-    width = 5.0 * np.median((errors(np.zeros(6 * VARIABLE + 3 * POINTS)) ** 2).sum(axis=1)) / 1.386
+    start_chi2 = (errors(np.zeros(6 * VARIABLE + 3 * POINTS)) ** 2).sum(axis=1)
+    width = 5.0 * np.median(start_chi2 / chi2.median(np.where(has_depth, 3, 2)))
     solution = least_squares(residuals, np.zeros(6 * VARIABLE + 3 * POINTS), xtol=1e-12, ftol=1e-12)
     poses, _ = moved(solution.x)
     result = adjust_bundle(problem, 40)
