@@ -19,8 +19,15 @@ def doctor(as_json: AsJson = False) -> None:
     findings = examine()
     rows = [(finding.part, finding.name, finding.state) for finding in findings]
     missing = [f"- {f.part} {f.name}: {f.hint or f.state}" for f in findings if f.missing]
-    heading = "\nMissing, and how to get it (of this, rendered sequences need the packages alone):"
-    present(findings, table(("part", "name", "found"), rows), *([heading, *missing] if missing else []))
+    present(
+        findings,
+        table(("part", "name", "found"), rows),
+        *(
+            ["\nMissing, and how to get it (of this, rendered sequences need the packages alone):", *missing]
+            if missing
+            else []
+        ),
+    )
 
 
 def envs(as_json: AsJson = False) -> None:
@@ -40,8 +47,11 @@ def info(as_json: AsJson = False) -> None:
     sizes, entries = usage["bytes_by_stage"], usage["entries_by_stage"]
     rows = [(stage, entries[stage], size / 1e6) for stage, size in sizes.items()]
     total = sum(sizes.values())
-    shown = f"{usage['folder']}: {total / 1e6:.1f} of {usage['max_bytes'] / 1e6:.0f} MB"
-    present({"bytes": total, **usage}, shown, table(("stage", "entries", "MB"), rows))
+    present(
+        {"bytes": total, **usage},
+        f"{usage['folder']}: {total / 1e6:.1f} of {usage['max_bytes'] / 1e6:.0f} MB",
+        table(("stage", "entries", "MB"), rows),
+    )
 
 
 @cache.command()

@@ -165,8 +165,7 @@ def audit_paper(
 
     lines = [] if output is None else [str(output)]
     for findings_table in (findings.summary(), findings.details()) if output is None else ():
-        caption = wrapped(findings_table.caption)
-        lines += [findings_table.title, report_table(findings_table), "", caption, ""]
+        lines += [findings_table.title, report_table(findings_table), "", wrapped(findings_table.caption), ""]
     present(findings.findings, *lines)
 
 
@@ -195,8 +194,7 @@ def published(
     name = sequence if entry is None else entry.id
     if name not in published_sequences():
         raise ReportError(f"no published number of '{name}' was read", did_you_mean(name, published_sequences()))
-    chosen = None if protocol is None else get_protocol(protocol)
-    lines = published_for([name], chosen)
+    lines = published_for([name], None if protocol is None else get_protocol(protocol))
     errors = published_table(lines)
     if errors is None:
         raise ReportError(

@@ -147,8 +147,12 @@ def show(
         if evaluation is None:
             lines += ["", f"{which}: {metrics.reasons.get(which, 'not evaluated')}"]
         else:
-            values = table(("metric", "value"), sorted(evaluation.metrics.items()))
-            lines += ["", f"{which}: {evaluation.summary()}", values, *evaluation.diagnostics]
+            lines += [
+                "",
+                f"{which}: {evaluation.summary()}",
+                table(("metric", "value"), sorted(evaluation.metrics.items())),
+                *evaluation.diagnostics,
+            ]
     lines += [f"hint: {line}" for line in metrics.hints]
     present({"record": record, "metrics": metrics, "folder": store.place(record.run_id)}, *lines)
 
@@ -180,8 +184,7 @@ def merge(
 ) -> None:
     """Copy the runs of results folders into one; exit with 3 if another result of a run is there, which stays."""
     store = stored.RunStore(output)
-    merged = stored.merge(map(stored.open_store, sources), store)
-    show_merged(merged, str(store.root))
+    show_merged(stored.merge(map(stored.open_store, sources), store), str(store.root))
 
 
 @app.command()

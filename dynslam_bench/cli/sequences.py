@@ -41,8 +41,9 @@ def list_(
     patterns = (pattern, f"{pattern.rstrip('/')}/*")
     matches = [summary for summary in everything if any(fnmatch(summary["id"], glob) for glob in patterns)]
     if not matches:
-        ids = [summary["id"] for summary in everything]
-        raise SequenceError(f"no sequence matches '{pattern}'", did_you_mean(pattern, ids))
+        raise SequenceError(
+            f"no sequence matches '{pattern}'", did_you_mean(pattern, [summary["id"] for summary in everything])
+        )
     matches = [s for s in matches if (tag is None or tag in s["tags"]) and (s["here"] or not here)]
     lines = []
     for title, members in groupby(matches, key=lambda summary: summary["dataset"]):
@@ -53,8 +54,10 @@ def list_(
         columns = ("sequence", "here", "size", "tags", "split", "ground truth", "checksum")
         rows = [(s["id"], s["here"], s["size"], s["tags"], s["split"], s["ground_truth"], s["checksum"]) for s in group]
         lines += [f"{title} ({'; '.join(facts)})", table(columns, rows), ""]
-    none = f"none of these is here or has the tag; all {len(everything)}: dynslam-bench sequences list"
-    present(matches, *(lines or [none]))
+    present(
+        matches,
+        *(lines or [f"none of these is here or has the tag; all {len(everything)}: dynslam-bench sequences list"]),
+    )
 
 
 @app.command()
@@ -234,10 +237,12 @@ def calibrate(
     written = result.measured and output is not None
     if output is not None and written:
         write_camera(output, result.camera, fps=sequence.fps)
-    columns = ("quantity", "estimate", "95 % interval", "camera.toml", "why")
     present(
         {**asdict(result), "file": output if written else None},
-        table(columns, [_calibrated(quantity) for quantity in result.quantities]),
+        table(
+            (("quantity", "estimate", "95 % interval", "camera.toml", "why")),
+            [_calibrated(quantity) for quantity in result.quantities],
+        ),
         f"{result.windows} windows of {result.frames} frames, keypoints to {result.pixel_noise:.2f} px",
         *([str(output)] if written else []),
     )

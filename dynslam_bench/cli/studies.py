@@ -97,8 +97,11 @@ def status(study: Study, results: Results = Path("results"), as_json: AsJson = F
     from dynslam_bench.tuning.storage import Heartbeats, best_trials, count_states, extension_of
 
     stored = tuning.Study.open(study, results)
-    asked_for = stored.spec.trials + extension_of(stored.study)["trials"]
-    facts: dict[str, Any] = {"study": stored.spec.name, "folder": stored.folder, "asked_for": asked_for}
+    facts: dict[str, Any] = {
+        "study": stored.spec.name,
+        "folder": stored.folder,
+        "asked_for": stored.spec.trials + extension_of(stored.study)["trials"],
+    }
     facts |= count_states(stored.study)
     facts["running_trials"] = [f"{number} ({state})" for number, state in Heartbeats(stored.study).running().items()]
     settings: dict[str, Any] = {}

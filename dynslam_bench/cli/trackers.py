@@ -183,8 +183,10 @@ def test(
             on_check=on_check,
             on_wait=lambda check: advance(0, None, check),
         )
-    total = f"{report.subject}: {len(report.failed)} of {len(report.checks)} checks failed"
-    present({"subject": report.subject, "ok": report.ok, "checks": report.checks}, total)
+    present(
+        {"subject": report.subject, "ok": report.ok, "checks": report.checks},
+        f"{report.subject}: {len(report.failed)} of {len(report.checks)} checks failed",
+    )
     if not report.ok:
         raise typer.Exit(VERIFICATION_FAILED)
 

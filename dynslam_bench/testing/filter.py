@@ -53,8 +53,9 @@ def filter_report(construct: Callable[[], DynamicFilter]) -> ConformanceReport:
     """Run all checks of `check_filter` and report each."""
     steps = filter_scene()
     report = ConformanceReport.of("filter", construct)
-    declared = report.run("declaration", lambda: _declaration(construct()))
-    if declared and report.run("results", lambda: _run(construct(), steps)):
+    if report.run("declaration", lambda: _declaration(construct())) and report.run(
+        "results", lambda: _run(construct(), steps)
+    ):
         report.run_all(
             {
                 "declared stats": lambda: _declared_stats(construct(), steps),
@@ -116,8 +117,10 @@ def filter_scene(frames: int = 4, *, points: int = 400, seed: int = 0) -> Steps:
                 for past, _ in reversed(steps)
             )
             first = steps[0][0]
-            points_world = se3.transform(truth.T_world_cam[0], camera.unproject(first.xy, first.z))
-            state.map_points = (np.arange(points, dtype=np.int64), points_world)
+            state.map_points = (
+                np.arange(points, dtype=np.int64),
+                se3.transform(truth.T_world_cam[0], camera.unproject(first.xy, first.z)),
+            )
         steps.append((bundle, state))
     return steps
 
@@ -130,8 +133,12 @@ def check_result(result: FilterResult, frame: FrameBundle) -> FilterResult:
     """
     where, count = f"frame {frame.index}: ", (len(frame),)
     require(isinstance(result, FilterResult), f"{where}apply() gave a {type(result).__name__}, not a FilterResult")
-    cause = "the verdict is on all keypoints, not only on those that earlier filters kept"
-    require_arrays(result, {"keep": (np.bool_, count), "weight": (np.float32, count)}, where, cause)
+    require_arrays(
+        result,
+        {"keep": (np.bool_, count), "weight": (np.float32, count)},
+        where,
+        "the verdict is on all keypoints, not only on those that earlier filters kept",
+    )
     weight, bad = result.weight, {key: value for key, value in result.stats.items() if not np.isfinite(value)}
     require_all(
         (((weight >= 0) & (weight <= 1)).all(), f"{where}a weight lies outside [0, 1] or is no number"),
@@ -172,8 +179,11 @@ def _declared_stats(candidate: DynamicFilter, steps: Steps) -> None:
 def _left_alone(candidate: DynamicFilter, steps: Steps) -> None:
     candidate.reset(steps[0][1].camera)
     for frame, state in steps:
-        inputs = (frame.rgb, frame.depth, frame.xy, frame.z, state.keep)
-        require_unchanged(partial(candidate.apply, frame, state), *inputs, what=f"frame {frame.index} or its state")
+        require_unchanged(
+            partial(candidate.apply, frame, state),
+            *((frame.rgb, frame.depth, frame.xy, frame.z, state.keep)),
+            what=f"frame {frame.index} or its state",
+        )
 
 
 def _repeated(pair: tuple[DynamicFilter, DynamicFilter], steps: Steps, fault: str, cause: str) -> None:
@@ -200,16 +210,18 @@ def _few(count: int) -> Change:
     """Only the first keypoints of every frame."""
 
     def select(frame: FrameBundle) -> FrameBundle:
-        keypoints = frame.keypoints.select(np.arange(count))
-        return replace(frame, keypoints=keypoints, xy=frame.xy[:count], z=frame.z[:count])
+        return replace(
+            frame, keypoints=frame.keypoints.select(np.arange(count)), xy=frame.xy[:count], z=frame.z[:count]
+        )
 
     def change(frame: FrameBundle, state: FilterState) -> tuple[FrameBundle, FilterState]:
         keep = np.ones(count, dtype=bool)
         if state.flow is None or state.previous is None:
             return select(frame), replace(state, keep=keep)
         flow = FlowResult(state.flow.xy[:count], state.flow.valid[:count], state.flow.cost[:count], state.flow.stats)
-        previous = select(state.previous)
-        return select(frame), replace(state, keep=keep, flow=flow, previous=previous, previous_keep=keep.copy())
+        return select(frame), replace(
+            state, keep=keep, flow=flow, previous=select(state.previous), previous_keep=keep.copy()
+        )
 
     return change
 

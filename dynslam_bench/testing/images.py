@@ -175,9 +175,12 @@ def flow_report(construct: Callable[[], FlowEstimator], *, points: int = 200) ->
         )  # fmt: skip
 
     def outside() -> None:
-        strange = np.array([[-5, 5], [1e6, 5], [np.nan, 5]], np.float32)
-        result = results(second, np.concatenate([grid, strange]))
-        require(not result.valid[-3:].any(), "a point outside the reference image is valid in the target")
+        require(
+            not results(second, np.concatenate([grid, np.array([[-5, 5], [1e6, 5], [np.nan, 5]], np.float32)]))
+            .valid[-3:]
+            .any(),
+            "a point outside the reference image is valid in the target",
+        )
 
     report = ConformanceReport.of("flow", construct)
     report.run("construction", lambda: require_methods(construct(), "prepare", "track"))
@@ -209,8 +212,11 @@ def check_flow_result(result: FlowResult, points: NDArray[np.float32], names: tu
     """
     count = len(points)
     require(isinstance(result, FlowResult), f"track() gave a {type(result).__name__}, not a FlowResult")
-    expected = {"xy": (np.float32, (count, 2)), "valid": (np.bool_, (count,)), "cost": (np.float32, (count,))}
-    require_arrays(result, expected, cause="one row a point, in the order of the points")
+    require_arrays(
+        result,
+        {"xy": (np.float32, (count, 2)), "valid": (np.bool_, (count,)), "cost": (np.float32, (count,))},
+        cause="one row a point, in the order of the points",
+    )
     missing = [name for name in names if name not in result.stats]
     require_all(
         (np.isfinite(result.xy[result.valid]).all(), "a valid row is not finite", "mark it as not valid"),
@@ -306,8 +312,12 @@ def check_instances(instances: Instances, frame: Frame) -> None:
     )
     where, boxes, scores = f"frame {frame.index}: ", instances.boxes, instances.scores
     count, shape = len(instances.class_names), frame.depth.shape
-    cause = "masks have to be at the frame's resolution and thresholded"
-    require_arrays(instances, {"masks": (np.bool_, (count, *shape))}, where, cause)
+    require_arrays(
+        instances,
+        {"masks": (np.bool_, (count, *shape))},
+        where,
+        "masks have to be at the frame's resolution and thresholded",
+    )
     require_arrays(instances, {"boxes": (np.float32, (count, 4)), "scores": (np.float32, (count,))}, where)
     require_all(
         (((scores >= 0) & (scores <= 1)).all(), f"{where}a score lies outside [0, 1]", "logits, not scores"),
@@ -324,13 +334,21 @@ def check_instances(instances: Instances, frame: Frame) -> None:
         rows, columns = np.nonzero(mask)
         within = (columns >= box[0] - 1) & (columns <= box[2] + 1) & (rows >= box[1] - 1) & (rows <= box[3] + 1)
         outside = 100 * (1 - float(within.mean())) if len(rows) else 0.0
-        fault = f"{where}{outside:.0f} % of the mask of a {name} lie outside its box"
-        require(outside < 10, fault, "boxes of another resolution, or y before x")
+        require(
+            outside < 10,
+            f"{where}{outside:.0f} % of the mask of a {name} lie outside its box",
+            "boxes of another resolution, or y before x",
+        )
 
 
 def _segmenter_determinism(construct: Callable[[], Segmenter], frames: list[Frame]) -> None:
     first, second = construct(), construct()
     for frame in frames:
         fault = f"frame {frame.index} gives other objects when it is segmented again"
-        cause = "a network in training mode, or unseeded randomness"
-        require_equal(first.segment(frame), second.segment(frame), ("masks", "scores", "class_names"), fault, cause)
+        require_equal(
+            first.segment(frame),
+            second.segment(frame),
+            ("masks", "scores", "class_names"),
+            fault,
+            "a network in training mode, or unseeded randomness",
+        )
