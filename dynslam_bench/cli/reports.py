@@ -160,12 +160,12 @@ def audit_paper(
         if folder is not None and (folder / "groundtruth.txt").is_file():
             truth[name] = read_tum(folder / "groundtruth.txt")
     findings = audit(truth)
+    lines = []
+    for findings_table in (findings.summary(), findings.details()):
+        lines += [findings_table.title, report_table(findings_table), "", wrapped(findings_table.caption), ""]
     if output is not None:
         write_atomic(output, findings.to_markdown())
-
-    lines = [] if output is None else [str(output)]
-    for findings_table in (findings.summary(), findings.details()) if output is None else ():
-        lines += [findings_table.title, report_table(findings_table), "", wrapped(findings_table.caption), ""]
+        lines = [str(output)]
     present(findings.findings, *lines)
 
 
@@ -202,9 +202,7 @@ def published(
         )
     differing = spans(lines)
     span = span_table(differing)
-    text = []
-    if span is not None:
-        text = [f"{span.title}, on {name}:", report_table(span.without("sequence")), ""]
+    text = [] if span is None else [f"{span.title}, on {name}:", report_table(span.without("sequence")), ""]
     text += [f"{errors.title} of {name}:", report_table(errors.without("sequence")), "", wrapped(errors.caption)]
     present({"spans": differing.to_dict("records"), "numbers": lines.to_dict("records")}, *text)
 

@@ -344,11 +344,11 @@ def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: 
     }
     cells = [[shown_cell(name, row[name]) for name in columns.values()] for row in rows]
     write(table(list(columns), cells, least=_NAME_WIDTH), colours=COLOURS)
-    moving = [row for row in rows if row["false_motion_max_m"] is None]
-    pairs = [(row["ate_rmse_m"], row["static_camera_ate_rmse_m"]) for row in moving]
     ended = Counter(row["status"] for row in rows if row["status"] != "ok")
     if ended:
         write(f"{ended.total()} of {len(rows)} runs are not ok: {', '.join(f'{n} {s}' for s, n in ended.items())}.")
+    moving = (row for row in rows if row["false_motion_max_m"] is None)
+    pairs = ((row["ate_rmse_m"], row["static_camera_ate_rmse_m"]) for row in moving)
     worse = sum(None not in pair and pair[0] > (1 + 1e-9) * pair[1] for pair in pairs)
     if worse:
         write(f"{worse} of {len(rows)} runs are worse than a static camera.")
@@ -410,8 +410,8 @@ def recording_note(opened: Mapping[str, tuple[str, str | None, str | None]], row
     for row in rows:
         sequence, data_root, camera = opened[row["run_id"]]
         error, bound = row["ate_rmse_m"], row["static_camera_ate_rmse_m"]
-        static = row["tracker"] != "never-move" and error is not None and bound is not None and error >= bound
-        static = static and row["false_motion_max_m"] is None
+        may_move = row["tracker"] != "never-move" and row["false_motion_max_m"] is None
+        static = may_move and None not in (error, bound) and error >= bound
         if sequence.startswith("synthetic/") or not (row["status"] != "ok" or static):
             continue
         diagnosis = diagnose(sequence, data_root=data_root, camera=camera, most_frames=HINT_FRAMES)

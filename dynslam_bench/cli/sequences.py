@@ -253,10 +253,13 @@ def calibrate(
 def _calibrated(quantity: Quantity) -> tuple[str, ...]:
     """A row of the table of `calibrate`."""
     scale, unit = (1.0, "a metre") if quantity.name == "depth_factor" else (1e3, "ms")
-    value, interval = "", ""
-    if quantity.value is not None:
-        value = f"{scale * quantity.value:.4g} {unit}"
-    if quantity.low is not None and quantity.high is not None:
-        interval = f"{scale * quantity.low:.4g} to {scale * quantity.high:.4g}"
+    value = "" if quantity.value is None else f"{scale * quantity.value:.4g} {unit}"
+    limits = [f"{scale * limit:.4g}" for limit in (quantity.low, quantity.high) if limit is not None]
     written = "kept" if quantity.written is None else f"{quantity.written:g}"
-    return quantity.name, value, interval, written if quantity.observable else "not observable", quantity.reason
+    return (
+        quantity.name,
+        value,
+        " to ".join(limits),
+        written if quantity.observable else "not observable",
+        quantity.reason,
+    )

@@ -147,12 +147,10 @@ class StudyBar:
         """A trial has started or finished, or the study has begun another part."""
         if event.kind == "preview":
             announce(event.text)
-        elif event.kind == "finished":
+            return
+        if event.kind == "finished":
             note(event.text)
-        if event.kind in ("started", "finished"):
-            self._begin(event.text, event.number + (event.kind == "finished"), event.total)
-        elif event.kind == "reference":
-            self._begin(event.text, 0, event.total)
+        self._begin(event.text, event.number + (event.kind == "finished"), event.total)
 
     def note(self, text: str) -> None:
         """The final check has begun a step."""

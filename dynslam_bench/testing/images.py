@@ -62,16 +62,15 @@ def features_report(
         check_keypoints(keypoints, image.shape, descriptor_bytes)
         require(len(keypoints) >= least, f"only {len(keypoints)} keypoints in a textured image")
 
-    def left_alone() -> None:
-        require_unchanged(lambda: construct().extract(image), image, what="the image")
-
     report = ConformanceReport.of("extractor", construct)
     report.run("construction", lambda: require_methods(construct(), "extract"))
     if report.ok and report.run("results", lambda: results(scene[0], least=20)):
         report.run_all(
             {
                 "beside a mask": lambda: _masked_extraction(construct(), image),
-                "images are left alone": left_alone,
+                "images are left alone": lambda: require_unchanged(
+                    lambda: construct().extract(image), image, what="the image"
+                ),
                 "determinism": lambda: _extractor_determinism(construct, image, other),
                 **_on_hard_images(scene[0], results),
             }
@@ -234,9 +233,8 @@ def _grid(shape: tuple[int, ...], points: int) -> NDArray[np.float32]:
 def _flow_determinism(
     construct: Callable[[], FlowEstimator], first: Image, second: Image, points: NDArray[np.float32]
 ) -> None:
-    one, other = construct(), construct()
-    a = one.track(one.prepare(first), one.prepare(second), points, seed=7)
-    b = other.track(other.prepare(first), other.prepare(second), points, seed=7)
+    flows = construct(), construct()
+    a, b = (flow.track(flow.prepare(first), flow.prepare(second), points, seed=7) for flow in flows)
     same = np.array_equal(a.valid, b.valid) and np.array_equal(a.xy[a.valid], b.xy[b.valid])
     require(same, "the same images and seed give another flow", "unseeded randomness, or state that outlives an image")
 
@@ -276,24 +274,23 @@ def segmenter_report(
     """Run all checks of `check_segmenter` and report each."""
     scene = sequence if sequence is not None else CornerSequence(frames)
     inputs = [scene[index] for index in range(min(frames, len(scene)))]
+    first = inputs[0]
 
     def results(*frames: Frame) -> None:
         segmenter = construct()
         for frame in frames:
             check_instances(segmenter.segment(frame), frame)
 
-    def left_alone() -> None:
-        frame = inputs[0]
-        require_unchanged(lambda: construct().segment(frame), frame.rgb, frame.depth, what="the frame")
-
     report = ConformanceReport.of("segmenter", construct)
     report.run("construction", lambda: require_methods(construct(), "segment"))
     if report.ok and report.run("results", lambda: results(*inputs)):
         report.run_all(
             {
-                "images are left alone": left_alone,
+                "images are left alone": lambda: require_unchanged(
+                    lambda: construct().segment(first), first.rgb, first.depth, what="the frame"
+                ),
                 "determinism": lambda: _segmenter_determinism(construct, inputs),
-                **_on_hard_images(inputs[0], results),
+                **_on_hard_images(first, results),
             }
         )
     return report

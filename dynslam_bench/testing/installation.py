@@ -89,9 +89,9 @@ def _weights() -> list[Finding]:
     coco = cached_checkpoint(COCO)
     where = f"{COCO.megabytes} MB, fetched when first used, or put {COCO.url} into {weights_folder()}"
     fetched = Finding("weights", "coco", str(coco)) if coco else Finding("weights", "coco", "not here", True, where)
-    if embedded_weights():
-        return [Finding("weights", "embedded", "in the package, for rendered people"), fetched]
-    return [Finding("weights", "embedded", "missing", True, "reinstall"), fetched]
+    good = "embedded", "in the package, for rendered people"
+    embedded = good if embedded_weights() else ("embedded", "missing", True, "reinstall")
+    return [Finding("weights", *embedded), fetched]
 
 
 def _torch_device() -> Finding:

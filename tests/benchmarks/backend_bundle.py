@@ -75,8 +75,7 @@ def adjust_bundle_gtsam(problem: BundleProblem, iterations: int) -> BundleResult
 
 def main() -> int:
     """Print one row a solver."""
-    parser = parser_of(__doc__, repeats=5, observations=6000, iterations=3)
-    options = parser.parse_args()
+    options = parser_of(__doc__, repeats=5, observations=6000, iterations=3).parse_args()
     solvers = {"schur": adjust_bundle, "gtsam": adjust_bundle_gtsam}
     spent: dict[str, list[float]] = {name: [] for name in solvers}
     cost: dict[str, list[float]] = {name: [] for name in solvers}
@@ -89,8 +88,14 @@ def main() -> int:
             result = solve(each, options.iterations)
             spent[name].append(1e3 * (time.process_time() - begin))
             cost[name].append(adjust_bundle(replace(each, poses=result.poses, points=result.points), 0).cost)
-            gap = se3.inverse(result.poses[: each.variable]) @ truth[: each.variable]
-            error[name].append(1e3 * float(np.linalg.norm(gap[:, :3, 3], axis=1).mean()))
+            error[name].append(
+                1e3
+                * float(
+                    np.linalg.norm(
+                        (se3.inverse(result.poses[: each.variable]) @ truth[: each.variable])[:, :3, 3], axis=1
+                    ).mean()
+                )
+            )
     print(f"{options.observations} observations, 8 + 6 poses, {options.iterations} iterations, processor time")
     print("| solver | ms median | ms min | cost | camera error mm |")
     print("| --- | --- | --- | --- | --- |")

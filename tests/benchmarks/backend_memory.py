@@ -53,8 +53,7 @@ class ToAndFro:
 
 def resident_mb() -> float:
     """Resident memory of this process in MB (Linux)."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def walk(tracker_id: str, sequence: Sequence, frames: int, answer: Any) -> None:
@@ -63,9 +62,13 @@ def walk(tracker_id: str, sequence: Sequence, frames: int, answer: Any) -> None:
     torch.set_num_threads(1)
     source = ToAndFro(sequence)
     masks = source if source.known is not None else None
-    has_masks = "segmentation.source" in field_names(TRACKERS.get(tracker_id).settings)
-    overrides = {"segmentation.source": "oracle"} if has_masks and masks is not None else {}
-    tracker = build_tracker(tracker_id, overrides, TrackerContext(sequence_id=sequence.id, masks=masks))
+    tracker = build_tracker(
+        tracker_id,
+        {"segmentation.source": "oracle"}
+        if ("segmentation.source" in field_names(TRACKERS.get(tracker_id).settings)) and masks is not None
+        else {},
+        TrackerContext(sequence_id=sequence.id, masks=masks),
+    )
     tracker.reset(sequence.camera, rng=np.random.default_rng(0))
     marks: list[tuple[int, float]] = []
     lost, spent, step = 0, np.zeros(frames), max(1, frames // 20)
@@ -98,8 +101,11 @@ def main() -> None:
     parser = parser_of(__doc__, tracker=["orb-slam2"], sequence="synthetic/sitting_xyz", frames=10000, loop=300)
     parser.add_argument("--size", type=int, nargs=2, default=(640, 480))
     options = parser.parse_args()
-    smaller = PreprocessingSettings(width=options.size[0], height=options.size[1])
-    sequence = open_sequence(options.sequence, frames=(0, options.loop), preprocessing=smaller)
+    sequence = open_sequence(
+        options.sequence,
+        frames=(0, options.loop),
+        preprocessing=PreprocessingSettings(width=options.size[0], height=options.size[1]),
+    )
     head = ("tracker", "frames", "lost", "MB in the end", "MB per 1,000 frames", "ms early", "ms late", "late : early")
     print(f"| {' | '.join(head)} |\n| ---{' | ---:' * (len(head) - 1)} |")
     for tracker in ranked() if options.tracker == ["all"] else options.tracker:

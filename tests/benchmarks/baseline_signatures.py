@@ -104,11 +104,15 @@ def read_cells(folder: Path) -> pd.DataFrame:
             continue
         exact = run.tracker.id == "mask-rcnn" and run.overrides == {"segmentation.source": "oracle"}
         if exact or not run.overrides:
-            numbers = run.metrics.get("ate_rmse_m"), run.coverage, run.static_camera_ate_rmse_m, run.status in FAILED
-            rows.append((EXACT if exact else run.tracker.id, run.sequence.id, run.tracker.provenance, *numbers))
-    names = ["tracker", "sequence", "provenance", "ate", "coverage", "static_camera", "broken"]
-    frame = pd.DataFrame(rows, columns=names).astype({"ate": float, "static_camera": float})
-    return frame.groupby(["tracker", "sequence"], sort=False).agg(
+            rows.append(
+                (
+                    EXACT if exact else run.tracker.id,
+                    run.sequence.id,
+                    run.tracker.provenance,
+                    *(run.metrics.get("ate_rmse_m"), run.coverage, run.static_camera_ate_rmse_m, run.status in FAILED),
+                )
+            )
+    return pd.DataFrame(rows, columns=["tracker", "sequence", "provenance", "ate", "coverage", "static_camera", "broken"]).astype({"ate": float, "static_camera": float}).groupby(["tracker", "sequence"], sort=False).agg(
         provenance=("provenance", "first"), ate=("ate", "median"), low=("ate", "min"), high=("ate", "max"),
         coverage=("coverage", "median"), static_camera=("static_camera", "median"), broken=("broken", "any"),
     )  # fmt: skip

@@ -67,11 +67,16 @@ def main() -> None:
 
 def errors_of(tracker: str, assignments: list[str], sequences: list[str], chosen: argparse.Namespace) -> pd.Series:
     """Hold-last-pose ATE in metres of a tracker by sequence; a run without one counts as a static camera."""
-    specs = make_specs(tracker, sequences, settings=parse_assignments(assignments))
-    runs = run_specs(specs, results=chosen.folder / "runs", jobs=chosen.jobs)
+    runs = run_specs(
+        make_specs(tracker, sequences, settings=parse_assignments(assignments)),
+        results=chosen.folder / "runs",
+        jobs=chosen.jobs,
+    )
     table = db.load(chosen.folder / "runs").set_index("run_id").loc[[run.record.run_id for run in runs]]
-    held = table["hold_last_pose_ate_m"].fillna(table["static_camera_ate_rmse_m"])
-    return pd.Series(held.astype(float).to_numpy(), index=sequences)
+    return pd.Series(
+        table["hold_last_pose_ate_m"].fillna(table["static_camera_ate_rmse_m"]).astype(float).to_numpy(),
+        index=sequences,
+    )
 
 
 def share_of(name: str) -> float:
@@ -82,8 +87,9 @@ def share_of(name: str) -> float:
 
 def interval(values: np.ndarray) -> tuple[float, float]:
     """95 % interval of the median over instances, by resampling them."""
-    drawn = np.random.default_rng(0).choice(values, (2000, len(values)))
-    low, high = np.quantile(np.median(drawn, axis=1), [0.025, 0.975])
+    low, high = np.quantile(
+        np.median(np.random.default_rng(0).choice(values, (2000, len(values))), axis=1), [0.025, 0.975]
+    )
     return float(low), float(high)
 
 

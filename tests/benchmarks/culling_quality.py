@@ -67,8 +67,9 @@ def measure(
     """
     sequence = open_sequence(name, frames=part)
     assert sequence.masks is not None and sequence.ground_truth is not None, f"{name} has no exact masks"
-    context = TrackerContext(sequence_id=sequence.id, masks=sequence.masks, cache=str(cache))
-    tracker = build_tracker(tracker_id, settings, context)
+    tracker = build_tracker(
+        tracker_id, settings, TrackerContext(sequence_id=sequence.id, masks=sequence.masks, cache=str(cache))
+    )
     tracker.reset(sequence.camera, rng=np.random.default_rng(0))
     poses, counts = {}, []
     for i in range(len(sequence)):
@@ -81,8 +82,9 @@ def measure(
     coverage, ate = len(poses) / len(sequence), np.nan
     if len(poses) >= 3:
         online, due = Trajectory(np.array([*poses]), np.array([*poses.values()])), sequence.timestamps
-        protocol = get_protocol("tum-rgbd/v1")
-        ate = evaluate(online, sequence.ground_truth, protocol, input_timestamps=due).metrics["ate_rmse_m"]
+        ate = evaluate(online, sequence.ground_truth, get_protocol("tum-rgbd/v1"), input_timestamps=due).metrics[
+            "ate_rmse_m"
+        ]
     return ate, coverage, np.array(counts)
 
 

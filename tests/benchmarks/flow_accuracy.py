@@ -114,9 +114,17 @@ def main() -> None:
         dense_table()
         return
     warps = synthetic(KINDS, 6)
-    frames = real("fr1_xyz", (1, 3, 8, 14), 6) + real("fr1_rpy", (1, 2, 3, 5), 2)
-    sets = {"Real frames (fr1_xyz, fr1_rpy)": frames, "Real frames (Bonn crowd)": real("bonn", (1, 5, 10, 15), 12)}
-    sparse_table({**sets, "Synthetic warps": warps, "KITTI pair": [kitti_pair()]}, options.budgets)
+    sparse_table(
+        {
+            **{
+                "Real frames (fr1_xyz, fr1_rpy)": real("fr1_xyz", (1, 3, 8, 14), 6) + real("fr1_rpy", (1, 2, 3, 5), 2),
+                "Real frames (Bonn crowd)": real("bonn", (1, 5, 10, 15), 12),
+            },
+            "Synthetic warps": warps,
+            "KITTI pair": [kitti_pair()],
+        },
+        options.budgets,
+    )
     kinds_table(warps)
 
 

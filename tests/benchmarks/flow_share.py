@@ -124,8 +124,7 @@ def rendered(scene: int, start: int) -> list[Pair]:
         moved = se3.transform(kept_up, camera.unproject(points, np.maximum(z, 0.1)))
         guess = np.where((z > 0)[:, None] & (moved[:, 2:] > 0.1), camera.project(moved), np.nan).astype(np.float32)
         target = cv2.cvtColor(sequence[start + stride].rgb, cv2.COLOR_RGB2GRAY)
-        name = f"{motion}?scene={scene} +{stride}"
-        pairs.append(Pair(name, gray, target, points[seen], truth[seen], guess[seen]))
+        pairs.append(Pair(f"{motion}?scene={scene} +{stride}", gray, target, points[seen], truth[seen], guess[seen]))
     return pairs
 
 

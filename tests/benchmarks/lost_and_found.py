@@ -73,8 +73,9 @@ def rendered(source: str) -> Scene:
         frame, masks = sequence[index], sequence.masks[index]
         people = np.isin(masks.instances, [n for n, name in masks.class_names.items() if name == "person"])
         mask = cv2.dilate(people.astype(np.uint8), kernel) > 0
-        gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        keypoints = extractor.extract_masked(gray, mask, SegmentationSettings().outside_share)
+        keypoints = extractor.extract_masked(
+            cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), mask, SegmentationSettings().outside_share
+        )
         column, row = np.rint(keypoints.xy).astype(int).T
         at = row.clip(0, mask.shape[0] - 1), column.clip(0, mask.shape[1] - 1)
         static = np.flatnonzero(~mask[at])
@@ -93,8 +94,7 @@ def frame_of(scene: Scene, index: int | None, number: int) -> FrameBundle:
         keypoints, z, mask = keypoints.select(np.zeros(0, np.int64)), z[:0], np.zeros(size, bool)
     blank = np.zeros((*size, 3), np.uint8)
     pictures = blank, blank[..., 0], np.zeros(size, np.float32)
-    xy = keypoints.xy.astype(np.float64)
-    return FrameBundle(number, number / scene.fps, *pictures, keypoints, xy, z, mask=mask)
+    return FrameBundle(number, number / scene.fps, *pictures, keypoints, keypoints.xy.astype(np.float64), z, mask=mask)
 
 
 def path_of(kind: str, start: int) -> list[int | None]:

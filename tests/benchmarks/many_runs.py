@@ -41,8 +41,13 @@ class LookedUp(Exception):
 
 def specs(folder: str, count: int) -> Iterator[RunSpec]:
     for number in range(count):
-        tracker = ("orb-slam2", "never-move")[number % 2]
-        yield RunSpec(tracker=tracker, sequence=folder, offset=number // 2 % 10, seed=number // 20, device="cpu")
+        yield RunSpec(
+            tracker=("orb-slam2", "never-move")[number % 2],
+            sequence=folder,
+            offset=number // 2 % 10,
+            seed=number // 20,
+            device="cpu",
+        )
 
 
 def look_up(folder: str, count: int, results: str) -> dict[str, float]:
@@ -54,8 +59,12 @@ def look_up(folder: str, count: int, results: str) -> dict[str, float]:
 
     began = time.monotonic()
     try:
-        events = {"on_event": lambda event: times.append(time.monotonic() - began), "on_plan": looked_up}
-        run_many(specs(folder, count), results=results, executor=Nowhere(), **events)
+        run_many(
+            specs(folder, count),
+            results=results,
+            executor=Nowhere(),
+            **{"on_event": lambda event: times.append(time.monotonic() - began), "on_plan": looked_up},
+        )
     except LookedUp:
         return {"first run": times[0], "look-up": time.process_time()}
     raise AssertionError("unreachable")
@@ -74,8 +83,9 @@ def fill(folder: str, count: int, results: str) -> dict[str, float]:
             if (model / name).is_file():
                 shutil.copy(model / name, store.runs / run_id)
         (store.runs / run_id / "run.json").write_text(text.replace(record.run_id, run_id))
-        state = store.index.state(run_id, record.sequence.part)
-        entries.append((run_id, state, metrics.to_line().replace(record.run_id, run_id)))
+        entries.append(
+            (run_id, store.index.state(run_id, record.sequence.part), metrics.to_line().replace(record.run_id, run_id))
+        )
     store.index.write(f"metrics {metrics.protocol_digest}", metrics.code, entries)
     return {}
 
@@ -128,8 +138,12 @@ def of_frames(folder: str, frames: int, results: str) -> dict[str, float]:
     records = run_many(still(folder, frames, range(RUNS)), results=results)
     head, other = time.process_time() - spent, sum(server.cpu_times()) - before
     files = list(RunStore(results).folder(records[0].run_id).iterdir())
-    kilobytes = sum(file.stat().st_size for file in files) / 1000
-    return {"head": 1000 * head / RUNS, "other": 1000 * other / RUNS, "kB": kilobytes, "files": len(files)}
+    return {
+        "head": 1000 * head / RUNS,
+        "other": 1000 * other / RUNS,
+        "kB": sum(file.stat().st_size for file in files) / 1000,
+        "files": len(files),
+    }
 
 
 RUNS = 50
@@ -149,8 +163,13 @@ CURVES = {"on_workers": on_workers, "of_frames": of_frames}
 
 def measured(name: str, folder: Path, count: int, results: str) -> dict[str, float]:
     """What a part measures in a process of its own, with the most memory (MB) that it takes."""
-    command = [sys.executable, __file__, str(folder), "--part", name, str(count), results]
-    return json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout.splitlines()[-1])
+    return json.loads(
+        subprocess.run(
+            [sys.executable, __file__, str(folder), "--part", name, str(count), results],
+            check=True,
+            stdout=subprocess.PIPE,
+        ).stdout.splitlines()[-1]
+    )
 
 
 def main() -> None:
@@ -165,8 +184,7 @@ def main() -> None:
     if chosen.part:
         name, count, results = chosen.part
         values = (PARTS | CURVES)[name](str(chosen.folder), int(count), results)
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        print(json.dumps(values | {"MB": peak}))
+        print(json.dumps(values | {"MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}))
         return
     print(
         "| runs | first run, s | look-up, s | resume, s | first list, s | later lists, s | frame, s | most memory, MB |"

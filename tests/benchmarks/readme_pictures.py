@@ -50,8 +50,7 @@ def main() -> None:
         browser.until("one('.dt-search input')", tries=200)
         framed(browser, "main", options.output / "leaderboard.webp", most=760)
         store = RunStore(options.results)
-        report = build_report(store, Path(folder) / "report")
-        browser.open(report.run, 1100, anchor=f"#{store.ids()[0]}")
+        browser.open(build_report(store, Path(folder) / "report").run, 1100, anchor=f"#{store.ids()[0]}")
         browser.until("one('#time .main-svg') && one('#picture img').complete", tries=200)
         browser.run(f"slide(byId('frame'), {options.frame})") if options.frame >= 0 else None
         browser.settle()

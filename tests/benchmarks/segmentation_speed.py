@@ -42,8 +42,7 @@ def untrained(config: NetworkConfig, side: int, threads: int, objects: int, devi
 
 def main() -> None:
     """Print the table."""
-    parser = parser_of(None, threads=2, repeats=7, objects=3, device="cpu")
-    arguments = parser.parse_args()
+    arguments = parser_of(None, threads=2, repeats=7, objects=3, device="cpu").parse_args()
     cv2.setNumThreads(arguments.threads)
     sequence = open_sequence("synthetic/walking_xyz?scene=120&frames=60")
     frames = [sequence[index] for index in (30, 31)]
@@ -68,8 +67,10 @@ def main() -> None:
         )
     for name in ("yolov8n-seg_480x640_fp32", "deeplabv3_mnv2_voc_481x641"):
         if (WEIGHTS / f"{name}.onnx").is_file():
-            settings = SegmentationSettings(source=f"onnx:{WEIGHTS / name}.onnx")
-            add(name, build_segmenter(settings, threads=arguments.threads))
+            add(
+                name,
+                build_segmenter(SegmentationSettings(source=f"onnx:{WEIGHTS / name}.onnx"), threads=arguments.threads),
+            )
     oracle = build_segmenter(SegmentationSettings(source="oracle"), masks=sequence.masks)
     assert oracle is not None
     found = oracle.segment(frames[0])

@@ -56,8 +56,9 @@ def masked(sequence: SyntheticSequence, index: int) -> Frame:
 
 def run(sequence: SyntheticSequence, frames: list[Frame], seed: int) -> tuple[float, float]:
     """RMSE of the final trajectory of ORB-SLAM3 in metres, and the coverage."""
-    settings = OrbSlam3Settings(vocabulary=str(VOCABULARY))
-    tracker = OrbSlam3(settings, TrackerContext(sequence_id=sequence.id, fps=sequence.fps))
+    tracker = OrbSlam3(
+        OrbSlam3Settings(vocabulary=str(VOCABULARY)), TrackerContext(sequence_id=sequence.id, fps=sequence.fps)
+    )
     tracker.reset(sequence.camera, rng=np.random.default_rng(seed))
     coverage = np.mean([tracker.track(frame).state == "ok" for frame in frames])
     try:

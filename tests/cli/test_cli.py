@@ -209,8 +209,12 @@ def test_kitti_trajectories_with_their_stamps(cli, facts, walk, tmp_path):
     truth = walk / "groundtruth.txt"
     write_kitti(tmp_path / "kitti.txt", read_tum(truth))
     assert facts("eval", tmp_path / "kitti.txt", truth, "--timestamps", truth)["metrics"]["ate_rmse_m"] < 1e-6
-    options = ("--tracker", "theirs", "--sequence", walk, "--timestamps", truth)
-    assert facts("import", tmp_path / "kitti.txt", *options)[0]["ate_rmse_m"] < 1e-6
+    assert (
+        facts("import", tmp_path / "kitti.txt", *(("--tracker", "theirs", "--sequence", walk, "--timestamps", truth)))[
+            0
+        ]["ate_rmse_m"]
+        < 1e-6
+    )
     code, _, err = cli("eval", tmp_path / "kitti.txt", truth)
     assert code == 1 and "--timestamps FILE" in one_line(err)
 
@@ -319,8 +323,13 @@ def test_help_loads_nothing_heavy(arguments):
 
 
 def test_output_to_a_closed_pipe_is_no_error():
-    script = f"{sys.executable} -m dynslam_bench sequences list | head -1"
-    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, cwd=ROOT, check=True)
+    done = subprocess.run(
+        ["bash", "-c", f"{sys.executable} -m dynslam_bench sequences list | head -1"],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        check=True,
+    )
     assert done.stderr == "" and done.stdout.startswith("7-Scenes"), "the first data set"
 
 
@@ -386,8 +395,7 @@ def test_a_suite_its_report_and_its_frame(walk: Path, tmp_path: Path) -> None:
     runs = db.bench(suite, results=results)
     assert [run.status for run in runs] == ["ok", "ok"] and all(run.metrics["ate_rmse_m"] > 0 for run in runs)
     assert len(runs[0].trajectory) == len(runs[0].frames()) == 4 and (runs[0].folder / "run.json").is_file()
-    again = db.run("never-move", walk, results=results)
-    assert again.record.run_id == runs[0].record.run_id, "it is stored already"
+    assert db.run("never-move", walk, results=results).record.run_id == runs[0].record.run_id, "it is stored already"
     assert sorted(db.load(results)["tracker"]) == ["constant-velocity", "never-move"]
     assert db.report(results).html == results / "report" / "index.html"
 

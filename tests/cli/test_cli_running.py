@@ -256,10 +256,16 @@ def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number):
         "SPEC = TrackerSpec('waits', f'{__file__}:Waits', 'Waits', settings=WaitsSettings)\n"
     )
     pids = tmp_path / "pids"
-    values = {"tracker": f"{tracker}:SPEC", "folder": str(walk), "pids": str(pids)}
-    (tmp_path / "what.toml").write_text(text.format(**values).replace("'", '"'))
-    command = [sys.executable, "-m", "dynslam_bench", *verb.split(), "what.toml"]
-    program = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, preexec_fn=attentive)
+    (tmp_path / "what.toml").write_text(
+        text.format(**{"tracker": f"{tracker}:SPEC", "folder": str(walk), "pids": str(pids)}).replace("'", '"')
+    )
+    program = subprocess.Popen(
+        [sys.executable, "-m", "dynslam_bench", *verb.split(), "what.toml"],
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=attentive,
+    )
     try:
         hostile.until(lambda: program.poll() is not None or (pids.is_file() and pids.read_text().endswith("\n")), 300)
         assert program.poll() is None, program.stderr.read()
@@ -478,13 +484,20 @@ def test_numbers_are_never_shortened(monkeypatch):
 
 
 def test_what_names_a_column_or_fills_a_cell_reaches_no_terminal_as_an_escape():
-    lines = table(["tum/\x1b[2J", "\u202ea"], [["x\ny", "\x9b1m"], [1.5, True]]).splitlines()
-    assert lines == [r"tum/\x1b[2J  \u202ea", r"x y          \x9b1m", "1.5          yes"]
+    assert table(["tum/\x1b[2J", "\u202ea"], [["x\ny", "\x9b1m"], [1.5, True]]).splitlines() == [
+        r"tum/\x1b[2J  \u202ea",
+        r"x y          \x9b1m",
+        "1.5          yes",
+    ]
 
 
 def test_a_reports_table_has_no_markup():
-    source = Table("t", "title", "caption", [Column("a_b"), Column("empty")], [[TableCell("x|y_*"), TableCell()]])
-    assert report_table(source) == "a_b\nx|y_*"
+    assert (
+        report_table(
+            Table("t", "title", "caption", [Column("a_b"), Column("empty")], [[TableCell("x|y_*"), TableCell()]])
+        )
+        == "a_b\nx|y_*"
+    )
 
 
 def test_an_error_of_the_tracked_frames_alone_is_marked(capsys):
@@ -597,10 +610,19 @@ LABEL = "caf\xe9 \u2013 \U0001f600"
 
 
 def test_a_report_is_shown_on_a_terminal_that_lacks_characters(cli, walk: Path, tmp_path: Path) -> None:
-    options = "--tracker", "theirs", "--label", LABEL, "--sequence", walk, "--online"
-    assert cli("import", walk / "groundtruth.txt", *options)[0] == 0
-    command = [sys.executable, "-m", "dynslam_bench", "report", "results", "-o", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, env=os.environ | {"PYTHONIOENCODING": "latin-1"})
+    assert (
+        cli(
+            "import",
+            walk / "groundtruth.txt",
+            *("--tracker", "theirs", "--label", LABEL, "--sequence", walk, "--online"),
+        )[0]
+        == 0
+    )
+    done = subprocess.run(
+        [sys.executable, "-m", "dynslam_bench", "report", "results", "-o", str(tmp_path)],
+        capture_output=True,
+        env=os.environ | {"PYTHONIOENCODING": "latin-1"},
+    )
     assert done.returncode == 0
     assert [line for line in done.stderr.splitlines() if not line.endswith(b"so far")] == []
     assert "caf" in done.stdout.decode("latin-1") and b"?" in done.stdout
@@ -617,8 +639,9 @@ HOSTILE = "\x1b[2J\x1b]0;owned\x07\u202egnp\n"
 def stored(walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two runs, the latest of which holds escape sequences in all of its texts."""
     folder = tmp_path_factory.mktemp("results")
-    specs = [RunSpec(tracker="never-move", sequence=str(walk), seed=seed) for seed in (0, 1)]
-    _, last = run_many(specs, results=folder)
+    _, last = run_many(
+        [RunSpec(tracker="never-move", sequence=str(walk), seed=seed) for seed in (0, 1)], results=folder
+    )
     path = folder / "runs" / last.run_id / "run.json"
     record = json.loads(path.read_text())
     record |= {"reason": HOSTILE, "notes": [HOSTILE], "command": [HOSTILE], "overrides": {HOSTILE: HOSTILE}}

@@ -54,8 +54,10 @@ def words() -> frozenset[str]:
     names: set[str] = set()
     for file in [*sources(), *sorted((ROOT / "tests").rglob("*.py"))]:
         names |= {*read(file)[1], file.stem, *file.parent.relative_to(ROOT).parts}
-    data = [file for package in PACKAGES for kind in ("toml", "csv") for file in (ROOT / package).rglob(f"*.{kind}")]
-    for file in [*data, ROOT / "pyproject.toml"]:
+    for file in [
+        *[file for package in PACKAGES for kind in ("toml", "csv") for file in (ROOT / package).rglob(f"*.{kind}")],
+        ROOT / "pyproject.toml",
+    ]:
         names.update(re.findall(r"[A-Za-z_][A-Za-z0-9_-]*", file.read_text(encoding="utf-8")))
     return frozenset(names)
 

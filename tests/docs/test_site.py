@@ -34,8 +34,13 @@ class Page(HTMLParser):
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site")
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-f", ROOT / "mkdocs.yml", "-d", folder]
-    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
+    built = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "-f", ROOT / "mkdocs.yml", "-d", folder],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
     assert built.returncode == 0, built.stderr[-4000:]
     return folder
 
@@ -86,5 +91,6 @@ def test_every_door_setting_command_and_tracker_is_on_a_page(site: Path, pages: 
     settings = (site / "reference" / "settings.html").read_text()
     leaves = {name.partition(".")[2] for spec in specs for name in flatten(spec.settings()) if "." in name}
     assert len(leaves) > 100 and [name for name in leaves if f"<code>{name}</code>" not in settings] == []
-    commands = pages[site / "reference" / "commands.html"].anchors
-    assert {"dynslam-bench-demo", "dynslam-bench-tune-run", "dynslam-bench-report"} <= commands
+    assert {"dynslam-bench-demo", "dynslam-bench-tune-run", "dynslam-bench-report"} <= pages[
+        site / "reference" / "commands.html"
+    ].anchors
