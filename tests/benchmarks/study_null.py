@@ -60,22 +60,21 @@ def null(studies: int, folder: Path) -> Iterable[str]:
     yield line("scenes", "sd", "the best trial promises 5 %", "chosen", *(f"*{verdict}*" for verdict in verdicts))
     for count in SCENES:
         for simulated.STARTS_SD in SPREADS:
-            lucky = chosen = 0
-            said = Counter[str]()
+            counts = Counter[str]()
             for seed in range(count * 1000 + int(100 * simulated.STARTS_SD) * 100000, 10**9)[:studies]:
                 tuner = simulated.SimulatedTuner(
                     study_on(count, sampler_seed=seed, sampler="tpe"),
                     folder / f"{count}-{simulated.STARTS_SD}-{seed}",
                     seed=seed,
                 )
-                lucky += tuner.run().study.best_value < math.log(0.95)
+                counts["lucky"] += tuner.run().study.best_value < math.log(0.95)
                 summary = finish(tuner)
-                chosen += summary.best is not None and summary.best.chosen
-                said[summary.verdict.value] += 1
+                counts["chosen"] += summary.best is not None and summary.best.chosen
+                counts[summary.verdict.value] += 1
             yield line(
                 count,
                 str(simulated.STARTS_SD),
-                *[count / studies for count in (lucky, chosen, *(said[name] for name in verdicts))],
+                *[counts[name] / studies for name in ("lucky", "chosen", *verdicts)],
             )
 
 

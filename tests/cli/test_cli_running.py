@@ -89,15 +89,17 @@ def test_masks_of_a_recording_are_downloaded_only_by_agreement(cli, walk, fetche
     command = ("run", "mask-rcnn", walk, "--frames", "0:2")
     code, out, err = cli(*command)
     assert code == 1 and not out and not fetched.exists() and len(err.splitlines()) == 5, "an error and four cures"
-    for agrees in (False, True):
-        monkeypatch.setattr(running, "is_interactive", lambda: True)
-        monkeypatch.setattr(running.typer, "confirm", lambda *_, agrees=agrees, **__: agrees)
-        code, _, err = cli(*command)
-        assert code == 1 - agrees and "170 MB" in err and fetched.is_file() is agrees
+    monkeypatch.setattr(running, "is_interactive", lambda: True)
+    monkeypatch.setattr(running.typer, "confirm", lambda *_, **__: False)
+    code, _, err = cli(*command)
+    assert code == 1 and "170 MB" in err and not fetched.exists()
+    monkeypatch.setattr(running.typer, "confirm", lambda *_, **__: True)
+    assert cli(*command)[0] == 0 and fetched.is_file()
+    monkeypatch.setattr(running.typer, "confirm", pytest.fail)
+    assert cli(*command)[0] == 0, "nobody is asked again, and the run is stored"
     fetched.unlink()
-    monkeypatch.setattr(running, "is_interactive", lambda: False)
-    assert cli(*command, "--yes", "--seed", "1")[0] == 0 and fetched.is_file()
-    assert cli(*command, "--seed", "2")[0] == 0, "nobody is asked again"
+    monkeypatch.setattr(checkpoints, "fetch_checkpoint", lambda _: fetched.with_suffix(".asked").touch())
+    assert cli(*command, "--yes", "--seed", "1")[0] == 1 and fetched.with_suffix(".asked").exists()
 
 
 def test_bench_has_limits(cli, walk, tmp_path):
@@ -121,11 +123,12 @@ def test_a_part_without_runs_is_no_error(cli, walk, tmp_path):
 
 def test_pictures_of_a_stored_run_are_made(facts, walk):
     folder = Path(facts("run", "orb-slam2", walk)[0]["folder"])
-    for option, name in (("--snapshots", "frame_000000.webp"), ("--sheet", "sheet.png"), ("--video", "video.webm")):
-        assert not (folder / name).exists()
-        for from_store in (False, True):
-            (row,) = facts("run", "orb-slam2", walk, option)
-            assert row["from_store"] is from_store and Path(row["folder"]) == folder and (folder / name).is_file()
+    names = {"frame_000000.webp", "sheet.png", "video.webm"}
+    assert not names & {path.name for path in folder.iterdir()}
+    for from_store in (False, True):
+        (row,) = facts("run", "orb-slam2", walk, "--snapshots", "--sheet", "--video")
+        assert row["from_store"] is from_store and Path(row["folder"]) == folder
+        assert names <= {path.name for path in folder.iterdir()}
 
 
 def test_a_map_that_cannot_be_had_is_no_success(cli, walk):
@@ -203,7 +206,7 @@ def test_a_monocular_tracker_is_scored_with_its_scale_unless_told_otherwise(cli,
     assert row["protocol"] == "tum-rgbd/v1-sim3"
     (row,) = facts("run", "orb-slam2-mono", walk, "--protocol", "tum-rgbd/v1", code=code)
     assert row["protocol"] == "tum-rgbd/v1" and row["ate_rmse_m"] is None
-    assert "monocular" not in cli("run", "never-move", walk)[2]
+    assert running.default_protocol("never-move") == "tum-rgbd/v1"
 
 
 def test_progress_names_what_is_written_behind_the_last_frame():
