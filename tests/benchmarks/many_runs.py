@@ -1,6 +1,6 @@
 """What many runs cost beside their tracking, by their number, by Dask's workers and by their frames.
 
-    python tests/benchmarks/many_runs.py FOLDER [--runs 1000 10000 100000] [--workers 1 2 4 8] [--frames 5 50 200]
+    python tests/benchmarks/many_runs.py FOLDER
 
 FOLDER is a recording in TUM layout. First table: looking runs up, resuming when all are stored, listing them, and all
 runs as one frame. Each number of runs is shared by two trackers, ten start offsets and as many seeds as are needed. No
@@ -176,9 +176,6 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--runs", type=int, nargs="*", default=[1000, 10_000, 100_000])
-    parser.add_argument("--workers", type=int, nargs="*", default=[1, 2, 4, 8])
-    parser.add_argument("--frames", type=int, nargs="*", default=[5, 50, 200])
     parser.add_argument("--part", nargs=3, help=argparse.SUPPRESS)
     chosen = parser.parse_args()
     if chosen.part:
@@ -190,7 +187,7 @@ def main() -> None:
         "| runs | first run, s | look-up, s | resume, s | first list, s | later lists, s | frame, s | most memory, MB |"
     )
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    for count in chosen.runs:
+    for count in (1000, 10_000, 100_000):
         with tempfile.TemporaryDirectory() as results:
             parts = {name: measured(name, chosen.folder, count, results) for name in PARTS}
         cells = [parts["look_up"]["first run"], parts["look_up"]["look-up"], parts["resume"]["resume"]]
@@ -198,12 +195,12 @@ def main() -> None:
         most = max(values["MB"] for name, values in parts.items() if name != "fill")
         print(f"| {count} | " + " | ".join(f"{cell:.1f}" for cell in cells) + f" | {most:.0f} |", flush=True)
     print("\n| Dask's workers | head, ms a run | runs a minute |\n| --- | --- | --- |")
-    for count in chosen.workers:
+    for count in (1, 2, 4, 8):
         with tempfile.TemporaryDirectory() as results:
             values = measured("on_workers", chosen.folder, count, results)
         print(f"| {count} | {values['head']:.1f} | {values['a minute']:.0f} |", flush=True)
     print("\n| frames | head, ms a run | other processes, ms a run | kB a run | files a run |\n" + "| --- " * 5 + "|")
-    for count in chosen.frames:
+    for count in (5, 50, 200):
         with tempfile.TemporaryDirectory() as results:
             values = measured("of_frames", chosen.folder, count, results)
         cells = [f"{values[name]:.0f}" for name in ("head", "other", "kB", "files")]

@@ -1,6 +1,6 @@
 """The presets that ship, beside the default settings: error and processor time on held-out scenes and on recordings.
 
-    python tests/benchmarks/shipped_presets.py [TRACKER ...] [--part rendered bonn fr1] [--results FOLDER]
+    python tests/benchmarks/shipped_presets.py
 
 Both run instance by instance in turn, so that whatever else the machine does slows them alike. Rendered scenes are
 instances that no choice has seen, two start offsets each; the Bonn excerpt has 23 start offsets, others than the
@@ -10,10 +10,8 @@ named. Ratios are preset : default, with 95 % intervals over scenes (over starts
 worse" is said where the one-sided 95 % bound of the error's ratio lies below 1 + MARGIN. Two runs that differ in
 anything differ by 0.12 to 0.27 in the logarithm: a closer margin takes hundreds of runs."""
 
-import argparse
+from itertools import product
 from pathlib import Path
-
-from command_line import parser_of
 
 from dynslam_bench.core.settings import field_names
 from dynslam_bench.runs import RunStore, run_many
@@ -38,7 +36,7 @@ PARTS = {
 }  # fmt: skip
 
 
-def judge(tracker: str, preset: str, part: str, options: argparse.Namespace) -> str:
+def judge(tracker: str, preset: str, part: str) -> str:
     """One line: what the preset is worth on that part."""
     spec = TRACKERS.get(tracker)
     network = f"onnx:{NETWORK}" if part == "bonn" else "embedded"
@@ -46,7 +44,7 @@ def judge(tracker: str, preset: str, part: str, options: argparse.Namespace) -> 
     instances = [instance for text in PARTS[part] for instance in parse_instances(text)]
     settings = [source, {**source, **spec.presets[preset]}]
     outcomes: list[dict[ProblemInstance, Outcome]] = [{}, {}]
-    store, protocol = RunStore(options.results), held_protocol("tum-rgbd/v1")
+    store, protocol = RunStore("results/presets"), held_protocol("tum-rgbd/v1")
     for instance in instances:
         for of_settings, values in zip(outcomes, settings, strict=True):
             (record,) = run_many([instance.run_spec(tracker, settings=values)], results=store, protocol=protocol)
@@ -62,18 +60,13 @@ def judge(tracker: str, preset: str, part: str, options: argparse.Namespace) -> 
 
 
 def main() -> None:
-    """Judge the presets of the trackers that are named, or of all."""
-    parser = parser_of(__doc__, results=Path("results/presets"))
-    parser.add_argument("trackers", nargs="*", metavar="TRACKER")
-    parser.add_argument("--part", nargs="+", default=list(PARTS), choices=list(PARTS))
-    options = parser.parse_args()
-    for tracker in options.trackers or [found.spec.id for found in TRACKERS.all() if found.spec.presets]:
-        for preset in TRACKERS.get(tracker).presets:
-            for part in options.part:
-                if part == "rendered" or Path(PARTS[part][0].partition("?")[0]).is_dir():
-                    print(judge(tracker, preset, part, options), flush=True)
-                else:
-                    print(f"{tracker} {preset}, {part}: not judged, no recording under {SHARED}")
+    """Judge the presets of all trackers."""
+    presets = [(tracker.spec.id, preset) for tracker in TRACKERS.all() for preset in tracker.spec.presets]
+    for (tracker, preset), part in product(presets, PARTS):
+        if part == "rendered" or Path(PARTS[part][0].partition("?")[0]).is_dir():
+            print(judge(tracker, preset, part), flush=True)
+        else:
+            print(f"{tracker} {preset}, {part}: not judged, no recording under {SHARED}")
 
 
 if __name__ == "__main__":

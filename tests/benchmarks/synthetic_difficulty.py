@@ -1,6 +1,6 @@
 """How hard rendered sequences are for a reference system: ORB-SLAM3, repeated, with and without what moves.
 
-Usage: python tests/benchmarks/synthetic_difficulty.py [ID ...] [--runs 3]
+Usage: python tests/benchmarks/synthetic_difficulty.py [--runs 3]
 
 Prints a Markdown table: the median final ATE in m, with the share of the tracked frames where it is below 95 %.
 `moving` is the sequence as it is; `masked` removes the depth of people (and of everything while it moves) and fills
@@ -77,12 +77,11 @@ def cell(runs: list[tuple[float, float]]) -> str:
 
 
 def main() -> None:
-    parser = parser_of(__doc__, runs=3)
-    parser.add_argument("ids", nargs="*", default=[f"synthetic/{name}?scene=100&frames=120" for name in FAMILIES])
-    arguments = parser.parse_args()
+    arguments = parser_of(__doc__, runs=3).parse_args()
     print("| sequence | moving | masked | static camera |\n|" + " --- |" * 4)
     with tempfile.TemporaryDirectory() as cache:
-        for id in arguments.ids:
+        for family in FAMILIES:
+            id = f"synthetic/{family}?scene=100&frames=120"
             sequence = open_synthetic(id, Path(cache))
             sequence.render()
             controls = [
