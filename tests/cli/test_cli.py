@@ -186,15 +186,6 @@ def test_run_show_report_compare_and_remove(cli, facts, walk, tmp_path):
     assert facts("runs", "list") == []
 
 
-def test_damaged_sequences_never_become_runs(cli, walk, tmp_path):
-    """One line, exit code 1, and nothing half written; each kind of damage is a case of the tests of readers."""
-    copy = shutil.copytree(walk, tmp_path / "copy")
-    (copy / "rgb.txt").write_text("")
-    code, _, err = cli("run", "never-move", copy)
-    assert code == 1 and "lists no image" in one_line(err)
-    assert not list(tmp_path.glob("results/runs/*"))
-
-
 def test_eval_and_protocols(cli, facts, walk, tmp_path):
     truth = walk / "groundtruth.txt"
     code, out, _ = cli("eval", truth, truth)
@@ -219,10 +210,9 @@ def test_kitti_trajectories_with_their_stamps(cli, facts, walk, tmp_path):
     assert code == 1 and "--timestamps FILE" in one_line(err)
 
 
-def test_doctor(cli, facts):
+def test_doctor(facts):
     rows = facts("doctor")
     assert {"program", "weights", "folder", "device"} <= {row["part"] for row in rows}
-    assert "embedded" in cli("doctor")[1]
 
 
 def test_envs(facts):
