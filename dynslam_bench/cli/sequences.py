@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import typer
 
 from dynslam_bench.cli.options import AsJson, Camera, DataRoot, Frames, complete_sequences
-from dynslam_bench.cli.output import VERIFICATION_FAILED, fields, note, present, progress, table, warn, write
+from dynslam_bench.cli.output import fields, note, present, progress, table, warn, write
 from dynslam_bench.core import SequenceError, did_you_mean, find_data_root
 
 if TYPE_CHECKING:
@@ -129,9 +129,8 @@ def verify(
         lines.append(f"{report.id}: {verdict}, {report.frames} frames, {how}")
         lines += [f"  {report.dropped.describe()}"] if report.dropped is not None else []
         lines += [f"  {fault}" for fault in report.faults]
-    present([{**asdict(report), "ok": report.ok} for report in reports], *lines)
-    if not all(report.ok for report in reports):
-        raise typer.Exit(VERIFICATION_FAILED)
+    facts = [{**asdict(report), "ok": report.ok} for report in reports]
+    present(facts, *lines, verified=all(report.ok for report in reports))
 
 
 @app.command()
@@ -150,9 +149,8 @@ def doctor(
         {**asdict(diagnosis), "ok": diagnosis.ok},
         f"{diagnosis.id}: {diagnosis.verdict}, {diagnosis.frames} frames compared",
         *(f"  {f.severity} {f.id}: {f.text}\n    cure: {f.cure}" for f in diagnosis.findings),
+        verified=diagnosis.ok,
     )
-    if not diagnosis.ok:
-        raise typer.Exit(VERIFICATION_FAILED)
 
 
 @app.command()

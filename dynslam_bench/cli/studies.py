@@ -93,7 +93,6 @@ def worker(study: Study, results: Results = Path("results"), jobs: Jobs = 1) -> 
 @app.command()
 def status(study: Study, results: Results = Path("results"), as_json: AsJson = False) -> None:
     """Show the progress of a study."""
-    from dynslam_bench.tuning.judgement import StudySummary
     from dynslam_bench.tuning.storage import Heartbeats, best_trials, count_states, extension_of
 
     stored = tuning.Study.open(study, results)
@@ -106,7 +105,7 @@ def status(study: Study, results: Results = Path("results"), as_json: AsJson = F
     facts["running_trials"] = [f"{number} ({state})" for number, state in Heartbeats(stored.study).running().items()]
     settings: dict[str, Any] = {}
     summary = stored.folder / "summary.json"
-    conclusion = StudySummary.read(summary) if summary.is_file() else None
+    conclusion = tuning.StudySummary.read(summary) if summary.is_file() else None
     if conclusion is not None and conclusion.best is not None:  # as `tune best`
         facts |= {"best_trial": conclusion.best.trial, "conclusion": conclusion.conclusion}
         settings = conclusion.best.params

@@ -49,27 +49,23 @@ def check_filter(construct: Callable[[], DynamicFilter]) -> None:
 def filter_report(construct: Callable[[], DynamicFilter]) -> ConformanceReport:
     """Run all checks of `check_filter` and report each."""
     steps = filter_scene()
-    report = ConformanceReport.of("filter", construct)
-    if report.run("declaration", lambda: _declaration(construct())) and report.run(
-        "results", lambda: _run(construct(), steps)
-    ):
-        report.run_all(
-            {
-                "declared stats": lambda: _declared_stats(construct(), steps),
-                "frames are left alone": lambda: _left_alone(construct(), steps),
-                "determinism": lambda: _repeated(
-                    (construct(), construct()), steps, "two runs differ", "all randomness has to come from state.seed"
-                ),
-                "two resets": lambda: _repeated(
-                    (construct(),) * 2,
-                    steps,
-                    "the verdict changes after a second reset()",
-                    "reset() keeps something of the sequence before",
-                ),
-                **{name: partial(_run_changed, construct, steps, change) for name, change in _DEGENERATE.items()},
-            }
-        )
-    return report
+    return ConformanceReport.of("filter", construct).run_all(
+        {"declaration": lambda: _declaration(construct()), "results": lambda: _run(construct(), steps)},
+        {
+            "declared stats": lambda: _declared_stats(construct(), steps),
+            "frames are left alone": lambda: _left_alone(construct(), steps),
+            "determinism": lambda: _repeated(
+                (construct(), construct()), steps, "two runs differ", "all randomness has to come from state.seed"
+            ),
+            "two resets": lambda: _repeated(
+                (construct(),) * 2,
+                steps,
+                "the verdict changes after a second reset()",
+                "reset() keeps something of the sequence before",
+            ),
+            **{name: partial(_run_changed, construct, steps, change) for name, change in _DEGENERATE.items()},
+        },
+    )
 
 
 @lru_cache(maxsize=2)

@@ -62,20 +62,20 @@ def features_report(
         check_keypoints(keypoints, image.shape, descriptor_bytes)
         require(len(keypoints) >= least, f"only {len(keypoints)} keypoints in a textured image")
 
-    report = ConformanceReport.of("extractor", construct)
-    report.run("construction", lambda: require_methods(construct(), "extract"))
-    if report.ok and report.run("results", lambda: results(scene[0], least=20)):
-        report.run_all(
-            {
-                "beside a mask": lambda: _masked_extraction(construct(), image),
-                "images are left alone": lambda: require_unchanged(
-                    lambda: construct().extract(image), image, what="the image"
-                ),
-                "determinism": lambda: _extractor_determinism(construct, image, other),
-                **_on_hard_images(scene[0], results),
-            }
-        )
-    return report
+    return ConformanceReport.of("extractor", construct).run_all(
+        {
+            "construction": lambda: require_methods(construct(), "extract"),
+            "results": lambda: results(scene[0], least=20),
+        },
+        {
+            "beside a mask": lambda: _masked_extraction(construct(), image),
+            "images are left alone": lambda: require_unchanged(
+                lambda: construct().extract(image), image, what="the image"
+            ),
+            "determinism": lambda: _extractor_determinism(construct, image, other),
+            **_on_hard_images(scene[0], results),
+        },
+    )
 
 
 def _on_hard_images(frame: Frame, results: Callable[[Frame], object]) -> dict[str, Callable[[], object]]:
@@ -174,28 +174,25 @@ def flow_report(construct: Callable[[], FlowEstimator], *, points: int = 200) ->
         )  # fmt: skip
 
     def outside() -> None:
-        require(
-            not results(second, np.concatenate([grid, np.array([[-5, 5], [1e6, 5], [np.nan, 5]], np.float32)]))
-            .valid[-3:]
-            .any(),
-            "a point outside the reference image is valid in the target",
-        )
+        strange = np.array([[-5, 5], [1e6, 5], [np.nan, 5]], np.float32)
+        valid = results(second, np.concatenate([grid, strange])).valid
+        require(not valid[-3:].any(), "a point outside the reference image is valid in the target")
 
-    report = ConformanceReport.of("flow", construct)
-    report.run("construction", lambda: require_methods(construct(), "prepare", "track"))
-    if report.ok and report.run("results", lambda: results(second, grid)):
-        report.run_all(
-            {
-                "no points": lambda: results(second, grid[:0]),
-                "points outside": outside,
-                "guesses": lambda: results(second, grid, guess),
-                "a small shift is found": lambda: _flow_finds_shift(results, first, grid),
-                "images are left alone": left_alone,
-                "determinism": lambda: _flow_determinism(construct, first, second, grid),
-                **_on_hard_images(scene[0], lambda frame: results(grey(frame), grid)),
-            }
-        )
-    return report
+    return ConformanceReport.of("flow", construct).run_all(
+        {
+            "construction": lambda: require_methods(construct(), "prepare", "track"),
+            "results": lambda: results(second, grid),
+        },
+        {
+            "no points": lambda: results(second, grid[:0]),
+            "points outside": outside,
+            "guesses": lambda: results(second, grid, guess),
+            "a small shift is found": lambda: _flow_finds_shift(results, first, grid),
+            "images are left alone": left_alone,
+            "determinism": lambda: _flow_determinism(construct, first, second, grid),
+            **_on_hard_images(scene[0], lambda frame: results(grey(frame), grid)),
+        },
+    )
 
 
 def check_flow_result(result: FlowResult, points: NDArray[np.float32], names: tuple[str, ...] = ()) -> None:
@@ -281,19 +278,19 @@ def segmenter_report(
         for frame in frames:
             check_instances(segmenter.segment(frame), frame)
 
-    report = ConformanceReport.of("segmenter", construct)
-    report.run("construction", lambda: require_methods(construct(), "segment"))
-    if report.ok and report.run("results", lambda: results(*inputs)):
-        report.run_all(
-            {
-                "images are left alone": lambda: require_unchanged(
-                    lambda: construct().segment(first), first.rgb, first.depth, what="the frame"
-                ),
-                "determinism": lambda: _segmenter_determinism(construct, inputs),
-                **_on_hard_images(first, results),
-            }
-        )
-    return report
+    return ConformanceReport.of("segmenter", construct).run_all(
+        {
+            "construction": lambda: require_methods(construct(), "segment"),
+            "results": lambda: results(*inputs),
+        },
+        {
+            "images are left alone": lambda: require_unchanged(
+                lambda: construct().segment(first), first.rgb, first.depth, what="the frame"
+            ),
+            "determinism": lambda: _segmenter_determinism(construct, inputs),
+            **_on_hard_images(first, results),
+        },
+    )
 
 
 def check_instances(instances: Instances, frame: Frame) -> None:

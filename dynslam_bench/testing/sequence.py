@@ -38,7 +38,8 @@ def sequence_report(sequence: Sequence | str | Path, *, frames: int = 3) -> Conf
     if not report.run("protocol", lambda: _protocol(sequence)):
         return report
     chosen = sorted(set(np.linspace(0, len(sequence) - 1, max(frames, 2)).astype(int).tolist()))
-    report.run_all(
+    return report.run_all(
+        {},
         {
             "timestamps": lambda: _timestamps(sequence),
             "frames": lambda: _frames(sequence, chosen),
@@ -48,9 +49,8 @@ def sequence_report(sequence: Sequence | str | Path, *, frames: int = 3) -> Conf
             "masks": lambda: _masks(sequence, chosen),
             "digest": lambda: _digest(sequence),
             "pickling": lambda: _pickling(sequence),
-        }
+        },
     )
-    return report
 
 
 _MEMBERS = ("id", "camera", "timestamps", "ground_truth", "masks", "fps", "license", "citation", "digest", "__len__")

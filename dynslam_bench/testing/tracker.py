@@ -71,11 +71,10 @@ def tracker_report(
     if spec is not None:
         report.run("spec", lambda: _spec(spec, settings))
     run = _Runner(report, spec or subject, settings, scene, frames, seed)
-    if not (report.run("construction", lambda: _construction(run)) and report.run("results", lambda: _results(run))):
-        return report
     deterministic = spec is None or spec.deterministic
     turning_run = _Runner(report, spec or subject, settings, turning, len(turning), seed)
-    report.run_all(
+    return report.run_all(
+        {"construction": lambda: _construction(run), "results": lambda: _results(run)},
         {
             "camera to world": lambda: _conventions(turning_run, spec is not None and spec.sensors == "rgb"),
             "same stats on every frame": lambda: _same_keys(run),
@@ -87,9 +86,8 @@ def tracker_report(
             "online settings": lambda: _online_settings(run, spec, settings),
             "final trajectory": lambda: _final(run),
             "closing": lambda: _closing(run),
-        }
+        },
     )
-    return report
 
 
 class _Runner:
