@@ -238,7 +238,7 @@ def calibrate(
     present(
         {**asdict(result), "file": output if written else None},
         table(
-            (("quantity", "estimate", "95 % interval", "camera.toml", "why")),
+            ("quantity", "estimate", "95 % interval", "camera.toml", "why"),
             [_calibrated(quantity) for quantity in result.quantities],
         ),
         f"{result.windows} windows of {result.frames} frames, keypoints to {result.pixel_noise:.2f} px",

@@ -89,9 +89,12 @@ def _weights() -> list[Finding]:
     coco = cached_checkpoint(COCO)
     where = f"{COCO.megabytes} MB, fetched when first used, or put {COCO.url} into {weights_folder()}"
     fetched = Finding("weights", "coco", str(coco)) if coco else Finding("weights", "coco", "not here", True, where)
-    good = "embedded", "in the package, for rendered people"
-    embedded = good if embedded_weights() else ("embedded", "missing", True, "reinstall")
-    return [Finding("weights", *embedded), fetched]
+    embedded = (
+        Finding("weights", "embedded", "in the package, for rendered people")
+        if embedded_weights()
+        else Finding("weights", "embedded", "missing", True, "reinstall")
+    )
+    return [embedded, fetched]
 
 
 def _torch_device() -> Finding:

@@ -63,7 +63,8 @@ def look_up(folder: str, count: int, results: str) -> list[float]:
             specs(folder, count),
             results=results,
             executor=Nowhere(),
-            **{"on_event": lambda event: times.append(time.monotonic() - began), "on_plan": looked_up},
+            on_event=lambda event: times.append(time.monotonic() - began),
+            on_plan=looked_up,
         )
     except LookedUp:
         return [times[0], time.process_time()]

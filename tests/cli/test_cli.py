@@ -200,12 +200,8 @@ def test_kitti_trajectories_with_their_stamps(cli, facts, walk, tmp_path):
     truth = walk / "groundtruth.txt"
     write_kitti(tmp_path / "kitti.txt", read_tum(truth))
     assert facts("eval", tmp_path / "kitti.txt", truth, "--timestamps", truth)["metrics"]["ate_rmse_m"] < 1e-6
-    assert (
-        facts("import", tmp_path / "kitti.txt", *(("--tracker", "theirs", "--sequence", walk, "--timestamps", truth)))[
-            0
-        ]["ate_rmse_m"]
-        < 1e-6
-    )
+    options = ("--tracker", "theirs", "--sequence", walk, "--timestamps", truth)
+    assert facts("import", tmp_path / "kitti.txt", *options)[0]["ate_rmse_m"] < 1e-6
     code, _, err = cli("eval", tmp_path / "kitti.txt", truth)
     assert code == 1 and "--timestamps FILE" in one_line(err)
 

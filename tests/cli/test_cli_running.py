@@ -260,7 +260,7 @@ def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number):
     )
     pids = tmp_path / "pids"
     (tmp_path / "what.toml").write_text(
-        text.format(**{"tracker": f"{tracker}:SPEC", "folder": str(walk), "pids": str(pids)}).replace("'", '"')
+        text.format(tracker=f"{tracker}:SPEC", folder=str(walk), pids=str(pids)).replace("'", '"')
     )
     program = subprocess.Popen(
         [sys.executable, "-m", "dynslam_bench", *verb.split(), "what.toml"],
@@ -495,12 +495,8 @@ def test_what_names_a_column_or_fills_a_cell_reaches_no_terminal_as_an_escape():
 
 
 def test_a_reports_table_has_no_markup():
-    assert (
-        report_table(
-            Table("t", "title", "caption", [Column("a_b"), Column("empty")], [[TableCell("x|y_*"), TableCell()]])
-        )
-        == "a_b\nx|y_*"
-    )
+    source = Table("t", "title", "caption", [Column("a_b"), Column("empty")], [[TableCell("x|y_*"), TableCell()]])
+    assert report_table(source) == "a_b\nx|y_*"
 
 
 def test_an_error_of_the_tracked_frames_alone_is_marked(capsys):
@@ -613,14 +609,8 @@ LABEL = "caf\xe9 \u2013 \U0001f600"
 
 
 def test_a_report_is_shown_on_a_terminal_that_lacks_characters(cli, walk: Path, tmp_path: Path) -> None:
-    assert (
-        cli(
-            "import",
-            walk / "groundtruth.txt",
-            *("--tracker", "theirs", "--label", LABEL, "--sequence", walk, "--online"),
-        )[0]
-        == 0
-    )
+    options = "--tracker", "theirs", "--label", LABEL, "--sequence", walk, "--online"
+    assert cli("import", walk / "groundtruth.txt", *options)[0] == 0
     done = subprocess.run(
         [sys.executable, "-m", "dynslam_bench", "report", "results", "-o", str(tmp_path)],
         capture_output=True,

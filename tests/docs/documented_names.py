@@ -54,10 +54,8 @@ def words() -> frozenset[str]:
     names: set[str] = set()
     for file in [*sources(), *sorted((ROOT / "tests").rglob("*.py"))]:
         names |= {*read(file)[1], file.stem, *file.parent.relative_to(ROOT).parts}
-    for file in [
-        *[file for package in PACKAGES for kind in ("toml", "csv") for file in (ROOT / package).rglob(f"*.{kind}")],
-        ROOT / "pyproject.toml",
-    ]:
+    data = [file for package in PACKAGES for kind in ("toml", "csv") for file in (ROOT / package).rglob(f"*.{kind}")]
+    for file in [*data, ROOT / "pyproject.toml"]:
         names.update(re.findall(r"[A-Za-z_][A-Za-z0-9_-]*", file.read_text(encoding="utf-8")))
     return frozenset(names)
 

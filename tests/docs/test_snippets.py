@@ -125,9 +125,8 @@ def test_commands_print_what_the_page_shows(
             told = capsys.readouterr()
             assert not ended.value.code, told.err
             printed += told.out
-        assert doctest.OutputChecker().check_output(shown, printed, doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE), (
-            printed
-        )
+        options = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+        assert doctest.OutputChecker().check_output(shown, printed, options), printed
 
 
 def test_the_suite_on_the_page_is_one(tmp_path: Path) -> None:

@@ -37,17 +37,8 @@ def test_own_data_set_then_its_results(tmp_path: Path, capsys: pytest.CaptureFix
 
 def test_own_tracker_is_found_where_it_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = shutil.copytree(EXAMPLES / "own_tracker", tmp_path / "source")
-    subprocess.run(
-        [
-            *[sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index"],
-            "--target",
-            tmp_path / "there",
-            source,
-        ],
-        check=True,
-        capture_output=True,
-        timeout=120,
-    )
+    command = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
+    subprocess.run([*command, "--target", tmp_path / "there", source], check=True, capture_output=True, timeout=120)
     monkeypatch.syspath_prepend(tmp_path / "there")
     try:
         TRACKERS.refresh()

@@ -887,12 +887,9 @@ def _provenances() -> list[bytes]:
 def _maps() -> list[bytes]:
     with tempfile.TemporaryDirectory() as made:
         path = Path(made) / "map.ply"
-        map_files.write_ply(
-            path,
-            MapOutputs(
-                (), np.arange(4), np.random.default_rng(0).normal(size=(4, 3)), np.zeros((4, 3), np.uint8), np.arange(4)
-            ),
-        )
+        positions = np.random.default_rng(0).normal(size=(4, 3))
+        outputs = MapOutputs((), np.arange(4), positions, np.zeros((4, 3), np.uint8), np.arange(4))
+        map_files.write_ply(path, outputs)
         return [path.read_bytes()]
 
 
