@@ -1,4 +1,4 @@
-"""The program: its verbs, and how it ends."""
+"""The program: its verbs, those on the installation (``doctor``, ``envs``, ``cache``), and how it ends."""
 
 import os
 import sys
@@ -11,7 +11,6 @@ from dynslam_bench.cli import (
     demo,
     interrupted,
     leave_interrupted,
-    maintenance,
     reports,
     running,
     runs,
@@ -21,8 +20,8 @@ from dynslam_bench.cli import (
     trackers,
     trajectories,
 )
-from dynslam_bench.cli.options import CARE, MEASURE, REPORT, START, ShortHelp
-from dynslam_bench.cli.output import download_bar, set_json_mode, warn, write_error
+from dynslam_bench.cli.options import CARE, MEASURE, REPORT, START, AsJson, ShortHelp
+from dynslam_bench.cli.output import download_bar, present, set_json_mode, table, warn, write, write_error
 from dynslam_bench.core import DynslamError
 
 INTERRUPT_CODE = 130
@@ -51,9 +50,10 @@ app.add_typer(studies.app, name="tune", rich_help_panel=REPORT)
 app.add_typer(reports.app, name="report", rich_help_panel=REPORT)
 app.command(rich_help_panel=REPORT)(reports.published)
 app.add_typer(segmenters.app, name="segmenter", rich_help_panel=CARE)
-app.add_typer(maintenance.cache, name="cache", rich_help_panel=CARE)
-app.command(rich_help_panel=START)(maintenance.envs)
-app.command(rich_help_panel=START)(maintenance.doctor)
+cache = typer.Typer(
+    help="The stage cache: results that do not depend on the settings under study.", no_args_is_help=True
+)
+app.add_typer(cache, name="cache", rich_help_panel=CARE)
 
 
 def _version(asked: bool) -> None:
@@ -75,6 +75,54 @@ def _root(
     from dynslam_bench.core.download import show_downloads
 
     show_downloads(download_bar)
+
+
+@app.command(rich_help_panel=START)
+def envs(as_json: AsJson = False) -> None:
+    """List the Gymnasium environments, one for each listed sequence and a generic one."""
+    from dynslam_bench.envs import register_envs
+
+    ids = register_envs()
+    present(ids, *ids)
+
+
+@app.command(rich_help_panel=START)
+def doctor(as_json: AsJson = False) -> None:
+    """Show what is installed here, which weights, sequences and extras there are, and how to get what is missing."""
+    from dynslam_bench.testing.installation import examine
+
+    findings = examine()
+    rows = [(finding.part, finding.name, finding.state) for finding in findings]
+    missing = [f"- {f.part} {f.name}: {f.hint or f.state}" for f in findings if f.missing]
+    heading = "\nMissing, and how to get it (of this, rendered sequences need the packages alone):"
+    present(findings, table(("part", "name", "found"), rows), *([heading, *missing] if missing else []))
+
+
+@cache.command()
+def info(as_json: AsJson = False) -> None:
+    """Show how full the cache is."""
+    from dynslam_bench.core.stage_cache import StageCache
+
+    usage = StageCache().info()
+    sizes, entries = usage["bytes_by_stage"], usage["entries_by_stage"]
+    rows = [(stage, entries[stage], size / 1e6) for stage, size in sizes.items()]
+    total = sum(sizes.values())
+    present(
+        {"bytes": total, **usage},
+        f"{usage['folder']}: {total / 1e6:.1f} of {usage['max_bytes'] / 1e6:.0f} MB",
+        table(("stage", "entries", "MB"), rows),
+    )
+
+
+@cache.command()
+def clear(yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False) -> None:
+    """Delete all entries."""
+    from dynslam_bench.core.stage_cache import StageCache
+
+    stage_cache = StageCache()
+    if not yes:
+        typer.confirm(f"delete all entries below {stage_cache.folder}?", abort=True)
+    write(f"freed {stage_cache.clear() / 1e6:.1f} MB")
 
 
 def start(arguments: list[str] | None = None) -> None:

@@ -159,10 +159,9 @@ def compiled_ahead() -> Iterator[None]:
     the first runs, which report it.
     """
     command = python_command(f"from {__name__} import compile_kernels; compile_kernels()")
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        yield
-        process.wait()
-    finally:
-        process.kill()
-        process.wait()
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        try:
+            yield
+            process.wait()
+        finally:
+            process.kill()

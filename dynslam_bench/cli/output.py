@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+import typer
 from pydantic_core import from_json, to_json
 
 from dynslam_bench.core import DynslamError, printable, repeating
@@ -89,14 +90,20 @@ def is_interactive() -> bool:
     return sys.stdin.isatty() and sys.stderr.isatty() and not _json_mode
 
 
-def present(value: Any, *lines: str) -> None:
-    """Write a value as JSON with ``--json`` (pydantic models, dataclasses, paths and arrays included), else lines."""
+def present(value: Any, *lines: str, verified: bool = True) -> None:
+    """Write a value as JSON with ``--json`` (pydantic models, dataclasses, paths and arrays included), else lines.
+
+    Raises:
+        Exit: Something was checked and is not `verified`; the code is 4.
+    """
     if _json_mode:
         text = to_json(value, inf_nan_mode="null", fallback=_plain)
         sys.stdout.write(json.dumps(from_json(text), indent=2) + "\n")  # escapes what a terminal would execute
-        return
-    for line in lines:
-        write(line)
+    else:
+        for line in lines:
+            write(line)
+    if not verified:
+        raise typer.Exit(VERIFICATION_FAILED)
 
 
 def _plain(value: Any) -> Any:

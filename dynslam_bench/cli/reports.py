@@ -160,13 +160,12 @@ def audit_paper(
         if folder is not None and (folder / "groundtruth.txt").is_file():
             truth[name] = read_tum(folder / "groundtruth.txt")
     findings = audit(truth)
+    lines = []
+    for findings_table in (findings.summary(), findings.details()):
+        lines += [findings_table.title, report_table(findings_table), "", wrapped(findings_table.caption), ""]
     if output is not None:
         write_atomic(output, findings.to_markdown())
-
-    lines = [] if output is None else [str(output)]
-    for findings_table in (findings.summary(), findings.details()) if output is None else ():
-        caption = wrapped(findings_table.caption)
-        lines += [findings_table.title, report_table(findings_table), "", caption, ""]
+        lines = [str(output)]
     present(findings.findings, *lines)
 
 
@@ -195,8 +194,7 @@ def published(
     name = sequence if entry is None else entry.id
     if name not in published_sequences():
         raise ReportError(f"no published number of '{name}' was read", did_you_mean(name, published_sequences()))
-    chosen = None if protocol is None else get_protocol(protocol)
-    lines = published_for([name], chosen)
+    lines = published_for([name], None if protocol is None else get_protocol(protocol))
     errors = published_table(lines)
     if errors is None:
         raise ReportError(
@@ -204,9 +202,7 @@ def published(
         )
     differing = spans(lines)
     span = span_table(differing)
-    text = []
-    if span is not None:
-        text = [f"{span.title}, on {name}:", report_table(span.without("sequence")), ""]
+    text = [] if span is None else [f"{span.title}, on {name}:", report_table(span.without("sequence")), ""]
     text += [f"{errors.title} of {name}:", report_table(errors.without("sequence")), "", wrapped(errors.caption)]
     present({"spans": differing.to_dict("records"), "numbers": lines.to_dict("records")}, *text)
 

@@ -24,7 +24,6 @@ from dynslam_bench.cli.options import (
 )
 from dynslam_bench.cli.output import (
     SOME_RUNS_FAILED,
-    VERIFICATION_FAILED,
     announce,
     fields,
     json_mode,
@@ -147,8 +146,12 @@ def show(
         if evaluation is None:
             lines += ["", f"{which}: {metrics.reasons.get(which, 'not evaluated')}"]
         else:
-            values = table(("metric", "value"), sorted(evaluation.metrics.items()))
-            lines += ["", f"{which}: {evaluation.summary()}", values, *evaluation.diagnostics]
+            lines += [
+                "",
+                f"{which}: {evaluation.summary()}",
+                table(("metric", "value"), sorted(evaluation.metrics.items())),
+                *evaluation.diagnostics,
+            ]
     lines += [f"hint: {line}" for line in metrics.hints]
     present({"record": record, "metrics": metrics, "folder": store.place(record.run_id)}, *lines)
 
@@ -180,8 +183,7 @@ def merge(
 ) -> None:
     """Copy the runs of results folders into one; exit with 3 if another result of a run is there, which stays."""
     store = stored.RunStore(output)
-    merged = stored.merge(map(stored.open_store, sources), store)
-    show_merged(merged, str(store.root))
+    show_merged(stored.merge(map(stored.open_store, sources), store), str(store.root))
 
 
 @app.command()
@@ -240,9 +242,8 @@ def verify(bank: Folder, as_json: AsJson = False) -> None:
     from dynslam_bench.runs.bank import verify
 
     faults = verify(bank)
-    present({"faults": faults}, *faults, f"{bank}: {len(faults)} fault{'s' * (len(faults) != 1)}")
-    if faults:
-        raise typer.Exit(VERIFICATION_FAILED)
+    total = f"{bank}: {len(faults)} fault{'s' * (len(faults) != 1)}"
+    present({"faults": faults}, *faults, total, verified=not faults)
 
 
 @banks.command()
@@ -341,11 +342,11 @@ def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: 
     }
     cells = [[shown_cell(name, row[name]) for name in columns.values()] for row in rows]
     write(table(list(columns), cells, least=_NAME_WIDTH), colours=COLOURS)
-    moving = [row for row in rows if row["false_motion_max_m"] is None]
-    pairs = [(row["ate_rmse_m"], row["static_camera_ate_rmse_m"]) for row in moving]
     ended = Counter(row["status"] for row in rows if row["status"] != "ok")
     if ended:
         write(f"{ended.total()} of {len(rows)} runs are not ok: {', '.join(f'{n} {s}' for s, n in ended.items())}.")
+    moving = (row for row in rows if row["false_motion_max_m"] is None)
+    pairs = ((row["ate_rmse_m"], row["static_camera_ate_rmse_m"]) for row in moving)
     worse = sum(None not in pair and pair[0] > (1 + 1e-9) * pair[1] for pair in pairs)
     if worse:
         write(f"{worse} of {len(rows)} runs are worse than a static camera.")
@@ -407,8 +408,8 @@ def recording_note(opened: Mapping[str, tuple[str, str | None, str | None]], row
     for row in rows:
         sequence, data_root, camera = opened[row["run_id"]]
         error, bound = row["ate_rmse_m"], row["static_camera_ate_rmse_m"]
-        static = row["tracker"] != "never-move" and error is not None and bound is not None and error >= bound
-        static = static and row["false_motion_max_m"] is None
+        may_move = row["tracker"] != "never-move" and row["false_motion_max_m"] is None
+        static = may_move and None not in (error, bound) and error >= bound
         if sequence.startswith("synthetic/") or not (row["status"] != "ok" or static):
             continue
         diagnosis = diagnose(sequence, data_root=data_root, camera=camera, most_frames=HINT_FRAMES)

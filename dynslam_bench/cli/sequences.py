@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Optional
 import typer
 
 from dynslam_bench.cli.options import AsJson, Camera, DataRoot, Frames, complete_sequences
-from dynslam_bench.cli.output import VERIFICATION_FAILED, fields, note, present, progress, table, warn, write
+from dynslam_bench.cli.output import fields, note, present, progress, table, warn, write
 from dynslam_bench.core import SequenceError, did_you_mean, find_data_root
 
 if TYPE_CHECKING:
@@ -41,8 +41,9 @@ def list_(
     patterns = (pattern, f"{pattern.rstrip('/')}/*")
     matches = [summary for summary in everything if any(fnmatch(summary["id"], glob) for glob in patterns)]
     if not matches:
-        ids = [summary["id"] for summary in everything]
-        raise SequenceError(f"no sequence matches '{pattern}'", did_you_mean(pattern, ids))
+        raise SequenceError(
+            f"no sequence matches '{pattern}'", did_you_mean(pattern, [summary["id"] for summary in everything])
+        )
     matches = [s for s in matches if (tag is None or tag in s["tags"]) and (s["here"] or not here)]
     lines = []
     for title, members in groupby(matches, key=lambda summary: summary["dataset"]):
@@ -53,8 +54,10 @@ def list_(
         columns = ("sequence", "here", "size", "tags", "split", "ground truth", "checksum")
         rows = [(s["id"], s["here"], s["size"], s["tags"], s["split"], s["ground_truth"], s["checksum"]) for s in group]
         lines += [f"{title} ({'; '.join(facts)})", table(columns, rows), ""]
-    none = f"none of these is here or has the tag; all {len(everything)}: dynslam-bench sequences list"
-    present(matches, *(lines or [none]))
+    present(
+        matches,
+        *(lines or [f"none of these is here or has the tag; all {len(everything)}: dynslam-bench sequences list"]),
+    )
 
 
 @app.command()
@@ -126,9 +129,8 @@ def verify(
         lines.append(f"{report.id}: {verdict}, {report.frames} frames, {how}")
         lines += [f"  {report.dropped}"] if report.dropped else []
         lines += [f"  {fault}" for fault in report.faults]
-    present([{**asdict(report), "ok": report.ok} for report in reports], *lines)
-    if not all(report.ok for report in reports):
-        raise typer.Exit(VERIFICATION_FAILED)
+    facts = [{**asdict(report), "ok": report.ok} for report in reports]
+    present(facts, *lines, verified=all(report.ok for report in reports))
 
 
 @app.command()
@@ -147,9 +149,8 @@ def doctor(
         {**asdict(diagnosis), "ok": diagnosis.ok},
         f"{diagnosis.id}: {diagnosis.verdict}, {diagnosis.frames} frames compared",
         *(f"  {f.severity} {f.id}: {f.text}\n    cure: {f.cure}" for f in diagnosis.findings),
+        verified=diagnosis.ok,
     )
-    if not diagnosis.ok:
-        raise typer.Exit(VERIFICATION_FAILED)
 
 
 @app.command()
@@ -234,10 +235,12 @@ def calibrate(
     written = result.measured and output is not None
     if output is not None and written:
         write_camera(output, result.camera, fps=sequence.fps)
-    columns = ("quantity", "estimate", "95 % interval", "camera.toml", "why")
     present(
         {**asdict(result), "file": output if written else None},
-        table(columns, [_calibrated(quantity) for quantity in result.quantities]),
+        table(
+            ("quantity", "estimate", "95 % interval", "camera.toml", "why"),
+            [_calibrated(quantity) for quantity in result.quantities],
+        ),
         f"{result.windows} windows of {result.frames} frames, keypoints to {result.pixel_noise:.2f} px",
         *([str(output)] if written else []),
     )
@@ -248,10 +251,13 @@ def calibrate(
 def _calibrated(quantity: Quantity) -> tuple[str, ...]:
     """A row of the table of `calibrate`."""
     scale, unit = (1.0, "a metre") if quantity.name == "depth_factor" else (1e3, "ms")
-    value, interval = "", ""
-    if quantity.value is not None:
-        value = f"{scale * quantity.value:.4g} {unit}"
-    if quantity.low is not None and quantity.high is not None:
-        interval = f"{scale * quantity.low:.4g} to {scale * quantity.high:.4g}"
+    value = "" if quantity.value is None else f"{scale * quantity.value:.4g} {unit}"
+    limits = [f"{scale * limit:.4g}" for limit in (quantity.low, quantity.high) if limit is not None]
     written = "kept" if quantity.written is None else f"{quantity.written:g}"
-    return quantity.name, value, interval, written if quantity.observable else "not observable", quantity.reason
+    return (
+        quantity.name,
+        value,
+        " to ".join(limits),
+        written if quantity.observable else "not observable",
+        quantity.reason,
+    )

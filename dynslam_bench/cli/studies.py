@@ -93,17 +93,19 @@ def worker(study: Study, results: Results = Path("results"), jobs: Jobs = 1) -> 
 @app.command()
 def status(study: Study, results: Results = Path("results"), as_json: AsJson = False) -> None:
     """Show the progress of a study."""
-    from dynslam_bench.tuning.judgement import StudySummary
     from dynslam_bench.tuning.storage import Heartbeats, best_trials, count_states, extension_of
 
     stored = tuning.Study.open(study, results)
-    asked_for = stored.spec.trials + extension_of(stored.study)["trials"]
-    facts: dict[str, Any] = {"study": stored.spec.name, "folder": stored.folder, "asked_for": asked_for}
+    facts: dict[str, Any] = {
+        "study": stored.spec.name,
+        "folder": stored.folder,
+        "asked_for": stored.spec.trials + extension_of(stored.study)["trials"],
+    }
     facts |= count_states(stored.study)
     facts["running_trials"] = [f"{number} ({state})" for number, state in Heartbeats(stored.study).running().items()]
     settings: dict[str, Any] = {}
     summary = stored.folder / "summary.json"
-    conclusion = StudySummary.read(summary) if summary.is_file() else None
+    conclusion = tuning.StudySummary.read(summary) if summary.is_file() else None
     if conclusion is not None and conclusion.best is not None:  # as `tune best`
         facts |= {"best_trial": conclusion.best.trial, "conclusion": conclusion.conclusion}
         settings = conclusion.best.params
@@ -144,12 +146,10 @@ class StudyBar:
         """A trial has started or finished, or the study has begun another part."""
         if event.kind == "preview":
             announce(event.text)
-        elif event.kind == "finished":
+            return
+        if event.kind == "finished":
             note(event.text)
-        if event.kind in ("started", "finished"):
-            self._begin(event.text, event.number + (event.kind == "finished"), event.total)
-        elif event.kind == "reference":
-            self._begin(event.text, 0, event.total)
+        self._begin(event.text, event.number + (event.kind == "finished"), event.total)
 
     def note(self, text: str) -> None:
         """The final check has begun a step."""

@@ -18,10 +18,10 @@ from dynslam_bench.cli.options import (
     complete_trackers,
     gather_settings,
 )
-from dynslam_bench.cli.output import VERIFICATION_FAILED, fields, json_mode, present, progress, table, wrapped, write
+from dynslam_bench.cli.output import fields, json_mode, present, progress, table, wrapped, write
 
 if TYPE_CHECKING:
-    from dynslam_bench.core.settings import Parameter, Settings
+    from dynslam_bench.core.settings import Parameter
     from dynslam_bench.testing import Check
     from dynslam_bench.trackers import TrackerSpec
 
@@ -67,7 +67,10 @@ def info(tracker: Tracker, as_json: AsJson = False) -> None:
     from dynslam_bench.trackers import TRACKERS
 
     spec = TRACKERS.get(tracker)
-    reported = _published(spec)
+    reported, defaults = _published(spec), flatten(spec.settings())
+    shown = parameters(spec.settings)
+    shown += [parameter for parameter in parameters(spec.settings, online_only=True) if not parameter.tunable]
+    described = {parameter.name: asdict(parameter) for parameter in shown}
     facts: dict[str, Any] = {
         "id": spec.id,
         "label": spec.label,
@@ -86,13 +89,14 @@ def info(tracker: Tracker, as_json: AsJson = False) -> None:
         "presets": spec.presets,
         "assumptions": spec.assumptions,
         "remarks": spec.remarks,
-        "settings": flatten(spec.settings()),
-        "parameters": parameter_facts(spec.settings),
+        "settings": defaults,
+        "parameters": [
+            {"name": name, "default": default, "tunable": False, "online": False} | described.get(name, {})
+            for name, default in defaults.items()
+        ],
         "reported": reported,
     }
-    shown = parameters(spec.settings)
-    shown += [parameter for parameter in parameters(spec.settings, online_only=True) if not parameter.tunable]
-    fixed = len(flatten(spec.settings())) - len(shown)
+    fixed = len(defaults) - len(shown)
     sources = [f"{source} ({count})" for source, count in Counter(row["source"] for row in reported).items()]
     rows = [(p.name, p.default, range_text(p), p.unit, p.online, p.meaning) for p in shown]
     present(
@@ -109,17 +113,6 @@ def range_text(parameter: Parameter) -> str:
     if parameter.choices:
         return shorten(", ".join(map(str, parameter.choices)), 50, placeholder=" ...")
     return f"{parameter.low:g} to {parameter.high:g}{' (log)' if parameter.scale == 'log' else ''}"
-
-
-def parameter_facts(settings: type[Settings]) -> list[dict[str, Any]]:
-    """Every setting with its default; those tunable or online also with range, scale, unit and meaning."""
-    from dynslam_bench.core.settings import flatten, parameters
-
-    described = {p.name: asdict(p) for p in (*parameters(settings), *parameters(settings, online_only=True))}
-    return [
-        {"name": name, "default": default, "tunable": False, "online": False} | described.get(name, {})
-        for name, default in flatten(settings()).items()
-    ]
 
 
 def _published(spec: TrackerSpec) -> list[dict[str, Any]]:
@@ -183,10 +176,11 @@ def test(
             on_check=on_check,
             on_wait=lambda check: advance(0, None, check),
         )
-    total = f"{report.subject}: {len(report.failed)} of {len(report.checks)} checks failed"
-    present({"subject": report.subject, "ok": report.ok, "checks": report.checks}, total)
-    if not report.ok:
-        raise typer.Exit(VERIFICATION_FAILED)
+    present(
+        {"subject": report.subject, "ok": report.ok, "checks": report.checks},
+        f"{report.subject}: {len(report.failed)} of {len(report.checks)} checks failed",
+        verified=report.ok,
+    )
 
 
 @app.command()

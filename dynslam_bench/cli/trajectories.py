@@ -43,8 +43,9 @@ def evaluate(
 
     loaded, truth = (runs.read_trajectory(path, timestamps) for path in (estimate, ground_truth))
     result = evaluate_loaded(loaded, truth, protocol)
-    prepared = truth_of_file(truth.trajectory, get_protocol(protocol))
-    likely = hints(loaded.trajectory, prepared, protocol, notes=loaded.notes)
+    likely = hints(
+        loaded.trajectory, truth_of_file(truth.trajectory, get_protocol(protocol)), protocol, notes=loaded.notes
+    )
     present(
         {**result.model_dump(), "hints": likely},
         result.summary(),
@@ -61,8 +62,13 @@ def list_(as_json: AsJson = False) -> None:
     from dynslam_bench.evaluation import PROTOCOLS
 
     entries = [{"digest": protocol.digest(), **protocol.model_dump()} for protocol in PROTOCOLS.values()]
-    rows = [(protocol.id, protocol.digest(), protocol.describe()) for protocol in PROTOCOLS.values()]
-    present(entries, table(("id", "digest", "meaning"), rows))
+    present(
+        entries,
+        table(
+            ("id", "digest", "meaning"),
+            [(protocol.id, protocol.digest(), protocol.describe()) for protocol in PROTOCOLS.values()],
+        ),
+    )
 
 
 @protocols.command()
@@ -92,8 +98,11 @@ def compare(
     last = f"No row agrees with {published}; the nearest is {nearest.label}, {nearest.rmse_m:.6f}." * (not any(marks))
     columns.insert(2, "published")
     rows = [[*row[:2], "agrees" if mark else "", *row[2:]] for row, mark in zip(rows, marks, strict=True)]
-    matched = [{**asdict(score), "agrees": mark} for score, mark in zip(scores, marks, strict=True)]
-    present(matched, table(columns, rows), *filter(None, [last]))
+    present(
+        [{**asdict(score), "agrees": mark} for score, mark in zip(scores, marks, strict=True)],
+        table(columns, rows),
+        *filter(None, [last]),
+    )
 
 
 def import_(

@@ -62,21 +62,20 @@ def features_report(
         check_keypoints(keypoints, image.shape, descriptor_bytes)
         require(len(keypoints) >= least, f"only {len(keypoints)} keypoints in a textured image")
 
-    def left_alone() -> None:
-        require_unchanged(lambda: construct().extract(image), image, what="the image")
-
-    report = ConformanceReport.of("extractor", construct)
-    report.run("construction", lambda: require_methods(construct(), "extract"))
-    if report.ok and report.run("results", lambda: results(scene[0], least=20)):
-        report.run_all(
-            {
-                "beside a mask": lambda: _masked_extraction(construct(), image),
-                "images are left alone": left_alone,
-                "determinism": lambda: _extractor_determinism(construct, image, other),
-                **_on_hard_images(scene[0], results),
-            }
-        )
-    return report
+    return ConformanceReport.of("extractor", construct).run_all(
+        {
+            "construction": lambda: require_methods(construct(), "extract"),
+            "results": lambda: results(scene[0], least=20),
+        },
+        {
+            "beside a mask": lambda: _masked_extraction(construct(), image),
+            "images are left alone": lambda: require_unchanged(
+                lambda: construct().extract(image), image, what="the image"
+            ),
+            "determinism": lambda: _extractor_determinism(construct, image, other),
+            **_on_hard_images(scene[0], results),
+        },
+    )
 
 
 def _on_hard_images(frame: Frame, results: Callable[[Frame], object]) -> dict[str, Callable[[], object]]:
@@ -176,24 +175,24 @@ def flow_report(construct: Callable[[], FlowEstimator], *, points: int = 200) ->
 
     def outside() -> None:
         strange = np.array([[-5, 5], [1e6, 5], [np.nan, 5]], np.float32)
-        result = results(second, np.concatenate([grid, strange]))
-        require(not result.valid[-3:].any(), "a point outside the reference image is valid in the target")
+        valid = results(second, np.concatenate([grid, strange])).valid
+        require(not valid[-3:].any(), "a point outside the reference image is valid in the target")
 
-    report = ConformanceReport.of("flow", construct)
-    report.run("construction", lambda: require_methods(construct(), "prepare", "track"))
-    if report.ok and report.run("results", lambda: results(second, grid)):
-        report.run_all(
-            {
-                "no points": lambda: results(second, grid[:0]),
-                "points outside": outside,
-                "guesses": lambda: results(second, grid, guess),
-                "a small shift is found": lambda: _flow_finds_shift(results, first, grid),
-                "images are left alone": left_alone,
-                "determinism": lambda: _flow_determinism(construct, first, second, grid),
-                **_on_hard_images(scene[0], lambda frame: results(grey(frame), grid)),
-            }
-        )
-    return report
+    return ConformanceReport.of("flow", construct).run_all(
+        {
+            "construction": lambda: require_methods(construct(), "prepare", "track"),
+            "results": lambda: results(second, grid),
+        },
+        {
+            "no points": lambda: results(second, grid[:0]),
+            "points outside": outside,
+            "guesses": lambda: results(second, grid, guess),
+            "a small shift is found": lambda: _flow_finds_shift(results, first, grid),
+            "images are left alone": left_alone,
+            "determinism": lambda: _flow_determinism(construct, first, second, grid),
+            **_on_hard_images(scene[0], lambda frame: results(grey(frame), grid)),
+        },
+    )
 
 
 def check_flow_result(result: FlowResult, points: NDArray[np.float32], names: tuple[str, ...] = ()) -> None:
@@ -209,8 +208,11 @@ def check_flow_result(result: FlowResult, points: NDArray[np.float32], names: tu
     """
     count = len(points)
     require(isinstance(result, FlowResult), f"track() gave a {type(result).__name__}, not a FlowResult")
-    expected = {"xy": (np.float32, (count, 2)), "valid": (np.bool_, (count,)), "cost": (np.float32, (count,))}
-    require_arrays(result, expected, cause="one row a point, in the order of the points")
+    require_arrays(
+        result,
+        {"xy": (np.float32, (count, 2)), "valid": (np.bool_, (count,)), "cost": (np.float32, (count,))},
+        cause="one row a point, in the order of the points",
+    )
     missing = [name for name in names if name not in result.stats]
     require_all(
         (np.isfinite(result.xy[result.valid]).all(), "a valid row is not finite", "mark it as not valid"),
@@ -228,9 +230,8 @@ def _grid(shape: tuple[int, ...], points: int) -> NDArray[np.float32]:
 def _flow_determinism(
     construct: Callable[[], FlowEstimator], first: Image, second: Image, points: NDArray[np.float32]
 ) -> None:
-    one, other = construct(), construct()
-    a = one.track(one.prepare(first), one.prepare(second), points, seed=7)
-    b = other.track(other.prepare(first), other.prepare(second), points, seed=7)
+    flows = construct(), construct()
+    a, b = (flow.track(flow.prepare(first), flow.prepare(second), points, seed=7) for flow in flows)
     same = np.array_equal(a.valid, b.valid) and np.array_equal(a.xy[a.valid], b.xy[b.valid])
     require(same, "the same images and seed give another flow", "unseeded randomness, or state that outlives an image")
 
@@ -270,27 +271,26 @@ def segmenter_report(
     """Run all checks of `check_segmenter` and report each."""
     scene = sequence if sequence is not None else CornerSequence(frames)
     inputs = [scene[index] for index in range(min(frames, len(scene)))]
+    first = inputs[0]
 
     def results(*frames: Frame) -> None:
         segmenter = construct()
         for frame in frames:
             check_instances(segmenter.segment(frame), frame)
 
-    def left_alone() -> None:
-        frame = inputs[0]
-        require_unchanged(lambda: construct().segment(frame), frame.rgb, frame.depth, what="the frame")
-
-    report = ConformanceReport.of("segmenter", construct)
-    report.run("construction", lambda: require_methods(construct(), "segment"))
-    if report.ok and report.run("results", lambda: results(*inputs)):
-        report.run_all(
-            {
-                "images are left alone": left_alone,
-                "determinism": lambda: _segmenter_determinism(construct, inputs),
-                **_on_hard_images(inputs[0], results),
-            }
-        )
-    return report
+    return ConformanceReport.of("segmenter", construct).run_all(
+        {
+            "construction": lambda: require_methods(construct(), "segment"),
+            "results": lambda: results(*inputs),
+        },
+        {
+            "images are left alone": lambda: require_unchanged(
+                lambda: construct().segment(first), first.rgb, first.depth, what="the frame"
+            ),
+            "determinism": lambda: _segmenter_determinism(construct, inputs),
+            **_on_hard_images(first, results),
+        },
+    )
 
 
 def check_instances(instances: Instances, frame: Frame) -> None:
@@ -306,8 +306,12 @@ def check_instances(instances: Instances, frame: Frame) -> None:
     )
     where, boxes, scores = f"frame {frame.index}: ", instances.boxes, instances.scores
     count, shape = len(instances.class_names), frame.depth.shape
-    cause = "masks have to be at the frame's resolution and thresholded"
-    require_arrays(instances, {"masks": (np.bool_, (count, *shape))}, where, cause)
+    require_arrays(
+        instances,
+        {"masks": (np.bool_, (count, *shape))},
+        where,
+        "masks have to be at the frame's resolution and thresholded",
+    )
     require_arrays(instances, {"boxes": (np.float32, (count, 4)), "scores": (np.float32, (count,))}, where)
     require_all(
         (((scores >= 0) & (scores <= 1)).all(), f"{where}a score lies outside [0, 1]", "logits, not scores"),
@@ -324,13 +328,21 @@ def check_instances(instances: Instances, frame: Frame) -> None:
         rows, columns = np.nonzero(mask)
         within = (columns >= box[0] - 1) & (columns <= box[2] + 1) & (rows >= box[1] - 1) & (rows <= box[3] + 1)
         outside = 100 * (1 - float(within.mean())) if len(rows) else 0.0
-        fault = f"{where}{outside:.0f} % of the mask of a {name} lie outside its box"
-        require(outside < 10, fault, "boxes of another resolution, or y before x")
+        require(
+            outside < 10,
+            f"{where}{outside:.0f} % of the mask of a {name} lie outside its box",
+            "boxes of another resolution, or y before x",
+        )
 
 
 def _segmenter_determinism(construct: Callable[[], Segmenter], frames: list[Frame]) -> None:
     first, second = construct(), construct()
     for frame in frames:
         fault = f"frame {frame.index} gives other objects when it is segmented again"
-        cause = "a network in training mode, or unseeded randomness"
-        require_equal(first.segment(frame), second.segment(frame), ("masks", "scores", "class_names"), fault, cause)
+        require_equal(
+            first.segment(frame),
+            second.segment(frame),
+            ("masks", "scores", "class_names"),
+            fault,
+            "a network in training mode, or unseeded randomness",
+        )

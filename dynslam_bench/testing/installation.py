@@ -44,8 +44,15 @@ def examine() -> list[Finding]:
     findings.append(Finding("sequences", "recorded", f"{recorded} in {find_data_root()}", not recorded, hint))
     for name, folder in (("stage cache", stage_cache_folder()), ("weights", weights_folder())):
         good = is_writable(folder)
-        state = f"{folder}, {'' if good else 'not '}writable"
-        findings.append(Finding("folder", name, state, not good, "" if good else "another one: see core/folders.py"))
+        findings.append(
+            Finding(
+                "folder",
+                name,
+                f"{folder}, {'' if good else 'not '}writable",
+                not good,
+                "" if good else "another one: see core/folders.py",
+            )
+        )
     return [*findings, *unavailable_plugins(), _torch_device()]
 
 

@@ -83,8 +83,9 @@ def isolated_tracker_report(
                 if running:  # noqa: B023
                     on_wait(running)  # noqa: B023
 
-            outcomes = [asdict(check) for check in checks]
-            job = make_job(_WORK, folder.path, spec={"threads": 1}, known=outcomes, **job_options)
+            job = make_job(
+                _WORK, folder.path, spec={"threads": 1}, known=[asdict(check) for check in checks], **job_options
+            )
             verdict = supervise(Child(), job, limits, receive, tick=tick, located=False)
         if verdict.status != "ok":
             add(_failure(verdict, running, checks))

@@ -44,8 +44,7 @@ def pytest_collection_modifyitems(session: pytest.Session, config: pytest.Config
             except DynslamError as error:
                 raise pytest.UsageError(f"--dynslam-{kind}: {error}") from error
             for check in checks:
-                name = f"{kind} {subject}::{check.name}"
-                items.append(ConformanceItem.from_parent(session, name=name, check=check))
+                items.append(ConformanceItem.from_parent(session, name=f"{kind} {subject}::{check.name}", check=check))
 
 
 class ConformanceItem(pytest.Item):
@@ -104,8 +103,9 @@ def report_on(kind: str, subject: str) -> ConformanceReport:
     from dynslam_bench.features.settings import FeatureSettings
 
     spec = FEATURES.get(subject)
-    extractor = partial(build_extractor, FeatureSettings(extractor=subject))
-    return testing.features_report(extractor, descriptor_bytes=spec.descriptor_bytes)
+    return testing.features_report(
+        partial(build_extractor, FeatureSettings(extractor=subject)), descriptor_bytes=spec.descriptor_bytes
+    )
 
 
 def _open(subject: str) -> Any:

@@ -76,10 +76,18 @@ class ConformanceReport:
         self.checks.append(outcome)
         return outcome.status != "failed"
 
-    def run_all(self, checks: Mapping[str, Callable[[], object]]) -> None:
-        """Run checks by name, whatever the others give."""
-        for name, check in checks.items():
-            self.run(name, check)
+    def run_all(
+        self, needed: Mapping[str, Callable[[], object]], others: Mapping[str, Callable[[], object]]
+    ) -> ConformanceReport:
+        """Run checks by name: the needed ones until one fails; if none does, all others, whatever each gives.
+
+        Returns:
+            This report.
+        """
+        if all(self.run(name, check) for name, check in needed.items()):
+            for name, check in others.items():
+                self.run(name, check)
+        return self
 
     def alive(self) -> None:
         """Called while a check makes progress."""

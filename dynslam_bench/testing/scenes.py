@@ -33,8 +33,9 @@ class CornerSequence:
     def __init__(self, frames: int = 8) -> None:
         self._count = frames
         self.timestamps: NDArray[np.float64] = np.round(100.0 + np.arange(frames) / 30, 6)
-        poses = np.stack([self.pose(index) for index in range(frames)])
-        self.ground_truth: Trajectory | None = Trajectory(self.timestamps, poses)
+        self.ground_truth: Trajectory | None = Trajectory(
+            self.timestamps, np.stack([self.pose(index) for index in range(frames)])
+        )
 
     @property
     def masks(self) -> MaskSource | None:

@@ -38,7 +38,8 @@ def sequence_report(sequence: Sequence | str | Path, *, frames: int = 3) -> Conf
     if not report.run("protocol", lambda: _protocol(sequence)):
         return report
     chosen = sorted(set(np.linspace(0, len(sequence) - 1, max(frames, 2)).astype(int).tolist()))
-    report.run_all(
+    return report.run_all(
+        {},
         {
             "timestamps": lambda: _timestamps(sequence),
             "frames": lambda: _frames(sequence, chosen),
@@ -48,9 +49,8 @@ def sequence_report(sequence: Sequence | str | Path, *, frames: int = 3) -> Conf
             "masks": lambda: _masks(sequence, chosen),
             "digest": lambda: _digest(sequence),
             "pickling": lambda: _pickling(sequence),
-        }
+        },
     )
-    return report
 
 
 _MEMBERS = ("id", "camera", "timestamps", "ground_truth", "masks", "fps", "license", "citation", "digest", "__len__")
@@ -85,8 +85,11 @@ def _timestamps(sequence: Sequence) -> None:
         (fps > 0, f"fps is {fps}"),
     )
     rate = 1 / float(np.median(intervals)) if len(intervals) else fps
-    fault = f"fps is {fps:g}, but the median rate is {rate:g} Hz"
-    require(1 / 3 < rate / fps < 3, fault, "timestamps have to be in seconds")
+    require(
+        1 / 3 < rate / fps < 3,
+        f"fps is {fps:g}, but the median rate is {rate:g} Hz",
+        "timestamps have to be in seconds",
+    )
 
 
 def _frames(sequence: Sequence, chosen: list[int]) -> None:
@@ -94,8 +97,12 @@ def _frames(sequence: Sequence, chosen: list[int]) -> None:
     for index in chosen:
         frame, stamp, where = sequence[index], float(sequence.timestamps[index]), f"frame {index}: "
         require(isinstance(frame, Frame), f"frame {index} is a {type(frame).__name__}, not a Frame")
-        cause = "the camera's size is not the image's, or the image is grey"
-        require_arrays(frame, {"rgb": (np.uint8, (*size, 3)), "depth": (np.float32, size)}, where, cause)
+        require_arrays(
+            frame,
+            {"rgb": (np.uint8, (*size, 3)), "depth": (np.float32, size)},
+            where,
+            "the camera's size is not the image's, or the image is grey",
+        )
         depth, measured = frame.depth, frame.depth[frame.depth > 0]
         median = float(np.median(measured)) if len(measured) else 1.0
         require_all(
@@ -120,8 +127,9 @@ def _end(sequence: Sequence) -> None:
 
 def _twice(sequence: Sequence, index: int) -> None:
     cause = "randomness, or a buffer that is written again"
-    fault = f"frame {index} differs when it is read again"
-    require_equal(sequence[index], sequence[index], ("rgb", "depth"), fault, cause)
+    require_equal(
+        sequence[index], sequence[index], ("rgb", "depth"), f"frame {index} differs when it is read again", cause
+    )
 
 
 def _ground_truth(sequence: Sequence) -> None:
@@ -130,9 +138,8 @@ def _ground_truth(sequence: Sequence) -> None:
         raise NotApplicable("the sequence has none")
     require(isinstance(truth, Trajectory), f"the ground truth is a {type(truth).__name__}, not a Trajectory")
     stamps = sequence.timestamps
-    overlap = (truth.timestamps >= stamps[0] - 0.1) & (truth.timestamps <= stamps[-1] + 0.1)
     require(
-        overlap.any(),
+        ((truth.timestamps >= stamps[0] - 0.1) & (truth.timestamps <= stamps[-1] + 0.1)).any(),
         f"the ground truth spans {truth.timestamps[0]:.3f} to {truth.timestamps[-1]:.3f} s, the frames "
         f"{stamps[0]:.3f} to {stamps[-1]:.3f} s",
         "they use different clocks",

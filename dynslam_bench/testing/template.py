@@ -2,18 +2,19 @@
 
 import re
 from pathlib import Path
+from string import Template
 
 from dynslam_bench.core import PluginError, write_atomic
 
-_TEMPLATE = '''"""@TITLE@: a tracker for dynslam-bench.
+_TEMPLATE = Template('''"""$title: a tracker for dynslam-bench.
 
-Check it:  dynslam-bench trackers test ./@FILE@:SPEC
-Run it:    dynslam-bench run ./@FILE@:SPEC synthetic/walking_xyz --frames 0:100
+Check it:  dynslam-bench trackers test ./$file:SPEC
+Run it:    dynslam-bench run ./$file:SPEC synthetic/walking_xyz --frames 0:100
 
 To ship it with a package, name the spec in that package's pyproject.toml:
 
     [project.entry-points."dynslam_bench.trackers"]
-    @ID@ = "your_package.@MODULE@:SPEC"
+    $id = "your_package.$module:SPEC"
 """
 
 import time
@@ -24,7 +25,7 @@ from dynslam_bench.contracts import TrackerSpec, TrackResult
 from dynslam_bench.core.settings import Settings, tunable
 
 
-class @CLASS@Settings(Settings):
+class ${name}Settings(Settings):
     """Every tunable field is annotated once: from here come validation, --set, and the search space of studies."""
 
     features: int = tunable(800, low=100, high=2000, scale="log", meaning="corners looked for in a frame")
@@ -34,7 +35,7 @@ class @CLASS@Settings(Settings):
     )
 
 
-class @CLASS@:
+class $name:
     """Frame-to-frame visual odometry: corners of the last frame with depth, tracked by Lucas-Kanade, solved as PnP."""
 
     def __init__(self, settings):
@@ -93,14 +94,14 @@ class @CLASS@:
 
 
 SPEC = TrackerSpec(
-    id="@ID@",
-    entry_point=f"{__file__}:@CLASS@",
-    label="@TITLE@",
-    settings=@CLASS@Settings,
+    id="$id",
+    entry_point=f"{__file__}:$name",
+    label="$title",
+    settings=${name}Settings,
     summary="frame-to-frame PnP on tracked corners",
     license="MIT",
 )
-'''
+''')
 
 
 def write_tracker_template(name: str, folder: Path | str = ".") -> Path:
@@ -124,15 +125,12 @@ def write_tracker_template(name: str, folder: Path | str = ".") -> Path:
     path = Path(folder).expanduser() / f"{module}.py"
     if path.exists():
         raise PluginError(f"{path} exists already", "choose another name or folder")
-    text = _TEMPLATE
-    names = {
-        "@TITLE@": " ".join(word if word.isupper() else word.capitalize() for word in words),
-        "@FILE@": path.name,
-        "@MODULE@": module,
-        "@ID@": identifier,
-        "@CLASS@": "".join(word[0].upper() + word[1:] for word in words),
-    }
-    for key, value in names.items():
-        text = text.replace(key, value)
+    text = _TEMPLATE.substitute(
+        title=" ".join(word if word.isupper() else word.capitalize() for word in words),
+        file=path.name,
+        module=module,
+        id=identifier,
+        name="".join(word[0].upper() + word[1:] for word in words),
+    )
     write_atomic(path, text)
     return path

@@ -71,11 +71,10 @@ def tracker_report(
     if spec is not None:
         report.run("spec", lambda: _spec(spec, settings))
     run = _Runner(report, spec or subject, settings, scene, frames, seed)
-    if not (report.run("construction", lambda: _construction(run)) and report.run("results", lambda: _results(run))):
-        return report
     deterministic = spec is None or spec.deterministic
     turning_run = _Runner(report, spec or subject, settings, turning, len(turning), seed)
-    report.run_all(
+    return report.run_all(
+        {"construction": lambda: _construction(run), "results": lambda: _results(run)},
         {
             "camera to world": lambda: _conventions(turning_run, spec is not None and spec.sensors == "rgb"),
             "same stats on every frame": lambda: _same_keys(run),
@@ -87,9 +86,8 @@ def tracker_report(
             "online settings": lambda: _online_settings(run, spec, settings),
             "final trajectory": lambda: _final(run),
             "closing": lambda: _closing(run),
-        }
+        },
     )
-    return report
 
 
 class _Runner:
@@ -105,8 +103,11 @@ class _Runner:
         """A tracker; with other settings than the subject's where they are given."""
         if not isinstance(self.subject, TrackerSpec):
             return self.subject()
-        context = TrackerContext(self.scene.id, self.scene.masks, fps=self.scene.fps)
-        return build_tracker(self.subject, self.settings if settings is None else settings, context)
+        return build_tracker(
+            self.subject,
+            self.settings if settings is None else settings,
+            TrackerContext(self.scene.id, self.scene.masks, fps=self.scene.fps),
+        )
 
     def track(
         self, frames: list[Frame], tracker: Any = None, changed: Settings | None = None, at: int = 0
@@ -133,8 +134,11 @@ class _Runner:
             results = _results_of(used.finalize(), frames)
             poses = [np.array(result.T_world_cam) for result in results]
         for frame, result, pose in zip(frames, results, poses, strict=True):
-            same = result.T_world_cam is None or np.array_equal(result.T_world_cam, pose)
-            require(same, f"the pose of frame {frame.index} changed later", "return a copy of the state, not the state")
+            require(
+                result.T_world_cam is None or np.array_equal(result.T_world_cam, pose),
+                f"the pose of frame {frame.index} changed later",
+                "return a copy of the state, not the state",
+            )
         if tracker is None:
             _close(used)
         return results
@@ -169,10 +173,9 @@ def _none_of(all_faults: Iterable[Fault], where: str) -> None:
 def _spec(spec: TrackerSpec, settings: Settings | Mapping[str, Any] | None) -> None:
     require(spec.id and spec.label, "the spec has no id or label")
     default = spec.settings()
-    changed = "the default settings change when they are written as JSON and read again"
     require(
         build(spec.settings, json.loads(default.model_dump_json())) == default,
-        changed,
+        "the default settings change when they are written as JSON and read again",
         "a field's type does not survive JSON",
     )
     for name, overrides in spec.presets.items():
@@ -192,16 +195,22 @@ def _construction(run: _Runner) -> None:
 
 def _results(run: _Runner) -> None:
     states = [result.state for result in run.track(run.frames)]
-    fault = f"no frame of an easy scene was tracked: {states}"
-    require("ok" in states, fault, "on this scene features abound and depth is exact")
+    require(
+        "ok" in states,
+        f"no frame of an easy scene was tracked: {states}",
+        "on this scene features abound and depth is exact",
+    )
 
 
 def _same_keys(run: _Runner) -> None:
     results = run.track(run.frames)
     for frame, result in zip(run.frames, results, strict=True):
         changed = set(results[0].stats) ^ set(result.stats)
-        fault = f"frame {frame.index}: stats have other keys than on frame 0: {sorted(changed)}"
-        require(not changed, fault, "the keys must be the same on every frame; use 0 where there is no value")
+        require(
+            not changed,
+            f"frame {frame.index}: stats have other keys than on frame 0: {sorted(changed)}",
+            "the keys must be the same on every frame; use 0 where there is no value",
+        )
 
 
 def _conventions(run: _Runner, monocular: bool) -> None:
@@ -220,8 +229,9 @@ def _conventions(run: _Runner, monocular: bool) -> None:
 
 def _frames_left_alone(run: _Runner) -> None:
     frames = [run.scene[frame.index] for frame in run.frames]  # earlier checks may have changed the others
-    images = [image for frame in frames for image in (frame.rgb, frame.depth)]
-    require_unchanged(lambda: run.track(frames), *images, what="a frame")
+    require_unchanged(
+        lambda: run.track(frames), *[image for frame in frames for image in (frame.rgb, frame.depth)], what="a frame"
+    )
 
 
 def _determinism(run: _Runner, deterministic: bool) -> None:
@@ -233,8 +243,11 @@ def _determinism(run: _Runner, deterministic: bool) -> None:
         np.random.seed(seed)  # noqa: NPY002
         episodes.append(run.track(run.frames))
     at = first_difference(*episodes)
-    cause = "randomness that does not come from rng (numpy.random, random, cv2.theRNG), threads, or hashing order"
-    require(not at, f"two runs with one seed differ: {at}", cause)
+    require(
+        not at,
+        f"two runs with one seed differ: {at}",
+        "randomness that does not come from rng (numpy.random, random, cv2.theRNG), threads, or hashing order",
+    )
 
 
 def _two_resets(run: _Runner, deterministic: bool) -> None:
@@ -244,8 +257,11 @@ def _two_resets(run: _Runner, deterministic: bool) -> None:
     run.track(mirrored, tracker)
     at = first_difference(first, run.track(run.frames, tracker))
     _close(tracker)
-    cause = "reset() leaves something of the sequence before: map, last pose, motion model, generator"
-    require(not at or not deterministic, f"the same frames give other results after a second reset(): {at}", cause)
+    require(
+        not at or not deterministic,
+        f"the same frames give other results after a second reset(): {at}",
+        "reset() leaves something of the sequence before: map, last pose, motion model, generator",
+    )
 
 
 def _hard_frame(run: _Runner, name: str) -> None:
@@ -276,8 +292,11 @@ def _final(run: _Runner, count: int | None = None) -> None:
     _none_of(trajectory_faults(final), "finalize() gave")
     assert isinstance(final, Trajectory)
     foreign = set(final.timestamps.tolist()) - {frame.timestamp for frame in frames}
-    fault = f"the final trajectory has {len(foreign)} stamps of no frame, e.g. {sorted(foreign)[:1]}"
-    require(not foreign, fault, "stamps have to be those of the frames, unrounded")
+    require(
+        not foreign,
+        f"the final trajectory has {len(foreign)} stamps of no frame, e.g. {sorted(foreign)[:1]}",
+        "stamps have to be those of the frames, unrounded",
+    )
 
 
 def _closing(run: _Runner) -> None:
@@ -317,8 +336,11 @@ def _online_settings(run: _Runner, spec: TrackerSpec | None, settings: Settings 
     tracker = run.construct(start)
     names = ", ".join(parameter.name for parameter in online[:4]) + (", ..." if len(online) > 4 else "")
     fault = f"the tracker class {type(tracker).__name__} has no method configure(settings), but {names} is online"
-    cause = "implement configure (see core.settings.Reconfigurable), or declare the setting without online=True"
-    require(callable(getattr(tracker, "configure", None)), fault, cause)
+    require(
+        callable(getattr(tracker, "configure", None)),
+        fault,
+        "implement configure (see core.settings.Reconfigurable), or declare the setting without online=True",
+    )
     fresh, half = run.track(run.frames, tracker), len(run.frames) // 2
     has_effect, late_effects = False, []
     for first in (0, 1):

@@ -1,6 +1,6 @@
 """Local bundle adjustment by the Schur solver and by gtsam on the same problems, in turn: time, cost reached, poses.
 
-    python tests/benchmarks/backend_bundle.py [--repeats 5] [--observations 6000] [--iterations 3]
+    python tests/benchmarks/backend_bundle.py
 
 Needs the extra: ``pip install '.[gtsam]'``.
 """
@@ -8,13 +8,11 @@ Needs the extra: ``pip install '.[gtsam]'``.
 import one_thread  # noqa: F401  # before all others
 
 # isort: split
-import sys
 import time
 from dataclasses import replace
 
 import gtsam
 import numpy as np
-from command_line import parser_of
 
 from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.slam.bundle_adjustment import DEPTH_SHARE, BundleProblem, BundleResult, adjust_bundle
@@ -22,6 +20,9 @@ from dynslam_bench.slam.pose_optimisation import cauchy_width
 
 FIXED_SIGMA = 1e-5
 """Standard deviation (rad, m) of the prior of a fixed pose; an equality constraint is seven times slower."""
+
+
+REPEATS, OBSERVATIONS, ITERATIONS = 5, 6000, 3
 
 
 def problem(observations: int, seed: int, poses: int = 14, variable: int = 8) -> tuple[BundleProblem, np.ndarray]:
@@ -73,25 +74,29 @@ def adjust_bundle_gtsam(problem: BundleProblem, iterations: int) -> BundleResult
     return adjust_bundle(replace(problem, poses=poses, points=points), 0)
 
 
-def main() -> int:
+def main() -> None:
     """Print one row a solver."""
-    parser = parser_of(__doc__, repeats=5, observations=6000, iterations=3)
-    options = parser.parse_args()
     solvers = {"schur": adjust_bundle, "gtsam": adjust_bundle_gtsam}
     spent: dict[str, list[float]] = {name: [] for name in solvers}
     cost: dict[str, list[float]] = {name: [] for name in solvers}
     error: dict[str, list[float]] = {name: [] for name in solvers}
     adjust_bundle(problem(200, 0)[0], 1)  # compiles
-    for seed in range(options.repeats):
-        each, truth = problem(options.observations, seed)
+    for seed in range(REPEATS):
+        each, truth = problem(OBSERVATIONS, seed)
         for name, solve in solvers.items():
             begin = time.process_time()
-            result = solve(each, options.iterations)
+            result = solve(each, ITERATIONS)
             spent[name].append(1e3 * (time.process_time() - begin))
             cost[name].append(adjust_bundle(replace(each, poses=result.poses, points=result.points), 0).cost)
-            gap = se3.inverse(result.poses[: each.variable]) @ truth[: each.variable]
-            error[name].append(1e3 * float(np.linalg.norm(gap[:, :3, 3], axis=1).mean()))
-    print(f"{options.observations} observations, 8 + 6 poses, {options.iterations} iterations, processor time")
+            error[name].append(
+                1e3
+                * float(
+                    np.linalg.norm(
+                        (se3.inverse(result.poses[: each.variable]) @ truth[: each.variable])[:, :3, 3], axis=1
+                    ).mean()
+                )
+            )
+    print(f"{OBSERVATIONS} observations, 8 + 6 poses, {ITERATIONS} iterations, processor time")
     print("| solver | ms median | ms min | cost | camera error mm |")
     print("| --- | --- | --- | --- | --- |")
     for name in solvers:
@@ -99,8 +104,7 @@ def main() -> int:
             f"| {name} | {np.median(spent[name]):.1f} | {min(spent[name]):.1f} | {np.mean(cost[name]):.0f} "
             f"| {np.mean(error[name]):.2f} |"
         )
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

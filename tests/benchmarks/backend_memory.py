@@ -1,12 +1,11 @@
 """Resident memory and frame time of systems over 10,000 frames of a rendered room, walked to and fro.
 
-    python tests/benchmarks/backend_memory.py [--tracker orb-slam2 ... | all] [--frames 10000] [--loop 300]
-        [--size 640 480] [--sequence synthetic/sitting_xyz]
+    python tests/benchmarks/backend_memory.py [--tracker orb-slam2 ...] [--frames 10000] [--loop 300] [--size 640 480]
 
 A Markdown table. Each tracker runs whole (features, masks, culling, tracking, mapping) in a process of its own. The
 sequence's first `loop` frames are held in memory and played forwards and backwards in turn, so that nothing but the
-tracker grows. Masks are the exact ones. ``all`` stands for every built-in system that leaderboards rank; with
-``--size 160 120 --loop 60`` a frame costs a tenth, and what is kept of each frame shows just as well.
+tracker grows. Masks are the exact ones. With ``--size 160 120 --loop 60`` a frame costs a tenth, and what is
+kept of each frame shows just as well.
 
 Bars: less than 1 MB of growth a 1,000 frames after the first fifth, and in the end at most 1.2 times the frame time
 (processor time, median of a tenth of the frames) that it was at a tenth of the way.
@@ -39,12 +38,11 @@ class ToAndFro:
 
     def __init__(self, sequence: Sequence) -> None:
         self.frames = [sequence[index] for index in range(len(sequence))]
-        self.known = None if sequence.masks is None else [sequence.masks[index] for index in range(len(sequence))]
+        self.masks = [sequence.masks[index] for index in range(len(sequence))]
         self.turns = [*range(len(self.frames)), *range(len(self.frames) - 2, 0, -1)]
 
     def __getitem__(self, index: int) -> FrameMasks:
-        assert self.known is not None
-        return self.known[self.turns[index % len(self.turns)]]
+        return self.masks[self.turns[index % len(self.turns)]]
 
     def frame(self, index: int) -> Any:
         """The frame of that number, stamped at 30 Hz."""
@@ -53,19 +51,17 @@ class ToAndFro:
 
 def resident_mb() -> float:
     """Resident memory of this process in MB (Linux)."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def walk(tracker_id: str, sequence: Sequence, frames: int, answer: Any) -> None:
-    """Track so many frames, print the memory twenty times, answer with the growth."""
+def walk(tracker_id: str, sequence: Sequence, frames: int) -> None:
+    """Track so many frames, print the memory twenty times, and a row of the table."""
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     source = ToAndFro(sequence)
-    masks = source if source.known is not None else None
     has_masks = "segmentation.source" in field_names(TRACKERS.get(tracker_id).settings)
-    overrides = {"segmentation.source": "oracle"} if has_masks and masks is not None else {}
-    tracker = build_tracker(tracker_id, overrides, TrackerContext(sequence_id=sequence.id, masks=masks))
+    overrides = {"segmentation.source": "oracle"} if has_masks else {}
+    tracker = build_tracker(tracker_id, overrides, TrackerContext(sequence_id=sequence.id, masks=source))
     tracker.reset(sequence.camera, rng=np.random.default_rng(0))
     marks: list[tuple[int, float]] = []
     lost, spent, step = 0, np.zeros(frames), max(1, frames // 20)
@@ -82,36 +78,29 @@ def walk(tracker_id: str, sequence: Sequence, frames: int, answer: Any) -> None:
     late = np.array([mark for mark in marks if mark[0] >= frames / 5])
     slope = 1e3 * float(np.polyfit(late[:, 0], late[:, 1], 1)[0])
     early, late_ms = (float(np.median(spent[end - 2 * step : end])) for end in (max(frames // 10, 2 * step), frames))
-    answer.send({"tracker": tracker_id, "frames": frames, "lost": lost, "last_mb": round(marks[-1][1], 1),
-                 "growth_mb_per_1000": round(slope, 3), "ms_early": round(early, 2), "ms_late": round(late_ms, 2),
-                 "slower": round(late_ms / early, 3)})  # fmt: skip
-
-
-def ranked() -> list[str]:
-    """Every built-in system that leaderboards rank and that runs here without another program."""
-    specs = [found.spec for found in TRACKERS.all()]
-    return [spec.id for spec in specs if spec.ranked and spec.entry_point.startswith("dynslam_bench.trackers.systems")]
+    print(
+        f"| {tracker_id} | {frames} | {lost} | {marks[-1][1]:.1f} | {slope:.3f} | {early:.2f} | {late_ms:.2f} "
+        f"| {late_ms / early:.3f} |",
+        flush=True,
+    )
 
 
 def main() -> None:
     """Print a row a tracker."""
-    parser = parser_of(__doc__, tracker=["orb-slam2"], sequence="synthetic/sitting_xyz", frames=10000, loop=300)
+    parser = parser_of(__doc__, tracker=["orb-slam2"], frames=10000, loop=300)
     parser.add_argument("--size", type=int, nargs=2, default=(640, 480))
     options = parser.parse_args()
-    smaller = PreprocessingSettings(width=options.size[0], height=options.size[1])
-    sequence = open_sequence(options.sequence, frames=(0, options.loop), preprocessing=smaller)
+    sequence = open_sequence(
+        "synthetic/sitting_xyz",
+        frames=(0, options.loop),
+        preprocessing=PreprocessingSettings(width=options.size[0], height=options.size[1]),
+    )
     head = ("tracker", "frames", "lost", "MB in the end", "MB per 1,000 frames", "ms early", "ms late", "late : early")
-    print(f"| {' | '.join(head)} |\n| ---{' | ---:' * (len(head) - 1)} |")
-    for tracker in ranked() if options.tracker == ["all"] else options.tracker:
-        ours, theirs = multiprocessing.Pipe()
-        process = multiprocessing.get_context("fork").Process(
-            target=walk, args=(tracker, sequence, options.frames, theirs)
-        )
+    print(f"| {' | '.join(head)} |\n| ---{' | ---:' * (len(head) - 1)} |", flush=True)  # before the processes copy it
+    for tracker in options.tracker:
+        process = multiprocessing.get_context("fork").Process(target=walk, args=(tracker, sequence, options.frames))
         process.start()
-        theirs.close()
-        row = ours.recv()
         process.join()
-        print(f"| {' | '.join(map(str, row.values()))} |", flush=True)
 
 
 if __name__ == "__main__":

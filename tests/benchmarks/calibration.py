@@ -1,20 +1,19 @@
 """How near `sequences calibrate` comes to the truth: rolling shutters of known readout, global ones, real excerpts.
 
-    python tests/benchmarks/calibration.py [--scenes 0 1] [--frames 100] [--readouts 0 10 20 26 33]
-        [--part fast global real] [--data-root FOLDER]
+    python tests/benchmarks/calibration.py [--scenes 0 1]
 
 A Markdown table, one row a recording: true and estimated readout in ms with the 95 % interval, whether the truth lies
 within, the delay of depth, the depth factor, processor time. Then how often the truth lies within the interval, and
-how often a global shutter was taken for a rolling one. `--readouts` renders the `fast_*` families with other readout
-times than their 26 ms, each below a data root of its own. Excerpts are looked for in ``../shared``; what is not there
+how often a global shutter was taken for a rolling one. The `fast_*` families are rendered with other readout times
+than their 26 ms, too, each below a data root of its own. Excerpts are looked for in ``../shared``; what is not there
 is named.
 """
 
-import argparse
 import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 from command_line import parser_of
@@ -27,28 +26,26 @@ from dynslam_bench.sequences.synthetic import families, open_synthetic
 
 SHARED = Path(__file__).resolve().parents[3] / "shared/data"
 REAL = ("tum/rgbd_dataset_freiburg1_xyz", "tum/rgbd_dataset_freiburg1_rpy", "bonn/rgbd_bonn_crowd")
+FRAMES, READOUTS_MS = 100, (0.0, 26.0)
 FAST = ("desk", "rpy", "spin", "walking")
 GLOBAL = ("walking_xyz", "walking_rpy", "walking_halfsphere", "walking_static", "sitting_rpy", "crowd_xyz", "loop_room")
 
 
-def recordings(options: argparse.Namespace) -> Iterator[tuple[str, float | None, Sequence]]:
+def recordings(scenes: list[int]) -> Iterator[tuple[str, float | None, Sequence]]:
     """Name, true readout in ms where it is known, and the recording."""
-    root = find_data_root(options.data_root)
+    root = find_data_root(None)
     optics = families.OPTICS
-    for ms in options.readouts if "fast" in options.part else ():
-        for kind in FAST:
-            for scene in options.scenes:
-                families.OPTICS = replace(optics, readout_s=1e-3 * ms)
-                name = f"synthetic/fast_{kind}@{scene}?frames={options.frames}"
-                sequence = open_synthetic(name, root / f"readout_{ms:g}ms")
-                assert sequence.camera.readout_s == 1e-3 * ms  # the scene is built while the optics are these
-                yield name, ms, sequence
+    for ms, kind, scene in product(READOUTS_MS, FAST, scenes):
+        families.OPTICS = replace(optics, readout_s=1e-3 * ms)
+        name = f"synthetic/fast_{kind}@{scene}?frames={FRAMES}"
+        sequence = open_synthetic(name, root / f"readout_{ms:g}ms")
+        assert sequence.camera.readout_s == 1e-3 * ms  # the scene is built while the optics are these
+        yield name, ms, sequence
     families.OPTICS = optics
-    for kind in GLOBAL if "global" in options.part else ():
-        for scene in options.scenes:
-            name = f"synthetic/{kind}@{scene}?frames={options.frames}"
-            yield name, 0.0, open_synthetic(name, root)
-    for folder in REAL if "real" in options.part else ():
+    for kind, scene in product(GLOBAL, scenes):
+        name = f"synthetic/{kind}@{scene}?frames={FRAMES}"
+        yield name, 0.0, open_synthetic(name, root)
+    for folder in REAL:
         if (SHARED / folder).is_dir():
             yield folder, None, open_sequence(SHARED / folder)
         else:
@@ -65,13 +62,11 @@ def text(quantity: Quantity, scale: float) -> str:
 
 def main() -> None:
     """One line a recording, then the counts."""
-    parser = parser_of(__doc__, scenes=[0, 1], frames=100, readouts=[0.0, 26.0], data_root=Path)
-    parser.add_argument("--part", nargs="+", default=["fast", "global", "real"], choices=["fast", "global", "real"])
-    options = parser.parse_args()
+    options = parser_of(__doc__, scenes=[0, 1]).parse_args()
     rolling, still, observable = [], [], 0
     head = ("recording", "true ms", "readout ms", "truth within", "delay of depth ms", "depth factor", "processor s")
     print(f"| {' | '.join(head)} |\n|{' --- |' * len(head)}")
-    for name, truth, sequence in recordings(options):
+    for name, truth, sequence in recordings(options.scenes):
         began = time.process_time()
         try:
             result = calibrate(sequence)

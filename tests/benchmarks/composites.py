@@ -8,7 +8,6 @@ masks), and the worst instance. The second one has the error of the last tracker
 fill.
 """
 
-import argparse
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +20,7 @@ from dynslam_bench.core.settings import parse_assignments
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.sequences.compose import compose
 
+FOLDER = Path("results/composites")
 TRACKERS = (
     "orb-slam2", "opencv-odometry", "dynaslam-g", "dai-slam", "opf-slam", "emfoa-oft?masks=none",
     *(f"{name} segmentation.source=oracle" for name in (
@@ -32,25 +32,24 @@ TRACKERS = (
 
 def main() -> None:
     """Make the instances and the runs, and print the tables."""
-    parser = parser_of(__doc__, instances=10, folder=Path("results/composites"), jobs=1)
+    parser = parser_of(__doc__, instances=10)
     parser.add_argument("hosts", nargs="+")
     parser.add_argument("--with", dest="people", required=True)
-    parser.add_argument("--trackers", nargs="+", default=TRACKERS, metavar="'TRACKER [NAME=VALUE ...]'")
     chosen = parser.parse_args()
     people = open_sequence(chosen.people)
     hosts: dict[str, str] = {}
     for host, instance in ((host, k) for host in chosen.hosts for k in range(chosen.instances)):
-        folder = chosen.folder / f"{Path(host).name}_{instance}"
+        folder = FOLDER / f"{Path(host).name}_{instance}"
         if not folder.is_dir():
             compose(open_sequence(host), people, folder, instance)
         hosts[str(folder)] = host
     shares = {name: share_of(name) for name in hosts}
     lines, errors = [], pd.Series(dtype=float)
-    for text in chosen.trackers:
+    for text in TRACKERS:
         tracker, *assignments = text.split()
         masked = any(part.startswith("segmentation.source") for part in assignments)
-        base = errors_of(*(("orb-slam2", []) if masked else (tracker, assignments)), chosen.hosts, chosen)
-        errors = errors_of(tracker, assignments, list(hosts), chosen)
+        base = errors_of(*(("orb-slam2", []) if masked else (tracker, assignments)), chosen.hosts)
+        errors = errors_of(tracker, assignments, list(hosts))
         ratios = np.log([errors[name] / base[host] for name, host in hosts.items()])
         low, high = interval(errors.to_numpy())
         lines.append(
@@ -59,19 +58,23 @@ def main() -> None:
         )
     print("| tracker | host mm | composites mm, median [95 %] | ratio to the host | worst mm |")
     print("| --- | ---: | ---: | ---: | ---: |", *lines, sep="\n", end="\n\n")
-    print(f"| people fill | instances | `{chosen.trackers[-1].split()[0]}`, median mm |\n| --- | ---: | ---: |")
+    print(f"| people fill | instances | `{TRACKERS[-1]}`, median mm |\n| --- | ---: | ---: |")
     thirds = pd.qcut(pd.Series(shares), 3)
     for span, names in thirds.groupby(thirds, observed=True).groups.items():
         print(f"| {span.left:.0%} to {span.right:.0%} | {len(names)} | {1e3 * errors[names].median():.1f} |")
 
 
-def errors_of(tracker: str, assignments: list[str], sequences: list[str], chosen: argparse.Namespace) -> pd.Series:
+def errors_of(tracker: str, assignments: list[str], sequences: list[str]) -> pd.Series:
     """Hold-last-pose ATE in metres of a tracker by sequence; a run without one counts as a static camera."""
-    specs = make_specs(tracker, sequences, settings=parse_assignments(assignments))
-    runs = run_specs(specs, results=chosen.folder / "runs", jobs=chosen.jobs)
-    table = db.load(chosen.folder / "runs").set_index("run_id").loc[[run.record.run_id for run in runs]]
-    held = table["hold_last_pose_ate_m"].fillna(table["static_camera_ate_rmse_m"])
-    return pd.Series(held.astype(float).to_numpy(), index=sequences)
+    runs = run_specs(
+        make_specs(tracker, sequences, settings=parse_assignments(assignments)),
+        results=FOLDER / "runs",
+    )
+    table = db.load(FOLDER / "runs").set_index("run_id").loc[[run.record.run_id for run in runs]]
+    return pd.Series(
+        table["hold_last_pose_ate_m"].fillna(table["static_camera_ate_rmse_m"]).astype(float).to_numpy(),
+        index=sequences,
+    )
 
 
 def share_of(name: str) -> float:
@@ -82,8 +85,9 @@ def share_of(name: str) -> float:
 
 def interval(values: np.ndarray) -> tuple[float, float]:
     """95 % interval of the median over instances, by resampling them."""
-    drawn = np.random.default_rng(0).choice(values, (2000, len(values)))
-    low, high = np.quantile(np.median(drawn, axis=1), [0.025, 0.975])
+    low, high = np.quantile(
+        np.median(np.random.default_rng(0).choice(values, (2000, len(values))), axis=1), [0.025, 0.975]
+    )
     return float(low), float(high)
 
 

@@ -1,7 +1,6 @@
 """Culling quality of `emfoa-oft`, its ablations and other systems, per feature, against exact masks.
 
-    python tests/benchmarks/culling_quality.py [--sequences "synthetic/walking_xyz?scene=100&frames=300" ...]
-        [--frames 60:160] [--trackers emfoa-oft yolo-slam] [--masks oracle] [--cache DIR] [--jobs N]
+    python tests/benchmarks/culling_quality.py [--frames 60:160]
 
 Every feature of every frame lies on one of three things, by the renderer's exact masks:
 
@@ -21,8 +20,6 @@ import one_thread  # noqa: F401  # before all others
 
 # isort: split
 import tempfile
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
@@ -33,8 +30,8 @@ from dynslam_bench.contracts.sequence import FrameMasks
 from dynslam_bench.core.settings import parse_assignments
 from dynslam_bench.evaluation import evaluate, get_protocol
 from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.sequences.catalogue import open_sequence
-from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
+from dynslam_bench.sequences.catalogue import open_sequence, parse_frames
+from dynslam_bench.trackers import TrackerContext, build_tracker
 
 SEQUENCES = [
     f"synthetic/walking_{motion}?scene={100 + number}&frames=300"
@@ -67,8 +64,9 @@ def measure(
     """
     sequence = open_sequence(name, frames=part)
     assert sequence.masks is not None and sequence.ground_truth is not None, f"{name} has no exact masks"
-    context = TrackerContext(sequence_id=sequence.id, masks=sequence.masks, cache=str(cache))
-    tracker = build_tracker(tracker_id, settings, context)
+    tracker = build_tracker(
+        tracker_id, settings, TrackerContext(sequence_id=sequence.id, masks=sequence.masks, cache=str(cache))
+    )
     tracker.reset(sequence.camera, rng=np.random.default_rng(0))
     poses, counts = {}, []
     for i in range(len(sequence)):
@@ -81,20 +79,20 @@ def measure(
     coverage, ate = len(poses) / len(sequence), np.nan
     if len(poses) >= 3:
         online, due = Trajectory(np.array([*poses]), np.array([*poses.values()])), sequence.timestamps
-        protocol = get_protocol("tum-rgbd/v1")
-        ate = evaluate(online, sequence.ground_truth, protocol, input_timestamps=due).metrics["ate_rmse_m"]
+        ate = evaluate(online, sequence.ground_truth, get_protocol("tum-rgbd/v1"), input_timestamps=due).metrics[
+            "ate_rmse_m"
+        ]
     return ate, coverage, np.array(counts)
 
 
-def row(label: str, names: list[str], part: tuple[int, int | None], masks: str | None, cache: Path) -> str:
+def row(label: str, part: tuple[int, int | None], cache: Path) -> str:
     """One system's row of the table."""
     cv2.setNumThreads(1)
     tracker_id, *assignments = label.split()
     settings = parse_assignments(assignments)
-    default = getattr(TRACKERS.get(tracker_id).settings(), "segmentation", None)
-    if masks is not None and default is not None and default.source != "none":
-        settings = settings | {"segmentation.source": masks}
-    ates, coverages, counts = zip(*(measure(tracker_id, settings, name, part, cache) for name in names), strict=True)
+    ates, coverages, counts = zip(
+        *(measure(tracker_id, settings, name, part, cache) for name in SEQUENCES), strict=True
+    )
     by_frame = np.concatenate(counts)
     seen, culled = by_frame.sum(axis=0)
     precision = culled[2] / (culled[0] + culled[2]) if culled[[0, 2]].any() else np.nan
@@ -109,24 +107,16 @@ def row(label: str, names: list[str], part: tuple[int, int | None], masks: str |
 
 def main() -> None:
     """Print one table row a system."""
-    parser = parser_of(__doc__, sequences=SEQUENCES, jobs=1)
-    parser.add_argument("--frames", default="0:", help="part of each sequence, A:B")
-    parser.add_argument("--trackers", nargs="+", default=TRACKERS_AND_SETTINGS, metavar="'TRACKER [NAME=VALUE ...]'")
-    parser.add_argument("--masks", metavar="SOURCE", help="where systems with masks have them from, e.g. oracle")
-    parser.add_argument("--cache", type=Path, help="folder of the stage cache; default: a temporary one")
-    chosen = parser.parse_args()
-    first, last = chosen.frames.split(":")
-    part = (int(first or 0), int(last) if last else None)
-    with tempfile.TemporaryDirectory() as scratch, ProcessPoolExecutor(chosen.jobs, get_context("spawn")) as pool:
+    chosen = parser_of(__doc__, frames="0:").parse_args()
+    with tempfile.TemporaryDirectory() as cache:
         print(
             "| system | precision | recall | background culled | still people culled | frames without culling "
             "| ATE, mm | coverage |"
         )
         print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-        shared = (chosen.sequences, part, chosen.masks, chosen.cache or Path(scratch))
-        for line in pool.map(row, chosen.trackers, *([value] * len(chosen.trackers) for value in shared)):
-            print(line, flush=True)
-    print("\nATE in brackets: " + ", ".join(chosen.sequences))
+        for label in TRACKERS_AND_SETTINGS:
+            print(row(label, parse_frames(chosen.frames), Path(cache)), flush=True)
+    print("\nATE in brackets: " + ", ".join(SEQUENCES))
 
 
 if __name__ == "__main__":

@@ -23,8 +23,9 @@ SETTINGS = {"preprocessing.width": 320, "preprocessing.height": 240, "features.n
 
 def steps_a_second(sequence: str, count: int, steps: int, memory_map: bool) -> float:
     """Steps of all environments a second of wall time, after ten steps of warm-up."""
-    make = partial(SlamEnv, sequence, "orb-slam2", settings=SETTINGS, cache=False, memory_map=memory_map)
-    envs = gym.vector.AsyncVectorEnv([make] * count)
+    envs = gym.vector.AsyncVectorEnv(
+        [partial(SlamEnv, sequence, "orb-slam2", settings=SETTINGS, cache=False, memory_map=memory_map)] * count
+    )
     try:
         envs.reset(seed=0)
         for _ in range(10):

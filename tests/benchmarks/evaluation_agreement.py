@@ -25,14 +25,20 @@ def mended(scripts: Path, folder: Path) -> Path:
     for name in ("associate.py", "evaluate_ate.py", "evaluate_rpe.py"):
         shutil.copy(scripts / name, folder / name)
         path = folder / name
-        text = path.read_text().replace("numpy.linalg.linalg", "numpy.linalg")
-        path.write_text(re.sub(r"keys = (\w+)\.keys\(\)", r"keys = list(\1.keys())", text))
+        path.write_text(
+            re.sub(
+                r"keys = (\w+)\.keys\(\)",
+                r"keys = list(\1.keys())",
+                path.read_text().replace("numpy.linalg.linalg", "numpy.linalg"),
+            )
+        )
     return folder
 
 
 def official(folder: Path, script: str, *arguments: str) -> dict[str, float]:
-    command = [sys.executable, script, *arguments, "--verbose"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600)
+    done = subprocess.run(
+        [sys.executable, script, *arguments, "--verbose"], cwd=folder, capture_output=True, text=True, timeout=600
+    )
     found = re.findall(r"(compared_pose_pairs|[\w.]*rmse) ([\d.]+)", done.stdout)
     if not found:
         raise SystemExit(f"{script} failed: {done.stderr.strip().splitlines()[-1:]}")
@@ -59,8 +65,9 @@ def main() -> None:
                 f"| {ours.metrics['ate_rmse_m']:.6f} | | |"
             )
             for delta, unit in DELTAS:
-                fixed = ("--fixed_delta", "--delta", str(delta), "--delta_unit", unit)
-                theirs = official(folder, "evaluate_rpe.py", *pair, *fixed)
+                theirs = official(
+                    folder, "evaluate_rpe.py", *pair, *(("--fixed_delta", "--delta", str(delta), "--delta_unit", unit))
+                )
                 spec = RPESpec(delta=delta, unit=unit)
                 ours = evaluate(estimate, truth, Protocol(id="agreement", rpe=(spec,)))
                 print(

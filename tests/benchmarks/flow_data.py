@@ -1,5 +1,6 @@
 """Image pairs with known correspondences for the flow measurements: exact warps, real frames with depth and pose."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,6 +39,11 @@ class Pair:
     guess: np.ndarray | None = None
 
 
+def lengths(pairs: Sequence[Pair]) -> np.ndarray:
+    """How far the points of all pairs move, in pixels."""
+    return np.concatenate([np.hypot(*(pair.truth - pair.points).T) for pair in pairs])
+
+
 def corners(gray: np.ndarray, count: int = 1000) -> np.ndarray:
     """ORB keypoints over all octaves, spread over a grid, float32 ``[N, 2]``."""
     keypoints = sorted(cv2.ORB.create(4 * count, fastThreshold=7).detect(gray), key=lambda k: -k.response)
@@ -54,11 +60,8 @@ def textures(limit: int) -> list[np.ndarray]:
         files = sorted((folder / "rgb").glob("*.png"))
         paths += [files[0], files[len(files) // 2]]
     photos = sorted((DATA / "coco128-seg/images/train2017").glob("*.jpg"))
-    images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in paths]
-    images += [
-        image for image in (cv2.imread(str(p), cv2.IMREAD_GRAYSCALE) for p in photos) if image.shape == (480, 640)
-    ]
-    return images[:limit]
+    images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in [*paths, *photos]]
+    return [image for image in images if image.shape == (480, 640)][:limit]
 
 
 def _warp(image: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
@@ -74,12 +77,16 @@ def _similarity(scale: float, degrees: float, tx: float, ty: float, centre: tupl
     return np.array([[c, -s, x - c * x + s * y + tx], [s, c, y - s * x - c * y + ty], [0, 0, 1.0]])
 
 
-def synthetic(kinds: tuple[str, ...], images: int, seed: int = 7) -> list[Pair]:
-    """Exact warps of real images with sensor noise of 1.5 grey levels.
+SIMILARITIES = {
+    "translation": (0, 0, 1), "scale": (1, 0, 0.3), "rotation": (0, 45, 0.3), "similarity": (0.5, 20, 0.5),
+    "foreground": (0.5, 20, 0.5),
+}  # fmt: skip
+"""Of each kind of warp the largest octaves of scale and degrees of rotation, and the share of the translation."""
 
-    Kinds: ``translation``, ``scale``, ``rotation``, ``similarity``, ``homography``, ``foreground``.
-    """
-    rng = np.random.default_rng(seed)
+
+def synthetic(kinds: tuple[str, ...], images: int) -> list[Pair]:
+    """Exact warps of real images with sensor noise of 1.5 grey levels: ``homography``, and those of `SIMILARITIES`."""
+    rng = np.random.default_rng(7)
     pairs = []
     pictures = textures(images + 1)
     for index, image in enumerate(pictures[:-1]):
@@ -88,18 +95,14 @@ def synthetic(kinds: tuple[str, ...], images: int, seed: int = 7) -> list[Pair]:
         points = corners(image)
         for kind in kinds:
             t = rng.uniform(-1, 1, 2) * (100, 75)
-            if kind == "translation":
-                matrix = _similarity(1, 0, *t, centre)
-            elif kind == "scale":
-                matrix = _similarity(2 ** rng.uniform(-1, 1), 0, *(t * 0.3), centre)
-            elif kind == "rotation":
-                matrix = _similarity(1, rng.uniform(-45, 45), *(t * 0.3), centre)
-            elif kind in ("similarity", "foreground"):
-                matrix = _similarity(2 ** rng.uniform(-0.5, 0.5), rng.uniform(-20, 20), *(t * 0.5), centre)
-            elif kind == "homography":
+            if kind == "homography":
                 corner = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
                 moved = corner + rng.uniform(-90, 90, (4, 2)).astype(np.float32)
                 matrix = cv2.getPerspectiveTransform(corner, moved).astype(np.float64)
+            else:
+                octaves, degrees, share = SIMILARITIES[kind]
+                scale = 2 ** rng.uniform(-octaves, octaves) if octaves else 1
+                matrix = _similarity(scale, rng.uniform(-degrees, degrees) if degrees else 0, *(t * share), centre)
             target = _warp(image, matrix, size)
             reference, here = image, points
             truth = cv2.perspectiveTransform(points[:, None].astype(np.float64), matrix)[:, 0]
@@ -194,9 +197,9 @@ def real(name: str, gaps: tuple[int, ...], every: int = 4) -> list[Pair]:
     return pairs
 
 
-def kitti() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The KITTI pair: colour frames (BGR), flow float32 ``[H, W, 2]``, validity."""
+def kitti() -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+    """The KITTI pair: both images in grey, flow float32 ``[H, W, 2]``, validity."""
     folder = DATA / "flow/kitti"
     raw = cv2.imread(str(folder / "flow_gt.png"), cv2.IMREAD_UNCHANGED)[..., ::-1].astype(np.float32)
-    frames = [cv2.imread(str(folder / name)) for name in ("frame1.png", "frame2.png")]
-    return frames[0], frames[1], (raw[..., :2] - 2**15) / 64, raw[..., 2] > 0
+    images = [cv2.imread(str(folder / name)) for name in ("frame1.png", "frame2.png")]
+    return [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in images], (raw[..., :2] - 2**15) / 64, raw[..., 2] > 0

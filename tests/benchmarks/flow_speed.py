@@ -49,15 +49,13 @@ def dense_table(first: np.ndarray, second: np.ndarray, points: np.ndarray, repea
 def main() -> None:
     """Print all tables."""
     options = parser_of(None, repeats=40, dense=False).parse_args()
-    repeats = options.repeats
     cv2.setNumThreads(1)
     pair = synthetic(("similarity",), 3)[-1]
-    first, second = pair.reference, pair.target
-    points = a_thousand(first)
+    images = pair.reference, pair.target, a_thousand(pair.reference)
     if options.dense:
-        dense_table(first, second, points, repeats)
+        dense_table(*images, options.repeats)
         return
-    wall, processor = timed(one_frame(build_flow(LUCAS_KANADE), first, second, points), repeats)
+    wall, processor = timed(one_frame(build_flow(LUCAS_KANADE), *images), options.repeats)
     reference = min(processor)
     print("| method, budget | threads | min ms | median ms | processor ms | ratio to LK | % < 1.5 px |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
@@ -67,16 +65,25 @@ def main() -> None:
     for settings in rows:
         for threads in (1, 2):
             flow = build_flow(settings, threads=threads)
-            wall, processor = timed(one_frame(flow, first, second, points), repeats)
-            result = flow.track(flow.prepare(first), flow.prepare(second), pair.points)
-            good = 100 * (np.hypot(*(result.xy - pair.truth).T) < 1.5).mean()
-            note = (
-                "default"
-                if settings == FlowSettings()
-                else ", ".join(f"{k}={v}" for k, v in settings.model_dump().items() if v != getattr(FlowSettings(), k))
+            wall, processor = timed(one_frame(flow, *images), options.repeats)
+            good = (
+                100
+                * (
+                    np.hypot(
+                        *(
+                            flow.track(flow.prepare(pair.reference), flow.prepare(pair.target), pair.points).xy
+                            - pair.truth
+                        ).T
+                    )
+                    < 1.5
+                ).mean()
             )
+            note = ", ".join(f"{k}={v}" for k, v in settings.model_dump().items() if v != getattr(FlowSettings(), k))
             cost = f"{min(processor):.1f} | {min(processor) / reference:.2f}" if threads == 1 else "- | -"
-            print(f"| {note} | {threads} | {min(wall):.1f} | {np.median(wall):.1f} | {cost} | {good:.1f} |", flush=True)
+            print(
+                f"| {note or 'default'} | {threads} | {min(wall):.1f} | {np.median(wall):.1f} | {cost} | {good:.1f} |",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
 """Blackouts and kidnapped cameras in rendered scenes: after how many frames the camera is relocalised.
 
-    python tests/benchmarks/lost_and_found.py [--sequences ID ...] [--frames 300] [--black 20] [--cases 6]
+    python tests/benchmarks/lost_and_found.py
 
 Frames are rendered and their ORB features kept, those on people left out by the exact masks; the back end of
 `orb-slam2` is driven over them again and again, each time from another start. A case is one of:
 
-* black: 100 frames, `--black` frames without any feature while the camera moves on, 30 frames;
+* black: 100 frames, 20 frames without any feature while the camera moves on, 30 frames;
 * kidnapped: 200 frames, then 30 frames of what was seen 150 frames ago, from one frame to the next;
-* carried: the same with `--black` frames in between.
+* carried: the same with 20 frames in between.
 
 The view afterwards is known if an earlier frame that was tracked was taken within 0.3 m and 20 degrees of it. Bar: of
 the known ones all are `ok` within ten frames. A frame that is `ok` is wrong if its camera centre is farther than 0.1 m
@@ -22,10 +22,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import pandas as pd
-from command_line import parser_of
 
 from dynslam_bench.contracts import FrameBundle, Keypoints
-from dynslam_bench.core.settings import apply_overrides, parse_assignments
 from dynslam_bench.features.registry import build_extractor
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry import Camera, se3
@@ -41,6 +39,8 @@ SCENES = [
 ]
 BEFORE = {"black": 100, "kidnapped": 200, "carried": 200}
 BACK, AFTER, SOON = 150, 30, 10
+FRAMES, BLACK, CASES = 300, 20, 6
+"""Frames of a scene, black ones of a case, cases of a kind in a scene."""
 NEAR_M, NEAR_DEG, WRONG_M = 0.3, 20.0, 0.1
 DILATION = 15
 """Pixels around people that count as theirs."""
@@ -63,18 +63,19 @@ class Scene:
     fps: float
 
 
-def rendered(source: str, count: int) -> Scene:
-    """Features of the first `count` frames of a sequence; of every second one where the camera walks."""
+def rendered(source: str) -> Scene:
+    """Features of the first `FRAMES` frames of a sequence; of every second one where the camera walks."""
     stride = 2 if "loop" in source else 1
-    sequence = open_sequence(source, frames=(0, count * stride), stride=stride)
+    sequence = open_sequence(source, frames=(0, FRAMES * stride), stride=stride)
     extractor = build_extractor(FeatureSettings())
     kernel, frames = np.ones((2 * DILATION + 1, 2 * DILATION + 1), np.uint8), []
     for index in range(len(sequence)):
         frame, masks = sequence[index], sequence.masks[index]
         people = np.isin(masks.instances, [n for n, name in masks.class_names.items() if name == "person"])
         mask = cv2.dilate(people.astype(np.uint8), kernel) > 0
-        gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-        keypoints = extractor.extract_masked(gray, mask, SegmentationSettings().outside_share)
+        keypoints = extractor.extract_masked(
+            cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), mask, SegmentationSettings().outside_share
+        )
         column, row = np.rint(keypoints.xy).astype(int).T
         at = row.clip(0, mask.shape[0] - 1), column.clip(0, mask.shape[1] - 1)
         static = np.flatnonzero(~mask[at])
@@ -93,15 +94,14 @@ def frame_of(scene: Scene, index: int | None, number: int) -> FrameBundle:
         keypoints, z, mask = keypoints.select(np.zeros(0, np.int64)), z[:0], np.zeros(size, bool)
     blank = np.zeros((*size, 3), np.uint8)
     pictures = blank, blank[..., 0], np.zeros(size, np.float32)
-    xy = keypoints.xy.astype(np.float64)
-    return FrameBundle(number, number / scene.fps, *pictures, keypoints, xy, z, mask=mask)
+    return FrameBundle(number, number / scene.fps, *pictures, keypoints, keypoints.xy.astype(np.float64), z, mask=mask)
 
 
-def path_of(kind: str, start: int, black: int) -> list[int | None]:
+def path_of(kind: str, start: int) -> list[int | None]:
     """Which frames a case shows, in order."""
     left = start + BEFORE[kind]
-    back = left + black if kind == "black" else left - BACK
-    return [*range(start, left), *[None] * (0 if kind == "kidnapped" else black), *range(back, back + AFTER)]
+    back = left + BLACK if kind == "black" else left - BACK
+    return [*range(start, left), *[None] * (0 if kind == "kidnapped" else BLACK), *range(back, back + AFTER)]
 
 
 def is_known(scene: Scene, view: int, mapped: list[int]) -> bool:
@@ -112,10 +112,10 @@ def is_known(scene: Scene, view: int, mapped: list[int]) -> bool:
     return bool((near & (rotated <= NEAR_DEG)).any())
 
 
-def case(scene: Scene, kind: str, start: int, black: int, settings: BackendSettings) -> dict[str, object]:
+def case(scene: Scene, kind: str, start: int) -> dict[str, object]:
     """Drive one case; a row of the table of cases."""
-    path, before = path_of(kind, start, black), BEFORE[kind]
-    backend = RgbdBackend(settings)
+    path, before = path_of(kind, start), BEFORE[kind]
+    backend = RgbdBackend(BackendSettings())
     backend.reset(scene.camera, 0)
     ok, error = np.zeros(len(path), bool), np.zeros(len(path))
     for number, index in enumerate(path):
@@ -133,8 +133,6 @@ def case(scene: Scene, kind: str, start: int, black: int, settings: BackendSetti
         "frames_lost": int(again[0]) + 1 if len(again) else np.inf,
         "wrong": np.count_nonzero(ok & (dark | (error > error[:before].max() + WRONG_M))),
         "worst_mm": 1e3 * error[ok].max(initial=0),
-        "tracked": np.count_nonzero(ok),
-        "frames": len(path),
     }
 
 
@@ -149,18 +147,13 @@ def row(name: str, cases: pd.DataFrame) -> str:
 
 def main() -> None:
     """Print a row for each kind of loss."""
-    parser = parser_of(__doc__, sequences=SCENES, frames=300, black=20, cases=6)
-    parser.add_argument("--set", nargs="*", default=[], help="settings of the back end, e.g. loop_closing.enabled=true")
-    options = parser.parse_args()
     cv2.setNumThreads(1)
-    settings = apply_overrides(BackendSettings(), parse_assignments(options.set))
     rows = []
-    for source in options.sequences:
-        scene = rendered(source, options.frames)
+    for scene in map(rendered, SCENES):
         for kind in BEFORE:
-            length = max(index for index in path_of(kind, 0, options.black) if index is not None) + 1
-            for start in np.linspace(0, options.frames - length, options.cases).astype(int):
-                rows.append({"scene": source, "loss": kind} | case(scene, kind, int(start), options.black, settings))
+            length = max(index for index in path_of(kind, 0) if index is not None) + 1
+            starts = np.linspace(0, FRAMES - length, CASES).astype(int).tolist()
+            rows += [{"loss": kind} | case(scene, kind, start) for start in starts]
     cases = pd.DataFrame(rows)
     head = ("loss", "cases", "known views", "relocalised within ten frames", "median frames", "most frames",
             "wrong poses", "largest error mm")  # fmt: skip

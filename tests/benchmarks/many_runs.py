@@ -1,6 +1,6 @@
 """What many runs cost beside their tracking, by their number, by Dask's workers and by their frames.
 
-    python tests/benchmarks/many_runs.py FOLDER [--runs 1000 10000 100000] [--workers 1 2 4 8] [--frames 5 50 200]
+    python tests/benchmarks/many_runs.py FOLDER
 
 FOLDER is a recording in TUM layout. First table: looking runs up, resuming when all are stored, listing them, and all
 runs as one frame. Each number of runs is shared by two trackers, ten start offsets and as many seeds as are needed. No
@@ -9,19 +9,19 @@ run, which is the clock's. The other tables: runs of `never-move`, which tracks 
 milliseconds a run: of the process that asks for the runs, and of those that make them.
 """
 
-import argparse
-import json
 import resource
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
-from concurrent.futures import Executor, Future
-from pathlib import Path
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from itertools import chain
+from multiprocessing import get_context
 
 import psutil
+from command_line import parser_of
 
 from dynslam_bench.runs import RunSpec, RunStore, list_runs, run_many
 from dynslam_bench.runs.cluster import DaskWorkers
@@ -41,11 +41,16 @@ class LookedUp(Exception):
 
 def specs(folder: str, count: int) -> Iterator[RunSpec]:
     for number in range(count):
-        tracker = ("orb-slam2", "never-move")[number % 2]
-        yield RunSpec(tracker=tracker, sequence=folder, offset=number // 2 % 10, seed=number // 20, device="cpu")
+        yield RunSpec(
+            tracker=("orb-slam2", "never-move")[number % 2],
+            sequence=folder,
+            offset=number // 2 % 10,
+            seed=number // 20,
+            device="cpu",
+        )
 
 
-def look_up(folder: str, count: int, results: str) -> dict[str, float]:
+def look_up(folder: str, count: int, results: str) -> list[float]:
     """The head's work until all runs are known and the first is handed out."""
     times: list[float] = []
 
@@ -54,14 +59,19 @@ def look_up(folder: str, count: int, results: str) -> dict[str, float]:
 
     began = time.monotonic()
     try:
-        events = {"on_event": lambda event: times.append(time.monotonic() - began), "on_plan": looked_up}
-        run_many(specs(folder, count), results=results, executor=Nowhere(), **events)
+        run_many(
+            specs(folder, count),
+            results=results,
+            executor=Nowhere(),
+            on_event=lambda event: times.append(time.monotonic() - began),
+            on_plan=looked_up,
+        )
     except LookedUp:
-        return {"first run": times[0], "look-up": time.process_time()}
+        return [times[0], time.process_time()]
     raise AssertionError("unreachable")
 
 
-def fill(folder: str, count: int, results: str) -> dict[str, float]:
+def fill(folder: str, count: int, results: str) -> list[float]:
     """Store copies of one run, with its metrics, under the ids of all."""
     store = RunStore(results)
     (record,) = run_many([RunSpec(tracker="orb-slam2", sequence=folder, frames=(0, 30), device="cpu")], results=store)
@@ -74,28 +84,29 @@ def fill(folder: str, count: int, results: str) -> dict[str, float]:
             if (model / name).is_file():
                 shutil.copy(model / name, store.runs / run_id)
         (store.runs / run_id / "run.json").write_text(text.replace(record.run_id, run_id))
-        state = store.index.state(run_id, record.sequence.part)
-        entries.append((run_id, state, metrics.to_line().replace(record.run_id, run_id)))
+        entries.append(
+            (run_id, store.index.state(run_id, record.sequence.part), metrics.to_line().replace(record.run_id, run_id))
+        )
     store.index.write(f"metrics {metrics.protocol_digest}", metrics.code, entries)
-    return {}
+    return []
 
 
-def resume(folder: str, count: int, results: str) -> dict[str, float]:
+def resume(folder: str, count: int, results: str) -> list[float]:
     """Look all up and take them from the store."""
     assert len(run_many(specs(folder, count), results=results)) == count
-    return {"resume": time.process_time()}
+    return [time.process_time()]
 
 
-def listing(folder: str, count: int, results: str) -> dict[str, float]:
+def listing(folder: str, count: int, results: str) -> list[float]:
     """All rows of ``runs list``."""
     assert len(list_runs(RunStore(results))[0]) == count + 1
-    return {"list": time.process_time()}
+    return [time.process_time()]
 
 
-def frame(folder: str, count: int, results: str) -> dict[str, float]:
+def frame(folder: str, count: int, results: str) -> list[float]:
     """All runs as one pandas frame."""
     assert len(RunStore(results).frame()) == count + 1
-    return {"frame": time.process_time()}
+    return [time.process_time()]
 
 
 _CLUSTER = """
@@ -107,7 +118,7 @@ cluster.close()
 """
 
 
-def on_workers(folder: str, workers: int, results: str) -> dict[str, float]:
+def on_workers(folder: str, workers: int, results: str) -> list[float]:
     """Runs of five frames on Dask's workers."""
     command = [sys.executable, "-c", _CLUSTER.format(workers=workers)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as cluster:
@@ -117,10 +128,10 @@ def on_workers(folder: str, workers: int, results: str) -> dict[str, float]:
             run_many(still(folder, 5, range(RUNS)), results=results, executor=executor)
         head_ms, minutes = 1000 * (time.process_time() - spent) / RUNS, (time.monotonic() - began) / 60
         cluster.communicate("\n")
-    return {"head": head_ms, "a minute": RUNS / minutes}
+    return [head_ms, RUNS / minutes]
 
 
-def of_frames(folder: str, frames: int, results: str) -> dict[str, float]:
+def of_frames(folder: str, frames: int, results: str) -> list[float]:
     """Runs of so many frames."""
     run_many(still(folder, frames, [-1]), results=results)  # the fork server has started then
     (server,) = psutil.Process().children()
@@ -129,7 +140,7 @@ def of_frames(folder: str, frames: int, results: str) -> dict[str, float]:
     head, other = time.process_time() - spent, sum(server.cpu_times()) - before
     files = list(RunStore(results).folder(records[0].run_id).iterdir())
     kilobytes = sum(file.stat().st_size for file in files) / 1000
-    return {"head": 1000 * head / RUNS, "other": 1000 * other / RUNS, "kB": kilobytes, "files": len(files)}
+    return [1000 * head / RUNS, 1000 * other / RUNS, kilobytes, len(files)]
 
 
 RUNS = 50
@@ -143,53 +154,43 @@ def still(folder: str, frames: int, seeds: Iterable[int]) -> list[RunSpec]:
     ]
 
 
-PARTS = {"look_up": look_up, "fill": fill, "resume": resume, "listed": listing, "list": listing, "frame": frame}
-CURVES = {"on_workers": on_workers, "of_frames": of_frames}
+def with_peak(part: Callable[..., list[float]], *arguments: object) -> tuple[list[float], float]:
+    """What a part measures, and the most memory of the process in MB."""
+    return part(*arguments), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def measured(name: str, folder: Path, count: int, results: str) -> dict[str, float]:
-    """What a part measures in a process of its own, with the most memory (MB) that it takes."""
-    command = [sys.executable, __file__, str(folder), "--part", name, str(count), results]
-    return json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout.splitlines()[-1])
+def measured(part: Callable[..., list[float]], *arguments: object) -> tuple[list[float], float]:
+    """`with_peak` in a process of its own."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        return pool.submit(with_peak, part, *arguments).result()
 
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--runs", type=int, nargs="*", default=[1000, 10_000, 100_000])
-    parser.add_argument("--workers", type=int, nargs="*", default=[1, 2, 4, 8])
-    parser.add_argument("--frames", type=int, nargs="*", default=[5, 50, 200])
-    parser.add_argument("--part", nargs=3, help=argparse.SUPPRESS)
-    chosen = parser.parse_args()
-    if chosen.part:
-        name, count, results = chosen.part
-        values = (PARTS | CURVES)[name](str(chosen.folder), int(count), results)
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        print(json.dumps(values | {"MB": peak}))
-        return
+    parser = parser_of(__doc__)
+    parser.add_argument("folder")
+    folder = parser.parse_args().folder
     print(
         "| runs | first run, s | look-up, s | resume, s | first list, s | later lists, s | frame, s | most memory, MB |"
     )
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    for count in chosen.runs:
+    for count in (1000, 10_000, 100_000):
         with tempfile.TemporaryDirectory() as results:
-            parts = {name: measured(name, chosen.folder, count, results) for name in PARTS}
-        cells = [parts["look_up"]["first run"], parts["look_up"]["look-up"], parts["resume"]["resume"]]
-        cells += [parts["listed"]["list"], parts["list"]["list"], parts["frame"]["frame"]]
-        most = max(values["MB"] for name, values in parts.items() if name != "fill")
-        print(f"| {count} | " + " | ".join(f"{cell:.1f}" for cell in cells) + f" | {most:.0f} |", flush=True)
+            before = measured(look_up, folder, count, results)
+            measured(fill, folder, count, results)
+            after = [measured(part, folder, count, results) for part in (resume, listing, listing, frame)]
+        cells, peaks = zip(before, *after, strict=True)
+        print(f"| {count} | {' | '.join(f'{cell:.1f}' for cell in chain(*cells))} | {max(peaks):.0f} |", flush=True)
     print("\n| Dask's workers | head, ms a run | runs a minute |\n| --- | --- | --- |")
-    for count in chosen.workers:
+    for count in (1, 2, 4, 8):
         with tempfile.TemporaryDirectory() as results:
-            values = measured("on_workers", chosen.folder, count, results)
-        print(f"| {count} | {values['head']:.1f} | {values['a minute']:.0f} |", flush=True)
+            (head_ms, a_minute), _ = measured(on_workers, folder, count, results)
+        print(f"| {count} | {head_ms:.1f} | {a_minute:.0f} |", flush=True)
     print("\n| frames | head, ms a run | other processes, ms a run | kB a run | files a run |\n" + "| --- " * 5 + "|")
-    for count in chosen.frames:
+    for count in (5, 50, 200):
         with tempfile.TemporaryDirectory() as results:
-            values = measured("of_frames", chosen.folder, count, results)
-        cells = [f"{values[name]:.0f}" for name in ("head", "other", "kB", "files")]
-        print(f"| {count} | {' | '.join(cells)} |", flush=True)
+            cells, _ = measured(of_frames, folder, count, results)
+        print(f"| {count} | {' | '.join(f'{cell:.0f}' for cell in cells)} |", flush=True)
 
 
 if __name__ == "__main__":

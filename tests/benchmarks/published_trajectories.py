@@ -45,8 +45,10 @@ def agreement(folder: Path) -> None:
             inside = (estimate.timestamps >= poses.timestamps[0] - 0.01) & (
                 estimate.timestamps <= poses.timestamps[-1] + 0.01
             )
-            shorter = evaluate(estimate.select(inside), poses, "evo-as/v1").metrics["ate_rmse_m"]
-            cut.append(abs(shorter - float(line["rmse_m"])) < 1e-6)
+            cut.append(
+                abs(evaluate(estimate.select(inside), poses, "evo-as/v1").metrics["ate_rmse_m"] - float(line["rmse_m"]))
+                < 1e-6
+            )
         good = sum(difference < 1e-9 for difference in differences)
         print(f"| {table.parent.name} | {len(cut)} | {good} | {max(differences):.0e} | {sum(cut)} |")
 

@@ -1,6 +1,6 @@
 """The pictures at the top of the README, out of a leaderboard and a run.
 
-    python tests/benchmarks/readme_pictures.py SITE RESULTS [-o docs/pictures]
+    python tests/benchmarks/readme_pictures.py SITE RESULTS
 
 `SITE` is a published site (`dynslam-bench report publish`); `RESULTS` holds one run of a tracker that culls, e.g. with
 `dynslam-bench run emfoa-oft 'synthetic/walking_xyz?scene=100' --frames 0:60 --snapshots`. Headless Chromium draws both.
@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 
 ROOT = Path(__file__).resolve().parents[2]
+PICTURES = ROOT / "docs" / "pictures"
 sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "reports")]
 
 from reports_browser import Browser  # noqa: E402
@@ -28,7 +29,6 @@ def framed(browser: Browser, selector: str, target: Path, most: int = 0) -> None
         f"(() => {{ const box = one({selector!r}).getBoundingClientRect();"
         " return [box.x + scrollX, box.y + scrollY, box.width, box.height].map(Math.round); })()"
     )
-    target.parent.mkdir(parents=True, exist_ok=True)
     browser.picture(target.with_suffix(".png"))
     image = cv2.imread(str(target.with_suffix(".png")))
     target.with_suffix(".png").unlink()
@@ -41,21 +41,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("site", type=Path)
     parser.add_argument("results", type=Path)
-    parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "pictures")
-    parser.add_argument("--frame", type=int, default=-1, help="which frame of the run")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         browser = Browser(Path(folder) / "browser")
         browser.open(options.site / "leaderboard" / "index.html", 1400)
         browser.until("one('.dt-search input')", tries=200)
-        framed(browser, "main", options.output / "leaderboard.webp", most=760)
+        framed(browser, "main", PICTURES / "leaderboard.webp", most=760)
         store = RunStore(options.results)
-        report = build_report(store, Path(folder) / "report")
-        browser.open(report.run, 1100, anchor=f"#{store.ids()[0]}")
+        browser.open(build_report(store, Path(folder) / "report").run, 1100, anchor=f"#{store.ids()[0]}")
         browser.until("one('#time .main-svg') && one('#picture img').complete", tries=200)
-        browser.run(f"slide(byId('frame'), {options.frame})") if options.frame >= 0 else None
         browser.settle()
-        framed(browser, ".panes", options.output / "culling.webp")
+        framed(browser, ".panes", PICTURES / "culling.webp")
         browser.close()
 
 

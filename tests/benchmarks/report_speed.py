@@ -1,6 +1,6 @@
 """How long a report of thousands of runs takes to make and to open, and how much of it is loaded first.
 
-    python tests/benchmarks/report_speed.py [--trackers 20] [--sequences 20] [--repeats 5] [--keep FOLDER]
+    python tests/benchmarks/report_speed.py
 
 Makes a results folder with files as large as those of real runs: trajectories, 39 columns of ``frames.csv``, snapshots
 of 1500 features and a mask on 30 frames, logs. Then seconds, processor seconds and memory of `build_report`: without
@@ -10,7 +10,6 @@ the time from opening to the first contentful paint and to the load event, with 
 Bars for 2000 runs on two idle cores: made in 30 s, first paint after 0.5 s, 1 MB loaded before the script of plotly.
 """
 
-import argparse
 import resource
 import shutil
 import sys
@@ -39,19 +38,22 @@ PAINT = "(performance.getEntriesByName('first-contentful-paint')[0] ?? {}).start
 LOAD = "performance.getEntriesByType('navigation')[0].loadEventEnd"
 
 
-def fill(root: Path, trackers: int, sequences: int, repeats: int, frames: int) -> RunStore:
-    """A results folder of so many runs."""
+FRAMES, TRACKERS, SEQUENCES, REPEATS = 200, 20, 20, 5
+
+
+def fill(root: Path) -> RunStore:
+    """A results folder of 2,000 runs."""
     store = RunStore(root / "results")
-    for number in range(sequences):
+    for number in range(SEQUENCES):
         pattern = root / "patterns" / str(number)
         pattern.mkdir(parents=True)
-        add_frames(pattern, frames, features=1500, size=(480, 640), stages=STAGES, stats=STATS, seed=number)
-        for at, seed in product(range(trackers), range(repeats)):
-            quality = float(np.geomspace(0.005, 0.2, trackers)[at])
+        add_frames(pattern, FRAMES, features=1500, size=(480, 640), stages=STAGES, stats=STATS, seed=number)
+        for at, seed in product(range(TRACKERS), range(REPEATS)):
+            quality = float(np.geomspace(0.005, 0.2, TRACKERS)[at])
             broken = (at + number + seed) % 37 == 0
             run_id = add_run(
                 store, f"tracker-{at:02d}", f"synthetic/sequence_{number:02d}", seed,
-                error=quality * (1 + 0.1 * seed), n=frames, final_error=0.9 * quality,
+                error=quality * (1 + 0.1 * seed), n=FRAMES, final_error=0.9 * quality,
                 status="crashed" if broken else "ok", reason="RuntimeError: no map" if broken else "",
                 lost=range(50, 60) if at % 4 == 0 else (), tags=("high-dynamic",) if number % 2 else ("static",),
                 mask_iou=0.8, settings=SETTINGS, identity={"scheme": IDENTITY_SCHEME, "settings": SETTINGS},
@@ -95,16 +97,8 @@ def opened(page: Path, folder: Path) -> str:
 
 def main() -> None:
     """Print seconds and megabytes."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for name, value in {"trackers": 20, "sequences": 20, "repeats": 5, "frames": 200}.items():
-        parser.add_argument(f"--{name}", type=int, default=value)
-    parser.add_argument("--keep", type=Path, help="folder for the results, used again if it is there")
-    options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="report-speed-") as folder:
-        root = options.keep or Path(folder)
-        store = RunStore(root / "results")
-        if not store.runs.is_dir():
-            fill(root, options.trackers, options.sequences, options.repeats, options.frames)
+        store = fill(Path(folder))
         store.index.path.unlink(missing_ok=True)
         print(f"| {len(store.ids())} runs | s | processor s | at most MB of memory | MB written |")
         print("| --- | ---: | ---: | ---: | ---: |")

@@ -69,10 +69,14 @@ def remade(section: str, data: str = "") -> str:
 
 
 def _run(command: str) -> str:
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    environment = os.environ | {"PATH": path, "PYTHONPATH": str(ROOT)}
     return subprocess.run(
-        ["bash", "-euc", command], cwd=ROOT, env=environment, check=True, capture_output=True, text=True
+        ["bash", "-euc", command],
+        cwd=ROOT,
+        env=os.environ
+        | {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": str(ROOT)},
+        check=True,
+        capture_output=True,
+        text=True,
     ).stdout
 
 

@@ -31,10 +31,10 @@ from dynslam_bench.sequences.catalogue import open_sequence
 WEIGHTS = Path(__file__).resolve().parents[3] / "shared" / "weights"
 
 
-def untrained(config: NetworkConfig, side: int, threads: int, objects: int, device: str) -> MaskRCNNSegmenter:
-    """A network with random weights that gives `objects` detections, so that the mask branch has its usual work."""
+def untrained(config: NetworkConfig, side: int, threads: int, device: str) -> MaskRCNNSegmenter:
+    """A network with random weights that gives three detections, so that the mask branch has its usual work."""
     torch.manual_seed(0)
-    network = MaskRCNN(config.model_copy(update={"max_detections": objects, "classes": ("person",) * 90}))
+    network = MaskRCNN(config.model_copy(update={"max_detections": 3, "classes": ("person",) * 90}))
     network.roi_heads.config = network.config
     network.set_input(side)
     return MaskRCNNSegmenter(network, SegmentationSettings(), device=device, threads=threads, floor=0.0)
@@ -42,8 +42,7 @@ def untrained(config: NetworkConfig, side: int, threads: int, objects: int, devi
 
 def main() -> None:
     """Print the table."""
-    parser = parser_of(None, threads=2, repeats=7, objects=3, device="cpu")
-    arguments = parser.parse_args()
+    arguments = parser_of(None, threads=2, repeats=7, device="cpu").parse_args()
     cv2.setNumThreads(arguments.threads)
     sequence = open_sequence("synthetic/walking_xyz?scene=120&frames=60")
     frames = [sequence[index] for index in (30, 31)]
@@ -54,18 +53,13 @@ def main() -> None:
         frame: Frame = frames[0]
         rows.append((label, lambda: segmenter.segment(frame)))  # type: ignore[attr-defined]
 
-    for side in (480, 800):
-        network = untrained(NetworkConfig(), side, arguments.threads, arguments.objects, arguments.device)
-        add(f"Mask R-CNN, ResNet-50, CFPN, shorter side {side}", network)
-    network = untrained(RESNET18, 480, arguments.threads, arguments.objects, arguments.device)
-    add("Mask R-CNN, ResNet-18, CFPN, shorter side 480", network)
-    if embedded_weights().is_file():
-        add(
-            "embedded (half-width ResNet-18, CFPN, 320x240)",
-            build_segmenter(
-                SegmentationSettings(source="embedded"), device=arguments.device, threads=arguments.threads
-            ),
-        )
+    for name, config, side in (("50", NetworkConfig(), 480), ("50", NetworkConfig(), 800), ("18", RESNET18, 480)):
+        network = untrained(config, side, arguments.threads, arguments.device)
+        add(f"Mask R-CNN, ResNet-{name}, CFPN, shorter side {side}", network)
+    if embedded_weights() is not None:
+        settings = SegmentationSettings(source="embedded")
+        embedded = build_segmenter(settings, device=arguments.device, threads=arguments.threads)
+        add("embedded (half-width ResNet-18, CFPN, 320x240)", embedded)
     for name in ("yolov8n-seg_480x640_fp32", "deeplabv3_mnv2_voc_481x641"):
         if (WEIGHTS / f"{name}.onnx").is_file():
             settings = SegmentationSettings(source=f"onnx:{WEIGHTS / name}.onnx")

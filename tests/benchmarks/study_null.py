@@ -44,8 +44,9 @@ MOST_RUNS = 40
 
 def study_on(scenes: int, offsets: str = "0-1", **changes: object) -> Any:
     """A simulated study on so many scenes."""
-    tune = f"synthetic/walking_xyz?scene=0-{scenes - 1}&frames=20&offsets={offsets}"
-    return simulated.make_spec(tune=[tune], **changes)
+    return simulated.make_spec(
+        tune=[f"synthetic/walking_xyz?scene=0-{scenes - 1}&frames=20&offsets={offsets}"], **changes
+    )
 
 
 def line(*cells: object) -> str:
@@ -59,17 +60,22 @@ def null(studies: int, folder: Path) -> Iterable[str]:
     yield line("scenes", "sd", "the best trial promises 5 %", "chosen", *(f"*{verdict}*" for verdict in verdicts))
     for count in SCENES:
         for simulated.STARTS_SD in SPREADS:
-            lucky = chosen = 0
-            said = Counter[str]()
+            counts = Counter[str]()
             for seed in range(count * 1000 + int(100 * simulated.STARTS_SD) * 100000, 10**9)[:studies]:
-                spec = study_on(count, sampler_seed=seed, sampler="tpe")
-                tuner = simulated.SimulatedTuner(spec, folder / f"{count}-{simulated.STARTS_SD}-{seed}", seed=seed)
-                lucky += tuner.run().study.best_value < math.log(0.95)
+                tuner = simulated.SimulatedTuner(
+                    study_on(count, sampler_seed=seed, sampler="tpe"),
+                    folder / f"{count}-{simulated.STARTS_SD}-{seed}",
+                    seed=seed,
+                )
+                counts["lucky"] += tuner.run().study.best_value < math.log(0.95)
                 summary = finish(tuner)
-                chosen += summary.best is not None and summary.best.chosen
-                said[summary.verdict.value] += 1
-            shares = [count / studies for count in (lucky, chosen, *(said[name] for name in verdicts))]
-            yield line(count, str(simulated.STARTS_SD), *shares)
+                counts["chosen"] += summary.best is not None and summary.best.chosen
+                counts[summary.verdict.value] += 1
+            yield line(
+                count,
+                str(simulated.STARTS_SD),
+                *[counts[name] / studies for name in ("lucky", "chosen", *verdicts)],
+            )
 
 
 def choice(studies: int, folder: Path) -> Iterable[str]:
@@ -126,8 +132,12 @@ def recovered(studies: int, folder: Path) -> Iterable[str]:
                 summary = finish(tuner)
             counts["extended"] += summary.verdict == Verdict.PROVEN
         names = ("chosen", Verdict.PROVEN, Verdict.PROMISING, "extended", Verdict.NO_MATTER, "known")
-        shares = [counts[name] / studies for name in names]
-        yield line(str(simulated.STARTS_SD), float(np.mean(gains)), *shares, best_power(design, loss))
+        yield line(
+            str(simulated.STARTS_SD),
+            float(np.mean(gains)),
+            *[counts[name] / studies for name in names],
+            best_power(design, loss),
+        )
 
 
 def best_power(design: Any, gain: float) -> float:
@@ -146,13 +156,22 @@ def regret(studies: int, folder: Path) -> Iterable[str]:
     """Regret of a study with each pruner, beside plain Optuna's on as many runs, and how many trials each made."""
 
     simulated.STARTS_SD = 0.28
-    plain_ones = ("plain Optuna, `WilcoxonPruner`", "trials", "plain Optuna, no pruner", "trials")
-    yield line("pruner", "runs", "regret", "trials", *plain_ones)
+    yield line(
+        "pruner",
+        "runs",
+        "regret",
+        "trials",
+        *(("plain Optuna, `WilcoxonPruner`", "trials", "plain Optuna, no pruner", "trials")),
+    )
     for pruner in ("none", "halving", "wilcoxon"):
         runs, ours, others = [], [], {optuna.pruners.WilcoxonPruner: [], optuna.pruners.NopPruner: []}
         for seed in range(studies):
-            spec = study_on(8, pruner=pruner, trials=24, sampler="tpe", sampler_seed=seed)
-            tuner = simulated.SimulatedTuner(spec, folder / f"{pruner}-{seed}", effect=simulated.valley, seed=seed)
+            tuner = simulated.SimulatedTuner(
+                study_on(8, pruner=pruner, trials=24, sampler="tpe", sampler_seed=seed),
+                folder / f"{pruner}-{seed}",
+                effect=simulated.valley,
+                seed=seed,
+            )
             trials = tuner.run().study.get_trials(deepcopy=False)
             runs.append(
                 sum(len(trial.user_attrs["instances"]) for trial in trials)
@@ -160,8 +179,9 @@ def regret(studies: int, folder: Path) -> Iterable[str]:
             ours.append((simulated.valley(finish(tuner).best.params), len(trials)))
             for kind, found in others.items():
                 found.append(plain(tuner, seed, runs[-1], kind()))
-        cells = [cell for found in (ours, *others.values()) for cell in summed(found)]
-        yield line(f"`{pruner}`", round(np.mean(runs)), *cells)
+        yield line(
+            f"`{pruner}`", round(np.mean(runs)), *[cell for found in (ours, *others.values()) for cell in summed(found)]
+        )
 
 
 def summed(found: Sequence[tuple[float, int]]) -> tuple[str, int]:

@@ -1,6 +1,6 @@
 """Speed of the renderer: the first frame, all others with PNG writing, and reading back.
 
-Usage: python tests/benchmarks/synthetic_speed.py [ID] [--frames 120] [--threads 2]
+Usage: python tests/benchmarks/synthetic_speed.py [--frames 120] [--threads 2]
 
 A Markdown table of wall and CPU time a frame: on a machine shared with others only the CPU time says something.
 """
@@ -24,12 +24,11 @@ def timed(what: str, frames: int, work: Callable[[], object]) -> None:
 
 
 if __name__ == "__main__":
-    parser = parser_of(__doc__, frames=120, threads=2)
-    parser.add_argument("id", nargs="?", default="synthetic/walking_xyz")
-    arguments = parser.parse_args()
+    arguments = parser_of(__doc__, frames=120, threads=2).parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        chosen = f"{arguments.id}{'&' if '?' in arguments.id else '?'}frames={arguments.frames}"
-        sequence = open_synthetic(chosen, Path(folder), threads=arguments.threads)
+        sequence = open_synthetic(
+            f"synthetic/walking_xyz?frames={arguments.frames}", Path(folder), threads=arguments.threads
+        )
         print("| work | wall ms a frame | CPU ms a frame |\n| --- | ---: | ---: |")
         timed("first frame (textures, compilation if not cached)", 1, lambda: sequence[0])
         timed("render and write", arguments.frames - 1, sequence.render)

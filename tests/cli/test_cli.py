@@ -186,15 +186,6 @@ def test_run_show_report_compare_and_remove(cli, facts, walk, tmp_path):
     assert facts("runs", "list") == []
 
 
-def test_damaged_sequences_never_become_runs(cli, walk, tmp_path):
-    """One line, exit code 1, and nothing half written; each kind of damage is a case of the tests of readers."""
-    copy = shutil.copytree(walk, tmp_path / "copy")
-    (copy / "rgb.txt").write_text("")
-    code, _, err = cli("run", "never-move", copy)
-    assert code == 1 and "lists no image" in one_line(err)
-    assert not list(tmp_path.glob("results/runs/*"))
-
-
 def test_eval_and_protocols(cli, facts, walk, tmp_path):
     truth = walk / "groundtruth.txt"
     code, out, _ = cli("eval", truth, truth)
@@ -215,10 +206,9 @@ def test_kitti_trajectories_with_their_stamps(cli, facts, walk, tmp_path):
     assert code == 1 and "--timestamps FILE" in one_line(err)
 
 
-def test_doctor(cli, facts):
+def test_doctor(facts):
     rows = facts("doctor")
     assert {"program", "weights", "folder", "device"} <= {row["part"] for row in rows}
-    assert "embedded" in cli("doctor")[1]
 
 
 def test_envs(facts):
@@ -319,8 +309,13 @@ def test_help_loads_nothing_heavy(arguments):
 
 
 def test_output_to_a_closed_pipe_is_no_error():
-    script = f"{sys.executable} -m dynslam_bench sequences list | head -1"
-    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, cwd=ROOT, check=True)
+    done = subprocess.run(
+        ["bash", "-c", f"{sys.executable} -m dynslam_bench sequences list | head -1"],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        check=True,
+    )
     assert done.stderr == "" and done.stdout.startswith("7-Scenes"), "the first data set"
 
 
@@ -386,8 +381,7 @@ def test_a_suite_its_report_and_its_frame(walk: Path, tmp_path: Path) -> None:
     runs = db.bench(suite, results=results)
     assert [run.status for run in runs] == ["ok", "ok"] and all(run.metrics["ate_rmse_m"] > 0 for run in runs)
     assert len(runs[0].trajectory) == len(runs[0].frames()) == 4 and (runs[0].folder / "run.json").is_file()
-    again = db.run("never-move", walk, results=results)
-    assert again.record.run_id == runs[0].record.run_id, "it is stored already"
+    assert db.run("never-move", walk, results=results).record.run_id == runs[0].record.run_id, "it is stored already"
     assert sorted(db.load(results)["tracker"]) == ["constant-velocity", "never-move"]
     assert db.report(results).html == results / "report" / "index.html"
 

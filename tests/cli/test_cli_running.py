@@ -89,15 +89,17 @@ def test_masks_of_a_recording_are_downloaded_only_by_agreement(cli, walk, fetche
     command = ("run", "mask-rcnn", walk, "--frames", "0:2")
     code, out, err = cli(*command)
     assert code == 1 and not out and not fetched.exists() and len(err.splitlines()) == 5, "an error and four cures"
-    for agrees in (False, True):
-        monkeypatch.setattr(running, "is_interactive", lambda: True)
-        monkeypatch.setattr(running.typer, "confirm", lambda *_, agrees=agrees, **__: agrees)
-        code, _, err = cli(*command)
-        assert code == 1 - agrees and "170 MB" in err and fetched.is_file() is agrees
+    monkeypatch.setattr(running, "is_interactive", lambda: True)
+    monkeypatch.setattr(running.typer, "confirm", lambda *_, **__: False)
+    code, _, err = cli(*command)
+    assert code == 1 and "170 MB" in err and not fetched.exists()
+    monkeypatch.setattr(running.typer, "confirm", lambda *_, **__: True)
+    assert cli(*command)[0] == 0 and fetched.is_file()
+    monkeypatch.setattr(running.typer, "confirm", pytest.fail)
+    assert cli(*command)[0] == 0, "nobody is asked again, and the run is stored"
     fetched.unlink()
-    monkeypatch.setattr(running, "is_interactive", lambda: False)
-    assert cli(*command, "--yes", "--seed", "1")[0] == 0 and fetched.is_file()
-    assert cli(*command, "--seed", "2")[0] == 0, "nobody is asked again"
+    monkeypatch.setattr(checkpoints, "fetch_checkpoint", lambda _: fetched.with_suffix(".asked").touch())
+    assert cli(*command, "--yes", "--seed", "1")[0] == 1 and fetched.with_suffix(".asked").exists()
 
 
 def test_bench_has_limits(cli, walk, tmp_path):
@@ -121,11 +123,12 @@ def test_a_part_without_runs_is_no_error(cli, walk, tmp_path):
 
 def test_pictures_of_a_stored_run_are_made(facts, walk):
     folder = Path(facts("run", "orb-slam2", walk)[0]["folder"])
-    for option, name in (("--snapshots", "frame_000000.webp"), ("--sheet", "sheet.png"), ("--video", "video.webm")):
-        assert not (folder / name).exists()
-        for from_store in (False, True):
-            (row,) = facts("run", "orb-slam2", walk, option)
-            assert row["from_store"] is from_store and Path(row["folder"]) == folder and (folder / name).is_file()
+    names = {"frame_000000.webp", "sheet.png", "video.webm"}
+    assert not names & {path.name for path in folder.iterdir()}
+    for from_store in (False, True):
+        (row,) = facts("run", "orb-slam2", walk, "--snapshots", "--sheet", "--video")
+        assert row["from_store"] is from_store and Path(row["folder"]) == folder
+        assert names <= {path.name for path in folder.iterdir()}
 
 
 def test_a_map_that_cannot_be_had_is_no_success(cli, walk):
@@ -203,7 +206,7 @@ def test_a_monocular_tracker_is_scored_with_its_scale_unless_told_otherwise(cli,
     assert row["protocol"] == "tum-rgbd/v1-sim3"
     (row,) = facts("run", "orb-slam2-mono", walk, "--protocol", "tum-rgbd/v1", code=code)
     assert row["protocol"] == "tum-rgbd/v1" and row["ate_rmse_m"] is None
-    assert "monocular" not in cli("run", "never-move", walk)[2]
+    assert running.default_protocol("never-move") == "tum-rgbd/v1"
 
 
 def test_progress_names_what_is_written_behind_the_last_frame():
@@ -256,10 +259,16 @@ def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number):
         "SPEC = TrackerSpec('waits', f'{__file__}:Waits', 'Waits', settings=WaitsSettings)\n"
     )
     pids = tmp_path / "pids"
-    values = {"tracker": f"{tracker}:SPEC", "folder": str(walk), "pids": str(pids)}
-    (tmp_path / "what.toml").write_text(text.format(**values).replace("'", '"'))
-    command = [sys.executable, "-m", "dynslam_bench", *verb.split(), "what.toml"]
-    program = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, preexec_fn=attentive)
+    (tmp_path / "what.toml").write_text(
+        text.format(tracker=f"{tracker}:SPEC", folder=str(walk), pids=str(pids)).replace("'", '"')
+    )
+    program = subprocess.Popen(
+        [sys.executable, "-m", "dynslam_bench", *verb.split(), "what.toml"],
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=attentive,
+    )
     try:
         hostile.until(lambda: program.poll() is not None or (pids.is_file() and pids.read_text().endswith("\n")), 300)
         assert program.poll() is None, program.stderr.read()
@@ -478,8 +487,11 @@ def test_numbers_are_never_shortened(monkeypatch):
 
 
 def test_what_names_a_column_or_fills_a_cell_reaches_no_terminal_as_an_escape():
-    lines = table(["tum/\x1b[2J", "\u202ea"], [["x\ny", "\x9b1m"], [1.5, True]]).splitlines()
-    assert lines == [r"tum/\x1b[2J  \u202ea", r"x y          \x9b1m", "1.5          yes"]
+    assert table(["tum/\x1b[2J", "\u202ea"], [["x\ny", "\x9b1m"], [1.5, True]]).splitlines() == [
+        r"tum/\x1b[2J  \u202ea",
+        r"x y          \x9b1m",
+        "1.5          yes",
+    ]
 
 
 def test_a_reports_table_has_no_markup():
@@ -599,8 +611,11 @@ LABEL = "caf\xe9 \u2013 \U0001f600"
 def test_a_report_is_shown_on_a_terminal_that_lacks_characters(cli, walk: Path, tmp_path: Path) -> None:
     options = "--tracker", "theirs", "--label", LABEL, "--sequence", walk, "--online"
     assert cli("import", walk / "groundtruth.txt", *options)[0] == 0
-    command = [sys.executable, "-m", "dynslam_bench", "report", "results", "-o", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, env=os.environ | {"PYTHONIOENCODING": "latin-1"})
+    done = subprocess.run(
+        [sys.executable, "-m", "dynslam_bench", "report", "results", "-o", str(tmp_path)],
+        capture_output=True,
+        env=os.environ | {"PYTHONIOENCODING": "latin-1"},
+    )
     assert done.returncode == 0
     assert [line for line in done.stderr.splitlines() if not line.endswith(b"so far")] == []
     assert "caf" in done.stdout.decode("latin-1") and b"?" in done.stdout
@@ -617,8 +632,9 @@ HOSTILE = "\x1b[2J\x1b]0;owned\x07\u202egnp\n"
 def stored(walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two runs, the latest of which holds escape sequences in all of its texts."""
     folder = tmp_path_factory.mktemp("results")
-    specs = [RunSpec(tracker="never-move", sequence=str(walk), seed=seed) for seed in (0, 1)]
-    _, last = run_many(specs, results=folder)
+    _, last = run_many(
+        [RunSpec(tracker="never-move", sequence=str(walk), seed=seed) for seed in (0, 1)], results=folder
+    )
     path = folder / "runs" / last.run_id / "run.json"
     record = json.loads(path.read_text())
     record |= {"reason": HOSTILE, "notes": [HOSTILE], "command": [HOSTILE], "overrides": {HOSTILE: HOSTILE}}

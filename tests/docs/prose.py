@@ -1,10 +1,6 @@
-"""The sentences and tables of a page, without code, headings and markup.
-
-python tests/docs/prose.py      # words, median and longest sentence of every page
-"""
+"""The sentences and tables of a page, without code, headings and markup."""
 
 import re
-import statistics
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -54,22 +50,3 @@ def tables(text: str) -> list[list[list[str]]]:
         [[cell.strip() for cell in CELLS.split(row.strip())[1:-1]] for row in block.splitlines() if "| --" not in row]
         for block in blocks
     ]
-
-
-def main() -> None:
-    """Print every page's figures, and those of all."""
-    everything: list[int] = []
-    total = 0
-    for page in user_pages():
-        text = page.read_text(encoding="utf-8")
-        lengths = [len(words(sentence)) for sentence in sentences(text)]
-        everything += lengths
-        total += len(text.split())
-        middle = statistics.median(lengths) if lengths else 0
-        longest = max(lengths, default=0)
-        print(f"{len(text.split()):6} words, median {middle:4}, longest {longest:3}  {page.relative_to(ROOT)}")
-    print(f"{total:6} words, median {statistics.median(everything)}, longest {max(everything)}")
-
-
-if __name__ == "__main__":
-    main()

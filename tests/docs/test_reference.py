@@ -15,8 +15,7 @@ PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
 
 @pytest.mark.parametrize(("page", "text"), reference_pages().items(), ids=lambda value: value[:30])
 def test_reference_pages_are_those_of_the_code(page: str, text: str) -> None:
-    held = (ROOT / "docs" / page).read_text(encoding="utf-8")
-    assert held == text, "write it again: python .ci/site/generated.py"
+    assert (ROOT / "docs" / page).read_text(encoding="utf-8") == text, "write it again: python .ci/site/generated.py"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())

@@ -65,8 +65,7 @@ ELSEWHERE = {
 
 
 def blocks(page: Path | str, language: str = "python") -> list[str]:
-    text = (ROOT / page).read_text(encoding="utf-8")
-    return re.findall(rf"^```{language}\n(.*?)^```", text, flags=re.S | re.M)
+    return re.findall(rf"^```{language}\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), flags=re.S | re.M)
 
 
 def test_every_block_of_python_is_run_by_some_test() -> None:
@@ -89,8 +88,11 @@ def test_a_page_s_python_runs(page: str, tmp_path: Path, monkeypatch: pytest.Mon
 
 def outputs(page: str, language: str) -> list[tuple[str, str]]:
     """The blocks of a page that a block of text follows, each with that text."""
-    text = (ROOT / page).read_text(encoding="utf-8")
-    return re.findall(rf"^```{language}\n([^`]*?)^```\n\n```text\n(.*?)^```", text, flags=re.S | re.M)
+    return re.findall(
+        rf"^```{language}\n([^`]*?)^```\n\n```text\n(.*?)^```",
+        (ROOT / page).read_text(encoding="utf-8"),
+        flags=re.S | re.M,
+    )
 
 
 def test_pages_that_show_outputs_are_compared() -> None:
@@ -165,8 +167,7 @@ def test_the_entry_point_on_the_page_is_of_a_group_that_is_read() -> None:
 
 def module_of(file: Path) -> str:
     parts = file.relative_to(ROOT).with_suffix("").parts
-    inside = parts if parts[0] == "dynslam_bench" else ("dynslam_bench", *parts)
-    return ".".join(inside).removesuffix(".__init__")
+    return ".".join(parts if parts[0] == "dynslam_bench" else ("dynslam_bench", *parts)).removesuffix(".__init__")
 
 
 WITH_EXAMPLES = [module_of(file) for file in sources() if ">>> " in file.read_text(encoding="utf-8")]

@@ -130,18 +130,6 @@ def test_a_page_outside_of_results_holds_no_measured_table(page: Path) -> None:
         assert measured(page.read_text(encoding="utf-8")) == [], "move it: docs/results/README.md"
 
 
-def test_measured_tables_are_told_from_others() -> None:
-    errors = "| sequence | ATE mm |\n| --- | --- |\n| fr1_xyz | **4.94** ± 0.07 |\n| fr1_rpy | 5.92 [5.1 - 6.2] |\n"
-    assert measured(errors) == ["sequence | ATE mm"]
-    assert measured("| system | share |\n| --- | --- |\n| a | 31 % |\n| b | 5 % |\n") == ["system | share"]
-    ids = "| ids | frames |\n| --- | --- |\n| `loop_room`: laps of 21 m at 0.45 m/s | 2400 |\n| `fast_desk` | 600 |\n"
-    assert measured(ids) == []
-    ranges = (
-        "| status | when |\n| --- | --- |\n| `timeout` | no frame within 120 s |\n| `lost` | below 0.02 s apart |\n"
-    )
-    assert measured(ranges) == []
-
-
 @pytest.mark.parametrize("page", RESULTS, ids=lambda page: page.stem)
 def test_every_table_says_how_it_was_made(page: Path) -> None:
     text = page.read_text(encoding="utf-8")

@@ -1,7 +1,6 @@
 """A reader to attack, and the attack: damaged files for a while, and what escaped."""
 
 import io
-import os
 import resource
 import signal
 import tempfile
@@ -66,8 +65,6 @@ HANGS_S = 30.0
 LONGEST_MESSAGE = 2100
 _MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None
 """Where folders are made."""
-WATCHED = 16
-"""The memory is measured every so many inputs, which may take longer than the reading."""
 
 
 def attack(target: Target, inputs: int, seed: int = 0) -> dict[str, bytes | None]:
@@ -84,18 +81,13 @@ def attack(target: Target, inputs: int, seed: int = 0) -> dict[str, bytes | None
     random, corpus = Random(f"{target.name} {seed}"), target.seeds()
     first: list[bytes | None] = [*corpus, None, b"", b"\xff\xfe\x00", b"{}", b"[" * 100_000]
     findings: dict[str, bytes | None] = {}
-    recent: list[bytes | None] = []
     peak = _peak_mb()
     for number in range(inputs):
         data = first[number] if number < len(first) else _damaged(target, corpus, random)
         fault = _one(target, data)
-        recent.append(data)
-        if number < len(first) or number % WATCHED == 0:
-            before, peak = peak, _peak_mb()
-            if peak - before > MOST_MB:
-                data = next((each for each in recent if _is_hungry(target, each)), data)
-                fault = f"takes more than {MOST_MB} MB"
-            recent.clear()
+        before, peak = peak, _peak_mb()
+        if peak - before > MOST_MB:
+            fault = f"takes more than {MOST_MB} MB"
         if fault:
             findings.setdefault(fault, data)
     return findings
@@ -129,16 +121,6 @@ def _one(target: Target, data: bytes | None) -> str:
     if not fault and time.process_time() - began > MOST_S:
         fault = f"takes more than {MOST_S:g} s"
     return fault
-
-
-def _is_hungry(target: Target, data: bytes | None) -> bool:
-    """Whether an input alone takes too much memory: read again in a process of its own, whose peak is its own."""
-    pid = os.fork()
-    if pid == 0:
-        before = _peak_mb()
-        _one(target, data)
-        os._exit(int(_peak_mb() - before > MOST_MB))
-    return os.waitpid(pid, 0)[1] != 0
 
 
 def _peak_mb() -> float:

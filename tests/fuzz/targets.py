@@ -311,8 +311,9 @@ def _read_folder(data: bytes | None, folder: Path) -> None:
     for name in ("1.png", "3.png", "4.png"):
         at(folder, f"rgb/{name}", _PNG)
         at(folder, f"depth/{name}", _DEPTH)
-    camera = Camera(8, 8, 8.0, 8.0, 4.0, 4.0)
-    sequence = reader.RecordedSequence(folder, layouts.read_tum(folder, 30.0), camera, id="fuzz")
+    sequence = reader.RecordedSequence(
+        folder, layouts.read_tum(folder, 30.0), Camera(8, 8, 8.0, 8.0, 4.0, 4.0), id="fuzz"
+    )
     files = (*sequence._colour, *sequence._depth)
     assert files and all((folder / file).resolve().is_relative_to(folder.resolve()) for file in files)
 
@@ -658,8 +659,7 @@ def _extract(data: bytes | None, folder: Path) -> None:
 
 @cache
 def _checkpoints() -> list[bytes]:
-    network = MaskRCNN(SMALL)
-    state = network.state_dict()
+    state = MaskRCNN(SMALL).state_dict()
     ours = {"format": loading.FORMAT, "config": SMALL.model_dump_json(), "model": state}
     odd = next(iter(state))
     contents: list[Any] = [
@@ -673,8 +673,11 @@ def _checkpoints() -> list[bytes]:
         *({"model": {**state, "roi_heads.box_predictor.cls_score.weight": torch.zeros(size, 4)}} for size in (91, 7)),
     ]
     stored = [written(lambda file, content=content: torch.save(content, file)) for content in contents]
-    old = written(lambda file: torch.save(ours, file, _use_new_zipfile_serialization=False))
-    return [*stored, old, zipped({"archive/data.pkl": bytes(1 << 20)}, zipfile.ZIP_DEFLATED)]
+    return [
+        *stored,
+        written(lambda file: torch.save(ours, file, _use_new_zipfile_serialization=False)),
+        zipped({"archive/data.pkl": bytes(1 << 20)}, zipfile.ZIP_DEFLATED),
+    ]
 
 
 def _onnx() -> bytes:
@@ -771,8 +774,9 @@ def _attacked(name: str, damaged: tuple[str, ...]) -> Target:
             at(folder, file, content)
         at(folder, damaged[first % GONE % len(damaged)], None if data is None or first >= GONE else data[1:])
         contents = layouts.layout_of(name).read(folder, None)
-        camera = Camera(*SIZE, 10.0, 10.0, 8.0, 6.0, depth_factor=1000.0)
-        sequence = reader.RecordedSequence(folder, contents, camera, id="fuzz", any_depth_size=True)
+        sequence = reader.RecordedSequence(
+            folder, contents, Camera(*SIZE, 10.0, 10.0, 8.0, 6.0, depth_factor=1000.0), id="fuzz", any_depth_size=True
+        )
         for index in range(min(len(sequence), 3)):
             depth = sequence[index].depth
             assert np.isfinite(depth).all() and (depth >= 0).all()
@@ -860,8 +864,7 @@ RGB = b"1.5 rgb/1.5.png\n2.5 rgb/2.5.png\n3.5 c.png\n"
 def _read_colmap(data: bytes | None, folder: Path) -> None:
     """With the stamps in the names, or in a list: a part of the inputs each."""
     at(folder, formats.IMAGES, data)
-    stamps = at(folder, "rgb.txt", RGB) if len(data or b"") % 2 == 0 else None
-    formats.read_trajectory(folder, stamps)
+    formats.read_trajectory(folder, at(folder, "rgb.txt", RGB) if len(data or b"") % 2 == 0 else None)
 
 
 def _read_provenance(data: bytes | None, folder: Path) -> None:
@@ -873,8 +876,11 @@ def _read_provenance(data: bytes | None, folder: Path) -> None:
 
 def _provenances() -> list[bytes]:
     digest = transfer.digest_of(Path(__file__))
-    record = RunRecord.read(Path(__file__).parents[1] / "runs" / "data" / "run.json")
-    shared = {"format": "tum", "which": "final", "run": record}
+    shared = {
+        "format": "tum",
+        "which": "final",
+        "run": RunRecord.read(Path(__file__).parents[1] / "runs" / "data" / "run.json"),
+    }
     files = ({"trajectory.txt": digest}, {"../x": digest}, {"a\x00b": digest}, {})
     return [transfer.Provenance(files=each, **shared).to_json().encode() for each in files]
 
@@ -882,8 +888,8 @@ def _provenances() -> list[bytes]:
 def _maps() -> list[bytes]:
     with tempfile.TemporaryDirectory() as made:
         path = Path(made) / "map.ply"
-        rng = np.random.default_rng(0)
-        outputs = MapOutputs((), np.arange(4), rng.normal(size=(4, 3)), np.zeros((4, 3), np.uint8), np.arange(4))
+        positions = np.random.default_rng(0).normal(size=(4, 3))
+        outputs = MapOutputs((), np.arange(4), positions, np.zeros((4, 3), np.uint8), np.arange(4))
         map_files.write_ply(path, outputs)
         return [path.read_bytes()]
 

@@ -134,8 +134,7 @@ def test_a_module_that_exits_when_it_is_loaded(tmp_path):
 def test_unknown_names_are_errors_and_no_verdicts():
     with pytest.raises(PluginError, match=r"unknown tracker 'orb-slam'.*orb-slam2"):
         isolated_tracker_report("orb-slam")
-    report = isolated_tracker_report("never-move", settings={"speed": 1})
-    assert "unknown setting 'speed'" in failures(report)["spec"]
+    assert "unknown setting 'speed'" in failures(isolated_tracker_report("never-move", settings={"speed": 1}))["spec"]
 
 
 # Each check finds the fault that it is for, and names it.
@@ -269,8 +268,7 @@ def test_trackers_that_break_on_hard_frames(condition, name):
 
 
 def test_the_spec_is_checked_too(tmp_path):
-    spec = TrackerSpec("mine", f"{__name__}:Good", "Mine", presets={"fast": {"nothing": 1}})
-    report = tracker_report(spec, frames=2)
+    report = tracker_report(TrackerSpec("mine", f"{__name__}:Good", "Mine", presets={"fast": {"nothing": 1}}), frames=2)
     assert report.checks[0].status == "failed" and "preset 'fast' does not fit" in report.checks[0].message
 
 
@@ -341,8 +339,9 @@ def test_faulty_filters(change, words):
 def instances(frame, **change):
     mask = np.zeros((1, *frame.depth.shape), bool)
     mask[0, 10:20, 30:60] = True
-    whole = Instances(mask, np.array([[30, 10, 60, 20]], np.float32), ("person",), np.ones(1, np.float32))
-    return replace(whole, **change)
+    return replace(
+        Instances(mask, np.array([[30, 10, 60, 20]], np.float32), ("person",), np.ones(1, np.float32)), **change
+    )
 
 
 @pytest.mark.parametrize(

@@ -142,8 +142,13 @@ class BadFeatures:
         count = len(xy)
         angle = np.full(count, -1 if self.fault == "radians" else 1, np.float32)
         octave = np.zeros(count, np.int64 if self.fault == "octave" else np.int32)
-        descriptors = np.zeros((count, 16 if self.fault == "short" else 32), np.uint8)
-        return Keypoints(xy + 1000 * (self.fault == "outside"), octave, angle, np.ones(count, np.float32), descriptors)
+        return Keypoints(
+            xy + 1000 * (self.fault == "outside"),
+            octave,
+            angle,
+            np.ones(count, np.float32),
+            np.zeros((count, 16 if self.fault == "short" else 32), np.uint8),
+        )
 
 
 @pytest.mark.parametrize(

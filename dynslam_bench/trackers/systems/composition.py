@@ -24,7 +24,7 @@ _SECOND: dict[str, Any] = {"segmentation.schedule": "every_nth", "segmentation.n
 FAST_MASKS = {"fast": _SECOND | {"segmentation.crowded_share": 0.5}}
 """Preset: the network runs on every second frame, and on every frame while masks cover half of the view.
 
-``tests/benchmarks/shipped_presets.py`` compares the presets with the defaults on held-out scenes.
+``dynslam-bench report compare`` compares runs with a preset and without.
 """
 FAST_FLOW = {"fast": _SECOND | {"flow.budget": 24}}
 """Preset: the network runs on every second frame, and the flow searches for less than half as long."""
