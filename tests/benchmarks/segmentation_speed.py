@@ -20,7 +20,6 @@ from command_line import parser_of, timed
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.segmentation.build_segmenter import build_segmenter
 from dynslam_bench.segmentation.networks.backbone import RESNET18, NetworkConfig
-from dynslam_bench.segmentation.networks.checkpoints import embedded_weights
 from dynslam_bench.segmentation.networks.mask_rcnn_segmenter import MaskRCNNSegmenter
 from dynslam_bench.segmentation.networks.network import MaskRCNN
 from dynslam_bench.segmentation.postprocess import dynamic_mask
@@ -56,10 +55,9 @@ def main() -> None:
     for name, config, side in (("50", NetworkConfig(), 480), ("50", NetworkConfig(), 800), ("18", RESNET18, 480)):
         network = untrained(config, side, arguments.threads, arguments.device)
         add(f"Mask R-CNN, ResNet-{name}, CFPN, shorter side {side}", network)
-    if embedded_weights() is not None:
-        settings = SegmentationSettings(source="embedded")
-        embedded = build_segmenter(settings, device=arguments.device, threads=arguments.threads)
-        add("embedded (half-width ResNet-18, CFPN, 320x240)", embedded)
+    settings = SegmentationSettings(source="embedded")
+    embedded = build_segmenter(settings, device=arguments.device, threads=arguments.threads)
+    add("embedded (half-width ResNet-18, CFPN, 320x240)", embedded)
     for name in ("yolov8n-seg_480x640_fp32", "deeplabv3_mnv2_voc_481x641"):
         if (WEIGHTS / f"{name}.onnx").is_file():
             settings = SegmentationSettings(source=f"onnx:{WEIGHTS / name}.onnx")
