@@ -22,6 +22,7 @@ from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
 from dynslam_bench.flow import layout
 from dynslam_bench.flow.degenerate import STATS_NAMES, clean_points, flow_stats, usable_points
+from dynslam_bench.flow.label_search import labels_as_seen, nearest, search_labels
 from dynslam_bench.flow.matching_cost import (
     MAX_COST,
     CostTables,
@@ -34,7 +35,6 @@ from dynslam_bench.flow.matching_cost import (
     rotate_descriptor,
 )
 from dynslam_bench.flow.orientation_maps import OrientationMaps, Side
-from dynslam_bench.flow.propagation import labels_as_seen, nearest
 from dynslam_bench.flow.refinement import BORDER
 from dynslam_bench.flow.settings import DaisySettings, DenseFlowSettings, FlowSettings
 from dynslam_bench.flow.simd import Bytes, Doubles, Flags, Floats, Ints, Longs, Words
@@ -215,7 +215,8 @@ class _RegionLabels:
         self._best = np.full(reference.half.shape, np.inf, dtype=np.float32)
         self._winner = np.zeros((*reference.half.shape, 4), dtype=np.float32)
         centres, neighbours = reference.centres, reference.neighbours
-        state = sparse.search(reference.described, pair, neighbours, None, seed)
+        costs = reference.described, side_of(pair.target, pair.tables), pair.tables
+        state = search_labels(sparse.settings, sparse.workers.run, costs, neighbours, None, seed)
         labels = np.ascontiguousarray(state.flames[:, 0])
         if settings.refinement == "lucas-kanade":
             sparse.refine_together(centres, labels, neighbours, pair)
