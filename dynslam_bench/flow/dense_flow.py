@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,34 +130,16 @@ class DenseDaisyFlow:
         """Flow of every pixel from the reference to the target."""
         forward = _RegionLabels(self.settings, self._sparse, reference, target, seed)
         backward = _RegionLabels(self.settings, self._sparse, target, reference, seed + 1)
-        flow, back = forward.flow(), backward.flow()
+        flow, back, tolerance = forward.flow(), backward.flow(), np.float32(self.settings.consistency_px)
         if self.settings.second_round:
-            forward.try_regional_motion(self._consistent(flow, back))
-            backward.try_regional_motion(self._consistent(back, flow))
+            forward.try_regional_motion(consistent(flow, back, tolerance))
+            backward.try_regional_motion(consistent(back, flow, tolerance))
             flow, back = forward.flow(), backward.flow()
-        valid = self._consistent(flow, back)
+        valid = consistent(flow, back, tolerance)
         fitted = fit_regional_motion(flow, valid, reference.regions, reference.half)
         if fitted is not None:
-            height, smooth = len(flow), np.empty_like(flow)
-            self._sparse.workers.run(
-                fill_and_smooth,
-                0,
-                height,
-                flow,
-                valid,
-                reference.regions.labels,
-                reference.centres,
-                fitted.astype(np.float32),
-                smooth,
-            )
-            flow = smooth
+            flow = fill_and_smooth(flow, valid, reference.regions, fitted.astype(np.float32))
         return DenseFlow(flow, valid, forward.cost(), forward.evaluations + backward.evaluations, back)
-
-    def _consistent(self, forward: Floats, backward: Floats) -> Flags:
-        valid = np.empty(forward.shape[:2], dtype=np.bool_)
-        tolerance = np.float32(self.settings.consistency_px)
-        self._sparse.workers.run(consistent, 0, len(valid), forward, backward, tolerance, valid)
-        return valid
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +169,7 @@ def describe_image(maps: OrientationMaps, settings: DenseFlowSettings, sparse: S
     """Compute superpixels and descriptors of an image."""
     half = np.ascontiguousarray(maps.framed_half[BORDER:-BORDER, BORDER:-BORDER])
     regions = superpixels(half, max(2, settings.superpixel_px // 2))
-    centres = regions.centres * 2 + 0.5  # half-resolution pixel i covers 2 i and 2 i + 1
+    centres = regions.full_centres
     tables = sparse.pair(maps, maps).tables
     descriptors = np.empty(half.size * layout.HISTOGRAMS, dtype=np.uint64)
     sparse.workers.run(read_descriptors, 0, *half.shape, maps.side, tables, descriptors)
@@ -251,42 +233,44 @@ class _RegionLabels:
 
     def flow(self) -> NDArray[np.float32]:
         """Displacement of every full-image pixel under the labels chosen so far."""
-        image = self._image
-        height, width = image.maps.gray.shape
-        flow = np.empty((height, width, 2), dtype=np.float32)
-        self._sparse.workers.run(spread_labels, 0, height, self._winner, image.regions.labels, image.centres, flow)
-        return flow
+        shape = self._image.maps.gray.shape
+        u, v, a, b = np.moveaxis(doubled(self._winner, shape), 2, 0)
+        dx, dy = from_centres(self._image.regions, shape)
+        return np.stack([u + a * dx - b * dy - dx, v + b * dx + a * dy - dy], axis=2)
 
     def cost(self) -> NDArray[np.float32]:
         """Aggregated cost of every full-image pixel, as a share of the largest possible."""
-        full, half = self._image.maps.gray.shape, self._image.half.shape
-        rows, columns = (np.minimum(np.arange(n) // 2, h - 1) for n, h in zip(full, half, strict=True))
-        share = self._best[np.ix_(rows, columns)]
-        return np.asarray(np.clip(share / np.float32(self._tables.ceiling), 0, 1), dtype=np.float32)  # may overshoot
+        share = doubled(self._best, self._image.maps.gray.shape) / np.float32(self._tables.ceiling)
+        return np.asarray(np.clip(share, 0, 1), dtype=np.float32)  # may overshoot
 
 
-@kernel
-def consistent(start: int, stop: int, forward: Floats, backward: Floats, tolerance: Scalar, valid: Flags) -> None:
-    """Mark pixels whose flow, followed by the backward flow where it ends, returns to within `tolerance` pixels.
+def doubled(half: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+    """What half-resolution pixels ``[h, w, ...]`` hold, at each pixel of the full image of a shape ``(H, W)``."""
+    rows, columns = (np.minimum(np.arange(n) // 2, h - 1) for n, h in zip(shape, half.shape, strict=False))
+    return np.asarray(half[np.ix_(rows, columns)])
+
+
+def from_centres(regions: Superpixels, shape: tuple[int, ...]) -> tuple[Floats, Floats]:
+    """Offsets x and y, float32 ``[H, W]``, of full-image pixels from the centres of their regions."""
+    y, x = np.indices(shape, dtype=np.float32)
+    centres = regions.full_centres[doubled(regions.labels, shape)]
+    return x - centres[..., 0], y - centres[..., 1]
+
+
+def consistent(forward: Floats, backward: Floats, tolerance: Scalar) -> Flags:
+    """Which pixels' flow, followed by the backward flow where it ends, returns to within `tolerance` pixels.
 
     Args:
-        start: First row.
-        stop: One past the last.
         forward: float32 ``[H, W, 2]``.
         backward: Likewise.
         tolerance: Pixels.
-        valid: bool ``[H, W]``, filled.
+
+    Returns:
+        bool ``[H, W]``.
     """
-    height, width = valid.shape
-    limit = tolerance * tolerance
-    for y in range(start, stop):
-        for x in range(width):
-            u, v = forward[y, x, 0], forward[y, x, 1]
-            column, row = np.int64(np.rint(np.float32(x) + u)), np.int64(np.rint(np.float32(y) + v))
-            valid[y, x] = False
-            if 0 <= column < width and 0 <= row < height:
-                dx, dy = u + backward[row, column, 0], v + backward[row, column, 1]
-                valid[y, x] = dx * dx + dy * dy <= limit
+    y, x = np.indices(forward.shape[:2], dtype=np.float32)
+    end, inside = pixel_index(np.stack([x, y], axis=2) + forward, forward.shape)
+    return inside & (((forward + backward[end]) ** 2).sum(axis=2) <= tolerance * tolerance)
 
 
 def nearest_similarities(motion: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -312,14 +296,14 @@ def fit_regional_motion(
         float64 ``[K, 3, 2]``, flow at the centre, and its change per pixel along x and y; None where fewer than three
         regions are reliable.
     """
-    count = len(regions.centres)
-    sums = np.zeros((count, 6))
-    sum_regions(flow, valid, regions.labels, sums)
-    consistent = sums[:, 1]
-    reliable = np.flatnonzero((consistent >= SHARE * np.maximum(sums[:, 0], 1)) & (consistent > 0))
+    count, labels = len(regions.centres), doubled(regions.labels, valid.shape)
+    pixels, consistent = (np.bincount(of, minlength=count) for of in (labels.ravel(), labels[valid]))
+    reliable = np.flatnonzero((consistent >= SHARE * np.maximum(pixels, 1)) & (consistent > 0))
     if len(reliable) < 3:
         return None
-    mean = sums[:, 2:] / np.maximum(consistent, 1)[:, None]  # position and flow of each region's consistent pixels
+    values = (*np.nonzero(valid)[::-1], *flow[valid].T)  # position and flow of the consistent pixels
+    sums = np.stack([np.bincount(labels[valid], weights=value, minlength=count) for value in values], axis=1)
+    mean = sums / np.maximum(consistent, 1)[:, None]
     centres = regions.centres.astype(np.float64) * 2 + 0.5
     total = np.bincount(regions.labels.ravel(), weights=guide.ravel(), minlength=count)
     grey = total / np.maximum(np.bincount(regions.labels.ravel(), minlength=count), 1)
@@ -331,61 +315,32 @@ def fit_regional_motion(
     weight = np.exp(-0.5 * (distance / spread) ** 2 - np.abs(grey[chosen] - grey[:, None]) / 20.0) + 1e-6
     offset = (mean[chosen, :2] - centres[:, None]) / spread[..., None]
     basis = np.concatenate([np.ones((count, near, 1)), offset], axis=2)
-    values = mean[chosen, 2:]
+    moved = mean[chosen, 2:]
     motion = np.zeros((count, 3, 2))
     for _ in range(3):  # iteratively reweighted: a foreground region must not bend the background
         weighted = basis * weight[..., None]
         normal = weighted.transpose(0, 2, 1) @ basis
         normal[:, (0, 1, 2), (0, 1, 2)] += weight.sum(axis=1, keepdims=True) * (1e-6, 0.05, 0.05)
-        motion = np.linalg.solve(normal, weighted.transpose(0, 2, 1) @ values)
-        weight = weight / (1 + (np.linalg.norm(values - basis @ motion, axis=2) / 2.0) ** 2)
+        motion = np.linalg.solve(normal, weighted.transpose(0, 2, 1) @ moved)
+        weight = weight / (1 + (np.linalg.norm(moved - basis @ motion, axis=2) / 2.0) ** 2)
     motion[:, 1:] /= spread[:, :, None]
     return motion
 
 
-@kernel
-def sum_regions(flow: Floats, valid: Flags, labels: Ints, sums: Doubles) -> None:
-    """Add up pixels, consistent pixels, and their x, y and flow, by region: float64 ``[K, 6]``."""
-    for y in range(len(valid)):
-        row = labels[min(y // 2, len(labels) - 1)]
-        for x in range(valid.shape[1]):
-            r = row[min(x // 2, len(row) - 1)]
-            sums[r, 0] += 1
-            if valid[y, x]:
-                sums[r, 1] += 1
-                sums[r, 2] += x
-                sums[r, 3] += y
-                sums[r, 4] += flow[y, x, 0]
-                sums[r, 5] += flow[y, x, 1]
-
-
-@kernel
-def fill_and_smooth(
-    start: int, stop: int, flow: Floats, valid: Flags, labels: Ints, centres: Floats, motion: Floats, out: Floats
-) -> None:
-    """Copy rows start..stop; pixels not valid, or within `SMOOTH_PX` of it, take their region's fitted motion.
+def fill_and_smooth(flow: Floats, valid: Flags, regions: Superpixels, motion: Floats) -> Floats:
+    """The flow, but pixels not valid, or within `SMOOTH_PX` of it, take their region's fitted motion.
 
     Args:
-        start: First row.
-        stop: One past the last.
         flow: float32 ``[H, W, 2]``.
         valid: bool ``[H, W]``, consistent pixels.
-        labels: `Superpixels.labels`.
-        centres: float32 ``[K, 2]``, full-image pixels.
+        regions: Superpixels at half resolution.
         motion: float32 ``[K, 3, 2]`` of `fit_regional_motion`.
-        out: float32 ``[H, W, 2]``, filled.
     """
-    limit = np.float32(SMOOTH_PX**2)
-    for y in range(start, stop):
-        row = labels[min(y // 2, len(labels) - 1)]
-        for x in range(flow.shape[1]):
-            r = row[min(x // 2, len(row) - 1)]
-            dx, dy = np.float32(x) - centres[r, 0], np.float32(y) - centres[r, 1]
-            u = motion[r, 0, 0] + dx * motion[r, 1, 0] + dy * motion[r, 2, 0]
-            v = motion[r, 0, 1] + dx * motion[r, 1, 1] + dy * motion[r, 2, 1]
-            own_u, own_v = flow[y, x, 0], flow[y, x, 1]
-            replaced = not valid[y, x] or (u - own_u) * (u - own_u) + (v - own_v) * (v - own_v) < limit
-            out[y, x, 0], out[y, x, 1] = (u, v) if replaced else (own_u, own_v)
+    dx, dy = (offset[..., None] for offset in from_centres(regions, valid.shape))
+    at_centre, along_x, along_y = np.moveaxis(motion[doubled(regions.labels, valid.shape)], 2, 0)
+    fitted = at_centre + dx * along_x + dy * along_y
+    replaced = ~valid | (((fitted - flow) ** 2).sum(axis=2) < SMOOTH_PX**2)
+    return np.where(replaced[..., None], fitted, flow)
 
 
 # ---------------------------------------------------------------------- superpixels
@@ -407,6 +362,11 @@ class Superpixels:
     members: NDArray[np.int64]
     starts: NDArray[np.int64]
 
+    @property
+    def full_centres(self) -> NDArray[np.float32]:
+        """The centres in full-image pixels, of regions of a half-resolution image."""
+        return self.centres * 2 + 0.5  # half-resolution pixel i covers 2 i and 2 i + 1
+
 
 def superpixels(gray: NDArray[np.uint8], size: int, *, compactness: float = 20.0, iterations: int = 4) -> Superpixels:
     """Divide a uint8 ``[H, W]`` image into regions of about ``size * size`` pixels.
@@ -425,49 +385,35 @@ def superpixels(gray: NDArray[np.uint8], size: int, *, compactness: float = 20.0
     centres[:, 0], centres[:, 1] = np.tile(x, rows), np.repeat(y, columns)
     centres[:, 2] = gray[np.rint(centres[:, 1]).astype(int), np.rint(centres[:, 0]).astype(int)]
     labels = np.empty((height, width), dtype=np.int32)
-    assign_pixels(gray, centres, size, (size / compactness) ** 2, iterations, labels)
-    flat = labels.reshape(-1)
+    flat, pixels = labels.reshape(-1), (*np.indices(gray.shape)[::-1].reshape(2, -1), gray.ravel())
+    for _ in range(iterations):
+        assign_pixels(gray, centres, size, (size / compactness) ** 2, labels)
+        count = np.bincount(flat, minlength=len(centres))[:, None]
+        sums = np.stack([np.bincount(flat, weights=values, minlength=len(centres)) for values in pixels], axis=1)
+        centres = np.where(count > 0, sums / np.maximum(count, 1), centres)
     starts = np.concatenate([[0], np.cumsum(np.bincount(flat, minlength=len(centres)))])
     members = np.argsort(flat, kind="stable")
     return Superpixels(labels, centres[:, :2].astype(np.float32), members, starts.astype(np.int64))
 
 
 @kernel
-def assign_pixels(gray: Bytes, centres: Doubles, size: int, weight: float, iterations: int, labels: Ints) -> None:
-    """K-means: each centre competes for the pixels within `size` of it; fills `labels`, moves `centres`."""
+def assign_pixels(gray: Bytes, centres: Doubles, size: int, weight: float, labels: Ints) -> None:
+    """A step of k-means: each centre competes for the pixels within `size` of it; fills `labels`."""
     height, width = gray.shape
-    distance = np.empty((height, width), dtype=np.float64)
-    sums = np.empty((len(centres), 4), dtype=np.float64)
-    for _ in range(iterations):
-        distance[:] = np.inf
-        labels[:] = -1
-        for k in range(len(centres)):
-            cx, cy, cg = centres[k, 0], centres[k, 1], centres[k, 2]
-            for y in range(max(0, int(cy - size)), min(height, int(cy + size) + 2)):
-                for x in range(max(0, int(cx - size)), min(width, int(cx + size) + 2)):
-                    dx, dy, dg = x - cx, y - cy, gray[y, x] - cg
-                    d = dx * dx + dy * dy + weight * dg * dg
-                    if d < distance[y, x]:
-                        distance[y, x], labels[y, x] = d, k
-        sums[:] = 0
-        for y in range(height):
-            for x in range(width):
-                k = labels[y, x]
-                if k < 0:  # too far from every centre: the nearest in position
-                    best = np.inf
-                    for other in range(len(centres)):
-                        d = (x - centres[other, 0]) ** 2 + (y - centres[other, 1]) ** 2
-                        if d < best:
-                            best, k = d, other
-                    labels[y, x] = k
-                sums[k, 0] += x
-                sums[k, 1] += y
-                sums[k, 2] += gray[y, x]
-                sums[k, 3] += 1
-        for k in range(len(centres)):
-            if sums[k, 3] > 0:
-                for j in range(3):
-                    centres[k, j] = sums[k, j] / sums[k, 3]
+    distance = np.full((height, width), np.inf)
+    labels[:] = -1
+    for k in range(len(centres)):
+        cx, cy, cg = centres[k, 0], centres[k, 1], centres[k, 2]
+        for y in range(max(0, int(cy - size)), min(height, int(cy + size) + 2)):
+            for x in range(max(0, int(cx - size)), min(width, int(cx + size) + 2)):
+                dx, dy, dg = x - cx, y - cy, gray[y, x] - cg
+                d = dx * dx + dy * dy + weight * dg * dg
+                if d < distance[y, x]:
+                    distance[y, x], labels[y, x] = d, k
+    for y in range(height):
+        for x in range(width):
+            if labels[y, x] < 0:  # too far from every centre: the nearest in position
+                labels[y, x] = np.argmin((x - centres[:, 0]) ** 2 + (y - centres[:, 1]) ** 2)
 
 
 # ---------------------------------------------------------------------- aggregation (Eq. 1-3)
@@ -733,17 +679,3 @@ def raw_costs(
                     cost += tables.intensity[abs(gray - own_gray)]
                     cost += tables.gradient[abs(gradient - own_gradient)]
             raw[(y + radius) * (wide + 2 * radius) + x + radius] = np.float32(cost)
-
-
-@kernel
-def spread_labels(start: int, stop: int, winner: Floats, regions: Ints, centres: Floats, flow: Floats) -> None:
-    """Displacement of full-image rows start..stop from the half-resolution labels around the regions' centres."""
-    for y in range(start, stop):
-        row = min(y // 2, winner.shape[0] - 1)
-        for x in range(flow.shape[1]):
-            column = min(x // 2, winner.shape[1] - 1)
-            u, v, a, b = winner[row, column]
-            r = regions[row, column]
-            dx, dy = np.float32(x) - centres[r, 0], np.float32(y) - centres[r, 1]
-            flow[y, x, 0] = u + a * dx - b * dy - dx
-            flow[y, x, 1] = v + b * dx + a * dy - dy

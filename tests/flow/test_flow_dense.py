@@ -74,21 +74,14 @@ def test_superpixels_cover_the_image_and_follow_edges():
         assert len(np.unique(image.ravel()[members])) <= 1  # no region straddles the edge
 
 
-def check(forward, backward, tolerance):
-    """`consistent` of all rows."""
-    valid = np.empty(forward.shape[:2], bool)
-    consistent(0, len(valid), forward, backward, np.float32(tolerance), valid)
-    return valid
-
-
 def test_consistency_check():
     forward = np.zeros((10, 12, 2), np.float32)
     forward[..., 0] = 3
     backward = -forward
-    valid = check(forward, backward, 1.0)
+    valid = consistent(forward, backward, 1.0)
     assert valid[:, :9].all() and not valid[:, 9:].any()
     backward[5, 6] = 2
-    assert not check(forward, backward, 1.0)[5, 3]
+    assert not consistent(forward, backward, 1.0)[5, 3]
 
 
 def test_dense_flow_of_a_similarity_and_its_thread_independence():
