@@ -136,9 +136,9 @@ class DenseDaisyFlow:
             backward.try_regional_motion(consistent(back, flow, tolerance))
             flow, back = forward.flow(), backward.flow()
         valid = consistent(flow, back, tolerance)
-        fitted = fit_regional_motion(flow, valid, reference.regions, reference.half)
+        fitted = fit_regional_motion(flow, valid, reference)
         if fitted is not None:
-            flow = fill_and_smooth(flow, valid, reference.regions, fitted.astype(np.float32))
+            flow = fill_and_smooth(flow, valid, reference, fitted.astype(np.float32))
         return DenseFlow(flow, valid, forward.cost(), forward.evaluations + backward.evaluations, back)
 
 
@@ -150,7 +150,9 @@ class DescribedImage:
         maps: Its orientation maps.
         half: uint8 ``[h, w]``, grey levels.
         regions: Its superpixels.
+        labels: int32 ``[H, W]``, superpixel of each full-image pixel.
         centres: float32 ``[K, 2]``, their centres, full-image pixels.
+        offsets: float32 ``[2, H, W]``, x and y of each full-image pixel from the centre of its superpixel.
         neighbours: int64 ``[K, 8]``, the nearest other regions.
         described: The centres for the label search.
         descriptors: uint64, flat ``[h, w, 17]``, unrotated, a histogram each.
@@ -159,7 +161,9 @@ class DescribedImage:
     maps: OrientationMaps
     half: NDArray[np.uint8]
     regions: Superpixels
+    labels: NDArray[np.int32]
     centres: NDArray[np.float32]
+    offsets: NDArray[np.float32]
     neighbours: NDArray[np.int64]
     described: Reference
     descriptors: NDArray[np.uint64]
@@ -169,12 +173,15 @@ def describe_image(maps: OrientationMaps, settings: DenseFlowSettings, sparse: S
     """Compute superpixels and descriptors of an image."""
     half = np.ascontiguousarray(maps.framed_half[BORDER:-BORDER, BORDER:-BORDER])
     regions = superpixels(half, max(2, settings.superpixel_px // 2))
-    centres = regions.full_centres
+    centres = regions.centres * 2 + 0.5  # half-resolution pixel i covers 2 i and 2 i + 1
+    labels = doubled(regions.labels, maps.gray.shape)
+    offsets = np.indices(labels.shape, dtype=np.float32)[::-1] - centres.T.take(labels, axis=1)
     tables = sparse.pair(maps, maps).tables
     descriptors = np.empty(half.size * layout.HISTOGRAMS, dtype=np.uint64)
     sparse.workers.run(read_descriptors, 0, *half.shape, maps.side, tables, descriptors)
     neighbours = nearest(centres, sparse.workers.run)
-    return DescribedImage(maps, half, regions, centres, neighbours, sparse.describe(maps, centres, tables), descriptors)
+    centre = sparse.describe(maps, centres, tables)
+    return DescribedImage(maps, half, regions, labels, centres, offsets, neighbours, centre, descriptors)
 
 
 class _RegionLabels:
@@ -208,7 +215,7 @@ class _RegionLabels:
 
     def try_regional_motion(self, valid: NDArray[np.bool_]) -> None:
         """Try, on every region, the motion of the consistent regions around it, as fitted and refined."""
-        fitted = fit_regional_motion(self.flow(), valid, self._image.regions, self._image.half)
+        fitted = fit_regional_motion(self.flow(), valid, self._image)
         if fitted is None:
             return
         candidates = [nearest_similarities(fitted)]
@@ -233,10 +240,10 @@ class _RegionLabels:
 
     def flow(self) -> NDArray[np.float32]:
         """Displacement of every full-image pixel under the labels chosen so far."""
-        shape = self._image.maps.gray.shape
-        u, v, a, b = np.moveaxis(doubled(self._winner, shape), 2, 0)
-        dx, dy = from_centres(self._image.regions, shape)
-        return np.stack([u + a * dx - b * dy - dx, v + b * dx + a * dy - dy], axis=2)
+        labels, offsets = self._image.labels, self._image.offsets
+        flow = np.empty((*labels.shape, 2), dtype=np.float32)
+        self._sparse.workers.run(spread_labels, 0, len(flow), self._winner, offsets, flow)
+        return flow
 
     def cost(self) -> NDArray[np.float32]:
         """Aggregated cost of every full-image pixel, as a share of the largest possible."""
@@ -247,14 +254,7 @@ class _RegionLabels:
 def doubled(half: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
     """What half-resolution pixels ``[h, w, ...]`` hold, at each pixel of the full image of a shape ``(H, W)``."""
     rows, columns = (np.minimum(np.arange(n) // 2, h - 1) for n, h in zip(shape, half.shape, strict=False))
-    return np.asarray(half[np.ix_(rows, columns)])
-
-
-def from_centres(regions: Superpixels, shape: tuple[int, ...]) -> tuple[Floats, Floats]:
-    """Offsets x and y, float32 ``[H, W]``, of full-image pixels from the centres of their regions."""
-    y, x = np.indices(shape, dtype=np.float32)
-    centres = regions.full_centres[doubled(regions.labels, shape)]
-    return x - centres[..., 0], y - centres[..., 1]
+    return half.take(rows, axis=0).take(columns, axis=1)
 
 
 def consistent(forward: Floats, backward: Floats, tolerance: Scalar) -> Flags:
@@ -270,7 +270,8 @@ def consistent(forward: Floats, backward: Floats, tolerance: Scalar) -> Flags:
     """
     y, x = np.indices(forward.shape[:2], dtype=np.float32)
     end, inside = pixel_index(np.stack([x, y], axis=2) + forward, forward.shape)
-    return inside & (((forward + backward[end]) ** 2).sum(axis=2) <= tolerance * tolerance)
+    rest_x, rest_y = np.moveaxis(forward + backward[end], 2, 0)
+    return inside & (rest_x * rest_x + rest_y * rest_y <= tolerance * tolerance)
 
 
 def nearest_similarities(motion: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -282,30 +283,29 @@ def nearest_similarities(motion: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 def fit_regional_motion(
-    flow: NDArray[np.float32], valid: NDArray[np.bool_], regions: Superpixels, guide: NDArray[np.uint8]
+    flow: NDArray[np.float32], valid: NDArray[np.bool_], image: DescribedImage
 ) -> NDArray[np.float64] | None:
-    """Fit an affine motion to the reliable regions around each region, robustly.
+    """Fit an affine motion to the reliable regions around each region, robustly; similar grey levels count more.
 
     Args:
         flow: float32 ``[H, W, 2]``.
         valid: bool ``[H, W]``, consistent pixels.
-        regions: Superpixels at half resolution.
-        guide: uint8 ``[H / 2, W / 2]``, their image; regions of similar grey level count more.
+        image: The image and its superpixels.
 
     Returns:
         float64 ``[K, 3, 2]``, flow at the centre, and its change per pixel along x and y; None where fewer than three
         regions are reliable.
     """
-    count, labels = len(regions.centres), doubled(regions.labels, valid.shape)
-    pixels, consistent = (np.bincount(of, minlength=count) for of in (labels.ravel(), labels[valid]))
+    count, followed, regions = len(image.centres), image.labels[valid], image.regions
+    pixels, consistent = (np.bincount(of, minlength=count) for of in (image.labels.ravel(), followed))
     reliable = np.flatnonzero((consistent >= SHARE * np.maximum(pixels, 1)) & (consistent > 0))
     if len(reliable) < 3:
         return None
     values = (*np.nonzero(valid)[::-1], *flow[valid].T)  # position and flow of the consistent pixels
-    sums = np.stack([np.bincount(labels[valid], weights=value, minlength=count) for value in values], axis=1)
+    sums = np.stack([np.bincount(followed, weights=value, minlength=count) for value in values], axis=1)
     mean = sums / np.maximum(consistent, 1)[:, None]
     centres = regions.centres.astype(np.float64) * 2 + 0.5
-    total = np.bincount(regions.labels.ravel(), weights=guide.ravel(), minlength=count)
+    total = np.bincount(regions.labels.ravel(), weights=image.half.ravel(), minlength=count)
     grey = total / np.maximum(np.bincount(regions.labels.ravel(), minlength=count), 1)
     near = min(NEIGHBOURS, len(reliable))
     distance, index = cKDTree(mean[reliable, :2]).query(centres, k=near)
@@ -327,20 +327,20 @@ def fit_regional_motion(
     return motion
 
 
-def fill_and_smooth(flow: Floats, valid: Flags, regions: Superpixels, motion: Floats) -> Floats:
+def fill_and_smooth(flow: Floats, valid: Flags, image: DescribedImage, motion: Floats) -> Floats:
     """The flow, but pixels not valid, or within `SMOOTH_PX` of it, take their region's fitted motion.
 
     Args:
         flow: float32 ``[H, W, 2]``.
         valid: bool ``[H, W]``, consistent pixels.
-        regions: Superpixels at half resolution.
+        image: The image.
         motion: float32 ``[K, 3, 2]`` of `fit_regional_motion`.
     """
-    dx, dy = (offset[..., None] for offset in from_centres(regions, valid.shape))
-    at_centre, along_x, along_y = np.moveaxis(motion[doubled(regions.labels, valid.shape)], 2, 0)
+    dx, dy = (offset[..., None] for offset in image.offsets)
+    at_centre, along_x, along_y = motion.swapaxes(0, 1).take(image.labels, axis=1)
     fitted = at_centre + dx * along_x + dy * along_y
-    replaced = ~valid | (((fitted - flow) ** 2).sum(axis=2) < SMOOTH_PX**2)
-    return np.where(replaced[..., None], fitted, flow)
+    u, v = np.moveaxis(fitted - flow, 2, 0)
+    return np.where((~valid | (u * u + v * v < SMOOTH_PX**2))[..., None], fitted, flow)
 
 
 # ---------------------------------------------------------------------- superpixels
@@ -361,11 +361,6 @@ class Superpixels:
     centres: NDArray[np.float32]
     members: NDArray[np.int64]
     starts: NDArray[np.int64]
-
-    @property
-    def full_centres(self) -> NDArray[np.float32]:
-        """The centres in full-image pixels, of regions of a half-resolution image."""
-        return self.centres * 2 + 0.5  # half-resolution pixel i covers 2 i and 2 i + 1
 
 
 def superpixels(gray: NDArray[np.uint8], size: int, *, compactness: float = 20.0, iterations: int = 4) -> Superpixels:
@@ -679,3 +674,15 @@ def raw_costs(
                     cost += tables.intensity[abs(gray - own_gray)]
                     cost += tables.gradient[abs(gradient - own_gradient)]
             raw[(y + radius) * (wide + 2 * radius) + x + radius] = np.float32(cost)
+
+
+@kernel
+def spread_labels(start: int, stop: int, winner: Floats, offsets: Floats, flow: Floats) -> None:
+    """Displacement of full-image rows start..stop from the half-resolution labels around the regions' centres."""
+    rows, columns, _ = winner.shape
+    for y in range(start, stop):
+        for x in range(flow.shape[1]):
+            u, v, a, b = winner[min(y // 2, rows - 1), min(x // 2, columns - 1)]
+            dx, dy = offsets[0, y, x], offsets[1, y, x]
+            flow[y, x, 0] = u + a * dx - b * dy - dx
+            flow[y, x, 1] = v + b * dx + a * dy - dy
