@@ -21,16 +21,10 @@ from dynslam_bench.flow.label_search import (
     dissenting_labels,
     labels_as_seen,
     nearest,
+    parabola,
     search_labels,
 )
-from dynslam_bench.flow.matching_cost import (
-    MAX_COST,
-    CostTables,
-    Reference,
-    cost_tables,
-    describe,
-    parabola,
-)
+from dynslam_bench.flow.matching_cost import MAX_COST, CostTables, Reference, cost_tables, describe
 from dynslam_bench.flow.orientation_maps import Buffers, OrientationMaps, Side, orientation_maps
 from dynslam_bench.flow.refinement import Window, similarity_lucas_kanade
 from dynslam_bench.flow.settings import FlowSettings
