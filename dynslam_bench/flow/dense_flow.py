@@ -254,7 +254,7 @@ class _RegionLabels:
 def doubled(half: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
     """What half-resolution pixels ``[h, w, ...]`` hold, at each pixel of the full image of a shape ``(H, W)``."""
     rows, columns = (np.minimum(np.arange(n) // 2, h - 1) for n, h in zip(shape, half.shape, strict=False))
-    return half.take(rows, axis=0).take(columns, axis=1)
+    return np.asarray(half.take(rows, axis=0).take(columns, axis=1))
 
 
 def consistent(forward: Floats, backward: Floats, tolerance: Scalar) -> Flags:
@@ -271,7 +271,7 @@ def consistent(forward: Floats, backward: Floats, tolerance: Scalar) -> Flags:
     y, x = np.indices(forward.shape[:2], dtype=np.float32)
     end, inside = pixel_index(np.stack([x, y], axis=2) + forward, forward.shape)
     rest_x, rest_y = np.moveaxis(forward + backward[end], 2, 0)
-    return inside & (rest_x * rest_x + rest_y * rest_y <= tolerance * tolerance)
+    return np.asarray(inside & (rest_x * rest_x + rest_y * rest_y <= tolerance * tolerance))
 
 
 def nearest_similarities(motion: NDArray[np.float64]) -> NDArray[np.float32]:

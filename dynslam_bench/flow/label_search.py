@@ -297,11 +297,9 @@ def finite_labels(candidates: Floats, trials: Floats) -> int:
     """Fill `trials` with the candidates that are finite; returns how many."""
     count = 0
     for c in range(len(candidates)):
-        total = np.float32(0)
         for j in range(4):
             trials[count, j] = candidates[c, j]
-            total += candidates[c, j]
-        count += np.isfinite(total)
+        count += np.isfinite(candidates[c, 0] + candidates[c, 1] + candidates[c, 2] + candidates[c, 3])
     return count
 
 

@@ -89,7 +89,7 @@ def gradient_magnitudes(gray: Bytes) -> Bytes:
     """The gradients' rounded magnitudes, uint8 ``[H, W]``, by central differences, edges repeated."""
     levels = np.pad(gray, 1, mode="edge").astype(np.float32)
     gx, gy = levels[1:-1, 2:] - levels[1:-1, :-2], levels[2:, 1:-1] - levels[:-2, 1:-1]
-    return (np.sqrt(gx * gx + gy * gy) * np.float32(0.5) + np.float32(0.5)).astype(np.uint8)
+    return np.asarray(np.sqrt(gx * gx + gy * gy) * np.float32(0.5) + np.float32(0.5), dtype=np.uint8)
 
 
 def orientation_maps(
