@@ -1,12 +1,14 @@
-"""The label search: which searches there are, how a budget is divided into phases, and the kernels that run a phase.
+"""The label search: searches and their phases, the kernels that run a phase, and propagation between neighbours.
 
 Positions are labels; a moth's fitness is the matching cost of its label (Eq. 5-7). The moth-flame equations (Eq. 4-22,
 corrected Algorithm 1) are those of `moth_flame`: values that depend on the iteration alone come from there as a table,
-and `move_moths` is `moth_flame.moth_positions` for one point, with spirals and Cauchy numbers from tables.
+and `move_moths` is `moth_flame.moth_positions` for one point, with spirals and Cauchy numbers from tables. Between the
+phases neighbouring points exchange their best labels, and points try the motions with which most of them agree.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,8 +20,18 @@ from dynslam_bench.flow.matching_cost import CostTables, Reference, label_cost
 from dynslam_bench.flow.moth_flame import FlightTable
 from dynslam_bench.flow.orientation_maps import Side
 from dynslam_bench.flow.settings import DaisySettings, SearchName
-from dynslam_bench.flow.simd import Floats, Longs
+from dynslam_bench.flow.simd import Flags, Floats, Longs
 
+Run = Callable[..., Any]
+"""`Workers.run`, which divides a kernel's points among threads."""
+VOTE = (192, np.float32(5.0))
+"""Pairs of points tried for a common motion, and the distance in pixels at which a point agrees with one."""
+VOTERS = 256
+"""Approximate number of points that vote on a hypothesis."""
+NO_MOTION = np.empty((0, 4), dtype=np.float32)
+NEIGHBOUR_WINDOW = 40
+"""Points compared on each side, in the order of x, to find the nearest neighbours."""
+MOST_NEIGHBOURS = 8
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX2 = np.uint64(0x94D049BB133111EB)
@@ -94,6 +106,54 @@ class SearchState(NamedTuple):
     used: NDArray[np.int64]
     lower: NDArray[np.float32]
     upper: NDArray[np.float32]
+
+
+def search_labels(
+    settings: DaisySettings, run: Run, costs: tuple[Reference, Side, CostTables], neighbours: NDArray[np.int64],
+    guess: NDArray[np.float32] | None, seed: int,
+) -> SearchState:  # fmt: skip
+    """The label search of all points: phases of `DaisySettings.search` with propagation between them.
+
+    Args:
+        settings: Which search, its budget and its range.
+        run: Divides the points among threads.
+        costs: Points, target and tables of the matching cost.
+        neighbours: int64 ``[N, K]`` of `nearest`.
+        guess: float32 ``[N, 2]``, predicted positions; not finite means none.
+        seed: Of the frame.
+
+    Returns:
+        The final state; ``flames[:, 0]`` and ``costs[:, 0]`` are the best labels and their costs.
+    """
+    (points, *_), _, tables = costs
+    n = len(points)
+    start = np.zeros((n, 1, 4), dtype=np.float32)  # zero flow, or the motion model's prediction
+    if guess is not None:
+        offset = guess - points
+        start[:, 0, :2] = np.where(np.isfinite(offset).all(axis=1, keepdims=True), offset, 0)
+    rotation = np.deg2rad(settings.rotation_range_deg)
+    extent = np.array([settings.range_px, settings.range_px, settings.scale_range_octaves, rotation], np.float32)
+    lower, upper = start[:, 0] - extent, start[:, 0] + extent
+    population, ends, options = make_plan(settings)
+    flames = np.repeat(start, population, axis=1)
+    unknown = np.full((n, population), tables.ceiling, np.int64)  # nothing has been evaluated
+    state = SearchState(np.zeros_like(flames), flames, unknown, np.zeros(n, np.int64), lower, upper)
+    candidates = start
+    if STRATEGIES[settings.search].shrink == 0:  # nothing is drawn: zero flow is tried beside the prediction
+        zero = np.where(start.any(axis=2, keepdims=True), np.float32(0), np.float32(np.nan))
+        candidates = np.concatenate([start, np.broadcast_to(zero, start.shape)], axis=1)
+    neighbours = np.ascontiguousarray(neighbours[:, : settings.neighbours])
+    motions = np.full((2, 4), np.nan, dtype=np.float32)
+    for phase, end in enumerate(ends):
+        if phase > 0:
+            best = state.flames[:, 0].copy()
+            if settings.similarity_seeds:
+                motions = common_motions(points, best, state.costs[:, 0], seed + phase)
+            candidates = np.empty((n, neighbours.shape[1] + 2, 4), dtype=np.float32)
+            sources = (points, best, label_turns(best), neighbours, motions)
+            run(transported_labels, 0, n, *sources, lower, upper, candidates)
+        run(run_phase, 0, n, *costs, state, candidates, end, phase, np.uint64(seed), *options)
+    return state
 
 
 @inlined
@@ -237,11 +297,9 @@ def finite_labels(candidates: Floats, trials: Floats) -> int:
     """Fill `trials` with the candidates that are finite; returns how many."""
     count = 0
     for c in range(len(candidates)):
-        total = np.float32(0)
         for j in range(4):
             trials[count, j] = candidates[c, j]
-            total += candidates[c, j]
-        count += np.isfinite(total)
+        count += np.isfinite(candidates[c, 0] + candidates[c, 1] + candidates[c, 2] + candidates[c, 3])
     return count
 
 
@@ -323,3 +381,274 @@ def draw(
         else:
             step = (np.float32(2) * uniform(bits, j) - np.float32(1)) * window * extent
             label[j] = min(max(flames[0, j] + step, lower[j]), upper[j])
+
+
+@kernel
+def parabola(
+    start: int, stop: int, labels: Floats, step: float, reference: Reference, target: Side, tables: CostTables,
+    used: Longs,
+) -> None:  # fmt: skip
+    """Move each label to the vertex of the parabolas through its cost and those `step` pixels beside it.
+
+    Args:
+        start: First point.
+        stop: One past the last.
+        labels: float32 ``[N, 4]``, changed in place; moves by at most `step`.
+        step: Pixels.
+        reference: `Reference`.
+        target: `orientation_maps.Side`.
+        tables: `CostTables`.
+        used: int64 ``[N]``, cost evaluations, counted on.
+    """
+    far = np.int64(1 << 40)
+    for i in range(start, stop):
+        u, v, s, theta = labels[i, 0], labels[i, 1], labels[i, 2], labels[i, 3]
+        middle = label_cost(i, u, v, s, theta, reference, target, tables, far)
+        left = label_cost(i, u - step, v, s, theta, reference, target, tables, far)
+        right = label_cost(i, u + step, v, s, theta, reference, target, tables, far)
+        up = label_cost(i, u, v - step, s, theta, reference, target, tables, far)
+        down = label_cost(i, u, v + step, s, theta, reference, target, tables, far)
+        used[i] += 5
+        labels[i, 0] = u + step * vertex(left, middle, right)
+        labels[i, 1] = v + step * vertex(up, middle, down)
+
+
+@inlined
+def vertex(before: Scalar, middle: Scalar, after: Scalar) -> Scalar:
+    """Position of the minimum of a parabola through values at -1, 0, 1, within these; 0 if it is not convex."""
+    curvature = before + after - 2 * middle
+    if curvature <= 0:
+        return np.float32(0)
+    return min(max(np.float32(before - after) / np.float32(2 * curvature), np.float32(-1)), np.float32(1))
+
+
+# ------------------------------------------------------------------ propagation between neighbouring points
+
+
+@kernel
+def transported_labels(
+    start: int, stop: int, points: Floats, labels: Floats, turns: Floats, neighbours: Longs, motions: Floats,
+    lower: Floats, upper: Floats, out: Floats,
+) -> None:  # fmt: skip
+    """Labels of neighbours and of common motions, as seen from each point.
+
+    A neighbour's label is a similarity around the neighbour; at point p it means the displacement that this similarity
+    gives p. Scale and rotation are clipped to the point's bounds; the displacement is not: a label of a neighbour
+    is a tested match, and the bounds limit only where the search draws.
+
+    Args:
+        start: First point.
+        stop: One past the last.
+        points: float32 ``[N, 2]``.
+        labels: float32 ``[N, 4]``, best labels of the previous phase.
+        turns: float32 ``[N, 2]`` of `label_turns`.
+        neighbours: int64 ``[N, K]``, indices; negative means none.
+        motions: float32 ``[M, 4]``, similarities ``(a, b, tx, ty)``: ``p' = [[a, -b], [b, a]] p + t``; NaN means none.
+        lower: float32 ``[N, 4]``.
+        upper: float32 ``[N, 4]``.
+        out: float32 ``[N, K + M, 4]``, NaN where there is none.
+    """
+    count = neighbours.shape[1]
+    sizes, angles = np.empty(len(motions), dtype=np.float32), np.empty(len(motions), dtype=np.float32)
+    for m in range(len(motions)):
+        a, b = motions[m, 0], motions[m, 1]
+        sizes[m] = np.float32(0.5) * np.float32(np.log2(max(a * a + b * b, np.float32(1e-12))))
+        angles[m] = np.float32(np.arctan2(b, a))
+    for i in range(start, stop):
+        x, y = points[i, 0], points[i, 1]
+        for k in range(count):
+            j = neighbours[i, k]
+            if j < 0:
+                out[i, k, 0] = np.nan
+                continue
+            c, n = turns[j, 0], turns[j, 1]
+            dx, dy = x - points[j, 0], y - points[j, 1]
+            u = points[j, 0] + labels[j, 0] + c * dx - n * dy - x
+            v = points[j, 1] + labels[j, 1] + n * dx + c * dy - y
+            admit(out, i, k, u, v, labels[j, 2], labels[j, 3], lower, upper)
+        for m in range(len(motions)):
+            a, b = motions[m, 0], motions[m, 1]
+            u, v = a * x - b * y + motions[m, 2] - x, b * x + a * y + motions[m, 3] - y
+            admit(out, i, count + m, u, v, sizes[m], angles[m], lower, upper)
+
+
+@inlined
+def admit(
+    out: Floats, i: int, k: int, u: Scalar, v: Scalar, s: Scalar, theta: Scalar, lower: Floats, upper: Floats
+) -> None:
+    """Store a candidate."""
+    out[i, k, 0], out[i, k, 1] = u, v
+    out[i, k, 2] = min(max(s, lower[i, 2]), upper[i, 2])
+    out[i, k, 3] = min(max(theta, lower[i, 3]), upper[i, 3])
+
+
+@kernel
+def label_turns(labels: Floats) -> Floats:
+    """What labels ``[N, 4]`` do to directions: ``2**s (cos theta, sin theta)``, float32 ``[N, 2]``."""
+    turns = np.empty((len(labels), 2), dtype=np.float32)
+    for i in range(len(labels)):
+        scale = np.float32(np.exp2(labels[i, 2]))
+        turns[i, 0] = np.float32(np.cos(labels[i, 3])) * scale
+        turns[i, 1] = np.float32(np.sin(labels[i, 3])) * scale
+    return turns
+
+
+def labels_as_seen(points: Floats, labels: Floats, neighbours: Longs, motions: Floats = NO_MOTION) -> Floats:
+    """`transported_labels` without bounds that matter, float32 ``[N, K + M, 4]``."""
+    count = len(points)
+    extent = np.full((count, 4), 8.0, dtype=np.float32)
+    out = np.empty((count, neighbours.shape[1] + len(motions), 4), dtype=np.float32)
+    transported_labels(0, count, points, labels, label_turns(labels), neighbours, motions, -extent, extent, out)
+    return out
+
+
+def common_motions(points: Floats, labels: Floats, costs: Longs, seed: int) -> Floats:
+    """Up to two similarity motions with which most points agree (RANSAC over pairs of well-matched points).
+
+    Args:
+        points: float32 ``[N, 2]``.
+        labels: float32 ``[N, 4]``.
+        costs: int64 ``[N]``; pairs are drawn from the better half.
+        seed: Of the frame.
+
+    Returns:
+        float32 ``[2, 4]``, ``(a, b, tx, ty)``; NaN where fewer than 6 points agree.
+    """
+    motions = np.full((2, 4), np.nan, dtype=np.float32)
+    if len(points) < 4:
+        return motions
+    half = max(len(costs) // 2, 4)
+    keys = costs * len(costs) + np.arange(len(costs))  # of equal costs the first
+    # partitioned in numpy: in a kernel it would add a tenth to the compile time of all kernels
+    good = np.sort(np.argpartition(keys, half - 1)[:half])
+    # where the good points lie and where their labels take them, one coordinate after the other for vector code
+    tracks = np.concatenate([points[good], points[good] + labels[good, :2]], axis=1).T.copy()
+    random = np.uint64(seed) ^ np.uint64(0x5DEECE66D)
+    for motion in motions:
+        if tracks.shape[1] < 6:
+            break
+        voters = tracks[:, :: -(-tracks.shape[1] // VOTERS)].copy()
+        random = np.uint64(vote(tracks, voters, *VOTE, random, motion))
+        # the second motion is fitted to the points that do not follow the first
+        (x, y, to_x, to_y), (a, b, tx, ty) = tracks, motion
+        missed = (a * x - b * y + tx - to_x) ** 2 + (b * x + a * y + ty - to_y) ** 2
+        tracks = np.compress(missed >= 4 * VOTE[1] ** 2, tracks, axis=1)
+    return motions
+
+
+@kernel
+def vote(tracks: Floats, voters: Floats, hypotheses: int, tolerance: Scalar, random: Scalar, motion: Floats) -> Scalar:
+    """Choose the similarity, of those through two tracks, with which most voters agree.
+
+    Args:
+        tracks: float32 ``[4, N]``, x and y of points, and where they go.
+        voters: float32 ``[4, M]``, likewise.
+        hypotheses: Number of pairs tried.
+        tolerance: Distance in pixels at which a voter agrees.
+        random: State of the draws.
+        motion: float32 ``[4]``, filled with ``(a, b, tx, ty)`` if at least 6 voters agree.
+
+    Returns:
+        The next state of the draws.
+    """
+    x, y, to_x, to_y = tracks[0], tracks[1], tracks[2], tracks[3]
+    count, limit, most = np.uint64(len(x)), np.float32(tolerance * tolerance), 5
+    for _ in range(hypotheses):
+        random = advance(random)
+        bits = scrambled(random)
+        i = np.int64(((bits & np.uint64(0xFFFFFFFF)) * count) >> np.uint64(32))
+        j = np.int64(((bits >> np.uint64(32)) * count) >> np.uint64(32))
+        dx, dy = x[j] - x[i], y[j] - y[i]
+        length = dx * dx + dy * dy
+        if length < 400:
+            continue
+        ex, ey = to_x[j] - to_x[i], to_y[j] - to_y[i]
+        a, b = (ex * dx + ey * dy) / length, (ey * dx - ex * dy) / length
+        grown = a * a + b * b
+        if grown < 0.15 or grown > 6.5:
+            continue
+        tx, ty = to_x[i] - a * x[i] + b * y[i], to_y[i] - b * x[i] - a * y[i]
+        votes = count_votes(voters, a, b, tx, ty, limit)
+        if votes > most:
+            most = votes
+            motion[0], motion[1], motion[2], motion[3] = a, b, tx, ty
+    return random
+
+
+@inlined
+def count_votes(voters: Floats, a: Scalar, b: Scalar, tx: Scalar, ty: Scalar, limit: Scalar) -> int:
+    """How many voters a motion takes to where their labels do, by squared distance."""
+    from_x, from_y, goal_x, goal_y = voters[0], voters[1], voters[2], voters[3]
+    votes = np.int32(0)
+    for k in range(voters.shape[1]):
+        rx, ry = a * from_x[k] - b * from_y[k] + tx - goal_x[k], b * from_x[k] + a * from_y[k] + ty - goal_y[k]
+        votes = np.int32(votes + np.int32(rx * rx + ry * ry < limit))
+    return int(votes)
+
+
+def nearest(points: Floats, run: Run) -> Longs:
+    """Indices ``[N, K]`` of each point's nearest others; `run` divides the work among threads."""
+    n = len(points)
+    neighbours = np.empty((n, min(MOST_NEIGHBOURS, n - 1)), dtype=np.int64)
+    if n > 1:
+        order = np.argsort(points[:, 0], kind="stable")
+        run(nearest_neighbours, 0, n, points[order], order, NEIGHBOUR_WINDOW, neighbours)
+    return neighbours
+
+
+@kernel
+def nearest_neighbours(start: int, stop: int, ordered: Floats, order: Longs, width: int, out: Longs) -> None:
+    """The nearest other points of each point, in an approximate but deterministic search over rows of equal bands.
+
+    Args:
+        start: First position in the order.
+        stop: One past the last.
+        ordered: float32 ``[N, 2]``, the points sorted by x.
+        order: int64 ``[N]``, their indices.
+        width: Number of points compared on each side in that order.
+        out: int64 ``[N, K]``, nearest first; -1 where there are fewer. Rows are points, not positions in the order.
+    """
+    n, count = out.shape
+    best = np.empty(count, dtype=np.float32)
+    distances = np.empty(2 * width + 1, dtype=np.float32)
+    for place in range(start, stop):
+        x, y = ordered[place, 0], ordered[place, 1]
+        first, last = max(0, place - width), min(n, place + width + 1)
+        for k in range(last - first):
+            dx, dy = ordered[first + k, 0] - x, ordered[first + k, 1] - y
+            distances[k] = dx * dx + dy * dy
+        distances[place - first] = np.inf
+        index = out[order[place]]
+        best[:], index[:] = np.inf, -1
+        worst = np.float32(np.inf)
+        for k in range(last - first):
+            distance = distances[k]
+            if distance < worst:
+                slot = count - 1
+                while slot > 0 and best[slot - 1] > distance:
+                    best[slot], index[slot] = best[slot - 1], index[slot - 1]
+                    slot -= 1
+                best[slot], index[slot] = distance, order[first + k]
+                worst = best[count - 1]
+
+
+def dissenting_labels(predictions: Floats, labels: Floats, tolerance: Scalar) -> tuple[Floats, Flags]:
+    """Find points whose neighbours agree with each other but not with the point, e.g. one period off on a texture.
+
+    Args:
+        predictions: float32 ``[N, K, 4]``, the neighbours' labels as seen from each point; NaN means none.
+        labels: float32 ``[N, 4]``, the points' own labels.
+        tolerance: Displacements this close agree, pixels.
+
+    Returns:
+        float32 ``[N, 4]``, the prediction on which most neighbours agree, and bool ``[N]``, whether it has more support
+        than the point's own label.
+    """
+    limit, (u, v) = tolerance * tolerance, np.moveaxis(predictions[:, :, :2], 2, 0)
+    du, dv = u[:, :, None] - u[:, None], v[:, :, None] - v[:, None]
+    support = np.count_nonzero(du * du + dv * dv < limit, axis=2)
+    du, dv = u - labels[:, :1], v - labels[:, 1:2]
+    away = du * du + dv * dv
+    choice = np.arange(len(labels)), support.argmax(axis=1)
+    most, own = support[choice], np.count_nonzero(away < limit, axis=1)
+    return predictions[choice], (most > 1) & (most > own) & (away[choice] >= limit)

@@ -82,21 +82,14 @@ class OrientationMaps:
 
     @cached_property
     def full_side(self) -> Side:  # noqa: D102 - see the class
-        gradients = np.empty_like(self.gray)
-        gradient_magnitudes(self.gray, gradients)
-        return self.side._replace(gradients=gradients)
+        return self.side._replace(gradients=gradient_magnitudes(self.gray))
 
 
-@kernel
-def gradient_magnitudes(gray: Bytes, out: Bytes) -> None:
-    """Fill ``[H, W]`` with the gradients' rounded magnitudes, by central differences, edges repeated."""
-    height, width = gray.shape
-    for y in range(height):
-        above, below = gray[max(y - 1, 0)], gray[min(y + 1, height - 1)]
-        for x in range(width):
-            gx = np.int32(gray[y, min(x + 1, width - 1)]) - np.int32(gray[y, max(x - 1, 0)])
-            gy = np.int32(below[x]) - np.int32(above[x])
-            out[y, x] = np.uint8(np.sqrt(np.float32(gx * gx + gy * gy)) * np.float32(0.5) + np.float32(0.5))
+def gradient_magnitudes(gray: Bytes) -> Bytes:
+    """The gradients' rounded magnitudes, uint8 ``[H, W]``, by central differences, edges repeated."""
+    levels = np.pad(gray, 1, mode="edge").astype(np.float32)
+    gx, gy = levels[1:-1, 2:] - levels[1:-1, :-2], levels[2:, 1:-1] - levels[:-2, 1:-1]
+    return np.asarray(np.sqrt(gx * gx + gy * gy) * np.float32(0.5) + np.float32(0.5), dtype=np.uint8)
 
 
 def orientation_maps(

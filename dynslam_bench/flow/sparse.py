@@ -15,30 +15,21 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.flow import layout
 from dynslam_bench.flow.degenerate import STATS_NAMES, clean_points, flow_stats, invalid_result, usable_points
-from dynslam_bench.flow.label_search import STRATEGIES, SearchState, make_plan, run_phase
-from dynslam_bench.flow.matching_cost import (
-    MAX_COST,
-    CostTables,
-    Reference,
-    cost_tables,
-    describe,
-    parabola,
-)
-from dynslam_bench.flow.orientation_maps import Buffers, OrientationMaps, Side, orientation_maps
-from dynslam_bench.flow.propagation import (
+from dynslam_bench.flow.label_search import (
+    STRATEGIES,
     common_motions,
     dissenting_labels,
-    label_turns,
     labels_as_seen,
     nearest,
-    transported_labels,
+    parabola,
+    search_labels,
 )
+from dynslam_bench.flow.matching_cost import MAX_COST, CostTables, Reference, cost_tables, describe
+from dynslam_bench.flow.orientation_maps import Buffers, OrientationMaps, Side, orientation_maps
 from dynslam_bench.flow.refinement import Window, similarity_lucas_kanade
 from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.flow.workers import Workers
 
-VOTE = (192, np.float32(5.0))
-"""Pairs of points tried for a common motion, and the distance in pixels at which a point agrees with one."""
 PARABOLA_STEP_PX = np.float32(2.0)
 COARSE = Window(step=2, radius=7, margin=3, warps=2)
 """The refinement at half resolution."""
@@ -105,11 +96,11 @@ class SparseDaisyFlow:
         pair = self.pair(reference, target)
         if guess is not None:
             guess = np.asarray(guess, dtype=np.float32).reshape(-1, 2)[usable]
-        described, neighbours = self.describe(reference, points, pair.tables), nearest(points, self.workers.run)
-        state = self.search(described, pair, neighbours, guess, seed)
+        costs = self.describe(reference, points, pair.tables), side_of(target, pair.tables), pair.tables
+        neighbours = nearest(points, self.workers.run)
+        state = search_labels(settings, self.workers.run, costs, neighbours, guess, seed)
         labels, cost, evaluations = state.flames[:, 0].copy(), state.costs[:, 0], state.used
         if settings.refinement == "lucas-kanade":
-            costs = (described, side_of(target, pair.tables), pair.tables)
             self.workers.run(parabola, 0, len(points), labels, PARABOLA_STEP_PX, *costs, evaluations)
         good = (cost < MAX_COST * pair.tables.ceiling) & (evaluations > 0)
         if settings.refinement == "lucas-kanade":
@@ -142,50 +133,6 @@ class SparseDaisyFlow:
         self.workers.run(describe, 0, count, points, side_of(image, tables), tables, descriptors, appearance)
         return Reference(points, descriptors, appearance)
 
-    def search(
-        self,
-        described: Reference,
-        pair: Pair,
-        neighbours: NDArray[np.int64],
-        guess: NDArray[np.float32] | None,
-        seed: int,
-    ) -> SearchState:
-        """The label search alone: phases of `FlowSettings.search` with propagation between them.
-
-        Returns:
-            The final state; ``flames[:, 0]`` and ``costs[:, 0]`` are the best labels and their costs.
-        """
-        settings, points, run = self.settings, described.points, self.workers.run
-        n = len(points)
-        start = np.zeros((n, 1, 4), dtype=np.float32)  # zero flow, or the motion model's prediction
-        if guess is not None:
-            offset = guess - points
-            start[:, 0, :2] = np.where(np.isfinite(offset).all(axis=1, keepdims=True), offset, 0)
-        rotation = np.deg2rad(settings.rotation_range_deg)
-        extent = np.array([settings.range_px, settings.range_px, settings.scale_range_octaves, rotation], np.float32)
-        lower, upper = start[:, 0] - extent, start[:, 0] + extent
-        population, ends, options = make_plan(settings)
-        costs = np.full((n, population), pair.tables.ceiling, np.int64)  # nothing has been evaluated
-        flames = np.repeat(start, population, axis=1)
-        state = SearchState(np.zeros_like(flames), flames, costs, np.zeros(n, np.int64), lower, upper)
-        candidates = start
-        if STRATEGIES[settings.search].shrink == 0:  # nothing is drawn: zero flow is tried beside the prediction
-            zero = np.where(start.any(axis=2, keepdims=True), np.float32(0), np.float32(np.nan))
-            candidates = np.concatenate([start, np.broadcast_to(zero, start.shape)], axis=1)
-        neighbours = np.ascontiguousarray(neighbours[:, : settings.neighbours])
-        motions = np.full((2, 4), np.nan, dtype=np.float32)
-        images = described, side_of(pair.target, pair.tables), pair.tables
-        for phase, end in enumerate(ends):
-            if phase > 0:
-                best = state.flames[:, 0].copy()
-                if settings.similarity_seeds:
-                    common_motions(points, best, state.costs[:, 0].copy(), *VOTE, np.uint64(seed + phase), motions)
-                candidates = np.empty((n, neighbours.shape[1] + 2, 4), dtype=np.float32)
-                sources = (points, best, label_turns(best), neighbours, motions)
-                run(transported_labels, 0, n, *sources, lower, upper, candidates)
-            run(run_phase, 0, n, *images, state, candidates, end, phase, np.uint64(seed), *options)
-        return state
-
     def refine_together(
         self, points: NDArray[np.float32], labels: NDArray[np.float32], neighbours: NDArray[np.int64], pair: Pair
     ) -> NDArray[np.float32]:
@@ -201,9 +148,7 @@ class SparseDaisyFlow:
         alternative, dissents = dissenting_labels(predictions, labels, np.float32(CONSENSUS_PX))
         self._take_better(points, labels, correlation, alternative, dissents, pair)
         if self.settings.similarity_seeds:
-            motions = np.empty((2, 4), dtype=np.float32)
-            doubt = np.rint(1000 * (1 - correlation)).astype(np.int64)
-            common_motions(points, labels, doubt, *VOTE, np.uint64(1), motions)
+            motions = common_motions(points, labels, np.rint(1000 * (1 - correlation)).astype(np.int64), 1)
             alternative = labels_as_seen(points, labels, np.empty((len(points), 0), np.int64), motions)[:, 0]
             with np.errstate(invalid="ignore"):
                 dissents = np.hypot(*(alternative[:, :2] - labels[:, :2]).T) > CONSENSUS_PX

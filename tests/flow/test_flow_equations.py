@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from dynslam_bench.flow import moth_flame as rules
-from dynslam_bench.flow.label_search import advance, move_moths, scrambled
-from dynslam_bench.flow.propagation import nearest
+from dynslam_bench.flow.label_search import advance, move_moths, nearest, scrambled, search_labels
 from dynslam_bench.flow.settings import FlowSettings
-from dynslam_bench.flow.sparse import SparseDaisyFlow
+from dynslam_bench.flow.sparse import SparseDaisyFlow, side_of
 
 FAMILY = {"emfoa": rules.EMFOA, "mfo": rules.MFO, "printed": rules.EMFOA_LITERAL}
 POPULATION, ITERATIONS = 6, 10
@@ -101,9 +100,8 @@ def searched(search):
     guess[::2] = np.nan
     flow = SparseDaisyFlow(FlowSettings(search=search))
     pair = flow.pair(flow.prepare(image), flow.prepare(target))
-    return flow.search(
-        flow.describe(pair.reference, points, pair.tables), pair, nearest(points, flow.workers.run), guess, 9
-    )
+    costs = flow.describe(pair.reference, points, pair.tables), side_of(pair.target, pair.tables), pair.tables
+    return search_labels(flow.settings, flow.workers.run, costs, nearest(points, flow.workers.run), guess, 9)
 
 
 STORED = {

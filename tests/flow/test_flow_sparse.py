@@ -12,9 +12,8 @@ from pictures import grid, moved, moved_points, picture
 from dynslam_bench.contracts.flow import FlowEstimator
 from dynslam_bench.core.errors import PluginError
 from dynslam_bench.core.settings import parameters
-from dynslam_bench.flow.label_search import STRATEGIES
+from dynslam_bench.flow.label_search import STRATEGIES, common_motions
 from dynslam_bench.flow.opencv import LucasKanadeFlow
-from dynslam_bench.flow.propagation import common_motions
 from dynslam_bench.flow.registry import FLOWS, build_flow
 from dynslam_bench.flow.settings import DenseFlowSettings, FlowMethodSettings, FlowSettings
 from dynslam_bench.flow.sparse import SparseDaisyFlow
@@ -185,11 +184,8 @@ def test_common_motions_finds_two_similarities_among_noise():
         moved_to = points[part] @ np.array([[a, b], [-b, a]]) + (tx, ty)
         labels[part, :2] = moved_to - points[part] + rng.normal(0, 0.5, moved_to.shape)
     costs = np.where(np.arange(400) < 260, rng.integers(0, 1000, 400), rng.integers(800, 3000, 400))
-    found = np.empty((2, 4), np.float32)
-    common_motions(points, labels, costs, 192, np.float32(5), np.uint64(1), found)
-    np.testing.assert_allclose(found[:, :2], motions[:, :2], atol=0.03)
-    common_motions(points[:3], labels[:3], costs[:3], 192, np.float32(5), np.uint64(1), found)
-    assert np.isnan(found).all()
+    np.testing.assert_allclose(common_motions(points, labels, costs, 1)[:, :2], motions[:, :2], atol=0.03)
+    assert np.isnan(common_motions(points[:3], labels[:3], costs[:3], 1)).all()
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -31,7 +31,7 @@ from dynslam_bench.sequences.synthetic import (
     parse_synthetic_id,
     render_synthetic,
 )
-from dynslam_bench.sequences.synthetic.parts import BOX, At
+from dynslam_bench.sequences.synthetic.parts import BOX
 from dynslam_bench.sequences.synthetic.people import draw_person, write_script
 from dynslam_bench.sequences.synthetic.renderer import bounds_of
 from dynslam_bench.sequences.synthetic.rooms import plan_room
@@ -380,20 +380,6 @@ def test_flow_ends_where_the_other_frames_rows_see_the_point(fast) -> None:
     assert np.abs((1 - share) * seen[0] + share * seen[1] - ends).max() < 2e-3
 
 
-def test_splits_share_no_place_of_any_thing() -> None:
-    def places(scenes: range) -> set[tuple[str, At]]:
-        return {
-            (name, key)
-            for scene in scenes
-            for name in ("box_obstructing", "trolley", "kidnapped")
-            for body in parse_synthetic_id(f"synthetic/objects_{name}").variant.build(scene).bodies
-            for key in body.path.args[0][2:4]
-        }
-
-    tune, held_out = places(range(0, 100, 9)), places(range(100, 200, 9))
-    assert len(tune) > 20 and not tune & held_out
-
-
 # Long paths: laps of the length they say, places come back to, furniture moved out of sight, walls never met.
 
 
@@ -581,30 +567,23 @@ def test_the_cache_is_a_folder_in_tum_layout(tmp_path: Path) -> None:
     assert np.array_equal(folder.timestamps, sequence.timestamps)
 
 
-def test_two_processes_may_render_the_same_sequence(tmp_path: Path) -> None:
-    code = (
-        "import sys; from pathlib import Path; from dynslam_bench.sequences.synthetic import render_synthetic; "
-        "render_synthetic('synthetic/walking_static?frames=3', Path(sys.argv[1]), threads=1)"
-    )
-    children = [subprocess.Popen([sys.executable, "-c", code, str(tmp_path)]) for _ in range(2)]
-    assert [child.wait() for child in children] == [0, 0]
-    sequence = open_synthetic("synthetic/walking_static?frames=3", tmp_path)
-    assert sequence.render() == 0
-    assert not [path for path in tmp_path.rglob(".*")]
-
-
-def test_a_forked_child_can_render_on(tmp_path: Path) -> None:
+def test_two_forked_processes_may_render_the_same_sequence_after_their_parent_has_rendered(tmp_path: Path) -> None:
     code = """
 import os, sys
-from dynslam_bench.sequences.synthetic import open_synthetic
-sequence = open_synthetic("synthetic/walking_xyz", None, threads=2)
-before = sequence[3].rgb.tobytes()
-child = os.fork()
-if child == 0:
-    os._exit(0 if sequence[3].rgb.tobytes() == before else 1)
-print(os.waitpid(child, 0)[1])
+from pathlib import Path
+from dynslam_bench.sequences.synthetic import open_synthetic, render_synthetic
+sequence = open_synthetic("synthetic/walking_static?frames=3", None, threads=2)
+before = sequence[1].rgb.tobytes()
+for _ in range(2):
+    if os.fork() == 0:
+        render_synthetic("synthetic/walking_static?frames=3", Path(sys.argv[1]), threads=2)
+        os._exit(0 if sequence[1].rgb.tobytes() == before else 1)
+print(os.wait()[1], os.wait()[1])
 """
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "0\n"
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=True)
+    assert done.stdout == "0 0\n", done.stderr
+    assert open_synthetic("synthetic/walking_static?frames=3", tmp_path).render() == 0
+    assert not [path for path in tmp_path.rglob(".*")]
 
 
 def test_tuning_and_held_out_scenes_share_nothing() -> None:
@@ -612,6 +591,10 @@ def test_tuning_and_held_out_scenes_share_nothing() -> None:
         plan, script = plan_room(scene), write_script("walking", scene)
         values: set[object] = {("back", plan.back_y), ("left", plan.left_x), ("desk", plan.desk_y, plan.desk_x)}
         values |= {("path", k, p[0].x, p[0].y) for k, p in enumerate(script.people)}
+        if scene % 9 == 0:  # what moves takes longer to build
+            for name in ("box_obstructing", "trolley", "kidnapped"):
+                (body,) = parse_synthetic_id(f"synthetic/objects_{name}").variant.build(scene).bodies
+                values |= {(name, key) for key in body.path.args[0][2:4]}
         return values | {("height", k, draw_person(scene, k).height) for k in range(2)}
 
     tune, held_out = (set().union(*map(traits, scenes)) for scenes in (range(100), range(100, 200)))

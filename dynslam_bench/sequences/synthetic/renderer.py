@@ -24,7 +24,6 @@ from dynslam_bench.sequences.synthetic.kernels import NEAR_M, TILE
 from dynslam_bench.sequences.synthetic.parts import QUAD, ROUND_CONE
 from dynslam_bench.sequences.synthetic.scene import Scene, View
 from dynslam_bench.sequences.synthetic.settings import CAMERA, FPS, RenderSettings
-from dynslam_bench.sequences.synthetic.textures import Atlas
 
 SIZE = CAMERA.height, CAMERA.width
 _INTRINSICS = CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy
@@ -141,11 +140,6 @@ class Renderer:
         self._seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:6], "little")
         self._ids = np.append(scene.instance, 0).astype(np.uint8)
 
-    @cached_property
-    def atlas(self) -> Atlas:
-        """The textures; drawn when the first frame is coloured."""
-        return self.scene.atlas()
-
     def render(self, index: int) -> Rendered:
         """Render frame `index`."""
         now, time = self.scene.view(index), index / FPS
@@ -227,7 +221,7 @@ class Renderer:
         self, now: View, tiles: Tiles, local: Array, hit: NDArray[np.int32], depth: Array, time: float
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Colour ``[H, W, 3]`` and cosine of incidence ``[H, W]``; a rolling shutter's normals are those of a band."""
-        scene, atlas, density = self.scene, self.atlas, self._density
+        scene, density = self.scene, self._density
         color, cosine = np.empty((*SIZE, 3), np.float32), np.empty(SIZE, np.float32)
         jitter = _JITTER if self.settings.antialias else np.zeros((1, 2))
 
@@ -237,7 +231,7 @@ class Renderer:
             facets = self._facets(now, pose, lights, density)
             kernels.shade_pixels(
                 a, b, _INTRINSICS, *tiles, scene.kind, local, scene.shape, scene.texture, scene.uv, scene.tint, facets,
-                *atlas, lights, hit, depth, jitter, color, cosine,
+                *scene.atlas, lights, hit, depth, jitter, color, cosine,
             )  # fmt: skip
 
         self._rows(work)
@@ -294,7 +288,7 @@ class Renderer:
     @cached_property
     def _density(self) -> Array:
         """Texels a pixel at 1 m on each face ``[P, 6]`` seen at right angles."""
-        scene, log2_size = self.scene, self.atlas[2]
+        scene, log2_size = self.scene, self.scene.atlas[2]
         repeats, cones = np.abs(scene.uv[:, :, :2]), scene.kind == ROUND_CONE
         repeats[cones, :, 0] /= (math.pi * np.maximum(scene.shape[cones, 1] + scene.shape[cones, 2], 2e-3))[:, None]
         repeats[cones] /= scene.scale[cones].mean(axis=1)[:, None, None]

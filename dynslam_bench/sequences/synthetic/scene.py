@@ -5,7 +5,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import chain
 from typing import Any
 
@@ -176,8 +176,9 @@ class Scene:
         self.view = lru_cache(maxsize=8)(self._view)
         """How frame `index` sees the scene; neighbouring frames ask for the same views."""
 
+    @cached_property
     def atlas(self) -> textures.Atlas:
-        """The scene's textures."""
+        """The scene's textures; drawn when the first frame is coloured."""
         drawn = (
             textures.MAKERS[name.partition(":")[0]](stream(self.seed, "synthetic", "texture", name))
             for name in self.texture_names

@@ -267,7 +267,7 @@ class SyntheticSequence:
         report(total - len(todo), total)
         if todo:
             renderer = Renderer(self._id, self.scene, self.settings, threads=1)
-            _ = renderer.atlas  # drawn once, before several threads ask for it
+            _ = self.scene.atlas  # drawn once, before several threads ask for it
             with ThreadPoolExecutor(self.threads) as pool:
                 frames = pool.map(lambda index: self._make(index, renderer) and None, todo)
                 for done, _ in enumerate(frames, total - len(todo) + 1):
