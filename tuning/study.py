@@ -395,7 +395,8 @@ class Study(Plan):
         if self.spec.pruner == "none" or len(self.objectives) > 1 or not objective.counts(last):
             return False
         if self.spec.pruner == "wilcoxon":
-            trial.report(*objective.by_start({last: outcomes[last]}, reference), step=len(outcomes))
+            (value,) = objective.by_start({last: outcomes[last]}, reference)
+            trial.report(value, len(outcomes))
         elif max(violations(self.spec, outcomes, reference).values(), default=0) <= 0:
             trial.report(objective.value(outcomes, reference), len(outcomes))
         return 0 < trial.number and len(outcomes) < len(self.design.tune) and trial.should_prune()

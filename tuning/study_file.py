@@ -206,13 +206,13 @@ def further_scenes(
 
 def stretches_behind(instances: Iterable[ProblemInstance], data_root: str | None) -> list[ProblemInstance]:
     """The parts of recordings moved behind the last frame that is named of each, as far as the recording goes."""
-    parts = [
-        (instance, *instance.frames)
-        for instance in instances
-        if instance.frames and instance.frames[1] is not None and not instance.sequence.startswith("synthetic/")
-    ]
+    parts: dict[str, list[tuple[ProblemInstance, int, int]]] = {}
+    for instance in instances:
+        first, last = instance.frames or (0, None)
+        if last is not None and not instance.sequence.startswith("synthetic/"):
+            parts.setdefault(instance.sequence, []).append((instance, first, last))
     moved = []
-    for sequence, group in grouped(parts, lambda part: part[0].sequence).items():
+    for sequence, group in parts.items():
         shift = max(last for _, _, last in group) - min(first for _, first, _ in group)
         length = len(open_sequence(sequence, data_root=data_root))
         moved += [

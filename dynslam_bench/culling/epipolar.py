@@ -362,16 +362,18 @@ class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
         side = 2 * self.settings.radius_px + 1  # a square window, as in the authors' code
         near_people = cv2.dilate(people.view(np.uint8), np.ones((side, side), np.uint8)).astype(bool)
         votes = np.count_nonzero(inside(near_people, moving))
-        stats = {"corners": corners, "moving": len(moving), "votes": votes, "f_asked": asked, "f_judged": judged}
-        if votes < self.settings.min_votes:
-            return self.verdict(keep, **stats)
-        return self.verdict(~inside(people, frame.keypoints.xy), people, **stats)
+        mask = people if votes >= self.settings.min_votes else None
+        if mask is not None:
+            keep = ~inside(people, frame.keypoints.xy)
+        return self.verdict(
+            keep, mask, corners=corners, moving=len(moving), votes=votes, f_asked=asked, f_judged=judged
+        )
 
     def _moving_corners(
         self, previous: NDArray[np.uint8], current: NDArray[np.uint8], camera: Camera
     ) -> tuple[NDArray[np.float32], int, bool]:
         """Pixels ``[M, 2]`` of the corners off their line, the number of tracked corners, whether F was estimated."""
-        no_corners, border = np.zeros((0, 2), np.float32), VOTE_BORDER_PX
+        no_corners = np.zeros((0, 2), np.float32)
         corners = cv2.goodFeaturesToTrack(
             previous, self.settings.corners, 0.01, 8, blockSize=3, useHarrisDetector=True, k=HARRIS_K
         )
@@ -389,14 +391,17 @@ class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
             criteria=(criteria[0], 20, 0.01),
         )
         before, after = corners.reshape(-1, 2), tracked.reshape(-1, 2)
-        both = np.stack([before, after])
-        inner = (both >= border) & (both <= np.array(current.shape[::-1]) - border - 1)
-        good = status.ravel().astype(bool) & inner.all(axis=(0, 2))
+        low, high = VOTE_BORDER_PX, np.array(current.shape[::-1]) - VOTE_BORDER_PX - 1
+        good = status.ravel().astype(bool)
+        for xy in (before, after):
+            good &= (xy >= low).all(axis=1) & (xy <= high).all(axis=1)
         good[good] = _patch_difference(previous, current, before[good], after[good]) <= self.settings.sad_limit
         before, after = before[good], after[good]
         first, second = camera.undistort_points(before), camera.undistort_points(after)
-        as_published = {"max_draws": 1000, "min_matches": VOTE_MATCHES, "refits": 0}
-        matrix = fundamental_matrix(first, second, inlier_px=self.settings.inlier_px, **as_published)
+        inlier_px = self.settings.inlier_px
+        matrix = fundamental_matrix(
+            first, second, inlier_px=inlier_px, max_draws=1000, min_matches=VOTE_MATCHES, refits=0
+        )
         if matrix is None:
             return no_corners, len(before), False
         return after[epipolar_distance(matrix, first, second) > self.settings.threshold_px], len(before), True

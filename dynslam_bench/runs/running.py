@@ -15,6 +15,7 @@ from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExec
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -484,10 +485,13 @@ class _Bench:
                     asked = (spec.model_dump_json(), protocol, json.dumps(run.identity, default=str))
                     sent[_asked(executor.submit, run_packed, *asked)] = run
                 for future in wait(sent, return_when=FIRST_COMPLETED).done:
-                    self._attempt(sent.pop(future), lambda _, future=future: unpack(_asked(future.result), self.store))
+                    self._attempt(sent.pop(future), partial(self._take, future))
         finally:
             for future in sent:
                 future.cancel()
+
+    def _take(self, future: Future[Any], run: ResolvedRun) -> RunRecord:
+        return unpack(_asked(future.result), self.store)
 
     def _attempt(self, run: ResolvedRun, make: Callable[[ResolvedRun], RunRecord]) -> None:
         """Make a run; one that cannot be made although nothing is broken here is set aside."""

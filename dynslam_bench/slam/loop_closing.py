@@ -389,8 +389,8 @@ class LoopCloser:
         self.rescaled = dict(zip(slots.tolist(), scales.tolist(), strict=True))
 
     def _edge(self, one: int, other: int, pose_of_other: Array, weight: float = 1.0) -> Edge:
-        ids = self.world.kf_id[[one, other]].tolist()
-        return Edge(*ids, pose_of_other @ se3.inverse(self.world.kf_pose[one]), weight)
+        id_one, id_other = self.world.kf_id[[one, other]].tolist()
+        return Edge(id_one, id_other, pose_of_other @ se3.inverse(self.world.kf_pose[one]), weight)
 
     def _covisibility_edges(self, slots: Slots) -> list[Edge]:
         """Edges of each keyframe to the older ones that share many points, and to the one that shares most.
@@ -557,4 +557,4 @@ def _inverse_left_jacobian(twist: Array) -> Array:
     """``[..., 6, 6]``, to second order: how the logarithm of a pose follows a twist on its left."""
     by_translation, by_rotation = se3.hat(twist[..., :3]), se3.hat(twist[..., 3:])
     ad = np.block([[by_rotation, by_translation], [np.zeros_like(by_rotation), by_rotation]])
-    return np.eye(6) - ad / 2 + ad @ ad / 12
+    return np.asarray(np.eye(6) - ad / 2 + ad @ ad / 12)
