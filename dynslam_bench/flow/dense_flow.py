@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,16 +130,34 @@ class DenseDaisyFlow:
         """Flow of every pixel from the reference to the target."""
         forward = _RegionLabels(self.settings, self._sparse, reference, target, seed)
         backward = _RegionLabels(self.settings, self._sparse, target, reference, seed + 1)
-        flow, back, tolerance = forward.flow(), backward.flow(), np.float32(self.settings.consistency_px)
+        flow, back = forward.flow(), backward.flow()
         if self.settings.second_round:
-            forward.try_regional_motion(consistent(flow, back, tolerance))
-            backward.try_regional_motion(consistent(back, flow, tolerance))
+            forward.try_regional_motion(self._consistent(flow, back))
+            backward.try_regional_motion(self._consistent(back, flow))
             flow, back = forward.flow(), backward.flow()
-        valid = consistent(flow, back, tolerance)
-        fitted = fit_regional_motion(flow, valid, reference)
+        valid = self._consistent(flow, back)
+        fitted = fit_regional_motion(flow, valid, reference.regions, reference.half)
         if fitted is not None:
-            flow = fill_and_smooth(flow, valid, reference, fitted.astype(np.float32))
+            height, smooth = len(flow), np.empty_like(flow)
+            self._sparse.workers.run(
+                fill_and_smooth,
+                0,
+                height,
+                flow,
+                valid,
+                reference.regions.labels,
+                reference.centres,
+                fitted.astype(np.float32),
+                smooth,
+            )
+            flow = smooth
         return DenseFlow(flow, valid, forward.cost(), forward.evaluations + backward.evaluations, back)
+
+    def _consistent(self, forward: Floats, backward: Floats) -> Flags:
+        valid = np.empty(forward.shape[:2], dtype=np.bool_)
+        tolerance = np.float32(self.settings.consistency_px)
+        self._sparse.workers.run(consistent, 0, len(valid), forward, backward, tolerance, valid)
+        return valid
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,9 +168,7 @@ class DescribedImage:
         maps: Its orientation maps.
         half: uint8 ``[h, w]``, grey levels.
         regions: Its superpixels.
-        labels: int32 ``[H, W]``, superpixel of each full-image pixel.
         centres: float32 ``[K, 2]``, their centres, full-image pixels.
-        offsets: float32 ``[2, H, W]``, x and y of each full-image pixel from the centre of its superpixel.
         neighbours: int64 ``[K, 8]``, the nearest other regions.
         described: The centres for the label search.
         descriptors: uint64, flat ``[h, w, 17]``, unrotated, a histogram each.
@@ -161,9 +177,7 @@ class DescribedImage:
     maps: OrientationMaps
     half: NDArray[np.uint8]
     regions: Superpixels
-    labels: NDArray[np.int32]
     centres: NDArray[np.float32]
-    offsets: NDArray[np.float32]
     neighbours: NDArray[np.int64]
     described: Reference
     descriptors: NDArray[np.uint64]
@@ -174,14 +188,11 @@ def describe_image(maps: OrientationMaps, settings: DenseFlowSettings, sparse: S
     half = np.ascontiguousarray(maps.framed_half[BORDER:-BORDER, BORDER:-BORDER])
     regions = superpixels(half, max(2, settings.superpixel_px // 2))
     centres = regions.centres * 2 + 0.5  # half-resolution pixel i covers 2 i and 2 i + 1
-    labels = doubled(regions.labels, maps.gray.shape)
-    offsets = np.indices(labels.shape, dtype=np.float32)[::-1] - centres.T.take(labels, axis=1)
     tables = sparse.pair(maps, maps).tables
     descriptors = np.empty(half.size * layout.HISTOGRAMS, dtype=np.uint64)
     sparse.workers.run(read_descriptors, 0, *half.shape, maps.side, tables, descriptors)
     neighbours = nearest(centres, sparse.workers.run)
-    centre = sparse.describe(maps, centres, tables)
-    return DescribedImage(maps, half, regions, labels, centres, offsets, neighbours, centre, descriptors)
+    return DescribedImage(maps, half, regions, centres, neighbours, sparse.describe(maps, centres, tables), descriptors)
 
 
 class _RegionLabels:
@@ -215,7 +226,7 @@ class _RegionLabels:
 
     def try_regional_motion(self, valid: NDArray[np.bool_]) -> None:
         """Try, on every region, the motion of the consistent regions around it, as fitted and refined."""
-        fitted = fit_regional_motion(self.flow(), valid, self._image)
+        fitted = fit_regional_motion(self.flow(), valid, self._image.regions, self._image.half)
         if fitted is None:
             return
         candidates = [nearest_similarities(fitted)]
@@ -240,38 +251,42 @@ class _RegionLabels:
 
     def flow(self) -> NDArray[np.float32]:
         """Displacement of every full-image pixel under the labels chosen so far."""
-        labels, offsets = self._image.labels, self._image.offsets
-        flow = np.empty((*labels.shape, 2), dtype=np.float32)
-        self._sparse.workers.run(spread_labels, 0, len(flow), self._winner, offsets, flow)
+        image = self._image
+        height, width = image.maps.gray.shape
+        flow = np.empty((height, width, 2), dtype=np.float32)
+        self._sparse.workers.run(spread_labels, 0, height, self._winner, image.regions.labels, image.centres, flow)
         return flow
 
     def cost(self) -> NDArray[np.float32]:
         """Aggregated cost of every full-image pixel, as a share of the largest possible."""
-        share = doubled(self._best, self._image.maps.gray.shape) / np.float32(self._tables.ceiling)
-        return np.asarray(np.clip(share, 0, 1), dtype=np.float32)  # may overshoot
+        full, half = self._image.maps.gray.shape, self._image.half.shape
+        rows, columns = (np.minimum(np.arange(n) // 2, h - 1) for n, h in zip(full, half, strict=True))
+        share = self._best[np.ix_(rows, columns)]
+        return np.asarray(np.clip(share / np.float32(self._tables.ceiling), 0, 1), dtype=np.float32)  # may overshoot
 
 
-def doubled(half: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """What half-resolution pixels ``[h, w, ...]`` hold, at each pixel of the full image of a shape ``(H, W)``."""
-    rows, columns = (np.minimum(np.arange(n) // 2, h - 1) for n, h in zip(shape, half.shape, strict=False))
-    return np.asarray(half.take(rows, axis=0).take(columns, axis=1))
-
-
-def consistent(forward: Floats, backward: Floats, tolerance: Scalar) -> Flags:
-    """Which pixels' flow, followed by the backward flow where it ends, returns to within `tolerance` pixels.
+@kernel
+def consistent(start: int, stop: int, forward: Floats, backward: Floats, tolerance: Scalar, valid: Flags) -> None:
+    """Mark pixels whose flow, followed by the backward flow where it ends, returns to within `tolerance` pixels.
 
     Args:
+        start: First row.
+        stop: One past the last.
         forward: float32 ``[H, W, 2]``.
         backward: Likewise.
         tolerance: Pixels.
-
-    Returns:
-        bool ``[H, W]``.
+        valid: bool ``[H, W]``, filled.
     """
-    y, x = np.indices(forward.shape[:2], dtype=np.float32)
-    end, inside = pixel_index(np.stack([x, y], axis=2) + forward, forward.shape)
-    rest_x, rest_y = np.moveaxis(forward + backward[end], 2, 0)
-    return np.asarray(inside & (rest_x * rest_x + rest_y * rest_y <= tolerance * tolerance))
+    height, width = valid.shape
+    limit = tolerance * tolerance
+    for y in range(start, stop):
+        for x in range(width):
+            u, v = forward[y, x, 0], forward[y, x, 1]
+            column, row = np.int64(np.rint(np.float32(x) + u)), np.int64(np.rint(np.float32(y) + v))
+            valid[y, x] = False
+            if 0 <= column < width and 0 <= row < height:
+                dx, dy = u + backward[row, column, 0], v + backward[row, column, 1]
+                valid[y, x] = dx * dx + dy * dy <= limit
 
 
 def nearest_similarities(motion: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -283,29 +298,30 @@ def nearest_similarities(motion: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 def fit_regional_motion(
-    flow: NDArray[np.float32], valid: NDArray[np.bool_], image: DescribedImage
+    flow: NDArray[np.float32], valid: NDArray[np.bool_], regions: Superpixels, guide: NDArray[np.uint8]
 ) -> NDArray[np.float64] | None:
-    """Fit an affine motion to the reliable regions around each region, robustly; similar grey levels count more.
+    """Fit an affine motion to the reliable regions around each region, robustly.
 
     Args:
         flow: float32 ``[H, W, 2]``.
         valid: bool ``[H, W]``, consistent pixels.
-        image: The image and its superpixels.
+        regions: Superpixels at half resolution.
+        guide: uint8 ``[H / 2, W / 2]``, their image; regions of similar grey level count more.
 
     Returns:
         float64 ``[K, 3, 2]``, flow at the centre, and its change per pixel along x and y; None where fewer than three
         regions are reliable.
     """
-    count, followed, regions = len(image.centres), image.labels[valid], image.regions
-    pixels, consistent = (np.bincount(of, minlength=count) for of in (image.labels.ravel(), followed))
-    reliable = np.flatnonzero((consistent >= SHARE * np.maximum(pixels, 1)) & (consistent > 0))
+    count = len(regions.centres)
+    sums = np.zeros((count, 6))
+    sum_regions(flow, valid, regions.labels, sums)
+    consistent = sums[:, 1]
+    reliable = np.flatnonzero((consistent >= SHARE * np.maximum(sums[:, 0], 1)) & (consistent > 0))
     if len(reliable) < 3:
         return None
-    values = (*np.nonzero(valid)[::-1], *flow[valid].T)  # position and flow of the consistent pixels
-    sums = np.stack([np.bincount(followed, weights=value, minlength=count) for value in values], axis=1)
-    mean = sums / np.maximum(consistent, 1)[:, None]
+    mean = sums[:, 2:] / np.maximum(consistent, 1)[:, None]  # position and flow of each region's consistent pixels
     centres = regions.centres.astype(np.float64) * 2 + 0.5
-    total = np.bincount(regions.labels.ravel(), weights=image.half.ravel(), minlength=count)
+    total = np.bincount(regions.labels.ravel(), weights=guide.ravel(), minlength=count)
     grey = total / np.maximum(np.bincount(regions.labels.ravel(), minlength=count), 1)
     near = min(NEIGHBOURS, len(reliable))
     distance, index = cKDTree(mean[reliable, :2]).query(centres, k=near)
@@ -315,32 +331,61 @@ def fit_regional_motion(
     weight = np.exp(-0.5 * (distance / spread) ** 2 - np.abs(grey[chosen] - grey[:, None]) / 20.0) + 1e-6
     offset = (mean[chosen, :2] - centres[:, None]) / spread[..., None]
     basis = np.concatenate([np.ones((count, near, 1)), offset], axis=2)
-    moved = mean[chosen, 2:]
+    values = mean[chosen, 2:]
     motion = np.zeros((count, 3, 2))
     for _ in range(3):  # iteratively reweighted: a foreground region must not bend the background
         weighted = basis * weight[..., None]
         normal = weighted.transpose(0, 2, 1) @ basis
         normal[:, (0, 1, 2), (0, 1, 2)] += weight.sum(axis=1, keepdims=True) * (1e-6, 0.05, 0.05)
-        motion = np.linalg.solve(normal, weighted.transpose(0, 2, 1) @ moved)
-        weight = weight / (1 + (np.linalg.norm(moved - basis @ motion, axis=2) / 2.0) ** 2)
+        motion = np.linalg.solve(normal, weighted.transpose(0, 2, 1) @ values)
+        weight = weight / (1 + (np.linalg.norm(values - basis @ motion, axis=2) / 2.0) ** 2)
     motion[:, 1:] /= spread[:, :, None]
     return motion
 
 
-def fill_and_smooth(flow: Floats, valid: Flags, image: DescribedImage, motion: Floats) -> Floats:
-    """The flow, but pixels not valid, or within `SMOOTH_PX` of it, take their region's fitted motion.
+@kernel
+def sum_regions(flow: Floats, valid: Flags, labels: Ints, sums: Doubles) -> None:
+    """Add up pixels, consistent pixels, and their x, y and flow, by region: float64 ``[K, 6]``."""
+    for y in range(len(valid)):
+        row = labels[min(y // 2, len(labels) - 1)]
+        for x in range(valid.shape[1]):
+            r = row[min(x // 2, len(row) - 1)]
+            sums[r, 0] += 1
+            if valid[y, x]:
+                sums[r, 1] += 1
+                sums[r, 2] += x
+                sums[r, 3] += y
+                sums[r, 4] += flow[y, x, 0]
+                sums[r, 5] += flow[y, x, 1]
+
+
+@kernel
+def fill_and_smooth(
+    start: int, stop: int, flow: Floats, valid: Flags, labels: Ints, centres: Floats, motion: Floats, out: Floats
+) -> None:
+    """Copy rows start..stop; pixels not valid, or within `SMOOTH_PX` of it, take their region's fitted motion.
 
     Args:
+        start: First row.
+        stop: One past the last.
         flow: float32 ``[H, W, 2]``.
         valid: bool ``[H, W]``, consistent pixels.
-        image: The image.
+        labels: `Superpixels.labels`.
+        centres: float32 ``[K, 2]``, full-image pixels.
         motion: float32 ``[K, 3, 2]`` of `fit_regional_motion`.
+        out: float32 ``[H, W, 2]``, filled.
     """
-    dx, dy = (offset[..., None] for offset in image.offsets)
-    at_centre, along_x, along_y = motion.swapaxes(0, 1).take(image.labels, axis=1)
-    fitted = at_centre + dx * along_x + dy * along_y
-    u, v = np.moveaxis(fitted - flow, 2, 0)
-    return np.where((~valid | (u * u + v * v < SMOOTH_PX**2))[..., None], fitted, flow)
+    limit = np.float32(SMOOTH_PX**2)
+    for y in range(start, stop):
+        row = labels[min(y // 2, len(labels) - 1)]
+        for x in range(flow.shape[1]):
+            r = row[min(x // 2, len(row) - 1)]
+            dx, dy = np.float32(x) - centres[r, 0], np.float32(y) - centres[r, 1]
+            u = motion[r, 0, 0] + dx * motion[r, 1, 0] + dy * motion[r, 2, 0]
+            v = motion[r, 0, 1] + dx * motion[r, 1, 1] + dy * motion[r, 2, 1]
+            own_u, own_v = flow[y, x, 0], flow[y, x, 1]
+            replaced = not valid[y, x] or (u - own_u) * (u - own_u) + (v - own_v) * (v - own_v) < limit
+            out[y, x, 0], out[y, x, 1] = (u, v) if replaced else (own_u, own_v)
 
 
 # ---------------------------------------------------------------------- superpixels
@@ -380,35 +425,49 @@ def superpixels(gray: NDArray[np.uint8], size: int, *, compactness: float = 20.0
     centres[:, 0], centres[:, 1] = np.tile(x, rows), np.repeat(y, columns)
     centres[:, 2] = gray[np.rint(centres[:, 1]).astype(int), np.rint(centres[:, 0]).astype(int)]
     labels = np.empty((height, width), dtype=np.int32)
-    flat, pixels = labels.reshape(-1), (*np.indices(gray.shape)[::-1].reshape(2, -1), gray.ravel())
-    for _ in range(iterations):
-        assign_pixels(gray, centres, size, (size / compactness) ** 2, labels)
-        count = np.bincount(flat, minlength=len(centres))[:, None]
-        sums = np.stack([np.bincount(flat, weights=values, minlength=len(centres)) for values in pixels], axis=1)
-        centres = np.where(count > 0, sums / np.maximum(count, 1), centres)
+    assign_pixels(gray, centres, size, (size / compactness) ** 2, iterations, labels)
+    flat = labels.reshape(-1)
     starts = np.concatenate([[0], np.cumsum(np.bincount(flat, minlength=len(centres)))])
     members = np.argsort(flat, kind="stable")
     return Superpixels(labels, centres[:, :2].astype(np.float32), members, starts.astype(np.int64))
 
 
 @kernel
-def assign_pixels(gray: Bytes, centres: Doubles, size: int, weight: float, labels: Ints) -> None:
-    """A step of k-means: each centre competes for the pixels within `size` of it; fills `labels`."""
+def assign_pixels(gray: Bytes, centres: Doubles, size: int, weight: float, iterations: int, labels: Ints) -> None:
+    """K-means: each centre competes for the pixels within `size` of it; fills `labels`, moves `centres`."""
     height, width = gray.shape
-    distance = np.full((height, width), np.inf)
-    labels[:] = -1
-    for k in range(len(centres)):
-        cx, cy, cg = centres[k, 0], centres[k, 1], centres[k, 2]
-        for y in range(max(0, int(cy - size)), min(height, int(cy + size) + 2)):
-            for x in range(max(0, int(cx - size)), min(width, int(cx + size) + 2)):
-                dx, dy, dg = x - cx, y - cy, gray[y, x] - cg
-                d = dx * dx + dy * dy + weight * dg * dg
-                if d < distance[y, x]:
-                    distance[y, x], labels[y, x] = d, k
-    for y in range(height):
-        for x in range(width):
-            if labels[y, x] < 0:  # too far from every centre: the nearest in position
-                labels[y, x] = np.argmin((x - centres[:, 0]) ** 2 + (y - centres[:, 1]) ** 2)
+    distance = np.empty((height, width), dtype=np.float64)
+    sums = np.empty((len(centres), 4), dtype=np.float64)
+    for _ in range(iterations):
+        distance[:] = np.inf
+        labels[:] = -1
+        for k in range(len(centres)):
+            cx, cy, cg = centres[k, 0], centres[k, 1], centres[k, 2]
+            for y in range(max(0, int(cy - size)), min(height, int(cy + size) + 2)):
+                for x in range(max(0, int(cx - size)), min(width, int(cx + size) + 2)):
+                    dx, dy, dg = x - cx, y - cy, gray[y, x] - cg
+                    d = dx * dx + dy * dy + weight * dg * dg
+                    if d < distance[y, x]:
+                        distance[y, x], labels[y, x] = d, k
+        sums[:] = 0
+        for y in range(height):
+            for x in range(width):
+                k = labels[y, x]
+                if k < 0:  # too far from every centre: the nearest in position
+                    best = np.inf
+                    for other in range(len(centres)):
+                        d = (x - centres[other, 0]) ** 2 + (y - centres[other, 1]) ** 2
+                        if d < best:
+                            best, k = d, other
+                    labels[y, x] = k
+                sums[k, 0] += x
+                sums[k, 1] += y
+                sums[k, 2] += gray[y, x]
+                sums[k, 3] += 1
+        for k in range(len(centres)):
+            if sums[k, 3] > 0:
+                for j in range(3):
+                    centres[k, j] = sums[k, j] / sums[k, 3]
 
 
 # ---------------------------------------------------------------------- aggregation (Eq. 1-3)
@@ -677,12 +736,14 @@ def raw_costs(
 
 
 @kernel
-def spread_labels(start: int, stop: int, winner: Floats, offsets: Floats, flow: Floats) -> None:
+def spread_labels(start: int, stop: int, winner: Floats, regions: Ints, centres: Floats, flow: Floats) -> None:
     """Displacement of full-image rows start..stop from the half-resolution labels around the regions' centres."""
-    rows, columns, _ = winner.shape
     for y in range(start, stop):
+        row = min(y // 2, winner.shape[0] - 1)
         for x in range(flow.shape[1]):
-            u, v, a, b = winner[min(y // 2, rows - 1), min(x // 2, columns - 1)]
-            dx, dy = offsets[0, y, x], offsets[1, y, x]
+            column = min(x // 2, winner.shape[1] - 1)
+            u, v, a, b = winner[row, column]
+            r = regions[row, column]
+            dx, dy = np.float32(x) - centres[r, 0], np.float32(y) - centres[r, 1]
             flow[y, x, 0] = u + a * dx - b * dy - dx
             flow[y, x, 1] = v + b * dx + a * dy - dy

@@ -53,6 +53,14 @@ def test_guided_filter_without_regularisation():
     assert np.isfinite(flat).all() and flat.min() >= values.min() and flat.max() <= values.max()
 
 
+def test_filtering_a_patch_with_twice_the_radius_around_equals_the_whole():
+    rng = np.random.default_rng(1)
+    guide, values = rng.uniform(0, 1, (60, 70)), rng.uniform(0, 100, (60, 70))
+    whole = guided_filter(guide, values, 4, 0.01)
+    part = guided_filter(guide[12:48, 15:55], values[12:48, 15:55], 4, 0.01)
+    np.testing.assert_allclose(part[8:-8, 8:-8], whole[20:40, 23:47], rtol=1e-3, atol=0.05)
+
+
 def test_superpixels_cover_the_image_and_follow_edges():
     image = np.full((60, 80), 40, np.uint8)
     image[:, 43:] = 200
@@ -66,14 +74,21 @@ def test_superpixels_cover_the_image_and_follow_edges():
         assert len(np.unique(image.ravel()[members])) <= 1  # no region straddles the edge
 
 
+def check(forward, backward, tolerance):
+    """`consistent` of all rows."""
+    valid = np.empty(forward.shape[:2], bool)
+    consistent(0, len(valid), forward, backward, np.float32(tolerance), valid)
+    return valid
+
+
 def test_consistency_check():
     forward = np.zeros((10, 12, 2), np.float32)
     forward[..., 0] = 3
     backward = -forward
-    valid = consistent(forward, backward, 1.0)
+    valid = check(forward, backward, 1.0)
     assert valid[:, :9].all() and not valid[:, 9:].any()
     backward[5, 6] = 2
-    assert not consistent(forward, backward, 1.0)[5, 3]
+    assert not check(forward, backward, 1.0)[5, 3]
 
 
 def test_dense_flow_of_a_similarity_and_its_thread_independence():
