@@ -15,7 +15,7 @@ from dynslam_bench.core import TABLE_BYTES, DynslamError, setting_text, write_li
 from dynslam_bench.core.records import Record, schema
 from dynslam_bench.evaluation import Evaluation, Protocol
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
-from dynslam_bench.evaluation.ape import ate_rmse_m, static_camera
+from dynslam_bench.evaluation.ape import ate_rmse_m, static_camera_rmse_m
 from dynslam_bench.geometry import Trajectory
 from dynslam_bench.runs.record import LOST_COVERAGE, MetricRecord, RunRecord
 from dynslam_bench.runs.store import RunStore, Which, score
@@ -319,8 +319,7 @@ def _static_camera_error(
     with suppress(DynslamError):
         truth = store.ground_truth(record.sequence.part)
         if truth is not None:
-            errors = static_camera(truth, store.timestamps(record.sequence.part), protocol.max_dt)
-            return errors["first_rmse_m" if protocol.alignment in ("none", "origin") else "constant_rmse_m"]
+            return static_camera_rmse_m(truth, store.timestamps(record.sequence.part), protocol)
     return None
 
 

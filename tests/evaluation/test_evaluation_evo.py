@@ -14,7 +14,7 @@ from evo.tools import file_interface
 
 from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.evaluation import Protocol, RPESpec, evaluate, evaluate_files
-from dynslam_bench.evaluation.compare_protocols import ComparisonRow, agrees, compare_protocols_of_files
+from dynslam_bench.evaluation.compare_protocols import ComparisonRow, agrees, compare_protocols
 from dynslam_bench.evaluation.rpe import closest, random_pairs
 from dynslam_bench.geometry import RepeatedStamps, Trajectory, load_tum, read_tum, se3, write_tum
 
@@ -158,7 +158,7 @@ def test_tolerance_and_scale_move_one_published_number():
         "evo-as/v1": (0.0733, 554), "tum-rgbd/v1-sim3": (0.1099, 904),
         "evo-as/v1-se3": (54.8671, 554), "tum-rgbd/v1": (53.3026, 904),
     }  # fmt: skip
-    rows = compare_protocols_of_files(load_tum(estimate), load_tum(truth))
+    rows = compare_protocols(load_tum(estimate), load_tum(truth))
     assert [row.label for row in rows if agrees(row, "0.0733")] == ["evo_ape -as"]
 
 

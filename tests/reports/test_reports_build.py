@@ -29,7 +29,7 @@ from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs
 from dynslam_bench.reports.tables import table as tables
 from dynslam_bench.reports.tables.leaderboard import repeatability
-from dynslam_bench.reports.tables.table import Column, Table, TableCell, csv_text, to_csv, to_markdown
+from dynslam_bench.reports.tables.table import Column, Table, TableCell, csv_text, to_markdown
 from dynslam_bench.runs.store import RunStore
 
 PAGES = ("index", "errors", "compare", "paper", "diagnostics", "reproduce", "run")
@@ -322,7 +322,7 @@ def test_unlisted_runs_count_in_every_cell(tmp_path, monkeypatch):
 def test_long_tables_are_shown_in_part_and_written_whole(monkeypatch):
     monkeypatch.setattr(tables, "MOST_ROWS", 3)
     long = Table("long", "Long", "All of it.", [Column("x")], [[TableCell(str(at), value=at)] for at in range(5)])
-    assert len(long.displayed().rows) == 3 and to_csv(long).splitlines() == ["x", *"01234"]
+    assert len(long.displayed().rows) == 3 and csv_text(long.frame()).splitlines() == ["x", *"01234"]
     assert "All of it. These are the first 3 of 5 rows; all stand in csv/long.csv." in to_markdown(long)
 
 

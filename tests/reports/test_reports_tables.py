@@ -16,9 +16,9 @@ from dynslam_bench.reports.tables.table import (
     Column,
     Table,
     TableCell,
+    csv_text,
     emphasise,
     escape_latex,
-    to_csv,
     to_latex,
     to_markdown,
 )
@@ -42,7 +42,7 @@ def test_tables_in_every_format():
         ],
     )
     assert "| a\\|b\\_\\* (imported) | **0.5** ±0.1 |  |" in to_markdown(table)
-    assert to_csv(table) == "name,G: x,G: y\na|b_* imported,0.51234,\nc,,2\n"
+    assert csv_text(table.frame()) == "name,G: x,G: y\na|b_* imported,0.51234,\nc,,2\n"
     latex = to_latex(table)
     assert r"\caption{A \& B.}" in latex
     assert r"\multicolumn{2}{c}{G}" in to_latex(
@@ -55,7 +55,7 @@ def test_a_column_in_which_nothing_is_written_is_in_the_csv_only():
     columns = [Column("tracker", numeric=False), Column("p"), Column("ATE")]
     rows = [[TableCell("a"), TableCell(), TableCell("1.0", value=1.0)]]
     table = Table("t", "Title", "Caption.", columns, rows)
-    assert to_csv(table).splitlines()[0] == "tracker,p,ATE"
+    assert csv_text(table.frame()).splitlines()[0] == "tracker,p,ATE"
     assert "| tracker | ATE |" in to_markdown(table) and " p " not in to_latex(table)
     full = Table("t", "Title", "Caption.", columns, [*rows, [TableCell("b"), TableCell("0.04"), TableCell("2.0")]])
     assert "| tracker | p | ATE |" in to_markdown(full)
@@ -137,7 +137,7 @@ def test_no_name_is_more_than_a_name():
     assert escape_latex("😀 é 猫 “q”") == "[U+1F600] é [U+732B] ``q''"
     cells = [[TableCell("=HYPERLINK(1)"), TableCell("-1.5", value=-1.5)], [TableCell("@x"), TableCell("+2")]]
     table = Table("t", "a\n# b", "c\n\n# d <i>", [Column("=1+1", numeric=False), Column("y")], cells)
-    assert to_csv(table).splitlines() == ["'=1+1,y", "'=HYPERLINK(1),-1.5", "'@x,'+2"]
+    assert csv_text(table.frame()).splitlines() == ["'=1+1,y", "'=HYPERLINK(1),-1.5", "'@x,'+2"]
     markdown = to_markdown(table)
     assert "## a # b" in markdown and "\nc # d &lt;i>" in markdown
 
