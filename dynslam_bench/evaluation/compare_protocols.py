@@ -46,7 +46,7 @@ def compare_protocols(estimate: P, ground_truth: P) -> list[ComparisonRow]:
     Raises:
         EvaluationError: The trajectory cannot be evaluated under `tum-rgbd/v1` either.
     """
-    evaluation = evaluate if isinstance(estimate, Trajectory) else evaluate_loaded
+    evaluation: Callable[..., Evaluation] = evaluate if isinstance(estimate, Trajectory) else evaluate_loaded
     score = partial(evaluation, estimate, ground_truth)
     score(_TUM)  # whatever cannot be scored so has no rows
     habits = (("ATE", ABSOLUTE), ("RPE", RELATIVE))

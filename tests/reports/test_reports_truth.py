@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from reports_fake_store import add_frames, add_run
-from reports_rows import PROTOCOL, cell_of, crashed, page_data, row, rows_of
+from reports_rows import PROTOCOL, cell_of, columns_of, crashed, page_data, row, rows_of
 
 from dynslam_bench.reports import build_report, compare, load_board, load_frame
 from dynslam_bench.reports.html.run_pages import RunPage, error_by_share, share_sums
@@ -66,9 +66,7 @@ def test_a_tracker_that_never_succeeded_stands_below_all_and_is_never_emphasised
     for each, partly in zip(relative_errors(board, PROTOCOL), relative_errors(half, PROTOCOL), strict=True):
         assert [cells[0].text for cells in each.rows] == ["GOOD", "BAD", "CONTROL"]
         assert cell_of(each, "GOOD").emphasis == "best"
-        assert [(cell_of(partly, "C", at).text, cell_of(partly, "C", at).emphasis) for at in (1, 2)] == [
-            ("", "failed")
-        ] * 2
+        assert [(cell.text, cell.emphasis) for cell in cell_of(partly, "C", slice(1, 3))] == [("", "failed")] * 2
 
 
 def test_a_cell_with_one_failure_is_not_bold_and_not_green():
@@ -168,9 +166,8 @@ def test_imports_of_several_files_are_repeats_and_a_run_made_again_supersedes(st
 def test_copies_are_no_repeats():
     rows = [row("copy", error=0.1, seed=i) for i in range(4)]
     board = make_board([*rows, *(row("real", error=0.1 + 0.01 * i, seed=i) for i in range(4))])
-    table = per_sequence(board, PROTOCOL)
+    table, copies = per_sequence(board, PROTOCOL), board.cells[rows[0].variant_key]["s"]
     assert [cell_of(table, name).small for name in ("COPY", "REAL")] == ["deterministic", "±7.5"]
-    copies = board.cells[rows[0].variant_key]["s"]
     assert (len(copies.scores), len(copies.rows)) == (1, 4)
 
 
@@ -204,8 +201,7 @@ def test_times_from_the_cache_are_marked(store):
     add_run(store, "real", "s/a", cached=True, frame_s=0.02, provenance="external")
     board = make_board(load_runs([store], PROTOCOL).rows)
     table = leaderboard(board, PROTOCOL)
-    column = [column.name for column in table.columns].index("× real time")
-    times = {cells[2].text: cells[column].small for cells in table.rows}
+    times = {cell.text: time.small for cell, time in zip(*columns_of(table, "tracker", "× real time"), strict=True)}
     assert times == {"cached": "10.0 ms†", "both": "50.0 ms", "fresh": "20.0 ms", "real": "20.0 ms"}
     assert "†" in table.caption
     flags = {(r.tracker, r.sequence): r.cached for r in board.frame().itertuples()}
@@ -214,9 +210,7 @@ def test_times_from_the_cache_are_marked(store):
 
 def test_the_share_without_fundamental_matrix_stands_beside_the_error():
     board = make_board([row("ours", s, epipolar_skipped=0.98) for s in "st"] + [row("plain", s, 0.2) for s in "st"])
-    table = leaderboard(board, PROTOCOL)
-    column = [c.name for c in table.columns].index("F skipped")
-    assert {cells[2].text: cells[column].text for cells in table.rows} == {"OURS": "98 %", "PLAIN": ""}
+    assert [cell.text for cell in columns_of(leaderboard(board, PROTOCOL), "F skipped")[0]] == ["98 %", ""]
     errors = per_sequence(board, PROTOCOL)
     assert (cell_of(errors, "OURS").small, cell_of(errors, "PLAIN").small) == ("F skipped 98 %", "")
     assert "F skipped" not in [c.name for c in leaderboard(make_board([row()]), PROTOCOL).columns]
@@ -247,10 +241,10 @@ def test_little_data_claims_little():
     rows = [row("orb-slam2", "s", 0.2237), row("orb-slam2", "t", 0.02)]
     rows += [row("a", "s", 0.2196), row("a", "t", 0.01)]
     table = leaderboard(make_board(rows), PROTOCOL)
-    columns = dict(zip((c.name for c in table.columns), zip(*table.rows, strict=True), strict=True))
-    assert [(cell.text, cell.small) for cell in columns["#"]] == [("1–2", "")] * 2
-    assert [(cell.small, cell.emphasis) for cell in columns["ATE ratio"]] == [("", "")] * 2
-    assert [cell.text for name in ("better?", "wins") for cell in columns[name]] == ["", "reference", "2 of 2", ""]
+    ranks, ratios, *others = columns_of(table, "#", "ATE ratio", "better?", "wins")
+    assert [(cell.text, cell.small) for cell in ranks] == [("1–2", "")] * 2
+    assert [(cell.small, cell.emphasis) for cell in ratios] == [("", "")] * 2
+    assert [cell.text for column in others for cell in column] == ["", "reference", "2 of 2", ""]
 
 
 def test_bold_is_not_given_to_most():
@@ -263,8 +257,7 @@ def test_bold_is_not_given_to_most():
 
     def bold(rows):
         table = leaderboard(make_board(rows, reference=rows[0].tracker.id), PROTOCOL)
-        place = [column.name for column in table.columns].index("ATE ratio")
-        return [cells[place].emphasis for cells in table.rows]
+        return [cell.emphasis for cell in columns_of(table, "ATE ratio")[0]]
 
     assert bold(apart) == ["best", "", ""]
     assert bold(near + far) == [""] * 4
