@@ -207,8 +207,7 @@ def nearest_match(stamps: Array, others: Array, max_dt: float, *, strict: bool) 
 def _record(
     t_est: Array, t_gt: Array, index_est: Index, index_gt: Index, max_dt: float, *, strict: bool
 ) -> AssociationRecord:
-    unmatched = np.ones(len(t_est), dtype=bool)
-    unmatched[index_est] = False
+    unmatched = ~np.isin(np.arange(len(t_est)), index_est)
     gap = nearest_gap(t_est, t_gt)
     far = gap >= max_dt if strict else gap > max_dt
     outside = far & ((t_est < t_gt[0]) | (t_est > t_gt[-1]))
@@ -334,9 +333,7 @@ def tracked_frames(estimate: Trajectory, input_timestamps: ArrayLike) -> NDArray
             f"{len(poses) - len(index)} of {len(poses)} estimated poses belong to none of {len(stamps)} input frames",
             "the estimate has to carry the stamps of the images",
         )
-    tracked = np.zeros(len(stamps), dtype=bool)
-    tracked[index] = True
-    return tracked
+    return np.isin(np.arange(len(stamps)), index)
 
 
 def hold(estimate: Trajectory, input_timestamps: ArrayLike) -> Trajectory:

@@ -114,7 +114,9 @@ COLUMNS = (
 
 
 def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
-    failed = sum(row.failed for row in board.rows)
+    failed, groups = sum(row.failed for row in board.rows), dict.fromkeys(board.groups[name] for name in board.common)
+    several = len(groups) > 1 and board.category == OVERALL
+    mean = f"It is a mean over {_count(len(groups), 'category')} ({', '.join(groups)}), which all weigh the same. "
     intervals = (
         "Brackets: Student's 95 % intervals over sequences."
         if len(board.common) >= FEWEST
@@ -123,7 +125,7 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
     parts = [
         f"{protocol.describe()}; for the ranking a lost frame counts as not having moved since the last tracked one.",
         f"ATE ratio: geometric mean over {_count(len(board.common), 'sequence')} of the median ATE over that of "
-        f"{board.reference_name}; below 1 is better. {_mean_words(board)}{intervals}",
+        f"{board.reference_name}; below 1 is better. {mean if several else ''}{intervals}",
         f"A run that failed or was lost counts as a static camera, or worse ({failed} of "
         f"{_count(len(board.rows), 'run')}); trackers without any success stand below the last line.",
         "Grey rows are shown but not ranked: controls, inspired or assumed re-implementations, runs that begin "
@@ -149,13 +151,6 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
         f"({hinted}), as the diagnostics say; no number is changed for that.": hinted,
     }
     return " ".join(parts + [remark for remark, holds in remarks.items() if holds])
-
-
-def _mean_words(board: Board) -> str:
-    groups = list(dict.fromkeys(board.groups[name] for name in board.common))
-    if len(groups) < 2 or board.category != OVERALL:
-        return ""
-    return f"It is a mean over {_count(len(groups), 'category')} ({', '.join(groups)}), which all weigh the same. "
 
 
 def _hinted(rows: Iterable[RunRow]) -> str:
@@ -880,8 +875,7 @@ def _statistics_table(
         brief,
         behind=lambda cell: SEEN * cell.in_training + LOST_MARK * has_lost(cell),
     )
-    if any(cell.text.endswith(LOST_MARK) for row in table.rows for cell in row):
-        table.caption += f" {LOST_NOTE}"
+    table.caption += f" {LOST_NOTE}" * any(cell.text.endswith(LOST_MARK) for row in table.rows for cell in row)
     keys = {key for key, _ in errors["rmse"]}
     subject = subject_of(board)
     others = [key for key in board.ranked if key in keys and key != subject]
