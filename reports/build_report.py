@@ -279,38 +279,14 @@ def _write(
         rows=board.rows,
     ).write(paths.data)
     write_assets(output)
-    write_atomic(paths.html, _first_page(board, boards, protocol, facts, notes, title, footer, paged))
-    for page, sections in pages.items():
-        name = dict(LINKS)[page]
-        text = sections_page(
-            sections, title=f"{title}: {name}", links=LINKS, here=page, footer=footer, protocol=protocol.describe(),
-            errors_table=page == "errors.html", scripts=["errors.js"] if page == "errors.html" else [],
-        )  # fmt: skip
-        write_atomic(output / page, text)
-    write_atomic(paths.run, render("run.html.j2", title=title, links=LINKS, footer=footer, scripts=["run.js"]))
-    compare = {"title": "Two trackers side by side", "links": LINKS, "here": COMPARE_PAGE, "footer": footer}
-    write_atomic(output / COMPARE_PAGE, render("compare.html.j2", scripts=["run.js", "compare.js"], **compare))
-    return paths
-
-
-def _first_page(
-    board: Board,
-    boards: dict[str, Board],
-    protocol: Protocol,
-    facts: Sequence[Fact],
-    notes: Sequence[str],
-    title: str,
-    footer: str,
-    paged: Collection[str],
-) -> str:
-    """The board: the sentence first, then the data, the ranking by category, and accuracy against speed."""
+    speed = figures.speed_figure(board)
     caption = (
         f"{'All categories. ' * (len(boards) > 1)}Lower right is better. The dotted line joins ranked trackers that no "
         "other beats in both; open ones are not ranked. Frame times hold for the machine named under Reproduce."
+        + f" {tables.CACHED_NOTE}"
+        * any(row.cached for row in board.rows)
     )
-    caption += f" {tables.CACHED_NOTE}" * any(row.cached for row in board.rows)
-    speed = figures.speed_figure(board)
-    return render(
+    first_page = render(
         "board.html.j2",
         title=title,
         links=LINKS,
@@ -328,6 +304,18 @@ def _first_page(
         caption=caption,
         figures={} if speed is None else {"speed": speed},
     )
+    write_atomic(paths.html, first_page)
+    for page, sections in pages.items():
+        name = dict(LINKS)[page]
+        text = sections_page(
+            sections, title=f"{title}: {name}", links=LINKS, here=page, footer=footer, protocol=protocol.describe(),
+            errors_table=page == "errors.html", scripts=["errors.js"] if page == "errors.html" else [],
+        )  # fmt: skip
+        write_atomic(output / page, text)
+    write_atomic(paths.run, render("run.html.j2", title=title, links=LINKS, footer=footer, scripts=["run.js"]))
+    compare = {"title": "Two trackers side by side", "links": LINKS, "here": COMPARE_PAGE, "footer": footer}
+    write_atomic(output / COMPARE_PAGE, render("compare.html.j2", scripts=["run.js", "compare.js"], **compare))
+    return paths
 
 
 def how_to_read(board: Board) -> str:
@@ -457,11 +445,9 @@ def errors_section(board: Board, protocol: Protocol) -> Section:
 
 def masks_section(board: Board) -> Section:
     """Quality of the masks, and the pose error against it."""
-    caption = "One point a run."
-    if any(len(board.runs(key)) > figures.MOST_POINTS for key in board.trackers):
-        caption += (
-            f" Of trackers with more than {figures.MOST_POINTS} runs fewer are drawn, from the best to the worst."
-        )
+    thinned = any(len(board.runs(key)) > figures.MOST_POINTS for key in board.trackers)
+    fewer = f" Of trackers with more than {figures.MOST_POINTS} runs fewer are drawn, from the best to the worst."
+    caption = "One point a run." + fewer * thinned
     blocks = figure_blocks(figures.mask_figure(board), caption) + table_blocks(tables.mask_quality(board))
     return Section("masks", "Mask quality and pose error", blocks=blocks)
 
@@ -513,8 +499,7 @@ def first_of(entries: list[str], most: int, others: str) -> list[str]:
 
 def paper_section(board: Board, protocol: Protocol) -> Section:
     """Tables 1 to 3 and Figures 9 to 12, as the paper lays them out."""
-    section = Section("paper", "Four statistics of the errors, and time")
-    section.blocks += table_blocks(
+    blocks = table_blocks(
         tables.absolute_table(board, protocol),
         tables.relative_table(board, protocol),
         tables.time_table(board),
@@ -527,8 +512,8 @@ def paper_section(board: Board, protocol: Protocol) -> Section:
             f"As the paper's Figure {number}: {tables.STATISTICS[statistic]} of the absolute pose error, median over "
             "the runs that succeeded; pale bars are not ranked." + f" {tables.LOST_NOTE}" * lost
         )
-        section.blocks += figure_blocks(figure, caption)
-    return section
+        blocks += figure_blocks(figure, caption)
+    return Section("paper", "Four statistics of the errors, and time", blocks=blocks)
 
 
 # -- the site that is published
@@ -623,8 +608,8 @@ def _publish_study(study: Path, output: Path) -> tuple[str, str, str]:
     for page in folder.glob("*.html"):
         shared = f'="../../leaderboard/{ASSETS}/'
         page.write_text(page.read_text(encoding="utf-8").replace(f'="{ASSETS}/', shared), encoding="utf-8")
+    lists = r'"(pictures|files)":\[(?:[^\[\]]|\[[^\[\]]*\])*\]'
     for path in folder.glob("data/run-*.js"):  # pictures and files of runs are not published
-        lists = r'"(pictures|files)":\[(?:[^\[\]]|\[[^\[\]]*\])*\]'
         path.write_text(re.sub(lists, r'"\1":[]', path.read_text(encoding="utf-8")), encoding="utf-8")
     summary = study / "summary.json"
     words = read_json(summary)["conclusion"] if summary.is_file() else ""

@@ -129,10 +129,11 @@ def _write_page(
 ) -> Path:
     """Write the page: both sides of every tracker, with the pages of the runs that stand for a cell."""
     output = output.expanduser().absolute()
-    cells: dict[str, dict[str, Cell]] = {}
-    for name, pairs in compared.items():
-        cells[f"A: {name}"] = {sequence: a for sequence, a, _ in pairs}
-        cells[f"B: {name}"] = {sequence: b for sequence, _, b in pairs}
+    cells = {
+        f"{side}: {name}": {sequence: sides[at] for sequence, *sides in pairs}
+        for name, pairs in compared.items()
+        for at, side in enumerate("AB")
+    }
     typical = {cell.typical.run_id: cell.typical for some in cells.values() for cell in some.values()}
     paged = {run_id: row for run_id, row in typical.items() if row.folder.is_dir()}  # a report alone brings no files
     write_run_pages(list(paged.values()), paged, protocol, output)
@@ -206,8 +207,8 @@ def _differences(first: RunRow, second: RunRow) -> list[str]:
     names = sorted(
         name for name in {*first.variant, *second.variant} if first.variant.get(name) != second.variant.get(name)
     )
-    a, b = ([setting_text(row.variant.get(name, "default")) for name in names] for row in (first, second))
-    return [f"{name}: {value} in A, {other} in B" for name, value, other in zip(names, a, b, strict=True)]
+    sides = [{name: setting_text(row.variant.get(name, "default")) for name in names} for row in (first, second)]
+    return [f"{name}: {sides[0][name]} in A, {sides[1][name]} in B" for name in names]
 
 
 def ratio_of(_: str, a: Cell, b: Cell) -> float:
@@ -245,10 +246,8 @@ def _table(
         wins = sum(ratio_of(*pair) < 1 for pair in paired)
         ratio = interval_cell(overall[name], ".3f", "best")
         verdict = TableCell(_verdict(overall[name], wins, len(paired)))
-        empty = TableCell()
-        rows.append(
-            [TableCell(name), TableCell(f"all {len(paired)} sequences"), empty, empty, ratio, verdict, *[empty] * 3]
-        )
+        words = [TableCell(name), TableCell(f"all {len(paired)} sequences")]
+        rows.append([*words, *[TableCell()] * 2, ratio, verdict, *[TableCell()] * 3])
     columns = [*texts("tracker", "sequence"), *numbers("ATE A", "ATE B", "B / A"), *texts("verdict")]
     columns += numbers("coverage A", "coverage B", "runs")
     return Table("paired", title, caption, columns, rows, separators=separators - {0})

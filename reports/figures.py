@@ -95,12 +95,6 @@ def log_axis(title: str) -> dict[str, Any]:
     return {"type": "log", "title": title, "minexponent": 5}
 
 
-def error_bars(interval: Any) -> dict[str, Any]:
-    """An interval as plotly's asymmetric error bar of one point."""
-    above, below = interval.high - interval.value, interval.value - interval.low
-    return {"type": "data", "symmetric": False, "array": rounded([above]), "arrayminus": rounded([below])}
-
-
 GUIDE: dict[str, Any] = {"line": {"color": NEUTRAL, "width": 1, "dash": "dash"}, "layer": "below"}
 """A dashed line across a figure at one value."""
 
@@ -115,7 +109,7 @@ def speed_figure(board: Board) -> go.Figure | None:
         if key in placed and factors and np.isfinite(placed[key].ratio.value):
             mark = f" {CACHED_MARK}" if any(row.cached for row in rows) else ""
             points.append((key, float(np.median(factors)), placed[key].ratio, mark))
-    traces = []
+    traces: list[Any] = []
     ranked = {(speed, ratio.value) for key, speed, ratio, _ in points if key in board.ranked}
     front = sorted(p for p in ranked if not any(q != p and q[0] >= p[0] and q[1] <= p[1] for q in ranked))
     if len(front) > 1:
@@ -124,6 +118,7 @@ def speed_figure(board: Board) -> go.Figure | None:
         traces.append(go.Scatter(x=x, y=y, mode="lines", line=line, name="Pareto front", hoverinfo="skip"))
     for key, speed, ratio, mark in points:
         symbol = look[key]["symbol"] + "-open" * (key not in board.ranked)
+        above, below = rounded([ratio.high - ratio.value]), rounded([ratio.value - ratio.low])
         traces.append(
             go.Scatter(
                 x=[significant(speed)],
@@ -131,7 +126,7 @@ def speed_figure(board: Board) -> go.Figure | None:
                 mode="markers",
                 name=wrapped(board.names[key] + mark),
                 marker={"size": 12, "color": look[key]["color"], "symbol": symbol},
-                error_y=error_bars(ratio),
+                error_y={"type": "data", "symmetric": False, "array": above, "arrayminus": below},
                 hovertemplate="%{fullData.name}<br>%{x:.2f} × real time<br>ratio %{y:.3f}<extra></extra>",
             )
         )

@@ -16,7 +16,7 @@ from dynslam_bench.reports.build_report import sections_page
 from dynslam_bench.reports.figures import COLOURS, GUIDE, NEUTRAL
 from dynslam_bench.reports.html.page import Block, Section, figure_blocks, write_assets
 from dynslam_bench.reports.model.row import SEEN, command_line
-from dynslam_bench.reports.tables.table import Column, Table, TableCell, number, numbers, to_csv
+from dynslam_bench.reports.tables.table import Column, Table, TableCell, csv_text, number, numbers
 from dynslam_bench.tuning.judgement import Candidate, Ratio, StudySummary, Verdict
 from dynslam_bench.tuning.plan import FEWEST_STARTS, Design, seen_note
 from dynslam_bench.tuning.storage import EARLIER, FEWEST_TRIALS, is_feasible, quiet
@@ -44,7 +44,7 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
     params, proven = summary.best.params if summary.best else {}, summary.verdict == Verdict.PROVEN
     settings = settings_table(tuner.space, tuner.base, params, proven)
     for table in (candidates, trials, settings):
-        write_atomic(tuner.folder / "csv" / f"{table.id}.csv", to_csv(table))
+        write_atomic(tuner.folder / "csv" / f"{table.id}.csv", csv_text(table.frame()))
     caption = (
         "Ratios to the baseline, below 1 is better: of the trials, where the best is partly luck; of the best "
         "ones on scenes that no trial had seen (confirm); and of the choice on held-out scenes and on recordings. "

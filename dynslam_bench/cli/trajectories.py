@@ -83,10 +83,10 @@ def compare(
     as_json: AsJson = False,
 ) -> None:
     """Show how one trajectory scores under every protocol of the field."""
-    from dynslam_bench.evaluation.compare_protocols import agrees, compare_protocols_of_files
+    from dynslam_bench.evaluation.compare_protocols import agrees, compare_protocols
 
     estimated, truth = (runs.read_trajectory(path, timestamps) for path in (estimate, ground_truth))
-    scores = compare_protocols_of_files(estimated, truth)
+    scores = compare_protocols(estimated, truth)
     columns = ["metric", "protocol", "rmse (m)", "pairs", "note"]
     rows = [[score.metric, score.label, score.rmse_m, score.pairs, score.note] for score in scores]
     if published is None:

@@ -76,9 +76,7 @@ def ate_rmse_m(
     Raises:
         EvaluationError: Fewer than two poses have ground truth, or the poses belong to no input frames.
     """
-    if held_at is not None:
-        estimate = hold(estimate, held_at)
-    comparison = compare(estimate, ground_truth, protocol, held_at)
+    comparison = compare(estimate if held_at is None else hold(estimate, held_at), ground_truth, protocol, held_at)
     left = comparison.aligned[:, :3, 3] - comparison.truth[:, :3, 3]
     return math.sqrt(float((left * left).sum()) / len(left))
 
@@ -103,8 +101,7 @@ def static_camera(ground_truth: Trajectory, stamps: ArrayLike | None = None, max
     """
     positions = ground_truth.positions
     if stamps is not None:
-        index, _ = associate(ground_truth.timestamps, stamps, max_dt)
-        positions = positions[index]
+        positions = positions[associate(ground_truth.timestamps, stamps, max_dt)[0]]
     if not len(positions):
         raise EvaluationError(f"none of {len(ground_truth)} true poses belongs to an input frame")
     constant = np.linalg.norm(positions - positions.mean(axis=0), axis=1)
@@ -115,12 +112,16 @@ def static_camera(ground_truth: Trajectory, stamps: ArrayLike | None = None, max
 def static_camera_metrics(comparison: Comparison) -> dict[str, float]:
     """``static_camera_ate_rmse_m``: what a camera that does not move scores under the same alignment."""
     truth, protocol = comparison.ground_truth, comparison.protocol
-    if comparison.input_timestamps is None or protocol.thins:
-        errors = static_camera(truth.select(np.unique(comparison.truth_index)))
-    else:
-        errors = static_camera(truth, comparison.input_timestamps, protocol.max_dt)
+    stamps = comparison.input_timestamps
+    if stamps is None or protocol.thins:
+        truth, stamps = truth.select(np.unique(comparison.truth_index)), None
+    return {"static_camera_ate_rmse_m": static_camera_rmse_m(truth, stamps, protocol)}
+
+
+def static_camera_rmse_m(ground_truth: Trajectory, stamps: ArrayLike | None, protocol: Protocol) -> float:
+    """The RMSE of `static_camera` in metres that a protocol's alignment leaves."""
     fit = "first" if protocol.alignment in ("none", "origin") else "constant"
-    return {"static_camera_ate_rmse_m": errors[f"{fit}_rmse_m"]}
+    return static_camera(ground_truth, stamps, protocol.max_dt)[f"{fit}_rmse_m"]
 
 
 def false_motion_metrics(comparison: Comparison) -> dict[str, float]:

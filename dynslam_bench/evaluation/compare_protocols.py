@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from functools import partial
+from typing import TypeVar
 
 from dynslam_bench.core import EvaluationError
 from dynslam_bench.evaluation.evaluate import Evaluation, evaluate, evaluate_loaded
@@ -32,26 +33,24 @@ class ComparisonRow:
     note: str = ""
 
 
-def compare_protocols(estimate: Trajectory, ground_truth: Trajectory) -> list[ComparisonRow]:
+P = TypeVar("P", Trajectory, TumFile)
+
+
+def compare_protocols(estimate: P, ground_truth: P) -> list[ComparisonRow]:
     """ATE under every alignment and RPE under every habit of the field, of one and the same trajectory.
 
     Args:
-        estimate: Estimated camera-to-world poses.
-        ground_truth: True poses.
+        estimate: Estimated camera-to-world poses, or a file of them as `evaluate_loaded` takes it.
+        ground_truth: True poses, likewise.
 
     Raises:
         EvaluationError: The trajectory cannot be evaluated under `tum-rgbd/v1` either.
     """
-    return _compare(partial(evaluate, estimate, ground_truth))
-
-
-def compare_protocols_of_files(estimate: TumFile, ground_truth: TumFile) -> list[ComparisonRow]:
-    """The same of two files that were read, as `evaluate_loaded` takes them.
-
-    Raises:
-        EvaluationError: As `compare_protocols`.
-    """
-    return _compare(partial(evaluate_loaded, estimate, ground_truth))
+    evaluation: Callable[..., Evaluation] = evaluate if isinstance(estimate, Trajectory) else evaluate_loaded
+    score = partial(evaluation, estimate, ground_truth)
+    score(_TUM)  # whatever cannot be scored so has no rows
+    habits = (("ATE", ABSOLUTE), ("RPE", RELATIVE))
+    return [_row(metric, label, score, protocol) for metric, labels in habits for label, protocol in labels]
 
 
 def agrees(row: ComparisonRow, printed: str) -> bool:
@@ -70,12 +69,6 @@ def agrees(row: ComparisonRow, printed: str) -> bool:
     except (InvalidOperation, ValueError):
         raise EvaluationError(f"'{printed}' is not a number in metres as it was printed, e.g. 0.0733") from None
     return row.rmse_m is not None and abs(Decimal(row.rmse_m) - number) <= half_digit
-
-
-def _compare(score: Callable[[Protocol], Evaluation]) -> list[ComparisonRow]:
-    score(_TUM)  # whatever cannot be scored so has no rows
-    habits = (("ATE", ABSOLUTE), ("RPE", RELATIVE))
-    return [_row(metric, label, score, protocol) for metric, labels in habits for label, protocol in labels]
 
 
 _TUM, _EVO = PROTOCOLS["tum-rgbd/v1"], PROTOCOLS["evo-default"]
@@ -112,14 +105,15 @@ RELATIVE = (
 
 
 def _row(metric: str, label: str, score: Callable[[Protocol], Evaluation], protocol: Protocol) -> ComparisonRow:
-    text, spec = protocol.describe(), protocol.rpe[0] if metric == "RPE" else None
+    row = partial(ComparisonRow, metric, label, protocol=protocol.describe())
     try:
         result = score(protocol)
     except EvaluationError as error:
-        return ComparisonRow(metric, label, None, 0, text, str(error))
-    if spec is None:
+        return row(rmse_m=None, pairs=0, note=str(error))
+    if metric == "ATE":
         note = f"means something for {protocol.only_for}* only" if protocol.only_for else ""
-        return ComparisonRow(metric, label, result.metrics["ate_rmse_m"], result.n_pairs, text, note)
+        return row(rmse_m=result.metrics["ate_rmse_m"], pairs=result.n_pairs, note=note)
+    spec = protocol.rpe[0]
     rmse = result.metrics.get(spec.metric("trans"))
     note = "" if rmse is not None else f"the trajectory has no pair {spec.describe()} apart"
-    return ComparisonRow(metric, label, rmse, result.n_pairs_rpe[spec.key], text, note)
+    return row(rmse_m=rmse, pairs=result.n_pairs_rpe[spec.key], note=note)

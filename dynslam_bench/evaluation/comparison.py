@@ -157,9 +157,8 @@ def match(estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol) ->
     Raises:
         EvaluationError: A trajectory is empty or no pair is close enough; the message carries the measured gap.
     """
-    for name, trajectory in (("estimate", estimate), ("ground truth", ground_truth)):
-        if not len(trajectory):
-            raise EvaluationError(f"the {name} holds no poses")
+    if not (len(estimate) and len(ground_truth)):
+        raise EvaluationError(f"the {'ground truth' if len(estimate) else 'estimate'} holds no poses")
     t_est, t_gt, max_dt, strict = estimate.timestamps, ground_truth.timestamps, protocol.max_dt, protocol.strict
     if protocol.one_to_one:
         index_gt, index_est = associate(t_gt, t_est, max_dt, strict=strict)
@@ -170,7 +169,15 @@ def match(estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol) ->
     else:
         index_est, index_gt = nearest_match(t_est, t_gt, max_dt, strict=strict)
     if not len(index_est):
-        raise _nothing_matched(t_est, t_gt, max_dt)
+        other_unit = not 1e-5 <= np.abs(t_est).max() / max(np.abs(t_gt).max(), 1e-9) <= 1e5
+        raise EvaluationError(
+            f"none of {len(t_est)} poses has ground truth within {max_dt:g} s: the nearest is "
+            f"{nearest_gap(t_est, t_gt).min():.3f} s away; the estimate covers {t_est[0]:.3f} to {t_est[-1]:.3f} s, "
+            f"the ground truth {t_gt[0]:.3f} to {t_gt[-1]:.3f} s",
+            "are the stamps of one file in nanoseconds or frame numbers?"
+            if other_unit
+            else "do the files belong together, and do their clocks agree?",
+        )
     return index_est, index_gt, _record(t_est, t_gt, index_est, index_gt, max_dt, strict=strict)
 
 
@@ -200,8 +207,7 @@ def nearest_match(stamps: Array, others: Array, max_dt: float, *, strict: bool) 
 def _record(
     t_est: Array, t_gt: Array, index_est: Index, index_gt: Index, max_dt: float, *, strict: bool
 ) -> AssociationRecord:
-    unmatched = np.ones(len(t_est), dtype=bool)
-    unmatched[index_est] = False
+    unmatched = ~np.isin(np.arange(len(t_est)), index_est)
     gap = nearest_gap(t_est, t_gt)
     far = gap >= max_dt if strict else gap > max_dt
     outside = far & ((t_est < t_gt[0]) | (t_est > t_gt[-1]))
@@ -218,18 +224,6 @@ def _record(
         largest_hole_s=float(edges[hole + 1] - edges[hole]),
         hole_at_s=float(edges[hole]),
     )
-
-
-def _nothing_matched(t_est: Array, t_gt: Array, max_dt: float) -> EvaluationError:
-    gap = nearest_gap(t_est, t_gt)
-    message = (
-        f"none of {len(t_est)} poses has ground truth within {max_dt:g} s: the nearest is {gap.min():.3f} s "
-        f"away; the estimate covers {t_est[0]:.3f} to {t_est[-1]:.3f} s, "
-        f"the ground truth {t_gt[0]:.3f} to {t_gt[-1]:.3f} s"
-    )
-    other_unit = not 1e-5 <= np.abs(t_est).max() / max(np.abs(t_gt).max(), 1e-9) <= 1e5
-    hint = "are the stamps of one file in nanoseconds or frame numbers?"
-    return EvaluationError(message, hint if other_unit else "do the files belong together, and do their clocks agree?")
 
 
 # What is done to both before: the truth's corrections, which frames, lost frames.
@@ -339,9 +333,7 @@ def tracked_frames(estimate: Trajectory, input_timestamps: ArrayLike) -> NDArray
             f"{len(poses) - len(index)} of {len(poses)} estimated poses belong to none of {len(stamps)} input frames",
             "the estimate has to carry the stamps of the images",
         )
-    tracked = np.zeros(len(stamps), dtype=bool)
-    tracked[index] = True
-    return tracked
+    return np.isin(np.arange(len(stamps)), index)
 
 
 def hold(estimate: Trajectory, input_timestamps: ArrayLike) -> Trajectory:

@@ -64,12 +64,18 @@ class RPESpec(_Frozen):
 
     @model_validator(mode="after")
     def _whole_frames(self) -> RPESpec:
-        if self.unit == "f" and self.delta != round(self.delta):
-            raise ValueError(f"a delta in frames is a whole number, got {self.delta:g}")
-        if self.pairs in ("consecutive", "all") and self.unit != "f":
-            raise ValueError(f"{self.pairs} pairs are taken over frames, not over '{self.unit}'")
-        if self.rate and self.unit != "s":
-            raise ValueError(f"a rate is taken over seconds, not over '{self.unit}'")
+        faults = {
+            f"a delta in frames is a whole number, got {self.delta:g}": (
+                self.unit == "f" and self.delta != round(self.delta)
+            ),
+            f"{self.pairs} pairs are taken over frames, not over '{self.unit}'": (
+                self.pairs in ("consecutive", "all") and self.unit != "f"
+            ),
+            f"a rate is taken over seconds, not over '{self.unit}'": self.rate and self.unit != "s",
+        }
+        for fault, holds in faults.items():
+            if holds:
+                raise ValueError(fault)
         return self
 
     @property

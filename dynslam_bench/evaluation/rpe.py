@@ -11,9 +11,6 @@ from dynslam_bench.evaluation.comparison import Comparison, Index
 from dynslam_bench.evaluation.protocol import RPESpec
 from dynslam_bench.geometry import Array, nearest_gap, se3
 
-_ANGLES = {"deg": 180 / np.pi, "rad": 1.0}
-"""Units of rotation in a radian."""
-
 
 def relative_metrics(comparison: Comparison) -> dict[str, float]:
     """``rpe_<delta><unit>_trans_<statistic>_m`` and ``..._rot_<statistic>_deg`` for each relative error of a protocol.
@@ -114,13 +111,13 @@ def select_pairs(stamps: Array, poses: Array, spec: RPESpec) -> Index:
 
 def path_index(stamps: Array, poses: Array, spec: RPESpec) -> Array:
     """Path length up to every pose ``[N]``, in the unit of the delta."""
-    if spec.unit == "f":
-        return np.arange(len(poses), dtype=np.float64)
-    if spec.unit == "s":
-        return stamps
+    if spec.unit in ("f", "s"):
+        return np.arange(len(poses), dtype=np.float64) if spec.unit == "f" else stamps
     steps = se3.inverse(poses[:-1]) @ poses[1:]
-    by_metres = spec.unit == "m"
-    step = np.linalg.norm(steps[:, :3, 3], axis=1) if by_metres else se3.rotation_angle(steps) * _ANGLES[spec.unit]
+    if spec.unit == "m":
+        step = np.linalg.norm(steps[:, :3, 3], axis=1)
+    else:
+        step = se3.rotation_angle(steps) * (180 / np.pi if spec.unit == "deg" else 1.0)
     return np.asarray(np.concatenate([np.zeros(1), np.cumsum(step)]), dtype=np.float64)
 
 

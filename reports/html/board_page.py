@@ -55,7 +55,6 @@ def entries_of(
         first = board.first(key)
         typical = [runs[name].typical for name in board.sequences if name in runs] or [first]
         start = next((run for run in typical if run.run_id in paged), typical[0])
-        kind = TableCell("imported") if first.imported else cells["provenance"]
         ended = [run for run in board.runs(key) if not run.failed]
         marks = cells["tracker"].text.removeprefix(board.labels[key])
         failure = next((run for run in board.runs(key) if run.failed), None)
@@ -67,9 +66,9 @@ def entries_of(
                 "at": keys.index(key),
                 "group": 2 if first.tracker.provenance == "control" else int(key not in board.ranked),
                 "name": replace(cells["tracker"], text=board.names[key] + marks, link=run_link(start)),
-                "kind": kind,
+                "kind": TableCell("imported") if first.imported else cells["provenance"],
                 "rank": TableCell("–") if standing is None else rank_cell(standing),
-                "ratio": _ratio_cell(board, key, standing),
+                "ratio": cells["ATE ratio"] if standing is None else _ratio_cell(board, standing, cells["ATE ratio"]),
                 "bar": {} if standing is None else _bar(standing.ratio, limits),
                 "verdict": TableCell("not ranked", why) if (why := board.unranked_why(key)) else cells["better?"],
                 "success": cells["success"],
@@ -82,23 +81,20 @@ def entries_of(
     return sorted(entries, key=itemgetter("group"))
 
 
-def _ratio_cell(board: Board, key: str, standing: Standing | None) -> TableCell:
-    if key in board.hopeless:
-        return TableCell("nothing succeeded", emphasis="failed")
-    if standing is None or not math.isfinite(standing.ratio.value):
-        return TableCell()
-    ratio = standing.ratio
-    tip = f"95 % interval {ratio.low:.2f} to {ratio.high:.2f}" if math.isfinite(ratio.low) else ""
-    missing = standing.sequences < len(board.common)
-    small = f"{standing.sequences} of {len(board.common)} sequences" if missing else ""
-    return TableCell(f"{ratio.value:.2f}", small, ratio.value, tip=tip)
+def _ratio_cell(board: Board, standing: Standing, cell: TableCell) -> TableCell:
+    """The leaderboard's cell with the interval, which is drawn beside it, as a tip."""
+    if cell.emphasis == "failed":
+        return cell
+    low, high, some = standing.ratio.low, standing.ratio.high, standing.sequences < len(board.common)
+    tip = f"95 % interval {low:.2f} to {high:.2f}" if math.isfinite(low) else ""
+    small = f"{standing.sequences} of {len(board.common)} sequences" if some else ""
+    return replace(cell, small=small, emphasis="", tip=tip)
 
 
 def _limits(ratios: Sequence[Interval]) -> tuple[float, float]:
     """Ends of the axis of interval bars, in logarithms; 1 lies between them."""
     ends = [end for ratio in ratios for end in (ratio.value, ratio.low, ratio.high) if math.isfinite(end) and end > 0]
-    low, high = min([0.8, *ends]), max([1.25, *ends])
-    return math.log(max(low, 0.02)), math.log(min(high, 20.0))
+    return math.log(max(min([0.8, *ends]), 0.02)), math.log(min(max([1.25, *ends]), 20.0))
 
 
 def _bar(ratio: Interval, limits: tuple[float, float]) -> dict[str, float]:

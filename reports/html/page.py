@@ -99,10 +99,13 @@ def resource(name: str) -> str:
 def _assets() -> dict[str, str]:
     """The files that all pages share: plotly, DataTables, our style and scripts."""
     bundle = files("itables") / "html"
-    tables = (bundle / "dt_bundle.js").read_text(encoding="utf-8")
-    exported = re.search(r"export\s*\{[^}]*?([\w$]+) as default[^}]*\};?", tables)
-    assert exported is not None, "the DataTables bundle of itables exports its class"
-    tables = tables.replace(exported[0], f"globalThis.DataTable={exported[1]};")  # a page in a folder loads no modules
+    # a page in a folder loads no modules
+    tables, exports = re.subn(
+        r"export\s*\{[^}]*?([\w$]+) as default[^}]*\};?",
+        r"globalThis.DataTable=\1;",
+        (bundle / "dt_bundle.js").read_text(encoding="utf-8"),
+    )
+    assert exports == 1, "the DataTables bundle of itables exports its class"
     return {
         "plotly.min.js": get_plotlyjs(),
         "datatables.js": f"(()=>{{{tables}\n}})();",

@@ -121,8 +121,8 @@ def _write_page(row: RunRow, pictured: bool, share: Mapping[int, float], protoco
         return RunPage(row.variant_key, *earlier[1:])
     record, frames = row.store.read_whole(row.run_id), read_frames(row, share)
     content = run_content(row, record, frames, protocol, _copy_pictures(row, output) if pictured else [])
-    exact = np.isfinite(frames.errors_m) & np.isfinite(frames.share)
-    exact &= (frames.share_source == EXACT) & (not row.failed)
+    known = (frames.share_source == EXACT) & (not row.failed)
+    exact = np.isfinite(frames.errors_m) & np.isfinite(frames.share) & known
     sums = share_sums(frames.share[exact], frames.errors_m[exact])
     write_side(output, name, content | {"files": files}, remark=[made_of, *sums])
     return RunPage(row.variant_key, *sums)
@@ -131,9 +131,8 @@ def _write_page(row: RunRow, pictured: bool, share: Mapping[int, float], protoco
 def _copy_pictures(row: RunRow, output: Path) -> list[int]:
     """Copy the pictures of a run beside its page; returns their frames."""
     sources, target = sorted(row.folder.glob("frame_*.webp")), output / "frames" / row.run_id
-    if sources:
-        target.mkdir(parents=True, exist_ok=True)
     for source in sources:
+        target.mkdir(parents=True, exist_ok=True)
         if not (target / source.name).is_file():
             shutil.copyfile(source, target / source.name)
     return [int(source.stem.removeprefix("frame_")) for source in sources]
@@ -192,8 +191,7 @@ def run_content(
         pictures: Frames that have a picture.
     """
     series, lost = _series(frames, pictures)
-    start = float(frames.columns["timestamp"][0]) if frames.columns else None
-    track, fault = _track(row, protocol, start)
+    track, fault = _track(row, protocol, float(frames.columns["timestamp"][0]) if frames.columns else None)
     level, verdict = verdict_of(row, frames)
     settings = {name: value if isinstance(value, str | int | bool) else str(value)
                 for name, value in record.settings.items()}  # fmt: skip
@@ -268,14 +266,11 @@ def _loss(frames: RunFrames, length: str) -> str:
         return ""
     at = int(lost[0])
     seconds = frames.columns["timestamp"][at] - frames.columns["timestamp"][0]
-    facts = []
-    inliers = frames.columns.get("stat_inliers")
-    if inliers is not None and np.isfinite(inliers[at]):
-        facts.append(f"{inliers[at]:.0f} inliers")
-    if np.isfinite(frames.share[at]):
-        who = "people fill" if frames.share_source == EXACT else "its masks cover"
-        facts.append(f"{who} {100 * frames.share[at]:.0f} %")
-    return f"Lost after {seconds:.1f} s of {length}" + (f": {' while '.join(facts)}" if facts else "")
+    inliers = frames.columns.get("stat_inliers", np.full(at + 1, np.nan))[at]
+    who = "people fill" if frames.share_source == EXACT else "its masks cover"
+    values = {f"{inliers:.0f} inliers": inliers, f"{who} {100 * frames.share[at]:.0f} %": frames.share[at]}
+    facts = " while ".join(words for words, value in values.items() if np.isfinite(value))
+    return f"Lost after {seconds:.1f} s of {length}" + f": {facts}" * bool(facts)
 
 
 def _numbers(row: RunRow, rpe: Sequence[RPESpec]) -> list[list[str]]:
@@ -347,11 +342,13 @@ def _worst(frames: RunFrames) -> list[list[float | None]]:
 
 def _rotation_doubt(row: RunRow) -> str:
     """Why no angles are drawn; empty where they are."""
-    if row.rotation_reliable:
-        return ""
     return (
-        "No angles are drawn: the path hardly determines the alignment's rotation (standard error "
-        f"{row.rotation_uncertainty_deg:.0f}°). Positions are not affected."
+        ""
+        if row.rotation_reliable
+        else (
+            "No angles are drawn: the path hardly determines the alignment's rotation (standard error "
+            f"{row.rotation_uncertainty_deg:.0f}°). Positions are not affected."
+        )
     )
 
 
@@ -395,8 +392,7 @@ def _track(row: RunRow, protocol: Protocol, start: float | None) -> tuple[Series
     series: Series = {}
     if truth is not None and len(truth) > 1:
         drawn = _of_part(row, truth)
-        columns = np.column_stack([drawn.positions, _angles(drawn, truth)])
-        series |= _along("true", drawn.timestamps - first, columns)
+        series = _along("true", drawn.timestamps - first, [drawn.positions, _angles(drawn, truth)])
     if estimate is None or len(estimate) < 2:
         return series, ""
     error_mm = np.full(len(estimate), np.nan)
@@ -406,7 +402,7 @@ def _track(row: RunRow, protocol: Protocol, start: float | None) -> tuple[Series
         except DynslamError as error:
             return series, str(error)
         error_mm = 1000 * errors["trans_m"]
-    columns = np.column_stack([estimate.positions, _angles(estimate, truth or estimate), error_mm])
+    columns = [estimate.positions, _angles(estimate, truth or estimate), error_mm]
     return series | _along("track", estimate.timestamps - first, columns), ""
 
 
@@ -421,9 +417,9 @@ def _of_part(row: RunRow, truth: Trajectory) -> Trajectory:
     return truth
 
 
-def _along(name: str, stamps: Array, columns: Array) -> Series:
+def _along(name: str, stamps: Array, columns: Sequence[Array]) -> Series:
     """Time, position, angles and error along a track, thinned and broken at gaps."""
-    stamps, values = broken(stamps, columns, MOST_FRAMES)
+    stamps, values = broken(stamps, np.column_stack(columns), MOST_FRAMES)
     names = ("x", "y", "z", "yaw", "pitch", "roll", "error")[: values.shape[1]]
     return {f"{name}_t": stamps} | {f"{name}_{part}": values[:, at] for at, part in enumerate(names)}
 
@@ -515,9 +511,9 @@ def _track_figure(track: Series) -> dict[str, Any]:
 
 
 def _path(name: str, part: str, line: dict[str, Any], hover: str = "") -> dict[str, Any]:
-    place: dict[str, Any] = {axis: f"@{part}_{axis}" for axis in "xyz"}
-    extra: dict[str, Any] = {"hovertemplate": hover} if hover else {"hoverinfo": "skip"}
-    return {"type": "scatter3d", "mode": "lines", "name": name, "line": line} | place | extra
+    place = {axis: f"@{part}_{axis}" for axis in "xyz"}
+    place |= {"hovertemplate": hover} if hover else {"hoverinfo": "skip"}
+    return {"type": "scatter3d", "mode": "lines", "name": name, "line": line} | place
 
 
 def _poses_figure(row: RunRow, track: Series) -> dict[str, Any]:
@@ -526,11 +522,13 @@ def _poses_figure(row: RunRow, track: Series) -> dict[str, Any]:
         return {}
     parts = {"x": "x (m)", "y": "y (m)", "z": "z (m)"}
     parts |= {"yaw": "yaw (°)", "pitch": "pitch (°)", "roll": "roll (°)"} if row.rotation_reliable else {}
-    data = []
-    for at, part in enumerate(parts, 1):
-        if "true_t" in track:
-            data.append(_line("truth", "true_t", f"true_{part}", NEUTRAL, at, line={"dash": "dash"}))
-        data.append(_line("estimate", "track_t", f"track_{part}", COLOURS[0], at))
+    kinds = [("truth", "true", NEUTRAL, {"line": {"dash": "dash"}}), ("estimate", "track", COLOURS[0], {})]
+    data = [
+        _line(name, f"{of}_t", f"{of}_{part}", colour, at, **more)
+        for at, part in enumerate(parts, 1)
+        for name, of, colour, more in kinds
+        if f"{of}_t" in track
+    ]
     layout = {"height": 130 * len(parts), "showlegend": False} | _axes([*parts.values()], 0.01)
     return {"data": data, "layout": layout}
 
@@ -624,22 +622,17 @@ def read_frames(row: RunRow, exact: Mapping[int, float]) -> RunFrames:
         exact: Frame in the numbering of the run's part without offset to the exact share.
     """
     try:
-        columns = read_table(row.folder / CSV_FILE, _is_shown) or {}
+        columns = read_table(row.folder / CSV_FILE, _is_shown)
     except RunError as error:
         return RunFrames({}, np.zeros(0), np.zeros(0), fault=str(error))
-    if not columns:
+    if columns is None:
         return RunFrames({}, np.zeros(0), np.zeros(0))
-    errors_m, own = columns["frame_error_trans_m"], columns.get("stat_mask_fraction")
+    share, source = columns.get("stat_mask_fraction", np.zeros(0)), "the tracker's own masks"
     if exact:
-        return RunFrames(
-            columns,
-            errors_m,
-            np.array([exact.get(index + row.offset, np.nan) for index in columns["index"].tolist()]),
-            EXACT,
-        )
-    if own is not None and own.any():  # else it may have no masks
-        return RunFrames(columns, errors_m, own, "the tracker's own masks")
-    return RunFrames(columns, errors_m, np.full(len(errors_m), np.nan))
+        share, source = np.array([exact.get(at + row.offset, np.nan) for at in columns["index"].tolist()]), EXACT
+    elif not share.any():  # it may have no masks
+        share, source = np.full(len(columns["index"]), np.nan), ""
+    return RunFrames(columns, columns["frame_error_trans_m"], share, source)
 
 
 def exact_shares(rows: Sequence[RunRow]) -> dict[int, float]:

@@ -306,10 +306,18 @@ def category_boards(board: Board) -> dict[str, Board]:
     for category, names in board.categories.items():
         rows = [row for row in board.rows if board.sequence(row) in names]
         keys = {row.variant_key for row in rows}
-        part = Board(rows, board.on, board.rank_seen, board.columns, asked_reference=board.asked_reference)
-        part.labels = {key: label for key, label in board.labels.items() if key in keys}
-        part.category = category
-        boards[category] = _completed(part)
+        labels = {key: label for key, label in board.labels.items() if key in keys}
+        boards[category] = _completed(
+            Board(
+                rows,
+                board.on,
+                board.rank_seen,
+                board.columns,
+                labels=labels,
+                category=category,
+                asked_reference=board.asked_reference,
+            )
+        )
     return boards
 
 
@@ -323,23 +331,20 @@ def _completed(board: Board) -> Board:
     board.final_only = [
         key
         for key in board.labels  # imports and batch programs without the trajectory that the protocol asks for
-        if all(_final_only(row) for row in board.runs(key))
+        if all(
+            (row.imported or not row.tracker.online) and not row.metrics and row.final_ate_m is not None
+            for row in board.runs(key)
+        )
     ]
     shown = [key for key in board.labels if key not in board.final_only]
     scored = [key for key in shown if board.scored(key)]
     _choose_ranked(board, scored)
     _choose_reference(board, scored, board.asked_reference or DEFAULT_REFERENCE)
     board.standings = rank(board, scored, board.ranked)
-    placed = [standing.key for standing in board.standings]
-    placed += sorted((key for key in shown if key not in placed), key=board.labels.__getitem__)
-    board.trackers = sorted(placed, key=lambda key: key in board.hopeless)
+    others = sorted(set(shown) - board.placed.keys(), key=board.labels.__getitem__)
+    board.trackers = sorted([*board.placed, *others], key=lambda key: key in board.hopeless)
     board.ranked = [key for key in board.trackers if key in board.ranked]
     return board
-
-
-def _final_only(row: RunRow) -> bool:
-    """Whether nothing but the final trajectory of a run is known, and the protocol asks for the online one."""
-    return (row.imported or not row.tracker.online) and not row.metrics and row.final_ate_m is not None
 
 
 def _choose_reference(board: Board, scored: Sequence[str], tracker: str) -> None:
@@ -614,10 +619,10 @@ def missing_commands(board: Board) -> list[str]:
     for key, names in missing_cells(board).items():
         if board.first(key).imported:
             continue
-        seeds = sorted({run.seed for run in board.runs(key)})
-        offsets = sorted({run.offset for run in board.runs(key)})
-        repeats = ["--seed", *map(str, seeds)] if seeds != [0] else []
-        repeats += ["--offset", *map(str, offsets)] if offsets != [0] else []
+        repeats: list[str] = []
+        for name in ("seed", "offset"):
+            values = sorted({getattr(run, name) for run in board.runs(key)})
+            repeats += [f"--{name}", *map(str, values)] if values != [0] else []
         others = grouped((by_sequence[name][0] for name in names), lambda row: tuple(part_options(row)))
         commands += [
             command_with(board.first(key), [*[row.place or row.sequence.id for row in rows], *part, *repeats])

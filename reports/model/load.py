@@ -196,7 +196,19 @@ def load_runs(
     loaded = Loaded()
     everything = []
     for store in stores:
-        everything += rows_of(store, store.ids(), protocol, loaded, on_progress, pool)
+        run_ids = store.ids()
+        unchanged = _unchanged_rows(store, protocol, run_ids)
+        unread = [run_id for run_id in run_ids if run_id not in unchanged]
+        scored: list[tuple[RunRow, str]] = []
+        for done, answer in enumerate(run_jobs(pool, _score_run, [(store, protocol, run_id) for run_id in unread]), 1):
+            if isinstance(answer, str):
+                loaded.unreadable.append(answer)
+                on_progress(done, len(unread), "")
+            else:
+                scored.append(answer)
+                on_progress(done, len(unread), f"scoring {answer[0].tracker.id} on {answer[0].sequence.id}")
+        _keep_rows(store, protocol, scored)
+        everything += [*unchanged.values(), *(row for row, _ in scored)]
     warn_of_unreadable(loaded.unreadable)
     ended = [row for row in everything if row.status != "stopped"]
     scaled = [row for row in ended if protocol.finds_scale or row.tracker.sensors != "rgb"]
@@ -210,46 +222,14 @@ def load_runs(
     _split_programs(newest.values())
     loaded.superseded = len(rows) - len(newest)
     loaded.rows = list(newest.values())
-    if not newest and loaded.without_scale:
+    if newest:
+        return loaded
+    if loaded.without_scale:
         raise ReportError(f"all {without_scale_words(loaded.without_scale, protocol)}")
-    if not newest and loaded.trials:
+    if loaded.trials:
         raise ReportError(f"all {trial_words(loaded.trials)}")
-    if not newest:
-        places = ", ".join(str(store.source) for store in stores)
-        raise ReportError(f"there are no runs in {places}", next(iter(loaded.unreadable), "make some with 'run'"))
-    return loaded
-
-
-def rows_of(
-    store: RunStore,
-    run_ids: Sequence[str],
-    protocol: Protocol,
-    loaded: Loaded,
-    on_progress: OnProgress = no_progress,
-    pool: Executor | None = None,
-) -> list[RunRow]:
-    """The rows of some runs of a store: those of unchanged runs, and those that are read now.
-
-    Args:
-        store: The store.
-        run_ids: The runs.
-        protocol: How to evaluate.
-        loaded: Is told of unreadable runs.
-        on_progress: As in `build_report`.
-        pool: Workers that score the runs; None to score them here.
-    """
-    rows = _unchanged_rows(store, protocol, run_ids)
-    unread = [run_id for run_id in run_ids if run_id not in rows]
-    scored: list[tuple[RunRow, str]] = []
-    for done, answer in enumerate(run_jobs(pool, _score_run, [(store, protocol, run_id) for run_id in unread]), 1):
-        if isinstance(answer, str):
-            loaded.unreadable.append(answer)
-            on_progress(done, len(unread), "")
-        else:
-            scored.append(answer)
-            on_progress(done, len(unread), f"scoring {answer[0].tracker.id} on {answer[0].sequence.id}")
-    _keep_rows(store, protocol, scored)
-    return [*rows.values(), *(row for row, _ in scored)]
+    places = ", ".join(str(store.source) for store in stores)
+    raise ReportError(f"there are no runs in {places}", next(iter(loaded.unreadable), "make some with 'run'"))
 
 
 def without_scale_words(count: int, protocol: Protocol) -> str:

@@ -89,9 +89,8 @@ def _camera_words(row: RunRow) -> str:
     """The camera in a few words, empty if the record does not name it."""
     camera = row.identity.get("camera")
     values = [camera.get(name) for name in ("width", "height", "fx", "fy")] if isinstance(camera, dict) else [None]
-    if not all(isinstance(value, int | float) for value in values):
-        return ""
-    return "camera {:g}x{:g}, f {:g} {:g}".format(*values)
+    stated = all(isinstance(value, int | float) for value in values)
+    return "camera {:g}x{:g}, f {:g} {:g}".format(*values) if stated else ""
 
 
 OUR_BACK_END, OUR_OWN = " (our back end)", ", our own"

@@ -185,8 +185,7 @@ def reported_for(sequences: Sequence[str], protocol: Protocol) -> list[ReportedC
     ]
     if scored_as("SE(3) or not stated", "", protocol):
         remark = "contradicts itself and what the systems' authors published; see the audit"
-        frame = claimed().query("kind == 'value' and quantity == 'ape_rmse'")
-        frame = frame[frame["sequence"].isin(sequences)]
+        frame = claimed().query("kind == 'value' and quantity == 'ape_rmse' and sequence in @sequences")
         cells += [ReportedCell(c.system, c.sequence, c.value, remark, CLAIMED) for c in lines_of(frame)]
     return cells
 

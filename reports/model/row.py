@@ -5,7 +5,7 @@ import shlex
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from contextlib import suppress
 from functools import cached_property
-from itertools import chain
+from itertools import chain, zip_longest
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
@@ -15,7 +15,7 @@ from dynslam_bench.core import TABLE_BYTES, DynslamError, setting_text, write_li
 from dynslam_bench.core.records import Record, schema
 from dynslam_bench.evaluation import Evaluation, Protocol
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
-from dynslam_bench.evaluation.ape import ate_rmse_m, static_camera
+from dynslam_bench.evaluation.ape import ate_rmse_m, static_camera_rmse_m
 from dynslam_bench.geometry import Trajectory
 from dynslam_bench.runs.record import LOST_COVERAGE, MetricRecord, RunRecord
 from dynslam_bench.runs.store import RunStore, Which, score
@@ -302,12 +302,14 @@ def _outcome(
     if record.kind == "imported" or protocol.trajectory == "online" or n_tracked is None:
         return {}
     outcome: dict[str, Any] = {"n_tracked": n_tracked, "coverage": evaluation.coverage}
-    if n_tracked and not record.failed and n_tracked < LOST_COVERAGE * frames_due:
-        outcome["status"] = "lost"
-        outcome["reason"] = f"the final trajectory has poses of {n_tracked} of {frames_due} frames"
-    elif n_tracked and not record.failed and n_tracked >= frames_due:  # frames lost online were found later
-        outcome |= {"status": "ok", "reason": ""}
-    return outcome
+    if not n_tracked or record.failed or LOST_COVERAGE * frames_due <= n_tracked < frames_due:
+        return outcome
+    if n_tracked >= frames_due:  # frames lost online were found later
+        return outcome | {"status": "ok", "reason": ""}
+    return outcome | {
+        "status": "lost",
+        "reason": f"the final trajectory has poses of {n_tracked} of {frames_due} frames",
+    }
 
 
 def _static_camera_error(
@@ -319,8 +321,7 @@ def _static_camera_error(
     with suppress(DynslamError):
         truth = store.ground_truth(record.sequence.part)
         if truth is not None:
-            errors = static_camera(truth, store.timestamps(record.sequence.part), protocol.max_dt)
-            return errors["first_rmse_m" if protocol.alignment in ("none", "origin") else "constant_rmse_m"]
+            return static_camera_rmse_m(truth, store.timestamps(record.sequence.part), protocol)
     return None
 
 
@@ -346,22 +347,19 @@ def _hold_last_pose_error(
 
 def command_line(command: list[str]) -> str:
     """The command line as one would type it; a results folder named by its absolute path is ``RESULTS``."""
-    if not command:
-        return ""
-    head = Path(command[0]).name
     place = _option(command, "--results")
     words = [word.replace(place, "RESULTS") for word in command] if place and Path(place).is_absolute() else command
-    return shlex.join(["dynslam-bench" if head in ("__main__.py", "dynslam-bench") else command[0], *words[1:]])
+    heads = ["dynslam-bench" if Path(head).name in ("__main__.py", "dynslam-bench") else head for head in command[:1]]
+    return shlex.join([*heads, *words[1:]])
 
 
 def run_command(row: RunRow) -> str:
     """The command that makes a run again; empty for an imported trajectory."""
     if row.imported:
         return ""
-    words = [row.place or row.sequence.id, *part_options(row)]
-    words += ["--seed", str(row.seed)] if row.seed else []
-    words += ["--offset", str(row.offset)] if row.offset else []
-    return command_with(row, words)
+    repeats = {"--seed": row.seed, "--offset": row.offset}
+    words = [word for name, value in repeats.items() if value for word in (name, str(value))]
+    return command_with(row, [row.place or row.sequence.id, *part_options(row), *words])
 
 
 def command_with(row: RunRow, words: Iterable[str]) -> str:
@@ -384,18 +382,15 @@ def command_with(row: RunRow, words: Iterable[str]) -> str:
 
 def part_options(row: RunRow) -> list[str]:
     """Its part of the sequence, and the camera that its command named, as options of the command line."""
-    start, stop = row.frames or (0, None)
-    frames = ["--frames", f"{start}:{'' if stop is None else stop}"] if row.frames is not None else []
+    frames = "" if row.frames is None else ":".join("" if end is None else str(end) for end in row.frames)
     camera = _option(row.command, "--camera") if row.place else None
-    options = frames + (["--camera", camera] if camera else [])
-    return options + (["--stride", str(row.stride)] if row.stride != 1 else [])
+    options = {"--frames": frames, "--camera": camera, "--stride": "" if row.stride == 1 else str(row.stride)}
+    return [word for name, value in options.items() if value for word in (name, value)]
 
 
 def _option(command: Sequence[str], name: str) -> str | None:
     """The value of an option in a command line; None where it is not named."""
-    for at, word in enumerate(command):
-        if word.startswith(f"{name}="):
-            return word.partition("=")[2]
-        if word == name and at + 1 < len(command):
-            return command[at + 1]
+    for word, following in zip_longest(command, command[1:]):
+        if word == name or word.startswith(f"{name}="):
+            return following if word == name else word.partition("=")[2]
     return None

@@ -93,7 +93,9 @@ def standings(
     verdicts = verdicts_against(ranked_logs, base, share)
     means = [round(float(np.average(log, weights=share)), 12) for log in ranked_logs.values()]
     ranks = dict(zip(ranked, scipy.stats.rankdata(means, method="min").astype(int).tolist(), strict=True))
-    groups, mean_ranks = rank_groups(ranked_logs, share), _mean_ranks(ranked_logs)
+    by_sequence = scipy.stats.rankdata(np.reshape([*ranked_logs.values()], (len(ranked), len(names))), axis=0)
+    mean_ranks = dict(zip(ranked, by_sequence.mean(axis=1).tolist(), strict=True))
+    groups = rank_groups(ranked_logs, share)
     unordered = [
         Standing(
             key=key,
@@ -119,11 +121,10 @@ def ratio_interval(log_ratios: Array, weights: Array | None = None) -> Interval:
         weights: Their weights ``[S]``; all the same where there are none.
     """
     finite = np.isfinite(log_ratios)
-    if not finite.any():
-        return Interval(math.nan, math.nan, math.nan)
     values, share = log_ratios[finite], np.ones(finite.sum()) if weights is None else weights[finite]
     if len(values) < FEWEST:
-        return Interval(float(np.exp(np.average(values, weights=share))), math.nan, math.nan)
+        few = float(np.exp(np.average(values, weights=share))) if len(values) else math.nan
+        return Interval(few, math.nan, math.nan)
     mean, error, freedom = _weighted_mean(values, share)
     half = float(scipy.special.stdtrit(freedom, 0.975) * error)
     return Interval(float(np.exp(mean)), float(np.exp(mean - half)), float(np.exp(mean + half)))
@@ -230,11 +231,3 @@ def log_medians(cell: Mapping[str, Sequence[float]], names: Sequence[str]) -> Ar
     """Logarithms of the median errors ``[S]``; nan where there is no run."""
     medians = [float(np.median(cell[name])) if cell.get(name) else np.nan for name in names]
     return np.asarray(np.log(np.maximum(np.asarray(medians, dtype=np.float64), FLOOR_M)))
-
-
-def _mean_ranks(logs: Mapping[str, Array]) -> dict[str, float]:
-    """Mean over sequences of each tracker's rank there."""
-    if not logs:
-        return {}
-    ranks = scipy.stats.rankdata(np.stack(list(logs.values())), axis=0)
-    return dict(zip(logs, ranks.mean(axis=1).tolist(), strict=True))

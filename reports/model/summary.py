@@ -22,7 +22,8 @@ def headline(board: Board) -> str:
         return "No tracker can be ranked."
     where = f"On {_sequences(board)} "
     best = ranked[0]
-    ratio = "" if best.key == board.reference else f", {_ratio_words(board, best)}"
+    reference = "a static camera" if board.reference_name == STATIC_CAMERA else board.reference_name
+    ratio = f", with {best.ratio.value:.2f} times the error of {reference}" * (best.key != board.reference)
     if len(ranked) == 1:
         return f"{where}{board.names[best.key]} alone is ranked{ratio}."
     if len(board.common) < FEWEST:
@@ -51,8 +52,10 @@ def explanation(board: Board) -> str:
             f"{FEWEST}, chance alone could produce it."
         )
     count = Counter(standing.verdict for standing in board.standings)
-    spread = math.log(max(_typical_width(board), 1.0 + 1e-9))
-    more = math.ceil(len(board.common) * (spread / math.log(1.1)) ** 2)
+    ratios = [s.ratio for s in board.standings if s.rank is not None and s.ratio.high > s.ratio.value > 0]
+    # the factor between an interval's end and its middle, of a typical tracker
+    width = median_high([ratio.high / ratio.value for ratio in ratios] or [1.0])
+    more = math.ceil(len(board.common) * (math.log(max(width, 1.0 + 1e-9)) / math.log(1.1)) ** 2)
     sentences = [
         f"Every tracker is compared with {board.reference_name} on the same sequences.",
         "'Better' and 'worse' mean that the difference is so steady over the sequences that fewer than one such board "
@@ -98,12 +101,6 @@ def mean_rank_note(board: Board) -> str:
     )
 
 
-def _typical_width(board: Board) -> float:
-    """Median over trackers of the factor between an interval's end and its middle."""
-    ratios = [s.ratio for s in board.standings if s.rank is not None and s.ratio.high > s.ratio.value > 0]
-    return median_high(ratio.high / ratio.value for ratio in ratios) if ratios else 1.0
-
-
 def _sequences(board: Board) -> str:
     number = len(board.common)
     plural = f"sequence{'s' * (number != 1)}"
@@ -124,8 +121,3 @@ def _names(board: Board, standings: list[Standing]) -> str:
     if len(names) > _MOST_NAMED:
         return f"{names[0]} and {len(names) - 1} others"
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-
-
-def _ratio_words(board: Board, standing: Standing) -> str:
-    reference = "a static camera" if board.reference_name == STATIC_CAMERA else board.reference_name
-    return f"with {standing.ratio.value:.2f} times the error of {reference}"

@@ -114,7 +114,9 @@ COLUMNS = (
 
 
 def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
-    failed = sum(row.failed for row in board.rows)
+    failed, groups = sum(row.failed for row in board.rows), dict.fromkeys(board.groups[name] for name in board.common)
+    several = len(groups) > 1 and board.category == OVERALL
+    mean = f"It is a mean over {_count(len(groups), 'category')} ({', '.join(groups)}), which all weigh the same. "
     intervals = (
         "Brackets: Student's 95 % intervals over sequences."
         if len(board.common) >= FEWEST
@@ -123,7 +125,7 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
     parts = [
         f"{protocol.describe()}; for the ranking a lost frame counts as not having moved since the last tracked one.",
         f"ATE ratio: geometric mean over {_count(len(board.common), 'sequence')} of the median ATE over that of "
-        f"{board.reference_name}; below 1 is better. {_mean_words(board)}{intervals}",
+        f"{board.reference_name}; below 1 is better. {mean if several else ''}{intervals}",
         f"A run that failed or was lost counts as a static camera, or worse ({failed} of "
         f"{_count(len(board.rows), 'run')}); trackers without any success stand below the last line.",
         "Grey rows are shown but not ranked: controls, inspired or assumed re-implementations, runs that begin "
@@ -149,13 +151,6 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
         f"({hinted}), as the diagnostics say; no number is changed for that.": hinted,
     }
     return " ".join(parts + [remark for remark, holds in remarks.items() if holds])
-
-
-def _mean_words(board: Board) -> str:
-    groups = list(dict.fromkeys(board.groups[name] for name in board.common))
-    if len(groups) < 2 or board.category != OVERALL:
-        return ""
-    return f"It is a mean over {_count(len(groups), 'category')} ({', '.join(groups)}), which all weigh the same. "
 
 
 def _hinted(rows: Iterable[RunRow]) -> str:
@@ -191,7 +186,7 @@ def leaderboard_cells(board: Board, key: str) -> dict[str, TableCell]:
         return cells | {"ATE ratio": TableCell("nothing succeeded", emphasis="failed")}
     if standing is None:
         return cells
-    ratio = interval_cell(standing.ratio, ".2f", "best" if key in board.emphasised else "")
+    ratio = ratio_cell(board, standing)
     if standing.sequences < len(board.common):
         small = f"{ratio.small} on {standing.sequences} of {len(board.common)}".strip()
         ratio = TableCell(ratio.text, small, ratio.value)
@@ -210,8 +205,7 @@ def verdict_cell(board: Board, standing: Standing) -> TableCell:
     if not standing.verdict or (len(board.common) < FEWEST and standing.verdict != "reference"):
         return TableCell()
     p = "" if standing.p_value is None else "p < 0.001" if standing.p_value < 0.001 else f"p {standing.p_value:.3f}"
-    colours = {"better": shade(0.5), "worse": shade(2.0)}
-    return TableCell(standing.verdict, p, shade=colours.get(standing.verdict))
+    return TableCell(standing.verdict, p, shade={"better": shade(0.5), "worse": shade(2.0)}.get(standing.verdict))
 
 
 def category_table(boards: Mapping[str, Board]) -> Table | None:
@@ -224,15 +218,16 @@ def category_table(boards: Mapping[str, Board]) -> Table | None:
         return None
     overall = boards[OVERALL]
 
-    def shown(board: Board, key: str) -> TableCell:
-        standing = board.placed.get(key)
-        if standing is None:
-            return TableCell()
-        cell = interval_cell(standing.ratio, ".2f", "best" if key in board.emphasised else "")
-        return replace(cell, shade=verdict_cell(board, standing).shade, tip=standing.verdict)
-
+    cells = [
+        {
+            key: replace(ratio_cell(board, s), shade=verdict_cell(board, s).shade, tip=s.verdict)
+            for key, s in board.placed.items()
+        }
+        for board in boards.values()
+    ]
     rows = [
-        [TableCell(overall.labels[key]), *(shown(board, key) for board in boards.values())] for key in overall.trackers
+        [TableCell(overall.labels[key]), *(placed.get(key, TableCell()) for placed in cells)]
+        for key in overall.trackers
     ]
     columns = [
         Column(name, meaning=f"{_count(len(board.common), 'sequence')}, against {board.reference_name}")
@@ -290,10 +285,12 @@ def speed_cell(ended: Sequence[RunRow]) -> TableCell:
 
 def rank_cell(standing: Standing) -> TableCell:
     """The ranks that the data leave open."""
-    if standing.rank is None or standing.group is None:
-        return TableCell("–")
-    first, last = standing.group
-    return TableCell(str(first)) if first == last else TableCell(f"{first}–{last}")
+    return TableCell("–".join(map(str, dict.fromkeys(standing.group))) if standing.group else "–")
+
+
+def ratio_cell(board: Board, standing: Standing) -> TableCell:
+    """The ratio to the reference with its interval, bold for those that may be first."""
+    return interval_cell(standing.ratio, ".2f", "best" if standing.key in board.emphasised else "")
 
 
 def interval_cell(interval: Interval, digits: str, emphasis: Emphasis = "") -> TableCell:
@@ -546,8 +543,7 @@ def relative_errors(board: Board, protocol: Protocol) -> list[Table]:
         )
 
     parts = (("trans", "mm", "translation"), ("rot", "°", "rotation"))
-    tables = [table(spec, *part) for spec in protocol.rpe for part in parts]
-    return [table for table in tables if table is not None]
+    return [shown for spec in protocol.rpe for part in parts if (shown := table(spec, *part)) is not None]
 
 
 def rotation_errors(board: Board, protocol: Protocol) -> Table | None:
@@ -627,26 +623,24 @@ def _error_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual: in
         return TableCell(cell.ending, count, emphasis="failed", tip=tip, link=link)
     if cell.median is None:
         return TableCell("", emphasis="muted")
-    skipped = mean_of(row.epipolar_skipped for row in cell.rows)
+    skipped, base = mean_of(row.epipolar_skipped for row in cell.rows), board.reference_median(sequence)
+    no_better = board.no_better_than_static(key, sequence)
+    ratio = None if base is None else cell.median / max(base, FLOOR_M)
     notes = [
         _spread(cell),
         count,
         "" if skipped is None else f"F skipped {percent(skipped)}",
-        "no better than a static camera" * board.no_better_than_static(key, sequence),
+        "no better than a static camera" * no_better,
         f"{cell.success}/{len(cell.rows)} succeeded" if cell.failed else "",
     ]
-    base = board.reference_median(sequence)
-    colour, tip = None, coverage
-    if base is not None and cell.in_training:
-        tip = SEEN_NOTE
-    elif base is not None:
-        ratio = cell.median / max(base, FLOOR_M)
-        colour = shade(ratio)
-        if cell.failed or board.no_better_than_static(key, sequence):
-            colour = max(colour, 0.0)
-        tip = f"{ratio:.2f} × the reference, {coverage}" + (f"; {cell.ending}" if cell.failed else "")
-    text = mm(cell.median) + SEEN * cell.in_training
-    return TableCell(text, ", ".join(filter(None, notes)), cell.median, mark, colour, tip, link=link)
+    shown = TableCell(
+        mm(cell.median) + SEEN * cell.in_training, ", ".join(filter(None, notes)), cell.median, mark, link=link
+    )
+    if ratio is None or cell.in_training:
+        return replace(shown, tip=coverage if ratio is None else SEEN_NOTE)
+    best = 0.0 if cell.failed or no_better else -1.0
+    tip = f"{ratio:.2f} × the reference, {coverage}" + (f"; {cell.ending}" if cell.failed else "")
+    return replace(shown, shade=max(shade(ratio), best), tip=tip)
 
 
 def _spread(cell: Cell) -> str:
@@ -683,15 +677,13 @@ def failure_rule_table(board: Board) -> Table | None:
         "failures left out too": lambda row: None if row.failed else _tracked_error(row),
     }
     columns = [*texts("tracker"), *(column for name in rules for column in numbers("#", "ATE ratio", group=name))]
-    placed = [{s.key: s for s in rank(board, board.ranked, board.ranked, rule)} for rule in rules.values()]
-
-    def shown(standing: Standing | None) -> list[TableCell]:
-        if standing is None:
-            return [TableCell(), TableCell()]
-        return [rank_cell(standing), interval_cell(standing.ratio, ".2f")]
-
+    cells = [
+        {s.key: [rank_cell(s), interval_cell(s.ratio, ".2f")] for s in rank(board, board.ranked, board.ranked, rule)}
+        for rule in rules.values()
+    ]
+    empty = [TableCell(), TableCell()]
     rows = [
-        [TableCell(board.labels[key]), *(cell for standings in placed for cell in shown(standings.get(key)))]
+        [TableCell(board.labels[key]), *(cell for pairs in cells for cell in pairs.get(key, empty))]
         for key in board.ranked
     ]
     return Table(
@@ -883,8 +875,7 @@ def _statistics_table(
         brief,
         behind=lambda cell: SEEN * cell.in_training + LOST_MARK * has_lost(cell),
     )
-    if any(cell.text.endswith(LOST_MARK) for row in table.rows for cell in row):
-        table.caption += f" {LOST_NOTE}"
+    table.caption += f" {LOST_NOTE}" * any(cell.text.endswith(LOST_MARK) for row in table.rows for cell in row)
     keys = {key for key, _ in errors["rmse"]}
     subject = subject_of(board)
     others = [key for key in board.ranked if key in keys and key != subject]

@@ -131,12 +131,13 @@ class Table:
         caption = self.caption
         if len(self.rows) > MOST_ROWS:
             caption += f" These are the first {MOST_ROWS} of {len(self.rows)} rows; all stand in csv/{self.id}.csv."
-        rows = [[row[at] for at in kept] for row in self.rows[:MOST_ROWS]]
-        return replace(self, caption=caption, columns=[self.columns[at] for at in kept], rows=rows)
+        return replace(self, caption=caption, rows=self.rows[:MOST_ROWS])._with_columns(kept)
 
     def without(self, *names: str) -> Table:
         """The table without the columns of these names."""
-        kept = [at for at, column in enumerate(self.columns) if column.name not in names]
+        return self._with_columns([at for at, column in enumerate(self.columns) if column.name not in names])
+
+    def _with_columns(self, kept: Sequence[int]) -> Table:
         rows = [[row[at] for at in kept] for row in self.rows]
         return replace(self, columns=[self.columns[at] for at in kept], rows=rows)
 
@@ -159,11 +160,6 @@ def to_markdown(table: Table) -> str:
     return "\n".join([*lines, "", prose(table.caption), ""])
 
 
-def to_csv(table: Table) -> str:
-    """The table as CSV; numbers stand with all their digits."""
-    return csv_text(table.frame())
-
-
 def csv_text(frame: pd.DataFrame) -> str:
     """A frame as CSV that a spreadsheet may open, a terminal may show: nothing is a formula or an escape.
 
@@ -179,8 +175,8 @@ def csv_text(frame: pd.DataFrame) -> str:
 def emphasise(values: Sequence[float | None]) -> list[Emphasis]:
     """Best and second best (smallest) of a column; equal values share the mark."""
     present = sorted({value for value in values if value is not None})
-    marks: dict[float, Emphasis] = dict(zip(present, ("best", "second"), strict=False)) if len(present) > 1 else {}
-    return ["" if value is None else marks.get(value, "") for value in values]
+    marks: dict[float | None, Emphasis] = dict(zip(present, ("best", "second"), strict=False))
+    return [marks.get(value, "") if len(present) > 1 else "" for value in values]
 
 
 def prose(text: str) -> str:
@@ -189,8 +185,7 @@ def prose(text: str) -> str:
 
 
 def _escape_markdown(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace("|", "\\|")
-    return prose(escaped).replace("*", "\\*").replace("_", "\\_").replace("[", "\\[")
+    return re.sub(r"[*_\[]", r"\\\g<0>", prose(re.sub(r"[\\|]", r"\\\g<0>", text)))
 
 
 def _markdown_cell(cell: TableCell) -> str:
@@ -205,9 +200,9 @@ def _words(cell: TableCell) -> str:
 
 def _no_formula(value: object) -> object:
     """The value; words that a spreadsheet would take for a formula begin with a quote."""
-    if not isinstance(value, str):
-        return value
-    return ("'" if value.startswith(("=", "+", "-", "@", "\t", "\r")) else "") + printable(value)
+    if isinstance(value, str):
+        return "'" * value.startswith(("=", "+", "-", "@", "\t", "\r")) + printable(value)
+    return value
 
 
 def mm(metres: float) -> str:
@@ -272,13 +267,12 @@ def to_latex(table: Table, protocol: str = "") -> str:
     table = table.displayed()
     floats: list[list[str]] = []
     used = MOST_LINES
-    for columns in _blocks(table):
-        for text, lines in _tabulars(table, columns):
-            if used + lines > MOST_LINES:
-                floats.append([])
-                used = 0
-            floats[-1].append(text)
-            used += lines
+    for text, lines in (tabular for columns in _blocks(table) for tabular in _tabulars(table, columns)):
+        if used + lines > MOST_LINES:
+            floats.append([])
+            used = 0
+        floats[-1].append(text)
+        used += lines
     return "\n".join(_float(table, tabulars, number, protocol) for number, tabulars in enumerate(floats))
 
 
@@ -292,12 +286,10 @@ def escape_latex(text: str) -> str:
 
 
 def _character(character: str) -> str:
-    if character in _LATEX:
-        return _LATEX[character]
+    if character in _LATEX or ("\u00c0" <= character <= "\u017e" and character != "÷"):
+        return _LATEX.get(character, character)
     if character.isascii():
         return character if character.isprintable() else " "
-    if "\u00c0" <= character <= "\u017e" and character not in "×÷":
-        return character
     plain = unicodedata.normalize("NFKD", character).encode("ascii", "ignore").decode()
     return "".join(_LATEX.get(letter, letter) for letter in plain) if plain else f"[U+{ord(character):04X}]"
 
@@ -305,15 +297,16 @@ def _character(character: str) -> str:
 def _float(table: Table, blocks: Sequence[str], number: int, protocol: str) -> str:
     words = [table.brief or table.title] + [f"protocol {protocol}"] * bool(protocol) + ["continued"] * bool(number)
     note = " $^*$\\,our back end." if any(_STAR in block for block in blocks) else ""
-    lines = [
-        "\\begin{table}[htbp]",
-        "\\centering\\footnotesize\\setlength{\\tabcolsep}{3pt}",
-        f"\\caption{{{escape_latex(', '.join(words))}.{note}}}",
-        f"\\label{{tab:{table.id}{f'-{number + 1}' if number else ''}}}",
-        "\n\\par\\medskip\n".join(blocks),
-        "\\end{table}",
-    ]
-    return "\n".join(lines) + "\n"
+    return "\n".join(
+        [
+            "\\begin{table}[htbp]",
+            "\\centering\\footnotesize\\setlength{\\tabcolsep}{3pt}",
+            f"\\caption{{{escape_latex(', '.join(words))}.{note}}}",
+            f"\\label{{tab:{table.id}{f'-{number + 1}' if number else ''}}}",
+            "\n\\par\\medskip\n".join(blocks),
+            "\\end{table}\n",
+        ]
+    )
 
 
 def _blocks(table: Table) -> list[list[int]]:
@@ -364,7 +357,8 @@ def _tabulars(table: Table, columns: Sequence[int]) -> list[tuple[str, int]]:
     chosen = [table.columns[at] for at in columns]
     wide = _width_pt(table, columns[0]) > _NAMES_PT
     kinds = (f"p{{{_NAMES_PT:.0f}pt}}" if wide else "l") + "".join("r" if c.numeric else "l" for c in chosen[1:])
-    head = [_groups(chosen)] if any(column.group for column in chosen) else []
+    groups = replace(table, columns=chosen).groups()
+    head = [_groups(groups)] if any(name for name, _ in groups) else []
     head.append(" & ".join(_stacked(column.name) for column in chosen) + " \\\\")
     head_lines = len(head) + max(len(_heading(column.name)) for column in chosen) + 1
     names = [_plain(row[columns[0]]) for row in table.rows]
@@ -392,18 +386,15 @@ def _stacked(name: str) -> str:
 def _cell(cell: TableCell) -> str:
     if cell.emphasis == "failed":
         return "failed"
-    text = escape_latex(cell.text.replace(OUR_BACK_END, ""))
-    if text and cell.emphasis in ("best", "second"):
-        text = f"\\text{'bf' if cell.emphasis == 'best' else 'it'}{{{text}}}"
-    text += _STAR * (OUR_BACK_END in cell.text)
+    text, font = escape_latex(cell.text.replace(OUR_BACK_END, "")), {"best": "bf", "second": "it"}.get(cell.emphasis)
+    text = (f"\\text{font}{{{text}}}" if text and font else text) + _STAR * (OUR_BACK_END in cell.text)
     return f"{text}~{{\\scriptsize {escape_latex(cell.small)}}}" if cell.small.startswith("[") else text
 
 
-def _groups(columns: Sequence[Column]) -> str:
+def _groups(groups: Sequence[tuple[str, int]]) -> str:
     """The line of headings above the columns' own, with a rule below each."""
     cells, rules, at = [], [], 1
-    for name, group in groupby(columns, key=lambda column: column.group):
-        width = len(list(group))
+    for name, width in groups:
         cells.append(f"\\multicolumn{{{width}}}{{c}}{{{escape_latex(name)}}}" if name else " & ".join([""] * width))
         rules += [f"\\cmidrule(lr){{{at}-{at + width - 1}}}"] if name else []
         at += width

@@ -11,7 +11,7 @@ import csv
 from pathlib import Path
 
 from dynslam_bench.evaluation import evaluate, evaluate_files, static_camera
-from dynslam_bench.evaluation.compare_protocols import agrees, compare_protocols_of_files
+from dynslam_bench.evaluation.compare_protocols import agrees, compare_protocols
 from dynslam_bench.geometry.trajectory_files import load_tum, read_tum
 
 STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
@@ -59,7 +59,7 @@ def conventions(folder: Path) -> None:
     estimate, truth = (load_tum(crowd / name) for name in ("rgbdvo.txt", "groundtruth.txt"))
     print("| metric | convention | m | pairs | 0.0733 is printed |")
     print("| --- | --- | ---: | ---: | --- |")
-    for row in compare_protocols_of_files(estimate, truth):
+    for row in compare_protocols(estimate, truth):
         mark = "agrees" if agrees(row, "0.0733") else ""
         print(f"| {row.metric} | {row.label} | {row.rmse_m:.4f} | {row.pairs} | {mark} |")
     static = static_camera(truth.trajectory, estimate.trajectory.timestamps)["constant_rmse_m"]

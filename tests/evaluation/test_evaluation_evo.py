@@ -14,7 +14,7 @@ from evo.tools import file_interface
 
 from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.evaluation import Protocol, RPESpec, evaluate, evaluate_files
-from dynslam_bench.evaluation.compare_protocols import ComparisonRow, agrees, compare_protocols_of_files
+from dynslam_bench.evaluation.compare_protocols import ComparisonRow, agrees, compare_protocols
 from dynslam_bench.evaluation.rpe import closest, random_pairs
 from dynslam_bench.geometry import RepeatedStamps, Trajectory, load_tum, read_tum, se3, write_tum
 
@@ -42,25 +42,17 @@ def perturbed(truth, seed):
     return Trajectory(picked.timestamps + rng.uniform(-0.006, 0.006, len(picked)), se3.exp(rng.normal(size=6)) @ poses)
 
 
-def cases():
-    for seed in range(4):
-        truth = smooth(seed)
-        yield pytest.param(perturbed(truth, seed), truth, id=f"random-{seed}")
-    for path in REAL:
-        truth = read_tum(path)
-        yield pytest.param(perturbed(truth, 7), truth, id=path.parent.name)
-    # an estimate with more poses than the ground truth: evo then starts from the ground truth
-    yield pytest.param(perturbed(smooth(9), 9), smooth(9).select(slice(0, None, 7)), id="longer-estimate")
-
-
-def to_evo(trajectory):
-    return PoseTrajectory3D(poses_se3=list(trajectory.T_world_cam), timestamps=trajectory.timestamps.copy())
+TRUTHS = {f"random-{seed}": smooth(seed) for seed in range(4)} | {path.parent.name: read_tum(path) for path in REAL}
+CASES = [pytest.param(perturbed(truth, at), truth, id=name) for at, (name, truth) in enumerate(TRUTHS.items())]
+# an estimate with more poses than the ground truth: evo then starts from the ground truth
+CASES += [pytest.param(perturbed(smooth(9), 9), smooth(9).select(slice(0, None, 7)), id="longer-estimate")]
 
 
 @lru_cache(maxsize=128)
 def evo_pair(estimate, truth, alignment, max_dt):
     """What evo compares, associated and aligned; its metrics only read it."""
-    return aligned(to_evo(truth), to_evo(estimate), alignment, max_dt)
+    pair = (PoseTrajectory3D(poses_se3=list(t.T_world_cam), timestamps=t.timestamps.copy()) for t in (truth, estimate))
+    return aligned(*pair, alignment, max_dt)
 
 
 def aligned(reference, estimated, alignment, max_dt):
@@ -72,7 +64,13 @@ def aligned(reference, estimated, alignment, max_dt):
     return reference, estimated
 
 
-@pytest.mark.parametrize(("estimate", "truth"), list(cases()))
+def statistics_of(evaluation, prefix, unit):
+    """The statistics of one error, by evo's names."""
+    names = {"sse": f"{prefix}_sse_{unit}2"} | {name: f"{prefix}_{name}_{unit}" for name in STATISTICS}
+    return {name: evaluation.metrics[key] for name, key in names.items()}
+
+
+@pytest.mark.parametrize(("estimate", "truth"), CASES)
 @pytest.mark.parametrize("alignment", ["none", "origin", "se3", "sim3"])
 @pytest.mark.parametrize("max_dt", [0.01, 0.003])
 def test_absolute_errors(estimate, truth, alignment, max_dt):
@@ -86,12 +84,10 @@ def test_absolute_errors(estimate, truth, alignment, max_dt):
     ):
         ape = metrics.APE(relation)
         ape.process_data(pair)
-        for name, value in ape.get_all_statistics().items():
-            key = f"{prefix}_{name}_{unit}{'2' if name == 'sse' else ''}"
-            assert ours.metrics[key] == pytest.approx(value, abs=1e-9, rel=1e-9), key
+        assert statistics_of(ours, prefix, unit) == pytest.approx(ape.get_all_statistics(), abs=1e-9, rel=1e-9)
 
 
-@pytest.mark.parametrize(("estimate", "truth"), list(cases()))
+@pytest.mark.parametrize(("estimate", "truth"), CASES)
 @pytest.mark.parametrize("alignment", ["none", "se3", "sim3"])
 @pytest.mark.parametrize("mode", ["consecutive", "all"])
 @pytest.mark.parametrize("delta", [1, 7])
@@ -108,15 +104,12 @@ def test_relative_errors(estimate, truth, alignment, mode, delta):
         try:
             rpe.process_data(pair)
         except Exception as error:  # evo refuses where there is no such pair; we leave the metric out and say so
-            assert "produced an empty index list" in str(error)
-            assert ours.n_pairs_rpe[spec.key] == 0
-            assert any("no pair of poses" in line for line in ours.diagnostics)
-            assert f"rpe_{spec.key}_{part}_rmse_{ending}" not in ours.metrics
+            assert "produced an empty index list" in str(error) and "no pair of poses" in str(ours.diagnostics)
+            assert ours.n_pairs_rpe[spec.key] == 0 and f"rpe_{spec.key}_{part}_rmse_{ending}" not in ours.metrics
             continue
         assert ours.n_pairs_rpe[spec.key] == len(rpe.error)
-        for name, value in rpe.get_all_statistics().items():
-            key = f"rpe_{spec.key}_{part}_{name}_{ending}{'2' if name == 'sse' else ''}"
-            assert ours.metrics[key] == pytest.approx(value, abs=1e-9, rel=1e-9), key
+        found = statistics_of(ours, f"rpe_{spec.key}_{part}", ending)
+        assert found == pytest.approx(rpe.get_all_statistics(), abs=1e-9, rel=1e-9)
 
 
 # Published numbers from published trajectories, repeated stamps beside evo, rows that agree with a printed number.
@@ -149,16 +142,12 @@ def test_an_authors_evo_tables_are_given_back():
 @needs_author
 def test_tolerance_and_scale_move_one_published_number():
     estimate, truth = AUTHOR / "rgbd_bonn_crowd" / "rgbdvo.txt", AUTHOR / "rgbd_bonn_crowd" / "groundtruth.txt"
-    shown = {
-        name: (round(result.metrics["ate_rmse_m"], 4), result.n_pairs)
-        for name in ("evo-as/v1", "tum-rgbd/v1-sim3", "evo-as/v1-se3", "tum-rgbd/v1")
-        for result in [evaluate_files(estimate, truth, name)]
-    }
-    assert shown == {
-        "evo-as/v1": (0.0733, 554), "tum-rgbd/v1-sim3": (0.1099, 904),
-        "evo-as/v1-se3": (54.8671, 554), "tum-rgbd/v1": (53.3026, 904),
+    rows = compare_protocols(load_tum(estimate), load_tum(truth))
+    expected = {
+        "evo_ape -as": (0.0733, 554), "Sim(3)-aligned": (0.1099, 904),
+        "evo_ape -a": (54.8671, 554), "SE(3)-aligned (TUM's ATE)": (53.3026, 904),
     }  # fmt: skip
-    rows = compare_protocols_of_files(load_tum(estimate), load_tum(truth))
+    assert {row.label: (round(row.rmse_m, 4), row.pairs) for row in rows if row.label in expected} == expected
     assert [row.label for row in rows if agrees(row, "0.0733")] == ["evo_ape -as"]
 
 
@@ -301,10 +290,9 @@ def test_rpe_with_fixed_delta(truth, estimate, delta, unit):
     ours = evaluate(estimate, truth, Protocol(id="x", rpe=(spec,)))
     translation, rotation = slow_rpe(truth, estimate, delta, unit)
     assert ours.n_pairs_rpe[spec.key] == len(translation) > 10
-    expected = {"rmse": np.sqrt((translation**2).mean())}
+    expected = {"rmse": np.sqrt((translation**2).mean()), "sse": (translation**2).sum()}
     expected |= {name: getattr(np, name)(translation) for name in ("mean", "median", "std", "min", "max")}
-    for name, value in expected.items():
-        assert ours.metrics[f"rpe_{spec.key}_trans_{name}_m"] == pytest.approx(value, abs=1e-12)
+    assert statistics_of(ours, f"rpe_{spec.key}_trans", "m") == pytest.approx(expected, abs=1e-12)
     # the reference's arccos loses half the digits near zero, ours does not
     assert ours.metrics[f"rpe_{spec.key}_rot_rmse_deg"] == pytest.approx(np.sqrt((rotation**2).mean()), abs=1e-5)
 

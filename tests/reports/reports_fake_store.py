@@ -75,7 +75,6 @@ def add_run(
     frames=None,
     cached=False,
     skipped=None,
-    died_at=None,
     duration_s=None,
     masks="",
     settings=None,
@@ -103,13 +102,8 @@ def add_run(
     drift = np.cumsum(rng.normal(0, 1, (n, 6)), axis=0)
     drift = (drift - drift.mean(0)) / drift.std() * error
     poses = se3.exp(rng.normal(size=6)) @ truth.T_world_cam[nearest] @ se3.exp(drift * [1, 1, 1, 0.3, 0.3, 0.3])
-    ok = np.ones(n, dtype=bool)
-    ok[list(lost)] = False
-    if status in ("crashed", "timeout", "invalid", "out-of-memory"):
-        died_at = n // 4 if died_at is None else died_at
-        ok[died_at:] = False
-    if status == "lost":
-        ok[n // 4 :] = False
+    ended = status in ("ok", "stopped")
+    ok = ~np.isin(np.arange(n), lost) & (ended | (np.arange(n) < n // 4))
     record = RunRecord(
         kind=kind, run_id=run_id, status=status, reason=reason,
         tracker=TrackerInfo(id=tracker, label=label or tracker, provenance=provenance, ranked=ranked, given=given),
@@ -121,7 +115,7 @@ def add_run(
         frames=frames, offset=offset, place=place, epipolar_skipped=skipped,
         identity=({"scheme": IDENTITY_SCHEME} if identity is None else identity)
         | ({"cache": True} if cached else {}) | ({"camera": camera} if camera else {}),
-        n_frames=n, n_processed=n if died_at is None else died_at,
+        n_frames=n, n_processed=n if ended or status == "lost" else n // 4,
         n_tracked=int(ok.sum()), n_lost=int((~ok).sum()), coverage=float(ok.mean()),
         timings={"total": StageTime(median_s=frame_s, p95_s=2 * frame_s, mean_s=frame_s)} if frame_s else {},
         started=started, wall_s=3.0, peak_memory_mb=300.0, machine=MACHINE, versions={"python": "3.11", "numpy": "2.0"},
@@ -164,8 +158,7 @@ def add_frames(
         outcome = FrameOutcome(at, 1000.01 + at / 30, "ok", np.eye(4), numbers, times, error, -0.001)
         rows.append(FrameRow.of(outcome, 0.5, share if exact else None))
         points = rng.uniform(0, size, (features, 2)).astype(np.float32)[:, ::-1]
-        mask = np.zeros(size, bool)
-        mask[:, : int(size[1] * share)] = True
+        mask = np.broadcast_to(np.arange(size[1]) < int(size[1] * share), size)
         kept = np.arange(features) >= 0.4 * features
         writer.add(
             outcome, np.full((*size, 3), 90, np.uint8), TrackResult(np.eye(4), "ok", numbers, times, mask, points, kept)

@@ -50,3 +50,9 @@ def crashed(tracker="c", sequence="s", error=0.001, **changes):
 
 def cell_of(table, name, column=1):
     return next(cells for cells in table.rows if cells[0].text == name)[column]
+
+
+def columns_of(table, *names):
+    """The cells of some columns of a table."""
+    headings = [column.name for column in table.columns]
+    return [[cells[headings.index(name)] for cells in table.rows] for name in names]

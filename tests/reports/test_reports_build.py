@@ -5,9 +5,9 @@ import os
 import re
 import shutil
 import sqlite3
-import subprocess
 import sys
 from itertools import product
+from types import ModuleType
 
 import numpy as np
 import pandas as pd
@@ -26,10 +26,10 @@ from dynslam_bench.reports.html import board_page
 from dynslam_bench.reports.html.run_pages import broken, exact_shares
 from dynslam_bench.reports.model import load
 from dynslam_bench.reports.model.board import make_board
-from dynslam_bench.reports.model.load import check_one_protocol, load_runs
+from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.tables import table as tables
 from dynslam_bench.reports.tables.leaderboard import repeatability
-from dynslam_bench.reports.tables.table import Column, Table, TableCell, csv_text, to_csv, to_markdown
+from dynslam_bench.reports.tables.table import Column, Table, TableCell, csv_text, to_markdown
 from dynslam_bench.runs.store import RunStore
 
 PAGES = ("index", "errors", "compare", "paper", "diagnostics", "reproduce", "run")
@@ -50,38 +50,32 @@ def test_every_page_loads_nothing_but_what_lies_beside_it(made):
 
 def test_the_first_page_is_small_before_plotly(made):
     folder = made[1].html.parent
-    text = made[1].html.read_text()
+    text = (folder / "index.html").read_text()
     files = [path for path in re.findall(r'(?:src|href)="(assets/[^"]+)"', text) if "plotly" not in path]
     assert len(files) >= 5 and len(text.encode()) + sum((folder / path).stat().st_size for path in files) < 1e6
 
 
 def test_figures_are_plotly_figures(made):
-    folder, found = made[1].html.parent, 0
-    for name in PAGES:
-        text = re.search(r"const FIGURES = (\{.*?\});</script>", (folder / f"{name}.html").read_text(), re.DOTALL)[1]
-        for figure in json.loads(text).values():
-            assert go.Figure(figure).data and figure["layout"]["height"] > 100
-            found += 1
-    assert found >= 6  # speed, masks, and four of the paper
-    for path in (folder / "data").glob("run-*.js"):
-        run = page_data(folder, path.stem)
-        for figure in run["figures"].values():
-            made_of = json.dumps(figure)
-            assert set(re.findall(r'"@(\w+)"', made_of)) <= set(run["series"])
-            filled = json.loads(re.sub(r'"@\w+"', "[1, 2]", made_of))
-            assert go.Figure(filled).data
+    folder = made[1].html.parent
+    texts = ((folder / f"{name}.html").read_text() for name in PAGES)
+    pages = [re.search(r"const FIGURES = (\{.*?\});</script>", text, re.DOTALL)[1] for text in texts]
+    figures_of_pages = [figure for page in pages for figure in json.loads(page).values()]
+    assert len(figures_of_pages) >= 6  # speed, masks, and four of the paper
+    assert all(go.Figure(figure).data and figure["layout"]["height"] > 100 for figure in figures_of_pages)
+    run = page_data(folder, f"run-{made[0].ids()[0]}")
+    for figure in map(json.dumps, run["figures"].values()):
+        assert set(re.findall(r'"@(\w+)"', figure)) <= set(run["series"])
+        assert go.Figure(json.loads(re.sub(r'"@\w+"', "[1, 2]", figure))).data
 
 
 def test_every_run_has_its_side_file_and_a_cell_that_leads_to_it(made):
-    store, paths = made
-    ids = set(store.ids())
-    assert {path.stem.removeprefix("run-") for path in (paths.html.parent / "data").glob("run-*.js")} == ids
-    errors = (paths.html.parent / "errors.html").read_text()
-    linked = set(re.findall(r"run\.html#([0-9a-f]{16})", errors))
-    assert linked <= ids and len(linked) == 21  # 5 trackers on 4 sequences, and an import
-    board = page_data(paths.html.parent, "board")
-    assert {run[0] for run in board["runs"]} == ids and len(board["runs"]) == len(ids)
+    folder, ids = made[1].html.parent, made[0].ids()
+    linked = set(re.findall(r"run\.html#([0-9a-f]{16})", (folder / "errors.html").read_text()))
+    assert linked <= set(ids) and len(linked) == 21  # 5 trackers on 4 sequences, and an import
+    board = page_data(folder, "board")
     assert {cell[6] for cell in board["cells"]} == linked
+    listed, paged = (run[0] for run in board["runs"]), (path.stem[4:] for path in folder.glob("data/run-*.js"))
+    assert sorted(listed) == sorted(paged) == sorted(ids)
 
 
 def test_the_leaderboard_orders_and_compares(made):
@@ -110,23 +104,20 @@ def test_failures_are_rows_and_count_as_not_moving(made):
     assert (page["level"], page["verdict"]) == ("red", "Crashed at 30/120 frames: RuntimeError: the map is empty")
     assert page["log"] == (store.folder(failed["run"]) / "log.txt").read_text() == "a log\n"
     markdown = paths.markdown.read_text()
-    assert "2/3 succeeded" in markdown and "counts as a static camera, or worse (1 of 61 runs)" in markdown
+    assert "1/2 succeeded" in markdown and "counts as a static camera, or worse (1 of 41 runs)" in markdown
 
 
 def test_a_report_can_be_made_again_under_another_protocol(made, tmp_path):
     store, paths = made
-    other = build_report(store, tmp_path / "other", protocol="vslam-lab")
+    other = build_report(store, tmp_path / "other", protocol="vslam-lab", most_pages=0)
     assert "Sim(3)-aligned" in other.html.read_text() and "SE(3)-aligned" in paths.html.read_text()
     first, second = ReportData.read(paths.data), ReportData.read(other.data)
     assert {row.protocol_digest for row in first.rows}.isdisjoint({row.protocol_digest for row in second.rows})
     assert not any(name.startswith("rpe_") for name in other.csv)
-    with pytest.raises(
-        ReportError, match=r"cannot mix 2 protocols: tum-rgbd/v1 \[1190f97bbd77\] \(61 rows\) and vslam-lab"
-    ):
-        check_one_protocol(first.rows + second.rows)
-    with pytest.raises(ReportError, match="cannot mix 2 protocols"):
+    mixed = r"cannot mix 2 protocols: tum-rgbd/v1 \[1190f97bbd77\] \(41 rows\) and vslam-lab"
+    with pytest.raises(ReportError, match=mixed):
         compare(paths.data.parent, other.data.parent)
-    with pytest.raises(ReportError, match="cannot mix"):
+    with pytest.raises(ReportError, match=mixed):
         make_board(first.rows + second.rows)
 
 
@@ -135,7 +126,7 @@ def test_reference_that_was_not_run_everywhere_gives_way_to_not_moving(made, tmp
     with pytest.raises(ReportError) as caught:
         build_report(store, tmp_path / "none", reference="orb-slam4")
     assert "orb-slam3" in caught.value.hint and not (tmp_path / "none").exists()
-    paths = build_report(store, tmp_path, reference="orb-slam3")
+    paths = build_report(store, tmp_path, reference="orb-slam3", most_pages=0)
     assert "static camera (from ground truth)" in rows_of(paths.csv["per_sequence"])[-1]["tracker"]
     assert ReportData.read(paths.data).reference == "static camera (from ground truth)"
     assert float(rows_of(paths.csv["leaderboard"])[0]["ATE ratio"]) < 0.2
@@ -144,21 +135,19 @@ def test_reference_that_was_not_run_everywhere_gives_way_to_not_moving(made, tmp
 def test_small_and_odd_results(tmp_path):
     """One run; a sequence without ground truth; nothing but failures; hostile names."""
     hostile = "</script><script>alert(1)</script> & | % _ $"
-    stores = {name: RunStore(tmp_path / name) for name in ("one", "blind", "dead", "hostile")}
+    stores = {name: RunStore(tmp_path / name) for name in ("one", "blind", "dead")}
     add_run(stores["one"], "a", "s/a", mask_iou=0.5)
     add_run(stores["blind"], "a", "s/a", ground_truth=False)
-    for tracker, seed in product(("a", "orb-slam2"), (0, 1)):
-        add_run(stores["dead"], tracker, "s/a", seed, status="crashed", reason="boom", lost=range(120))
-    add_run(stores["hostile"], "evil", "s/a", label=hostile, reason=hostile, status="crashed")
-    add_run(stores["hostile"], "orb-slam2", "s/a")
+    for (tracker, label), seed in product({"evil": hostile, "orb-slam2": ""}.items(), (0, 1)):
+        add_run(stores["dead"], tracker, "s/a", seed, label=label, status="crashed", reason=label, lost=range(120))
     made = {name: build_report(store, tmp_path / f"report-{name}") for name, store in stores.items()}
     assert "a alone is ranked" in made["one"].markdown.read_text()
     assert "in no table of errors: s/a" in made["blind"].markdown.read_text()
     ratios = [row["ATE ratio"] for row in rows_of(made["dead"].csv["leaderboard"])]
     assert ratios == ["nothing succeeded"] * 2 and len(rows_of(made["dead"].csv["failures"])) == 4
-    text = made["hostile"].html.read_text()
+    text = made["dead"].html.read_text()
     assert "<script>alert(1)" not in text and "&lt;script&gt;alert(1)" in text
-    assert r"\textless{}script\textgreater{}" in made["hostile"].latex.read_text()
+    assert r"\textless{}script\textgreater{}" in made["dead"].latex.read_text()
 
 
 @pytest.mark.parametrize(
@@ -212,10 +201,8 @@ def test_lines_are_broken_at_gaps_of_more_than_twice_the_median():
 
 def contents(folder):
     """Every file of a report but those that hold the time when it was made."""
-    files = [
-        path for path in folder.rglob("*") if path.is_file() and path.suffix != ".html" and path.name != "report.md"
-    ]
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
+    files = (path for path in folder.rglob("*.*") if path.suffix != ".html" and path.name != "report.md")
+    return {path.relative_to(folder).as_posix(): digest(path.read_bytes().hex()) for path in files}
 
 
 def refuse(kind):
@@ -239,14 +226,17 @@ def test_workers_make_the_same_report(tmp_path, two_cores, monkeypatch):
     monkeypatch.setattr(load, "MANY", 1000)
     build_report(store, tmp_path / "alone", command="c")
     alone, helped = contents(tmp_path / "alone"), contents(tmp_path / "helped")
-    assert alone.keys() == helped.keys() and len(alone) > len(store.ids())
-    assert [name for name in alone if alone[name] != helped[name]] == []
+    assert alone == helped and len(alone) > len(store.ids())
     scored = [done for done, total, what in events if what.startswith("scoring") and total == len(store.ids())]
     assert scored[-1] == len(store.ids())
 
 
-def test_an_error_of_a_worker_is_raised_and_a_dead_worker_is_named(two_cores):
+def test_workers_run_no_script_of_the_caller_and_their_errors_and_deaths_are_named(two_cores, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "__main__", ModuleType("__main__"))
+    sys.modules["__main__"].__file__ = str(tmp_path / "script.py")
+    (tmp_path / "script.py").write_text("raise SystemExit('a script need not guard what it does at import')")
     with load.worker_pool(1) as pool:
+        assert list(load.run_jobs(pool, abs, [(-2,), (3,)])) == [2, 3]
         for kind, error in (("raise", ReportError), ("die", InfrastructureError)):
             with pytest.raises(error):
                 list(load.run_jobs(pool, refuse, [(kind,)] * 3))
@@ -257,18 +247,6 @@ def test_few_runs_and_one_core_need_no_workers(runs, cores, monkeypatch):
     monkeypatch.setattr(load.os, "sched_getaffinity", lambda _: set(range(cores)), raising=False)
     with load.worker_pool(runs) as pool:
         assert pool is None
-
-
-def test_a_script_needs_no_guard(tmp_path):
-    """Workers do not run the caller's script."""
-    script = tmp_path / "script.py"
-    script.write_text(
-        "from dynslam_bench.reports.model import load\n"
-        "load.MANY = 1\nload.os.sched_getaffinity = lambda _: {0, 1}\nprint('once')\n"
-        "with load.worker_pool(1) as pool:\n    print(list(load.run_jobs(pool, abs, [(-2,), (3,)])))\n"
-    )
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True, timeout=120)
-    assert done.stdout == "once\n[2, 3]\n"
 
 
 @pytest.fixture
@@ -322,7 +300,7 @@ def test_unlisted_runs_count_in_every_cell(tmp_path, monkeypatch):
 def test_long_tables_are_shown_in_part_and_written_whole(monkeypatch):
     monkeypatch.setattr(tables, "MOST_ROWS", 3)
     long = Table("long", "Long", "All of it.", [Column("x")], [[TableCell(str(at), value=at)] for at in range(5)])
-    assert len(long.displayed().rows) == 3 and to_csv(long).splitlines() == ["x", *"01234"]
+    assert len(long.displayed().rows) == 3 and csv_text(long.frame()).splitlines() == ["x", *"01234"]
     assert "All of it. These are the first 3 of 5 rows; all stand in csv/long.csv." in to_markdown(long)
 
 
@@ -356,12 +334,11 @@ def test_csv_of_every_kind_of_column():
 
 def test_rows_are_written_one_a_line_and_read_back(tmp_path):
     rows = [row(run_id=digest([at], 16), reason="postgresql://me:secret@db/x") for at in range(3)]
+    path = tmp_path / "report.json"
     for some in (rows, rows[:1], []):
-        ReportData(title="t", protocol="p", reference="r", version="1", rows=some).write(tmp_path / "report.json")
-        text = (tmp_path / "report.json").read_text()
-        read = ReportData.read(tmp_path / "report.json")
-        assert [each.run_id for each in read.rows] == [each.run_id for each in some]
-        assert "secret" not in text and len(text.splitlines()) == len(some) + 2
+        ReportData(title="t", protocol="p", reference="r", version="1", rows=some).write(path)
+        assert [each.run_id for each in ReportData.read(path).rows] == [each.run_id for each in some]
+        assert "secret" not in path.read_text() and len(path.read_text().splitlines()) == len(some) + 2
 
 
 HEAD = b"index,timestamp,state,frame_error_trans_m,dynamic_share\n"
@@ -379,21 +356,20 @@ DAMAGE = {
 
 
 def test_damaged_files_of_a_store_cost_only_their_own_figures_and_are_named(store, tmp_path):
-    sound = [add_run(store, name, "s/a", error=error, n=40) for name, error in (("a", 0.01), ("b", 0.02))]
-    hurt = {add_run(store, "a", "s/a", seed, n=40): damage for seed, damage in enumerate(DAMAGE, start=2)}
-    for run_id in sound:
-        add_frames(store.folder(run_id), 40)
+    sound = add_run(store, "b", "s/a", n=40)
+    add_frames(store.folder(sound), 40)
+    hurt = {add_run(store, "a", "s/a", seed, n=40): damage for seed, damage in enumerate(DAMAGE)}
     for run_id, damage in hurt.items():
         (store.folder(run_id) / "frames.csv").write_bytes(DAMAGE[damage])
     for name, text in (("d" * 16, "{"), ("e" * 16, '{"schema_version": 99, "new": 1}')):
         (store.runs / name).mkdir()
         (store.runs / name / "run.json").write_text(text)
     paths = build_report(store, tmp_path / "report")
-    pages = {run_id: page_data(paths.html.parent, f"run-{run_id}") for run_id in (*sound, *hurt)}
     for run_id, damage in hurt.items():
-        assert any("frames.csv" in note for note in pages[run_id]["notes"]), damage
-        assert "t" not in pages[run_id]["series"] and "track_x" in pages[run_id]["series"], damage
-    assert all("t" in pages[run_id]["series"] for run_id in sound)
+        page = page_data(paths.html.parent, f"run-{run_id}")
+        assert any("frames.csv" in note for note in page["notes"]), damage
+        assert "t" not in page["series"] and "track_x" in page["series"], damage
+    assert "t" in page_data(paths.html.parent, f"run-{sound}")["series"]
     assert "2 folders without a valid record" in paths.html.read_text()
     assert {"d" * 16, "e" * 16} <= set(re.findall(r"runs/(\w{16})", (paths.html.parent / "reproduce.html").read_text()))
 
@@ -421,12 +397,11 @@ def test_a_final_trajectory_of_few_frames_is_no_success(tmp_path):
     for name, kept in (("whole", None), ("thin", [0, 1, 2, 3])):
         add_run(store, name, "s/a", error=0.01, final_error=0.005, final_frames=kept)
     protocol = PROTOCOL.model_copy(update={"id": "x/v1", "trajectory": "final"})
-    rows = {row.tracker.id: row for row in load_runs([store], protocol).rows}
-    assert (rows["whole"].coverage, rows["whole"].failed) == (1.0, False)
-    thin = rows["thin"]
+    thin, whole = sorted(load_runs([store], protocol).rows, key=lambda row: row.tracker.id)
+    assert (whole.coverage, whole.failed) == (1.0, False)
     assert (thin.n_tracked, thin.failed, thin.status) == (4, True, "lost") and thin.coverage < 0.1
     assert "the final trajectory has poses of 4 of" in thin.reason and thin.ending.startswith("lost, 4/")
-    assert {row.tracker.id: row.failed for row in load_runs([store], PROTOCOL).rows} == dict.fromkeys(rows, False)
+    assert not any(row.failed for row in load_runs([store], PROTOCOL).rows)
 
 
 def test_what_was_lost_as_it_came_and_found_in_the_end_is_a_success_of_the_final_trajectory(tmp_path):

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from reports_fake_store import add_frames, add_run
-from reports_rows import PROTOCOL, cell_of, crashed, page_data, row, rows_of
+from reports_rows import PROTOCOL, cell_of, columns_of, crashed, page_data, row, rows_of
 
 from dynslam_bench.reports import build_report, compare, load_board, load_frame
 from dynslam_bench.reports.html.run_pages import RunPage, error_by_share, share_sums
@@ -45,10 +46,8 @@ def test_losing_frames_is_not_free(store, tmp_path):
 
 
 def test_a_failure_never_scores_better_than_not_moving():
-    assert crashed().score_m == 0.3
-    assert crashed(hold_last_pose_ate_m=0.7).score_m == 0.7
-    assert crashed(hold_last_pose_ate_m=None, metrics={}).score_m == 0.3
-    assert crashed(static_camera_ate_rmse_m=None).score_m is None
+    kinds = {}, {"hold_last_pose_ate_m": 0.7}, {"hold_last_pose_ate_m": None}, {"static_camera_ate_rmse_m": None}
+    assert [crashed(**changes).score_m for changes in kinds] == [0.3, 0.7, 0.3, None]
 
 
 def test_a_tracker_that_never_succeeded_stands_below_all_and_is_never_emphasised():
@@ -67,9 +66,7 @@ def test_a_tracker_that_never_succeeded_stands_below_all_and_is_never_emphasised
     for each, partly in zip(relative_errors(board, PROTOCOL), relative_errors(half, PROTOCOL), strict=True):
         assert [cells[0].text for cells in each.rows] == ["GOOD", "BAD", "CONTROL"]
         assert cell_of(each, "GOOD").emphasis == "best"
-        assert [(cell_of(partly, "C", at).text, cell_of(partly, "C", at).emphasis) for at in (1, 2)] == [
-            ("", "failed")
-        ] * 2
+        assert [(cell.text, cell.emphasis) for cell in cell_of(partly, "C", slice(1, 3))] == [("", "failed")] * 2
 
 
 def test_a_cell_with_one_failure_is_not_bold_and_not_green():
@@ -77,19 +74,16 @@ def test_a_cell_with_one_failure_is_not_bold_and_not_green():
     rows += [row("mixed", error=0.01, seed=0), row("mixed", error=0.02, seed=1), crashed("mixed", seed=2)]
     board = make_board(rows, reference="ref")
     cell = cell_of(per_sequence(board, PROTOCOL), "MIXED")
-    assert cell.emphasis == ""
-    assert cell.shade == 0.0
-    assert "2/3 succeeded" in cell.small
-    assert "crashed at 20/60" in cell.tip
+    assert (cell.emphasis, cell.shade) == ("", 0.0)
+    assert "2/3 succeeded" in cell.small and "crashed at 20/60" in cell.tip
     success = {cells[2].text: cells[1].text for cells in leaderboard(board, PROTOCOL).rows}
     assert success == {"GOOD": "3/3", "REF": "3/3", "MIXED": "2/3"}
 
 
 def test_ways_to_fail_are_named():
-    assert crashed(status="timeout").ending == "timeout at 20/60"
-    assert crashed(status="lost", n_tracked=12).ending == "lost, 12/60 tracked"
-    assert crashed(status="ok", not_evaluated=True).ending == "not evaluated"
-    assert row().ending == ""
+    runs = crashed(status="timeout"), crashed(status="lost", n_tracked=12), crashed(status="ok", not_evaluated=True)
+    endings = ["timeout at 20/60", "lost, 12/60 tracked", "not evaluated", ""]
+    assert [run.ending for run in (*runs, row())] == endings
     board = make_board([crashed(seed=0), crashed(seed=1, n_processed=31), row("g")])
     assert cell_of(per_sequence(board, PROTOCOL), "C").text == "2 failed: crashed at 20/60; crashed at 31/60"
 
@@ -158,11 +152,12 @@ def test_a_final_trajectory_stands_in_no_online_table(tmp_path):
     assert note in paths.markdown.read_text() and len(rows_of(alone.csv["final_trajectory"])) == 1
 
 
-def test_imports_of_several_files_are_repeats_and_not_dropped(store):
+@pytest.mark.parametrize(("kind", "kept"), [("imported", 3), ("run", 1)])
+def test_imports_of_several_files_are_repeats_and_a_run_made_again_supersedes(store, kind, kept):
     for day in (1, 2, 3):
-        add_run(store, "orb-slam3", "s/a", kind="imported", started=f"2026-01-0{day}T00:00:00+00:00")
+        add_run(store, "orb-slam3", "s/a", kind=kind, started=f"2026-01-0{day}T00:00:00+00:00")
     loaded = load_runs([store], PROTOCOL)
-    assert (len(loaded.rows), loaded.superseded) == (3, 0)
+    assert (len(loaded.rows), loaded.superseded) == (kept, 3 - kept)
 
 
 # -- repeats
@@ -171,9 +166,8 @@ def test_imports_of_several_files_are_repeats_and_not_dropped(store):
 def test_copies_are_no_repeats():
     rows = [row("copy", error=0.1, seed=i) for i in range(4)]
     board = make_board([*rows, *(row("real", error=0.1 + 0.01 * i, seed=i) for i in range(4))])
-    table = per_sequence(board, PROTOCOL)
+    table, copies = per_sequence(board, PROTOCOL), board.cells[rows[0].variant_key]["s"]
     assert [cell_of(table, name).small for name in ("COPY", "REAL")] == ["deterministic", "±7.5"]
-    copies = board.cells[rows[0].variant_key]["s"]
     assert (len(copies.scores), len(copies.rows)) == (1, 4)
 
 
@@ -183,10 +177,9 @@ def test_offsets_and_noise_are_repeats_of_one_cell():
     board = make_board(rows)
     assert board.sequences == ["s"]
     (cell,) = (cells["s"] for cells in board.cells.values())
-    assert len(cell.rows) == 7
+    assert len(cell.rows) == 7 and not cell.deterministic
     assert sorted(cell.scores) == pytest.approx([0.1, 0.11, 0.12, 0.15])
     assert [r.repeat for r in cell.rows][:3] == ["seed 0", "seed 1", "seed 0, noise 5"]
-    assert not cell.deterministic
 
 
 def test_a_deterministic_trackers_offsets_keep_apart_in_the_store(store):
@@ -208,8 +201,7 @@ def test_times_from_the_cache_are_marked(store):
     add_run(store, "real", "s/a", cached=True, frame_s=0.02, provenance="external")
     board = make_board(load_runs([store], PROTOCOL).rows)
     table = leaderboard(board, PROTOCOL)
-    column = [column.name for column in table.columns].index("× real time")
-    times = {cells[2].text: cells[column].small for cells in table.rows}
+    times = {cell.text: time.small for cell, time in zip(*columns_of(table, "tracker", "× real time"), strict=True)}
     assert times == {"cached": "10.0 ms†", "both": "50.0 ms", "fresh": "20.0 ms", "real": "20.0 ms"}
     assert "†" in table.caption
     flags = {(r.tracker, r.sequence): r.cached for r in board.frame().itertuples()}
@@ -218,20 +210,17 @@ def test_times_from_the_cache_are_marked(store):
 
 def test_the_share_without_fundamental_matrix_stands_beside_the_error():
     board = make_board([row("ours", s, epipolar_skipped=0.98) for s in "st"] + [row("plain", s, 0.2) for s in "st"])
-    table = leaderboard(board, PROTOCOL)
-    column = [c.name for c in table.columns].index("F skipped")
-    assert {cells[2].text: cells[column].text for cells in table.rows} == {"OURS": "98 %", "PLAIN": ""}
+    assert [cell.text for cell in columns_of(leaderboard(board, PROTOCOL), "F skipped")[0]] == ["98 %", ""]
     errors = per_sequence(board, PROTOCOL)
     assert (cell_of(errors, "OURS").small, cell_of(errors, "PLAIN").small) == ("F skipped 98 %", "")
     assert "F skipped" not in [c.name for c in leaderboard(make_board([row()]), PROTOCOL).columns]
 
 
 def test_the_page_of_a_run_stacks_stages_alone_and_claims_no_share_of_people_where_there_are_no_masks(store, tmp_path):
-    shown = {}
-    for name, known in {"exact": {}, "own": {"exact": False}, "none": {"exact": False, "masks": False}}.items():
-        run_id = add_run(store, name, f"s/{name}", n=40)
-        add_frames(store.folder(run_id), 40, **known)
-        shown[name] = run_id
+    kinds = {"exact": {}, "own": {"exact": False}, "none": {"exact": False, "masks": False}}
+    shown = {name: add_run(store, name, f"s/{name}", n=40) for name in kinds}
+    for name, masks in kinds.items():
+        add_frames(store.folder(shown[name]), 40, **masks)
     folder = build_report(store, tmp_path / "report").html.parent
     runs = {name: page_data(folder, f"run-{run_id}") for name, run_id in shown.items()}
     stacked = {name: [trace["name"] for trace in run["figures"]["stages"]["data"]] for name, run in runs.items()}
@@ -252,14 +241,10 @@ def test_little_data_claims_little():
     rows = [row("orb-slam2", "s", 0.2237), row("orb-slam2", "t", 0.02)]
     rows += [row("a", "s", 0.2196), row("a", "t", 0.01)]
     table = leaderboard(make_board(rows), PROTOCOL)
-    names = [c.name for c in table.columns]
-    assert "P(better)" not in names
-    for cells in table.rows:
-        assert (cells[0].text, cells[0].small) == ("1–2", "")
-        assert cells[names.index("ATE ratio")].small == ""
-        assert cells[names.index("ATE ratio")].emphasis == ""
-        assert cells[names.index("better?")].text in ("", "reference")
-    assert [cells[names.index("wins")].text for cells in table.rows] == ["2 of 2", ""]
+    ranks, ratios, *others = columns_of(table, "#", "ATE ratio", "better?", "wins")
+    assert [(cell.text, cell.small) for cell in ranks] == [("1–2", "")] * 2
+    assert [(cell.small, cell.emphasis) for cell in ratios] == [("", "")] * 2
+    assert [cell.text for column in others for cell in column] == ["", "reference", "2 of 2", ""]
 
 
 def test_bold_is_not_given_to_most():
@@ -272,8 +257,7 @@ def test_bold_is_not_given_to_most():
 
     def bold(rows):
         table = leaderboard(make_board(rows, reference=rows[0].tracker.id), PROTOCOL)
-        place = [column.name for column in table.columns].index("ATE ratio")
-        return [cells[place].emphasis for cells in table.rows]
+        return [cell.emphasis for cell in columns_of(table, "ATE ratio")[0]]
 
     assert bold(apart) == ["best", "", ""]
     assert bold(near + far) == [""] * 4
@@ -312,10 +296,7 @@ def test_what_is_no_better_than_not_moving_is_named():
     small = {cells[0].text: [cell.small for cell in cells[1:]] for cells in per_sequence(board, PROTOCOL, []).rows}
     assert "no better than a static camera" in small["FROZEN"][0]
     worse = make_board([row("frozen", s, 0.3) for s in "st"] + [row("orb-slam2", s, 0.6) for s in "st"])
-    cells = (
-        cell_of(per_sequence(worse, PROTOCOL, []), "FROZEN"),
-        cell_of(per_sequence(worse, PROTOCOL, []), "ORB-SLAM2"),
-    )
+    cells = (cell_of(per_sequence(worse, PROTOCOL, []), name) for name in ("FROZEN", "ORB-SLAM2"))
     assert [(cell.emphasis, cell.shade) for cell in cells] == [("", 0.0)] * 2, "neither bold nor blue"
     assert not any("no better" in text for name in ("GOOD", "CONTROL", "FLAKY") for text in small[name])
 
@@ -325,7 +306,7 @@ def test_columns_of_two_cameras_are_named_by_them(store):
     add_run(store, "a", "folder/s", camera=right, block="right")
     add_run(store, "b", "folder/s", camera=right | {"fx": 400.0}, block="wrong")
     board = make_board(load_runs([store], PROTOCOL).rows)
-    assert board.sequences == ["folder/s (camera 640x480, f 400 525)", "folder/s (camera 640x480, f 525 525)"]
+    assert board.sequences == [f"folder/s (camera 640x480, f {fx} 525)" for fx in (400, 525)]
 
 
 def test_the_same_frames_are_one_column_in_every_spelling(store):
@@ -340,9 +321,8 @@ def test_the_same_frames_are_one_column_in_every_spelling(store):
 def test_names_of_columns_are_never_alike():
     same = dict(sequence="folder/x", content="c" * 12)
     rows = [row(**same, block="b1"), row(**same, block="b2"), row(sequence="folder/x", content="d" * 12, block="b3")]
-    names = name_columns(rows)
-    assert len(set(names.values())) == 3
-    assert all(name.startswith("folder/x (") for name in names.values())
+    names = set(name_columns(rows).values())
+    assert len(names) == 3 and all(name.startswith("folder/x (") for name in names)
     deep = [row(sequence="folder/x", block=str(i), place=p, frames=(0, 9)) for i, p in enumerate(["/a/1/x", "/b/1/x"])]
     assert list(name_columns(deep).values()) == ["a/1/x [0:9]", "b/1/x [0:9]"]
 
@@ -350,9 +330,8 @@ def test_names_of_columns_are_never_alike():
 def test_sequences_are_grouped_from_static_to_dynamic():
     tags = {"z": ["static"], "b": ["high-dynamic"], "a": ["low-dynamic"], "c": ["high-dynamic"], "d": []}
     board = make_board([row(sequence=name, tags=names) for name, names in tags.items()])
-    groups = [(name, board.groups[name]) for name in board.sequences]
-    dynamic = [("a", "low dynamic"), ("b", "high dynamic"), ("c", "high dynamic")]
-    assert groups == [("z", "static"), *dynamic, ("d", "other")]
+    groups = ["static", "low dynamic", "high dynamic", "high dynamic", "other"]
+    assert [(name, board.groups[name]) for name in board.sequences] == [*zip("zabcd", groups, strict=True)]
 
 
 @pytest.mark.parametrize(
@@ -444,16 +423,14 @@ def test_runs_of_two_programs_are_two_rows_and_the_older_is_not_ranked(
     board = load_board(store)
     rows = sequences_by_row(board, "mine")
     assert len(rows) == 2 and all(len(sequences) == 1 and f" {name} " in label for label, sequences in rows.items())
-    newer = {board.first(key).started[:10] for key in board.ranked if board.first(key).tracker.id == "mine"}
-    older = [board.first(key).is_current for key, label in board.labels.items() if label in rows]
-    assert newer <= {"2026-01-02"} and sorted(older) == [False, True]
+    current = {row.started[:10]: row.is_current for row in board.rows if row.tracker.id == "mine"}
+    assert current == {"2026-01-01": False, "2026-01-02": True}
+    assert not any(row.variant_key in board.ranked for row in board.rows if not row.is_current)
 
 
 def test_a_program_that_ran_everything_again_supersedes_the_older_one(store: RunStore) -> None:
-    for day, source in enumerate("12", start=1):
-        for sequence in SEQUENCES:
-            started = f"2026-01-0{day}T00:00:00+00:00"
-            add_run(store, "mine", sequence, identity=made_by(source=source), started=started)
+    for source, sequence in product("12", SEQUENCES):
+        add_run(store, "mine", sequence, identity=made_by(source=source), started=f"2026-01-0{source}T00:00:00+00:00")
     loaded = load_runs([store], PROTOCOL)
     assert loaded.superseded == 2 and {row.started[:10] for row in loaded.rows} == {"2026-01-02"}
     assert list(sequences_by_row(load_board(store), "mine")) == ["mine"]
@@ -499,14 +476,12 @@ OLD, NEW = "synthetic/walking_xyz?scene=3", "synthetic/walking_xyz?scene=103"
 
 
 @pytest.fixture
-def seen(tmp_path):
+def seen(store):
     """Four trackers, two with the network's masks, on a scene of the training set and on a held-out one."""
-    store = RunStore(tmp_path / "results")
-    for sequence in (OLD, NEW):
-        add_run(store, "orb-slam2", sequence, error=0.05)
-        add_run(store, "mask-rcnn", sequence, error=0.01, masks="embedded")
-        add_run(store, "dynaslam", sequence, error=0.03, masks="embedded")
-        add_run(store, "ds-slam", sequence, error=0.02, masks="yolo")
+    masks = {"orb-slam2": ("", 0.05), "mask-rcnn": ("embedded", 0.01), "dynaslam": ("embedded", 0.03),
+             "ds-slam": ("yolo", 0.02)}  # fmt: skip
+    for sequence, (tracker, (source, error)) in product((OLD, NEW), masks.items()):
+        add_run(store, tracker, sequence, error=error, masks=source)
     return store
 
 
@@ -526,8 +501,7 @@ def test_what_the_embedded_network_was_trained_on(source, sequence, seen):
     assert seen_in_training(source, sequence) is seen
 
 
-def test_a_tracker_that_was_judged_only_where_its_network_was_trained_is_not_ranked(tmp_path):
-    store = RunStore(tmp_path / "results")
+def test_a_tracker_that_was_judged_only_where_its_network_was_trained_is_not_ranked(store):
     for tracker, masks in (("orb-slam2", ""), ("ds-slam", "yolo"), ("mask-rcnn", "embedded")):
         add_run(store, tracker, OLD, masks=masks, error=0.001 if masks == "embedded" else 0.03)
     board = load_board(store)
@@ -558,8 +532,7 @@ def test_every_format_carries_the_mark(seen, tmp_path, rank_seen):
     assert "§" in to_markdown(compare(seen, seen).table)
 
 
-def test_a_recording_of_unknown_length_beside_published_numbers_is_named(tmp_path):
-    store = RunStore(tmp_path / "r")
+def test_a_recording_of_unknown_length_beside_published_numbers_is_named(store, tmp_path):
     for name in ("bonn/balloon", "tum/fr3/walking_rpy"):
         add_run(store, "orb-slam2", name, block=name, duration_s=30.6)
     markdown = build_report(store, tmp_path / "report").markdown.read_text()
@@ -567,9 +540,8 @@ def test_a_recording_of_unknown_length_beside_published_numbers_is_named(tmp_pat
     assert least_length_s("bonn/balloon") is None and not is_excerpt("bonn/balloon", 1.0), "no source, no claim"
 
 
-def test_what_was_put_together_here_is_called_no_system_of_ours(tmp_path):
+def test_what_was_put_together_here_is_called_no_system_of_ours(store, tmp_path):
     """The back end in the manner of ORB-SLAM2 and masks by Mask R-CNN are others' systems in our composition."""
-    store = RunStore(tmp_path / "results")
     for tracker in ("orb-slam2", "mask-rcnn", "emfoa-oft"):
         assert TRACKERS.get(tracker).provenance == "own"
         add_run(store, tracker, NEW, provenance="own")
