@@ -65,7 +65,10 @@ class StageCache:
         except (DynslamError, KeyError):
             entry = None
         with contextlib.suppress(OSError):  # a cache that can only be read, or one that another process has evicted of
-            os.utime(path) if entry else path.unlink()
+            if entry is None:
+                path.unlink()
+            else:
+                os.utime(path)
         return entry
 
     def put(self, stage: str, key: str, arrays: Mapping[str, NDArray[Any]], cost_s: float) -> None:

@@ -96,16 +96,16 @@ def evaluate(
         estimate: Camera-to-world poses of the tracked frames, in any world frame that the protocol's alignment undoes.
         ground_truth: True camera-to-world poses at their own stamps; may have holes.
         protocol: A protocol or the id of a registered one.
-        input_timestamps: Stamps in seconds of all input frames; needed for coverage and for the lost-frame policies
-            ``hold`` and ``fail``.
+        input_timestamps: Stamps in seconds of all input frames; needed for coverage and for the lost-frame policy
+            ``hold``.
 
     Returns:
         Every metric that is defined. A relative error whose delta is longer than the trajectory is left out and the
         diagnostics say so.
 
     Raises:
-        EvaluationError: Fewer than two poses have ground truth (with the measured gaps), the policy needs the input
-            frames, or a frame was lost where the policy allows none.
+        EvaluationError: Fewer than two poses have ground truth (with the measured gaps), or the policy needs the
+            input frames.
     """
     protocol = get_protocol(protocol)
     diagnostics: list[str] = []

@@ -121,8 +121,8 @@ def _write_page(row: RunRow, pictured: bool, share: Mapping[int, float], protoco
         return RunPage(row.variant_key, *earlier[1:])
     record, frames = row.store.read_whole(row.run_id), read_frames(row, share)
     content = run_content(row, record, frames, protocol, _copy_pictures(row, output) if pictured else [])
-    known = (frames.share_source == EXACT) & (not row.failed)
-    exact = np.isfinite(frames.errors_m) & np.isfinite(frames.share) & known
+    has_exact = (frames.share_source == EXACT) & (not row.failed)
+    exact = np.isfinite(frames.errors_m) & np.isfinite(frames.share) & has_exact
     sums = share_sums(frames.share[exact], frames.errors_m[exact])
     write_side(output, name, content | {"files": files}, remark=[made_of, *sums])
     return RunPage(row.variant_key, *sums)

@@ -116,7 +116,7 @@ COLUMNS = (
 def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
     failed, groups = sum(row.failed for row in board.rows), dict.fromkeys(board.groups[name] for name in board.common)
     several = len(groups) > 1 and board.category == OVERALL
-    mean = f"It is a mean over {_count(len(groups), 'category')} ({', '.join(groups)}), which all weigh the same. "
+    mean = f"It is a mean over {len(groups)} categories ({', '.join(groups)}), which all weigh the same. "
     intervals = (
         "Brackets: Student's 95 % intervals over sequences."
         if len(board.common) >= FEWEST
