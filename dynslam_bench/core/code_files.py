@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import threading
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
@@ -15,6 +16,7 @@ CODE = (".py", ".so", ".pyd", ".dylib", ".dll")
 _TEXT = (".py", ".sh", ".bash", ".pl", ".rb", ".lua", ".js", ".jl", ".yaml", ".yml", ".toml", ".json", ".cfg", ".ini",
          ".xml", ".c", ".cc", ".cpp", ".cu", ".h", ".hpp")  # fmt: skip
 _LARGEST_TEXT = 1 << 20
+_PARSING = threading.Lock()
 _WORD = re.compile(rb"[\w./~+\-]+")
 _QUOTED = re.compile(rb"[\"']([\w.+\-]+)(?:/[^\"'\n]*)?[\"']")
 """A text in quotes that could be a path, of which the first part is taken."""
@@ -76,6 +78,16 @@ def program_files(folder: Path) -> list[Path]:
     return sure + _named(sure, [file for file in everything if file not in set(sure)])
 
 
+def parsed(source: bytes) -> ast.Module:
+    """`ast.parse`, one thread at a time: in Python 3.11 two at once can fail with a SystemError.
+
+    Raises:
+        SyntaxError: It is no Python of this version; ValueError and RecursionError likewise.
+    """
+    with _PARSING:
+        return ast.parse(source)
+
+
 def imported_modules(files: Iterable[Path]) -> set[str]:
     """Top-level names of the modules that Python sources import, by statements or by names in ``import_module``.
 
@@ -85,7 +97,7 @@ def imported_modules(files: Iterable[Path]) -> set[str]:
     modules: set[str] = set()
     for file in filter(is_python, files):
         try:
-            nodes = list(ast.walk(ast.parse(file.read_bytes())))
+            nodes = list(ast.walk(parsed(file.read_bytes())))
         except (SyntaxError, ValueError, RecursionError):  # of another version of Python
             continue
         for node in nodes:

@@ -30,6 +30,7 @@ from dynslam_bench.core.code_files import (
     is_code,
     is_installed,
     leads_back,
+    parsed,
     program_files,
 )
 from dynslam_bench.core.errors import DynslamError, PluginError, raising
@@ -297,7 +298,7 @@ def syntax_digest(source: bytes) -> str:
     It does not depend on the version of Python that parses it. What cannot be parsed counts by its bytes.
     """
     try:
-        words = "\0".join(_tokens_of(ast.parse(source)))
+        words = "\0".join(_tokens_of(parsed(source)))
     except (SyntaxError, ValueError, RecursionError):
         return hashlib.sha256(source).hexdigest()
     return hashlib.sha256(words.encode(errors="backslashreplace")).hexdigest()

@@ -219,15 +219,18 @@ def _module_name(path: Path) -> str:
 
 
 def _load_file(path: Path) -> ModuleType:
-    resolved, name = path.expanduser().resolve(), _module_name(path)
+    resolved = path.expanduser().resolve()
+    if not resolved.is_file():
+        raise FileNotFoundError(f"no file {resolved}")
+    name = _module_name(path)
     if name in sys.modules:
         return sys.modules[name]
-    # from its text: byte code of an edit of equal length in the same second would pass for that of this one
-    code = compile(resolved.read_bytes(), resolved, "exec")
-    module = sys.modules[name] = ModuleType(name)
-    module.__file__ = str(resolved)
-    try:
-        exec(code, module.__dict__)
+    spec = importlib.util.spec_from_file_location(name, resolved)
+    assert spec is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:  # from its text: byte code of an edit of equal length in the same second would pass for that of this one
+        exec(compile(resolved.read_bytes(), resolved, "exec"), module.__dict__)
     except BaseException:
         del sys.modules[name]
         raise

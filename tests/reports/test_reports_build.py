@@ -261,6 +261,7 @@ def opened(monkeypatch):
 def test_fifty_known_runs_cost_no_file_each(store, tmp_path, opened):
     for number in range(50):
         add_run(store, f"tracker-{number % 5}", f"s/{number % 2}", number // 10, n=20)
+    opened.clear()
     load_runs([store], PROTOCOL)
     assert opened.count("run.json") == 50
     opened.clear()
