@@ -24,7 +24,7 @@ import psutil
 from optuna.exceptions import StorageInternalError, UpdateFinishedTrialError
 from optuna.storages import BaseStorage, RDBStorage, journal
 from optuna.trial import FrozenTrial, TrialState, create_trial
-from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
+from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError, PendingRollbackError
 
 from dynslam_bench.core import HIDDEN, StudyError, raising, read_json, repeating, without_passwords
 from dynslam_bench.core.records import Record, validated
@@ -287,7 +287,8 @@ class PatientStorage(RDBStorage):
 
 
 BEGINNING_S, PATIENCE_S = 5.0, 60.0
-_NO_ANSWER = (OperationalError, InterfaceError)
+_NO_ANSWER = (OperationalError, InterfaceError, PendingRollbackError)
+"""Errors of a database that is away; the last one where it went within a transaction."""
 
 
 def _patient(method: Callable[..., Any]) -> Callable[..., Any]:
