@@ -98,9 +98,10 @@ class RecordTrajectory(SlamWrapper):
         """
         outcome = self.env.step(action)
         if outcome[2] or outcome[3]:
-            self.written.append(Path(self._pattern.replace("{episode}", str(self._episode))))
+            path = Path(self._pattern.replace("{episode}", str(self._episode)))
             comment = f"{self._base.tracker_spec.id} on {self._base.sequence.id}, online"
-            write_tum(self.written[-1], self._base.online_trajectory(), comment=comment)
+            write_tum(path, self._base.online_trajectory(), comment=comment)
+            self.written.append(path)
         return outcome
 
 

@@ -266,16 +266,16 @@ def open_database(url: str) -> BaseStorage:
     Raises:
         Exception: What the database's driver raises.
     """
-    deadline = time.monotonic() + BEGINNING_S
-    while True:
+    for attempt in range(ATTEMPTS):
         try:  # a server takes few connections, e.g. 100
             storage = PatientStorage(url, engine_kwargs={"pool_pre_ping": True, "pool_size": 1})
             return optuna.storages.get_storage(storage)
         except (DBAPIError, StorageInternalError) as error:
             cause = str(error.__cause__ or error).lower()
-            if time.monotonic() > deadline or not any(words in cause for words in _BEING_MADE):
+            if attempt + 1 == ATTEMPTS or not any(words in cause for words in _BEING_MADE):
                 raise
         time.sleep(random.uniform(0.05, 0.5))
+    raise AssertionError("unreachable")
 
 
 class PatientStorage(RDBStorage):
@@ -286,7 +286,7 @@ class PatientStorage(RDBStorage):
     """
 
 
-BEGINNING_S, PATIENCE_S = 5.0, 60.0
+ATTEMPTS, PATIENCE_S = 10, 60.0
 _NO_ANSWER = (OperationalError, InterfaceError, PendingRollbackError)
 """Errors of a database that is away; the last one where it went within a transaction."""
 
@@ -373,8 +373,8 @@ class Heartbeats:
         if worker := trial.user_attrs.get("worker"):
             return self._has_ended(worker)
         alive = {key.removeprefix(_ALIVE) for key in self._study.user_attrs if key.startswith(_ALIVE)}
-        waited_s = self._stands_still(f"trial {trial.number}", None)
-        return waited_s > NAMELESS_S and all(map(self._has_ended, alive - {self._name}))
+        others_ended = all(map(self._has_ended, alive - {self._name}))  # starts their clocks
+        return self._stands_still(f"trial {trial.number}", None) > NAMELESS_S and others_ended
 
     def _has_ended(self, name: str) -> bool:
         machine, _, pid = name.rpartition(":")

@@ -79,7 +79,7 @@ def replace_folder(work: Path, target: Path) -> None:
     system can exchange two names at once: Linux, on its own file systems; elsewhere it is missing for a moment).
 
     Raises:
-        OSError: It cannot be renamed; then `target` is as it was, where two names can be exchanged.
+        OSError: It cannot be renamed; then `target` is as it was.
     """
     old = work.with_name(f"{work.name}.old")
     while True:
@@ -88,6 +88,8 @@ def replace_folder(work: Path, target: Path) -> None:
             break
         except OSError as error:
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                with suppress(OSError):  # what was moved aside below, if anything was
+                    old.rename(target)
                 raise
         if _exchange(work, target):
             old = work

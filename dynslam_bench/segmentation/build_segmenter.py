@@ -136,6 +136,8 @@ def segmentation_source(settings: Settings, sequence: Sequence, *, fetch: bool =
         path = Path(argument).expanduser()
         stat = path.stat() if path.is_file() else None
         _check_network(kind, argument, group, stat and (stat.st_size, stat.st_mtime_ns))
+    elif kind == "embedded" and not embedded_weights().is_file():
+        raise SegmentationError("the embedded network's weights are missing from this installation", "reinstall it")
     elif kind == "coco" and fetch:
         fetch_checkpoint(COCO)
     elif kind == "plugin":

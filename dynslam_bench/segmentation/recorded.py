@@ -67,8 +67,9 @@ class RecordedSegmenter:
             numbers = np.array([float(file.stem if self.by_stamp else int(file.stem)) for file in files])
             if not np.isfinite(numbers).all():
                 raise ValueError("a stamp is not finite")
-        self._keys: NDArray[np.float64] = numbers
-        self._files = files
+        order = np.argsort(numbers, kind="stable")
+        self._keys: NDArray[np.float64] = numbers[order]
+        self._files = [files[i] for i in order]
         self._names = read_classes(self.folder / CLASSES_FILE) or dict.fromkeys(range(1 << 16), "person")
 
     def segment(self, frame: Frame) -> Instances:

@@ -5,12 +5,15 @@ Between its runs, masks are carried along by optical flow.
 
 from __future__ import annotations
 
+import atexit
 import time
 import warnings
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, wait
 from copy import copy
 from dataclasses import dataclass, replace
+from threading import Thread
 from typing import Any
+from weakref import WeakSet
 
 import cv2
 import numpy as np
@@ -30,6 +33,10 @@ SMOOTHING = 0.5
 """Weight of the newest velocity."""
 STAMP_TOLERANCE_S = 1e-3
 """Masks are due so much early: sums of stamps and latencies are rounded."""
+EXIT_S = 10.0
+"""At its end the process waits so long for a segmenter: a thread that it stops within a network would abort it."""
+_working: WeakSet[Future[tuple[Instances, float]]] = WeakSet()
+atexit.register(lambda: wait(_working, EXIT_S))
 
 
 @dataclass(eq=False)
@@ -160,9 +167,9 @@ class MaskScheduler:
         else:
             self._instances = carry_dense(self._instances, flow)
         if request is None or taken:
-            worker = ThreadPoolExecutor(1)
-            answer = worker.submit(_segment, self._frozen(), frame)
-            worker.shutdown(wait=False)  # it ends with this frame; the process waits for it at its end
+            answer: Future[tuple[Instances, float]] = Future()
+            _working.add(answer)
+            Thread(target=_segment, args=(self._frozen(), frame, answer), daemon=True).start()
             since = self._age if request is None else request.age
             self._request = _Request(frame.timestamp + self._settings.latency_s, since, answer, np.zeros_like(flow))
         return taken
@@ -182,12 +189,15 @@ class MaskScheduler:
         return keyframe or self._age >= MAX_CARRY
 
 
-def _segment(segmenter: Segmenter, frame: Frame) -> tuple[Instances, float]:
-    """Segment a frame in a thread of its own: the objects, and the seconds without the stage cache."""
-    if isinstance(segmenter, ConfiguredSegmenter) and isinstance(segmenter.inner, CachedSegmenter):
-        segmenter.inner = segmenter.inner.network()
-    start = time.perf_counter()
-    return segmenter.segment(frame), time.perf_counter() - start
+def _segment(segmenter: Segmenter, frame: Frame, answer: Future[tuple[Instances, float]]) -> None:
+    """Segment a frame in a thread of its own; the answer holds the objects and the seconds, or the error."""
+    try:
+        if isinstance(segmenter, ConfiguredSegmenter) and isinstance(segmenter.inner, CachedSegmenter):
+            segmenter.inner = segmenter.inner.network()
+        start = time.perf_counter()
+        answer.set_result((segmenter.segment(frame), time.perf_counter() - start))
+    except BaseException as error:  # raised again where the masks are taken
+        answer.set_exception(error)
 
 
 @dataclass

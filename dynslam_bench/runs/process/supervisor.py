@@ -248,8 +248,11 @@ def memory_mb(members: list[psutil.Process]) -> float:
 
 def machine_memory_mb() -> float:
     """Main memory in MB: the machine's, or the container's if that is less."""
-    limits = [file.read_text().strip() for file in _CGROUP_LIMITS if file.is_file()]
-    return float(min([psutil.virtual_memory().total, *(int(limit) for limit in limits if limit != "max")]) / 1e6)
+    amounts = [float(psutil.virtual_memory().total)]
+    for file in _CGROUP_LIMITS:
+        with contextlib.suppress(OSError, ValueError):  # there is none, or it says "max"
+            amounts.append(float(file.read_text()))
+    return min(amounts) / 1e6
 
 
 def memory_limit(asked_mb: float | None, at_a_time: int = 1) -> tuple[float | None, str]:

@@ -72,9 +72,12 @@ def _prepared(path: Path, size: int, modified_ns: int) -> Path:
         TrackerError,
         f"orbslam3: the vocabulary {path} ({size} bytes) is no intact .xz file",
         HINT,
-        of=lzma.LZMAError,
+        of=(lzma.LZMAError, EOFError, ValueError),
     ):
-        text = lzma.decompress(packed, format=lzma.FORMAT_XZ, memlimit=MAX_MEMORY)
+        reader = lzma.LZMADecompressor(format=lzma.FORMAT_XZ, memlimit=MAX_MEMORY)
+        text = reader.decompress(packed, max_length=MAX_BYTES)
+        if not reader.eof:
+            raise ValueError(f"it is truncated, or unpacks to more than {MAX_BYTES >> 20} MB")
     _check(text, path)
     write_atomic(target, text)
     return target
