@@ -339,8 +339,8 @@ ADAPTERS = (
         sensors="rgb",
         remarks=(
             "Assumes a static world. Its scale is free, and another after each loss that begins a new map; its "
-            "poses are "
-            "taken as they come, and it saves none of single frames at the end. Threads and vocabulary: see orbslam3."
+            "poses are taken as they come, and it saves none of single frames at the end. Threads and vocabulary: see "
+            "orbslam3."
         ),
     ),
     TrackerSpec(
@@ -358,9 +358,8 @@ ADAPTERS = (
         requires={"svo_cpp": "pip install --no-deps svo-cpp (Linux x86-64)"},
         remarks=(
             "Made for cameras that look down with a wide view. Assumes a static world, and after a loss only "
-            "relocalises. "
-            "Its scale is free. Images are undistorted for it. Its package asks for a second OpenCV, which it "
-            "never loads."
+            "relocalises. Its scale is free. Images are undistorted for it. Its package asks for a second OpenCV, "
+            "which it never loads."
         ),
     ),
     TrackerSpec(
