@@ -1,5 +1,6 @@
 """The program: its verbs, those on the installation (``doctor``, ``envs``, ``cache``), and how it ends."""
 
+import errno
 import os
 import sys
 import warnings
@@ -137,11 +138,14 @@ def start(arguments: list[str] | None = None) -> None:
             warnings.showwarning = lambda message, *_, **__: warn(f"warning: {message}")
             app(args=arguments, prog_name="dynslam-bench")
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader has ended, e.g. `| head`
+        _discard_output()  # the reader has ended, e.g. `| head`
         sys.exit(0)
     except Exception as error:
         if interrupted():  # libraries turn an interrupt into errors of their own
             leave_interrupted()
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+            _discard_output()
+            error = DynslamError(f"cannot write {error.filename or 'the output'}: no space is left on the device")
         if not isinstance(error, DynslamError):
             raise
         write_error(error)
@@ -152,6 +156,11 @@ def start(arguments: list[str] | None = None) -> None:
         raise
     finally:
         set_json_mode(False)
+
+
+def _discard_output() -> None:
+    """Drop what is not written yet: the interpreter would fail to write it at its end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def expand_lists(arguments: list[str]) -> list[str]:

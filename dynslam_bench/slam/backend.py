@@ -297,15 +297,18 @@ class RgbdBackend:
 
         Where fewer points agree then than the `inliers` before, the first frame is left uncompensated.
         """
+        seconds = dict[str, float]()
         for assumed in (velocity, None):
             self.reset(self.camera, self.seed)
             self.shutter.velocity = assumed
             observations = first[1] if assumed is None else compensate_rolling_shutter(first[1], self.camera, assumed)
-            self._begin_map(first[0], observations, np.eye(4))
+            begun = self._begin_map(first[0], observations, np.eye(4))
             result = self._track(frame, raw)
+            for stage, spent in (*begun.timings.items(), *result.timings.items()):
+                seconds[stage] = seconds.get(stage, 0.0) + spent
             if result.state == "ok" and result.stats["inliers"] >= MIN_AGREEING * inliers:
                 break
-        return result
+        return replace(result, timings=seconds)
 
     def _begin_submap(self, frame: FrameBundle, observations: Observations, last: TrackedFrame) -> TrackResult | None:
         """Begin a submap where the camera was lost, rotated as the images tell; None if not yet."""

@@ -319,6 +319,14 @@ def test_output_to_a_closed_pipe_is_no_error():
     assert done.stderr == "" and done.stdout.startswith("7-Scenes"), "the first data set"
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device without space")
+def test_output_to_a_full_device_is_one_line():
+    command = [sys.executable, "-m", "dynslam_bench", "sequences", "list"]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT, check=False)
+    assert done.returncode == 1 and done.stderr.count("\n") == 1
+
+
 # `eval` takes every format that it names.
 
 

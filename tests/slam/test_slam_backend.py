@@ -378,6 +378,7 @@ def test_the_first_frame_is_compensated_too(shaken_frames):
     backend, results = rolling_backend(room, frames[:2], READOUT_S)
     world = backend.world
     assert states(results) == ["ok", "ok"] and world.kf_id[0] == 0
+    assert results[1].timings["mapping"] > 0, "the first keyframe was inserted again"
     _, at_once = rolling(room, shaken, 3, depthless=0.0, limit=500)
     left = np.linalg.norm(world.kf_xy[0, : world.kf_count[0]] - at_once.xy, axis=1)
     assert np.median(left) < 0.4 * np.median(np.linalg.norm(frames[0].xy - at_once.xy, axis=1))
