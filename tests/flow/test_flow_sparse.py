@@ -232,17 +232,10 @@ def test_tiny_images_and_few_points(method, shape, count):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_methods_behind_the_interface(method):
-    flow = build_flow(FlowMethodSettings(method=method))
-    assert isinstance(flow, FlowEstimator)
-    image, points = picture(11), grid()
-    target, matrix = moved(image, 1.01, 1, 4, -3)
-    result = flow.track(flow.prepare(image), flow.prepare(target), points)
-    assert flow.stats_names == tuple(result.stats)
-    error = np.hypot(*(result.xy - moved_points(points, matrix)).T)
-    assert (error[result.valid] < 1.0).mean() > 0.98 and result.valid.mean() > 0.9
+def test_images_of_two_sizes_are_refused(method):
+    flow, image = build_flow(FlowMethodSettings(method=method)), picture(11)
     with pytest.raises(ValueError, match="size"):
-        flow.track(flow.prepare(image), flow.prepare(image[:120]), points)
+        flow.track(flow.prepare(image), flow.prepare(image[:120]), grid())
 
 
 def test_the_forward_backward_check_rejects_what_is_covered():
