@@ -2,7 +2,7 @@
 
 Eight rectified directional derivatives are blurred in a cascade of seven Gaussians. Maps of small Gaussians are stored
 at half, of large ones at quarter resolution. Each histogram is normalised on its own (partial normalisation) and stored
-as eight adjacent bytes, so that one descriptor histogram is one 64-bit load. `tests/flow/daisy_reference.py` follows
+as eight adjacent bytes, so that one descriptor histogram is one 64-bit load. `tests/flow/test_flow_daisy.py` follows
 the definition.
 
 A Gaussian is replaced by the binomial of equal variance, made of rounded means: ``[1 4 6 4 1] / 16`` has variance 1 and

@@ -90,18 +90,17 @@ def resolve_source(
         return "embedded"
     if cached_checkpoint(COCO) is not None:
         return "coco"
-    options = [
-        "--yes (run, bench) or segmentation.source=coco downloads it once",
-        "segmentation.source=onnx:PATH takes your export of a network, e.g. of YOLO-seg",
-        "segmentation.source=recorded:DIR takes masks that were stored before",
-    ]
-    options += ["segmentation.source=oracle takes the sequence's exact masks"] if masks is not None else []
     without = "segmentation.source=none" if optional else "a tracker such as 'emfoa-oft?masks=none' or orb-slam2"
-    options.append(f"without masks: {without}")
     raise NetworkNotFetched(
         f"no masks for '{sequence_id or 'this sequence'}': segmentation.source=auto needs "
         f"the COCO checkpoint ({COCO.megabytes} MB), which is not in the cache",
-        options=options,
+        options=[
+            "--yes (run, bench) or segmentation.source=coco downloads it once",
+            "segmentation.source=onnx:PATH takes your export of a network, e.g. of YOLO-seg",
+            "segmentation.source=recorded:DIR takes masks that were stored before",
+            *(["segmentation.source=oracle takes the sequence's exact masks"] if masks is not None else []),
+            f"without masks: {without}",
+        ],
     )
 
 

@@ -308,38 +308,15 @@ def test_reseeding_leaves_all_that_there_is_where_it_is_less_than_the_budget(lef
     assert verdict.keep.all() and verdict.stats["missing"] == 600 - left
 
 
-def test_all_rules_are_here() -> None:
-    assert len(RULES) == 16
-
-
 @pytest.mark.parametrize("name", sorted(RULES))
-@pytest.mark.parametrize(
-    "case",
-    ["first frame", "no points", "few matches", "no depth", "nan depth", "no objects", "identical", "invalid flow"],
-)
-def test_degenerate_input_culls_nothing_and_never_raises(name: str, case: str) -> None:
+def test_nothing_is_culled_where_nothing_is_known_of_the_past_nor_moves_nor_has_depth(name: str) -> None:
+    """That no rule fails on less than that is a check of `testing.check_filter`."""
     made, rule = scene(np.eye(4), noise_px=0.0), RULES[name]()
-    frame, state = made.frame, made.state
-    if case == "first frame":
-        state = FilterState(camera=CAMERA, keep=state.keep)
-    elif case == "no points":
-        frame = bundle(np.zeros((0, 2)), np.zeros(0), frame.depth, 1.0)
-        frame.instances = box_instance(0, 0, 10, 10)
-        state = FilterState(camera=CAMERA, keep=np.zeros(0, bool), previous=made.state.previous)
-    elif case == "few matches":
-        state.flow.valid[7:] = False
-    elif case.endswith("depth"):
-        frame.depth[:] = np.nan if case == "nan depth" else 0
-        frame.z[:] = 0
-    elif case == "no objects":
-        frame.instances = box_instance(0, 0, 10, 10).of_classes(())
-    elif case == "invalid flow":
-        state.flow.valid[:] = False
-        state.flow.xy[:] = np.nan
-    rule.reset(CAMERA)
-    verdict = rule.apply(frame, state)
-    assert verdict.keep.shape == (len(frame),) and verdict.keep.all()
-    assert set(verdict.stats) == set(rule.stats_names) and np.isfinite(list(verdict.stats.values())).all()
+    for state in (FilterState(camera=CAMERA, keep=made.state.keep), made.state):
+        rule.reset(CAMERA)
+        assert rule.apply(made.frame, state).keep.all()
+    made.frame.depth[:], made.frame.z[:] = np.nan, 0
+    assert rule.apply(made.frame, made.state).keep.all()
 
 
 def test_guard_undoes_the_least_reliable_verdict_first() -> None:
@@ -415,4 +392,4 @@ def test_both_ends_of_the_range_give_other_verdicts(name: str) -> None:
     group, verdict = CASES[name]
     parameter = next(p for p in parameters(group) if p.name == name.partition(".")[2])
     first, *_, last = parameter.choices or (parameter.low, parameter.high)
-    assert verdict(first) == verdict(first) != verdict(last)
+    assert verdict(first) != verdict(last)

@@ -1,10 +1,9 @@
-"""Orientation maps, rotated descriptors and matching costs in plain numpy: the exact reference of the kernels."""
+"""Orientation maps in plain numpy: the exact reference of the kernels."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.flow import layout
-from dynslam_bench.flow.matching_cost import OUTSIDE, CostTables
 from dynslam_bench.flow.orientation_maps import FIXED_POINT, NORM_FLOOR
 from dynslam_bench.flow.simd import COSINES, DERIVATIVE_SHIFT
 
@@ -71,52 +70,3 @@ def halved(maps: Array) -> Array:
     maps = even(maps)
     tall = mean(maps[:, ::2], maps[:, 1::2])
     return mean(tall[..., ::2], tall[..., 1::2])
-
-
-def sample(histograms: Array, xy: Array, scale: Array, rotation: Array, tables: CostTables) -> Array:
-    """Histograms ``[..., 17, 8]`` at positions ``[..., 2]`` for scale and rotation indices ``[...]``."""
-    cells = []
-    for level, places in ((tables.ring0[scale], slice(0, 9)), (tables.ring1[scale], slice(9, 17))):
-        quarter = (xy * 4 + np.float32(0.5)).astype(np.int64) + level[..., 3:4]
-        half = quarter >> (level[..., 2:3] - 1)
-        first = level[..., 0] + (half[..., 1] >> 1) * level[..., 1] + (half[..., 0] >> 1)
-        phase = 2 * (half[..., 1] & 1) + (half[..., 0] & 1)
-        cells.append(first[..., None] + tables.samples[scale, rotation, phase][..., places] // layout.BINS)
-    return histograms[np.concatenate(cells, axis=-1)].astype(np.int32)
-
-
-def within(xy: Array, shape: tuple[int, int]) -> Array:
-    return np.minimum(xy.clip(min=0), np.array(shape[::-1], np.float32) - 1)
-
-
-def rotated_descriptors(histograms: Array, points: Array, shape: tuple[int, int], tables: CostTables) -> Array:
-    """Reference descriptors uint8 ``[N, S, ROTATIONS, 17, 8]`` of points float32 ``[N, 2]``."""
-    xy = within(points[:, None] + tables.support.astype(np.float32), shape)
-    neutral = np.full(xy.shape[:-1], -layout.SCALE_LOW)
-    plain = sample(histograms, xy, neutral, np.full_like(neutral, -layout.ANGLE_LOW), tables)
-    turned = []
-    for sixths in range(layout.ANGLE_LOW, layout.ANGLE_HIGH + 1):
-        whole, part = divmod(sixths, 6)
-        far = part * 171  # of 1026
-        turned.append(((1026 - far) * np.roll(plain, whole, -1) + far * np.roll(plain, whole + 1, -1) + 512) >> 10)
-    return np.stack(turned, axis=2).astype(np.uint8)
-
-
-def label_costs(
-    points: Array, labels: Array, descriptors: Array, histograms: Array, shape: tuple[int, int], tables: CostTables
-) -> Array:
-    """First term of Eq. 1 of one label a point, ``[N, 4]``; `OUTSIDE` where it leaves the image. Int64 ``[N]``."""
-    centre = points + labels[:, :2]
-    inside = (centre == within(centre, shape)).all(axis=1)
-    labels = np.where(inside[:, None], labels, 0)
-    scale = np.floor(labels[:, 2] * 4 + np.float32(0.5)).astype(int) - layout.SCALE_LOW
-    rotation = np.floor(labels[:, 3] * np.float32(7.639437268410976) + np.float32(0.5)).astype(int) - layout.ANGLE_LOW
-    scale, rotation = scale.clip(0, layout.SCALE_HIGH - layout.SCALE_LOW), rotation.clip(0, layout.ROTATIONS - 1)
-    c, s = np.exp2(labels[:, 2]) * (np.cos(labels[:, 3]), np.sin(labels[:, 3]))
-    total = np.zeros(len(points), np.int64)
-    for q, (dx, dy) in enumerate(tables.support.astype(np.float32)):
-        xy = points + labels[:, :2] + np.stack([c * dx - s * dy, s * dx + c * dy], axis=1)
-        theirs = sample(histograms, within(xy, shape), scale, rotation, tables)
-        distance = np.abs(theirs - descriptors[np.arange(len(points)), q, rotation].astype(np.int32)).sum(axis=2)
-        total += distance.clip(max=tables.truncation).sum(axis=1)
-    return np.where(inside, total, OUTSIDE)

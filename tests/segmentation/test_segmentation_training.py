@@ -1,5 +1,6 @@
 """Labelled data from files and sequences, training with resume, evaluation."""
 
+import json
 import os
 import pickle
 import zipfile
@@ -10,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from coco_file import coco
 
 from dynslam_bench.core.errors import SegmentationError
 from dynslam_bench.segmentation.networks.backbone import NetworkConfig
@@ -50,6 +50,19 @@ def write_yolo(folder, count=6, seed=0):
         chair = "0.03125 0.83333 0.125 0.83333 0.125 0.95833 0.03125 0.95833"
         (folder / "labels" / f"{k}.txt").write_text(f"0 {flat}\n56 {chair}\n")
     return folder
+
+
+def coco(folder: Path, segmentation: object, *, changes: dict[str, object] | None = None, **extra: object) -> Path:
+    """A COCO file of one image and one object; `extra` are fields of the annotation, `changes` replace whole parts."""
+    cv2.imwrite(str(folder / "a.png"), np.zeros((6, 8, 3), np.uint8))
+    content = {
+        "images": [{"id": 1, "file_name": "a.png"}],
+        "categories": [{"id": 1, "name": "person"}],
+        "annotations": [{"image_id": 1, "category_id": 1, "segmentation": segmentation, **extra}],
+    }
+    path = folder / "annotations.json"
+    path.write_text(json.dumps(content | (changes or {})))
+    return path
 
 
 # --- data --------------------------------------------------------------------------------------------------------
@@ -157,7 +170,7 @@ def settings_for(folder, **changes):
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path, small_images):
-    data = write_yolo(tmp_path / "data", 4)
+    data = write_yolo(tmp_path / "data", 2)
     cache = tmp_path / "cache"
     whole = train(settings_for(data), tmp_path / "whole", data_cache=cache)
     assert whole.best == tmp_path / "whole" / "best.pt"
@@ -186,10 +199,10 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path, small_images):
 
 @pytest.mark.usefixtures("small_images")
 def test_losses_fall_on_a_simple_task(tmp_path):
-    data = write_yolo(tmp_path / "data", 4)
+    data = write_yolo(tmp_path / "data", 2)
     seen = []
     train(
-        settings_for(data, iterations=14, batch=2, evaluate_every=14, checkpoint_every=14),
+        settings_for(data, iterations=12, batch=2, evaluate_every=12, checkpoint_every=12),
         tmp_path / "run",
         data_cache=tmp_path / "cache",
         progress=lambda p: seen.append(sum(p.values.values())) if p.stage == "train" else None,

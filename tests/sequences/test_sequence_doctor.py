@@ -17,14 +17,16 @@ from sequence_folders import SHARED, Altered, frame_hash, make_folder, needs_sha
 
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.geometry import Camera, Trajectory, se3
-from dynslam_bench.sequences import Frame, FrameMasks, PreprocessingSettings, SequenceView, open_sequence
-from dynslam_bench.sequences.calibration import Window, adjust, calibrate
+from dynslam_bench.sequences import Frame, FrameMasks, PreprocessingSettings, SequenceView, doctor, open_sequence
+from dynslam_bench.sequences import compose as composing
+from dynslam_bench.sequences.calibration import calibrate
 from dynslam_bench.sequences.cameras import read_camera, write_camera
 from dynslam_bench.sequences.compose import compose
 from dynslam_bench.sequences.doctor import Diagnosis, Finding, _turn, diagnose, examine, stretches, truth_findings
 from dynslam_bench.sequences.preprocessing import Preprocessed, normalise
 from dynslam_bench.sequences.rgbd_motion import rgbd_pairs
 from dynslam_bench.sequences.synthetic import RenderSettings, open_synthetic
+from dynslam_bench.sequences.synthetic.settings import ColorSensor
 from dynslam_bench.sequences.view import Part, Wrapped, part_of
 
 FRAMES = 80
@@ -34,15 +36,30 @@ FRAMES = 80
 def sound():
     """A rendered office without people, at half the size."""
     id = f"synthetic/walking_halfsphere?scene=1&frames={FRAMES}"
-    settings = RenderSettings(people="none", antialias=False)  # halving smooths enough
+    plain = ColorSensor(noise=False, shutter=0)
+    settings = RenderSettings(people="none", antialias=False, color=plain)  # halving smooths enough
     small = PreprocessingSettings(width=320, height=240)
     return Altered(Preprocessed(open_synthetic(id, None, settings=settings), small))
 
 
 @pytest.fixture(scope="module")
-def pairs(sound):
-    """The motions that `examine` compares with a truth."""
-    return [pair for start in (0, 40) for pair in rgbd_pairs(sound.frames[start : start + 40], sound.camera)]
+def examined(sound):
+    """What is found of the sound recording, and the motions that its truth was compared with."""
+    measured = []
+
+    def measure(frames, camera):
+        pairs = list(rgbd_pairs(frames, camera))
+        measured.extend(pairs)
+        return pairs
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(doctor, "rgbd_pairs", measure)
+        return examine(sound), measured
+
+
+@pytest.fixture(scope="module")
+def pairs(examined):
+    return examined[1]
 
 
 @pytest.fixture(scope="module")
@@ -113,8 +130,8 @@ VALUES = {"truth-time-shift": 0.2, "truth-scale": 1000.0, "depth-factor": 5.0, "
 """The sizes of some of them."""
 
 
-def test_a_sound_recording_has_no_fault(sound):
-    assert examine(sound) == Diagnosis(sound.id, FRAMES, ())
+def test_a_sound_recording_has_no_fault(sound, examined):
+    assert examined[0] == Diagnosis(sound.id, FRAMES, ())
 
 
 @pytest.mark.parametrize("name", FAULTS)
@@ -149,7 +166,7 @@ REST = {"frame": lambda frame, base: (base[0].rgb, base[0].depth)}
 def test_without_truth_depth_or_motion_it_is_a_note(sound, severity, finding, changes):
     sequence = Altered(sound, **changes)
     sequence.has_depth = finding != "no-depth"
-    findings = [(found.severity, found.id) for found in examine(sequence).findings]
+    findings = [(found.severity, found.id) for found in examine(SequenceView(sequence, 0, 40)).findings]
     assert findings[0] == (severity, finding) and (finding == "no-depth" or len(findings) == 1)
     assert {found for found, _ in findings} == {severity}
 
@@ -215,73 +232,30 @@ def test_real_recordings_have_no_fault(name):
     assert diagnose(SHARED / "data" / name, most_frames=60).ok
 
 
-# Readout time, delay of depth and depth factor, from exact points, a rendered sequence, and what cannot tell them.
+# Readout time, delay of depth and depth factor, of a rendered sequence and of what cannot tell them.
 
 
 PINHOLE = Camera(320, 240, 260.0, 262.0, 160.0, 118.0)
-FPS, WINDOW = 30.0, 12
-NORMAL, DISTANCE = np.array([0.35, 0.5, 1.0]), 2.0
-"""The world is the plane NORMAL . X = DISTANCE."""
-
-
-def pose(times):
-    """Rotations camera to world ``[N, 3, 3]`` and centres ``[N, 3]`` of a camera that is turned to and fro."""
-    t = np.asarray(times)[:, None]
-    angles = np.array([0.12, 0.15, 0.2]) * np.sin(2 * np.pi * np.array([1.1, 0.9, 1.3]) * t + (0.3, 1.2, 2.5))
-    centres = 0.12 * np.sin(2 * np.pi * np.array([0.8, 1.2, 0.7]) * t + (0.0, 2.0, 4.0))
-    return Rotation.from_rotvec(angles).as_matrix(), centres
-
-
-def depth_image(stamp, readout_s):
-    """Depth of the plane, every row from its own pose."""
-    v, u = np.mgrid[0 : PINHOLE.height, 0 : PINHOLE.width].astype(float)
-    R, centre = pose(stamp + ((np.arange(PINHOLE.height) + 0.5) / PINHOLE.height - 0.5) * readout_s)
-    rays = np.stack([(u - PINHOLE.cx) / PINHOLE.fx, (v - PINHOLE.cy) / PINHOLE.fy, np.ones_like(u)], axis=-1)
-    along = np.einsum("rij,rcj,i->rc", R, rays, NORMAL)
-    return ((DISTANCE - centre @ NORMAL)[:, None] / along).astype(np.float32)
-
-
-def seen(points, stamp, readout_s):
-    """Pixels ``[L, 2]`` of points, each by the pose of the row that it falls on; NaN outside of the image."""
-    late = np.zeros(len(points))
-    for _ in range(8):
-        R, centre = pose(stamp + late)
-        pixels = PINHOLE.project(np.einsum("nji,nj->ni", R, points - centre))
-        late = ((pixels[:, 1] + 0.5) / PINHOLE.height - 0.5) * readout_s
-    outside = ((pixels < 4) | (pixels > (PINHOLE.width - 5, PINHOLE.height - 5))).any(axis=1)
-    return np.where(outside[:, None], np.nan, pixels)
-
-
-def window(first, readout_s, delay_s, rng):
-    """Exact tracks through some frames, but for a tenth of a pixel."""
-    stamps = (first + np.arange(WINDOW)) / FPS
-    at = rng.uniform(-1.5, 1.5, (150, 2))
-    points = np.column_stack([at, (DISTANCE - at @ NORMAL[:2]) / NORMAL[2]])
-    pixels = np.stack([seen(points, stamp, readout_s) for stamp in stamps], axis=1)
-    pixels += rng.normal(0, 0.1, pixels.shape)
-    depth = np.stack([depth_image(stamp + delay_s, readout_s) for stamp in stamps])
-    return Window(PINHOLE, stamps, pixels[np.isfinite(pixels[..., 0]).sum(1) >= 4], depth, np.zeros(WINDOW))
-
-
-@pytest.mark.parametrize(("readout_s", "delay_s"), [(0.0, 0.0), (0.03, -0.034)])
-def test_exact_points_give_back_readout_and_delay(readout_s, delay_s):
-    rng = np.random.default_rng(3)
-    readout, delay = adjust([window(first, readout_s, delay_s, rng) for first in (0, 12, 24, 36)])
-    for estimate, true, error in ((readout, readout_s, 5e-4), (delay, delay_s, 1e-3)):
-        assert abs(estimate.value - true) < min(error, estimate.half) and estimate.half < 0.004
+FPS = 30.0
 
 
 def test_a_rendered_rolling_shutter_is_measured_and_what_differs_is_to_be_written(tmp_path):
-    sequence = open_synthetic("synthetic/fast_desk@0?frames=26", tmp_path)
+    sequence = open_synthetic("synthetic/fast_desk@0?frames=20", tmp_path)
     stated = calibrate(sequence)
     readout, delay, factor = stated.quantities
     assert readout.value == pytest.approx(0.026, abs=0.003)
     assert readout.low < 0.026 < readout.high and delay.low < 0.0 < delay.high and factor.low < 5000 < factor.high
     assert readout.observable and not stated.measured, "it is what the camera states"
     truth, camera = scaled(sequence.ground_truth, 2.0), replace(sequence.camera, readout_s=0.0)
-    other = calibrate(Altered(sequence, truth=lambda _: truth, camera=lambda _: camera))
-    readout, _, factor = other.quantities
+
+    def late(frame, base):
+        """Its depth is that of the next frame."""
+        return frame.rgb, base[min(frame.index + 1, len(base) - 1)].depth
+
+    other = calibrate(Altered(sequence, frame=late, truth=lambda _: truth, camera=lambda _: camera))
+    readout, delay, factor = other.quantities
     assert other.camera.readout_s == readout.written == pytest.approx(0.026, abs=0.003)
+    assert other.camera.depth_delay_s == delay.written == pytest.approx(1 / FPS, abs=0.003)
     assert factor.low < 2500 < factor.high and other.measured
 
 
@@ -374,6 +348,15 @@ class Watched(Wrapped):
         return frame
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_places():
+    """Three places are tried for each person, not twelve."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(composing, "_PLACES", 3)
+        patch.setattr(composing, "Cutouts", cache(composing.Cutouts))  # of one recording once
+        yield
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Host, people and the composite of instance 0, as folders."""
@@ -384,12 +367,12 @@ def folder(tmp_path_factory):
     return folder
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def host(folder):
     return open_sequence(folder / "host")
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def people(folder):
     return open_sequence(folder / "people")
 
@@ -424,7 +407,7 @@ def test_an_instance_repeats_and_another_one_differs(host, people, folder, tmp_p
 
 def test_images_are_not_held(host, tmp_path):
     people = Watched(Room("people", 22, walker=True))
-    compose(host, people, tmp_path / "made", 2)
+    compose(host, people, tmp_path / "made", 0)
     assert people.most < 20
 
 

@@ -173,7 +173,7 @@ def test_bundle_adjustment_agrees_with_general_least_squares(with_depth):
     start = np.concatenate([se3.exp(rng.normal(0, 0.01, (VARIABLE, 6))) @ true[:VARIABLE], true[VARIABLE:]])
     problem = BundleProblem(
         start, VARIABLE, points + rng.normal(0, 0.02, points.shape), np.tile(np.arange(POSES), POINTS),
-        np.repeat(np.arange(POINTS), POSES), values[:, :2], values[:, 2], info, info * has_depth, CAMERA,
+        np.repeat(np.arange(POINTS), POSES), values[:, :2].copy(), values[:, 2].copy(), info, info * has_depth, CAMERA,
     )  # fmt: skip
 
     def moved(x):

@@ -92,7 +92,7 @@ def before_a_wall(room, seed, noise_px):
 @pytest.mark.parametrize("noise_px", [0.8, 1.5])
 def test_a_motion_that_leaves_out_contradicting_points_is_not_accepted(room, noise_px):
     """The homography's other motion fits the wall and drops the things before it; it is 72 degrees off."""
-    initial_maps = [initialise(before_a_wall(room, seed, noise_px), room.camera) for seed in range(6)]
+    initial_maps = [initialise(before_a_wall(room, seed, noise_px), room.camera) for seed in range(3)]
     translation = np.array([-0.1, 0.0, -0.04])
     off = [angle_deg(m.motion.T_second_first[:3, 3], translation) for m in initial_maps if m is not None]
     assert max(off, default=0.0) < 10.0 and (off or noise_px > 1.0)

@@ -63,7 +63,7 @@ def test_a_kidnapped_camera_is_relocalised_at_once_in_a_known_place():
 
 @pytest.mark.parametrize(
     ("alike", "blind", "more", "recognised"),
-    [(0.0, 30, 10, True), (0.2, 30, 0, True), (0.5, 30, 0, False), (0.9, 30, 10, False), (0.5, 0, 0, False)],
+    [(0.0, 30, 10, True), (0.5, 30, 0, False), (0.5, 0, 0, False)],
 )
 def test_a_frame_of_two_places_tells_nothing(alike, blind, more, recognised):
     """Blind for three seconds, in which both can be reached, or kidnapped from one frame to the next."""

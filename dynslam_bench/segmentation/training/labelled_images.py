@@ -1,6 +1,7 @@
 """Labelled images for training and evaluation: COCO and YOLO files, sequences with masks, rendered sequences."""
 
 import json
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -224,22 +225,15 @@ def decode_runs(text: str) -> list[int]:
     Raises:
         ValueError: The text ends within a number, or a number is longer than any image.
     """
+    rest = re.sub(r"\A(?:[P-o]{0,12}[0-O])*", "", text, count=1)  # a number's last digit is below 32, that is P
+    if rest:
+        raise ValueError(f"the run lengths are damaged at character {len(text) - len(rest)} of {len(text)}")
     runs: list[int] = []
-    value = shift = 0
-    for position, character in enumerate(text):
-        digit = ord(character) - 48
-        value |= (digit & 0x1F) << shift
-        shift += 5
-        if digit & 0x20 and shift <= 60:  # another digit follows
-            continue
-        if digit & 0x20:
-            raise ValueError(f"the run lengths are damaged at character {position} of {len(text)}")
-        if digit & 0x10:
-            value |= -1 << shift
+    for number in re.findall("[P-o]*[0-O]", text):
+        digits = [ord(character) - 48 for character in number]
+        value = sum((digit & 31) << 5 * place for place, digit in enumerate(digits))
+        value -= (digits[-1] & 16) << 5 * len(digits) - 4  # two's complement
         runs.append(value + (runs[-2] if len(runs) > 2 else 0))
-        value = shift = 0
-    if shift:
-        raise ValueError(f"the run lengths are damaged: their {len(text)} characters end within a number")
     return runs
 
 

@@ -27,24 +27,22 @@ from dynslam_bench.geometry import (
 from dynslam_bench.sequences.readers.lists import (
     Contents,
     ImageList,
+    camera_on_body,
     checked_camera,
     find_names,
     list_folder,
-    read_associations,
-    read_image_list,
-    size_of_first,
-    stamped,
-)
-from dynslam_bench.sequences.readers.tables import (
-    camera_on_body,
     nanoseconds,
     numbers,
     pick,
+    read_associations,
+    read_image_list,
     read_pose_table,
     read_rows,
     read_yaml,
     rigid,
     section,
+    size_of_first,
+    stamped,
 )
 
 PEOPLE_LIST = "people.txt"
