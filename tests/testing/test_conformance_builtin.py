@@ -1,7 +1,6 @@
 """Everything that comes with the package passes its own conformance checks."""
 
 import re
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +14,7 @@ from dynslam_bench.contracts.filter import FilterResult
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.tracker import TrackResult
 from dynslam_bench.core.errors import PluginError
+from dynslam_bench.core.plugins import ISOLATED_VARIABLE
 from dynslam_bench.core.settings import Settings, tunable
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.se3 import inverse
@@ -84,9 +84,8 @@ def test_segmenters():
 # Conformance checks of trackers that exit, hang, crash or leave processes behind: a verdict on every check.
 
 
-def report_of(mode, tmp_path=None, target=hostile.TARGET, **options):
-    settings = {"mode": mode} | ({} if tmp_path is None else {"pids": str(tmp_path / "pids")})
-    return isolated_tracker_report(target, settings=settings, frames=4, **({"frame_s": 3.0} | options))
+def report_of(mode, target=hostile.TARGET, **options):
+    return isolated_tracker_report(target, settings={"mode": mode}, frames=4, **options)
 
 
 def failures(report):
@@ -98,13 +97,12 @@ def failures(report):
     [
         ("sys.exit", "results", "called sys.exit(0)"),
         ("os._exit", "results", "the process left with exit code 0 (likely cause: os._exit"),
-        ("segfault", "results", "SIGSEGV (segmentation fault)"),
-        ("hang", "results", "no sign of life for 3 s (likely cause: an endless loop"),
+        ("hang", "results", "no sign of life for 1 s (likely cause: an endless loop"),
         ("build-os._exit", "construction", "the process left with exit code 0"),
     ],
 )
 def test_a_tracker_that_ends_its_process_fails_the_check(mode, check, words):
-    report = report_of(mode)
+    report = report_of(mode, frame_s=1.0)
     assert list(failures(report)) == [check] and words in failures(report)[check]
     assert "\n" not in failures(report)[check]
 
@@ -116,13 +114,6 @@ def test_the_other_checks_go_on():
     assert list(failures(report)) == ["all-black frame"]
     assert told == report.checks and len({check.name for check in told}) == len(told) >= 14
     assert report.checks[-1].name == "closing" and report.subject == "tracker 'blackhater'"
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="needs Linux' subreapers")
-def test_nothing_survives(tmp_path):
-    assert report_of("children", tmp_path).ok
-    pids = [int(line) for line in (tmp_path / "pids").read_text().split()]
-    assert len(pids) >= 3 and hostile.alive(pids) == []
 
 
 def test_a_module_that_exits_when_it_is_loaded(tmp_path):
@@ -415,7 +406,8 @@ Inert = type("Inert", (Configured,), {"track": Good.track})
         (Inert, "skipped", "shift change nothing on this scene"),
     ],
 )
-def test_online_settings_are_checked(tracker, status, words):
+def test_online_settings_are_checked(tracker, status, words, monkeypatch):
+    monkeypatch.setenv(ISOLATED_VARIABLE, "1")  # this file is no danger to the process
     spec = TrackerSpec("t", f"{__file__}:{tracker.__name__}", "T", settings=Online)
     (check,) = [c for c in tracker_report(spec, frames=4).checks if c.name == "online settings"]
     assert check.status == status and re.search(words, check.message), check
