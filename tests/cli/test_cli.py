@@ -206,8 +206,7 @@ def test_kitti_trajectories_with_their_stamps(cli, facts, walk, tmp_path):
 
 
 def test_doctor(facts):
-    rows = facts("doctor")
-    assert {"program", "weights", "folder", "device"} <= {row["part"] for row in rows}
+    assert {"program", "weights", "folder", "device"} <= {row["part"] for row in facts("doctor")}
 
 
 def test_envs(facts):

@@ -415,8 +415,7 @@ def test_a_programs_secrets_are_in_no_record(secret: str) -> None:
     command = f"slam {secret} --threads 2"
     words = ["dynslam-bench", "run", f"subprocess:{command}", "--set", f"command={command}"]
     shell = shlex.split(command)
-    settings = {"api_key": "s3cret", "command": command, "words": words}
-    stored = Sample(text=command, words=shell, more=settings)
+    stored = Sample(text=command, words=shell, more={"api_key": "s3cret", "command": command, "words": words})
     for text in (stored.to_json(), stored.to_line()):
         assert "s3cret" not in text
         again = Sample.model_validate_json(text)

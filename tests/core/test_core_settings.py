@@ -80,8 +80,7 @@ def test_parameters_describe_the_search_space():
     ],
 )
 def test_assignments_of_the_command_line(assignment, name, value):
-    settings = apply_overrides(Root(), parse_assignments([assignment]))
-    assert flatten(settings) == flatten(Root()) | {name: value}
+    assert flatten(apply_overrides(Root(), parse_assignments([assignment]))) == flatten(Root()) | {name: value}
 
 
 @pytest.mark.parametrize(
@@ -186,8 +185,7 @@ def test_kernels_compile_where_nothing_can_be_cached(compile_, monkeypatch: pyte
 def test_kernels_are_cached_and_release_the_lock() -> None:
     from dynslam_bench.geometry.gauss_newton import apply_twist
 
-    options = apply_twist.targetoptions
-    assert options["nogil"] and apply_twist.stats.cache_path
+    assert apply_twist.targetoptions["nogil"] and apply_twist.stats.cache_path
 
 
 def test_kernels_on_disk_are_loaded_before_they_are_called(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -134,8 +134,7 @@ def documented() -> list[str]:
     lines = []
     for page in PAGES:
         for block in re.findall(r"^```bash\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE):
-            joined = block.replace("\\\n", " ")
-            lines += [line for line in joined.splitlines() if line.startswith("dynslam-bench ")]
+            lines += [line for line in block.replace("\\\n", " ").splitlines() if line.startswith("dynslam-bench ")]
     return lines
 
 

@@ -63,10 +63,9 @@ def words(sentence: str) -> list[str]:
 def tables(text: str) -> list[list[list[str]]]:
     """A page's tables as rows of cells, each with its header first and without the rule below it."""
     text = BLOCKS.sub("\n", text)
-    blocks = re.findall(r"(?:^ *\|.*\n?)+", text, flags=re.MULTILINE)
     return [
         [[cell.strip() for cell in CELLS.split(row.strip())[1:-1]] for row in block.splitlines() if "| --" not in row]
-        for block in blocks
+        for block in re.findall(r"(?:^ *\|.*\n?)+", text, flags=re.MULTILINE)
     ]
 
 

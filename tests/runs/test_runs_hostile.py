@@ -140,8 +140,7 @@ def test_the_parent_ends_and_all_end_with_it(toy_folder: str, tmp_path: Path) ->
         f"spec = RunSpec(tracker={hostile.TARGET!r}, sequence={toy_folder!r}, frames=(0, 6), settings={settings!r})\n"
         "run_one(spec, store)\n"
     )
-    fresh = os.environ | {START_VARIABLE: "fresh"}
-    parent = subprocess.Popen([sys.executable, "-c", script], cwd=tmp_path, env=fresh)
+    parent = subprocess.Popen([sys.executable, "-c", script], cwd=tmp_path, env=os.environ | {START_VARIABLE: "fresh"})
     until(lambda: (tmp_path / "pids").is_file() and (tmp_path / "pids").read_text().endswith("\n"), 60)
     pids = [int(line) for line in (tmp_path / "pids").read_text().split()]
     assert alive(pids) == pids
@@ -283,8 +282,7 @@ class _Slow:
 
 def test_the_time_limit_begins_when_the_run_does(tmp_path: Path) -> None:
     began = time.monotonic()
-    verdict = supervise(_Slow(1.0), {}, Limits(time_s=0.5))
-    assert verdict.status == "timeout" and time.monotonic() - began > 1.5
+    assert supervise(_Slow(1.0), {}, Limits(time_s=0.5)).status == "timeout" and time.monotonic() - began > 1.5
     with pytest.raises(InfrastructureError, match=r"no process for the run within 0\.3 s"):
         supervise(_Slow(60), {}, Limits(time_s=0.1, start_s=0.3))
 

@@ -284,8 +284,7 @@ def test_every_suite_names_only_what_exists(name: str) -> None:
     suite = load_suite(name)
     assert suite.title and suite.description and suite.name == name
     for sequence in suite.sequences:
-        whole = sequence.partition("?")[0]
-        assert whole in sequence_ids() or entry_of(sequence) is not None
+        assert sequence.partition("?")[0] in sequence_ids() or entry_of(sequence) is not None
         if sequence.startswith("synthetic/"):
             assert parse_synthetic_id(sequence).split == "held-out", "the embedded network was trained on the others"
     specs = list(suite.specs())
@@ -301,8 +300,7 @@ def test_dynamic_holds_every_ranked_system_on_three_scenes_of_the_eight_replicas
     assert composed - ablations <= set(suite.trackers)
     assert load_suite("dynamic-full").trackers == suite.trackers
     objects = load_suite("objects")
-    slow = {"emfoa-oft-paper"}  # its dense flow takes about half a second a frame
-    assert set(suite.trackers) - slow < set(objects.trackers)
+    assert set(suite.trackers) - {"emfoa-oft-paper"} < set(objects.trackers)  # that one takes half a second a frame
     assert objects.settings == {"segmentation.source": "oracle-classes"}
 
 
@@ -342,8 +340,7 @@ def test_a_suite_of_the_users_own(tmp_path: Path) -> None:
 def test_offsets_of_a_suite_are_repeats_beside_the_seeds(tmp_path: Path) -> None:
     text = 'trackers = ["never-move"]\nsequences = ["synthetic/walking_xyz"]\nseeds = [0, 1]\noffsets = [0, 3]\n'
     suite = load_suite(write(tmp_path / "mine.toml", text))
-    repeats = [(spec.seed, spec.offset) for spec in suite.specs()]
-    assert repeats == [(0, 0), (0, 3), (1, 0), (1, 3)]
+    assert [(spec.seed, spec.offset) for spec in suite.specs()] == [(0, 0), (0, 3), (1, 0), (1, 3)]
     assert [spec.offset for spec in suite.specs(seeds=(0,), offsets=(5,))] == [5]
     with pytest.raises(DynslamError, match=r"offsets\.0: input should be greater than or equal to 0"):
         load_suite(write(tmp_path / "bad.toml", text.replace("[0, 3]", "[-1]")))
