@@ -309,6 +309,7 @@ def odd_masks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         raise OSError("network is unreachable")
 
     monkeypatch.setattr("urllib.request.OpenerDirector.open", refuse)
+    monkeypatch.setattr("dynslam_bench.core.download._LONGEST_PAUSE_S", 0.0)
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "weights"))
     (tmp_path / "garbage.onnx").write_bytes(b"no network at all" * 20)
     (tmp_path / "masks").mkdir()
