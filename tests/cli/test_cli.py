@@ -20,10 +20,8 @@ from dynslam_bench.cli.app import expand_lists
 from dynslam_bench.core.errors import RunError, SettingsError
 from dynslam_bench.core.stage_cache import StageCache
 from dynslam_bench.evaluation import evaluate_files
-from dynslam_bench.geometry import se3
+from dynslam_bench.geometry import Trajectory, read_tum, se3, write_kitti, write_tum
 from dynslam_bench.geometry.se3 import inverse
-from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.trajectory_files import read_tum, write_kitti, write_tum
 from dynslam_bench.sequences import open_sequence
 from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS
 from dynslam_bench.testing import TurningSequence

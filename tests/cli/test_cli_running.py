@@ -22,8 +22,7 @@ from dynslam_bench import cli as program
 from dynslam_bench.cli import app, demo, output, running, runs
 from dynslam_bench.cli.demo import compiled_ahead, tell
 from dynslam_bench.cli.output import report_table, table
-from dynslam_bench.core.errors import RunError
-from dynslam_bench.core.folders import WEIGHTS_VARIABLE
+from dynslam_bench.core import WEIGHTS_VARIABLE, RunError
 from dynslam_bench.core.records import digest
 from dynslam_bench.geometry.trajectory_files import read_tum
 from dynslam_bench.reports.model.row import RunRow

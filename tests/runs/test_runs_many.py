@@ -27,8 +27,7 @@ from hostile import until
 from dynslam_bench.api import bench, report
 from dynslam_bench.cli.running import parse_shard, show_workers
 from dynslam_bench.core.errors import DynslamError, InfrastructureError, RunError
-from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.trajectory_files import read_tum, write_tum
+from dynslam_bench.geometry import Trajectory, read_tum, write_tum
 from dynslam_bench.reports import load_frame
 from dynslam_bench.runs import (
     RunEvent,

@@ -10,15 +10,12 @@ import numpy as np
 import pytest
 from culling_rules import RULES
 
-from dynslam_bench.contracts.filter import FilterResult
-from dynslam_bench.contracts.segmenter import Instances
-from dynslam_bench.contracts.tracker import TrackResult
+from dynslam_bench.contracts import FilterResult, Instances, TrackResult
 from dynslam_bench.core.errors import PluginError
 from dynslam_bench.core.plugins import ISOLATED_VARIABLE
 from dynslam_bench.core.settings import Settings, tunable
-from dynslam_bench.geometry import se3
+from dynslam_bench.geometry import Trajectory, se3
 from dynslam_bench.geometry.se3 import inverse
-from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.segmentation.build_segmenter import build_segmenter
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences import open_sequence

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from dynslam_bench.contracts import FlowResult, Keypoints
-from dynslam_bench.core.errors import PluginError
-from dynslam_bench.core.folders import WEIGHTS_VARIABLE
+from dynslam_bench.core import WEIGHTS_VARIABLE, PluginError
 from dynslam_bench.features.registry import build_extractor
 from dynslam_bench.flow.registry import build_flow
 from dynslam_bench.flow.settings import FlowSettings
