@@ -1,4 +1,4 @@
-"""What pages and docstrings name exists: files, settings, symbols, options, ids, links; made pages are those made now."""
+"""What pages and docstrings name exists: files, settings, symbols, options, ids, links; made pages are not stale."""
 
 import re
 import shlex

@@ -627,10 +627,9 @@ def _read_mask(data: bytes | None, folder: Path) -> None:
     at(folder, "0.9.png" if stamped else "0.png", b"")
     at(folder, "1.0.png" if stamped else "1.png", data)
     at(folder, recorded.CLASSES_FILE, b'{"1": "person"}')
-    frame = _FRAME
     segmenter = recorded.RecordedSegmenter(folder)
     segmenter.missing(np.array([1.0, 2.0]))
-    segmenter.segment(frame)
+    segmenter.segment(_FRAME)
 
 
 def _read_rendered(data: bytes | None, folder: Path) -> None:
