@@ -242,8 +242,7 @@ def verify(bank: Folder, as_json: AsJson = False) -> None:
     from dynslam_bench.runs.bank import verify
 
     faults = verify(bank)
-    total = f"{bank}: {len(faults)} fault{'s' * (len(faults) != 1)}"
-    present({"faults": faults}, *faults, total, verified=not faults)
+    present({"faults": faults}, *faults, f"{bank}: {len(faults)} fault{'s' * (len(faults) != 1)}", verified=not faults)
 
 
 @banks.command()

@@ -142,8 +142,7 @@ def doctor(as_json: AsJson = False) -> None:
     from dynslam_bench.testing.installation import unavailable_plugins
 
     plugins = unavailable_plugins()
-    lines = [f"{plugin.name}: {plugin.hint}" for plugin in plugins]
-    present(plugins, *(lines or ["all plug-ins are available"]))
+    present(plugins, *([f"{plugin.name}: {plugin.hint}" for plugin in plugins] or ["all plug-ins are available"]))
 
 
 @app.command()

@@ -61,9 +61,8 @@ def list_(as_json: AsJson = False) -> None:
     """List the protocols."""
     from dynslam_bench.evaluation import PROTOCOLS
 
-    entries = [{"digest": protocol.digest(), **protocol.model_dump()} for protocol in PROTOCOLS.values()]
     present(
-        entries,
+        [{"digest": protocol.digest(), **protocol.model_dump()} for protocol in PROTOCOLS.values()],
         table(
             ("id", "digest", "meaning"),
             [(protocol.id, protocol.digest(), protocol.describe()) for protocol in PROTOCOLS.values()],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import MapOutputs, TrackResult
 from dynslam_bench.core import RunError, TrackerError, raising, read_npz
-from dynslam_bench.envs import SlamEnv
+from dynslam_bench.envs import FrameOutcome, SlamEnv
 from dynslam_bench.envs.rendering import CULLED, KEPT, MASK, Canvas, Image, annotated
 from dynslam_bench.evaluation.alignment import align
 from dynslam_bench.evaluation.online import truths_at
@@ -20,10 +20,6 @@ from dynslam_bench.geometry import Trajectory, se3
 from dynslam_bench.runs.spec import RunSpec
 from dynslam_bench.slam.map_files import MAP_FILE, write_keyframes_csv, write_ply
 from dynslam_bench.slam.run_figure import write_run_figure
-
-if TYPE_CHECKING:
-    from dynslam_bench.envs import FrameOutcome
-
 
 SNAPSHOTS_FILE = "snapshots.npz"
 SPREAD = 24

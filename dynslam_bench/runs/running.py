@@ -414,8 +414,7 @@ class _Bench:
 
     def _reuse(self, run: ResolvedRun, record: RunRecord) -> None:
         if run.spec.label not in ("", record.tracker.label):
-            labelled = record.tracker.model_copy(update={"label": run.spec.label})
-            record = self.store.rewrite(record, tracker=labelled)
+            record = self.store.rewrite(record, tracker=record.tracker.model_copy(update={"label": run.spec.label}))
         if record.study and not run.spec.study:
             record = self.store.rewrite(record, study="")
         self._take_in(run, record, "reused")

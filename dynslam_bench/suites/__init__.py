@@ -197,8 +197,7 @@ def load_suite(name: str | Path) -> Suite:
     elif path.suffix.lower() == ".toml":
         text, where = read_text(path, kind=RunError), str(path)
     else:
-        hint = did_you_mean(str(name), suite_names())
-        raise RunError(f"unknown suite '{name}'", f"{hint} Or name a .toml file")
+        raise RunError(f"unknown suite '{name}'", f"{did_you_mean(str(name), suite_names())} Or name a .toml file")
     document = parse_toml(text, where, kind=RunError)
     document.setdefault("name", Path(where).stem)
     suite = validated(Suite, document, where, RunError)

@@ -338,11 +338,10 @@ def check_instances(instances: Instances, frame: Frame) -> None:
 def _segmenter_determinism(construct: Callable[[], Segmenter], frames: list[Frame]) -> None:
     first, second = construct(), construct()
     for frame in frames:
-        fault = f"frame {frame.index} gives other objects when it is segmented again"
         require_equal(
             first.segment(frame),
             second.segment(frame),
             ("masks", "scores", "class_names"),
-            fault,
+            f"frame {frame.index} gives other objects when it is segmented again",
             "a network in training mode, or unseeded randomness",
         )

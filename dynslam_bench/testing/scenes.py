@@ -109,13 +109,12 @@ def hard_frames(like: Frame) -> dict[str, Frame]:
         like: A frame whose index, stamp and size they take.
     """
     black, zero = np.zeros_like(like.rgb), np.zeros_like(like.depth)
-    speckle = np.random.default_rng(3).integers(0, 256, like.rgb.shape, dtype=np.uint8)
     return {
         "all-black": replace(like, rgb=black, depth=zero),
         "saturated": replace(like, rgb=np.full_like(like.rgb, 255)),
         "zero depth": replace(like, depth=zero),
         "textureless": replace(like, rgb=np.full_like(like.rgb, 128), depth=np.full_like(like.depth, 2.0)),
-        "noise": replace(like, rgb=speckle),
+        "noise": replace(like, rgb=np.random.default_rng(3).integers(0, 256, like.rgb.shape, dtype=np.uint8)),
     }
 
 

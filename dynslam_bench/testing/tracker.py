@@ -67,16 +67,18 @@ def tracker_report(
     report = ConformanceReport("") if report is None else report
     spec = TRACKERS.get(subject) if isinstance(subject, str) else subject if isinstance(subject, TrackerSpec) else None
     report.subject = f"tracker {spec.id!r}" if spec else ConformanceReport.of("tracker", subject).subject
-    scene, turning = sequence if sequence is not None else CornerSequence(frames), TurningSequence()
+    scene, turning = CornerSequence(frames) if sequence is None else sequence, TurningSequence()
     if spec is not None:
         report.run("spec", lambda: _spec(spec, settings))
     run = _Runner(report, spec or subject, settings, scene, frames, seed)
     deterministic = spec is None or spec.deterministic
-    turning_run = _Runner(report, spec or subject, settings, turning, len(turning), seed)
     return report.run_all(
         {"construction": lambda: _construction(run), "results": lambda: _results(run)},
         {
-            "camera to world": lambda: _conventions(turning_run, spec is not None and spec.sensors == "rgb"),
+            "camera to world": lambda: _conventions(
+                _Runner(report, spec or subject, settings, turning, len(turning), seed),
+                spec is not None and spec.sensors == "rgb",
+            ),
             "same stats on every frame": lambda: _same_keys(run),
             "frames are left alone": lambda: _frames_left_alone(run),
             "determinism": lambda: _determinism(run, deterministic),

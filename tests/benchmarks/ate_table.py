@@ -54,13 +54,12 @@ CELLS: dict[str, Callable[[Sequence[float]], str]] = {
 def measured(run: RunResult) -> dict[str, float]:
     """What a run's row does not hold; path length and largest distance from the first pose are in metres."""
     positions = np.zeros((1, 3)) if run.trajectory is None else run.trajectory.positions
-    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     return {
         "keyframes": run.record.keyframes,
         "loops": int(run.frames().get("stat_loops", pd.Series([0])).max()),
         "dropped": run.record.n_dropped / run.record.n_frames,
         "frame_p95_s": run.record.timings["total"].p95_s,
-        "path_m": steps.sum(),
+        "path_m": np.linalg.norm(np.diff(positions, axis=0), axis=1).sum(),
         "farthest_m": np.linalg.norm(positions - positions[0], axis=1).max(),
     }
 

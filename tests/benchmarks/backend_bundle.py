@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import gtsam
 import numpy as np
+import pandas as pd
 
 from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.slam.bundle_adjustment import DEPTH_SHARE, BundleProblem, BundleResult, adjust_bundle
@@ -76,33 +77,24 @@ def adjust_bundle_gtsam(problem: BundleProblem, iterations: int) -> BundleResult
 
 def main() -> None:
     """Print one row a solver."""
-    solvers = {"schur": adjust_bundle, "gtsam": adjust_bundle_gtsam}
-    spent: dict[str, list[float]] = {name: [] for name in solvers}
-    cost: dict[str, list[float]] = {name: [] for name in solvers}
-    error: dict[str, list[float]] = {name: [] for name in solvers}
     adjust_bundle(problem(200, 0)[0], 1)  # compiles
+    rows = []
     for seed in range(REPEATS):
-        each, truth = problem(OBSERVATIONS, seed)
-        for name, solve in solvers.items():
+        bundle, truth = problem(OBSERVATIONS, seed)
+        for name, solve in (("schur", adjust_bundle), ("gtsam", adjust_bundle_gtsam)):
             begin = time.process_time()
-            result = solve(each, ITERATIONS)
-            spent[name].append(1e3 * (time.process_time() - begin))
-            cost[name].append(adjust_bundle(replace(each, poses=result.poses, points=result.points), 0).cost)
-            error[name].append(
-                1e3
-                * float(
-                    np.linalg.norm(
-                        (se3.inverse(result.poses[: each.variable]) @ truth[: each.variable])[:, :3, 3], axis=1
-                    ).mean()
-                )
-            )
+            result = solve(bundle, ITERATIONS)
+            spent_ms = 1e3 * (time.process_time() - begin)
+            cost = adjust_bundle(replace(bundle, poses=result.poses, points=result.points), 0).cost
+            off = se3.inverse(result.poses[: bundle.variable]) @ truth[: bundle.variable]
+            rows.append((name, spent_ms, cost, 1e3 * np.linalg.norm(off[:, :3, 3], axis=1).mean()))
+    measured = pd.DataFrame(rows, columns=["solver", "ms", "cost", "mm"])
     print(f"{OBSERVATIONS} observations, 8 + 6 poses, {ITERATIONS} iterations, processor time")
     print("| solver | ms median | ms min | cost | camera error mm |")
     print("| --- | --- | --- | --- | --- |")
-    for name in solvers:
+    for name, part in measured.groupby("solver", sort=False):
         print(
-            f"| {name} | {np.median(spent[name]):.1f} | {min(spent[name]):.1f} | {np.mean(cost[name]):.0f} "
-            f"| {np.mean(error[name]):.2f} |"
+            f"| {name} | {part.ms.median():.1f} | {part.ms.min():.1f} | {part.cost.mean():.0f} | {part.mm.mean():.2f} |"
         )
 
 

@@ -5,15 +5,10 @@ process of its own. Repeats alternate between the two; the ratio is the median o
 """
 
 import statistics
-import sys
 import time
 from functools import partial
-from pathlib import Path
 
 import gymnasium as gym
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # the checkout that this script lies in
-
 from command_line import parser_of
 
 from dynslam_bench.envs import SlamEnv

@@ -15,7 +15,7 @@ import cv2
 
 ROOT = Path(__file__).resolve().parents[2]
 PICTURES = ROOT / "docs" / "pictures"
-sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "reports")]
+sys.path.insert(0, str(ROOT / "tests" / "reports"))
 
 from reports_browser import Browser  # noqa: E402
 

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "reports")]
+sys.path.insert(0, str(ROOT / "tests" / "reports"))
 
 from reports_browser import EXECUTABLE, Browser  # noqa: E402
 from reports_fake_store import add_frames, add_run  # noqa: E402

@@ -40,8 +40,7 @@ COMMANDS = re.compile(r"^```bash\n(.*?)^```\n", re.DOTALL | re.MULTILINE)
 
 def sections(page: str) -> dict[str, str]:
     """A page's sections by their headings, each with its heading."""
-    parts = re.split(r"^(?=## )", page, flags=re.MULTILINE)[1:]
-    return {part.partition("\n")[0][3:]: part for part in parts}
+    return {part.partition("\n")[0][3:]: part for part in re.split(r"^(?=## )", page, flags=re.MULTILINE)[1:]}
 
 
 def made_at() -> str:

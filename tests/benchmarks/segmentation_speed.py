@@ -5,16 +5,12 @@ medians; user CPU time stands beside them, because wall times of a busy machine 
 """
 
 import statistics
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[2]))  # the checkout that this script lies in
-
 from command_line import parser_of, timed
 
 from dynslam_bench.contracts.sequence import Frame

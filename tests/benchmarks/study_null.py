@@ -32,9 +32,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tuning"))
 import simulated
 from command_line import parser_of
 
-from dynslam_bench.tuning import Verdict, finish
+from dynslam_bench.tuning import Verdict, distributions, finish
 from dynslam_bench.tuning.judgement import compared
-from dynslam_bench.tuning.plan import distributions
 from dynslam_bench.tuning.study_file import scenes
 
 SCENES, SPREADS = (6, 11, 12, 24), (0.15, 0.5)

@@ -7,6 +7,8 @@ from cli_helpers import PROGRAM
 from envs_toys import write_sequence
 
 from dynslam_bench.cli import app, output
+from dynslam_bench.core import fingerprint
+from dynslam_bench.core.folders import digest_cache_folder
 from dynslam_bench.testing import CornerSequence
 
 
@@ -14,6 +16,8 @@ from dynslam_bench.testing import CornerSequence
 def cli(capsys, monkeypatch, tmp_path):
     """Runs the program in an empty folder; returns exit code, output and errors."""
     monkeypatch.chdir(tmp_path)
+    digests = digest_cache_folder()  # shared: those of this package's code take seconds
+    monkeypatch.setattr(fingerprint, "digest_cache_folder", lambda: digests)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.delenv("DYNSLAM_BENCH_DATA", raising=False)
     monkeypatch.setattr(app, "app", PROGRAM)

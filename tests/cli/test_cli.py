@@ -20,10 +20,8 @@ from dynslam_bench.cli.app import expand_lists
 from dynslam_bench.core.errors import RunError, SettingsError
 from dynslam_bench.core.stage_cache import StageCache
 from dynslam_bench.evaluation import evaluate_files
-from dynslam_bench.geometry import se3
+from dynslam_bench.geometry import Trajectory, read_tum, se3, write_kitti, write_tum
 from dynslam_bench.geometry.se3 import inverse
-from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.trajectory_files import read_tum, write_kitti, write_tum
 from dynslam_bench.sequences import open_sequence
 from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS
 from dynslam_bench.testing import TurningSequence
@@ -142,13 +140,12 @@ def test_sequences_verify(cli, facts, walk, tmp_path):
 
 
 def test_a_faulty_recording_is_found_by_the_doctor_and_named_after_a_bad_run(cli, facts, tmp_path):
-    scene = TurningSequence(40)
+    scene = TurningSequence(34)
     sound = write_sequence(tmp_path / "sound", scene)
     scene.ground_truth = Trajectory(scene.timestamps, inverse(scene.ground_truth.T_world_cam))
     faulty = write_sequence(tmp_path / "faulty", scene)
     findings = facts("sequences", "doctor", faulty, code=4)["findings"]
     assert "truth-inverted" in {finding["id"] for finding in findings}
-    assert cli("sequences", "doctor", sound)[0] == 0
     _, _, err = cli("run", "constant-velocity", faulty)
     assert f"sequences doctor {faulty}" in err and findings[0]["text"] in err
     assert "sequences doctor" not in cli("run", "constant-velocity", sound)[2]
@@ -207,8 +204,7 @@ def test_kitti_trajectories_with_their_stamps(cli, facts, walk, tmp_path):
 
 
 def test_doctor(facts):
-    rows = facts("doctor")
-    assert {"program", "weights", "folder", "device"} <= {row["part"] for row in rows}
+    assert {"program", "weights", "folder", "device"} <= {row["part"] for row in facts("doctor")}
 
 
 def test_envs(facts):
@@ -297,15 +293,14 @@ def test_seed_lists(line, expanded):
 HEAVY = ("torch", "cv2", "numpy", "scipy", "pandas", "optuna", "gymnasium", "numba", "gtsam")
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"], ["report", "--help"]])
-def test_help_loads_nothing_heavy(arguments):
+def test_help_loads_nothing_heavy():
     code = (
         "import sys\nfrom dynslam_bench.cli.app import start\n"
-        f"try: start({arguments!r})\nexcept SystemExit: pass\n"
+        "for words in ([], ['run'], ['report']):\n    try: start([*words, '--help'])\n    except SystemExit: pass\n"
         f"sys.stderr.write(' '.join(m for m in {HEAVY!r} if m in sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
-    assert done.stderr == "" and "Usage: dynslam-bench" in done.stdout
+    assert done.stderr == "" and done.stdout.count("Usage: dynslam-bench") == 3
 
 
 def test_output_to_a_closed_pipe_is_no_error():

@@ -1,5 +1,6 @@
 """`run`, `bench` and `runs list`: what a row says of its run, limits, labels, refusals, progress off a terminal."""
 
+import io
 import json
 import os
 import re
@@ -17,16 +18,17 @@ from cli_helpers import one_line
 from envs_toys import write_folder
 from reports_fake_store import add_run
 
+from dynslam_bench import cli as program
 from dynslam_bench.cli import app, demo, output, running, runs
 from dynslam_bench.cli.demo import compiled_ahead, tell
 from dynslam_bench.cli.output import report_table, table
-from dynslam_bench.core.errors import RunError
-from dynslam_bench.core.folders import WEIGHTS_VARIABLE
+from dynslam_bench.core import WEIGHTS_VARIABLE, RunError
 from dynslam_bench.core.records import digest
 from dynslam_bench.geometry.trajectory_files import read_tum
 from dynslam_bench.reports.model.row import RunRow
 from dynslam_bench.reports.tables.table import Column, Table, TableCell
 from dynslam_bench.runs import RunEvent, RunSpec, RunStore, run_many
+from dynslam_bench.runs.process.fork_server import START_VARIABLE
 from dynslam_bench.segmentation.networks import checkpoints
 from dynslam_bench.trackers import TRACKERS
 
@@ -265,6 +267,7 @@ def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number):
     program = subprocess.Popen(
         [sys.executable, "-m", "dynslam_bench", *verb.split(), "what.toml"],
         cwd=tmp_path,
+        env=os.environ | {START_VARIABLE: "fresh"},
         stderr=subprocess.PIPE,
         text=True,
         preexec_fn=attentive,
@@ -429,7 +432,7 @@ def test_a_broken_plugin_is_explained_and_ends_neither_run_nor_list(cli, facts, 
 def test_a_new_tracker_passes_its_checks_and_runs(cli, facts, walk):
     code, out, _ = cli("trackers", "new", "My SLAM-2")
     assert code == 0 and Path("my_slam_2.py").is_file() and "trackers test ./my_slam_2.py:SPEC" in out
-    code, out, _ = cli("trackers", "test", "./my_slam_2.py:SPEC", "--frames", "4")
+    code, out, _ = cli("trackers", "test", "./my_slam_2.py:SPEC", "--frames", "2")
     assert code == 0, out
     *checks, total = [line for line in out.splitlines() if line]
     assert {line.split()[0] for line in checks} == {"passed", "skipped"}
@@ -440,7 +443,7 @@ def test_a_new_tracker_passes_its_checks_and_runs(cli, facts, walk):
     assert "is no name" in one_line(cli("trackers", "new", "../evil")[2])
 
 
-def test_a_faulty_tracker_fails_with_4(cli, tmp_path):
+def test_a_faulty_tracker_fails_with_4(facts, tmp_path):
     (tmp_path / "faulty.py").write_text(
         "from dynslam_bench.trackers import TrackerSpec\n"
         "class Faulty:\n"
@@ -449,10 +452,9 @@ def test_a_faulty_tracker_fails_with_4(cli, tmp_path):
         "    def track(self, frame): return None\n"
         "SPEC = TrackerSpec('faulty', f'{__file__}:Faulty', 'Faulty')\n"
     )
-    code, out, _ = cli("trackers", "test", "faulty.py:SPEC")
-    assert code == 4 and "gave a NoneType, not a TrackResult" in out
-    code, out, _ = cli("trackers", "test", "faulty.py:SPEC", "--json")
-    assert code == 4 and json.loads(out)["ok"] is False
+    report = facts("trackers", "test", "faulty.py:SPEC", code=4)
+    (fault,) = [check["message"] for check in report["checks"] if check["status"] == "failed"]
+    assert report["ok"] is False and "gave a NoneType, not a TrackResult" in fault
 
 
 ROWS = [
@@ -608,17 +610,17 @@ def test_published_numbers_are_listed_with_whose_they_are(cli, facts):
 LABEL = "caf\xe9 \u2013 \U0001f600"
 
 
-def test_a_report_is_shown_on_a_terminal_that_lacks_characters(cli, walk: Path, tmp_path: Path) -> None:
+def test_a_report_is_shown_on_a_terminal_that_lacks_characters(cli, walk: Path, tmp_path: Path, monkeypatch) -> None:
     options = "--tracker", "theirs", "--label", LABEL, "--sequence", walk, "--online"
     assert cli("import", walk / "groundtruth.txt", *options)[0] == 0
-    done = subprocess.run(
-        [sys.executable, "-m", "dynslam_bench", "report", "results", "-o", str(tmp_path)],
-        capture_output=True,
-        env=os.environ | {"PYTHONIOENCODING": "latin-1"},
-    )
-    assert done.returncode == 0
-    assert [line for line in done.stderr.splitlines() if not line.endswith(b"so far")] == []
-    assert "caf" in done.stdout.decode("latin-1") and b"?" in done.stdout
+    terminal = io.TextIOWrapper(io.BytesIO(), encoding="latin-1")
+    monkeypatch.setattr(program, "_SIGNALS", ())  # pytest handles its own
+    monkeypatch.setattr(sys, "argv", ["dynslam-bench", "report", "results", "-o", str(tmp_path)])
+    monkeypatch.setattr(sys, "stdout", terminal)
+    with pytest.raises(SystemExit, match="0"):
+        program.main()
+    shown = terminal.buffer.getvalue()
+    assert "caf" in shown.decode("latin-1") and b"?" in shown
     assert LABEL in (tmp_path / "report.md").read_text(encoding="utf-8")
 
 

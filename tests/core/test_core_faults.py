@@ -101,24 +101,6 @@ def test_a_folder_is_the_old_one_or_the_new_one(tmp_path: Path) -> None:
     assert found.operations >= 8 and found.ends["kill", -9] == found.operations
 
 
-@in_a_small_process
-def test_the_cache_never_gives_half_an_entry(tmp_path: Path) -> None:
-    root = tmp_path / "stages"
-    cache, arrays = StageCache(root), {"a": np.arange(2000)}
-
-    def whole_or_missing() -> None:
-        found = cache.get("orb", "ab" * 20)
-        assert found is None or (found.arrays["a"] == arrays["a"]).all()
-
-    found = survey(
-        lambda: cache.put("orb", "ab" * 20, arrays, 1.0),
-        root,
-        halfway=whole_or_missing,
-        result=lambda: (swept(root).keys(), cache.get("orb", "ab" * 20).arrays["a"].tolist()),
-    )
-    assert found.operations >= 4 and found.ends["kill", -9] == found.operations
-
-
 RECORD = RunRecord.read(Path(__file__).parents[1] / "runs" / "data" / "run.json")
 TRUTH = Trajectory(np.arange(5.0), np.tile(np.eye(4), (5, 1, 1)))
 
@@ -140,34 +122,27 @@ def held(root: Path) -> dict[str, bytes | str]:
     return tree(root)
 
 
+FAILED = RECORD.model_copy(update={"status": "crashed", "reason": "an earlier try"})
+
+
+@pytest.mark.parametrize("before", ["nothing", "a failed run"])
 @in_a_small_process
-def test_a_new_run_is_there_whole_or_not_at_all(tmp_path: Path) -> None:
-    root = tmp_path / "results"
-
-    def whole_or_missing() -> None:
-        records, unreadable = RunStore(root).all()
-        assert list(records) in ([], [RECORD]) and unreadable == []
-
-    faults = ("kill", "full", "read-only")
-    found = survey(lambda: make(root), root, halfway=whole_or_missing, result=lambda: held(root), faults=faults)
-    assert {name.split("/")[0] for name in tree(root)} == {"runs", "sequences", "latest"}
-    assert found.operations > 20 and found.ends["kill", -9] == found.operations
-    assert found.ends["full", 3] > 5 and found.ends["read-only", 3] > 5
-
-
-@in_a_small_process
-def test_a_run_that_is_made_again_is_never_lost(tmp_path: Path) -> None:
-    root, failed = tmp_path / "results", RECORD.model_copy(update={"status": "crashed", "reason": "an earlier try"})
+def test_a_run_is_there_whole_or_not_at_all_and_one_that_is_made_again_is_never_lost(
+    before: str, tmp_path: Path
+) -> None:
+    root, earlier = tmp_path / "results", [] if before == "nothing" else [FAILED]
 
     def old_or_new() -> None:
-        (record,) = RunStore(root).all()[0]
-        assert record in (failed, RECORD)
+        records, unreadable = RunStore(root).all()
+        assert list(records) in (earlier, [RECORD]) and unreadable == []
 
     found = survey(
-        lambda: make(root), root, begin=lambda: make(root, failed), halfway=old_or_new, result=lambda: held(root),
-        faults=("kill",),
+        lambda: make(root), root, begin=lambda: [make(root, record) for record in earlier], halfway=old_or_new,
+        result=lambda: held(root), faults=("kill",) if earlier else ("kill", "full", "read-only"),
     )  # fmt: skip
+    assert {name.split("/")[0] for name in tree(root)} == {"runs", "sequences", "latest"}
     assert found.operations > 15 and found.ends["kill", -9] == found.operations
+    assert earlier or (found.ends["full", 3] > 5 and found.ends["read-only", 3] > 5)
 
 
 @in_a_small_process
@@ -440,8 +415,7 @@ def test_a_programs_secrets_are_in_no_record(secret: str) -> None:
     command = f"slam {secret} --threads 2"
     words = ["dynslam-bench", "run", f"subprocess:{command}", "--set", f"command={command}"]
     shell = shlex.split(command)
-    settings = {"api_key": "s3cret", "command": command, "words": words}
-    stored = Sample(text=command, words=shell, more=settings)
+    stored = Sample(text=command, words=shell, more={"api_key": "s3cret", "command": command, "words": words})
     for text in (stored.to_json(), stored.to_line()):
         assert "s3cret" not in text
         again = Sample.model_validate_json(text)

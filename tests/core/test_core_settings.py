@@ -80,8 +80,7 @@ def test_parameters_describe_the_search_space():
     ],
 )
 def test_assignments_of_the_command_line(assignment, name, value):
-    settings = apply_overrides(Root(), parse_assignments([assignment]))
-    assert flatten(settings) == flatten(Root()) | {name: value}
+    assert flatten(apply_overrides(Root(), parse_assignments([assignment]))) == flatten(Root()) | {name: value}
 
 
 @pytest.mark.parametrize(
@@ -186,8 +185,7 @@ def test_kernels_compile_where_nothing_can_be_cached(compile_, monkeypatch: pyte
 def test_kernels_are_cached_and_release_the_lock() -> None:
     from dynslam_bench.geometry.gauss_newton import apply_twist
 
-    options = apply_twist.targetoptions
-    assert options["nogil"] and apply_twist.stats.cache_path
+    assert apply_twist.targetoptions["nogil"] and apply_twist.stats.cache_path
 
 
 def test_kernels_on_disk_are_loaded_before_they_are_called(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -458,7 +456,6 @@ def test_a_file_that_raises_gives_its_reason_and_can_be_mended(tmp_path):
 ENDINGS = {
     "import sys; sys.exit(0)": "exit code 0",
     "import os; os._exit(0)": "exit code 0",
-    "raise SystemExit('no GPU')": "exit code 1",
     "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)": "SIGSEGV",
 }
 
@@ -480,9 +477,9 @@ def test_an_import_that_ends_the_process_is_an_error_like_any_other(tmp_path, mo
 
 
 def test_an_import_without_an_end_is_an_error_too(tmp_path, monkeypatch):
-    monkeypatch.setattr(plugin_probe, "LIMIT_S", 3)
+    monkeypatch.setattr(plugin_probe, "LIMIT_S", 1)
     (tmp_path / "endless.py").write_text("while True: pass\n")
-    with pytest.raises(PluginError, match="is not done after 3 s"):
+    with pytest.raises(PluginError, match="is not done after 1 s"):
         load_object(f"{tmp_path / 'endless.py'}:SPEC")
 
 

@@ -1,7 +1,8 @@
-"""What the pages and docstrings name exists: files, settings, symbols, options, ids."""
+"""What pages and docstrings name exists: files, settings, symbols, options, ids, links; made pages are not stale."""
 
 import re
 import shlex
+import sys
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import pytest
 import typer.main
 from documented_names import (
+    ROOT,
     SUFFIXES,
     Mention,
     exists,
@@ -22,6 +24,9 @@ from dynslam_bench.core.settings import field_names
 from dynslam_bench.sequences.catalogue import entry_of
 from dynslam_bench.testing.pytest_plugin import OPTIONS as CHECKED_KINDS
 from dynslam_bench.trackers import TRACKERS
+
+sys.path.insert(0, str(ROOT / ".ci" / "site"))
+from generated import reference_pages
 
 OF_USERS = ("results/", "path/", "~/", "videos/")
 """How paths begin that are made by runs or by the reader."""
@@ -123,7 +128,6 @@ def test_options_exist() -> None:
 # Every command line that the README and the docs print is one that the program takes.
 
 
-ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 MADE_UP = ("path/", "./", "/", "grey/")
 """How names begin that stand for a reader's own files and plug-ins."""
@@ -134,8 +138,7 @@ def documented() -> list[str]:
     lines = []
     for page in PAGES:
         for block in re.findall(r"^```bash\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE):
-            joined = block.replace("\\\n", " ")
-            lines += [line for line in joined.splitlines() if line.startswith("dynslam-bench ")]
+            lines += [line for line in block.replace("\\\n", " ").splitlines() if line.startswith("dynslam-bench ")]
     return lines
 
 
@@ -154,3 +157,20 @@ def test_the_documented_command_parses(line: str) -> None:
         assert ":" in tracker or tracker in {entry.spec.id for entry in TRACKERS.all()}, f"no tracker '{tracker}'"
         for sequence in context.params["sequences"]:
             assert sequence.startswith(("synthetic/", *MADE_UP)) or entry_of(sequence) is not None, sequence
+
+
+# The reference pages that are made of the code are those that the code makes now, and all links between pages hold.
+
+
+@pytest.mark.parametrize(("page", "text"), reference_pages().items(), ids=lambda value: value[:30])
+def test_reference_pages_are_those_of_the_code(page: str, text: str) -> None:
+    assert (ROOT / "docs" / page).read_text(encoding="utf-8") == text, "write it again: python .ci/site/generated.py"
+
+
+@pytest.mark.parametrize(
+    "page", [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")], ids=lambda page: page.relative_to(ROOT).as_posix()
+)
+def test_links_between_files_hold_without_the_site(page: Path) -> None:
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.S | re.M)
+    links = re.findall(r"\]\((?![a-z]+:|#)([^)#\s]+)", text)
+    assert [link for link in links if not (page.parent / link).exists()] == []

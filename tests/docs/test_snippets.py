@@ -200,8 +200,7 @@ def imports(code: str) -> list[tuple[str, str]]:
 
 def test_plug_ins_import_from_the_contracts_only(tmp_path: Path) -> None:
     page = "\n".join((ROOT / "docs" / page).read_text(encoding="utf-8") for page in PLUGIN_PAGES)
-    texts = re.findall(r"^```python\n(.*?)^```", page, flags=re.S | re.M)
-    taken = [pair for text in texts for pair in imports(text)]
+    taken = [pair for text in re.findall(r"^```python\n(.*?)^```", page, flags=re.S | re.M) for pair in imports(text)]
     assert len(taken) > 10 and {module for module, _ in taken} <= OPEN | {COMPOSING, RULES}
     template = imports(write_tracker_template("my-slam", tmp_path).read_text())
     assert ("dynslam_bench.contracts", "TrackerSpec") in template and {module for module, _ in template} <= OPEN

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 import results
-from documented_names import sources
-from prose import ROOT, paragraphs, sentences, tables, user_pages, words
+from documented_names import PAGES as WRITTEN
+from documented_names import ROOT, sources
 
 LONGEST, MEDIAN = 35, 18
 """Words of a sentence."""
@@ -27,7 +27,46 @@ WORDS = {
     r"\bsteer(?:s|ed|ing)?\b": "change online settings",
 }
 """Words of no reader's field, and what to write in their place."""
-PAGES = user_pages()
+NOTES = ("lab", "decisions", "paper", "example")
+"""Folders of `docs/` that are not written for users."""
+BLOCKS = re.compile(r"^---\n.*?^---\n|^```.*?^```|<!--.*?-->", re.DOTALL | re.MULTILINE)
+CELLS = re.compile(r"(?<!\\)\|")
+PAGES = [page for page in WRITTEN if not set(page.relative_to(ROOT).parts[1:-1]) & set(NOTES)]
+"""The pages that are written for users."""
+
+
+def paragraphs(text: str) -> list[str]:
+    """Paragraphs and list items in plain words; a name in backticks is one word."""
+    text = BLOCKS.sub("\n", text)
+    text = re.sub(r"^(#|\||\*Made at |!\[|\[!\[).*$", "", text, flags=re.MULTILINE)
+    text = re.sub(r"^ *(?:[-*]|\d+\.) ", "\n", text, flags=re.MULTILINE)
+    text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", text)
+    text = re.sub(r"`[^`]*`", "Name", text)
+    return [" ".join(part.replace("*", "").split()) for part in re.split(r"\n\s*\n", text) if part.strip()]
+
+
+def sentences(text: str) -> list[str]:
+    """A page's sentences."""
+    return [
+        sentence
+        for paragraph in paragraphs(text)
+        for sentence in re.split(r"(?<=[.!?])\)? +(?=[A-Z0-9(\"])", paragraph)
+        if len(words(sentence)) > 1
+    ]
+
+
+def words(sentence: str) -> list[str]:
+    """A sentence's words."""
+    return [word for word in sentence.split() if re.search(r"\w", word)]
+
+
+def tables(text: str) -> list[list[list[str]]]:
+    """A page's tables as rows of cells, each with its header first and without the rule below it."""
+    text = BLOCKS.sub("\n", text)
+    return [
+        [[cell.strip() for cell in CELLS.split(row.strip())[1:-1]] for row in block.splitlines() if "| --" not in row]
+        for block in re.findall(r"(?:^ *\|.*\n?)+", text, flags=re.MULTILINE)
+    ]
 
 
 @pytest.fixture(params=PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -55,7 +94,7 @@ def test_a_page_begins_with_one_sentence_that_says_what_it_is_for(text: str) -> 
 
 def test_all_pages_are_short() -> None:
     total = 0
-    for page in user_pages():
+    for page in PAGES:
         text = page.read_text(encoding="utf-8")
         total += sum(len(part.split()) for part in (paragraphs(text) if page.parent.name == "results" else [text]))
     assert total <= ALL_PAGES
@@ -124,7 +163,7 @@ def measured(text: str) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize("page", user_pages(), ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_a_page_outside_of_results_holds_no_measured_table(page: Path) -> None:
     if page not in RESULTS:
         assert measured(page.read_text(encoding="utf-8")) == [], "move it: docs/results/README.md"

@@ -12,6 +12,7 @@ import tempfile
 import zipfile
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from random import Random
@@ -38,9 +39,8 @@ from dynslam_bench.core.stage_cache import StageCache  # what of the cache reads
 from dynslam_bench.evaluation import get_protocol
 from dynslam_bench.geometry import Camera, load_tum, read_kitti
 from dynslam_bench.reports.model.load import load_runs
-from dynslam_bench.runs import RunStore, artifacts, bank, frames, running
+from dynslam_bench.runs import RunRecord, RunStore, artifacts, bank, frames, running
 from dynslam_bench.runs.exchange import formats, transfer
-from dynslam_bench.runs.record import RunRecord
 from dynslam_bench.runs.store import INDEX_FILE, list_runs
 from dynslam_bench.segmentation import recorded
 from dynslam_bench.segmentation.networks import loading, onnx_segmenter
@@ -59,8 +59,48 @@ from dynslam_bench.suites import load_suite
 from dynslam_bench.trackers.adapters import orbslam3, subprocess_tracker
 from dynslam_bench.tuning import Study, StudySummary, study_file
 
-from .campaign import Target, at, written
 from .mutate import mutate, mutate_json, mutate_lines, mutate_png, mutate_zip, zipped
+
+Mutation = Callable[[bytes, Random], bytes]
+
+
+@dataclass(frozen=True)
+class Target:
+    """A reader.
+
+    Attributes:
+        name: Its name.
+        read: Reads what the bytes are in an empty folder of its own; None stands for a file that is missing. It ends,
+            or raises an error of `allowed`; anything else is a finding.
+        seeds: Makes sound and unsound files, once.
+        mutation: Damage that keeps checksums or syntax right, used every other time beside damage to plain bytes.
+        allowed: The errors that its documentation names.
+    """
+
+    name: str
+    read: Callable[[bytes | None, Path], object]
+    seeds: Callable[[], list[bytes]]
+    mutation: Mutation | None = None
+    allowed: tuple[type[BaseException], ...] = (DynslamError,)
+
+
+def written(write: Callable[[io.BytesIO], object]) -> bytes:
+    """What a function writes to a file."""
+    buffer = io.BytesIO()
+    write(buffer)
+    return buffer.getvalue()
+
+
+def at(folder: Path, name: str, data: bytes | None) -> Path:
+    """A file of that name with the bytes, or its path where there are none."""
+    path = folder / name
+    if data is None:
+        path.unlink(missing_ok=True)
+    else:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+    return path
+
 
 FIXTURE = Path(__file__).resolve().parents[1] / "fixtures" / "results"
 RUN, OTHER = "a7abe04996a79cc4", b"e7f8d4df9db4bb16"
@@ -587,10 +627,9 @@ def _read_mask(data: bytes | None, folder: Path) -> None:
     at(folder, "0.9.png" if stamped else "0.png", b"")
     at(folder, "1.0.png" if stamped else "1.png", data)
     at(folder, recorded.CLASSES_FILE, b'{"1": "person"}')
-    frame = _FRAME
     segmenter = recorded.RecordedSegmenter(folder)
     segmenter.missing(np.array([1.0, 2.0]))
-    segmenter.segment(frame)
+    segmenter.segment(_FRAME)
 
 
 def _read_rendered(data: bytes | None, folder: Path) -> None:

@@ -62,8 +62,7 @@ STAMPS = 100.0 + np.arange(0, 60, 2) / 30.0
 def poses(count: int) -> np.ndarray:
     """Camera-to-world poses that turn all the way round."""
     rng = np.random.default_rng(4)
-    twists = np.concatenate([rng.normal(size=(count, 3)), rng.uniform(-3, 3, (count, 3))], axis=1)
-    return se3.exp(twists)
+    return se3.exp(np.concatenate([rng.normal(size=(count, 3)), rng.uniform(-3, 3, (count, 3))], axis=1))
 
 
 def points() -> MapOutputs:
@@ -273,8 +272,7 @@ def test_without_the_library_one_line_says_what_to_install(monkeypatch: pytest.M
 
 @needs_rerun
 def test_a_recording_of_100_frames(store: RunStore, tmp_path: Path) -> None:
-    folder = str(write_folder(tmp_path / "toy", FRAMES))
-    record = run_one(RunSpec(tracker=TARGET, sequence=folder, rrd=True), store)
+    record = run_one(RunSpec(tracker=TARGET, sequence=str(write_folder(tmp_path / "toy", FRAMES)), rrd=True), store)
     assert record.status == "ok", record.reason
     own = store.folder(record.run_id)
     seen = Opened(own / RECORDING_FILE)
@@ -310,8 +308,7 @@ def test_a_recording_that_cannot_be_written_says_so(tmp_path: Path) -> None:
 
 @needs_rerun
 def test_the_recording_of_a_stored_run(store: RunStore, tmp_path: Path) -> None:
-    folder = str(write_folder(tmp_path / "toy", 40))
-    record = run_one(RunSpec(tracker=TARGET, sequence=folder, snapshots=True), store)
+    record = run_one(RunSpec(tracker=TARGET, sequence=str(write_folder(tmp_path / "toy", 40)), snapshots=True), store)
     rng = np.random.default_rng(0)
     colours = rng.integers(0, 255, (7, 3), np.uint8)
     outputs = MapOutputs((), np.arange(7), rng.normal(size=(7, 3)), colours, np.ones(7, np.int64))
@@ -324,8 +321,7 @@ def test_the_recording_of_a_stored_run(store: RunStore, tmp_path: Path) -> None:
     assert list(seen("/features/kept", "Scalars:scalars")) == known
     cleared = sorted(frame or 0 for frame in seen(f"{IMAGE}/kept", "Clear:is_recursive"))
     assert cleared == [index + 1 for index in known if index + 1 < 40 and index + 1 not in known]
-    cloud = np.array(seen("/world/map", "Points3D:positions")[None])
-    assert np.abs(cloud - outputs.positions).max() < 1e-6
+    assert np.abs(np.array(seen("/world/map", "Points3D:positions")[None]) - outputs.positions).max() < 1e-6
 
 
 PUBLISHED = Path(__file__).resolve().parents[3] / "shared" / "data" / "trajectories"
@@ -473,8 +469,7 @@ def test_through_a_bare_git_repository_and_back(made, remote, tmp_path, monkeypa
     assert bank.push(made, Path(remote).name).added == []
     log = subprocess.run(["git", "-C", remote, "log", "--format=%s"], capture_output=True, text=True, check=True)
     assert log.stdout == "Add runs: 2\n"
-    pulled = bank.pull(remote, tmp_path / "pulled")
-    assert len(pulled.added) == 2 and bank.verify(tmp_path / "pulled") == []
+    assert len(bank.pull(remote, tmp_path / "pulled").added) == 2 and bank.verify(tmp_path / "pulled") == []
     assert (tmp_path / "pulled" / "SHA256SUMS").read_bytes() == (made / "SHA256SUMS").read_bytes()
 
 

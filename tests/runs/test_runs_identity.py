@@ -249,8 +249,7 @@ def test_a_rebuilt_shared_library_is_another_run(tmp_path: Path) -> None:
 
 
 def test_libraries_weights_and_own_code_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = str(write_folder(tmp_path / "toy", 4))
-    spec = RunSpec(tracker="orb-slam2", sequence=folder)
+    spec = RunSpec(tracker="orb-slam2", sequence=str(write_folder(tmp_path / "toy", 4)))
     ids = {resolve(spec).run_id}
     known = identity.versions()
     for name in identity.LIBRARIES:

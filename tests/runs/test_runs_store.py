@@ -475,7 +475,6 @@ def test_a_record_whose_id_is_not_its_folders_name_is_unreadable(
     assert two_runs.get(BAD) is None
     with pytest.raises(DynslamError, match=r"run_id|names itself"):
         two_runs.read(BAD)
-    build_report(str(two_runs.root), tmp_path / "in" / "report")
     assert outside(tmp_path) == []
 
 
@@ -497,28 +496,29 @@ def test_no_folder_of_the_store_has_another_name_than_an_id(two_runs: RunStore, 
 
 
 @pytest.mark.parametrize("content", [b"\xff", b"", b"{}", b"[" * 10**5, b'{"reason": "\\ud800"}', b"null"])
-def test_one_damaged_record_disables_nothing(two_runs: RunStore, tmp_path: Path, content: bytes) -> None:
+def test_one_damaged_record_disables_nothing(two_runs: RunStore, content: bytes) -> None:
     (two_runs.folder(BAD) / "run.json").write_bytes(content)
     records, unreadable = two_runs.all()
     assert [record.run_id for record in records] == [GOOD] and len(unreadable) == 1
     for _ in range(2):
         assert [bad.path for bad in list_runs(two_runs)[1]] == [two_runs.folder(BAD)]
     assert "\n" not in unreadable[0].reason and str(two_runs.folder(BAD)) in unreadable[0].reason
-    assert build_report(str(two_runs.root), tmp_path / "report").html.is_file()
-    (two_runs.folder(GOOD) / "run.json").write_bytes(content)
+
+
+def test_a_report_is_made_of_the_sound_records_alone(two_runs: RunStore, tmp_path: Path) -> None:
+    edit(two_runs, run_id="../../../out/x")
+    assert build_report(str(two_runs.root), tmp_path / "in" / "report").html.is_file() and outside(tmp_path) == []
+    (two_runs.folder(GOOD) / "run.json").write_bytes(b"")
     with pytest.raises(ReportError, match="there are no runs in"):
-        build_report(str(two_runs.root), tmp_path / "none")
+        build_report(str(two_runs.root), tmp_path / "in" / "none")
 
 
 @pytest.mark.parametrize("file", ["trajectory_online.txt", "../../sequences/8a65f345d9b34895/groundtruth.txt",
                                   "../../sequences/8a65f345d9b34895/timestamps.txt"])  # fmt: skip
-def test_a_damaged_trajectory_is_the_reason_why_there_is_no_error(
-    two_runs: RunStore, tmp_path: Path, file: str
-) -> None:
+def test_a_damaged_trajectory_is_the_reason_why_there_is_no_error(two_runs: RunStore, file: str) -> None:
     (two_runs.folder(BAD) / file).write_bytes(b"\xff\xfe")
     scored = score(two_runs, two_runs.read(BAD), again=True)
     assert scored.online is None and "is not a text file" in scored.reasons["online"]
-    assert build_report(str(two_runs.root), tmp_path / "report").html.is_file()
     (outcome,) = rescore(two_runs)  # one line names the run and the fault; a shared truth is that of both runs
     assert outcome.runs == 2 - len(outcome.unreadable) == int("online" in file)
     assert f"{two_runs.folder(BAD)}: {scored.reasons['online']}" in outcome.unreadable

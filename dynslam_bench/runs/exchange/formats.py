@@ -153,8 +153,7 @@ def read_colmap(folder: Path, stamps: Mapping[str, float] | None = None) -> Traj
         values = np.array(parts[1:8], dtype=np.float64)
         if not np.isfinite(values).all() or not np.any(values[:4]):
             raise TrajectoryError(f"{path} line {number} holds no pose")
-        name = parts[9].strip()
-        poses_by_stamp[_stamp(name, stamps, path)] = se3.from_quaternion(values[4:], values[[1, 2, 3, 0]])
+        poses_by_stamp[_stamp(parts[9].strip(), stamps, path)] = se3.from_quaternion(values[4:], values[[1, 2, 3, 0]])
     if not poses_by_stamp:
         raise TrajectoryError(f"{path} names no image")
     order = sorted(poses_by_stamp)

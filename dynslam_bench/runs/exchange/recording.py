@@ -205,8 +205,7 @@ def write_stored(
         for index in range(len(sequence)):
             frame, row = sequence[index], rows.get(index)
             state = ("", None) if row is None else (str(row.state), row.pose_error_trans_m)
-            image = encode(frame.rgb)
-            yield RecordedFrame(index, frame.timestamp, image, poses.get(index), shots.get(index), *state)
+            yield RecordedFrame(index, frame.timestamp, encode(frame.rgb), poses.get(index), shots.get(index), *state)
 
     cloud = read_ply(folder / "map.ply") if (folder / "map.ply").is_file() else None
     truth = aligned_truth(sequence.ground_truth, trajectory)[0]

@@ -39,7 +39,7 @@ from dynslam_bench.core.plugins import module_command
 
 _CHILD = "dynslam_bench.runs.process.child"
 PRELOADED = (
-    *("numpy", "scipy.spatial.transform", "cv2", "torch", "numba", "gtsam", "gymnasium"),
+    *("numpy", "scipy.spatial.transform", "cv2", "torch", "numba", "gymnasium"),
     *("dynslam_bench.envs", "dynslam_bench.evaluation.evaluate"),
     *("dynslam_bench.slam.pipeline", "dynslam_bench.slam.backend", "dynslam_bench.features.orb"),
     *("dynslam_bench.flow.moth_flame", "dynslam_bench.segmentation.schedule", _CHILD),
