@@ -22,9 +22,8 @@ from scipy.stats import mstats
 from simulated import SimulatedTuner, make_spec, toy_spec
 
 from dynslam_bench.cli.studies import status
-from dynslam_bench.core.errors import StudyError
+from dynslam_bench.core import StudyError, read_settings
 from dynslam_bench.core.settings import Parameter
-from dynslam_bench.core.toml import read_settings
 from dynslam_bench.tuning import (
     Outcome,
     ProblemInstance,
@@ -219,7 +218,7 @@ def test_importances_are_optunas_from_enough_trials_on(count: int) -> None:
 
 def test_a_study_is_a_frame(folders: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     spec = toy_spec(
-        tune=folders[:1], held_out=folders[1:5], trials=5, top=1, sampler_seed=3, min_coverage=0.5, offsets=[0, 3],
+        tune=folders[:1], held_out=folders[1:2], trials=5, top=1, sampler_seed=3, min_coverage=0.5,
         space={"include": ["gain", "mode", "anger"], "fixed": {"wobble": 0}},
     )  # fmt: skip
     tuner = run_study(spec, results=tmp_path)
@@ -414,10 +413,10 @@ def test_the_page_shows_verdict_funnel_and_optunas_plots(tmp_path: Path) -> None
     tuner = simulated.SimulatedTuner(simulated.make_spec(trials=12), tmp_path)
     tuner.run()
     summary = finish(tuner)
-    browser = Browser(tmp_path / "profile")
+    page, browser = write_page(tuner, summary), Browser(tmp_path / "profile")
     try:
         for width in (1440, 390):
-            browser.open(write_page(tuner, summary), width)
+            browser.open(page, width)
             browser.run("all('.figure').forEach((figure) => figure.scrollIntoView())")
             browser.until("all('.figure').every((figure) => figure.querySelector('.main-svg'))", tries=200)
             assert browser.faults == [] and browser.run("document.documentElement.scrollWidth") == width

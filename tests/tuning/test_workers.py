@@ -99,7 +99,7 @@ def test_running_trials_are_shown_with_their_workers(
     assert states == {number: f"{name}, {end}" for number, (name, end) in enumerate(ends)}
 
 
-@pytest.mark.parametrize("answers_after", [2, None])
+@pytest.mark.parametrize("answers_after", [1, None])
 def test_a_database_that_does_not_answer_is_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answers_after: int | None
 ) -> None:
@@ -262,14 +262,6 @@ def test_nothing_is_claimed_where_nothing_is_better(tmp_path: Path) -> None:
     assert verdicts.count(Verdict.PROVEN) == 0 and verdicts.count(Verdict.NO_MATTER) >= 9
     assert sum(summary.candidates[0].chosen for summary in summaries) <= 2, "5 % of 12, and its chance"
     assert lucky >= 5, "what the trials alone say"
-
-
-def test_an_injected_regression_is_found_and_judged(tmp_path: Path) -> None:
-    spec = make_spec(space={"include": ["gain"], "fixed": {}}, trials=20, top=1)
-    summary = finish(SimulatedTuner(spec, tmp_path, effect=lambda settings: 4 * valley(settings), seed=3).run())
-    held, injected = summary.candidates[0].held_out, 4 * valley({"gain": 1.5})
-    assert summary.verdict == Verdict.PROVEN and held.high < 1
-    assert -math.log(held.ratio) > 0.8 * injected - 0.2, "most of the injected loss, within the noise"
 
 
 def test_eight_workers_and_a_resume_repeat_no_trial(tmp_path: Path) -> None:
