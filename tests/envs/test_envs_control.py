@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from envs_toys import CAMERA, TARGET, ToySequence, images
 
-from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.contracts.tracker import TrackResult
+from dynslam_bench.contracts import Frame, TrackResult
 from dynslam_bench.core.errors import DynslamError, SettingsError
 from dynslam_bench.core.settings import Settings, online_parameters, tunable
 from dynslam_bench.envs import STATS_LAYOUT, ActionMap, SlamEnv

@@ -74,7 +74,7 @@ def test_training_and_test_scenes_are_of_their_splits(id: str) -> None:
 
 
 def test_the_first_action_is_the_default() -> None:
-    env = control_benchmark("masks-v0").make("test", 0)
+    env = short("masks-v0").make("test", 0)
     assert np.array_equal(env.action(0), env.unwrapped.neutral_action)
 
 

@@ -101,7 +101,3 @@ class Browser:
     def picture(self, path):
         """A screenshot of the whole page as PNG."""
         self._page.screenshot(path=path, full_page=True)
-
-    def pdf(self, path):
-        """The page as it is printed."""
-        self._page.pdf(path=path, print_background=True, prefer_css_page_size=True)

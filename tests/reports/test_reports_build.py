@@ -13,19 +13,16 @@ import numpy as np
 import pandas as pd
 import plotly.graph_objects as go
 import pytest
-from reports_fake_store import add_frames, add_run, fill, truth_of
-from reports_rows import PROTOCOL, crashed, page_data, row, rows_of
+from reports_fake_store import PROTOCOL, add_frames, add_run, crashed, fill, page_data, row, rows_of, truth_of
 
-from dynslam_bench.core import reading
-from dynslam_bench.core.errors import DynslamError, InfrastructureError, ReportError
+from dynslam_bench.core import DynslamError, InfrastructureError, ReportError, reading
 from dynslam_bench.core.records import digest
 from dynslam_bench.geometry.trajectory_files import write_tum
-from dynslam_bench.reports import ReportData, build_report, compare, figures
+from dynslam_bench.reports import ReportData, build_report, compare, figures, make_board
 from dynslam_bench.reports.build_report import FEWER_PAGES, MOST_PAGES, masks_section, pages_for
 from dynslam_bench.reports.html import board_page
 from dynslam_bench.reports.html.run_pages import broken, exact_shares
 from dynslam_bench.reports.model import load
-from dynslam_bench.reports.model.board import make_board
 from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.tables import table as tables
 from dynslam_bench.reports.tables.leaderboard import repeatability
@@ -140,7 +137,8 @@ def test_small_and_odd_results(tmp_path):
     add_run(stores["blind"], "a", "s/a", ground_truth=False)
     for (tracker, label), seed in product({"evil": hostile, "orb-slam2": ""}.items(), (0, 1)):
         add_run(stores["dead"], tracker, "s/a", seed, label=label, status="crashed", reason=label, lost=range(120))
-    made = {name: build_report(store, tmp_path / f"report-{name}") for name, store in stores.items()}
+    made = {name: build_report(store, tmp_path / f"report-{name}", title=hostile) for name, store in stores.items()}
+    assert made["one"].markdown.read_text().startswith("# &lt;/script>&lt;script>")
     assert "a alone is ranked" in made["one"].markdown.read_text()
     assert "in no table of errors: s/a" in made["blind"].markdown.read_text()
     ratios = [row["ATE ratio"] for row in rows_of(made["dead"].csv["leaderboard"])]
@@ -258,14 +256,12 @@ def opened(monkeypatch):
     return found
 
 
-def test_fifty_known_runs_cost_no_file_each(store, tmp_path, opened):
-    for number in range(50):
+def test_known_runs_cost_no_file_each(store, tmp_path, opened):
+    for number in range(20):
         add_run(store, f"tracker-{number % 5}", f"s/{number % 2}", number // 10, n=20)
-    opened.clear()
     load_runs([store], PROTOCOL)
-    assert opened.count("run.json") == 50
     opened.clear()
-    assert len(load_runs([store], PROTOCOL).rows) == 50 and opened == []
+    assert len(load_runs([store], PROTOCOL).rows) == 20 and opened == []
     build_report(store, tmp_path / "report", most_pages=7)
     assert opened.count("run.json") == 7  # those that have a page, and every one once
     opened.clear()
@@ -478,7 +474,7 @@ def test_what_changed_shows_at_once(known, reads, change):
     after = loaded_from(known)
     assert len(set(reads)) <= len(known.ids()) // 2
     known.index.path.unlink()
-    assert after == loaded_from(known) and (after == before) == (change == "forgotten")
+    assert after == loaded_from(known) and after != before
 
 
 @pytest.mark.parametrize("change", ["value = '{'", "value = x'ff'", "run_id = '0000000000000000'", "state = 'x'"])
