@@ -195,7 +195,7 @@ def test_the_scenes_that_a_gain_needs_are_the_fewest_and_show_it_in_four_of_five
     rng, gain = np.random.default_rng(1), detectable(0.25, 8)
     assert scenes_needed(gain, 0.25) == 8 and detectable(0.25, 1) == 1
     for true, share in ((math.log(1 - gain), 0.8), (0.0, 0.025)):
-        highs = [bounds(rng.normal(true, 0.25, 8))[1] for _ in range(2000)]
+        highs = [bounds(rng.normal(true, 0.25, 8))[1] for _ in range(1000)]
         assert np.mean(np.array(highs) < 0) == pytest.approx(share, abs=0.03)
 
 
