@@ -35,8 +35,7 @@ from dynslam_bench.core.settings import (
 )
 from dynslam_bench.geometry import Camera
 from dynslam_bench.reports.model.row import SEEN, grouped
-from dynslam_bench.runs import RunRecord, RunSpec, RunStore, load_frames
-from dynslam_bench.runs.identity import resolve
+from dynslam_bench.runs import RunRecord, RunSpec, RunStore, load_frames, resolve
 from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
 from dynslam_bench.sequences.catalogue import catalogue, open_public, open_sequence
 from dynslam_bench.sequences.synthetic import HELD_OUT_SCENES, TUNE_SCENES

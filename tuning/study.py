@@ -23,8 +23,7 @@ from dynslam_bench.core import StudyError, read_settings, storable, words_withou
 from dynslam_bench.core.records import digest, validated
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.core.settings import Scalar
-from dynslam_bench.runs import RunEvent, run_many
-from dynslam_bench.runs.identity import resolve
+from dynslam_bench.runs import RunEvent, resolve, run_many
 from dynslam_bench.runs.record import program_of
 from dynslam_bench.tuning.objectives import (
     CancelledError,

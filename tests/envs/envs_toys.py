@@ -9,13 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from dynslam_bench.contracts.sequence import Frame, FrameMasks, Sequence
-from dynslam_bench.contracts.tracker import TrackerSpec, TrackResult
+from dynslam_bench.contracts import Frame, FrameMasks, Sequence, TrackerSpec, TrackResult
 from dynslam_bench.core.settings import Settings, tunable
-from dynslam_bench.geometry import se3
-from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.trajectory import Trajectory
-from dynslam_bench.geometry.trajectory_files import write_tum
+from dynslam_bench.geometry import Camera, Trajectory, se3, write_tum
 from dynslam_bench.sequences.cameras import write_camera
 
 CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)

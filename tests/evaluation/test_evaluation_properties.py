@@ -404,12 +404,6 @@ def test_a_lost_frame_counts_as_the_last_tracked_pose_repeated():
     assert jumps[0] == pytest.approx(jumps[1], abs=1e-12)
 
 
-def test_a_predicted_pose_of_a_lost_frame_counts_for_nothing():
-    ok = np.arange(len(SHORT)) < 25
-    without = [pose if good else None for pose, good in zip(POSES, ok, strict=True)]
-    assert run(SHORT, POSES, ok) == run(SHORT, without, ok)
-
-
 def test_a_tracker_that_never_starts_stands_at_the_first_true_pose():
     samples = run(SHORT, [None] * len(SHORT))
     way = np.linalg.norm(SHORT.positions - SHORT.positions[0], axis=1)

@@ -6,13 +6,11 @@ from itertools import product
 import numpy as np
 import pandas as pd
 import pytest
-from reports_fake_store import add_run, truth_of
-from reports_rows import PROTOCOL, rows_of
+from reports_fake_store import PROTOCOL, add_run, rows_of, truth_of
 
 from dynslam_bench.cli.app import start
 from dynslam_bench.core.errors import ReportError
-from dynslam_bench.evaluation import evaluate
-from dynslam_bench.evaluation.protocol import PROTOCOLS, get_protocol
+from dynslam_bench.evaluation import PROTOCOLS, evaluate, get_protocol
 from dynslam_bench.geometry.trajectory import Trajectory
 from dynslam_bench.reports import audit as audit_module
 from dynslam_bench.reports import load_board, publish

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import scikit_posthocs as posthocs
 from rank_groups import simulate
-from reports_fake_store import MACHINE, add_run
-from reports_rows import PROTOCOL, cell_of, crashed, row
+from reports_fake_store import MACHINE, PROTOCOL, add_run, cell_of, crashed, row
 from scipy import stats
 
 from dynslam_bench.cli.output import report_table

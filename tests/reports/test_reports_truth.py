@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from reports_fake_store import add_frames, add_run
-from reports_rows import PROTOCOL, cell_of, columns_of, crashed, page_data, row, rows_of
+from reports_fake_store import PROTOCOL, add_frames, add_run, cell_of, columns_of, crashed, page_data, row, rows_of
 
 from dynslam_bench.reports import build_report, compare, load_board, load_frame
 from dynslam_bench.reports.html.run_pages import RunPage, error_by_share, share_sums

@@ -4,12 +4,10 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
-from quick_dense import quick
 
-from dynslam_bench.contracts.segmenter import Instances
-from dynslam_bench.contracts.sequence import Frame, FrameMasks
-from dynslam_bench.contracts.tracker import TrackResult
+from dynslam_bench.contracts import Frame, FrameMasks, Instances, TrackResult
 from dynslam_bench.core.settings import Settings, parameters
+from dynslam_bench.flow.settings import DenseFlowSettings
 from dynslam_bench.segmentation.build_segmenter import SegmenterContext, SegmenterSpec
 from dynslam_bench.segmentation.recorded import instances_of
 from dynslam_bench.sequences.catalogue import open_sequence
@@ -17,6 +15,22 @@ from dynslam_bench.testing.tracker import first_difference
 from dynslam_bench.trackers import TrackerContext, TrackerSpec, build_tracker
 from dynslam_bench.trackers.registry import resolve_settings
 from dynslam_bench.trackers.systems.composition import SemanticSystemSettings
+
+QUICK_DENSE = {
+    "flow.budget": 16,
+    "flow.sweeps": 1,
+    "flow.candidates": 2,
+    "flow.second_round": False,
+    "flow.superpixel_px": 24,
+    "flow.filter_radius_px": 2,
+}
+
+
+def quick(settings: type[Settings]) -> dict[str, object]:
+    """Overrides with which a system's flow costs little; none where it has no dense flow."""
+    dense = "flow" in settings.model_fields and isinstance(settings().flow, DenseFlowSettings)
+    return dict(QUICK_DENSE) if dense else {}
+
 
 STRIDE = 3
 FRAMES = 14

@@ -14,11 +14,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from quick_dense import quick
-from steering_scene import FRAMES, SmallScene, construct, difference, play, settings_for
+from steering_scene import FRAMES, SmallScene, construct, difference, play, quick, settings_for
 
-from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.contracts.tracker import TrackResult
+from dynslam_bench.contracts import Frame, TrackResult
 from dynslam_bench.core.errors import DynslamError, SegmentationError, SequenceError, SettingsError, TrackerError
 from dynslam_bench.core.settings import (
     OnlineSettings,

@@ -15,11 +15,9 @@ import toy_tracker
 
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.seeding import stream
-from dynslam_bench.tuning import Study, StudySpec
-from dynslam_bench.tuning.objectives import Outcome
+from dynslam_bench.tuning import Outcome, ProblemInstance, Study, StudySpec
 from dynslam_bench.tuning.plan import Design, design_of
 from dynslam_bench.tuning.storage import open_storage
-from dynslam_bench.tuning.study_file import ProblemInstance
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
 TUNE, HELD_OUT = (

@@ -8,8 +8,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from dynslam_bench.contracts.sequence import Frame
-from dynslam_bench.contracts.tracker import TrackResult
+from dynslam_bench.contracts import Frame, TrackResult
 from dynslam_bench.core.settings import Settings, tunable
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.sequences.cameras import write_camera

@@ -5,22 +5,24 @@ import json
 import os
 import re
 import resource
+import shlex
 import shutil
 import subprocess
 import sys
 import tempfile
+import textwrap
 import time
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from adapter_programs import GOOD, frame, reset
 from envs_play import play
 from hostile import alive, until
 from test_adapter_controls import PACKED, XYZ, needs_data
 
 from dynslam_bench import api as db
+from dynslam_bench.contracts import Frame
 from dynslam_bench.core.errors import (
     DynslamError,
     InfrastructureError,
@@ -29,22 +31,76 @@ from dynslam_bench.core.errors import (
     TrackerTimeoutError,
 )
 from dynslam_bench.envs.slam_env import SlamEnv
-from dynslam_bench.geometry import Trajectory, se3, write_tum
-from dynslam_bench.geometry.camera import Camera
+from dynslam_bench.geometry import Camera, Trajectory, se3, write_tum
 from dynslam_bench.reports.model.board import load_board
 from dynslam_bench.sequences import open_sequence
 from dynslam_bench.sequences.readers.layouts import read_vslam_lab
-from dynslam_bench.testing import CornerSequence, TurningSequence, check_tracker, isolated_tracker_report
+from dynslam_bench.testing import CornerSequence, TurningSequence, check_tracker, tracker_report
 from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
 from dynslam_bench.trackers.adapters import subprocess_tracker as exchange
 from dynslam_bench.trackers.adapters.specs import BatchSettings, SubprocessSettings
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "examples" / "batch"
+CAMERA = Camera(64, 48, 60.0, 61.0, 31.5, 23.5, distortion=(0.1, -0.2, 0.001, 0.002, 0.3), baseline_m=0.08)
+
+PRELUDE = """
+import json, os, sys, time
+def say(answer):
+    sys.stdout.write(json.dumps(index | answer) + "\\n"); sys.stdout.flush()
+STILL = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+index = {}
+def read():
+    for line in sys.stdin:
+        request = json.loads(line)
+        index.clear()
+        index.update({key: request[key] for key in request if key == "index"})
+        yield request
+requests = read()
+"""
+
+GOOD = """
+for request in requests:
+    if request["op"] == "reset":
+        say({"ok": True})
+    elif request["op"] == "track":
+        say({"state": "ok", "T_world_cam": STILL})
+    elif request["op"] == "close":
+        break
+"""
+
+
+def frame(index, seed=0):
+    rng = np.random.default_rng([seed, index])
+    depth = rng.uniform(0.5, 4, (48, 64)).astype(np.float32)
+    depth[:5] = 0
+    return Frame(index, 1.5 + index / 30, rng.integers(0, 256, (48, 64, 3), dtype=np.uint8), depth)
+
+
+def reset(tracker, seed=0):
+    tracker.reset(CAMERA, rng=np.random.default_rng(seed))
+    return tracker
+
+
+@pytest.fixture
+def program(tmp_path):
+    """Makes a tracker of a program's text; all of them are closed at the end."""
+    made = []
+
+    def make(text, context=None, **settings):
+        path = tmp_path / f"program{len(made)}.py"
+        path.write_text(PRELUDE + textwrap.dedent(text))
+        command = shlex.join([sys.executable, str(path)])
+        made.append(build_tracker(f"subprocess:{command}", settings, context))
+        return made[-1]
+
+    yield make
+    for tracker in made:
+        tracker.close()
 
 
 def test_a_program_keeps_the_contract(program):
     made = program(GOOD)
-    check_tracker(lambda: made)
+    check_tracker(lambda: made, frames=3)
 
 
 def test_reset_tells_all(program, tmp_path):
@@ -548,11 +604,11 @@ write([pose for pose in truth if float(pose[0]) in {float(row[0]) for row in row
 @pytest.mark.parametrize("inverted", [False, True], ids=["good", "world to camera"])
 def test_the_conformance_kit_checks_the_final_trajectory(toml, tmp_path, inverted):
     path = toml(BY_HEART)
-    for scene in (CornerSequence(4), TurningSequence()):
+    for scene in (CornerSequence(2), TurningSequence()):
         truth = scene.ground_truth
         poses = se3.inverse(truth.T_world_cam) if inverted else truth.T_world_cam
         write_tum(tmp_path / f"{scene.camera.width}.txt", Trajectory(truth.timestamps, poses))
-    report = isolated_tracker_report(f"batch:{path}", frames=4)
+    report = tracker_report(f"batch:{path}", frames=2)
     statuses = {check.name: check.status for check in report.checks}
     assert [check.name for check in report.failed] == ["camera to world"] * inverted, report.checks
     assert statuses["results"] == statuses["final trajectory"] == statuses["two resets"] == "passed"

@@ -8,14 +8,12 @@ import cv2
 import numpy as np
 import pytest
 from envs_play import play
-from quick_dense import quick
 from reports_fake_store import add_run
 from scenes import ACROSS, BOX, SIDEWAYS, Scene, box_instance, on_rectangle, scene
-from steering_scene import SmallScene, construct
+from steering_scene import SmallScene, construct, quick
 from steering_scene import play as play_small
 
-from dynslam_bench.contracts.segmenter import Instances
-from dynslam_bench.contracts.tracker import TrackResult
+from dynslam_bench.contracts import Instances, TrackResult
 from dynslam_bench.core import settings as core_settings
 from dynslam_bench.core.errors import DynslamError, SettingsError
 from dynslam_bench.core.settings import parameters, settings_table
