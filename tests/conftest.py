@@ -10,24 +10,26 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 os.environ["PYTHONSAFEPATH"] = "1"
 # Their matrices are small: threads of OpenBLAS would only wait for each other.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"
-KERNELS = (
-    "from dynslam_bench.cli.demo import compile_kernels; compile_kernels('orb-slam2')",
-    """
+TRACKER = "from dynslam_bench.cli.demo import compile_kernels; compile_kernels({!r})"
+FLOWS = """
 import numpy as np
 from dynslam_bench.flow.registry import build_flow
-rng, flow = np.random.default_rng(0), build_flow()
+from dynslam_bench.flow.settings import DenseFlowSettings, FlowSettings
+rng = np.random.default_rng(0)
 image, points = rng.integers(0, 256, (240, 320), np.uint8), rng.uniform(60, 180, (200, 2)).astype(np.float32)
-flow.track(flow.prepare(image), flow.prepare(np.roll(image, 3, 1)), points)
-""",
-)
-"""What compiles half of the kernels each: those of rendering and SLAM, those of the flow."""
+for flow in map(build_flow, (FlowSettings(), DenseFlowSettings(terms=3))):
+    flow.track(flow.prepare(image), flow.prepare(np.roll(image, 3, 1)), points)
+"""
+KERNELS = (TRACKER.format("orb-slam2"), FLOWS), (TRACKER.format("emfoa-oft?masks=none"), TRACKER.format("dynaslam"))
+"""What compiles the kernels in two rounds of two processes: rendering and SLAM, flow; then those that use both."""
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile the kernels once, on two cores: several workers would each compile all of them."""
     if getattr(session.config.option, "numprocesses", None) and not hasattr(session.config, "workerinput"):
-        for half in [subprocess.Popen([sys.executable, "-c", code]) for code in KERNELS]:
-            half.wait()
+        for codes in KERNELS:
+            for process in [subprocess.Popen([sys.executable, "-c", code]) for code in codes]:
+                process.wait()
 
 
 @pytest.fixture
