@@ -225,15 +225,19 @@ class _RegionLabels:
         self._choose(np.concatenate([labels[:, None], labels_as_seen(centres, labels, near)], axis=1))
 
     def try_regional_motion(self, valid: NDArray[np.bool_]) -> None:
-        """Try, on every region, the motion of the consistent regions around it, as fitted and refined."""
-        fitted = fit_regional_motion(self.flow(), valid, self._image.regions, self._image.half)
+        """Try, on every region with an inconsistent pixel, the motion of the regions around it, fitted and refined."""
+        regions, (height, width) = self._image.regions, self._image.half.shape
+        fitted = fit_regional_motion(self.flow(), valid, regions, self._image.half)
         if fitted is None:
             return
-        candidates = [nearest_similarities(fitted)]
+        doubtful = np.unique(regions.labels[~valid[: 2 * height : 2, : 2 * width : 2]])
+        labels = nearest_similarities(fitted)[doubtful]
+        candidates = np.full((len(fitted), 2, 4), np.nan, dtype=np.float32)
+        candidates[doubtful, 0] = labels
         if self.settings.refinement == "lucas-kanade":
-            candidates.append(candidates[0].copy())
-            self._sparse.refine(self._image.centres, candidates[1], self._pair)
-        self._choose(np.stack(candidates, axis=1))
+            self._sparse.refine(self._image.centres[doubtful], labels, self._pair)
+            candidates[doubtful, 1] = labels
+        self._choose(candidates)
 
     def _choose(self, candidates: NDArray[np.float32]) -> None:
         """Let every pixel take the best of its region's candidates ``[K, C, 4]``, if it beats the label it has."""

@@ -43,7 +43,7 @@ class DaisySettings(FlowMethodSettings):
     )
     budget: int = tunable(
         64, low=24, high=384, limits=(8, 4096), scale="log", online=True,
-        meaning="cost evaluations a point or superpixel in the label search",
+        meaning="cost evaluations a point in the label search",
     )  # fmt: skip
     population: int = tunable(6, low=4, high=16, limits=(2, 32), meaning="moths (and flames) a point or superpixel")
     sweeps: int = tunable(4, low=1, high=8, limits=(1, 32), meaning="times neighbours exchange their best labels")
@@ -88,9 +88,14 @@ class DenseFlowSettings(DaisySettings):
         160.0, low=16.0, high=256.0, limits=(1.0, 1024.0), scale="log", unit="px",
         meaning="largest displacement searched",
     )  # fmt: skip
-    superpixel_px: int = Field(12, ge=4, le=128, description="side of a superpixel")
+    budget: int = tunable(
+        96, low=24, high=384, limits=(8, 4096), scale="log", online=True,
+        meaning="cost evaluations a superpixel in the label search",
+    )  # fmt: skip
+    sweeps: int = tunable(6, low=1, high=8, limits=(1, 32), meaning="times neighbours exchange their best labels")
+    superpixel_px: int = Field(16, ge=4, le=128, description="side of a superpixel")
     candidates: int = Field(
-        3, ge=1, le=9, description="labels tried at each pixel: its superpixel's own and its neighbours'"
+        2, ge=1, le=9, description="labels tried at each pixel: its superpixel's own and its neighbours'"
     )
     filter_radius_px: int = Field(5, ge=2, le=32, description="guided filter's radius (Eq. 2)")
     filter_epsilon: float = Field(

@@ -20,7 +20,11 @@ RECORDINGS = {
     "fr1_rpy": DATA / "tum/rgbd_dataset_freiburg1_rpy",
     "bonn": DATA / "bonn/rgbd_bonn_crowd",
 }
-DENSE_SEARCHES = {"default": DenseFlowSettings(), "larger": DenseFlowSettings(budget=384, sweeps=12, candidates=5)}
+DENSE_SEARCHES = {
+    "default": DenseFlowSettings(),
+    "smaller superpixels": DenseFlowSettings(superpixel_px=12, budget=64, sweeps=4, candidates=3),
+    "larger": DenseFlowSettings(superpixel_px=12, budget=384, sweeps=12, candidates=5),
+}
 """Searches of the dense flow that the measurements compare."""
 
 

@@ -273,7 +273,7 @@ FIXED = {
         "support": 5, "terms": 3, "refinement": "none", "refinement_window_px": 9,
     },
     "dense": {
-        "terms": 3, "refinement": "none", "superpixel_px": 20, "candidates": 2, "filter_radius_px": 12,
+        "terms": 3, "refinement": "none", "superpixel_px": 20, "candidates": 3, "filter_radius_px": 12,
         "filter_epsilon": 0.1, "consistency_px": 0.5, "second_round": False,
     },
     "lucas-kanade": {"window_px": 9},
