@@ -228,8 +228,7 @@ def test_an_edited_trajectory_or_truth_is_scored_again(filled, file: str) -> Non
 def test_metrics_hold_for_one_version_of_the_code(filled, monkeypatch: pytest.MonkeyPatch) -> None:
     store, ids = filled
     record = store.read_whole(ids[0])
-    scored = store.score(record)
-    assert store.metrics(record, PROTOCOL) == scored
+    assert store.score(record) == store.metrics(record, PROTOCOL)
     monkeypatch.setattr(store_module, "evaluation_code", lambda: "newer")
     assert store.metrics(record, PROTOCOL) is None and store.score(record).code == "newer"
     monkeypatch.undo()

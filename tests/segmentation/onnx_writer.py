@@ -49,8 +49,7 @@ def model(input_shape, outputs: dict[str, np.ndarray]) -> bytes:
     graph += text(1, node("Mul", ["mean", "zero"], ["nothing"], "mul_node"))
     outs = b""
     for name, value in outputs.items():
-        flat = value.astype(np.float32)
-        inits += text(5, tensor(f"const_{name}", flat))
+        inits += text(5, tensor(f"const_{name}", value.astype(np.float32)))
         graph += text(1, node("Reshape", ["nothing", "one_dim"], [f"flat_{name}"], f"flatten_{name}"))
         graph += text(1, node("Add", [f"const_{name}", f"flat_{name}"], [name], f"add_{name}"))
         outs += text(12, info(name, value.shape))

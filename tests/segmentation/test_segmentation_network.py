@@ -153,8 +153,7 @@ def test_a_fresh_cfpn_changes_nothing_and_a_trained_one_the_masks_only():
 def test_fusing_batch_norm_changes_no_output():
     for config in (SMALL, SMALL.model_copy(update={"norm": "frozen", "bottleneck": True, "blocks": (1, 2, 1, 1)})):
         made = network(config)
-        image = torch.rand(3, 60, 80)
-        x, _ = made.prepare(image)
+        x, _ = made.prepare(torch.rand(3, 60, 80))
         before = made.backbone(x)[0]
         after = copy.deepcopy(made).fuse().backbone(x)[0]
         assert len(before) > 1
@@ -292,8 +291,7 @@ def test_pasted_masks_fill_their_box():
     box = np.array([10, 20, 50, 80], np.float32)
     exact = paste(plane, box, 100, 100, 0.5, exact=True)
     assert exact[20:80, 10:50].all() and exact.sum() == 40 * 60
-    mask = paste(plane, box, 100, 100, 0.5)
-    rows, columns = np.nonzero(mask)
+    rows, columns = np.nonzero(paste(plane, box, 100, 100, 0.5))
     assert (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1) == pytest.approx((10, 20, 50, 80), abs=1.01)
     half = np.tile(np.repeat(np.float32([0, 1]), 14), (28, 1))
     moved = paste(half, box + np.float32(0.4), 100, 100, 0.5, exact=True)
@@ -376,8 +374,7 @@ def make(torchvision, seed, size):
 @pytest.mark.parametrize(("seed", "shape", "size"), [(0, (120, 160), (128, 171)), (1, (100, 90), (96, 128))])
 def test_outputs_equal_torchvisions(torchvision, tmp_path, seed, shape, size):
     model = make(torchvision, seed, size)
-    state = model.state_dict()
-    torch.save(state, tmp_path / "theirs.pth")
+    torch.save(model.state_dict(), tmp_path / "theirs.pth")
     ours = load_network(tmp_path / "theirs.pth")
     ours.config = ours.config.model_copy(update={"min_side": size[0], "max_side": size[1]})
     ours.rpn.config = ours.rpn.config.model_copy(update={"pre_nms": 60, "post_nms": 40})

@@ -404,8 +404,7 @@ def test_suppression_in_rounds_is_the_greedy_one() -> None:
     scores = torch.linspace(1, 0.1, 120)
     kept = unsuppressed(box_iou(boxes, boxes) > 0.3, torch.ones(120))
     assert torch.nonzero(kept)[:, 0].tolist() == nms(boxes, scores, 0.3).tolist()
-    valid = (torch.arange(120) > 0).float()
-    without = unsuppressed(box_iou(boxes, boxes) > 0.3, valid)
+    without = unsuppressed(box_iou(boxes, boxes) > 0.3, (torch.arange(120) > 0).float())
     assert torch.nonzero(without)[:, 0].tolist() == [1 + i for i in nms(boxes[1:], scores[1:], 0.3).tolist()]
 
 
@@ -500,8 +499,7 @@ def test_dilation_is_a_disc_of_that_radius(radius):
 
 def test_dynamic_mask_of_nothing():
     assert not dynamic_mask(Instances.empty(H, W), SegmentationSettings()).any()
-    found = instances(block(10, 50, 10, 50), scores=[0.05])
-    assert not dynamic_mask(found, SegmentationSettings()).any()
+    assert not dynamic_mask(instances(block(10, 50, 10, 50), scores=[0.05]), SegmentationSettings()).any()
 
 
 def test_holes_are_filled_and_bays_stay():
@@ -561,8 +559,7 @@ def test_masks_follow_the_motion(move, motion):
 def test_carrying_nothing_and_carrying_over_black_images(move):
     black = np.zeros((H, W), np.uint8)
     assert len(move(Instances.empty(H, W), black, black)) == 0
-    kept = move(instances(block(20, 80, 30, 90)), black, black)
-    assert iou(kept.masks[0], block(20, 80, 30, 90)) > 0.95
+    assert iou(move(instances(block(20, 80, 30, 90)), black, black).masks[0], block(20, 80, 30, 90)) > 0.95
 
 
 def test_an_exact_flow_moves_masks_exactly():

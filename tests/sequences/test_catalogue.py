@@ -180,8 +180,7 @@ def test_tags_of_rendered_sequences(name, people, tags):
 @pytest.mark.parametrize(("radius_m", "turns", "loop"), [(2.5, 1.0, True), (2.5, 0.8, False), (0.9, 4.0, False)])
 def test_a_loop_is_a_long_path_that_comes_back_to_where_it_was(radius_m, turns, loop):
     angle = 2 * np.pi * np.linspace(0, turns, 1200)
-    circle = radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    assert ("loop" in motion_tags(path(circle))) == loop
+    assert ("loop" in motion_tags(path(radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)))) == loop
 
 
 def test_noise_of_the_ground_truth_is_no_fast_motion():

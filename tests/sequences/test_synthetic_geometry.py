@@ -378,8 +378,7 @@ def test_laps_have_their_length_and_are_walked_more_than_once(shape: str, lap_m:
     lap = round(walk.lap_s * 30)
     again = np.linalg.norm(truth.positions[lap:] - truth.positions[:-lap], axis=1)
     assert 0.01 < again.max() < 0.6, "the same path again, not the same poses"
-    middle = lap // 2
-    assert np.linalg.norm(truth.positions[middle] - truth.positions[0]) > 2
+    assert np.linalg.norm(truth.positions[lap // 2] - truth.positions[0]) > 2
 
 
 def test_furniture_is_moved_only_out_of_sight() -> None:
