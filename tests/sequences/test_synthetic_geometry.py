@@ -539,8 +539,7 @@ def test_the_cache_is_a_folder_in_tum_layout(tmp_path: Path) -> None:
     sequence.render()
     folder = open_sequence(sequence.store.folder)
     assert len(folder) == 3 and folder.camera == sequence.camera
-    for index in range(3):
-        assert frame_hash(folder[index]) == frame_hash(sequence[index])
+    assert [frame_hash(folder[index]) for index in range(3)] == [frame_hash(sequence[index]) for index in range(3)]
     assert np.abs(folder.ground_truth.T_world_cam - sequence.ground_truth.T_world_cam).max() < 1e-8
     assert np.array_equal(folder.timestamps, sequence.timestamps)
 
