@@ -450,10 +450,18 @@ def test_no_name_leads_out_of_its_folder(tmp_path: Path, name: str) -> None:
     assert inside(tmp_path, "rgb/1.000.png", where="a list", kind=RunError) == tmp_path / "rgb" / "1.000.png"
 
 
-def test_terminals_get_nothing_that_they_act_upon() -> None:
-    text = "\x1b[31mred\x07\x9b2J\u202egnp.exe\ud800\x7f"
-    assert printable(text) == "\\x1b[31mred\\x07\\x9b2J\\u202egnp.exe\\ud800\\x7f"
-    assert printable("Zoë\tβ\n") == "Zoë\tβ\n"
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        (
+            "\x1b[31mred\x07\x9b2J\u202egnp.exe\ud800\x7f",
+            "\\x1b[31mred\\x07\\x9b2J\\u202egnp.exe\\ud800\\x7f",
+        ),
+        ("Zoë\tβ\n", "Zoë\tβ\n"),
+    ],
+)
+def test_terminals_get_nothing_that_they_act_upon(text: str, shown: str) -> None:
+    assert printable(text) == shown
 
 
 def test_files_and_folders_have_the_permissions_that_the_umask_gives(tmp_path: Path) -> None:

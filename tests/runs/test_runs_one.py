@@ -327,7 +327,6 @@ def odd_masks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("oracle", r"has no exact masks"),
         ("auto", r"^(?!.*segmentation\.source=none)no masks for .*COCO checkpoint \(170 MB\).*onnx:PATH.*masks=none"),
         ("plugin:mine", r"unknown segmenter 'mine'"),
-        ("coco", r"cannot fetch the checkpoint 'coco': .*network is unreachable \(put"),
     ],
 )
 def test_masks_that_cannot_be_had(store: RunStore, toy_folder: str, odd_masks: Path, source: str, words: str) -> None:
@@ -340,6 +339,14 @@ def test_masks_that_cannot_be_had(store: RunStore, toy_folder: str, odd_masks: P
     ):
         with pytest.raises(DynslamError, match=words):
             attempt()
+    assert store.ids() == []
+
+
+@pytest.mark.usefixtures("odd_masks")
+def test_coco_without_a_network(store: RunStore, toy_folder: str) -> None:
+    spec = RunSpec(tracker="mask-rcnn", sequence=toy_folder, settings={"segmentation.source": "coco"})
+    with pytest.raises(DynslamError, match=r"cannot fetch the checkpoint 'coco': .*network is unreachable \(put"):
+        run_one(spec, store)
     assert store.ids() == []
 
 

@@ -328,8 +328,7 @@ def two_runs(tmp_path: Path) -> RunStore:
 
 def test_the_log_gives_back_every_row_and_leaves_out_an_unfinished_one(tmp_path: Path) -> None:
     (tmp_path / "log").write_text("".join(row.to_json() for row in ROWS) + ROWS[0].to_json()[:40])
-    assert FrameLog.read(tmp_path / "log") == FrameLog(ROWS)
-    assert FrameLog.read(tmp_path / "none") == FrameLog()
+    assert [FrameLog.read(tmp_path / name) for name in ("log", "none")] == [FrameLog(ROWS), FrameLog()]
 
 
 def test_the_table_gives_back_all_but_the_poses(tmp_path: Path) -> None:
