@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import hostile
 import pandas as pd
@@ -288,8 +289,10 @@ def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number):
 
 
 def test_sigterm_ends_with_the_shells_code():
-    code = "from dynslam_bench import cli; from dynslam_bench.cli import app; from os import getpid, kill; "
-    code += f"app.start = lambda: kill(getpid(), {signal.SIGTERM:d}); cli.main()"
+    code = (
+        "from dynslam_bench import cli; from dynslam_bench.cli import app; from os import getpid, kill; "
+        f"app.start = lambda: kill(getpid(), {signal.SIGTERM:d}); cli.main()"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 128 + signal.SIGTERM and done.stderr == "interrupted\n"
 
@@ -301,10 +304,7 @@ def _crowded():
 
 @pytest.mark.parametrize("error", [ValueError("schema: KeyboardInterrupt"), RunError("cannot load")])
 def test_an_error_that_a_library_makes_of_an_interrupt_is_an_interrupt(monkeypatch, capsys, error):
-    def fails(**_):
-        raise error
-
-    monkeypatch.setattr(app, "app", fails)
+    monkeypatch.setattr(app, "app", Mock(side_effect=error))
     monkeypatch.setattr(app, "interrupted", lambda: True)
     with pytest.raises(SystemExit, match="130"):
         app.start(["eval"])
@@ -504,8 +504,7 @@ def test_a_reports_table_has_no_markup():
 def test_an_error_of_the_tracked_frames_alone_is_marked(capsys):
     for coverage in (0.5, 1.0):
         row = dict.fromkeys(runs.COLUMNS.values(), "x") | {"ate_rmse_m": 0.1, "coverage": coverage}
-        row |= {"false_motion_max_m": None}
-        runs.show_rows([row | {"static_camera_ate_rmse_m": 0.2}], None, "p")
+        runs.show_rows([row | {"static_camera_ate_rmse_m": 0.2, "false_motion_max_m": None}], None, "p")
         assert ("of the tracked frames alone" in capsys.readouterr().out) == (coverage < 1)
 
 
@@ -519,8 +518,7 @@ def test_no_motion_of_a_fixed_camera_is_shown_and_nothing_is_worse_than_it(capsy
 
 
 def test_report_prints_its_message_the_leaderboard_and_its_place(cli, walk, tmp_path):
-    trackers = ("never-move", "constant-velocity")
-    (tmp_path / "mine.toml").write_text(f"trackers = {list(trackers)}\nsequences = ['{walk}']\n")
+    (tmp_path / "mine.toml").write_text(f"trackers = ['never-move', 'constant-velocity']\nsequences = ['{walk}']\n")
     assert cli("bench", "mine.toml")[0] == 0
     code, out, _ = cli("report")
     lines = out.splitlines()
@@ -668,8 +666,7 @@ def test_names_are_shown_as_text(cli, results: Path, arguments: tuple[str, ...])
 
 def test_errors_are_shown_as_text(cli, results: Path) -> None:
     code, out, err = cli("runs", "show", HOSTILE, "--results", results)
-    assert code == 1 and harmless(out + err) and err.startswith("error: there is no run")
-    assert err.count("\n") == 1
+    assert code == 1 and harmless(out + err) and err.startswith("error: there is no run") and err.count("\n") == 1
 
 
 def test_one_unreadable_record_is_named_and_the_others_are_listed(cli, results: Path) -> None:

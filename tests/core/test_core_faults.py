@@ -8,7 +8,7 @@ import signal
 import stat
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from itertools import repeat
 from pathlib import Path
@@ -55,12 +55,16 @@ def one_of(value: object, *allowed: object) -> None:
     assert value in allowed
 
 
-def swept(root: Path) -> dict[str, bytes | str]:
+def sweep_below(root: Path) -> None:
+    for folder in [root, *(path for path in root.rglob("*") if path.is_dir())]:
+        sweep_temporary(folder)
+
+
+def swept(root: Path, sweep: Callable[[Path], None] = sweep_below) -> dict[str, bytes | str]:
     """What is left once those have swept up who come a minute later."""
     for new in root.rglob(".*.new"):
         os.utime(new, (0, 0))
-    for folder in [root, *(path for path in root.rglob("*") if path.is_dir())]:
-        sweep_temporary(folder)
+    sweep(root)
     return tree(root)
 
 
@@ -114,12 +118,9 @@ def make(root: Path, record: RunRecord = RECORD) -> None:
         store.publish(work, record)
 
 
-def held(root: Path) -> dict[str, bytes | str]:
-    """What is in the store once the next command has swept it, a minute later."""
-    for new in root.rglob(".*.new"):
-        os.utime(new, (0, 0))
+def prepared(root: Path) -> None:
+    """The next command of a store sweeps it."""
     RunStore(root).prepare()
-    return tree(root)
 
 
 FAILED = RECORD.model_copy(update={"status": "crashed", "reason": "an earlier try"})
@@ -138,7 +139,7 @@ def test_a_run_is_there_whole_or_not_at_all_and_one_that_is_made_again_is_never_
 
     found = survey(
         lambda: make(root), root, begin=lambda: [make(root, record) for record in earlier], halfway=old_or_new,
-        result=lambda: held(root), faults=("kill",) if earlier else ("kill", "full", "read-only"),
+        result=lambda: swept(root, prepared), faults=("kill",) if earlier else ("kill", "full", "read-only"),
     )  # fmt: skip
     assert {name.split("/")[0] for name in tree(root)} == {"runs", "sequences", "latest"}
     assert found.operations > 15 and found.ends["kill", -9] == found.operations
@@ -154,7 +155,9 @@ def test_a_run_is_removed_or_still_there(tmp_path: Path) -> None:
         if store.ids():
             store.remove(RECORD.run_id)
 
-    found = survey(remove, root, begin=lambda: make(root), result=lambda: held(root).keys(), faults=("kill", "full"))
+    found = survey(
+        remove, root, begin=lambda: make(root), result=lambda: swept(root, prepared).keys(), faults=("kill", "full")
+    )
     assert not RunStore(root).ids() and found.operations > 5 and found.ends["kill", -9] == found.operations
 
 
@@ -233,8 +236,7 @@ def test_a_damaged_entry_counts_as_missing_and_goes(tmp_path: Path, damage: byte
     cache.put("masks", "ab12", {"a": np.arange(9)}, 0.1)
     (path,) = tmp_path.rglob("*.npz")
     path.write_bytes(damage)
-    assert cache.get("masks", "ab12") is None
-    assert not path.exists()
+    assert cache.get("masks", "ab12") is None and not path.exists()
 
 
 def test_the_least_recently_used_entries_go_first(tmp_path: Path) -> None:
@@ -384,8 +386,7 @@ class Sample(Record):
 
 
 def test_half_characters_do_not_keep_a_record_from_being_stored(tmp_path: Path) -> None:
-    record = Sample(text="caf\udce9", more={"\ud800": ["\udfff"]})
-    write_atomic(tmp_path / "record.json", record.to_json())
+    write_atomic(tmp_path / "record.json", Sample(text="caf\udce9", more={"\ud800": ["\udfff"]}).to_json())
     assert Sample.read(tmp_path / "record.json") == Sample(text="caf\\udce9", more={"\\ud800": ["\\udfff"]})
     for value in (0.1 + 0.2, 1e-300, np.inf, -np.inf, np.nan):
         assert np.array_equal(Sample.parse(Sample(text="p", x=value).to_json(), "p").x, value, equal_nan=True)
@@ -449,10 +450,18 @@ def test_no_name_leads_out_of_its_folder(tmp_path: Path, name: str) -> None:
     assert inside(tmp_path, "rgb/1.000.png", where="a list", kind=RunError) == tmp_path / "rgb" / "1.000.png"
 
 
-def test_terminals_get_nothing_that_they_act_upon() -> None:
-    text = "\x1b[31mred\x07\x9b2J\u202egnp.exe\ud800\x7f"
-    assert printable(text) == "\\x1b[31mred\\x07\\x9b2J\\u202egnp.exe\\ud800\\x7f"
-    assert printable("Zoë\tβ\n") == "Zoë\tβ\n"
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        (
+            "\x1b[31mred\x07\x9b2J\u202egnp.exe\ud800\x7f",
+            "\\x1b[31mred\\x07\\x9b2J\\u202egnp.exe\\ud800\\x7f",
+        ),
+        ("Zoë\tβ\n", "Zoë\tβ\n"),
+    ],
+)
+def test_terminals_get_nothing_that_they_act_upon(text: str, shown: str) -> None:
+    assert printable(text) == shown
 
 
 def test_files_and_folders_have_the_permissions_that_the_umask_gives(tmp_path: Path) -> None:
@@ -463,8 +472,8 @@ def test_files_and_folders_have_the_permissions_that_the_umask_gives(tmp_path: P
             (work / "inside").touch()
     finally:
         os.umask(before)
-    assert stat.S_IMODE((tmp_path / "file").stat().st_mode) == 0o640
-    assert stat.S_IMODE((tmp_path / "folder").stat().st_mode) == 0o750
+    modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in tmp_path.iterdir()}
+    assert modes == {"file": 0o640, "folder": 0o750}
 
 
 @pytest.mark.parametrize("size", [0, 1, 1 << 16, (1 << 16) + 1, 1 << 17])
@@ -475,10 +484,6 @@ def test_files_of_any_size_are_read_whole_up_to_the_limit(tmp_path, size):
     (tmp_path / "larger").write_bytes(path.read_bytes() + b"x")
     with pytest.raises(DynslamError, match="more than the"):
         read_bytes(tmp_path / "larger", limit=size)
-
-
-EXPECTED_FLOW = [7831125740418745553, 14977623595910913313]
-EXPECTED_WIDE = [12832584331059455313]
 
 
 @pytest.mark.parametrize(
@@ -508,8 +513,8 @@ def test_digest_is_stable_and_blind_to_order():
 
 def test_streams_are_fixed_for_good():
     # raw words: guaranteed by NumPy across versions and platforms
-    assert stream(0, "flow", 3).bit_generator.random_raw(2).tolist() == EXPECTED_FLOW
-    assert stream(2**40 + 7).bit_generator.random_raw(1).tolist() == EXPECTED_WIDE
+    assert stream(0, "flow", 3).bit_generator.random_raw(2).tolist() == [7831125740418745553, 14977623595910913313]
+    assert stream(2**40 + 7).bit_generator.random_raw(1).tolist() == [12832584331059455313]
 
 
 def test_streams_do_not_disturb_each_other():

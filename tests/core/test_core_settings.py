@@ -7,6 +7,7 @@ from importlib import metadata
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Literal
+from unittest.mock import Mock
 
 import numba
 import numpy as np
@@ -59,8 +60,7 @@ def test_parameters_describe_the_search_space():
     threshold = by_name["epipolar.threshold_px"]
     assert (threshold.kind, threshold.low, threshold.high, threshold.scale) == ("float", 0.1, 5.0, "log")
     assert by_name["features"].kind == "int"
-    assert by_name["epipolar.enabled"].choices == (False, True)
-    assert by_name["method"].choices == ("orb", "fast")
+    assert (by_name["epipolar.enabled"].choices, by_name["method"].choices) == ((False, True), ("orb", "fast"))
     online = parameters(Root, online_only=True)
     assert [(p.name, p.tunable) for p in online] == [("epipolar.threshold_px", True), ("when", False)]
     assert online[1].choices == ("rule", "now") and "`rule`, `now` |  | yes |" in settings_table(Root)
@@ -153,17 +153,23 @@ def test_a_group_with_other_defaults_is_described_with_them():
     class Other(Root):
         epipolar: Epipolar = Epipolar(threshold_px=2.5)
 
-    assert {p.name: p.default for p in parameters(Other)}["epipolar.threshold_px"] == 2.5
-    assert {p.name: p.default for p in parameters(Root)}["epipolar.threshold_px"] == 1.0
+    defaults = [p.default for kind in (Other, Root) for p in parameters(kind) if p.name == "epipolar.threshold_px"]
+    assert defaults == [2.5, 1.0]
     assert "| `epipolar.threshold_px` | `2.5` |" in settings_table(Other)
 
 
-def test_did_you_mean():
-    assert did_you_mean("walkin", ["walking", "sitting"]) == "did you mean 'walking'?"
-    assert did_you_mean("TUM", ["tum", "x"]) == "did you mean 'tum'?"
-    assert did_you_mean("qqq", ["a", "b"]) == "known: a, b"
-    assert did_you_mean("qqq", [f"name{i}" for i in range(30)]) == "30 are known, none is close"
-    assert did_you_mean("a", []) == ""
+@pytest.mark.parametrize(
+    ("name", "names", "answer"),
+    [
+        ("walkin", ["walking", "sitting"], "did you mean 'walking'?"),
+        ("TUM", ["tum", "x"], "did you mean 'tum'?"),
+        ("qqq", ["a", "b"], "known: a, b"),
+        ("qqq", [f"name{i}" for i in range(30)], "30 are known, none is close"),
+        ("a", [], ""),
+    ],
+)
+def test_did_you_mean(name, names, answer):
+    assert did_you_mean(name, names) == answer
 
 
 def test_errors_survive_a_process_border():
@@ -221,8 +227,7 @@ def write(path: Path, text: str) -> Path:
 
 def test_content_digest_sees_type_shape_and_value() -> None:
     base = np.zeros((2, 3), np.uint8)
-    others = [base.reshape(3, 2), base.astype(np.int8), base + 1]
-    assert len({content_digest(each) for each in (base, *others)}) == 4
+    assert len({*map(content_digest, (base, base.reshape(3, 2), base.astype(np.int8), base + 1))}) == 4
     assert content_digest(base) == content_digest(np.zeros((2, 6), np.uint8)[:, ::2])
 
 
@@ -377,10 +382,7 @@ def test_the_release_of_a_version(installed: str, release: str, monkeypatch: pyt
 
 @pytest.mark.usefixtures("fresh_version")
 def test_a_checkout_that_is_not_installed_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(name: str) -> str:
-        raise metadata.PackageNotFoundError(name)
-
-    monkeypatch.setattr(metadata, "version", missing)
+    monkeypatch.setattr(metadata, "version", Mock(side_effect=metadata.PackageNotFoundError))
     assert (dynslam_bench.__version__, versions.release()) == ("0+unknown", "0.0.0")
 
 
@@ -396,9 +398,7 @@ SPEC_SOURCE = "from tests_plugin_contract import Spec\nSPEC = Spec('{id}')\nOTHE
 @pytest.fixture(autouse=True)
 def contract(monkeypatch):
     """Makes `Spec` importable by the plug-in files, and the environment clean."""
-    module = type(sys)("tests_plugin_contract")
-    module.Spec = Spec
-    monkeypatch.setitem(sys.modules, "tests_plugin_contract", module)
+    monkeypatch.setitem(sys.modules, "tests_plugin_contract", SimpleNamespace(Spec=Spec))
     monkeypatch.delenv(ENVIRONMENT_VARIABLE, raising=False)
 
 
@@ -415,8 +415,7 @@ def fake_distribution(folder, group, targets, name="fake-dist"):
 
 
 def test_file_and_module_targets(tmp_path, monkeypatch):
-    file = tmp_path / "my_tracker.py"
-    file.write_text(SPEC_SOURCE.format(id="mine"))
+    file = write(tmp_path / "my_tracker.py", SPEC_SOURCE.format(id="mine"))
     assert registry().get(f"{file}:SPEC").id == "mine"
     monkeypatch.syspath_prepend(tmp_path)
     assert registry().get("my_tracker:SPEC").id == "mine"
@@ -445,8 +444,7 @@ def test_targets_that_cannot_be_loaded(target, expected):
 
 
 def test_a_file_that_raises_gives_its_reason_and_can_be_mended(tmp_path):
-    file = tmp_path / "broken.py"
-    file.write_text("raise RuntimeError('no GPU here')\n")
+    file = write(tmp_path / "broken.py", "raise RuntimeError('no GPU here')\n")
     with pytest.raises(PluginError, match="RuntimeError: no GPU here"):
         load_object(f"{file}:SPEC")
     file.write_text("SPEC = 7\n")
@@ -484,9 +482,8 @@ def test_an_import_without_an_end_is_an_error_too(tmp_path, monkeypatch):
 
 
 def test_environment_variable(tmp_path, monkeypatch):
-    good, broken = tmp_path / "good.py", tmp_path / "broken.py"
-    good.write_text(SPEC_SOURCE.format(id="from-env"))
-    broken.write_text("import nothing_of_that_name\n")
+    good = write(tmp_path / "good.py", SPEC_SOURCE.format(id="from-env"))
+    broken = write(tmp_path / "broken.py", "import nothing_of_that_name\n")
     monkeypatch.setenv(ENVIRONMENT_VARIABLE, f"{good}:SPEC, flow={good}:SPEC,trackers={broken}:SPEC")
     trackers = registry()
     assert [found.spec.id for found in trackers.all()] == ["built-in", "from-env", "never-move"]

@@ -62,11 +62,10 @@ def words() -> frozenset[str]:
 
 def _names_of(node: ast.AST) -> Iterator[str]:
     match node:
-        case ast.Name(id=name) | ast.Attribute(attr=name) | ast.arg(arg=name):
-            yield name
-        case ast.keyword(arg=str(name)):
-            yield name
-        case ast.FunctionDef(name=name) | ast.ClassDef(name=name):
+        case (
+            ast.Name(id=name) | ast.Attribute(attr=name) | ast.arg(arg=name) | ast.keyword(arg=str(name))
+            | ast.FunctionDef(name=name) | ast.ClassDef(name=name)
+        ):  # fmt: skip
             yield name
         case ast.Import(names=names) | ast.ImportFrom(names=names):
             for alias in names:
@@ -77,9 +76,9 @@ def _docstrings(nodes: list[ast.AST]) -> Iterator[ast.Constant]:
     """The docstrings of a module: of itself, its classes and functions, and those below assignments."""
     for node in nodes:
         for statement in getattr(node, "body", []) if not isinstance(node, ast.Lambda | ast.IfExp) else []:
-            if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
-                if isinstance(statement.value.value, str):
-                    yield statement.value
+            match statement:
+                case ast.Expr(value=ast.Constant(value=str()) as docstring):
+                    yield docstring
 
 
 def in_pages() -> Iterator[Mention]:

@@ -135,11 +135,13 @@ MADE_UP = ("path/", "./", "/", "grey/")
 
 def documented() -> list[str]:
     """The program's command lines in the fenced blocks of all pages, without comments."""
-    lines = []
-    for page in PAGES:
-        for block in re.findall(r"^```bash\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE):
-            lines += [line for line in block.replace("\\\n", " ").splitlines() if line.startswith("dynslam-bench ")]
-    return lines
+    return [
+        line
+        for page in PAGES
+        for block in re.findall(r"^```bash\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+        for line in block.replace("\\\n", " ").splitlines()
+        if line.startswith("dynslam-bench ")
+    ]
 
 
 @pytest.mark.parametrize("line", documented())

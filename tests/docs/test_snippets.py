@@ -58,7 +58,7 @@ ELSEWHERE = {
     "docs/how-to/program.md": (1, "tests/trackers/adapters/test_adapter_controls.py"),
     "docs/how-to/segmenter.md": (2, "tests/trackers/adapters/test_adapter_controls.py"),
     "docs/reference/plugins.md": (1, "tests/trackers/adapters/test_adapter_controls.py"),
-    "docs/how-to/report.md": (1, "tests/reports/test_reports_tables.py"),
+    "docs/how-to/report.md": (1, "tests/reports/test_reports_build.py"),
     "docs/how-to/study.md": (2, "tests/tuning/test_studies.py"),
 }
 """Pages with blocks of Python that another test runs, how many, and which."""
@@ -129,10 +129,15 @@ def test_commands_print_what_the_page_shows(
         assert doctest.OutputChecker().check_output(shown, printed, options), printed
 
 
+def only_toml(page: str, folder: Path) -> Path:
+    """A file with the one block of TOML of a page."""
+    (text,) = blocks(page, "toml")
+    (folder / "mine.toml").write_text(text)
+    return folder / "mine.toml"
+
+
 def test_the_suite_on_the_page_is_one(tmp_path: Path) -> None:
-    (text,) = blocks("docs/how-to/suite.md", "toml")
-    (tmp_path / "mine.toml").write_text(text)
-    suite = load_suite(tmp_path / "mine.toml")
+    suite = load_suite(only_toml("docs/how-to/suite.md", tmp_path))
     trackers = {"orb-slam2", "emfoa-oft", "never-move"}
     specs = list(suite.specs(trackers=tuple(sorted(trackers))))
     assert len(specs) == 4 * 2 * 2 * 3, "three trackers and a row, two sequences, two variants, three offsets"
@@ -141,9 +146,7 @@ def test_the_suite_on_the_page_is_one(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("page", ["docs/how-to/study.md", "docs/tutorials/study.md"])
 def test_the_studies_on_the_pages_are_some(page: str, tmp_path: Path) -> None:
-    (text,) = blocks(page, "toml")
-    (tmp_path / "study.toml").write_text(text)
-    spec = read_study(tmp_path / "study.toml")
+    spec = read_study(only_toml(page, tmp_path))
     settings = flatten(TRACKERS.get(spec.tracker).settings())
     assert spec.instances(*spec.tune) and spec.instances(*spec.held_out) and spec.space.include
     for pattern in (*spec.space.include, *spec.space.fixed):
@@ -151,9 +154,7 @@ def test_the_studies_on_the_pages_are_some(page: str, tmp_path: Path) -> None:
 
 
 def test_the_camera_on_the_page_is_one(tmp_path: Path) -> None:
-    (text,) = blocks("docs/how-to/recording.md", "toml")
-    (tmp_path / "camera.toml").write_text(text)
-    assert read_camera(tmp_path / "camera.toml").fx == 535.4
+    assert read_camera(only_toml("docs/how-to/recording.md", tmp_path)).fx == 535.4
 
 
 def test_the_entry_point_on_the_page_is_of_a_group_that_is_read() -> None:
@@ -193,9 +194,12 @@ RULES = "dynslam_bench.culling.semantic"
 
 def imports(code: str) -> list[tuple[str, str]]:
     """Module and name of everything that a text takes from this package."""
-    nodes = [node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.ImportFrom)]
-    taken = [(node.module or "", alias.name) for node in nodes for alias in node.names]
-    return [(module, name) for module, name in taken if module.startswith("dynslam_bench")]
+    return [
+        (node.module, alias.name)
+        for node in ast.walk(ast.parse(code))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("dynslam_bench")
+        for alias in node.names
+    ]
 
 
 def test_plug_ins_import_from_the_contracts_only(tmp_path: Path) -> None:

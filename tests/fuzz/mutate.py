@@ -88,8 +88,7 @@ _TOKEN = re.compile(rb"[-+]?[0-9][0-9.eE+-]*|[A-Za-z_]+")
 def mutate(data: bytes, others: list[bytes], random: Random) -> bytes:
     """One to four damages to some bytes; `others` are spliced in."""
     for _ in range(random.choice((1, 1, 1, 2, 3, 4))):
-        damage = random.choice((_replace_part, _replace_part, _replace_part, _replace_token, _move_line))
-        data = damage(data, others, random)
+        data = random.choice((*[_replace_part] * 3, _replace_token, _move_line))(data, others, random)
     return data[: 1 << 22]
 
 

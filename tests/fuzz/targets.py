@@ -368,8 +368,7 @@ def _read_coco(data: bytes | None, folder: Path) -> None:
     at(folder, "b/c.png", _PNG)
     labelled = labelled_images.coco_images(str(at(folder, "annotations.json", data)))
     assert labelled.name and labelled.version
-    for index in range(min(len(labelled), 4)):
-        labelled[index]
+    [labelled[index] for index in range(min(len(labelled), 4))]
 
 
 def _read_yolo(data: bytes | None, folder: Path) -> None:
@@ -577,9 +576,9 @@ def _encoded(*suffixes: str, image: np.ndarray | None = None) -> list[bytes]:
 
 def _colours() -> list[bytes]:
     grey, deep = np.full((12, 16), 80, np.uint8), np.full((12, 16, 3), 999, np.uint16)
-    alpha = np.full((12, 16, 4), 80, np.uint8)
     return [*_encoded(".png", ".jpg", ".bmp", ".tiff", ".ppm"), *_encoded(".png", image=grey),
-            *_encoded(".png", image=alpha), *_encoded(".png", image=deep), *_odd_headers()]  # fmt: skip
+            *_encoded(".png", image=np.full((12, 16, 4), 80, np.uint8)), *_encoded(".png", image=deep),
+            *_odd_headers()]  # fmt: skip
 
 
 def _odd_headers() -> list[bytes]:
@@ -587,10 +586,9 @@ def _odd_headers() -> list[bytes]:
     start = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + b"IHDR"
     bitmap = b"BM" + bytes(12) + struct.pack("<IHH", 12, 16, 12) + bytes(99)
     jpeg = b"\xff\xd8\xff\xff\xd0\x00\xff\xc0\x00\x11\x08\xff\xff\xff\xff" + bytes(20)
-    cut = _encoded(".png")[0][:-20]
     huge = start + struct.pack(">IIBB", 65535, 60000, 8, 2) + bytes(60) + b"IEND\xaeB`\x82"
     tiff, pnm = b"II*\0\x08\0\0\0\0\0", b"P5 99999 99999 255\n"
-    return [huge, start[:20], bitmap, b"BM", jpeg, tiff, pnm, b"no image", cut]
+    return [huge, start[:20], bitmap, b"BM", jpeg, tiff, pnm, b"no image", _encoded(".png")[0][:-20]]
 
 
 def _depths() -> list[bytes]:
@@ -928,8 +926,7 @@ def _maps() -> list[bytes]:
     with tempfile.TemporaryDirectory() as made:
         path = Path(made) / "map.ply"
         positions = np.random.default_rng(0).normal(size=(4, 3))
-        outputs = MapOutputs((), np.arange(4), positions, np.zeros((4, 3), np.uint8), np.arange(4))
-        map_files.write_ply(path, outputs)
+        map_files.write_ply(path, MapOutputs((), np.arange(4), positions, np.zeros((4, 3), np.uint8), np.arange(4)))
         return [path.read_bytes()]
 
 

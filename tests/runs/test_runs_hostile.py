@@ -129,14 +129,14 @@ def test_a_flooded_log_keeps_its_ends(attack, store: RunStore) -> None:
 
 
 @linux
-def test_the_parent_ends_and_all_end_with_it(toy_folder: str, tmp_path: Path) -> None:
+def test_the_parent_ends_and_all_end_with_it(store: RunStore, toy_folder: str, tmp_path: Path) -> None:
     """The program is killed in mid-run, without a chance to clean up."""
     here = Path(hostile.__file__).parent
     settings = {"mode": "hog-child", "pids": str(tmp_path / "pids")}
     script = (
         f"import sys; sys.path[:0] = [{str(here)!r}, {str(here.parents[1])!r}]\n"
         "from dynslam_bench.runs import RunSpec, RunStore, run_one\n"
-        f"store = RunStore({str(tmp_path / 'results')!r}); store.prepare()\n"
+        f"store = RunStore({str(store.root)!r}); store.prepare()\n"
         f"spec = RunSpec(tracker={hostile.TARGET!r}, sequence={toy_folder!r}, frames=(0, 6), settings={settings!r})\n"
         "run_one(spec, store)\n"
     )
@@ -147,7 +147,6 @@ def test_the_parent_ends_and_all_end_with_it(toy_folder: str, tmp_path: Path) ->
     parent.kill()
     parent.wait()
     until(lambda: alive(pids) == [], 20)
-    store = RunStore(tmp_path / "results")
     store.prepare()
     assert list(store.runs.iterdir()) == []
 
@@ -244,9 +243,7 @@ def test_shared_memory_goes_with_a_run_that_is_killed(strays, store: RunStore) -
 
 
 @pytest.mark.parametrize(("mode", "words"), [("full", "No space left on device"), ("gone", "was removed")])
-def test_a_full_disk_or_a_removed_folder_is_no_outcome(mode: str, words: str, tmp_path: Path, toy_folder: str) -> None:
-    store = RunStore(tmp_path / "results")
-    store.prepare()
+def test_a_full_disk_or_a_removed_folder_is_no_outcome(mode: str, words: str, store: RunStore, toy_folder: str) -> None:
     settings = {"mode": mode, "pids": str(store.root)}
     spec = RunSpec(tracker=hostile.TARGET, sequence=toy_folder, frames=(0, 6), settings=settings)
     with pytest.raises(InfrastructureError, match=words):

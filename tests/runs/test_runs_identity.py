@@ -50,25 +50,6 @@ def uncompressed(path: Path, image: np.ndarray) -> None:
     cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 0])
 
 
-def sequence(tmp_path: Path) -> Path:
-    folder = write_folder(tmp_path / "toy", 6)
-    for file in (folder / "depth").glob("*.png"):
-        uncompressed(file, cv2.imread(str(file), cv2.IMREAD_UNCHANGED))
-    return folder
-
-
-def a_change_of_data(name: str, folder: Path) -> Callable[[], object]:
-    depth, colour = sorted((folder / "depth").iterdir())[3], sorted((folder / "rgb").iterdir())[3]
-    return {
-        "depth": lambda: uncompressed(depth, cv2.imread(str(depth), cv2.IMREAD_UNCHANGED) // 5),
-        "colour": lambda: cv2.imwrite(str(colour), cv2.imread(str(colour))[::-1]),
-        "truth": edit(folder / "groundtruth.txt", "100.1", "100.2"),
-        "stamps": edit(folder / "rgb.txt", "100.066667 rgb", "100.066668 rgb"),
-        "camera": edit(folder / "camera.toml", "fx = ", "fx =1"),
-        "frame rate": edit(folder / "camera.toml", "fps = 30", "fps = 15"),
-    }[name]
-
-
 def makes_another_run(spec: RunSpec, change: Callable[[], object]) -> bool:
     before = resolve(spec).run_id
     assert resolve(spec).run_id == before
@@ -78,8 +59,19 @@ def makes_another_run(spec: RunSpec, change: Callable[[], object]) -> bool:
 
 @pytest.mark.parametrize("name", ["depth", "colour", "truth", "stamps", "camera", "frame rate"])
 def test_changed_data_is_another_run(name: str, tmp_path: Path) -> None:
-    folder = sequence(tmp_path)
-    assert makes_another_run(RunSpec(tracker="never-move", sequence=str(folder)), a_change_of_data(name, folder))
+    folder = write_folder(tmp_path / "toy", 6)
+    for file in (folder / "depth").glob("*.png"):
+        uncompressed(file, cv2.imread(str(file), cv2.IMREAD_UNCHANGED))
+    depth, colour = sorted((folder / "depth").iterdir())[3], sorted((folder / "rgb").iterdir())[3]
+    change = {
+        "depth": lambda: uncompressed(depth, cv2.imread(str(depth), cv2.IMREAD_UNCHANGED) // 5),
+        "colour": lambda: cv2.imwrite(str(colour), cv2.imread(str(colour))[::-1]),
+        "truth": edit(folder / "groundtruth.txt", "100.1", "100.2"),
+        "stamps": edit(folder / "rgb.txt", "100.066667 rgb", "100.066668 rgb"),
+        "camera": edit(folder / "camera.toml", "fx = ", "fx =1"),
+        "frame rate": edit(folder / "camera.toml", "fps = 30", "fps = 15"),
+    }[name]
+    assert makes_another_run(RunSpec(tracker="never-move", sequence=str(folder)), change)
 
 
 def plugin(tmp_path: Path) -> tuple[RunSpec, Path]:

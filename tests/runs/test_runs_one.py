@@ -4,6 +4,7 @@ import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -120,15 +121,20 @@ def test_every_failure_is_a_record_with_status_and_reason(
     assert leftovers(store) == []
 
 
-def test_lost_at_the_end_and_found_again(store: RunStore, toy_folder: str) -> None:
-    def outcome(at: int, until: int) -> tuple[str, str]:
-        settings = {"mode": "lost", "at": at, "until": until}
-        record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, settings=settings), store)
-        return record.status, record.reason
-
-    assert outcome(20, 40) == ("ok", "")
-    assert outcome(50, 100) == ("lost", "lost from frame 50 to the end, tracked on 50 of 60 frames")
-    assert outcome(55, 100) == ("ok", "")
+@pytest.mark.parametrize(
+    ("at", "until", "status", "reason"),
+    [
+        (20, 40, "ok", ""),
+        (50, 100, "lost", "lost from frame 50 to the end, tracked on 50 of 60 frames"),
+        (55, 100, "ok", ""),
+    ],
+)
+def test_lost_at_the_end_and_found_again(
+    store: RunStore, toy_folder: str, at: int, until: int, status: str, reason: str
+) -> None:
+    settings = {"mode": "lost", "at": at, "until": until}
+    record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, settings=settings), store)
+    assert (record.status, record.reason) == (status, reason)
 
 
 def test_partial_metrics_and_stopping(store: RunStore, toy_folder: str) -> None:
@@ -155,8 +161,8 @@ def test_degraded_and_dropped_frames(store: RunStore, toy_folder: str) -> None:
     record = run_one(RunSpec(tracker=TARGET, sequence=toy_folder, degrade={"noise": 0.5}, drop_share=0.4), store)
     assert record.status == "ok" and record.n_dropped > 10
     assert record.coverage == pytest.approx(1 - record.n_dropped / 60) and record.n_processed == 60 - record.n_dropped
-    rows = read_csv(store.folder(record.run_id) / "frames.csv")
-    assert sum(row.state == "dropped" for row in rows) == record.n_dropped
+    states = [row.state for row in read_csv(store.folder(record.run_id) / "frames.csv")]
+    assert states.count("dropped") == record.n_dropped
 
 
 def test_masks_are_compared_with_the_exact_ones(store: RunStore) -> None:
@@ -164,8 +170,7 @@ def test_masks_are_compared_with_the_exact_ones(store: RunStore) -> None:
     record = run_one(spec.model_copy(update={"settings": {"segmentation.source": "oracle"}}), store)
     assert record.status == "ok" and record.segmentation == "oracle" and 0.3 < record.mask_iou <= 1
     assert record.epipolar_skipped is None, "it has no such test"
-    assert (store.folder(record.run_id) / "keyframes.csv").is_file()
-    assert (store.folder(record.run_id) / "map.ply").is_file()
+    assert {"keyframes.csv", "map.ply"} <= {path.name for path in store.folder(record.run_id).iterdir()}
     assert record.keyframes >= 1 and record.map_points > 10
     rows = read_csv(store.folder(record.run_id) / "frames.csv")
     assert np.mean([row.mask_iou for row in rows]) == pytest.approx(record.mask_iou)
@@ -265,10 +270,6 @@ def stamps() -> list[str]:
     return [format_ns(START + STEP * index) for index in range(FRAMES)]
 
 
-def column(path: Path, separator: str = " ") -> list[str]:
-    return [line.split(separator)[0] for line in path.read_text().splitlines() if not line.startswith(("#", "index"))]
-
-
 def test_every_file_of_a_run_has_the_frames_own_stamps(store: RunStore, folder: Path) -> None:
     record = run_one(RunSpec(tracker=TARGET, sequence=str(folder)), store)
     made, part = store.folder(record.run_id), store.root / "sequences" / record.sequence.part
@@ -278,7 +279,7 @@ def test_every_file_of_a_run_has_the_frames_own_stamps(store: RunStore, folder: 
         part / "timestamps.txt",
         part / "groundtruth.txt",
     ):
-        assert column(path) == stamps(), path.name
+        assert [line.split()[0] for line in path.read_text().splitlines() if line[0] != "#"] == stamps(), path.name
     assert [line.split(",")[1] for line in (made / "frames.csv").read_text().splitlines()[1:]] == stamps()
     assert record.status == "ok" and score(store, record).metrics["ate_rmse_m"] > 0
 
@@ -304,11 +305,7 @@ def test_a_data_set_of_the_users_may_state_its_nanoseconds() -> None:
 @pytest.fixture
 def odd_masks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with no network, no weights, and masks of a third of the frames; nothing can be fetched."""
-
-    def refuse(*args: object, **kwargs: object) -> None:
-        raise OSError("network is unreachable")
-
-    monkeypatch.setattr("urllib.request.OpenerDirector.open", refuse)
+    monkeypatch.setattr("urllib.request.OpenerDirector.open", Mock(side_effect=OSError("network is unreachable")))
     monkeypatch.setattr("dynslam_bench.core.download._LONGEST_PAUSE_S", 0.0)
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(tmp_path / "weights"))
     (tmp_path / "garbage.onnx").write_bytes(b"no network at all" * 20)
@@ -463,8 +460,7 @@ def test_a_run_begins_in_the_map_of_another_and_says_so(store: RunStore, tmp_pat
     name = f"map={begun_in.digest[:8]}"
     assert name in make_labels([row])[row.variant_key], "named though no other variant stands beside it"
     assert f"--map {file}" in run_command(row) and "backend.map.localisation_only=true" in run_command(row)
-    for said in (run_row(found, None)["settings"], runs_frame([(found, None)])["settings"][0]):
-        assert f"map={begun_in.digest[:8]}" in said
+    assert name in run_row(found, None)["settings"] and name in runs_frame([(found, None)])["settings"][0]
 
 
 def test_a_map_that_does_not_fit_is_refused_before_the_run(store: RunStore, tmp_path: Path) -> None:
@@ -475,8 +471,9 @@ def test_a_map_that_does_not_fit_is_refused_before_the_run(store: RunStore, tmp_
 
 
 def test_maps_that_never_met_are_said(tmp_path: Path) -> None:
-    numbers = [0, 0, 1, 1, 1, 3]
-    keyframes = tuple(KeyframeRecord(i, i, i / 30, np.eye(4), 9, 9, number) for i, number in enumerate(numbers))
+    keyframes = tuple(
+        KeyframeRecord(i, i, i / 30, np.eye(4), 9, 9, number) for i, number in enumerate([0, 0, 1, 1, 1, 3])
+    )
     none = np.zeros(0, np.int64)
     outputs = MapOutputs(keyframes, none, np.zeros((0, 3)), np.zeros((0, 3), np.uint8), none)
     spec = RunSpec(tracker="a", sequence="b")

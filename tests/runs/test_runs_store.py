@@ -7,10 +7,10 @@ import signal
 import sqlite3
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -117,10 +117,9 @@ def test_listing_finding_and_removing(store: RunStore) -> None:
     assert [record.run_id for record in records] == [first, second] and not unreadable
     assert store.find(first[:10]) == first and store.find("latest") == second
     assert store.read("latest") == store.read(second)
-    with pytest.raises(RunError, match="no run 'zzzz'"):
-        store.find("zzzz")
-    with pytest.raises(RunError, match=r"2 runs begin|no run ''"):
-        store.find("")
+    for name, words in (("zzzz", "no run 'zzzz'"), ("", r"2 runs begin|no run ''")):
+        with pytest.raises(RunError, match=words):
+            store.find(name)
     store.remove(first[:12])
     assert store.ids() == [second]
     store.remove("latest")
@@ -131,8 +130,10 @@ def test_listing_finding_and_removing(store: RunStore) -> None:
 
 def test_a_newer_record_is_refused_not_misread(tmp_path: Path) -> None:
     text = (Path(__file__).parent / "data" / "run.json").read_text()
-    newer = {'"coverage_new"': '"coverage"', 'schema_version": 99': 'schema_version": 1'}
-    for (new, old), words in zip(newer.items(), ("coverage_new", "a newer dynslam-bench"), strict=True):
+    for old, new, words in (
+        ('"coverage"', '"coverage_new"', "coverage_new"),
+        ('schema_version": 1', 'schema_version": 99', "a newer dynslam-bench"),
+    ):
         (tmp_path / "run.json").write_text(text.replace(old, new, 1))
         with pytest.raises(DynslamError, match=words):
             RunRecord.read(tmp_path / "run.json")
@@ -228,8 +229,7 @@ def test_an_edited_trajectory_or_truth_is_scored_again(filled, file: str) -> Non
 def test_metrics_hold_for_one_version_of_the_code(filled, monkeypatch: pytest.MonkeyPatch) -> None:
     store, ids = filled
     record = store.read_whole(ids[0])
-    scored = store.score(record)
-    assert store.metrics(record, PROTOCOL) == scored
+    assert store.score(record) == store.metrics(record, PROTOCOL)
     monkeypatch.setattr(store_module, "evaluation_code", lambda: "newer")
     assert store.metrics(record, PROTOCOL) is None and store.score(record).code == "newer"
     monkeypatch.undo()
@@ -253,10 +253,6 @@ def test_rescoring_says_what_has_changed(filled) -> None:
     assert outcomes == {"tum-rgbd/v1": (ids[0],), "evo-default": ()} and store.metrics(record, PROTOCOL) == scored
 
 
-def damaged(content: bytes):
-    return lambda path: path.write_bytes(content)
-
-
 def rewritten(command: str):
     def change(path: Path) -> None:
         with sqlite3.connect(path) as connection:
@@ -267,8 +263,8 @@ def rewritten(command: str):
 
 
 DAMAGES = {
-    "empty": damaged(b""),
-    "no database": damaged(b"x" * 5000),
+    "empty": lambda path: path.write_bytes(b""),
+    "no database": lambda path: path.write_bytes(b"x" * 5000),
     "a torn database": lambda path: path.write_bytes(path.read_bytes()[:5000]),
     "no table": rewritten("DROP TABLE computed"),
     "another table": rewritten("ALTER TABLE computed RENAME COLUMN value TO other"),
@@ -332,8 +328,7 @@ def two_runs(tmp_path: Path) -> RunStore:
 
 def test_the_log_gives_back_every_row_and_leaves_out_an_unfinished_one(tmp_path: Path) -> None:
     (tmp_path / "log").write_text("".join(row.to_json() for row in ROWS) + ROWS[0].to_json()[:40])
-    assert FrameLog.read(tmp_path / "log") == FrameLog(ROWS)
-    assert FrameLog.read(tmp_path / "none") == FrameLog()
+    assert [FrameLog.read(tmp_path / name) for name in ("log", "none")] == [FrameLog(ROWS), FrameLog()]
 
 
 def test_the_table_gives_back_all_but_the_poses(tmp_path: Path) -> None:
@@ -342,9 +337,8 @@ def test_the_table_gives_back_all_but_the_poses(tmp_path: Path) -> None:
     write_csv(tmp_path / "frames.csv", ROWS)
     head = (tmp_path / "frames.csv").read_text().splitlines()[0]
     assert head.split(",")[-4:] == ["total_s", "flow_s", "stat_culled", "stat_f_s"]
-    found = read_csv(tmp_path / "frames.csv")
-    assert [row.cells() for row in found] == [row.cells() for row in ROWS]
-    assert [row.pose for row in found] == [None] * 3
+    rows = [(row.cells(), row.pose) for row in read_csv(tmp_path / "frames.csv")]
+    assert rows == [(row.cells(), None) for row in ROWS]
 
 
 def test_frames_of_a_run_by_record_id_and_path(two_runs: RunStore) -> None:
@@ -488,9 +482,7 @@ def test_a_record_whose_part_is_a_path_is_unreadable(two_runs: RunStore, part: s
 
 @pytest.mark.parametrize("name", ["../../x", "/etc", "latest", ".", "", "a7abe04996a79cc"])
 def test_no_folder_of_the_store_has_another_name_than_an_id(two_runs: RunStore, name: str) -> None:
-    asked: list[Callable[[str], object]] = [two_runs.folder, two_runs.get, two_runs.trajectory]
-    asked += [two_runs.ground_truth, two_runs.timestamps]
-    for ask in asked:
+    for ask in (two_runs.folder, two_runs.get, two_runs.trajectory, two_runs.ground_truth, two_runs.timestamps):
         with pytest.raises(RunError, match="expected 16 hexadecimal digits"):
             ask(name)
 
@@ -533,10 +525,8 @@ def test_faults_in_an_archive_name_the_archive(two_runs: RunStore, tmp_path: Pat
 
 
 def test_a_store_that_can_only_be_read_is_scored(two_runs: RunStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object, **__: object) -> None:
-        raise sqlite3.OperationalError("attempt to write a readonly database")
-
-    monkeypatch.setattr("sqlite3.connect", refuse)  # root may write anywhere
+    refusal = sqlite3.OperationalError("attempt to write a readonly database")
+    monkeypatch.setattr("sqlite3.connect", Mock(side_effect=refusal))  # root may write anywhere
     assert score(two_runs, two_runs.read(BAD), "evo-default").metrics["ate_rmse_m"] > 0
     assert len(two_runs.frame("evo-default")) == 2
 
@@ -555,11 +545,14 @@ def test_a_damaged_log_of_frames_is_taken_up_to_the_damage(tmp_path: Path, line:
     path = tmp_path / "frames.jsonl"
     path.write_bytes(f"{good}\n{line}\n{good}\n".encode(errors="surrogateescape"))
     log = FrameLog.read(path)
-    rows, damage = log.rows, log.damage
     # a line that is no UTF-8 may take those before it in the same block with it
-    assert len(rows) in ((0, 1) if "\udcff" in line else (1,)) and "is damaged" in damage and "\n" not in damage
+    assert (
+        len(log.rows) in ((0, 1) if "\udcff" in line else (1,))
+        and "is damaged" in log.damage
+        and "\n" not in log.damage
+    )
     log.write(tmp_path, "comment")
-    assert len(read_csv(tmp_path / "frames.csv")) == len(rows)
+    assert len(read_csv(tmp_path / "frames.csv")) == len(log.rows)
 
 
 def test_stats_named_with_half_characters_are_stored(tmp_path: Path) -> None:

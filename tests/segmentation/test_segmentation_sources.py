@@ -128,11 +128,10 @@ def test_oracle_refuses_what_does_not_fit():
     for masks, wrong, words in (
         (Masks(), frame(7), "frame 7"),
         (nameless, frame(), "object 9 has no class name"),
+        (Masks(), frame(shape=(30, 40)), "the frame is 40x30"),
     ):
         with pytest.raises(SegmentationError, match=words):
-            OracleSegmenter(masks).segment(wrong)
-    with pytest.raises(SegmentationError, match="the frame is 40x30"):
-        build_segmenter(SegmentationSettings(source="oracle"), masks=Masks()).segment(frame(shape=(30, 40)))
+            build_segmenter(SegmentationSettings(source="oracle"), masks=masks).segment(wrong)
 
 
 # --- recorded ----------------------------------------------------------------------------------------------------
@@ -214,8 +213,7 @@ class FixedSegmenter:
     def segment(self, frame):
         masks = np.zeros((2, 24, 32), bool)
         masks[:, 3:9, 3:9] = True
-        boxes = np.array([[3, 3, 9, 9]] * 2, np.float32)
-        return Instances(masks, boxes, ("person", "person"), np.array([0.9, 0.2], np.float32))
+        return Instances(masks, boxes_of(masks), ("person", "person"), np.array([0.9, 0.2], np.float32))
 
 
 class SmallMasks(FixedSegmenter):
@@ -323,9 +321,8 @@ def test_a_folder_of_other_masks_is_refused(sequence, tmp_path: Path) -> None:
 
 def test_numbers_stand_for_classes_in_every_frame() -> None:
     def objects(*names: str) -> Instances:
-        masks = np.zeros((len(names), 2, 8), bool)
-        for place in range(len(names)):
-            masks[place, :, place : place + 2] = True
+        columns = np.tile(np.arange(8), (2, 1))
+        masks = np.stack([np.isin(columns, (place, place + 1)) for place in range(len(names))])
         scores = np.linspace(0.9, 0.5, len(names)).astype(np.float32)
         return Instances(masks, np.zeros((len(names), 4), np.float32), names, scores)
 
@@ -367,10 +364,9 @@ def noise(height: int, width: int) -> np.ndarray:
 
 
 def objects(found: tuple[torch.Tensor, ...], threshold: float) -> list[tuple[str, float, np.ndarray, np.ndarray]]:
-    boxes, labels, scores, masks = found
     rows = [
         (CLASSES[int(label) - 1], float(score), box.numpy(), mask[0].numpy() >= threshold)
-        for box, label, score, mask in zip(boxes, labels, scores, masks, strict=True)
+        for box, label, score, mask in zip(*found, strict=True)
         if score > 0
     ]
     return [row for row in rows if row[3].any()]
@@ -402,11 +398,9 @@ def test_suppression_in_rounds_is_the_greedy_one() -> None:
     corner = torch.rand(120, 2, generator=generator) * 60
     boxes = torch.cat([corner, corner + 5 + 20 * torch.rand(120, 2, generator=generator)], dim=1)
     scores = torch.linspace(1, 0.1, 120)
-    kept = unsuppressed(box_iou(boxes, boxes) > 0.3, torch.ones(120))
-    assert torch.nonzero(kept)[:, 0].tolist() == nms(boxes, scores, 0.3).tolist()
-    valid = (torch.arange(120) > 0).float()
-    without = unsuppressed(box_iou(boxes, boxes) > 0.3, valid)
-    assert torch.nonzero(without)[:, 0].tolist() == [1 + i for i in nms(boxes[1:], scores[1:], 0.3).tolist()]
+    for first in (0, 1):
+        kept = unsuppressed(box_iou(boxes, boxes) > 0.3, (torch.arange(120) >= first).float())
+        assert torch.nonzero(kept)[:, 0].tolist() == (first + nms(boxes[first:], scores[first:], 0.3)).tolist()
 
 
 def test_other_runtimes_give_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -442,8 +436,7 @@ def test_what_cannot_be_exported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
             parse_size(text)
     assert parse_size("640x480") == (480, 640)
     monkeypatch.setitem(sys.modules, "onnx", None)
-    hint = r"\(pip install '\.\[onnx\]' in the checkout of dynslam-bench\)"
-    with pytest.raises(SegmentationError, match=f"onnx and onnxscript.* {hint}"):
+    with pytest.raises(SegmentationError, match=r"onnx and onnxscript.* \(pip install '\.\[onnx\]' in the checkout of"):
         write_onnx(tiny(), tmp_path / "x.onnx")
 
 
@@ -481,9 +474,8 @@ def iou(a, b):
 def test_selection_by_class_score_and_motion():
     masks = [block(0, 20, 0, 20), block(30, 50, 0, 20), block(60, 80, 0, 20), block(90, 92, 0, 2)]
     found = instances(*masks, names=["person", "chair", "person", "person"], scores=[0.9, 0.9, 0.2, 0.9])
-    assert len(select(found, SegmentationSettings())) == 2
-    assert len(select(found, SegmentationSettings(confidence=0.1))) == 3
-    assert len(select(found, SegmentationSettings(classes="person,chair"))) == 3
+    changes = ({}, {"confidence": 0.1}, {"classes": "person,chair"})
+    assert [len(select(found, SegmentationSettings(**change))) for change in changes] == [2, 3, 3]
     oracle = instances(*masks[:2], names=["person", "chair"], moving=[False, True])
     assert select(oracle, SegmentationSettings()).class_names == ("person", "chair")
 
@@ -498,10 +490,9 @@ def test_dilation_is_a_disc_of_that_radius(radius):
     assert not dilate(np.zeros((H, W), bool), radius).any()
 
 
-def test_dynamic_mask_of_nothing():
-    assert not dynamic_mask(Instances.empty(H, W), SegmentationSettings()).any()
-    found = instances(block(10, 50, 10, 50), scores=[0.05])
-    assert not dynamic_mask(found, SegmentationSettings()).any()
+@pytest.mark.parametrize("nothing", [Instances.empty(H, W), instances(block(10, 50, 10, 50), scores=[0.05])])
+def test_dynamic_mask_of_nothing(nothing):
+    assert not dynamic_mask(nothing, SegmentationSettings()).any()
 
 
 def test_holes_are_filled_and_bays_stay():
@@ -561,8 +552,7 @@ def test_masks_follow_the_motion(move, motion):
 def test_carrying_nothing_and_carrying_over_black_images(move):
     black = np.zeros((H, W), np.uint8)
     assert len(move(Instances.empty(H, W), black, black)) == 0
-    kept = move(instances(block(20, 80, 30, 90)), black, black)
-    assert iou(kept.masks[0], block(20, 80, 30, 90)) > 0.95
+    assert iou(move(instances(block(20, 80, 30, 90)), black, black).masks[0], block(20, 80, 30, 90)) > 0.95
 
 
 def test_an_exact_flow_moves_masks_exactly():
@@ -654,12 +644,11 @@ def feed(stage, index, *, keyframe=False):
 
 
 def run(settings, count=10, keyframes=()):
-    segmenter, quality = Square(), []
-    stage = MaskScheduler(settings, segmenter)
+    stage, quality = MaskScheduler(settings, Square()), []
     for index in range(count):
         quality.append(feed(stage, index, keyframe=index in keyframes)[1])
-        assert stage.segmented == (segmenter.calls[-1] == index)
-    return segmenter.calls, quality
+        assert stage.segmented == (stage.segmenter.calls[-1] == index)
+    return stage.segmenter.calls, quality
 
 
 def test_every_frame_every_nth_and_keyframes(monkeypatch):
@@ -792,28 +781,33 @@ def test_the_schedule_may_change_while_the_segmenter_runs_beside_tracking():
 
 
 def test_settings_may_change_while_a_run_lasts_and_reset_forgets():
-    segmenter = Square()
     settings = SegmentationSettings(schedule="every_nth", n=10)
-    stage = MaskScheduler(settings, segmenter)
+    stage = MaskScheduler(settings, Square())
     changes = {2: settings.model_copy(update={"n": 1}), 3: settings}
     for index in range(5):
         stage.configure(changes.get(index, settings))
         if index == 4:
             stage.reset()
         feed(stage, index)
-    assert segmenter.calls == [0, 2, 4]
+    assert stage.segmenter.calls == [0, 2, 4]
 
 
 # --- metrics -----------------------------------------------------------------------------------------------------
 
 
-def test_average_precision_by_hand():
-    hits = np.array([True, False, True])
-    # recall .5 at precision 1, recall 1 at precision 2/3: 51 points at 1, 50 at 2/3
-    assert average_precision(np.array([0.9, 0.8, 0.7]), hits, 2) == pytest.approx((51 + 50 * 2 / 3) / 101)
-    assert average_precision(np.array([0.9]), np.array([True]), 2) == pytest.approx(51 / 101)
-    assert average_precision(np.array([]), np.zeros(0, bool), 3) == 0.0
-    assert np.isnan(average_precision(np.array([0.5]), np.array([False]), 0))
+@pytest.mark.parametrize(
+    ("scores", "hits", "truths", "expected"),
+    [
+        # recall .5 at precision 1, recall 1 at precision 2/3: 51 points at 1, 50 at 2/3
+        ([0.9, 0.8, 0.7], [True, False, True], 2, (51 + 50 * 2 / 3) / 101),
+        ([0.9], [True], 2, 51 / 101),
+        ([], [], 3, 0.0),
+        ([0.5], [False], 0, np.nan),
+    ],
+)
+def test_average_precision_by_hand(scores, hits, truths, expected):
+    precision = pytest.approx(expected, rel=1e-6, abs=0.0, nan_ok=True)
+    assert average_precision(np.array(scores), np.array(hits, bool), truths) == precision
 
 
 def add(tally, true=(), guess=(), scores=None):
@@ -830,8 +824,8 @@ def test_quality_of_perfect_shifted_missed_and_false_detections():
     add(tally, [], [walker(5)])
     quality = tally.quality()
     assert (quality["truths"], quality["detections"]) == (3, 3) and 0 < quality["ap50"] < 1
-    assert quality["recall"] == pytest.approx(2 / 3) and quality["instance_iou"] == pytest.approx(2 / 3)
-    assert quality["iou"] == pytest.approx(2 / 4) and quality["frame_iou"] == pytest.approx(1 / 3)
+    shares = [quality[name] for name in ("recall", "instance_iou", "iou", "frame_iou")]
+    assert shares == pytest.approx([2 / 3, 2 / 3, 2 / 4, 1 / 3])
     nothing = MaskTally().quality()
     assert nothing["truths"] == 0 and nothing["ap"] is None and nothing["iou"] is None
 

@@ -85,11 +85,9 @@ def test_coco_polygons_and_run_lengths(tmp_path):
     expected = np.zeros((6, 8), bool)
     expected[1:4, 2:6] = True
     polygon = [[2, 1, 6, 1, 6, 4, 2, 4]]
-    counts = [13, 3, 3, 3, 3, 3, 3, 3, 14]
-    for segmentation in (polygon, {"size": [6, 8], "counts": counts}):
+    for segmentation in (polygon, {"size": [6, 8], "counts": [13, 3, 3, 3, 3, 3, 3, 3, 14]}):
         image = coco_images(str(coco(tmp_path, segmentation)))[0]
-        assert image.class_names == ("person",)
-        assert np.count_nonzero(image.masks[0] != expected) == 0
+        assert image.class_names == ("person",) and np.array_equal(image.masks[0], expected)
     assert len(coco_images(str(coco(tmp_path, polygon, iscrowd=1)))[0].masks) == 0
 
 
@@ -138,8 +136,7 @@ def test_matching_and_sampling():
     boxes = torch.tensor([[0.0, 0, 10, 10], [0, 0, 10, 14], [50, 50, 60, 60], [0, 0, 40, 40], [100, 100, 101, 101]])
     truth = torch.tensor([[0.0, 0, 10, 10], [20, 20, 60, 60]])
     assert match(boxes, truth, high=0.7, low=0.3, keep_best=False).tolist() == [0, 0, NEGATIVE, NEGATIVE, NEGATIVE]
-    best = match(boxes, truth, high=0.8, low=0.1, keep_best=True).tolist()
-    assert best == [0, IGNORED, NEGATIVE, 1, NEGATIVE]
+    assert match(boxes, truth, high=0.8, low=0.1, keep_best=True).tolist() == [0, IGNORED, NEGATIVE, 1, NEGATIVE]
     assert match(boxes, truth[:0], high=0.7, low=0.3, keep_best=True).tolist() == [NEGATIVE] * 5
     matched, generator = torch.tensor([0, 1, 0, 1] + [NEGATIVE] * 50 + [IGNORED] * 9), torch.Generator().manual_seed(0)
     positive, negative = sample(matched, count=8, positive_share=0.25, generator=generator)
@@ -162,11 +159,10 @@ def small_images(monkeypatch):
 
 
 def settings_for(folder, **changes):
-    values = {
+    return TrainSettings(**{
         "data": (f"yolo:{folder}",), "validation": f"yolo:{folder}", "iterations": 3, "batch": 1, "proposals": 16,
         "warmup": 2, "evaluate_every": 3, "checkpoint_every": 1, "average": 0.5, **changes,
-    }  # fmt: skip
-    return TrainSettings(**values)
+    })  # fmt: skip
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path, small_images):
@@ -364,11 +360,7 @@ def test_damaged_prepared_images_are_one_clear_line(tmp_path: Path) -> None:
 
 def test_a_network_that_is_only_compared_with_a_file_is_made_of_shapes_alone(monkeypatch):
     """Numbers on torch's ``meta`` device take its compiler, and seconds to load that in every run."""
-
-    def drawn(*_: object, **__: object) -> None:
-        raise AssertionError("numbers are drawn")
-
-    monkeypatch.setattr(torch.Tensor, "normal_", drawn)
+    monkeypatch.setattr(torch.Tensor, "normal_", pytest.fail)  # no numbers are drawn
     with torch.device("meta"):
         network = MaskRCNN(SMALL)
     assert all(weight.is_meta for weight in network.parameters())

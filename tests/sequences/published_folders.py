@@ -82,9 +82,8 @@ def write_shibuya(folder, poses, size=(640, 360)):
         image(folder / "image_0" / f"{i:06d}.png", 90, size)
         (folder / "depth_0").mkdir(exist_ok=True)
         np.save(folder / "depth_0" / f"{i:06d}.npy", depth)
-    ned = poses @ np.linalg.inv(NED)
     lines(folder / "times.txt", [f"{0.1 * i!r}" for i in range(len(poses))])
-    lines(folder / "gt_pose.txt", [tum_line(0.1 * i, pose) for i, pose in enumerate(ned)])
+    lines(folder / "gt_pose.txt", [tum_line(0.1 * i, pose) for i, pose in enumerate(poses @ np.linalg.inv(NED))])
 
 
 def write_openloris(folder, poses, size=(848, 480)):

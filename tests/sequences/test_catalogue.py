@@ -30,14 +30,9 @@ from dynslam_bench.sequences.synthetic import REPLICA_IDS, RenderSettings, open_
 from dynslam_bench.sequences.tags import motion_tags, sequence_tags
 
 
-@pytest.fixture
-def vga(tmp_path):
-    """Makes a small sequence of full-size images under a path."""
-
-    def make(path):
-        return make_folder(tmp_path / path, frames=2, width=640, height=480)[0]
-
-    return make
+def vga(folder):
+    """Makes a small sequence of full-size images."""
+    return make_folder(folder, frames=2, width=640, height=480)[0]
 
 
 def test_the_catalogue_is_complete_and_sound():
@@ -74,8 +69,8 @@ def test_common_folder_names_name_no_sequence(tmp_path):
     "place",
     ["tum/rgbd_dataset_freiburg3_walking_xyz", "rgbd_dataset_freiburg3_walking_xyz", "tum/fr3/walking_xyz"],
 )
-def test_ids_and_aliases_find_a_folder_below_the_root(vga, tmp_path, place):
-    vga(place)
+def test_ids_and_aliases_find_a_folder_below_the_root(tmp_path, place):
+    vga(tmp_path / place)
     for name in ("tum/fr3/walking_xyz", "rgbd_dataset_freiburg3_walking_xyz"):
         sequence = open_sequence(name, data_root=tmp_path, camera="tum-fr3")
         assert sequence.id == "tum/fr3/walking_xyz" and sequence.camera == CAMERAS["tum-fr3"]
@@ -83,8 +78,8 @@ def test_ids_and_aliases_find_a_folder_below_the_root(vga, tmp_path, place):
         assert sequence.tags == {"high-dynamic"} and sequence.split == "tune" and sequence.fps == 30
 
 
-def test_camera_of_a_published_folder_name(vga):
-    folder = vga("anywhere/rgbd_bonn_crowd2")
+def test_camera_of_a_published_folder_name(tmp_path):
+    folder = vga(tmp_path / "anywhere/rgbd_bonn_crowd2")
     (folder / "camera.toml").unlink()
     sequence = open_sequence(folder)
     assert (sequence.id, sequence.camera) == ("bonn/crowd2", CAMERAS["bonn"])
@@ -139,8 +134,8 @@ def test_bad_camera_files(tmp_path, text, words):
         open_sequence(folder)
 
 
-def test_camera_choices(tmp_path, vga):
-    folder = vga("s")
+def test_camera_choices(tmp_path):
+    folder = vga(tmp_path / "s")
     assert open_sequence(folder, camera="tum-fr2").camera == CAMERAS["tum-fr2"]
     write_camera(tmp_path / "mine.toml", CAMERAS["bonn"])
     assert open_sequence(folder, camera=tmp_path / "mine.toml").camera == CAMERAS["bonn"]
@@ -180,14 +175,12 @@ def test_tags_of_rendered_sequences(name, people, tags):
 @pytest.mark.parametrize(("radius_m", "turns", "loop"), [(2.5, 1.0, True), (2.5, 0.8, False), (0.9, 4.0, False)])
 def test_a_loop_is_a_long_path_that_comes_back_to_where_it_was(radius_m, turns, loop):
     angle = 2 * np.pi * np.linspace(0, turns, 1200)
-    circle = radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    assert ("loop" in motion_tags(path(circle))) == loop
+    assert ("loop" in motion_tags(path(radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)))) == loop
 
 
 def test_noise_of_the_ground_truth_is_no_fast_motion():
     noise = np.random.default_rng(0).normal(0, 0.005, (3000, 3))
-    assert motion_tags(path(noise, rate=300)) == set()
-    assert motion_tags(path(0.0 * noise)) == {"fixed-camera"}
+    assert (motion_tags(path(noise, rate=300)), motion_tags(path(0.0 * noise))) == (set(), {"fixed-camera"})
     assert motion_tags(path(np.linspace(0, 1.2, 31)[:, None])) == {"fast"}
 
 
@@ -252,17 +245,16 @@ def test_wrong_checksum(get, server, monkeypatch, tmp_path, packed, sha256):
 
 
 def test_without_a_known_checksum_the_first_one_counts(get, server, tmp_path, sha256):
-    first = sha256
     shutil.rmtree(get())
     shutil.rmtree(get())
     (kept,) = (tmp_path / "root" / ".downloads").iterdir()
-    assert kept.read_text() == f"{first}  {server.url}\n"
-    kept.write_text(kept.read_text().replace(first, "0" * 64))
-    with pytest.raises(SequenceError, match=f"has the checksum {first}, but gave {'0' * 64} before"):
+    assert kept.read_text() == f"{sha256}  {server.url}\n"
+    kept.write_text(kept.read_text().replace(sha256, "0" * 64))
+    with pytest.raises(SequenceError, match=f"has the checksum {sha256}, but gave {'0' * 64} before"):
         get()
     assert list((tmp_path / "root" / ".downloads").iterdir()) == [kept]
-    assert Receipt.read(get(checksum=False) / "fetched.json").sha256 == first
-    assert kept.read_text().startswith(first)
+    assert Receipt.read(get(checksum=False) / "fetched.json").sha256 == sha256
+    assert kept.read_text().startswith(sha256)
 
 
 @pytest.mark.parametrize(

@@ -144,9 +144,10 @@ BROKEN = {
 }
 
 
-@pytest.mark.parametrize(("name", "case"), [(name, case) for name, cases in BROKEN.items() for case in cases])
-def test_wrong_or_partial_folders_give_one_clear_line(tmp_path, name, case):
-    file, content, words = case
+@pytest.mark.parametrize(
+    ("name", "file", "content", "words"), [(name, *case) for name, cases in BROKEN.items() for case in cases]
+)
+def test_wrong_or_partial_folders_give_one_clear_line(tmp_path, name, file, content, words):
     WRITERS[name](tmp_path / "s", random_poses(2))
     if content is None:
         (tmp_path / "s" / file).unlink()
@@ -232,8 +233,7 @@ def test_digest_tells_contents_apart_and_survives_moving_and_links(tmp_path):
     (moved / "rgb").symlink_to(tmp_path / "elsewhere")
     (moved / "up").symlink_to(moved)
     assert open_sequence(moved).digest() == digests[0]
-    rolling = replace(open_sequence(moved).camera, readout_s=0.02)
-    digests.append(open_sequence(moved, camera=rolling).digest())
+    digests.append(open_sequence(moved, camera=replace(open_sequence(moved).camera, readout_s=0.02)).digest())
     rewrite(moved / "groundtruth.txt", lambda lines: lines[:-1])
     digests.append(open_sequence(moved).digest())
     (tmp_path / "elsewhere" / "0.png").write_bytes((moved / "rgb" / "1.png").read_bytes() + b"\0")
@@ -351,8 +351,7 @@ def test_folders_without_lists(tmp_path):
         (folder / name).unlink()
     with pytest.raises(SequenceError, match="named by a frame number, which has no time"):
         open_sequence(folder)
-    with (folder / "camera.toml").open("a") as file:
-        file.write("fps = 25.0\n")
+    rewrite(folder / "camera.toml", lambda lines: [*lines, "fps = 25.0"])
     sequence = open_sequence(folder)
     assert sequence.timestamps.tolist() == [0, 0.04, 0.08] and (sequence[1].rgb == rgb[1]).all()
     for path in folder.glob("*/?.png"):
@@ -482,8 +481,7 @@ def test_a_bag_is_unpacked_to_the_last_bit(write, tmp_path, kind):
         assert (sequence[i].rgb == COLOUR[i]).all() and np.array_equal(sequence[i].depth, METRES[i])
     assert np.allclose(sequence.timestamps, START + np.arange(3) * 0.033333333, atol=1e-6, rtol=0)
     assert np.abs(sequence.ground_truth.T_world_cam - POSES).max() < 1e-12
-    lens = (0.1, -0.2, 1e-3, 2e-3, 0.3)
-    assert sequence.camera == Camera(16, 12, 300.0, 301.0, 8.0, 6.0, lens, depth_factor=1000.0)
+    assert sequence.camera == Camera(16, 12, 300.0, 301.0, 8.0, 6.0, (0.1, -0.2, 1e-3, 2e-3, 0.3), depth_factor=1000.0)
     with pytest.raises(SequenceError, match=r"is a bag \(unpack it first: dynslam-bench sequences unpack"):
         open_sequence(bag)
 
@@ -565,8 +563,7 @@ def test_a_damaged_file_is_written_again(folder: Path, cache: StageCache, damage
 def test_other_frames_are_another_file(folder: Path, cache: StageCache) -> None:
     whole = open_sequence(folder)
     smaller = open_sequence(folder, preprocessing=PreprocessingSettings(width=16, height=16))
-    variants = [whole, SequenceView(whole, 1), SequenceView(whole, 0, None, 2), smaller]
-    for count, variant in enumerate(variants, 1):
+    for count, variant in enumerate([whole, SequenceView(whole, 1), SequenceView(whole, 0, None, 2), smaller], 1):
         assert same(Decoded(variant), variant) and len(files(cache)) == count
     cv2.imwrite(str(folder / "rgb" / "3.png"), 255 - whole[3].rgb)
     changed = open_sequence(folder)

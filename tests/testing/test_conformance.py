@@ -3,7 +3,7 @@
 import re
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib import metadata
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -445,13 +445,15 @@ SPEC = FlowSpec("still", f"{__file__}:build")
 """
 
 
-INSTALLED = bool(entry_points(group="pytest11", name="dynslam-bench"))
+PLUGINS = [
+    *("-p", "no:cacheprovider", "-p", "no:xdist"),
+    *([] if entry_points(group="pytest11", name="dynslam-bench") else ["-p", "dynslam_bench.testing.pytest_plugin"]),
+]
 """Where the distribution is installed, pytest finds the plug-in by itself."""
 
 
 def run_pytest(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "pytest", "-v", "-p", "no:cacheprovider", "-p", "no:xdist", *options, str(folder)]
-    command += [] if INSTALLED else ["-p", "dynslam_bench.testing.pytest_plugin"]
+    command = [sys.executable, "-m", "pytest", "-v", *PLUGINS, *options, str(folder)]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 
@@ -501,11 +503,11 @@ def test_the_built_in_extractor_conforms() -> None:
     assert {check.status for check in report.checks} == {"passed"}, report.failed
 
 
+@dataclass
 class BadFlow:
     """Each fault by name."""
 
-    def __init__(self, fault: str) -> None:
-        self.fault = fault
+    fault: str
 
     def prepare(self, gray):
         prepared = gray.copy()
@@ -536,21 +538,19 @@ def test_a_flow_that_breaks_the_contract_is_found(fault: str, check: str) -> Non
         check_flow(lambda: BadFlow(fault))
 
 
+@dataclass
 class BadFeatures:
-    def __init__(self, fault: str) -> None:
-        self.fault = fault
+    fault: str
 
     def extract(self, gray):
         corners = cv2.goodFeaturesToTrack(gray, 100, 0.01, 5)
         gray[:] *= self.fault != "changes images"
         xy = np.zeros((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
         count = len(xy)
-        angle = np.full(count, -1 if self.fault == "radians" else 1, np.float32)
-        octave = np.zeros(count, np.int64 if self.fault == "octave" else np.int32)
         return Keypoints(
             xy + 1000 * (self.fault == "outside"),
-            octave,
-            angle,
+            np.zeros(count, np.int64 if self.fault == "octave" else np.int32),
+            np.full(count, -1 if self.fault == "radians" else 1, np.float32),
             np.ones(count, np.float32),
             np.zeros((count, 16 if self.fault == "short" else 32), np.uint8),
         )
