@@ -71,8 +71,8 @@ def test_semantic_drops_the_features_on_people_only() -> None:
 
 
 def test_box_epipolar_has_a_limit_of_its_own_inside_boxes() -> None:
-    slow = np.array([0.0, 0.0022, 0.0])  # about 0.8 px at 1.5 m
-    made = scene(SIDEWAYS, motion=slow, noise_px=0.02, instances=box_instance(*BOX))
+    # the motion is about 0.8 px at 1.5 m
+    made = scene(SIDEWAYS, motion=np.array([0.0, 0.0022, 0.0]), noise_px=0.02, instances=box_instance(*BOX))
     strict = BoxEpipolarFilter(BoxEpipolarSettings(inside_px=0.3, outside_px=50.0), SEGMENTATION)
     keep = strict.apply(made.frame, made.state).keep
     assert not keep[made.moving].any() and keep[~on_rectangle(made, *BOX)].all()
@@ -105,8 +105,7 @@ def test_class_rule_drops_people_and_only_those_movable_objects_that_move() -> N
 
 
 def test_class_rule_fits_f_to_static_labelled_points_only() -> None:
-    chair = box_instance(*BOX, name="chair")
-    made = scene(SIDEWAYS, n_static=160, n_moving=300, motion=ACROSS, instances=chair)
+    made = scene(SIDEWAYS, n_static=160, n_moving=300, motion=ACROSS, instances=box_instance(*BOX, name="chair"))
     keep = ClassRuleFilter(ClassRuleSettings(), SEGMENTATION).apply(made.frame, made.state).keep
     assert not keep[made.moving].any(), "a chair with most of the points does not become the reference"
     only_tv = ClassRuleFilter(ClassRuleSettings(movable="tv"), SEGMENTATION).apply(made.frame, made.state)
@@ -196,8 +195,7 @@ def test_expansion_gives_new_features_a_share_of_near_certain_ones() -> None:
     probability = np.array([0.9, 0.1, 0.6, 0.5, 0.5, 0.5, 0.5])
     expanded = expand(xy, probability, np.arange(7) < 3, 32.0)
     influence = np.exp(-0.5 * (4 / 16) ** 2)
-    expected = [0.9, 0.1, 0.6, 0.5 + 0.4 * influence, 0.5 - 0.4 * influence, 0.5, 0.5]
-    np.testing.assert_allclose(expanded, expected)
+    np.testing.assert_allclose(expanded, [0.9, 0.1, 0.6, 0.5 + 0.4 * influence, 0.5 - 0.4 * influence, 0.5, 0.5])
 
 
 def panned(shift: int) -> Scene:
@@ -343,8 +341,7 @@ def tracked_corners(value: int) -> float:
 
 
 def chair_of_which_half_moves(value: float) -> list[bool]:
-    chair = box_instance(*BOX, name="chair")
-    made = scene(SIDEWAYS, n_static=900, n_moving=40, motion=ACROSS, instances=chair)
+    made = scene(SIDEWAYS, n_static=900, n_moving=40, motion=ACROSS, instances=box_instance(*BOX, name="chair"))
     rule = ClassRuleFilter(ClassRuleSettings(vote_share=value, depth_m=2.0), SEGMENTATION)
     return rule.apply(made.frame, made.state).keep.tolist()
 

@@ -184,8 +184,7 @@ def test_a_tracker_that_needs_depth_is_refused_where_there_is_none() -> None:
 
 def test_a_hole_in_the_ground_truth() -> None:
     _, infos, _ = play(SlamEnv(ToySequence(12, hole=(4, 8)), TARGET))
-    have = ["pose_error_trans_m" in info for info in infos]
-    assert have == [True] * 4 + [False] * 4 + [True] * 4
+    assert ["pose_error_trans_m" in info for info in infos] == [True] * 4 + [False] * 4 + [True] * 4
     assert "frame_error_trans_m" not in infos[8] and "frame_error_trans_m" in infos[9]
     assert all(np.isfinite(value) for info in infos for value in info.values() if isinstance(value, float))
 

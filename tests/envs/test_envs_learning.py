@@ -307,8 +307,7 @@ def test_the_windowed_error_is_the_relative_error_over_the_window() -> None:
     for frame in range(1, 12):
         start = max(frame - 4, 0)
         moved, est = (np.linalg.inv(poses[start]) @ poses[frame] for poses in (true, estimate))
-        error = np.linalg.norm((np.linalg.inv(moved) @ est)[:3, 3])
-        assert rewards[frame - 1] == pytest.approx(-error, abs=1e-12)
+        assert rewards[frame - 1] == pytest.approx(-np.linalg.norm((np.linalg.inv(moved) @ est)[:3, 3]), abs=1e-12)
 
 
 def test_dropped_frames_do_not_end_a_row_of_lost_ones() -> None:
@@ -427,8 +426,7 @@ def test_the_gray_image_is_that_of_the_frame() -> None:
     env = SlamEnv(ToySequence(4), TARGET, observation=["gray"])
     seen, _ = env.reset(seed=0)
     assert seen["gray"].shape == (60, 80, 1) and seen["gray"].dtype == np.uint8
-    weights = np.array([0.299, 0.587, 0.114])
-    blocks = (env.frame.rgb @ weights).reshape(60, 2, 80, 2).mean(axis=(1, 3))
+    blocks = (env.frame.rgb @ np.array([0.299, 0.587, 0.114])).reshape(60, 2, 80, 2).mean(axis=(1, 3))
     assert np.abs(seen["gray"][..., 0] - blocks).max() <= 1.5
 
 

@@ -78,8 +78,7 @@ def test_orientation_turns_with_the_image():
 
 @pytest.mark.parametrize("shape", [(1, 1), (20, 30), (39, 640), (45, 45), (480, 640)])
 def test_small_and_flat_images_are_no_error(shape):
-    noise = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
-    features = OrbExtractor().extract(noise)
+    features = OrbExtractor().extract(np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8))
     assert ((features.xy >= 0) & (features.xy < shape[::-1])).all()
     flat = OrbExtractor().extract(np.full(shape, 128, np.uint8))
     assert len(flat) == 0 and flat.descriptors.shape == (0, 32)
@@ -233,10 +232,8 @@ def test_search_in_radius_against_plain_search():
 
 
 def test_rotation_histogram_drops_the_odd_ones():
-    rng = np.random.default_rng(0)
-    a = rng.uniform(0, 360, 100)
+    a = np.random.default_rng(0).uniform(0, 360, 100)
     b = (a - 350) % 360
     b[:10] = (b[:10] + 90) % 360
-    keep = rotation_consistent(a, b)
-    assert keep[10:].all()
+    assert rotation_consistent(a, b)[10:].all()
     assert rotation_consistent(np.zeros(0), np.zeros(0)).shape == (0,)

@@ -52,8 +52,7 @@ def test_every_page_loads_nothing_but_what_lies_beside_it(made):
         assert all((folder / path).is_file() for path in loaded)
         ids = re.findall(r'<[^<>]*\bid="([^"]+)"', re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL))
         assert len(ids) == len(set(ids)) > 0 and "default-src 'none'" in text
-        links = set(re.findall(r'href="([a-z]+\.html)[#"]', text))
-        assert links <= {f"{page}.html" for page in PAGES}
+        assert set(re.findall(r'href="([a-z]+\.html)[#"]', text)) <= {f"{page}.html" for page in PAGES}
 
 
 def test_the_first_page_is_small_before_plotly(made):
@@ -637,8 +636,7 @@ def test_no_name_is_more_than_a_name():
 def test_compare_finds_what_changed(made, tmp_path):
     store, paths = made
     walking = ["synthetic/walking_xyz", "synthetic/walking_rpy"]
-    better = fill(tmp_path / "b", {"orb-slam2": 0.10, "mask-rcnn": 0.002}, walking, seeds=(0, 1))
-    comparison = compare(store, better)
+    comparison = compare(store, fill(tmp_path / "b", {"orb-slam2": 0.10, "mask-rcnn": 0.002}, walking, seeds=(0, 1)))
     changed, same = (comparison.overall[f"{name} (our back end)"] for name in ("Mask R-CNN", "ORB-SLAM2"))
     assert changed.value == pytest.approx(0.1, rel=0.1) and same.value == pytest.approx(1.0)
     assert np.isnan(changed.high)  # two sequences give no interval

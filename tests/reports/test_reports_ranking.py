@@ -44,8 +44,7 @@ def test_what_is_worse_than_a_static_camera_is_never_first():
     board = make_board([*rows, row("good", "s", 0.1), crashed("good", "t")])
     assert names(board, board.trackers) == ["good", "still", "bad"]
     table = leaderboard(board, PROTOCOL)
-    ranks = {cells[2].text: cells[0].text for cells in table.rows}
-    assert ranks == {"GOOD": "1", "STILL": "\u2013", "BAD": "\u2013"}
+    assert {cells[2].text: cells[0].text for cells in table.rows} == {"GOOD": "1", "STILL": "\u2013", "BAD": "\u2013"}
     lines = report_table(table, ["#", "tracker"]).splitlines()[1:4]
     assert [name in line for name, line in zip(("GOOD", "STILL", "BAD"), lines, strict=True)] == [True] * 3
 

@@ -36,8 +36,7 @@ class PointWorld:
         local = se3.transform(se3.inverse(T_world_cam), self.points)
         with np.errstate(divide="ignore", invalid="ignore"):
             uv = camera.project(local)
-        visible = (local[:, 2] > 0.2) & (uv > 4).all(axis=1) & (uv[:, 0] < 636) & (uv[:, 1] < 476)
-        rows = np.flatnonzero(visible)
+        rows = np.flatnonzero((local[:, 2] > 0.2) & (uv > 4).all(axis=1) & (uv[:, 0] < 636) & (uv[:, 1] < 476))
         if len(rows) > limit:
             rows = np.sort(rng.permutation(rows)[:limit])
         n = len(rows)

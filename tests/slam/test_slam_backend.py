@@ -187,8 +187,7 @@ def test_the_prediction_is_the_motion_models_at_the_time_of_the_frame(room):
         if number == 0:
             start = result.T_world_cam @ se3.inverse(path[0])
     assert np.mean(ahead) < 0.5 * np.mean(stay)
-    beyond = steps[-1] / 30.0 + MAX_GAP_S + 1e-6
-    pose, covariance = backend.predict(beyond)
+    pose, covariance = backend.predict(steps[-1] / 30.0 + MAX_GAP_S + 1e-6)
     assert covariance is None
     np.testing.assert_allclose(pose, result.T_world_cam, atol=1e-12)
 

@@ -53,8 +53,7 @@ def angle_deg(one, other):
 
 def flattened(room):
     """All points on one slanted wall."""
-    rng = np.random.default_rng(5)
-    x, y = rng.uniform([-3.0, -2.0], [3.0, 2.0], (len(room.points), 2)).T
+    x, y = np.random.default_rng(5).uniform([-3.0, -2.0], [3.0, 2.0], (len(room.points), 2)).T
     room.points = np.stack([x, y, 2.5 + 0.4 * x], axis=1)
     return room
 

@@ -217,8 +217,7 @@ def test_keyframes_csv(tmp_path):
 def test_binary_ply_byte_by_byte(tmp_path, points):
     map_outputs = outputs(points)
     write_ply(tmp_path / "map.ply", map_outputs)
-    data = (tmp_path / "map.ply").read_bytes()
-    head, body = data.split(b"end_header\n")
+    head, body = (tmp_path / "map.ply").read_bytes().split(b"end_header\n")
     assert head.startswith(b"ply\nformat binary_little_endian 1.0\n") and f"element vertex {points}\n".encode() in head
     assert len(body) == 19 * points
     for i, (x, y, z, r, g, b, n) in enumerate(struct.iter_unpack("<fffBBBi", body)):

@@ -91,8 +91,7 @@ def test_ratios_are_to_the_baseline_and_the_default_stands_beside(tmp_path: Path
 
 def test_the_baseline_may_be_another_tracker(folders: list[str], tmp_path: Path) -> None:
     spec = make(folders, baseline="never-move", confirm=folders[1:2], held_out=[])
-    tuner = run_study(spec, results=tmp_path)
-    summary = finish(tuner)
+    summary = finish(run_study(spec, results=tmp_path))
     assert summary.baseline == "never-move" and summary.shipped["confirm"].ratio < 1
     assert 0 in {candidate.trial for candidate in summary.candidates}, "the default settings compete with it"
     with pytest.raises(StudyError, match="stored with other baseline"):

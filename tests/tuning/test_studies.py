@@ -574,8 +574,7 @@ def test_a_killed_worker_and_a_restarted_database_lose_no_trial(
                 os.killpg(worker.pid, signal.SIGKILL)
     assert workers[1].returncode == 0 and "Traceback" not in errors, errors[-2000:]
     trials = optuna.load_study(study_name="toy", storage=postgres.url).get_trials()
-    states = [trial.state for trial in trials]
-    assert states.count(TrialState.COMPLETE) == 10
+    assert [trial.state for trial in trials].count(TrialState.COMPLETE) == 10
     assert all(trial.user_attrs["reason"] == CRASHED_WORKER for trial in trials if trial.state == TrialState.FAIL)
     assert len(trials) <= 12
 

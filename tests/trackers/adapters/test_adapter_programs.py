@@ -89,8 +89,7 @@ def program(tmp_path):
     def make(text, context=None, **settings):
         path = tmp_path / f"program{len(made)}.py"
         path.write_text(PRELUDE + textwrap.dedent(text))
-        command = shlex.join([sys.executable, str(path)])
-        made.append(build_tracker(f"subprocess:{command}", settings, context))
+        made.append(build_tracker(f"subprocess:{shlex.join([sys.executable, str(path)])}", settings, context))
         return made[-1]
 
     yield make
@@ -403,8 +402,7 @@ def test_serve_answers_for_a_python_tracker(program):
     tracker = reset(program(text, final=True))
     for index in range(2):
         sent = frame(index)
-        stats = tracker.track(sent).stats
-        assert stats == {"sum": float(sent.rgb.sum()), "known": float((sent.depth > 0).sum())}
+        assert tracker.track(sent).stats == {"sum": float(sent.rgb.sum()), "known": float((sent.depth > 0).sum())}
     with pytest.raises(TrackerError, match="at frame 2: RuntimeError: no features"):
         tracker.track(frame(2))
     assert tracker.track(frame(3)).state == "ok", "an answered error does not end the program"
@@ -506,8 +504,7 @@ assert threads == os.environ["OMP_NUM_THREADS"] == "3" and os.listdir() == []
 
 
 def test_indices_stand_for_stamps(toml, toy_folder):
-    half = toml("write([[i, 0.01 * i] for i in (8, 4, 0)])", format="indices")
-    trajectory, _, sequence = ran(half, toy_folder)
+    trajectory, _, sequence = ran(toml("write([[i, 0.01 * i] for i in (8, 4, 0)])", format="indices"), toy_folder)
     assert trajectory.timestamps.tolist() == sequence.timestamps[[0, 4, 8]].tolist()
     assert np.allclose(trajectory.positions[:, 0], [0.0, 0.04, 0.08])
 

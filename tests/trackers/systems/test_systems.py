@@ -362,8 +362,7 @@ def test_a_moving_region_whose_flow_fails_goes_by_the_named_rule(name: str, rule
 @pytest.mark.parametrize("name", sorted(TESTED | FOLLOWED))
 def test_published_flows_are_lucas_kanade_without_a_check_of_ours(name: str) -> None:
     """What the flow of a system finds is what OpenCV's tracker finds, though a way back would contradict some of it."""
-    rng = np.random.default_rng(0)
-    texture = cv2.GaussianBlur(rng.integers(0, 255, (240, 320), dtype=np.uint8), (0, 0), 2.0)
+    texture = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (240, 320), dtype=np.uint8), (0, 0), 2.0)
     first = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)
     second = np.roll(first, (3, 9), (0, 1))
     second[60:180, 80:240] = cv2.GaussianBlur(second[60:180, 240:80:-1], (0, 0), 4.0)  # something else came in
