@@ -60,7 +60,7 @@ from dynslam_bench.features.orb import OrbExtractor
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.slam.pipeline import restore_starved
 
-PERSON = (220, 100, 330, 380)
+RESEEDING = ReseedingFilter(ReseedingSettings(budget=600), FeatureSettings(n_features=900))
 
 
 def test_semantic_drops_the_features_on_people_only() -> None:
@@ -143,7 +143,7 @@ def test_depth_blocks_complete_a_mask_that_covers_enough_of_the_person(bottom: i
 @pytest.mark.parametrize(("other", "touched"), [((330, 300, 380, 380), True), ((450, 100, 500, 200), False)])
 def test_depth_blocks_drop_what_a_person_touches(other: tuple[int, int, int, int], touched: bool) -> None:
     frame, _ = person_before_a_wall()
-    person, chair = box_instance(*PERSON), box_instance(*other, name="chair")
+    person, chair = box_instance(220, 100, 330, 380), box_instance(*other, name="chair")
     masks, boxes_ = np.concatenate([person.masks, chair.masks]), np.concatenate([person.boxes, chair.boxes])
     frame.instances = type(person)(masks, boxes_, ("person", "chair"), np.ones(2, np.float32))
     verdict, on_other = blocks(frame), on_rectangle(frame, *other)
@@ -275,13 +275,12 @@ def ids(frame: FrameBundle, rows: np.ndarray) -> set[tuple[float, float, int]]:
 
 def test_reseeding_replaces_what_fell_to_a_mask_with_static_features_elsewhere() -> None:
     frame = textured(900)
-    block = ReseedingFilter(ReseedingSettings(budget=600), FeatureSettings(n_features=900))
     on_person = (frame.keypoints.xy[:, 0] > 420) & (frame.keypoints.xy[:, 1] > 60)
     assert on_person.sum() > 200
-    verdict = block.apply(frame, FilterState(camera=CAMERA, keep=~on_person))
+    verdict = RESEEDING.apply(frame, FilterState(camera=CAMERA, keep=~on_person))
     used = verdict.keep & ~on_person
     assert used.sum() == min(600, (~on_person).sum())
-    plain = block.apply(frame, FilterState(camera=CAMERA, keep=np.ones(len(frame), bool))).keep & ~on_person
+    plain = RESEEDING.apply(frame, FilterState(camera=CAMERA, keep=np.ones(len(frame), bool))).keep & ~on_person
     assert used.sum() > 1.2 * plain.sum(), "the static background has more features than without re-seeding"
     assert plain[used].sum() >= 0.95 * plain.sum(), "those that were there stay"
     assert verdict.stats["reseeded"] == np.count_nonzero(used & ~plain) > 100
@@ -291,8 +290,7 @@ def test_reseeding_replaces_what_fell_to_a_mask_with_static_features_elsewhere()
 
 def test_reseeding_changes_nothing_where_nothing_is_dynamic() -> None:
     frame, usual = textured(900), textured(600)
-    block = ReseedingFilter(ReseedingSettings(budget=600), FeatureSettings(n_features=900))
-    verdict = block.apply(frame, FilterState(camera=CAMERA, keep=np.ones(len(frame), bool)))
+    verdict = RESEEDING.apply(frame, FilterState(camera=CAMERA, keep=np.ones(len(frame), bool)))
     assert verdict.stats["reseeded"] == 0 and verdict.stats["missing"] == 0
     assert ids(frame, verdict.keep) == ids(usual, np.ones(len(usual), bool)), "the features that other systems get"
 
@@ -300,9 +298,7 @@ def test_reseeding_changes_nothing_where_nothing_is_dynamic() -> None:
 @pytest.mark.parametrize("left", [0, 1, 400])
 def test_reseeding_leaves_all_that_there_is_where_it_is_less_than_the_budget(left: int) -> None:
     frame = textured(900)
-    keep = np.arange(len(frame)) < left
-    block = ReseedingFilter(ReseedingSettings(budget=600), FeatureSettings(n_features=900))
-    verdict = block.apply(frame, FilterState(camera=CAMERA, keep=keep))
+    verdict = RESEEDING.apply(frame, FilterState(camera=CAMERA, keep=np.arange(len(frame)) < left))
     assert verdict.keep.all() and verdict.stats["missing"] == 600 - left
 
 
@@ -319,13 +315,12 @@ def test_nothing_is_culled_where_nothing_is_known_of_the_past_nor_moves_nor_has_
 
 def test_guard_undoes_the_least_reliable_verdict_first() -> None:
     semantic, nothing = np.arange(100) >= 30, np.zeros(100, bool)
-    settings = GuardSettings(min_features=40)
     for verdicts, expected, undone in (
         ([semantic, nothing], semantic, 1),
         ([nothing, nothing], ~nothing, 2),
         ([semantic], semantic, 0),
     ):
-        keep, count = restore_starved(verdicts, settings, 100)
+        keep, count = restore_starved(verdicts, GuardSettings(min_features=40), 100)
         assert count == undone
         np.testing.assert_array_equal(keep, expected)
     assert restore_starved([semantic], GuardSettings(min_features=0, min_fraction=0.8), 100)[1] == 1

@@ -125,9 +125,8 @@ def test_an_action_is_in_force_from_its_frame_on_and_reset_undoes_it() -> None:
     off, loud = np.array([-1.0, 0.0]), np.array([1.0, 1.0])
     env.reset(seed=0)
     errors = [env.step(action)[4]["frame_error_trans_m"] for action in (off, off, loud, off, off)]
-    assert errors[0] < 0.01 and errors[1] == pytest.approx(0, abs=1e-12)
-    assert errors[2] > 0.02 and errors[3] > 0.02
-    assert errors[4] == pytest.approx(0, abs=1e-12)
+    assert errors[0] < 0.01 and min(errors[2:4]) > 0.02
+    assert [errors[1], errors[4]] == pytest.approx([0, 0], abs=1e-12)
     first, _ = env.reset(seed=0)
     fresh, _ = SlamEnv(ToySequence(12), TARGET, control=["noise.enabled", "noise.level_m"]).reset(seed=0)
     assert first.tobytes() == fresh.tobytes()
@@ -197,11 +196,10 @@ def test_rgbd_holds_copies_of_the_images() -> None:
 
 
 SEQUENCE = "synthetic/sitting_xyz?frames=4"
-HALF = {"preprocessing.width": 320, "preprocessing.height": 240}
 
 
 def test_frames_are_resized_and_the_intrinsics_with_them() -> None:
-    env = SlamEnv(SEQUENCE, "orb-slam2", settings=HALF)
+    env = SlamEnv(SEQUENCE, "orb-slam2", settings={"preprocessing.width": 320, "preprocessing.height": 240})
     assert (env.sequence.camera.width, env.sequence.camera.height, env.sequence.camera.fx) == (320, 240, 535.4 / 2)
     env.reset(seed=0)
     info = [env.step(0)[4] for _ in range(3)][-1]

@@ -398,8 +398,9 @@ def test_choices_that_are_none(actions: Any, words: str) -> None:
 @pytest.mark.parametrize("parts", [*([part] for part in PARTS), PARTS])
 def test_every_part_passes_the_checker_alone_and_together(parts: list[str]) -> None:
     for tracker in (TARGET, TARGET.replace(":SPEC", ":FIXED")):
-        arguments = {"sequence": ToySequence(6), "tracker": tracker, "observation": parts}
-        checked(gym.make(GENERIC_ID, render_mode="rgb_array", **arguments))
+        checked(
+            gym.make(GENERIC_ID, sequence=ToySequence(6), tracker=tracker, observation=parts, render_mode="rgb_array")
+        )
 
 
 def test_keypoints_are_padded_and_thinned_and_say_what_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -488,9 +489,8 @@ def test_a_busy_tracker_misses_frames(frame_time_s: float, speed: float, tracked
 def test_dropped_frames_cost_the_error_of_not_moving() -> None:
     whole, *_ = play(SlamEnv(ToySequence(11), TARGET, settings=QUIET))
     dropping, *_ = play(DropFrames(SlamEnv(ToySequence(11), TARGET, settings=QUIET), frame_time_s=1.9 / 30))
-    motion = np.hypot(0.01, 0.002)
     assert sum(whole) == pytest.approx(0, abs=1e-9)
-    assert sum(dropping) == pytest.approx(-8 * motion, abs=1e-6)  # 4 dropped, 4 ways back
+    assert sum(dropping) == pytest.approx(-8 * np.hypot(0.01, 0.002), abs=1e-6)  # 4 dropped, 4 ways back
 
 
 def test_random_drops_are_seeded_and_near_their_share() -> None:

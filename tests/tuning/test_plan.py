@@ -37,8 +37,7 @@ from dynslam_bench.tuning.study_file import (
 
 
 def make(folders: list[str], **changes: object) -> StudySpec:
-    splits = {"tune": folders[:1], "confirm": folders[1:4], "held_out": folders[4:]}
-    return toy_spec(**splits | changes)
+    return toy_spec(**{"tune": folders[:1], "confirm": folders[1:4], "held_out": folders[4:]} | changes)
 
 
 def check(tune: list[str], held_out: list[str]) -> None:
@@ -112,8 +111,9 @@ def test_a_baseline_that_cannot_be_is_one_clear_line(
 
 @pytest.fixture
 def earlier(tmp_path: Path) -> Study:
-    spec = make_spec(name="first", trials=8, pruner="none")
-    return SimulatedTuner(spec, tmp_path, effect=valley, in_memory=False).run()
+    return SimulatedTuner(
+        make_spec(name="first", trials=8, pruner="none"), tmp_path, effect=valley, in_memory=False
+    ).run()
 
 
 def test_a_study_begins_with_what_an_earlier_one_learnt(earlier: Study, tmp_path: Path) -> None:
