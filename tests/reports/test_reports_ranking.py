@@ -143,9 +143,9 @@ def rows_of_truth(sizes, sequences, spread=0.05, seed=0):
             for tracker, by_category in ({"orb-slam2": dict.fromkeys(sequences, 1.0)} | sizes).items():
                 error = hardness * by_category[category] * np.exp(rng.normal(0, spread))
                 tags = [category, *(["fast"] if i == 0 else [])]
-                rows += [
+                rows.append(
                     row(tracker, f"synthetic/{category}?scene={i}", error, tags=tags, static_camera_ate_rmse_m=1.0)
-                ]
+                )
     return rows
 
 

@@ -3,6 +3,7 @@
 import importlib.util
 import lzma
 import re
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -481,8 +482,7 @@ def test_vocabularies_that_are_not_there(tmp_path):
 def test_two_resets_on_real_frames():
     """25 frames of fr1_xyz, twice in one process: poses, stats, final trajectory, and nothing left running."""
     sequence = open_sequence(XYZ, frames=(0, 25))
-    tracker = build_tracker("orbslam3", {"vocabulary": str(PACKED)}, TrackerContext(fps=sequence.fps))
-    try:
+    with closing(build_tracker("orbslam3", {"vocabulary": str(PACKED)}, TrackerContext(fps=sequence.fps))) as tracker:
         for _ in range(2):
             tracker.reset(sequence.camera, rng=np.random.default_rng(0))
             results = [tracker.track(sequence[index]) for index in range(25)]
@@ -498,8 +498,6 @@ def test_two_resets_on_real_frames():
             at = np.searchsorted(sequence.ground_truth.timestamps, sequence.timestamps)
             assert abs(np.linalg.norm(poses[-1, :3, 3]) - np.linalg.norm(truth[at[-1]] - truth[at[0]])) < 0.02
         process = tracker._program._process
-    finally:
-        tracker.close()
     assert process.poll() is not None
 
 
@@ -508,9 +506,7 @@ def test_two_resets_on_real_frames():
 def test_frames_without_features():
     """Black frames give no pose and no crash; once there is something to see it begins."""
     camera = replace(FR1, distortion=(0.0,) * 5)
-    tracker = build_tracker("orbslam3", {"vocabulary": str(PACKED)})
-    try:
-        tracker.reset(camera, rng=np.random.default_rng(0))
+    with closing(reset(build_tracker("orbslam3", {"vocabulary": str(PACKED)}), camera)) as tracker:
         for index in range(4):
             black = Frame(index, index / 30, np.zeros((480, 640, 3), np.uint8), np.zeros((480, 640), np.float32))
             result = tracker.track(black)
@@ -520,5 +516,3 @@ def test_frames_without_features():
         seen = Frame(4, 4 / 30, np.repeat(grey[..., None], 3, axis=2), np.full((480, 640), 2.0, np.float32))
         assert tracker.track(seen).state == "ok"
         assert tracker.finalize().timestamps.tolist() == [4 / 30]
-    finally:
-        tracker.close()
