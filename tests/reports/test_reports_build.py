@@ -643,7 +643,8 @@ def test_compare_finds_what_changed(made, tmp_path):
     assert np.isnan(changed.high)  # two sequences give no interval
     verdicts = {row[0].text: row[5].text for row in comparison.table.rows if row[1].text.startswith("all ")}
     assert verdicts == {
-        "Mask R-CNN (our back end)": "B better on 2 of 2, too few to tell", "ORB-SLAM2 (our back end)": "equal"
+        "Mask R-CNN (our back end)": "B better on 2 of 2, too few to tell", "ORB-SLAM2 (our back end)": "equal",
+        "constant velocity": "equal",
     }  # fmt: skip
     assert (comparison.only_a, comparison.only_b) == (8 + 8 + 1 + 3 * 4, 0)
     itself = compare(paths.data.parent, paths.data).overall
