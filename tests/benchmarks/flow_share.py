@@ -80,8 +80,7 @@ def table(title: str, rows: Mapping[str, DaisySettings], columns: dict[str, Unit
     heads = []
     for name, units in columns.items():
         pairs = [pair for each in units.values() for pair in each]
-        moved = lengths(pairs)
-        head = f"{name}: {len(units)} units, {len(pairs)} pairs, {np.median(moved):.0f} px"
+        head = f"{name}: {len(units)} units, {len(pairs)} pairs, {np.median(lengths(pairs)):.0f} px"
         if guess:
             off = np.concatenate([np.hypot(*(p.truth - p.guess).T) for p in pairs])
             head += f", guess off by {np.nanmedian(off):.0f}"

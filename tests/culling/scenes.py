@@ -126,8 +126,7 @@ def at_rest(frame: FrameBundle, previous: FrameBundle | None = None, keyframes: 
 
 def texture(seed: int) -> np.ndarray:
     noise = np.random.default_rng(seed).integers(0, 255, (480, 640), dtype=np.uint8)
-    blurred = cv2.GaussianBlur(noise, (0, 0), 2.0)
-    return cv2.normalize(blurred, None, 0, 255, cv2.NORM_MINMAX)
+    return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2.0), None, 0, 255, cv2.NORM_MINMAX)
 
 
 def moved_patch(shift: int) -> tuple[np.ndarray, np.ndarray]:

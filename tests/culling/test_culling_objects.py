@@ -60,7 +60,7 @@ from dynslam_bench.features.orb import OrbExtractor
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.slam.pipeline import restore_starved
 
-PERSON = (220, 100, 330, 380)
+RESEEDING = ReseedingFilter(ReseedingSettings(budget=600), FeatureSettings(n_features=900))
 
 
 def test_semantic_drops_the_features_on_people_only() -> None:
@@ -71,8 +71,8 @@ def test_semantic_drops_the_features_on_people_only() -> None:
 
 
 def test_box_epipolar_has_a_limit_of_its_own_inside_boxes() -> None:
-    slow = np.array([0.0, 0.0022, 0.0])  # about 0.8 px at 1.5 m
-    made = scene(SIDEWAYS, motion=slow, noise_px=0.02, instances=box_instance(*BOX))
+    # the motion is about 0.8 px at 1.5 m
+    made = scene(SIDEWAYS, motion=np.array([0.0, 0.0022, 0.0]), noise_px=0.02, instances=box_instance(*BOX))
     strict = BoxEpipolarFilter(BoxEpipolarSettings(inside_px=0.3, outside_px=50.0), SEGMENTATION)
     keep = strict.apply(made.frame, made.state).keep
     assert not keep[made.moving].any() and keep[~on_rectangle(made, *BOX)].all()
@@ -105,8 +105,7 @@ def test_class_rule_drops_people_and_only_those_movable_objects_that_move() -> N
 
 
 def test_class_rule_fits_f_to_static_labelled_points_only() -> None:
-    chair = box_instance(*BOX, name="chair")
-    made = scene(SIDEWAYS, n_static=160, n_moving=300, motion=ACROSS, instances=chair)
+    made = scene(SIDEWAYS, n_static=160, n_moving=300, motion=ACROSS, instances=box_instance(*BOX, name="chair"))
     keep = ClassRuleFilter(ClassRuleSettings(), SEGMENTATION).apply(made.frame, made.state).keep
     assert not keep[made.moving].any(), "a chair with most of the points does not become the reference"
     only_tv = ClassRuleFilter(ClassRuleSettings(movable="tv"), SEGMENTATION).apply(made.frame, made.state)
@@ -144,7 +143,7 @@ def test_depth_blocks_complete_a_mask_that_covers_enough_of_the_person(bottom: i
 @pytest.mark.parametrize(("other", "touched"), [((330, 300, 380, 380), True), ((450, 100, 500, 200), False)])
 def test_depth_blocks_drop_what_a_person_touches(other: tuple[int, int, int, int], touched: bool) -> None:
     frame, _ = person_before_a_wall()
-    person, chair = box_instance(*PERSON), box_instance(*other, name="chair")
+    person, chair = box_instance(220, 100, 330, 380), box_instance(*other, name="chair")
     masks, boxes_ = np.concatenate([person.masks, chair.masks]), np.concatenate([person.boxes, chair.boxes])
     frame.instances = type(person)(masks, boxes_, ("person", "chair"), np.ones(2, np.float32))
     verdict, on_other = blocks(frame), on_rectangle(frame, *other)
@@ -196,8 +195,7 @@ def test_expansion_gives_new_features_a_share_of_near_certain_ones() -> None:
     probability = np.array([0.9, 0.1, 0.6, 0.5, 0.5, 0.5, 0.5])
     expanded = expand(xy, probability, np.arange(7) < 3, 32.0)
     influence = np.exp(-0.5 * (4 / 16) ** 2)
-    expected = [0.9, 0.1, 0.6, 0.5 + 0.4 * influence, 0.5 - 0.4 * influence, 0.5, 0.5]
-    np.testing.assert_allclose(expanded, expected)
+    np.testing.assert_allclose(expanded, [0.9, 0.1, 0.6, 0.5 + 0.4 * influence, 0.5 - 0.4 * influence, 0.5, 0.5])
 
 
 def panned(shift: int) -> Scene:
@@ -277,13 +275,12 @@ def ids(frame: FrameBundle, rows: np.ndarray) -> set[tuple[float, float, int]]:
 
 def test_reseeding_replaces_what_fell_to_a_mask_with_static_features_elsewhere() -> None:
     frame = textured(900)
-    block = ReseedingFilter(ReseedingSettings(budget=600), FeatureSettings(n_features=900))
     on_person = (frame.keypoints.xy[:, 0] > 420) & (frame.keypoints.xy[:, 1] > 60)
     assert on_person.sum() > 200
-    verdict = block.apply(frame, FilterState(camera=CAMERA, keep=~on_person))
+    verdict = RESEEDING.apply(frame, FilterState(camera=CAMERA, keep=~on_person))
     used = verdict.keep & ~on_person
     assert used.sum() == min(600, (~on_person).sum())
-    plain = block.apply(frame, FilterState(camera=CAMERA, keep=np.ones(len(frame), bool))).keep & ~on_person
+    plain = RESEEDING.apply(frame, FilterState(camera=CAMERA, keep=np.ones(len(frame), bool))).keep & ~on_person
     assert used.sum() > 1.2 * plain.sum(), "the static background has more features than without re-seeding"
     assert plain[used].sum() >= 0.95 * plain.sum(), "those that were there stay"
     assert verdict.stats["reseeded"] == np.count_nonzero(used & ~plain) > 100
@@ -293,8 +290,7 @@ def test_reseeding_replaces_what_fell_to_a_mask_with_static_features_elsewhere()
 
 def test_reseeding_changes_nothing_where_nothing_is_dynamic() -> None:
     frame, usual = textured(900), textured(600)
-    block = ReseedingFilter(ReseedingSettings(budget=600), FeatureSettings(n_features=900))
-    verdict = block.apply(frame, FilterState(camera=CAMERA, keep=np.ones(len(frame), bool)))
+    verdict = RESEEDING.apply(frame, FilterState(camera=CAMERA, keep=np.ones(len(frame), bool)))
     assert verdict.stats["reseeded"] == 0 and verdict.stats["missing"] == 0
     assert ids(frame, verdict.keep) == ids(usual, np.ones(len(usual), bool)), "the features that other systems get"
 
@@ -302,9 +298,7 @@ def test_reseeding_changes_nothing_where_nothing_is_dynamic() -> None:
 @pytest.mark.parametrize("left", [0, 1, 400])
 def test_reseeding_leaves_all_that_there_is_where_it_is_less_than_the_budget(left: int) -> None:
     frame = textured(900)
-    keep = np.arange(len(frame)) < left
-    block = ReseedingFilter(ReseedingSettings(budget=600), FeatureSettings(n_features=900))
-    verdict = block.apply(frame, FilterState(camera=CAMERA, keep=keep))
+    verdict = RESEEDING.apply(frame, FilterState(camera=CAMERA, keep=np.arange(len(frame)) < left))
     assert verdict.keep.all() and verdict.stats["missing"] == 600 - left
 
 
@@ -321,13 +315,12 @@ def test_nothing_is_culled_where_nothing_is_known_of_the_past_nor_moves_nor_has_
 
 def test_guard_undoes_the_least_reliable_verdict_first() -> None:
     semantic, nothing = np.arange(100) >= 30, np.zeros(100, bool)
-    settings = GuardSettings(min_features=40)
     for verdicts, expected, undone in (
         ([semantic, nothing], semantic, 1),
         ([nothing, nothing], ~nothing, 2),
         ([semantic], semantic, 0),
     ):
-        keep, count = restore_starved(verdicts, settings, 100)
+        keep, count = restore_starved(verdicts, GuardSettings(min_features=40), 100)
         assert count == undone
         np.testing.assert_array_equal(keep, expected)
     assert restore_starved([semantic], GuardSettings(min_features=0, min_fraction=0.8), 100)[1] == 1
@@ -343,8 +336,7 @@ def tracked_corners(value: int) -> float:
 
 
 def chair_of_which_half_moves(value: float) -> list[bool]:
-    chair = box_instance(*BOX, name="chair")
-    made = scene(SIDEWAYS, n_static=900, n_moving=40, motion=ACROSS, instances=chair)
+    made = scene(SIDEWAYS, n_static=900, n_moving=40, motion=ACROSS, instances=box_instance(*BOX, name="chair"))
     rule = ClassRuleFilter(ClassRuleSettings(vote_share=value, depth_m=2.0), SEGMENTATION)
     return rule.apply(made.frame, made.state).keep.tolist()
 

@@ -307,8 +307,7 @@ def test_the_windowed_error_is_the_relative_error_over_the_window() -> None:
     for frame in range(1, 12):
         start = max(frame - 4, 0)
         moved, est = (np.linalg.inv(poses[start]) @ poses[frame] for poses in (true, estimate))
-        error = np.linalg.norm((np.linalg.inv(moved) @ est)[:3, 3])
-        assert rewards[frame - 1] == pytest.approx(-error, abs=1e-12)
+        assert rewards[frame - 1] == pytest.approx(-np.linalg.norm((np.linalg.inv(moved) @ est)[:3, 3]), abs=1e-12)
 
 
 def test_dropped_frames_do_not_end_a_row_of_lost_ones() -> None:
@@ -399,8 +398,9 @@ def test_choices_that_are_none(actions: Any, words: str) -> None:
 @pytest.mark.parametrize("parts", [*([part] for part in PARTS), PARTS])
 def test_every_part_passes_the_checker_alone_and_together(parts: list[str]) -> None:
     for tracker in (TARGET, TARGET.replace(":SPEC", ":FIXED")):
-        arguments = {"sequence": ToySequence(6), "tracker": tracker, "observation": parts}
-        checked(gym.make(GENERIC_ID, render_mode="rgb_array", **arguments))
+        checked(
+            gym.make(GENERIC_ID, sequence=ToySequence(6), tracker=tracker, observation=parts, render_mode="rgb_array")
+        )
 
 
 def test_keypoints_are_padded_and_thinned_and_say_what_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -427,8 +427,7 @@ def test_the_gray_image_is_that_of_the_frame() -> None:
     env = SlamEnv(ToySequence(4), TARGET, observation=["gray"])
     seen, _ = env.reset(seed=0)
     assert seen["gray"].shape == (60, 80, 1) and seen["gray"].dtype == np.uint8
-    weights = np.array([0.299, 0.587, 0.114])
-    blocks = (env.frame.rgb @ weights).reshape(60, 2, 80, 2).mean(axis=(1, 3))
+    blocks = (env.frame.rgb @ np.array([0.299, 0.587, 0.114])).reshape(60, 2, 80, 2).mean(axis=(1, 3))
     assert np.abs(seen["gray"][..., 0] - blocks).max() <= 1.5
 
 
@@ -490,9 +489,8 @@ def test_a_busy_tracker_misses_frames(frame_time_s: float, speed: float, tracked
 def test_dropped_frames_cost_the_error_of_not_moving() -> None:
     whole, *_ = play(SlamEnv(ToySequence(11), TARGET, settings=QUIET))
     dropping, *_ = play(DropFrames(SlamEnv(ToySequence(11), TARGET, settings=QUIET), frame_time_s=1.9 / 30))
-    motion = np.hypot(0.01, 0.002)
     assert sum(whole) == pytest.approx(0, abs=1e-9)
-    assert sum(dropping) == pytest.approx(-8 * motion, abs=1e-6)  # 4 dropped, 4 ways back
+    assert sum(dropping) == pytest.approx(-8 * np.hypot(0.01, 0.002), abs=1e-6)  # 4 dropped, 4 ways back
 
 
 def test_random_drops_are_seeded_and_near_their_share() -> None:

@@ -19,9 +19,6 @@ from dynslam_bench.evaluation.rpe import closest, random_pairs
 from dynslam_bench.geometry import RepeatedStamps, Trajectory, load_tum, read_tum, se3, write_tum
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
-REAL = [
-    path for path in sorted(SHARED.glob("*/*/groundtruth.txt")) if path.parts[-3] != "fixed_camera"
-]  # evo needs motion
 
 
 def smooth(seed, n=240):
@@ -42,7 +39,11 @@ def perturbed(truth, seed):
     return Trajectory(picked.timestamps + rng.uniform(-0.006, 0.006, len(picked)), se3.exp(rng.normal(size=6)) @ poses)
 
 
-TRUTHS = {f"random-{seed}": smooth(seed) for seed in range(4)} | {path.parent.name: read_tum(path) for path in REAL}
+TRUTHS = {f"random-{seed}": smooth(seed) for seed in range(4)} | {
+    path.parent.name: read_tum(path)
+    for path in sorted(SHARED.glob("*/*/groundtruth.txt"))
+    if path.parts[-3] != "fixed_camera"  # evo needs motion
+}
 CASES = [pytest.param(perturbed(truth, at), truth, id=name) for at, (name, truth) in enumerate(TRUTHS.items())]
 # an estimate with more poses than the ground truth: evo then starts from the ground truth
 CASES += [pytest.param(perturbed(smooth(9), 9), smooth(9).select(slice(0, None, 7)), id="longer-estimate")]

@@ -43,8 +43,7 @@ def by_hand(moths, flames, iteration, family, uniform, jumps, scale):
 
 def drawn(seed, stepping):
     """A population, its flames, and the numbers that the compiled search would draw for them."""
-    rng = np.random.default_rng(seed)
-    moths, flames = rng.uniform(-40, 40, (2, POPULATION, 4)).astype(np.float32)
+    moths, flames = np.random.default_rng(seed).uniform(-40, 40, (2, POPULATION, 4)).astype(np.float32)
     state, uniform, jumps = np.uint64(seed + 77), np.empty((POPULATION, 4)), np.full((POPULATION, 4), 0.5)
     for i in range(POPULATION):
         for numbers, levels in ((uniform, 65536), (jumps, 4096))[: 1 + stepping]:

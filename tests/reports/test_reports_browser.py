@@ -94,8 +94,7 @@ def test_nothing_faults_nothing_is_fetched_all_fits_and_is_accessible(browser, r
     if page == "run":  # a straight path
         sides = browser.run("Object.values(byId('track')._fullLayout.scene.aspectratio)")
         assert min(sides) > 0.3 * max(sides), "the box of the track fits the view"
-    right = browser.run("all('.figure').map((each) => each.getBoundingClientRect().right)")
-    assert max(right, default=0) <= width
+    assert max(browser.run("all('.figure').map((figure) => figure.getBoundingClientRect().right)"), default=0) <= width
     assert browser.violations() == []
     browser.prefer("light")
 

@@ -171,11 +171,10 @@ def test_a_table_that_is_right_passes(monkeypatch):
     values = {}
     for system, size in (("A", 0.02), (OURS, 0.01)):
         error = np.abs(rng.normal(0, size, 500))
-        statistics = {"mean": error.mean(), "median": np.median(error), "std": error.std()}
-        statistics["rmse"] = np.sqrt((error**2).mean())
+        rmse = np.sqrt((error**2).mean())
+        statistics = {"mean": error.mean(), "median": np.median(error), "std": error.std(), "rmse": rmse}
         for (table, metric), place, name in product(((1, "ape"), (2, "rpe")), ("sitting", "walking"), statistics):
-            key = (table, system, f"tum/fr3/{place}_xyz", f"{metric}_{name}")
-            values[key] = round(float(statistics[name]), 4)
+            values[table, system, f"tum/fr3/{place}_xyz", f"{metric}_{name}"] = round(float(statistics[name]), 4)
     rows = [(*key, "value", value, 4) for key, value in values.items()]
     for (table, name, sequence, quantity), value in values.items():
         gain = 100 * (value - values[table, OURS, sequence, quantity]) / value
@@ -191,8 +190,7 @@ def test_never_moving_can_be_recomputed_from_ground_truth():
     n = 400
     poses = np.tile(np.eye(4), (n, 1, 1))
     poses[:, 0, 3] = np.where(np.arange(n) % 2, 1.0, -1.0)  # one metre from its centre at all times
-    truth = Trajectory(np.arange(n) / 100, poses)
-    findings = audit_paper({"tum/fr3/sitting_xyz": truth}).of("better-than-not-moving")
+    findings = audit_paper({"tum/fr3/sitting_xyz": Trajectory(np.arange(n) / 100, poses)}).of("better-than-not-moving")
     assert {(f.expected, f.holds) for f in findings if f.table == 1 and "sitting" in f.sequence} == {(1.0, True)}
 
 
@@ -222,8 +220,7 @@ def test_published_numbers_are_plausible_and_sourced():
 
 def test_reported_rows_do_not_mix_alignments():
     sequences = ["tum/fr3/walking_xyz", "synthetic/walking_xyz"]
-    tum, droid_w = get_protocol("tum-rgbd/v1"), get_protocol("droid-w/v1")
-    se3, sim3 = reported_for(sequences, tum), reported_for(sequences, droid_w)
+    se3, sim3 = (reported_for(sequences, get_protocol(name)) for name in ("tum-rgbd/v1", "droid-w/v1"))
     assert se3 and sim3 and not {c.system for c in se3} & {c.system for c in sim3}
     claims = {c.system: c.value for c in se3 if c.tag == "claimed by the paper"}
     assert len(claims) == 7 and claims[OURS] == 0.2724
@@ -280,7 +277,6 @@ def test_records_stand_beside_their_own_protocol_only():
     cell = tum[KINDS["cpu"], "bonn/crowd"]
     assert (cell.value, cell.tag) == (0.024, "record")
     assert "NGD-SLAM; RGB-D; SE(3) or not stated; Ryzen 7 4800H, no GPU" in cell.source and "second-hand" in cell.source
-    assert [cell.value for cell in records_for(names, get_protocol("droid-w/v1"))] == [0.012]
-    assert [cell.value for cell in records_for(names, get_protocol("droid-w/v1-bonn"))] == [0.013]
-    assert records_for(names, get_protocol("bonn-camera/v1")) == []
+    others = {"droid-w/v1": [0.012], "droid-w/v1-bonn": [0.013], "bonn-camera/v1": []}
+    assert {name: [cell.value for cell in records_for(names, get_protocol(name))] for name in others} == others
     assert records_for(["bonn/crowd [0:200]"], get_protocol("tum-rgbd/v1")) == []

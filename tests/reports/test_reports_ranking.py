@@ -44,8 +44,7 @@ def test_what_is_worse_than_a_static_camera_is_never_first():
     board = make_board([*rows, row("good", "s", 0.1), crashed("good", "t")])
     assert names(board, board.trackers) == ["good", "still", "bad"]
     table = leaderboard(board, PROTOCOL)
-    ranks = {cells[2].text: cells[0].text for cells in table.rows}
-    assert ranks == {"GOOD": "1", "STILL": "\u2013", "BAD": "\u2013"}
+    assert {cells[2].text: cells[0].text for cells in table.rows} == {"GOOD": "1", "STILL": "\u2013", "BAD": "\u2013"}
     lines = report_table(table, ["#", "tracker"]).splitlines()[1:4]
     assert [name in line for name, line in zip(("GOOD", "STILL", "BAD"), lines, strict=True)] == [True] * 3
 
@@ -67,9 +66,8 @@ def fixed(tracker, error, **changes):
 
 
 def test_before_a_fixed_camera_trackers_rank_though_none_is_better_than_not_moving():
-    errors = {"orb-slam2": 0.05, "good": 0.002, "bad": 0.24}
-    rows = [*(fixed(name, error) for name, error in errors.items()), fixed("never", 0.0, provenance="control")]
-    board = make_board(rows)
+    systems = fixed("orb-slam2", 0.05), fixed("good", 0.002), fixed("bad", 0.24)
+    board = make_board([*systems, fixed("never", 0.0, provenance="control")])
     assert names(board, board.ranked) == ["good", "orb-slam2", "bad"] and not board.no_better
     assert board.groups == {"f": "fixed camera"} and board.static_camera == {"f": 0.0}
     assert "no better" not in per_sequence(board, PROTOCOL).caption.replace("or are no better", "")
@@ -145,8 +143,9 @@ def rows_of_truth(sizes, sequences, spread=0.05, seed=0):
             for tracker, by_category in ({"orb-slam2": dict.fromkeys(sequences, 1.0)} | sizes).items():
                 error = hardness * by_category[category] * np.exp(rng.normal(0, spread))
                 tags = [category, *(["fast"] if i == 0 else [])]
-                name = f"synthetic/{category}?scene={i}"
-                rows.append(row(tracker, name, error, tags=tags, static_camera_ate_rmse_m=1.0))
+                rows.append(
+                    row(tracker, f"synthetic/{category}?scene={i}", error, tags=tags, static_camera_ate_rmse_m=1.0)
+                )
     return rows
 
 
@@ -274,10 +273,9 @@ def test_who_is_better_than_the_reference_is_tested_as_scipy_does_and_corrected_
 
 def test_weights_make_categories_count_alike_and_one_sequence_of_many_weights_is_no_evidence():
     logs = np.concatenate([np.full(2, -1.0), np.full(20, 1.0)]) + np.random.default_rng(8).normal(0, 0.01, 22)
-    weights = np.concatenate([np.full(2, 1 / 2), np.full(20, 1 / 20)])
-    found = ratio_interval(logs, weights)
-    assert found.value == pytest.approx(np.exp((logs[:2].mean() + logs[2:].mean()) / 2))
-    assert found.low < 0.4 and found.high > 2.5, "two sequences carry half of the weight"
+    interval = ratio_interval(logs, np.repeat([1 / 2, 1 / 20], [2, 20]))
+    assert interval.value == pytest.approx(np.exp((logs[:2].mean() + logs[2:].mean()) / 2))
+    assert interval.low < 0.4 and interval.high > 2.5, "two sequences carry half of the weight"
 
 
 def test_nemenyis_differences_are_those_of_scikit_posthocs():

@@ -32,12 +32,10 @@ class PointWorld:
     ):
         """The frame at a pose; `wrong` features get positions that fit no point."""
         rng = np.random.default_rng([index, 77])
-        camera = self.camera
         local = se3.transform(se3.inverse(T_world_cam), self.points)
         with np.errstate(divide="ignore", invalid="ignore"):
-            uv = camera.project(local)
-        visible = (local[:, 2] > 0.2) & (uv > 4).all(axis=1) & (uv[:, 0] < 636) & (uv[:, 1] < 476)
-        rows = np.flatnonzero(visible)
+            uv = self.camera.project(local)
+        rows = np.flatnonzero((local[:, 2] > 0.2) & (uv > 4).all(axis=1) & (uv[:, 0] < 636) & (uv[:, 1] < 476))
         if len(rows) > limit:
             rows = np.sort(rng.permutation(rows)[:limit])
         n = len(rows)
@@ -48,13 +46,12 @@ class PointWorld:
         z = (local[rows, 2] * (1 + rng.normal(0, depth_noise, n))).astype(np.float32)
         z[rng.random(n) < depthless] = 0
         bits = np.unpackbits(self.descriptors[rows], axis=1)
-        flips = rng.random(bits.shape) < 0.03
         keypoints = Keypoints(
             xy.astype(np.float32),
             np.zeros(n, np.int32),
             np.zeros(n, np.float32),
             np.ones(n, np.float32),
-            np.packbits(bits ^ flips, axis=1),
+            np.packbits(bits ^ (rng.random(bits.shape) < 0.03), axis=1),
         )
         blank = np.zeros((480, 640), np.uint8)
         return FrameBundle(
@@ -69,11 +66,10 @@ class PointWorld:
     def path(self, count):
         """Camera-to-world poses of a smooth hand-held movement, 30 Hz."""
         t = np.arange(count) / 30.0
-        xi = np.stack(
+        return se3.exp(np.stack(
             [0.5 * np.sin(1.1 * t), 0.2 * np.sin(1.7 * t), 0.3 * (1 - np.cos(0.9 * t)), 0.15 * np.sin(0.8 * t),
              0.4 * np.sin(0.7 * t), 0.1 * np.sin(1.3 * t)], axis=1,
-        )  # fmt: skip
-        return se3.exp(xi)
+        ))  # fmt: skip
 
 
 def without_depth(frame):

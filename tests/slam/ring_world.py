@@ -11,8 +11,7 @@ VIEW_M = 6.0
 
 
 def rotated(quarters):
-    angle = quarters * np.pi / 2
-    c, s = np.cos(angle), np.sin(angle)
+    c, s = np.cos(quarters * np.pi / 2), np.sin(quarters * np.pi / 2)
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
@@ -70,13 +69,12 @@ def drive(world, path, step_m, *, rate=10.0, monocular=False, noise=None, **sett
     """A back end along frames of a lap (None is a blind frame), the results, and the lap's poses from the first one."""
     backend = make_backend(world, monocular=monocular, **settings)
     lap = world.lap(max(index for index in path if index is not None) + 1, step_m)
-    frames = []
-    for number, index in enumerate(path):
-        stamp = number / rate
-        if index is None:
-            frames.append(world.blind(number, stamp=stamp))
-        else:
-            frames.append(world.see(lap[index], number, stamp=stamp, **(noise or {})))
+    frames = [
+        world.blind(number, stamp=number / rate)
+        if index is None
+        else world.see(lap[index], number, stamp=number / rate, **(noise or {}))
+        for number, index in enumerate(path)
+    ]
     results = track_all(backend, map(without_depth, frames) if monocular else frames)
     return backend, results, se3.inverse(lap[path[0]]) @ lap
 

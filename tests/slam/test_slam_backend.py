@@ -187,8 +187,7 @@ def test_the_prediction_is_the_motion_models_at_the_time_of_the_frame(room):
         if number == 0:
             start = result.T_world_cam @ se3.inverse(path[0])
     assert np.mean(ahead) < 0.5 * np.mean(stay)
-    beyond = steps[-1] / 30.0 + MAX_GAP_S + 1e-6
-    pose, covariance = backend.predict(beyond)
+    pose, covariance = backend.predict(steps[-1] / 30.0 + MAX_GAP_S + 1e-6)
     assert covariance is None
     np.testing.assert_allclose(pose, result.T_world_cam, atol=1e-12)
 
@@ -286,11 +285,6 @@ def shaken(t):
     return se3.exp(np.array([*swing, 0.2 * np.sin(6 * t + 1), 0.35 * np.sin(5 * t + 0.5), 0.15 * np.sin(4 * t)]))
 
 
-def steady(t):
-    """A constant twist: half a metre and 2 rad a second."""
-    return se3.inverse(se3.exp(t * np.array([0.3, -0.4, 0.1, 0.5, 1.9, -0.6])))
-
-
 def rolling(room, pose_at, index, **how):
     """The frame at index / 30 s whose rows are seen from the poses at their own times, and the one seen at once."""
     exact = {"noise_px": 0.0, "depth_noise": 0.0, "depthless": 0.0, "limit": 10**6} | how
@@ -358,8 +352,8 @@ def test_a_feature_that_a_motion_would_put_behind_the_camera_stays(room):
     assert behind.any() and np.isfinite(wild.xy).all()
     np.testing.assert_array_equal(wild.xy[behind], observations.xy[behind])
     np.testing.assert_array_equal(wild.z[behind], observations.z[behind])
-    blind = observed(room.blind(1), camera)
-    assert len(compensate_rolling_shutter(blind, camera, CameraVelocity(np.ones(3), np.ones(3)))) == 0
+    ahead = CameraVelocity(np.ones(3), np.ones(3))
+    assert len(compensate_rolling_shutter(observed(room.blind(1), camera), camera, ahead)) == 0
 
 
 @pytest.mark.parametrize(("stamp_noise_s", "factor"), [(0.0, 0.4), (0.003, 0.5)])
@@ -416,8 +410,7 @@ def test_a_cut_is_no_motion(shaken_frames, after):
         return shaken(t) @ (se3.exp(np.array(after, float)) if t > 14.5 / 30 else np.eye(4))
 
     frames = [*frames[:12], *(rolling(room, cut, index, depthless=0.0, limit=500)[0] for index in range(15, 20))]
-    _, off = rolling_backend(room, frames, READOUT_S, tracking__rolling_shutter=False)
-    _, on = rolling_backend(room, frames, READOUT_S)
+    off, on = (rolling_backend(room, frames, READOUT_S, tracking__rolling_shutter=use)[1] for use in (False, True))
     assert states(on) == states(off) == ["ok"] * len(frames)
     assert largest_error(on, frames, cut) < 0.8 * largest_error(off, frames, cut)
 

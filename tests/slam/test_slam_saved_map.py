@@ -120,6 +120,13 @@ def test_other_descriptors_and_missing_maps_are_refused(made, tmp_path):
         make_backend(room).save_map(tmp_path / "map.npz")
 
 
+@pytest.fixture
+def arrays(made):
+    """Those of the map's file."""
+    with np.load(made[2]) as stored:
+        return dict(stored)
+
+
 def put(name, index, value):
     return lambda arrays: arrays[name].__setitem__(index, value)
 
@@ -154,9 +161,7 @@ FAULTS = [
 
 
 @pytest.mark.parametrize(("change", "words"), FAULTS)
-def test_a_damaged_map_is_refused_before_it_is_used(made, tmp_path, change, words):
-    with np.load(made[2]) as stored:
-        arrays = dict(stored)
+def test_a_damaged_map_is_refused_before_it_is_used(arrays, tmp_path, change, words):
     change(arrays)
     np.savez(tmp_path / "odd.npz", **arrays)
     with pytest.raises(SettingsError, match=words):
@@ -168,11 +173,9 @@ def test_a_damaged_map_is_refused_before_it_is_used(made, tmp_path, change, word
     [({"schema_version": MAP_SCHEMA + 1}, "upgrade"), ({"kind": "a run"}, "kind"), ({"next_point": 5}, "above 4"),
      ({}, "8000 words")],
 )  # fmt: skip
-def test_a_file_of_another_version_kind_or_size_is_refused(made, tmp_path, header, words):
-    with np.load(made[2]) as stored:
-        arrays = dict(stored)
-    text = json.dumps(json.loads(arrays[HEADER].tobytes()) | header).encode()
-    arrays[HEADER] = np.frombuffer(text, np.uint8)
+def test_a_file_of_another_version_kind_or_size_is_refused(made, arrays, tmp_path, header, words):
+    text = json.dumps(json.loads(arrays[HEADER].tobytes()) | header)
+    arrays[HEADER] = np.frombuffer(text.encode(), np.uint8)
     if not header:  # a small file that claims large tables
         arrays |= {name: np.zeros((len(arrays[name]), 8000), np.uint64) for name in ("kf_words", "words")}
     np.savez_compressed(tmp_path / "odd.npz", **arrays)
@@ -217,8 +220,7 @@ def test_keyframes_csv(tmp_path):
 def test_binary_ply_byte_by_byte(tmp_path, points):
     map_outputs = outputs(points)
     write_ply(tmp_path / "map.ply", map_outputs)
-    data = (tmp_path / "map.ply").read_bytes()
-    head, body = data.split(b"end_header\n")
+    head, body = (tmp_path / "map.ply").read_bytes().split(b"end_header\n")
     assert head.startswith(b"ply\nformat binary_little_endian 1.0\n") and f"element vertex {points}\n".encode() in head
     assert len(body) == 19 * points
     for i, (x, y, z, r, g, b, n) in enumerate(struct.iter_unpack("<fffBBBi", body)):

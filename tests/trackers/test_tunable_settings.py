@@ -7,6 +7,7 @@ After `reset` the settings that the tracker was built with are in force again.
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from copy import copy
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -254,28 +255,17 @@ def test_only_what_differs_is_handed_on() -> None:
 # Systems without depth: they never read it, they are refused what takes it, and what they score says so.
 
 
-OURS = [
-    spec.id for spec in all_specs() if spec.sensors == "rgb" and issubclass(spec.settings, UnfilteredSystemSettings)
-]
-
-
 @pytest.fixture(scope="module")
 def plain_scene():
     return SmallScene()
 
 
-def with_depth(scene, depth_of):
-    """The same scene with other depth images."""
-    other = SmallScene.__new__(SmallScene)
-    other.__dict__ |= scene.__dict__
-    other.frames = [replace(frame, depth=depth_of(frame)) for frame in scene.frames]
-    return other
-
-
-@pytest.mark.parametrize("tracker", OURS)
+@pytest.mark.parametrize("tracker", [name for name, spec in SYSTEMS.items() if spec.sensors == "rgb"])
 def test_depth_is_never_read(plain_scene, tracker):
-    rng = np.random.default_rng(0)
-    wild = with_depth(plain_scene, lambda frame: rng.uniform(0.1, 9.0, frame.depth.shape).astype(np.float32))
+    rng, wild = np.random.default_rng(0), copy(plain_scene)
+    wild.frames = [
+        replace(frame, depth=rng.uniform(0.1, 9.0, frame.depth.shape).astype(np.float32)) for frame in wild.frames
+    ]
     spec = TRACKERS.get(tracker)
     few = {"backend.two_views.min_matches": 40, "backend.two_views.min_points": 25}  # the images are small
     true = list(play(construct(spec, plain_scene, **few), plain_scene))
@@ -376,10 +366,7 @@ def test_a_missing_file_is_an_error_at_once_with_the_cache_too(rendered, tmp_pat
 # The presets that ship: they fit, change something and act in a run.
 
 
-SHIPPED = [(found.spec.id, name) for found in TRACKERS.all() for name in found.spec.presets]
-
-
-@pytest.mark.parametrize(("tracker", "name"), SHIPPED)
+@pytest.mark.parametrize(("tracker", "name"), [(t.spec.id, name) for t in TRACKERS.all() for name in t.spec.presets])
 def test_each_sets_something_else_than_the_default(tracker, name):
     spec = TRACKERS.get(tracker)
     default, chosen = flatten(spec.settings()), flatten(resolve_settings(spec, spec.presets[name]))
@@ -396,7 +383,6 @@ def test_fast_asks_the_network_on_every_second_frame_but_where_people_cover_the_
     assert [tracker.track(sitting[index]).stats["segmented"] for index in range(len(asked))] == asked
 
 
-HARD = 44
 BAD = range(4, 9)
 """The frames that a fault spoils."""
 END = 13
@@ -405,7 +391,7 @@ END = 13
 
 @pytest.fixture(scope="module")
 def sitting(tmp_path_factory: pytest.TempPathFactory):
-    return open_synthetic(f"synthetic/sitting_xyz?scene=2&frames={HARD}", tmp_path_factory.mktemp("rendered"))
+    return open_synthetic("synthetic/sitting_xyz?scene=2&frames=44", tmp_path_factory.mktemp("rendered"))
 
 
 def started(sitting, name: str = "orb-slam2"):
@@ -511,6 +497,4 @@ def test_missing_depth_is_missing_however_it_is_written_and_buffers_may_be_reuse
             found.append(tracker.track(replace(frame, depth=buffer if reuse else depth)).T_world_cam)
         return np.array(found).tobytes()
 
-    zero = poses(0.0, reuse=False)
-    assert poses(np.inf, reuse=False) == zero and poses(np.nan, reuse=False) == zero
-    assert poses(0.0, reuse=True) == zero
+    assert poses(0.0, reuse=False) == poses(np.inf, reuse=False) == poses(np.nan, reuse=False) == poses(0.0, reuse=True)

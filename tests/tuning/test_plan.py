@@ -37,8 +37,7 @@ from dynslam_bench.tuning.study_file import (
 
 
 def make(folders: list[str], **changes: object) -> StudySpec:
-    splits = {"tune": folders[:1], "confirm": folders[1:4], "held_out": folders[4:]}
-    return toy_spec(**splits | changes)
+    return toy_spec(**{"tune": folders[:1], "confirm": folders[1:4], "held_out": folders[4:]} | changes)
 
 
 def check(tune: list[str], held_out: list[str]) -> None:
@@ -91,8 +90,7 @@ def test_ratios_are_to_the_baseline_and_the_default_stands_beside(tmp_path: Path
 
 def test_the_baseline_may_be_another_tracker(folders: list[str], tmp_path: Path) -> None:
     spec = make(folders, baseline="never-move", confirm=folders[1:2], held_out=[])
-    tuner = run_study(spec, results=tmp_path)
-    summary = finish(tuner)
+    summary = finish(run_study(spec, results=tmp_path))
     assert summary.baseline == "never-move" and summary.shipped["confirm"].ratio < 1
     assert 0 in {candidate.trial for candidate in summary.candidates}, "the default settings compete with it"
     with pytest.raises(StudyError, match="stored with other baseline"):
@@ -113,8 +111,9 @@ def test_a_baseline_that_cannot_be_is_one_clear_line(
 
 @pytest.fixture
 def earlier(tmp_path: Path) -> Study:
-    spec = make_spec(name="first", trials=8, pruner="none")
-    return SimulatedTuner(spec, tmp_path, effect=valley, in_memory=False).run()
+    return SimulatedTuner(
+        make_spec(name="first", trials=8, pruner="none"), tmp_path, effect=valley, in_memory=False
+    ).run()
 
 
 def test_a_study_begins_with_what_an_earlier_one_learnt(earlier: Study, tmp_path: Path) -> None:

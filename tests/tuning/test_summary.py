@@ -14,7 +14,6 @@ from typing import Any, cast
 import numpy as np
 import optuna
 import pytest
-import simulated
 from optuna.trial import TrialState
 from reports_browser import Browser, needs_browser
 from scipy import stats
@@ -77,8 +76,8 @@ def test_intervals_and_bounds_cover_the_truth(scenes: int, lost: float) -> None:
 def test_the_interval_is_students_and_from_ten_on_that_of_the_trimmed_mean() -> None:
     sample, many = (np.random.default_rng(seed).normal(size=size) for seed, size in enumerate((9, 20)))
     assert bounds(sample) == pytest.approx(stats.t.interval(0.95, 8, sample.mean(), stats.sem(sample)))
-    winsorised = np.asarray(mstats.winsorize(many, (0.1, 0.1)))  # 10 % of 20 is whole: SciPy's formula is the same
-    error = winsorised.std(ddof=1) / (0.8 * math.sqrt(20))
+    # 10 % of 20 is whole: SciPy's formula is the same
+    error = np.asarray(mstats.winsorize(many, (0.1, 0.1))).std(ddof=1) / (0.8 * math.sqrt(20))
     assert centre(many) == pytest.approx(np.sort(many)[2:18].mean())
     assert bounds(many) == pytest.approx(stats.t.interval(0.95, 15, centre(many), error))
 
@@ -195,8 +194,8 @@ def test_the_scenes_that_a_gain_needs_are_the_fewest_and_show_it_in_four_of_five
     rng, gain = np.random.default_rng(1), detectable(0.25, 8)
     assert scenes_needed(gain, 0.25) == 8 and detectable(0.25, 1) == 1
     for true, share in ((math.log(1 - gain), 0.8), (0.0, 0.025)):
-        highs = [bounds(rng.normal(true, 0.25, 8))[1] for _ in range(1000)]
-        assert np.mean(np.array(highs) < 0) == pytest.approx(share, abs=0.03)
+        shown = [bounds(rng.normal(true, 0.25, 8))[1] < 0 for _ in range(1000)]
+        assert np.mean(shown) == pytest.approx(share, abs=0.03)
 
 
 @pytest.mark.parametrize("count", [FEWEST_TRIALS - 1, 60])
@@ -303,8 +302,7 @@ class TimedTuner(SimulatedTuner):
 
 
 def spec(objectives: list[str], include: list[str], **changes: object):
-    values = {"objectives": objectives, "space": {"include": include}, "trials": 14, "top": 3}
-    return make_spec(**values | changes)
+    return make_spec(**{"objectives": objectives, "space": {"include": include}, "trials": 14, "top": 3} | changes)
 
 
 def test_speed_decides_where_the_poses_stay_as_they_are(tmp_path: Path) -> None:
@@ -376,8 +374,7 @@ def tuner_of(study: optuna.Study, objective: str = "accuracy") -> Study:
 @pytest.mark.parametrize("offsets", [(0,), (0, 1), (0, 1, 2), (0, 1, 2, 3)])
 def test_a_default_of_more_starts_than_the_trials_is_explained(offsets: tuple[int, ...]) -> None:
     tune = tuple(ProblemInstance("synthetic/walking_xyz?scene=0", offset=offset) for offset in offsets)
-    text = fewer_starts(Design(tune, tuple(with_more_starts(tune)), (), (), ()))
-    assert bool(text) == (len(offsets) < 3)
+    assert bool(fewer_starts(Design(tune, tuple(with_more_starts(tune)), (), (), ()))) == (len(offsets) < 3)
 
 
 @pytest.mark.parametrize(("values", "count"), [((0.01, 0.02, 0.03), 3), ((-0.01, 0.02, 0.03), 2), ((-1, -1, -1), 0)])
@@ -410,8 +407,7 @@ def test_the_table_holds_default_chosen_and_range() -> None:
 
 @needs_browser
 def test_the_page_shows_verdict_funnel_and_optunas_plots(tmp_path: Path) -> None:
-    tuner = simulated.SimulatedTuner(simulated.make_spec(trials=12), tmp_path)
-    tuner.run()
+    tuner = SimulatedTuner(make_spec(trials=12), tmp_path).run()
     summary = finish(tuner)
     page, browser = write_page(tuner, summary), Browser(tmp_path / "profile")
     try:

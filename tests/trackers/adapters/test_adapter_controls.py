@@ -3,6 +3,7 @@
 import importlib.util
 import lzma
 import re
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -176,8 +177,7 @@ def test_opencv_keeps_the_contract():
 )
 def test_odometries_follow_a_static_scene(name, settings, bound):
     sequence = open_sequence(XYZ, frames=(0, 12))
-    tracker = build_tracker(name, settings)
-    tracker.reset(sequence.camera, rng=np.random.default_rng(0))
+    tracker = reset(build_tracker(name, settings), sequence.camera)
     results = [tracker.track(sequence[index]) for index in range(12)]
     assert {result.state for result in results} == {"ok"}
     estimate = Trajectory(sequence.timestamps, np.stack([result.T_world_cam for result in results]))
@@ -211,16 +211,6 @@ class Scripted(FrameToFrame):
         return None if current in self.failing else se3.exp(np.array([current - reference, 0.0, 0, 0, 0, 0]))
 
 
-def run_scripted(failing, count, blind):
-    tracker = Scripted(failing)
-    tracker.reset(CAMERA, rng=np.random.default_rng(0))
-    results = []
-    for index in range(count):
-        depth = np.full((48, 64), 0.0 if index in blind else 1.0, np.float32)
-        results.append(tracker.track(Frame(index, float(index), np.full((48, 64, 3), index, np.uint8), depth)))
-    return results
-
-
 @pytest.mark.parametrize(
     ("failing", "blind", "states", "place"),
     [
@@ -230,7 +220,10 @@ def run_scripted(failing, count, blind):
     ],
 )
 def test_lost_frames_are_bridged_from_the_last_good_one(failing, blind, states, place):
-    results = run_scripted(failing, len(states.split()), blind)
+    tracker, results = reset(Scripted(failing)), []
+    for index in range(len(states.split())):
+        depth = np.full((48, 64), 0.0 if index in blind else 1.0, np.float32)
+        results.append(tracker.track(Frame(index, float(index), np.full((48, 64, 3), index, np.uint8), depth)))
     assert " ".join(result.state for result in results) == states
     assert results[-1].T_world_cam[0, 3] == place
     assert all((result.T_world_cam is None) == (result.state != "ok") for result in results)
@@ -244,14 +237,13 @@ def test_undistortion_maps_invert_the_distortion():
     assert np.abs(columns - expected[..., 0]).max() < 1e-3 and np.abs(rows - expected[..., 1]).max() < 1e-3
 
 
-DOCS = Path(__file__).resolve().parents[3] / "docs"
 PAGES = ("reference/plugins.md", "how-to/dataset.md", "how-to/filter.md", "how-to/program.md", "how-to/segmenter.md")
 
 
 @pytest.fixture
 def example(tmp_path):
     """Writes a named example of the pages and gives its path."""
-    text = "\n".join((DOCS / page).read_text(encoding="utf-8") for page in PAGES)
+    text = "\n".join((Path(__file__).parents[3] / "docs" / page).read_text(encoding="utf-8") for page in PAGES)
     blocks = re.findall(r"```python\n(# (\w+\.py)\n.*?)```", text, re.DOTALL)
     texts = {name: text for text, name in blocks}
     assert len(texts) == len(blocks) >= 7
@@ -284,9 +276,8 @@ def plugged(monkeypatch):
 def test_tracker(example):
     path = example("my_slam.py")
     check_tracker(f"{path}:SPEC", frames=3)
-    tracker = build_tracker(f"{path}:SPEC", {"step_m": "0.02"})
     sequence = CornerSequence(4)
-    tracker.reset(sequence.camera, rng=np.random.default_rng(0))
+    tracker = reset(build_tracker(f"{path}:SPEC", {"step_m": "0.02"}), sequence.camera)
     assert [tracker.track(sequence[i]).T_world_cam[2, 3] for i in range(4)] == pytest.approx([0, 0.02, 0.04, 0.06])
 
 
@@ -304,9 +295,8 @@ def test_segmenter(example, plugged):
     plugged("segmenters", example("my_segmenter.py"), SEGMENTERS)
     build = load_object(SEGMENTERS.get("near").entry_point)
     check_segmenter(lambda: build(None, None))
-    tracker = build_tracker("mask-rcnn", {"segmentation.source": "plugin:near"})
     sequence = CornerSequence(3)
-    tracker.reset(sequence.camera, rng=np.random.default_rng(0))
+    tracker = reset(build_tracker("mask-rcnn", {"segmentation.source": "plugin:near"}), sequence.camera)
     assert tracker.track(sequence[0]).state == "ok"
 
 
@@ -339,8 +329,7 @@ def test_filter_beside_masks(example):
     dropped = []
     for behind_m in (0.0, 0.5):
         chosen = {"segmentation.source": "oracle", "carried.behind_m": behind_m}
-        tracker = build_tracker(f"{path}:SPEC", chosen, context)
-        tracker.reset(sequence.camera, rng=np.random.default_rng(0))
+        tracker = reset(build_tracker(f"{path}:SPEC", chosen, context), sequence.camera)
         stats = tracker.track(sequence[0]).stats
         dropped.append(stats["carried_dropped"])
         assert stats["semantic_objects"] >= 1
@@ -354,8 +343,7 @@ def test_a_filter_that_needs_masks_without_the_group_is_told_how_to_get_it(examp
         compose(SystemSettings(), TrackerContext(), [carried])
 
 
-SHARED = Path(__file__).resolve().parents[4] / "shared"
-PACKED = SHARED / "weights" / "orb_vocabulary_small.txt.xz"
+PACKED = XYZ.parents[2] / "weights" / "orb_vocabulary_small.txt.xz"
 INSTALLED = importlib.util.find_spec("pyorbslam3") is not None
 FR1 = Camera(640, 480, 517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
 
@@ -494,8 +482,7 @@ def test_vocabularies_that_are_not_there(tmp_path):
 def test_two_resets_on_real_frames():
     """25 frames of fr1_xyz, twice in one process: poses, stats, final trajectory, and nothing left running."""
     sequence = open_sequence(XYZ, frames=(0, 25))
-    tracker = build_tracker("orbslam3", {"vocabulary": str(PACKED)}, TrackerContext(fps=sequence.fps))
-    try:
+    with closing(build_tracker("orbslam3", {"vocabulary": str(PACKED)}, TrackerContext(fps=sequence.fps))) as tracker:
         for _ in range(2):
             tracker.reset(sequence.camera, rng=np.random.default_rng(0))
             results = [tracker.track(sequence[index]) for index in range(25)]
@@ -509,11 +496,8 @@ def test_two_resets_on_real_frames():
             assert np.abs(final.T_world_cam - poses).max() < 0.05
             truth = sequence.ground_truth.positions
             at = np.searchsorted(sequence.ground_truth.timestamps, sequence.timestamps)
-            moved = np.linalg.norm(truth[at[-1]] - truth[at[0]])
-            assert abs(np.linalg.norm(poses[-1, :3, 3]) - moved) < 0.02
+            assert abs(np.linalg.norm(poses[-1, :3, 3]) - np.linalg.norm(truth[at[-1]] - truth[at[0]])) < 0.02
         process = tracker._program._process
-    finally:
-        tracker.close()
     assert process.poll() is not None
 
 
@@ -522,9 +506,7 @@ def test_two_resets_on_real_frames():
 def test_frames_without_features():
     """Black frames give no pose and no crash; once there is something to see it begins."""
     camera = replace(FR1, distortion=(0.0,) * 5)
-    tracker = build_tracker("orbslam3", {"vocabulary": str(PACKED)})
-    try:
-        tracker.reset(camera, rng=np.random.default_rng(0))
+    with closing(reset(build_tracker("orbslam3", {"vocabulary": str(PACKED)}), camera)) as tracker:
         for index in range(4):
             black = Frame(index, index / 30, np.zeros((480, 640, 3), np.uint8), np.zeros((480, 640), np.float32))
             result = tracker.track(black)
@@ -534,5 +516,3 @@ def test_frames_without_features():
         seen = Frame(4, 4 / 30, np.repeat(grey[..., None], 3, axis=2), np.full((480, 640), 2.0, np.float32))
         assert tracker.track(seen).state == "ok"
         assert tracker.finalize().timestamps.tolist() == [4 / 30]
-    finally:
-        tracker.close()

@@ -12,6 +12,7 @@ import sys
 import tempfile
 import textwrap
 import time
+from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -89,8 +90,7 @@ def program(tmp_path):
     def make(text, context=None, **settings):
         path = tmp_path / f"program{len(made)}.py"
         path.write_text(PRELUDE + textwrap.dedent(text))
-        command = shlex.join([sys.executable, str(path)])
-        made.append(build_tracker(f"subprocess:{command}", settings, context))
+        made.append(build_tracker(f"subprocess:{shlex.join([sys.executable, str(path)])}", settings, context))
         return made[-1]
 
     yield make
@@ -114,11 +114,11 @@ def test_reset_tells_all(program, tmp_path):
     context = TrackerContext(sequence_id="tum/fr1/xyz", device="cuda:1", threads=3, fps=25.0)
     reset(program(text, context, folder=str(tmp_path)))
     request, threads, folder = json.loads(told.read_text())
-    camera = request["camera"]
-    assert (camera["width"], camera["height"], camera["fx"], camera["fy"]) == (64, 48, 60.0, 61.0)
-    assert camera["distortion"] == [0.1, -0.2, 0.001, 0.002, 0.3] and camera["baseline_m"] == 0.08
-    assert camera["fps"] == 25.0 and request["threads"] == 3 and request["device"] == "cuda:1"
-    assert request["sequence"] == "tum/fr1/xyz" and threads == "3"
+    assert request["camera"] == request["camera"] | {
+        "width": 64, "height": 48, "fx": 60.0, "fy": 61.0, "distortion": [0.1, -0.2, 0.001, 0.002, 0.3],
+        "baseline_m": 0.08, "fps": 25.0,
+    }  # fmt: skip
+    assert request == request | {"threads": 3, "device": "cuda:1", "sequence": "tum/fr1/xyz"} and threads == "3"
     assert Path(folder).resolve() == tmp_path.resolve()
 
 
@@ -191,8 +191,7 @@ def test_final_trajectory(program):
     tracker = reset(program(text, final=True))
     tracker.track(frame(0))
     final = tracker.finalize()
-    assert final.timestamps.tolist() == [1.5, 1.6]
-    assert final.positions.tolist() == [[1, 2, 3], [0, 0, 0]]
+    assert (final.timestamps.tolist(), final.positions.tolist()) == ([1.5, 1.6], [[1, 2, 3], [0, 0, 0]])
     assert np.allclose(final.T_world_cam[0, :3, :3], [[0.28, -0.96, 0], [0.96, 0.28, 0], [0, 0, 1]])
     assert not hasattr(program(text), "finalize")
 
@@ -247,15 +246,14 @@ def test_second_reset_starts_afresh(program):
 # The example in C++: compiled with the system's compiler, run as anybody would.
 
 
-SOURCE = Path(__file__).resolve().parents[3] / "examples" / "cpp" / "direct_odometry.cpp"
 COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
 
 
 @pytest.mark.skipif(COMPILER is None, reason="there is no C++ compiler here")
 def test_a_tracker_in_one_cpp_file_follows_the_camera(tmp_path: Path) -> None:
     program = tmp_path / "direct_odometry"
-    assert COMPILER is not None
-    command = [COMPILER, "-O2", "-Wall", "-Wextra", "-Werror", "-o", str(program), str(SOURCE)]
+    source = EXAMPLES.parent / "cpp" / "direct_odometry.cpp"
+    command = [COMPILER, "-O2", "-Wall", "-Wextra", "-Werror", "-o", program, source]
     subprocess.run(command, check=True, capture_output=True)
     env = SlamEnv("synthetic/sitting_xyz?scene=100", f"subprocess:{program}", frames=(0, 12))
     _, infos, _ = play(env)
@@ -403,8 +401,7 @@ def test_serve_answers_for_a_python_tracker(program):
     tracker = reset(program(text, final=True))
     for index in range(2):
         sent = frame(index)
-        stats = tracker.track(sent).stats
-        assert stats == {"sum": float(sent.rgb.sum()), "known": float((sent.depth > 0).sum())}
+        assert tracker.track(sent).stats == {"sum": float(sent.rgb.sum()), "known": float((sent.depth > 0).sum())}
     with pytest.raises(TrackerError, match="at frame 2: RuntimeError: no features"):
         tracker.track(frame(2))
     assert tracker.track(frame(3)).state == "ok", "an answered error does not end the program"
@@ -448,7 +445,6 @@ def write(rows, text="{} {} 0 0 0 0 0 1"):
         file.write("".join(text.format(*row) + "\\n" for row in rows))
 """
 GOOD_BATCH = "write([[row[0], 0.01 * i] for i, row in enumerate(rows)])\n"
-WORDS = ["{sequence}", "{associations}", "{camera}", "{output}", "{threads}"]
 
 
 @pytest.fixture
@@ -457,14 +453,15 @@ def toml(tmp_path):
 
     def write(code, **fields):
         (tmp_path / "slam.py").write_text(HEAD + code)
-        told = {
+        words = ["{sequence}", "{associations}", "{camera}", "{output}", "{threads}"]
+        given = {
             "name": "Toy",
             "version": "7",
             "license": "MIT",
-            "command": [sys.executable, "slam.py", *WORDS],
+            "command": [sys.executable, "slam.py", *words],
         } | fields
         path = tmp_path / "slam.toml"
-        path.write_text("".join(f"{name} = {value!r}\n" for name, value in told.items()))
+        path.write_text("".join(f"{name} = {value!r}\n" for name, value in given.items()))
         return path
 
     return write
@@ -475,12 +472,10 @@ def ran(path, folder, **settings):
     sequence = open_sequence(folder, frames=(0, 12))
     tracker = build_tracker(f"batch:{path}", settings, TrackerContext(fps=sequence.fps, threads=3))
     tracker.reset(sequence.camera, rng=np.random.default_rng(0))
-    try:
+    with closing(tracker):
         results = [tracker.track(sequence[index]) for index in range(len(sequence))]
         assert {(result.state, result.T_world_cam) for result in results} == {("initialising", None)}
         return tracker.finalize(), tracker, sequence
-    finally:
-        tracker.close()
 
 
 def test_the_program_sees_the_frames_as_they_are(toml, toy_folder, tmp_path):
@@ -506,8 +501,7 @@ assert threads == os.environ["OMP_NUM_THREADS"] == "3" and os.listdir() == []
 
 
 def test_indices_stand_for_stamps(toml, toy_folder):
-    half = toml("write([[i, 0.01 * i] for i in (8, 4, 0)])", format="indices")
-    trajectory, _, sequence = ran(half, toy_folder)
+    trajectory, _, sequence = ran(toml("write([[i, 0.01 * i] for i in (8, 4, 0)])", format="indices"), toy_folder)
     assert trajectory.timestamps.tolist() == sequence.timestamps[[0, 4, 8]].tolist()
     assert np.allclose(trajectory.positions[:, 0], [0.0, 0.04, 0.08])
 
@@ -588,8 +582,7 @@ ROWS = {
 
 @pytest.mark.parametrize("code, status, words", ROWS.values(), ids=ROWS)
 def test_each_way_to_fail_is_a_row_with_the_program_s_last_words(toml, toy_folder, tmp_path, code, status, words):
-    settings = {"timeout_s": 2}
-    run = db.run(f"batch:{toml(code)}", toy_folder, frames=(0, 12), settings=settings, results=tmp_path / "results")
+    run = db.run(f"batch:{toml(code)}", toy_folder, frames=(0, 12), settings={"timeout_s": 2}, results=tmp_path / "r")
     assert run.status == status
     assert re.search(words, " ".join([run.record.reason, *run.record.notes]))
 

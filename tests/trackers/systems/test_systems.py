@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from envs_play import play
 from reports_fake_store import add_run
-from scenes import ACROSS, BOX, SIDEWAYS, Scene, box_instance, on_rectangle, scene
+from scenes import ACROSS, BOX, SIDEWAYS, box_instance, on_rectangle, scene
 from steering_scene import SmallScene, construct, quick
 from steering_scene import play as play_small
 
@@ -129,8 +129,7 @@ def test_variants_are_listed_under_their_system_and_ablations_rank_never() -> No
     ],
 )
 def test_a_variant_lacks_the_settings_of_what_it_leaves_out(name: str, missing: set[str]) -> None:
-    groups = set(TRACKERS.get("emfoa-oft").settings.model_fields)
-    assert groups - set(TRACKERS.get(name).settings.model_fields) == missing
+    assert TRACKERS.get("emfoa-oft").settings.model_fields.keys() - TRACKERS.get(name).settings.model_fields == missing
 
 
 def test_systems_with_a_compensation_of_their_own_bridge_longer() -> None:
@@ -143,11 +142,9 @@ def test_systems_with_a_compensation_of_their_own_bridge_longer() -> None:
 # People fill the view: they must not take the places of the few features that the camera's pose is found with.
 
 
-CROWDED = (0, 24)  # people cover 85 % of the features; with all of them counted the camera was lost from frame 14 on
-
-
 def test_a_crowd_in_front_of_the_camera_leaves_enough_features() -> None:
-    sequence = open_sequence("synthetic/walking_halfsphere?scene=102", frames=CROWDED)
+    """People cover 85 % of the features; with all of them counted the camera was lost from frame 14 on."""
+    sequence = open_sequence("synthetic/walking_halfsphere?scene=102", frames=(0, 24))
     kept, states = {}, {}
     for share in (0.0, 0.3):
         settings = {"segmentation.source": "oracle", "segmentation.outside_share": share}
@@ -161,10 +158,6 @@ def test_a_crowd_in_front_of_the_camera_leaves_enough_features() -> None:
 
 
 # What published systems get from the shared stages is the same as their sources say, or stands in their specs.
-
-
-OBJECTS = ("ds-slam", "di-slam", "yolo-slam", "dynatm-slam", "ngd-slam", "sgc-slam", "detect-slam", "dgs-slam")
-"""Systems that judge by boxes or by whole objects."""
 
 
 @pytest.mark.parametrize("spec", SYSTEMS, ids=lambda spec: spec.id)
@@ -185,7 +178,10 @@ def test_no_published_system_has_a_check_on_its_flow_but_one_that_says_so() -> N
     assert describe_tracks(TRACKERS.get("dai-slam").settings().flow) in "; ".join(TRACKERS.get("dai-slam").assumptions)
 
 
-@pytest.mark.parametrize("name", (*OBJECTS, "blitz-slam"))
+# Systems that judge by boxes or by whole objects, and the one that grows its masks.
+@pytest.mark.parametrize("name", [
+    "ds-slam", "di-slam", "yolo-slam", "dynatm-slam", "ngd-slam", "sgc-slam", "detect-slam", "dgs-slam", "blitz-slam",
+])  # fmt: skip
 def test_masks_are_grown_and_repaired_only_where_the_system_does_it(name: str) -> None:
     settings = TRACKERS.get(name).settings
     assert ("segmentation.dilation_px" in {each.name for each in parameters(settings)}) == (name == "blitz-slam")
@@ -248,7 +244,6 @@ def test_published_classes(tracker: str, sequence: str, expected: str | None) ->
 
 def test_table_of_a_store_of_computed_trajectories(tmp_path: Path) -> None:
     store = RunStore(tmp_path)
-    replica = "synthetic/walking_rpy"
     for seed, (tracker, options) in product(
         (0, 1),
         {
@@ -261,7 +256,7 @@ def test_table_of_a_store_of_computed_trajectories(tmp_path: Path) -> None:
             "di-slam": {"provenance": "inspired"},
         }.items(),
     ):
-        add_run(store, tracker, replica, seed, **{"error": 0.005} | options)
+        add_run(store, tracker, "synthetic/walking_rpy", seed, **{"error": 0.005} | options)
     text = signatures.report(tmp_path)
     verdicts = {
         line.split("|")[1].strip(): line.rsplit("|", 2)[1].strip()
@@ -288,19 +283,17 @@ def test_a_store_without_the_reference_system_is_a_clear_error(tmp_path: Path) -
 SHARED = Path(__file__).resolve().parents[4] / "shared"
 YOLO = SHARED / "weights" / "yolov8n-seg_480x640_fp32.onnx"
 GEOMETRY = "emfoa-oft?masks=none"
-SLACK = 1.3
+
+
 # Excerpt, tracker, frames, stride, and the least ATE so far in mm. Of Bonn crowd as many frames as are needed for a
 # system that culls nothing to fail (295 and 206 mm there): all 200 with a network would take a minute.
-FLOORS = [
+@pytest.mark.parametrize("excerpt, tracker, frames, stride, least_mm", [
     pytest.param("tum/rgbd_dataset_freiburg1_xyz", "orb-slam2", None, 1, 4.9, id="fr1_xyz"),
     pytest.param("tum/rgbd_dataset_freiburg1_rpy", "orb-slam2", None, 1, 5.2, id="fr1_rpy"),
     pytest.param("fixed_camera/man_130", GEOMETRY, None, 1, 0.3, id="man_130, no masks"),
     pytest.param("bonn/rgbd_bonn_crowd", GEOMETRY, (0, 100), 1, 7.0, id="crowd, no masks"),
     pytest.param("bonn/rgbd_bonn_crowd", "mask-rcnn", (0, 140), 2, 11.5, id="crowd, YOLO"),
-]
-
-
-@pytest.mark.parametrize("excerpt, tracker, frames, stride, least_mm", FLOORS)
+])  # fmt: skip
 def test_the_error_on_a_recording_has_not_grown(excerpt, tracker, frames, stride, least_mm):
     needed = [SHARED / "data" / excerpt, *([YOLO] if tracker == "mask-rcnn" else [])]
     missing = [str(path) for path in needed if not path.exists()]
@@ -309,8 +302,7 @@ def test_the_error_on_a_recording_has_not_grown(excerpt, tracker, frames, stride
     masks = {"segmentation.source": f"onnx:{YOLO}"} if tracker == "mask-rcnn" else {}
     _, infos, _ = play(SlamEnv(str(needed[0]), tracker, settings=masks, frames=frames, stride=stride))
     metrics = infos[-1]["episode_metrics"]
-    assert metrics["coverage"] == 1.0
-    assert 1000 * metrics["ate_rmse_m"] < SLACK * least_mm
+    assert metrics["coverage"] == 1.0 and 1000 * metrics["ate_rmse_m"] < 1.3 * least_mm
 
 
 TESTED = {
@@ -319,17 +311,6 @@ TESTED = {
 """Systems that test matches; a feature without one stays."""
 FOLLOWED = {"detect-slam", "huai-slam", "cfp-slam"}
 """Systems that follow features from frame to frame."""
-UNPUBLISHED = {"dai-slam"}
-"""Its tracks are judged over a window: `correlation_graph.py`."""
-
-
-def moving_scene(thing: str) -> tuple[Scene, np.ndarray]:
-    """A thing that moved across before a wall, and bool ``[N]``: those of its features whose flow failed."""
-    made = scene(SIDEWAYS, n_moving=80, motion=ACROSS, instances=box_instance(*BOX, name=thing))
-    made.state.previous.instances = made.frame.instances
-    lost = made.moving & (np.arange(len(made.frame)) % 2 == 1)
-    made.state.flow.valid[lost] = False
-    return made, lost
 
 
 def system(name: str, **settings: object) -> SlamPipeline:
@@ -341,7 +322,8 @@ def system(name: str, **settings: object) -> SlamPipeline:
 
 def test_every_published_flow_is_covered() -> None:
     with_flow = {spec.id for spec in all_specs() if "flow" in spec.settings.model_fields}
-    assert {name for name in with_flow if not name.startswith("emfoa-oft")} == TESTED | FOLLOWED | UNPUBLISHED
+    # the tracks of dai-slam are judged over a window: `correlation_graph.py`
+    assert {name for name in with_flow if not name.startswith("emfoa-oft")} == TESTED | FOLLOWED | {"dai-slam"}
 
 
 @pytest.mark.parametrize("rule", ["keep", "drop", "judge"])
@@ -351,7 +333,11 @@ def test_a_moving_region_whose_flow_fails_goes_by_the_named_rule(name: str, rule
     assert block.settings.unmatched == "keep"
     block.settings = block.settings.model_copy(update={"unmatched": rule})
     movable = name in ("sof-slam", "seg-slam")
-    made, lost = moving_scene("chair" if movable else "person")
+    thing = box_instance(*BOX, name="chair" if movable else "person")
+    made = scene(SIDEWAYS, n_moving=80, motion=ACROSS, instances=thing)
+    made.state.previous.instances = thing
+    lost = made.moving & (np.arange(len(made.frame)) % 2 == 1)  # the flow of every second of its features fails
+    made.state.flow.valid[lost] = False
     if movable:  # the depth of a moving thing takes its unmatched features along: not what is tested here
         block.settings = block.settings.model_copy(update={"depth_m": 0.0})
     keep = block.apply(made.frame, made.state).keep
@@ -362,8 +348,7 @@ def test_a_moving_region_whose_flow_fails_goes_by_the_named_rule(name: str, rule
 @pytest.mark.parametrize("name", sorted(TESTED | FOLLOWED))
 def test_published_flows_are_lucas_kanade_without_a_check_of_ours(name: str) -> None:
     """What the flow of a system finds is what OpenCV's tracker finds, though a way back would contradict some of it."""
-    rng = np.random.default_rng(0)
-    texture = cv2.GaussianBlur(rng.integers(0, 255, (240, 320), dtype=np.uint8), (0, 0), 2.0)
+    texture = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (240, 320), dtype=np.uint8), (0, 0), 2.0)
     first = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)
     second = np.roll(first, (3, 9), (0, 1))
     second[60:180, 80:240] = cv2.GaussianBlur(second[60:180, 240:80:-1], (0, 0), 4.0)  # something else came in
