@@ -94,7 +94,7 @@ class DenseDaisyFlow:
         self.settings = settings
         common = {name: getattr(settings, name) for name in DaisySettings.model_fields}
         self._sparse.configure(
-            FlowSettings(**common, support=9, support_spacing_px=max(1, settings.superpixel_px // 2))
+            FlowSettings(**common, support=5, support_spacing_px=max(1, settings.superpixel_px // 2))
         )
 
     def prepare(self, gray: NDArray[np.uint8]) -> DescribedImage:
