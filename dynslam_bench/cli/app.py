@@ -143,9 +143,9 @@ def start(arguments: list[str] | None = None) -> None:
     except Exception as error:
         if interrupted():  # libraries turn an interrupt into errors of their own
             leave_interrupted()
-        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             _discard_output()
-            error = DynslamError(f"cannot write {error.filename or 'the output'}: no space is left on the device")
+            error = DynslamError(f"cannot write {error.filename or ''}".rstrip() + f": {error.strerror}")
         if not isinstance(error, DynslamError):
             raise
         write_error(error)

@@ -225,7 +225,10 @@ class _RegionLabels:
         self._choose(np.concatenate([labels[:, None], labels_as_seen(centres, labels, near)], axis=1))
 
     def try_regional_motion(self, valid: NDArray[np.bool_]) -> None:
-        """Try, on every region with an inconsistent pixel, the motion of the regions around it, fitted and refined."""
+        """Try, on every region with an inconsistent pixel, the motion of the regions around it, fitted and refined.
+
+        One pixel in four is looked at: those of even rows and columns.
+        """
         regions, (height, width) = self._image.regions, self._image.half.shape
         fitted = fit_regional_motion(self.flow(), valid, regions, self._image.half)
         if fitted is None:

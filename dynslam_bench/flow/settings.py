@@ -105,5 +105,5 @@ class DenseFlowSettings(DaisySettings):
         3.0, gt=0.0, le=100.0, description="largest forward-backward error of a consistent pixel"
     )
     second_round: bool = Field(
-        True, description="try on every region the motion that consistent regions nearby suggest"
+        True, description="try on regions with inconsistent pixels the motion that regions nearby suggest"
     )

@@ -67,7 +67,8 @@ def tracker_report(
     report = ConformanceReport("") if report is None else report
     spec = TRACKERS.get(subject) if isinstance(subject, str) else subject if isinstance(subject, TrackerSpec) else None
     report.subject = f"tracker {spec.id!r}" if spec else ConformanceReport.of("tracker", subject).subject
-    scene, turning = CornerSequence(frames) if sequence is None else sequence, TurningSequence()
+    scene = CornerSequence(frames) if sequence is None else sequence
+    turning = TurningSequence()
     if spec is not None:
         report.run("spec", lambda: _spec(spec, settings))
     run = _Runner(report, spec or subject, settings, scene, frames, seed)

@@ -242,10 +242,10 @@ def attentive():
 
 
 @pytest.mark.parametrize(
-    ("verb", "text", "number"),
-    [("bench", SUITE, signal.SIGHUP), ("tune run", STUDY, signal.SIGINT)],
+    ("verb", "text", "number", "start"),
+    [("bench", SUITE, signal.SIGHUP, "fork"), ("tune run", STUDY, signal.SIGINT, "fresh")],
 )
-def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number):
+def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number, start):
     tracker = tmp_path / "waits.py"
     tracker.write_text(
         f"import sys; sys.path.insert(0, {str(HERE / 'runs')!r})\n"
@@ -268,7 +268,7 @@ def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number):
     program = subprocess.Popen(
         [sys.executable, "-m", "dynslam_bench", *verb.split(), "what.toml"],
         cwd=tmp_path,
-        env=os.environ | {START_VARIABLE: "fresh"},
+        env=os.environ | {START_VARIABLE: start},
         stderr=subprocess.PIPE,
         text=True,
         preexec_fn=attentive,

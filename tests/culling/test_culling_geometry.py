@@ -229,6 +229,16 @@ def test_covariance_of_the_motion_is_that_of_sampled_motions() -> None:
     assert not prior_information(FilterState(CAMERA, np.ones(0, bool)), np.eye(4)).any()
 
 
+def test_epipolar_distance_agrees_with_the_definition() -> None:
+    rng = np.random.default_rng(0)
+    matrix, (first, second) = rng.normal(size=(3, 3)), rng.uniform(0, 600, (2, 20, 2))
+    expected = []
+    for (u1, v1), (u2, v2) in zip(first, second, strict=True):
+        x, y, w = matrix @ (u1, v1, 1)
+        expected.append(abs(x * u2 + y * v2 + w) / np.hypot(x, y))
+    np.testing.assert_allclose(epipolar_distance(matrix, first, second), expected, rtol=1e-12)
+
+
 def test_fundamental_matrix_is_that_of_the_true_motion() -> None:
     made, clean = scene(SIDEWAYS, n_moving=0, noise_px=0.05), scene(SIDEWAYS, n_moving=0, noise_px=0.0, seed=5)
     matrix = fundamental_matrix(made.state.flow.xy.astype(float), made.frame.xy)

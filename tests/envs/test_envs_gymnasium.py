@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from envs_play import QUIET, checked, play, stepped
-from envs_toys import SPEC, STEP_M, TARGET, ToySequence, ToyTracker
+from envs_toys import SPEC, STEP_M, TARGET, ToySequence, ToyTracker, truth
 from gymnasium.envs.registration import EnvSpec
 
 import dynslam_bench.envs
@@ -133,6 +133,18 @@ MOTION_M = float(np.hypot(STEP_M, 0.002))
 def test_rewards_are_minus_the_errors_in_info(reward: str, error: str) -> None:
     rewards, infos, _ = play(SlamEnv(ToySequence(12), TARGET, reward=reward))
     assert rewards == [-info[error] for info in infos[1:]] and min(rewards) < 0
+
+
+def test_errors_against_an_independent_computation() -> None:
+    env = SlamEnv(ToySequence(12), TARGET)
+    _, infos, _ = play(env)
+    estimate, true = env.online_trajectory().T_world_cam, truth(12)
+    for i, info in enumerate(infos[1:], start=1):
+        for kind, first in (("pose", 0), ("frame", i - 1)):
+            error = np.linalg.inv(np.linalg.inv(true[first]) @ true[i]) @ (np.linalg.inv(estimate[first]) @ estimate[i])
+            assert info[f"{kind}_error_trans_m"] == pytest.approx(np.linalg.norm(error[:3, 3]), abs=1e-12)
+            angle = np.rad2deg(np.arccos(np.clip((np.trace(error[:3, :3]) - 1) / 2, -1, 1)))
+            assert info[f"{kind}_error_rot_deg"] == pytest.approx(angle, abs=1e-5)
 
 
 def test_lost_frames_cost_twice_the_way_and_the_way_back_nothing() -> None:

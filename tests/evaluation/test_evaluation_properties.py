@@ -356,7 +356,8 @@ def test_the_uncertainty_is_that_of_repetition(frames: int) -> None:
 
 def test_an_exact_estimate_and_a_short_one() -> None:
     cases = (300, "se3"), (23, "se3"), (2, "se3"), (300, "origin")
-    uncertain = [align(*[straight(0.05, frames)] * 2, mode).uncertainty_deg for frames, mode in cases]
+    paths = [(straight(0.05, frames), mode) for frames, mode in cases]
+    uncertain = [align(path, path, mode).uncertainty_deg for path, mode in paths]
     assert uncertain == [pytest.approx(0.0, abs=1e-5), pytest.approx(0.0, abs=1e-5), None, None]
 
 

@@ -48,6 +48,15 @@ def test_same_image_gives_same_bits_whatever_the_threads():
         assert np.array_equal(getattr(results[0], name), getattr(results[1], name))
 
 
+def test_features_cover_the_image_better_than_plain_orb():
+    image = texture(seed=1)
+    image[:, :320] = cv2.addWeighted(image[:, :320], 0.35, np.full((480, 320), 80, np.uint8), 0.65, 0)  # weak half
+    ours = OrbExtractor(FeatureSettings(n_features=500)).extract(image).xy
+    plain = np.array([k.pt for k in cv2.ORB_create(500).detect(image)])
+    weak = [np.count_nonzero(xy[:, 0] < 320) for xy in (ours, plain)]
+    assert weak[0] > 30 and weak[0] > 5 * weak[1]
+
+
 def test_weak_corners_count_only_in_cells_without_strong_ones():
     image = np.full((480, 640), 100, np.uint8)
     image[100:110, 100:110] = 200  # strong square

@@ -92,6 +92,20 @@ def test_compiled_cost_follows_the_reference_descriptor():
     assert (compiled_cost(image, image, points, np.zeros_like(labels))[0] == 0).all()
 
 
+def test_the_cost_over_a_support_is_the_sum_over_its_points():
+    shape, rng = (120, 160), np.random.default_rng(0)
+    first, second = picture(2, shape), picture(3, shape)
+    points = rng.uniform((40, 40), (120, 80), (400, 2)).astype(np.float32)
+    labels = (rng.uniform(-1, 1, (400, 4)) * (20, 20, 1.0, 0.7)).astype(np.float32)
+    cost, tables, _ = compiled_cost(first, second, points, labels, support=5)
+    a, b = np.exp2(labels[:, 2]) * (np.cos(labels[:, 3]), np.sin(labels[:, 3]))
+    total = np.zeros_like(cost)
+    for dx, dy in tables.support:
+        shift = np.column_stack([a * dx - b * dy - dx, b * dx + a * dy - dy, *np.zeros((2, 400))])
+        total += compiled_cost(first, second, points + np.float32((dx, dy)), labels + shift.astype(np.float32))[0]
+    assert (total == cost).mean() > 0.97  # rounded cosines may fall into neighbouring cells
+
+
 def test_right_scale_and_rotation_cost_least():
     image = picture(5)
     warped, matrix = moved(image, 2**0.5, 22.5)

@@ -368,7 +368,8 @@ def _read_coco(data: bytes | None, folder: Path) -> None:
     at(folder, "b/c.png", _PNG)
     labelled = labelled_images.coco_images(str(at(folder, "annotations.json", data)))
     assert labelled.name and labelled.version
-    [labelled[index] for index in range(min(len(labelled), 4))]
+    for index in range(min(len(labelled), 4)):
+        labelled[index]
 
 
 def _read_yolo(data: bytes | None, folder: Path) -> None:

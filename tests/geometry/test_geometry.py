@@ -306,7 +306,7 @@ def test_equals_the_slow_rule(seed, strict):
     second = np.unique(np.round(1305031102.0 + rng.uniform(0, 2, 80), 6) // grid * grid)
     first, second = rng.permutation(first), rng.permutation(second)
     indices = associate(first, second, 0.02, strict=strict)
-    assert [*zip(*(index.tolist() for index in indices), strict=True)] == slow_associate(first, second, 0.02, strict)
+    assert list(zip(*(index.tolist() for index in indices), strict=True)) == slow_associate(first, second, 0.02, strict)
 
 
 @pytest.mark.parametrize(

@@ -242,6 +242,8 @@ def test_a_failed_run_explains_itself(browser, report):
     browser.open(report.html)
     linked = browser.run("select('#panel-0 td a').find((link) => link.textContent === '7/8').href")
     assert linked.endswith(f"run.html{failed}"), "the number of successes leads to the failure"
+    browser.run("dispatchEvent(new Event('beforeprint'))")
+    assert browser.run("all('details:not([open])').length") == 0, "folds are printed open"
 
 
 def test_an_unknown_run_and_a_missing_file_are_said(browser, report):

@@ -30,7 +30,8 @@ from dynslam_bench.sequences.bags import unpack_bag
 from dynslam_bench.sequences.cameras import CAMERAS
 from dynslam_bench.sequences.catalogue import catalogue
 from dynslam_bench.sequences.decoded import Decoded
-from dynslam_bench.sequences.readers import lists, recorded
+from dynslam_bench.sequences.readers import files as reader_files
+from dynslam_bench.sequences.readers import recorded
 from dynslam_bench.sequences.readers.layouts import LAYOUTS, find_layout, layout_of
 from dynslam_bench.testing import CornerSequence, check_sequence
 
@@ -665,12 +666,12 @@ def test_a_manifest_that_leads_outside_is_a_fault(tmp_path: Path) -> None:
         assert "does not lie in" in fault or "is not a text file" in fault
 
 
-@pytest.mark.parametrize("module", [lists, trajectory_files])
+@pytest.mark.parametrize("module", [reader_files, trajectory_files])
 def test_millions_of_lines_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: ModuleType) -> None:
     monkeypatch.setattr(module, "MOST_LINES", 1000)
     (tmp_path / "seq.txt").write_bytes(b"#\n" * 1001)
     with pytest.raises(DynslamError, match="has more than 1000 lines"):
-        (lists.read_image_list if module is lists else load_tum)(tmp_path / "seq.txt")
+        (reader_files.read_image_list if module is reader_files else load_tum)(tmp_path / "seq.txt")
 
 
 def refuses(archive: Path, words: str) -> None:

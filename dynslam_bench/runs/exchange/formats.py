@@ -10,8 +10,8 @@ from dynslam_bench.core import RunError, TrajectoryError, raising, read_lines, t
 from dynslam_bench.core.version import install_hint
 from dynslam_bench.geometry import Array, Camera, FileNotes, Trajectory, TumFile, is_number, load_trajectory, se3
 from dynslam_bench.sequences.bags import read_bag_poses
+from dynslam_bench.sequences.readers.files import POSE, camera_truth, read_image_list, read_pose_table
 from dynslam_bench.sequences.readers.layouts import is_bag
-from dynslam_bench.sequences.readers.lists import POSE, camera_truth, read_image_list, read_pose_table
 from dynslam_bench.slam.map_files import Cloud
 
 

@@ -219,20 +219,24 @@ def _coco_mask(segmentation: Any, shape: tuple[int, ...], where: Path) -> NDArra
         return np.ascontiguousarray(np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(width, height).T)
 
 
+_NOT_LAST, _LAST = "[P-o]", "[0-O]"
+"""Digits of COCO's run lengths, 48 less than the character's code: with bit 32 another digit follows."""
+
+
 def decode_runs(text: str) -> list[int]:
     """COCO's compressed run lengths: base-32 digits, least first, differences to the run two before.
 
     Raises:
-        ValueError: The text ends within a number, or a number is longer than any image.
+        ValueError: The text ends within a number, a number is longer than any image, or a character is no digit.
     """
-    rest = re.sub(r"\A(?:[P-o]{0,12}[0-O])*", "", text, count=1)  # a number's last digit is below 32, that is P
+    rest = re.sub(rf"\A(?:{_NOT_LAST}{{0,12}}{_LAST})*", "", text, count=1)
     if rest:
         raise ValueError(f"the run lengths are damaged at character {len(text) - len(rest)} of {len(text)}")
     runs: list[int] = []
-    for number in re.findall("[P-o]*[0-O]", text):
+    for number in re.findall(f"{_NOT_LAST}*{_LAST}", text):
         digits = [ord(character) - 48 for character in number]
         value = sum((digit & 31) << 5 * place for place, digit in enumerate(digits))
-        value -= (digits[-1] & 16) << 5 * len(digits) - 4  # two's complement
+        value -= (digits[-1] & 16) << (5 * len(digits) - 4)  # two's complement
         runs.append(value + (runs[-2] if len(runs) > 2 else 0))
     return runs
 

@@ -24,7 +24,7 @@ from dynslam_bench.geometry import (
     se3,
     to_seconds,
 )
-from dynslam_bench.sequences.readers.lists import (
+from dynslam_bench.sequences.readers.files import (
     Contents,
     ImageList,
     camera_on_body,

@@ -17,7 +17,7 @@ from dynslam_bench.core.images import read_image
 from dynslam_bench.core.records import digest
 from dynslam_bench.geometry import Camera, associate, nearest_gap
 from dynslam_bench.geometry.rigs import in_camera_axes
-from dynslam_bench.sequences.readers.lists import Contents, ImageList
+from dynslam_bench.sequences.readers.files import Contents, ImageList
 from dynslam_bench.sequences.view import Masks
 
 GROUND_TRUTH_DT_S = 0.02
