@@ -48,7 +48,7 @@ from dynslam_bench.segmentation.networks.backbone import NetworkConfig
 from dynslam_bench.segmentation.networks.network import MaskRCNN
 from dynslam_bench.segmentation.training import labelled_images
 from dynslam_bench.sequences import cameras, catalogue, fetch
-from dynslam_bench.sequences.readers import layouts, lists
+from dynslam_bench.sequences.readers import files, layouts
 from dynslam_bench.sequences.readers import recorded as reader
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
 from dynslam_bench.sequences.synthetic.sequence import FrameStore, encode_png
@@ -432,8 +432,8 @@ TEXTS = [
             *(b"# none\n\n", b"1 0 0 0 0 1 0 0 0 0 1 x\n", b"1 2 3\n", b"2 0 0 0 0 2 0 0 0 0 2 0\n"),
         ],
     ),
-    Target("list of images", lambda data, folder: lists.read_image_list(at(folder, "rgb.txt", data)), lambda: [LIST]),
-    Target("associations", lambda data, folder: lists.read_associations(at(folder, "a.txt", data)), lambda: [PAIRS]),
+    Target("list of images", lambda data, folder: files.read_image_list(at(folder, "rgb.txt", data)), lambda: [LIST]),
+    Target("associations", lambda data, folder: files.read_associations(at(folder, "a.txt", data)), lambda: [PAIRS]),
     Target(
         "folder in TUM layout",
         _read_folder,
