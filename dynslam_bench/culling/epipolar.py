@@ -157,7 +157,7 @@ class EpipolarFilter(Rule[EpipolarSettings]):
         distance = matches.distances(fit)
         if distance is None:
             return self.verdict(keep, **stats)
-        failing = distance > self.settings.threshold_px  # dynamic: farther from the epipolar line, Eq. 25
+        failing = distance > self.settings.threshold_px  # too far from the epipolar line, Eq. 25
         stats["inliers"] = np.count_nonzero(fit & ~failing)
         if self.settings.max_contradiction < 1:
             share = stats["contradiction"] = contradiction(frame, state, failing, matches)

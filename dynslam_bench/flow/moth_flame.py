@@ -1,8 +1,9 @@
 """The moth-flame equations (Eq. 8-22), and the members of the moth-flame family.
 
-All searches take them from here: the compiled label search (`label_search`, which reads `flight_table`, `spiral_table`
-and `cauchy_table`) and the Optuna sampler (`slam_hpo.moth_flame_sampler`). Moths and flames are arrays of any leading
-shape with the dimensions of the problem last; `uniform(shape)` draws from [0, 1).
+The Optuna sampler (`slam_hpo.moth_flame_sampler`) calls them. The flow's search is compiled: `move_moths` of
+`label_search` is `moth_positions` for one point, with `flight_table`, `spiral_table` and `cauchy_table` from here.
+Moths and flames are arrays of any leading shape with the dimensions of the problem last; `uniform(shape)` draws from
+[0, 1).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What is kept of a run: `run.json`, and the metrics that lie apart from it."""
+"""What is kept of a run: `run.json`, which `store` writes, and the metrics, which lie apart in the index."""
 
 from __future__ import annotations
 

@@ -2,7 +2,8 @@
 
 As in ORB-SLAM3 (Campos et al., 2021) a camera that is not relocalised begins a new submap, which is merged when a place
 of another map is recognised. Keyframes and points of all maps lie in one `Map` (`Map.kf_map` says which is whose; 0 is
-the root map). The atlas knows where an unmerged submap may lie. Poses count in the world of the root map alone.
+the root map). The atlas knows where an unmerged submap may lie, `loop_closing` merges it. Poses count in the world of
+the root map alone.
 """
 
 from __future__ import annotations

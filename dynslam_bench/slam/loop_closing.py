@@ -376,7 +376,7 @@ class LoopCloser:
         return (own, other, loop.correction) if own > other else (other, own, loop.correction.inverse)
 
     def _merge(self, slot: int, loop: Loop) -> None:
-        """Merge two submaps (ORB-SLAM3's ``MergeLocal``): the younger one moves onto the older one."""
+        """Merge two submaps (ORB-SLAM3's ``MergeLocal``): the younger moves onto the older or the root map."""
         world = self.world
         younger, older, correction = self._merge_of(slot, loop)
         slots = world.move_submap(younger, correction.T_now_before, older, correction.scale)
