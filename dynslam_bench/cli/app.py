@@ -145,7 +145,8 @@ def start(arguments: list[str] | None = None) -> None:
             leave_interrupted()
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
             _discard_output()
-            error = DynslamError(f"cannot write {error.filename or ''}".rstrip() + f": {error.strerror}")
+            file = f" {error.filename}" if error.filename else ""
+            error = DynslamError(f"cannot write{file}: {error.strerror}")
         if not isinstance(error, DynslamError):
             raise
         write_error(error)
