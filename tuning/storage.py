@@ -266,16 +266,17 @@ def open_database(url: str) -> BaseStorage:
     Raises:
         Exception: What the database's driver raises.
     """
-    for attempt in range(ATTEMPTS):
+    attempts = 0
+    while True:
         try:  # a server takes few connections, e.g. 100
             storage = PatientStorage(url, engine_kwargs={"pool_pre_ping": True, "pool_size": 1})
             return optuna.storages.get_storage(storage)
         except (DBAPIError, StorageInternalError) as error:
             cause = str(error.__cause__ or error).lower()
-            if attempt + 1 == ATTEMPTS or not any(words in cause for words in _BEING_MADE):
+            attempts += 1
+            if attempts == ATTEMPTS or not any(words in cause for words in _BEING_MADE):
                 raise
         time.sleep(random.uniform(0.05, 0.5))
-    raise AssertionError("unreachable")
 
 
 class PatientStorage(RDBStorage):
