@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts import Keypoints
 from dynslam_bench.core import SettingsError
 from dynslam_bench.core.compiled import kernel
+from dynslam_bench.core.simd import BYTE_LANES, store_corner_scores, store_maxima
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry import inside
 
@@ -25,6 +26,12 @@ PATCH_RADIUS = 15
 """Radius of the disc whose intensity centroid gives the orientation, pixels of the level."""
 EDGE = 19
 """Corners nearer to a level's border than this are not used: the rotated descriptor pattern would leave the image."""
+
+CIRCLE = np.array([
+    (0, 3), (1, 3), (2, 2), (3, 1), (3, 0), (3, -1), (2, -2), (1, -3),
+    (0, -3), (-1, -3), (-2, -2), (-3, -1), (-3, 0), (-3, 1), (-2, 2), (-1, 3),
+])  # fmt: skip
+"""The sixteen pixels of FAST around a corner, (column, row) each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,15 +77,13 @@ class OrbExtractor:
     def configure(self, settings: FeatureSettings) -> None:
         """Use other FAST thresholds and numbers; with a second threshold above the first, the second alone applies."""
         self.settings = settings
-        self._detector.setThreshold(settings.fast_threshold_min)
 
     def __getstate__(self) -> FeatureSettings:
-        """The settings alone: OpenCV's detectors cannot be copied or pickled, and store nothing of an image."""
+        """The settings alone: OpenCV's describer cannot be copied or pickled, and stores nothing of an image."""
         return self.settings
 
     def __setstate__(self, s: FeatureSettings) -> None:
         self.settings = s
-        self._detector = cv2.FastFeatureDetector.create(s.fast_threshold_min, True)
         self._describer = cv2.ORB.create(
             nfeatures=s.n_features, scaleFactor=s.scale_factor, nlevels=s.levels, edgeThreshold=EDGE,
             firstLevel=0, WTA_K=2, patchSize=2 * PATCH_RADIUS + 1, fastThreshold=s.fast_threshold_min,
@@ -132,14 +137,12 @@ class OrbExtractor:
         return chosen[::-1]
 
     def _corners(self, image: NDArray[np.uint8], scale: float) -> _Level:
-        inner = image[EDGE - 3 : image.shape[0] - EDGE + 3, EDGE - 3 : image.shape[1] - EDGE + 3]
-        cell = self.settings.cell_px
-        corners = self._detector.detect(inner)
-        xy = np.asarray(cv2.KeyPoint.convert(corners), dtype=np.float32).reshape(-1, 2)
-        response = np.array([corner.response for corner in corners], dtype=np.int16)
-        column, row = (xy * np.float32(1.0 / cell)).astype(np.int64).T
-        cells = row * -(-inner.shape[1] // cell) + column
-        return _Level(image, scale, xy + np.float32(EDGE - 3), response, cells)
+        at, response = fast_corners(image, self.settings.fast_threshold_min)
+        row, column = np.divmod(at, image.shape[1])
+        cell, origin = self.settings.cell_px, EDGE - 3
+        columns = -(-(image.shape[1] - 2 * origin) // cell)
+        cells = (row - origin) // cell * columns + (column - origin) // cell
+        return _Level(image, scale, np.stack([column, row], axis=1).astype(np.float32), response, cells)
 
     def _describe(
         self, gray: NDArray[np.uint8], levels: Sequence[_Level], chosen: Sequence[NDArray[np.int64]]
@@ -208,6 +211,38 @@ def patch_half_widths(radius: int) -> NDArray[np.int64]:
 
 
 @kernel
+def fast_corners(image: NDArray[np.uint8], threshold: int) -> tuple[NDArray[np.int64], NDArray[np.int16]]:
+    """FAST corners that are stronger than their eight neighbours, row by row; the same as OpenCV's.
+
+    Args:
+        image: uint8 ``[H, W]``, more than twice `EDGE` wide and high; corners nearer to its border are left out.
+        threshold: Least score, at least 1.
+
+    Returns:
+        Indices ``[N]`` into the flat image, and their scores ``[N]``.
+    """
+    height, width = image.shape
+    pixels, scores, maxima = image.reshape(-1), np.zeros(image.size, np.uint8), np.zeros(image.size, np.uint8)
+    circle = CIRCLE[:, 0] + CIRCLE[:, 1] * width
+    first, last = EDGE * width, (height - EDGE) * width
+    for at in range(first, last, BYTE_LANES):
+        store_corner_scores(scores, pixels, at, circle)
+    for y in range(EDGE, height - EDGE):
+        for x in range(EDGE):
+            scores[y * width + x] = scores[(y + 1) * width - 1 - x] = 0
+    for at in range(last, last + BYTE_LANES):
+        scores[at] = 0
+    for at in range(first, last, BYTE_LANES):
+        store_maxima(maxima, scores, at, width, threshold)
+    corners, count = np.empty(image.size // 4, np.int64), 0  # of four adjacent pixels one at most is a maximum
+    for at in range(first, last):
+        corners[count] = at
+        count += maxima[at] > 0
+    corners = corners[:count]
+    return corners, maxima[corners].astype(np.int16)
+
+
+@kernel
 def orientations(
     image: NDArray[np.uint8], xy: NDArray[np.float32], half_widths: NDArray[np.int64]
 ) -> NDArray[np.float32]:
@@ -220,17 +255,19 @@ def orientations(
     """
     out = np.zeros(len(xy), np.float32)
     radius = len(half_widths) - 1
+    steps = np.arange(-radius, radius + 1).astype(np.int32)
     for i in range(len(xy)):
         x0, y0 = int(xy[i, 0]), int(xy[i, 1])
-        m10, m01 = np.int64(0), np.int64(0)
+        m10, m01 = np.int32(0), np.int32(0)
         for dy in range(-radius, radius + 1):
             w = half_widths[abs(dy)]
-            row = np.int64(0)
-            for dx in range(-w, w + 1):
-                value = np.int64(image[y0 + dy, x0 + dx])
-                m10 += dx * value
+            pixels, dx = image[y0 + dy, x0 - w : x0 + w + 1], steps[radius - w : radius + w + 1]
+            row = np.int32(0)
+            for k in range(len(pixels)):
+                value = np.int32(pixels[k])
+                m10 += dx[k] * value
                 row += value
-            m01 += dy * row
+            m01 += np.int32(dy) * row
         out[i] = math.degrees(math.atan2(float(m01), float(m10))) % 360.0
         if out[i] >= 360.0:  # rounded up by float32
             out[i] = 0.0

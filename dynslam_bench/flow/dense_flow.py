@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 
 from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
+from dynslam_bench.core.simd import Bytes, Doubles, Flags, Floats, Ints, Longs, Words
 from dynslam_bench.flow import layout
 from dynslam_bench.flow.degenerate import STATS_NAMES, clean_points, flow_stats, usable_points
 from dynslam_bench.flow.label_search import labels_as_seen, nearest, search_labels
@@ -37,7 +38,6 @@ from dynslam_bench.flow.matching_cost import (
 from dynslam_bench.flow.orientation_maps import OrientationMaps, Side
 from dynslam_bench.flow.refinement import BORDER
 from dynslam_bench.flow.settings import DaisySettings, DenseFlowSettings, FlowSettings
-from dynslam_bench.flow.simd import Bytes, Doubles, Flags, Floats, Ints, Longs, Words
 from dynslam_bench.flow.sparse import SparseDaisyFlow, side_of
 from dynslam_bench.geometry import pixel_index
 

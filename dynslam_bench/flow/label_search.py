@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
+from dynslam_bench.core.simd import Flags, Floats, Longs
 from dynslam_bench.flow import moth_flame
 from dynslam_bench.flow.matching_cost import CostTables, Reference, label_cost
 from dynslam_bench.flow.moth_flame import FlightTable
 from dynslam_bench.flow.orientation_maps import Side
 from dynslam_bench.flow.settings import DaisySettings, SearchName
-from dynslam_bench.flow.simd import Flags, Floats, Longs
 
 Run = Callable[..., Any]
 """`Workers.run`, which divides a kernel's points among threads."""

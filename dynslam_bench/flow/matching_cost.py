@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
+from dynslam_bench.core.simd import Bytes, Floats, Ints, Longs, Words, descriptor_sum
 from dynslam_bench.flow import layout
 from dynslam_bench.flow.orientation_maps import Side
-from dynslam_bench.flow.simd import Bytes, Floats, Ints, Longs, Words, descriptor_sum
 
 OUTSIDE = 1 << 20
 """Cost of a label that leaves the target image."""

@@ -22,10 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import inlined, kernel
-from dynslam_bench.flow import layout
-from dynslam_bench.flow.layout import MapGeometry, map_geometry
-from dynslam_bench.flow.refinement import BORDER
-from dynslam_bench.flow.simd import (
+from dynslam_bench.core.simd import (
     Bytes,
     Halves,
     Longs,
@@ -36,6 +33,9 @@ from dynslam_bench.flow.simd import (
     store_normalised,
     store_uint16,
 )
+from dynslam_bench.flow import layout
+from dynslam_bench.flow.layout import MapGeometry, map_geometry
+from dynslam_bench.flow.refinement import BORDER
 from dynslam_bench.flow.workers import Workers
 
 NORM_FLOOR = 0.01 * 255.0

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
-from dynslam_bench.flow.simd import Bytes, Floats, Ints, load, load_bytes, sample, spread, store, total
+from dynslam_bench.core.simd import Bytes, Floats, Ints, load, load_bytes, sample, spread, store, total
 from dynslam_bench.geometry.gauss_newton import cholesky_solve
 
 BORDER = 48

@@ -14,7 +14,7 @@ from dynslam_bench.features.matching import (
     rotation_consistent,
     search_in_radius,
 )
-from dynslam_bench.features.orb import OrbExtractor, spread
+from dynslam_bench.features.orb import EDGE, OrbExtractor, fast_corners, spread
 from dynslam_bench.features.registry import FEATURES, build_extractor
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry.camera import inside
@@ -81,6 +81,18 @@ def test_orientation_turns_with_the_image():
     i, j = np.array(pairs).T
     turn = (b.angle[j] - a.angle[i] + 90 + 180) % 360 - 180
     assert np.abs(turn).max() < 0.01
+
+
+@pytest.mark.parametrize("shape", [(39, 39), (39, 640), (97, 103), (300, 401)])
+@pytest.mark.parametrize("threshold", [1, 7, 40])
+def test_the_corners_are_those_of_opencv(shape, threshold):
+    noise = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
+    for image in (noise, cv2.GaussianBlur(noise, (7, 7), 2)):
+        at, score = fast_corners(image, threshold)
+        inner = image[EDGE - 3 : 3 - EDGE, EDGE - 3 : 3 - EDGE]
+        theirs = cv2.FastFeatureDetector.create(threshold, True).detect(inner)
+        ours = np.c_[at % shape[1] - EDGE + 3, at // shape[1] - EDGE + 3, score]
+        assert ours.tolist() == [[*keypoint.pt, keypoint.response] for keypoint in theirs]
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (20, 30), (39, 640), (45, 45), (480, 640)])

@@ -1,4 +1,4 @@
-"""SIMD vectors inside the compiled kernels: sixteen float32 or thirty-two uint16 numbers as one value.
+"""SIMD vectors inside compiled kernels: sixteen float32, thirty-two uint16 or sixty-four uint8 numbers as one value.
 
 Written as generic vector code of fixed width (llvmlite): LLVM maps it to the processor's instructions. A lane is the
 place of one number in a vector, as in SIMD hardware. The order of
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
+from functools import partial, reduce
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -48,6 +49,8 @@ _FLOAT, _INT64, _INT32, _UINT16, _BYTE = ir.FloatType(), ir.IntType(64), ir.IntT
 _FLOATS, _INTS = ir.VectorType(_FLOAT, FLOAT_LANES), ir.VectorType(_INT32, FLOAT_LANES)
 _BYTES16, _PAIRS = ir.VectorType(_BYTE, FLOAT_LANES), ir.VectorType(_UINT16, FLOAT_LANES)
 _HALVES, _BYTES32 = ir.VectorType(_UINT16, UINT16_LANES), ir.VectorType(_BYTE, UINT16_LANES)
+BYTE_LANES = 64
+_BYTES64 = ir.VectorType(_BYTE, BYTE_LANES)
 COSINES = (32768, 23170, 0, -23170, -32768, -23170, 0, 23170)
 """Cosines of multiples of 45 degrees, in 32768ths; two places on are the sines."""
 DERIVATIVE_SHIFT = 11
@@ -407,3 +410,85 @@ def descriptor_sum(
         return total
 
     return signature, generate
+
+
+def _smaller(builder: Code, first: Code, second: Code) -> Code:
+    return builder.select(builder.icmp_unsigned("<", first, second), first, second)
+
+
+def _larger(builder: Code, first: Code, second: Code) -> Code:
+    return builder.select(builder.icmp_unsigned(">", first, second), first, second)
+
+
+@instruction
+def store_corner_scores(typing_context: Code, scores: Code, image: Code, at: Code, circle: Code) -> Definition:
+    """Write the FAST scores of sixty-four adjacent pixels (Rosten and Drummond 2006; OpenCV's ``TYPE_9_16``).
+
+    The score is the largest threshold at which the pixel is a corner: nine adjacent pixels of the circle around it are
+    all brighter, or all darker, by more than the threshold. It is 0 where there is none.
+
+    Args:
+        typing_context: Numba's.
+        scores: Flat uint8 array that is written.
+        image: Flat uint8 array, grey levels.
+        at: Index of the first pixel.
+        circle: int64 array, offsets of the sixteen pixels of the circle, in order.
+    """
+
+    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
+        scores, image, at, circle = arguments
+        offsets = context.make_array(kind.args[3])(context, builder, circle).data
+        load = partial(load_vector, context, builder, kind.args[1], image, vector=_BYTES64, align=1)
+        ring = [
+            load(index=builder.add(at, builder.load(builder.gep(offsets, [ir.Constant(_INT64, k)])))) for k in range(16)
+        ]
+        smaller, larger, centre = partial(_smaller, builder), partial(_larger, builder), load(index=at)
+
+        def best_arc(worse: Callable[..., Code], better: Callable[..., Code]) -> Code:
+            """The grey level that all pixels of the best arc of nine reach."""
+            twos = [worse(ring[k], ring[(k + 1) % 16]) for k in range(1, 16, 2)]
+            fours = [worse(twos[k], twos[(k + 1) % 8]) for k in range(8)]
+            eights = [worse(fours[k], fours[(k + 2) % 8]) for k in range(8)]  # with one more pixel at either end
+            arcs = [worse(eights[k], better(ring[2 * k], ring[(2 * k + 9) % 16])) for k in range(8)]
+            return reduce(better, arcs)
+
+        brighter = builder.sub(larger(best_arc(smaller, larger), centre), centre)
+        darker = builder.sub(centre, smaller(best_arc(larger, smaller), centre))
+        one = constant(_BYTES64, 1)
+        score = builder.sub(larger(larger(brighter, darker), one), one)
+        builder.store(score, pointer_to(context, builder, kind.args[0], scores, at, _BYTES64), align=1)
+        return context.get_dummy_value()
+
+    return types.void(scores, image, types.int64, circle), generate
+
+
+@instruction
+def store_maxima(typing_context: Code, maxima: Code, scores: Code, at: Code, width: Code, least: Code) -> Definition:
+    """Write sixty-four adjacent scores, those that are below `least` or not above all eight around them as 0.
+
+    Args:
+        typing_context: Numba's.
+        maxima: Flat uint8 array that is written.
+        scores: Flat uint8 array.
+        at: Index of the first score.
+        width: Scores a row.
+        least: In 1 to 255.
+    """
+
+    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
+        maxima, scores, at, width, least = arguments
+        load = partial(load_vector, context, builder, kind.args[1], scores, vector=_BYTES64, align=1)
+        steps = [builder.sub(at, width), at, builder.add(at, width)]
+        around = [
+            load(index=builder.add(step, ir.Constant(_INT64, dx)))
+            for step in steps
+            for dx in (-1, 0, 1)
+            if dx or step is not at
+        ]
+        limit = builder.sub(splat(builder, _BYTES64, builder.trunc(least, _BYTE)), constant(_BYTES64, 1))
+        score, bound = load(index=at), reduce(partial(_larger, builder), around, limit)
+        kept = builder.select(builder.icmp_unsigned(">", score, bound), score, constant(_BYTES64, 0))
+        builder.store(kept, pointer_to(context, builder, kind.args[0], maxima, at, _BYTES64), align=1)
+        return context.get_dummy_value()
+
+    return types.void(maxima, scores, types.int64, types.int64, types.int64), generate
