@@ -331,20 +331,21 @@ def nearby_mean(xy: Floats, z: Floats, values: Array, at: Floats, at_z: Floats) 
     Returns:
         Means ``[M, K]``; 0 where there is no such point.
     """
-    order, rows = np.argsort(xy[:, 1]), np.sort(xy[:, 1])
+    order = np.argsort(xy[:, 1])
+    columns, rows, depths, sorted_values = xy[order, 0].copy(), xy[order, 1].copy(), z[order], values[order]
     means = np.zeros((len(at), values.shape[1]))
     for i in range(len(at)):
-        total, count = means[i], 0
-        for k in range(np.searchsorted(rows, at[i, 1] - NEARBY_PX), len(order)):
-            j = order[k]
-            if rows[k] > at[i, 1] + NEARBY_PX:
+        column, depth, tolerance, last = at[i, 0], at_z[i], SIMILAR_DEPTH * at_z[i], at[i, 1] + NEARBY_PX
+        count = 0
+        for k in range(np.searchsorted(rows, at[i, 1] - NEARBY_PX), len(rows)):
+            if rows[k] > last:
                 break
-            similar = at_z[i] <= 0 or abs(z[j] - at_z[i]) <= SIMILAR_DEPTH * at_z[i]
-            if similar and abs(xy[j, 0] - at[i, 0]) <= NEARBY_PX:
-                total += values[j]
+            if abs(columns[k] - column) <= NEARBY_PX and (depth <= 0 or abs(depths[k] - depth) <= tolerance):
+                for j in range(means.shape[1]):
+                    means[i, j] += sorted_values[k, j]
                 count += 1
         if count:
-            total /= count
+            means[i] /= count
     return means
 
 

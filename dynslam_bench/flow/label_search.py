@@ -644,11 +644,11 @@ def dissenting_labels(predictions: Floats, labels: Floats, tolerance: Scalar) ->
         float32 ``[N, 4]``, the prediction on which most neighbours agree, and bool ``[N]``, whether it has more support
         than the point's own label.
     """
-    limit, (u, v) = tolerance * tolerance, np.moveaxis(predictions[:, :, :2], 2, 0)
-    du, dv = u[:, :, None] - u[:, None], v[:, :, None] - v[:, None]
-    support = np.count_nonzero(du * du + dv * dv < limit, axis=2)
-    du, dv = u - labels[:, :1], v - labels[:, 1:2]
+    limit, (u, v) = tolerance * tolerance, np.ascontiguousarray(predictions[:, :, :2].T)
+    du, dv = u[:, None] - u, v[:, None] - v
+    support = np.count_nonzero(du * du + dv * dv < limit, axis=1)
+    du, dv = u - labels[:, 0], v - labels[:, 1]
     away = du * du + dv * dv
-    choice = np.arange(len(labels)), support.argmax(axis=1)
-    most, own = support[choice], np.count_nonzero(away < limit, axis=1)
-    return predictions[choice], (most > 1) & (most > own) & (away[choice] >= limit)
+    choice = support.argmax(axis=0), np.arange(len(labels))
+    most, own = support[choice], np.count_nonzero(away < limit, axis=0)
+    return predictions[choice[::-1]], (most > 1) & (most > own) & (away[choice] >= limit)

@@ -65,8 +65,11 @@ def pose_covariance(T_cam_world: Array, information: Array, inflation: float = I
 
 
 def _process_noise(dt: float, settings: MotionModelSettings) -> Array:
-    q = np.diag(np.repeat([settings.acceleration**2, settings.angular_acceleration**2], 3))
-    return np.block([[q * dt**4 / 4, q * dt**3 / 2], [q * dt**3 / 2, q * dt**2]])
+    variance = np.repeat([settings.acceleration**2, settings.angular_acceleration**2], 3)
+    noise, pose, speed = np.zeros((12, 12)), np.arange(6), np.arange(6, 12)
+    noise[pose, pose], noise[speed, speed] = variance * dt**4 / 4, variance * dt**2
+    noise[pose, speed] = noise[speed, pose] = variance * dt**3 / 2
+    return noise
 
 
 @kernel

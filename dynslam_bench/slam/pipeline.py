@@ -166,7 +166,8 @@ class SlamPipeline:
             frame = replace(frame, depth=np.zeros((camera.height, camera.width), np.float32))
         clock = StageClock(self._cached)
         gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-        depth = np.where(np.isfinite(frame.depth), frame.depth, 0).astype(np.float32)
+        depth = frame.depth.astype(np.float32)
+        depth[~np.isfinite(depth)] = 0
         instances = mask = None
         if self._masks is not None:
             with clock("segmentation"):
