@@ -187,6 +187,7 @@ class RunRecord(Record):
         stamps_match: Whether all poses carry the stamps of input frames; False only for imported trajectories.
         study: Study that made it, if it was not asked for without the study; else empty.
         notes: Anything a reader should know, one line each.
+        files: SHA-256 of the trajectories, the stamps and the ground truth, by the file's name.
     """
 
     schema_version: int = schema(RUN_SCHEMA)
@@ -237,6 +238,7 @@ class RunRecord(Record):
     stamps_match: bool = True
     study: str = ""
     notes: list[str] = Field(default_factory=list)
+    files: dict[str, str] = Field(default_factory=dict)
 
     def normalised(self) -> RunRecord:
         """The record as it reads after it was written: tuples inside settings are lists then."""

@@ -30,6 +30,7 @@ from dynslam_bench.core import (
     assignments,
     claimed,
     did_you_mean,
+    file_sha256,
     raising,
     read_lines,
     replace_folder,
@@ -290,6 +291,8 @@ class RunStore:
         target = self.folder(record.run_id)
         record = self._with_alarm(record, work)
         with raising(InfrastructureError, f"cannot write {target}", "check the free space"):
+            files = record.files or self._files(record.sequence.part, work)
+            record = record.model_copy(update={"files": files})
             (work / RUN_FILE).write_text(record.to_json(), encoding="utf-8")
             replace_folder(work, target)
         link = self.root / "latest"
@@ -298,6 +301,24 @@ class RunStore:
             fresh.symlink_to(target.relative_to(self.root))
             fresh.replace(link)
         return record
+
+    def _files(self, part: str, run: Path) -> dict[str, str]:
+        """Checksums of the files that a run's values are computed from, by name."""
+        paths = [run / ONLINE, run / FINAL, self._part(part) / "groundtruth.txt", self._part(part) / "timestamps.txt"]
+        return {path.name: file_sha256(path) for path in paths if path.is_file()}
+
+    def verify(self, record: RunRecord) -> None:
+        """Refuse files that are not those with which the run was stored.
+
+        Raises:
+            RunError: Of one that was changed or is missing.
+        """
+        check_plain(self._part(record.sequence.part), self.root)
+        files = self._files(record.sequence.part, self.folder(record.run_id))
+        for name, checksum in record.files.items():
+            if files.get(name) != checksum:
+                fault = "was changed after" if name in files else "is missing, but was stored with"
+                raise RunError(f"{name} {fault} run {record.run_id}", "run it again, or copy the file again")
 
     def _with_alarm(self, record: RunRecord, work: Path) -> RunRecord:
         """The record, with a note where an earlier run of its id, which should be equal, gave another trajectory."""
@@ -336,13 +357,14 @@ class RunStore:
                 write_atomic(folder / file.name, file.read_bytes())
 
     def add_sequence(self, part: str, timestamps_ns: NDArray[np.int64], ground_truth: Trajectory | None) -> None:
-        """Keep the stamps of a sequence's frames, in nanoseconds, and its ground truth; done once a part."""
+        """Keep the stamps of a sequence's frames, in nanoseconds, and its ground truth, in place of other ones."""
         folder = self._part(part)
-        if (folder / "timestamps.txt").is_file():
-            return
+        texts = {"timestamps.txt": "".join(f"{format_ns(ns)}\n" for ns in timestamps_ns.tolist())}
         if ground_truth is not None and len(ground_truth):
-            write_atomic(folder / "groundtruth.txt", format_tum(ground_truth))
-        write_atomic(folder / "timestamps.txt", "".join(f"{format_ns(ns)}\n" for ns in timestamps_ns.tolist()))
+            texts = {"groundtruth.txt": format_tum(ground_truth), **texts}
+        for name, text in texts.items():
+            if not (folder / name).is_file() or (folder / name).read_bytes() != text.encode():
+                write_atomic(folder / name, text)
 
     def rewrite(self, record: RunRecord, **changes: Any) -> RunRecord:
         """Change fields of a stored run that are no part of its outcome: its label in tables, the study that made it.
@@ -468,8 +490,9 @@ class RunStore:
         """Read the trajectories of a run, and the stamps and the ground truth of its part of a sequence.
 
         Raises:
-            DynslamError: One is damaged, or the stamps are missing.
+            DynslamError: One is damaged or was changed, or the stamps are missing.
         """
+        self.verify(record)
         self.timestamps(record.sequence.part), self.ground_truth(record.sequence.part)
         self.trajectory(record.run_id, "online"), self.trajectory(record.run_id, "final")
 
@@ -543,10 +566,12 @@ class RunStore:
         """One of a run's trajectories, the ground truth, and the stamps of the input frames where its own are theirs.
 
         Raises:
-            DynslamError: One is missing or damaged, or the protocol does not fit the sequence or the tracker.
+            DynslamError: One is missing, damaged or was changed, or the protocol does not fit the sequence or the
+                tracker.
         """
         protocol.check_sequence(record.sequence.id)
         protocol.check_scale(record.tracker.id, record.tracker.sensors)
+        self.verify(record)
         truth = self.ground_truth(record.sequence.part, repeats=not protocol.one_to_one)
         if truth is None:
             raise EvaluationError(f"sequence '{record.sequence.id}' has no ground truth")
@@ -734,6 +759,10 @@ def _why_left_out(source: RunStore, record: RunRecord, store: RunStore) -> str:
     earlier, folders = store.get(record.run_id), (source.folder(record.run_id), store.folder(record.run_id))
     if earlier is not None and (earlier.status != record.status or not _equal(*folders, ONLINE, FINAL)):
         return f"{store.source} holds another result of this run"
+    try:
+        source.verify(record)
+    except RunError as error:
+        return str(error)
     return ""
 
 
