@@ -404,8 +404,13 @@ class _Bench:
             run_ids.add(run.run_id)
             stored = self.store.get(run.run_id)
             if stored is not None and stored.status not in again and not _lacks_pictures(self.store, run, stored):
-                self._reuse(run, stored)
-                continue
+                if self.store.changed(stored):
+                    self.store.add_sequence(
+                        stored.sequence.part, timestamps_ns(run.sequence), run.sequence.ground_truth
+                    )
+                if not self.store.changed(stored):
+                    self._reuse(run, stored)
+                    continue
             plan.runs += 1
             plan.frames[run.tracker.id] += len(run.sequence)
             self.waiting.append((run, stored))

@@ -307,18 +307,14 @@ class RunStore:
         paths = [run / ONLINE, run / FINAL, self._part(part) / "groundtruth.txt", self._part(part) / "timestamps.txt"]
         return {path.name: file_sha256(path) for path in paths if path.is_file()}
 
-    def verify(self, record: RunRecord) -> None:
-        """Refuse files that are not those with which the run was stored.
-
-        Raises:
-            RunError: Of one that was changed or is missing.
-        """
-        check_plain(self._part(record.sequence.part), self.root)
+    def changed(self, record: RunRecord) -> str:
+        """The first file that is not the one with which a run was stored, and what happened to it; empty for none."""
         files = self._files(record.sequence.part, self.folder(record.run_id))
         for name, checksum in record.files.items():
             if files.get(name) != checksum:
-                fault = "was changed after" if name in files else "is missing, but was stored with"
-                raise RunError(f"{name} {fault} run {record.run_id}", "run it again, or copy the file again")
+                happened = "was changed" if name in files else "is missing"
+                return f"{name} {happened} since run {record.run_id} was stored (run it again, or copy the file again)"
+        return ""
 
     def _with_alarm(self, record: RunRecord, work: Path) -> RunRecord:
         """The record, with a note where an earlier run of its id, which should be equal, gave another trajectory."""
@@ -492,9 +488,10 @@ class RunStore:
         Raises:
             DynslamError: One is damaged or was changed, or the stamps are missing.
         """
-        self.verify(record)
         self.timestamps(record.sequence.part), self.ground_truth(record.sequence.part)
         self.trajectory(record.run_id, "online"), self.trajectory(record.run_id, "final")
+        if fault := self.changed(record):
+            raise RunError(fault)
 
     # -- scores ----------------------------------------------------------------------------------------------------
 
@@ -571,7 +568,9 @@ class RunStore:
         """
         protocol.check_sequence(record.sequence.id)
         protocol.check_scale(record.tracker.id, record.tracker.sensors)
-        self.verify(record)
+        check_plain(self._part(record.sequence.part), self.root)
+        if fault := self.changed(record):
+            raise RunError(fault)
         truth = self.ground_truth(record.sequence.part, repeats=not protocol.one_to_one)
         if truth is None:
             raise EvaluationError(f"sequence '{record.sequence.id}' has no ground truth")
@@ -759,11 +758,7 @@ def _why_left_out(source: RunStore, record: RunRecord, store: RunStore) -> str:
     earlier, folders = store.get(record.run_id), (source.folder(record.run_id), store.folder(record.run_id))
     if earlier is not None and (earlier.status != record.status or not _equal(*folders, ONLINE, FINAL)):
         return f"{store.source} holds another result of this run"
-    try:
-        source.verify(record)
-    except RunError as error:
-        return str(error)
-    return ""
+    return source.changed(record)
 
 
 def _equal(one: Path, other: Path, *names: str) -> bool:

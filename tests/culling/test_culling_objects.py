@@ -193,9 +193,9 @@ def test_probability_rises_on_masks_and_follows_the_flow() -> None:
 def test_expansion_gives_new_features_a_share_of_near_certain_ones() -> None:
     xy = np.array([[0.0, 0], [100, 0], [200, 0], [4, 0], [104, 0], [204, 0], [150, 0]])
     probability = np.array([0.9, 0.1, 0.6, 0.5, 0.5, 0.5, 0.5])
-    expanded = expand(xy, probability, np.arange(7) < 3, 32.0)
-    influence = np.exp(-0.5 * (4 / 16) ** 2)
-    np.testing.assert_allclose(expanded, [0.9, 0.1, 0.6, 0.5 + 0.4 * influence, 0.5 - 0.4 * influence, 0.5, 0.5])
+    shift = 0.4 * np.exp(-0.5 * (4 / 16) ** 2)
+    expected = [0.9, 0.1, 0.6, 0.5 + shift, 0.5 - shift, 0.5, 0.5]
+    np.testing.assert_allclose(expand(xy, probability, np.arange(7) < 3, 32.0), expected)
 
 
 def panned(shift: int) -> Scene:

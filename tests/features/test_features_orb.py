@@ -79,8 +79,7 @@ def test_orientation_turns_with_the_image():
     pairs = [(i, where[y, 480 - x]) for i, (x, y) in places if (y, 480 - x) in where]
     assert len(pairs) > 200
     i, j = np.array(pairs).T
-    turn = (b.angle[j] - a.angle[i] + 90 + 180) % 360 - 180
-    assert np.abs(turn).max() < 0.01
+    assert np.abs((b.angle[j] - a.angle[i] + 90 + 180) % 360 - 180).max() < 0.01
 
 
 @pytest.mark.parametrize("shape", [(39, 39), (39, 640), (97, 103), (300, 401)])
@@ -89,8 +88,7 @@ def test_the_corners_are_those_of_opencv(shape, threshold):
     noise = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
     for image in (noise, cv2.GaussianBlur(noise, (7, 7), 2)):
         at, score = fast_corners(image, threshold)
-        inner = image[EDGE - 3 : 3 - EDGE, EDGE - 3 : 3 - EDGE]
-        theirs = cv2.FastFeatureDetector.create(threshold, True).detect(inner)
+        theirs = cv2.FastFeatureDetector.create(threshold, True).detect(image[EDGE - 3 : 3 - EDGE, EDGE - 3 : 3 - EDGE])
         ours = np.c_[at % shape[1] - EDGE + 3, at // shape[1] - EDGE + 3, score]
         assert ours.tolist() == [[*keypoint.pt, keypoint.response] for keypoint in theirs]
 

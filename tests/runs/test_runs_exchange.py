@@ -474,7 +474,7 @@ def test_a_submission_with_an_altered_trajectory_is_refused(made, remote, tmp_pa
     bank.push(made, remote)
     altered(made)
     sum_up(made)
-    with pytest.raises(RunError, match=r"trajectory_online.txt was changed after run"):
+    with pytest.raises(RunError, match=r"trajectory_online.txt was changed since run"):
         bank.push(made, remote)
 
 

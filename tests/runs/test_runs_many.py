@@ -581,6 +581,8 @@ def test_what_contradicts_the_store_is_named_and_left_out(tmp_path: Path, toy_fo
     assert "a link that leads out" in merged.left_out[4].reason and not list(stores[0].root.rglob("more.txt"))
     assert "another result" in merged.left_out[0].reason and "stamps or truth" in merged.left_out[2].reason
     assert (merged.added, merged.stored, outcomes(stores[0])) == ([], [], before) and one.is_dir()
+    for store in (stores[1], stores[3]):  # made again, and put back
+        assert store.changed(record) and not store.changed(*run_many([spec], results=store))
 
 
 class OtherWorkers(ThreadPoolExecutor):

@@ -221,7 +221,7 @@ def test_an_edited_trajectory_or_truth_is_not_scored_until_it_is_put_back(filled
     folder = store.folder(ids[0]) if "online" in file else store.root / "sequences" / record.sequence.part
     text = (folder / file).read_text()
     shift(folder / file)
-    assert f"{file} was changed after run {ids[0]}" in store.score(record).reasons["online"]
+    assert f"{file} was changed since run {ids[0]}" in store.score(record).reasons["online"]
     assert {row["run_id"]: row["ate_rmse_m"] for row in list_runs(store)[0]}[ids[0]] is None
     (folder / file).write_text(text)
     assert store.score(record) == before

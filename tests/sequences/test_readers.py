@@ -74,8 +74,7 @@ def test_a_folder_in_the_published_format_is_read(written, name):
     assert len(sequence) == (4 if name == "icl-nuim" else 3)
     truth = sequence.ground_truth
     assert np.abs(truth.T_world_cam - poses).max() < 1e-12
-    with_truth = sequence.timestamps[-3:]
-    assert np.abs(truth.timestamps - with_truth).max() < 1e-6
+    assert np.abs(truth.timestamps - sequence.timestamps[-3:]).max() < 1e-6
     check_sequence(sequence)
     chosen = open_sequence(root / name, camera=Camera(camera.width, camera.height, 100.0, 100.0, 10.0, 10.0))
     assert chosen.camera.fx == 100.0 and chosen.digest() != sequence.digest()
