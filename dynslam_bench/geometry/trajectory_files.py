@@ -7,7 +7,7 @@ lines with one stamp the last holds. Whatever is not taken as it stands is count
 
 from array import array
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -124,18 +124,29 @@ def load_tum(path: str | Path) -> TumFile:
             "nanoseconds? EuRoC's tables are read by `eval` and `import` where their heading is left in",
         )
     ns = np.array([parse_ns(texts[row]) for row in np.flatnonzero(valid)], dtype=np.int64)
-    order = np.argsort(ns, kind="stable")
     line_of = dict(zip(ns.tolist(), np.array(numbers)[valid].tolist(), strict=True))
-    refuse_close(ns[order], str(path), TrajectoryError, line_of.get)
-    last_of_stamp = np.append(np.diff(ns[order]) > 0, True)
-    lines, exact = kept[order], ns[order]
-    notes = FileNotes(
-        **counted,
+    refuse_close(np.sort(ns), str(path), TrajectoryError, line_of.get)
+    return ordered_file(ns, se3.from_quaternion(kept[:, 1:4], kept[:, 4:8]), FileNotes(**counted))
+
+
+def ordered_file(ns: NDArray[np.int64], T_world_cam: NDArray[np.float64], notes: FileNotes) -> TumFile:
+    """Poses in the order of their stamps, with the counts of sorted and replaced lines.
+
+    Args:
+        ns: Stamps in nanoseconds ``[N]``, as the file's lines have them.
+        T_world_cam: Camera-to-world poses ``[N, 4, 4]``.
+        notes: The counts of skipped lines.
+    """
+    order = np.argsort(ns, kind="stable")
+    exact = ns[order]
+    last_of_stamp = np.append(np.diff(exact) > 0, True)
+    notes = replace(
+        notes,
         duplicates=int((~last_of_stamp).sum()),
         out_of_order=int((np.diff(ns) < 0).sum()),
         back_s=float(-np.diff(ns).min(initial=0)) / 1e9,
     )
-    every_line = RepeatedStamps(to_seconds(exact), se3.from_quaternion(lines[:, 1:4], lines[:, 4:8]), exact)
+    every_line = RepeatedStamps(to_seconds(exact), T_world_cam[order], exact)
     trajectory = Trajectory(
         every_line.timestamps[last_of_stamp], every_line.T_world_cam[last_of_stamp], exact[last_of_stamp]
     )

@@ -184,6 +184,7 @@ def verify(bank: str | Path) -> list[str]:
     for record in records:
         if record.run_id != digest(record.identity, 16):
             faults.append(f"runs/{record.run_id}: its id is not that of what it says of itself")
+        faults += [f"runs/{record.run_id}: its {name} is not that of its identity" for name in _contradicted(record)]
         if f"sequences/{record.sequence.part}/timestamps.txt" not in listed:
             faults.append(f"runs/{record.run_id}: the stamps of its sequence are missing")
             continue
@@ -192,6 +193,14 @@ def verify(bank: str | Path) -> list[str]:
         except DynslamError as error:
             faults.append(f"runs/{record.run_id}: {error}")
     return faults
+
+
+def _contradicted(record: RunRecord) -> list[str]:
+    """Fields of a record that are part of its identity, and differ from it."""
+    stated = {name: getattr(record, name) for name in ("offset", "stride", "seed", "device", "threads", "realtime")}
+    stated |= {"tracker": record.tracker.id, "tracker_version": record.tracker.version, "drop_share": record.drop_share}
+    stated |= {"sequence": record.sequence.id, "content": record.sequence.content, "degrade": record.degrade}
+    return [name for name, value in stated.items() if record.identity.get(name, value) != value]
 
 
 def pull(source: str, bank: str | Path) -> Merged:

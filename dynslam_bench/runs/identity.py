@@ -60,6 +60,7 @@ class ResolvedRun:
         segmentation: Where the masks come from; empty for trackers without a semantic stage.
         identity: What the run's id is a digest of.
         start_map: The map that it begins in; None for a run that begins without one.
+        files: Those that the tracker's command names, in the identity by their content.
     """
 
     spec: RunSpec
@@ -70,6 +71,7 @@ class ResolvedRun:
     segmentation: str
     identity: dict[str, Any]
     start_map: StartMap | None = None
+    files: tuple[Path, ...] = ()
 
     @cached_property
     def run_id(self) -> str:
@@ -99,7 +101,7 @@ class Resolver:
         self._part = lru_cache(maxsize=None)(self._open_part)
         self._device = lru_cache(maxsize=None)(resolve_device)
         self._configured: dict[str, tuple[TrackerSpec, Settings, dict[str, Any]]] = {}
-        self._code: dict[tuple[str, str], dict[str, Any]] = {}
+        self._code: dict[tuple[str, str], tuple[dict[str, Any], tuple[Path, ...]]] = {}
 
     def __call__(self, spec: RunSpec) -> ResolvedRun:
         """Look up a run; see `resolve`."""
@@ -119,7 +121,7 @@ class Resolver:
         source = segmentation_source(settings, sequence)
         if (configuration, source) not in self._code:
             self._code[configuration, source] = _code_of(tracker, settings, source)
-        code = self._code[configuration, source]
+        code, files = self._code[configuration, source]
         start_map = start_map_of(settings, sequence.camera, tracker.sensors, code["weights"])
         identity = {
             "scheme": IDENTITY_SCHEME,
@@ -144,7 +146,7 @@ class Resolver:
             "degrade": {name: value for name, value in sorted(spec.degrade.items()) if value},
             **({"sequence_plugin": sequence_plugin} if sequence_plugin else {}),
         }
-        return ResolvedRun(spec, tracker, settings, sequence, device, source, identity, start_map)
+        return ResolvedRun(spec, tracker, settings, sequence, device, source, identity, start_map, files)
 
     def _open_part(
         self,
@@ -172,24 +174,26 @@ def _configured(spec: RunSpec) -> tuple[TrackerSpec, Settings, dict[str, Any]]:
     return tracker, settings, flatten(settings)
 
 
-def _code_of(tracker: TrackerSpec, settings: Settings, source: str) -> dict[str, Any]:
-    """What of a run's identity says by which code, libraries, weights and files it is made."""
+def _code_of(tracker: TrackerSpec, settings: Settings, source: str) -> tuple[dict[str, Any], tuple[Path, ...]]:
+    """What of a run's identity says by which code, libraries, weights and files it is made; and the files."""
     with raising(PluginError, f"cannot read a file of tracker '{tracker.id}'"):
-        files = contents_digest(load_object(tracker.files)(settings)) if tracker.files else ""
+        files = tuple(map(Path, load_object(tracker.files)(settings))) if tracker.files else ()
+        content = {"files": contents_digest(files)} if tracker.files else {}
     weights, group = named_digests(settings), getattr(settings, "segmentation", None)
     if source in ("embedded", "coco") and isinstance(group, SegmentationSettings):
         weights[source] = weights_digest(group.model_copy(update={"source": source}))
     installed = versions()  # another version of what computes with the run's data may give other bits
     top = tracker.entry_point.rpartition(":")[0].partition(".")[0]
     own = f"dynslam-bench {release()}"
-    return {
+    code = {
         "distribution": own if top == "dynslam_bench" else " ".join(distribution_of_module(top)).strip(),
         "source": source_fingerprint(tracker, settings, source),
         "requires": {module: distribution_of_module(module)[1] for module in sorted(tracker.requires)},
         "weights": weights,  # of every file that the settings name, or of the network in use where none is named
-        **({"files": files} if files else {}),
+        **content,
         "libraries": {name: installed.get(name, "") for name in LIBRARIES},
     }
+    return code, files
 
 
 def source_fingerprint(tracker: TrackerSpec, settings: Settings | None = None, source: str = "") -> str:
@@ -215,22 +219,26 @@ def source_fingerprint(tracker: TrackerSpec, settings: Settings | None = None, s
 
 
 def check_unchanged(run: ResolvedRun) -> None:
-    """A run was made with the code, and began in the map, that were looked up for it.
+    """What a run was made of is what was looked up for it: data, code, files, weights, map.
 
     Raises:
-        RunError: They have changed since.
-        PluginError: The code cannot be read any more.
+        RunError: Something has changed since.
+        DynslamError: Something cannot be read any more.
     """
     if has_package_changed(CODE_PACKAGES):
         raise RunError("the code of dynslam-bench has changed since this process began", "start it again")
-    begun_in = run.start_map
-    if begun_in is not None and named_digests(run.settings).get(MAP_SETTING) != begun_in.digest:
-        raise RunError(f"the map {begun_in.file} has changed since the run was asked for", "the run is not stored")
-    if source_fingerprint(run.tracker, run.settings, run.segmentation) != run.identity["source"]:
-        raise RunError(
-            f"the code of tracker '{run.tracker.id}' has changed since the run was asked for",
-            "the run is not stored; ask again, and let no tracker write files beside its code",
-        )
+    before, now = run.identity, resolve(run.spec).identity
+    # files that were not there before are the run's own output
+    with raising(PluginError, f"cannot read a file of tracker '{run.tracker.id}'"):
+        now |= {"files": contents_digest(run.files)} if run.files else {"files": before.get("files")}
+    now["weights"] = {name: now["weights"].get(name) if value else value for name, value in before["weights"].items()}
+    changed = [name for name in before if now.get(name) != before[name]]
+    if changed:
+        words = {"source": f"the code of tracker '{run.tracker.id}'", "content": f"sequence '{run.sequence.id}'"}
+        words |= {"files": f"the program of tracker '{run.tracker.id}'", "weights": "a file that the settings name"}
+        what = ", ".join(words.get(name, name) for name in changed)
+        hint = "the run is not stored; ask again, and let no tracker write files beside its code"
+        raise RunError(f"{what} has changed since the run was asked for", hint)
 
 
 def start_map_of(settings: Settings, camera: Camera, sensors: Sensors, digests: dict[str, str]) -> StartMap | None:

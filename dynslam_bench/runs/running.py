@@ -48,6 +48,7 @@ from dynslam_bench.segmentation.build_segmenter import NetworkNotFetched
 from dynslam_bench.sequences.tags import sequence_tags
 from dynslam_bench.sequences.view import part_of
 from dynslam_bench.slam.map_files import MAP_FILE
+from dynslam_bench.trackers.registry import resolve_settings
 
 T = TypeVar("T")
 WORK = "dynslam_bench.runs.loop:run_loop"
@@ -174,6 +175,8 @@ def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: 
     status, reason, dropped = verdict.status, verdict.reason, states["dropped"]
     tracked, lost, initialising = states["ok"], states["lost"], states["initialising"]
     lost_at_end = frames.lost_streak()
+    flat, default = flatten(resolved.settings), flatten(resolve_settings(tracker, {}))
+    asked = {name: value for name, value in spec.settings.items() if name not in default or flat[name] != default[name]}
     timings, batch = frames.timings(), not tracker.online
     if batch:
         tracked, lost_at_end = final.get("tracked", 0), final.get("lost_at_end", total)
@@ -199,8 +202,8 @@ def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: 
             given="" if spec.tracker == tracker.id else spec.tracker,
             **{name: getattr(tracker, name) for name in _OF_THE_TRACKER},
         ),
-        overrides=spec.settings,
-        settings=flatten(resolved.settings),
+        overrides=asked,
+        settings=flat,
         sequence=sequence_info(resolved.sequence, identity["content"], part_digest(identity), spec.offset),
         **{name: getattr(spec, name) for name in _AS_ASKED},
         device=resolved.device,

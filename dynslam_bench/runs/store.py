@@ -100,6 +100,11 @@ class RunIndex:
         rows = self._query(f"{_VALUES} AND run_id = ?", name, version, run_id)
         return next((value for _, state, value in rows if self._holds(run_id, state, value)), None)
 
+    def last(self, name: str, run_id: str) -> str | None:
+        """The value of one run that was kept last, whether it still holds or not."""
+        rows = self._query("SELECT value FROM computed WHERE name = ? AND run_id = ?", name, run_id)
+        return rows[0][0] if rows else None
+
     def read(self, name: str, version: str, run_ids: Iterable[str], *, check_links: bool = False) -> dict[str, str]:
         """The values that hold, by run.
 
@@ -341,7 +346,8 @@ class RunStore:
             InfrastructureError: It cannot be written.
         """
         self.copy_part(other, record)
-        with self.work_folder(record.run_id) as work:
+        full = raising(InfrastructureError, f"cannot write {self.folder(record.run_id)}", "check the free space")
+        with self.work_folder(record.run_id) as work, full:
             shutil.copytree(other.folder(record.run_id), work, dirs_exist_ok=True)
             return self.publish(work, record)
 
@@ -862,13 +868,21 @@ def rescore(
     for current in chosen:
         changed = []
         for number, record in enumerate(ended, start=1):
-            before = store.metrics(record, current)
+            before = store.index.last(_metrics_of(current), record.run_id)
             after = store.score(record, current, again=True)
-            if before is not None and (before.online, before.final) != (after.online, after.final):
+            if before is not None and _errors(before) != _errors(after.to_line()):
                 changed.append(record.run_id)
             on_progress(len(outcomes) * len(ended) + number, len(chosen) * len(ended))
         outcomes.append(Rescored(current.id, len(ended), tuple(changed), reasons))
     return outcomes
+
+
+def _errors(text: str) -> object:
+    """The evaluations of a metrics record; its text where it is damaged."""
+    try:
+        return [json.loads(text)[name] for name in ("online", "final")]
+    except (ValueError, LookupError, TypeError, RecursionError):
+        return text
 
 
 # -- runs as rows of tables --------------------------------------------------------------------------------------------
@@ -892,6 +906,7 @@ def run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
 
     errors = {} if metrics is None or record.failed else metrics.metrics  # what a part of a run scores says nothing
     not_scored = "" if metrics is None or errors else metrics.reasons.get(metrics.trajectory, "")
+    final = metrics.final if metrics is not None and metrics.trajectory == "final" else None
     return {
         "run_id": record.run_id,
         "tracker": record.tracker.id,
@@ -906,7 +921,7 @@ def run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
         "ate_rmse_m": errors.get("ate_rmse_m"),
         "static_camera_ate_rmse_m": errors.get("static_camera_ate_rmse_m"),
         "false_motion_max_m": errors.get("false_motion_max_m"),
-        "coverage": record.coverage,
+        "coverage": record.coverage if final is None or final.coverage is None else final.coverage,
         "frame_ms": None if record.frame_time_s is None else 1000 * record.frame_time_s,
         "segmentation": record.segmentation,
         "seen_in_training": seen_in_training(record.segmentation, record.sequence.id),

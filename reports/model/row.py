@@ -43,6 +43,7 @@ class RunRow(RunRecord):
         trajectory: Which trajectory the metrics are of; an import may hold the final one only.
         metrics: Errors of the trajectory that the protocol asks for; empty for a failure without any.
         final_metrics: All errors of the final trajectory; empty if there is none.
+        final_coverage: Share of the input frames with a pose in it; None where it is not known.
         rotation_uncertainty_deg: Standard error of the rotation of the trajectory's alignment, see
             `AlignmentRecord.uncertainty_deg`; None where it is not known or does not come from the positions.
         hold_last_pose_ate_m: The ATE with lost frames held at the last tracked pose, which ranks; None without
@@ -65,6 +66,7 @@ class RunRow(RunRecord):
     trajectory: Which = "online"
     metrics: dict[str, float] = Field(default_factory=dict)
     final_metrics: dict[str, float] = Field(default_factory=dict)
+    final_coverage: float | None = None
     rotation_uncertainty_deg: float | None = None
     hold_last_pose_ate_m: float | None = None
     static_camera_ate_rmse_m: float | None = None
@@ -275,6 +277,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         trajectory=protocol.trajectory,
         metrics={} if evaluation is None else evaluation.metrics,
         final_metrics={} if scored.final is None else scored.final.metrics,
+        final_coverage=None if scored.final is None else scored.final.coverage,
         rotation_uncertainty_deg=None if alignment is None else alignment.uncertainty_deg,
         hold_last_pose_ate_m=_hold_last_pose_error(store, record, protocol, evaluation, static_m),
         static_camera_ate_rmse_m=static_m,

@@ -315,6 +315,8 @@ Value = Callable[[RunRow], float | None]
 """A number of a run; None where it has none."""
 DOUBT = "‡"
 """Behind a number that says nothing of its tracker."""
+FINAL_SHARE = 0.9
+"""With poses of a smaller share of the tracked frames, a final trajectory's error is in doubt: keyframes err less."""
 
 
 def metric_table(
@@ -511,7 +513,15 @@ def final_errors(board: Board, protocol: Protocol) -> Table | None:
         "Error of the final trajectory",
         "Median ATE (RMSE, millimetres) of the trajectory as it was after the last frame, whatever was optimised until "
         f"then, of the trackers that have one; all other tables show the {protocol.trajectory} one.",
+        doubt=_final_doubt,
     )
+
+
+def _final_doubt(cell: Cell) -> str:
+    """Why the error of a final trajectory says little: it lacks poses of frames that were tracked."""
+    shares = [row.final_coverage / row.coverage for row in cell.rows if row.final_coverage and row.coverage]
+    least = min(shares, default=1.0)
+    return f"it has poses of only {100 * least:.0f} % of the tracked frames" if least < FINAL_SHARE else ""
 
 
 def tracked_errors(board: Board, protocol: Protocol) -> Table | None:

@@ -456,8 +456,8 @@ def test_records_that_do_not_fit_are_named(made):
         timestamps.unlink()
     sum_up(made)
     faults = bank.verify(made)
-    assert len(faults) == 3 and second in faults[0]
-    assert first in faults[1] and "id" in faults[1] and "stamps" in faults[2]
+    assert len(faults) == 4 and second in faults[0]
+    assert first in faults[1] and "id" in faults[1] and "its seed" in faults[2] and "stamps" in faults[3]
 
 
 def test_through_a_bare_git_repository_and_back(made, remote, tmp_path, monkeypatch):

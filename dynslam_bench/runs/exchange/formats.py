@@ -30,21 +30,18 @@ def read_trajectory(path: str | Path, timestamps: str | Path | None = None, topi
     """
     path = Path(path).expanduser()
     if path.name == IMAGES or (path / IMAGES).is_file():
-        return _whole(read_colmap(path, None if timestamps is None else _stamps_by_name(Path(timestamps))))
+        trajectory = read_colmap(path, None if timestamps is None else _stamps_by_name(Path(timestamps)))
+        return TumFile(trajectory, FileNotes(lines=len(trajectory)))
     if is_bag(path):
-        return _whole(read_bag_trajectory(path, topic))
+        return read_bag_trajectory(path, topic)
     if path.is_dir():
         raise TrajectoryError(f"the folder {path} holds neither {IMAGES} of COLMAP nor a bag of ROS 2")
     if is_pose_table(path):
         camera_poses = read_pose_table(path, np.eye(4))
         if camera_poses is None:
             raise TrajectoryError(f"no row of {path} holds a rotation")
-        return _whole(camera_poses)
+        return camera_poses
     return load_trajectory(path, timestamps)
-
-
-def _whole(trajectory: Trajectory) -> TumFile:
-    return TumFile(trajectory, FileNotes(lines=len(trajectory)))
 
 
 def _stamps_by_name(path: Path) -> dict[str, float]:
@@ -137,7 +134,7 @@ def read_colmap(folder: Path, stamps: Mapping[str, float] | None = None) -> Traj
         stamps: Stamp in seconds of each image by its name; None where the names are the stamps.
 
     Raises:
-        TrajectoryError: A line is malformed, an image has no stamp, or there is no image.
+        TrajectoryError: A line is malformed, an image has no stamp or that of another one, or there is no image.
     """
     path = folder / IMAGES if folder.is_dir() else folder
     poses_by_stamp: dict[float, Array] = {}
@@ -153,7 +150,10 @@ def read_colmap(folder: Path, stamps: Mapping[str, float] | None = None) -> Traj
         values = np.array(parts[1:8], dtype=np.float64)
         if not np.isfinite(values).all() or not np.any(values[:4]):
             raise TrajectoryError(f"{path} line {number} holds no pose")
-        poses_by_stamp[_stamp(parts[9].strip(), stamps, path)] = se3.from_quaternion(values[4:], values[[1, 2, 3, 0]])
+        stamp = _stamp(parts[9].strip(), stamps, path)
+        if stamp in poses_by_stamp:
+            raise TrajectoryError(f"{path} line {number} repeats a stamp, {stamp:.6f}", "keep one camera")
+        poses_by_stamp[stamp] = se3.from_quaternion(values[4:], values[[1, 2, 3, 0]])
     if not poses_by_stamp:
         raise TrajectoryError(f"{path} names no image")
     order = sorted(poses_by_stamp)
@@ -178,7 +178,7 @@ def _stamp(name: str, stamps: Mapping[str, float] | None, path: Path) -> float:
 POSE_MESSAGE, PATH = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Path"
 
 
-def read_bag_trajectory(path: Path, topic: str | None = None) -> Trajectory:
+def read_bag_trajectory(path: Path, topic: str | None = None) -> TumFile:
     """The poses of a ROS 1 or 2 bag or an MCAP file, taken for the camera's.
 
     Args:

@@ -20,10 +20,13 @@ from dynslam_bench.core.images import image_size
 from dynslam_bench.geometry import (
     Array,
     Camera,
+    FileNotes,
     Trajectory,
+    TumFile,
     format_ns,
     is_number,
     ns_of,
+    ordered_file,
     parse_ns,
     refuse_close,
     se3,
@@ -341,22 +344,21 @@ def camera_on_body(sensor: Mapping[str, Any], where: str) -> Array:
     return np.eye(4) if sensor.get("T_BS") is None else rigid(numbers(sensor, "T_BS", 16, where), f"{where}: T_BS")
 
 
-def camera_truth(stamps: NDArray[np.int64], rows: Array, T_body_cam: Array, where: str) -> Trajectory | None:
+def camera_truth(stamps: NDArray[np.int64], rows: Array, T_body_cam: Array, where: str) -> TumFile | None:
     """Camera-to-world poses of the body's, rows ``tx ty tz qx qy qz qw`` ``[N, 7]`` at stamps in nanoseconds ``[N]``.
 
-    Rows without a rotation are left out, of several with one stamp the last holds; None where nothing is left.
+    Rows without a rotation are left out and counted, of several with one stamp the last holds; None where nothing is
+    left.
 
     Raises:
         SequenceError: Two stamps of `where` differ by less than 1 us.
     """
-    order = np.argsort(stamps, kind="stable")
-    stamps, rows = stamps[order], rows[order]
-    refuse_close(stamps, where, SequenceError)
-    keep = np.append(np.diff(stamps) > 0, True) & (np.linalg.norm(rows[:, 3:], axis=1) > 1e-8)
+    refuse_close(np.sort(stamps), where, SequenceError)
+    keep = np.linalg.norm(rows[:, 3:], axis=1) > 1e-8
     if not keep.any():
         return None
-    poses = se3.from_quaternion(rows[keep, :3], rows[keep, 3:]) @ T_body_cam
-    return Trajectory(to_seconds(stamps[keep]), poses, stamps[keep])
+    notes = FileNotes(lines=len(rows), zero_quaternions=int(np.count_nonzero(~keep)))
+    return ordered_file(stamps[keep], se3.from_quaternion(rows[keep, :3], rows[keep, 3:]) @ T_body_cam, notes)
 
 
 # Tables in CSV whose stamps are nanoseconds, as EuRoC and VSLAM-LAB write them.
@@ -365,7 +367,7 @@ POSE = ("ts (ns)", "tx (m)", "ty (m)", "tz (m)", "qx", "qy", "qz", "qw")
 """Heading of VSLAM-LAB's tables of poses."""
 
 
-def read_pose_table(path: Path, T_body_cam: Array) -> Trajectory | None:
+def read_pose_table(path: Path, T_body_cam: Array) -> TumFile | None:
     """The camera's poses of a table of EuRoC or VSLAM-LAB; None where no row holds a rotation.
 
     Args:

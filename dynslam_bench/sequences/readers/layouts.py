@@ -259,7 +259,8 @@ def read_vslam_lab(folder: Path, fps: float | None) -> Contents:
         raise SequenceError(f"{where}: the distortion '{str(kind)[:40]}' is not read, only radtan4 and radtan5")
     k = [] if kind is None else numbers(stated, "distortion_coefficients", 4 if kind == "radtan4" else 5, where)
     camera = checked_camera(where, size, focal, centre, factor, k)
-    truth = read_pose_table(poses, camera_on_body(stated, where)) if poses.is_file() else None
+    file = read_pose_table(poses, camera_on_body(stated, where)) if poses.is_file() else None
+    truth = None if file is None else file.trajectory
     return Contents(colour, depth, True, truth, camera=camera, fps=fps or _frame_rate(stated.get("fps")))
 
 
@@ -284,7 +285,8 @@ def read_euroc(folder: Path, fps: float | None) -> Contents:
     (factor,) = numbers(depth_sensor, "depth_factor", 1, str(depth_file))
     camera = checked_camera(where, size, intrinsics[:2], intrinsics[2:], factor, k)
     poses = folder / base / "state_groundtruth_estimate0" / "data.csv"
-    truth = read_pose_table(poses, camera_on_body(sensor, where)) if poses.is_file() else None
+    file = read_pose_table(poses, camera_on_body(sensor, where)) if poses.is_file() else None
+    truth = None if file is None else file.trajectory
     return Contents(colour, depth, truth=truth, camera=camera, fps=fps or _frame_rate(sensor.get("rate_hz")))
 
 

@@ -132,7 +132,8 @@ class BatchProgram(Record):
     def words(self, here: Path, **places: str) -> list[str]:
         """The command with these paths for its placeholders."""
         words = [
-            str(here / word) if re.search(r"[./]", word) and (here / word).is_file() else word for word in self.command
+            str(here / word) if re.search(r"[./]", word) and (here / word).is_file() and word != self.output else word
+            for word in self.command
         ]
         for name, place in {"here": str(here), "python": sys.executable, **places}.items():
             words = [word.replace(f"{{{name}}}", place) for word in words]

@@ -429,7 +429,8 @@ class ProgramTracker:
         }
         self._program = Program(self.name, self._command, folder=self._folder, environment=environment)
         try:
-            self._ask(request, self.limits.start_timeout_s, "at reset")
+            if self._ask(request, self.limits.start_timeout_s, "at reset").get("ok") is False:
+                raise TrackerError(f"{self.name} answered reset with ok: false")
         except DynslamError:
             self.close()
             raise
