@@ -53,8 +53,7 @@ def splat(xy: np.ndarray, z: np.ndarray, background: float = 0.0) -> np.ndarray:
 
 def on_top(xy: np.ndarray, z: np.ndarray) -> np.ndarray:
     """Which points no other point's patch covers."""
-    gap = np.abs(xy[:, None] - xy[None]).max(axis=2)
-    return ~((gap < 5) & (z[None] < z[:, None])).any(axis=1)
+    return ~((np.abs(xy[:, None] - xy[None]).max(axis=2) < 5) & (z[None] < z[:, None])).any(axis=1)
 
 
 def scene(
@@ -66,16 +65,19 @@ def scene(
     noise_px: float = 0.1,
     seed: int = 0,
     instances: Instances | None = None,
+    depths: tuple[float, float] = (1.0, 4.0),
+    camera: Camera = CAMERA,
 ) -> Scene:
     """Static points all over the image, moving ones inside x 200..330, y 100..380 at 1.5 m.
 
-    `motion` [3] is the moving points' displacement between the frames, metres, in the previous camera frame.
+    `motion` [3] is the moving points' displacement between the frames, metres, in the previous camera frame. `camera`
+    is `CAMERA` with any distortion, which moves where the keypoints and the ends of their flow lie in the image.
     """
     rng = np.random.default_rng(seed)
     xy = np.concatenate(
         [rng.uniform((20, 20), (620, 460), (n_static, 2)), rng.uniform((200, 100), (330, 380), (n_moving, 2))]
     )
-    z = np.concatenate([rng.uniform(1.0, 4.0, n_static), rng.uniform(1.45, 1.55, n_moving)])
+    z = np.concatenate([rng.uniform(*depths, n_static), rng.uniform(1.45, 1.55, n_moving)])
     moving = np.arange(len(xy)) >= n_static
     previous_points = se3.transform(T_prev_cur, CAMERA.unproject(xy, z))
     if motion is not None:
@@ -84,18 +86,22 @@ def scene(
     visible = (before > 5).all(axis=1) & (before < (634, 474)).all(axis=1)
     visible &= on_top(xy, z) & on_top(before, previous_points[:, 2])
     xy, z, moving, before, previous_points = (array[visible] for array in (xy, z, moving, before, previous_points))
-    frame = bundle(xy, z, splat(xy, z), 1.0)
+    frame = replace(
+        bundle(xy, z, splat(xy, z), 1.0), keypoints=keypoints(camera.distort_points(xy)), instances=instances
+    )
     previous = bundle(before, previous_points[:, 2], splat(before, previous_points[:, 2]), 1.0 - 1 / 30)
     state = FilterState(
-        camera=CAMERA,
+        camera=camera,
         keep=np.ones(len(xy), bool),
         previous=previous,
         previous_keep=np.ones(len(xy), bool),
         T_world_prev=np.eye(4),
         T_world_pred=T_prev_cur,
-        flow=FlowResult(before.astype(np.float32), np.ones(len(xy), bool), np.zeros(len(xy), np.float32)),
+        flow=FlowResult(
+            camera.distort_points(before).astype(np.float32), np.ones(len(xy), bool), np.zeros(len(xy), np.float32)
+        ),
     )
-    return Scene(replace(frame, instances=instances), state, moving)
+    return Scene(frame, state, moving)
 
 
 def box_instance(x0: int, y0: int, x1: int, y1: int, name: str = "person") -> Instances:
@@ -106,8 +112,7 @@ def box_instance(x0: int, y0: int, x1: int, y1: int, name: str = "person") -> In
 
 def on_rectangle(made: Scene | FrameBundle, x0: int, y0: int, x1: int, y1: int) -> np.ndarray:
     """Which keypoints, rounded to pixels, lie on a rectangle."""
-    frame = made.frame if isinstance(made, Scene) else made
-    x, y = np.rint(frame.keypoints.xy).T
+    x, y = np.rint((made.frame if isinstance(made, Scene) else made).keypoints.xy).T
     return (x >= x0) & (x < x1) & (y >= y0) & (y < y1)
 
 

@@ -46,17 +46,28 @@ from dynslam_bench.trackers import TRACKERS
 FORWARD = se3.exp(np.array([0, 0, 0.05, 0, 0, 0]))
 
 
-def test_epipolar_culls_exactly_the_moving_points() -> None:
-    made, still = scene(SIDEWAYS, motion=ACROSS), scene(SIDEWAYS)
+@pytest.mark.parametrize("distortion", [(0.0, 0.0, 0.0, 0.0, 0.0), (-0.28, 0.09, 0.001, 0.0005, 0.0)])
+def test_epipolar_culls_exactly_the_moving_points(distortion: tuple[float, float, float, float, float]) -> None:
+    camera = replace(CAMERA, distortion=distortion)
+    made, still = scene(SIDEWAYS, motion=ACROSS, camera=camera), scene(SIDEWAYS, camera=camera)
     verdict = EpipolarFilter(EpipolarSettings(min_share=0.0)).apply(made.frame, made.state)
     np.testing.assert_array_equal(verdict.keep, ~made.moving)
     assert verdict.stats["degenerate"] == 0
     assert EpipolarFilter(EpipolarSettings()).apply(still.frame, still.state).keep.all()
 
 
-@pytest.mark.parametrize("motion", [ROTATION, np.eye(4)], ids=["pure rotation", "static camera"])
-def test_epipolar_is_skipped_where_it_is_degenerate(motion: np.ndarray) -> None:
-    made = scene(motion, motion=ACROSS)
+@pytest.mark.parametrize(
+    ("motion", "depths"),
+    [
+        (ROTATION, (1.0, 4.0)),
+        (np.eye(4), (1.0, 4.0)),
+        (se3.exp(np.array([0.02, 0, 0, 0, 0.15, 0])), (1.0, 4.0)),
+        (SIDEWAYS, (2.0, 2.0)),
+    ],
+    ids=["pure rotation", "static camera", "fast rotation with little parallax", "plane"],
+)
+def test_epipolar_is_skipped_where_it_is_degenerate(motion: np.ndarray, depths: tuple[float, float]) -> None:
+    made = scene(motion, n_moving=30, motion=ACROSS, depths=depths)
     verdict = EpipolarFilter(EpipolarSettings()).apply(made.frame, made.state)
     assert verdict.keep.all() and verdict.stats["degenerate"] == 1
 
@@ -75,6 +86,14 @@ def test_epipolar_is_skipped_where_depth_contradicts_f() -> None:
     assert (verdict.keep == ~made.moving).all() and verdict.stats["contradiction"] < 0.05
 
 
+def test_what_was_culled_before_neither_determines_f_nor_contradicts_it() -> None:
+    """Most points lie on people, who also took the predicted pose along."""
+    made = scene(SIDEWAYS, n_static=120, n_moving=600, motion=ACROSS)
+    made.state.keep, made.state.T_world_pred = ~made.moving, se3.exp(np.r_[-ACROSS, 0, 0, 0]) @ SIDEWAYS
+    keep = EpipolarFilter(EpipolarSettings(min_share=0.0)).apply(made.frame, made.state).keep
+    np.testing.assert_array_equal(keep, ~made.moving)
+
+
 @pytest.mark.parametrize("left", [200, 400])
 def test_epipolar_object_mode_drops_whole_objects_and_nothing_else(left: int) -> None:
     made = scene(SIDEWAYS, motion=ACROSS)
@@ -85,16 +104,31 @@ def test_epipolar_object_mode_drops_whole_objects_and_nothing_else(left: int) ->
 
 
 @pytest.mark.parametrize(
-    ("depth_m", "age_s", "violated"), [(4.5, 0.5, True), (4.5, MAX_AGE_S + 1, False), (0, 0.5, False)]
+    ("measured", "settings", "violated"),
+    [
+        ([(4.5, 0.5)], {}, True),
+        ([(4.5, MAX_AGE_S + 1)], {}, False),
+        ([(0, 0.5)], {}, False),
+        ([(4.5, 0.5), (4.5, 0.6)], {}, True),
+        ([(4.5, 0.5), (0, 0.6)], {}, False),
+        ([(4.5, 0.5), (0, 0.6)], {"min_votes": 1}, True),
+        ([(4.5, 0.5)], {"threshold_m": 4.0}, False),
+        ([(6.0, 0.5)], {"threshold_sigma": 100.0}, False),
+    ],
 )
-def test_free_space_culls_what_stands_where_a_recent_keyframe_measured_further(
-    depth_m: float, age_s: float, violated: bool
+def test_free_space_culls_what_stands_where_enough_recent_keyframes_measured_clearly_further(
+    measured: list[tuple[float, float]], settings: dict[str, float], violated: bool
 ) -> None:
-    made = scene(SIDEWAYS)
-    depth = np.full((CAMERA.height, CAMERA.width), depth_m, np.float32) if depth_m else made.state.previous.depth
-    view = keyframe(np.eye(4), depth, made.frame.timestamp - age_s)
-    state = FilterState(CAMERA, made.state.keep, T_world_pred=SIDEWAYS, keyframes=(view,))
-    keep = FreeSpaceFilter(FreeSpaceSettings(min_votes=1, min_share=0.0)).apply(made.frame, state).keep
+    """Keyframes from the previous pose, of so many metres (0: what the scene shows there) and seconds of age."""
+    made, previous = scene(SIDEWAYS), se3.exp(np.array([1.0, 2.0, 3.0, 0.5, 0.4, 0.3]))
+    views = tuple(
+        keyframe(
+            previous, np.where(depth_m, np.float32(depth_m), made.state.previous.depth), made.frame.timestamp - age_s
+        )
+        for depth_m, age_s in measured
+    )
+    state = FilterState(CAMERA, made.state.keep, T_world_pred=previous @ SIDEWAYS, keyframes=views)
+    keep = FreeSpaceFilter(FreeSpaceSettings(min_share=0.0, **settings)).apply(made.frame, state).keep
     assert keep[made.frame.z < 3.9].any() != violated and keep.all() != violated
 
 

@@ -109,8 +109,7 @@ def test_what_lies_on_a_mask_takes_no_place_of_what_lies_outside():
     plain, beside = extractor.extract(image), extractor.extract_masked(image, mask, share=0.3)
     assert isinstance(extractor, MaskedExtractor)
     assert np.count_nonzero(~inside(mask, plain.xy)) < 100 < 400 < np.count_nonzero(~inside(mask, beside.xy)) <= 500
-    on = inside(mask, plain.xy)
-    assert np.array_equal(plain.xy[on], beside.xy[inside(mask, beside.xy)])
+    assert np.array_equal(plain.xy[inside(mask, plain.xy)], beside.xy[inside(mask, beside.xy)])
     assert np.all(np.diff(beside.octave) >= 0)
     assert len(np.unique(np.c_[beside.xy, beside.octave], axis=0)) == len(beside)
     enough = extractor.extract_masked(image, mask, share=0.02)

@@ -509,8 +509,7 @@ def test_depth_repair_fits_the_border_to_the_depth_edge():
     depth[::7] = 0  # missing rows decide nothing
     settings = SegmentationSettings(repair="depth", dilation_px=0)
     for wrong in (block(25, 95, 55, 105), block(15, 105, 45, 115), block(20, 100, 54, 114)):
-        repaired = dynamic_mask(instances(wrong), settings, depth)
-        assert iou(repaired, truth) > 0.93 > iou(wrong, truth)
+        assert iou(dynamic_mask(instances(wrong), settings, depth), truth) > 0.93 > iou(wrong, truth)
     wrong = block(25, 95, 55, 105)
     assert np.array_equal(dynamic_mask(instances(wrong), settings), wrong)
     assert np.array_equal(repair(wrong, np.zeros((H, W), np.float32), 0.2), wrong)

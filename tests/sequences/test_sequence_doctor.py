@@ -36,8 +36,8 @@ FRAMES = 80
 def sound():
     """A rendered office without people, at half the size."""
     id = f"synthetic/walking_halfsphere?scene=1&frames={FRAMES}"
-    plain = ColorSensor(noise=False, shutter=0)
-    settings = RenderSettings(people="none", antialias=False, color=plain)  # halving smooths enough
+    # halving smooths enough
+    settings = RenderSettings(people="none", antialias=False, color=ColorSensor(noise=False, shutter=0))
     small = PreprocessingSettings(width=320, height=240)
     return Altered(Preprocessed(open_synthetic(id, None, settings=settings), small))
 

@@ -163,8 +163,7 @@ def test_bounds_hold_all_points_before_the_camera_and_no_more() -> None:
     inside[:, :2000] /= np.abs(inside[:, :2000]).max(axis=2, keepdims=True)  # half of them on the surface
     points = (inside * half) @ turns + centre
     seen = points[:, :, 2] > 0.05
-    crossing = seen.any(axis=1) & ~seen.all(axis=1)
-    assert crossing.sum() > 50 and (~seen).all(axis=1).sum() > 50
+    assert (seen.any(axis=1) & ~seen.all(axis=1)).sum() > 50 and (~seen).all(axis=1).sum() > 50
     z = np.where(seen, points[:, :, 2], np.nan)
     u, v = points[:, :, 0] / z * CAMERA.fx + CAMERA.cx, points[:, :, 1] / z * CAMERA.fy + CAMERA.cy
     for value, low, high in ((u, low_u, high_u), (v, low_v, high_v)):

@@ -210,13 +210,17 @@ def test_of_frames_with_one_stamp_the_first_is_in_the_final_trajectory(room):
     backend = make_backend(room, motion__smooth=False)
     results, final = track_all(backend, frames), backend.finalize()
     assert states(results) == ["ok"] * 10 and len(final) == 6
-    off = [np.linalg.norm(final.positions[-1] - result.T_world_cam[:3, 3]) for result in results]
-    assert int(np.argmin(off)) == 5
+    assert np.argmin([np.linalg.norm(final.positions[-1] - r.T_world_cam[:3, 3]) for r in results]) == 5
 
 
 def resting(room):
     """A camera at rest before many new features in every frame: only the gap asks for a keyframe."""
     return [room.see(np.eye(4), index, limit=900, wrong=110) for index in range(14)]
+
+
+def fading(room):
+    """A camera at rest that tracks fewer of the same points in every frame."""
+    return [room.see(np.eye(4), index, limit=300 - 10 * index) for index in range(14)]
 
 
 def strolling(room):
@@ -227,6 +231,7 @@ def strolling(room):
     ("name", "ends", "frames", "others"),
     [
         ("keyframes__max_gap", (10, 90), resting, {}),
+        ("keyframes__tracked_share", (0.4, 0.95), fading, {}),
         ("bundle_adjustment__window", (2, 20), strolling, {"keyframes__tracked_share": 0.95}),
         ("keyframes__redundant_share", (0.7, 1.0), strolling, {"keyframes__tracked_share": 0.95}),
     ],

@@ -210,7 +210,7 @@ def test_one_patch_does_not_determine_the_pose_nor_do_a_few_matches_beside_it(ha
     few = few.select(fitted.inliers)
     depth = np.median(se3.transform(fitted.T_cam_world, few.position)[:, 2])
     place = InitialPose(fitted.T_cam_world, few, 0, depth=float(depth))
-    assert len(place.matches) > 60
+    assert len(place.matches) > 60 and np.array_equal(fitted.information, fitted.information.T)
     assert (pose_uncertainty(backend.world, observations, place, np.random.default_rng(0)) <= 1) == precise
 
 
