@@ -512,7 +512,8 @@ def final_errors(board: Board, protocol: Protocol) -> Table | None:
         "final_trajectory",
         "Error of the final trajectory",
         "Median ATE (RMSE, millimetres) of the trajectory as it was after the last frame, whatever was optimised until "
-        f"then, of the trackers that have one; all other tables show the {protocol.trajectory} one.",
+        f"then, of the trackers that have one; all other tables show the {protocol.trajectory} one. "
+        f"{DOUBT}: it has poses of fewer than {100 * FINAL_SHARE:.0f} % of the tracked frames, and is not compared.",
         doubt=_final_doubt,
     )
 

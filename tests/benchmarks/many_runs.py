@@ -139,8 +139,7 @@ def of_frames(folder: str, frames: int, results: str) -> list[float]:
     records = run_many(still(folder, frames, range(RUNS)), results=results)
     head, other = time.process_time() - spent, sum(server.cpu_times()) - before
     files = list(RunStore(results).folder(records[0].run_id).iterdir())
-    kilobytes = sum(file.stat().st_size for file in files) / 1000
-    return [1000 * head / RUNS, 1000 * other / RUNS, kilobytes, len(files)]
+    return [1000 * head / RUNS, 1000 * other / RUNS, sum(file.stat().st_size for file in files) / 1000, len(files)]
 
 
 RUNS = 50

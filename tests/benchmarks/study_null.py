@@ -186,8 +186,7 @@ def regret(studies: int, folder: Path) -> Iterable[str]:
 def summed(found: Sequence[tuple[float, int]]) -> tuple[str, int]:
     """Mean regret with its standard error, and mean number of trials."""
     regrets, trials = zip(*found, strict=True)
-    error = np.std(regrets, ddof=1) / math.sqrt(len(regrets))
-    return f"{np.mean(regrets):.3f} ± {error:.3f}", round(np.mean(trials))
+    return f"{np.mean(regrets):.3f} ± {np.std(regrets, ddof=1) / math.sqrt(len(regrets)):.3f}", round(np.mean(trials))
 
 
 def plain(tuner: Any, seed: int, most: int, pruner: optuna.pruners.BasePruner) -> tuple[float, int]:

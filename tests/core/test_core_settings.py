@@ -288,8 +288,7 @@ def test_only_what_names_a_file_counts_as_one(tmp_path: Path, monkeypatch: pytes
     assert set(found) == named and len(set(found.values())) == 3
     net.write_text("three")
     masks.write_text("2222")
-    changed = {name for name, digest in named_digests(settings).items() if digest != found[name]}
-    assert changed == named - {"vocabulary"}
+    assert {name for name, digest in named_digests(settings).items() if digest != found[name]} == named - {"vocabulary"}
     monkeypatch.setenv("FP_TEST_VOCABULARY", str(tmp_path / "voc.txt"))
     assert named_digests(Whole())["vocabulary"] == found["vocabulary"], "named by the environment"
 

@@ -366,8 +366,7 @@ def test_seeds_lie_well_inside_an_object_and_need_depth_at_their_pixel() -> None
 
 def test_missing_depth_counts_in_the_variance() -> None:
     assert MultiViewFilter(PLAIN).apply(*in_front()).stats["seeds"] > 0
-    speckled = (slice(100, 380, 8), slice(220, 330, 8))
-    assert MultiViewFilter(PLAIN).apply(*in_front(hole=speckled)).stats["seeds"] == 0
+    assert MultiViewFilter(PLAIN).apply(*in_front(hole=(slice(100, 380, 8), slice(220, 330, 8)))).stats["seeds"] == 0
 
 
 def test_features_at_the_border_of_the_mask_are_dropped() -> None:

@@ -345,8 +345,7 @@ def near_person(value: float) -> list[bool]:
     """A person who fills half of the image."""
     made = scene(np.eye(4), instances=box_instance(0, 0, 320, 480))
     made.frame.depth[:, :320], made.frame.depth[:, 320:] = 1.0, 3.0
-    rule = BoxDepthFilter(BoxDepthSettings(max_cover=value), SEGMENTATION)
-    return rule.apply(made.frame, made.state).keep.tolist()
+    return BoxDepthFilter(BoxDepthSettings(max_cover=value), SEGMENTATION).apply(made.frame, made.state).keep.tolist()
 
 
 def many_points_on_a_small_body(value: str) -> list[bool]:

@@ -19,8 +19,7 @@ def chained(steps):
 
 
 def noisy(truth, seed=1, size=0.01):
-    rng = np.random.default_rng(seed)
-    return truth.with_poses(truth.T_world_cam @ se3.exp(rng.normal(0, size, (len(truth), 6))))
+    return truth.with_poses(truth.T_world_cam @ se3.exp(np.random.default_rng(seed).normal(0, size, (len(truth), 6))))
 
 
 def turned(trajectory, seed):

@@ -397,8 +397,7 @@ def test_a_run_that_crashed_hides_no_exact_share(tmp_path):
     store = RunStore(tmp_path / "r")
     for name, count in (("crashed", 30), ("whole", 60)):
         add_frames(store.folder(add_run(store, name, "s/a", n=60)), count)
-    runs = sorted(load_runs([store], PROTOCOL).rows, key=lambda row: row.tracker.id)
-    assert [*exact_shares(runs)] == [*range(60)]
+    assert [*exact_shares(sorted(load_runs([store], PROTOCOL).rows, key=lambda row: row.tracker.id))] == [*range(60)]
 
 
 def test_a_final_trajectory_of_few_frames_is_no_success(tmp_path):
@@ -412,6 +411,7 @@ def test_a_final_trajectory_of_few_frames_is_no_success(tmp_path):
     assert (thin.n_tracked, thin.failed, thin.status) == (4, True, "lost") and thin.coverage < 0.1
     assert "the final trajectory has poses of 4 of" in thin.reason and thin.ending.startswith("lost, 4/")
     assert not any(row.failed for row in load_runs([store], PROTOCOL).rows)
+    assert re.search(r"\| thin \| \S+‡ \|", build_report(store, tmp_path / "out", most_pages=0).markdown.read_text())
 
 
 def test_what_was_lost_as_it_came_and_found_in_the_end_is_a_success_of_the_final_trajectory(tmp_path):

@@ -237,8 +237,7 @@ def test_numbers_have_three_digits_and_no_more():
 
 def test_little_data_claims_little():
     rows = [row("orb-slam2", "s", 0.2237), row("orb-slam2", "t", 0.02), row("a", "s", 0.2196), row("a", "t", 0.01)]
-    table = leaderboard(make_board(rows), PROTOCOL)
-    ranks, ratios, *others = columns_of(table, "#", "ATE ratio", "better?", "wins")
+    ranks, ratios, *others = columns_of(leaderboard(make_board(rows), PROTOCOL), "#", "ATE ratio", "better?", "wins")
     assert [(cell.text, cell.small) for cell in ranks] == [("1–2", "")] * 2
     assert [(cell.small, cell.emphasis) for cell in ratios] == [("", "")] * 2
     assert [cell.text for column in others for cell in column] == ["", "reference", "2 of 2", ""]

@@ -223,6 +223,16 @@ def test_damaged_tables(tmp_path: Path, text: str, complaint: str) -> None:
         read_trajectory(tmp_path / "data.csv")
 
 
+def test_what_a_table_or_a_reconstruction_repeats_or_lacks_is_said(tmp_path: Path) -> None:
+    rows = [f"{stamp},0,0,0,{w},0,0,0" for stamp, w in ((20000, 1), (10000, 1), (20000, 1), (30000, 0))]
+    (tmp_path / "data.csv").write_text("\n".join(["#timestamp,x,y,z,q_w,q_x,q_y,q_z", *rows]))
+    notes = read_trajectory(tmp_path / "data.csv").notes
+    assert (notes.lines, notes.duplicates, notes.out_of_order, notes.zero_quaternions) == (4, 1, 1, 1)
+    (tmp_path / "images.txt").write_text("".join(f"{n} 1 0 0 0 0 0 0 {n} cam{n}/1.5.png\n\n" for n in (1, 2)))
+    with pytest.raises(TrajectoryError, match=r"line 3 repeats a stamp, 1\.5"):
+        read_colmap(tmp_path)
+
+
 def test_folders_that_hold_no_trajectory(store: RunStore, run: RunRecord, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(TrajectoryError, match=r"holds neither images\.txt of COLMAP nor a bag of ROS 2"):

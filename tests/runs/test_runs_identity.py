@@ -240,6 +240,17 @@ def test_a_rebuilt_shared_library_is_another_run(tmp_path: Path) -> None:
     assert makes_another_run(spec, lambda: os.system(build))
 
 
+def test_data_and_programs_that_change_meanwhile_are_noticed_but_no_output(tmp_path: Path) -> None:
+    program, folder = write(tmp_path / "slam.py", "x = 1"), write_folder(tmp_path / "toy", 4)
+    asked = resolve(RunSpec(tracker=f"subprocess:{sys.executable} {program} {tmp_path}/out", sequence=str(folder)))
+    write(tmp_path / "out", "poses")
+    identity.check_unchanged(asked)
+    write(program, "x = 22")
+    shutil.copy(*sorted((folder / "rgb").iterdir())[:2])
+    with pytest.raises(RunError, match=r"program of tracker .*, sequence '.*has changed since"):
+        identity.check_unchanged(asked)
+
+
 def test_libraries_weights_and_own_code_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spec = RunSpec(tracker="orb-slam2", sequence=str(write_folder(tmp_path / "toy", 4)))
     ids = {resolve(spec).run_id}

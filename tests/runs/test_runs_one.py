@@ -35,7 +35,10 @@ def leftovers(store: RunStore) -> list[str]:
 
 def test_what_a_run_leaves(store: RunStore, toy_folder: str) -> None:
     record = run_one(
-        RunSpec(tracker=TARGET, sequence=toy_folder, seed=3, settings={"noise.clip": 3.0}, snapshots=True), store
+        RunSpec(
+            tracker=TARGET, sequence=toy_folder, seed=3, settings={"noise.clip": 3.0, "mode": "ok"}, snapshots=True
+        ),
+        store,
     )
     assert (record.status, record.reason, record.n_frames, record.n_tracked, record.coverage) == ("ok", "", 60, 60, 1.0)
     folder = store.folder(record.run_id)

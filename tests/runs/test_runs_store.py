@@ -248,7 +248,7 @@ def test_rescoring_says_what_has_changed(filled) -> None:
     assert (same.protocol, same.runs, same.changed) == ("tum-rgbd/v1", 3, ())
     record = store.read_whole(ids[0])
     scored = store.score(record)
-    store.add_metrics(record, scored.model_copy(update={"online": None}))
+    store.add_metrics(record, scored.model_copy(update={"online": None, "code": "older"}), "another state")
     store.score(record, "evo-default")
     outcomes = {outcome.protocol: outcome.changed for outcome in rescore(store)}
     assert outcomes == {"tum-rgbd/v1": (ids[0],), "evo-default": ()} and store.metrics(record, PROTOCOL) == scored

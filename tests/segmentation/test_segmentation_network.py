@@ -293,8 +293,7 @@ def test_pasted_masks_fill_their_box():
     assert exact[20:80, 10:50].all() and exact.sum() == 40 * 60
     rows, columns = np.nonzero(paste(plane, box, 100, 100, 0.5))
     assert (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1) == pytest.approx((10, 20, 50, 80), abs=1.01)
-    half = np.tile(np.repeat(np.float32([0, 1]), 14), (28, 1))
-    moved = paste(half, box + np.float32(0.4), 100, 100, 0.5, exact=True)
+    moved = paste(np.tile(np.repeat(np.float32([0, 1]), 14), (28, 1)), box + np.float32(0.4), 100, 100, 0.5, exact=True)
     assert not moved[:, :30].any() and moved[21:80, 31:50].all()
     assert not paste(plane, np.array([-30, -30, -5, -5], np.float32), 100, 100, 0.5).any()
 

@@ -84,8 +84,7 @@ def test_hits_lie_on_their_surfaces(walking) -> None:
     local = np.einsum("nji,nj->ni", view.rotation[prims], world - view.origin[prims]) / scene.scale[prims]
     shape, kind = scene.shape[prims], scene.kind[prims]
     box, cone, axis = kind != 1, kind == 1, faces >> 1
-    expected = np.where(kind[box] == 2, 0.0, shape[box, axis[box]])
-    assert np.abs(np.abs(local[box, axis[box]]) - expected).max() < 1e-9
+    assert np.abs(np.abs(local[box, axis[box]]) - np.where(kind[box] == 2, 0.0, shape[box, axis[box]])).max() < 1e-9
     (h, r1, r2), p = shape[cone].T, local[cone]
     radial = np.hypot(p[:, 0], p[:, 1])
     # Signed distance of a round cone: the nearest point of its axis, in the slanted metric of its side.

@@ -17,8 +17,7 @@ from dynslam_bench.slam.tracking import LocalMap, unconnected, weakly_connected
 
 
 def keyframe_of(room, world, pose, index, octave=0):
-    frame = without_depth(room.see(pose, index, noise_px=0.0))
-    observations = observed(frame, room.camera, levels=len(world.scales))
+    observations = observed(without_depth(room.see(pose, index, noise_px=0.0)), room.camera, levels=len(world.scales))
     return world.add_keyframe(
         replace(observations, octave=observations.octave + octave), se3.inverse(pose), index, index / 30
     )

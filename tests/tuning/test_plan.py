@@ -408,8 +408,7 @@ def test_the_baseline_runs_from_three_starts() -> None:
 
 @pytest.mark.parametrize(("scenes_to_tune_on", "reserved"), [(1, 18), (11, 18), (40, 20)])
 def test_the_choice_is_made_on_further_scenes(scenes_to_tune_on: int, reserved: int) -> None:
-    tune = (f"{WALK}?scene=0-{scenes_to_tune_on - 1}&frames=20",)
-    design = design_of(StudySpec(name="s", tune=tune, recorded=()))
+    design = design_of(StudySpec(name="s", tune=(f"{WALK}?scene=0-{scenes_to_tune_on - 1}&frames=20",), recorded=()))
     confirm, tuned = scenes(design.confirm).keys(), scenes(design.tune).keys()
     assert (len(tuned), len(confirm)) == (scenes_to_tune_on, reserved) and not confirm & tuned
     assert len(scenes(design.tune[:scenes_to_tune_on])) == scenes_to_tune_on, "in turn"

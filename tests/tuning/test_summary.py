@@ -257,8 +257,7 @@ def test_a_damaged_stored_study_is_one_clear_line(tmp_path: Path, content: bytes
 @pytest.mark.parametrize("value", ["", {}, [1], "x" * 400])
 def test_a_storage_that_holds_no_trials_is_one_clear_line(tmp_path: Path, value: object) -> None:
     spec = StudySpec(name="small", tune=("a",))
-    study = optuna.create_study(study_name="small", storage=open_storage(tmp_path, spec))
-    study.ask().set_user_attr("coverage", value)
+    optuna.create_study(study_name="small", storage=open_storage(tmp_path, spec)).ask().set_user_attr("coverage", value)
     with pytest.raises(StudyError, match="no trial"):
         Study.open(spec, tmp_path).frame()
 
