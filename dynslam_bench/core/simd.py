@@ -422,7 +422,7 @@ def _larger(builder: Code, first: Code, second: Code) -> Code:
 
 @instruction
 def store_corner_scores(typing_context: Code, scores: Code, image: Code, at: Code, circle: Code) -> Definition:
-    """Write the FAST scores of sixty-four adjacent pixels (Rosten and Drummond 2006; OpenCV's ``TYPE_9_16``).
+    """Write the FAST scores of sixty-four adjacent pixels (Rosten and Drummond 2006).
 
     The score is the largest threshold at which the pixel is a corner: nine adjacent pixels of the circle around it are
     all brighter, or all darker, by more than the threshold. It is 0 where there is none.
