@@ -135,7 +135,10 @@ def test_a_run_is_there_whole_or_not_at_all_and_one_that_is_made_again_is_never_
 
     def old_or_new() -> None:
         records, unreadable = RunStore(root).all()
-        assert list(records) in (earlier, [RECORD]) and unreadable == []
+        assert [record.model_copy(update={"files": {}}) for record in records] in (
+            earlier,
+            [RECORD],
+        ) and unreadable == []
 
     found = survey(
         lambda: make(root), root, begin=lambda: [make(root, record) for record in earlier], halfway=old_or_new,
