@@ -218,8 +218,12 @@ def source_fingerprint(tracker: TrackerSpec, settings: Settings | None = None, s
     return digest([code_digest(tracker.entry_point, CODE_PACKAGES), plugins])
 
 
-def check_unchanged(run: ResolvedRun) -> None:
-    """What a run was made of is what was looked up for it: data, code, files, weights, map.
+def check_unchanged(run: ResolvedRun, *, begun: bool = False) -> None:
+    """What a run is made of is what was looked up for it: data, code, files, weights, map.
+
+    Args:
+        run: The run.
+        begun: Whether it was begun: what a program's command names may be its output then.
 
     Raises:
         RunError: Something has changed since.
@@ -228,9 +232,8 @@ def check_unchanged(run: ResolvedRun) -> None:
     if has_package_changed(CODE_PACKAGES):
         raise RunError("the code of dynslam-bench has changed since this process began", "start it again")
     before, now = run.identity, resolve(run.spec).identity
-    # files that were not there before are the run's own output
     with raising(PluginError, f"cannot read a file of tracker '{run.tracker.id}'"):
-        now |= {"files": contents_digest(run.files)} if run.files else {"files": before.get("files")}
+        now |= {"files": contents_digest(run.files) if run.files and not begun else before.get("files")}
     now["weights"] = {name: now["weights"].get(name) if value else value for name, value in before["weights"].items()}
     changed = [name for name in before if now.get(name) != before[name]]
     if changed:

@@ -100,6 +100,8 @@ def run_one(
             (`InfrastructureError`); nothing is stored then.
     """
     resolved = resolve(run) if isinstance(run, RunSpec) else run
+    if resolved is run:
+        check_unchanged(resolved)
     run_id = resolved.run_id
     started = datetime.now(timezone.utc).isoformat(timespec="milliseconds")
     clock = time.perf_counter()
@@ -136,7 +138,7 @@ def run_one(
             title = f"{resolved.tracker.id} on {resolved.sequence.id}, seed {resolved.spec.seed}, online"
             frames.write(work, title, exact_stamps(resolved.sequence))
             (work / FRAMES_FILE).unlink(missing_ok=True)
-        check_unchanged(resolved)
+        check_unchanged(resolved, begun=True)
         record = _record(resolved, verdict, frames, started, time.perf_counter() - clock).normalised()
         if record.status != "stopped":
             store.add_sequence(record.sequence.part, timestamps_ns(resolved.sequence), resolved.sequence.ground_truth)

@@ -247,8 +247,9 @@ def test_data_and_programs_that_change_meanwhile_are_noticed_but_no_output(tmp_p
     identity.check_unchanged(asked)
     write(program, "x = 22")
     shutil.copy(*sorted((folder / "rgb").iterdir())[:2])
-    with pytest.raises(RunError, match=r"program of tracker .*, sequence '.*has changed since"):
-        identity.check_unchanged(asked)
+    for begun, changed in ((False, "the program of tracker .*, sequence"), (True, "^sequence")):
+        with pytest.raises(RunError, match=f"{changed} '.*has changed since"):
+            identity.check_unchanged(asked, begun=begun)
 
 
 def test_libraries_weights_and_own_code_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

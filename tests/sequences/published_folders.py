@@ -70,8 +70,7 @@ def write_seven_scenes(folder, poses, size=(640, 480)):
     for i, pose in enumerate(poses):
         image(folder / f"frame-{i:06d}.color.png", 90, size)
         image(folder / f"frame-{i:06d}.depth.png", 65535 if i == 1 else 2000, size, np.uint16)
-        rows = ["\t ".join(f"{value:.17e}" for value in row) for row in pose]
-        lines(folder / f"frame-{i:06d}.pose.txt", rows)
+        lines(folder / f"frame-{i:06d}.pose.txt", ["\t ".join(f"{value:.17e}" for value in row) for row in pose])
 
 
 def write_shibuya(folder, poses, size=(640, 360)):
