@@ -240,7 +240,7 @@ def check_unchanged(run: ResolvedRun, *, begun: bool = False) -> None:
         words = {"source": f"the code of tracker '{run.tracker.id}'", "content": f"sequence '{run.sequence.id}'"}
         words |= {"files": f"the program of tracker '{run.tracker.id}'", "weights": "a file that the settings name"}
         what = ", ".join(words.get(name, name) for name in changed)
-        hint = "the run is not stored; ask again, and let no tracker write files beside its code"
+        hint = "the run is not stored; ask again, and let no tracker write files beside its code or data"
         raise RunError(f"{what} has changed since the run was asked for", hint)
 
 

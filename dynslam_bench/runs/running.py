@@ -409,11 +409,12 @@ class _Bench:
             run_ids.add(run.run_id)
             stored = self.store.get(run.run_id)
             if stored is not None and stored.status not in again and not _lacks_pictures(self.store, run, stored):
-                if self.store.changed(stored):
-                    self.store.add_sequence(
-                        stored.sequence.part, timestamps_ns(run.sequence), run.sequence.ground_truth
-                    )
-                if not self.store.changed(stored):
+                fault = self.store.changed(stored)
+                if fault:  # the sequence's files are put back; where the run's differ, it is made again
+                    stamps, truth = timestamps_ns(run.sequence), run.sequence.ground_truth
+                    self.store.add_sequence(stored.sequence.part, stamps, truth)
+                    fault = self.store.changed(stored)
+                if not fault:
                     self._reuse(run, stored)
                     continue
             plan.runs += 1
