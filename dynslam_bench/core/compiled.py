@@ -34,7 +34,7 @@ def spliced(function: Function) -> Function:
 
 def inlined(function: Function) -> Function:
     """Compile a small function of scalars and arrays into its callers' machine code."""
-    return cast("Function", numba.njit(nogil=True, forceinline=True)(function))
+    return cast("Function", numba.njit(nogil=True, forceinline=True, _nrt=False)(function))
 
 
 def load_kernels() -> None:

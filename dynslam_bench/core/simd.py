@@ -50,7 +50,9 @@ _FLOATS, _INTS = ir.VectorType(_FLOAT, FLOAT_LANES), ir.VectorType(_INT32, FLOAT
 _BYTES16, _PAIRS = ir.VectorType(_BYTE, FLOAT_LANES), ir.VectorType(_UINT16, FLOAT_LANES)
 _HALVES, _BYTES32 = ir.VectorType(_UINT16, UINT16_LANES), ir.VectorType(_BYTE, UINT16_LANES)
 BYTE_LANES = 64
-_BYTES64 = ir.VectorType(_BYTE, BYTE_LANES)
+_BYTES64, _INTS32 = ir.VectorType(_BYTE, BYTE_LANES), ir.VectorType(_INT32, UINT16_LANES)
+PATCH_ROWS = 31
+"""Rows of the patches that `patch_sum` reads."""
 COSINES = (32768, 23170, 0, -23170, -32768, -23170, 0, 23170)
 """Cosines of multiples of 45 degrees, in 32768ths; two places on are the sines."""
 DERIVATIVE_SHIFT = 11
@@ -168,6 +170,15 @@ store_uint16 = _storing(UINT16X32, 2)
 """Write thirty-two adjacent numbers of a flat uint16 array."""
 
 
+def _sum_of_lanes(builder: Code, vector: Code, add: Callable[[Code, Code], Code]) -> Code:
+    """Code for the sum of a vector's numbers: halves onto halves, always in the same order."""
+    width = vector.type.count
+    while width > 1:
+        width //= 2
+        vector = add(*(builder.shuffle_vector(vector, vector, _places(*range(k, k + width))) for k in (0, width)))
+    return builder.extract_element(vector, ir.Constant(_INT32, 0))
+
+
 @instruction
 def spread(typing_context: Code, value: Code) -> Definition:
     """The same float32 in every place."""
@@ -183,30 +194,69 @@ def total(typing_context: Code, vector: Code) -> Definition:
     """Sum of the numbers: halves onto halves, always in the same order."""
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        rest, width = arguments[0], FLOAT_LANES
-        while width > 1:
-            width //= 2
-            halves = (builder.shuffle_vector(rest, rest, _places(*range(k, k + width))) for k in (0, width))
-            rest = builder.fadd(*halves)
-        return builder.extract_element(rest, ir.Constant(_INT32, 0))
+        return _sum_of_lanes(builder, arguments[0], builder.fadd)
 
     return types.float32(vector), generate
 
 
+def _grid_places(context: Code, builder: Code, kinds: Code, grid: Code) -> tuple[Code, Code]:
+    """Code for columns and rows, in 65536ths of a pixel, of sixteen places of a rotated and scaled grid (`sample`)."""
+    columns, rows, at, *origin_and_steps = grid
+    right, down = (load_vector(context, builder, kinds[k], array, at, _INTS, 4) for k, array in ((1, columns), (2, rows)))
+    column, row, dx, dy = (splat(builder, _INTS, value) for value in origin_and_steps)
+    x = builder.sub(builder.add(column, builder.mul(right, dx)), builder.mul(down, dy))
+    y = builder.add(builder.add(row, builder.mul(right, dy)), builder.mul(down, dx))
+    return x, y
+
+
+@instruction
+def store_offsets(
+    typing_context: Code, offsets: Code, columns: Code, rows: Code, at: Code, column: Code, row: Code, step_x: Code,
+    step_y: Code, stride: Code,
+) -> Definition:  # fmt: skip
+    """Write where in a flat image the pixels lie that are up and left of sixteen places, int32; see `sample`.
+
+    `stride` is the number of pixels a row of the image, int32.
+    """
+
+    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
+        offsets, *grid, stride = arguments
+        x, y = (builder.ashr(c, constant(_INTS, 16)) for c in _grid_places(context, builder, kind.args, grid))
+        offset = builder.add(builder.mul(y, splat(builder, _INTS, stride)), x)
+        builder.store(offset, pointer_to(context, builder, kind.args[0], offsets, grid[2], _INTS), align=4)
+        return context.get_dummy_value()
+
+    return types.void(offsets, columns, rows, types.int64, *([types.int32] * 5)), generate
+
+
+@instruction
+def square(typing_context: Code, image: Code, at: Code, stride: Code) -> Definition:
+    """The four pixels right of and below an index of a flat uint8 image, as the bytes of an int32; see `sample`."""
+
+    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
+        image, at, stride = arguments
+        above, below = (
+            builder.zext(load_vector(context, builder, kind.args[0], image, index, _UINT16, 1), _INT32)
+            for index in (at, builder.add(at, stride))
+        )
+        return builder.or_(above, builder.shl(below, ir.Constant(_INT32, 16)))
+
+    return types.int32(image, types.int64, types.int64), generate
+
+
 @instruction
 def sample(
-    typing_context: Code, image: Code, stride: Code, columns: Code, rows: Code, at: Code, column: Code, row: Code,
-    step_x: Code, step_y: Code,
+    typing_context: Code, squares: Code, columns: Code, rows: Code, at: Code, column: Code, row: Code, step_x: Code,
+    step_y: Code,
 ) -> Definition:  # fmt: skip
-    """Bilinear samples of a flat uint8 image at sixteen places of a rotated and scaled grid.
+    """Bilinear samples of an image at sixteen places of a rotated and scaled grid.
 
     Args:
         typing_context: Numba's.
-        image: Flat uint8 array.
-        stride: Bytes a row of the image, int32.
+        squares: Flat int32 array, `square` of the image for each place of the grid.
         columns: Flat int32 array, the places' column on the grid ...
         rows: ... and row.
-        at: Index of the first of the sixteen in `columns` and `rows`.
+        at: Index of the first of the sixteen in these.
         column: Image column of the grid's origin, in 65536ths of a pixel, int32.
         row: Image row of the grid's origin, likewise.
         step_x: Image columns a grid column (and rows a grid row), likewise.
@@ -217,41 +267,22 @@ def sample(
     """
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        pixels, stride, columns, rows, at, column, row, step_x, step_y = arguments
-        grid = [
-            load_vector(context, builder, kind.args[k], array, at, _INTS, 4) for k, array in ((2, columns), (3, rows))
+        squares, *grid = arguments
+        right, down = (
+            builder.fmul(builder.sitofp(builder.and_(c, constant(_INTS, 65535)), _FLOATS), constant(_FLOATS, 1 / 65536))
+            for c in _grid_places(context, builder, kind.args, grid)
+        )
+        pixels = load_vector(context, builder, kind.args[0], squares, grid[2], _INTS, 4)
+        corners = [
+            builder.sitofp(builder.and_(builder.lshr(pixels, constant(_INTS, 8 * k)), constant(_INTS, 255)), _FLOATS)
+            for k in range(4)
         ]
-        dx, dy = (splat(builder, _INTS, step) for step in (step_x, step_y))
-        x = builder.add(splat(builder, _INTS, column), builder.mul(grid[0], dx))
-        x = builder.sub(x, builder.mul(grid[1], dy))
-        y = builder.add(splat(builder, _INTS, row), builder.mul(grid[0], dy))
-        y = builder.add(y, builder.mul(grid[1], dx))
-        sixteen, low = constant(_INTS, 16), constant(_INTS, 65535)
-        whole = [builder.ashr(value, sixteen) for value in (x, y)]
-        share = [
-            builder.fmul(builder.sitofp(builder.and_(value, low), _FLOATS), constant(_FLOATS, 1 / 65536))
-            for value in (x, y)
-        ]
-        offset = builder.add(builder.mul(whole[1], splat(builder, _INTS, stride)), whole[0])
-        data = context.make_array(kind.args[0])(context, builder, pixels).data
-        pairs = [ir.Constant(_PAIRS, ir.Undefined)] * 2  # two adjacent pixels in each lane, of the upper and lower row
-        for lane in range(FLOAT_LANES):
-            index = ir.Constant(_INT32, lane)
-            first = builder.gep(data, [builder.sext(builder.extract_element(offset, index), _INT64)])
-            second = builder.gep(first, [builder.sext(stride, _INT64)])
-            for line, place in enumerate((first, second)):
-                pair = builder.load(builder.bitcast(place, _UINT16.as_pointer()))
-                pair.align = 1
-                pairs[line] = builder.insert_element(pairs[line], pair, index)
-        lines = []
-        for pair in pairs:
-            both = builder.zext(pair, _INTS)
-            left = builder.sitofp(builder.and_(both, constant(_INTS, 255)), _FLOATS)
-            right = builder.sitofp(builder.lshr(both, constant(_INTS, 8)), _FLOATS)
-            lines.append(builder.fadd(left, builder.fmul(share[0], builder.fsub(right, left))))
-        return builder.fadd(lines[0], builder.fmul(share[1], builder.fsub(lines[1], lines[0])))
+        above, below = (
+            builder.fadd(corners[k], builder.fmul(right, builder.fsub(corners[k + 1], corners[k]))) for k in (0, 2)
+        )
+        return builder.fadd(above, builder.fmul(down, builder.fsub(below, above)))
 
-    return FLOAT32X16(image, types.int32, columns, rows, types.int64, *([types.int32] * 4)), generate
+    return FLOAT32X16(squares, columns, rows, types.int64, *([types.int32] * 4)), generate
 
 
 def _average(builder: Code, first: Code, second: Code) -> Code:
@@ -405,8 +436,7 @@ def descriptor_sum(
             distances = _histogram_distances(builder, theirs, own, count)
             limit = splat(builder, lanes, truncation)
             kept = builder.select(builder.icmp_unsigned("<", distances, limit), distances, limit)
-            for k in range(count):
-                total = builder.add(total, builder.extract_element(kept, ir.Constant(_INT32, k)))
+            total = builder.add(total, _sum_of_lanes(builder, kept, builder.add))
         return total
 
     return signature, generate
@@ -492,3 +522,29 @@ def store_maxima(typing_context: Code, maxima: Code, scores: Code, at: Code, wid
         return context.get_dummy_value()
 
     return types.void(maxima, scores, types.int64, types.int64, types.int64), generate
+
+
+@instruction
+def patch_sum(typing_context: Code, image: Code, at: Code, width: Code, weights: Code) -> Definition:
+    """Weighted sum of a patch of `PATCH_ROWS` rows and `UINT16_LANES` columns, exact in 32 bits.
+
+    Args:
+        typing_context: Numba's.
+        image: Flat uint8 array.
+        at: Index of the patch's first pixel.
+        width: Pixels a row of the image.
+        weights: Flat int16 array, one of each pixel of the patch, row by row.
+    """
+
+    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
+        image, at, width, weights = arguments
+        total = constant(_INTS32, 0)
+        for row in range(PATCH_ROWS):
+            pixels = load_vector(context, builder, kind.args[0], image, at, _BYTES32, 1)
+            first = ir.Constant(_INT64, UINT16_LANES * row)
+            factors = load_vector(context, builder, kind.args[3], weights, first, _HALVES, 2)
+            total = builder.add(total, builder.mul(builder.zext(pixels, _INTS32), builder.sext(factors, _INTS32)))
+            at = builder.add(at, width)
+        return _sum_of_lanes(builder, total, builder.add)
+
+    return types.int32(image, types.int64, types.int64, weights), generate

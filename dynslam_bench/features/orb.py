@@ -18,12 +18,16 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts import Keypoints
 from dynslam_bench.core import SettingsError
 from dynslam_bench.core.compiled import kernel
-from dynslam_bench.core.simd import BYTE_LANES, store_corner_scores, store_maxima
+from dynslam_bench.core.simd import BYTE_LANES, PATCH_ROWS, UINT16_LANES, patch_sum, store_corner_scores, store_maxima
+from dynslam_bench.features.brief import rotated_brief, smooth
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry import inside
 
 PATCH_RADIUS = 15
 """Radius of the disc whose intensity centroid gives the orientation, pixels of the level."""
+_ROW, _COLUMN = np.mgrid[:PATCH_ROWS, :UINT16_LANES].astype(np.int16) - PATCH_RADIUS
+_IN_DISC = _ROW * _ROW + _COLUMN * _COLUMN <= PATCH_RADIUS * PATCH_RADIUS
+_DISC = ((_COLUMN * _IN_DISC).reshape(-1), (_ROW * _IN_DISC).reshape(-1))
 EDGE = 19
 """Corners nearer to a level's border than this are not used: the rotated descriptor pattern would leave the image."""
 
@@ -72,23 +76,11 @@ class OrbExtractor:
                 f"fast_threshold_min is {s.fast_threshold_min}, above fast_threshold {s.fast_threshold}",
                 "lower fast_threshold_min",
             )
-        self.__setstate__(s)
+        self.settings = s
 
     def configure(self, settings: FeatureSettings) -> None:
         """Use other FAST thresholds and numbers; with a second threshold above the first, the second alone applies."""
         self.settings = settings
-
-    def __getstate__(self) -> FeatureSettings:
-        """The settings alone: OpenCV's describer cannot be copied or pickled, and stores nothing of an image."""
-        return self.settings
-
-    def __setstate__(self, s: FeatureSettings) -> None:
-        self.settings = s
-        self._describer = cv2.ORB.create(
-            nfeatures=s.n_features, scaleFactor=s.scale_factor, nlevels=s.levels, edgeThreshold=EDGE,
-            firstLevel=0, WTA_K=2, patchSize=2 * PATCH_RADIUS + 1, fastThreshold=s.fast_threshold_min,
-        )  # fmt: skip
-        self._half_widths = patch_half_widths(PATCH_RADIUS)
 
     def extract(self, gray: NDArray[np.uint8]) -> Keypoints:
         """The keypoints of a uint8 ``[H, W]`` image, ordered by level; none is an empty result."""
@@ -147,26 +139,18 @@ class OrbExtractor:
     def _describe(
         self, gray: NDArray[np.uint8], levels: Sequence[_Level], chosen: Sequence[NDArray[np.int64]]
     ) -> Keypoints:
-        if not any(len(index) for index in chosen):
-            none = np.zeros(0, np.float32)
-            return Keypoints(none.reshape(0, 2), none.astype(np.int32), none, none, np.zeros((0, 32), np.uint8))
-        pairs = list(zip(levels, chosen, strict=True))
-        scales = np.array([level.scale for level in levels])
         octave = np.repeat(np.arange(len(levels), dtype=np.int32), [len(index) for index in chosen])
-        level_xy = [level.xy[index] for level, index in pairs]
-        xy = np.asarray(np.concatenate(level_xy).astype(np.float64) * scales[octave][:, None], dtype=np.float32)
-        response = np.concatenate([level.response[index] for level, index in pairs]).astype(np.float32)
-        angle = np.concatenate(
-            [orientations(level.image, at, self._half_widths) for level, at in zip(levels, level_xy, strict=True)]
-        )
-        size = (2 * PATCH_RADIUS + 1) * scales[octave]
-        columns = (*xy.T, size, angle, response, octave, np.arange(len(xy)))
-        points = [cv2.KeyPoint(*row) for row in zip(*(column.tolist() for column in columns), strict=True)]
-        kept, descriptors = self._describer.compute(np.ascontiguousarray(gray), points)
-        if descriptors is None or not len(kept):
-            return self._describe(gray, [], [])
-        index = np.array([point.class_id for point in kept], dtype=np.int64)
-        return Keypoints(xy[index], octave[index], angle[index], response[index], np.ascontiguousarray(descriptors))
+        xy, descriptors = np.empty((len(octave), 2)), np.empty((len(octave), 32), np.uint8)
+        angle, response = np.empty((2, len(octave)), np.float32)
+        image, end = gray, 0
+        for level, index in zip(levels, chosen, strict=True):
+            at, rows = level.xy[index], slice(end, end := end + len(index))
+            xy[rows], response[rows] = np.multiply(at, level.scale, dtype=np.float64), level.response[index]
+            angle[rows] = orientations(level.image, at, *_DISC)
+            if level.scale > 1:  # OpenCV's ORB describes levels that are resized more exactly than those of the corners
+                image = np.asarray(cv2.resize(image, level.image.shape[::-1], interpolation=cv2.INTER_LINEAR_EXACT))
+            descriptors[rows] = rotated_brief(smooth(image), at, angle[rows])
+        return Keypoints(xy.astype(np.float32), octave, angle, response, descriptors)
 
 
 def level_quotas(n_features: int, levels: int, scale_factor: float) -> list[int]:
@@ -177,6 +161,7 @@ def level_quotas(n_features: int, levels: int, scale_factor: float) -> list[int]
     return list(map(int, quotas))
 
 
+@kernel
 def spread(
     cells: NDArray[np.int64], response: NDArray[np.int16], allowed: NDArray[np.bool_], quota: int
 ) -> NDArray[np.int64]:
@@ -192,22 +177,28 @@ def spread(
         Indices of the chosen points, at most `quota`, in order of rank within the cell, then of strength.
     """
     index = np.flatnonzero(allowed)
-    index = index[np.argsort(-response[index], kind="stable")]
-    by_cell = np.argsort(cells[index], kind="stable")
-    sorted_cells = cells[index][by_cell]
-    first = np.searchsorted(sorted_cells, sorted_cells, side="left")
-    rank = np.empty(len(index), np.int16)
-    rank[by_cell] = np.arange(len(index)) - first
-    return np.asarray(index[np.argsort(rank, kind="stable")[: max(quota, 0)]], dtype=np.int64)
+    if len(index) == 0:
+        return index
+    index = index[_stable_order(-response[index])]
+    taken, rank = np.zeros(cells.max() + 1, np.int64), np.empty(len(index), np.int64)
+    for i, cell in enumerate(cells[index]):
+        rank[i] = taken[cell]
+        taken[cell] += 1
+    return index[_stable_order(rank)][: max(quota, 0)]
 
 
-def patch_half_widths(radius: int) -> NDArray[np.int64]:
-    """Half widths of the rows of a disc: row ``dy`` spans ``-w[|dy|] .. w[|dy|]``, int64 ``[radius + 1]``.
-
-    The disc holds the pixels with ``dx^2 + dy^2 <= radius^2``, so that it is the same after a quarter turn.
-    """
-    rows = np.arange(radius + 1)
-    return np.asarray(np.floor(np.sqrt(radius * radius - rows * rows)), dtype=np.int64)
+@kernel
+def _stable_order(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Indices that sort integers of a small range; equal ones keep their order."""
+    lowest = keys.min()
+    start, order = np.zeros(keys.max() - lowest + 2, np.int64), np.empty(len(keys), np.int64)
+    for key in keys:
+        start[key - lowest + 1] += 1
+    start = np.cumsum(start)
+    for i, key in enumerate(keys):
+        order[start[key - lowest]] = i
+        start[key - lowest] += 1
+    return order
 
 
 @kernel
@@ -244,30 +235,21 @@ def fast_corners(image: NDArray[np.uint8], threshold: int) -> tuple[NDArray[np.i
 
 @kernel
 def orientations(
-    image: NDArray[np.uint8], xy: NDArray[np.float32], half_widths: NDArray[np.int64]
+    image: NDArray[np.uint8], xy: NDArray[np.float32], columns: NDArray[np.int16], rows: NDArray[np.int16]
 ) -> NDArray[np.float32]:
-    """Orientations of patches by their intensity centroid (Rublee et al., 2011, Section 3.2), degrees in [0, 360).
+    """Orientations of discs by their intensity centroid (Rublee et al., 2011, Section 3.2), degrees in [0, 360).
 
     Args:
         image: uint8 ``[H, W]``.
-        xy: Integer-valued pixels, float32 ``[N, 2]``, at least the disc's radius away from the border.
-        half_widths: Of `patch_half_widths`.
+        xy: Integer-valued pixels, float32 ``[N, 2]``, more than the disc's radius away from the border.
+        columns: Column of each pixel of the disc from its centre, flat int16, as `patch_sum` reads it; 0 outside ...
+        rows: ... and its row.
     """
     out = np.zeros(len(xy), np.float32)
-    radius = len(half_widths) - 1
-    steps = np.arange(-radius, radius + 1).astype(np.int32)
+    pixels, width = image.reshape(-1), image.shape[1]
     for i in range(len(xy)):
-        x0, y0 = int(xy[i, 0]), int(xy[i, 1])
-        m10, m01 = np.int32(0), np.int32(0)
-        for dy in range(-radius, radius + 1):
-            w = half_widths[abs(dy)]
-            pixels, dx = image[y0 + dy, x0 - w : x0 + w + 1], steps[radius - w : radius + w + 1]
-            row = np.int32(0)
-            for k in range(len(pixels)):
-                value = np.int32(pixels[k])
-                m10 += dx[k] * value
-                row += value
-            m01 += np.int32(dy) * row
+        first = (int(xy[i, 1]) - PATCH_RADIUS) * width + int(xy[i, 0]) - PATCH_RADIUS
+        m10, m01 = patch_sum(pixels, first, width, columns), patch_sum(pixels, first, width, rows)
         out[i] = math.degrees(math.atan2(float(m01), float(m10))) % 360.0
         if out[i] >= 360.0:  # rounded up by float32
             out[i] = 0.0

@@ -234,12 +234,13 @@ def label_cost(
         return np.int64(OUTSIDE)
     si, ti = quantised(s, theta)
     supports = len(tables.support)
-    total = np.int64(0)
+    total, c, n = np.int64(0), np.float32(0), np.float32(0)
+    if supports > 1:
+        scale = np.float32(np.exp2(s))
+        c, n = np.cos(theta) * scale, np.sin(theta) * scale
     for q in range(supports):
         tx, ty = cx, cy
         if q > 0:
-            scale = np.float32(np.exp2(s))
-            c, n = np.cos(theta) * scale, np.sin(theta) * scale
             dx, dy = np.float32(tables.support[q, 0]), np.float32(tables.support[q, 1])
             tx = min(max(cx + c * dx - n * dy, np.float32(0)), np.float32(width - 1))
             ty = min(max(cy + n * dx + c * dy, np.float32(0)), np.float32(height - 1))

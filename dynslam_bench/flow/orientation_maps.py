@@ -220,7 +220,7 @@ def quarter_line(rows: Halves, upper: int, lower: int, columns: int, target: Hal
         store_uint16(target, i, average_of_pairs(left, right))
 
 
-@inlined
+@kernel
 def level_reach(blurs: Longs) -> Longs:
     """Rows beyond a stripe that each level must compute for the levels after it, int64 ``[L + 1]``."""
     reach = np.zeros(len(blurs) + 1, dtype=np.int64)

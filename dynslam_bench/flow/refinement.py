@@ -11,7 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
-from dynslam_bench.core.simd import Bytes, Floats, Ints, load, load_bytes, sample, spread, store, total
+from dynslam_bench.core.simd import (
+    Bytes, Floats, Ints, load, load_bytes, sample, spread, square, store, store_offsets, total,
+)  # fmt: skip
 from dynslam_bench.geometry.gauss_newton import cholesky_solve
 
 BORDER = 48
@@ -65,15 +67,20 @@ def read_frame(image: Bytes, x: Scalar, y: Scalar, rows: int, pitch: int, out: F
 
 @inlined
 def warp_patch(
-    image: Bytes, x: Scalar, y: Scalar, a: Scalar, b: Scalar, reach: int, columns: Ints, rows: Ints, out: Floats
-) -> None:
+    image: Bytes, x: Scalar, y: Scalar, a: Scalar, b: Scalar, reach: int, columns: Ints, rows: Ints, scratch: Ints,
+    out: Floats,
+) -> None:  # fmt: skip
     """Samples of a square patch of radius `reach` under the similarity ``[[a, -b], [b, a]]`` around (x, y)."""
     one, far = np.float32(65536), np.float32(reach)
     column, row = np.int32((x - a * far + b * far) * one), np.int32((y - b * far - a * far) * one)
     step_x, step_y = np.int32(a * one), np.int32(b * one)
-    flat, stride = image.reshape(-1), np.int32(image.shape[1])
+    flat, stride = image.reshape(-1), np.int64(image.shape[1])
     for k in range(0, len(columns), 16):
-        store(out, k, sample(flat, stride, columns, rows, k, column, row, step_x, step_y))
+        store_offsets(scratch, columns, rows, k, column, row, step_x, step_y, np.int32(stride))
+    for k in range(len(columns)):
+        scratch[k] = square(flat, np.int64(scratch[k]), stride)
+    for k in range(0, len(columns), 16):
+        store(out, k, sample(scratch, columns, rows, k, column, row, step_x, step_y))
 
 
 @kernel
@@ -108,6 +115,7 @@ def similarity_lucas_kanade(
     slack = 2 * pitch + 32
     patch = np.zeros(16 * ((pitch * pitch + 15) // 16) + slack, dtype=np.float32)
     grid_columns, grid_rows = np.zeros(len(patch) - slack, dtype=np.int32), np.zeros(len(patch) - slack, dtype=np.int32)
+    scratch = np.empty(len(patch) - slack, dtype=np.int32)
     for k in range(pitch * pitch):
         grid_columns[k], grid_rows[k] = k % pitch, k // pitch
     frame = np.zeros((side + 2) * pitch + slack, dtype=np.float32)
@@ -169,7 +177,7 @@ def similarity_lucas_kanade(
             least, most_x, most_y = max(span, np.float32(border)), columns - border - 1, rows - border - 1
             if not (least <= tx <= most_x and least <= ty <= most_y and tx < columns - span and ty < rows - span):
                 break
-            warp_patch(target_image, tx, ty, a, b, reach, grid_columns, grid_rows, patch)
+            warp_patch(target_image, tx, ty, a, b, reach, grid_columns, grid_rows, scratch, patch)
             ox = oy = np.float32(0)
             mean = 0.0
             at, w00, w01, w10, w11 = np.int64(0), zero, zero, zero, zero
