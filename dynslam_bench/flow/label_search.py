@@ -177,13 +177,14 @@ def uniform(bits: Scalar, quarter: int) -> Scalar:
 
 
 @inlined
-def insert(flames: Floats, costs: Longs, label: Floats, cost: Scalar) -> None:
+def insert(flames: Floats, costs: Longs, trials: Floats, trial: int, cost: Scalar) -> None:
     """Merge an evaluated label into a point's sorted flames if it is better than the worst (``F = best N``).
 
     Args:
         flames: float32 ``[P, 4]``, changed in place.
         costs: int64 ``[P]``, likewise.
-        label: float32 ``[4]``.
+        trials: float32 ``[T, 4]``, evaluated labels.
+        trial: Which of them.
         cost: Its cost.
     """
     k = len(costs) - 1
@@ -196,7 +197,7 @@ def insert(flames: Floats, costs: Longs, label: Floats, cost: Scalar) -> None:
         k -= 1
     costs[k] = cost
     for j in range(4):
-        flames[k, j] = label[j]
+        flames[k, j] = trials[trial, j]
 
 
 @inlined
@@ -262,8 +263,9 @@ def run_phase(
                 break
             elif moth_flame:
                 iteration = min(max((used - initial) // population, 0), iterations - 1)
-                random = move_moths(moths, flames, lower, upper, iteration, table, spiral, cauchy, steps, random)
-                trials[:population] = moths
+                random = move_moths(
+                    moths, flames, lower, upper, iteration, table, spiral, cauchy, steps, trials, random
+                )
             elif shrink == 0:
                 break
             else:
@@ -273,11 +275,9 @@ def run_phase(
                 if window * (upper[0] - lower[0]) < np.float32(1):
                     window = np.float32(0.5)
             for k in range(min(count, end - used)):
-                label = trials[k]
-                cost = label_cost(
-                    i, label[0], label[1], label[2], label[3], reference, target, tables, costs[population - 1]
-                )
-                insert(flames, costs, label, cost)
+                u, v, s, theta = trials[k, 0], trials[k, 1], trials[k, 2], trials[k, 3]
+                cost = label_cost(i, u, v, s, theta, reference, target, tables, costs[population - 1])
+                insert(flames, costs, trials, k, cost)
                 used += 1
             if stage == CANDIDATES:
                 widen(lower, upper, flames)
@@ -341,9 +341,13 @@ def oppose(
 @inlined
 def move_moths(
     moths: Floats, flames: Floats, lower: Floats, upper: Floats, iteration: int, table: FlightTable, spiral: Floats,
-    cauchy: Floats, steps: Floats, random: Scalar,
+    cauchy: Floats, steps: Floats, trials: Floats, random: Scalar,
 ) -> Scalar:  # fmt: skip
-    """Move every moth once (Eq. 8, 10, 12, 13, 17), as `moth_flame.moth_positions`; returns the next random state."""
+    """Move every moth once (Eq. 8, 10, 12, 13, 17), as `moth_flame.moth_positions`, and try where it is.
+
+    Returns:
+        The next random state.
+    """
     population = len(moths)
     now = table.coefficients[iteration]
     span, own, best, stepping, pulling = now[0], now[1], now[2], now[3] > 0, now[2] > 0
@@ -365,7 +369,7 @@ def move_moths(
             position = distance * turn + goal
             if stepping:  # Eq. 13
                 position += cauchy[np.int64((jumps >> np.uint64(16 * j)) & np.uint64(4095))] * steps[j]
-            moths[m, j] = min(max(position, lower[j]), upper[j])
+            moths[m, j] = trials[m, j] = min(max(position, lower[j]), upper[j])
     return random
 
 
