@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -102,6 +103,12 @@ class FilterState:
     keyframes: tuple[KeyframeView, ...] = ()
     map_points: tuple[NDArray[np.int64], NDArray[np.float64]] | None = None
     seed: int = 0
+
+    @cached_property
+    def flow_xy(self) -> NDArray[np.float64]:
+        """Undistorted pixels ``[N, 2]`` in the previous image to which the flow leads; asked when the flow has run."""
+        assert self.flow is not None
+        return self.camera.undistort_points(self.flow.xy)
 
 
 @dataclass(frozen=True, eq=False)

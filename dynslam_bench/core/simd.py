@@ -201,8 +201,8 @@ def total(typing_context: Code, vector: Code) -> Definition:
 
 def _grid_places(context: Code, builder: Code, kinds: Code, grid: Code) -> tuple[Code, Code]:
     """Code for columns and rows, in 65536ths of a pixel, of sixteen places of a rotated and scaled grid (`sample`)."""
-    columns, rows, at, *origin_and_steps = grid
-    right, down = (load_vector(context, builder, kinds[k], array, at, _INTS, 4) for k, array in ((1, columns), (2, rows)))
+    at, origin_and_steps = grid[2], grid[3:]
+    right, down = (load_vector(context, builder, kinds[k], grid[k - 1], at, _INTS, 4) for k in (1, 2))
     column, row, dx, dy = (splat(builder, _INTS, value) for value in origin_and_steps)
     x = builder.sub(builder.add(column, builder.mul(right, dx)), builder.mul(down, dy))
     y = builder.add(builder.add(row, builder.mul(right, dy)), builder.mul(down, dx))

@@ -135,7 +135,7 @@ def refine_prediction(frame: FrameBundle, state: FilterState) -> NDArray[np.floa
         return state.T_world_pred
     start, prior, share = np.eye(4), NO_PRIOR, static_share(frame, state, flow.xy[use])
     points = state.camera.unproject(frame.xy[use], frame.z[use])
-    before = state.camera.undistort_points(flow.xy[use])
+    before = state.flow_xy[use]
     if state.T_world_pred is not None:
         start = se3.inverse(state.T_world_prev) @ state.T_world_pred
         prior = prior_information(state, start)
@@ -308,7 +308,7 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
         """Which of K tested points fail now, residuals ``[K, 2]`` and what is added to a threshold ``[K]``, pixels."""
         assert state.flow is not None and state.previous is not None
         moved, expected = rigid_flow(frame, state, tested)
-        residual = expected - state.camera.undistort_points(state.flow.xy[tested])
+        residual = expected - state.flow_xy[tested]
         distance = np.linalg.norm(residual, axis=1)
         allowed = THRESHOLD_SHARE * np.linalg.norm(expected - frame.xy[tested], axis=1)
         measured = nearest_depth(state.previous.depth, state.flow.xy[tested], moved[:, 2])

@@ -125,7 +125,7 @@ def matches_by_flow(frame: FrameBundle, state: FilterState, unmatched: Unmatched
     tested = flow.valid
     if unmatched is not None:
         tested = state.keep & (np.isfinite(flow.xy).all(axis=1) if unmatched == "judge" else flow.valid)
-    return Matches(state.camera.undistort_points(flow.xy), frame.xy, flow.valid, tested)
+    return Matches(state.flow_xy, frame.xy, flow.valid, tested)
 
 
 class EpipolarFilter(Rule[EpipolarSettings]):
@@ -196,8 +196,12 @@ def rotation_residual(first: Points, second: Points, camera: Camera) -> float:
 
 
 def homography_share(first: Points, second: Points) -> float:
-    """Share of the matches ``[N, 2]`` within 1 px of one homography: 1 for a plane or a pure rotation."""
-    matrix, mask = cv2.findHomography(first, second, cv2.RANSAC, 1.0, maxIters=300, confidence=0.99)
+    """Share of the matches ``[N, 2]`` within 1 px of one homography: 1 for a plane or a pure rotation.
+
+    Of a homography with the share 0.8 that matters, one of 50 draws of four matches is free of outliers but for once in
+    10^11.
+    """
+    matrix, mask = cv2.findHomography(first, second, cv2.RANSAC, 1.0, maxIters=50, confidence=0.99)
     return 0.0 if matrix is None else float(np.mean(mask))
 
 

@@ -115,11 +115,25 @@ class CellGrid:
     def of(cls, xy: NDArray[np.float64], width: int, height: int, cell: float = 20.0) -> CellGrid:
         """Sort the points ``[N, 2]`` into cells; points outside the image go to the nearest border cell."""
         columns, rows = max(1, int(np.ceil(width / cell))), max(1, int(np.ceil(height / cell)))
-        column = np.clip(xy[:, 0] // cell, 0, columns - 1).astype(np.int64)
-        row = np.clip(xy[:, 1] // cell, 0, rows - 1).astype(np.int64)
-        index = row * columns + column
-        start = np.concatenate([[0], np.cumsum(np.bincount(index, minlength=rows * columns))]).astype(np.int64)
-        return cls(cell, columns, rows, start, np.argsort(index, kind="stable").astype(np.int64))
+        return cls(cell, columns, rows, *_sorted_into_cells(xy, cell, columns, rows))
+
+
+@kernel
+def _sorted_into_cells(
+    xy: NDArray[np.float64], cell: float, columns: int, rows: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """`CellGrid.start` and `CellGrid.order`."""
+    cells, start = np.empty(len(xy), np.int64), np.zeros(rows * columns + 1, np.int64)
+    for i in range(len(xy)):
+        column, row = min(max(xy[i, 0] // cell, 0), columns - 1), min(max(xy[i, 1] // cell, 0), rows - 1)
+        cells[i] = int(row) * columns + int(column)
+        start[cells[i] + 1] += 1
+    start = np.cumsum(start)
+    order, place = np.empty(len(xy), np.int64), start.copy()
+    for i in range(len(xy)):
+        order[place[cells[i]]] = i
+        place[cells[i]] += 1
+    return start, order
 
 
 class Features(NamedTuple):

@@ -12,8 +12,18 @@ import numpy as np
 
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
 from dynslam_bench.core.simd import (
-    Bytes, Floats, Ints, load, load_bytes, sample, spread, square, store, store_offsets, total,
-)  # fmt: skip
+    Bytes,
+    Floats,
+    Ints,
+    load,
+    load_bytes,
+    sample,
+    spread,
+    square,
+    store,
+    store_offsets,
+    total,
+)
 from dynslam_bench.geometry.gauss_newton import cholesky_solve
 
 BORDER = 48

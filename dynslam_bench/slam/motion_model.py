@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.features.matching import CellGrid
@@ -301,17 +300,36 @@ def compensate_rolling_shutter(observations: Observations, camera: Camera, veloc
     Returns:
         New observations; a feature that such a motion would put behind the camera stays where it is.
     """
-    row = observations.keypoints.xy[:, 1:].astype(np.float64)
-    late = ((row + 0.5) / camera.height - 0.5) * camera.readout_s
-    has_depth = observations.z > 0
-    points = camera.unproject(observations.xy, np.where(has_depth, observations.z, 1.0))
-    points = points - np.where(has_depth[:, None], late, 0.0) * velocity.linear
-    points = Rotation.from_rotvec(-late * velocity.angular).apply(points)
-    ahead = points[:, 2] > 0
-    xy = np.where(ahead[:, None], camera.project(points), observations.xy)
-    z = np.where(ahead & has_depth, points[:, 2], observations.z)
+    lens = camera.fx, camera.fy, camera.cx, camera.cy
+    late = ((observations.keypoints.xy[:, 1] + 0.5) / camera.height - 0.5) * camera.readout_s
+    xy, z = _compensated(observations.xy, observations.z, late, velocity.linear, velocity.angular, *lens)
     grid = CellGrid.of(xy, camera.width, camera.height)
     return replace(observations, xy=xy, z=z, right=right_coordinates(xy, z, camera), grid=grid)
+
+
+@kernel
+def _compensated(
+    xy: Array, z: Array, late: Array, linear: Array, angular: Array, fx: float, fy: float, cx: float, cy: float
+) -> tuple[Array, Array]:
+    """Pixels and depths of features that were exposed so many seconds after the middle row, as of that row's time."""
+    xy, z, speed = xy.copy(), z.copy(), np.sqrt((angular**2).sum())
+    ax, ay, az = angular / max(speed, 1e-12)
+    for i in range(len(xy)):
+        has_depth = z[i] > 0
+        depth, travelled = z[i] if has_depth else 1.0, late[i] if has_depth else 0.0
+        x = (xy[i, 0] - cx) / fx * depth - travelled * linear[0]
+        y = (xy[i, 1] - cy) / fy * depth - travelled * linear[1]
+        depth -= travelled * linear[2]
+        # Rodrigues' rotation by -late * angular
+        cosine, sine = np.cos(late[i] * speed), -np.sin(late[i] * speed)
+        along = (1 - cosine) * (ax * x + ay * y + az * depth)
+        ahead = cosine * depth + sine * (ax * y - ay * x) + along * az
+        if ahead > 0:
+            xy[i, 0] = (cosine * x + sine * (ay * depth - az * y) + along * ax) / ahead * fx + cx
+            xy[i, 1] = (cosine * y + sine * (az * x - ax * depth) + along * ay) / ahead * fy + cy
+            if has_depth:
+                z[i] = ahead
+    return xy, z
 
 
 class RollingShutter:
