@@ -374,7 +374,9 @@ class WatchedRuns:
 def event_text(event: runs.RunEvent) -> str:
     """Tracker, sequence and progress of a run, for a progress bar: the frame, then what is written behind the last."""
     text = f"{label_text(event.spec.tracker)} on {label_text(event.spec.sequence)}"
-    if event.kind != "progress" or event.partial is None:
+    if event.kind == "started":
+        return f"{text}, starting (the first run of a system compiles its code for up to a minute)"
+    if event.partial is None:
         return text
     done, frames = event.partial["frames_done"], event.partial["frames"]
     if done < frames:

@@ -24,9 +24,6 @@ _LETTERS = (
 PATTERN = (np.frombuffer(_LETTERS.encode(), np.uint8).astype(np.float32) - ord("N")).reshape(256, 2, 2)
 """The 256 pairs of places that are compared (learned by Rublee et al.), (column, row) from the keypoint each."""
 
-REACH = 19
-"""Places of the rotated pattern lie at most this far from the keypoint in either axis, pixels."""
-
 _GAUSSIAN = cv2.getGaussianKernel(7, 2.0, cv2.CV_32F)
 _ROWS = PATTERN.transpose(2, 1, 0).reshape(2, 512).copy()
 _ONE_BIT_A_BYTE = np.uint64(0x0102040810204080)
@@ -45,7 +42,7 @@ def rotated_brief(
 
     Args:
         smoothed: uint8 ``[H, W]``.
-        xy: Integer-valued pixels, float32 ``[N, 2]``, at least `REACH` away from the border.
+        xy: Integer-valued pixels, float32 ``[N, 2]``, at least 19 away from the border.
         angle: Orientations in degrees, float32 ``[N]``.
     """
     return _rotated_brief(smoothed, xy, angle, *_ROWS)

@@ -85,7 +85,7 @@ class OrbExtractor:
     def extract(self, gray: NDArray[np.uint8]) -> Keypoints:
         """The keypoints of a uint8 ``[H, W]`` image, ordered by level; none is an empty result."""
         levels = self._levels(gray)
-        return self._describe(gray, levels, self._choose(levels, [np.ones(len(level.xy), bool) for level in levels]))
+        return self._describe(levels, self._choose(levels, [np.ones(len(level.xy), bool) for level in levels]))
 
     def extract_masked(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float) -> Keypoints:
         """As `extract`; with less than a share of `n_features` outside the mask, all of them are extracted there."""
@@ -96,7 +96,7 @@ class OrbExtractor:
         if count < share * self.settings.n_features:
             triples = zip(outside, chosen, self._choose(levels, outside), strict=True)
             chosen = [np.concatenate([index[~out[index]], more]) for out, index, more in triples]
-        return self._describe(gray, levels, chosen)
+        return self._describe(levels, chosen)
 
     def _levels(self, gray: NDArray[np.uint8]) -> list[_Level]:
         """All corners of every level of the pyramid."""
@@ -136,20 +136,16 @@ class OrbExtractor:
         cells = (row - origin) // cell * columns + (column - origin) // cell
         return _Level(image, scale, np.stack([column, row], axis=1).astype(np.float32), response, cells)
 
-    def _describe(
-        self, gray: NDArray[np.uint8], levels: Sequence[_Level], chosen: Sequence[NDArray[np.int64]]
-    ) -> Keypoints:
+    def _describe(self, levels: Sequence[_Level], chosen: Sequence[NDArray[np.int64]]) -> Keypoints:
         octave = np.repeat(np.arange(len(levels), dtype=np.int32), [len(index) for index in chosen])
         xy, descriptors = np.empty((len(octave), 2)), np.empty((len(octave), 32), np.uint8)
         angle, response = np.empty((2, len(octave)), np.float32)
-        image, end = gray, 0
+        end = 0
         for level, index in zip(levels, chosen, strict=True):
             at, rows = level.xy[index], slice(end, end := end + len(index))
             xy[rows], response[rows] = np.multiply(at, level.scale, dtype=np.float64), level.response[index]
             angle[rows] = orientations(level.image, at, *_DISC)
-            if level.scale > 1:  # OpenCV's ORB describes levels that are resized more exactly than those of the corners
-                image = np.asarray(cv2.resize(image, level.image.shape[::-1], interpolation=cv2.INTER_LINEAR_EXACT))
-            descriptors[rows] = rotated_brief(smooth(image), at, angle[rows])
+            descriptors[rows] = rotated_brief(smooth(level.image), at, angle[rows])
         return Keypoints(xy.astype(np.float32), octave, angle, response, descriptors)
 
 

@@ -43,8 +43,9 @@ def main() -> None:
             tuple(measure(count, arguments.steps, mapped) for mapped in (False, True)) for _ in range(arguments.repeats)
         ]
         before, after = (statistics.median(column) for column in zip(*pairs, strict=True))
-        ratio = statistics.median(b / a for a, b in pairs)
-        print(f"| {count} | {before:.0f} | {after:.0f} | {ratio:.2f} |", flush=True)
+        print(
+            f"| {count} | {before:.0f} | {after:.0f} | {statistics.median(b / a for a, b in pairs):.2f} |", flush=True
+        )
 
 
 if __name__ == "__main__":

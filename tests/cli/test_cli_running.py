@@ -212,13 +212,12 @@ def test_a_monocular_tracker_is_scored_with_its_scale_unless_told_otherwise(cli,
     assert running.default_protocol("never-move") == "tum-rgbd/v1"
 
 
-def test_progress_names_what_is_written_behind_the_last_frame():
+def test_progress_names_what_is_compiled_before_the_first_frame_and_written_behind_the_last():
     spec = RunSpec(tracker="never-move", sequence="walk", video=True, sheet=True)
-    texts = [
-        running.event_text(RunEvent("progress", "id", spec, 1, partial={"frames_done": done, "frames": 9}))
-        for done in (8, 9)
-    ]
-    assert texts[0].endswith(", frame 8 of 9") and texts[1].endswith(", writing trajectories, video.webm, sheet.png")
+    events = [RunEvent("progress", "id", spec, 1, partial={"frames_done": done, "frames": 9}) for done in (8, 9)]
+    texts = [running.event_text(event) for event in (RunEvent("started", "id", spec, 1), *events)]
+    assert "compiles its code" in texts[0] and texts[1].endswith(", frame 8 of 9")
+    assert texts[2].endswith(", writing trajectories, video.webm, sheet.png")
 
 
 # Ctrl-C, SIGTERM and SIGHUP in long commands: they stop at once, say how to go on, and exit with the shell's code.

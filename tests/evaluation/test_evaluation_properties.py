@@ -462,8 +462,7 @@ def tracked(truth, seed=1, drift=0.01, jitter=5e-4, every=1):
     rng = np.random.default_rng(seed)
     steps = se3.inverse(truth.T_world_cam[:-1]) @ truth.T_world_cam[1:]
     size = np.linalg.norm(se3.log(steps), axis=1, keepdims=True)
-    drifting = steps @ se3.exp(rng.normal(size=(len(steps), 6)) * drift * size)
-    poses = chained(np.concatenate([np.eye(4)[None], drifting]))
+    poses = chained(np.concatenate([np.eye(4)[None], steps @ se3.exp(rng.normal(size=(len(steps), 6)) * drift * size)]))
     return truth.with_poses(poses @ se3.exp(rng.normal(0, jitter, (len(truth), 6)))).select(slice(None, None, every))
 
 

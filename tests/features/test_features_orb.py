@@ -93,6 +93,12 @@ def test_the_corners_are_those_of_opencv(shape, threshold):
         assert ours.tolist() == [[*keypoint.pt, keypoint.response] for keypoint in theirs]
 
 
+def test_the_descriptors_are_those_of_opencv():
+    ours = OrbExtractor(FeatureSettings(levels=1)).extract(image := texture(seed=2))
+    points = [cv2.KeyPoint(*map(float, (*xy, 31, angle))) for xy, angle in zip(ours.xy, ours.angle, strict=True)]
+    assert (cv2.ORB.create(nlevels=1, edgeThreshold=EDGE).compute(image, points)[1] == ours.descriptors).all()
+
+
 @pytest.mark.parametrize("shape", [(1, 1), (20, 30), (39, 640), (45, 45), (480, 640)])
 def test_small_and_flat_images_are_no_error(shape):
     features = OrbExtractor().extract(np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8))

@@ -250,8 +250,8 @@ def test_published_errors_of_one_system_are_compared_under_one_alignment():
     assert (dynaslam.numbers, dynaslam.authors_m) == (3, 0.015)  # the authors' N+G, and not the Sim(3) of others
     assert spans(published_for(["bonn/kidnapping_box"])).empty
     assert published_for(["bonn/crowd"], get_protocol("kitti")).empty
-    alignments = set(published_for(["bonn/crowd"], get_protocol("tum-rgbd/v1"))["alignment"])
-    assert alignments == {"SE(3) or not stated"}  # a table of cameras alone that states none is not taken for TUM's
+    # a table of cameras alone that states none is not taken for TUM's
+    assert set(published_for(["bonn/crowd"], get_protocol("tum-rgbd/v1"))["alignment"]) == {"SE(3) or not stated"}
 
 
 def test_records_say_whose_they_are_and_how_they_were_read():

@@ -264,8 +264,7 @@ def folder(tmp_path: Path) -> Path:
     folder = write_folder(tmp_path / "toy", FRAMES)
     for name in ("rgb.txt", "depth.txt", "groundtruth.txt"):
         lines = [line.partition(" ")[2] for line in (folder / name).read_text().splitlines() if line[0] != "#"]
-        stamped = [f"{text} {rest}\n" for text, rest in zip(stamps(), lines, strict=True)]
-        (folder / name).write_text("".join(stamped))
+        (folder / name).write_text("".join(f"{text} {rest}\n" for text, rest in zip(stamps(), lines, strict=True)))
     return folder
 
 

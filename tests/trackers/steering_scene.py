@@ -28,8 +28,7 @@ QUICK_DENSE = {
 
 def quick(settings: type[Settings]) -> dict[str, object]:
     """Overrides with which a system's flow costs little; none where it has no dense flow."""
-    dense = "flow" in settings.model_fields and isinstance(settings().flow, DenseFlowSettings)
-    return dict(QUICK_DENSE) if dense else {}
+    return dict(QUICK_DENSE) if isinstance(getattr(settings(), "flow", None), DenseFlowSettings) else {}
 
 
 STRIDE = 3
