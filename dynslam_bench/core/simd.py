@@ -50,6 +50,7 @@ _FLOATS, _INTS = ir.VectorType(_FLOAT, FLOAT_LANES), ir.VectorType(_INT32, FLOAT
 _BYTES16, _PAIRS = ir.VectorType(_BYTE, FLOAT_LANES), ir.VectorType(_UINT16, FLOAT_LANES)
 _HALVES, _BYTES32 = ir.VectorType(_UINT16, UINT16_LANES), ir.VectorType(_BYTE, UINT16_LANES)
 BYTE_LANES = 64
+_DOUBLES = ir.VectorType(ir.DoubleType(), 8)
 _BYTES64, _INTS32 = ir.VectorType(_BYTE, BYTE_LANES), ir.VectorType(_INT32, UINT16_LANES)
 PATCH_ROWS = 31
 """Rows of the patches that `patch_sum` reads."""
@@ -79,6 +80,8 @@ class _SimdModel(models.PrimitiveModel):
 
 
 FLOAT32X16, UINT16X32 = SimdType("Float32x16", _FLOATS), SimdType("UInt16x32", _HALVES)
+SUMS = types.UniTuple(SimdType("Float64x8", _DOUBLES), 6)
+"""Of normal equations: six rows of six numbers of the matrix, one of the vector and a zero."""
 
 
 class _Arithmetic(AbstractTemplate):
@@ -548,3 +551,52 @@ def patch_sum(typing_context: Code, image: Code, at: Code, width: Code, weights:
         return _sum_of_lanes(builder, total, builder.add)
 
     return types.int32(image, types.int64, types.int64, weights), generate
+
+
+@instruction
+def normal_equations(typing_context: Code) -> Definition:
+    """Sums of no residuals, for `add_normal_equation`."""
+
+    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
+        return context.make_tuple(builder, kind.return_type, [constant(_DOUBLES, 0.0)] * 6)
+
+    return SUMS(), generate
+
+
+@instruction
+def add_normal_equation(
+    typing_context: Code, sums: Code, weight: Code, j0: Code, j1: Code, j2: Code, j3: Code, j4: Code, j5: Code,
+    residual: Code,
+) -> Definition:  # fmt: skip
+    """Sums with ``weight j^T j`` and ``weight j^T residual`` of one residual more, j its derivatives by six numbers."""
+
+    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
+        sums, weight, *numbers = arguments
+        row = constant(_DOUBLES, 0.0)
+        for place, number in enumerate(numbers):
+            row = builder.insert_element(row, number, ir.Constant(_INT32, place))
+        scaled = builder.fmul(splat(builder, _DOUBLES, weight), row)
+        factors = [builder.shuffle_vector(scaled, scaled, _places(*([m] * 8))) for m in range(6)]
+        rows = cgutils.unpack_tuple(builder, sums, 6)
+        added = [builder.fadd(old, builder.fmul(factor, row)) for old, factor in zip(rows, factors, strict=True)]
+        return context.make_tuple(builder, kind.return_type, added)
+
+    return SUMS(SUMS, *([types.float64] * 8)), generate
+
+
+@instruction
+def store_normal_equations(typing_context: Code, sums: Code, matrix: Code, vector: Code) -> Definition:
+    """Write the matrix ``[6, 6]`` and the vector ``[6]`` of the sums into float64 arrays."""
+
+    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
+        sums, *arrays = arguments
+        data = [
+            context.make_array(k)(context, builder, array).data for k, array in zip(kind.args[1:], arrays, strict=True)
+        ]
+        for m, row in enumerate(cgutils.unpack_tuple(builder, sums, 6)):
+            for n in range(7):
+                place = builder.gep(data[n // 6], [ir.Constant(_INT64, m if n == 6 else 6 * m + n)])
+                builder.store(builder.extract_element(row, ir.Constant(_INT32, n)), place)
+        return context.get_dummy_value()
+
+    return types.void(sums, matrix, vector), generate

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.core.compiled import kernel
+from dynslam_bench.core.simd import add_normal_equation, normal_equations, store_normal_equations
 from dynslam_bench.culling import Rule
 from dynslam_bench.culling.settings import RigidMotionSettings
 from dynslam_bench.geometry import Camera, pixel_index, se3
@@ -237,9 +238,9 @@ def _linearise(
     pose: Array, points: Array, pixels: Array, prior_weight: Array, shutter: Array, scale2: float,
     fx: float, fy: float, cx: float, cy: float,
 ) -> tuple[Array, Array, float]:  # fmt: skip
-    """Lower triangle of the Gauss-Newton matrix ``[6, 6]``, gradient ``[6]`` of a left twist, sum of the weights."""
-    hessian, gradient, total = np.zeros((6, 6)), np.zeros(6), 0.0
-    j = np.zeros((2, 6))
+    """Gauss-Newton matrix ``[6, 6]``, gradient ``[6]`` of a left twist, sum of the weights."""
+    hessian, gradient = np.empty((6, 6)), np.empty(6)
+    sums, total = normal_equations(), 0.0
     for i in range(len(points)):
         x, y, z = moved_point(pose, points[i])
         if z <= NEAR_M:
@@ -248,14 +249,10 @@ def _linearise(
         du, dv = fx * x + cx - pixels[i, 0], fy * y + cy - pixels[i, 1]
         weight = prior_weight[i] / (1 + (du * du + dv * dv) / (scale2 + shutter[i])) ** 2
         total += weight
-        j[0, 0], j[0, 2], j[0, 3], j[0, 4], j[0, 5] = fx / z, -fx * x / z, -fx * x * y, fx * (1 + x * x), -fx * y
-        j[1, 1], j[1, 2], j[1, 3], j[1, 4], j[1, 5] = fy / z, -fy * y / z, -fy * (1 + y * y), fy * x * y, fy * x
-        for row, error in ((0, du), (1, dv)):
-            for m in range(6):
-                scaled = weight * j[row, m]
-                gradient[m] += scaled * error
-                for n in range(m + 1):
-                    hessian[m, n] += scaled * j[row, n]
+        a, b = fx / z, fy / z
+        sums = add_normal_equation(sums, weight, a, 0.0, -fx * x / z, -fx * x * y, fx * (1 + x * x), -fx * y, du)
+        sums = add_normal_equation(sums, weight, 0.0, b, -fy * y / z, -fy * (1 + y * y), fy * x * y, fy * x, dv)
+    store_normal_equations(sums, hessian, gradient)
     return hessian, gradient, total
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import kernel
+from dynslam_bench.core.simd import add_normal_equation, normal_equations, store_normal_equations
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.gauss_newton import apply_twist, cholesky_solve, moved_point
 
@@ -66,12 +67,11 @@ def _linearise(
     pose: Array, points: Array, uv: Array, right: Array, info: Array, info_right: Array, active: NDArray[np.bool_],
     width: float, fx: float, fy: float, cx: float, cy: float, bf: float, h: Array, g: Array,
 ) -> float:  # fmt: skip
-    """Fill the Gauss-Newton system, of the matrix its lower triangle; returns the cost.
+    """Fill the Gauss-Newton system; returns the cost.
 
     The cost is that of Cauchy's kernel of a squared width, or of Huber's where that is 0.
     """
-    h[:], g[:], cost = 0.0, 0.0, 0.0
-    j, r = np.zeros((3, 6)), np.zeros(3)
+    sums, cost = normal_equations(), 0.0
     for i in range(points.shape[0]):
         if not active[i]:
             continue
@@ -83,10 +83,9 @@ def _linearise(
             continue
         iz = 1.0 / z
         u = fx * x * iz + cx
-        r[0] = uv[i, 0] - u
-        r[1] = uv[i, 1] - (fy * y * iz + cy)
-        r[2] = right[i] - (u - bf * iz) if depth else 0.0
-        chi2 = info[i] * (r[0] * r[0] + r[1] * r[1]) + (info_right[i] * r[2] * r[2] if depth else 0.0)
+        du, dv = uv[i, 0] - u, uv[i, 1] - (fy * y * iz + cy)
+        dr = right[i] - (u - bf * iz) if depth else 0.0
+        chi2 = info[i] * (du * du + dv * dv) + (info_right[i] * dr * dr if depth else 0.0)
         w = 1.0
         if width > 0.0:
             w = 1.0 / (1.0 + chi2 / width)
@@ -96,21 +95,14 @@ def _linearise(
             cost += 2.0 * np.sqrt(limit * chi2) - limit
         else:
             cost += chi2
-        a, b = fx * iz, fy * iz
-        j[0, 0], j[0, 1], j[0, 2] = a, 0.0, -a * x * iz
-        j[0, 3], j[0, 4], j[0, 5] = -fx * x * y * iz * iz, fx * (1.0 + x * x * iz * iz), -a * y
-        j[1, 0], j[1, 1], j[1, 2] = 0.0, b, -b * y * iz
-        j[1, 3], j[1, 4], j[1, 5] = -fy * (1.0 + y * y * iz * iz), fy * x * y * iz * iz, b * x
-        c = bf * iz * iz
-        j[2, 0], j[2, 1], j[2, 2] = j[0, 0], 0.0, j[0, 2] + c
-        j[2, 3], j[2, 4], j[2, 5] = j[0, 3] + c * y, j[0, 4] - c * x, j[0, 5]
-        for row in range(3 if depth else 2):
-            weight = w * (info_right[i] if row == 2 else info[i])
-            for m in range(6):
-                f = weight * j[row, m]
-                g[m] += f * r[row]
-                for n in range(m + 1):
-                    h[m, n] += f * j[row, n]
+        a, b, c = fx * iz, fy * iz, bf * iz * iz
+        j2, j3, j4, j5 = -a * x * iz, -fx * x * y * iz * iz, fx * (1.0 + x * x * iz * iz), -a * y
+        sums = add_normal_equation(sums, w * info[i], a, 0.0, j2, j3, j4, j5, du)
+        turned = -fy * (1.0 + y * y * iz * iz)
+        sums = add_normal_equation(sums, w * info[i], 0.0, b, -b * y * iz, turned, fy * x * y * iz * iz, b * x, dv)
+        if depth:
+            sums = add_normal_equation(sums, w * info_right[i], a, 0.0, j2 + c, j3 + c * y, j4 - c * x, j5, dr)
+    store_normal_equations(sums, h, g)
     return cost
 
 
@@ -214,4 +206,4 @@ def optimise_pose(
     lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.fx * camera.baseline_m
     pose, inliers, error, h = _optimise(start, points, uv, right, info, info_right, *lens, rounds, iterations)
     residual_px = float(np.median(error[inliers])) if inliers.any() else np.nan
-    return PoseEstimate(pose, inliers, int(np.count_nonzero(inliers)), residual_px, h + np.tril(h, -1).T)
+    return PoseEstimate(pose, inliers, int(np.count_nonzero(inliers)), residual_px, np.tril(h) + np.tril(h, -1).T)

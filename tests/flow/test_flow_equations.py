@@ -68,14 +68,12 @@ def test_numpy_and_the_kernel_follow_the_equations(family, iteration):
     np.testing.assert_allclose(positions, expected, rtol=1e-5, atol=1e-4)
     table = rules.flight_table(POPULATION, ITERATIONS, family)
     box = np.full(4, 1e9, np.float32)
-    flying, steps = moths.copy(), scale.astype(np.float32)
-    state = np.uint64(iteration + 77)
-    move_moths(
-        flying, flames, -box, box, iteration - 1, table, rules.spiral_table(), rules.cauchy_table(), steps, state
-    )
+    flying, tried, steps = moths.copy(), np.empty_like(moths), scale.astype(np.float32)
+    tables = table, rules.spiral_table(), rules.cauchy_table()
+    move_moths(flying, flames, -box, box, iteration - 1, *tables, steps, tried, np.uint64(iteration + 77))
     # the spiral is looked up in steps of 1/1024: its slope is at most 2 pi e^2 outside, 2 pi e inside t <= 1
     looked_up = abs(flames - moths) * 2 * np.pi * np.exp(2 if family.as_printed else 1) / 1024 + 1e-3
-    assert (abs(flying - expected) <= looked_up + 1e-4 * abs(expected)).all()
+    assert (abs(flying - expected) <= looked_up + 1e-4 * abs(expected)).all() and np.array_equal(tried, flying)
 
 
 def test_opposites_keep_to_their_bounds():
