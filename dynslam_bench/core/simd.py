@@ -1,4 +1,4 @@
-"""SIMD vectors inside compiled kernels: sixteen float32, thirty-two uint16 or sixty-four uint8 numbers as one value.
+"""SIMD vectors inside compiled kernels: 8 float64, 16 float32, 32 uint16 or 64 uint8 numbers as one value.
 
 Written as generic vector code of fixed width (llvmlite): LLVM maps it to the processor's instructions. A lane is the
 place of one number in a vector, as in SIMD hardware. The order of

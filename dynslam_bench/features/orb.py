@@ -184,7 +184,7 @@ def spread(
 
 
 @kernel
-def _stable_order(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+def _stable_order(keys: NDArray[np.signedinteger]) -> NDArray[np.int64]:
     """Indices that sort integers of a small range; equal ones keep their order."""
     lowest = keys.min()
     start, order = np.zeros(keys.max() - lowest + 2, np.int64), np.empty(len(keys), np.int64)
