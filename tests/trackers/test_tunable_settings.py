@@ -69,7 +69,7 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
     "backend.relocalisation.min_inliers": ("emfoa-oft", {}),
     "epipolar.min_share": ("emfoa-oft-paper?masks=none", {}),
     "free_space.threshold_m": ("emfoa-oft?masks=none", {
-        **KEYFRAMES, "free_space.min_votes": 1, "free_space.threshold_sigma": 0.0,
+        **KEYFRAMES, "backend.keyframes.schedule": "every", "free_space.min_votes": 1, "free_space.threshold_sigma": 0.0,
     }),
     "free_space.threshold_sigma": ("emfoa-oft?masks=none", {
         **KEYFRAMES, "free_space.min_votes": 1, "free_space.threshold_m": 0.01,
@@ -257,7 +257,7 @@ def test_only_what_differs_is_handed_on() -> None:
 
 @pytest.fixture(scope="module")
 def plain_scene():
-    return SmallScene()
+    return SmallScene("synthetic/walking_xyz?scene=105")
 
 
 @pytest.mark.parametrize("tracker", [name for name, spec in SYSTEMS.items() if spec.sensors == "rgb"])
