@@ -69,7 +69,8 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
     "backend.relocalisation.min_inliers": ("emfoa-oft", {}),
     "epipolar.min_share": ("emfoa-oft-paper?masks=none", {}),
     "free_space.threshold_m": ("emfoa-oft?masks=none", {
-        **KEYFRAMES, "backend.keyframes.schedule": "every", "free_space.min_votes": 1, "free_space.threshold_sigma": 0.0,
+        **KEYFRAMES, "backend.keyframes.schedule": "every", "free_space.min_votes": 1,
+        "free_space.threshold_sigma": 0.0,
     }),
     "free_space.threshold_sigma": ("emfoa-oft?masks=none", {
         **KEYFRAMES, "free_space.min_votes": 1, "free_space.threshold_m": 0.01,
