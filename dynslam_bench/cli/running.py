@@ -374,9 +374,7 @@ class WatchedRuns:
 def event_text(event: runs.RunEvent) -> str:
     """Tracker, sequence and progress of a run, for a progress bar: the frame, then what is written behind the last."""
     text = f"{label_text(event.spec.tracker)} on {label_text(event.spec.sequence)}"
-    if event.kind == "started":
-        return f"{text}, starting (the first run of a system compiles its code for up to a minute)"
-    if event.partial is None:
+    if event.kind != "progress" or event.partial is None:
         return text
     done, frames = event.partial["frames_done"], event.partial["frames"]
     if done < frames:
@@ -392,7 +390,7 @@ def describe_plan(plan: runs.Plan, store: runs.RunStore, jobs: int, protocol: st
         if row["frame_ms"]:
             times_ms[row["tracker"]].append(row["frame_ms"])
     if not plan.frames.keys() <= times_ms.keys():
-        return text
+        return f"{text}; a system's first run on a machine compiles its code for up to a minute"
     expected_ms = sum(frames * median(times_ms[tracker]) for tracker, frames in plan.frames.items())
     seconds = round(expected_ms / min(jobs, plan.runs) / 1000)
     return f"{text}, about {timedelta(seconds=seconds)} by the frame times of stored runs"

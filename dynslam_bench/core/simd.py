@@ -47,7 +47,7 @@ def instruction(define: Callable[..., Definition]) -> Code:
 FLOAT_LANES, UINT16_LANES = 16, 32
 _FLOAT, _INT64, _INT32, _UINT16, _BYTE = ir.FloatType(), ir.IntType(64), ir.IntType(32), ir.IntType(16), ir.IntType(8)
 _FLOATS, _INTS = ir.VectorType(_FLOAT, FLOAT_LANES), ir.VectorType(_INT32, FLOAT_LANES)
-_BYTES16, _PAIRS = ir.VectorType(_BYTE, FLOAT_LANES), ir.VectorType(_UINT16, FLOAT_LANES)
+_BYTES16 = ir.VectorType(_BYTE, FLOAT_LANES)
 _HALVES, _BYTES32 = ir.VectorType(_UINT16, UINT16_LANES), ir.VectorType(_BYTE, UINT16_LANES)
 BYTE_LANES = 64
 _DOUBLES = ir.VectorType(ir.DoubleType(), 8)
@@ -234,7 +234,10 @@ def store_offsets(
 
 @instruction
 def square(typing_context: Code, image: Code, at: Code, stride: Code) -> Definition:
-    """The four pixels right of and below an index of a flat uint8 image, as the bytes of an int32; see `sample`."""
+    """Four pixels of a flat uint8 image as the bytes of an int32: at an index, right of it, and below these two.
+
+    `stride` is the number of pixels a row of the image; `sample` interpolates between the four.
+    """
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         image, at, stride = arguments

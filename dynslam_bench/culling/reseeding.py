@@ -63,9 +63,8 @@ class ReseedingFilter(Rule[ReseedingSettings]):
             column, row = (xy / self._features.cell_px).astype(np.int64).T
             # ranks of the responses, so that equal ones stay equal and keep their order
             strength = np.unique(frame.keypoints.response[rows], return_inverse=True)[1].astype(np.int16)
-            picked = rows[
-                spread(row * (column.max(initial=0) + 1) + column, strength, np.ones(len(rows), dtype=bool), quota)
-            ]
+            cells, everyone = row * (column.max(initial=0) + 1) + column, np.ones(len(rows), dtype=bool)
+            picked = rows[spread(cells, strength, everyone, quota)]
             missing = quota - len(picked)  # a coarse level's missing features are added to the next finer level
             chosen[picked] = True
         return chosen

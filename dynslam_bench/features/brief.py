@@ -1,4 +1,4 @@
-"""Rotated BRIEF descriptors (Rublee et al., 2011, Section 4): the same bits as OpenCV's ORB."""
+"""Rotated BRIEF descriptors (Rublee et al., 2011, Section 4): on one image the same bits as OpenCV's ORB."""
 
 import math
 
