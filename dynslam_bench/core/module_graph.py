@@ -1,0 +1,281 @@
+"""Which modules of this package a module uses, and the digest of their code.
+
+The closure of a module holds the module itself and all modules of this package that it reaches by import statements,
+wherever in the source they stand. A package's ``__init__`` that passes a name on is looked through: the name counts with
+the module that defines it. What a text names is no import: entry points of plug-ins, tables of lazily loaded names.
+
+Sources count by their syntax: comments, layout and docstrings change nothing.
+"""
+
+import ast
+import hashlib
+import json
+import sys
+import threading
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.files import write_atomic
+from dynslam_bench.core.folders import digest_cache_folder
+
+PACKAGE = "dynslam_bench"
+SETTLED_NS = 2_000_000_000
+"""What was read of a younger file is not remembered: a change within the same tick of the clock would not show."""
+_PARSING = threading.Lock()
+
+Reference = tuple[str, str]
+"""A module of this package, and a name that is taken from it; the empty name stands for the module itself."""
+
+
+@dataclass(frozen=True)
+class ModuleCode:
+    """What is known of one module's source.
+
+    Attributes:
+        digest: Of its syntax, see `syntax_digest`.
+        imports: What it imports from this package.
+        names: What each name stands for that it imports at its top level, by the name that it has in this module.
+    """
+
+    digest: str
+    imports: list[Reference]
+    names: dict[str, Reference]
+
+
+class ModuleGraph:
+    """The modules of this package with their imports.
+
+    Args:
+        modules: What is known of each module, by its name.
+    """
+
+    def __init__(self, modules: Mapping[str, ModuleCode]) -> None:
+        self.modules = modules
+        self._packages = {module.rpartition(".")[0] for module in modules}
+
+    def closure(self, roots: Iterable[str]) -> list[str]:
+        """All modules that modules use, themselves among them, sorted.
+
+        Args:
+            roots: Names of modules; those that do not belong to this package are left out.
+        """
+        reached: set[str] = set()
+        waiting = [root for root in roots if root in self.modules]
+        while waiting:
+            module = waiting.pop()
+            if module in reached:
+                continue
+            reached.add(module)
+            defining = [self.defining_module(*reference) for reference in self.modules[module].imports]
+            waiting += [source for source in defining if source is not None]
+        return sorted(reached)
+
+    def digest(self, roots: Iterable[str]) -> str:
+        """SHA-256 of the syntax of all modules in a closure, with their names."""
+        state = hashlib.sha256()
+        for module in self.closure(roots):
+            state.update(f"{module}\0{self.modules[module].digest}\n".encode())
+        return state.hexdigest()
+
+    def defining_module(self, source: str, name: str) -> str | None:
+        """The module that defines what is imported; None where it does not belong to this package.
+
+        Args:
+            source: The module that the import statement names.
+            name: The name that is taken from it; empty for the module itself.
+        """
+        seen: set[Reference] = set()
+        while (source, name) not in seen:  # two packages may pass a name on to each other
+            seen.add((source, name))
+            if name and f"{source}.{name}" in self.modules:
+                return f"{source}.{name}"
+            if source not in self.modules:
+                return None
+            passed_on = self.modules[source].names.get(name)
+            if passed_on is None or source not in self._packages:
+                return source
+            source, name = passed_on
+        return source
+
+
+@cache
+def module_graph() -> ModuleGraph:
+    """The graph of this package as it lay on the disk when this process asked first.
+
+    Raises:
+        OSError: A source cannot be read.
+    """
+    return read_module_graph()
+
+
+def read_module_graph() -> ModuleGraph:
+    """The graph of this package as it lies on the disk now.
+
+    What was read of a file is remembered in the user's cache while the file's size and times stay the same: parsing all
+    files takes more than a second.
+
+    Raises:
+        OSError: A source cannot be read.
+    """
+    places = [str(place) for place in sys.modules[PACKAGE].__path__]
+    name_of_places = hashlib.sha256("\0".join(places).encode(errors="surrogateescape")).hexdigest()[:16]
+    memory = digest_cache_folder() / f"modules-{name_of_places}.json"
+    remembered = _read_remembered(memory)
+
+    modules = {}
+    stamps = {}
+    for name, file in module_files().items():
+        status = file.stat()
+        changed_ns = max(status.st_mtime_ns, status.st_ctime_ns)
+        stamp = f"{status.st_size},{status.st_mtime_ns},{status.st_ctime_ns},{status.st_ino}"
+        old_stamp, old_code = remembered.get(name, ("", None))
+        modules[name] = old_code if old_code is not None and old_stamp == stamp else read_module(name, file.read_bytes())
+        stamps[name] = stamp if time.time_ns() - changed_ns > SETTLED_NS else ""
+
+    entries = {name: (stamps[name], code) for name, code in modules.items() if stamps[name]}
+    if entries != remembered:
+        _remember(memory, entries)
+    return ModuleGraph(modules)
+
+
+def module_files() -> dict[str, Path]:
+    """The source of every module of this package, by the module's name."""
+    files: dict[str, Path] = {}
+    for place in map(Path, sys.modules[PACKAGE].__path__):
+        if place.name == PACKAGE:
+            files |= {_module_name(file, place): file for file in place.glob("*.py")}
+        for folder in sorted(place.iterdir()):
+            # in a checkout the folders beside the package are on its path, the package itself among them
+            if folder.name != PACKAGE and (folder / "__init__.py").is_file():
+                files |= {_module_name(file, place): file for file in sorted(folder.rglob("*.py"))}
+    return files
+
+
+def _module_name(file: Path, place: Path) -> str:
+    """The name of a module, from its file and the folder on the package's path that this lies in."""
+    parts = file.relative_to(place).with_suffix("").parts
+    if parts[-1] == "__init__":
+        parts = parts[:-1]
+    return ".".join((PACKAGE, *parts))
+
+
+def _read_remembered(memory: Path) -> dict[str, tuple[str, ModuleCode]]:
+    """Stamp and code of each module that was remembered; empty where nothing can be read."""
+    try:
+        stored = json.loads(memory.read_text(encoding="utf-8"))
+        return {
+            name: (
+                entry["stamp"],
+                ModuleCode(
+                    digest=entry["digest"],
+                    imports=[(source, imported) for source, imported in entry["imports"]],
+                    names={own: (source, imported) for own, (source, imported) in entry["names"].items()},
+                ),
+            )
+            for name, entry in stored.items()
+        }
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # it is missing, cut off or of another version
+        return {}
+
+
+def _remember(memory: Path, entries: Mapping[str, tuple[str, ModuleCode]]) -> None:
+    stored = {name: {"stamp": stamp, **asdict(code)} for name, (stamp, code) in entries.items()}
+    try:
+        write_atomic(memory, json.dumps(stored))
+    except DynslamError:
+        return  # a cache that cannot be written costs time only
+
+
+# -- one source --------------------------------------------------------------------------------------------------------
+
+
+def read_module(name: str, source: bytes) -> ModuleCode:
+    """The digest and the imports of a module's source; one that cannot be parsed imports nothing.
+
+    Args:
+        name: The module.
+        source: Its text.
+    """
+    try:
+        tree = parsed(source)
+    except (SyntaxError, ValueError, RecursionError):
+        return ModuleCode(hashlib.sha256(source).hexdigest(), [], {})
+    imports = [reference for statement in _import_statements(tree) for reference in _references(statement).values()]
+    names: dict[str, Reference] = {}
+    for statement in tree.body:
+        names |= _references(statement)
+    return ModuleCode(syntax_digest(source), sorted(set(imports)), names)
+
+
+def _import_statements(node: ast.AST) -> Iterator[ast.AST]:
+    """All import statements below a node but those that only type checkers read."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.Import | ast.ImportFrom):
+            yield child
+        elif isinstance(child, ast.If) and ast.unparse(child.test).endswith("TYPE_CHECKING"):
+            for statement in child.orelse:
+                yield from _import_statements(ast.Module([statement], []))
+        else:
+            yield from _import_statements(child)
+
+
+def _references(statement: ast.AST) -> dict[str, Reference]:
+    """What a statement imports from this package, by the name that it gives to it."""
+    if isinstance(statement, ast.Import):
+        return {
+            alias.asname or alias.name: (alias.name, "")
+            for alias in statement.names
+            if alias.name.partition(".")[0] == PACKAGE
+        }
+    if isinstance(statement, ast.ImportFrom) and (statement.module or "").partition(".")[0] == PACKAGE:
+        return {alias.asname or alias.name: (str(statement.module), alias.name) for alias in statement.names}
+    return {}
+
+
+def parsed(source: bytes) -> ast.Module:
+    """`ast.parse`, one thread at a time: in Python 3.11 two at once can fail with a SystemError.
+
+    Raises:
+        SyntaxError: It is no Python of this version; ValueError and RecursionError likewise.
+    """
+    with _PARSING:
+        return ast.parse(source)
+
+
+def syntax_digest(source: bytes) -> str:
+    """SHA-256 of a Python source's syntax tree without comments, layout and docstrings.
+
+    It does not depend on the version of Python that parses it. What cannot be parsed counts by its bytes.
+    """
+    try:
+        words = "\0".join(_tokens_of(parsed(source)))
+    except (SyntaxError, ValueError, RecursionError):
+        return hashlib.sha256(source).hexdigest()
+    return hashlib.sha256(words.encode(errors="backslashreplace")).hexdigest()
+
+
+def _tokens_of(node: Any) -> Iterator[str]:
+    """A syntax tree as text tokens; empty fields, which differ between versions of Python, are left out."""
+    if isinstance(node, ast.AST):
+        yield f"({type(node).__name__}"
+        for name, value in ast.iter_fields(node):
+            if value is not None and value != [] and name not in ("ctx", "kind", "type_comment"):
+                yield name
+                yield from _tokens_of(value)
+        yield ")"
+    elif isinstance(node, list):
+        for inner in node:
+            if not _is_docstring(inner):
+                yield from _tokens_of(inner)
+    else:
+        yield repr(node)
+
+
+def _is_docstring(node: Any) -> bool:
+    """Whether a statement is a string alone, which does nothing."""
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
