@@ -17,7 +17,7 @@ opposites  # flow.moth_flame: the same
 
 # called by name: specs name their factories as "module:name"
 OrbExtractor  # features.registry
-build_daisy  # flow.registry
+build_daisy  # flow.daisy
 build_recorded  # segmentation.registry
 build_oracle  # segmentation.registry
 build_embedded  # segmentation.registry

@@ -36,7 +36,8 @@ from dynslam_bench.core.settings import (
 from dynslam_bench.geometry import Camera
 from dynslam_bench.reports.model.row import SEEN, grouped
 from dynslam_bench.runs import RunRecord, RunSpec, RunStore, load_frames, resolve
-from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
+from dynslam_bench.runs.lookup import LookUp
+from dynslam_bench.segmentation.training_scenes import seen_in_training
 from dynslam_bench.sequences.catalogue import catalogue, open_public, open_sequence
 from dynslam_bench.sequences.synthetic import HELD_OUT_SCENES, TUNE_SCENES
 from dynslam_bench.sequences.view import Part, part_of
@@ -284,7 +285,7 @@ class Plan:
 
     def _stored(self, instance: ProblemInstance) -> RunRecord | None:
         """The baseline's run on an instance, if it is stored and came to its end."""
-        record = self.store.get(resolve(self.run_spec(instance, self.baseline)).run_id)
+        record = LookUp(self.store).find(resolve(self.run_spec(instance, self.baseline)))
         return None if record is None or record.failed or record.status == "stopped" else record
 
     def _scatter(self, records: dict[ProblemInstance, RunRecord]) -> float:

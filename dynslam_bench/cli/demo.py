@@ -85,11 +85,10 @@ def demo(
 def study_spec(frames: int, trials: int) -> StudySpec:
     """A study of the error, which does not depend on the machine's load, on three scenes, judged on six others."""
     from dynslam_bench.core.records import digest
-    from dynslam_bench.runs.identity import source_fingerprint
-    from dynslam_bench.trackers import TRACKERS
+    from dynslam_bench.runs.own_code import package_code
     from dynslam_bench.tuning import SpaceSpec, StudySpec
 
-    code = digest([frames, source_fingerprint(TRACKERS.get(STUDIED))], 6)  # other code is another study
+    code = digest([frames, package_code()], 6)  # other code is another study
     return StudySpec(
         name=f"demo-{code}",
         tracker=STUDIED,

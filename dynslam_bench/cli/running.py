@@ -356,9 +356,10 @@ class WatchedRuns:
     def _event(self, event: runs.RunEvent) -> None:
         before = self._shares.pop(event.run_id, 0.0)
         if event.record is not None:
-            self.opened[event.run_id] = (event.spec.sequence, event.spec.data_root, event.spec.camera)
+            self.opened[event.record.run_id] = (event.spec.sequence, event.spec.data_root, event.spec.camera)
             self._done += 1.0 - before
-            self.reused |= {event.run_id} if event.kind == "reused" else set()
+            if event.kind == "reused":
+                self.reused.add(event.record.run_id)
             note(event.record.describe() + (" (stored)" if event.kind == "reused" else ""))
         elif event.partial is not None:
             self._shares[event.run_id] = event.partial["frames_done"] / max(event.partial["frames"], 1)

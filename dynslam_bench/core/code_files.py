@@ -6,17 +6,17 @@ import re
 import shutil
 import subprocess
 import sys
-import threading
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 
+from dynslam_bench.core.module_graph import parsed
+
 CODE = (".py", ".so", ".pyd", ".dylib", ".dll")
 _TEXT = (".py", ".sh", ".bash", ".pl", ".rb", ".lua", ".js", ".jl", ".yaml", ".yml", ".toml", ".json", ".cfg", ".ini",
          ".xml", ".c", ".cc", ".cpp", ".cu", ".h", ".hpp")  # fmt: skip
 _LARGEST_TEXT = 1 << 20
-_PARSING = threading.Lock()
 _WORD = re.compile(rb"[\w./~+\-]+")
 _QUOTED = re.compile(rb"[\"']([\w.+\-]+)(?:/[^\"'\n]*)?[\"']")
 """A text in quotes that could be a path, of which the first part is taken."""
@@ -76,16 +76,6 @@ def program_files(folder: Path) -> list[Path]:
     quoted = {name.decode() for file in filter(is_python, code) for name in _QUOTED.findall(file.read_bytes())}
     sure = [file for file in everything if file in set(code) or file.relative_to(folder).parts[0] in quoted]
     return sure + _named(sure, [file for file in everything if file not in set(sure)])
-
-
-def parsed(source: bytes) -> ast.Module:
-    """`ast.parse`, one thread at a time: in Python 3.11 two at once can fail with a SystemError.
-
-    Raises:
-        SyntaxError: It is no Python of this version; ValueError and RecursionError likewise.
-    """
-    with _PARSING:
-        return ast.parse(source)
 
 
 def imported_modules(files: Iterable[Path]) -> set[str]:

@@ -1,21 +1,20 @@
 """What a result was made of: digests of code, weights, machine and content.
 
-Run ids and the stage cache's keys are made of these and nothing else, so that what is another run is another entry.
-Everything is read from files and folders: no plug-in is imported to know its digest.
+Run ids and the stage cache's keys are made of these, of the code in `core.module_graph`, and of what plug-ins read
+(`core.reads`), so that what is another run is another entry.
 """
 
-import ast
 import contextlib
 import hashlib
 import importlib.metadata
 import os
 import platform
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib.util import find_spec
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -23,29 +22,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 import dynslam_bench
-from dynslam_bench.core.code_files import (
-    files_below,
-    foreign_modules,
-    imported_modules,
-    is_code,
-    is_installed,
-    leads_back,
-    parsed,
-    program_files,
-)
+from dynslam_bench.core.code_files import files_below, leads_back
 from dynslam_bench.core.errors import DynslamError, PluginError, raising
 from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.folders import digest_cache_folder
 from dynslam_bench.core.reading import file_sha256
 from dynslam_bench.core.records import Record, digest
-from dynslam_bench.core.settings import Settings, flatten, named
+from dynslam_bench.core.settings import Settings, field_names, named
 from dynslam_bench.core.version import release
 
 OPENCV = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python")
 """The distributions that bring OpenCV; more than one may be installed, over each other."""
 _STAGES_NEED = ("numpy", "torch", "numba")
 """Further distributions whose version may change a stage's result."""
-_OWN = "dynslam_bench"
 _FILE_PREFIXES = ("onnx", "weights", "recorded")
 
 
@@ -55,108 +44,62 @@ _FILE_PREFIXES = ("onnx", "weights", "recorded")
 def named_digests(settings: Settings) -> dict[str, str]:
     """Digest of the content of every file and folder that settings name and that is there, by the setting's name.
 
-    A setting counts that is declared to name a file (`core.settings.names`, or of type `Path`), and one with the prefix
-    ``onnx:``, ``weights:`` or ``recorded:``. So does one that is written as the path of a file: with a separator. A
-    bare word is a word, whatever lies in the working folder.
+    A setting counts that is declared to name a file (`core.settings.names`), a path in it at any depth of lists and
+    tables, and a text with the prefix ``onnx:``, ``weights:`` or ``recorded:``. So does a text that is written as a
+    path, with a separator, or as a file's name with an ending, where that is there. ``~`` and ``$VARIABLE`` are
+    replaced. A bare word without an ending is a word, whatever lies in the working folder.
 
     Raises:
         PluginError: One cannot be read.
     """
     texts = {name: value for name, (kind, value) in named(settings).items() if kind == "file"}
-    for name, value in flatten(settings).items():
-        for setting, text in _texts(name, value):
-            prefix, _, argument = text.partition(":")
-            if prefix in _FILE_PREFIXES and argument:
-                texts.setdefault(setting, argument)
-            elif os.sep in text and os.path.isfile(Path(text).expanduser()):  # noqa: PTH113 - any text
+    for name in field_names(type(settings)):
+        for setting, value in _leaves_of(name, attrgetter(name)(settings)):
+            text = _path_in(value)
+            if text:
                 texts.setdefault(setting, text)
     digests = {}
     for name, text in texts.items():
-        path = Path(text).expanduser()
+        path = Path(os.path.expandvars(text)).expanduser()
         with raising(PluginError, f"cannot read {path}, which the setting '{name}' names"):
             if path.exists():
                 digests[name] = path_digest(path)[:16]
     return digests
 
 
-def _texts(name: str, value: object) -> Iterator[tuple[str, str]]:
-    """All strings in a setting's value, which may be a free table of options, with their dotted names."""
-    if isinstance(value, str):
+def _path_in(value: str | Path) -> str:
+    """The path that a setting's value names; empty for one that names none."""
+    if isinstance(value, Path):
+        return str(value)
+    prefix, _, argument = value.partition(":")
+    if prefix in _FILE_PREFIXES and argument:
+        return argument
+    path = os.path.expanduser(os.path.expandvars(value))  # noqa: PTH111 - any text, which Path may refuse
+    is_written_as_path = os.sep in path
+    is_written_as_file = bool(os.path.splitext(path)[1])  # noqa: PTH122
+    if is_written_as_path and os.path.exists(path):  # noqa: PTH110
+        return value
+    if is_written_as_file and os.path.isfile(path):  # noqa: PTH113
+        return value
+    return ""
+
+
+def _leaves_of(name: str, value: object) -> Iterator[tuple[str, str | Path]]:
+    """All texts and paths in a setting's value, which may be nested, with their dotted names."""
+    if isinstance(value, str | Path):
         yield name, value
+    elif isinstance(value, Settings):
+        for key, inner in value:
+            yield from _leaves_of(f"{name}.{key}", inner)
     elif isinstance(value, Mapping):
         for key, inner in value.items():
-            yield from _texts(f"{name}.{key}", inner)
-    elif isinstance(value, list | tuple):
+            yield from _leaves_of(f"{name}.{key}", inner)
+    elif isinstance(value, list | tuple | set | frozenset):
         for index, inner in enumerate(value):
-            yield from _texts(f"{name}.{index}", inner)
+            yield from _leaves_of(f"{name}.{index}", inner)
 
 
-# -- code --------------------------------------------------------------------------------------------------------------
-
-
-def code_digest(entry_point: str, packages: Sequence[str]) -> str:
-    """Digest of the code behind an entry point as it is on the disk now: packages of ours and a plug-in's files.
-
-    A plug-in in a file counts with the code of its folder and the data files that this names, one in a package with all
-    files of its top-level package. Python sources count by their syntax: comments and docstrings change nothing.
-
-    Args:
-        entry_point: ``module:Attr`` or ``file.py:Attr``.
-        packages: The subpackages of this package that it may use, e.g. ``features``.
-
-    Raises:
-        PluginError: The plug-in's files cannot be found or read.
-    """
-    return digest([package_digest(packages), plugin_digest(entry_point)])
-
-
-def plugin_digest(entry_point: str) -> str:
-    """Digest of a plug-in's own files and of what they import; empty for what this package brings.
-
-    An imported module counts with the version of its distribution, or with its files where it is installed for
-    development or lies on the path.
-
-    Raises:
-        PluginError: The files cannot be found or read.
-    """
-    module = entry_point.rpartition(":")[0]
-    top = module.partition(".")[0]
-    if top == _OWN and not module.endswith(".py"):
-        return ""
-    with raising(PluginError, f"cannot read the code of plug-in '{entry_point}'"):
-        if module.endswith(".py"):
-            file = Path(module).expanduser().resolve()
-            files = program_files(file.parent)
-            return digest([contents_digest(files, file.parent), _dependencies(foreign_modules(file))])
-        places = _folders_of(top)
-        names = imported_modules(file for place in places for file in _files_of(place)) - {top}
-        return digest([[_whole(place) for place in places], _dependencies(names)])
-
-
-def _dependencies(modules: set[str]) -> dict[str, str]:
-    """What modules beside this package and the standard library are: versions, or digests of development code.
-
-    Those that cannot be found are left out: an import that may fail.
-
-    Raises:
-        OSError: A file cannot be read.
-    """
-    digests: dict[str, str] = {}
-    waiting = set(modules)
-    while waiting:
-        top = waiting.pop()
-        if top in digests or top == _OWN or top in sys.stdlib_module_names:
-            continue
-        try:
-            places = _folders_of(top)
-        except (PluginError, ImportError, ValueError):
-            continue
-        if is_installed(places[0]):
-            digests[top] = distribution_of_module(top)[1]
-        else:
-            digests[top] = digest([_whole(place) for place in places])
-            waiting |= imported_modules(file for place in places for file in _files_of(place))
-    return digests
+# -- installed distributions ------------------------------------------------------------------------------------------
 
 
 def distribution_of_module(module: str) -> tuple[str, str]:
@@ -166,46 +109,66 @@ def distribution_of_module(module: str) -> tuple[str, str]:
 
 
 _distributions = cache(importlib.metadata.packages_distributions)
+SEARCH_VARIABLES = ("LD_LIBRARY_PATH", "LD_PRELOAD", "DYLD_LIBRARY_PATH", "DYLD_INSERT_LIBRARIES")
+"""Variables of the linker: with others the same program may run other code."""
 
 
-def package_digest(packages: Sequence[str]) -> str:
-    """Digest of the code of packages of this package; read once a process, as its modules are."""
-    return digest([[folder.name, _package_code(folder)] for folder in _own_folders(packages)])
+def library_identity(module: str) -> str:
+    """What is imported under a module's name: version and files of its distribution, or the files alone.
+
+    A module that lies before the installed one on the import path is another one. The files of a distribution count by
+    its ``RECORD``, which holds their checksums.
+
+    Args:
+        module: A top-level module; it is not imported.
+
+    Returns:
+        For example ``2.1.0 files 0a1b2c3d``; empty where there is no such module.
+    """
+    try:
+        spec = find_spec(module)
+    except ValueError:  # it was put into `sys.modules` by hand
+        return ""
+    if spec is None:
+        return ""
+    places = [Path(place) for place in spec.submodule_search_locations or ()]
+    if spec.origin is not None and Path(spec.origin).is_file():
+        places.append(Path(spec.origin))
+    for name in _distributions().get(module, ()):
+        distribution = importlib.metadata.distribution(name)
+        site_packages = Path(str(distribution.locate_file("")))
+        record = [file for file in distribution.files or () if file.name == "RECORD"]
+        if record and all(place.is_relative_to(site_packages) for place in places):
+            return f"{distribution.version} files {_record_digest(Path(str(distribution.locate_file(record[0]))))}"
+    contents = [contents_digest(files_below(place), place) for place in places if place.is_dir()]
+    contents += [path_digest(place) for place in places if place.is_file()]
+    return f"files {digest(contents, 8)}"
 
 
-def has_package_changed(packages: Sequence[str]) -> bool:
-    """Whether the code of packages of this package differs from what this process read first."""
-    return any(_package_code.__wrapped__(folder) != _package_code(folder) for folder in _own_folders(packages))
+def _record_digest(record: Path) -> str:
+    """Digest of the checksums of a distribution's files.
+
+    Scripts outside of the package's folder, byte code and the description of the installation differ between equal
+    installations, and are left out.
+    """
+
+    def compute() -> str:
+        lines = record.read_text(encoding="utf-8").splitlines()
+        kept = [line for line in lines if not any(part in line for part in ("../", ".pyc", ".dist-info/"))]
+        return hashlib.sha256("\n".join(sorted(kept)).encode()).hexdigest()
+
+    return _remembered("record", [record], compute)[:8]
 
 
-def _own_folders(packages: Sequence[str]) -> list[Path]:
-    folders = (Path(place, name) for place in dynslam_bench.__path__ for name in packages)
-    return [folder for folder in folders if folder.is_dir()]
-
-
-@cache
-def _package_code(folder: Path) -> str:
-    return contents_digest([file for file in files_below(folder) if is_code(file)], folder)
-
-
-def _files_of(place: Path) -> list[Path]:
-    return [place] if place.is_file() else list(files_below(place))
-
-
-def _whole(place: Path) -> str:
-    return contents_digest(_files_of(place), place.parent if place.is_file() else place)
-
-
-def _folders_of(top: str) -> list[Path]:
-    """Where a top-level package or module lies: its folders (several for a namespace package) or its one file."""
-    spec = getattr(sys.modules.get(top), "__spec__", None) or find_spec(top)
-    if spec is not None and spec.submodule_search_locations:
-        return [Path(folder) for folder in spec.submodule_search_locations]
-    if spec is None or spec.origin is None or not Path(spec.origin).is_file():
-        raise PluginError(
-            f"the code of '{top}' cannot be found, so its runs could not be told apart", "is it installed?"
-        )
-    return [Path(spec.origin)]
+def search_path() -> dict[str, str]:
+    """The variables of the linker that are set, without the folders that OpenCV's own import puts there."""
+    found = {}
+    for name in SEARCH_VARIABLES:
+        folders = os.environ.get(name, "").split(os.pathsep)
+        kept = [folder for folder in folders if folder and "/cv2/" not in folder]
+        if kept:
+            found[name] = os.pathsep.join(kept)
+    return found
 
 
 # -- machine and content -----------------------------------------------------------------------------------------------
@@ -253,13 +216,12 @@ _SETTLED_NS = 2_000_000_000
 """Digests of files that are younger are not stored: a change within the same tick of the clock would not show."""
 
 
-def contents_digest(files: Iterable[str | Path], root: Path | None = None, *, syntax: bool = True) -> str:
+def contents_digest(files: Iterable[str | Path], root: Path | None = None) -> str:
     """SHA-256 of the contents of files.
 
     Args:
         files: The files; without a root their order counts and their names do not.
         root: A folder; with one their names below it count and their order does not.
-        syntax: Whether Python sources count by `syntax_digest`, and not by their bytes.
 
     Raises:
         OSError: One cannot be read.
@@ -270,11 +232,10 @@ def contents_digest(files: Iterable[str | Path], root: Path | None = None, *, sy
         whole = hashlib.sha256()
         for file in map(Path, ordered):
             name = "" if root is None else f"{file.relative_to(root).as_posix()}\0"
-            content = syntax_digest(file.read_bytes()) if syntax and file.suffix == ".py" else file_sha256(file)
-            whole.update(f"{name}{content}\n".encode(errors="surrogateescape"))
+            whole.update(f"{name}{file_sha256(file)}\n".encode(errors="surrogateescape"))
         return whole.hexdigest()
 
-    return _remembered(f"contents {root} {syntax}", ordered, compute)
+    return _remembered(f"bytes {root}", ordered, compute)
 
 
 def path_digest(path: Path) -> str:
@@ -289,41 +250,7 @@ def path_digest(path: Path) -> str:
     for place, folders, names in os.walk(path, followlinks=True):
         folders[:] = [name for name in folders if not leads_back(Path(place, name))]
         files += [file for name in names if (file := Path(place, name)).is_file()]
-    return contents_digest(files, path, syntax=False)
-
-
-def syntax_digest(source: bytes) -> str:
-    """SHA-256 of a Python source's syntax tree without comments, layout and docstrings.
-
-    It does not depend on the version of Python that parses it. What cannot be parsed counts by its bytes.
-    """
-    try:
-        words = "\0".join(_tokens_of(parsed(source)))
-    except (SyntaxError, ValueError, RecursionError):
-        return hashlib.sha256(source).hexdigest()
-    return hashlib.sha256(words.encode(errors="backslashreplace")).hexdigest()
-
-
-def _tokens_of(node: Any) -> Iterator[str]:
-    """A syntax tree as text tokens; empty fields, which differ between versions of Python, are left out."""
-    if isinstance(node, ast.AST):
-        yield f"({type(node).__name__}"
-        for name, value in ast.iter_fields(node):
-            if value is not None and value != [] and name not in ("ctx", "kind", "type_comment"):
-                yield name
-                yield from _tokens_of(value)
-        yield ")"
-    elif isinstance(node, list):
-        for inner in node:
-            if not _is_docstring(inner):
-                yield from _tokens_of(inner)
-    else:
-        yield repr(node)
-
-
-def _is_docstring(node: Any) -> bool:
-    """Whether a statement is a string alone, which does nothing."""
-    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+    return contents_digest(files, path)
 
 
 def _remembered(kind: str, files: Sequence[str | Path], compute: Callable[[], str]) -> str:

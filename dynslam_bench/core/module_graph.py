@@ -1,8 +1,8 @@
 """Which modules of this package a module uses, and the digest of their code.
 
-The closure of a module holds the module itself and all modules of this package that it reaches by import statements,
-wherever in the source they stand. A package's ``__init__`` that passes a name on is looked through: the name counts with
-the module that defines it. What a text names is no import: entry points of plug-ins, tables of lazily loaded names.
+The closure of a module holds the module itself and all modules of this package that it reaches by import
+statements, wherever in the source they stand. A package's ``__init__`` that passes a name on is looked through: the name counts
+with the module that defines it. What a text names is no import: entry points of plug-ins, tables of lazily loaded names.
 
 Sources count by their syntax: comments, layout and docstrings change nothing.
 """
@@ -24,6 +24,14 @@ from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.folders import digest_cache_folder
 
 PACKAGE = "dynslam_bench"
+PLUMBING = tuple(
+    f"{PACKAGE}.core.{name}"
+    for name in (
+        *("arguments", "code_files", "download", "errors", "files", "fingerprint", "folders", "module_graph"),
+        *("plugins", "reads", "records", "sanitise", "version"),
+    )
+)
+"""Modules that name faults, find, fetch, store and digest files, and load plug-ins: no number passes through them."""
 SETTLED_NS = 2_000_000_000
 """What was read of a younger file is not remembered: a change within the same tick of the clock would not show."""
 _PARSING = threading.Lock()
@@ -58,27 +66,33 @@ class ModuleGraph:
         self.modules = modules
         self._packages = {module.rpartition(".")[0] for module in modules}
 
-    def closure(self, roots: Iterable[str]) -> list[str]:
+    def closure(self, roots: Iterable[str], without: Iterable[str] = ()) -> list[str]:
         """All modules that modules use, themselves among them, sorted.
 
         Args:
             roots: Names of modules; those that do not belong to this package are left out.
+            without: Modules that are left out, with what only they use.
         """
+        left_out = set(without)
         reached: set[str] = set()
         waiting = [root for root in roots if root in self.modules]
         while waiting:
             module = waiting.pop()
-            if module in reached:
+            if module in reached or module in left_out:
                 continue
             reached.add(module)
             defining = [self.defining_module(*reference) for reference in self.modules[module].imports]
             waiting += [source for source in defining if source is not None]
         return sorted(reached)
 
-    def digest(self, roots: Iterable[str]) -> str:
-        """SHA-256 of the syntax of all modules in a closure, with their names."""
+    def digest(self, roots: Iterable[str], without: Iterable[str] = ()) -> str:
+        """SHA-256 of the syntax of all modules in a closure, with their names; see `closure`."""
+        return self.code_digest(self.closure(roots, without))
+
+    def code_digest(self, modules: Iterable[str]) -> str:
+        """SHA-256 of the syntax of modules, with their names."""
         state = hashlib.sha256()
-        for module in self.closure(roots):
+        for module in sorted(modules):
             state.update(f"{module}\0{self.modules[module].digest}\n".encode())
         return state.hexdigest()
 
@@ -133,8 +147,10 @@ def read_module_graph() -> ModuleGraph:
         status = file.stat()
         changed_ns = max(status.st_mtime_ns, status.st_ctime_ns)
         stamp = f"{status.st_size},{status.st_mtime_ns},{status.st_ctime_ns},{status.st_ino}"
-        old_stamp, old_code = remembered.get(name, ("", None))
-        modules[name] = old_code if old_code is not None and old_stamp == stamp else read_module(name, file.read_bytes())
+        old_stamp, code = remembered.get(name, ("", None))
+        if code is None or old_stamp != stamp:
+            code = read_module(name, file.read_bytes())
+        modules[name] = code
         stamps[name] = stamp if time.time_ns() - changed_ns > SETTLED_NS else ""
 
     entries = {name: (stamps[name], code) for name, code in modules.items() if stamps[name]}

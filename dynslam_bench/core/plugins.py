@@ -8,6 +8,7 @@ rest; the reason is kept and shown by ``trackers doctor``.
 """
 
 import importlib.util
+import json
 import os
 import signal
 import subprocess
@@ -60,8 +61,26 @@ class Found(Generic[P]):
     source: str
 
 
+@dataclass(frozen=True)
+class Listed:
+    """A plug-in that is listed and need not be imported yet.
+
+    Attributes:
+        target: ``module:Attr`` or ``file.py:Attr`` of its spec.
+        source: Who lists it, in words.
+        name: What the list calls it: the name of an entry point, by custom the spec's id; empty where there is none.
+    """
+
+    target: str
+    source: str
+    name: str = ""
+
+
 class Registry(Generic[P]):
     """All plug-ins of one kind.
+
+    A plug-in that is only listed is imported when it is asked for by its id, or when all are asked for: what another
+    plug-in does at its import, such as patching numpy, must not reach runs and scores that do not use it.
 
     Args:
         kind: Which entry-point group to read.
@@ -72,56 +91,94 @@ class Registry(Generic[P]):
     def __init__(self, kind: Kind, spec_type: type[P], builtin: Callable[[], Iterable[P]]) -> None:
         self.kind = kind
         self._spec_type = spec_type
-        self._builtin = builtin
+        self._builtin_specs = builtin
+        self._builtin: dict[str, P] | None = None
         self._found: dict[str, Found[P]] | None = None
         self._failures: list[Failure] = []
 
     def all(self) -> list[Found[P]]:
-        """Every available plug-in, sorted by id."""
+        """Every available plug-in, sorted by id; imports all that are listed."""
         return [plugin for _, plugin in sorted(self._discover().items())]
 
     def failures(self) -> list[Failure]:
-        """The plug-ins that could not be loaded, with reasons."""
+        """The plug-ins that could not be loaded, with reasons; imports all that are listed."""
         self._discover()
         return list(self._failures)
 
+    def builtin(self) -> dict[str, P]:
+        """The built-in specs by id."""
+        if self._builtin is None:
+            self._builtin = {spec.id: spec for spec in self._builtin_specs()}
+        return self._builtin
+
     def get(self, name: str) -> P:
-        """The spec of an id, or of ``module:Attr`` / ``file.py:Attr``.
+        """The spec of an id, or of ``module:Attr`` / ``file.py:Attr``; imports no other plug-in.
 
         Raises:
             PluginError: Unknown id (with a did-you-mean), or the named object cannot be loaded or is no spec.
         """
-        plugins = self._discover()
-        if name in plugins:
-            return plugins[name].spec
+        spec = self.find(name)
+        if spec is not None:
+            return spec
         if ":" in name:
             spec = self._check(load_object(name), name)
-            registered = plugins.get(spec.id)  # under a built-in id tables could not tell them apart
-            if registered is not None and registered.source == "built in" and registered.spec != spec:
+            builtin = self.builtin().get(spec.id)  # under a built-in id tables could not tell them apart
+            if builtin is not None and builtin != spec:
                 raise PluginError(f"{name} has the id '{spec.id}', which is built in", "give the plug-in another id")
             return spec
+        plugins = self._discover()
         broken = [f"{failure.source} failed to load: {failure.reason}" for failure in self._failures]
         named = [line for line in broken if name in line]
         hints = named[:1] or [did_you_mean(name, plugins), *broken[:1]]
         raise PluginError(f"unknown {self.kind.rstrip('s')} '{name}'", "; ".join(filter(None, hints)))
+
+    def find(self, name: str) -> P | None:
+        """The spec of an id, None where no plug-in has it; imports no other plug-in."""
+        if name in self.builtin():
+            return self.builtin()[name]
+        target = self.target_of(name)
+        if target is None:
+            return None
+        try:
+            return self._check(load_object(target), target)
+        except PluginError:
+            return None  # what is wrong with it is said where all are listed
+
+    def target_of(self, name: str) -> str | None:
+        """``module:Attr`` of the listed plug-in with an id; None for a built-in id, and where none has it."""
+        if name in self.builtin():
+            return None
+        called_so = [listed for listed in self.listed() if listed.name == name]
+        others = [listed for listed in self.listed() if listed.name != name]
+        for listed in (*called_so, *others):
+            if described(listed.target).get("id") == name:
+                return listed.target
+        return None
+
+    def listed(self) -> list[Listed]:
+        """What the environment variable and the installed distributions list; nothing is imported."""
+        targets = [Listed(target, f"{ENVIRONMENT_VARIABLE}: {target}") for target in _environment_targets(self.kind)]
+        installed = _entry_points(*sys.path).select(group=f"dynslam_bench.{self.kind}")
+        for point in sorted(installed, key=attrgetter("name")):
+            distribution = point.dist.name if point.dist else "unknown distribution"
+            source = f"entry point '{point.name}' of {distribution}"
+            targets.append(Listed(f"{point.module}:{point.attr}", source, point.name))
+        return targets
 
     def refresh(self) -> None:
         """Forget what was discovered, e.g. after the environment variable changed."""
         self._found = None
         self._failures = []
         _entry_points.cache_clear()
+        described.cache_clear()
 
     def _discover(self) -> dict[str, Found[P]]:
         if self._found is None:
             self._found = {}
-            for spec in self._builtin():
+            for spec in self.builtin().values():
                 self._add(spec, "built in")
-            for target in _environment_targets(self.kind):
-                self._add(target, f"{ENVIRONMENT_VARIABLE}: {target}")
-            installed = _entry_points(*sys.path).select(group=f"dynslam_bench.{self.kind}")
-            for point in sorted(installed, key=attrgetter("name")):
-                distribution = point.dist.name if point.dist else "unknown distribution"
-                self._add(f"{point.module}:{point.attr}", f"entry point '{point.name}' of {distribution}")
+            for listed in self.listed():
+                self._add(listed.target, listed.source)
         return self._found
 
     def _add(self, plugin: P | str, source: str) -> None:
@@ -215,7 +272,10 @@ def _is_imported(location: str) -> bool:
 
 
 def _module_name(path: Path) -> str:
-    return f"_dynslam_bench_plugin_{sha256(str(path.expanduser().resolve()).encode()).hexdigest()[:12]}"
+    """The name of a file's module, made of path and content: an edited file is imported again."""
+    file = path.expanduser().resolve()
+    content = file.read_bytes() if file.is_file() else b""
+    return f"_dynslam_bench_plugin_{sha256(str(file).encode() + content).hexdigest()[:12]}"
 
 
 def _load_file(path: Path) -> ModuleType:
@@ -256,13 +316,18 @@ ISOLATED_VARIABLE = "DYNSLAM_BENCH_ISOLATED"
 LIMIT_S = 120
 _IMPORTED = 113
 _PROBE = """
-import os
-from dynslam_bench.core.plugins import import_module
+import json, os
+from dynslam_bench.core.plugins import import_module, load_object
+location, target, code, pipe = sys.argv[1:]
 try:
-    import_module(sys.argv[1])
+    import_module(location)
+    if target:
+        spec = load_object(target)
+        about = {"id": str(spec.id), "sequences": list(map(str, getattr(spec, "sequences", ())))}
+        os.write(int(pipe), json.dumps(about).encode())
 except Exception:
     pass  # the caller meets it again and reports it
-os._exit(int(sys.argv[2]))
+os._exit(int(code))
 """
 
 
@@ -294,25 +359,65 @@ def check_import(location: str) -> None:
     Raises:
         PluginError: It does not; with how it ended.
     """
-    if os.environ.get(ISOLATED_VARIABLE):
-        return
-    command = [*python_command(_PROBE), location, str(_IMPORTED)]
-    quiet = subprocess.DEVNULL
+    if not os.environ.get(ISOLATED_VARIABLE):
+        _probe(location, "")
+
+
+@cache
+def described(target: str) -> dict[str, Any]:
+    """``id`` and ``sequences`` of a plug-in's spec, read in a process of its own; empty where it cannot be loaded.
+
+    In the process of a run, which may be changed by what it imports, the spec is loaded there.
+
+    Args:
+        target: ``module:Attr`` or ``file.py:Attr``.
+    """
+    location = target.rpartition(":")[0]
     try:
-        code = subprocess.run(
-            command,
-            env=os.environ | {ISOLATED_VARIABLE: "1"},
-            timeout=LIMIT_S,
-            check=False,
-            stdin=quiet,
-            stdout=quiet,
-            stderr=quiet,
-        ).returncode
-    except subprocess.TimeoutExpired:
-        raise PluginError(f"cannot import {location}: it is not done after {LIMIT_S} s") from None
-    if code != _IMPORTED:
-        how = f"exit code {code}" if code >= 0 else signal.Signals(-code).name
-        raise PluginError(
-            f"cannot import {location}: that ends the process ({how})",
-            "a plug-in must not call sys.exit or os._exit when it is imported",
-        )
+        if os.environ.get(ISOLATED_VARIABLE):
+            spec = load_object(target)
+            return {"id": str(spec.id), "sequences": list(map(str, getattr(spec, "sequences", ())))}
+        answer = _probe(location, target)
+    except Exception:  # it fails in any way; `Registry.failures` says how
+        return {}
+    return dict(json.loads(answer)) if answer else {}
+
+
+def _probe(location: str, target: str) -> bytes:
+    """Import a module in a process of its own, and read a spec of it.
+
+    Args:
+        location: Name of a module, or path of a ``.py`` file.
+        target: The spec; empty to import the module alone.
+
+    Returns:
+        What the process wrote of the spec, see `_PROBE`.
+
+    Raises:
+        PluginError: The process hangs, or it is ended by the import.
+    """
+    quiet = subprocess.DEVNULL
+    reading, writing = os.pipe()
+    with os.fdopen(reading, "rb") as answer:
+        try:
+            code = subprocess.run(
+                [*python_command(_PROBE), location, target, str(_IMPORTED), str(writing)],
+                env=os.environ | {ISOLATED_VARIABLE: "1"},
+                timeout=LIMIT_S,
+                check=False,
+                stdin=quiet,
+                stdout=quiet,
+                stderr=quiet,
+                pass_fds=[writing],
+            ).returncode
+        except subprocess.TimeoutExpired:
+            raise PluginError(f"cannot import {location}: it is not done after {LIMIT_S} s") from None
+        finally:
+            os.close(writing)
+        if code != _IMPORTED:
+            how = f"exit code {code}" if code >= 0 else signal.Signals(-code).name
+            raise PluginError(
+                f"cannot import {location}: that ends the process ({how})",
+                "a plug-in must not call sys.exit or os._exit when it is imported",
+            )
+        return answer.read()

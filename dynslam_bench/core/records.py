@@ -15,7 +15,9 @@ from dynslam_bench.core.sanitise import json_without_passwords, storable
 R = TypeVar("R", bound="Record")
 M = TypeVar("M", bound=BaseModel)
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
-"""Sixteen hexadecimal digits, as `digest` makes them; nothing else names a file or folder."""
+"""Sixteen hexadecimal digits, as `digest` makes them: the name of a sequence's part."""
+RunId = Annotated[str, Field(pattern=r"^[0-9a-f]{16}([0-9a-f]{4})?$")]
+"""Twenty hexadecimal digits: twelve of what was asked for, eight of what was read for it. Older runs have sixteen."""
 
 
 def schema(newest: int) -> Any:

@@ -9,7 +9,7 @@ over its bound.
 import contextlib
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
@@ -21,7 +21,37 @@ from numpy.typing import NDArray
 from dynslam_bench.core.errors import DynslamError, raising
 from dynslam_bench.core.files import replacing
 from dynslam_bench.core.folders import STAGES_VARIABLE, stage_cache_folder
+from dynslam_bench.core.module_graph import PLUMBING, module_graph
 from dynslam_bench.core.reading import read_npz
+
+ReadsSoFar = Callable[[], str]
+"""Gives a digest of all that the plug-ins of this process have read so far."""
+_RECORDING: list[ReadsSoFar] = []
+
+
+def record_reads(reads_so_far: ReadsSoFar) -> None:
+    """Say how this process records what plug-ins read; without it their stages are not cached."""
+    _RECORDING[:] = [reads_so_far]
+
+
+def stage_code(entry_point: str) -> ReadsSoFar | None:
+    """Gives the digest of the code of a stage, of a plug-in with all that it has read so far.
+
+    It is asked before and after a stage computes: what a plug-in reads meanwhile, such as its weights at its first
+    frame, makes the result one of an unknown state, which is not stored.
+
+    Args:
+        entry_point: ``module:Attr`` or ``file.py:Attr`` of the stage.
+
+    Returns:
+        None where the code is a plug-in's and nothing records what it reads.
+    """
+    module = entry_point.rpartition(":")[0]
+    if module in module_graph().modules:
+        code = module_graph().digest([module], PLUMBING)
+        return lambda: code
+    return _RECORDING[0] if _RECORDING else None
+
 
 DEFAULT_MAX_BYTES = 8 * 2**30
 _PRUNE_EVERY = 512

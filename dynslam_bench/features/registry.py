@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -10,11 +9,11 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import FeatureExtractor, FeatureSpec, Keypoints, MaskedExtractor
 from dynslam_bench.core import PluginError
-from dynslam_bench.core.fingerprint import code_digest, content_digest, machine_digest, named_digests
+from dynslam_bench.core.fingerprint import content_digest, machine_digest, named_digests
 from dynslam_bench.core.plugins import Registry, build_plugin
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import Reconfigurable, Settings
-from dynslam_bench.core.stage_cache import StageCache
+from dynslam_bench.core.stage_cache import ReadsSoFar, StageCache, stage_code
 from dynslam_bench.features.settings import FeatureSettings
 
 __all__ = ["FEATURES", "ORB", "FeatureSpec"]
@@ -46,10 +45,6 @@ def build_extractor(settings: FeatureSettings | None = None) -> FeatureExtractor
 
 # Keypoints from the stage cache.
 
-_PACKAGES = ("core", "contracts", "features")
-"""The packages whose code decides what an extractor returns."""
-
-
 class CachedExtractor:
     """An extractor whose results are stored, addressed by the image, the extractor's code and the settings.
 
@@ -58,6 +53,7 @@ class CachedExtractor:
         settings: Its settings.
         cache: Where results are stored.
         threads: Threads of the extractor, part of the cost.
+        code: Gives the digest of its code, see `stage_code`.
 
     Attributes:
         hit: Whether the last call's result was stored.
@@ -65,11 +61,13 @@ class CachedExtractor:
             less the look-up, or minus the time of storing.
     """
 
-    def __init__(self, extractor: FeatureExtractor, settings: Settings, cache: StageCache, threads: int) -> None:
+    def __init__(
+        self, extractor: FeatureExtractor, settings: Settings, cache: StageCache, threads: int, code: ReadsSoFar
+    ) -> None:
         self._extractor = extractor
         self._cache = cache
         self._threads = threads
-        self._code = code_of(str(getattr(settings, "extractor", "orb")))
+        self._code = code
         self._address(settings)
         self.hit = False
         self.saved_s = 0.0
@@ -82,7 +80,7 @@ class CachedExtractor:
 
     def _address(self, settings: Settings) -> None:
         weights = named_digests(settings)
-        self._prefix = digest([self._code, weights, settings.model_dump(mode="json"), machine_digest(), self._threads])
+        self._prefix = digest([weights, settings.model_dump(mode="json"), machine_digest(), self._threads])
 
     def extract(self, gray: NDArray[np.uint8]) -> Keypoints:
         """The keypoints of a uint8 ``[H, W]`` image."""
@@ -90,7 +88,8 @@ class CachedExtractor:
 
     def _answer(self, inputs: list[Any], compute: Callable[[], Keypoints]) -> Keypoints:
         begin = time.perf_counter()
-        key = digest([self._prefix, *inputs], 32)
+        code = self._code()
+        key = digest([code, self._prefix, *inputs], 32)
         entry = self._cache.get("features", key)
         self.hit = entry is not None
         if entry is not None:
@@ -99,7 +98,8 @@ class CachedExtractor:
             start = time.perf_counter()
             keypoints = compute()
             cost = time.perf_counter() - start
-            self._cache.put("features", key, vars(keypoints), cost)
+            if self._code() == code:
+                self._cache.put("features", key, vars(keypoints), cost)
         self.saved_s = cost - (time.perf_counter() - begin)
         return keypoints
 
@@ -117,19 +117,14 @@ class CachedMaskedExtractor(CachedExtractor):
 
 def cached_extractor(
     extractor: FeatureExtractor, settings: Settings, cache: StageCache, threads: int
-) -> CachedExtractor:
-    """The extractor with a cache; with masked extraction if it has that."""
-    kind = CachedMaskedExtractor if isinstance(extractor, MaskedExtractor) else CachedExtractor
-    return kind(extractor, settings, cache, threads)
-
-
-@cache
-def code_of(extractor: str) -> str:
-    """Digest of the code of an extractor: this package's, and a plug-in's own.
-
-    It is read once a process, when the plug-in is loaded: later edits of the file do not change the running code.
+) -> CachedExtractor | None:
+    """The extractor with a cache, with masked extraction if it has that; None for one that cannot be cached.
 
     Raises:
-        PluginError: No such extractor, or its code cannot be read.
+        PluginError: No such extractor.
     """
-    return code_digest(FEATURES.get(extractor).entry_point, _PACKAGES)
+    code = stage_code(FEATURES.get(str(getattr(settings, "extractor", "orb"))).entry_point)
+    if code is None:
+        return None
+    kind = CachedMaskedExtractor if isinstance(extractor, MaskedExtractor) else CachedExtractor
+    return kind(extractor, settings, cache, threads, code)

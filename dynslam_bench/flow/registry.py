@@ -5,14 +5,14 @@ from __future__ import annotations
 from dynslam_bench.contracts.flow import FlowEstimator, FlowSpec
 from dynslam_bench.core.errors import PluginError
 from dynslam_bench.core.plugins import Registry, build_plugin
-from dynslam_bench.flow.settings import DenseFlowSettings, FlowMethodSettings, FlowSettings
+from dynslam_bench.flow.settings import FlowMethodSettings, FlowSettings
 
 __all__ = ["FLOWS", "FlowSpec"]
 
 BUILT_IN = (
     FlowSpec(
         "daisy",
-        "dynslam_bench.flow.registry:build_daisy",
+        "dynslam_bench.flow.daisy:build_daisy",
         "DAISY Filter Flow, sparse or dense, with an interchangeable label search",
         "MIT",
     ),
@@ -28,6 +28,15 @@ BUILT_IN = (
 FLOWS: Registry[FlowSpec] = Registry("flow", FlowSpec, lambda: BUILT_IN)
 
 
+def spec_of(settings: FlowMethodSettings) -> FlowSpec:
+    """The flow that settings name.
+
+    Raises:
+        PluginError: No such flow.
+    """
+    return FLOWS.get(settings.plugin or settings.method)
+
+
 def build_flow(settings: FlowMethodSettings | None = None, *, device: str = "cpu", threads: int = 1) -> FlowEstimator:
     """Load and construct the flow that the settings name.
 
@@ -41,24 +50,10 @@ def build_flow(settings: FlowMethodSettings | None = None, *, device: str = "cpu
         SettingsError: The flow refuses the settings.
     """
     settings = settings or FlowSettings()
-    spec = FLOWS.get(settings.plugin or settings.method)
     return build_plugin(
         "flow",
-        spec,
+        spec_of(settings),
         FlowEstimator,  # type: ignore[type-abstract]
         PluginError,
         lambda build: build(settings, device=device, threads=threads),
     )
-
-
-def build_daisy(settings: FlowMethodSettings, *, device: str = "cpu", threads: int = 1) -> FlowEstimator:
-    """DAISY Filter Flow, sparse or dense; on the processor, whatever the device."""
-    if isinstance(settings, DenseFlowSettings):
-        from dynslam_bench.flow.dense_flow import DenseDaisyFlow
-
-        return DenseDaisyFlow(settings, threads=threads)
-    from dynslam_bench.flow.sparse import SparseDaisyFlow
-
-    if not isinstance(settings, FlowSettings):  # a system with another flow by default: DAISY's own options are absent
-        settings = FlowSettings(**settings.model_dump())
-    return SparseDaisyFlow(settings, threads=threads)

@@ -107,3 +107,14 @@ class DenseFlowSettings(DaisySettings):
     second_round: bool = Field(
         True, description="try on regions with inconsistent pixels the motion that regions nearby suggest"
     )
+
+
+class PublishedFlowSettings(FlowMethodSettings):
+    """Lucas-Kanade as published systems use it: none of their sources names a forward-backward check."""
+
+    method: Literal["daisy", "lucas-kanade", "dis"] = Field(
+        "lucas-kanade", description="which flow; the published one is Lucas-Kanade"
+    )
+    forward_backward_px: float = Field(
+        0.0, ge=0.0, le=100.0, description="largest forward-backward error in pixels; 0, no check, as published"
+    )

@@ -31,7 +31,7 @@ from dynslam_bench.core.download import download
 from dynslam_bench.core.errors import left_out_of_messages
 from dynslam_bench.core.records import Record, digest, validated
 from dynslam_bench.runs.exchange.transfer import import_trajectory
-from dynslam_bench.runs.record import RunRecord
+from dynslam_bench.runs.record import RunRecord, run_id_of
 from dynslam_bench.runs.store import FINAL, ONLINE, RUN_FILE, Merged, RunStore, Unreadable, Which, merge, open_store
 
 SUMS = "SHA256SUMS"
@@ -182,7 +182,7 @@ def verify(bank: str | Path) -> list[str]:
     records, unreadable = store.all()
     faults += [f"{entry.path}: {entry.reason}" for entry in unreadable]
     for record in records:
-        if record.run_id != digest(record.identity, 16):
+        if record.run_id not in (run_id_of(record.identity), digest(record.identity, 16)):  # the second of older runs
             faults.append(f"runs/{record.run_id}: its id is not that of what it says of itself")
         faults += [f"runs/{record.run_id}: its {name} is not that of its identity" for name in _contradicted(record)]
         if f"sequences/{record.sequence.part}/timestamps.txt" not in listed:

@@ -12,10 +12,10 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from dynslam_bench.core import RunError, find_data_root, raising
-from dynslam_bench.core.fingerprint import package_digest, versions
+from dynslam_bench.core.fingerprint import versions
 from dynslam_bench.core.version import install_hint
 from dynslam_bench.envs import resolve_device
-from dynslam_bench.runs.identity import CODE_PACKAGES
+from dynslam_bench.runs.own_code import package_code
 from dynslam_bench.segmentation.networks.checkpoints import COCO, cached_checkpoint
 from dynslam_bench.sequences.catalogue import entry_of
 
@@ -136,7 +136,7 @@ def _facts(sequences: Sequence[str], data_root: str | None) -> dict[str, Any]:
     """What this machine has."""
     lacking = {name for name in sequences if not _is_here(name, data_root)}
     return {
-        "code": package_digest(CODE_PACKAGES),
+        "code": package_code(),
         "packages": set(versions().items()),
         "device": resolve_device(),
         "lacking": lacking | (set() if cached_checkpoint(COCO) else {f"network {COCO.id}"}),

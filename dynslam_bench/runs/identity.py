@@ -1,6 +1,11 @@
-"""What makes two runs the same run: everything that its result depends on, and nothing else."""
+"""What makes two runs the same run: what was asked for, and what was read for it.
+
+A run's id has twelve digits of what was asked for and eight of what was read. A stored run is taken again while all
+that was read for it is unchanged.
+"""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -10,41 +15,34 @@ from dynslam_bench.contracts import Sequence, TrackerSpec
 from dynslam_bench.contracts.checks import check_sensors
 from dynslam_bench.core import PluginError, RunError, SettingsError, did_you_mean, raising
 from dynslam_bench.core.fingerprint import (
-    code_digest,
     contents_digest,
     distribution_of_module,
-    has_package_changed,
+    library_identity,
     named_digests,
-    plugin_digest,
+    search_path,
     this_machine,
-    versions,
 )
-from dynslam_bench.core.plugins import Registry, load_object
-from dynslam_bench.core.records import digest
-from dynslam_bench.core.settings import Settings, flatten, named
+from dynslam_bench.core.module_graph import module_graph, read_module_graph
+from dynslam_bench.core.plugins import load_object
+from dynslam_bench.core.settings import Settings, flatten
 from dynslam_bench.core.version import release
 from dynslam_bench.envs import Degradation
 from dynslam_bench.envs.slam_env import check_frames, open_frames, preprocessing_of, resolve_device
-from dynslam_bench.features.registry import FEATURES
 from dynslam_bench.features.settings import FeatureSettings
-from dynslam_bench.flow.registry import FLOWS
 from dynslam_bench.geometry import Camera
-from dynslam_bench.runs.record import IDENTITY_SCHEME, StartMap
+from dynslam_bench.runs.own_code import is_foreign, modules_of_run, parts_of_run
+from dynslam_bench.runs.record import IDENTITY_SCHEME, StartMap, asked_digest, run_id_of
 from dynslam_bench.runs.spec import MAP_SETTING, RunSpec
-from dynslam_bench.segmentation.build_segmenter import SEGMENTERS, segmentation_source, weights_digest
+from dynslam_bench.segmentation.build_segmenter import segmentation_source, weights_digest
 from dynslam_bench.segmentation.settings import SegmentationSettings
-from dynslam_bench.sequences import DATASETS, PreprocessingSettings
+from dynslam_bench.sequences import PreprocessingSettings
 from dynslam_bench.sequences.view import Part, part_of
 from dynslam_bench.slam.map_files import MapFeatures, Sensors, read_map
 from dynslam_bench.slam.settings import BackendSettings
 from dynslam_bench.trackers.registry import TRACKERS, resolve_settings
 
-CODE_PACKAGES = (
-    *("core", "geometry", "contracts", "sequences", "features", "segmentation", "flow"),
-    *("culling", "slam", "trackers", "envs"),
-)
-"""The packages whose source a trajectory may depend on."""
-LIBRARIES = ("numpy", "scipy", "opencv", "torch", "numba")
+LIBRARIES = {"numpy": "numpy", "scipy": "scipy", "opencv": "cv2", "torch": "torch", "numba": "numba"}
+"""The modules that compute with a run's data, by the name that tables give them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +56,8 @@ class ResolvedRun:
         sequence: The opened sequence, cut to the frames asked for.
         device: ``cpu`` or ``cuda:N``.
         segmentation: Where the masks come from; empty for trackers without a semantic stage.
-        identity: What the run's id is a digest of.
+        identity: What is asked for, and what is known beforehand of what the run will read.
+        foreign: Whether plug-ins or programs take part: what they read is known only after the run.
         start_map: The map that it begins in; None for a run that begins without one.
         files: Those that the tracker's command names, in the identity by their content.
     """
@@ -70,13 +69,36 @@ class ResolvedRun:
     device: str
     segmentation: str
     identity: dict[str, Any]
+    foreign: bool = False
     start_map: StartMap | None = None
     files: tuple[Path, ...] = ()
 
     @cached_property
+    def asked(self) -> str:
+        """The first twelve digits of its id: what is asked for."""
+        return asked_digest(self.identity)
+
+    @cached_property
     def run_id(self) -> str:
-        """Sixteen hexadecimal digits that stand for the identity."""
-        return digest(self.identity, 16)
+        """Its id; that of a run with foreign parts changes when it is known what they read."""
+        return run_id_of(self.identity)
+
+    @cached_property
+    def stated(self) -> dict[str, Any]:
+        """The identity as it reads after it was stored."""
+        return dict(json.loads(json.dumps(self.identity, default=str)))
+
+    @property
+    def anchors(self) -> dict[str, str]:
+        return {}
+
+    @property
+    def distribution(self) -> str:
+        """Name and version of the distribution that the tracker comes from."""
+        top = self.tracker.entry_point.rpartition(":")[0].partition(".")[0]
+        if top == "dynslam_bench":
+            return f"dynslam-bench {release()}"
+        return " ".join(distribution_of_module(top)).strip()
 
 
 def resolve(spec: RunSpec) -> ResolvedRun:
@@ -100,8 +122,9 @@ class Resolver:
         self._whole = lru_cache(maxsize=None)(open_frames)
         self._part = lru_cache(maxsize=None)(self._open_part)
         self._device = lru_cache(maxsize=None)(resolve_device)
+        self._libraries = lru_cache(maxsize=None)(libraries)
         self._configured: dict[str, tuple[TrackerSpec, Settings, dict[str, Any]]] = {}
-        self._code: dict[tuple[str, str], tuple[dict[str, Any], tuple[Path, ...]]] = {}
+        self._files: dict[tuple[str, str], tuple[dict[str, Any], tuple[Path, ...]]] = {}
 
     def __call__(self, spec: RunSpec) -> ResolvedRun:
         """Look up a run; see `resolve`."""
@@ -111,28 +134,21 @@ class Resolver:
             self._configured[configuration] = _configured(spec)
         tracker, settings, flat = self._configured[configuration]
         where = (spec.sequence, spec.data_root, spec.camera, preprocessing_of(settings))
-        sequence, part, sequence_plugin = self._part(where, spec.frames_seen, spec.stride, spec.offset)
+        sequence, part = self._part(where, spec.frames_seen, spec.stride, spec.offset)
         check_sensors(tracker, sequence)
-        strengths = set(Degradation.__dataclass_fields__) - {"seed"}
-        for unknown in sorted(set(spec.degrade) - strengths):
-            raise RunError(f"unknown degradation '{unknown}'", did_you_mean(unknown, strengths))
-        Degradation(seed=0, **spec.degrade)  # checks the strengths
+        check_degradation(spec.degrade)
         device = self._device(spec.device)
         source = segmentation_source(settings, sequence)
-        if (configuration, source) not in self._code:
-            self._code[configuration, source] = _code_of(tracker, settings, source)
-        code, files = self._code[configuration, source]
-        start_map = start_map_of(settings, sequence.camera, tracker.sensors, code["weights"])
-        identity = {
+        if (configuration, source) not in self._files:
+            self._files[configuration, source] = _files_of(tracker, settings, source)
+        named, files = self._files[configuration, source]
+        start_map = start_map_of(settings, sequence.camera, tracker.sensors, named["weights"])
+
+        asked = {
             "scheme": IDENTITY_SCHEME,
             "tracker": tracker.id,
-            "tracker_version": tracker.version,
-            **code,
             "settings": flat if start_map is None else flat | {MAP_SETTING: ""},  # its digest is among the weights
-            "segmentation": source,
             "sequence": part.id,
-            "content": part.content,
-            "camera": part.camera,
             "frames": [part.start, part.stop],
             "offset": spec.offset,
             "stride": part.stride,
@@ -141,12 +157,27 @@ class Resolver:
             "threads": spec.threads,
             **({"cache": True} if spec.cache else {}),
             "realtime": spec.realtime,
-            **({"machine": this_machine().model_dump()} if spec.realtime else {}),
             "drop_share": spec.drop_share,
             "degrade": {name: value for name, value in sorted(spec.degrade.items()) if value},
-            **({"sequence_plugin": sequence_plugin} if sequence_plugin else {}),
         }
-        return ResolvedRun(spec, tracker, settings, sequence, device, source, identity, start_map, files)
+        changes_frames = bool(asked["degrade"]) or spec.realtime or bool(spec.drop_share)
+        parts = parts_of_run(tracker, settings, source, sequence, changes_frames=changes_frames)
+        foreign = any(map(is_foreign, parts)) or bool(tracker.files)
+        read = {
+            "tracker_version": tracker.version,
+            "parts": parts,
+            "source": source_digest(parts),
+            "requires": {module: library_identity(module) for module in sorted(tracker.requires)},
+            "libraries": self._libraries(),
+            **named,
+            "segmentation": source,
+            "content": part.content,
+            "camera": part.camera,
+            **({"machine": this_machine().model_dump()} if spec.realtime else {}),
+        }
+        return ResolvedRun(
+            spec, tracker, settings, sequence, device, source, asked | read, foreign, start_map, files
+        )
 
     def _open_part(
         self,
@@ -154,15 +185,26 @@ class Resolver:
         frames: tuple[int, int | None] | None,
         stride: int,
         offset: int,
-    ) -> tuple[Sequence, Part, str]:
-        """Checked frames of a sequence, what part of it they are, and the digest of the plug-in that reads it."""
+    ) -> tuple[Sequence, Part]:
+        """Checked frames of a sequence, and what part of it they are."""
         name, data_root, camera, preprocessing = where
         whole = self._whole(name, data_root, camera, None, 1, preprocessing)
         sequence = open_frames(whole, None, None, frames, stride)
         check_frames(sequence)
-        datasets = {plugin.spec.id: plugin.spec for plugin in DATASETS.all()}
-        dataset = datasets.get(name.partition("/")[0])
-        return sequence, part_of(sequence, offset), "" if dataset is None else plugin_digest(dataset.entry_point)
+        return sequence, part_of(sequence, offset)
+
+
+def check_degradation(strengths: Mapping[str, float]) -> None:
+    """Refuse degradations that are unknown or too strong.
+
+    Raises:
+        RunError: Unknown name.
+        DynslamError: A strength out of its range.
+    """
+    known = set(Degradation.__dataclass_fields__) - {"seed"}
+    for unknown in sorted(set(strengths) - known):
+        raise RunError(f"unknown degradation '{unknown}'", did_you_mean(unknown, known))
+    Degradation(seed=0, **strengths)
 
 
 def _configured(spec: RunSpec) -> tuple[TrackerSpec, Settings, dict[str, Any]]:
@@ -174,48 +216,30 @@ def _configured(spec: RunSpec) -> tuple[TrackerSpec, Settings, dict[str, Any]]:
     return tracker, settings, flatten(settings)
 
 
-def _code_of(tracker: TrackerSpec, settings: Settings, source: str) -> tuple[dict[str, Any], tuple[Path, ...]]:
-    """What of a run's identity says by which code, libraries, weights and files it is made; and the files."""
-    with raising(PluginError, f"cannot read a file of tracker '{tracker.id}'"):
-        files = tuple(map(Path, load_object(tracker.files)(settings))) if tracker.files else ()
-        content = {"files": contents_digest(files)} if tracker.files else {}
-    weights, group = named_digests(settings), getattr(settings, "segmentation", None)
+def _files_of(tracker: TrackerSpec, settings: Settings, source: str) -> tuple[dict[str, Any], tuple[Path, ...]]:
+    """What of a run's identity says by which weights and files it is made; and the files of its program."""
+    weights = named_digests(settings)
+    group = getattr(settings, "segmentation", None)
     if source in ("embedded", "coco") and isinstance(group, SegmentationSettings):
         weights[source] = weights_digest(group.model_copy(update={"source": source}))
-    installed = versions()  # another version of what computes with the run's data may give other bits
-    top = tracker.entry_point.rpartition(":")[0].partition(".")[0]
-    own = f"dynslam-bench {release()}"
-    code = {
-        "distribution": own if top == "dynslam_bench" else " ".join(distribution_of_module(top)).strip(),
-        "source": source_fingerprint(tracker, settings, source),
-        "requires": {module: distribution_of_module(module)[1] for module in sorted(tracker.requires)},
-        "weights": weights,  # of every file that the settings name, or of the network in use where none is named
-        **content,
-        "libraries": {name: installed.get(name, "") for name in LIBRARIES},
-    }
-    return code, files
+    named: dict[str, Any] = {"weights": weights}
+    if not tracker.files:
+        return named, ()
+    with raising(PluginError, f"cannot read a file of tracker '{tracker.id}'"):
+        files = tuple(map(Path, load_object(tracker.files)(settings)))
+        return named | {"files": contents_digest(files)}, files
 
 
-def source_fingerprint(tracker: TrackerSpec, settings: Settings | None = None, source: str = "") -> str:
-    """Digest of the code that the tracker runs: this package's, the tracker's own, and that of plug-ins it names.
+def libraries() -> dict[str, str]:
+    """What computes with a run's data: versions of the modules that are imported, and what comes before them."""
+    found = {name: library_identity(module) for name, module in LIBRARIES.items()}
+    return found | search_path()
 
-    Args:
-        tracker: The tracker.
-        settings: Its settings; the plug-ins that they name count with their code.
-        source: Where its masks come from; ``plugin:ID`` counts with its code.
 
-    Raises:
-        PluginError: A plug-in is unknown, or its code cannot be read.
-    """
-    registries: dict[str, Registry[Any]] = {"features": FEATURES, "flow": FLOWS}
-    plugins = {}
-    for name, (kind, value) in sorted(named(settings).items() if settings is not None else ()):
-        if kind in registries:
-            plugins[name] = plugin_digest(registries[kind].get(value).entry_point)
-    prefix, _, segmenter = source.partition(":")
-    if prefix == "plugin":
-        plugins["segmentation.source"] = plugin_digest(SEGMENTERS.get(segmenter).entry_point)
-    return digest([code_digest(tracker.entry_point, CODE_PACKAGES), plugins])
+def source_digest(parts: list[str]) -> str:
+    """Digest of the code of this package that a run's parts use; see `own_code.parts_of_run`."""
+    graph = module_graph()
+    return graph.code_digest(modules_of_run(graph, parts))[:16]
 
 
 def check_unchanged(run: ResolvedRun, *, begun: bool = False) -> None:
@@ -229,7 +253,8 @@ def check_unchanged(run: ResolvedRun, *, begun: bool = False) -> None:
         RunError: Something has changed since.
         DynslamError: Something cannot be read any more.
     """
-    if has_package_changed(CODE_PACKAGES):
+    graph = read_module_graph()
+    if graph.code_digest(modules_of_run(graph, run.identity["parts"]))[:16] != run.identity["source"]:
         raise RunError("the code of dynslam-bench has changed since this process began", "start it again")
     before, now = run.identity, resolve(run.spec).identity
     with raising(PluginError, f"cannot read a file of tracker '{run.tracker.id}'"):
@@ -237,8 +262,11 @@ def check_unchanged(run: ResolvedRun, *, begun: bool = False) -> None:
     now["weights"] = {name: now["weights"].get(name) if value else value for name, value in before["weights"].items()}
     changed = [name for name in before if now.get(name) != before[name]]
     if changed:
-        words = {"source": f"the code of tracker '{run.tracker.id}'", "content": f"sequence '{run.sequence.id}'"}
-        words |= {"files": f"the program of tracker '{run.tracker.id}'", "weights": "a file that the settings name"}
+        words = {
+            "content": f"sequence '{run.sequence.id}'",
+            "files": f"the program of tracker '{run.tracker.id}'",
+            "weights": "a file that the settings name",
+        }
         what = ", ".join(words.get(name, name) for name in changed)
         hint = "the run is not stored; ask again, and let no tracker write files beside its code or data"
         raise RunError(f"{what} has changed since the run was asked for", hint)

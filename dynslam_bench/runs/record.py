@@ -9,20 +9,37 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from dynslam_bench.core.fingerprint import GitRevision, Machine
-from dynslam_bench.core.records import Digest, Record, digest, schema
+from dynslam_bench.core.reads import Reads
+from dynslam_bench.core.records import Digest, Record, RunId, digest, schema
 from dynslam_bench.evaluation import Evaluation
 
 RUN_SCHEMA = 1
 METRIC_SCHEMA = 1
 
 Status = Literal["ok", "lost", "crashed", "timeout", "out-of-memory", "invalid", "stopped"]
-IDENTITY_SCHEME = 1
+IDENTITY_SCHEME = 2
 """Raised when run ids are made of other things. Stored runs of another scheme are shown as unverified."""
-_CODE = ("tracker_version", "distribution", "source", "requires", "files")
+ASKED = (
+    *("scheme", "tracker", "settings", "sequence", "frames", "offset", "stride", "seed", "device", "threads", "cache"),
+    *("realtime", "drop_share", "degrade"),
+)
+"""What of an identity was asked for; all else was read for it: code, data, weights, libraries, files."""
+_CODE = ("tracker_version", "source", "requires", "files", "reads")
 FAILED: tuple[Status, ...] = ("crashed", "timeout", "out-of-memory", "invalid")
 """Statuses of runs that did not come to their end."""
 LOST_COVERAGE = 0.5
 """A trajectory with poses of a smaller share of the frames that were due is that of a camera that was lost."""
+
+
+def asked_digest(identity: Mapping[str, Any]) -> str:
+    """The first twelve digits of a run's id: what was asked for."""
+    return digest({name: identity[name] for name in ASKED if name in identity}, 12)
+
+
+def run_id_of(identity: Mapping[str, Any]) -> str:
+    """The id of a run: twelve digits of what was asked for, eight of what was read for it."""
+    read = {name: value for name, value in identity.items() if name not in ASKED}
+    return asked_digest(identity) + digest(read, 8)
 
 
 def coverage_text(coverage: float | None) -> str:
@@ -192,7 +209,7 @@ class RunRecord(Record):
 
     schema_version: int = schema(RUN_SCHEMA)
     kind: Literal["run", "imported"] = "run"
-    run_id: Digest
+    run_id: RunId
     status: Status
     reason: str = ""
     tracker: TrackerInfo
@@ -243,6 +260,12 @@ class RunRecord(Record):
     def normalised(self) -> RunRecord:
         """The record as it reads after it was written: tuples inside settings are lists then."""
         return RunRecord.model_validate_json(self.to_json())
+
+    @property
+    def reads(self) -> Reads | None:
+        """What the plug-ins and programs of the run read; None for a run without such, or where it is not known."""
+        stored = self.identity.get("reads")
+        return None if stored is None else Reads.model_validate(stored)
 
     @property
     def verified(self) -> bool:
@@ -337,7 +360,7 @@ class MetricRecord(Record):
     """
 
     schema_version: int = schema(METRIC_SCHEMA)
-    run_id: Digest
+    run_id: RunId
     protocol_id: str
     protocol_digest: str
     code: str = ""

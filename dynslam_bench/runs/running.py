@@ -31,6 +31,7 @@ from dynslam_bench.core import (
     reason_of,
 )
 from dynslam_bench.core.fingerprint import git_revision, this_machine, versions
+from dynslam_bench.core.reads import Reads
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import flatten
 from dynslam_bench.evaluation import Protocol, get_protocol
@@ -38,10 +39,20 @@ from dynslam_bench.runs.artifacts import PICTURE, SHEET_FILE, VIDEO_FILE
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE
 from dynslam_bench.runs.frames import FRAMES_FILE, FrameLog
 from dynslam_bench.runs.identity import ResolvedRun, Resolver, check_unchanged, resolve
+from dynslam_bench.runs.lookup import LookUp
 from dynslam_bench.runs.process.child import LOG_FILE
 from dynslam_bench.runs.process.fork_server import Child, make_job
 from dynslam_bench.runs.process.supervisor import LONGEST_LOG, LONGEST_YET, Verdict, bound_log, supervise
-from dynslam_bench.runs.record import FAILED, LOST_COVERAGE, RunRecord, SequenceInfo, StageTime, Status, TrackerInfo
+from dynslam_bench.runs.record import (
+    FAILED,
+    LOST_COVERAGE,
+    RunRecord,
+    SequenceInfo,
+    StageTime,
+    Status,
+    TrackerInfo,
+    run_id_of,
+)
 from dynslam_bench.runs.spec import RunSpec, place_of
 from dynslam_bench.runs.store import DEFAULT_PROTOCOL, Records, RunStore
 from dynslam_bench.segmentation.build_segmenter import NetworkNotFetched
@@ -50,6 +61,7 @@ from dynslam_bench.sequences.view import part_of
 from dynslam_bench.slam.map_files import MAP_FILE
 from dynslam_bench.trackers.registry import resolve_settings
 
+def read_reads(work): return None
 T = TypeVar("T")
 WORK = "dynslam_bench.runs.loop:run_loop"
 """What the child does."""
@@ -117,6 +129,7 @@ def run_one(
             spec=resolved.spec.model_dump(mode="json"),
             protocol=get_protocol(protocol).model_dump(mode="json"),
             progress_every=progress_every,
+            anchors=resolved.anchors if resolved.foreign else None,
         )
         log = work / LOG_FILE
         watched: dict[str, Any] = {"tick": lambda: bound_log(log, LONGEST_YET), "at_a_time": at_a_time}
@@ -139,7 +152,8 @@ def run_one(
             frames.write(work, title, exact_stamps(resolved.sequence))
             (work / FRAMES_FILE).unlink(missing_ok=True)
         check_unchanged(resolved, begun=True)
-        record = _record(resolved, verdict, frames, started, time.perf_counter() - clock).normalised()
+        reads = read_reads(work) if resolved.foreign else None
+        record = _record(resolved, verdict, frames, reads, started, time.perf_counter() - clock).normalised()
         if record.status != "stopped":
             store.add_sequence(record.sequence.part, timestamps_ns(resolved.sequence), resolved.sequence.ground_truth)
             record = store.publish(work, record)
@@ -171,8 +185,11 @@ def part_digest(identity: dict[str, Any]) -> str:
     return digest({key: identity[key] for key in ("sequence", "content", "frames", "offset", "stride")}, 16)
 
 
-def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: str, wall_s: float) -> RunRecord:
-    spec, tracker, identity, final = resolved.spec, resolved.tracker, resolved.identity, verdict.final
+def _record(
+    resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, reads: Reads | None, started: str, wall_s: float
+) -> RunRecord:
+    spec, tracker, final = resolved.spec, resolved.tracker, verdict.final
+    identity = resolved.stated if reads is None else resolved.stated | {"reads": reads.model_dump(mode="json")}
     total, states = len(resolved.sequence), Counter(row.state for row in frames.rows)
     status, reason, dropped = verdict.status, verdict.reason, states["dropped"]
     tracked, lost, initialising = states["ok"], states["lost"], states["initialising"]
@@ -195,12 +212,12 @@ def _record(resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, started: 
     notes += [BATCH_NOTE] if batch else []
     notes += [] if resolved.start_map is None else [resolved.start_map.describe()]
     return RunRecord(
-        run_id=resolved.run_id,
+        run_id=run_id_of(identity),
         status=status,
         reason=reason,
         tracker=TrackerInfo(
             label=spec.label or tracker.label,
-            distribution=identity["distribution"],
+            distribution=resolved.distribution,
             given="" if spec.tracker == tracker.id else spec.tracker,
             **{name: getattr(tracker, name) for name in _OF_THE_TRACKER},
         ),
@@ -277,7 +294,7 @@ class RunEvent:
 
     Attributes:
         kind: ``reused`` (it was stored already), ``started``, ``progress`` or ``finished``.
-        run_id: The run.
+        run_id: The run. One with plug-ins or programs gets its final id, that of `record`, when it is finished.
         spec: What was asked for.
         total: How many runs there are, of those looked up so far while some are ``reused``.
         record: The outcome, with ``reused`` and ``finished``.
@@ -363,7 +380,8 @@ def run_many(
         bench.make_remotely(executor)
     if bench.first_fault is not None and on_fault is None:
         raise bench.first_fault
-    return Records(store, [run_id for run_id in bench.run_ids if run_id in bench.done], bench.not_stored)
+    finished = [bench.done[run_id] for run_id in bench.run_ids if run_id in bench.done]
+    return Records(store, finished, bench.not_stored)
 
 
 @dataclass
@@ -379,10 +397,11 @@ class _Bench:
     cancelled: Callable[[], bool]
     on_fault: OnFault | None
     run_ids: list[str] = field(default_factory=list)
-    """Of the runs that were looked up, in their order."""
+    """Of the runs that were looked up, in their order, as they were known then."""
     waiting: list[tuple[ResolvedRun, RunRecord | None]] = field(default_factory=list)
     """Runs that are to be made, each with the record that is stored."""
-    done: set[str] = field(default_factory=set)
+    done: dict[str, str] = field(default_factory=dict)
+    """The id of each finished run's record, by the id that was known before."""
     not_stored: dict[str, RunRecord] = field(default_factory=dict)
     first_fault: DynslamError | None = None
     lock: threading.Lock = field(default_factory=threading.Lock)
@@ -390,10 +409,13 @@ class _Bench:
 
     def look_up(self, specs: Iterable[RunSpec], again: Collection[str]) -> None:
         """Look the runs up: take what is stored, let the others wait to be made."""
-        look_up, plan, run_ids = Resolver(), Plan(), set[str]()
+        resolver = Resolver()
+        stored_runs = LookUp(self.store)
+        plan = Plan()
+        run_ids: set[str] = set()
         for spec in specs:
             try:
-                run = look_up(spec)
+                run = resolver(spec)
             except (NetworkNotFetched, InfrastructureError):
                 raise
             except DynslamError as error:
@@ -407,7 +429,7 @@ class _Bench:
             if run.run_id in run_ids:
                 continue
             run_ids.add(run.run_id)
-            stored = self.store.get(run.run_id)
+            stored = stored_runs.find(run)
             if stored is not None and stored.status not in again and not _lacks_pictures(self.store, run, stored):
                 fault = self.store.changed(stored)
                 if fault:  # the sequence's files are put back; where the run's differ, it is made again
@@ -451,7 +473,7 @@ class _Bench:
                     time.sleep(_LOOK_AGAIN_S)
                     continue
                 run, before = claimed
-                stored = self.store.get(run.run_id)
+                stored = LookUp(self.store).find(run)  # another process may have made it meanwhile
                 if stored is not None and stored != before:
                     self._reuse(run, stored)
                 else:
@@ -492,7 +514,7 @@ class _Bench:
                     run, _ = self.waiting.pop(0)
                     self._report("started", run)
                     spec = run.spec.model_copy(update={"device": run.device})
-                    asked = (spec.model_dump_json(), protocol, json.dumps(run.identity, default=str))
+                    asked = (spec.model_dump_json(), protocol, json.dumps(run.stated))
                     sent[_asked(executor.submit, run_packed, *asked)] = run
                 for future in wait(sent, return_when=FIRST_COMPLETED).done:
                     self._attempt(sent.pop(future), partial(self._take, future))
@@ -515,9 +537,9 @@ class _Bench:
             self._take_in(run, record, "finished")
 
     def _take_in(self, run: ResolvedRun, record: RunRecord, kind: EventKind) -> None:
-        self.done.add(run.run_id)
+        self.done[run.run_id] = record.run_id
         if record.status == "stopped":
-            self.not_stored[run.run_id] = record
+            self.not_stored[record.run_id] = record
         elif kind == "finished":
             self.store.score(record, self.protocol)
         self._report(kind, run, record=record)
@@ -572,7 +594,7 @@ def _lacks_pictures(store: RunStore, run: ResolvedRun, stored: RunRecord) -> boo
     return any(not (folder / name).is_file() for name in set(wanted) - excused)
 
 
-_ENTRY = re.compile(r"(runs|sequences)/([0-9a-f]{16})/([A-Za-z0-9_]+\.[a-z0-9]+)")
+_ENTRY = re.compile(r"(runs|sequences)/([0-9a-f]{16}(?:[0-9a-f]{4})?)/([A-Za-z0-9_]+\.[a-z0-9]+)")
 
 
 def run_packed(spec_json: str, protocol_json: str, identity_json: str, *, at_a_time: int = 1) -> bytes:
@@ -595,7 +617,7 @@ def run_packed(spec_json: str, protocol_json: str, identity_json: str, *, at_a_t
         resolved = resolve(RunSpec.model_validate_json(spec_json))
     except DynslamError as error:
         raise RunError(f"{name} cannot make the run: {error.args[0]}", error.hint) from error
-    asked, own = json.loads(identity_json), json.loads(json.dumps(resolved.identity, default=str))
+    asked, own = json.loads(identity_json), resolved.stated
     differing = [key for key in sorted(asked | own) if asked.get(key) != own.get(key) and key != "machine"]
     if differing:
         raise RunError(

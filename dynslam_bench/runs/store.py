@@ -39,11 +39,11 @@ from dynslam_bench.core import (
     write_atomic,
 )
 from dynslam_bench.core.errors import left_out_of_messages
-from dynslam_bench.core.fingerprint import package_digest
+from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, module_graph
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation import PROTOCOLS, Evaluation, Protocol, evaluate, get_protocol, hints
 from dynslam_bench.geometry import Trajectory, TumFile, format_ns, format_tum, load_tum, read_tum
-from dynslam_bench.runs.record import MetricRecord, RunRecord
+from dynslam_bench.runs.record import MetricRecord, RunRecord, run_id_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 LOGGER = logging.getLogger(__name__)
 DEFAULT_PROTOCOL = "tum-rgbd/v1"
 Which = Literal["online", "final"]
-_RUN_ID = re.compile(r"[0-9a-f]{16}")
+_RUN_ID = re.compile(r"[0-9a-f]{16}([0-9a-f]{4})?")
 OnProgress = Callable[[int, int], None]
 """Called with how many runs are done, of how many."""
 
@@ -239,7 +239,8 @@ class RunStore:
         """Folder of one run, whether it exists or not.
 
         Raises:
-            RunError: It is no run's id, which is 16 hexadecimal digits: anything else could lead out of the store.
+            RunError: It is no run's id, which is 20 hexadecimal digits (16 of older runs): anything else could lead
+                out of the store.
         """
         return self.runs / _checked(run_id, "a run's id")
 
@@ -293,6 +294,7 @@ class RunStore:
         Raises:
             InfrastructureError: It cannot be written; then nothing has changed.
         """
+        record = self._under_free_id(record)
         target = self.folder(record.run_id)
         record = self._with_alarm(record, work)
         with raising(InfrastructureError, f"cannot write {target}", "check the free space"):
@@ -305,6 +307,15 @@ class RunStore:
             fresh = folder / link.name
             fresh.symlink_to(target.relative_to(self.root))
             fresh.replace(link)
+        return record
+
+    def _under_free_id(self, record: RunRecord) -> RunRecord:
+        """The record, under another id where a run of another identity has that one: such a run is not overwritten."""
+        earlier = self.get(record.run_id)
+        while earlier is not None and earlier.identity != record.identity:
+            identity = record.identity | {"id_taken_by": earlier.run_id}
+            record = record.model_copy(update={"identity": identity, "run_id": run_id_of(identity)})
+            earlier = self.get(record.run_id)
         return record
 
     def _files(self, part: str, run: Path) -> dict[str, str]:
@@ -402,6 +413,10 @@ class RunStore:
             return []
         with os.scandir(self.runs) as entries:
             return sorted(entry.name for entry in entries if _RUN_ID.fullmatch(entry.name) and entry.is_dir())
+
+    def ids_of(self, asked: str) -> list[str]:
+        """Ids of the stored runs of one request, by its first twelve digits; see `record.asked_digest`."""
+        return [run_id for run_id in self.ids() if run_id.startswith(asked)]
 
     def read(self, run_id: str) -> RunRecord:
         """The record of a run by its id, the id's first digits, or ``latest``.
@@ -669,7 +684,8 @@ def open_store(results: str | Path) -> RunStore:
 
 def evaluation_code() -> str:
     """Digest of the code that metrics are computed by."""
-    return package_digest(("evaluation", "geometry"))
+    parts = [f"{PACKAGE}.evaluation.evaluate", f"{PACKAGE}.evaluation.hints"]
+    return module_graph().digest(parts, PLUMBING)[:12]
 
 
 def _metrics_of(protocol: Protocol) -> str:
@@ -679,7 +695,7 @@ def _metrics_of(protocol: Protocol) -> str:
 def _checked(name: str, what: str) -> str:
     """A name that data gives to a folder of the store, if it is one that this package makes."""
     if not _RUN_ID.fullmatch(name):
-        raise RunError(f"{name[:100]!r} is not {what}: expected 16 hexadecimal digits")
+        raise RunError(f"{name[:100]!r} is not {what}: expected 20 hexadecimal digits, or 16 of older runs")
     return name
 
 
@@ -791,7 +807,7 @@ def list_runs(
     """
     protocol = get_protocol(protocol)
     name = f"list {protocol.digest()}"
-    version = digest([package_digest(("evaluation", "geometry", "runs")), *FIELDS])
+    version = digest([module_graph().digest([__name__], PLUMBING), *FIELDS])
     ids = store.ids()
     rows = {run_id: row for run_id, text in store.index.read(name, version, ids).items() if (row := _row(run_id, text))}
     entries: list[tuple[str, str, str]] = []
@@ -902,7 +918,7 @@ def run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
         record: The run.
         metrics: Its errors under some protocol; None without.
     """
-    from dynslam_bench.segmentation.networks.checkpoints import seen_in_training  # loads the catalogue of all sequences
+    from dynslam_bench.segmentation.training_scenes import seen_in_training  # loads the catalogue of all sequences
 
     errors = {} if metrics is None or record.failed else metrics.metrics  # what a part of a run scores says nothing
     not_scored = "" if metrics is None or errors else metrics.reasons.get(metrics.trajectory, "")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable
-from functools import cache, lru_cache, partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,11 @@ import numpy as np
 
 from dynslam_bench.contracts import Frame, Instances, MaskSource, Segmenter, SegmenterContext, SegmenterSpec, Sequence
 from dynslam_bench.core import SegmentationError, raising
-from dynslam_bench.core.fingerprint import code_digest, content_digest, machine_digest, path_digest
+from dynslam_bench.core.fingerprint import content_digest, machine_digest, path_digest
 from dynslam_bench.core.plugins import Registry, build_plugin
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import Settings
-from dynslam_bench.core.stage_cache import Arrays, StageCache
+from dynslam_bench.core.stage_cache import Arrays, ReadsSoFar, StageCache, stage_code
 from dynslam_bench.segmentation.networks.checkpoints import (
     COCO,
     Checkpoint,
@@ -32,8 +32,6 @@ LOWEST_CONFIDENCE = 0.1
 """Networks report detections down to this score, so that the confidence may be changed while a run lasts."""
 NETWORKS = frozenset({"embedded", "coco", "onnx", "weights", "plugin"})
 """Sources whose masks depend on the colour image alone."""
-_PACKAGES = ("core", "contracts", "sequences", "segmentation")
-"""The packages whose code decides what a network finds."""
 
 
 def _builtin() -> Iterable[SegmenterSpec]:
@@ -197,10 +195,10 @@ def build_segmenter(
     name, argument = (argument, "") if kind == "plugin" else (kind, argument)
     floor = min(LOWEST_CONFIDENCE, settings.confidence)
     context = SegmenterContext(sequence_id, masks, device, threads, argument, floor)
-    if cache is None or kind not in NETWORKS:
+    code = None if cache is None or kind not in NETWORKS else stage_code(SEGMENTERS.get(name).entry_point)
+    if cache is None or code is None:
         return ConfiguredSegmenter(_load(name, settings, context), settings, source, also)
     identity = {
-        "code": _code_of(name),
         "source": source,
         "weights": weights_digest(settings, sequence_id),
         "confidence": floor,
@@ -208,7 +206,7 @@ def build_segmenter(
         "device": device,
         "threads": threads,
     }
-    cached = CachedSegmenter(partial(_load, name, settings, context), identity, cache)
+    cached = CachedSegmenter(partial(_load, name, settings, context), identity, cache, code)
     if not identity["weights"]:
         cached.network()  # without a file there is nothing to wait for
     return ConfiguredSegmenter(cached, settings, source, also)
@@ -219,18 +217,6 @@ def _load(name: str, settings: SegmentationSettings, context: SegmenterContext) 
     spec = SEGMENTERS.get(name)
     protocol: type[Segmenter] = Segmenter  # type: ignore[type-abstract]
     return build_plugin("segmenter", spec, protocol, SegmentationError, lambda build: build(settings, context))
-
-
-@cache
-def _code_of(name: str) -> str:
-    """Digest of the code of a segmenter: this package's, and a plug-in's own.
-
-    It is read once a process, when the plug-in is loaded: later edits of its file do not act in this process.
-
-    Raises:
-        PluginError: No such segmenter, or its code cannot be read.
-    """
-    return code_digest(SEGMENTERS.get(name).entry_point, _PACKAGES)
 
 
 class SharedNetwork:
@@ -262,8 +248,9 @@ class CachedSegmenter:
 
     Args:
         load: Loads the network, when a frame needs it.
-        identity: JSON-able description of code, network, weights and settings that change its masks, and of its cost.
+        identity: JSON-able description of network, weights and settings that change its masks, and of its cost.
         cache: Where results are stored.
+        code: Gives the digest of its code, see `stage_code`.
 
     Attributes:
         network: Loads the network at its first call and returns it.
@@ -271,9 +258,10 @@ class CachedSegmenter:
         saved_s: Seconds to add to the last call's wall time to get its cost without the cache.
     """
 
-    def __init__(self, load: Callable[[], Segmenter], identity: object, cache: StageCache) -> None:
+    def __init__(self, load: Callable[[], Segmenter], identity: object, cache: StageCache, code: ReadsSoFar) -> None:
         self.network = SharedNetwork(load)
         self._cache = cache
+        self._code = code
         self._prefix = digest([identity, machine_digest()])
         self.hit = False
         self.saved_s = 0.0
@@ -281,7 +269,8 @@ class CachedSegmenter:
     def segment(self, frame: Frame) -> Instances:
         """The objects in the frame."""
         begin = time.perf_counter()
-        key = digest([self._prefix, content_digest(frame.rgb)], 32)
+        code = self._code()
+        key = digest([code, self._prefix, content_digest(frame.rgb)], 32)
         entry = self._cache.get("masks", key)
         self.hit = entry is not None
         if entry is not None:
@@ -291,7 +280,8 @@ class CachedSegmenter:
             start = time.perf_counter()
             instances = network.segment(frame)
             cost = time.perf_counter() - start
-            self._cache.put("masks", key, _pack(instances), cost)
+            if self._code() == code:
+                self._cache.put("masks", key, _pack(instances), cost)
         self.saved_s = cost - (time.perf_counter() - begin)
         return instances
 

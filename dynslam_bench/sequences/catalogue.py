@@ -13,7 +13,7 @@ from pydantic import Field
 
 from dynslam_bench.contracts import DatasetSpec, Sequence
 from dynslam_bench.core import SequenceError, did_you_mean, find_data_root, is_writable, read_toml, user_cache
-from dynslam_bench.core.plugins import Registry, load_object
+from dynslam_bench.core.plugins import Registry, described, load_object
 from dynslam_bench.core.settings import Settings, build
 from dynslam_bench.geometry import Camera
 from dynslam_bench.sequences.cameras import CAMERAS, MARKER_TO_CAMERA, chosen_camera, find_camera
@@ -115,8 +115,11 @@ def by_folder() -> dict[str, CatalogueEntry]:
 
 
 def sequence_ids() -> list[str]:
-    """Ids of all listed sequences: the public ones, the rendered ones, and those of plug-ins."""
-    return [name for dataset in DATASETS.all() for name in dataset.spec.sequences]
+    """Ids of all listed sequences: the public ones, the rendered ones, and those of plug-ins, none of which is imported."""
+    ids = [name for dataset in DATASETS.builtin().values() for name in dataset.sequences]
+    for listed in DATASETS.listed():
+        ids += described(listed.target).get("sequences", [])
+    return list(dict.fromkeys(ids))
 
 
 def open_sequence(
@@ -245,12 +248,14 @@ def _open_whole(
     entry = None if is_path else entry_of(name)
     if entry is not None:
         return open_public(entry.id, data_root=data_root, camera=camera, settings=settings)
-    prefix, public = name.partition("/")[0], {entry.dataset for entry in catalogue().values()}
-    datasets = {dataset.spec.id: dataset.spec for dataset in DATASETS.all() if dataset.spec.id not in public}
-    if not is_path and "/" in name and prefix in datasets:
-        if camera is not None:
+    prefix, separator, _ = name.partition("/")
+    public = {entry.dataset for entry in catalogue().values()}
+    if separator and not is_path and prefix not in public:
+        dataset = DATASETS.find(prefix)
+        if dataset is not None and camera is not None:
             raise SequenceError(f"sequence '{name}' brings its own camera", "leave out --camera")
-        return cast("Sequence", load_object(datasets[prefix].entry_point)(name, data_root=data_root))
+        if dataset is not None:
+            return cast("Sequence", load_object(dataset.entry_point)(name, data_root=data_root))
     if is_bag(path):
         raise SequenceError(f"{path} is a bag", f"unpack it first: dynslam-bench sequences unpack {path} FOLDER")
     if path.is_dir():

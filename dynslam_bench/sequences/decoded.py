@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, Sequence
 from dynslam_bench.core import STAGES_VARIABLE, DynslamError, SequenceError, raising, replacing, turn
-from dynslam_bench.core.fingerprint import opencv_version, package_digest
+from dynslam_bench.core.fingerprint import opencv_version
+from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, module_graph
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.stage_cache import StageCache
-from dynslam_bench.sequences.view import Wrapped, part_of
+from dynslam_bench.sequences.view import Wrapped, part_of, reader_of
 
 
 class Decoded(Wrapped):
@@ -45,7 +46,7 @@ class Decoded(Wrapped):
 def _mapped(sequence: Sequence) -> NDArray[np.void]:
     """The frames as a mapped array of records ``rgb`` and ``depth``, which is written if it is not there or damaged."""
     cache, part = StageCache(), part_of(sequence)
-    code = [package_digest(("core", "geometry", "sequences")), opencv_version()]
+    code = [module_graph().digest([reader_of(sequence), f"{PACKAGE}.sequences.preprocessing"], PLUMBING), opencv_version()]
     path = cache.path("frames", digest([sequence.digest(), part.start, part.stop, part.stride, code]), ".npy")
     if (frames := _read(path)) is None:
         with raising(DynslamError, f"cannot write the stage cache {cache.folder}", f"set {STAGES_VARIABLE}"):

@@ -80,6 +80,14 @@ class SequenceView(Wrapped):
         return Frame(range(len(self))[index], frame.timestamp, frame.rgb, frame.depth)
 
 
+def reader_of(sequence: Sequence) -> str:
+    """The module that reads or renders a sequence, whatever views and preprocessing lie around it."""
+    base = sequence
+    while isinstance(base, Wrapped):
+        base = base.base
+    return type(base).__module__
+
+
 @dataclass(frozen=True)
 class Masks:
     """A `MaskSource` that is a function of the frame's index."""

@@ -34,7 +34,6 @@ from dynslam_bench.contracts.checks import check_frame
 from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.seeding import derive_seed, stream
 from dynslam_bench.core.settings import OnlineSettings, Reconfigurable, Settings
-from dynslam_bench.culling.ego_motion import refine_prediction
 from dynslam_bench.culling.settings import GuardSettings
 from dynslam_bench.geometry import Camera, Trajectory, se3
 from dynslam_bench.segmentation.postprocess import dynamic_mask
@@ -43,6 +42,9 @@ from dynslam_bench.slam.backend import RgbdBackend
 
 if TYPE_CHECKING:
     from dynslam_bench.segmentation.schedule import MaskScheduler
+
+RefinePrediction = Callable[[FrameBundle, FilterState], NDArray[np.float64] | None]
+"""Called with a frame and what is known beside it, its flow among that; gives ``T_world_cam`` or None."""
 
 
 class CachedStage(Protocol):
@@ -105,6 +107,8 @@ class SlamPipeline:
         masks: Segmentation stage; None for systems without semantics.
         filters: Dynamic feature filters in the order of application.
         flow: Flow of the keypoints that are left to the previous image; run before the first filter that needs it.
+        refine_prediction: Gives the predicted pose ``T_world_cam`` that follows from the flow and the motion model,
+            None where neither tells; needed with a flow.
         backend: Tracking and mapping.
         settings: The system's complete settings; their group ``guard`` says what the filters must leave.
         cached: Stages that answer from the stage cache, by name (``features``, ``segmentation``); their times are
@@ -123,6 +127,7 @@ class SlamPipeline:
         filters: Sequence[DynamicFilter],
         flow: FlowEstimator | None,
         backend: RgbdBackend,
+        refine_prediction: RefinePrediction | None = None,
         settings: Settings,
         cached: Mapping[str, CachedStage] | None = None,
     ) -> None:
@@ -132,7 +137,10 @@ class SlamPipeline:
         self._extractor = extractor
         self._masks = masks
         self._filters = tuple(filters)
+        if flow is not None and refine_prediction is None:
+            raise TrackerError("a system with an optical flow needs a function that refines the predicted pose with it")
         self._flow = flow
+        self._refine_prediction = refine_prediction
         self._backend = backend
         self._guard: GuardSettings = getattr(settings, "guard", GuardSettings())
         self._segmentation: SegmentationSettings | None = getattr(settings, "segmentation", None)
@@ -249,8 +257,9 @@ class SlamPipeline:
             if (previous := self._previous) is not None:
                 other = self._flow.prepare(previous.frame.gray) if previous.image is None else previous.image
                 state.flow = flow_to_previous(self._flow, image, other, frame, state)
+        assert self._refine_prediction is not None  # checked in the constructor
         with clock("ego_motion"):
-            state.T_world_pred = refine_prediction(frame, state)
+            state.T_world_pred = self._refine_prediction(frame, state)
         return image
 
     def _stats(

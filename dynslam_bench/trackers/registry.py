@@ -51,16 +51,17 @@ class TrackerRegistry(Registry[TrackerSpec]):
     """
 
     def get(self, name: str) -> TrackerSpec:
-        """The spec of an id, of ``id:value``, or of ``module:Attr`` / ``file.py:Attr``.
+        """The spec of an id, of ``id:value``, or of ``module:Attr`` / ``file.py:Attr``; imports no other plug-in.
 
         Raises:
             PluginError: Unknown id (with a did-you-mean), an empty value, or the named object is no spec.
         """
-        specs = {plugin.spec.id: plugin.spec for plugin in self.all()}
         prefix, separator, value = name.partition(":")
-        if name in specs or not separator or prefix not in specs or not specs[prefix].parameter:
-            return super().get(name)
-        return _bind(specs[prefix], value)
+        if separator and self.find(name) is None:
+            spec = self.find(prefix)
+            if spec is not None and spec.parameter:
+                return _bind(spec, value)
+        return super().get(name)
 
 
 def _bind(spec: TrackerSpec, value: str) -> TrackerSpec:

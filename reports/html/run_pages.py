@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from dynslam_bench.core import TABLE_BYTES, DynslamError, RunError, read_bytes
-from dynslam_bench.core.fingerprint import package_digest
+from dynslam_bench.core.module_graph import PLUMBING, module_graph
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation import Protocol, RPESpec, pose_errors
 from dynslam_bench.geometry import Trajectory
@@ -49,7 +49,6 @@ WORST = 6
 _APART = 15
 """Frames between two of these at least."""
 _LOG_BYTES = 20_000
-_CODE = ("evaluation", "geometry", "reports", "runs")
 """Packages whose code makes a page."""
 _WHOLE = ("total_s", "processor_s", "read_s")
 """Times of a frame that are no stage of it: the figure stacks stages."""
@@ -114,7 +113,7 @@ def _write_page(row: RunRow, pictured: bool, share: Mapping[int, float], protoco
     name, files = f"run-{row.run_id}", _files(row, output)
     stamps = [file_stamp(row.folder / file) for file in (CSV_FILE, "log.txt")]
     state = row.store.index.state(row.run_id, row.sequence.part)
-    code = [package_digest(_CODE), protocol.digest(), *share.items()]
+    code = [module_graph().digest([__name__], PLUMBING), protocol.digest(), *share.items()]
     made_of = digest([code, state, stamps, files, pictured, row.notes, row.failed])
     earlier = read_remark(output, name)
     if earlier and earlier[0] == made_of:

@@ -21,9 +21,8 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-import dynslam_bench
 from dynslam_bench.core import DynslamError, InfrastructureError, ReportError, raising
-from dynslam_bench.core.fingerprint import package_digest
+from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, module_graph
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation.protocol import MONOCULAR, Protocol
 from dynslam_bench.reports.model.row import RunRow, grouped, make_row
@@ -37,7 +36,8 @@ MANY = 250
 MOST_WORKERS = 8
 _AT_ONCE = 40
 """Jobs that a worker takes at once."""
-_CODE = ("evaluation", "geometry", "reports/model", "runs")
+_ROW_CODE = (f"{PACKAGE}.reports.model.row",)
+"""What rows are computed by, with all that it uses."""
 
 
 def no_progress(done: float, total: float | None, what: str) -> None:
@@ -112,7 +112,7 @@ def _without_main() -> Iterator[None]:
 
 def _place(protocol: Protocol) -> tuple[str, str]:
     """Under which name and version a store's index holds the rows of a protocol."""
-    return f"report {protocol.digest()}", digest([dynslam_bench.__version__, package_digest(_CODE)])
+    return f"report {protocol.digest()}", module_graph().digest(_ROW_CODE, PLUMBING)
 
 
 def _unchanged_rows(store: RunStore, protocol: Protocol, run_ids: Sequence[str]) -> dict[str, RunRow]:

@@ -21,7 +21,7 @@ from dynslam_bench.reports.tables.leaderboard import leaderboard, per_sequence, 
 from dynslam_bench.reports.tables.table import mm, percent, to_markdown
 from dynslam_bench.runs.record import IDENTITY_SCHEME
 from dynslam_bench.runs.store import RunStore
-from dynslam_bench.segmentation.networks.checkpoints import seen_in_training
+from dynslam_bench.segmentation.training_scenes import seen_in_training
 from dynslam_bench.trackers import TRACKERS
 
 # -- what ranks

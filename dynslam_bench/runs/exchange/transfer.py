@@ -29,7 +29,7 @@ from dynslam_bench.geometry import (
 )
 from dynslam_bench.runs.exchange.formats import read_trajectory, write_bag, write_colmap, write_pose_table
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE, write_stored
-from dynslam_bench.runs.record import RunRecord, SequenceInfo, TrackerInfo
+from dynslam_bench.runs.record import RunRecord, SequenceInfo, TrackerInfo, run_id_of
 from dynslam_bench.runs.running import judge_coverage, part_digest, sequence_info
 from dynslam_bench.runs.spec import place_of
 from dynslam_bench.runs.store import RunStore, Which, open_store
@@ -326,7 +326,7 @@ def import_trajectory(
     info = sequence_info(opened, part.content, named) if stated is None else _info_by_truth(part, stated, named)
     record = RunRecord(
         kind="imported",
-        run_id=digest(identity, 16),
+        run_id=run_id_of(identity),
         status=status,
         reason=reason,
         tracker=TrackerInfo(id=tracker, label=label or f"{tracker} (imported)", provenance="external"),

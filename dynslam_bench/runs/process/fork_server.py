@@ -34,7 +34,7 @@ from typing import Any
 import psutil
 
 from dynslam_bench.core import InfrastructureError, sweep
-from dynslam_bench.core.fingerprint import package_digest
+from dynslam_bench.core.module_graph import module_graph
 from dynslam_bench.core.plugins import module_command
 
 _CHILD = "dynslam_bench.runs.process.child"
@@ -307,8 +307,7 @@ def serve(fd: int, start: str) -> None:
     if start == "fork":
         with contextlib.suppress(Exception):  # what is not loaded here each child loads itself
             importlib.import_module("dynslam_bench.core.compiled").load_kernels()
-            # remembered: the keys of the children's stage caches are of the code that is loaded here
-            package_digest(importlib.import_module("dynslam_bench.runs.identity").CODE_PACKAGES)
+            module_graph()  # remembered: the keys of the children's stage caches are of the code that is loaded here
     adopt_orphans()
     _Server(control, start).run()
 

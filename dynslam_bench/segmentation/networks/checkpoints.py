@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from dynslam_bench.core import DownloadError, SegmentationError, SequenceError, weights_folder
+from dynslam_bench.core import DownloadError, SegmentationError, weights_folder
 from dynslam_bench.core.download import Report, download
-from dynslam_bench.sequences.synthetic import TUNE_SCENES, parse_synthetic_id
 
 
 @dataclass(frozen=True)
@@ -78,20 +77,3 @@ def fetch_checkpoint(checkpoint: Checkpoint, progress: Report | None = None) -> 
             f"{checkpoint.sha256_prefix}) at {path}",
         ) from error
     return path
-
-
-def seen_in_training(source: str, sequence_id: str) -> bool:
-    """Whether masks come from a network that was trained on frames of that scene.
-
-    This is known of the embedded network only: it was trained on every rendered sequence of the scenes 0-99.
-
-    Args:
-        source: Source of the masks, resolved (``embedded``, never ``auto``).
-        sequence_id: For example ``synthetic/walking_xyz?scene=3``.
-    """
-    if source != "embedded" or not sequence_id.startswith("synthetic/"):
-        return False
-    try:
-        return parse_synthetic_id(sequence_id).scene in TUNE_SCENES
-    except SequenceError:  # an imported trajectory may name any sequence
-        return False

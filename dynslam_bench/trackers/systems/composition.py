@@ -3,7 +3,7 @@
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 from pydantic import Field, create_model
 
@@ -13,10 +13,12 @@ from dynslam_bench.core.plugins import load_object
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.culling.settings import GuardSettings, Unmatched
 from dynslam_bench.features.settings import FeatureSettings
-from dynslam_bench.flow.settings import FlowMethodSettings
-from dynslam_bench.segmentation.settings import FORMS, SegmentationSettings, expand_classes
-from dynslam_bench.sequences import PreprocessingSettings
+from dynslam_bench.segmentation.settings import FORMS, SegmentationSettings
+from dynslam_bench.sequences.settings import PreprocessingSettings
 from dynslam_bench.slam.settings import BackendSettings, MonocularBackendSettings
+
+if TYPE_CHECKING:
+    from dynslam_bench.flow.settings import FlowMethodSettings
 
 SOURCES = ", ".join(form for form in FORMS.split(", ") if form != "none")
 """Sources of masks, as `segmentation.source` names them."""
@@ -87,21 +89,30 @@ class MonocularSemanticSettings(SemanticSystemSettings):
     segmentation: UnrepairedSettings = UnrepairedSettings()
 
 
-class PublishedFlowSettings(FlowMethodSettings):
-    """Lucas-Kanade as published systems use it: none of their sources names a forward-backward check."""
-
-    method: Literal["daisy", "lucas-kanade", "dis"] = Field(
-        "lucas-kanade", description="which flow; the published one is Lucas-Kanade"
-    )
-    forward_backward_px: float = Field(
-        0.0, ge=0.0, le=100.0, description="largest forward-backward error in pixels; 0, no check, as published"
-    )
+MASK_STAGE = "dynslam_bench.trackers.systems.mask_stage:build_mask_stage"
+FLOW = "dynslam_bench.flow.registry:build_flow"
+REFINE_PREDICTION = "dynslam_bench.culling.ego_motion:refine_prediction"
+"""Parts that only some systems have. They are loaded by name, so that no other system depends on their code."""
 
 
-def movable_classes(filters: Sequence[DynamicFilter]) -> frozenset[str]:
-    """The classes that filters watch although they are not dynamic by themselves: their setting ``movable``."""
-    named = (getattr(getattr(block, "settings", None), "movable", "") for block in filters)
-    return frozenset().union(*(expand_classes(names) for names in named if names))
+def parts_of(settings: UnfilteredSystemSettings) -> list[str]:
+    """The entry points of the parts that a system has beside the back end: filters in force, masks, flow."""
+    parts = [f"dynslam_bench.culling.{name}" for name, _ in _filters_in_force(settings)]
+    if isinstance(settings, SemanticSystemSettings):
+        parts.append(MASK_STAGE)
+    if getattr(settings, "flow", None) is not None:
+        parts += [FLOW, REFINE_PREDICTION]
+    return parts
+
+
+def _filters_in_force(settings: UnfilteredSystemSettings) -> list[tuple[str, list[Any]]]:
+    """The rules of a system that are not left out: ``module:Class``, and the groups of settings that it takes."""
+    in_force = []
+    for name, *groups in settings.filters:
+        arguments = [getattr(settings, group, None) for group in groups]
+        if None not in arguments and getattr(arguments[0], "enabled", True):
+            in_force.append((name, arguments))
+    return in_force
 
 
 def build(settings: UnfilteredSystemSettings, context: TrackerContext) -> Tracker:
@@ -109,19 +120,18 @@ def build(settings: UnfilteredSystemSettings, context: TrackerContext) -> Tracke
 
     The filters are loaded here, so that a table of systems imports neither torch nor OpenCV.
     """
-    blocks = []
-    for name, *groups in settings.filters:
-        arguments = [getattr(settings, group, None) for group in groups]
-        if None not in arguments and getattr(arguments[0], "enabled", True):
-            blocks.append(load_object(f"dynslam_bench.culling.{name}")(*arguments))
-    return compose(settings, context, blocks, getattr(settings, "flow", None))
+    filters = []
+    for name, arguments in _filters_in_force(settings):
+        make_filter = load_object(f"dynslam_bench.culling.{name}")
+        filters.append(make_filter(*arguments))
+    return compose(settings, context, filters, getattr(settings, "flow", None))
 
 
 def compose(
     settings: UnfilteredSystemSettings,
     context: TrackerContext,
     filters: Sequence[DynamicFilter] = (),
-    flow: FlowMethodSettings | None = None,
+    flow: "FlowMethodSettings | None" = None,
 ) -> Tracker:
     """The pipeline of a system.
 
@@ -137,48 +147,59 @@ def compose(
     """
     from dynslam_bench.core.stage_cache import StageCache
     from dynslam_bench.features.registry import build_extractor, cached_extractor
-    from dynslam_bench.flow.registry import build_flow
-    from dynslam_bench.segmentation.build_segmenter import CachedSegmenter, build_segmenter
-    from dynslam_bench.segmentation.schedule import MaskScheduler
     from dynslam_bench.slam.backend import build_backend
     from dynslam_bench.slam.pipeline import CachedStage, SlamPipeline
 
     cache = None if context.cache is None else StageCache(Path(context.cache))
     cached: dict[str, CachedStage] = {}
+
+    # Features, from the stage cache where there is one.
     features = settings.features
     extractor = build_extractor(features)
     if cache is not None:
-        extractor = cached["features"] = cached_extractor(extractor, features, cache, context.threads)
+        cached_features = cached_extractor(extractor, features, cache, context.threads)
+        if cached_features is not None:
+            extractor = cached["features"] = cached_features
+
+    # Masks, for systems with a semantic stage.
     masks = None
     if isinstance(settings, SemanticSystemSettings):
-        segmenter = build_segmenter(
-            settings.segmentation,
-            sequence_id=context.sequence_id,
-            masks=context.masks,
-            device=context.device,
-            threads=context.threads,
-            cache=cache,
-            also=movable_classes(filters),
-        )
-        masks = None if segmenter is None else MaskScheduler(settings.segmentation, segmenter)
-        if segmenter is not None and isinstance(segmenter.inner, CachedSegmenter):
-            cached["segmentation"] = segmenter.inner
-    needing = [block.name for block in filters if {"masks", "boxes"} & block.needs]
-    if masks is None and needing:
-        fault, cure = "segmentation.source is 'none'", f"sources: {SOURCES}"
-        if not isinstance(settings, SemanticSystemSettings):
-            fault = f"{type(settings).__name__} has no group segmentation"
-            cure = "derive it from SemanticSystemSettings, see docs/how-to/filter.md (A filter beside masks)"
-        raise SegmentationError(f"filter '{needing[0]}' needs masks, but {fault}", cure)
+        masks, cached_masks = load_object(MASK_STAGE)(settings.segmentation, context, filters, cache)
+        if cached_masks is not None:
+            cached["segmentation"] = cached_masks
+    if masks is None:
+        _check_masks_not_needed(settings, filters)
+
+    # Flow, and the motion of the camera that follows from it.
+    estimate_flow = None
+    refine_prediction = None
+    if flow is not None:
+        estimate_flow = load_object(FLOW)(flow, device=context.device, threads=context.threads)
+        refine_prediction = load_object(REFINE_PREDICTION)
+
     return SlamPipeline(
         extractor=extractor,
         masks=masks,
         filters=filters,
-        flow=None if flow is None else build_flow(flow, device=context.device, threads=context.threads),
+        flow=estimate_flow,
+        refine_prediction=refine_prediction,
         backend=build_backend(settings.backend, features.scale_factor, features.levels, features.extractor),
         settings=settings,
         cached=cached,
     )
+
+
+def _check_masks_not_needed(settings: UnfilteredSystemSettings, filters: Sequence[DynamicFilter]) -> None:
+    """Raise `SegmentationError` where a filter needs masks of a system that has none."""
+    needing = [block.name for block in filters if {"masks", "boxes"} & block.needs]
+    if not needing:
+        return
+    fault = "segmentation.source is 'none'"
+    cure = f"sources: {SOURCES}"
+    if not isinstance(settings, SemanticSystemSettings):
+        fault = f"{type(settings).__name__} has no group segmentation"
+        cure = "derive it from SemanticSystemSettings, see docs/how-to/filter.md (A filter beside masks)"
+    raise SegmentationError(f"filter '{needing[0]}' needs masks, but {fault}", cure)
 
 
 BACKEND = (
@@ -271,7 +292,7 @@ def describe_masks(segmentation: SegmentationSettings) -> str:
     )
 
 
-def describe_tracks(flow: FlowMethodSettings) -> str:
+def describe_tracks(flow: "FlowMethodSettings") -> str:
     """How a system's flow is computed."""
     limit = flow.forward_backward_px
     check = f"a check of {limit:g} px on the way back" if limit else "no check on the way back"

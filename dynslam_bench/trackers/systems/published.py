@@ -23,7 +23,7 @@ from dynslam_bench.culling.settings import (
     TemplateSettings,
 )
 from dynslam_bench.features.settings import FeatureSettings
-from dynslam_bench.flow.settings import FlowMethodSettings
+from dynslam_bench.flow.settings import FlowMethodSettings, PublishedFlowSettings
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.slam.settings import MonocularBackendSettings
 from dynslam_bench.trackers.systems.composition import (
@@ -32,7 +32,6 @@ from dynslam_bench.trackers.systems.composition import (
     FAST_MASKS,
     MonocularSemanticSettings,
     ObjectSettings,
-    PublishedFlowSettings,
     SemanticSystemSettings,
     SystemSettings,
     UnfilteredSystemSettings,

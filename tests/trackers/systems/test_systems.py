@@ -20,6 +20,7 @@ from dynslam_bench.core.settings import parameters, settings_table
 from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.flow import dense_flow as dense
 from dynslam_bench.flow.opencv import LEVELS
+from dynslam_bench.flow.settings import PublishedFlowSettings
 from dynslam_bench.runs import RunStore
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.sequences.catalogue import open_sequence
@@ -27,7 +28,6 @@ from dynslam_bench.slam.pipeline import SlamPipeline
 from dynslam_bench.trackers import TRACKERS, TrackerContext, TrackerSpec, build_tracker
 from dynslam_bench.trackers.registry import all_specs, tracker_groups
 from dynslam_bench.trackers.systems.composition import (
-    PublishedFlowSettings,
     SemanticSystemSettings,
     UnfilteredSystemSettings,
     describe_masks,

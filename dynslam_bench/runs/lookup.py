@@ -1,0 +1,45 @@
+"""Finds the stored run of a request: the one of which all that was read is unchanged."""
+
+from dynslam_bench.core.reads import Verifier
+from dynslam_bench.runs.identity import ResolvedRun
+from dynslam_bench.runs.record import RunRecord
+from dynslam_bench.runs.store import RunStore
+
+
+class LookUp:
+    """Finds stored runs.
+
+    A run of built-in parts is known by its id: all that it reads is known beforehand. What plug-ins and programs read
+    stands in the record of each run that they made; of the runs of one request the one is taken whose files,
+    environment variables and packages are unchanged.
+
+    Args:
+        store: Where the runs lie.
+    """
+
+    def __init__(self, store: RunStore) -> None:
+        self._store = store
+        self._verifier = Verifier()
+
+    def find(self, run: ResolvedRun) -> RunRecord | None:
+        """The record of a run, None if there is none whose reads are unchanged.
+
+        Of several the newest is taken: a file may have been changed and put back.
+        """
+        if not run.foreign:
+            record = self._store.get(run.run_id)
+            if record is not None and record.identity == run.stated:
+                return record
+        candidates = [record for record in map(self._store.get, self._store.ids_of(run.asked)) if record is not None]
+        valid = [record for record in candidates if self._holds(record, run)]
+        return max(valid, key=lambda record: record.started, default=None)
+
+    def _holds(self, record: RunRecord, run: ResolvedRun) -> bool:
+        """Whether a stored run is what is asked for, and nothing that it read has changed."""
+        known_before = {name: value for name, value in record.identity.items() if name in run.stated}
+        if known_before != run.stated:
+            return False
+        if not run.foreign:
+            return True
+        reads = record.reads
+        return reads is not None and not self._verifier.changed(reads, run.anchors)

@@ -1,0 +1,120 @@
+"""Which modules of this package decide the result of a run: those that its parts import.
+
+The parts are the tracker's entry point, its filters, features, flow and segmenter, the reader or renderer of the
+sequence, and the environment with the run's loop. A change of any other module changes no run.
+"""
+
+from collections.abc import Iterable, Iterator
+
+from dynslam_bench.contracts import Sequence, TrackerSpec
+from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, ModuleGraph, module_graph
+from dynslam_bench.core.settings import Settings
+from dynslam_bench.features.registry import FEATURES
+from dynslam_bench.features.settings import FeatureSettings
+from dynslam_bench.flow.registry import spec_of
+from dynslam_bench.flow.settings import FlowMethodSettings
+from dynslam_bench.segmentation.build_segmenter import SEGMENTERS
+from dynslam_bench.sequences.view import reader_of
+from dynslam_bench.trackers.systems.composition import UnfilteredSystemSettings, parts_of
+
+ENVIRONMENT = ("envs.slam_env", "runs.loop")
+DEGRADED_FRAMES = "envs.wrappers"
+"""Needed by runs with degraded or dropped frames alone."""
+FINDERS = ("trackers.registry", "sequences.catalogue")
+"""They look up what a name stands for; what they find is part of the identity by itself."""
+BESIDE_THE_LOOP = (
+    *("envs.rendering", "runs.artifacts", "runs.exchange.recording", "runs.process.child", "runs.record", "runs.store"),
+    *("envs.wrappers", "segmentation.build_segmenter", "sequences.decoded"),
+)
+"""What the environment and the loop use to draw and to store; masks count with the systems that have them."""
+WITH_PLUGINS = (
+    *("contracts", "core", "culling", "envs", "evaluation", "features", "flow", "geometry", "segmentation"),
+    *("sequences", "slam", "trackers"),
+)
+"""The packages that a plug-in may use: what it imports of this package is known only while it runs."""
+
+
+def parts_of_run(
+    tracker: TrackerSpec, settings: Settings, source: str, sequence: Sequence, *, changes_frames: bool
+) -> list[str]:
+    """What a run is made of beside the environment: entry points, and modules of the sequence, sorted.
+
+    Args:
+        tracker: The tracker.
+        settings: Its complete settings.
+        source: Where its masks come from; empty for a tracker without a semantic stage.
+        sequence: The opened sequence.
+        changes_frames: Whether frames are degraded or dropped.
+    """
+    parts = {*entry_points_of(tracker, settings, source), reader_of(sequence)}
+    if changes_frames:
+        parts.add(f"{PACKAGE}.{DEGRADED_FRAMES}")
+    return sorted(parts)
+
+
+def modules_of_run(graph: ModuleGraph, parts: Iterable[str]) -> list[str]:
+    """The modules of this package that decide a run's result, sorted.
+
+    Args:
+        graph: The package's modules.
+        parts: See `parts_of_run`.
+    """
+    never = [PACKAGE, *PLUMBING, *(f"{PACKAGE}.{name}" for name in FINDERS)]
+    environment = [f"{PACKAGE}.{name}" for name in ENVIRONMENT]
+    beside_the_loop = [f"{PACKAGE}.{name}" for name in BESIDE_THE_LOOP]
+    modules = {*graph.closure(environment, [*never, *beside_the_loop])}
+    modules |= {*graph.closure(map(module_of, parts), never)}
+    if any(map(is_foreign, parts)):
+        modules |= {*modules_for_plugins(graph)}
+    return sorted(modules)
+
+
+def modules_for_plugins(graph: ModuleGraph) -> list[str]:
+    """The modules of all packages that a plug-in may use."""
+    packages = tuple(f"{PACKAGE}.{name}." for name in WITH_PLUGINS)
+    return [module for module in graph.modules if f"{module}.".startswith(packages)]
+
+
+def package_code() -> str:
+    """Digest of all code that any run may use: two machines of a cluster need the same."""
+    graph = module_graph()
+    return graph.code_digest(modules_for_plugins(graph))
+
+
+def module_of(part: str) -> str:
+    """The module of an entry point ``module:Attr`` or ``file.py:Attr``; a module's name stays as it is."""
+    return part.rpartition(":")[0] or part
+
+
+def entry_points_of(tracker: TrackerSpec, settings: Settings, source: str) -> Iterator[str]:
+    """The entry points of all that a tracker is made of."""
+    yield tracker.entry_point
+    if isinstance(settings, UnfilteredSystemSettings):
+        yield from parts_of(settings)
+    for group in groups_of(settings):
+        if isinstance(group, FeatureSettings):
+            yield FEATURES.get(group.extractor).entry_point
+        if isinstance(group, FlowMethodSettings):
+            yield spec_of(group).entry_point
+    if source not in ("", "none"):
+        yield SEGMENTERS.get(segmenter_of(source)).entry_point
+
+
+def groups_of(settings: Settings) -> Iterator[Settings]:
+    """The groups of settings, at any depth, and the settings themselves."""
+    yield settings
+    for _, value in settings:
+        if isinstance(value, Settings):
+            yield from groups_of(value)
+
+
+def segmenter_of(source: str) -> str:
+    """The id of the segmenter behind a source of masks: ``onnx`` of ``onnx:PATH``, ``mine`` of ``plugin:mine``."""
+    kind, _, argument = source.partition(":")
+    return argument if kind == "plugin" else kind
+
+
+def is_foreign(part: str) -> bool:
+    """Whether a part of a run lies outside this package."""
+    module = module_of(part)
+    return module.endswith(".py") or module.partition(".")[0] != PACKAGE
