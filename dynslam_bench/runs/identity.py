@@ -24,13 +24,14 @@ from dynslam_bench.core.fingerprint import (
 )
 from dynslam_bench.core.module_graph import module_graph, read_module_graph
 from dynslam_bench.core.plugins import load_object
+from dynslam_bench.core.reads import Anchors
 from dynslam_bench.core.settings import Settings, flatten
 from dynslam_bench.core.version import release
 from dynslam_bench.envs import Degradation
 from dynslam_bench.envs.slam_env import check_frames, open_frames, preprocessing_of, resolve_device
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry import Camera
-from dynslam_bench.runs.own_code import is_foreign, modules_of_run, parts_of_run
+from dynslam_bench.runs.own_code import is_foreign, module_of, modules_of_run, parts_of_run
 from dynslam_bench.runs.record import IDENTITY_SCHEME, StartMap, asked_digest, run_id_of
 from dynslam_bench.runs.spec import MAP_SETTING, RunSpec
 from dynslam_bench.segmentation.build_segmenter import segmentation_source, weights_digest
@@ -88,9 +89,17 @@ class ResolvedRun:
         """The identity as it reads after it was stored."""
         return dict(json.loads(json.dumps(self.identity, default=str)))
 
-    @property
-    def anchors(self) -> dict[str, str]:
-        return {}
+    @cached_property
+    def anchors(self) -> Anchors:
+        """The folders in which names of files begin that plug-ins and programs read."""
+        files = [Path(module_of(part)) for part in self.identity["parts"] if module_of(part).endswith(".py")]
+        return Anchors(plugin=files[0].parent if files else None, work=Path.cwd())
+
+    @cached_property
+    def plugin_packages(self) -> list[str]:
+        """The top-level names of the installed modules that take part."""
+        modules = [module_of(part) for part in self.identity["parts"] if is_foreign(part)]
+        return sorted({module.partition(".")[0] for module in modules if not module.endswith(".py")})
 
     @property
     def distribution(self) -> str:

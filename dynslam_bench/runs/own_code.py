@@ -20,7 +20,7 @@ from dynslam_bench.trackers.systems.composition import UnfilteredSystemSettings,
 ENVIRONMENT = ("envs.slam_env", "runs.loop")
 DEGRADED_FRAMES = "envs.wrappers"
 """Needed by runs with degraded or dropped frames alone."""
-FINDERS = ("trackers.registry", "sequences.catalogue")
+FINDERS = ("trackers.registry", "sequences.catalogue", "sequences.synthetic")
 """They look up what a name stands for; what they find is part of the identity by itself."""
 BESIDE_THE_LOOP = (
     *("envs.rendering", "runs.artifacts", "runs.exchange.recording", "runs.process.child", "runs.record", "runs.store"),

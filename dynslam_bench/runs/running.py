@@ -40,7 +40,7 @@ from dynslam_bench.runs.exchange.recording import RECORDING_FILE
 from dynslam_bench.runs.frames import FRAMES_FILE, FrameLog
 from dynslam_bench.runs.identity import ResolvedRun, Resolver, check_unchanged, resolve
 from dynslam_bench.runs.lookup import LookUp
-from dynslam_bench.runs.process.child import LOG_FILE
+from dynslam_bench.runs.process.child import LOG_FILE, READS_FILE
 from dynslam_bench.runs.process.fork_server import Child, make_job
 from dynslam_bench.runs.process.supervisor import LONGEST_LOG, LONGEST_YET, Verdict, bound_log, supervise
 from dynslam_bench.runs.record import (
@@ -61,7 +61,6 @@ from dynslam_bench.sequences.view import part_of
 from dynslam_bench.slam.map_files import MAP_FILE
 from dynslam_bench.trackers.registry import resolve_settings
 
-def read_reads(work): return None
 T = TypeVar("T")
 WORK = "dynslam_bench.runs.loop:run_loop"
 """What the child does."""
@@ -129,7 +128,7 @@ def run_one(
             spec=resolved.spec.model_dump(mode="json"),
             protocol=get_protocol(protocol).model_dump(mode="json"),
             progress_every=progress_every,
-            anchors=resolved.anchors if resolved.foreign else None,
+            recorded=recorded_parts(resolved),
         )
         log = work / LOG_FILE
         watched: dict[str, Any] = {"tick": lambda: bound_log(log, LONGEST_YET), "at_a_time": at_a_time}
@@ -158,6 +157,24 @@ def run_one(
             store.add_sequence(record.sequence.part, timestamps_ns(resolved.sequence), resolved.sequence.ground_truth)
             record = store.publish(work, record)
     return record
+
+
+def recorded_parts(run: ResolvedRun) -> dict[str, Any] | None:
+    """What the child needs to know to record what plug-ins and programs read; None for a run without such."""
+    if not run.foreign:
+        return None
+    plugin = None if run.anchors.plugin is None else str(run.anchors.plugin)
+    return {"plugin": plugin, "work": str(run.anchors.work), "packages": run.plugin_packages}
+
+
+def read_reads(work: Path) -> Reads | None:
+    """What the child has recorded, which is taken out of the run's folder; None where it was killed before."""
+    file = work / READS_FILE
+    if not file.is_file():
+        return None
+    reads = Reads.read(file)
+    file.unlink()
+    return reads
 
 
 def sequence_info(sequence: Any, content: str, part: str, offset: int = 0) -> SequenceInfo:

@@ -42,6 +42,8 @@ from dynslam_bench.core.plugins import ISOLATED_VARIABLE, load_object
 from dynslam_bench.runs.process.fork_server import THREAD_VARIABLES, adopt_orphans
 
 LOG_FILE = "log.txt"
+READS_FILE = "reads.json"
+"""Where the child puts what plug-ins and programs have read."""
 _LONGEST = 400
 _REFUSALS = (SettingsError, PluginError, TrajectoryError)
 """Raised before the first frame is tracked, these say that what was asked for cannot be."""
@@ -75,7 +77,15 @@ def main(connection: Connection) -> int:
         with contextlib.closing(TemporaryFolder()) as temporary:
             os.environ["TMPDIR"] = tempfile.tempdir = str(temporary.path)
             _prepare(job)
-            message = load_object(job["work"])(job, lambda message: _send(connection, message), stop.is_set)
+            work = load_object(job["work"])
+            with recording_reads(job, temporary.path) as keep_reads:
+
+                def send(message: dict[str, Any]) -> None:
+                    if message["type"] in ("started", "progress") or message.get("index") == 0:
+                        keep_reads()  # a run that is killed later has read this much at least
+                    _send(connection, message)
+
+                message = work(job, send, stop.is_set)
     except BaseException as error:
         traceback.print_exc()
         message = describe_failure(error)
@@ -85,6 +95,47 @@ def main(connection: Connection) -> int:
     sys.stdout.flush()
     sys.stderr.flush()
     return 0
+
+
+@contextmanager
+def recording_reads(job: dict[str, Any], temporary: Path) -> Iterator[Callable[[], None]]:
+    """Record what plug-ins and programs read while a run lasts, and write it into the run's folder at the end.
+
+    A run that fails has read something, too: it is not made again while that is unchanged.
+
+    Args:
+        job: ``recorded`` says where plug-ins lie; None for a run without such.
+        temporary: The run's private folder.
+
+    Yields:
+        A function that writes what was read so far.
+
+    Raises:
+        RunError: What was read has changed meanwhile.
+    """
+    if job.get("recorded") is None:
+        yield lambda: None
+        return
+    from dynslam_bench.core.reads import Anchors, Reads
+    from dynslam_bench.core.stage_cache import record_reads
+    from dynslam_bench.runs.process.recorder import ReadRecorder
+
+    about = job["recorded"]
+    plugin = None if about["plugin"] is None else Path(about["plugin"])
+    folder = Path(job["folder"])
+    anchors = Anchors(plugin=plugin, work=Path(about["work"]))
+    recorder = ReadRecorder(anchors, private=[temporary, folder], plugins=about["packages"])
+
+
+    def keep(reads: Reads) -> None:
+        (folder / READS_FILE).write_text(reads.to_json(), encoding="utf-8")
+
+    recorder.start()
+    record_reads(recorder.snapshot)
+    try:
+        yield lambda: keep(recorder.so_far())
+    finally:
+        keep(recorder.finish())
 
 
 def peak_memory_mb() -> float:

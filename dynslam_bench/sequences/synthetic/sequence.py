@@ -21,6 +21,7 @@ from PIL import Image
 
 from dynslam_bench.contracts import Frame, FrameMasks
 from dynslam_bench.core import SequenceError, read_lines, write_atomic
+from dynslam_bench.core.module_graph import PLUMBING, module_graph
 from dynslam_bench.core.records import digest
 from dynslam_bench.geometry import Camera, Trajectory, write_tum
 from dynslam_bench.sequences.cameras import write_camera
@@ -128,6 +129,7 @@ class FrameStore:
         write_camera(self.folder / "camera.toml", self.camera, fps=FPS)
 
 
+_RENDERER = "dynslam_bench.sequences.synthetic.renderer"
 START_S = 1000.0
 """Stamp of the first frame in seconds."""
 
@@ -164,7 +166,9 @@ class SyntheticSequence:
         self.citation = f"dynslam-bench rendered sequence {self.id}, renderer version {RENDERER_VERSION}"
         self.timestamps = np.round(START_S + np.arange(sequence.frames) / FPS, 6)
         noise = "" if sequence.noise is None else f"-noise{sequence.noise}"
-        label = f"{sequence.name}@{sequence.scene}{noise}-{self._key()}"  # no "?": Windows has none in names
+        # Stored frames are those of this code: an edited renderer renders again.
+        rendered_by = digest([self._key(), module_graph().digest([_RENDERER], PLUMBING)], 8)
+        label = f"{sequence.name}@{sequence.scene}{noise}-{rendered_by}"  # no "?": Windows has none in names
         self.store = None if cache_root is None else FrameStore(Path(cache_root) / "synthetic" / label, CAMERA)
 
     def __reduce__(self) -> tuple[Any, ...]:
