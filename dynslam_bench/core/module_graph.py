@@ -1,8 +1,8 @@
 """Which modules of this package a module uses, and the digest of their code.
 
-The closure of a module holds the module itself and all modules of this package that it reaches by import
-statements, wherever in the source they stand. A package's ``__init__`` that passes a name on is looked through: the name counts
-with the module that defines it. What a text names is no import: entry points of plug-ins, tables of lazily loaded names.
+The closure of a module holds itself and all modules of this package that it reaches by import statements,
+wherever in the source they stand. A package's ``__init__`` that passes a name on is looked through: the name counts
+with the module that defines it. What a text names is no import: entry points of plug-ins, tables of lazy names.
 
 Sources count by their syntax: comments, layout and docstrings change nothing.
 """

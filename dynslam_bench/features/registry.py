@@ -45,6 +45,7 @@ def build_extractor(settings: FeatureSettings | None = None) -> FeatureExtractor
 
 # Keypoints from the stage cache.
 
+
 class CachedExtractor:
     """An extractor whose results are stored, addressed by the image, the extractor's code and the settings.
 

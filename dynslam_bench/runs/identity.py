@@ -184,9 +184,7 @@ class Resolver:
             "camera": part.camera,
             **({"machine": this_machine().model_dump()} if spec.realtime else {}),
         }
-        return ResolvedRun(
-            spec, tracker, settings, sequence, device, source, asked | read, foreign, start_map, files
-        )
+        return ResolvedRun(spec, tracker, settings, sequence, device, source, asked | read, foreign, start_map, files)
 
     def _open_part(
         self,

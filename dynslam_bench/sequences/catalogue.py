@@ -115,7 +115,7 @@ def by_folder() -> dict[str, CatalogueEntry]:
 
 
 def sequence_ids() -> list[str]:
-    """Ids of all listed sequences: the public ones, the rendered ones, and those of plug-ins, none of which is imported."""
+    """Ids of all listed sequences: the public ones, the rendered ones, and those of plug-ins; imports none."""
     ids = [name for dataset in DATASETS.builtin().values() for name in dataset.sequences]
     for listed in DATASETS.listed():
         ids += described(listed.target).get("sequences", [])

@@ -46,7 +46,10 @@ class Decoded(Wrapped):
 def _mapped(sequence: Sequence) -> NDArray[np.void]:
     """The frames as a mapped array of records ``rgb`` and ``depth``, which is written if it is not there or damaged."""
     cache, part = StageCache(), part_of(sequence)
-    code = [module_graph().digest([reader_of(sequence), f"{PACKAGE}.sequences.preprocessing"], PLUMBING), opencv_version()]
+    code = [
+        module_graph().digest([reader_of(sequence), f"{PACKAGE}.sequences.preprocessing"], PLUMBING),
+        opencv_version(),
+    ]
     path = cache.path("frames", digest([sequence.digest(), part.start, part.stop, part.stride, code]), ".npy")
     if (frames := _read(path)) is None:
         with raising(DynslamError, f"cannot write the stage cache {cache.folder}", f"set {STAGES_VARIABLE}"):

@@ -23,7 +23,6 @@ from pydantic import ValidationError
 
 from dynslam_bench.core import DynslamError, InfrastructureError, ReportError, raising
 from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, module_graph
-from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation.protocol import MONOCULAR, Protocol
 from dynslam_bench.reports.model.row import RunRow, grouped, make_row
 from dynslam_bench.runs.store import RunStore, open_store, warn_of_unreadable

@@ -11,8 +11,8 @@ import subprocess
 from collections.abc import Iterable
 from pathlib import Path, PurePosixPath
 
-from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, ModuleCode, ModuleGraph, read_module
-from dynslam_bench.runs.own_code import BESIDE_THE_LOOP, ENVIRONMENT, FINDERS
+from dynslam_bench.core.module_graph import PACKAGE, ModuleCode, ModuleGraph, read_module
+from dynslam_bench.runs.own_code import modules_of_run
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 OLD_PACKAGES = (
@@ -30,7 +30,8 @@ CUT = {
     ("segmentation.networks.checkpoints", "sequences"),
     ("trackers.systems.composition", "segmentation.build_segmenter"),
     ("trackers.systems.composition", "segmentation.schedule"),
-    ("trackers.systems.composition", "flow.registry"),
+    ("trackers.systems.composition", "flow"),
+    ("slam.pipeline", "culling.ego_motion"),
 }
 """Imports that were taken out when ids began to follow imports: module, and what it imported."""
 
@@ -76,8 +77,7 @@ def is_cut(module: str, reference: tuple[str, str]) -> bool:
     """Whether an import was taken out later."""
     imported = ".".join(filter(None, reference))
     return any(
-        module == f"{PACKAGE}.{source}" and f"{imported}.".startswith(f"{PACKAGE}.{target}.")
-        for source, target in CUT
+        module == f"{PACKAGE}.{source}" and f"{imported}.".startswith(f"{PACKAGE}.{target}.") for source, target in CUT
     )
 
 
@@ -96,23 +96,20 @@ def main() -> None:
     commits = git("rev-list", "--first-parent", f"--max-count={arguments.last + 1}", arguments.upto).decode().split()
     history = History()
     changes = dict.fromkeys(["whole packages", *SYSTEMS], 0)
+    counted: dict[str, int] = {}
     before: dict[str, str] = {}
     for commit in reversed(commits):
         graph = history.graph(commit)
         now = {"whole packages": digest_of_packages(graph, OLD_PACKAGES)}
         for system, begins in SYSTEMS.items():
-            roots = [f"{PACKAGE}.{name}" for name in (*begins, *ENVIRONMENT, *RUN_LOOP)]
-            now[system] = graph.digest(roots, [f"{PACKAGE}.{name}" for name in FINDERS])
+            modules = modules_of_run(graph, [f"{PACKAGE}.{name}" for name in begins])
+            now[system] = graph.code_digest(modules)
+            counted[system] = len(modules)
         for name, digest in now.items():
             changes[name] += before.get(name, digest) != digest
         before = now
-    modules = {
-        system: len(graph.closure([f"{PACKAGE}.{name}" for name in (*begins, *ENVIRONMENT, *RUN_LOOP)],
-                                  [f"{PACKAGE}.{name}" for name in FINDERS]))
-        for system, begins in SYSTEMS.items()
-    }
     for name, count in changes.items():
-        print(f"{name}: {count} of {len(commits) - 1} commits", f"({modules[name]} modules)" if name in modules else "")
+        print(f"{name}: {count} of {len(commits) - 1} commits", f"({counted[name]} modules)" if name in counted else "")
 
 
 if __name__ == "__main__":

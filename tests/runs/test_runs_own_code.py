@@ -88,7 +88,12 @@ def test_two_packages_that_pass_a_name_to_each_other_come_to_an_end() -> None:
 
 @pytest.mark.parametrize(
     ("edited", "changes"),
-    [("x = 1  # a note\n", False), ('"""What it is."""\nx  =  1\n', False), ("x = 2\n", True), ("x = 1\ny = 1\n", True)],
+    [
+        ("x = 1  # a note\n", False),
+        ('"""What it is."""\nx  =  1\n', False),
+        ("x = 2\n", True),
+        ("x = 1\ny = 1\n", True),
+    ],
 )
 def test_code_counts_by_its_syntax(edited: str, changes: bool) -> None:
     before = graph_of(a="from dynslam_bench.b import x\n", b="x = 1\n").digest([f"{PACKAGE}.a"])

@@ -126,7 +126,6 @@ def recording_reads(job: dict[str, Any], temporary: Path) -> Iterator[Callable[[
     anchors = Anchors(plugin=plugin, work=Path(about["work"]))
     recorder = ReadRecorder(anchors, private=[temporary, folder], plugins=about["packages"])
 
-
     def keep(reads: Reads) -> None:
         (folder / READS_FILE).write_text(reads.to_json(), encoding="utf-8")
 
