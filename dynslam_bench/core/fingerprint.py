@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import dynslam_bench
-from dynslam_bench.core.code_files import files_below, leads_back
+from dynslam_bench.core.code_files import leads_back
 from dynslam_bench.core.errors import DynslamError, PluginError, raising
 from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.folders import digest_cache_folder
@@ -109,66 +109,6 @@ def distribution_of_module(module: str) -> tuple[str, str]:
 
 
 _distributions = cache(importlib.metadata.packages_distributions)
-SEARCH_VARIABLES = ("LD_LIBRARY_PATH", "LD_PRELOAD", "DYLD_LIBRARY_PATH", "DYLD_INSERT_LIBRARIES")
-"""Variables of the linker: with others the same program may run other code."""
-
-
-def library_identity(module: str) -> str:
-    """What is imported under a module's name: version and files of its distribution, or the files alone.
-
-    A module that lies before the installed one on the import path is another one. The files of a distribution count by
-    its ``RECORD``, which holds their checksums.
-
-    Args:
-        module: A top-level module; it is not imported.
-
-    Returns:
-        For example ``2.1.0 files 0a1b2c3d``; empty where there is no such module.
-    """
-    try:
-        spec = find_spec(module)
-    except ValueError:  # it was put into `sys.modules` by hand
-        return ""
-    if spec is None:
-        return ""
-    places = [Path(place) for place in spec.submodule_search_locations or ()]
-    if spec.origin is not None and Path(spec.origin).is_file():
-        places.append(Path(spec.origin))
-    for name in _distributions().get(module, ()):
-        distribution = importlib.metadata.distribution(name)
-        site_packages = Path(str(distribution.locate_file("")))
-        record = [file for file in distribution.files or () if file.name == "RECORD"]
-        if record and all(place.is_relative_to(site_packages) for place in places):
-            return f"{distribution.version} files {_record_digest(Path(str(distribution.locate_file(record[0]))))}"
-    contents = [contents_digest(files_below(place), place) for place in places if place.is_dir()]
-    contents += [path_digest(place) for place in places if place.is_file()]
-    return f"files {digest(contents, 8)}"
-
-
-def _record_digest(record: Path) -> str:
-    """Digest of the checksums of a distribution's files.
-
-    Scripts outside of the package's folder, byte code and the description of the installation differ between equal
-    installations, and are left out.
-    """
-
-    def compute() -> str:
-        lines = record.read_text(encoding="utf-8").splitlines()
-        kept = [line for line in lines if not any(part in line for part in ("../", ".pyc", ".dist-info/"))]
-        return hashlib.sha256("\n".join(sorted(kept)).encode()).hexdigest()
-
-    return _remembered("record", [record], compute)[:8]
-
-
-def search_path() -> dict[str, str]:
-    """The variables of the linker that are set, without the folders that OpenCV's own import puts there."""
-    found = {}
-    for name in SEARCH_VARIABLES:
-        folders = os.environ.get(name, "").split(os.pathsep)
-        kept = [folder for folder in folders if folder and "/cv2/" not in folder]
-        if kept:
-            found[name] = os.pathsep.join(kept)
-    return found
 
 
 # -- machine and content -----------------------------------------------------------------------------------------------

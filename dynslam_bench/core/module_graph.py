@@ -24,13 +24,11 @@ from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.folders import digest_cache_folder
 
 PACKAGE = "dynslam_bench"
-PLUMBING = tuple(
-    f"{PACKAGE}.core.{name}"
-    for name in (
-        *("arguments", "code_files", "download", "errors", "files", "fingerprint", "folders", "module_graph"),
-        *("plugins", "reads", "records", "sanitise", "version"),
-    )
+_PLUMBING = (
+    *("arguments", "code_files", "download", "errors", "files", "fingerprint", "folders", "libraries"),
+    *("module_graph", "plugins", "programs", "reads", "records", "sanitise", "version"),
 )
+PLUMBING = tuple(f"{PACKAGE}.core.{name}" for name in _PLUMBING)
 """Modules that name faults, find, fetch, store and digest files, and load plug-ins: no number passes through them."""
 SETTLED_NS = 2_000_000_000
 """What was read of a younger file is not remembered: a change within the same tick of the clock would not show."""

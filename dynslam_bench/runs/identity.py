@@ -17,11 +17,10 @@ from dynslam_bench.core import PluginError, RunError, SettingsError, did_you_mea
 from dynslam_bench.core.fingerprint import (
     contents_digest,
     distribution_of_module,
-    library_identity,
     named_digests,
-    search_path,
     this_machine,
 )
+from dynslam_bench.core.libraries import library_identity, search_path
 from dynslam_bench.core.module_graph import module_graph, read_module_graph
 from dynslam_bench.core.plugins import load_object
 from dynslam_bench.core.reads import Anchors

@@ -1,0 +1,46 @@
+"""Which libraries a run computes with: what lies under a module's name on the import path."""
+
+import os
+import sys
+from pathlib import Path
+
+from dynslam_bench.core.code_files import files_below
+from dynslam_bench.core.fingerprint import contents_digest
+from dynslam_bench.core.reads import ImportPath
+
+SEARCH_VARIABLES = ("LD_LIBRARY_PATH", "LD_PRELOAD", "DYLD_LIBRARY_PATH", "DYLD_INSERT_LIBRARIES")
+"""Variables of the linker: with others the same module may run other code."""
+
+
+def library_identity(module: str) -> str:
+    """Version and files of the distribution that a module is imported from, or the digest of the files alone.
+
+    A module that lies before the installed one on the import path is another one.
+
+    Args:
+        module: A top-level module; it is not imported.
+
+    Returns:
+        For example ``2.1.0 0a1b2c3d4e5f``; empty where there is no such module.
+    """
+    imports = ImportPath(sys.path)
+    place = imports.find(module)
+    if not place:
+        return ""
+    distributions = imports.distributions_of(module, place)
+    if distributions:
+        return ", ".join(imports.distribution(name) for name in distributions)
+    path = Path(place)
+    files = [path] if path.is_file() else list(files_below(path))
+    return f"files {contents_digest(files, path.parent)[:12]}"
+
+
+def search_path() -> dict[str, str]:
+    """The variables of the linker that are set, without the folders that OpenCV's own import puts there."""
+    found = {}
+    for name in SEARCH_VARIABLES:
+        folders = os.environ.get(name, "").split(os.pathsep)
+        kept = [folder for folder in folders if folder and "/cv2/" not in folder]
+        if kept:
+            found[name] = os.pathsep.join(kept)
+    return found

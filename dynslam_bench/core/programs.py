@@ -1,0 +1,174 @@
+"""What the processes of a program are made of, and which environment variables a program gets.
+
+What a program opens cannot be seen from outside. What its processes show can: the executable, the libraries and other
+files that are mapped into memory, the files and folders that the command line names.
+"""
+
+import contextlib
+import os
+import shutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import psutil
+
+RESULT_VARIABLES = (
+    # where libraries and modules are searched
+    *("LD_LIBRARY_PATH", "LD_PRELOAD", "DYLD_LIBRARY_PATH", "PYTHONPATH", "PYTHONHOME", "PYTHONHASHSEED"),
+    # how numbers and times are read and written: a decimal comma cuts numbers short
+    *("LANG", "LANGUAGE", "LC_ALL", "LC_CTYPE", "LC_NUMERIC", "LC_TIME", "LC_COLLATE", "TZ"),
+    # on what is computed, and in which order sums are made
+    *("CUDA_VISIBLE_DEVICES", "CUDA_LAUNCH_BLOCKING", "CUBLAS_WORKSPACE_CONFIG", "NVIDIA_TF32_OVERRIDE"),
+    *("OMP_DYNAMIC", "OMP_SCHEDULE", "OPENBLAS_CORETYPE", "MKL_CBWR", "MKL_DYNAMIC", "OPENCV_CPU_DISABLE"),
+    *("OPENCV_OPENCL_DEVICE", "OPENCV_OPENCL_RUNTIME", "LIBGL_ALWAYS_SOFTWARE"),
+)
+"""Programs get these variables, and their values count: each can change a result."""
+RUN_VARIABLES = (
+    *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "BLIS_NUM_THREADS"),
+    *("NUMBA_NUM_THREADS", "NUMBA_CACHE_DIR", "TMPDIR"),
+    *("DYNSLAM_BENCH_ISOLATED", "DYNSLAM_BENCH_CACHE", "DYNSLAM_BENCH_DATA", "DYNSLAM_BENCH_WEIGHTS"),
+)
+"""Programs get these variables. A run sets them by its settings, or they name places of data that counts by itself."""
+PLACE_VARIABLES = (
+    # found through these, programs and files count by their content
+    *("PATH", "HOME", "USER", "LOGNAME", "SHELL", "VIRTUAL_ENV", "CONDA_PREFIX"),
+    *("XDG_CACHE_HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_DATA_DIRS", "XDG_CONFIG_DIRS", "XDG_RUNTIME_DIR"),
+    # where windows are shown, without which viewers do not start
+    *("DISPLAY", "WAYLAND_DISPLAY", "XAUTHORITY", "QT_QPA_PLATFORM", "TERM"),
+    *("PYTHONUNBUFFERED", "PYTHONDONTWRITEBYTECODE", "PYTHONSAFEPATH"),
+)
+"""Programs get these variables, and their values do not count."""
+SESSION_VARIABLES = (
+    *("_", "PWD", "OLDPWD", "SHLVL", "TEMP", "TMP", "COLORTERM", "COLUMNS", "LINES", "LS_COLORS", "WINDOWID"),
+    *("SSH_CLIENT", "SSH_CONNECTION", "SSH_TTY", "SSH_AUTH_SOCK", "DBUS_SESSION_BUS_ADDRESS", "SESSION_MANAGER"),
+    *("XDG_SESSION_ID", "XDG_VTNR", "XDG_SEAT", "TMUX", "TMUX_PANE", "STY", "INVOCATION_ID", "JOURNAL_STREAM"),
+    *("TERM_SESSION_ID", "VSCODE_IPC_HOOK_CLI", "PYTEST_CURRENT_TEST"),
+)
+"""These name the terminal, the login or the moment. Programs do not get them, and their values do not count."""
+_UNCOUNTED = frozenset((*RUN_VARIABLES, *PLACE_VARIABLES, *SESSION_VARIABLES))
+_NOT_FILES = ("/proc/", "/sys/", "/dev/", "/memfd:", "/SYSV", "[")
+"""Beginnings of what is mapped, or named, and is no file on a disk."""
+
+
+def is_counted(variable: str) -> bool:
+    """Whether the value of an environment variable counts where foreign code looks it up."""
+    return variable not in _UNCOUNTED
+
+
+def program_environment(declared: Iterable[str] = (), environment: Mapping[str, str] | None = None) -> dict[str, str]:
+    """The environment variables that a program gets; a result cannot depend on others without a word.
+
+    Args:
+        declared: Names of further variables that the program's settings declare; their values count.
+        environment: Where values are taken from; None for this process's variables.
+    """
+    source = os.environ if environment is None else environment
+    names = (*RESULT_VARIABLES, *RUN_VARIABLES, *PLACE_VARIABLES, *declared)
+    return {name: source[name] for name in names if name in source}
+
+
+# -- what a command names ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Command:
+    """A program with its arguments.
+
+    Attributes:
+        words: The program and its arguments.
+        folder: Its working folder.
+    """
+
+    words: tuple[str, ...]
+    folder: str
+
+    def executable(self, search_path: str | None = None) -> str:
+        """The file of the program; empty where there is none.
+
+        Args:
+            search_path: The folders in which a bare name is searched; None for ``PATH``.
+        """
+        if os.sep in self.words[0]:
+            return os.path.normpath(os.path.join(self.folder, self.words[0]))
+        return shutil.which(self.words[0], path=search_path) or ""
+
+    def named(self) -> set[str]:
+        """The files and folders that are there among its arguments, also behind ``=``."""
+        texts = {text for word in self.words[1:] for text in (word, word.partition("=")[2]) if text}
+        paths = {os.path.normpath(os.path.join(self.folder, os.path.expanduser(text))) for text in texts}
+        return {path for path in paths if is_file_name(path) and _is_there(path)}
+
+
+def is_file_name(path: str) -> bool:
+    """Whether a path can be that of a file on a disk, and is none of the system's own or of its devices."""
+    return path.startswith(os.sep) and not path.startswith(_NOT_FILES)
+
+
+def _is_there(path: str) -> bool:
+    try:
+        return os.path.exists(path)
+    except ValueError:
+        return False
+
+
+# -- what processes show -----------------------------------------------------------------------------------------------
+
+
+@dataclass
+class ProgramReads:
+    """What the processes of a program were made of.
+
+    Attributes:
+        files: Executables and everything that is mapped into memory.
+        commands: The command of each process.
+        environment: The variables that the first process was started with.
+    """
+
+    files: set[str] = field(default_factory=set)
+    commands: set[Command] = field(default_factory=set)
+    environment: dict[str, str] = field(default_factory=dict)
+
+
+def program_reads(pid: int) -> ProgramReads:
+    """What a program's process and all its descendants show now; nothing where it has ended."""
+    reads = ProgramReads()
+    with contextlib.suppress(psutil.Error):  # it has ended meanwhile
+        top = psutil.Process(pid)
+        reads.environment = top.environ()
+        for process in (top, *top.children(recursive=True)):
+            look_at(process, reads)
+    return reads
+
+
+def look_at(process: psutil.Process, reads: ProgramReads) -> None:
+    """Add what one process shows; nothing where it has ended."""
+    with contextlib.suppress(psutil.Error, OSError):
+        words = process.cmdline()
+        files = {process.exe(), *mapped_files(process.pid)}
+        if words:
+            reads.commands.add(Command(tuple(words), process.cwd()))
+        reads.files |= {file for file in files if is_file_name(file)}
+
+
+def mapped_files(pid: int) -> set[str]:
+    """The files that are mapped into a process's memory; empty where the system does not tell.
+
+    Raises:
+        OSError: The process has ended or is another user's; psutil.Error likewise.
+    """
+    maps = Path(f"/proc/{pid}/maps")
+    if maps.is_file():
+        return set(_paths_in(maps.read_text(errors="surrogateescape").splitlines()))
+    process = psutil.Process(pid)
+    if not hasattr(process, "memory_maps"):  # macOS
+        return set()
+    return {entry.path for entry in process.memory_maps() if is_file_name(entry.path)}
+
+
+def _paths_in(maps: Sequence[str]) -> Iterator[str]:
+    """The paths in a table of mapped memory: the sixth column, which may hold spaces."""
+    for line in maps:
+        columns = line.split(maxsplit=5)
+        if len(columns) == 6 and is_file_name(columns[5]):
+            yield columns[5].removesuffix(" (deleted)")

@@ -1,0 +1,368 @@
+"""What a run read, made of what a recorder has noted: contents of files, modules, distributions and programs."""
+
+import os
+import re
+import sys
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from dynslam_bench.core.code_files import files_of_command
+from dynslam_bench.core.programs import Command, ProgramReads, is_file_name, mapped_files
+from dynslam_bench.core.reads import (
+    ABSENT,
+    COMMAND,
+    SEARCH_PATHS,
+    Anchors,
+    ImportPath,
+    Reads,
+    content_now,
+    digest_of_names,
+    link_now,
+    names_in,
+    search_now,
+    value_digest,
+)
+from dynslam_bench.runs.process.origins import Origins
+
+_LOADED_NS = time.time_ns()
+"""What the fork server has loaded is older than this: it imports this module, too."""
+_LONGEST_TEXT = 1 << 16
+"""Text files of up to so many bytes are searched for names of files; longer ones are data."""
+_LONGEST_SOURCE = 1 << 20
+_TEXT = (".yaml", ".yml", ".toml", ".json", ".cfg", ".ini", ".conf", ".txt", ".xml")
+_WORD = re.compile(r"[\w./~+\-]*[A-Za-z][\w./~+\-]*")
+_QUOTED = re.compile(r"[\"']([^\"'\n]{1,200})[\"']")
+_FILE_NAME = re.compile(r"[\w./~+\-]*\w\.[A-Za-z]\w{0,9}")
+"""A text that can be the name of a file: it has a suffix."""
+_OF_PYTHON = re.compile(
+    r"lib(?:c|m|dl|rt|util|pthread|resolv|nss_\w+|gcc_s|stdc\+\+|ssl|crypto|sqlite3|z|bz2|lzma|ffi|readline|ncursesw?|"
+    r"tinfow?|panelw?|uuid|expat|mpdec|gdbm\w*|db|nsl|tirpc)[-.].*"
+)
+"""Libraries of the operating system that Python itself is linked with: they are updated often, and change no result."""
+_OWN_DISTRIBUTION = "dynslam-bench"
+
+Stamp = tuple[int, int, int, int, int]
+"""Device, inode, size, time of modification and time of change of a file: as long as they stay, it is the same."""
+
+
+def stamp_of(path: str) -> Stamp | None:
+    """The stamp of what lies at a path, links followed; None where nothing is there or it cannot be looked at."""
+    try:
+        status = os.stat(path)
+    except (OSError, ValueError):
+        return None
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+
+
+def is_code(path: str) -> bool:
+    """Whether a file is Python source, byte code or a native library, by its name."""
+    return path.endswith((".py", ".pyc", ".so")) or ".so." in path
+
+
+@dataclass
+class FileNote:
+    """A file that was opened.
+
+    Attributes:
+        stamp: What it was then; None where it was not there.
+        digest: Of its content then; empty where it is still to be taken.
+    """
+
+    stamp: Stamp | None
+    digest: str = ""
+
+
+@dataclass
+class Notes:
+    """What a recorder has noted.
+
+    Attributes:
+        files: Each file that was opened to be read.
+        folders: The names in each folder that was listed; None where it was not there.
+        variables: Environment variables that were looked up.
+        modules: Top-level names of modules that were imported, or could not be.
+        commands: When each command was started first, in nanoseconds since the epoch.
+        made: Files that the run has written or removed.
+        made_folders: Beginnings of the paths of what lies in folders that it has made.
+        changed: Files that were another when they were opened again.
+    """
+
+    files: dict[str, FileNote] = field(default_factory=dict)
+    folders: dict[str, list[str] | None] = field(default_factory=dict)
+    variables: set[str] = field(default_factory=set)
+    modules: set[str] = field(default_factory=set)
+    commands: dict[Command, int] = field(default_factory=dict)
+    made: set[str] = field(default_factory=set)
+    made_folders: tuple[str, ...] = ()
+    changed: list[str] = field(default_factory=list)
+
+
+@dataclass
+class _Modules:
+    """The modules that are loaded.
+
+    Attributes:
+        places: Where each top-level module is found.
+        distributions: Names of distributions, and whether they were loaded before the recorder was started.
+        files: The same of the files of modules that belong to no distribution.
+    """
+
+    places: dict[str, str] = field(default_factory=dict)
+    distributions: dict[str, bool] = field(default_factory=dict)
+    files: dict[str, bool] = field(default_factory=dict)
+
+
+class Collector:
+    """Makes `Reads` of notes; knows what there was when the recorder was started, which is when this is made.
+
+    Args:
+        anchors: The folders in which names of files begin.
+        origins: Whose files are.
+        private: Beginnings of the paths of what the run owns.
+    """
+
+    def __init__(self, anchors: Anchors, origins: Origins, private: tuple[str, ...]) -> None:
+        self.notes = Notes()
+        self.programs = ProgramReads()
+        self.began_ns = time.time_ns()
+        self.environment = dict(os.environ)
+        self._anchors = anchors
+        self._origins = origins
+        self._private = private
+        self._path = list(sys.path)
+        self._mapped = mapped_files(os.getpid())
+        self._loaded = {name.partition(".")[0] for name in sys.modules}
+        self._texts: dict[tuple[str, Stamp], set[str]] = {}
+        self._commands: dict[Command, set[str]] = {}
+
+    def collect(self) -> Reads:
+        """What was read so far."""
+        imports = ImportPath(self._path)
+        modules = self._modules(imports)
+        programs, distributions = self._programs(imports)
+
+        # what was noted counts as it was then, what was not noted as it is now
+        opened = {
+            path: note.digest or self._content(path, note)
+            for path, note in dict(self.notes.files).items()
+            if path in modules.files or not is_code(path) or not imports.distributions_at(path)
+        }
+        files = opened | {path: content_now(path) for path in self._libraries() | set(modules.files) - opened.keys()}
+        named, missing = self._named_files(files)
+        files |= {path: content_now(path) for path in named - files.keys()}
+        files |= dict.fromkeys(missing - files.keys(), ABSENT)
+        folders = {path: self._folder(path, names) for path, names in dict(self.notes.folders).items()}
+
+        name = self._anchors.name
+        links = {path: link_now(path, self._anchors) for path in (*files, *folders, *programs)}
+        return Reads(
+            files={name(path): digest for path, digest in files.items()},
+            folders={name(path): digest for path, digest in folders.items()},
+            links={name(path): target for path, target in links.items() if target},
+            environment={f"${key}": value_digest(self.environment.get(key)) for key in set(self.notes.variables)},
+            search=self._search(),
+            modules=modules.places,
+            distributions={key: imports.distribution(key) for key in modules.distributions.keys() | distributions},
+            programs={name(path): content_now(path) for path in programs},
+        )
+
+    # -- what is an input ----------------------------------------------------------------------------------------------
+
+    def is_output(self, path: str) -> bool:
+        """Whether the run has made what lies at a path."""
+        return path in self.notes.made or path.startswith((*self._private, *self.notes.made_folders))
+
+    def is_of_program(self, stamp: Stamp | None) -> bool:
+        """Whether a file was written after a program was started."""
+        return stamp is not None and stamp[3] >= min(self.notes.commands.values(), default=sys.maxsize)
+
+    def _is_input(self, path: str) -> bool:
+        """Whether something lies at a path that was there before the run."""
+        if not is_file_name(path) or self.is_output(path):
+            return False
+        stamp = stamp_of(path)
+        return stamp is not None and not self.is_of_program(stamp)
+
+    def _content(self, path: str, note: FileNote) -> str:
+        return ABSENT if note.stamp is None else content_now(path)
+
+    def _folder(self, path: str, names: list[str] | None) -> str:
+        """Digest of the names in a folder as it was listed, but with the files that the run itself has made or removed.
+
+        Else the run would change what it has read.
+        """
+        if names is None:
+            return ABSENT
+        made = {os.path.basename(file) for file in set(self.notes.made) if os.path.dirname(file) == path}
+        if made:
+            names = sorted(set(names) - made | made.intersection(names_in(path)))
+        return digest_of_names(names)
+
+    def _search(self) -> dict[str, str]:
+        """The search paths, and where commands were found that were named without a folder."""
+        commands = {command.words[0] for command in dict(self.notes.commands)}
+        names = (*SEARCH_PATHS, *(f"{COMMAND}{word}" for word in commands if os.sep not in word))
+        return {name: search_now(name, self.environment, self._anchors) for name in names}
+
+    # -- what has changed while it was read ----------------------------------------------------------------------------
+
+    def changed(self) -> str:
+        """The first thing that has changed since it was read, in words; empty where nothing has."""
+        for path, note in self.notes.files.items():
+            self.compare(path, note, stamp_of(path))
+        if self.notes.changed:
+            return f"the file {self.notes.changed[0]}"
+        # what nobody saw opened is as it was loaded if it is older than that
+        imports = ImportPath(self._path)
+        modules = self._modules(imports)
+        for path, was_loaded in modules.files.items():
+            if path not in self.notes.files and self._is_newer(path, was_loaded):
+                return f"the file {path}"
+        for name, was_loaded in modules.distributions.items():
+            if self._is_newer(imports.record_of(name), was_loaded):
+                return f"the installed {name}"
+        return ""
+
+    def compare(self, path: str, note: FileNote, stamp: Stamp | None) -> None:
+        """Take it down where a file is another than when it was opened first."""
+        if stamp == note.stamp or path in self.notes.made:
+            return
+        if note.stamp is None and self.is_of_program(stamp):
+            return
+        if note.digest and content_now(path) == note.digest:
+            note.stamp = stamp  # it was written anew with the same content
+        else:
+            self.notes.changed.append(path)
+
+    def _is_newer(self, path: str, was_loaded: bool) -> bool:
+        """Whether an input has changed since the recorder was started, or since this process loaded its libraries."""
+        stamp = stamp_of(path)
+        since_ns = _LOADED_NS if was_loaded else self.began_ns
+        return stamp is not None and stamp[4] > since_ns and self._is_input(path)
+
+    # -- modules and libraries -----------------------------------------------------------------------------------------
+
+    def _modules(self, imports: ImportPath) -> _Modules:
+        """All loaded modules but Python's and this package's, and those that were asked for in vain."""
+        modules = _Modules()
+        files_of: dict[str, str] = {}
+        for name, module in list(sys.modules.items()):
+            file = vars(module).get("__file__") if hasattr(module, "__dict__") else None
+            if not isinstance(file, str) or name == "__main__" or self._origins.of_file(file) in ("own", "python"):
+                continue
+            top = name.partition(".")[0]
+            was_loaded = top in self._loaded
+            distributions = imports.distributions_of(top, file)
+            if _OWN_DISTRIBUTION in distributions:  # how it was installed in a checkout
+                continue
+            modules.distributions |= dict.fromkeys(distributions, was_loaded)
+            if not distributions or self._origins.is_plugin(name):
+                modules.files[_on_disk(file)] = was_loaded
+            files_of.setdefault(top, file)
+        for top, file in files_of.items():
+            found = imports.find(top)
+            if found and file.startswith(found):  # else a plug-in has changed the path
+                modules.places[top] = imports.place(top, self._anchors)
+        for top in set(self.notes.modules) - sys.modules.keys():
+            modules.places[top] = imports.place(top, self._anchors)
+            modules.distributions |= dict.fromkeys(imports.distributions_of(top, imports.find(top)), False)
+        modules.files = {path: loaded for path, loaded in modules.files.items() if self._is_input(path)}
+        return modules
+
+    def _libraries(self) -> set[str]:
+        """The files that were mapped into memory since the start, or because a search path named them."""
+        mapped = mapped_files(os.getpid())
+        preloaded = set(re.split("[: ]", self.environment.get("LD_PRELOAD", "")))
+        folders = filter(None, self.environment.get("LD_LIBRARY_PATH", "").split(os.pathsep))
+        beginnings = tuple(f"{os.path.realpath(folder)}{os.sep}" for folder in folders)
+        named = {path for path in mapped if path in preloaded or path.startswith(beginnings)}
+        new = {path for path in mapped - self._mapped if self._origins.of_file(path) == "foreign"}
+        new = {path for path in new if not _OF_PYTHON.fullmatch(os.path.basename(path))}
+        return set(filter(self._is_input, named | new))
+
+    # -- programs ------------------------------------------------------------------------------------------------------
+
+    def _programs(self, imports: ImportPath) -> tuple[set[str], set[str]]:
+        """The files and folders that programs are made of, and the distributions of this environment that they use."""
+        files = set(self.programs.files)
+        for command in {**self.notes.commands, **dict.fromkeys(self.programs.commands)}:
+            if command not in self._commands:
+                self._commands[command] = self._files_of(command)
+            files |= self._commands[command]
+        inputs = set[str]()
+        distributions = set[str]()
+        for file in files:
+            origin = self._origins.of_file(file)
+            names = imports.distributions_at(file) if origin == "library" else []
+            distributions |= set(names)
+            if not names and origin in ("library", "foreign"):
+                inputs |= self._unwritten(file)
+        return inputs, distributions
+
+    def _files_of(self, command: Command) -> set[str]:
+        """The executable of a command, the files and folders that it names, and what these name or import."""
+        named = command.named()
+        below = tuple(f"{path}{os.sep}" for path in named if os.path.isdir(path))
+        executable = command.executable(self.environment.get("PATH"))
+        reached = (str(file) for file in files_of_command(command.words, Path(command.folder)))
+        return named | {path for path in (executable, *reached) if path and not path.startswith(below)}
+
+    def _unwritten(self, path: str) -> set[str]:
+        """A file or folder, if nothing in it was written by the run; else the files in the folder that were not."""
+        if not os.path.isdir(path):
+            return {path} if self._is_input(path) else set()
+        files = {os.path.join(place, name) for place, _, names in os.walk(path) for name in names}
+        inputs = set(filter(self._is_input, files))
+        return {path} if inputs == files and self._is_input(path) else inputs
+
+    # -- files that are named in texts ---------------------------------------------------------------------------------
+
+    def _named_files(self, texts: Iterable[str]) -> tuple[set[str], set[str]]:
+        """The files that foreign sources and small text files name, and those that sources name and that are not there.
+
+        A name is looked for in the folder of the text, in that of the plug-in and in the working folder.
+        """
+        named = set[str]()
+        missing = set[str]()
+        for text in texts:
+            for word in self._words(text):
+                places = self._places_of(word, text)
+                there = {place for place in places if os.path.isfile(place)}
+                named |= there
+                if not there and text.endswith(".py") and _can_be_missing(word):
+                    missing |= places
+        return set(filter(self._is_input, named)), {path for path in missing if not self.is_output(path)}
+
+    def _words(self, text: str) -> set[str]:
+        """The words of a text file that could be names of files; none of a file that is no such text."""
+        is_source = text.endswith(".py") and self._origins.of_file(text) == "foreign"
+        stamp = stamp_of(text) if is_source or text.endswith(_TEXT) else None
+        if stamp is None or stamp[2] > (_LONGEST_SOURCE if is_source else _LONGEST_TEXT):
+            return set()
+        if (text, stamp) not in self._texts:
+            content = Path(text).read_text(encoding="utf-8", errors="replace")
+            words = set(_QUOTED.findall(content)) if is_source else set(_WORD.findall(content))
+            self._texts[text, stamp] = {word for word in words if is_source or "." in word or os.sep in word}
+        return self._texts[text, stamp]
+
+    def _places_of(self, word: str, text: str) -> set[str]:
+        """Where a file of that name could lie."""
+        folders = {os.path.dirname(text), os.getcwd()}
+        if self._anchors.plugin is not None:
+            folders.add(str(self._anchors.plugin))
+        path = os.path.expanduser(word)
+        return {os.path.normpath(os.path.join(folder, path)) for folder in folders}
+
+
+def _can_be_missing(word: str) -> bool:
+    """Whether a text in a source looks like the name of a file, and not like that of a module."""
+    top = word.partition(".")[0]
+    return _FILE_NAME.fullmatch(word) is not None and top not in sys.modules and top not in sys.stdlib_module_names
+
+
+def _on_disk(file: str) -> str:
+    """The file that a module was loaded from; that of the archive where it lies in one."""
+    path = Path(file)
+    return str(next((place for place in (path, *path.parents) if place.is_file()), path))

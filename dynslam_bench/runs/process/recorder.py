@@ -1,0 +1,588 @@
+"""Records what foreign code reads while a run is made: files, folders, modules, environment variables and programs.
+
+Foreign are plug-ins, and libraries while a plug-in calls them (`origins`). Python announces what they are about to do
+(`sys.addaudithook`); a mapping in place of ``os.environ`` announces the variables that they look up.
+
+Files that libraries open in machine code are not announced: by ``cv2.imread``, ``cv2.dnn.readNet``, ``onnxruntime``. In
+their place each file counts whose name is written in a plug-in's sources, or in a small text file that foreign code
+opened. Nor is it announced that a plug-in asks whether a file is there (``Path.exists``): a file that its sources name
+and that is not there counts as absent. Files that are named by a descriptor of their folder (``dir_fd``) are not seen.
+Of programs counts what `core.programs` shows, and what their command lines name.
+
+What a run makes is no input of it: its private folders, files that it writes before it reads them, files that are
+written after a program was started.
+"""
+
+import hashlib
+import importlib.util
+import json
+import os
+import re
+import sys
+import threading
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import psutil
+
+from dynslam_bench.core.errors import RunError
+from dynslam_bench.core.folders import digest_cache_folder, stage_cache_folder
+from dynslam_bench.core.programs import RESULT_VARIABLES, Command, is_counted, is_file_name, look_at
+from dynslam_bench.core.reads import (
+    BYTE_CODE_FOLDER,
+    SEARCH_PATHS,
+    Anchors,
+    Reads,
+    content_now,
+    digest_of,
+    names_in,
+)
+from dynslam_bench.runs.process.collector import Collector, FileNote, is_code, stamp_of
+from dynslam_bench.runs.process.origins import Origins
+
+_SMALL = 1 << 20
+"""Files of up to so many bytes are digested when they are opened; larger ones, which take time, at the end."""
+_LOOK_S = 0.5
+"""Seconds between two looks at the programs. One that has ended before the first look counts by its command."""
+_CLOCK_NS = 10_000_000
+"""So far the clock that stamps files may be behind that of the system."""
+_ADAPTERS = "dynslam_bench.trackers.adapters"
+"""The modules of this package that start programs of others."""
+_IMPORTING = ("<frozen importlib", "<frozen zipimport", os.path.dirname(importlib.__file__))
+"""Beginnings of the files that search for modules and for metadata: these list all folders of the path."""
+_RELATIVE_TO_DESCRIPTOR = ("shutil.py", "os.py", "<frozen os>")
+"""These open files by their names in folders that they hold open; the announcement does not tell which folder."""
+_KERNELS = (".nbi", ".nbc")
+"""Numba's compiled code, which follows from its source."""
+_METADATA = re.compile(r"\.(?:dist|egg)-info(?:/|$)")
+_SHELL_WORD = re.compile(r"[^\s;|&<>()'\"`$]+")
+_LOG = "reads-{}.jsonl"
+"""In the first private folder: what a forked process has read."""
+
+_VARIABLE = "dynslam_bench.variable"
+_ALL_VARIABLES = "dynslam_bench.variables"
+_VARIABLE_SET = "dynslam_bench.variable_set"
+
+
+class ReadRecorder:
+    """Records what foreign code reads in this process, and in those that are forked from it, until `finish`.
+
+    It belongs into the process that makes a run, and is started before a plug-in is loaded. One at a time is at work.
+
+    Args:
+        anchors: The folders in which names of files begin.
+        private: Folders of the run's own, at least one: what lies there is no input. Forked processes write their
+            reads into the first one.
+        plugins: Top-level names of the modules of installed plug-ins; their sources count by their bytes.
+
+    Attributes:
+        count: How many things were read so far.
+    """
+
+    def __init__(self, anchors: Anchors, *, private: Iterable[Path], plugins: Collection[str] = ()) -> None:
+        self.count = 0
+        self._anchors = anchors
+        self._folders = list(private)
+        self._plugins = plugins
+        self._unheard: set[int] = set()
+        self._error: Exception | None = None
+        self._ended = threading.Event()
+        self._looked: dict[tuple[int, float], float] = {}
+        self._watcher: threading.Thread | None = None
+        self._log = -1
+        self._snapshot = (-1, "")
+        self._handlers: dict[str, Callable[..., None]] = {
+            "open": self._on_open,
+            "mmap.__new__": self._on_map,
+            "sqlite3.connect": self._on_database,
+            "ctypes.dlopen": self._on_library,
+            "os.listdir": self._on_list,
+            "os.scandir": self._on_list,
+            "import": self._on_import,
+            _VARIABLE: self._on_variable,
+            _ALL_VARIABLES: self._on_all_variables,
+            _VARIABLE_SET: self._on_variable_set,
+            "os.rename": self._on_rename,
+            "os.link": self._on_rename,
+            "os.symlink": self._on_symlink,
+            "os.remove": self._on_remove,
+            "os.truncate": self._on_truncate,
+            "os.mkdir": self._on_mkdir,
+            "subprocess.Popen": self._on_popen,
+            "os.exec": self._on_exec,
+            "os.posix_spawn": self._on_exec,
+            "os.spawn": self._on_spawn,
+            "os.system": self._on_system,
+        }
+
+    def start(self) -> None:
+        """Begin to record."""
+        owned = (*self._folders, stage_cache_folder(), digest_cache_folder())
+        spellings = [spelling for folder in owned for spelling in (os.path.abspath(folder), os.path.realpath(folder))]
+        self._origins = Origins(self._anchors.plugin, self._plugins)
+        self._collector = Collector(self._anchors, self._origins, tuple(f"{folder}{os.sep}" for folder in spellings))
+        self._notes = self._collector.notes
+        _activate(self)
+
+    def stop(self) -> None:
+        """Record no more; may be called more than once."""
+        _activate(None)
+        self._ended.set()
+
+    def finish(self) -> Reads:
+        """Record no more, and give what was read.
+
+        Raises:
+            RunError: Something has changed while the run read it, so that nobody knows what it read.
+        """
+        self._look_at_programs(0.0)
+        self.stop()
+        self._add_forked()
+        if self._error is not None:
+            raise self._error
+        if changed := self._collector.changed():
+            raise RunError(
+                f"{changed} has changed while the run read it",
+                "the run is not stored; ask again, and let nothing change meanwhile what it reads",
+            )
+        return self._collector.collect()
+
+    def so_far(self) -> Reads:
+        """What was read so far; it may change until the end."""
+        with self._hearing_nothing():
+            return self._collector.collect()
+
+    def snapshot(self) -> str:
+        """Digest of everything that was read so far; costs nothing where nothing was read since the last call."""
+        count, value = self._snapshot
+        if count != self.count:
+            with self._hearing_nothing():
+                count = self.count
+                value = digest_of(self._collector.collect())
+            self._snapshot = (count, value)
+        return value
+
+    # -- what is announced ---------------------------------------------------------------------------------------------
+
+    def hear(self, event: str, arguments: tuple[Any, ...]) -> None:
+        """Take an announcement; what a recorder itself does is not announced.
+
+        Raises:
+            FileNotFoundError: Byte code is not to be used.
+        """
+        handler = self._handlers.get(event)
+        if handler is None or threading.get_ident() in self._unheard:
+            return
+        self._unheard.add(threading.get_ident())
+        try:
+            handler(sys._getframe(2), *arguments)
+        except _StaleByteCode:
+            raise
+        except Exception as error:  # a fault of the recorder's own, which must not become one of the plug-in
+            self._error = self._error or error
+        finally:
+            self._unheard.discard(threading.get_ident())
+
+    @contextmanager
+    def _hearing_nothing(self) -> Iterator[None]:
+        thread = threading.get_ident()
+        self._unheard.add(thread)
+        try:
+            yield
+        finally:
+            self._unheard.discard(thread)
+
+    def _note(self, kind: str, name: str) -> None:
+        """Count what was read; a forked process writes it down for the one that makes the run."""
+        self.count += kind != "made"
+        if self._log >= 0:
+            os.write(self._log, f"{json.dumps([kind, name])}\n".encode())
+
+    def _is_foreign(self, frame: FrameType | None) -> bool:
+        """Whether foreign code is at work: it calls, or has started a thread in which nobody else's code is at work."""
+        is_own = False
+        while frame is not None:
+            origin = self._origins.of_frame(frame)
+            if origin == "foreign":
+                return True
+            is_own = is_own or origin == "own"
+            frame = frame.f_back
+        return not is_own and threading.current_thread() is not threading.main_thread()
+
+    def _is_asked_by_foreign(self, frame: FrameType | None) -> bool:
+        """The same, but what this package looks up for itself when a plug-in calls it does not count."""
+        while frame is not None:
+            origin = self._origins.of_frame(frame)
+            if origin in ("foreign", "own"):
+                return origin == "foreign"
+            frame = frame.f_back
+        return threading.current_thread() is not threading.main_thread()
+
+    # -- files ---------------------------------------------------------------------------------------------------------
+
+    def _on_open(self, frame: FrameType, name: Any, mode: str | None, flags: int) -> None:
+        if isinstance(name, int):  # it was seen when the descriptor was opened
+            return
+        path = _absolute(name)
+        if path is None:
+            return
+        if mode is None and not os.path.isabs(name) and _is_in(frame, _RELATIVE_TO_DESCRIPTOR):
+            return
+        if not flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC):
+            self._read(frame, path)
+            return
+        if flags & os.O_RDWR and not flags & os.O_TRUNC:
+            self._read(frame, path, whole=True)
+        self._make(path)
+
+    def _on_map(self, frame: FrameType, descriptor: int, *_: Any) -> None:
+        if path := _absolute(descriptor):
+            self._read(frame, path)
+
+    def _on_database(self, frame: FrameType, name: Any) -> None:
+        text = os.fsdecode(name)
+        text = text.removeprefix("file:").partition("?")[0] if text.startswith("file:") else text
+        if text not in ("", ":memory:") and (path := _absolute(text)):
+            self._read(frame, path, whole=True)
+            self._make(path)
+
+    def _on_library(self, frame: FrameType, name: Any) -> None:
+        # one without a folder is found among what is mapped into memory
+        if isinstance(name, str | bytes) and os.sep in os.fsdecode(name) and (path := _absolute(name)):
+            self._read(frame, path)
+
+    def _read(self, frame: FrameType, path: str, *, whole: bool = False) -> None:
+        """Note a file that is about to be read.
+
+        Args:
+            frame: Who reads it.
+            path: The file.
+            whole: Whether its content is digested now, however large: it is about to be written, too.
+        """
+        path = self._source_of(path)
+        if self._collector.is_output(path):  # it may be a link to what is none
+            path = os.path.realpath(path)
+        stamp = stamp_of(path)
+        note = self._notes.files.get(path)
+        if note is not None:
+            self._collector.compare(path, note, stamp)
+            return
+        if not self._can_count(path) or os.path.isdir(path) or not self._is_foreign(frame):
+            return
+        if self._collector.is_output(os.path.realpath(path)) or self._collector.is_of_program(stamp):
+            return
+        note = FileNote(stamp)
+        if stamp is not None and whole:
+            note.digest = content_now(path)
+        elif stamp is not None and stamp[2] <= _SMALL:
+            note.digest = _sha256(path)
+        self._notes.files[path] = note
+        self._note("file", path)
+
+    def _source_of(self, path: str) -> str:
+        """The source of byte code, any other path as it is.
+
+        Raises:
+            FileNotFoundError: The source has changed after the byte code was written. Python would not see a change
+                that left size and second of modification as they were; now it compiles the source.
+        """
+        if not path.endswith(".pyc") or BYTE_CODE_FOLDER not in path:
+            return path
+        try:
+            source = importlib.util.source_from_cache(path)
+        except ValueError:
+            return path
+        if self._origins.of_file(source) == "foreign":
+            stamp = stamp_of(source)
+            compiled = stamp_of(path)
+            if stamp is not None and compiled is not None and stamp[4] >= compiled[3]:
+                raise _StaleByteCode(path)
+        return source
+
+    def _can_count(self, path: str) -> bool:
+        """Whether a file is none that counts in another way: by its distribution, as this package's code, as source."""
+        if not is_file_name(path) or path.endswith(_KERNELS) or BYTE_CODE_FOLDER in path or _METADATA.search(path):
+            return False
+        if path in sys.path:  # an archive: it counts where a module is loaded from it
+            return False
+        return not is_code(path) or self._origins.of_file(path) == "foreign"
+
+    def _make(self, path: str) -> None:
+        """Note a file that is about to be written, moved or removed."""
+        note = self._notes.files.get(path)
+        if note is not None and note.stamp is None:
+            del self._notes.files[path]  # that it was missing is no input where the run makes it
+            self.count += 1
+        elif note is not None:
+            note.digest = note.digest or content_now(path)
+        for spelling in {path, os.path.realpath(path)} - self._notes.made:
+            self._notes.made.add(spelling)
+            self._note("made", spelling)
+
+    def _on_rename(self, frame: FrameType, source: Any, target: Any, source_folder: int, target_folder: int) -> None:
+        if path := _absolute(source, source_folder):
+            self._read(frame, path)
+            self._make(path)
+        if path := _absolute(target, target_folder):
+            self._make(path)
+            if f"{_absolute(source, source_folder)}{os.sep}" in self._notes.made_folders:
+                self._notes.made_folders += (f"{path}{os.sep}",)
+
+    def _on_symlink(self, _: FrameType, __: Any, target: Any, folder: int) -> None:
+        if path := _absolute(target, folder):
+            self._make(path)
+
+    def _on_remove(self, _: FrameType, name: Any, folder: int) -> None:
+        if path := _absolute(name, folder):
+            self._make(path)
+
+    def _on_truncate(self, _: FrameType, name: Any, __: int) -> None:
+        if path := _absolute(name):
+            self._make(path)
+
+    def _on_mkdir(self, _: FrameType, name: Any, __: int, folder: int) -> None:
+        path = _absolute(name, folder)
+        if path is not None and not os.path.lexists(path):
+            self._make(path)
+            self._notes.made_folders += (f"{path}{os.sep}",)
+
+    def _on_list(self, frame: FrameType, name: Any) -> None:
+        path = _absolute("." if name is None else name)
+        if path is None or path in self._notes.folders or not is_file_name(path) or _is_in(frame, _IMPORTING):
+            return
+        if self._collector.is_output(f"{path}{os.sep}") or not self._is_foreign(frame):
+            return
+        try:
+            self._notes.folders[path] = names_in(path)
+        except OSError:
+            self._notes.folders[path] = None
+        self._note("folder", path)
+
+    # -- modules and variables -----------------------------------------------------------------------------------------
+
+    def _on_import(self, frame: FrameType, module: str, *_: Any) -> None:
+        top = module.partition(".")[0]
+        if top not in self._notes.modules and top not in sys.stdlib_module_names and self._is_foreign(frame):
+            self._notes.modules.add(top)
+            self._note("module", top)
+
+    def _on_variable(self, frame: FrameType, name: Any) -> None:
+        if self._is_asked_by_foreign(frame.f_back):
+            self._note_variables([_variable(name)])
+
+    def _on_all_variables(self, frame: FrameType) -> None:
+        if self._is_asked_by_foreign(frame.f_back):
+            self._note_variables(self._collector.environment)
+
+    def _on_variable_set(self, _: FrameType, name: Any) -> None:
+        self._notes.made.add(f"${_variable(name)}")
+
+    def _note_variables(self, names: Iterable[str]) -> None:
+        for name in names:
+            is_known = name in self._notes.variables or f"${name}" in self._notes.made
+            if is_counted(name) and name not in SEARCH_PATHS and not is_known:
+                self._notes.variables.add(name)
+                self._note("variable", name)
+
+    # -- programs ------------------------------------------------------------------------------------------------------
+
+    def _on_popen(self, frame: FrameType, executable: Any, words: Any, folder: Any, _: Any) -> None:
+        given = [words] if isinstance(words, str | bytes | os.PathLike) else list(words)
+        self._start_program(frame, [executable, *given[1:]], folder)
+
+    def _on_exec(self, frame: FrameType, path: Any, words: Any, _: Mapping[Any, Any] | None) -> None:
+        self._start_program(frame, [path, *list(words)[1:]])
+
+    def _on_spawn(self, frame: FrameType, _: int, path: Any, words: Any, __: Any) -> None:
+        self._start_program(frame, [path, *list(words)[1:]])
+
+    def _on_system(self, frame: FrameType, command: Any) -> None:
+        self._start_program(frame, ["/bin/sh", "-c", command])
+
+    def _start_program(self, frame: FrameType, words: list[Any], folder: Any = None) -> None:
+        """Note a program that is about to be started by foreign code, or for it by an adapter."""
+        if not self._is_foreign(frame) and not _is_adapter(frame):
+            return
+        texts = [os.fsdecode(word) for word in words]
+        if texts[1:2] == ["-c"]:  # what a shell's line names counts as what arguments name
+            texts += _SHELL_WORD.findall(texts[2])
+        command = Command(tuple(texts), _absolute("." if folder is None else folder) or os.getcwd())
+        if command not in self._notes.commands:
+            self._notes.commands[command] = time.time_ns() - _CLOCK_NS
+            self._note("command", json.dumps([texts, command.folder]))
+        self._note_variables(RESULT_VARIABLES)
+        if self._watcher is None:
+            self._watcher = threading.Thread(target=self._watch, daemon=True)
+            self._watcher.start()
+
+    def _watch(self) -> None:
+        """Look at the programs until the end; runs in a thread of its own, as the run may wait for a program."""
+        self._unheard.add(threading.get_ident())
+        while not self._ended.wait(_LOOK_S):
+            self._look_at_programs(_LOOK_S / 2)
+
+    def _look_at_programs(self, least_age_s: float) -> None:
+        """Note what the processes below this one are made of: each again when its age has doubled.
+
+        Args:
+            least_age_s: Younger ones have not loaded their libraries yet.
+        """
+        if not self._notes.commands:
+            return
+        with self._hearing_nothing():
+            own = psutil.Process().cmdline()
+            for process in psutil.Process().children(recursive=True):
+                try:
+                    born_s = process.create_time()
+                    is_fork = process.cmdline() == own
+                except psutil.Error:  # it has ended
+                    continue
+                age_s = time.time() - born_s
+                if not is_fork and age_s >= max(least_age_s, 2 * self._looked.get((process.pid, born_s), 0.0)):
+                    self._looked[process.pid, born_s] = age_s
+                    look_at(process, self._collector.programs)
+
+    # -- forked processes ----------------------------------------------------------------------------------------------
+
+    def begin_log(self) -> None:
+        """In a forked process: write down what is read, as it ends without a word."""
+        with self._hearing_nothing():
+            path = self._folders[0] / _LOG.format(os.getpid())
+            self._log = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+
+    def _add_forked(self) -> None:
+        """Take over what forked processes have read and made."""
+        lines = [line for log in self._folders[0].glob(_LOG.format("*")) for line in log.read_text().splitlines()]
+        entries = [json.loads(line) for line in lines]
+        for kind, name in entries:
+            if kind == "made":
+                self._notes.made.add(name)
+        for kind, name in entries:
+            match kind:
+                case "file" if name not in self._notes.files:
+                    self._notes.files[name] = FileNote(stamp := stamp_of(name))
+                    if stamp is not None and stamp[4] > self._collector.began_ns:
+                        self._notes.changed.append(name)
+                case "folder" if name not in self._notes.folders:
+                    self._notes.folders[name] = names_in(name) if os.path.isdir(name) else None
+                case "variable":
+                    self._notes.variables.add(name)
+                case "module":
+                    self._notes.modules.add(name)
+                case "command":
+                    words, folder = json.loads(name)
+                    self._notes.commands.setdefault(Command(tuple(words), folder), self._collector.began_ns)
+
+
+class _StaleByteCode(FileNotFoundError):
+    """Raised in place of opening byte code that is older than its source."""
+
+
+def _absolute(name: Any, folder: int = -1) -> str | None:
+    """The absolute path of a file; None of a descriptor that is of no file.
+
+    Args:
+        name: A path, or a descriptor.
+        folder: Descriptor of the folder in which a relative path begins; -1 for the working folder.
+    """
+    if isinstance(name, int):
+        return _of_descriptor(name)
+    path = os.fsdecode(name)
+    if not os.path.isabs(path):
+        base = os.getcwd() if folder == -1 else _of_descriptor(folder)
+        if base is None:
+            return None
+        path = os.path.join(base, path)
+    # a folder above a link is not the one before it
+    return os.path.realpath(path) if ".." in path.split(os.sep) else os.path.normpath(path)
+
+
+def _of_descriptor(descriptor: int) -> str | None:
+    """The path of an open file; None where it has none or the system does not tell."""
+    try:
+        path = os.readlink(f"/proc/self/fd/{descriptor}")
+    except OSError:
+        return None
+    return path if is_file_name(path) else None
+
+
+def _sha256(path: str) -> str:
+    """SHA-256 of a small file; empty where it cannot be read, which the reader is about to see."""
+    try:
+        return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+    except OSError:
+        return ""
+
+
+def _variable(name: Any) -> str:
+    """The name of an environment variable; anything else than a text or bytes is none, and fails where it is used."""
+    return os.fsdecode(name) if isinstance(name, str | bytes) else ""
+
+
+def _is_in(frame: FrameType, files: tuple[str, ...]) -> bool:
+    """Whether a function is one of some files, by beginnings or ends of their paths."""
+    file = frame.f_code.co_filename
+    return file.startswith(files) or file.endswith(files)
+
+
+def _is_adapter(frame: FrameType | None) -> bool:
+    """Whether an adapter of this package calls."""
+    while frame is not None:
+        if str(frame.f_globals.get("__name__", "")).startswith(_ADAPTERS):
+            return True
+        frame = frame.f_back
+    return False
+
+
+# -- what is at work in this process -----------------------------------------------------------------------------------
+
+_active: ReadRecorder | None = None
+_is_installed = False
+_Environment: Any = type(os.environ)
+
+
+class RecordedEnvironment(_Environment):  # type: ignore[misc]
+    """``os.environ`` that announces what is looked up in it; other mappings of variables are built on these."""
+
+    def __getitem__(self, key: Any) -> Any:
+        sys.audit(_VARIABLE, key)
+        return super().__getitem__(key)
+
+    def __iter__(self) -> Iterator[Any]:
+        sys.audit(_ALL_VARIABLES)
+        return iter(super().__iter__())
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        sys.audit(_VARIABLE_SET, key)
+        super().__setitem__(key, value)
+
+    def __delitem__(self, key: Any) -> None:
+        sys.audit(_VARIABLE_SET, key)
+        super().__delitem__(key)
+
+
+def _activate(recorder: ReadRecorder | None) -> None:
+    """Let a recorder hear announcements, or none."""
+    global _active, _is_installed
+    if recorder is not None and not _is_installed:  # a hook stays for the life of the process
+        sys.addaudithook(_hear)
+        os.register_at_fork(after_in_child=_begin_log)
+        _is_installed = True
+    _active = recorder
+    kind = _Environment if recorder is None else RecordedEnvironment
+    for variables in (os.environ, os.environb):
+        variables.__class__ = kind
+
+
+def _hear(event: str, arguments: tuple[Any, ...]) -> None:
+    if _active is not None:
+        _active.hear(event, arguments)
+
+
+def _begin_log() -> None:
+    if _active is not None:
+        _active.begin_log()

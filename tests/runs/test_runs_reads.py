@@ -1,0 +1,658 @@
+"""What a run's foreign code read: each change of it is noticed, and nothing else is."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dynslam_bench.core.reads import Anchors, Reads, Verifier, digest_of
+
+SERVER = Path(__file__).with_name("reads_server.py")
+
+
+class Child:
+    """A process that forks another for each recording; its code has no file, so that it is nobody's."""
+
+    def __init__(self) -> None:
+        code = f"exec(compile(open({str(SERVER)!r}).read(), '<server>', 'exec'))"
+        pipe = subprocess.PIPE
+        self.process = subprocess.Popen([sys.executable, "-c", code], stdin=pipe, stdout=pipe, text=True)
+
+    def ask(self, request: dict[str, Any]) -> dict[str, Any]:
+        print(json.dumps(request), file=self.process.stdin, flush=True)
+        return self.answer()
+
+    def answer(self) -> dict[str, Any]:
+        answer: dict[str, Any] = json.loads(self.process.stdout.readline())
+        assert "broken" not in answer, answer["broken"]
+        return answer
+
+    def resume(self) -> None:
+        print(file=self.process.stdin, flush=True)
+
+
+@pytest.fixture(scope="module")
+def child() -> Iterator[Child]:
+    child = Child()
+    yield child
+    child.process.stdin.close()
+    child.process.wait(10)
+
+
+@dataclass
+class Bench:
+    """A plug-in's folder, a working folder and a home of a test, and the process that records.
+
+    Attributes:
+        path: Folders that come first on the import path.
+        environment: Variables of the run.
+    """
+
+    child: Child
+    root: Path
+    path: list[str] = field(default_factory=list)
+    environment: dict[str, str] = field(default_factory=dict)
+    plugins: list[str] = field(default_factory=list)
+
+    @property
+    def plugin(self) -> Path:
+        return self.root / "plugin" / "mine.py"
+
+    @property
+    def work(self) -> Path:
+        return self.root / "work"
+
+    @property
+    def anchors(self) -> Anchors:
+        return Anchors(self.plugin.parent, self.work)
+
+    def write(self, name: str, text: str) -> Path:
+        file = self.root / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+        return file
+
+    def job(self, source: str, target: str = "", **arguments: Any) -> dict[str, Any]:
+        self.write("plugin/mine.py", source)
+        for folder in ("work", "private"):
+            (self.root / folder).mkdir(exist_ok=True)
+        return {
+            "plugin": target or str(self.plugin),
+            "work": str(self.work),
+            "private": str(self.root / "private"),
+            "path": self.path,
+            "environment": self.environment,
+            "plugins": self.plugins,
+            "arguments": arguments,
+        }
+
+    def record(self, source: str, target: str = "", **arguments: Any) -> Reads:
+        answer = self.child.ask(self.job(source, target, **arguments))
+        assert "fault" not in answer, answer
+        reads = Reads.model_validate(answer["reads"])
+        assert self.changed(reads) == ""
+        assert Reads.parse(reads.to_json(), "reads") == reads
+        return reads
+
+    def changed(self, reads: Reads) -> str:
+        verifier = Verifier([*self.path, *sys.path], {**os.environ, **self.environment})
+        return verifier.changed(reads, self.anchors)
+
+
+@pytest.fixture
+def bench(child: Child, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Bench:
+    return Bench(child, tmp_path)
+
+
+def edit(path: Path, text: str) -> None:
+    """Write another text of equal length, and leave the time of modification as it was."""
+    status = path.stat()
+    assert status.st_size == len(text)
+    path.write_text(text)
+    os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+
+
+# -- files and folders -------------------------------------------------------------------------------------------------
+
+READ_ALL = """
+from pathlib import Path
+def run(files):
+    named = files.values() if isinstance(files, dict) else files
+    for name in named:
+        Path(name).read_bytes()
+"""
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        ["a.bin", "parts/b.bin"],
+        {"left": "a.bin", "right": "parts/b.bin"},
+    ],
+    ids=["list or tuple", "dictionary"],
+)
+@pytest.mark.parametrize("edited", ["a.bin", "parts/b.bin"])
+def test_files_in_settings_of_any_form(files: Any, edited: str, bench: Bench) -> None:
+    for name in ("a.bin", "parts/b.bin"):
+        bench.write(f"work/{name}", "1111")
+    reads = bench.record(READ_ALL, files=files)
+    assert set(reads.files) == {"plugin:/mine.py", "work:/a.bin", "work:/parts/b.bin"}
+    edit(bench.work / edited, "2222")
+    assert bench.changed(reads) == f"the file {edited}"
+
+
+NAME = "net" + ".bin"  # the name of a file that no source writes: it would count without being opened
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        "open(NAME).read()",
+        "open(NAME.encode(), 'rb').read()",
+        "import io; io.FileIO(NAME).readall()",
+        "import os; os.read(os.open(NAME, os.O_RDONLY), 4)",
+        "import os; open(os.path.join(os.getcwd(), 'sub', '..', NAME)).read()",
+        "from pathlib import Path; Path(NAME).resolve().read_text()",
+        "import numpy; numpy.fromfile(NAME, numpy.uint8)",
+        "import numpy; numpy.memmap(NAME, numpy.uint8)",
+        "import numpy; numpy.memmap(NAME, numpy.uint8, mode='c')",
+        "import mmap; file = open(NAME); mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)",
+        "import shutil, tempfile; open(shutil.copy(NAME, tempfile.mkdtemp())).read()",
+        "import os, tempfile; link = tempfile.mkdtemp() + '/x'; os.symlink(os.path.abspath(NAME), link); open(link)",
+        "from concurrent.futures import ThreadPoolExecutor as Pool; list(Pool(2).map(open, [NAME]))",
+        "import threading; thread = threading.Thread(target=open, args=[NAME]); thread.start(); thread.join()",
+        "import multiprocessing as m; m.get_context('fork').Pool(1).map(open_it, [NAME])",
+        "import os; pid = os.fork() or (open(NAME), os._exit(0)); os.waitpid(pid, 0)",
+        "import pathlib; from dynslam_bench.core import read_bytes; read_bytes(pathlib.Path(NAME))",
+        "text = open(NAME, 'r+').read()",
+        "import sqlite3; sqlite3.connect(NAME)",
+        "import ctypes; ctypes.CDLL('./' + NAME)",
+        "import subprocess; subprocess.run(['cat', NAME])",
+        "import subprocess; subprocess.run(f'cat < {NAME} | wc', shell=True)",
+        "import os; os.system('cat ' + NAME)",
+    ],
+)
+def test_a_bare_name_in_the_working_folder_however_it_is_opened(read: str, bench: Bench) -> None:
+    bench.write(f"work/{NAME}", "1111")
+    bench.write("work/sub/x", "")
+    source = f"NAME = 'net' + '.bin'\ndef open_it(name):\n    open(name).read()\ndef run():\n    try:\n        {read}\n"
+    reads = bench.record(
+        source
+        + "    except OSError:\n        assert 'CDLL' in open_it.__doc__\n".replace("open_it.__doc__", repr(read))
+    )
+    assert f"work:/{NAME}" in (*reads.files, *reads.programs)
+    assert set(reads.files) <= {"plugin:/mine.py", f"work:/{NAME}"}
+    edit(bench.work / NAME, "2222")
+    assert bench.changed(reads).startswith(f"the file {NAME}")
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        "[open(os.path.join(FOLDER, name)) for name in os.listdir(FOLDER)]",
+        "[open(entry.path) for entry in os.scandir(FOLDER)]",
+        "[file.read_text() for file in pathlib.Path(FOLDER).iterdir()]",
+        "[file.read_text() for file in pathlib.Path(FOLDER).glob('*')]",
+        "[file.read_text() for file in pathlib.Path(FOLDER).rglob('*.txt')]",
+        "[open(name) for name in glob.glob(FOLDER + '/*')]",
+        "[open(os.path.join(place, name)) for place, _, names in os.walk(FOLDER) for name in names]",
+    ],
+)
+def test_a_folder_that_a_text_names(read: str, bench: Bench) -> None:
+    for name in ("associations.txt", "b.txt"):
+        bench.write(f"work/maps/{name}", "1111")
+    source = f"import glob, os, pathlib\ndef run(folder):\n    {read}\n".replace("FOLDER", "folder")
+    reads = bench.record(source, folder="maps")
+    assert set(reads.files) == {"plugin:/mine.py", "work:/maps/associations.txt", "work:/maps/b.txt"}
+    assert set(reads.folders) == {"work:/maps"}
+    edit(bench.work / "maps" / "associations.txt", "2222")
+    assert bench.changed(reads) == "the file maps/associations.txt"
+    edit(bench.work / "maps" / "associations.txt", "1111")
+    assert bench.changed(reads) == ""
+    bench.write("work/maps/c.txt", "")
+    assert bench.changed(reads) == "the names in the folder maps"
+
+
+@pytest.mark.parametrize(
+    "config", ["weights: net.bin", '{"weights": "net.bin"}', "[model]\nweights = '../work/net.bin'"]
+)
+@pytest.mark.parametrize("is_opened", [True, False], ids=["by Python", "in machine code"])
+def test_a_configuration_that_names_weights(config: str, is_opened: bool, bench: Bench) -> None:
+    suffix = ".json" if config.startswith("{") else ".yaml"
+    bench.write(f"work/slam{suffix}", config)
+    bench.write(f"work/{NAME}", "1111")
+    source = "def run(config, name):\n    open(config).read()\n    if name:\n        open(name)\n"
+    reads = bench.record(source, config=f"slam{suffix}", name=NAME if is_opened else "")
+    assert set(reads.files) == {"plugin:/mine.py", f"work:/slam{suffix}", f"work:/{NAME}"}
+    edit(bench.work / NAME, "2222")
+    assert bench.changed(reads) == f"the file {NAME}"
+
+
+def test_a_source_that_names_a_file_which_is_opened_in_machine_code(bench: Bench) -> None:
+    bench.write("plugin/mask.png", "1111")
+    bench.write("plugin/other.png", "1111")
+    source = "import os\nHERE = os.path.dirname(__file__)\ndef run():\n    return os.path.join(HERE, 'mask.png')\n"
+    reads = bench.record(source)
+    assert set(reads.files) == {"plugin:/mine.py", "plugin:/mask.png"}
+    edit(bench.plugin.parent / "mask.png", "2222")
+    assert bench.changed(reads) == "the file mask.png"
+
+
+@pytest.mark.parametrize(
+    "look",
+    ["open(name).read()", "from pathlib import Path; Path(name).read_bytes()", "import numpy; numpy.load(name)"],
+)
+def test_a_file_that_is_missing(look: str, bench: Bench) -> None:
+    source = f"def run(name):\n    try:\n        {look}\n    except OSError:\n        pass\n"
+    reads = bench.record(source, name="net.bin")
+    assert reads.files["work:/net.bin"] == ""
+    bench.write("work/net.bin", "1111")
+    assert bench.changed(reads) == "the file net.bin"
+
+
+@pytest.mark.parametrize("look", ["os.path.exists('tuned.yaml')", "pathlib.Path('tuned.yaml').is_file()"])
+def test_a_file_that_is_missing_and_never_opened(look: str, bench: Bench) -> None:
+    reads = bench.record(f"import os, pathlib\ndef run():\n    return {look}\n")
+    assert set(reads.files.values()) >= {""}
+    bench.write("work/tuned.yaml", "x: 1")
+    assert bench.changed(reads) == "the file tuned.yaml"
+
+
+@pytest.mark.parametrize("text", ["$WEIGHTS/net.bin", "${WEIGHTS}/net.bin", "~/net.bin"])
+def test_a_variable_in_a_path(text: str, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def point_to(folder: str) -> None:
+        bench.environment |= {"WEIGHTS": str(bench.root / folder), "HOME": str(bench.root / folder)}
+        monkeypatch.setenv("HOME", str(bench.root / folder))
+
+    for folder in ("first", "second"):
+        bench.write(f"{folder}/net.bin", folder)
+    point_to("first")
+    source = "import os\ndef run(text):\n    open(os.path.expanduser(os.path.expandvars(text))).read()\n"
+    reads = bench.record(source, text=text)
+    assert "~/net.bin" in reads.files
+    point_to("second")
+    assert bench.changed(reads) == ("the file ~/net.bin" if "~" in text else "the environment variable WEIGHTS")
+
+
+# -- environment variables ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "look",
+    [
+        "os.environ.get('MY_SLAM_MODE')",
+        "os.environ['MY_SLAM_MODE'] if 'MY_SLAM_MODE' in os.environ else ''",
+        "'MY_SLAM_MODE' in os.environ",
+        "os.getenv('MY_SLAM_MODE')",
+        "os.getenvb(b'MY_SLAM_MODE')",
+        "os.environb.get(b'MY_SLAM_MODE')",
+        "os.environ.copy()",
+        "dict(os.environ)",
+        "{**os.environ}",
+        "os.environ | {}",
+        "[key for key in os.environ]",
+        "list(os.environ.items())",
+        "os.path.expandvars('$MY_SLAM_MODE/x')",
+        "os.path.expandvars(b'$MY_SLAM_MODE/x')",
+        "__import__('string').Template('$MY_SLAM_MODE').safe_substitute(os.environ)",
+    ],
+)
+@pytest.mark.parametrize("value", ["fast", None])
+def test_an_environment_variable_that_a_plug_in_looks_up(
+    look: str, value: str | None, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if value is not None:
+        bench.environment["MY_SLAM_MODE"] = value
+    elif "copy" in look or "dict" in look or "{" in look or "items" in look or "for key" in look:
+        pytest.skip("what is not set is not among what is listed")
+    reads = bench.record(f"import os\ndef run():\n    return {look}\n")
+    assert "$MY_SLAM_MODE" in reads.environment
+    assert not value or value not in reads.to_json()
+    bench.environment["MY_SLAM_MODE"] = "slow"
+    assert bench.changed(reads) == "the environment variable MY_SLAM_MODE"
+
+
+@pytest.mark.parametrize(
+    ("source", "counts"),
+    [
+        ("import os, library\ndef run():\n    library.mode()\n", True),
+        ("import os\ndef run():\n    os.environ['MODE'] = '1'; os.environ['MODE']\n", False),
+        ("import os\ndef run():\n    os.environ.pop('MODE', None)\n", True),
+        ("import os\ndef run():\n    os.environ['HOME'], os.environ['PATH'], os.environ.get('DISPLAY')\n", False),
+        ("from dynslam_bench.core import find_data_root\ndef run():\n    find_data_root()\n", False),
+        ("import tempfile\ndef run():\n    tempfile.mkdtemp()\n", False),
+    ],
+)
+def test_whose_look_at_a_variable_counts(source: str, counts: bool, bench: Bench) -> None:
+    bench.write("path/library.py", "import os\ndef mode():\n    return os.environ.get('MODE')\n")
+    bench.path.append(str(bench.root / "path"))
+    bench.environment["MODE"] = "fast"
+    assert set(bench.record(source).environment) == ({"$MODE"} if counts else set())
+
+
+def test_a_secret_is_neither_stored_nor_hidden_from_the_comparison(bench: Bench) -> None:
+    bench.environment["MY_API_KEY"] = "s3cret-value"
+    reads = bench.record("import os\ndef run():\n    return os.environ['MY_API_KEY']\n")
+    stored = reads.to_json()
+    assert "s3cret" not in stored
+    assert Reads.parse(stored, "reads").environment == reads.environment
+    bench.environment["MY_API_KEY"] = "another"
+    assert bench.changed(reads) == "the environment variable MY_API_KEY"
+
+
+# -- modules -----------------------------------------------------------------------------------------------------------
+
+
+def on_path(bench: Bench, folder: str = "path") -> None:
+    (bench.root / folder).mkdir(exist_ok=True)
+    bench.path.append(str(bench.root / folder))
+
+
+IMPORTS = "def run():\n    import library\n    return library.VALUE\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "edited"),
+    [
+        ("library.py", "VALUE = 1\n", "VALUE = 2\n"),
+        ("library.py", '"""One."""\nVALUE = __doc__\n', '"""Two."""\nVALUE = __doc__\n'),
+        ("library.py", "VALUE = 1  # one\n", "VALUE = 1  # two\n"),
+        ("library/__init__.py", "VALUE = 1\n", "VALUE = 2\n"),
+    ],
+)
+def test_a_module_without_a_distribution_counts_by_its_bytes(name: str, text: str, edited: str, bench: Bench) -> None:
+    on_path(bench)
+    file = bench.write(f"path/{name}", text)
+    reads = bench.record(IMPORTS)
+    assert str(file) in reads.files
+    assert "library" not in reads.distributions
+    edit(file, edited)
+    assert bench.changed(reads) == f"the file {file}"
+
+
+@pytest.mark.parametrize("where", ["beside the plug-in", "in a package", "in a namespace package", "in an archive"])
+def test_modules_wherever_they_are_loaded_from(where: str, bench: Bench) -> None:
+    import zipfile
+
+    name, source = "library.py", "VALUE = 1\n"
+    match where:
+        case "beside the plug-in":
+            file = bench.write(f"plugin/{name}", source)
+            first = f"import os, sys\nsys.path.insert(0, os.path.dirname(__file__))\n{IMPORTS}"
+        case "in a package" | "in a namespace package":
+            on_path(bench)
+            file = bench.write(f"path/package/{name}", source)
+            if where == "in a package":
+                bench.write("path/package/__init__.py", "")
+            first = IMPORTS.replace("import library", "from package import library")
+        case _:
+            file = bench.root / "path.zip"
+            with zipfile.ZipFile(file, "w") as archive:
+                archive.writestr(name, source)
+            bench.path.append(str(file))
+            first = IMPORTS
+    reads = bench.record(first)
+    if where == "in an archive":
+        with zipfile.ZipFile(file, "w") as archive:
+            archive.writestr(name, "VALUE = 2\n")
+    else:
+        edit(file, "VALUE = 2\n")
+    assert bench.changed(reads).endswith(file.name)
+
+
+def test_a_docstring_of_the_plug_in_counts(bench: Bench) -> None:
+    source = 'def run():\n    """Gain 3."""\n    return run.__doc__\n'
+    reads = bench.record(source)
+    edit(bench.plugin, source.replace("3", "4"))
+    assert bench.changed(reads) == "the file mine.py"
+
+
+def test_byte_code_that_is_older_than_its_source_is_not_run(bench: Bench) -> None:
+    on_path(bench)
+    file = bench.write("path/library.py", "VALUE = 1\n")
+    source = "def run(name):\n    import library\n    open(name + str(library.VALUE))\n"
+    for value in (1, 2):
+        bench.write(f"work/gain{value}", "")
+    subprocess.run([sys.executable, "-m", "compileall", "-q", str(file)], check=True, env={**os.environ})
+    assert list(file.parent.glob("__pycache__/*.pyc"))
+    assert "work:/gain1" in bench.record(source, name="gain").files
+    edit(file, "VALUE = 2\n")
+    assert "work:/gain2" in bench.record(source, name="gain").files
+
+
+def install(folder: Path, version: str, content: str) -> None:
+    """Install a distribution as pip does."""
+    import hashlib
+    import shutil
+
+    shutil.rmtree(folder, ignore_errors=True)
+    metadata = folder / f"library_of_mine-{version}.dist-info"
+    files = {"library/__init__.py": f"VALUE = {content!r}\n", f"{metadata.name}/METADATA": f"Version: {version}\n"}
+    lines = []
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+        lines.append(f"{name},sha256={hashlib.sha256(text.encode()).hexdigest()},{len(text)}")
+    lines += [f"{metadata.name}/RECORD,,", "library/__pycache__/__init__.cpython-311.pyc,,", "../../bin/library,,"]
+    (metadata / "RECORD").write_text("\n".join(lines))
+
+
+@pytest.mark.parametrize(
+    ("version", "content", "changed"),
+    [
+        ("1.0", "one", ""),
+        ("1.0", "two", "library-of-mine 1.0"),
+        ("1.1", "one", "library-of-mine 1.0"),
+        ("", "", "the place of the module library"),
+    ],
+)
+def test_a_dependency_that_is_installed_anew(version: str, content: str, changed: str, bench: Bench) -> None:
+    on_path(bench, "site")
+    install(bench.root / "site", "1.0", "one")
+    reads = bench.record(IMPORTS)
+    assert reads.distributions["library-of-mine"].startswith("1.0 ")
+    assert reads.modules["library"] == "installed"
+    assert list(reads.files) == ["plugin:/mine.py"]
+    if version:
+        install(bench.root / "site", version, content)
+    else:
+        import shutil
+
+        shutil.rmtree(bench.root / "site")
+    assert bench.changed(reads) == changed
+
+
+@pytest.mark.parametrize("name", ["library.py", "library/__init__.py"])
+def test_another_module_of_that_name_earlier_on_the_path(name: str, bench: Bench) -> None:
+    on_path(bench, "first")
+    on_path(bench, "site")
+    install(bench.root / "site", "1.0", "one")
+    reads = bench.record(IMPORTS)
+    file = bench.write(f"first/{name}", "VALUE = 2\n")
+    assert bench.changed(reads) == "the place of the module library"
+    again = bench.record(IMPORTS)
+    assert str(file) in again.files
+    assert "library-of-mine" not in again.distributions
+    edit(file, "VALUE = 3\n")
+    assert bench.changed(again) == f"the file {file}"
+
+
+def test_a_module_that_could_not_be_imported(bench: Bench) -> None:
+    on_path(bench)
+    source = "def run():\n    try:\n        import library\n    except ImportError:\n        pass\n"
+    reads = bench.record(source)
+    assert reads.modules["library"] == ""
+    bench.write("path/library.py", "")
+    assert bench.changed(reads) == "the place of the module library"
+
+
+def test_another_plug_in_that_patches_a_library_shows(bench: Bench) -> None:
+    on_path(bench)
+    file = bench.write("path/patcher.py", "import numpy\nnumpy.my_mean = 1\n")
+    alone = bench.record("import numpy\ndef run():\n    pass\n")
+    both = bench.record("import numpy, patcher\ndef run():\n    pass\n")
+    assert str(file) not in alone.files
+    assert str(file) in both.files
+
+
+def test_the_sources_of_an_installed_plug_in_count_by_their_bytes(bench: Bench) -> None:
+    on_path(bench, "site-packages")
+    install(bench.root / "site-packages", "1.0", "one")
+    bench.write("site-packages/library/__init__.py", "def run(name):\n    open(name)\n")
+    bench.write(f"work/{NAME}", "1111")
+    bench.plugins.append("library")
+    reads = bench.record("", "library", name=NAME)
+    file = bench.root / "site-packages/library/__init__.py"
+    assert set(reads.files) == {f"work:/{NAME}", str(file)}
+    edit(file, "def run(name):\n    open(other)\n".replace("other", "nnnn"))
+    assert bench.changed(reads) == f"the file {file}"
+
+
+def test_search_paths_are_compared(bench: Bench) -> None:
+    reads = bench.record("def run():\n    pass\n")
+    assert set(reads.search) == {"PYTHONPATH", "LD_LIBRARY_PATH", "LD_PRELOAD"}
+    for name in ("PYTHONPATH", "LD_LIBRARY_PATH", "LD_PRELOAD"):
+        bench.environment[name] = str(bench.root)
+        assert bench.changed(reads) == name
+        del bench.environment[name]
+
+
+# -- what changes while it is read -------------------------------------------------------------------------------------
+
+TWICE = "def run(name):\n    open(name, 'rb').read()\ndef again():\n    pass\n"
+
+
+def record_while(bench: Bench, source: str, change: Any, **arguments: Any) -> str:
+    """The fault of a recording during which something is changed."""
+    assert bench.child.ask(bench.job(source, **arguments)) == {"paused": True}
+    change()
+    bench.child.resume()
+    bench.child.answer()
+    return str(bench.child.answer().get("fault", ""))
+
+
+def link(path: Path, target: str) -> None:
+    path.unlink(missing_ok=True)
+    path.symlink_to(target)
+
+
+@pytest.mark.parametrize("size", [4, 3 << 20], ids=["small", "large"])
+@pytest.mark.parametrize("through", ["file", "folder"])
+def test_links_that_are_another_for_a_while(size: int, through: str, bench: Bench) -> None:
+    for version in ("a", "b"):
+        bench.write(f"work/{version}/net.bin", version * size)
+    current = bench.work / "current"
+    targets = {"a": "a", "b": "b"} if through == "folder" else {"a": "a/net.bin", "b": "b/net.bin"}
+    name = "current/net.bin" if through == "folder" else "current"
+    link(current, targets["a"])
+    reads = bench.record(TWICE.partition("def again")[0], name=name)
+    assert reads.links == {f"work:/{name}": "work:/a/net.bin"}
+    link(current, targets["b"])
+    assert bench.changed(reads) == f"the file {name}"
+    fault = record_while(bench, TWICE, lambda: link(current, targets["a"]), name=name)
+    assert f"{name} has changed while the run read it" in fault
+
+
+@pytest.mark.parametrize("content", ["2222", "1111", None])
+def test_a_file_that_is_written_while_it_is_read(content: str | None, bench: Bench) -> None:
+    file = bench.write(f"work/{NAME}", "1111")
+    change = file.unlink if content is None else lambda: file.write_text(content)
+    fault = record_while(bench, TWICE, change, name=NAME)
+    assert ("has changed while the run read it" in fault) == (content != "1111")
+
+
+def test_a_file_that_appears_while_it_is_looked_for(bench: Bench) -> None:
+    source = "import os\ndef run(name):\n    try:\n        open(name)\n    except OSError: pass\ndef again(): pass\n"
+    fault = record_while(bench, source, lambda: bench.write(f"work/{NAME}", "1111"), name=NAME)
+    assert f"{NAME} has changed" in fault
+
+
+def test_a_source_that_is_edited_while_the_run_lasts(bench: Bench) -> None:
+    bench.write(f"work/{NAME}", "1111")
+    fault = record_while(bench, TWICE, lambda: edit(bench.plugin, TWICE.replace("rb", "br")), name=NAME)
+    assert "mine.py has changed" in fault
+
+
+def test_the_snapshot_grows_with_what_is_read(bench: Bench) -> None:
+    bench.write(f"work/{NAME}", "1111")
+    reading = "def run(name):\n    global NAME\n    NAME = name\ndef again():\n    open(NAME)\n"
+    for source, grows in ((reading, True), (reading.replace("open(NAME)", "pass"), False)):
+        assert bench.child.ask(bench.job(source, name=NAME)) == {"paused": True}
+        bench.child.resume()
+        assert bench.child.answer() == {"grown": [grows, grows]}
+        assert "reads" in bench.child.answer()
+
+
+# -- what does not count -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "file = tempfile.mkdtemp() + '/x'; open(file, 'w').write('1'); open(file).read()",
+        "tempfile.TemporaryFile().read()",
+        "tempfile.NamedTemporaryFile().read()",
+        "open(NAME, 'w').write('1'); open(NAME).read()",
+        "open(NAME, 'a').write('1')",
+        "open(NAME, 'x').write('1'); pathlib.Path(NAME).resolve().read_text()",
+        "open('t', 'w').write('1'); os.replace('t', NAME); open(NAME).read()",
+        "os.makedirs('out/a'); os.system('echo 1 > out/a/x'); open('out/a/x').read()",
+        "os.system('echo 1 > ' + NAME); open(NAME).read()",
+        "numpy.save('x.npy', numpy.zeros(3)); numpy.load('x.npy')",
+        "os.mkdir('out'); os.listdir('out'); [open('out/' + name) for name in os.listdir('out')]",
+        "cache(NAME); cache(NAME)",
+        "open('/proc/self/maps').read(); open('/dev/null').read(); os.listdir('/proc/self')",
+        "r, w = os.pipe(); os.close(w); open(r).read()",
+        "import decimal, xml.dom.minidom, wsgiref; importlib.metadata.version('numpy'); inspect.getsource(inspect)",
+        "traceback.format_stack(); warnings.warn('x')",
+        "shutil.copytree(os.path.dirname(__file__), tempfile.mkdtemp() + '/x'); shutil.rmtree(tempfile.mkdtemp())",
+    ],
+)
+def test_what_the_run_makes_is_no_input(body: str, bench: Bench) -> None:
+    source = f"""
+import importlib.metadata, inspect, os, pathlib, shutil, tempfile, traceback, warnings
+import numpy
+NAME = 'net' + '.bin'
+def cache(name):
+    try:
+        return open(name).read()
+    except OSError:
+        open(name, 'w').write('1')
+def run():
+    {body}
+"""
+    reads = bench.record(source)
+    assert list(reads.files) == ["plugin:/mine.py"]
+    assert "$TMPDIR" not in reads.environment
+
+
+def test_what_nobody_read_does_not_count(bench: Bench) -> None:
+    on_path(bench)
+    bench.write("path/library.py", "VALUE = 1\n")
+    bench.write(f"work/{NAME}", "1111")
+    reads = bench.record(READ_ALL, files=[NAME])
+    bench.write("work/other.bin", "")
+    bench.write("plugin/notes.md", "")
+    bench.write("path/library.py", "VALUE = 2\n")
+    bench.environment["MY_SLAM_MODE"] = "fast"
+    os.utime(bench.work / NAME)
+    os.utime(bench.plugin)
+    (bench.plugin.parent / "__pycache__").mkdir()
+    assert bench.changed(reads) == ""
+
+
+def test_reads_are_equal_in_another_place_of_equal_layout(
+    bench: Bench, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    other = Bench(bench.child, tmp_path_factory.mktemp("other"))
+    for place in (bench, other):
+        place.write(f"work/{NAME}", "1111")
+        place.write("work/maps/a.txt", "1111")
+    source = "import os\ndef run(name):\n    open(name); os.listdir('maps')\n"
+    assert digest_of(bench.record(source, name=NAME)) == digest_of(other.record(source, name=NAME))
