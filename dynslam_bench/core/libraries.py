@@ -6,7 +6,7 @@ from pathlib import Path
 
 from dynslam_bench.core.code_files import files_below
 from dynslam_bench.core.fingerprint import contents_digest
-from dynslam_bench.core.reads import ImportPath
+from dynslam_bench.core.reads import Anchors, ImportPath, search_now
 
 SEARCH_VARIABLES = ("LD_LIBRARY_PATH", "LD_PRELOAD", "DYLD_LIBRARY_PATH", "DYLD_INSERT_LIBRARIES")
 """Variables of the linker: with others the same module may run other code."""
@@ -36,11 +36,7 @@ def library_identity(module: str) -> str:
 
 
 def search_path() -> dict[str, str]:
-    """The variables of the linker that are set, without the folders that OpenCV's own import puts there."""
-    found = {}
-    for name in SEARCH_VARIABLES:
-        folders = os.environ.get(name, "").split(os.pathsep)
-        kept = [folder for folder in folders if folder and "/cv2/" not in folder]
-        if kept:
-            found[name] = os.pathsep.join(kept)
-    return found
+    """The variables of the linker that are set."""
+    anchors = Anchors(plugin=None, work=Path.cwd())
+    found = {name: search_now(name, os.environ, anchors) for name in SEARCH_VARIABLES}
+    return {name: folders for name, folders in found.items() if folders}

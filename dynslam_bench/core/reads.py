@@ -205,7 +205,9 @@ def search_now(name: str, environment: Mapping[str, str], anchors: Anchors) -> s
     if name.startswith(COMMAND):
         found = shutil.which(name[len(COMMAND) :], path=environment.get("PATH"))
         return ABSENT if found is None else anchors.name(os.path.abspath(found))
-    return anchors.names(environment.get(name, ""))
+    folders = environment.get(name, "").split(os.pathsep)
+    # OpenCV's import puts folders of its own there, which only a process that has imported it shows
+    return anchors.names(os.pathsep.join(folder for folder in folders if folder and "/cv2/" not in folder))
 
 
 class ImportPath:

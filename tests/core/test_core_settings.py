@@ -23,7 +23,6 @@ from dynslam_bench.core.fingerprint import (
     machine_digest,
     named_digests,
     opencv_version,
-    plugin_digest,
 )
 from dynslam_bench.core.plugins import ENVIRONMENT_VARIABLE, Registry, load_object
 from dynslam_bench.core.settings import (
@@ -231,26 +230,6 @@ def test_content_digest_sees_type_shape_and_value() -> None:
     assert content_digest(base) == content_digest(np.zeros((2, 6), np.uint8)[:, ::2])
 
 
-def test_what_is_built_in_has_no_digest_of_its_own_and_what_is_missing_none_at_all(tmp_path: Path) -> None:
-    assert plugin_digest("dynslam_bench.features.orb:OrbExtractor") == ""
-    with pytest.raises(PluginError, match=r"cannot read the code.*No such file"):
-        plugin_digest(f"{tmp_path}/none/none.py:SPEC")
-
-
-def test_packages_with_and_without_init_count_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(tmp_path))
-    write(tmp_path / "fp_regular" / "__init__.py", "")
-    for package in ("fp_regular", "fp_namespace"):
-        inner = write(tmp_path / package / "deep" / "inner.py", "a = 1\n")
-        before = plugin_digest(f"{package}.deep.inner:SPEC")
-        inner.write_text("a = 2\n")
-        changed = plugin_digest(f"{package}.deep.inner:SPEC")
-        inner.rename(inner.with_name("other.py"))
-        assert len({before, changed, plugin_digest(f"{package}.deep.inner:SPEC")}) == 3
-    with pytest.raises(PluginError, match="code of 'fp_nowhere' cannot be found"):
-        plugin_digest("fp_nowhere.module:SPEC")
-
-
 class Inner(Settings):
     source: str = "auto"
     options: dict[str, object] = {}  # noqa: RUF012
@@ -291,6 +270,39 @@ def test_only_what_names_a_file_counts_as_one(tmp_path: Path, monkeypatch: pytes
     assert {name for name, digest in named_digests(settings).items() if digest != found[name]} == named - {"vocabulary"}
     monkeypatch.setenv("FP_TEST_VOCABULARY", str(tmp_path / "voc.txt"))
     assert named_digests(Whole())["vocabulary"] == found["vocabulary"], "named by the environment"
+
+
+class Listed(Settings):
+    files: list[Path] = []  # noqa: RUF012
+    pair: tuple[Path, ...] = ()
+    table: dict[str, Path] = {}  # noqa: RUF012
+    text: str = ""
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        Listed(files=[Path("first.bin"), Path("net.bin")]),
+        Listed(pair=(Path("net.bin"), Path("first.bin"))),
+        Listed(table={"weights": Path("net.bin")}),
+        Listed(text="net.bin"),
+        Listed(text="./net.bin"),
+        Listed(text="$FP_TEST_FOLDER/net.bin"),
+        Listed(text="${FP_TEST_FOLDER}"),
+        Listed(table={"folder": Path("nets")}),
+        Listed(text="nets/"),
+    ],
+)
+def test_paths_count_in_every_form(settings: Listed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("FP_TEST_FOLDER", str(tmp_path))
+    files = [write(tmp_path / name, "1111") for name in ("net.bin", "nets/net.bin", "first.bin")]
+    before = named_digests(settings)
+    for file in files[:2]:
+        file.write_text("2222")
+    after = named_digests(settings)
+    assert before.keys() == after.keys()
+    assert before != after
 
 
 @pytest.mark.parametrize("name", fingerprint.OPENCV)

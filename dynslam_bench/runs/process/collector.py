@@ -254,7 +254,7 @@ class Collector:
                 continue
             top = name.partition(".")[0]
             was_loaded = top in self._loaded
-            distributions = imports.distributions_of(top, file)
+            distributions = imports.distributions_of(top, file) or imports.distributions_at(file)
             if _OWN_DISTRIBUTION in distributions:  # how it was installed in a checkout
                 continue
             modules.distributions |= dict.fromkeys(distributions, was_loaded)
