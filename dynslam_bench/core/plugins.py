@@ -146,7 +146,8 @@ class Registry(Generic[P]):
 
     def target_of(self, name: str) -> str | None:
         """``module:Attr`` of the listed plug-in with an id; None for a built-in id, and where none has it."""
-        if name in self.builtin():
+        is_file = name.rpartition(":")[0].endswith(".py")
+        if name in self.builtin() or is_file:
             return None
         called_so = [listed for listed in self.listed() if listed.name == name]
         others = [listed for listed in self.listed() if listed.name != name]
@@ -156,8 +157,18 @@ class Registry(Generic[P]):
         return None
 
     def listed(self) -> list[Listed]:
-        """What the environment variable and the installed distributions list; nothing is imported."""
+        """What the environment variable and the installed distributions list; nothing is imported.
+
+        In the process of a run the variable lists what the run uses, and installed ones are left out; see `used`.
+        """
         targets = [Listed(target, f"{ENVIRONMENT_VARIABLE}: {target}") for target in _environment_targets(self.kind)]
+        if os.environ.get(ISOLATED_VARIABLE):
+            return targets
+        return targets + self._installed()
+
+    def _installed(self) -> list[Listed]:
+        """What the installed distributions list."""
+        targets = []
         installed = _entry_points(*sys.path).select(group=f"dynslam_bench.{self.kind}")
         for point in sorted(installed, key=attrgetter("name")):
             distribution = point.dist.name if point.dist else "unknown distribution"
@@ -177,7 +188,8 @@ class Registry(Generic[P]):
             self._found = {}
             for spec in self.builtin().values():
                 self._add(spec, "built in")
-            for listed in self.listed():
+            in_environment = [listed for listed in self.listed() if not listed.name]
+            for listed in (*in_environment, *self._installed()):
                 self._add(listed.target, listed.source)
         return self._found
 
@@ -199,6 +211,16 @@ class Registry(Generic[P]):
         raise PluginError(
             f"{source} is a {type(value).__name__}, not a {self._spec_type.__name__}", "name the spec, not the class"
         )
+
+
+def used(names: Iterable[tuple[Registry[Any], str]]) -> str:
+    """The value of `ENVIRONMENT_VARIABLE` that lists some plug-ins alone, for the process of a run.
+
+    Args:
+        names: Registries, and ids that the run uses of them; built-in ones are left out.
+    """
+    targets = [(registry.kind, registry.target_of(name)) for registry, name in names]
+    return ",".join(f"{kind}={target}" for kind, target in targets if target is not None)
 
 
 @cache

@@ -5,16 +5,20 @@ sequence, and the environment with the run's loop. A change of any other module 
 """
 
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 from dynslam_bench.contracts import Sequence, TrackerSpec
 from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, ModuleGraph, module_graph
+from dynslam_bench.core.plugins import Registry, used
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.features.registry import FEATURES
 from dynslam_bench.features.settings import FeatureSettings
-from dynslam_bench.flow.registry import spec_of
+from dynslam_bench.flow.registry import FLOWS, spec_of
 from dynslam_bench.flow.settings import FlowMethodSettings
 from dynslam_bench.segmentation.build_segmenter import SEGMENTERS
+from dynslam_bench.sequences.catalogue import DATASETS
 from dynslam_bench.sequences.view import reader_of
+from dynslam_bench.trackers.registry import TRACKERS
 from dynslam_bench.trackers.systems.composition import UnfilteredSystemSettings, parts_of
 
 ENVIRONMENT = ("envs.slam_env", "runs.loop")
@@ -79,6 +83,26 @@ def package_code() -> str:
     """Digest of all code that any run may use: two machines of a cluster need the same."""
     graph = module_graph()
     return graph.code_digest(modules_for_plugins(graph))
+
+
+def plugins_of_run(tracker: str, settings: Settings, source: str, sequence: str) -> str:
+    """The listed plug-ins that a run names by their ids, as the environment variable of plug-ins lists them.
+
+    Args:
+        tracker: As it was asked for.
+        settings: Its complete settings.
+        source: Where its masks come from.
+        sequence: As it was asked for.
+    """
+    names: list[tuple[Registry[Any], str]] = [(TRACKERS, tracker), (DATASETS, sequence.partition("/")[0])]
+    for group in groups_of(settings):
+        if isinstance(group, FeatureSettings):
+            names.append((FEATURES, group.extractor))
+        if isinstance(group, FlowMethodSettings):
+            names.append((FLOWS, group.plugin or group.method))
+    if source not in ("", "none"):
+        names.append((SEGMENTERS, segmenter_of(source)))
+    return used(names)
 
 
 def module_of(part: str) -> str:

@@ -31,6 +31,7 @@ from dynslam_bench.core import (
     reason_of,
 )
 from dynslam_bench.core.fingerprint import git_revision, this_machine, versions
+from dynslam_bench.core.plugins import ENVIRONMENT_VARIABLE
 from dynslam_bench.core.reads import Reads
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import flatten
@@ -40,6 +41,7 @@ from dynslam_bench.runs.exchange.recording import RECORDING_FILE
 from dynslam_bench.runs.frames import FRAMES_FILE, FrameLog
 from dynslam_bench.runs.identity import ResolvedRun, Resolver, check_unchanged, resolve
 from dynslam_bench.runs.lookup import LookUp
+from dynslam_bench.runs.own_code import plugins_of_run
 from dynslam_bench.runs.process.child import LOG_FILE, READS_FILE
 from dynslam_bench.runs.process.fork_server import Child, make_job
 from dynslam_bench.runs.process.supervisor import LONGEST_LOG, LONGEST_YET, Verdict, bound_log, supervise
@@ -129,6 +131,9 @@ def run_one(
             protocol=get_protocol(protocol).model_dump(mode="json"),
             progress_every=progress_every,
             recorded=recorded_parts(resolved),
+        )
+        job["environment"][ENVIRONMENT_VARIABLE] = plugins_of_run(
+            resolved.spec.tracker, resolved.settings, resolved.segmentation, resolved.spec.sequence
         )
         log = work / LOG_FILE
         watched: dict[str, Any] = {"tick": lambda: bound_log(log, LONGEST_YET), "at_a_time": at_a_time}

@@ -4,6 +4,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -12,18 +13,35 @@ import numpy as np
 import pytest
 from envs_toys import TARGET, write_folder
 
-from dynslam_bench.core import PluginError, RunError, fingerprint
+from dynslam_bench.core import PluginError, RunError
 from dynslam_bench.runs import RunSpec, RunStore, identity, resolve, run_many, run_one
+from dynslam_bench.runs.record import run_id_of
+from dynslam_bench.trackers import TRACKERS
 
 PLUGIN = """
+import os, sys
 from pathlib import Path
-from dynslam_bench.contracts.tracker import TrackerSpec
+import numpy as np
+from dynslam_bench.contracts.tracker import TrackerSpec, TrackResult
+sys.path.insert(0, str(Path(__file__).parent))
 PARAMETERS = Path(__file__).parent / "params" / "slam.yaml"
-LAYERS = sorted(Path(__file__).parent.glob("weights/*"))
-SPEC = TrackerSpec("mine", f"{__file__}:build", "mine")
-def build(settings):
-    import helper
-    return helper.make(PARAMETERS.read_text())
+SPEC = TrackerSpec("mine", f"{__file__}:Mine", "mine")
+class Mine:
+    \'\'\'A docstring that is used.\'\'\'
+    def __init__(self, settings):
+        import helper
+        text = PARAMETERS.read_text() + self.__doc__ + os.environ.get("IDENTITY_TOY_MODE", "")
+        for layer in sorted(Path(__file__).parent.glob("weights/*")):
+            text += layer.read_text()
+        gain = helper.gain(text)
+        self.pose = np.eye(4)
+        self.pose[0, 3] = gain
+    def reset(self, camera, *, rng):
+        pass
+    def track(self, frame):
+        return TrackResult(self.pose, "ok")
+    def close(self):
+        pass
 """
 
 
@@ -74,106 +92,120 @@ def test_changed_data_is_another_run(name: str, tmp_path: Path) -> None:
     assert makes_another_run(RunSpec(tracker="never-move", sequence=str(folder)), change)
 
 
-def plugin(tmp_path: Path) -> tuple[RunSpec, Path]:
+def a_plug_in(tmp_path: Path, source: str = PLUGIN) -> tuple[RunSpec, Path]:
+    """A plug-in that reads files of every kind, with other files beside it; and a recording for it."""
     folder = tmp_path / "plugin"
     files = {
-        "mine.py": PLUGIN,
-        "helper.py": "def make(text):\n    return 1  # a note\n",
-        "params/slam.yaml": "threshold: 1\nweights: net.bin\n",
-        "params/net.bin": "1111",
+        "mine.py": source,
+        "helper.py": "def gain(text):\n    return len(text)  # a note\n",
+        "params/slam.yaml": "threshold: 1\n",
         "weights/layer0": "3333",
         "notes.md": "nothing reads this",
         "results/runs/x/slam.yaml": "an output",
-        "results/index.sqlite": "an output",
     }
     for name, text in files.items():
         write(folder / name, text)
     return RunSpec(tracker=f"{folder / 'mine.py'}:SPEC", sequence=str(write_folder(tmp_path / "toy", 4))), folder
 
 
+def made_again(spec: RunSpec, store: RunStore, change: Callable[[], object]) -> bool:
+    """Whether a run is made again after a change; twice before it is taken from the store."""
+    kinds: list[str] = []
+    (first,) = run_many([spec], results=store)
+    (again,) = run_many([spec], results=store, on_event=lambda event: kinds.append(event.kind))
+    assert kinds == ["reused"]
+    assert again.run_id == first.run_id
+    assert first.status == "ok", first.reason
+    change()
+    kinds.clear()
+    (later,) = run_many([spec], results=store, on_event=lambda event: kinds.append(event.kind))
+    assert ("finished" in kinds) is (later.run_id != first.run_id)
+    assert store.get(first.run_id) == first, "the earlier run stays"
+    assert later.run_id[:12] == first.run_id[:12], "the same is asked for"
+    return later.run_id != first.run_id
+
+
 @pytest.mark.parametrize(
     ("file", "old", "new"),
     [
         ("mine.py", '"mine")', '"ours")'),
-        ("helper.py", "return 1", "return 2"),
+        ("mine.py", "A docstring", "Another one"),
+        ("helper.py", "a note", "a word"),
         ("params/slam.yaml", ": 1", ": 2"),
-        ("params/net.bin", "1111", "2222"),
         ("weights/layer0", "3333", "4444"),
     ],
 )
-def test_a_changed_plug_in_is_another_run(file: str, old: str, new: str, tmp_path: Path) -> None:
-    spec, folder = plugin(tmp_path)
-    asked = resolve(spec)
-    assert makes_another_run(spec, edit(folder / file, old, new))
-    with pytest.raises(RunError, match="code of tracker 'mine' has changed since"):
-        identity.check_unchanged(asked)
-
-
-def test_code_of_this_package_that_changes_meanwhile_is_noticed(tmp_path: Path, monkeypatch) -> None:
-    file = write(tmp_path / "core" / "a.py", "x = 1")
-    monkeypatch.setattr("dynslam_bench.__path__", [str(tmp_path)])
-    before = fingerprint.package_digest(["core"])
-    assert not fingerprint.has_package_changed(["core"])
-    file.write_text("x = 22")
-    assert fingerprint.has_package_changed(["core"]) and fingerprint.package_digest(["core"]) == before
-
-
-@pytest.mark.parametrize(
-    ("file", "old", "new"),
-    [
-        ("helper.py", "a note", "a word"),
-        ("helper.py", "def make(text):\n", 'def make(text):\n    """What it does."""\n\n'),
-        ("notes.md", "nothing", "nobody"),
-        ("results/runs/x/slam.yaml", "output", "result"),
-    ],
-)
-def test_comments_docstrings_and_what_no_code_names_change_nothing(
-    file: str, old: str, new: str, tmp_path: Path
+def test_a_plug_in_that_reads_something_else_is_another_run(
+    file: str, old: str, new: str, tmp_path: Path, store: RunStore
 ) -> None:
-    spec, folder = plugin(tmp_path)
-    path = folder / file
-    assert not makes_another_run(spec, lambda: path.write_text(path.read_text().replace(old, new)))
+    spec, folder = a_plug_in(tmp_path)
+    assert made_again(spec, store, edit(folder / file, old, new))
 
 
-@pytest.mark.parametrize(
-    "named", ['"gain_%d.txt" % 3', '"gain" + "_3.txt"', 'f"gain_{3}.txt"', '"my gain_3.txt"', '"gain_3.txt"']
-)
-def test_a_data_file_counts_however_its_name_is_put_together(named: str, tmp_path: Path) -> None:
-    spec, folder = plugin(tmp_path)
-    write(folder / "helper.py", f"FILE = {named}\n")
-    for name in ("gain_3.txt", "my gain_3.txt"):
-        write(folder / name, "1111")
-    assert makes_another_run(spec, edit(folder / ("my gain_3.txt" if "my" in named else "gain_3.txt"), "1111", "2222"))
+def test_what_a_plug_in_does_not_read_makes_no_other_run(tmp_path: Path, store: RunStore) -> None:
+    spec, folder = a_plug_in(tmp_path)
+
+    def change() -> None:
+        write(folder / "notes.md", "nobody reads this")
+        write(folder / "results" / "runs" / "x" / "slam.yaml", "another output")
+        os.utime(folder / "params" / "slam.yaml")
+
+    assert not made_again(spec, store, change)
 
 
-@pytest.mark.parametrize(
-    "statement",
-    ["import os; import identity_toy_module", 'import importlib; importlib.import_module("identity_toy_module")'],
-)
-def test_an_import_counts_however_it_is_written(
-    statement: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_change_that_is_undone_finds_the_first_run_again(tmp_path: Path, store: RunStore) -> None:
+    spec, folder = a_plug_in(tmp_path)
+    (first,) = run_many([spec], results=store)
+    edit(folder / "params" / "slam.yaml", ": 1", ": 2")()
+    (second,) = run_many([spec], results=store)
+    edit(folder / "params" / "slam.yaml", ": 2", ": 1")()
+    (third,) = run_many([spec], results=store)
+    assert first.run_id == third.run_id
+    assert second.run_id != first.run_id
+
+
+@pytest.mark.parametrize("value", ["fast", "exact"])
+def test_a_variable_that_a_plug_in_looks_up_counts(
+    value: str, tmp_path: Path, store: RunStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    spec, folder = plugin(tmp_path)
-    module = write(tmp_path / "elsewhere" / "identity_toy_module.py", "gain = 1\n")
-    monkeypatch.syspath_prepend(str(module.parent))
-    write(folder / "mine.py", f"{PLUGIN}\ndef later():\n    {statement}\n")
-    assert makes_another_run(spec, edit(module, "1", "2"))
+    spec, _ = a_plug_in(tmp_path)
+    assert made_again(spec, store, partial(monkeypatch.setenv, "IDENTITY_TOY_MODE", value))
+    (stored,) = (store.get(run_id) for run_id in store.ids()[:1])
+    assert value not in stored.to_json(), "a value may be a secret"
 
 
-def test_what_a_plug_in_imports_from_elsewhere_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    spec, folder = plugin(tmp_path)
-    library = write(tmp_path / "elsewhere" / "identity_toy_library" / "__init__.py", "gain = 1\n")
-    monkeypatch.syspath_prepend(str(library.parents[1]))
-    write(folder / "helper.py", "import identity_toy_library, numpy\n")
-    assert makes_another_run(spec, lambda: library.write_text("gain = 2\n"))
-    real = fingerprint.distribution_version
-    newer = partial(
-        monkeypatch.setattr,
-        fingerprint,
-        "distribution_version",
-        lambda name: "0" if name == "numpy" else real(name),
+def test_a_plug_in_that_is_only_listed_is_imported_by_nobody(
+    tmp_path: Path, store: RunStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec, _ = a_plug_in(tmp_path)
+    trace = tmp_path / "imported"
+    other = write(
+        tmp_path / "other" / "other.py",
+        "import os, sys\n"
+        f"if 'dynslam_bench.envs' in sys.modules: open({str(trace)!r}, 'a').write('a run, or who asked for it')\n"
+        "from dynslam_bench.contracts import TrackerSpec\n"
+        "SPEC = TrackerSpec('other', 'nowhere:Other', 'other')\n",
     )
-    assert makes_another_run(spec, newer)
+    monkeypatch.setenv("DYNSLAM_BENCH_PLUGINS", f"{other}:SPEC")
+    TRACKERS.refresh()
+    try:
+        records = run_many([spec, RunSpec(tracker="never-move", sequence=spec.sequence)], results=store)
+        store.frame()
+    finally:
+        TRACKERS.refresh()
+    assert [record.status for record in records] == ["ok", "ok"]
+    assert not trace.exists()
+
+
+def test_an_id_of_another_identity_is_not_overwritten(tmp_path: Path, store: RunStore) -> None:
+    spec = RunSpec(tracker="never-move", sequence=str(write_folder(tmp_path / "toy", 4)))
+    (first,) = run_many([spec], results=store)
+    other = first.model_copy(update={"identity": first.identity | {"content": "another"}})
+    with store.work_folder(other.run_id) as work:
+        stored = store.publish(work, other)
+    assert stored.run_id != first.run_id
+    assert stored.run_id == run_id_of(stored.identity)
+    assert store.get(first.run_id) == first
 
 
 def a_program(tmp_path: Path) -> Path:
@@ -252,17 +284,33 @@ def test_data_and_programs_that_change_meanwhile_are_noticed_but_no_output(tmp_p
             identity.check_unchanged(asked, begun=begun)
 
 
-def test_libraries_weights_and_own_code_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("module", sorted(identity.LIBRARIES.values()))
+def test_another_module_before_an_installed_library_is_another_run(
+    module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     spec = RunSpec(tracker="orb-slam2", sequence=str(write_folder(tmp_path / "toy", 4)))
-    ids = {resolve(spec).run_id}
-    known = identity.versions()
-    for name in identity.LIBRARIES:
-        monkeypatch.setattr(identity, "versions", lambda name=name: known | {name: "another"})
-        ids.add(resolve(spec).run_id)
-    monkeypatch.undo()
-    monkeypatch.setattr(fingerprint, "package_digest", lambda packages: "another")
-    ids.add(resolve(spec).run_id)
-    assert len(ids) == len(identity.LIBRARIES) + 2
+    shadow = write(tmp_path / "shadow" / module / "__init__.py", "")
+    assert makes_another_run(spec, partial(monkeypatch.syspath_prepend, str(shadow.parents[1])))
+    assert makes_another_run(spec, partial(shadow.write_text, "x = 1"))
+
+
+@pytest.mark.parametrize("variable", ["LD_LIBRARY_PATH", "LD_PRELOAD"])
+def test_where_the_linker_looks_makes_another_run(
+    variable: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = RunSpec(tracker="orb-slam2", sequence=str(write_folder(tmp_path / "toy", 4)))
+    assert makes_another_run(spec, partial(monkeypatch.setenv, variable, str(tmp_path)))
+
+
+def test_own_code_that_changes_meanwhile_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = resolve(RunSpec(tracker="orb-slam2", sequence=str(write_folder(tmp_path / "toy", 4))))
+    identity.check_unchanged(asked)
+    graph = identity.read_module_graph()
+    code = graph.modules["dynslam_bench.slam.tracking"]
+    edited = {**graph.modules, "dynslam_bench.slam.tracking": replace(code, digest="another")}
+    monkeypatch.setattr(identity, "read_module_graph", lambda: type(graph)(edited))
+    with pytest.raises(RunError, match="the code of dynslam-bench has changed since this process began"):
+        identity.check_unchanged(asked)
 
 
 def test_no_plug_in_takes_the_id_of_a_built_in_tracker(tmp_path: Path) -> None:
