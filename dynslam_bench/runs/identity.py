@@ -5,9 +5,9 @@ that was read for it is unchanged.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -242,8 +242,13 @@ def libraries() -> dict[str, str]:
     return found | search_path()
 
 
-def source_digest(parts: list[str]) -> str:
+def source_digest(parts: Iterable[str]) -> str:
     """Digest of the code of this package that a run's parts use; see `own_code.parts_of_run`."""
+    return _source_digest(tuple(parts))
+
+
+@cache
+def _source_digest(parts: tuple[str, ...]) -> str:
     graph = module_graph()
     return graph.code_digest(modules_of_run(graph, parts))[:16]
 
