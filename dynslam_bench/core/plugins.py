@@ -229,6 +229,14 @@ def _entry_points(*_path: str) -> Any:
     return entry_points()
 
 
+_IMPORTED_PLUGINS: set[str] = set()
+
+
+def has_imported_plugins() -> bool:
+    """Whether this process has imported foreign code, which may have changed what numbers it computes."""
+    return bool(_IMPORTED_PLUGINS)
+
+
 def load_object(target: str) -> Any:
     """Import ``package.module:Attr`` or ``path/to/file.py:Attr``.
 
@@ -247,6 +255,8 @@ def load_object(target: str) -> Any:
         module = import_module(location)
     except (Exception, SystemExit) as error:
         raise PluginError(f"cannot import {location}: {_reason(error)}") from error
+    if location.partition(".")[0] != __name__.partition(".")[0] or location.endswith(".py"):
+        _IMPORTED_PLUGINS.add(location)
     try:
         return attrgetter(attribute)(module)
     except AttributeError:

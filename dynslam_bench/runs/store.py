@@ -40,6 +40,7 @@ from dynslam_bench.core import (
 )
 from dynslam_bench.core.errors import left_out_of_messages
 from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, module_graph
+from dynslam_bench.core.plugins import ISOLATED_VARIABLE, has_imported_plugins
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation import PROTOCOLS, Evaluation, Protocol, evaluate, get_protocol, hints
 from dynslam_bench.geometry import Trajectory, TumFile, format_ns, format_tum, load_tum, read_tum
@@ -550,6 +551,10 @@ class RunStore:
         stored = None if again else self.metrics(record, protocol)
         if stored is not None:
             return stored
+        if has_imported_plugins() and not os.environ.get(ISOLATED_VARIABLE):
+            from dynslam_bench.runs.scoring import score_apart
+
+            return score_apart(self, record.run_id, protocol, again=again)
         state = self.index.state(record.run_id, record.sequence.part)  # before the files are read
         evaluations: dict[Which, Evaluation | None] = {"online": None, "final": None}
         reasons, lines = dict[str, str](), list[str]()

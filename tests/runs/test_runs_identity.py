@@ -334,3 +334,19 @@ def test_one_run_id_with_two_results_is_said_and_another_scheme_is_unverified(
     assert again.run_id == record.run_id
     assert any("another trajectory" in note for note in again.notes)
     assert any(record.run_id in message for message in caplog.messages)
+
+
+def test_a_plug_in_that_patches_numpy_changes_no_score(tmp_path: Path, store: RunStore) -> None:
+    patching = PLUGIN + "\nif 'dynslam_bench.envs' in __import__('sys').modules:\n    np.sqrt = lambda x: 2 * x\n"
+    spec, _ = a_plug_in(tmp_path, patching)
+    other = RunSpec(tracker="never-move", sequence=spec.sequence)
+    (alone,) = run_many([other], results=store)
+    before = store.score(alone).metrics
+    original = np.sqrt
+    try:
+        together = RunStore(tmp_path / "together")
+        _, beside = run_many([spec, other], results=together)
+        assert np.sqrt is not original, "the plug-in has patched numpy in this process"
+        assert together.score(beside).metrics == before
+    finally:
+        np.sqrt = original
