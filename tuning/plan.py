@@ -288,6 +288,22 @@ class Plan:
         record = LookUp(self.store).find(resolve(self.run_spec(instance, self.baseline)))
         return None if record is None or record.failed or record.status == "stopped" else record
 
+    def check_plugins(self) -> None:
+        """Refuse to go on where what the plug-ins read has changed since the baseline ran.
+
+        What a plug-in reads is known only from its runs, so that the study's identity cannot hold it.
+
+        Raises:
+            StudyError: It names what has changed.
+        """
+        run = resolve(self.run_spec(self.design.tune[0], self.baseline))
+        changed = LookUp(self.store).changed(run) if run.foreign else ""
+        if changed:
+            raise StudyError(
+                f"study '{self.spec.name}': {changed} has changed since the baseline ran",
+                "undo the change, or give the study another name",
+            )
+
     def _scatter(self, records: dict[ProblemInstance, RunRecord]) -> float:
         """Standard deviation between starts of the log ratio of two runs; 0 where no scene has two stored runs."""
         protocol, root = held_protocol(self.spec.protocol), self.spec.data_root

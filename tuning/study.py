@@ -358,6 +358,7 @@ class Study(Plan):
     def evaluate(self, trial: optuna.Trial) -> Evaluation:
         """Run a trial on one instance after the other until it ends or is pruned."""
         outcomes: dict[ProblemInstance, Outcome] = {}
+        self.check_plugins()
         with self._heartbeats.beating():
             reference, pruned = self._reference or self.reference(), False
             try:
@@ -471,6 +472,8 @@ class Study(Plan):
             text = f"cannot open study '{self.spec.name}': {error}"
             raise StudyError(without_password(text, self.spec.storage)) from None
         self._check_identity(study)
+        if study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
+            self.check_plugins()
         if not self.spec.storage:
             write_atomic(self.folder / SPEC_FILE, json.dumps(self.spec.for_others(), indent=2) + "\n")
         return study

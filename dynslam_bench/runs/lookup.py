@@ -34,6 +34,17 @@ class LookUp:
         valid = [record for record in candidates if self._holds(record, run)]
         return max(valid, key=lambda record: record.started, default=None)
 
+    def changed(self, run: ResolvedRun) -> str:
+        """Why none of the stored runs of a request can be taken; empty where one can, or none is stored."""
+        candidates = [record for record in map(self._store.get, self._store.ids_of(run.asked)) if record is not None]
+        if not candidates or self.find(run) is not None:
+            return ""
+        newest = max(candidates, key=lambda record: record.started)
+        differing = [name for name, value in run.stated.items() if newest.identity.get(name) != value]
+        if differing:
+            return ", ".join(differing)
+        return "" if newest.reads is None else self._verifier.changed(newest.reads, run.anchors)
+
     def _holds(self, record: RunRecord, run: ResolvedRun) -> bool:
         """Whether a stored run is what is asked for, and nothing that it read has changed."""
         known_before = {name: value for name, value in record.identity.items() if name in run.stated}

@@ -215,7 +215,7 @@ def test_a_study_of_older_code_can_be_read_but_not_continued(
 ) -> None:
     spec = make(folders, tune=folders[:1], trials=2)
     run_study(spec, results=tmp_path)
-    monkeypatch.setattr("dynslam_bench.runs.identity.source_fingerprint", lambda *_: "newer")
+    monkeypatch.setattr("dynslam_bench.runs.identity.source_digest", lambda _: "newer")
     with pytest.raises(StudyError, match="stored with other code"):
         Study(spec, tmp_path)
     assert len(Study.open(spec, tmp_path).study.get_trials()) == 2
@@ -223,6 +223,18 @@ def test_a_study_of_older_code_can_be_read_but_not_continued(
     with pytest.raises(StudyError, match="there is no study 'toy'"):
         Study.open(spec, tmp_path / "elsewhere")
     assert not (tmp_path / "elsewhere" / "studies").exists(), "looking creates nothing"
+
+
+def test_a_study_does_not_go_on_after_its_plug_in_changed(tmp_path: Path) -> None:
+    folder = str(toy_tracker.make_sequence(tmp_path / "s0", 0.8))
+    plugin = tmp_path / "plugin" / "toy_plugin.py"
+    plugin.parent.mkdir()
+    shutil.copy(toy_tracker.__file__, plugin)
+    splits = {"tune": [folder], "confirm": [], "held_out": []}
+    run_study(make([folder] * 3, **splits, tracker=f"{plugin}:SPEC", trials=2), results=tmp_path / "r")
+    plugin.write_text(plugin.read_text() + "\n# a note\n")
+    with pytest.raises(StudyError, match=r"the file toy_plugin.py has changed since the baseline ran"):
+        run_study(make([folder] * 3, **splits, tracker=f"{plugin}:SPEC", trials=3), results=tmp_path / "r")
 
 
 def test_space_of_a_real_tracker_can_be_drawn() -> None:
