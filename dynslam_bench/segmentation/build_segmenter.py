@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -24,7 +26,7 @@ from dynslam_bench.segmentation.networks.checkpoints import (
     embedded_weights,
     fetch_checkpoint,
 )
-from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.segmentation.settings import COCO_NAMES, SegmentationSettings, canonical_name, check_classes
 
 __all__ = ["SEGMENTERS", "SegmenterContext", "SegmenterSpec"]
 
@@ -129,6 +131,7 @@ def segmentation_source(settings: Settings, sequence: Sequence, *, fetch: bool =
     kind, _, argument = source.partition(":")
     if kind in ("oracle", "oracle-classes"):
         _load(kind, group, SegmenterContext(sequence.id, sequence.masks))
+        _check_oracle(kind, group, sequence)
     elif kind == "recorded":
         _check_recorded(Path(argument), group, sequence)
     elif kind in ("onnx", "weights"):
@@ -147,7 +150,9 @@ def segmentation_source(settings: Settings, sequence: Sequence, *, fetch: bool =
 def _check_recorded(folder: Path, settings: SegmentationSettings, sequence: Sequence) -> None:
     from dynslam_bench.segmentation.recorded import RecordedSegmenter
 
-    missing = RecordedSegmenter(folder).missing(sequence.timestamps)
+    recorded = RecordedSegmenter(folder)
+    check_classes(recorded.class_names, settings, str(recorded.folder), "the folder of recorded masks")
+    missing = recorded.missing(sequence.timestamps)
     if settings.schedule == "every_nth" and settings.crowded_share >= 1:  # the only schedule that is known beforehand
         missing = [index for index in missing if index % settings.n == 0]
     if missing:
@@ -156,6 +161,26 @@ def _check_recorded(folder: Path, settings: SegmentationSettings, sequence: Sequ
             f"'{sequence.id}', the first is frame {missing[0]} ({sequence.timestamps[missing[0]]:.6f} s)",
             "is it of another sequence, or of another part?",
         )
+
+
+def _check_oracle(kind: str, settings: SegmentationSettings, sequence: Sequence) -> None:
+    """Compare the dynamic classes with the names of the exact masks, where nothing else selects objects.
+
+    Raises:
+        SegmentationError: A dynamic class that COCO does not have is none of the sequence's, too.
+    """
+    own = settings.class_names().difference(COCO_NAMES)
+    if sequence.masks is None or not (own or kind == "oracle-classes"):
+        return
+    from dynslam_bench.segmentation.recorded import exact_masks
+
+    names = exact_masks(sequence.masks, 0).class_names.values()
+    try:
+        check_classes(names, settings, sequence.id, "the sequence")
+    except SegmentationError as error:
+        if own:
+            raise
+        warnings.warn(str(error), stacklevel=2)  # a scene without people is no fault
 
 
 @lru_cache(maxsize=16)
@@ -197,18 +222,22 @@ def build_segmenter(
     name, argument = (argument, "") if kind == "plugin" else (kind, argument)
     floor = min(LOWEST_CONFIDENCE, settings.confidence)
     context = SegmenterContext(sequence_id, masks, device, threads, argument, floor)
+    # a network looks for the further classes, too
+    sought = settings.model_copy(update={"classes": ",".join(sorted(settings.class_names() | also))})
     if cache is None or kind not in NETWORKS:
-        return ConfiguredSegmenter(_load(name, settings, context), settings, source, also)
+        return ConfiguredSegmenter(_load(name, sought, context), settings, source, also)
     identity = {
         "code": _code_of(name),
         "source": source,
         "weights": weights_digest(settings, sequence_id),
         "confidence": floor,
-        "settings": settings.model_dump(include={"mask_threshold", "classes", "network_side", "onnx_normalisation"}),
+        "settings": sought.model_dump(
+            include={"mask_threshold", "classes", "network_side", "onnx_normalisation", "onnx_layout"}
+        ),
         "device": device,
         "threads": threads,
     }
-    cached = CachedSegmenter(partial(_load, name, settings, context), identity, cache)
+    cached = CachedSegmenter(partial(_load, name, sought, context), identity, cache)
     if not identity["weights"]:
         cached.network()  # without a file there is nothing to wait for
     return ConfiguredSegmenter(cached, settings, source, also)
@@ -350,6 +379,8 @@ class ConfiguredSegmenter:
             )
         if not np.isfinite(instances.boxes).all():
             raise SegmentationError(f"{self.source} gave boxes that are not finite", "give every object a finite box")
+        names = tuple(canonical_name(str(name)) for name in instances.class_names)
+        instances = replace(instances, class_names=names)
         return select(instances, self.settings, self.also)
 
 

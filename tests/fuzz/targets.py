@@ -43,7 +43,7 @@ from dynslam_bench.runs import RunRecord, RunStore, artifacts, bank, frames, run
 from dynslam_bench.runs.exchange import formats, transfer
 from dynslam_bench.runs.store import INDEX_FILE, list_runs
 from dynslam_bench.segmentation import recorded
-from dynslam_bench.segmentation.networks import loading, onnx_segmenter
+from dynslam_bench.segmentation.networks import loading, onnx_header
 from dynslam_bench.segmentation.networks.backbone import NetworkConfig
 from dynslam_bench.segmentation.networks.network import MaskRCNN
 from dynslam_bench.segmentation.training import labelled_images
@@ -773,7 +773,7 @@ BINARIES = [
     ),
     Target(
         "ONNX header",
-        lambda data, folder: str(onnx_segmenter.read_header(at(folder, "net.onnx", data))),
+        lambda data, folder: str(onnx_header.read_header(at(folder, "net.onnx", data))),
         lambda: [_onnx(), b"\x80" * 20],
     ),
     Target("prepared images", _read_prepared, lambda: [PREPARED, PREPARED + b"x"]),
