@@ -161,6 +161,21 @@ def _check_recorded(folder: Path, settings: SegmentationSettings, sequence: Sequ
             f"'{sequence.id}', the first is frame {missing[0]} ({sequence.timestamps[missing[0]]:.6f} s)",
             "is it of another sequence, or of another part?",
         )
+    stamps = tuple(sequence.timestamps.tolist())
+    if not _shows_objects(recorded.folder, recorded.folder.stat().st_mtime_ns, settings.class_names(), stamps):
+        warnings.warn(
+            f"the recorded masks in {recorded.folder} show no object of the classes {settings.classes} in any of "
+            f"{len(sequence)} frames of '{sequence.id}'",
+            stacklevel=2,
+        )
+
+
+@lru_cache(maxsize=16)
+def _shows_objects(folder: Path, changed: int, classes: frozenset[str], stamps: tuple[float, ...]) -> bool:
+    """Whether recorded masks show an object; read once a process, as long as no file comes or goes (`changed`)."""
+    from dynslam_bench.segmentation.recorded import RecordedSegmenter
+
+    return RecordedSegmenter(folder).first_object(np.array(stamps), classes) is not None
 
 
 def _check_oracle(kind: str, settings: SegmentationSettings, sequence: Sequence) -> None:
@@ -357,6 +372,7 @@ class ConfiguredSegmenter:
         self, inner: Segmenter, settings: SegmentationSettings, source: str, also: frozenset[str] = frozenset()
     ) -> None:
         self.inner, self.settings, self.source, self.also = inner, settings, source, also
+        self._foreign: set[str] = set()
 
     def segment(self, frame: Frame) -> Instances:
         """The objects of the frame that count: see `postprocess.select`.
@@ -381,7 +397,21 @@ class ConfiguredSegmenter:
             raise SegmentationError(f"{self.source} gave boxes that are not finite", "give every object a finite box")
         names = tuple(canonical_name(str(name)) for name in instances.class_names)
         instances = replace(instances, class_names=names)
+        self._warn_of_foreign(names)
         return select(instances, self.settings, self.also)
+
+    def _warn_of_foreign(self, names: Iterable[str]) -> None:
+        """Warn once of each name of a plug-in's that is neither COCO's nor asked for."""
+        if not self.source.startswith("plugin:"):
+            return
+        expected = self.settings.class_names().union(self.also, COCO_NAMES, self._foreign)
+        for name in sorted(set(names) - expected):
+            self._foreign.add(name)
+            warnings.warn(
+                f"{self.source} found '{name}', which is no COCO class and not among segmentation.classes "
+                f"({self.settings.classes}): its objects are not masked",
+                stacklevel=2,
+            )
 
 
 def weights_digest(settings: SegmentationSettings, sequence_id: str = "", masks: MaskSource | None = None) -> str:

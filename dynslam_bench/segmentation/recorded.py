@@ -25,7 +25,7 @@ MAX_DIFFERENCE_S = 0.02
 ORIGIN_FILE = "recorded.json"
 """Beside the masks: the sequence and the settings that they were made of."""
 MISSPELLED = 0.8
-"""Likeness (`difflib`) of a class name to a COCO name above which it is probably misspelled."""
+"""Ratio (`difflib`) of a class name to a COCO name above which it is probably misspelled."""
 
 
 class RecordedSegmenter:
@@ -95,21 +95,26 @@ class RecordedSegmenter:
                 f"the nearest is {path.name}" + (f", {distance:.3f} s away" if self.by_stamp else ""),
             )
         height, width = frame.rgb.shape[:2]
-        image = read_image(
-            path,
-            size=(width, height),
-            mismatch=f"but the frame is {width}x{height}",
-            hint="record the masks at the size of the frames",
-            flags=cv2.IMREAD_UNCHANGED,
-            kind=SegmentationError,
-        )
-        labels: NDArray[Any] = np.atleast_3d(image)
-        if (labels[:, :, :3] != labels[:, :, :1]).any():
-            raise SegmentationError(
-                f"{path} is a colour image", "a mask has one channel: 0 background, else the object's number"
-            )
-        instances = instances_of(FrameMasks(labels[:, :, 0], self._names, frozenset()), where=str(path))
+        labels = _read_labels(path, (width, height))
+        instances = instances_of(FrameMasks(labels, self._names, frozenset()), where=str(path))
         return replace(instances, moving=None)
+
+    def first_object(self, timestamps: NDArray[np.float64], classes: frozenset[str]) -> int | None:
+        """Index of the first frame with an object of these classes; None if no frame has one.
+
+        Args:
+            timestamps: Stamps in seconds of all frames, in their order.
+            classes: Names as `canonical_name` writes them.
+
+        Raises:
+            SegmentationError: A file cannot be read, or is a colour image.
+        """
+        numbers = [number for number, name in self._names.items() if canonical_name(name) in classes]
+        for index, key in enumerate(timestamps.tolist() if self.by_stamp else range(len(timestamps))):
+            nearest, distance = self._nearest(key)
+            if distance < self._tolerance and np.isin(_read_labels(self._files[nearest]), numbers).any():
+                return index
+        return None
 
     def missing(self, timestamps: NDArray[np.float64]) -> list[int]:
         """Indices of the frames that have no file.
@@ -125,6 +130,24 @@ class RecordedSegmenter:
         distance = np.abs(self._keys - key)
         nearest = int(np.argmin(distance))
         return nearest, float(distance[nearest])
+
+
+def _read_labels(path: Path, size: tuple[int, int] | None = None) -> NDArray[Any]:
+    """A label image ``[H, W]``; of this width and height, if they are given."""
+    image = read_image(
+        path,
+        size=size,
+        mismatch="" if size is None else f"but the frame is {size[0]}x{size[1]}",
+        hint="record the masks at the size of the frames",
+        flags=cv2.IMREAD_UNCHANGED,
+        kind=SegmentationError,
+    )
+    labels: NDArray[Any] = np.atleast_3d(image)
+    if (labels[:, :, :3] != labels[:, :, :1]).any():
+        raise SegmentationError(
+            f"{path} is a colour image", "a mask has one channel: 0 background, else the object's number"
+        )
+    return labels[:, :, 0]
 
 
 def read_classes(path: Path) -> dict[int, str]:

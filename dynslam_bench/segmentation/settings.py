@@ -161,9 +161,7 @@ class SegmentationSettings(Settings):
     classes alone), ``embedded``, ``coco``, ``onnx:PATH``, ``recorded:DIR``, ``weights:PATH`` (a Mask R-CNN checkpoint:
     torchvision's or this project's) or ``plugin:ID``."""
     classes: str = Field(
-        "person",
-        description="dynamic classes: comma-separated COCO names, presets (person, dynaslam19, all) or names that "
-        "onnx, weights, recorded, oracle and plugin sources bring",
+        "person", description="dynamic classes: comma-separated names or presets (person, dynaslam19, all)"
     )
     confidence: float = tunable(
         0.3, low=0.1, high=0.9, limits=(0.01, 1.0), online=True, meaning="detections with a lower score are ignored"
@@ -211,8 +209,9 @@ class SegmentationSettings(Settings):
     onnx_normalisation: Literal["auto", "unit", "symmetric", "imagenet"] = "auto"
     """Input scaling of an ONNX network: [0, 1], [-1, 1], ImageNet's statistics, or what its kind usually takes."""
     onnx_layout: Literal["auto", "yolo", "yolo-objectness", "yolo-nms", "semantic", "semantic-aligned", "instances"] = (
-        Field("auto", description="layout of an ONNX network's outputs, where file and shapes leave it open")
+        "auto"
     )
+    """Layout of an ONNX network's outputs, where the file's metadata and the shapes leave it open."""
 
     @field_validator("source")
     @classmethod
