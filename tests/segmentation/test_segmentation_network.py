@@ -199,7 +199,8 @@ NARROW = {"stem": 8, "channels": 16, "box_hidden": 16, "mask_channels": 16}
 
 def test_a_resnet18_checkpoint_is_recognised(tmp_path):
     torch.save(published(RESNET18.model_copy(update=NARROW), "counted"), tmp_path / "r18.pth")
-    config = load_network(tmp_path / "r18.pth").config
+    with pytest.warns(UserWarning, match="does not name its only class: it is taken for person"):
+        config = load_network(tmp_path / "r18.pth").config
     assert (config.blocks, config.bottleneck, config.stem, config.classes) == ((2, 2, 2, 2), False, 8, ("person",))
 
 

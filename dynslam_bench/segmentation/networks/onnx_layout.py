@@ -34,6 +34,8 @@ _SEMANTIC_NAMES = {
 """Names of the classes of a semantic network without names, by their number."""
 NO_OBJECT = frozenset({"", "background", "n/a"})
 """Names, as `canonical_name` writes them, of what is no object."""
+MOST_CLASSES = 1 << 16
+"""Numbers of classes lie below it."""
 _TASKS = {
     "segment": ("yolo", "instances"), "semantic": ("semantic",), "detect": (), "pose": (), "obb": (), "classify": (),
 }  # fmt: skip
@@ -137,6 +139,8 @@ def read_metadata(metadata: Mapping[str, str], where: str) -> Metadata:
                 raise ValueError(f"it is a {type(value).__name__}")
             pairs = value.items() if isinstance(value, dict) else enumerate(value)
             names = {int(number): str(name) for number, name in pairs}
+            if any(not 0 <= number < MOST_CLASSES for number in names):
+                raise ValueError(f"a number is not between 0 and {MOST_CLASSES - 1}")
     inside = metadata.get("end2end", "").strip().casefold()
     if inside not in ("", "true", "false"):
         raise SegmentationError(f"{where}: the metadata entry 'end2end' is '{inside[:100]}'", "expected True or False")
