@@ -107,6 +107,8 @@ INSTANCES = {"boxes": (None, 4), "labels": (None,), "scores": (None,), "masks": 
         ({"out": (1, 3, 60, 80)}, {"names": "{1: 'person', 2: 'car'}"}, (480, 640), ("semantic", True)),
         ({"out": (1, 3, 60, 80), "map": ((1, 60, 80), "int64")}, {"names": "['a', 'person', 'b']"}, (480, 640),
          ("semantic", True)),
+        ({"out": (1, 3, 60, 80), "map": (1, 480, 640)}, {"names": "['a', 'person', 'b']"}, (480, 640),
+         ("semantic", True)),
         ({"aux": (1, 21, 60, 80), "out": (1, 21, 60, 80)}, {}, (480, 640), ("semantic", True)),
         ({"out": (1, 21, 60, 21)}, {}, (480, 168), ("semantic", True)),
         # torchvision's Mask R-CNN
@@ -169,6 +171,8 @@ def test_without_names_the_number_of_classes_is_open(detections, usable, layouts
         (INSTANCES, {"names": "['person', 'car']"}, (480, 640), "label 0 for 'person' and 'instances' with label 1"),
         ({"out": (1, 21, 21, 21)}, {}, (168, 168), "with C = 21 in output out and 'semantic' [1, h, w, C]"),
         ({"a": (1, 116, 336), "b": (1, 32, 32, 32)}, {}, (128, 128), "'yolo' [1, 4+C+M, N] with C = 80, M = 32 and"),
+        ({"a": (1, 46, 46), "b": (1, 21, 46, 46)}, {"names": names_of(*"abcdefghijklmnopqrstu")}, (368, 368),
+         "'semantic' [1, C, h, w] with C = 21 in output b"),
         # channels last
         ({"a": (1, 116, 8400), "b": (1, 160, 160, 32)}, COCO_80, HD, "whose channels come last"),
         ({"out": (1, 60, 80, 21)}, {}, (480, 640), "whose channels come last"),

@@ -297,7 +297,8 @@ def _detections(
 def _semantic(outputs: Sequence[TensorInfo], facts: Metadata, size: tuple[int, int]) -> Iterator[_Fit]:
     """Logits of classes in planes; a label map may stand beside them, detections may not."""
     planes = _of_rank(outputs, 4)
-    if any(not _is_label_map(output, planes) for output in _of_rank(outputs, 3)):
+    maps = {size, *(output.shape[2:] for output in planes)}
+    if any(output.shape[1:] not in maps for output in _of_rank(outputs, 3)):
         return
     if {"out", "aux"} <= {output.name for output in planes}:  # torchvision's auxiliary head serves training
         planes = [output for output in planes if output.name != "aux"]
@@ -341,11 +342,6 @@ def _planes(output: TensorInfo) -> Iterator[tuple[int, tuple[int, int], bool]]:
     _, first, second, third = (int(length or 0) for length in output.shape)
     yield first, (second, third), False
     yield third, (first, second), True
-
-
-def _is_label_map(output: TensorInfo, planes: Sequence[TensorInfo]) -> bool:
-    """Whether an output ``[1, h, w]`` has the height and width of a network's planes."""
-    return any(output.shape[1:] == plane.shape[2:] for plane in planes)
 
 
 def _whole_stride(plane: tuple[int, int], size: tuple[int, int]) -> bool:
