@@ -19,7 +19,7 @@ class Instances:
     Attributes:
         masks: bool ``[K, H, W]`` at the frame's resolution.
         boxes: float32 ``[K, 4]``: x0, y0, x1, y1 in pixels (x1, y1 exclusive).
-        class_names: COCO name of each object, e.g. ``"person"``.
+        class_names: Class of each object, e.g. ``"person"``: COCO's name where there is one. Case does not matter.
         scores: float32 ``[K]`` in [0, 1].
     """
 

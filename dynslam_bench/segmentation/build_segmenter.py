@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -24,7 +26,7 @@ from dynslam_bench.segmentation.networks.checkpoints import (
     embedded_weights,
     fetch_checkpoint,
 )
-from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.segmentation.settings import COCO_NAMES, SegmentationSettings, canonical_name, check_classes
 
 __all__ = ["SEGMENTERS", "SegmenterContext", "SegmenterSpec"]
 
@@ -127,6 +129,7 @@ def segmentation_source(settings: Settings, sequence: Sequence, *, fetch: bool =
     kind, _, argument = source.partition(":")
     if kind in ("oracle", "oracle-classes"):
         _load(kind, group, SegmenterContext(sequence.id, sequence.masks))
+        _check_oracle(kind, group, sequence)
     elif kind == "recorded":
         _check_recorded(Path(argument), group, sequence)
     elif kind in ("onnx", "weights"):
@@ -145,7 +148,9 @@ def segmentation_source(settings: Settings, sequence: Sequence, *, fetch: bool =
 def _check_recorded(folder: Path, settings: SegmentationSettings, sequence: Sequence) -> None:
     from dynslam_bench.segmentation.recorded import RecordedSegmenter
 
-    missing = RecordedSegmenter(folder).missing(sequence.timestamps)
+    recorded = RecordedSegmenter(folder)
+    check_classes(recorded.class_names, settings, str(recorded.folder), "the folder of recorded masks")
+    missing = recorded.missing(sequence.timestamps)
     if settings.schedule == "every_nth" and settings.crowded_share >= 1:  # the only schedule that is known beforehand
         missing = [index for index in missing if index % settings.n == 0]
     if missing:
@@ -154,6 +159,41 @@ def _check_recorded(folder: Path, settings: SegmentationSettings, sequence: Sequ
             f"'{sequence.id}', the first is frame {missing[0]} ({sequence.timestamps[missing[0]]:.6f} s)",
             "is it of another sequence, or of another part?",
         )
+    stamps = tuple(sequence.timestamps.tolist())
+    if not _shows_objects(recorded.folder, recorded.folder.stat().st_mtime_ns, settings.class_names(), stamps):
+        warnings.warn(
+            f"the recorded masks in {recorded.folder} show no object of the classes {settings.classes} in any of "
+            f"{len(sequence)} frames of '{sequence.id}'",
+            stacklevel=2,
+        )
+
+
+@lru_cache(maxsize=16)
+def _shows_objects(folder: Path, changed: int, classes: frozenset[str], stamps: tuple[float, ...]) -> bool:
+    """Whether recorded masks show an object; read once a process, as long as no file comes or goes (`changed`)."""
+    from dynslam_bench.segmentation.recorded import RecordedSegmenter
+
+    return RecordedSegmenter(folder).first_object(np.array(stamps), classes) is not None
+
+
+def _check_oracle(kind: str, settings: SegmentationSettings, sequence: Sequence) -> None:
+    """Compare the dynamic classes with the names of the exact masks, where nothing else selects objects.
+
+    Raises:
+        SegmentationError: A dynamic class that COCO does not have is none of the sequence's, too.
+    """
+    own = settings.class_names().difference(COCO_NAMES)
+    if sequence.masks is None or not (own or kind == "oracle-classes"):
+        return
+    from dynslam_bench.segmentation.recorded import exact_masks
+
+    names = exact_masks(sequence.masks, 0).class_names.values()
+    try:
+        check_classes(names, settings, sequence.id, "the sequence")
+    except SegmentationError as error:
+        if own:
+            raise
+        warnings.warn(str(error), stacklevel=2)  # a scene without people is no fault
 
 
 @lru_cache(maxsize=16)
@@ -195,18 +235,22 @@ def build_segmenter(
     name, argument = (argument, "") if kind == "plugin" else (kind, argument)
     floor = min(LOWEST_CONFIDENCE, settings.confidence)
     context = SegmenterContext(sequence_id, masks, device, threads, argument, floor)
+    # a network looks for the further classes, too
+    sought = settings.model_copy(update={"classes": ",".join(sorted(settings.class_names() | also))})
     code = None if cache is None or kind not in NETWORKS else stage_code(SEGMENTERS.get(name).entry_point)
     if cache is None or code is None:
-        return ConfiguredSegmenter(_load(name, settings, context), settings, source, also)
+        return ConfiguredSegmenter(_load(name, sought, context), settings, source, also)
     identity = {
         "source": source,
         "weights": weights_digest(settings, sequence_id),
         "confidence": floor,
-        "settings": settings.model_dump(include={"mask_threshold", "classes", "network_side", "onnx_normalisation"}),
+        "settings": sought.model_dump(
+            include={"mask_threshold", "classes", "network_side", "onnx_normalisation", "onnx_layout"}
+        ),
         "device": device,
         "threads": threads,
     }
-    cached = CachedSegmenter(partial(_load, name, settings, context), identity, cache, code)
+    cached = CachedSegmenter(partial(_load, name, sought, context), identity, cache, code)
     if not identity["weights"]:
         cached.network()  # without a file there is nothing to wait for
     return ConfiguredSegmenter(cached, settings, source, also)
@@ -318,6 +362,7 @@ class ConfiguredSegmenter:
         self, inner: Segmenter, settings: SegmentationSettings, source: str, also: frozenset[str] = frozenset()
     ) -> None:
         self.inner, self.settings, self.source, self.also = inner, settings, source, also
+        self._foreign: set[str] = set()
 
     def segment(self, frame: Frame) -> Instances:
         """The objects of the frame that count: see `postprocess.select`.
@@ -340,7 +385,23 @@ class ConfiguredSegmenter:
             )
         if not np.isfinite(instances.boxes).all():
             raise SegmentationError(f"{self.source} gave boxes that are not finite", "give every object a finite box")
+        names = tuple(canonical_name(str(name)) for name in instances.class_names)
+        instances = replace(instances, class_names=names)
+        self._warn_of_foreign(names)
         return select(instances, self.settings, self.also)
+
+    def _warn_of_foreign(self, names: Iterable[str]) -> None:
+        """Warn once of each name of a plug-in's that is neither COCO's nor asked for."""
+        if not self.source.startswith("plugin:"):
+            return
+        expected = self.settings.class_names().union(self.also, COCO_NAMES, self._foreign)
+        for name in sorted(set(names) - expected):
+            self._foreign.add(name)
+            warnings.warn(
+                f"{self.source} found '{name}', which is no COCO class and not among segmentation.classes "
+                f"({self.settings.classes}): its objects are not masked",
+                stacklevel=2,
+            )
 
 
 def weights_digest(settings: SegmentationSettings, sequence_id: str = "", masks: MaskSource | None = None) -> str:

@@ -1,8 +1,10 @@
 """Masks that no network computes here: read from PNG files, written to them, or exact masks of the sequence."""
 
 import json
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +17,15 @@ from dynslam_bench.core import SegmentationError, raising, read_json, write_atom
 from dynslam_bench.core.images import read_image
 from dynslam_bench.segmentation.build_segmenter import build_segmenter, weights_digest
 from dynslam_bench.segmentation.postprocess import boxes_of
-from dynslam_bench.segmentation.settings import COCO_NAMES, SegmentationSettings
+from dynslam_bench.segmentation.settings import COCO_NAMES, SegmentationSettings, canonical_name
 
 CLASSES_FILE = "classes.json"
 MAX_DIFFERENCE_S = 0.02
 """Largest difference of a frame's stamp and a mask's, as in TUM's association of images."""
 ORIGIN_FILE = "recorded.json"
 """Beside the masks: the sequence and the settings that they were made of."""
+MISSPELLED = 0.8
+"""Ratio (`difflib`) of a class name to a COCO name above which it is probably misspelled."""
 
 
 class RecordedSegmenter:
@@ -29,13 +33,16 @@ class RecordedSegmenter:
 
     A label image is 8 or 16 bit, one channel (or several equal ones): 0 is background, every other value one object. A
     file with the values 0 and 255 (or 0 and 1) holds one object. Objects are persons unless ``DIR/classes.json`` maps
-    values to COCO names, e.g. ``{"1": "person", "7": "chair"}``.
+    values to class names, e.g. ``{"1": "person", "7": "chair"}``.
 
     File names with a decimal point are stamps in seconds, matched to the nearest within 0.02 s; names without are
     indices into the sequence as it is run (from 0): prefer stamps where only part of a sequence is run.
 
     Args:
         folder: Where the files are.
+
+    Attributes:
+        class_names: The names that objects may have.
 
     Raises:
         SegmentationError: No such folder, no PNG files in it, names of both kinds or of none, a bad ``classes.json``.
@@ -71,6 +78,7 @@ class RecordedSegmenter:
         self._keys: NDArray[np.float64] = numbers[order]
         self._files = [files[i] for i in order]
         self._names = read_classes(self.folder / CLASSES_FILE) or dict.fromkeys(range(1 << 16), "person")
+        self.class_names = tuple(dict.fromkeys(self._names.values()))
 
     def segment(self, frame: Frame) -> Instances:
         """The recorded objects of a frame.
@@ -87,21 +95,26 @@ class RecordedSegmenter:
                 f"the nearest is {path.name}" + (f", {distance:.3f} s away" if self.by_stamp else ""),
             )
         height, width = frame.rgb.shape[:2]
-        image = read_image(
-            path,
-            size=(width, height),
-            mismatch=f"but the frame is {width}x{height}",
-            hint="record the masks at the size of the frames",
-            flags=cv2.IMREAD_UNCHANGED,
-            kind=SegmentationError,
-        )
-        labels: NDArray[Any] = np.atleast_3d(image)
-        if (labels[:, :, :3] != labels[:, :, :1]).any():
-            raise SegmentationError(
-                f"{path} is a colour image", "a mask has one channel: 0 background, else the object's number"
-            )
-        instances = instances_of(FrameMasks(labels[:, :, 0], self._names, frozenset()), where=str(path))
+        labels = _read_labels(path, (width, height))
+        instances = instances_of(FrameMasks(labels, self._names, frozenset()), where=str(path))
         return replace(instances, moving=None)
+
+    def first_object(self, timestamps: NDArray[np.float64], classes: frozenset[str]) -> int | None:
+        """Index of the first frame with an object of these classes; None if no frame has one.
+
+        Args:
+            timestamps: Stamps in seconds of all frames, in their order.
+            classes: Names as `canonical_name` writes them.
+
+        Raises:
+            SegmentationError: A file cannot be read, or is a colour image.
+        """
+        numbers = [number for number, name in self._names.items() if canonical_name(name) in classes]
+        for index, key in enumerate(timestamps.tolist() if self.by_stamp else range(len(timestamps))):
+            nearest, distance = self._nearest(key)
+            if distance < self._tolerance and np.isin(_read_labels(self._files[nearest]), numbers).any():
+                return index
+        return None
 
     def missing(self, timestamps: NDArray[np.float64]) -> list[int]:
         """Indices of the frames that have no file.
@@ -119,11 +132,29 @@ class RecordedSegmenter:
         return nearest, float(distance[nearest])
 
 
+def _read_labels(path: Path, size: tuple[int, int] | None = None) -> NDArray[Any]:
+    """A label image ``[H, W]``; of this width and height, if they are given."""
+    image = read_image(
+        path,
+        size=size,
+        mismatch="" if size is None else f"but the frame is {size[0]}x{size[1]}",
+        hint="record the masks at the size of the frames",
+        flags=cv2.IMREAD_UNCHANGED,
+        kind=SegmentationError,
+    )
+    labels: NDArray[Any] = np.atleast_3d(image)
+    if (labels[:, :, :3] != labels[:, :, :1]).any():
+        raise SegmentationError(
+            f"{path} is a colour image", "a mask has one channel: 0 background, else the object's number"
+        )
+    return labels[:, :, 0]
+
+
 def read_classes(path: Path) -> dict[int, str]:
-    """The COCO name of each number in the label images; empty without that file.
+    """The class name of each number in the label images; empty without that file.
 
     Raises:
-        SegmentationError: The file cannot be read, or names an unknown class.
+        SegmentationError: The file cannot be read, or is no such table.
     """
     if not path.is_file():
         return {}
@@ -131,9 +162,10 @@ def read_classes(path: Path) -> dict[int, str]:
         SegmentationError, f"cannot read {path}", 'expected {"1": "person", ...}', of=(ValueError, AttributeError)
     ):
         names = {int(key): str(name) for key, name in read_json(path, kind=SegmentationError).items()}
-    unknown = sorted(set(names.values()) - set(COCO_NAMES))
-    if unknown:
-        raise SegmentationError(f"{path}: '{unknown[0]}' is no COCO class")
+    for name in names.values():
+        meant = get_close_matches(canonical_name(name), COCO_NAMES, n=1, cutoff=MISSPELLED)
+        if meant and meant[0] != canonical_name(name):
+            warnings.warn(f"{path}: '{name}' is no COCO class; did you mean '{meant[0]}'?", stacklevel=2)
     return names
 
 
@@ -150,6 +182,7 @@ def record_masks(
 
     The files hold the objects of the settings' classes and confidence, before repair and dilation, which are done when
     the masks are used. Where two objects overlap, the one with the higher score has the pixel. Scores are not stored.
+    It warns where no frame has an object.
 
     Args:
         sequence: The frames.
@@ -187,6 +220,9 @@ def record_masks(
             write_atomic(path, cv2.imencode(".png", labels)[1].tobytes())
             segmented += 1
         progress(index + 1, len(sequence))
+    if not classes:
+        objects = f"no object of the classes {settings.classes} in any of {len(sequence)} frames of {sequence.id}"
+        warnings.warn(f"{segmenter.source} found {objects}", stacklevel=2)
     return segmented
 
 
@@ -250,6 +286,22 @@ def instances_of(masks: FrameMasks, *, where: str = "masks") -> Instances:
     return Instances(stack, boxes_of(stack), classes, np.ones(len(numbers), np.float32), moving)
 
 
+def exact_masks(source: MaskSource, index: int) -> FrameMasks:
+    """A frame's exact masks.
+
+    Raises:
+        SegmentationError: The sequence has no masks for this frame, or they cannot be read.
+    """
+    try:
+        return source[index]
+    except (IndexError, KeyError) as error:
+        raise SegmentationError(f"there are no exact masks for frame {index}") from error
+    except MemoryError:
+        raise
+    except Exception as error:  # the masks of a plug-in's data set may raise anything
+        raise SegmentationError(f"the exact masks of frame {index} cannot be read: {error}") from error
+
+
 class OracleSegmenter:
     """A sequence's exact masks: every object, with the flag whether it moves.
 
@@ -267,14 +319,7 @@ class OracleSegmenter:
         Raises:
             SegmentationError: The sequence has no masks for this frame, or they cannot be read.
         """
-        try:
-            masks = self.source[frame.index]
-        except (IndexError, KeyError) as error:
-            raise SegmentationError(f"there are no exact masks for frame {frame.index}") from error
-        except MemoryError:
-            raise
-        except Exception as error:  # the masks of a plug-in's data set may raise anything
-            raise SegmentationError(f"the exact masks of frame {frame.index} cannot be read: {error}") from error
+        masks = exact_masks(self.source, frame.index)
         instances = instances_of(masks, where=f"exact masks of frame {frame.index}")
         return instances if self.motion else replace(instances, moving=None)
 

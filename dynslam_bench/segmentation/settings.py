@@ -4,11 +4,12 @@ The settings say where masks come from, which classes are dynamic, how masks are
 segmenter runs.
 """
 
-from collections.abc import Mapping
+import shlex
+from collections.abc import Iterable, Mapping
 from functools import cache
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, field_validator
+from pydantic import BeforeValidator, Field, ValidationInfo, field_validator
 
 from dynslam_bench.core import SegmentationError, did_you_mean
 from dynslam_bench.core.settings import Settings, tunable
@@ -50,36 +51,94 @@ PRESETS: dict[str, tuple[str, ...]] = {"person": ("person",), "dynaslam19": DYNA
 """Named class sets; a preset's name may stand wherever a class name may."""
 
 
+PEOPLE = ("person", "people", "pedestrian", "human", "man", "woman", "child")
+"""Words in the names of classes of people: such a class is the example where none of the classes is a dynamic one."""
+CLASSES_SHOWN = 12
+"""Classes that an error lists; the rest is counted."""
+
+
+@cache
+def canonical_name(name: str) -> str:
+    """A class name as names are compared: in lower case, ``_`` as a space, of synonyms between commas the first."""
+    return " ".join(name.partition(",")[0].replace("_", " ").split()).casefold()
+
+
 @cache
 def expand_classes(names: str) -> frozenset[str]:
-    """The COCO names meant by a comma-separated list of class names and presets.
+    """The class names meant by a comma-separated list of class names and presets, as `canonical_name` writes them.
+
+    Raises:
+        SegmentationError: There is none.
+    """
+    parts = filter(None, map(canonical_name, names.split(",")))
+    classes = frozenset(name for part in parts for name in PRESETS.get(part, (part,)))
+    if not classes:
+        raise SegmentationError("the list of classes is empty", "for example person or dynaslam19")
+    return classes
+
+
+def expand_coco_classes(names: str) -> frozenset[str]:
+    """`expand_classes` where all of them must be COCO's.
 
     Raises:
         SegmentationError: A name is neither a COCO class nor a preset (with a did-you-mean), or there is none.
     """
-    classes: set[str] = set()
-    for part in filter(None, map(str.strip, names.split(","))):
-        if part not in PRESETS and part not in COCO_NAMES:
-            raise SegmentationError(f"unknown class '{part}'", did_you_mean(part, [*PRESETS, *COCO_NAMES]))
-        classes.update(PRESETS.get(part, (part,)))
-    if not classes:
-        raise SegmentationError("the list of classes is empty", "for example person or dynaslam19")
-    return frozenset(classes)
+    classes = expand_classes(names)
+    for name in sorted(classes.difference(COCO_NAMES)):
+        raise SegmentationError(f"unknown class '{name}'", did_you_mean(name, [*PRESETS, *COCO_NAMES]))
+    return classes
 
 
-def _known_classes(value: Any) -> str:
-    text = ",".join(map(str, value)) if isinstance(value, (list, tuple)) else value if isinstance(value, str) else ""
+def check_classes(known: Iterable[str], settings: "SegmentationSettings", where: str, whose: str) -> None:
+    """Raise where the dynamic classes select nothing among those that a source of masks knows.
+
+    Args:
+        known: The names of its classes, without the background.
+        settings: Their `classes` are the dynamic ones.
+        where: The source's file, folder or sequence, for the error.
+        whose: What the classes are of, e.g. ``the network``.
+
+    Raises:
+        SegmentationError: None of the classes is a dynamic one, or a name that is no COCO name is none of them.
+    """
+    names = list(dict.fromkeys(known))
+    spelled = {canonical_name(name) for name in names}
+    asked = settings.class_names()
+    for name in sorted(asked - spelled - set(COCO_NAMES)):
+        raise SegmentationError(f"{where}: {whose} has no class '{name}'", did_you_mean(name, spelled))
+    if asked & spelled:
+        return
+    people = [name for name in names if any(word in canonical_name(name) for word in PEOPLE)]
+    example = canonical_name([*people, *names, "person"][0])
+    shown = ", ".join(names[:CLASSES_SHOWN])
+    more = f" and {len(names) - CLASSES_SHOWN} more" if len(names) > CLASSES_SHOWN else ""
+    raise SegmentationError(
+        f"{where}: none of the {len(names)} classes of {whose} is among the dynamic ones: {settings.classes}",
+        f"it has {shown or 'none'}{more}; name the dynamic ones, for example: "
+        f"--set {shlex.quote(f'segmentation.classes={example}')}",
+    )
+
+
+def _joined(value: Any) -> str:
+    """A list of names as a comma-separated text; empty for what is neither list nor text."""
+    return ",".join(map(str, value)) if isinstance(value, (list, tuple)) else value if isinstance(value, str) else ""
+
+
+def _coco_classes(value: Any) -> str:
+    text = _joined(value)
     try:
-        expand_classes(text)
+        expand_coco_classes(text)
     except SegmentationError as error:
         raise ValueError(str(error)) from None
     return text
 
 
-ClassList = Annotated[str, BeforeValidator(_known_classes)]
+ClassList = Annotated[str, BeforeValidator(_coco_classes)]
 """Comma-separated COCO names or presets, validated; a list of names is taken as well."""
 PLAIN_SOURCES = ("auto", "none", "oracle", "oracle-classes", "embedded", "coco")
 PREFIXED_SOURCES = ("onnx", "recorded", "weights", "plugin")
+COCO_SOURCES = ("auto", "none", "embedded", "coco")
+"""Sources whose classes are COCO's; the others may bring names of their own."""
 FORMS = "auto, none, oracle, oracle-classes, embedded, coco, onnx:PATH, recorded:DIR, weights:PATH, plugin:ID"
 NMS_IOU = 0.5
 """Overlap of two boxes of one class above which the weaker one is dropped: torchvision's and YOLO's value."""
@@ -101,8 +160,8 @@ class SegmentationSettings(Settings):
     fetched), ``none``, ``oracle`` (exact masks, also of whatever else moves), ``oracle-classes`` (exact masks of the
     classes alone), ``embedded``, ``coco``, ``onnx:PATH``, ``recorded:DIR``, ``weights:PATH`` (a Mask R-CNN checkpoint:
     torchvision's or this project's) or ``plugin:ID``."""
-    classes: ClassList = Field(
-        "person", description="dynamic classes: comma-separated COCO names or presets (person, dynaslam19, all)"
+    classes: str = Field(
+        "person", description="dynamic classes: comma-separated names or presets (person, dynaslam19, all)"
     )
     confidence: float = tunable(
         0.3, low=0.1, high=0.9, limits=(0.01, 1.0), online=True, meaning="detections with a lower score are ignored"
@@ -149,6 +208,10 @@ class SegmentationSettings(Settings):
     )
     onnx_normalisation: Literal["auto", "unit", "symmetric", "imagenet"] = "auto"
     """Input scaling of an ONNX network: [0, 1], [-1, 1], ImageNet's statistics, or what its kind usually takes."""
+    onnx_layout: Literal["auto", "yolo", "yolo-objectness", "yolo-nms", "semantic", "semantic-aligned", "instances"] = (
+        "auto"
+    )
+    """Layout of an ONNX network's outputs, where the file's metadata and the shapes leave it open."""
 
     @field_validator("source")
     @classmethod
@@ -160,6 +223,19 @@ class SegmentationSettings(Settings):
             raise ValueError(f"'{prefix}:' needs {'an id' if prefix == 'plugin' else 'a path'} after the colon")
         hint = did_you_mean(prefix, [*PLAIN_SOURCES, *(f"{name}:" for name in PREFIXED_SOURCES)])
         raise ValueError(f"not one of {FORMS}" + (f"; {hint}" if hint.startswith("did") else ""))
+
+    @field_validator("classes", mode="before")
+    @classmethod
+    def _known_classes(cls, value: Any, info: ValidationInfo) -> str:
+        """Names that are not COCO's are compared with those of the source, when it is known what it finds."""
+        if info.data.get("source", "auto") in COCO_SOURCES:
+            return _coco_classes(value)
+        text = _joined(value)
+        try:
+            expand_classes(text)
+        except SegmentationError as error:
+            raise ValueError(str(error)) from None
+        return text
 
     @property
     def unused(self) -> Mapping[str, str]:
@@ -173,5 +249,5 @@ class SegmentationSettings(Settings):
         return dict.fromkeys(fields.get(self.source.partition(":")[0], ()), f"segmentation.source is {self.source!r}")
 
     def class_names(self) -> frozenset[str]:
-        """The COCO names of the dynamic classes."""
+        """The names of the dynamic classes, as `canonical_name` writes them."""
         return expand_classes(self.classes)

@@ -43,7 +43,7 @@ from dynslam_bench.runs import RunRecord, RunStore, artifacts, bank, frames, run
 from dynslam_bench.runs.exchange import formats, transfer
 from dynslam_bench.runs.store import INDEX_FILE, list_runs
 from dynslam_bench.segmentation import recorded
-from dynslam_bench.segmentation.networks import loading, onnx_segmenter
+from dynslam_bench.segmentation.networks import loading, onnx_header, onnx_layout
 from dynslam_bench.segmentation.networks.backbone import NetworkConfig
 from dynslam_bench.segmentation.networks.network import MaskRCNN
 from dynslam_bench.segmentation.training import labelled_images
@@ -718,7 +718,7 @@ def _checkpoints() -> list[bytes]:
     ]
 
 
-def _onnx() -> bytes:
+def _onnx(metadata: dict[str, bytes]) -> bytes:
     """A model of one input and one output, written by hand."""
 
     def field(number: int, body: bytes) -> bytes:
@@ -727,7 +727,24 @@ def _onnx() -> bytes:
     shape = b"".join(field(1, bytes([1 << 3, size])) for size in (1, 3, 64, 64))
     value = field(1, b"images") + field(2, field(1, bytes([1 << 3, 1]) + field(2, shape)))
     graph = field(5, field(8, b"weight")) + field(11, value) + field(12, value)
-    return field(7, graph) + field(14, field(1, b"names") + field(2, b"{0: 'person'}"))
+    return field(7, graph) + b"".join(
+        field(14, field(1, key.encode()) + field(2, value)) for key, value in metadata.items()
+    )
+
+
+def _layouts() -> list[bytes]:
+    """Models with metadata; the output is one of three classes in planes."""
+    return [
+        _onnx({"names": b"['a', 'person', 'b']", "task": b"semantic"}),
+        _onnx({"names": b"{1: 'person', 2: 'b'}", "args": b"{'nms': False}", "end2end": b"True"}),
+        _onnx({"names": b"{0xffff: 'person'}", "args": b"[[[]]]"}),
+    ]
+
+
+def _find_layout(data: bytes | None, folder: Path) -> object:
+    path = at(folder, "net.onnx", data)
+    _, outputs, metadata = onnx_header.read_header(path)
+    return onnx_layout.detect_layout(outputs, metadata, (64, 64), str(path))
 
 
 def _read_prepared(data: bytes | None, folder: Path) -> None:
@@ -773,9 +790,10 @@ BINARIES = [
     ),
     Target(
         "ONNX header",
-        lambda data, folder: str(onnx_segmenter.read_header(at(folder, "net.onnx", data))),
-        lambda: [_onnx(), b"\x80" * 20],
+        lambda data, folder: str(onnx_header.read_header(at(folder, "net.onnx", data))),
+        lambda: [_onnx({"names": b"{0: 'person'}"}), b"\x80" * 20],
     ),
+    Target("ONNX layout", _find_layout, _layouts),
     Target("prepared images", _read_prepared, lambda: [PREPARED, PREPARED + b"x"]),
     Target(
         "vocabulary",

@@ -21,7 +21,7 @@ from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.sequence import Frame, FrameMasks
 from dynslam_bench.core.errors import PluginError, SegmentationError, SettingsError
 from dynslam_bench.core.folders import WEIGHTS_VARIABLE
-from dynslam_bench.core.settings import apply_overrides, build
+from dynslam_bench.core.settings import Settings, apply_overrides, build
 from dynslam_bench.core.stage_cache import StageCache
 from dynslam_bench.segmentation import schedule
 from dynslam_bench.segmentation.build_segmenter import (
@@ -31,6 +31,7 @@ from dynslam_bench.segmentation.build_segmenter import (
     SegmenterSpec,
     build_segmenter,
     resolve_source,
+    segmentation_source,
     weights_digest,
 )
 from dynslam_bench.segmentation.networks import checkpoints
@@ -99,6 +100,17 @@ def test_classes_are_names_and_presets():
     ):
         with pytest.raises(SettingsError, match=words):
             build(SegmentationSettings, {"classes": wrong})
+
+
+def test_the_case_of_class_names_does_not_matter():
+    assert SegmentationSettings(classes="Person, Traffic_Light").class_names() == {"person", "traffic light"}
+    assert build(SegmentationSettings, {"source": "onnx:a", "classes": ["Fork Lift", "person"]}).class_names() == {
+        "fork lift",
+        "person",
+    }
+    for empty in ("", " , ", []):
+        with pytest.raises(SettingsError, match="empty"):
+            build(SegmentationSettings, {"source": "onnx:a", "classes": empty})
 
 
 def test_class_tables():
@@ -221,6 +233,14 @@ class SmallMasks(FixedSegmenter):
         return Instances.empty(12, 16)
 
 
+class OwnNames(FixedSegmenter):
+    def segment(self, frame):
+        masks = np.zeros((1, *frame.rgb.shape[:2]), bool)
+        masks[0, 5:50, 5:50] = True
+        return Instances(masks, boxes_of(masks), ("Pedestrian",), np.ones(1, np.float32))
+
+
+OWN = SegmenterSpec("own", f"{__name__}:OwnNames")
 FIXED = SegmenterSpec("fixed", f"{__name__}:FixedSegmenter")
 SMALL = SegmenterSpec("small", f"{__name__}:SmallMasks")
 BROKEN = SegmenterSpec("broken", "operator:eq")
@@ -317,6 +337,85 @@ def test_a_folder_of_other_masks_is_refused(sequence, tmp_path: Path) -> None:
     ):
         with pytest.raises(SegmentationError, match=words):
             record_masks(sequence, tmp_path / folder, ORACLE.model_copy(update=change))
+
+
+# A selection that is empty is said before the run.
+
+
+class Tracked(Settings):
+    segmentation: SegmentationSettings = SegmentationSettings()
+
+
+def checked(sequence, source, **changes):
+    return segmentation_source(build(Tracked, {"segmentation": {"source": source, **changes}}), sequence)
+
+
+def record_stamps(folder, sequence, values, classes=None):
+    """Label images of all frames with an object of each value, and the names of the values."""
+    for stamp in sequence.timestamps:
+        record(folder, f"{stamp:.6f}.png", values, shape=sequence[0].rgb.shape[:2])
+    if classes is not None:
+        (folder / "classes.json").write_text(json.dumps(classes))
+    return f"recorded:{folder}"
+
+
+@pytest.mark.parametrize(
+    ("classes", "asked", "named", "count"),
+    [
+        (None, "dog", "person", 1),
+        ({"1": "chair"}, "person", "chair", 1),
+        ({"1": "chair", "2": "pedestrian"}, "dynaslam19", "chair, pedestrian", 2),
+    ],
+)
+def test_recorded_classes_none_of_which_is_dynamic_are_refused(sequence, tmp_path, classes, asked, named, count):
+    source = record_stamps(tmp_path, sequence, range(1, count + 1), classes)
+    with pytest.raises(SegmentationError) as error:
+        checked(sequence, source, classes=asked)
+    fault = f"none of the {count} classes of the folder of recorded masks is among the dynamic ones: {asked}"
+    assert fault in error.value.args[0] and f"it has {named};" in error.value.hint
+    name = error.value.hint.rpartition("segmentation.classes=")[2]
+    assert checked(sequence, source, classes=name) == source
+
+
+@pytest.mark.parametrize("values", [[], [7]])
+def test_recorded_masks_that_show_nobody_are_said(sequence, tmp_path, values):
+    source = record_stamps(tmp_path, sequence, values, {"1": "Person", "7": "chair"})
+    with pytest.warns(UserWarning, match=f"no object of the classes person in any of {len(sequence)} frames of"):
+        assert checked(sequence, source) == source
+    last = f"{sequence.timestamps[-1]:.6f}.png"
+    record(tmp_path, last, [1], shape=sequence[0].rgb.shape[:2])
+    assert RecordedSegmenter(tmp_path).first_object(sequence.timestamps, frozenset({"person"})) == len(sequence) - 1
+
+
+def test_a_misspelled_recorded_class_is_said(sequence, tmp_path):
+    record_stamps(tmp_path, sequence, [1], {"1": "person", "2": "chiar", "3": "pedestrian"})
+    with pytest.warns(UserWarning, match="'chiar' is no COCO class; did you mean 'chair'") as warned:
+        RecordedSegmenter(tmp_path)
+    assert len(warned) == 1
+
+
+def test_masks_of_own_names_are_recorded_and_used(sequence, tmp_path):
+    source = f"plugin:{__file__}:OWN"
+    with pytest.warns(UserWarning) as warned:
+        record_masks(sequence, tmp_path / "person", SegmentationSettings(source=source))
+    assert not (tmp_path / "person" / "classes.json").exists()
+    said = [str(warning.message) for warning in warned]
+    assert sum("found 'pedestrian', which is no COCO class" in text for text in said) == 1
+    assert sum("no object of the classes person in any of 3 frames" in text for text in said) == 1
+    record_masks(sequence, tmp_path / "pedestrian", SegmentationSettings(source=source, classes="Pedestrian"))
+    recorded = f"recorded:{tmp_path / 'pedestrian'}"
+    assert checked(sequence, recorded, classes="PEDESTRIAN") == recorded
+    stage = build_segmenter(SegmentationSettings(source=recorded, classes="PEDESTRIAN"))
+    assert stage.segment(sequence[0]).masks.sum() == 45 * 45
+
+
+def test_exact_masks_of_nobody_dynamic_are_said(sequence):
+    assert checked(sequence, "oracle-classes") == "oracle-classes"
+    with pytest.warns(UserWarning, match="classes of the sequence is among the dynamic ones: zebra"):
+        checked(sequence, "oracle-classes", classes="zebra")
+    for source in ("oracle", "oracle-classes"):
+        with pytest.raises(SegmentationError, match=r"the sequence has no class 'persson'.*'person'"):
+            checked(sequence, source, classes="persson")
 
 
 def test_numbers_stand_for_classes_in_every_frame() -> None:

@@ -81,6 +81,19 @@ def test_yolo_polygons(tmp_path):
         yolo_images(str(tmp_path / "none"))
 
 
+@pytest.mark.parametrize("names", ["names: [forklift, Person]", "names: {0: forklift, 1: Person}"])
+@pytest.mark.parametrize("place", [".", "set"])
+def test_yolo_classes_are_numbered_as_the_data_set_says(tmp_path, names, place):
+    folder = write_yolo(tmp_path / "set")
+    (folder / "labels" / "0.txt").write_text("1 0.1 0.1 0.5 0.1 0.5 0.5\n0 0.6 0.6 0.9 0.6 0.9 0.9\n")
+    assert yolo_images(str(folder))[0].class_names == ("person", "bicycle")[::-1]
+    (tmp_path / place / "data.yaml").write_text(f"path: here\n{names}\n")
+    assert yolo_images(str(folder))[0].class_names == ("person", "forklift")
+    (tmp_path / place / "data.yaml").write_text("nc: 2\n")
+    with pytest.raises(SegmentationError, match="'names' is not a table of class names"):
+        yolo_images(str(folder))
+
+
 def test_coco_polygons_and_run_lengths(tmp_path):
     expected = np.zeros((6, 8), bool)
     expected[1:4, 2:6] = True
@@ -88,6 +101,8 @@ def test_coco_polygons_and_run_lengths(tmp_path):
     for segmentation in (polygon, {"size": [6, 8], "counts": [13, 3, 3, 3, 3, 3, 3, 3, 14]}):
         image = coco_images(str(coco(tmp_path, segmentation)))[0]
         assert image.class_names == ("person",) and np.array_equal(image.masks[0], expected)
+    capital = coco(tmp_path, polygon, changes={"categories": [{"id": 1, "name": "Person"}]})
+    assert coco_images(str(capital))[0].class_names == ("person",)
     assert len(coco_images(str(coco(tmp_path, polygon, iscrowd=1)))[0].masks) == 0
 
 
@@ -213,6 +228,9 @@ def test_what_cannot_be_trained_is_refused(tmp_path):
     assert len(network_config(TrainSettings(classes="dynaslam19", network="resnet18")).classes) == 19
     with pytest.raises(SegmentationError, match="no images"):
         train(settings_for(tmp_path / "none"), tmp_path / "run")
+    data = write_yolo(tmp_path / "data", 2)
+    with pytest.raises(SegmentationError, match=r"none of 2 images of yolo:.* shows an object of the classes dog"):
+        train(settings_for(data, classes="dog"), tmp_path / "dogs")
 
 
 # --- evaluation --------------------------------------------------------------------------------------------------
@@ -225,6 +243,8 @@ def test_evaluating_a_network_and_writing_the_score(tmp_path):
     score = evaluate_segmenter(settings, f"yolo:{data}", output=tmp_path / "score.json", limit=2)
     assert score.images == 2 and score.classes["person"]["truths"] == 2 and len(score.weights) == 12
     assert SegmenterScore.read(tmp_path / "score.json") == score
+    with pytest.raises(SegmentationError, match=r"none of 3 images .* at least 100000 px: nothing is measured"):
+        evaluate_segmenter(settings, f"yolo:{data}", min_area=100_000)
     prepared = PreparedImages(prepare(open_labelled(f"yolo:{data}"), tmp_path / "cache", 240, 320), ("person",))
     assert (
         len(prepared) == 3

@@ -5,6 +5,7 @@ Loading is strict and never unpickles.
 
 import math
 import re
+import warnings
 import zipfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -153,6 +154,8 @@ def infer_config(state: Mapping[str, Tensor], path: Path) -> NetworkConfig:
             f"{path} has {rows['classes'] - 1} classes without names",
             "90 (COCO) and 1 (person) are known; others need this project's format",
         )
+    if names == ("person",):
+        warnings.warn(f"{path} does not name its only class: it is taken for person", stacklevel=2)
     if rows["ratios"] != 3:
         raise SegmentationError(f"{path} has {rows['ratios']} anchors a cell, torchvision's models have 3")
     stages = [[key.split(".")[3] for key in state if key.startswith(f"backbone.body.layer{n}.")] for n in range(1, 5)]

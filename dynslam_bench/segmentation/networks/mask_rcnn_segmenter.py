@@ -17,7 +17,7 @@ from dynslam_bench.segmentation.networks import pinned_threads
 from dynslam_bench.segmentation.networks.checkpoints import COCO, embedded_weights, fetch_checkpoint
 from dynslam_bench.segmentation.networks.loading import load_network
 from dynslam_bench.segmentation.networks.network import MaskRCNN
-from dynslam_bench.segmentation.settings import NMS_IOU, SegmentationSettings, expand_classes
+from dynslam_bench.segmentation.settings import NMS_IOU, SegmentationSettings, canonical_name, check_classes
 
 
 class MaskRCNNSegmenter:
@@ -54,8 +54,8 @@ class MaskRCNNSegmenter:
             image = torch.from_numpy(np.array(frame.rgb, order="C")).to(self.device).permute(2, 0, 1).float() / 255
             detections = self.network.detect(image, score=self.floor, iou=NMS_IOU)
         boxes, labels, scores, planes = (part.cpu().numpy() for part in detections)
-        config, wanted = self.network.config, expand_classes(self.settings.classes)
-        names = [config.classes[label - 1] for label in labels]
+        config, wanted = self.network.config, self.settings.class_names()
+        names = [canonical_name(config.classes[label - 1]) for label in labels]
         masks = np.zeros((len(names), height, width), bool)
         for mask, plane, box, name in zip(masks, planes, boxes, names, strict=True):
             if name in wanted:
@@ -87,12 +87,7 @@ def load_segmenter(path: Path, settings: SegmentationSettings, context: Segmente
     if context.device.startswith("cuda") and not torch.cuda.is_available():
         raise SegmentationError(f"device '{context.device}' is not available: torch {torch.__version__} sees no GPU")
     network = load_network(path)
-    classes = set(network.config.classes)
-    if not classes & settings.class_names():
-        raise SegmentationError(
-            f"{path} knows none of the classes {', '.join(sorted(settings.class_names()))}",
-            "it knows " + ", ".join(sorted(filter(None, classes))),
-        )
+    check_classes(filter(None, network.config.classes), settings, str(path), "the network")
     if settings.network_side > 0:
         network.set_input(settings.network_side)
     return MaskRCNNSegmenter(network, settings, device=context.device, threads=context.threads, floor=context.floor)

@@ -203,7 +203,7 @@ def evaluate_segmenter(
         progress: Called with (images done, images in all).
 
     Raises:
-        SegmentationError: The segmenter or the data are not available.
+        SegmentationError: The segmenter or the data are not available, or no image shows an object of the classes.
     """
     images = open_labelled(data)
     low = settings.model_copy(update={"confidence": min(0.05, settings.confidence)})  # AP takes weak detections as well
@@ -214,18 +214,26 @@ def evaluate_segmenter(
     chosen = np.unique(np.linspace(0, len(images) - 1, count).round().astype(int))
     tallies = {name: MaskTally(settings.confidence, min_area) for name in sorted(settings.class_names())}
     times = []
+    shown: set[str] = set()
     for done, index in enumerate(chosen.tolist(), 1):
         image = images[index]
         frame = Frame(index, float(index), image.rgb, np.zeros(image.rgb.shape[:2], np.float32))
         start = time.perf_counter()
         detections = segmenter.segment(frame)
         times.append(time.perf_counter() - start)
+        shown.update(image.class_names)
         for name, tally in tallies.items():
             predicted = detections.of_classes([name])
             tally.add(image.masks[[kind == name for kind in image.class_names]], predicted.masks, predicted.scores)
         progress(done, len(chosen))
     qualities = {name: tally.quality() for name, tally in tallies.items()}
     there = [quality for quality in qualities.values() if quality["truths"]]
+    if not there:
+        raise SegmentationError(
+            f"none of {len(chosen)} images of {images.name} shows an object of the classes {settings.classes} with at "
+            f"least {max(min_area, 1)} px: nothing is measured",
+            f"labelled are: {', '.join(sorted(shown)) or 'none'}",
+        )
     score = SegmenterScore(
         segmenter=resolve_source(settings, "synthetic/"), weights=weights_digest(settings, "synthetic/"),
         data=images.name, images=len(chosen), confidence=settings.confidence, min_area=min_area,

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -29,9 +29,10 @@ from dynslam_bench.core.seeding import stream
 from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.segmentation.postprocess import boxes_of
 from dynslam_bench.segmentation.recorded import instances_of
-from dynslam_bench.segmentation.settings import COCO_NAMES
+from dynslam_bench.segmentation.settings import COCO_NAMES, canonical_name
 from dynslam_bench.segmentation.training.settings import TrainSettings
 from dynslam_bench.sequences import open_sequence
+from dynslam_bench.sequences.readers.files import read_yaml
 from dynslam_bench.sequences.synthetic import REPLICA_IDS, RenderSettings, parse_synthetic_id
 from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence
 from dynslam_bench.sequences.synthetic.settings import RENDERER_VERSION
@@ -47,7 +48,7 @@ class LabelledImage:
     Attributes:
         rgb: uint8 ``[H, W, 3]``.
         masks: bool ``[K, H, W]``.
-        class_names: COCO name of each object.
+        class_names: Name of each object as `canonical_name` writes it; COCO's where COCO has the class.
     """
 
     rgb: NDArray[np.uint8]
@@ -99,7 +100,7 @@ def coco_images(text: str) -> LabelledImages:
         "it needs images, annotations and categories",
         of=(ValueError, LookupError, TypeError, AttributeError, OverflowError),
     ):
-        names = {int(entry["id"]): str(entry["name"]) for entry in content["categories"]}
+        names = {int(entry["id"]): canonical_name(str(entry["name"])) for entry in content["categories"]}
         shapes: dict[int, list[tuple[str, Any]]] = {int(entry["id"]): [] for entry in content["images"]}
         for entry in content["annotations"]:
             if not entry.get("iscrowd"):
@@ -121,14 +122,16 @@ def _read_coco(path: Path, objects: list[tuple[str, Any]]) -> LabelledImage:
 def yolo_images(text: str) -> LabelledImages:
     """Images with YOLO polygon labels: ``images/**/NAME.jpg`` beside ``labels/**/NAME.txt``.
 
-    A label's line is ``class x1 y1 x2 y2 ...`` with COCO's class numbers from 0 and coordinates in [0, 1]. An image
-    without a label file has no objects.
+    A label's line is ``class x1 y1 x2 y2 ...`` with coordinates in [0, 1]. The classes are numbered from 0 as ``names``
+    in ``data.yaml`` says, in the folder or the one above it; without that file they are COCO's. An image without a
+    label file has no objects.
 
     Args:
         text: The folder that holds ``images`` and ``labels``.
 
     Raises:
-        SegmentationError: The folder or its images are missing.
+        SegmentationError: The folder or its images are missing, or ``names`` is no table of class names.
+        SequenceError: ``data.yaml`` cannot be read.
     """
     folder = Path(text).expanduser()
     root, labels = folder / "images", folder / "labels"
@@ -136,14 +139,32 @@ def yolo_images(text: str) -> LabelledImages:
     if not images:
         raise SegmentationError(f"there are no images in {root}", "YOLO data has images/ and labels/ side by side")
 
-    def read(index: int) -> LabelledImage:
-        return _read_yolo(images[index], labels / images[index].relative_to(root).with_suffix(".txt"))
+    described = [place / "data.yaml" for place in (folder, folder.parent) if (place / "data.yaml").is_file()]
+    classes = _yolo_names(described[0]) if described else dict(enumerate(COCO_NAMES))
 
-    version = _files_digest([*images, *sorted(labels.rglob("*.txt"))])
+    def read(index: int) -> LabelledImage:
+        return _read_yolo(images[index], labels / images[index].relative_to(root).with_suffix(".txt"), classes)
+
+    version = _files_digest([*images, *sorted(labels.rglob("*.txt")), *described[:1]])
     return LabelledImages(f"yolo:{folder.name}", version, len(images), read)
 
 
-def _read_yolo(path: Path, label: Path) -> LabelledImage:
+def _yolo_names(path: Path) -> dict[int, str]:
+    """The names of the classes that a YOLO data set's description gives, a list or a mapping."""
+    names = read_yaml(path).get("names")
+    with raising(
+        SegmentationError,
+        f"{path}: 'names' is not a table of class names",
+        "expected names: [person, ...] or names: {0: person, ...}",
+        of=(ValueError, TypeError, OverflowError),
+    ):
+        if not isinstance(names, (list, Mapping)):
+            raise ValueError(f"it is a {type(names).__name__}")
+        pairs = names.items() if isinstance(names, Mapping) else enumerate(names)
+        return {int(number): canonical_name(str(name)) for number, name in pairs}
+
+
+def _read_yolo(path: Path, label: Path, classes: Mapping[int, str]) -> LabelledImage:
     rgb = _read(path)
     masks, names = [], []
     lines = read_lines(label, kind=SegmentationError) if label.is_file() else []
@@ -157,7 +178,7 @@ def _read_yolo(path: Path, label: Path) -> LabelledImage:
             of=(ValueError, LookupError, OverflowError),
         ):
             kind, *points = line.split()
-            names.append(dict(enumerate(COCO_NAMES))[int(kind)])
+            names.append(classes[int(kind)])
             masks.append(_fill([_polygon(points) * [rgb.shape[1], rgb.shape[0]]], rgb.shape[:2]))
     return _labelled(rgb, masks, names)
 
@@ -318,7 +339,8 @@ def _labelled_frame(sequence: RgbdSequence, index: int) -> LabelledImage:
     """A frame and its exact masks."""
     assert sequence.masks is not None
     instances = instances_of(sequence.masks[index], where=f"{sequence.id} frame {index}")
-    return LabelledImage(np.ascontiguousarray(sequence[index].rgb), instances.masks, instances.class_names)
+    names = tuple(map(canonical_name, instances.class_names))
+    return LabelledImage(np.ascontiguousarray(sequence[index].rgb), instances.masks, names)
 
 
 FORMS = "synthetic[:OPTIONS], sequence:ID, coco:ANNOTATIONS.json[:IMAGES], yolo:DIR"
@@ -391,7 +413,8 @@ class PreparedImages:
             self.images, self.labels = (
                 np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in ("images", "labels")
             )
-            self.names: list[list[str]] = read_json(folder / "names.json", limit=TABLE_BYTES, kind=SegmentationError)
+            names = read_json(folder / "names.json", limit=TABLE_BYTES, kind=SegmentationError)
+            self.names = [[canonical_name(name) for name in present] for present in names]
             if not len(self.images) == len(self.labels) == len(self.names):
                 raise ValueError("their numbers differ")
         self.classes = tuple(classes)

@@ -72,7 +72,14 @@ def train(
             open_labelled(text), data_cache or output / "data", height, width,
             lambda done, total: progress(TrainProgress("data", done, total, {})),
         )  # fmt: skip
-        return PreparedImages(folder, config.classes)
+        images = PreparedImages(folder, config.classes)
+        labelled = {name for names in images.names for name in names}
+        if labelled.isdisjoint(config.classes):
+            raise SegmentationError(
+                f"none of {len(images)} images of {text} shows an object of the classes {settings.classes}",
+                f"labelled are: {', '.join(sorted(labelled)) or 'none'}",
+            )
+        return images
 
     sets, validation = [load(text) for text in settings.data], load(settings.validation)
     with pinned_threads(torch.get_num_threads, torch.set_num_threads, threads):
