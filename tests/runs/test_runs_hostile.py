@@ -193,8 +193,8 @@ def started(pids: Path, count: int) -> list[int]:
 
 
 @linux
-def test_a_killed_server_takes_everything_along_and_is_no_outcome(strays, store: RunStore, monkeypatch) -> None:
-    """It is started again once; killed again, the run is given up, and nothing of it is stored or left."""
+def test_a_killed_server_takes_everything_along_and_its_run_is_repeated(strays, store: RunStore, monkeypatch) -> None:
+    """Nothing is left of either try; the second server dies with this run alone, which is taken for the cause."""
     spec, pids = strays
     trees: list[set[int]] = []
 
@@ -210,11 +210,19 @@ def test_a_killed_server_takes_everything_along_and_is_no_outcome(strays, store:
         for turn in (1, 2):
             seen = started(pids, 4 * turn)
             until(lambda: any(tree >= {*seen[-4:]} for tree in trees[:-1]))  # noqa: B023 (the supervisor knows them)
-            os.kill(SERVERS["fresh"]._running[1].pid, signal.SIGKILL)  # nothing else knows its number
+            (server,) = [top for top in psutil.Process().children() if seen[-4] in below(top)]  # noqa: B023
+            server.kill()
             until(lambda: alive(seen) == [], 20)  # noqa: B023
-        with pytest.raises(InfrastructureError, match=r"the fork server was ended from outside.*is not stored"):
-            run.result()
-    assert len(seen) == 8 and store.ids() == [] and list(store.runs.iterdir()) == []
+        record = run.result()
+    assert len(seen) == 8
+    assert record.status == "crashed"
+    assert record.reason.startswith("the fork server was killed twice, the second time with this run alone, after")
+    assert [path.name for path in store.runs.iterdir()] == [record.run_id]
+
+
+def below(process: psutil.Process) -> set[int]:
+    """The numbers of all descendants of a process."""
+    return {descendant.pid for descendant in process.children(recursive=True)}
 
 
 @linux
@@ -242,13 +250,111 @@ def test_shared_memory_goes_with_a_run_that_is_killed(strays, store: RunStore) -
     assert frame.is_relative_to(SHARED_MEMORY) and not frame.parent.exists()
 
 
-@pytest.mark.parametrize(("mode", "words"), [("full", "No space left on device"), ("gone", "was removed")])
+@pytest.mark.parametrize(
+    ("mode", "words"),
+    [
+        ("full", "No space left on device"),
+        ("gone", "was removed"),
+        ("gone-quietly", "was removed"),
+        ("moved", "was removed"),
+        ("made-again", "was removed"),
+        ("log-gone", "was removed"),
+    ],
+)
 def test_a_full_disk_or_a_removed_folder_is_no_outcome(mode: str, words: str, store: RunStore, toy_folder: str) -> None:
     settings = {"mode": mode, "pids": str(store.root)}
     spec = RunSpec(tracker=hostile.TARGET, sequence=toy_folder, frames=(0, 6), settings=settings)
     with pytest.raises(InfrastructureError, match=words):
         run_one(spec, store)
     assert store.ids() == []
+
+
+def hostile_spec(toy_folder: str, mode: str, **changes: object) -> RunSpec:
+    return RunSpec(tracker=hostile.TARGET, sequence=toy_folder, frames=(0, 6), settings={"mode": mode}, **changes)
+
+
+@pytest.mark.parametrize("mode", ["kill-parent", "end-parents-group"])
+def test_a_tracker_may_not_end_the_processes_above_it(attack, mode: str) -> None:
+    server = SERVERS["fork"]
+    attack("ok")
+    before = server._running
+    record, _ = attack(mode)
+    assert record.status == "crashed"
+    assert record.reason.startswith("frame 2 of 6: PermissionError: [Errno 1] a run may not signal process")
+    assert "(hostile.py:" in record.reason
+    assert server._running == before and before[1].poll() is None
+
+
+def test_a_tracker_may_ask_whether_the_processes_above_it_are_there(attack) -> None:
+    assert attack("ask-parent")[0].status == "ok"
+
+
+def test_a_tracker_may_not_end_the_program(store: RunStore, toy_folder: str, tmp_path: Path) -> None:
+    """The program is a process of its own here: it would be this one that is killed."""
+    here = Path(hostile.__file__).parent
+    spec = hostile_spec(toy_folder, "kill-program").model_dump_json()
+    script = (
+        f"import sys; sys.path[:0] = [{str(here)!r}, {str(here.parents[1])!r}]\n"
+        "from dynslam_bench.runs import RunSpec, RunStore, run_one\n"
+        f"print(run_one(RunSpec.model_validate_json({spec!r}), RunStore({str(store.root)!r})).reason)\n"
+    )
+    program = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
+    assert program.returncode == 0, program.stderr
+    assert program.stdout.startswith("frame 2 of 6: AccessDenied")
+
+
+@pytest.mark.parametrize(
+    ("event", "target", "is_refused"),
+    [
+        ("os.kill", "parent", True),
+        ("os.killpg", "parents group", True),
+        ("os.kill", "minus parents group", True),
+        ("os.kill", "everything", True),
+        ("os.killpg", "everybody", True),
+        ("os.kill", "own", False),
+        ("os.killpg", "own group", False),
+    ],
+)
+def test_which_signals_are_refused(event: str, target: str, is_refused: bool) -> None:
+    """The call is announced as Python announces it, and not made: it could end this process."""
+    script = f"""
+import os, sys
+sys.path[:0] = {[str(Path(hostile.__file__).parents[2])]!r}
+from dynslam_bench.runs.process.child import spare_ancestors
+os.setpgid(0, 0)
+spare_ancestors()
+group = os.getpgid(os.getppid())
+targets = {{"parent": os.getppid(), "parents group": group, "minus parents group": -group, "everything": -1,
+            "everybody": 1, "own": os.getpid(), "own group": 0}}
+sys.audit({event!r}, targets[{target!r}], 0)
+try:
+    sys.audit({event!r}, targets[{target!r}], 9)
+except PermissionError:
+    print("refused")
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "refused\n" if is_refused else ""), done.stderr
+
+
+@linux
+@pytest.mark.parametrize("mode", ["c-kill-parent", "shell-kill-parent"])
+def test_a_run_that_kills_the_fork_server_costs_itself_alone(
+    store: RunStore, toy_folder: str, monkeypatch: pytest.MonkeyPatch, mode: str
+) -> None:
+    """Runs beside it are repeated; it is repeated once, with nothing beside it, and has crashed."""
+    monkeypatch.setenv(START_VARIABLE, "fresh")  # a server that loads nothing is there again at once
+    others = [hostile_spec(toy_folder, "ok", seed=seed) for seed in range(4)]
+    specs = [others[0], hostile_spec(toy_folder, mode), *others[1:]]
+    records = list(run_many(specs, results=store, jobs=3))
+    assert [record.status for record in records] == ["ok", "crashed", "ok", "ok", "ok"]
+    assert records[1].reason == (
+        "the fork server was killed twice, the second time with this run alone, after frame 1 of 6"
+    )
+    assert records[1].n_processed == 2
+    assert sorted(store.ids()) == sorted(record.run_id for record in records)
+    reused: list[str] = []
+    run_many(specs, results=store, on_event=lambda event: reused.append(event.kind))
+    assert reused == ["reused"] * 5
 
 
 class _Slow:
