@@ -178,7 +178,8 @@ def _watched(work: Path, watch: Callable[[Child], Verdict]) -> Verdict:
         except ServerDiedError as error:
             if not error.where:
                 raise
-            return Verdict("crashed", f"the fork server was killed twice, the second time with this run alone{error.where}")
+            reason = f"the fork server was killed twice, the second time with this run alone{error.where}"
+            return Verdict("crashed", reason)
 
 
 def _empty(work: Path) -> None:

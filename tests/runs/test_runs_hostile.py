@@ -4,7 +4,6 @@ import errno
 import json
 import os
 import shlex
-import signal
 import subprocess
 import sys
 import time
@@ -210,7 +209,7 @@ def test_a_killed_server_takes_everything_along_and_its_run_is_repeated(strays, 
         for turn in (1, 2):
             seen = started(pids, 4 * turn)
             until(lambda: any(tree >= {*seen[-4:]} for tree in trees[:-1]))  # noqa: B023 (the supervisor knows them)
-            (server,) = [top for top in psutil.Process().children() if seen[-4] in below(top)]  # noqa: B023
+            (server,) = [top for top in psutil.Process().children() if seen[-4] in below(top)]
             server.kill()
             until(lambda: alive(seen) == [], 20)  # noqa: B023
         record = run.result()

@@ -243,7 +243,8 @@ def _broken_infrastructure(error: BaseException | None) -> str:
 def source_line(error: BaseException) -> str:
     """``file.py:31``: the innermost line of an exception's traceback outside of libraries, else the innermost."""
     lines = traceback.extract_tb(error.__traceback__)
-    libraries = (*map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib")), "<", sys.base_prefix, __file__)
+    folders = map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib"))
+    libraries = (*folders, "<", sys.base_prefix, __file__)
     outside = [
         line for line in lines if "site-packages" not in line.filename and not line.filename.startswith(libraries)
     ]

@@ -289,7 +289,8 @@ class _Server:
         """Reap the runs that have ended, end what they have left behind, then report them."""
         waited = [os.waitpid(pid, os.WNOHANG) for pid in self.runs]
         ended = [(self.runs.pop(pid), status) for pid, status in waited if pid]
-        for status_fd, _ in ended:  # at once: the system may give the number to another process, which is not to be killed
+        # at once: the system may give the number to another process, which is not to be killed
+        for status_fd, _ in ended:
             _tell(status_fd, {"pid": 0})
         if ended:
             end_children({*self.runs, *self.own})
