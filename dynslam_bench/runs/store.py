@@ -287,7 +287,7 @@ class RunStore:
         """
         with temporary_folder(self.runs / "probe"):
             pass
-        for pattern in (".*", "runs/.*", "sequences/*/.*"):
+        for pattern in (".*", "runs/.*", "sequences/*/.*", "studies/*/**/.*"):
             sweep_temporary(self.root, pattern)
         for left in self.runs.glob(".*.claim"):
             with claimed(left):  # if no process holds it, it is removed
