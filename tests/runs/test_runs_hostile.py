@@ -3,7 +3,9 @@
 import errno
 import json
 import os
+import pickle
 import shlex
+import signal
 import subprocess
 import sys
 import time
@@ -19,8 +21,8 @@ from hostile import alive, until
 from dynslam_bench.core import SHARED_MEMORY, InfrastructureError
 from dynslam_bench.runs import Limits, RunRecord, RunSpec, RunStore, run_many, run_one
 from dynslam_bench.runs.process import supervisor as memory_module
-from dynslam_bench.runs.process.fork_server import SERVERS, START_VARIABLE, process_tree
-from dynslam_bench.runs.process.supervisor import supervise
+from dynslam_bench.runs.process.fork_server import SERVERS, START_VARIABLE, Child, ForkServer, process_tree
+from dynslam_bench.runs.process.supervisor import ServerDiedError, supervise
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux' subreapers and /proc")
 
@@ -222,6 +224,61 @@ def test_a_killed_server_takes_everything_along_and_its_run_is_repeated(strays, 
 def below(process: psutil.Process) -> set[int]:
     """The numbers of all descendants of a process."""
     return {descendant.pid for descendant in process.children(recursive=True)}
+
+
+def test_a_server_that_dies_before_the_run_begins_is_no_outcome(
+    store: RunStore, toy_folder: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The run had no chance to kill it."""
+    tries: list[Child] = []
+
+    def dies(child: Child, *_: object, **__: object) -> None:
+        tries.append(child)
+        child.close()
+        raise ServerDiedError("")
+
+    monkeypatch.setenv(START_VARIABLE, "fresh")
+    monkeypatch.setattr("dynslam_bench.runs.running.supervise", dies)
+    with pytest.raises(InfrastructureError, match="the fork server was ended from outside") as raised:
+        run_one(hostile_spec(toy_folder, "ok"), store)
+    assert len(tries) == 2
+    assert raised.value.hint == "the run is not stored; the same command goes on from there"
+    assert list(store.runs.iterdir()) == []
+    assert str(pickle.loads(pickle.dumps(raised.value))) == str(raised.value)
+
+
+class _Scripted(ForkServer):
+    """A fork server that says what it is told to."""
+
+    def spawn(self, child_fd: int) -> int:
+        read_fd, self.says = os.pipe()
+        return read_fd
+
+    def say(self, **message: int) -> None:
+        os.write(self.says, json.dumps(message).encode() + b"\n")
+
+
+@pytest.mark.parametrize("is_told", [True, False])
+def test_the_number_of_a_process_that_has_ended_is_not_killed(is_told: bool) -> None:
+    """The system has given it to another process, which runs in a group of its own."""
+    server = _Scripted("fork")
+    child = Child(server)
+    with subprocess.Popen(
+        [sys.executable, "-S", "-c", "input()"], stdin=subprocess.PIPE, start_new_session=True
+    ) as other:
+        server.say(pid=other.pid)
+        assert child.poll() is None
+        assert child.pid == other.pid
+        if is_told:
+            server.say(pid=0)
+        child.kill()
+        assert child.pid == (0 if is_told else other.pid)
+        other.communicate(b"\n")
+    assert other.returncode == (0 if is_told else -signal.SIGKILL)
+    server.say(exit=0)
+    assert child.poll() == 0
+    child.close()
+    os.close(server.says)
 
 
 @linux
