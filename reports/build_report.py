@@ -12,7 +12,7 @@ from typing import Any
 from urllib.parse import quote
 
 import dynslam_bench
-from dynslam_bench.core import ReportError, read_json, write_atomic
+from dynslam_bench.core import ReportError, read_json, sweep_temporary, write_atomic
 from dynslam_bench.evaluation import Protocol, get_protocol
 from dynslam_bench.reports import figures
 from dynslam_bench.reports.html.board_page import MEANINGS, entries_of, ratios_content, side_content
@@ -147,6 +147,7 @@ def build_report(
     """
     protocol = get_protocol(protocol)
     output = Path(output).expanduser().absolute()
+    sweep_temporary(output, "**/.*")
     stores = open_stores(runs)
     with worker_pool(sum(len(store.ids()) for store in stores)) as pool:
         loaded = load_runs(stores, protocol, on_progress, pool, trials=trials)

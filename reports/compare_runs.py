@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dynslam_bench.core import ReportError, setting_text, write_atomic
+from dynslam_bench.core import ReportError, setting_text, sweep_temporary, write_atomic
 from dynslam_bench.evaluation import Protocol, get_protocol
 from dynslam_bench.reports.html.board_page import cell_content, ratio_numbers, settings_content
 from dynslam_bench.reports.html.page import render, write_assets, write_side
@@ -157,6 +157,7 @@ def _write_page(
         "runs": runs,
         "pairs": [[2 * at, 2 * at + 1] for at in range(len(compared))],
     }
+    sweep_temporary(output, "**/.*")
     write_side(output, "board", board)
     ratios = [
         [2 * at, 2 * at + 1, *ratio_numbers(overall[name]), len(pairs), ""]

@@ -7,6 +7,7 @@ import math
 import os
 import random
 import socket
+import sys
 import time
 import warnings
 from collections import Counter
@@ -334,8 +335,31 @@ def without_password(text: str, address: str) -> str:
 
 
 def worker_name() -> str:
-    """Names this process: host, boot and process namespace, process number."""
-    return f"{_machine()}:{os.getpid()}"
+    """Names this process: host, boot and process namespace, process number, and when the process started.
+
+    The number alone is not enough: the system gives that of a process which has ended to another one.
+    """
+    return f"{_machine()}:{os.getpid()}.{started(os.getpid())}"
+
+
+def started(pid: int) -> str:
+    """When a process started, as its system counts: clock ticks since the boot on Linux, which no clock changes.
+
+    Raises:
+        psutil.NoSuchProcess: There is none of this number.
+    """
+    if sys.platform != "linux":
+        return str(int(psutil.Process(pid).create_time()))
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text(errors="replace")
+    except OSError as error:
+        raise psutil.NoSuchProcess(pid) from error
+    after_name = stat.rpartition(")")[2].split()  # the name may hold anything
+    return after_name[_START_TIME]
+
+
+_START_TIME = 19
+"""Place of the time of start among the values of ``/proc/PID/stat`` that follow the name (proc(5), field 22)."""
 
 
 @cache
@@ -378,12 +402,17 @@ class Heartbeats:
         return self._stands_still(f"trial {trial.number}", None) > NAMELESS_S and others_ended
 
     def _has_ended(self, name: str) -> bool:
-        machine, _, pid = name.rpartition(":")
+        machine, _, process = name.rpartition(":")
+        pid, _, start = process.partition(".")
         if machine == _machine() and pid.isdigit():
             try:
-                return bool(psutil.Process(int(pid)).status() == psutil.STATUS_ZOMBIE)
+                if psutil.Process(int(pid)).status() == psutil.STATUS_ZOMBIE:
+                    return True
+                if start:
+                    return started(int(pid)) != start
             except psutil.NoSuchProcess:
                 return True
+        # on another machine, or of an earlier version, which did not say when it started
         return self._stands_still(name, self._study.user_attrs.get(_ALIVE + name)) > GRACE_S
 
     def _stands_still(self, name: str, count: int | None) -> float:

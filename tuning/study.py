@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -17,9 +17,19 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import optuna
 from optuna.distributions import BaseDistribution
+from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, TrialState, create_trial
 
-from dynslam_bench.core import StudyError, read_settings, storable, words_without_passwords, write_atomic
+from dynslam_bench.core import (
+    DynslamError,
+    StudyError,
+    raising,
+    read_settings,
+    storable,
+    turn,
+    words_without_passwords,
+    write_atomic,
+)
 from dynslam_bench.core.records import digest, validated
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.core.settings import Scalar
@@ -45,6 +55,7 @@ from dynslam_bench.tuning.objectives import (
 from dynslam_bench.tuning.plan import Plan, design_of, distributions, starting_point
 from dynslam_bench.tuning.storage import (
     EARLIER,
+    NAMELESS_S,
     SPEC_FILE,
     Heartbeats,
     best_trials,
@@ -66,7 +77,12 @@ if TYPE_CHECKING:
     from dynslam_bench.tuning.judgement import StudySummary
 
 _WAIT_S = 2.0
+_NAMES_S = 0.2
+_BEGINNING_S = 10.0
+_PRUNED_AFTER = "pruned_after"
+"""User attribute: after how many instances the pruner ended a trial. Optuna's pruner gives its answer once."""
 CRASHED_WORKER = "worker ended in the middle of the trial"
+"""Why earlier versions marked a trial as failed that is not counted as one; now it waits to be run again."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +113,7 @@ class Evaluation:
     """What a trial came to.
 
     Attributes:
-        state: Complete, pruned or failed.
+        state: Complete, pruned or failed; waiting if it was interrupted, and is to be run again.
         text: In words.
         values: The objectives' (natural logarithms of ratios to the baseline, less is better); None if it failed.
     """
@@ -195,6 +211,7 @@ class Study(Plan):
             StudyError: The baseline fails on a sequence; says where and why.
         """
         self.reference(on_event, jobs)
+        self._await_names()
         tell = on_event or (lambda _: None)
 
         def work() -> None:
@@ -207,8 +224,11 @@ class Study(Plan):
                     self._interrupted.wait(_WAIT_S)  # should one of their workers end, its trial is made again here
                     continue
                 tell(StudyEvent("started", trial.number, self.trials, f"trial {trial.number}"))
-                evaluation = self.evaluate(trial)
-                self.tell(trial, evaluation)
+                try:
+                    evaluation = self.evaluate(trial)
+                    self.tell(trial, evaluation)
+                except UpdateFinishedTrialError:  # another worker took this one for dead, and was quicker
+                    continue
                 tell(StudyEvent("finished", trial.number, self.trials, f"trial {trial.number}: {evaluation.text}"))
                 for callback in self._callbacks:
                     callback(self.study, self.study.get_trials(deepcopy=False)[trial.number])
@@ -359,15 +379,19 @@ class Study(Plan):
         """Run a trial on one instance after the other until it ends or is pruned."""
         outcomes: dict[ProblemInstance, Outcome] = {}
         self.check_plugins()
+        # of a trial whose worker was killed: it was not pruned before that step
+        passed = max(self.study.get_trials(deepcopy=False)[trial.number].intermediate_values, default=0)
         with self._heartbeats.beating():
             reference, pruned = self._reference or self.reference(), False
             try:
                 for instance in self.design.tune:
                     outcomes |= self.outcomes(self.configuration_of(trial).settings, [instance])
-                    if pruned := self._prune(trial, outcomes, instance):
+                    if len(outcomes) >= passed and (pruned := self._prune(trial, outcomes, instance)):
                         break
-            except (CancelledError, InstanceFailedError) as error:
-                return Evaluation(TrialState.FAIL, CRASHED_WORKER if isinstance(error, CancelledError) else str(error))
+            except CancelledError:
+                return Evaluation(TrialState.WAITING, "interrupted, it waits to be run again")
+            except InstanceFailedError as error:
+                return Evaluation(TrialState.FAIL, str(error))
         rows = [[str(place), run.run_id, run.ate_m, run.coverage, run.frame_s] for place, run in outcomes.items()]
         scenes = together(self.objectives).ratios(outcomes, reference)
         facts = {"coverage": coverage(outcomes), "fps": fps(outcomes), "scenes": scenes, "instances": rows}
@@ -391,31 +415,78 @@ class Study(Plan):
         For Wilcoxon's test that is the instance's own value. Optuna's pruners know no constraints: a trial that
         violates one takes no part in the comparison of successive halving.
         """
-        objective, reference = self.objectives[0], self._reference
+        objective, reference, step = self.objectives[0], self._reference, len(outcomes)
+        if trial.user_attrs.get(_PRUNED_AFTER) == step:  # its worker was killed after that
+            return True
         if self.spec.pruner == "none" or len(self.objectives) > 1 or not objective.counts(last):
             return False
-        if self.spec.pruner == "wilcoxon":
-            (value,) = objective.by_start({last: outcomes[last]}, reference)
-            trial.report(value, len(outcomes))
-        elif max(violations(self.spec, outcomes, reference).values(), default=0) <= 0:
-            trial.report(objective.value(outcomes, reference), len(outcomes))
-        return 0 < trial.number and len(outcomes) < len(self.design.tune) and trial.should_prune()
+        with quiet():  # a value that a killed worker has reported is not reported again
+            if self.spec.pruner == "wilcoxon":
+                (value,) = objective.by_start({last: outcomes[last]}, reference)
+                trial.report(value, step)
+            elif max(violations(self.spec, outcomes, reference).values(), default=0) <= 0:
+                trial.report(objective.value(outcomes, reference), step)
+        is_pruned = 0 < trial.number and step < len(self.design.tune) and trial.should_prune()
+        if is_pruned:
+            trial.set_user_attr(_PRUNED_AFTER, step)
+        return is_pruned
 
     def tell(self, trial: optuna.Trial, evaluation: Evaluation) -> None:
         """Store what a trial came to."""
+        if evaluation.state == TrialState.WAITING:
+            self._put_back(self.study.get_trials(deepcopy=False)[trial.number])
+            return
         if evaluation.state != TrialState.COMPLETE:
             trial.set_user_attr("reason", evaluation.text)
         with self._lock:
-            self.study.tell(trial, evaluation.values, state=evaluation.state)
+            if self.study.get_trials(deepcopy=False)[trial.number].state == TrialState.WAITING:  # it was put back
+                self.study._storage.set_trial_state_values(trial._trial_id, TrialState.RUNNING)
+            self.study.tell(trial, evaluation.values, state=evaluation.state, skip_if_finished=True)
+
+    def _put_back(self, trial: FrozenTrial) -> None:
+        """Let a running trial wait to be run again: it keeps its number, and so its settings.
+
+        Nothing is done where another worker has run it meanwhile, or runs it.
+        """
+        storage, worker = self.study._storage, trial.user_attrs.get("worker", "")
+        with self._turn("put-back"), suppress(UpdateFinishedTrialError):
+            now = storage.get_trial(trial._trial_id)
+            if now.state != TrialState.RUNNING or now.user_attrs.get("worker", "") != worker:
+                return
+            storage.set_trial_user_attr(trial._trial_id, "worker", "")
+            storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
+
+    def _turn(self, what: str) -> AbstractContextManager[None]:
+        """Do something alone among the workers that share the study's folder; a database has no such lock.
+
+        Raises:
+            StudyError: The folder cannot be written.
+        """
+        if self.spec.storage:
+            return nullcontext()
+        with raising(StudyError, f"cannot write {self.folder}", "check the permissions and the free space"):
+            self.folder.mkdir(parents=True, exist_ok=True)
+        return turn(self.folder / f".{what}")
+
+    def _await_names(self) -> None:
+        """Wait until each running trial has its worker's name, or that worker is known to have been killed before.
+
+        Else a later trial would be proposed without what such a trial comes to.
+        """
+        deadline = time.monotonic() + NAMELESS_S + 1.0
+        while time.monotonic() < deadline and not self._interrupted.is_set():
+            running = self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
+            nameless = [trial for trial in running if not trial.user_attrs.get("worker")]
+            if all(map(self._heartbeats.is_dead, nameless)):
+                return
+            time.sleep(_NAMES_S)
 
     def _more(self) -> bool:
-        """Whether another trial is wanted; running ones count, those of dead workers are marked as failed."""
+        """Whether another trial is wanted; running ones count, those of dead workers wait to be run again."""
         with self._lock:
             for trial in self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
                 if self._heartbeats.is_dead(trial):
-                    with suppress(RuntimeError):  # another worker has done so meanwhile
-                        self.study._storage.set_trial_user_attr(trial._trial_id, "reason", CRASHED_WORKER)
-                        self.study.tell(trial.number, state=TrialState.FAIL, skip_if_finished=True)
+                    self._put_back(trial)
             own = [
                 trial
                 for trial in self.study.get_trials(deepcopy=False)
@@ -464,10 +535,17 @@ class Study(Plan):
         storage, pruner = open_storage(self.results, self.spec), build_pruner(self.spec.pruner)
         how: Any = {"storage": storage, "study_name": self.spec.name, "sampler": sampler, "pruner": pruner}
         try:
-            study = optuna.create_study(directions=["minimize"] * len(self.objectives), **how)
-            self._begin(study, beginnings)
-        except optuna.exceptions.DuplicatedStudyError:
-            study = optuna.load_study(**how)
+            with self._turn("begin"):
+                try:
+                    study = optuna.create_study(directions=["minimize"] * len(self.objectives), **how)
+                    self._begin(study, beginnings)
+                except optuna.exceptions.DuplicatedStudyError:
+                    study = optuna.load_study(**how)
+                    self._await_identity(study)
+                    if self._is_half_begun(study):
+                        self._begin(study, beginnings)
+        except DynslamError:
+            raise
         except Exception as error:  # storages raise their drivers' errors
             text = f"cannot open study '{self.spec.name}': {error}"
             raise StudyError(without_password(text, self.spec.storage)) from None
@@ -479,24 +557,47 @@ class Study(Plan):
         return study
 
     def _begin(self, study: optuna.Study, beginnings: Sequence[FrozenTrial | dict[str, Scalar]]) -> None:
-        """What a new study begins with; the identity comes last, other workers wait for it."""
+        """What a new study begins with; the identity comes last, other workers wait for it.
+
+        Where a process was killed that began the study, this goes on from there.
+        """
         study.set_user_attr("spec", self.spec.for_others())
         study.set_user_attr("command", words_without_passwords(storable(sys.argv)))
         with quiet():
             study.set_metric_names(list(self.spec.objectives))
-        study.enqueue_trial({parameter.name: self.base[parameter.name] for parameter in self.space})
+        first = {parameter.name: self.base[parameter.name] for parameter in self.space}
+        entries: list[FrozenTrial | dict[str, Scalar]] = [first]
+        settings: list[dict[str, Any]] = [first]
         for beginning in beginnings:
             if isinstance(beginning, FrozenTrial):
-                study.add_trial(beginning)
+                settings.append(beginning.params)
+            elif beginning in settings:
+                continue
             else:
-                study.enqueue_trial(beginning, skip_if_exists=True)
+                settings.append(beginning)
+            entries.append(beginning)
+        for entry in entries[len(study.get_trials(deepcopy=False)) :]:
+            if isinstance(entry, FrozenTrial):
+                study.add_trial(entry)
+            else:
+                study.enqueue_trial(entry)
         study.set_user_attr("identity", self._identity)
+
+    def _await_identity(self, study: optuna.Study) -> None:
+        """Wait for a worker that is beginning the study; one that shares the study's folder has done so."""
+        deadline = time.monotonic() + (_BEGINNING_S if self.spec.storage else 0.0)
+        while "identity" not in study.user_attrs and time.monotonic() < deadline:
+            time.sleep(0.05)
+
+    def _is_half_begun(self, study: optuna.Study) -> bool:
+        """Whether a process was killed that began this study; a study of others has trials, or facts of its own."""
+        facts = study.user_attrs
+        is_ours = facts.get("spec") == json.loads(json.dumps(self.spec.for_others()))
+        return "identity" not in facts and (is_ours or not (facts or study.get_trials(deepcopy=False)))
 
     def _check_identity(self, study: optuna.Study) -> None:
         """Refuse a stored study that was made with something else; data and program count only to go on with it."""
-        deadline = time.monotonic() + 10.0
-        while (stored := study.user_attrs.get("identity")) is None and time.monotonic() < deadline:
-            time.sleep(0.05)  # another worker is beginning the study
+        stored = study.user_attrs.get("identity")
         if stored is None:
             raise StudyError(
                 f"the storage holds a study '{self.spec.name}' that is none of this toolkit", "give yours another name"

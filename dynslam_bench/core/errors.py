@@ -5,6 +5,7 @@ Each message is one line: what was found (with the measured numbers), what was e
 
 import difflib
 import os
+import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -146,6 +147,9 @@ def raising(
 
 def reason_of(error: BaseException) -> str:
     """What went wrong in the words of the library or of the system, one short line."""
+    if isinstance(error, shutil.Error) and error.args and isinstance(error.args[0], list):
+        source, _, reason = error.args[0][0]  # a folder could not be copied: the first of its files
+        return f"{reason} ({source})"
     return getattr(error, "strerror", None) or " ".join(str(error).split())[:200] or type(error).__name__
 
 

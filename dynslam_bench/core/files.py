@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from dynslam_bench.core.errors import DynslamError, raising
+from dynslam_bench.core.errors import InfrastructureError, raising
 
 _TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.(tmp|new)")
 _NEW_S = 60.0
@@ -52,9 +52,9 @@ def write_atomic(path: Path, content: str | bytes | memoryview) -> None:
     """Write a file under a temporary name beside its target, then rename it into place.
 
     Raises:
-        DynslamError: The folder cannot be written (full disk, permissions); nothing is left behind.
+        InfrastructureError: The folder cannot be written (full disk, permissions); nothing is left behind.
     """
-    with raising(DynslamError, f"cannot write {path}", _CURE), replacing(path) as temporary:
+    with raising(InfrastructureError, f"cannot write {path}", _CURE), replacing(path) as temporary:
         temporary.write_bytes(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
 
 
@@ -62,10 +62,10 @@ def write_lines(path: Path, lines: Iterable[str]) -> None:
     """The same of lines that are never all held at once; each gets its newline here.
 
     Raises:
-        DynslamError: As `write_atomic`.
+        InfrastructureError: As `write_atomic`.
     """
     with (
-        raising(DynslamError, f"cannot write {path}", _CURE),
+        raising(InfrastructureError, f"cannot write {path}", _CURE),
         replacing(path) as temporary,
         temporary.open("wb") as file,
     ):
@@ -115,6 +115,11 @@ def _reserve(path: Path, make: Callable[[Path], None]) -> tuple[Path, int]:
     return fresh.rename(fresh.with_suffix(".tmp")), lock
 
 
+def is_temporary(path: Path) -> bool:
+    """Whether a name is one that this module gives to what is not finished."""
+    return _TEMPORARY.fullmatch(path.name) is not None
+
+
 def sweep_temporary(folder: Path, pattern: str = ".*") -> None:
     """Remove the temporary files and folders that killed processes left in a folder.
 
@@ -123,7 +128,7 @@ def sweep_temporary(folder: Path, pattern: str = ".*") -> None:
         pattern: Of the paths below it to look at, e.g. ``runs/.*``.
     """
     for path in folder.glob(pattern):
-        if not _TEMPORARY.fullmatch(path.name) or not is_abandoned(path):
+        if not is_temporary(path) or not is_abandoned(path):
             continue
         with suppress(OSError):  # another process was faster, or it is another user's
             if path.suffix == ".tmp" or time.time() - path.stat().st_mtime > _NEW_S:
@@ -135,9 +140,9 @@ def temporary_folder(target: Path) -> Iterator[Path]:
     """A hidden folder beside `target` that is removed when the block ends, if it still has its name.
 
     Raises:
-        DynslamError: The parent folder cannot be written.
+        InfrastructureError: The parent folder cannot be written.
     """
-    with raising(DynslamError, f"cannot write into {target.parent}", "name another folder"):
+    with raising(InfrastructureError, f"cannot write into {target.parent}", "name another folder"):
         target.parent.mkdir(parents=True, exist_ok=True)
         work, lock = _reserve(target, Path.mkdir)
     try:
@@ -155,12 +160,12 @@ def atomic_folder(target: Path) -> Iterator[Path]:
     process left is swept up by the next one.
 
     Raises:
-        DynslamError: The parent folder cannot be written, or was removed meanwhile.
+        InfrastructureError: The parent folder cannot be written, or was removed meanwhile.
     """
     sweep_temporary(target.parent)
     with temporary_folder(target) as work:
         yield work
-        with raising(DynslamError, f"cannot write {target}", "check the permissions"):
+        with raising(InfrastructureError, f"cannot write {target}", "check the permissions"):
             replace_folder(work, target)
 
 
@@ -178,9 +183,9 @@ def claimed(path: Path) -> Iterator[bool]:
         Whether it is held; always, where the file system knows no locks.
 
     Raises:
-        DynslamError: The file cannot be made.
+        InfrastructureError: The file cannot be made.
     """
-    with raising(DynslamError, f"cannot write {path}", "check the permissions and the disk"):
+    with raising(InfrastructureError, f"cannot write {path}", "check the permissions and the disk"):
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     try:
         mine = _lock(handle) is not False and _is_at(handle, path)  # else its last holder has just removed it

@@ -156,7 +156,7 @@ def compare_sums(folder: Path, sums: Path, kind: type[DynslamError] = DynslamErr
         kind: What is raised.
 
     Raises:
-        DynslamError: Of the given kind: the list cannot be read, or names a file outside of the folder.
+        DynslamError: Of the given kind: the list or a file cannot be read, or a name leads out of the folder.
     """
     faults = []
     for line in read_lines(sums, kind=kind):
@@ -164,7 +164,10 @@ def compare_sums(folder: Path, sums: Path, kind: type[DynslamError] = DynslamErr
         path = inside(folder, name, where=str(sums), kind=kind)
         if not path.is_file():
             faults.append(f"{name} is missing")
-        elif file_sha256(path) != expected:
+            continue
+        with raising(kind, f"cannot read {path}", "check the disk and the permissions"):
+            actual = file_sha256(path)
+        if actual != expected:
             faults.append(f"{name} is not what {sums.name} says")
     return faults
 

@@ -2,6 +2,10 @@
 
 It holds ``runs/<run_id>/`` with ``run.json`` and the trajectories, ``sequences/<part>/`` with stamps and ground truth,
 and ``SHA256SUMS`` of them all, in the format of ``sha256sum -c``. Whatever reads a results folder reads a bank.
+
+Runs are added in four steps: an empty file `UNFINISHED` is written, the runs are copied, each of which appears whole or
+not at all, the checksums are written, the empty file is removed. Where a process was killed in between, the file says
+that there may be runs without checksums, and the next one that adds goes on from there.
 """
 
 import re
@@ -20,6 +24,7 @@ from dynslam_bench.core import (
     TemporaryFolder,
     compare_sums,
     file_sha256,
+    is_temporary,
     raising,
     read_lines,
     read_toml,
@@ -35,6 +40,7 @@ from dynslam_bench.runs.record import RunRecord, run_id_of
 from dynslam_bench.runs.store import FINAL, ONLINE, RUN_FILE, Merged, RunStore, Unreadable, Which, merge, open_store
 
 SUMS = "SHA256SUMS"
+UNFINISHED = ".unfinished"
 _PARTS = ("runs", "sequences")
 _ARCHIVE = re.compile(r"https?://.*\.(?:zip|tgz|tar|tar\.gz)(?:\?.*)?")
 _ADDRESS = re.compile(r"[a-z+]+://.*|(?:[\w.-]+@)?[\w.-]+:.+")
@@ -48,21 +54,35 @@ class Bank(RunStore):
 
         Raises:
             InfrastructureError: It cannot be written.
+            RunError: It was removed or changed while it was copied.
         """
         self.copy_part(other, record)
-        full = raising(InfrastructureError, f"cannot write {self.folder(record.run_id)}", "check the free space")
-        with self.work_folder(record.run_id) as work, full:
-            for file in (other.folder(record.run_id) / name for name in (ONLINE, FINAL)):
-                if file.is_file():
-                    shutil.copyfile(file, work / file.name)
-            (work / RUN_FILE).write_text(record.public().to_json(), encoding="utf-8")
-            replace_folder(work, self.folder(record.run_id))
+        with self.work_folder(record.run_id) as work:
+            with self.copying(other, record):
+                for file in (other.folder(record.run_id) / name for name in (ONLINE, FINAL)):
+                    if file.is_file():
+                        shutil.copyfile(file, work / file.name)
+                (work / RUN_FILE).write_text(record.public().to_json(), encoding="utf-8")
+            self.check_copy(work, record)
+            with raising(InfrastructureError, f"cannot write {self.folder(record.run_id)}", "check the free space"):
+                replace_folder(work, self.folder(record.run_id))
         return record
 
+    def link_latest(self, run_id: str) -> None:
+        """A bank has no link to its newest run."""
+
     def files(self) -> list[str]:
-        """Names of the files that its checksums are of, links and hidden ones included, relative to it."""
-        paths = (path for part in _PARTS for path in (self.root / part).rglob("*"))
-        return sorted(path.relative_to(self.root).as_posix() for path in paths if path.is_symlink() or path.is_file())
+        """Names of the files that its checksums are of, links and hidden ones included, relative to it.
+
+        What a killed process left unfinished is not among them.
+        """
+        names = []
+        for path in (path for part in _PARTS for path in (self.root / part).rglob("*")):
+            inside = path.relative_to(self.root)
+            is_unfinished = any(is_temporary(Path(name)) for name in inside.parts)
+            if not is_unfinished and (path.is_symlink() or path.is_file()):
+                names.append(inside.as_posix())
+        return sorted(names)
 
 
 class StatedTrajectory(Record):
@@ -147,6 +167,8 @@ def _import(manifest: Path, store: RunStore) -> Iterator[Unreadable]:
                     file, entry.tracker, entry.sequence, results=store, label=entry.label, which=entry.which,
                     provenance=entry.provenance or entry.file, truth=truth,
                 )  # fmt: skip
+            except InfrastructureError:
+                raise
             except DynslamError as error:
                 yield Unreadable(Path(entry.file), str(error))
 
@@ -171,13 +193,24 @@ def verify(bank: str | Path) -> list[str]:
         RunError: There is no bank.
     """
     store = Bank(bank)
-    sums = store.root / SUMS
-    if not sums.is_file():
+    if (store.root / UNFINISHED).exists():
+        text = f"runs were being added when the process ended, or still are: {SUMS} may lack some of them"
+        return [f"{text} (repeat the command, or add any other run)", *_faults(store, unfinished=True)]
+    if not (store.root / SUMS).is_file():
         raise RunError(f"{store.root} is no bank: it has no {SUMS}", "make one: dynslam-bench bank add RESULTS BANK")
-    faults = compare_sums(store.root, sums, RunError)
-    listed = {line.rstrip("\n").partition("  ")[2] for line in read_lines(sums, kind=RunError)}
+    return _faults(store)
+
+
+def _faults(store: Bank, *, unfinished: bool = False) -> list[str]:
+    """See `verify`; in a bank to which runs are still to be added, files may be without a checksum."""
+    sums, faults, listed = store.root / SUMS, list[str](), set[str]()
+    if sums.is_file() or not unfinished:
+        faults = compare_sums(store.root, sums, RunError)
+        listed = {line.rstrip("\n").partition("  ")[2] for line in read_lines(sums, kind=RunError)}
     names = store.files()
     faults += [f"{name} is a link" for name in (*_PARTS, *names) if (store.root / name).is_symlink()]
+    if unfinished:
+        listed.update(names)
     faults += [f"{name} is not listed in {SUMS}" for name in names if name not in listed]
     records, unreadable = store.all()
     faults += [f"{entry.path}: {entry.reason}" for entry in unreadable]
@@ -258,22 +291,47 @@ def push(bank: str | Path, target: str) -> Merged:
 
 
 def _merge(sources: Sequence[RunStore], bank: str | Path) -> Merged:
-    """Merge stores into a bank without faults, and bring its checksums up to date; one process at a time."""
+    """Merge stores into a bank without faults, and bring its checksums up to date; one process at a time.
+
+    It goes on where a process was killed that did the same.
+    """
     store = Bank(bank)
+    mark = store.root / UNFINISHED
     with raising(InfrastructureError, f"cannot write {store.root}", "name another folder"):
         store.root.mkdir(parents=True, exist_ok=True)
     with turn(store.root / ".merging"):
-        if (store.root / SUMS).exists() or store.files():
+        if mark.exists():
+            _refuse(store.root, _faults(store, unfinished=True))
+        elif (store.root / SUMS).exists() or store.files():
             _check(store.root)
+        write_atomic(mark, "")
         try:
             return merge(sources, store, trials=False)
         finally:  # what was copied before a fault is whole
-            sums = (f"{file_sha256(store.root / name)}  {name}\n" for name in store.files())
-            write_atomic(store.root / SUMS, "".join(sums))
+            _write_sums(store)
+            with raising(InfrastructureError, f"cannot remove {mark}", "repeat the command"):
+                mark.unlink(missing_ok=True)
+
+
+def _write_sums(store: Bank) -> None:
+    """Write the checksums of all files.
+
+    Raises:
+        InfrastructureError: A file cannot be read, or the list not be written.
+    """
+    lines = []
+    for name in store.files():
+        with raising(InfrastructureError, f"cannot read {store.root / name}", "repeat the command"):
+            lines.append(f"{file_sha256(store.root / name)}  {name}\n")
+    write_atomic(store.root / SUMS, "".join(lines))
 
 
 def _check(bank: str | Path) -> None:
-    if faults := verify(bank):
+    _refuse(bank, verify(bank))
+
+
+def _refuse(bank: str | Path, faults: Sequence[str]) -> None:
+    if faults:
         raise RunError(f"{bank} has faults, of {len(faults)} the first: {faults[0]}", "bank verify lists all")
 
 

@@ -4,6 +4,7 @@ import contextlib
 import io
 import json
 import re
+import shutil
 import socket
 import sys
 import threading
@@ -43,8 +44,15 @@ from dynslam_bench.runs.identity import ResolvedRun, Resolver, check_unchanged, 
 from dynslam_bench.runs.lookup import LookUp
 from dynslam_bench.runs.own_code import plugins_of_run
 from dynslam_bench.runs.process.child import LOG_FILE, READS_FILE
-from dynslam_bench.runs.process.fork_server import Child, make_job
-from dynslam_bench.runs.process.supervisor import LONGEST_LOG, LONGEST_YET, Verdict, bound_log, supervise
+from dynslam_bench.runs.process.fork_server import Child, ForkServer, make_job
+from dynslam_bench.runs.process.supervisor import (
+    LONGEST_LOG,
+    LONGEST_YET,
+    ServerDiedError,
+    Verdict,
+    bound_log,
+    supervise,
+)
 from dynslam_bench.runs.record import (
     FAILED,
     LOST_COVERAGE,
@@ -136,15 +144,17 @@ def run_one(
             resolved.spec.tracker, resolved.settings, resolved.segmentation, resolved.spec.sequence
         )
         log = work / LOG_FILE
-        watched: dict[str, Any] = {"tick": lambda: bound_log(log, LONGEST_YET), "at_a_time": at_a_time}
-        child = Child()
-        try:
-            verdict = supervise(child, job, resolved.spec.limits, report, cancelled, **watched)
-        except InfrastructureError:
-            if not child.lost:
-                raise
-            child = Child()  # of a new fork server
-            verdict = supervise(child, job, resolved.spec.limits, report, cancelled, **watched)
+
+        def watch(child: Child) -> Verdict:
+            tick = partial(bound_log, log, LONGEST_YET)
+            return supervise(child, job, resolved.spec.limits, report, cancelled, tick=tick, at_a_time=at_a_time)
+
+        verdict = _watched(work, watch)
+        if not (work / FRAMES_FILE).is_file():
+            raise InfrastructureError(
+                f"{work} was removed while the run was made",
+                "leave the results folder alone; nothing is stored, the same command goes on from there",
+            )
         if verdict.refused:
             raise RunError(
                 f"{resolved.tracker.id} cannot run on {resolved.sequence.id}: {verdict.reason}", "nothing is stored"
@@ -154,7 +164,7 @@ def run_one(
             frames = FrameLog.read(work / FRAMES_FILE)
             title = f"{resolved.tracker.id} on {resolved.sequence.id}, seed {resolved.spec.seed}, online"
             frames.write(work, title, exact_stamps(resolved.sequence))
-            (work / FRAMES_FILE).unlink(missing_ok=True)
+            (work / FRAMES_FILE).unlink()  # it fails where the folder was removed after all
         check_unchanged(resolved, begun=True)
         reads = read_reads(work) if resolved.foreign else None
         record = _record(resolved, verdict, frames, reads, started, time.perf_counter() - clock).normalised()
@@ -180,6 +190,43 @@ def read_reads(work: Path) -> Reads | None:
     reads = Reads.read(file)
     file.unlink()
     return reads
+
+
+def _watched(work: Path, watch: Callable[[Child], Verdict]) -> Verdict:
+    """The verdict on a run; when its fork server dies, the run is repeated with a fork server of its own.
+
+    No other run is there then. If that server dies, too, it is this run that has killed it: the run has crashed.
+
+    Args:
+        work: Its work folder, which is emptied before each try.
+        watch: Has a child make the run, and gives the verdict.
+
+    Raises:
+        InfrastructureError: See `supervise`.
+    """
+    _empty(work)
+    with contextlib.suppress(ServerDiedError):
+        return watch(Child())
+    _empty(work)
+    with contextlib.closing(ForkServer()) as own:
+        try:
+            return watch(Child(own))
+        except ServerDiedError as error:
+            if not error.where:
+                raise
+            reason = f"the fork server was killed twice, the second time with this run alone{error.where}"
+            return Verdict("crashed", reason)
+
+
+def _empty(work: Path) -> None:
+    """Leave in a work folder an empty log of frames and nothing else."""
+    with raising(InfrastructureError, f"cannot write {work}", "check the free space; nothing is stored"):
+        for path in work.iterdir():
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+        (work / FRAMES_FILE).touch()
 
 
 def sequence_info(sequence: Any, content: str, part: str, offset: int = 0) -> SequenceInfo:

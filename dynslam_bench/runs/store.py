@@ -67,6 +67,8 @@ _TABLE = (
 _KEEP = "INSERT OR REPLACE INTO computed (name, run_id, version, state, value) VALUES (?, ?, ?, ?, ?)"
 _VALUES = "SELECT run_id, state, value FROM computed WHERE name = ? AND version = ?"
 _LOCKED_S = 10.0
+"""Other processes keep the index for milliseconds."""
+_REMOVED = "if it was removed meanwhile, repeat the command"
 Row = dict[str, Any]
 
 
@@ -77,12 +79,16 @@ class RunIndex:
     it was computed from. The file may be deleted at any time; values that are missing, damaged or out of date are
     computed again from the run folders.
 
+    An index that another process has locked is waited for once, for `_LOCKED_S`. After that this process goes on
+    without it, with a warning: what it holds can be computed.
+
     Args:
         root: Folder of the store.
     """
 
     def __init__(self, root: Path) -> None:
         self.root, self.path = root, root / INDEX_FILE
+        self._is_locked = False
 
     def state(self, run_id: str, part: str, record_stamp: str = "") -> str:
         """The state of the files that a run's values are computed from.
@@ -124,9 +130,12 @@ class RunIndex:
         }
 
     def _query(self, command: str, *arguments: str) -> list[tuple[Any, ...]]:
-        with contextlib.suppress(sqlite3.Error), self._opened(create=False) as connection:
-            return connection.execute(command, arguments).fetchall()
-        return []
+        try:
+            with self._opened(create=False) as connection:
+                return connection.execute(command, arguments).fetchall()
+        except sqlite3.Error as error:
+            self._note_lock(error)
+            return []
 
     def _holds(self, run_id: str, state: Any, value: Any) -> bool:
         return (
@@ -147,7 +156,10 @@ class RunIndex:
                 with self._opened(create=True) as connection, connection:
                     connection.executemany(_KEEP, rows)
                 return
-            except (sqlite3.OperationalError, UnicodeEncodeError):  # it cannot be written, or a value not be encoded
+            except UnicodeEncodeError:
+                return
+            except sqlite3.OperationalError as error:  # it cannot be written
+                self._note_lock(error)
                 return
             except sqlite3.DatabaseError:  # it is damaged, or no database
                 with contextlib.suppress(OSError):
@@ -162,8 +174,10 @@ class RunIndex:
         """The database; no link is followed, and no pipe is opened.
 
         Raises:
-            sqlite3.OperationalError: It is not there, or cannot be opened.
+            sqlite3.OperationalError: It is not there, cannot be opened, or was locked when it was waited for.
         """
+        if self._is_locked:
+            raise sqlite3.OperationalError(f"{self.path} is left alone")
         is_free = create and not self.path.exists()
         if self.path.is_symlink() or not (is_free or self.path.is_file()):
             raise sqlite3.OperationalError(f"{self.path} is no database")
@@ -172,6 +186,18 @@ class RunIndex:
             if create:
                 connection.execute(_TABLE)
             yield connection
+
+    def _note_lock(self, error: sqlite3.Error) -> None:
+        """Leave the index alone from now on, with a warning, if another process has kept it locked."""
+        if self._is_locked or "database is locked" not in str(error):
+            return
+        self._is_locked = True
+        warnings.warn(
+            f"{self.path} was locked by another process for {_LOCKED_S:g} s: going on without it, scores are computed "
+            f"again (end that process: fuser {self.path}; or delete the file, which is made again)",
+            RuntimeWarning,
+            stacklevel=2,
+        )
 
     def _is_plain(self, run_id: str, state: str) -> bool:
         try:
@@ -263,7 +289,7 @@ class RunStore:
         """
         with temporary_folder(self.runs / "probe"):
             pass
-        for pattern in (".*", "runs/.*", "sequences/*/.*"):
+        for pattern in (".*", "runs/.*", "sequences/*/.*", "studies/*/**/.*"):
             sweep_temporary(self.root, pattern)
         for left in self.runs.glob(".*.claim"):
             with claimed(left):  # if no process holds it, it is removed
@@ -303,12 +329,16 @@ class RunStore:
             record = record.model_copy(update={"files": files})
             (work / RUN_FILE).write_text(record.to_json(), encoding="utf-8")
             replace_folder(work, target)
+        self.link_latest(record.run_id)
+        return record
+
+    def link_latest(self, run_id: str) -> None:
+        """Let ``latest`` lead to a run."""
         link = self.root / "latest"
         with contextlib.suppress(OSError), temporary_folder(link) as folder:  # a file system may have no links
             fresh = folder / link.name
-            fresh.symlink_to(target.relative_to(self.root))
+            fresh.symlink_to(self.folder(run_id).relative_to(self.root))
             fresh.replace(link)
-        return record
 
     def _under_free_id(self, record: RunRecord) -> RunRecord:
         """The record, under another id where a run of another identity has that one: such a run is not overwritten."""
@@ -320,9 +350,19 @@ class RunStore:
         return record
 
     def _files(self, part: str, run: Path) -> dict[str, str]:
-        """Checksums of the files that a run's values are computed from, by name."""
+        """Checksums of the files that a run's values are computed from, by name.
+
+        Raises:
+            RunError: One cannot be read.
+        """
         paths = [run / ONLINE, run / FINAL, self._part(part) / "groundtruth.txt", self._part(part) / "timestamps.txt"]
-        return {path.name: file_sha256(path) for path in paths if path.is_file()}
+        checksums = {}
+        for path in paths:
+            if not path.is_file():
+                continue
+            with raising(RunError, f"cannot read {path}", _REMOVED):
+                checksums[path.name] = file_sha256(path)
+        return checksums
 
     def changed(self, record: RunRecord) -> str:
         """The first file that is not the one with which a run was stored, and what happened to it; empty for none."""
@@ -356,19 +396,56 @@ class RunStore:
 
         Raises:
             InfrastructureError: It cannot be written.
+            RunError: It was removed or changed while it was copied.
         """
         self.copy_part(other, record)
-        full = raising(InfrastructureError, f"cannot write {self.folder(record.run_id)}", "check the free space")
-        with self.work_folder(record.run_id) as work, full:
-            shutil.copytree(other.folder(record.run_id), work, dirs_exist_ok=True)
+        with self.work_folder(record.run_id) as work:
+            with self.copying(other, record):
+                shutil.copytree(other.folder(record.run_id), work, dirs_exist_ok=True)
+            self.check_copy(work, record)
             return self.publish(work, record)
 
+    @contextlib.contextmanager
+    def copying(self, other: RunStore, record: RunRecord) -> Iterator[None]:
+        """Turn what fails while a run of another store is copied into an error that says whose fault it is.
+
+        Raises:
+            RunError: The run was removed meanwhile.
+            InfrastructureError: It cannot be written here.
+        """
+        source = other.folder(record.run_id)
+        try:
+            with raising(InfrastructureError, f"cannot write {self.folder(record.run_id)}", "check the free space"):
+                yield
+        except InfrastructureError as error:
+            if (source / RUN_FILE).is_file():
+                raise
+            raise RunError(f"{other.place(record.run_id)} was removed while it was copied") from error
+
+    def check_copy(self, work: Path, record: RunRecord) -> None:
+        """Check that a copied run has the trajectories that it was stored with.
+
+        Raises:
+            RunError: One is missing or another one.
+        """
+        copied = self._files(record.sequence.part, work)
+        for name in (ONLINE, FINAL):
+            if copied.get(name) != record.files.get(name, copied.get(name)):
+                raise RunError(f"{name} of run {record.run_id} was removed or changed while it was copied")
+
     def copy_part(self, other: RunStore, record: RunRecord) -> None:
-        """Copy the ground truth and then the stamps of a run's part of a sequence, if its stamps are not here."""
+        """Copy the ground truth and then the stamps of a run's part of a sequence, if its stamps are not here.
+
+        Raises:
+            InfrastructureError: They cannot be written.
+            RunError: They cannot be read.
+        """
         folder = self._part(record.sequence.part)
         if not (folder / "timestamps.txt").is_file():
             for file in sorted(other._part(record.sequence.part).glob("*.txt")):
-                write_atomic(folder / file.name, file.read_bytes())
+                with raising(RunError, f"cannot read {file}", _REMOVED):
+                    content = file.read_bytes()
+                write_atomic(folder / file.name, content)
 
     def add_sequence(self, part: str, timestamps_ns: NDArray[np.int64], ground_truth: Trajectory | None) -> None:
         """Keep the stamps of a sequence's frames, in nanoseconds, and its ground truth, in place of other ones."""
@@ -377,7 +454,7 @@ class RunStore:
         if ground_truth is not None and len(ground_truth):
             texts = {"groundtruth.txt": format_tum(ground_truth), **texts}
         for name, text in texts.items():
-            if not (folder / name).is_file() or (folder / name).read_bytes() != text.encode():
+            if _content(folder / name) != text.encode():
                 write_atomic(folder / name, text)
 
     def rewrite(self, record: RunRecord, **changes: Any) -> RunRecord:
@@ -410,10 +487,11 @@ class RunStore:
 
     def ids(self) -> list[str]:
         """Ids of all stored runs, sorted."""
-        if not self.runs.is_dir():
+        try:
+            with os.scandir(self.runs) as entries:
+                return sorted(entry.name for entry in entries if _RUN_ID.fullmatch(entry.name) and entry.is_dir())
+        except (FileNotFoundError, NotADirectoryError):
             return []
-        with os.scandir(self.runs) as entries:
-            return sorted(entry.name for entry in entries if _RUN_ID.fullmatch(entry.name) and entry.is_dir())
 
     def ids_of(self, asked: str) -> list[str]:
         """Ids of the stored runs of one request, by its first twelve digits; see `record.asked_digest`."""
@@ -443,7 +521,12 @@ class RunStore:
         """
         path = self.folder(run_id) / RUN_FILE
         check_plain(path.parent, self.root)
-        record = RunRecord.read(path)
+        try:
+            record = RunRecord.read(path)
+        except DynslamError as error:
+            if path.parent.is_dir():
+                raise
+            raise RunError(f"run {run_id} is not in {self.source}", _REMOVED) from error
         if record.run_id != run_id:
             raise RunError(f"{path} names itself {record.run_id}, not as its folder", "it was copied or made by hand")
         return record
@@ -616,9 +699,20 @@ class RunStore:
             The columns that `runs_frame` describes.
         """
         records, unreadable = self.all()
-        warn_of_unreadable([f"{entry.path}: {entry.reason}" for entry in unreadable])
-        listed = (record for record in records if trials or not record.trial_of)
-        return runs_frame((r, None if r.status == "stopped" else self.score(r, protocol)) for r in listed)
+        reasons = [f"{entry.path}: {entry.reason}" for entry in unreadable]
+
+        def scored() -> Iterator[tuple[RunRecord, MetricRecord | None]]:
+            for run_id in records.run_ids:
+                try:
+                    record = self.read_whole(run_id)
+                    if trials or not record.trial_of:
+                        yield record, None if record.status == "stopped" else self.score(record, protocol)
+                except DynslamError as error:
+                    reasons.append(f"{self.place(run_id)}: {error}")
+
+        frame = runs_frame(scored())
+        warn_of_unreadable(reasons)
+        return frame
 
 
 def warn_of_unreadable(reasons: Sequence[str]) -> None:
@@ -747,27 +841,39 @@ class Merged:
 def merge(sources: Iterable[RunStore], store: RunStore, *, trials: bool = True) -> Merged:
     """Copy the runs of stores into one, with or without the trials of studies; nothing that it holds is changed.
 
-    A run is left out if its record is damaged or its stamps are lost, or if the store holds another result under its
-    id, other stamps or another ground truth of its sequence.
+    A run is left out if its record is damaged, its stamps are lost or it is removed meanwhile, or if the store holds
+    another result under its id, other stamps or another ground truth of its sequence. ``latest`` leads to the newest of
+    the others afterwards.
 
     Raises:
-        DynslamError: The store cannot be written.
+        InfrastructureError: The store cannot be written; the runs that were copied before stay.
     """
     merged = Merged([], [], [])
+    newest = ("", "")
     store.prepare()
     for source in sources:
         records, unreadable = source.all()
         merged.left_out.extend(unreadable)
-        for record in records:
-            if record.trial_of and not trials:
+        for run_id in records.run_ids:
+            try:
+                record = source.read_whole(run_id)
+                if record.trial_of and not trials:
+                    continue
+                if reason := _why_left_out(source, record, store):
+                    raise RunError(reason)
+                if store.get(run_id) is not None:
+                    merged.stored.append(run_id)
+                else:
+                    store.copy_from(source, record)
+                    merged.added.append(run_id)
+            except InfrastructureError:
+                raise
+            except DynslamError as error:
+                merged.left_out.append(Unreadable(source.place(run_id), str(error)))
                 continue
-            if reason := _why_left_out(source, record, store):
-                merged.left_out.append(Unreadable(source.place(record.run_id), reason))
-            elif store.get(record.run_id) is not None:
-                merged.stored.append(record.run_id)
-            else:
-                store.copy_from(source, record)
-                merged.added.append(record.run_id)
+            newest = max(newest, (record.started, run_id))
+    if newest[1]:
+        store.link_latest(newest[1])
     return merged
 
 
@@ -790,11 +896,19 @@ def _why_left_out(source: RunStore, record: RunRecord, store: RunStore) -> str:
 
 def _equal(one: Path, other: Path, *names: str) -> bool:
     """Whether files of two folders have the same content; a missing file is an empty one."""
+    return all(_content(one / name) == _content(other / name) for name in names)
 
-    def content(file: Path) -> bytes:
-        return file.read_bytes() if file.is_file() else b""
 
-    return all(content(one / name) == content(other / name) for name in names)
+def _content(file: Path) -> bytes:
+    """The content of a file; none where there is no file.
+
+    Raises:
+        RunError: It cannot be read.
+    """
+    if not file.is_file():
+        return b""
+    with raising(RunError, f"cannot read {file}", _REMOVED):
+        return file.read_bytes()
 
 
 def list_runs(

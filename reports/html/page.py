@@ -158,6 +158,14 @@ def write_side(output: Path, name: str, value: Any, remark: Any = None) -> None:
         DynslamError: It cannot be written.
     """
     path = output / FOLDER / f"{name}.js"
-    content = f"//{to_script(remark)}\nkeep({json.dumps(name)},{to_script(value)});\n".encode()
-    if not path.is_file() or path.read_bytes() != content:  # to replace a file takes longer than to read it
+    write_changed(path, f"//{to_script(remark)}\nkeep({json.dumps(name)},{to_script(value)});\n".encode())
+
+
+def write_changed(path: Path, content: bytes) -> None:
+    """Write a file that does not have this content yet: to replace a file takes longer than to read it.
+
+    Raises:
+        DynslamError: It cannot be written.
+    """
+    if not path.is_file() or path.read_bytes() != content:
         write_atomic(path, content)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-import shutil
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Executor
@@ -24,7 +23,7 @@ from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation import Protocol, RPESpec, pose_errors
 from dynslam_bench.geometry import Trajectory
 from dynslam_bench.reports.figures import COLOURS, NEUTRAL, packed, significant
-from dynslam_bench.reports.html.page import read_remark, write_side
+from dynslam_bench.reports.html.page import read_remark, write_changed, write_side
 from dynslam_bench.reports.model.load import run_jobs
 from dynslam_bench.reports.model.row import RunRow, command_line, grouped, run_command
 from dynslam_bench.reports.model.summary import reservations
@@ -131,9 +130,7 @@ def _copy_pictures(row: RunRow, output: Path) -> list[int]:
     """Copy the pictures of a run beside its page; returns their frames."""
     sources, target = sorted(row.folder.glob("frame_*.webp")), output / "frames" / row.run_id
     for source in sources:
-        target.mkdir(parents=True, exist_ok=True)
-        if not (target / source.name).is_file():
-            shutil.copyfile(source, target / source.name)
+        write_changed(target / source.name, read_bytes(source, kind=RunError))
     return [int(source.stem.removeprefix("frame_")) for source in sources]
 
 

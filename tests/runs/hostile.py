@@ -1,6 +1,7 @@
 """A tracker that behaves badly in ways that concern the process and not the poses, for the tests of supervision."""
 
 import contextlib
+import ctypes
 import errno
 import os
 import shutil
@@ -71,6 +72,31 @@ class Hostile:
             case "gone":
                 shutil.rmtree(self.settings.pids)
                 raise ValueError("no folder")
+            case "gone-quietly":
+                shutil.rmtree(self.settings.pids)
+            case "moved":
+                Path(self.settings.pids).rename(f"{self.settings.pids}-moved")
+            case "made-again":
+                for folder in Path(self.settings.pids).glob("runs/.*.tmp"):
+                    shutil.rmtree(folder)
+                    folder.mkdir()
+            case "log-gone":
+                for log in Path(self.settings.pids).glob("runs/.*.tmp/frames.jsonl"):
+                    log.unlink()
+            case "kill-parent":
+                os.kill(os.getppid(), signal.SIGKILL)
+            case "end-parents-group":
+                os.killpg(os.getpgid(os.getppid()), signal.SIGTERM)
+            case "kill-program":
+                psutil.Process().parents()[1].kill()
+            case "ask-parent":
+                os.kill(os.getppid(), 0)
+            case "c-kill-parent":
+                ctypes.CDLL(None).kill(os.getppid(), signal.SIGKILL)
+                time.sleep(300)
+            case "shell-kill-parent":
+                subprocess.run(["kill", "-KILL", str(os.getppid())], check=False)
+                time.sleep(300)
             case "children":
                 self.leave_children()
             case "flood":

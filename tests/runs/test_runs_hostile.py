@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import pickle
 import shlex
 import signal
 import subprocess
@@ -20,8 +21,8 @@ from hostile import alive, until
 from dynslam_bench.core import SHARED_MEMORY, InfrastructureError
 from dynslam_bench.runs import Limits, RunRecord, RunSpec, RunStore, run_many, run_one
 from dynslam_bench.runs.process import supervisor as memory_module
-from dynslam_bench.runs.process.fork_server import SERVERS, START_VARIABLE, process_tree
-from dynslam_bench.runs.process.supervisor import supervise
+from dynslam_bench.runs.process.fork_server import SERVERS, START_VARIABLE, Child, ForkServer, process_tree
+from dynslam_bench.runs.process.supervisor import ServerDiedError, supervise
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux' subreapers and /proc")
 
@@ -193,8 +194,8 @@ def started(pids: Path, count: int) -> list[int]:
 
 
 @linux
-def test_a_killed_server_takes_everything_along_and_is_no_outcome(strays, store: RunStore, monkeypatch) -> None:
-    """It is started again once; killed again, the run is given up, and nothing of it is stored or left."""
+def test_a_killed_server_takes_everything_along_and_its_run_is_repeated(strays, store: RunStore, monkeypatch) -> None:
+    """Nothing is left of either try; the second server dies with this run alone, which is taken for the cause."""
     spec, pids = strays
     trees: list[set[int]] = []
 
@@ -210,11 +211,74 @@ def test_a_killed_server_takes_everything_along_and_is_no_outcome(strays, store:
         for turn in (1, 2):
             seen = started(pids, 4 * turn)
             until(lambda: any(tree >= {*seen[-4:]} for tree in trees[:-1]))  # noqa: B023 (the supervisor knows them)
-            os.kill(SERVERS["fresh"]._running[1].pid, signal.SIGKILL)  # nothing else knows its number
+            (server,) = [top for top in psutil.Process().children() if seen[-4] in below(top)]
+            server.kill()
             until(lambda: alive(seen) == [], 20)  # noqa: B023
-        with pytest.raises(InfrastructureError, match=r"the fork server was ended from outside.*is not stored"):
-            run.result()
-    assert len(seen) == 8 and store.ids() == [] and list(store.runs.iterdir()) == []
+        record = run.result()
+    assert len(seen) == 8
+    assert record.status == "crashed"
+    assert record.reason.startswith("the fork server was killed twice, the second time with this run alone, after")
+    assert [path.name for path in store.runs.iterdir()] == [record.run_id]
+
+
+def below(process: psutil.Process) -> set[int]:
+    """The numbers of all descendants of a process."""
+    return {descendant.pid for descendant in process.children(recursive=True)}
+
+
+def test_a_server_that_dies_before_the_run_begins_is_no_outcome(
+    store: RunStore, toy_folder: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The run had no chance to kill it."""
+    tries: list[Child] = []
+
+    def dies(child: Child, *_: object, **__: object) -> None:
+        tries.append(child)
+        child.close()
+        raise ServerDiedError("")
+
+    monkeypatch.setenv(START_VARIABLE, "fresh")
+    monkeypatch.setattr("dynslam_bench.runs.running.supervise", dies)
+    with pytest.raises(InfrastructureError, match="the fork server was ended from outside") as raised:
+        run_one(hostile_spec(toy_folder, "ok"), store)
+    assert len(tries) == 2
+    assert raised.value.hint == "the run is not stored; the same command goes on from there"
+    assert list(store.runs.iterdir()) == []
+    assert str(pickle.loads(pickle.dumps(raised.value))) == str(raised.value)
+
+
+class _Scripted(ForkServer):
+    """A fork server that says what it is told to."""
+
+    def spawn(self, child_fd: int) -> int:
+        read_fd, self.says = os.pipe()
+        return read_fd
+
+    def say(self, **message: int) -> None:
+        os.write(self.says, json.dumps(message).encode() + b"\n")
+
+
+@pytest.mark.parametrize("is_told", [True, False])
+def test_the_number_of_a_process_that_has_ended_is_not_killed(is_told: bool) -> None:
+    """The system has given it to another process, which runs in a group of its own."""
+    server = _Scripted("fork")
+    child = Child(server)
+    with subprocess.Popen(
+        [sys.executable, "-S", "-c", "input()"], stdin=subprocess.PIPE, start_new_session=True
+    ) as other:
+        server.say(pid=other.pid)
+        assert child.poll() is None
+        assert child.pid == other.pid
+        if is_told:
+            server.say(pid=0)
+        child.kill()
+        assert child.pid == (0 if is_told else other.pid)
+        other.communicate(b"\n")
+    assert other.returncode == (0 if is_told else -signal.SIGKILL)
+    server.say(exit=0)
+    assert child.poll() == 0
+    child.close()
+    os.close(server.says)
 
 
 @linux
@@ -242,13 +306,111 @@ def test_shared_memory_goes_with_a_run_that_is_killed(strays, store: RunStore) -
     assert frame.is_relative_to(SHARED_MEMORY) and not frame.parent.exists()
 
 
-@pytest.mark.parametrize(("mode", "words"), [("full", "No space left on device"), ("gone", "was removed")])
+@pytest.mark.parametrize(
+    ("mode", "words"),
+    [
+        ("full", "No space left on device"),
+        ("gone", "was removed"),
+        ("gone-quietly", "was removed"),
+        ("moved", "was removed"),
+        ("made-again", "was removed"),
+        ("log-gone", "was removed"),
+    ],
+)
 def test_a_full_disk_or_a_removed_folder_is_no_outcome(mode: str, words: str, store: RunStore, toy_folder: str) -> None:
     settings = {"mode": mode, "pids": str(store.root)}
     spec = RunSpec(tracker=hostile.TARGET, sequence=toy_folder, frames=(0, 6), settings=settings)
     with pytest.raises(InfrastructureError, match=words):
         run_one(spec, store)
     assert store.ids() == []
+
+
+def hostile_spec(toy_folder: str, mode: str, **changes: object) -> RunSpec:
+    return RunSpec(tracker=hostile.TARGET, sequence=toy_folder, frames=(0, 6), settings={"mode": mode}, **changes)
+
+
+@pytest.mark.parametrize("mode", ["kill-parent", "end-parents-group"])
+def test_a_tracker_may_not_end_the_processes_above_it(attack, mode: str) -> None:
+    server = SERVERS["fork"]
+    attack("ok")
+    before = server._running
+    record, _ = attack(mode)
+    assert record.status == "crashed"
+    assert record.reason.startswith("frame 2 of 6: PermissionError: [Errno 1] a run may not signal process")
+    assert "(hostile.py:" in record.reason
+    assert server._running == before and before[1].poll() is None
+
+
+def test_a_tracker_may_ask_whether_the_processes_above_it_are_there(attack) -> None:
+    assert attack("ask-parent")[0].status == "ok"
+
+
+def test_a_tracker_may_not_end_the_program(store: RunStore, toy_folder: str, tmp_path: Path) -> None:
+    """The program is a process of its own here: it would be this one that is killed."""
+    here = Path(hostile.__file__).parent
+    spec = hostile_spec(toy_folder, "kill-program").model_dump_json()
+    script = (
+        f"import sys; sys.path[:0] = [{str(here)!r}, {str(here.parents[1])!r}]\n"
+        "from dynslam_bench.runs import RunSpec, RunStore, run_one\n"
+        f"print(run_one(RunSpec.model_validate_json({spec!r}), RunStore({str(store.root)!r})).reason)\n"
+    )
+    program = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
+    assert program.returncode == 0, program.stderr
+    assert program.stdout.startswith("frame 2 of 6: AccessDenied")
+
+
+@pytest.mark.parametrize(
+    ("event", "target", "is_refused"),
+    [
+        ("os.kill", "parent", True),
+        ("os.killpg", "parents group", True),
+        ("os.kill", "minus parents group", True),
+        ("os.kill", "everything", True),
+        ("os.killpg", "everybody", True),
+        ("os.kill", "own", False),
+        ("os.killpg", "own group", False),
+    ],
+)
+def test_which_signals_are_refused(event: str, target: str, is_refused: bool) -> None:
+    """The call is announced as Python announces it, and not made: it could end this process."""
+    script = f"""
+import os, sys
+sys.path[:0] = {[str(Path(hostile.__file__).parents[2])]!r}
+from dynslam_bench.runs.process.child import spare_ancestors
+os.setpgid(0, 0)
+spare_ancestors()
+group = os.getpgid(os.getppid())
+targets = {{"parent": os.getppid(), "parents group": group, "minus parents group": -group, "everything": -1,
+            "everybody": 1, "own": os.getpid(), "own group": 0}}
+sys.audit({event!r}, targets[{target!r}], 0)
+try:
+    sys.audit({event!r}, targets[{target!r}], 9)
+except PermissionError:
+    print("refused")
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "refused\n" if is_refused else ""), done.stderr
+
+
+@linux
+@pytest.mark.parametrize("mode", ["c-kill-parent", "shell-kill-parent"])
+def test_a_run_that_kills_the_fork_server_costs_itself_alone(
+    store: RunStore, toy_folder: str, monkeypatch: pytest.MonkeyPatch, mode: str
+) -> None:
+    """Runs beside it are repeated; it is repeated once, with nothing beside it, and has crashed."""
+    monkeypatch.setenv(START_VARIABLE, "fresh")  # a server that loads nothing is there again at once
+    others = [hostile_spec(toy_folder, "ok", seed=seed) for seed in range(4)]
+    specs = [others[0], hostile_spec(toy_folder, mode), *others[1:]]
+    records = list(run_many(specs, results=store, jobs=3))
+    assert [record.status for record in records] == ["ok", "crashed", "ok", "ok", "ok"]
+    assert records[1].reason == (
+        "the fork server was killed twice, the second time with this run alone, after frame 1 of 6"
+    )
+    assert records[1].n_processed == 2
+    assert sorted(store.ids()) == sorted(record.run_id for record in records)
+    reused: list[str] = []
+    run_many(specs, results=store, on_event=lambda event: reused.append(event.kind))
+    assert reused == ["reused"] * 5
 
 
 class _Slow:

@@ -27,6 +27,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+import psutil
+
 from dynslam_bench.core import (
     DynslamError,
     InfrastructureError,
@@ -65,6 +67,7 @@ def main(connection: Connection) -> int:
     with contextlib.suppress(OSError):
         os.setsid()  # so that the parent can end this process together with what a tracker starts
     adopt_orphans(die_with_parent=True)  # so that what a tracker starts and forgets stays below this process
+    spare_ancestors()
     try:
         job = json.loads(connection.recv_bytes())
     except EOFError:
@@ -135,6 +138,31 @@ def recording_reads(job: dict[str, Any], temporary: Path) -> Iterator[Callable[[
         yield lambda: keep(recorder.so_far())
     finally:
         keep(recorder.finish())
+
+
+def spare_ancestors() -> None:
+    """From now on refuse this process' own signals to the processes above it: the fork server, the program, its shell.
+
+    A tracker that ends its parent process, as a script does that ends what it was started by, would end all other runs.
+    Python's calls alone are refused; what a program or a library signals, `run_one` finds out.
+    """
+    ancestors = {process.pid for process in psutil.Process().parents()}
+    groups = {1}  # it stands for all processes
+    for pid in ancestors:
+        with contextlib.suppress(OSError):  # it has just ended
+            groups.add(os.getpgid(pid))
+    groups.discard(0)  # the group of a process outside of this container; in a call 0 stands for one's own
+
+    def refuse(event: str, arguments: tuple[Any, ...]) -> None:
+        if event not in ("os.kill", "os.killpg"):
+            return
+        target, number = arguments
+        is_process = event == "os.kill" and target in ancestors
+        is_group = (target if event == "os.killpg" else -target) in groups
+        if number and (is_process or is_group):  # number 0 asks whether the process is there
+            raise PermissionError(errno.EPERM, f"a run may not signal process {target}, which it was started by")
+
+    sys.addaudithook(refuse)
 
 
 def peak_memory_mb() -> float:
@@ -265,7 +293,8 @@ def _broken_infrastructure(error: BaseException | None) -> str:
 def source_line(error: BaseException) -> str:
     """``file.py:31``: the innermost line of an exception's traceback outside of libraries, else the innermost."""
     lines = traceback.extract_tb(error.__traceback__)
-    libraries = (*map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib")), "<", sys.base_prefix)
+    folders = map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib"))
+    libraries = (*folders, "<", sys.base_prefix, __file__)
     outside = [
         line for line in lines if "site-packages" not in line.filename and not line.filename.startswith(libraries)
     ]

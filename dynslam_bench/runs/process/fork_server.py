@@ -1,10 +1,10 @@
 """The fork server: a process that has imported everything heavy and forks the children of runs in 10 ms each.
 
 The parent asks for a child over a Unix socket: one byte with two file descriptors, the child's end of its connection
-and a pipe. On the pipe the server answers with the child's process id and, later, its exit code, a JSON line each. A
-run's end is reported after all processes that it had started have ended and its temporary files are removed. When the
-socket closes, because the parent has ended, the server kills its children and ends. It has a session of its own, so
-that signals of a terminal do not reach it before.
+and a pipe. On the pipe the server answers with the child's process id, with 0 once that process has ended, and with its
+exit code, a JSON line each. The exit code is reported after all processes that the run had started have ended and its
+temporary files are removed. When the socket closes, because the parent has ended, the server kills its children and
+ends. It has a session of its own, so that signals of a terminal do not reach it before.
 
 Where forking is not safe (macOS) the server starts each child in a fresh interpreter instead.
 
@@ -59,15 +59,14 @@ class ForkServer:
     """The parent's end; the server is started when first used, and again if it has died.
 
     Args:
-        start: ``fork`` or ``fresh``.
+        start: ``fork`` or ``fresh``; None for what this process' environment says.
     """
 
-    def __init__(self, start: str) -> None:
-        self._start = start
+    def __init__(self, start: str | None = None) -> None:
+        self._start = default_start() if start is None else start
         self._lock = threading.Lock()
         self._running: tuple[socket.socket, subprocess.Popen[bytes]] | None = None
         self._owner = 0
-        atexit.register(self.close)
 
     def spawn(self, child_fd: int) -> int:
         """Start a child that makes a run over a connection.
@@ -129,30 +128,42 @@ class ForkServer:
         self._running = None
 
 
+def default_start() -> str:
+    """How children start: what `START_VARIABLE` says, or what is safe on this system."""
+    return os.environ.get(START_VARIABLE) or ("fork" if sys.platform == "linux" else "fresh")
+
+
 SERVERS = {start: ForkServer(start) for start in ("fork", "fresh")}
+"""The fork servers that all runs of this process share."""
+for _server in SERVERS.values():
+    atexit.register(_server.close)
 
 
 class Child:
-    """A child of the fork server, which waits for its job.
+    """A child of a fork server, which waits for its job.
+
+    Args:
+        server: The fork server; None for the one that all runs share.
 
     Attributes:
         connection: The parent's end.
-        pid: Its process id, 0 until it is known.
+        pid: Its process id; 0 until it is known, and when the process has ended: the system may give it to another.
         members: Its process tree when it was last looked at; for the case that the server is killed.
-        lost: Why nothing is known of its end, if that is so: the server has died.
+        lost: Why nothing is known of its end, if that is so: the server has died, or cannot start a process.
+        server_died: Whether the server has died.
 
     Raises:
         InfrastructureError: The fork server cannot be started.
     """
 
-    def __init__(self) -> None:
-        start = os.environ.get(START_VARIABLE) or ("fork" if sys.platform == "linux" else "fresh")
+    def __init__(self, server: ForkServer | None = None) -> None:
         self.connection, theirs = Pipe()
         with theirs:
-            self.status_fd = SERVERS[start].spawn(theirs.fileno())
+            self.status_fd = (server or SERVERS[default_start()]).spawn(theirs.fileno())
         os.set_blocking(self.status_fd, False)
         self.pid = 0
         self.lost = ""
+        self.server_died = False
         self.members: list[psutil.Process] = []
         self._buffer = b""
         self._exit: int | None = None
@@ -165,7 +176,9 @@ class Child:
             except BlockingIOError:
                 break
             if not data:
-                self._exit, self.lost = -signal.SIGKILL, self.lost or "the fork server was ended from outside"
+                self._exit = -signal.SIGKILL
+                self.server_died = not self.lost
+                self.lost = self.lost or "the fork server was ended from outside"
                 break
             *lines, self._buffer = (self._buffer + data).split(b"\n")
             for message in map(json.loads, lines):
@@ -176,7 +189,7 @@ class Child:
 
     def kill(self) -> None:
         """End it, with everything that it started."""
-        if self.pid and self.poll() is None:
+        if self.poll() is None and self.pid:  # in this order: the answer may be that the process has ended
             end_tree(self.pid)
 
     def close(self) -> None:
@@ -276,6 +289,9 @@ class _Server:
         """Reap the runs that have ended, end what they have left behind, then report them."""
         waited = [os.waitpid(pid, os.WNOHANG) for pid in self.runs]
         ended = [(self.runs.pop(pid), status) for pid, status in waited if pid]
+        # at once: the system may give the number to another process, which is not to be killed
+        for status_fd, _ in ended:
+            _tell(status_fd, {"pid": 0})
         if ended:
             end_children({*self.runs, *self.own})
             sweep()

@@ -53,6 +53,21 @@ class Verdict:
     refused: bool = False
 
 
+class ServerDiedError(InfrastructureError):
+    """The fork server died while a run was made, for example since the run itself has killed it.
+
+    Args:
+        where: Where the run was; empty if it had not begun.
+    """
+
+    def __init__(self, where: str) -> None:
+        super().__init__(f"the run could not go on: the fork server was ended from outside{where}", _GO_ON)
+        self.where = where
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.where,)
+
+
 def supervise(
     child: Child,
     job: Message,
@@ -80,6 +95,7 @@ def supervise(
         How it ended. The child has ended, too, and with it everything that it had started.
 
     Raises:
+        ServerDiedError: The fork server died meanwhile.
         InfrastructureError: The child could not do its work, through no fault of that.
     """
     memory = memory_limit(limits.memory_mb, at_a_time)
@@ -148,6 +164,8 @@ class _Supervisor:
             time.sleep(_SIGNAL_GRACE_S)
         if code < 0 and self.cancelled():
             return self._verdict("stopped", f"cancelled{self._where()}")
+        if self.child.server_died:
+            raise ServerDiedError("" if self.began is None else self._where())
         if self.child.lost or self.began is None:
             lost = self.child.lost or f"the process that was to make it ended with code {code}"
             raise InfrastructureError(f"the run could not go on: {lost}", _GO_ON)
@@ -200,7 +218,8 @@ class _Supervisor:
         self.tick()
         if now >= self.next_tree:
             self.next_tree = now + _TREE_S
-            tree = process_tree(self.child.pid)  # only a part of it if the fork server is killed meanwhile
+            # only a part of it if the fork server is killed meanwhile; none if the process has ended
+            tree = process_tree(self.child.pid) if self.child.pid else []
             rest = [member for member in self.child.members if member not in tree and member.is_running()]
             self.child.members = tree + rest
         used_mb = memory_mb(self.child.members)

@@ -1,0 +1,347 @@
+"""Kills commands at random moments, repeats them, and compares what they give with what they give undisturbed.
+
+    python tests/benchmarks/kills.py [--kills 10] [--seed 0] [--commands bench tune report merge bank]
+
+Each command does a small job: runs of a toy tracker on recordings of 12 images of 16 x 12 pixels. It is made
+once undisturbed. Then, so many times, it begins anew in an empty folder, its process group gets SIGKILL at a random
+moment between its first written file and its end, and the same command is given again. A kill that comes after the end
+is drawn again. The table gives the kills in the middle (some of the result was there, and not all), how many commands
+went on, with exit code 0, and how many gave an equal result: statuses, checksums of trajectories and errors of runs;
+trials, candidates and preset of a study; the files of a report, of merged results and of a bank. Times of the machine
+are not compared. The exit code is 1 unless all results are equal.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import cv2
+import numpy as np
+from command_line import parser_of
+
+from dynslam_bench.core.plugins import module_command
+from dynslam_bench.geometry import Camera
+from dynslam_bench.runs import RunStore
+from dynslam_bench.sequences.cameras import write_camera
+from dynslam_bench.tuning import Study
+
+TRACKER = '''
+"""Reads the camera's place from the depth, scales it, and adds noise."""
+
+import time
+
+import numpy as np
+
+from dynslam_bench.contracts import TrackerSpec, TrackResult
+from dynslam_bench.core.settings import Settings, tunable
+
+
+class DriftingSettings(Settings):
+    gain: float = tunable(1.5, low=0.2, high=3.0, scale="log", meaning="scale of the motion; 1 is right")
+    wobble: int = tunable(2, low=0, high=8, meaning="noise", unit="mm")
+
+
+class Drifting:
+    def __init__(self, settings):
+        self.settings = settings
+
+    def reset(self, camera, *, rng):
+        self.rng = rng
+
+    def track(self, frame):
+        time.sleep(0.02)  # so that kills meet runs and not the beginning of the program alone
+        pose = np.eye(4)
+        pose[0, 3] = self.settings.gain * (float(frame.depth[0, 0]) - 1.0)
+        pose[:3, 3] += self.rng.normal(0, 1e-3 * self.settings.wobble, 3)
+        return TrackResult(pose, "ok")
+
+
+SPEC = TrackerSpec(id="drifting", entry_point=f"{__file__}:Drifting", label="Drifting", settings=DriftingSettings)
+'''
+SUITE = """
+trackers = ["never-move", {tracker}]
+sequences = {sequences}
+seeds = [0, 1]
+"""
+STUDY = """
+tracker = {tracker}
+tune = {tune}
+confirm = {confirm}
+held_out = {held_out}
+recorded = []
+offsets = [0]
+trials = 6
+top = 2
+sampler = "tpe"
+min_coverage = 0.0
+
+[space]
+include = ["gain", "wobble"]
+"""
+
+
+def make_sequence(folder: Path, phase: float, frames: int = 12) -> Path:
+    """A folder in TUM layout whose camera swings along x; the depth of the first pixel tells where it is."""
+    lists: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
+    for index in range(frames):
+        x = 0.2 * np.sin(0.7 * index + phase)
+        stamp = 100 + index / 30
+        images = {
+            "rgb": np.full((12, 16, 3), 10 * index, np.uint8),
+            "depth": np.full((12, 16), round(5000 * (1 + x)), np.uint16),
+        }
+        for kind, image in images.items():
+            (folder / kind).mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(folder / kind / f"{index}.png"), image)
+            lists[kind].append(f"{stamp:.6f} {kind}/{index}.png")
+        lists["groundtruth"].append(f"{stamp:.6f} {x:.6f} 0 0 0 0 0 1")
+    for name, lines in lists.items():
+        (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
+    write_camera(folder / "camera.toml", Camera(16, 12, 15.0, 15.0, 7.5, 5.5))
+    return folder
+
+
+# -- what a command gives, without the times of the machine
+
+
+def runs_of(results: Path) -> list[Any]:
+    """Statuses, checksums of files and errors of all runs."""
+    store = RunStore(results)
+    records, unreadable = store.all()
+    rows: list[Any] = [str(entry) for entry in unreadable]
+    for record in sorted(records, key=lambda record: record.run_id):
+        rows.append([record.run_id, record.status, record.reason, record.notes, record.files, record.study])
+        rows.append(store.score(record).model_dump(mode="json"))
+    return rows
+
+
+def study_of(results: Path) -> list[Any]:
+    """Trials, candidates and preset of the study, and the runs that it made."""
+    folder = results / "studies" / "study"
+    stored = Study.open(folder)
+    trials = [
+        [trial.number, trial.state.name, trial.params, trial.values, trial.intermediate_values]
+        for trial in stored.study.get_trials()
+    ]
+    summary = json.loads((folder / "summary.json").read_text())
+    for candidate in summary["candidates"]:
+        for name in ("on_confirm", "on_held_out"):
+            candidate[name].pop("speed", None)
+    return [trials, summary, (folder / "best.toml").read_text(), runs_of(results)]
+
+
+_MADE_ON = re.compile(rb"on \d{4}-\d\d-\d\d \d\d:\d\d UTC")
+
+
+def files_of(folder: Path) -> dict[str, bytes | str]:
+    """All files, and where links lead; without the index of scores and the time at which a page was made."""
+    contents: dict[str, bytes | str] = {}
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if path.is_symlink():
+            contents[name] = str(path.readlink())
+        elif path.is_file() and path.name != "index.sqlite":
+            contents[name] = _MADE_ON.sub(b"", path.read_bytes())
+    return contents
+
+
+# -- commands
+
+
+@dataclass
+class Command:
+    """A command and how its result is read.
+
+    Attributes:
+        words: Of the command line; ``{target}`` is the folder that it writes.
+        read: Gives its result.
+    """
+
+    words: list[str]
+    read: Callable[[Path], Any]
+
+    def start(self, target: Path) -> subprocess.Popen[bytes]:
+        """Start it in a process group of its own."""
+        words = [word.format(target=target) for word in self.words]
+        command = [*module_command("dynslam_bench"), *words]
+        log = target.with_suffix(".log").open("wb")
+        with log:
+            return subprocess.Popen(
+                command, cwd=target.parent, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
+            )
+
+    def finish(self, target: Path) -> int:
+        """Give it, wait for its end, and give its exit code."""
+        return self.start(target).wait()
+
+
+def make_commands(folder: Path) -> dict[str, Command]:
+    """The five commands, on inputs that are made below a folder."""
+    sequences = [str(make_sequence(folder / f"s{number}", 0.5 * number)) for number in range(4)]
+    (folder / "drifting.py").write_text(TRACKER)
+    tracker = json.dumps(f"{folder / 'drifting.py'}:SPEC")
+    suite, study = folder / "suite.toml", folder / "study.toml"
+    suite.write_text(SUITE.format(tracker=tracker, sequences=json.dumps(sequences[:2])))
+    study.write_text(
+        STUDY.format(
+            tracker=tracker,
+            tune=json.dumps(sequences[:2]),
+            confirm=json.dumps(sequences[2:3]),
+            held_out=json.dumps(sequences[3:]),
+        )
+    )
+    bench = Command(["bench", str(suite), "--results", "{target}"], runs_of)
+    results = folder / "results"
+    assert bench.finish(results) == 0, results.with_suffix(".log").read_text()
+    shards = [str(shard) for shard in split(results, folder)]
+    return {
+        "bench": bench,
+        "tune": Command(["tune", "run", str(study), "--results", "{target}"], study_of),
+        "report": Command(["report", str(results), "-o", "{target}"], files_of),
+        "merge": Command(["runs", "merge", *shards, "-o", "{target}"], files_of),
+        "bank": Command(["bank", "add", *shards, "{target}"], files_of),
+    }
+
+
+def split(results: Path, folder: Path) -> Iterator[Path]:
+    """Two results folders, each with half of the runs of one."""
+    run_ids = RunStore(results).ids()
+    for number in range(2):
+        shard = folder / f"shard{number}"
+        shutil.copytree(results / "sequences", shard / "sequences")
+        for run_id in run_ids[number::2]:
+            shutil.copytree(results / "runs" / run_id, shard / "runs" / run_id)
+        yield shard
+
+
+# -- kills
+
+
+@dataclass
+class Tally:
+    """What came of the kills of one command.
+
+    Attributes:
+        name: The command.
+        undisturbed_s: How long it takes.
+        kills: How many there were.
+        middle: How many left some of the result, and not all.
+        went_on: How often the same command then ended with exit code 0.
+        equal: How often its result was that of the undisturbed one.
+        faults: What was wrong, a line each.
+    """
+
+    name: str
+    undisturbed_s: float = 0.0
+    kills: int = 0
+    middle: int = 0
+    went_on: int = 0
+    equal: int = 0
+    faults: list[str] = field(default_factory=list)
+
+    def row(self) -> str:
+        """A row of the table."""
+        return (
+            f"| {self.name} | {self.undisturbed_s:.1f} | {self.kills} | {self.middle} | {self.went_on} | {self.equal} |"
+        )
+
+
+def first_write_s(target: Path, began: float) -> float:
+    """When the first file of a result was written, in seconds after the beginning."""
+    times = [path.lstat().st_mtime for path in target.rglob("*")]
+    return max(0.0, min(times) - began)
+
+
+def kill_and_repeat(name: str, command: Command, folder: Path, kills: int, random: Random) -> Tally:
+    """Kill a command so many times, each time in an empty folder, and repeat it."""
+    tally = Tally(name)
+
+    # undisturbed: its result, and from when to when it writes
+    whole = folder / f"{name}-whole"
+    began = time.time()
+    assert command.finish(whole) == 0, whole.with_suffix(".log").read_text()
+    tally.undisturbed_s = time.time() - began
+    earliest_s = 0.95 * first_write_s(whole, began)
+    expected = command.read(whole)
+    count = len(files_of(whole))
+
+    while tally.kills < kills:
+        target = folder / f"{name}-{tally.kills}"
+        after_s = random.uniform(earliest_s, tally.undisturbed_s)
+        program = command.start(target)
+        with suppress(subprocess.TimeoutExpired):
+            program.wait(after_s)
+        is_running = program.poll() is None
+        with suppress(ProcessLookupError):
+            os.killpg(program.pid, signal.SIGKILL)
+        program.wait()
+        if not is_running:  # it was quicker this time
+            shutil.rmtree(target, ignore_errors=True)
+            continue
+        tally.kills += 1
+        left = len(files_of(target)) if target.is_dir() else 0
+        tally.middle += 0 < left < count
+
+        # the same command again
+        code = command.finish(target)
+        log = target.with_suffix(".log").read_text().strip()
+        where = f"{name}, killed after {after_s:.2f} s with {left} of {count} files there"
+        if code:
+            tally.faults.append(f"{where}: exit code {code}: {log[-500:]}")
+            continue
+        tally.went_on += 1
+        result = command.read(target)
+        if result == expected:
+            tally.equal += 1
+        else:
+            tally.faults.append(f"{where}: {difference(expected, result)}")
+        shutil.rmtree(target)
+    return tally
+
+
+def difference(expected: Any, result: Any) -> str:
+    """The first place where two results differ, in words."""
+    if isinstance(expected, dict) and isinstance(result, dict):
+        names = [name for name in sorted({*expected, *result}) if expected.get(name) != result.get(name)]
+        return f"{names[0]}: {difference(expected.get(names[0]), result.get(names[0]))}"
+    if isinstance(expected, list) and isinstance(result, list) and len(expected) == len(result):
+        at = next(at for at, pair in enumerate(zip(expected, result, strict=True)) if pair[0] != pair[1])
+        return f"[{at}] {difference(expected[at], result[at])}"
+    return f"{str(expected)[:300]} undisturbed, {str(result)[:300]} after the kill"
+
+
+def main() -> int:
+    """Print the table, and what was wrong."""
+    names = ["bench", "tune", "report", "merge", "bank"]
+    options = parser_of(__doc__, kills=10, seed=0, commands=names).parse_args()
+    print("| command | undisturbed, s | kills | in the middle | went on | equal results |\n" + "| --- " * 6 + "|")
+    with tempfile.TemporaryDirectory() as folder:
+        commands = make_commands(Path(folder))
+        tallies = []
+        for name in options.commands:
+            random = Random(f"{options.seed} {name}")
+            tallies.append(kill_and_repeat(name, commands[name], Path(folder), options.kills, random))
+            print(tallies[-1].row(), flush=True)
+    kills, equal = sum(tally.kills for tally in tallies), sum(tally.equal for tally in tallies)
+    print(f"\n{equal} of {kills} commands that were killed gave, when repeated, the result of an undisturbed one.")
+    for fault in (fault for tally in tallies for fault in tally.faults):
+        print(f"- {fault}")
+    return 0 if equal == kills else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
