@@ -71,6 +71,7 @@ sample_relative  # optuna.samplers.BaseSampler
 default_factory  # pydantic.fields.FieldInfo
 writeable  # numpy.ndarray.flags
 _SimdModel  # numba registers it by its decorator
+compile_extra  # numba.core.compiler.CompilerBase
 keywords  # numba: a signature of a typing template
 muted_rows  # reports/html/templates/report.html.j2
 mtime_ns  # core.fingerprint: part of the key of the cached function

@@ -6,7 +6,7 @@ import pytest
 
 # The tests start many interpreters, and each would compile the sources that it imports.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-# They import the installed package, also from the checkout's folder; else the kernels compile twice.
+# They import the installed package, also from the checkout's folder.
 os.environ["PYTHONSAFEPATH"] = "1"
 # Their matrices are small: threads of OpenBLAS would only wait for each other.
 os.environ["OPENBLAS_NUM_THREADS"] = "1"

@@ -138,7 +138,7 @@ def tell(rows: Iterable[RunRow]) -> list[str]:
 
 
 def compile_kernels(tracker: str = STUDIED) -> None:
-    """Use all kernels of rendering and a tracker once: then they lie compiled beside their sources (or in a cache)."""
+    """Use all kernels of rendering and a tracker once: then they lie compiled in the user's cache."""
     from dynslam_bench.envs import SlamEnv
     from dynslam_bench.sequences.synthetic import open_synthetic
     from dynslam_bench.testing import CornerSequence

@@ -4,6 +4,9 @@ from collections.abc import Callable
 from typing import Any, TypeAlias, TypeVar, cast
 
 import numba
+from numba.extending import is_jitted
+
+from dynslam_bench.core.kernel_cache import KernelCompiler, remember_kernel
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -15,11 +18,11 @@ annotation can say which. Arrays, records and counts are annotated as they are."
 def kernel(function: Function) -> Function:
     """Compile a function, cached on disk and without the GIL.
 
-    The compiled code lies beside the source, or in the user's cache folder; where neither can be written it is compiled
+    The compiled code lies in the user's cache folder (`core.kernel_cache`); where that cannot be written it is compiled
     again in every process. Sums of floats keep their written order (no fast-math), so that a result does not depend on
     the processor's vector width.
     """
-    return _compiled(function)
+    return _compiled(function, error_model="python")
 
 
 def dividing_kernel(function: Function) -> Function:
@@ -29,7 +32,7 @@ def dividing_kernel(function: Function) -> Function:
 
 def spliced(function: Function) -> Function:
     """Compile a function whose statements numba copies into its callers: arrays that are passed to it cost nothing."""
-    return _compiled(function, inline="always")
+    return _compiled(function, error_model="python", inline="always")
 
 
 def inlined(function: Function) -> Function:
@@ -40,25 +43,9 @@ def inlined(function: Function) -> Function:
     return cast("Function", numba.njit(nogil=True, forceinline=True, _nrt=False)(function))
 
 
-def load_kernels() -> None:
-    """Load what lies compiled on disk of all kernels, and with it the rest of numba.
-
-    Processes that are forked from this one have it then; else each takes 0.4 s to load it.
-    """
-    for compiled in _CACHED:
-        cache, target = compiled._cache, compiled.targetctx.codegen()
-        for key in cache._cache_file._load_index():
-            if key == cache._index_key(key[0], target):  # not of another processor
-                compiled.compile(key[0])
-
-
-_CACHED: list[Any] = []
-
-
-def _compiled(function: Function, **options: Any) -> Function:
-    try:
-        compiled = numba.njit(cache=True, nogil=True, **options)(function)
-    except RuntimeError:  # numba finds no folder in which it may cache
-        return cast("Function", numba.njit(nogil=True, **options)(function))
-    _CACHED.append(compiled)
+def _compiled(function: Function, *, error_model: str, **options: Any) -> Function:
+    # numba would give a kernel without an error model that of the kernel which calls it first
+    compiled = numba.njit(nogil=True, pipeline_class=KernelCompiler, error_model=error_model, **options)(function)
+    if is_jitted(compiled):  # not under NUMBA_DISABLE_JIT
+        remember_kernel(compiled)
     return cast("Function", compiled)

@@ -1,9 +1,8 @@
 """Every folder outside the working directory that this package reads or writes, and the variable that moves it.
 
 Below the user's cache folder lie ``data/`` (sequences), ``stages/`` (the stage cache), ``digests/`` (digests of file
-contents, see `core.fingerprint`), ``weights/`` (downloaded checkpoints) and ``vocabularies/`` (decompressed ORB
-vocabularies). Compiled kernels lie where numba puts them: beside the source, or in its own folder
-(``NUMBA_CACHE_DIR``).
+contents, see `core.fingerprint`), ``kernels/`` (compiled kernels, see `core.kernel_cache`), ``weights/`` (downloaded
+checkpoints) and ``vocabularies/`` (decompressed ORB vocabularies).
 """
 
 import os
@@ -43,6 +42,11 @@ def stage_cache_folder() -> Path:
 def digest_cache_folder() -> Path:
     """The folder of remembered digests: ``digests/`` in ``DYNSLAM_BENCH_CACHE``, else in the user's cache folder."""
     return _named(STAGES_VARIABLE, user_cache()) / "digests"
+
+
+def kernels_folder() -> Path:
+    """The folder of compiled kernels: ``kernels/`` in ``DYNSLAM_BENCH_CACHE``, else in the user's cache folder."""
+    return _named(STAGES_VARIABLE, user_cache()) / "kernels"
 
 
 def weights_folder() -> Path:

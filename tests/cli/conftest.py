@@ -7,8 +7,7 @@ from cli_helpers import PROGRAM
 from envs_toys import write_sequence
 
 from dynslam_bench.cli import app, output
-from dynslam_bench.core import fingerprint
-from dynslam_bench.core.folders import digest_cache_folder
+from dynslam_bench.core.folders import digest_cache_folder, kernels_folder, user_cache
 from dynslam_bench.testing import CornerSequence
 
 
@@ -16,9 +15,13 @@ from dynslam_bench.testing import CornerSequence
 def cli(capsys, monkeypatch, tmp_path):
     """Runs the program in an empty folder; returns exit code, output and errors."""
     monkeypatch.chdir(tmp_path)
-    digests = digest_cache_folder()  # shared: those of this package's code take seconds
-    monkeypatch.setattr(fingerprint, "digest_cache_folder", lambda: digests)
+    # shared by all tests: compiling the kernels takes minutes, reading this package's code seconds
+    shared = [kernels_folder(), digest_cache_folder()]
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    user_cache().mkdir(parents=True)
+    for folder in shared:
+        folder.mkdir(parents=True, exist_ok=True)
+        (user_cache() / folder.name).symlink_to(folder)
     monkeypatch.delenv("DYNSLAM_BENCH_DATA", raising=False)
     monkeypatch.setattr(app, "app", PROGRAM)
     monkeypatch.setattr(output, "HEARTBEAT_S", 1000.0)  # no lines of progress where the machine is slow

@@ -9,12 +9,11 @@ from types import SimpleNamespace
 from typing import Literal
 from unittest.mock import Mock
 
-import numba
 import numpy as np
 import pytest
 
 import dynslam_bench
-from dynslam_bench.core import DynslamError, PluginError, SettingsError, compiled, did_you_mean, fingerprint, folders
+from dynslam_bench.core import DynslamError, PluginError, SettingsError, did_you_mean, fingerprint, folders
 from dynslam_bench.core import plugins as plugin_probe
 from dynslam_bench.core import version as versions
 from dynslam_bench.core.code_files import files_below
@@ -176,48 +175,6 @@ def test_errors_survive_a_process_border():
     assert type(again) is SettingsError and str(again) == "what (how)" and str(DynslamError("only")) == "only"
 
 
-@pytest.mark.parametrize("compile_", [compiled.kernel, compiled.dividing_kernel, compiled.spliced])
-def test_kernels_compile_where_nothing_can_be_cached(compile_, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(**options: object):
-        if options.pop("cache", False):
-            raise RuntimeError("cannot cache function: no locator available")
-        return numba.njit(**options)
-
-    monkeypatch.setattr(compiled, "numba", SimpleNamespace(njit=refuse))
-    assert compile_(lambda x: x + 1)(2) == 3
-
-
-def test_kernels_are_cached_and_release_the_lock() -> None:
-    from dynslam_bench.geometry.gauss_newton import apply_twist
-
-    assert apply_twist.targetoptions["nogil"] and apply_twist.stats.cache_path
-
-
-def test_kernels_on_disk_are_loaded_before_they_are_called(monkeypatch: pytest.MonkeyPatch) -> None:
-    def twice(x: float) -> float:
-        return 2 * x
-
-    monkeypatch.setattr(compiled, "_CACHED", [])
-    compiled.kernel(twice)(1.0)
-    again = compiled.kernel(twice)
-    compiled.load_kernels()
-    assert again.signatures == [(numba.float64,)] and not again.stats.cache_misses
-
-
-def test_a_division_by_zero_is_an_error_unless_asked_for() -> None:
-    @compiled.dividing_kernel
-    def like_numpy(x: float) -> float:
-        return 1.0 / x
-
-    @compiled.kernel
-    def like_python(x: float) -> float:
-        return 1.0 / x
-
-    assert like_numpy(0.0) == np.inf
-    with pytest.raises(ZeroDivisionError):
-        like_python(0.0)
-
-
 def write(path: Path, text: str) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
@@ -336,9 +293,13 @@ def test_a_link_to_a_folder_above_it_is_not_followed(tmp_path):
 FOLDERS = {
     "data": folders.find_data_root,
     "stages": folders.stage_cache_folder,
+    "digests": folders.digest_cache_folder,
+    "kernels": folders.kernels_folder,
     "weights": folders.weights_folder,
     "vocabularies": folders.vocabularies_folder,
 }
+CACHES = ("stages", "digests", "kernels")
+"""What ``DYNSLAM_BENCH_CACHE`` moves."""
 VARIABLES = {"data": folders.DATA_VARIABLE, "stages": folders.STAGES_VARIABLE, "weights": folders.WEIGHTS_VARIABLE}
 
 
@@ -362,9 +323,9 @@ def test_everything_lies_in_one_cache_folder(name: str, platform: str, cache: st
 @pytest.mark.parametrize("name", VARIABLES)
 def test_a_variable_moves_one_of_them(name: str, home: Path, monkeypatch) -> None:
     monkeypatch.setenv(VARIABLES[name], str(home / "mine"))
-    assert FOLDERS[name]() == (home / "mine" / "stages" if name == "stages" else home / "mine")
-    for other in FOLDERS.keys() - {name}:
-        assert FOLDERS[other]() == folders.user_cache() / other
+    moved = {folder: home / "mine" / folder for folder in CACHES} if name == "stages" else {name: home / "mine"}
+    for folder, find in FOLDERS.items():
+        assert find() == moved.get(folder, folders.user_cache() / folder)
 
 
 @pytest.fixture

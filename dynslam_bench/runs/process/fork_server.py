@@ -322,7 +322,7 @@ def serve(fd: int, start: str) -> None:
             importlib.import_module(name)
     if start == "fork":
         with contextlib.suppress(Exception):  # what is not loaded here each child loads itself
-            importlib.import_module("dynslam_bench.core.compiled").load_kernels()
+            importlib.import_module("dynslam_bench.core.kernel_cache").load_kernels()
             module_graph()  # remembered: the keys of the children's stage caches are of the code that is loaded here
     adopt_orphans()
     _Server(control, start).run()

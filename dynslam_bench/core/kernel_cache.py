@@ -1,0 +1,178 @@
+"""Compiled kernels on disk: each file is named after what was compiled into it.
+
+The name holds the digest of the kernel's code and of all that it uses, of the types of its arguments, of numba,
+llvmlite, numpy and Python, and of the processor (see `core.kernel_code`). Checkouts and environments of which all of
+this is equal share files; an edit of anything that is compiled into a kernel leads to another file. Only whole files
+are used. See ``docs/decisions/kernel-cache.md``.
+"""
+
+import contextlib
+import hashlib
+import os
+import pickle
+import re
+import time
+from io import BytesIO
+from pathlib import Path
+from types import FunctionType
+
+from numba.core.caching import CompileResultCacheImpl
+from numba.core.compiler import Compiler
+from numba.core.serialize import dumps
+
+from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.files import sweep_temporary, write_atomic
+from dynslam_bench.core.folders import kernels_folder
+from dynslam_bench.core.kernel_code import Foreign, NotDescribedError, kernel_digest, signature_digest
+from dynslam_bench.core.module_graph import PACKAGE, module_graph
+
+SUFFIX = ".kernel"
+UNUSED_S = 30 * 24 * 3600
+"""Files that nobody has loaded for so long are removed: the kernels of one state of the sources take some 7 MB."""
+_DIGITS = 32
+"""Of each digest in a name; two of 10^9 states would share 32 hexadecimal digits with a probability of 10^-21."""
+
+KERNELS: dict[FunctionType, Foreign] = {}
+"""The kernels of this process that may lie on disk, by their Python functions."""
+
+
+def remember_kernel(kernel: Foreign) -> None:
+    """Let a kernel be stored on disk and loaded from there.
+
+    Args:
+        kernel: What `numba.njit` made, with `KernelCompiler` as its ``pipeline_class``.
+    """
+    KERNELS[kernel.py_func] = kernel
+    # the sources are read now: an edit between the import and the compilation of a module shows (`source_digest`)
+    with contextlib.suppress(OSError):
+        module_graph()
+
+
+class KernelCompiler(Compiler):
+    """Numba's compiler, which first looks for what was compiled before."""
+
+    def compile_extra(self, func: FunctionType) -> Foreign:
+        """Load or compile a kernel for the types in ``self.state``.
+
+        Args:
+            func: The kernel's Python function.
+        """
+        kernel = KERNELS[func]
+        file = kernel_file(kernel, self.state.args, self.state.return_type, self.state.flags)
+        if file is None:
+            return super().compile_extra(func)
+
+        content = _read(file)
+        if content is not None:
+            return _load(kernel, content)
+
+        compiled = super().compile_extra(func)
+        # code with "dynamic globals" holds addresses of this process
+        if not compiled.lifted and not compiled.library.has_dynamic_globals:
+            _store(file, self.state.args, compiled)
+        return compiled
+
+
+def load_kernels() -> None:
+    """Load what lies on disk of all kernels, and with it the rest of numba.
+
+    Processes that are forked from this one have it then; else each takes 0.4 s to load it.
+    """
+    files = sorted(kernels_folder().glob(f"*{SUFFIX}"))
+    for kernel in list(KERNELS.values()):
+        prefix = _name_prefix(kernel)
+        for file in files:
+            content = _read(file) if prefix and file.name.startswith(prefix) else None
+            if content is not None:
+                kernel.compile(pickle.loads(content))  # the first of the two objects in it: the types
+
+
+# -- names -------------------------------------------------------------------------------------------------------------
+
+
+def kernel_file(kernel: Foreign, arguments: tuple[Foreign, ...], return_type: Foreign, flags: Foreign) -> Path | None:
+    """Where a kernel lies that is compiled for some types; None if it is compiled in memory only.
+
+    Args:
+        kernel: One of `KERNELS`.
+        arguments: See `signature_digest`; so are the other two.
+        return_type: Likewise.
+        flags: Likewise.
+    """
+    prefix = _name_prefix(kernel)
+    try:
+        signature = signature_digest(arguments, return_type, flags)
+    except (NotDescribedError, OSError):
+        return None
+    return kernels_folder() / f"{prefix}{signature[:_DIGITS]}{SUFFIX}" if prefix else None
+
+
+def _name_prefix(kernel: Foreign) -> str:
+    """How the names of a kernel's files begin; empty if it is compiled in memory only."""
+    function = kernel.py_func
+    name = f"{function.__module__}.{function.__qualname__}".removeprefix(f"{PACKAGE}.")
+    try:
+        return f"{re.sub('[^A-Za-z0-9_.]', '', name)[-100:]}-{kernel_digest(kernel)[:_DIGITS]}-"
+    except (NotDescribedError, OSError):
+        return ""
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+class _Portable(CompileResultCacheImpl):
+    """Numba's conversion of compiled code to what can be written and back, without its choice of a folder."""
+
+    def __init__(self) -> None:
+        pass
+
+
+def _read(file: Path) -> bytes | None:
+    """What a file holds; None if it is missing, cut off, damaged or was written under another name."""
+    try:
+        header, _, content = file.read_bytes().partition(b"\n")
+    except OSError:
+        return None
+    if header != _header(file, content):
+        return None
+    with contextlib.suppress(OSError):  # a folder that can only be read
+        os.utime(file)
+    return content
+
+
+def _header(file: Path, content: bytes) -> bytes:
+    return f"{file.name} {hashlib.sha256(content).hexdigest()}".encode()
+
+
+def _load(kernel: Foreign, content: bytes) -> Foreign:
+    """Make what a file holds a compiled function of this process."""
+    stream = BytesIO(content)
+    pickle.load(stream)  # the types, which `load_kernels` reads
+    context = kernel.targetctx
+    context.refresh()
+    compiled = _Portable().rebuild(context, pickle.load(stream))
+    # kernels that are compiled later may call it
+    context.insert_user_function(compiled.entry_point, compiled.fndesc, [compiled.library])
+    return compiled
+
+
+def _store(file: Path, arguments: tuple[Foreign, ...], compiled: Foreign) -> None:
+    """Write compiled code; where that is not possible, the next process compiles it again."""
+    remove_unused(file.parent, time.time())
+    content = dumps(arguments) + dumps(_Portable().reduce(compiled))
+    with contextlib.suppress(DynslamError):
+        write_atomic(file, _header(file, content) + b"\n" + content)
+
+
+def remove_unused(folder: Path, now: float) -> None:
+    """Remove the kernels that nobody has loaded for `UNUSED_S`, and what killed processes left half-written.
+
+    Args:
+        folder: Where they lie; it may be missing.
+        now: The time, in seconds since the epoch.
+    """
+    sweep_temporary(folder)
+    for file in folder.glob(f"*{SUFFIX}"):
+        with contextlib.suppress(OSError):  # another process has removed it, or the folder can only be read
+            if now - file.stat().st_mtime > UNUSED_S:
+                file.unlink()

@@ -1,0 +1,253 @@
+"""What is compiled into a kernel, as a digest.
+
+A kernel's machine code holds the kernels that it calls, the constants that they use, wherever these are defined, and
+the instructions of `core.simd`. Kernels and constants are described as they are in memory when the kernel is compiled:
+by bytecode and value, without comments, docstrings and line numbers. What only numba can look into (its types,
+instructions in LLVM's language) is described by the source of its module and of all that this module imports.
+"""
+
+import hashlib
+import sys
+import sysconfig
+from collections.abc import Iterable, Iterator
+from functools import cache
+from types import CodeType, FunctionType, ModuleType
+from typing import Any, TypeAlias
+
+import llvmlite
+import numba
+import numpy as np
+from numba.extending import is_jitted
+
+from dynslam_bench.core.module_graph import PACKAGE, module_graph, read_module_graph
+
+Foreign: TypeAlias = Any
+"""A kernel, type or flag of numba, which has no annotations."""
+
+Seen: TypeAlias = dict[Any, int]
+"""Kernels and modules that are described already, by their `id`, in the order in which they were met."""
+
+VERSIONED = {"numba", "llvmlite", "numpy", *sys.stdlib_module_names}
+"""Packages whose versions are part of every digest: what they define is described by its name."""
+NO_CODE = ("CACHE", "COLOR", "CUDA", "DEBUG_CACHE", "DISABLE_PERFORMANCE", "NUMBA", "SHOW_HELP", "THREADING")
+"""How those settings of numba begin that do not change what is compiled."""
+_PLAIN = (bool, int, float, complex, str, bytes, type(None), type(...))
+
+
+class NotDescribedError(Exception):
+    """A kernel uses something whose content cannot be told."""
+
+
+def kernel_digest(kernel: Foreign) -> str:
+    """SHA-256 of what is compiled into a kernel, and of what it is compiled by and for.
+
+    Args:
+        kernel: A function that numba compiles.
+
+    Raises:
+        NotDescribedError: Something that it uses cannot be described.
+        OSError: A source cannot be read.
+    """
+    return _digest([*_target_words(kernel), *_kernel_words(kernel, {})])
+
+
+def signature_digest(arguments: tuple[Foreign, ...], return_type: Foreign, flags: Foreign) -> str:
+    """SHA-256 of the types that a kernel is compiled for.
+
+    Args:
+        arguments: Numba's types of the arguments.
+        return_type: Numba's type of the result, where the caller asks for one; else None.
+        flags: Numba's flags of this compilation: a kernel takes over some of the kernel that calls it.
+
+    Raises:
+        NotDescribedError: One of the types cannot be described.
+        OSError: A source cannot be read.
+    """
+    words = [str(return_type), *(f"{name}={value}" for name, value in sorted(flags.values().items()))]
+    for kind in arguments:
+        words += _type_words(kind)
+    return _digest(words)
+
+
+def _digest(words: Iterable[str]) -> str:
+    state = hashlib.sha256()
+    for word in words:
+        state.update(f"{len(word)} {word}\n".encode(errors="surrogatepass"))
+    return state.hexdigest()
+
+
+def _target_words(kernel: Foreign) -> Iterator[str]:
+    """Versions, processor and settings of numba."""
+    yield from (numba.__version__, llvmlite.__version__, np.__version__)
+    yield str(sysconfig.get_config_var("SOABI") or sys.implementation.cache_tag)
+    yield repr(kernel.targetctx.codegen().magic_tuple())  # operating system, processor and its instructions
+    for name, value in sorted(vars(numba.config).items()):
+        if name.isupper() and not name.startswith(NO_CODE):
+            yield f"{name}={value!r}"
+
+
+def _kernel_words(kernel: Foreign, seen: Seen) -> Iterator[str]:
+    """A kernel with its options and all that it uses; one that is met again is described by its number alone."""
+    function = kernel.py_func
+    known = id(function) in seen
+    yield f"kernel {function.__module__}.{function.__qualname__} {seen.setdefault(id(function), len(seen))}"
+    if not known:
+        yield repr(sorted(kernel.targetoptions.items()))
+        yield from _function_words(function, seen)
+
+
+def _function_words(function: FunctionType, seen: Seen) -> Iterator[str]:
+    codes = list(_with_inner_code(function.__code__))
+    for code in codes:
+        yield from _code_words(code, function.__doc__)
+
+    # what the function holds: defaults of its arguments, variables of the function around it
+    try:
+        enclosed = tuple(cell.cell_contents for cell in function.__closure__ or ())
+    except ValueError as error:
+        raise NotDescribedError(f"{function.__qualname__} uses a variable that has no value yet") from error
+    yield from _value_words((function.__defaults__, enclosed), (), seen)
+    yield from _value_words(tuple(sorted((function.__kwdefaults__ or {}).items())), (), seen)
+
+    # what it takes from its module; names of attributes are among them, for modules that it uses
+    names = tuple(sorted({name for code in codes for name in code.co_names}))
+    for name in names:
+        if name in function.__globals__:
+            yield name
+            yield from _value_words(function.__globals__[name], names, seen)
+
+
+def _with_inner_code(code: CodeType) -> Iterator[CodeType]:
+    """A function's code and that of the functions and comprehensions in it."""
+    yield code
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _with_inner_code(constant)
+
+
+def _code_words(code: CodeType, docstring: str | None) -> Iterator[str]:
+    yield code.co_code.hex()
+    yield getattr(code, "co_exceptiontable", b"").hex()  # Python 3.10 has none
+    yield repr((code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount, code.co_flags))
+    yield repr((code.co_names, code.co_varnames, code.co_freevars, code.co_cellvars))
+    for constant in code.co_consts:
+        if constant is None or constant == docstring:
+            yield "None"  # the place of a docstring holds None if there is none
+        elif isinstance(constant, CodeType):
+            yield "inner code"
+        else:
+            yield from _constant_words(constant)
+
+
+def _constant_words(constant: Any) -> Iterator[str]:
+    """A constant in bytecode; sets have no order of their own."""
+    if isinstance(constant, frozenset):
+        yield f"frozenset {sorted(map(repr, constant))}"
+    elif isinstance(constant, tuple):
+        yield f"tuple {len(constant)}"
+        for element in constant:
+            yield from _constant_words(element)
+    else:
+        yield f"{type(constant).__name__} {constant!r}"
+
+
+def _value_words(value: Any, names: tuple[str, ...], seen: Seen) -> Iterator[str]:
+    """A value that a kernel uses.
+
+    Args:
+        value: The value.
+        names: The names in the kernel's code: those are described that it may take from a module.
+        seen: What is described already.
+    """
+    if type(value) in _PLAIN:
+        yield f"{type(value).__name__} {value!r}"
+    elif is_jitted(value):
+        yield from _kernel_words(value, seen)
+    elif isinstance(value, ModuleType):
+        yield from _module_words(value, names, seen)
+    elif isinstance(value, tuple):
+        yield from _tuple_words(type(value), seen)
+        yield str(len(value))
+        for element in value:
+            yield from _value_words(element, names, seen)
+    elif isinstance(value, type) and issubclass(value, tuple):
+        yield from _tuple_words(value, seen)
+    elif isinstance(value, np.ndarray | np.generic) and not value.dtype.hasobject:
+        yield f"array {value.dtype!r} {value.shape} {value.strides} {value.tobytes().hex()}"
+    elif isinstance(value, np.dtype):
+        yield f"dtype {value!r}"
+    elif isinstance(value, numba.types.Type):
+        yield from _type_words(value)
+    else:
+        yield from _named_words(value)
+
+
+def _module_words(module: ModuleType, names: tuple[str, ...], seen: Seen) -> Iterator[str]:
+    yield f"module {module.__name__}"
+    is_versioned = module.__name__.partition(".")[0] in VERSIONED
+    if not is_versioned and (id(module), names) not in seen:
+        seen[id(module), names] = len(seen)
+        for name in names:
+            if hasattr(module, name):
+                yield name
+                yield from _value_words(getattr(module, name), names, seen)
+
+
+def _tuple_words(kind: type, seen: Seen) -> Iterator[str]:
+    """A class of tuples: `tuple` itself or a `NamedTuple`."""
+    yield f"tuple {kind.__module__}.{kind.__qualname__} {getattr(kind, '_fields', ())}"
+    for name, default in getattr(kind, "_field_defaults", {}).items():
+        yield name
+        yield from _value_words(default, (), seen)
+
+
+def _type_words(kind: Foreign) -> Iterator[str]:
+    """One of numba's types."""
+    if isinstance(kind, numba.types.Callable):
+        raise NotDescribedError(f"a function as an argument: {kind}")
+    yield f"type {kind}"
+    if isinstance(kind, numba.types.BaseNamedTuple):
+        yield from _tuple_words(kind.instance_class, {})
+    if isinstance(kind, numba.types.BaseTuple):
+        for inner in kind.types:
+            yield from _type_words(inner)
+    yield from _named_words(type(kind))
+
+
+def _named_words(value: Any) -> Iterator[str]:
+    """Something that is described by where it is defined."""
+    module = getattr(value, "__module__", None) or type(value).__module__
+    if _is_own(module):
+        # one inner function may make several instructions: they differ by the names that their module gives them
+        names = sorted(name for name, other in vars(sys.modules[module]).items() if other is value)
+        yield source_digest(module)
+    elif module.partition(".")[0] in VERSIONED:
+        name = str(getattr(value, "__qualname__", None) or getattr(value, "__name__", "<unknown>"))
+        names = [] if "<" in name else [name]
+    else:
+        names = []
+    if not names:
+        raise NotDescribedError(f"{value!r} of {module}")
+    yield f"{module} {names}"
+
+
+def _is_own(module: str) -> bool:
+    return module.partition(".")[0] == PACKAGE
+
+
+@cache
+def source_digest(module: str) -> str:
+    """The digest of a module's source and of all that it imports, see `core.module_graph`.
+
+    Args:
+        module: One that is imported already.
+
+    Raises:
+        NotDescribedError: Its source has changed since this process first looked at the sources, so that it may not
+            be what was imported; or it is none of this package's sources.
+        OSError: A source cannot be read.
+    """
+    digest = module_graph().digest([module])
+    if module not in module_graph().modules or read_module_graph().digest([module]) != digest:
+        raise NotDescribedError(f"{module} has changed since it was imported")
+    return digest
