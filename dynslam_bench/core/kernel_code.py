@@ -24,7 +24,7 @@ from dynslam_bench.core.module_graph import PACKAGE, module_graph, read_module_g
 Foreign: TypeAlias = Any
 """A kernel, type or flag of numba, which has no annotations."""
 
-Seen: TypeAlias = dict[Any, int]
+Described: TypeAlias = dict[Any, int]
 """Kernels and modules that are described already, by their `id`, in the order in which they were met."""
 
 VERSIONED = {"numba", "llvmlite", "numpy", *sys.stdlib_module_names}
@@ -86,17 +86,17 @@ def _target_words(kernel: Foreign) -> Iterator[str]:
             yield f"{name}={value!r}"
 
 
-def _kernel_words(kernel: Foreign, seen: Seen) -> Iterator[str]:
+def _kernel_words(kernel: Foreign, described: Described) -> Iterator[str]:
     """A kernel with its options and all that it uses; one that is met again is described by its number alone."""
     function = kernel.py_func
-    known = id(function) in seen
-    yield f"kernel {function.__module__}.{function.__qualname__} {seen.setdefault(id(function), len(seen))}"
-    if not known:
+    is_described = id(function) in described
+    yield f"kernel {function.__module__}.{function.__qualname__} {described.setdefault(id(function), len(described))}"
+    if not is_described:
         yield repr(sorted(kernel.targetoptions.items()))
-        yield from _function_words(function, seen)
+        yield from _function_words(function, described)
 
 
-def _function_words(function: FunctionType, seen: Seen) -> Iterator[str]:
+def _function_words(function: FunctionType, described: Described) -> Iterator[str]:
     codes = list(_with_inner_code(function.__code__))
     for code in codes:
         yield from _code_words(code, function.__doc__)
@@ -106,15 +106,15 @@ def _function_words(function: FunctionType, seen: Seen) -> Iterator[str]:
         enclosed = tuple(cell.cell_contents for cell in function.__closure__ or ())
     except ValueError as error:
         raise NotDescribedError(f"{function.__qualname__} uses a variable that has no value yet") from error
-    yield from _value_words((function.__defaults__, enclosed), (), seen)
-    yield from _value_words(tuple(sorted((function.__kwdefaults__ or {}).items())), (), seen)
+    yield from _value_words((function.__defaults__, enclosed), (), described)
+    yield from _value_words(tuple(sorted((function.__kwdefaults__ or {}).items())), (), described)
 
     # what it takes from its module; names of attributes are among them, for modules that it uses
     names = tuple(sorted({name for code in codes for name in code.co_names}))
     for name in names:
         if name in function.__globals__:
             yield name
-            yield from _value_words(function.__globals__[name], names, seen)
+            yield from _value_words(function.__globals__[name], names, described)
 
 
 def _with_inner_code(code: CodeType) -> Iterator[CodeType]:
@@ -151,27 +151,27 @@ def _constant_words(constant: Any) -> Iterator[str]:
         yield f"{type(constant).__name__} {constant!r}"
 
 
-def _value_words(value: Any, names: tuple[str, ...], seen: Seen) -> Iterator[str]:
+def _value_words(value: Any, names: tuple[str, ...], described: Described) -> Iterator[str]:
     """A value that a kernel uses.
 
     Args:
         value: The value.
         names: The names in the kernel's code: those are described that it may take from a module.
-        seen: What is described already.
+        described: What is described already.
     """
     if type(value) in _PLAIN:
         yield f"{type(value).__name__} {value!r}"
     elif is_jitted(value):
-        yield from _kernel_words(value, seen)
+        yield from _kernel_words(value, described)
     elif isinstance(value, ModuleType):
-        yield from _module_words(value, names, seen)
+        yield from _module_words(value, names, described)
     elif isinstance(value, tuple):
-        yield from _tuple_words(type(value), seen)
+        yield from _tuple_words(type(value), described)
         yield str(len(value))
         for element in value:
-            yield from _value_words(element, names, seen)
+            yield from _value_words(element, names, described)
     elif isinstance(value, type) and issubclass(value, tuple):
-        yield from _tuple_words(value, seen)
+        yield from _tuple_words(value, described)
     elif isinstance(value, np.ndarray | np.generic) and not value.dtype.hasobject:
         yield f"array {value.dtype!r} {value.shape} {value.strides} {value.tobytes().hex()}"
     elif isinstance(value, np.dtype):
@@ -182,23 +182,23 @@ def _value_words(value: Any, names: tuple[str, ...], seen: Seen) -> Iterator[str
         yield from _named_words(value)
 
 
-def _module_words(module: ModuleType, names: tuple[str, ...], seen: Seen) -> Iterator[str]:
+def _module_words(module: ModuleType, names: tuple[str, ...], described: Described) -> Iterator[str]:
     yield f"module {module.__name__}"
     is_versioned = module.__name__.partition(".")[0] in VERSIONED
-    if not is_versioned and (id(module), names) not in seen:
-        seen[id(module), names] = len(seen)
+    if not is_versioned and (id(module), names) not in described:
+        described[id(module), names] = len(described)
         for name in names:
             if hasattr(module, name):
                 yield name
-                yield from _value_words(getattr(module, name), names, seen)
+                yield from _value_words(getattr(module, name), names, described)
 
 
-def _tuple_words(kind: type, seen: Seen) -> Iterator[str]:
+def _tuple_words(kind: type, described: Described) -> Iterator[str]:
     """A class of tuples: `tuple` itself or a `NamedTuple`."""
     yield f"tuple {kind.__module__}.{kind.__qualname__} {getattr(kind, '_fields', ())}"
     for name, default in getattr(kind, "_field_defaults", {}).items():
         yield name
-        yield from _value_words(default, (), seen)
+        yield from _value_words(default, (), described)
 
 
 def _type_words(kind: Foreign) -> Iterator[str]:
