@@ -410,6 +410,8 @@ def _in_words(section: str, name: str, before: str) -> str:
     """What a user calls an entry of `Reads`."""
     short = re.sub("^(plugin|work):/", "", name)
     match section:
+        case "search" if name.startswith(COMMAND):
+            return f"the place of the {name}"
         case "search":
             return name
         case "environment":

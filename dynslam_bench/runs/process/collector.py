@@ -349,7 +349,7 @@ class Collector:
 
     def _places_of(self, word: str, text: str) -> set[str]:
         """Where a file of that name could lie."""
-        folders = {os.path.dirname(text), os.getcwd()}
+        folders = {os.path.dirname(text), str(self._anchors.work)}
         if self._anchors.plugin is not None:
             folders.add(str(self._anchors.plugin))
         path = os.path.expanduser(word)

@@ -445,6 +445,7 @@ class ReadRecorder:
 
     def begin_log(self) -> None:
         """In a forked process: write down what is read, as it ends without a word."""
+        self._unheard.clear()  # threads of the other process
         with self._hearing_nothing():
             path = self._folders[0] / _LOG.format(os.getpid())
             self._log = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
