@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from dynslam_bench.core.programs import is_counted, program_environment, program_reads
-from dynslam_bench.core.reads import Anchors, Reads, Verifier, changed_reads, digest_of
+from dynslam_bench.core.reads import Anchors, Reads, Verifier, changed_reads, digest_of, search_now
 
 SERVER = Path(__file__).with_name("reads_server.py")
 
@@ -247,6 +247,15 @@ def test_a_configuration_that_names_weights(config: str, is_opened: bool, bench:
     assert bench.changed(reads) == f"the file {NAME}"
 
 
+@pytest.mark.parametrize("name", ["0001.png", "net.ONNX"])
+def test_a_listed_folder_whose_images_are_opened_in_machine_code(name: str, bench: Bench) -> None:
+    bench.write(f"work/masks/{name}", "1111")
+    reads = bench.record("import os\ndef run(folder):\n    return os.listdir(folder)\n", folder="masks")
+    assert set(reads.files) == {"plugin:/mine.py", "work:/masks/"}
+    edit(bench.work / "masks" / name, "2222")
+    assert bench.changed(reads) == "the content of the folder masks"
+
+
 def test_a_source_that_names_a_file_which_is_opened_in_machine_code(bench: Bench) -> None:
     bench.write("plugin/mask.png", "1111")
     bench.write("plugin/other.png", "1111")
@@ -296,38 +305,46 @@ def test_a_variable_in_a_path(text: str, bench: Bench, monkeypatch: pytest.Monke
 # -- environment variables ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "look",
-    [
-        "os.environ.get('MY_SLAM_MODE')",
-        "os.environ['MY_SLAM_MODE'] if 'MY_SLAM_MODE' in os.environ else ''",
-        "'MY_SLAM_MODE' in os.environ",
-        "os.getenv('MY_SLAM_MODE')",
-        "os.getenvb(b'MY_SLAM_MODE')",
-        "os.environb.get(b'MY_SLAM_MODE')",
-        "os.environ.copy()",
-        "dict(os.environ)",
-        "{**os.environ}",
-        "os.environ | {}",
-        "[key for key in os.environ]",
-        "list(os.environ.items())",
-        "os.path.expandvars('$MY_SLAM_MODE/x')",
-        "os.path.expandvars(b'$MY_SLAM_MODE/x')",
-        "__import__('string').Template('$MY_SLAM_MODE').safe_substitute(os.environ)",
-    ],
-)
-@pytest.mark.parametrize("value", ["fast", None])
-def test_an_environment_variable_that_a_plug_in_looks_up(
-    look: str, value: str | None, bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if value is not None:
-        bench.environment["MY_SLAM_MODE"] = value
-    elif "copy" in look or "dict" in look or "{" in look or "items" in look or "for key" in look:
-        pytest.skip("what is not set is not among what is listed")
+LOOKS = [
+    "os.environ.get('MY_SLAM_MODE')",
+    "os.environ['MY_SLAM_MODE'] if 'MY_SLAM_MODE' in os.environ else ''",
+    "'MY_SLAM_MODE' in os.environ",
+    "os.getenv('MY_SLAM_MODE')",
+    "os.getenvb(b'MY_SLAM_MODE')",
+    "os.environb.get(b'MY_SLAM_MODE')",
+    "os.path.expandvars('$MY_SLAM_MODE/x')",
+    "os.path.expandvars(b'$MY_SLAM_MODE/x')",
+    "__import__('string').Template('$MY_SLAM_MODE').safe_substitute(os.environ)",
+]
+LISTINGS = [
+    "os.environ.copy()",
+    "dict(os.environ)",
+    "{**os.environ}",
+    "os.environ | {}",
+    "[key for key in os.environ]",
+    "list(os.environ.items())",
+    "dict(os.environb)",
+]
+
+
+@pytest.mark.parametrize("look", LOOKS)
+def test_a_variable_that_is_not_set_and_that_a_plug_in_looks_up(look: str, bench: Bench) -> None:
+    reads = bench.record(f"import os\ndef run():\n    return {look}\n")
+    assert reads.environment == {"$MY_SLAM_MODE": ""}
+    bench.environment["MY_SLAM_MODE"] = "slow"
+    assert bench.changed(reads) == "the environment variable MY_SLAM_MODE"
+
+
+@pytest.mark.parametrize("look", LOOKS + LISTINGS)
+def test_a_variable_that_a_plug_in_looks_up(look: str, bench: Bench) -> None:
+    bench.environment["MY_SLAM_MODE"] = "fast"
     reads = bench.record(f"import os\ndef run():\n    return {look}\n")
     assert "$MY_SLAM_MODE" in reads.environment
-    assert not value or value not in reads.to_json()
+    assert "HOME" not in reads.to_json()
+    assert "fast" not in reads.to_json()
     bench.environment["MY_SLAM_MODE"] = "slow"
+    assert bench.changed(reads) == "the environment variable MY_SLAM_MODE"
+    del bench.environment["MY_SLAM_MODE"]
     assert bench.changed(reads) == "the environment variable MY_SLAM_MODE"
 
 
@@ -562,6 +579,14 @@ def test_search_paths_are_compared(bench: Bench) -> None:
         del bench.environment[name]
 
 
+def test_what_opencv_adds_to_the_search_path_of_its_process_does_not_count(tmp_path: Path) -> None:
+    anchors = Anchors(None, tmp_path)
+    added = "/env/lib/python3.11/site-packages/cv2/../../lib64:"
+    assert search_now("LD_LIBRARY_PATH", {"LD_LIBRARY_PATH": added}, anchors) == ""
+    assert search_now("LD_LIBRARY_PATH", {"LD_LIBRARY_PATH": f"{added}{tmp_path}/lib"}, anchors) == "work:/lib"
+    assert program_environment((), {"LD_LIBRARY_PATH": f"{added}/opt/lib"}) == {"LD_LIBRARY_PATH": "/opt/lib"}
+
+
 # -- what changes while it is read -------------------------------------------------------------------------------------
 
 TWICE = "def run(name):\n    open(name, 'rb').read()\ndef again():\n    pass\n"
@@ -730,7 +755,7 @@ def test_what_a_program_is_made_of(words: list[str], edited: str, bench: Bench) 
     file = bench.root / edited
     text = file.read_text()
     edit(file, text.replace("1111", "2222").replace("net", "bet"))
-    shown = "maps" if "maps" in edited else edited.removeprefix("work/")
+    shown = "the content of the folder maps" if "maps" in edited else edited.removeprefix("work/")
     assert bench.changed(reads).endswith(f"{shown} of a program")
 
 
