@@ -6,6 +6,7 @@ files that are mapped into memory, the files and folders that the command line n
 
 import contextlib
 import os
+import re
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -47,6 +48,8 @@ SESSION_VARIABLES = (
 )
 """These name the terminal, the login or the moment. Programs do not get them, and their values do not count."""
 _UNCOUNTED = frozenset((*RUN_VARIABLES, *PLACE_VARIABLES, *SESSION_VARIABLES))
+_LIBRARIES = "LD_LIBRARY_PATH"
+_OF_OPENCV = re.compile(r"/cv2/\.\./\.\./lib\w*/?$")
 _NOT_FILES = ("/proc/", "/sys/", "/dev/", "/memfd:", "/SYSV", "[")
 """Beginnings of what is mapped, or named, and is no file on a disk."""
 
@@ -65,7 +68,15 @@ def program_environment(declared: Iterable[str] = (), environment: Mapping[str, 
     """
     source = os.environ if environment is None else environment
     names = (*RESULT_VARIABLES, *RUN_VARIABLES, *PLACE_VARIABLES, *declared)
-    return {name: source[name] for name in names if name in source}
+    variables = {name: source[name] for name in names if name in source}
+    if _LIBRARIES in variables:
+        variables[_LIBRARIES] = os.pathsep.join(folders_of(variables[_LIBRARIES]))
+    return variables
+
+
+def folders_of(search_path: str) -> list[str]:
+    """The folders of a search path, but for those that ``import cv2`` adds to ``LD_LIBRARY_PATH`` in its process."""
+    return [folder for folder in search_path.split(os.pathsep) if folder and not _OF_OPENCV.search(folder)]
 
 
 # -- what a command names ----------------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import re
 import shutil
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +20,7 @@ from typing import Annotated
 from pydantic import AfterValidator, Field
 
 from dynslam_bench.core.fingerprint import path_digest
+from dynslam_bench.core.programs import folders_of
 from dynslam_bench.core.records import Record, digest
 
 ABSENT = ""
@@ -53,7 +54,7 @@ class Reads(Record):
     Names of files begin in the folders of `Anchors`.
 
     Attributes:
-        files: SHA-256 of each file's bytes.
+        files: SHA-256 of each file's bytes. A name that ends in a slash is that of a folder whose whole content counts.
         folders: Digest of the names in each folder that was listed.
         links: Where each file or folder lies that was reached through symbolic links.
         environment: Digest of the value of each environment variable, by ``$NAME``. Values may be secrets: eight digits
@@ -61,7 +62,7 @@ class Reads(Record):
         search: The paths on which libraries and modules are searched; what each command was found to be.
         modules: Where each module that was asked for was found, by its top-level name.
         distributions: Version and digest of the RECORD of each distribution whose modules were imported.
-        programs: Digest of the content of each file and folder that the processes of programs were made of.
+        programs: The same of each file and folder that the processes of programs were made of.
     """
 
     files: Entries = Field(default_factory=dict)
@@ -123,9 +124,9 @@ class Anchors:
                 return folder + name[len(label) :]
         return name
 
-    def names(self, search_path: str) -> str:
+    def names(self, folders: Iterable[str]) -> str:
         """A search path such as ``PYTHONPATH`` with the names of its folders."""
-        return os.pathsep.join(map(self.name, search_path.split(os.pathsep)))
+        return os.pathsep.join(map(self.name, folders))
 
 
 # -- what is there now -------------------------------------------------------------------------------------------------
@@ -205,9 +206,7 @@ def search_now(name: str, environment: Mapping[str, str], anchors: Anchors) -> s
     if name.startswith(COMMAND):
         found = shutil.which(name[len(COMMAND) :], path=environment.get("PATH"))
         return ABSENT if found is None else anchors.name(os.path.abspath(found))
-    folders = environment.get(name, "").split(os.pathsep)
-    # OpenCV's import puts folders of its own there, which only a process that has imported it shows
-    return anchors.names(os.pathsep.join(folder for folder in folders if folder and "/cv2/" not in folder))
+    return anchors.names(folders_of(environment.get(name, "")))
 
 
 class ImportPath:
@@ -260,12 +259,13 @@ class ImportPath:
         return next(filter(os.path.isfile, files), metadata)
 
     @cached_property
-    def _of_module(self) -> dict[str, list[str]]:
-        """The names of the distributions that bring each top-level module."""
-        distributions: dict[str, list[str]] = {}
+    def _of_module(self) -> dict[str, list[tuple[str, str]]]:
+        """The names of the distributions that bring each top-level module, with the beginning of its files' paths."""
+        distributions: dict[str, list[tuple[str, str]]] = {}
         for name, metadata in self.distributions.items():
+            beginning = os.path.dirname(metadata) + os.sep
             for top in _top_level_names(metadata):
-                distributions.setdefault(top, []).append(name)
+                distributions.setdefault(top, []).append((name, beginning))
         return distributions
 
     def distributions_of(self, top: str, file: str) -> list[str]:
@@ -275,11 +275,7 @@ class ImportPath:
             top: Its top-level name.
             file: Its file.
         """
-        return [
-            name
-            for name in self._of_module.get(top, ())
-            if file.startswith(os.path.dirname(self.distributions[name]) + os.sep)
-        ]
+        return [name for name, beginning in self._of_module.get(top, ()) if file.startswith(beginning)]
 
     def distributions_at(self, file: str) -> list[str]:
         """The names of the distributions that bring the module in which a file lies; empty where there is none."""
@@ -289,6 +285,12 @@ class ImportPath:
                 if names := self.distributions_of(top, file):
                     return names
         return []
+
+    def read_all(self) -> None:
+        """Read what is installed, so that this process and those that it forks remember it."""
+        for name in self.distributions:
+            self.distribution(name)
+        self.distributions_of("", "")
 
     def find(self, top: str) -> str:
         """The file or folder of a top-level module, as Python would find it; `ABSENT` where it is not on the path."""
@@ -412,6 +414,8 @@ def _in_words(section: str, name: str, before: str) -> str:
     """What a user calls an entry of `Reads`."""
     short = re.sub("^(plugin|work):/", "", name)
     match section:
+        case "search" if name.startswith(COMMAND):
+            return f"the place of the {name}"
         case "search":
             return name
         case "environment":
@@ -424,6 +428,5 @@ def _in_words(section: str, name: str, before: str) -> str:
             return f"the names in the folder {short}"
         case "links":
             return f"the target of the link {short}"
-        case "programs":
-            return f"the file {short} of a program"
-    return f"the file {short}"
+    what = f"the content of the folder {short.rstrip(os.sep)}" if name.endswith(os.sep) else f"the file {short}"
+    return f"{what} of a program" if section == "programs" else what

@@ -35,7 +35,7 @@ def record(job, answer):
     snapshot = recorder.snapshot()
     reads = recorder.finish()
     forks = list(Path(job["private"]).glob("reads-*"))
-    assert forks or snapshot == digest_of(reads), "the snapshot at the end is another than the result"
+    assert forks or reads.programs or snapshot == digest_of(reads), "the snapshot at the end is another than the result"
     answer({"reads": reads.model_dump()})
 
 

@@ -4,25 +4,39 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from dynslam_bench.core.reads import Anchors, Reads, Verifier, digest_of
+from dynslam_bench.core.programs import is_counted, program_environment, program_reads
+from dynslam_bench.core.reads import Anchors, Reads, Verifier, changed_reads, digest_of, search_now
 
 SERVER = Path(__file__).with_name("reads_server.py")
 
 
 class Child:
-    """A process that forks another for each recording; its code has no file, so that it is nobody's."""
+    """A process that forks another for each recording; its code has no file, so that it is nobody's.
 
-    def __init__(self) -> None:
-        code = f"exec(compile(open({str(SERVER)!r}).read(), '<server>', 'exec'))"
+    Args:
+        path: Folders that come first on its import path.
+        preloaded: A module that it imports before it forks.
+    """
+
+    def __init__(self, path: Sequence[str] = (), preloaded: str = "sys") -> None:
+        code = f"import {preloaded}; exec(compile(open({str(SERVER)!r}).read(), '<server>', 'exec'))"
         pipe = subprocess.PIPE
-        self.process = subprocess.Popen([sys.executable, "-c", code], stdin=pipe, stdout=pipe, text=True)
+        places = os.pathsep.join([*path, os.environ.get("PYTHONPATH", "")])
+        environment = os.environ | {"PYTHONPATH": places}
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", code], stdin=pipe, stdout=pipe, text=True, env=environment
+        )
+
+    def close(self) -> None:
+        self.process.stdin.close()
+        self.process.wait(10)
 
     def ask(self, request: dict[str, Any]) -> dict[str, Any]:
         print(json.dumps(request), file=self.process.stdin, flush=True)
@@ -41,8 +55,7 @@ class Child:
 def child() -> Iterator[Child]:
     child = Child()
     yield child
-    child.process.stdin.close()
-    child.process.wait(10)
+    child.close()
 
 
 @dataclass
@@ -234,6 +247,15 @@ def test_a_configuration_that_names_weights(config: str, is_opened: bool, bench:
     assert bench.changed(reads) == f"the file {NAME}"
 
 
+@pytest.mark.parametrize("name", ["0001.png", "net.ONNX"])
+def test_a_listed_folder_whose_images_are_opened_in_machine_code(name: str, bench: Bench) -> None:
+    bench.write(f"work/masks/{name}", "1111")
+    reads = bench.record("import os\ndef run(folder):\n    return os.listdir(folder)\n", folder="masks")
+    assert set(reads.files) == {"plugin:/mine.py", "work:/masks/"}
+    edit(bench.work / "masks" / name, "2222")
+    assert bench.changed(reads) == "the content of the folder masks"
+
+
 def test_a_source_that_names_a_file_which_is_opened_in_machine_code(bench: Bench) -> None:
     bench.write("plugin/mask.png", "1111")
     bench.write("plugin/other.png", "1111")
@@ -283,38 +305,46 @@ def test_a_variable_in_a_path(text: str, bench: Bench, monkeypatch: pytest.Monke
 # -- environment variables ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "look",
-    [
-        "os.environ.get('MY_SLAM_MODE')",
-        "os.environ['MY_SLAM_MODE'] if 'MY_SLAM_MODE' in os.environ else ''",
-        "'MY_SLAM_MODE' in os.environ",
-        "os.getenv('MY_SLAM_MODE')",
-        "os.getenvb(b'MY_SLAM_MODE')",
-        "os.environb.get(b'MY_SLAM_MODE')",
-        "os.environ.copy()",
-        "dict(os.environ)",
-        "{**os.environ}",
-        "os.environ | {}",
-        "[key for key in os.environ]",
-        "list(os.environ.items())",
-        "os.path.expandvars('$MY_SLAM_MODE/x')",
-        "os.path.expandvars(b'$MY_SLAM_MODE/x')",
-        "__import__('string').Template('$MY_SLAM_MODE').safe_substitute(os.environ)",
-    ],
-)
-@pytest.mark.parametrize("value", ["fast", None])
-def test_an_environment_variable_that_a_plug_in_looks_up(
-    look: str, value: str | None, bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if value is not None:
-        bench.environment["MY_SLAM_MODE"] = value
-    elif "copy" in look or "dict" in look or "{" in look or "items" in look or "for key" in look:
-        pytest.skip("what is not set is not among what is listed")
+LOOKS = [
+    "os.environ.get('MY_SLAM_MODE')",
+    "os.environ['MY_SLAM_MODE'] if 'MY_SLAM_MODE' in os.environ else ''",
+    "'MY_SLAM_MODE' in os.environ",
+    "os.getenv('MY_SLAM_MODE')",
+    "os.getenvb(b'MY_SLAM_MODE')",
+    "os.environb.get(b'MY_SLAM_MODE')",
+    "os.path.expandvars('$MY_SLAM_MODE/x')",
+    "os.path.expandvars(b'$MY_SLAM_MODE/x')",
+    "__import__('string').Template('$MY_SLAM_MODE').safe_substitute(os.environ)",
+]
+LISTINGS = [
+    "os.environ.copy()",
+    "dict(os.environ)",
+    "{**os.environ}",
+    "os.environ | {}",
+    "[key for key in os.environ]",
+    "list(os.environ.items())",
+    "dict(os.environb)",
+]
+
+
+@pytest.mark.parametrize("look", LOOKS)
+def test_a_variable_that_is_not_set_and_that_a_plug_in_looks_up(look: str, bench: Bench) -> None:
+    reads = bench.record(f"import os\ndef run():\n    return {look}\n")
+    assert reads.environment == {"$MY_SLAM_MODE": ""}
+    bench.environment["MY_SLAM_MODE"] = "slow"
+    assert bench.changed(reads) == "the environment variable MY_SLAM_MODE"
+
+
+@pytest.mark.parametrize("look", LOOKS + LISTINGS)
+def test_a_variable_that_a_plug_in_looks_up(look: str, bench: Bench) -> None:
+    bench.environment["MY_SLAM_MODE"] = "fast"
     reads = bench.record(f"import os\ndef run():\n    return {look}\n")
     assert "$MY_SLAM_MODE" in reads.environment
-    assert not value or value not in reads.to_json()
+    assert "HOME" not in reads.to_json()
+    assert "fast" not in reads.to_json()
     bench.environment["MY_SLAM_MODE"] = "slow"
+    assert bench.changed(reads) == "the environment variable MY_SLAM_MODE"
+    del bench.environment["MY_SLAM_MODE"]
     assert bench.changed(reads) == "the environment variable MY_SLAM_MODE"
 
 
@@ -514,6 +544,32 @@ def test_the_sources_of_an_installed_plug_in_count_by_their_bytes(bench: Bench) 
     assert bench.changed(reads) == f"the file {file}"
 
 
+def test_another_library_that_was_loaded_before_the_run(tmp_path: Path) -> None:
+    file = tmp_path / "first" / "cv2.py"
+    file.parent.mkdir()
+    file.write_text("__version__ = '0'\n")
+    child = Child([str(file.parent)], "cv2")
+    bench = Bench(child, tmp_path, environment={"PYTHONPATH": ""})
+    bench.path.append(str(file.parent))
+    reads = bench.record("import cv2\ndef run():\n    pass\n")
+    child.close()
+    assert str(file) in reads.files
+    assert not [name for name in reads.distributions if name.startswith("opencv")]
+    edit(file, "__version__ = '1'\n")
+    assert bench.changed(reads) == f"the file {file}"
+
+
+def test_a_library_that_was_installed_anew_after_it_was_loaded(tmp_path: Path) -> None:
+    install(tmp_path / "site", "1.0", "one")
+    child = Child([str(tmp_path / "site")], "library")
+    bench = Bench(child, tmp_path, [str(tmp_path / "site")], {"PYTHONPATH": ""})
+    assert "library-of-mine" in bench.record(IMPORTS).distributions
+    install(tmp_path / "site", "1.0", "two")
+    answer = child.ask(bench.job(IMPORTS))
+    child.close()
+    assert "the installed library-of-mine has changed" in answer["fault"]
+
+
 def test_search_paths_are_compared(bench: Bench) -> None:
     reads = bench.record("def run():\n    pass\n")
     assert set(reads.search) == {"PYTHONPATH", "LD_LIBRARY_PATH", "LD_PRELOAD"}
@@ -521,6 +577,14 @@ def test_search_paths_are_compared(bench: Bench) -> None:
         bench.environment[name] = str(bench.root)
         assert bench.changed(reads) == name
         del bench.environment[name]
+
+
+def test_what_opencv_adds_to_the_search_path_of_its_process_does_not_count(tmp_path: Path) -> None:
+    anchors = Anchors(None, tmp_path)
+    added = "/env/lib/python3.11/site-packages/cv2/../../lib64:"
+    assert search_now("LD_LIBRARY_PATH", {"LD_LIBRARY_PATH": added}, anchors) == ""
+    assert search_now("LD_LIBRARY_PATH", {"LD_LIBRARY_PATH": f"{added}{tmp_path}/lib"}, anchors) == "work:/lib"
+    assert program_environment((), {"LD_LIBRARY_PATH": f"{added}/opt/lib"}) == {"LD_LIBRARY_PATH": "/opt/lib"}
 
 
 # -- what changes while it is read -------------------------------------------------------------------------------------
@@ -656,3 +720,122 @@ def test_reads_are_equal_in_another_place_of_equal_layout(
         place.write("work/maps/a.txt", "1111")
     source = "import os\ndef run(name):\n    open(name); os.listdir('maps')\n"
     assert digest_of(bench.record(source, name=NAME)) == digest_of(other.record(source, name=NAME))
+
+
+# -- programs ----------------------------------------------------------------------------------------------------------
+
+START = "import subprocess\ndef run(words, folder=None):\n    subprocess.run(words, cwd=folder)\n"
+
+
+def a_tool(bench: Bench, name: str = "bin/tool") -> Path:
+    file = bench.write(name, "#!/bin/sh\nexit 0  # 1111\n")
+    file.chmod(0o755)
+    return file
+
+
+@pytest.mark.parametrize(
+    ("words", "edited"),
+    [
+        (["../bin/tool"], "bin/tool"),
+        (["../bin/tool", "slam.yaml"], "work/slam.yaml"),
+        (["../bin/tool", "--config=slam.yaml"], "work/slam.yaml"),
+        (["../bin/tool", "--config", "slam.yaml"], "work/net.bin"),
+        (["../bin/tool", "maps"], "work/maps/a/associations.txt"),
+        (["/bin/sh", "-c", "../bin/tool < slam.yaml"], "bin/tool"),
+        ([sys.executable, "script.py"], "work/script.py"),
+        ([sys.executable, "script.py"], "work/part.py"),
+    ],
+)
+def test_what_a_program_is_made_of(words: list[str], edited: str, bench: Bench) -> None:
+    a_tool(bench)
+    texts = {"slam.yaml": "weights: net.bin", "net.bin": "1111", "maps/a/associations.txt": "1111", "part.py": "# 1111"}
+    for name, text in (texts | {"script.py": "import part  # 1111"}).items():
+        bench.write(f"work/{name}", text)
+    reads = bench.record(START, words=words)
+    file = bench.root / edited
+    text = file.read_text()
+    edit(file, text.replace("1111", "2222").replace("net", "bet"))
+    shown = "the content of the folder maps" if "maps" in edited else edited.removeprefix("work/")
+    assert bench.changed(reads).endswith(f"{shown} of a program")
+
+
+def test_a_program_is_searched_on_the_path(bench: Bench) -> None:
+    tool = a_tool(bench, "second/tool")
+    bench.environment["PATH"] = os.pathsep.join([str(bench.root / "first"), str(tool.parent), os.environ["PATH"]])
+    reads = bench.record(START, words=["tool"])
+    assert reads.search["command tool"] == str(tool)
+    edit(tool, tool.read_text().replace("1", "2"))
+    assert bench.changed(reads) == f"the file {tool} of a program"
+    edit(tool, tool.read_text().replace("2", "1"))
+    assert bench.changed(reads) == ""
+    a_tool(bench, "first/tool")
+    assert bench.changed(reads) == "the place of the command tool"
+
+
+def test_what_a_program_maps_into_memory_and_where_it_runs(bench: Bench) -> None:
+    code = "import mmap, sys; file = open(sys.argv[1] + '.bin'); m = mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ)\n"
+    bench.write("work/sub/program.py", f"{code}print('ready', flush=True)\nsys.stdin.readline()\n")
+    bench.write(f"work/sub/{NAME}", "1111")
+    source = """
+import subprocess
+def run(words):
+    program = subprocess.Popen(words, cwd='sub', stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    program.stdout.readline()
+"""
+    reads = bench.record(source, words=[sys.executable, "program.py", "net"])
+    assert {f"work:/sub/{NAME}", "work:/sub/program.py"} < reads.programs.keys()
+    edit(bench.work / "sub" / NAME, "2222")
+    assert bench.changed(reads) == f"the file sub/{NAME} of a program"
+
+
+def test_an_environment_variable_that_a_program_gets(bench: Bench) -> None:
+    reads = bench.record(START, words=["true"])
+    bench.environment["MY_SLAM_MODE"] = "fast"
+    assert bench.changed(reads) == ""
+    bench.environment["LC_ALL"] = "de_DE.UTF-8"
+    assert bench.changed(reads) == "the environment variable LC_ALL"
+
+
+def test_what_a_program_writes_is_no_input(bench: Bench) -> None:
+    for name in ("in/a", "out/old"):
+        bench.write(f"work/{name}", "1111")
+    reads = bench.record(START, words=["cp", "in/a", "out"])
+    assert {name for name in reads.programs if name.startswith("work:")} == {"work:/in/a", "work:/out/old"}
+
+
+def test_the_environment_of_a_program() -> None:
+    variables = {"PATH": "/bin", "LC_ALL": "C", "OMP_NUM_THREADS": "2", "MY_SLAM_MODE": "fast", "SSH_TTY": "x"}
+    assert program_environment((), variables) == {"PATH": "/bin", "LC_ALL": "C", "OMP_NUM_THREADS": "2"}
+    assert program_environment(["MY_SLAM_MODE", "UNSET"], variables)["MY_SLAM_MODE"] == "fast"
+    assert [name for name in variables if is_counted(name)] == ["LC_ALL", "MY_SLAM_MODE"]
+
+
+def test_what_a_process_shows() -> None:
+    shown = program_reads(os.getpid())
+    assert os.path.realpath(sys.executable) in shown.files
+    assert shown.environment["PATH"] == os.environ["PATH"]
+    assert any(command.words[0] == sys.executable for command in shown.commands) or shown.commands
+    assert program_reads(2**22 + 1).files == set()
+
+
+# -- comparing many runs -----------------------------------------------------------------------------------------------
+
+
+def test_a_verifier_looks_at_each_thing_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from dynslam_bench.core import reads as module
+
+    looked: list[str] = []
+    real = module.content_now
+    monkeypatch.setattr(module, "content_now", lambda path: looked.append(path) or real(path))
+    anchors = Anchors(None, tmp_path)
+    records = []
+    for number in range(4):
+        for name in ("shared", f"own{number}"):
+            (tmp_path / name).write_text(name)
+        digests = {f"work:/{name}": real(str(tmp_path / name)) for name in ("shared", f"own{number}")}
+        records.append(Reads(files=digests))
+    verifier = Verifier()
+    assert [verifier.changed(record, anchors) for record in records] == [""] * 4
+    assert len(looked) == 5
+    (tmp_path / "own2").write_text("another")
+    assert [changed_reads(record, anchors) for record in records] == ["", "", "the file own2", ""]

@@ -4,12 +4,12 @@ import os
 import re
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from dynslam_bench.core.code_files import files_of_command
-from dynslam_bench.core.programs import Command, ProgramReads, is_file_name, mapped_files
+from dynslam_bench.core.programs import Command, ProgramReads, folders_of, is_file_name, mapped_files
 from dynslam_bench.core.reads import (
     ABSENT,
     COMMAND,
@@ -32,6 +32,11 @@ _LONGEST_TEXT = 1 << 16
 """Text files of up to so many bytes are searched for names of files; longer ones are data."""
 _LONGEST_SOURCE = 1 << 20
 _TEXT = (".yaml", ".yml", ".toml", ".json", ".cfg", ".ini", ".conf", ".txt", ".xml")
+_READ_IN_MACHINE_CODE = (
+    *(".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".exr", ".pgm", ".ppm", ".webp", ".mp4", ".avi", ".mkv"),
+    *(".onnx", ".pb", ".tflite", ".pt", ".pth", ".caffemodel", ".weights", ".engine", ".safetensors", ".ply", ".pcd"),
+)
+"""Images, networks and clouds: OpenCV, onnxruntime, torch and others open them without a word."""
 _WORD = re.compile(r"[\w./~+\-]*[A-Za-z][\w./~+\-]*")
 _QUOTED = re.compile(r"[\"']([^\"'\n]{1,200})[\"']")
 _FILE_NAME = re.compile(r"[\w./~+\-]*\w\.[A-Za-z]\w{0,9}")
@@ -100,15 +105,17 @@ class Notes:
 
 
 @dataclass
-class _Modules:
-    """The modules that are loaded.
+class Modules:
+    """The modules that are loaded, but Python's and this package's, and those that were asked for in vain.
 
     Attributes:
+        imports: The import path on which they are found.
         places: Where each top-level module is found.
         distributions: Names of distributions, and whether they were loaded before the recorder was started.
         files: The same of the files of modules that belong to no distribution.
     """
 
+    imports: ImportPath
     places: dict[str, str] = field(default_factory=dict)
     distributions: dict[str, bool] = field(default_factory=dict)
     files: dict[str, bool] = field(default_factory=dict)
@@ -137,10 +144,13 @@ class Collector:
         self._texts: dict[tuple[str, Stamp], set[str]] = {}
         self._commands: dict[Command, set[str]] = {}
 
-    def collect(self) -> Reads:
-        """What was read so far."""
-        imports = ImportPath(self._path)
-        modules = self._modules(imports)
+    def collect(self, modules: Modules) -> Reads:
+        """What was read so far.
+
+        Args:
+            modules: Those that are loaded now.
+        """
+        imports = modules.imports
         programs, distributions = self._programs(imports)
 
         # what was noted counts as it was then, what was not noted as it is now
@@ -155,12 +165,14 @@ class Collector:
         files |= dict.fromkeys(missing - files.keys(), ABSENT)
         folders = {path: self._folder(path, names) for path, names in dict(self.notes.folders).items()}
 
-        name = self._anchors.name
+        files |= {path: content_now(path) for path in self._unseen_folders(opened)}
+
+        name = self._name
         links = {path: link_now(path, self._anchors) for path in (*files, *folders, *programs)}
         return Reads(
             files={name(path): digest for path, digest in files.items()},
-            folders={name(path): digest for path, digest in folders.items()},
-            links={name(path): target for path, target in links.items() if target},
+            folders={self._anchors.name(path): digest for path, digest in folders.items()},
+            links={self._anchors.name(path): target for path, target in links.items() if target},
             environment={f"${key}": value_digest(self.environment.get(key)) for key in set(self.notes.variables)},
             search=self._search(),
             modules=modules.places,
@@ -185,6 +197,10 @@ class Collector:
         stamp = stamp_of(path)
         return stamp is not None and not self.is_of_program(stamp)
 
+    def _name(self, path: str) -> str:
+        """The name of a file, or of a folder whose whole content counts."""
+        return self._anchors.name(path) + (os.sep if os.path.isdir(path) else "")
+
     def _content(self, path: str, note: FileNote) -> str:
         return ABSENT if note.stamp is None else content_now(path)
 
@@ -200,6 +216,15 @@ class Collector:
             names = sorted(set(names) - made | made.intersection(names_in(path)))
         return digest_of_names(names)
 
+    def _unseen_folders(self, opened: Mapping[str, str]) -> list[str]:
+        """The listed folders with images or networks that nobody was seen to open: libraries read them unannounced."""
+        unseen = []
+        for folder, names in dict(self.notes.folders).items():
+            files = [os.path.join(folder, name) for name in names or () if name.lower().endswith(_READ_IN_MACHINE_CODE)]
+            if set(files) - opened.keys() and self._unwritten(folder) == {folder}:
+                unseen.append(folder)
+        return unseen
+
     def _search(self) -> dict[str, str]:
         """The search paths, and where commands were found that were named without a folder."""
         commands = {command.words[0] for command in dict(self.notes.commands)}
@@ -208,20 +233,22 @@ class Collector:
 
     # -- what has changed while it was read ----------------------------------------------------------------------------
 
-    def changed(self) -> str:
-        """The first thing that has changed since it was read, in words; empty where nothing has."""
+    def changed(self, modules: Modules) -> str:
+        """The first thing that has changed since it was read, in words; empty where nothing has.
+
+        Args:
+            modules: Those that are loaded now.
+        """
         for path, note in self.notes.files.items():
             self.compare(path, note, stamp_of(path))
         if self.notes.changed:
             return f"the file {self.notes.changed[0]}"
         # what nobody saw opened is as it was loaded if it is older than that
-        imports = ImportPath(self._path)
-        modules = self._modules(imports)
         for path, was_loaded in modules.files.items():
             if path not in self.notes.files and self._is_newer(path, was_loaded):
                 return f"the file {path}"
         for name, was_loaded in modules.distributions.items():
-            if self._is_newer(imports.record_of(name), was_loaded):
+            if self._is_newer(modules.imports.record_of(name), was_loaded):
                 return f"the installed {name}"
         return ""
 
@@ -244,9 +271,10 @@ class Collector:
 
     # -- modules and libraries -----------------------------------------------------------------------------------------
 
-    def _modules(self, imports: ImportPath) -> _Modules:
-        """All loaded modules but Python's and this package's, and those that were asked for in vain."""
-        modules = _Modules()
+    def modules(self) -> Modules:
+        """Look at the modules that are loaded now."""
+        imports = ImportPath(self._path)
+        modules = Modules(imports)
         files_of: dict[str, str] = {}
         for name, module in list(sys.modules.items()):
             file = vars(module).get("__file__") if hasattr(module, "__dict__") else None
@@ -275,7 +303,7 @@ class Collector:
         """The files that were mapped into memory since the start, or because a search path named them."""
         mapped = mapped_files(os.getpid())
         preloaded = set(re.split("[: ]", self.environment.get("LD_PRELOAD", "")))
-        folders = filter(None, self.environment.get("LD_LIBRARY_PATH", "").split(os.pathsep))
+        folders = folders_of(self.environment.get("LD_LIBRARY_PATH", ""))
         beginnings = tuple(f"{os.path.realpath(folder)}{os.sep}" for folder in folders)
         named = {path for path in mapped if path in preloaded or path.startswith(beginnings)}
         new = {path for path in mapped - self._mapped if self._origins.of_file(path) == "foreign"}
@@ -349,7 +377,7 @@ class Collector:
 
     def _places_of(self, word: str, text: str) -> set[str]:
         """Where a file of that name could lie."""
-        folders = {os.path.dirname(text), os.getcwd()}
+        folders = {os.path.dirname(text), str(self._anchors.work)}
         if self._anchors.plugin is not None:
             folders.add(str(self._anchors.plugin))
         path = os.path.expanduser(word)

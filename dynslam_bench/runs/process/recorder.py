@@ -41,6 +41,7 @@ from dynslam_bench.core.reads import (
     digest_of,
     names_in,
 )
+from dynslam_bench.runs.process.announcing import ALL_VARIABLES, VARIABLE, VARIABLE_SET, listen
 from dynslam_bench.runs.process.collector import Collector, FileNote, is_code, stamp_of
 from dynslam_bench.runs.process.origins import Origins
 
@@ -63,13 +64,9 @@ _SHELL_WORD = re.compile(r"[^\s;|&<>()'\"`$]+")
 _LOG = "reads-{}.jsonl"
 """In the first private folder: what a forked process has read."""
 
-_VARIABLE = "dynslam_bench.variable"
-_ALL_VARIABLES = "dynslam_bench.variables"
-_VARIABLE_SET = "dynslam_bench.variable_set"
-
 
 class ReadRecorder:
-    """Records what foreign code reads in this process, and in those that are forked from it, until `finish`.
+    """Records what foreign code reads in this process, and in those that are forked from it, until it is finished.
 
     It belongs into the process that makes a run, and is started before a plug-in is loaded. One at a time is at work.
 
@@ -103,9 +100,9 @@ class ReadRecorder:
             "os.listdir": self._on_list,
             "os.scandir": self._on_list,
             "import": self._on_import,
-            _VARIABLE: self._on_variable,
-            _ALL_VARIABLES: self._on_all_variables,
-            _VARIABLE_SET: self._on_variable_set,
+            VARIABLE: self._on_variable,
+            ALL_VARIABLES: self._on_all_variables,
+            VARIABLE_SET: self._on_variable_set,
             "os.rename": self._on_rename,
             "os.link": self._on_rename,
             "os.symlink": self._on_symlink,
@@ -126,11 +123,11 @@ class ReadRecorder:
         self._origins = Origins(self._anchors.plugin, self._plugins)
         self._collector = Collector(self._anchors, self._origins, tuple(f"{folder}{os.sep}" for folder in spellings))
         self._notes = self._collector.notes
-        _activate(self)
+        listen(self.hear, self._handlers, self.begin_log)
 
     def stop(self) -> None:
         """Record no more; may be called more than once."""
-        _activate(None)
+        listen(None)
         self._ended.set()
 
     def finish(self) -> Reads:
@@ -144,12 +141,13 @@ class ReadRecorder:
         self._add_forked()
         if self._error is not None:
             raise self._error
-        if changed := self._collector.changed():
+        modules = self._collector.modules()
+        if changed := self._collector.changed(modules):
             raise RunError(
                 f"{changed} has changed while the run read it",
                 "the run is not stored; ask again, and let nothing change meanwhile what it reads",
             )
-        return self._collector.collect()
+        return self._collector.collect(modules)
 
     def so_far(self) -> Reads:
         """What was read so far; it may change until the end."""
@@ -162,30 +160,30 @@ class ReadRecorder:
         if count != self.count:
             with self._hearing_nothing():
                 count = self.count
-                value = digest_of(self._collector.collect())
+                value = digest_of(self._collector.collect(self._collector.modules()))
             self._snapshot = (count, value)
         return value
 
     # -- what is announced ---------------------------------------------------------------------------------------------
 
-    def hear(self, event: str, arguments: tuple[Any, ...]) -> None:
+    def hear(self, frame: FrameType, event: str, arguments: tuple[Any, ...]) -> None:
         """Take an announcement; what a recorder itself does is not announced.
 
         Raises:
             FileNotFoundError: Byte code is not to be used.
         """
-        handler = self._handlers.get(event)
-        if handler is None or threading.get_ident() in self._unheard:
+        thread = threading.get_ident()
+        if thread in self._unheard:
             return
-        self._unheard.add(threading.get_ident())
+        self._unheard.add(thread)
         try:
-            handler(sys._getframe(2), *arguments)
+            self._handlers[event](frame, *arguments)
         except _StaleByteCode:
             raise
         except Exception as error:  # a fault of the recorder's own, which must not become one of the plug-in
             self._error = self._error or error
         finally:
-            self._unheard.discard(threading.get_ident())
+            self._unheard.discard(thread)
 
     @contextmanager
     def _hearing_nothing(self) -> Iterator[None]:
@@ -450,6 +448,7 @@ class ReadRecorder:
 
     def begin_log(self) -> None:
         """In a forked process: write down what is read, as it ends without a word."""
+        self._unheard.clear()  # threads of the other process
         with self._hearing_nothing():
             path = self._folders[0] / _LOG.format(os.getpid())
             self._log = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
@@ -536,53 +535,3 @@ def _is_adapter(frame: FrameType | None) -> bool:
             return True
         frame = frame.f_back
     return False
-
-
-# -- what is at work in this process -----------------------------------------------------------------------------------
-
-_active: ReadRecorder | None = None
-_is_installed = False
-_Environment: Any = type(os.environ)
-
-
-class RecordedEnvironment(_Environment):  # type: ignore[misc]
-    """``os.environ`` that announces what is looked up in it; other mappings of variables are built on these."""
-
-    def __getitem__(self, key: Any) -> Any:
-        sys.audit(_VARIABLE, key)
-        return super().__getitem__(key)
-
-    def __iter__(self) -> Iterator[Any]:
-        sys.audit(_ALL_VARIABLES)
-        return iter(super().__iter__())
-
-    def __setitem__(self, key: Any, value: Any) -> None:
-        sys.audit(_VARIABLE_SET, key)
-        super().__setitem__(key, value)
-
-    def __delitem__(self, key: Any) -> None:
-        sys.audit(_VARIABLE_SET, key)
-        super().__delitem__(key)
-
-
-def _activate(recorder: ReadRecorder | None) -> None:
-    """Let a recorder hear announcements, or none."""
-    global _active, _is_installed
-    if recorder is not None and not _is_installed:  # a hook stays for the life of the process
-        sys.addaudithook(_hear)
-        os.register_at_fork(after_in_child=_begin_log)
-        _is_installed = True
-    _active = recorder
-    kind = _Environment if recorder is None else RecordedEnvironment
-    for variables in (os.environ, os.environb):
-        variables.__class__ = kind
-
-
-def _hear(event: str, arguments: tuple[Any, ...]) -> None:
-    if _active is not None:
-        _active.hear(event, arguments)
-
-
-def _begin_log() -> None:
-    if _active is not None:
-        _active.begin_log()
