@@ -111,8 +111,11 @@ def _centred(positions: Array) -> tuple[Array, Array, float]:
         The centre ``[3]``, the positions about it in units of their size ``[N, 3]``, and the size, the largest of
         their coordinates: 0, with zeros, where they differ by no more than the rounding of their coordinates.
     """
-    centre = positions.mean(axis=0)
-    apart = positions - centre
+    # first about one of them: means of large coordinates lose digits
+    apart = positions - positions[0]
+    mean = apart.mean(axis=0)
+    centre = positions[0] + mean
+    apart = apart - mean
     size = float(np.abs(apart).max())
     rounding = _ROUNDING * float(np.abs(positions).max())
     if size <= rounding:
@@ -121,7 +124,7 @@ def _centred(positions: Array) -> tuple[Array, Array, float]:
 
 
 _ROUNDING = 8 * float(np.finfo(np.float64).eps)
-"""How much of a coordinate the rounding of a mean and of a difference may make up."""
+"""How much of a coordinate the rounding of differences may make up."""
 _ON_A_LINE = 1e-12
 """Share of the first singular value below which the second one says that the positions lie on a line."""
 

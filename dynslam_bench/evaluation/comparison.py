@@ -191,14 +191,14 @@ def clock_hint(stamps: ArrayLike, true_stamps: ArrayLike) -> str:
     own, true = (np.asarray(values, dtype=np.float64) for values in (stamps, true_stamps))
     if are_frame_numbers(own) != are_frame_numbers(true):
         whose, numbers = ("estimate", own) if are_frame_numbers(own) else ("ground truth", true)
-        return f"{describe_frame_numbers(numbers, whose)}: of frame numbers, give the stamps of the images in seconds"
+        return f"{describe_frame_numbers(numbers, whose)}: frame numbers? Then give the stamps of the images in seconds"
     own_is_unix, true_is_unix = (UNIX_S <= float(np.abs(values).max()) <= LATEST_S for values in (own, true))
     if own_is_unix != true_is_unix and max(np.abs(own).max(), np.abs(true).max()) <= LATEST_S:
-        late = float(true.min() - own.min())
-        whose = "ground truth" if true_is_unix else "estimate"
+        whose, other = ("estimate", "ground truth") if own_is_unix else ("ground truth", "estimate")
+        later_s = abs(float(true.min() - own.min()))
         return (
-            f"only the {whose} has Unix time: if both begin with the same frame, add {late:.6f} s to each stamp of the "
-            "estimate"
+            f"only the {whose} has Unix time: if both begin with the same frame, add {later_s:.6f} s to each stamp of "
+            f"the {other}"
         )
     if not 1e-5 <= np.abs(own).max() / max(np.abs(true).max(), 1e-9) <= 1e5:
         return "are the stamps of one of them in nanoseconds? Give seconds"

@@ -40,7 +40,7 @@ def _of_stamps(trajectory: Trajectory, whose: str) -> list[str]:
     stamps = trajectory.timestamps
     if are_frame_numbers(stamps):
         fault = describe_frame_numbers(stamps, whose)
-        return [f"frame-numbers: {fault}: of frame numbers, give the stamps of the images in seconds"]
+        return [f"frame-numbers: {fault}: frame numbers? Then give the stamps of the images in seconds"]
     lines = []
     step_s = median_step(stamps)
     if step_s is not None and step_s > SLOWEST_S:
@@ -73,7 +73,7 @@ def _of_motion(trajectory: Trajectory, whose: str) -> list[str]:
     farthest = int(distances_m.argmax())
     fault = f"{fast.sum()} of {len(fast)} steps of the {whose} are faster than {FASTEST_M_S:g} m/s"
     where = f"the pose at the stamp {trajectory.timestamps[farthest]:.6f} lies {distances_m[farthest]:.3g} m"
-    return [f"far-positions: {fault}: {where} from the middle of the path"]
+    return [f"far-positions: {fault}: {where} from the middle of the path, correct or remove it"]
 
 
 def _of_pairs(comparison: Comparison) -> list[str]:

@@ -29,6 +29,9 @@ def relative_metrics(comparison: Comparison) -> dict[str, float]:
             errors, seconds = errors[:0], seconds[:0]
         elif not len(errors):
             comparison.diagnostics.append(f"no pair of poses for the relative error over {spec.key}; it is left out")
+        elif spec.pairs == "tum-fixed" and spec.unit == "s" and not spec.rate and not seconds.all():
+            itself = f"{np.count_nonzero(seconds == 0)} of {len(seconds)} pairs over {spec.key} join a pose with itself"
+            comparison.diagnostics.append(f"{itself}, as TUM's script has it where the next pose is far")
         comparison.n_pairs_rpe[spec.key] = len(errors)
         over = seconds if spec.rate else 1.0
         translation = np.linalg.norm(errors[:, :3, 3], axis=1) / over

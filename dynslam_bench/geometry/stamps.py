@@ -103,27 +103,6 @@ def refuse_close(
     )
 
 
-def refuse_repeated(ns: NDArray[np.int64], source: str) -> None:
-    """Refuse stamps of which most repeat the one before: digits were lost when they were written.
-
-    Args:
-        ns: Stamps in nanoseconds ``[N]``, as the lines have them.
-        source: The file.
-
-    Raises:
-        TrajectoryError: More than half of the lines repeat the stamp of the line before.
-    """
-    repeats = np.flatnonzero(np.diff(ns) == 0)
-    if 2 * len(repeats) <= len(ns):
-        return
-    first = format_ns(int(ns[repeats[0]]))
-    raise TrajectoryError(
-        f"{len(repeats)} of {len(ns)} lines of {source} repeat the stamp of the line before, e.g. {first} s: "
-        "digits were lost when they were written",
-        "write all digits of the stamps, e.g. with the format %.9f in place of %g, and no 32-bit floats",
-    )
-
-
 # One-to-one association of two lists of stamps, as the TUM RGB-D benchmark's ``associate.py`` does it.
 
 

@@ -22,7 +22,7 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.headings import Heading, parse_heading
 from dynslam_bench.geometry.rigs import nearest_rotation
 from dynslam_bench.geometry.stamp_units import SECONDS, SLOWEST_S, StampUnit, median_step, unit_of
-from dynslam_bench.geometry.stamps import format_ns, parse_ns, refuse_close, refuse_repeated, to_seconds
+from dynslam_bench.geometry.stamps import format_ns, parse_ns, refuse_close, to_seconds
 from dynslam_bench.geometry.trajectory import RepeatedStamps, Trajectory
 
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"
@@ -132,7 +132,6 @@ def load_tum(path: str | Path) -> TumFile:
     # stamps, exactly as they are written
     texts = [table.texts[row] for row in np.flatnonzero(valid)]
     ns, unit_note = _stamps_of(texts, kept[:, 0], str(path), heading.unit if heading else None)
-    refuse_repeated(ns, str(path))
     line_of = dict(zip(ns.tolist(), np.array(table.numbers)[valid].tolist(), strict=True))
     refuse_close(np.sort(ns), str(path), TrajectoryError, line_of.get)
     return ordered_file(ns, se3.from_quaternion(kept[:, 1:4], kept[:, 4:8]), replace(counted, stamps=unit_note))
@@ -144,8 +143,16 @@ def _stamps_of(
     """Stamps in nanoseconds ``[N]``, exactly, and a phrase on their unit (see `unit_of`).
 
     Raises:
-        TrajectoryError: The unit is not known, or a stamp lies beyond the range of 64 bits.
+        TrajectoryError: Most stamps repeat the one before, their unit is not known, or one lies beyond the range of 64
+            bits.
     """
+    repeats = np.flatnonzero(np.diff(values) == 0)
+    if 2 * len(repeats) > len(values):
+        raise TrajectoryError(
+            f"{len(repeats)} of {len(values)} lines of {source} repeat the stamp of the line before, e.g. "
+            f"{texts[repeats[0]][:40]}: digits were lost when they were written",
+            "write all digits of the stamps, e.g. with the format %.9f in place of %g, and no 32-bit floats",
+        )
     unit, note = unit_of(values, source, stated)
     try:
         return np.array([parse_ns(text, unit.digits) for text in texts], dtype=np.int64), note
@@ -388,7 +395,6 @@ def _load_kitti(path: Path, times: Path) -> TumFile:
     ns, unit_note = _load_stamps(times)
     if len(ns) != len(poses):
         raise TrajectoryError(f"{path} has {len(poses)} poses but {times} has {len(ns)} stamps")
-    refuse_repeated(ns, str(times))
     return TumFile(Trajectory(to_seconds(ns), poses, ns), FileNotes(lines=len(poses), stamps=unit_note))
 
 
