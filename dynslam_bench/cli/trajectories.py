@@ -35,7 +35,7 @@ Estimate = Annotated[
 GroundTruth = Annotated[Path, typer.Argument(help="Ground truth, in any of these formats.")]
 Topics = Annotated[
     Optional[list[str]],  # noqa: UP045
-    typer.Option("--topic", help="Of bags: the topic of the poses; a second one for the ground truth's."),
+    typer.Option("--topic", help="Topic of a bag's poses; a second one for the truth's."),
 ]
 
 

@@ -133,13 +133,13 @@ def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float
     # places on a grid of lags from which the estimate moves by a known displacement, some of them, without jumps
     at = _grid_places(track, step)
     moved = _displacements(track, stamps[0] + step * at, window)
-    known = np.flatnonzero(np.isfinite(moved[:, 0]))
-    known = known[:: 1 + len(known) // 128]
-    length = np.linalg.norm(moved[known], axis=1)
-    known = known[length <= 6 * np.median(length)] if len(known) else known
-    if len(known) < MIN_POSES:
+    usable = np.flatnonzero(np.isfinite(moved[:, 0]))
+    usable = usable[:: 1 + len(usable) // 128]
+    length = np.linalg.norm(moved[usable], axis=1)
+    usable = usable[length <= 6 * np.median(length)] if len(usable) else usable
+    if len(usable) < MIN_POSES:
         return 0.0, 1.0
-    at, moved = at[known], moved[known]
+    at, moved = at[usable], moved[usable]
     # the lag at which the true displacements agree best; each place of the grid is looked at once
     lags = np.arange(-most, most + 1)
     places, place_of = np.unique(at + lags[:, None], return_inverse=True)

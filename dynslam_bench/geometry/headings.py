@@ -15,7 +15,7 @@ _STAMP = re.compile(r"(?:time_?stamps?|times?|ts|t|stamps?|sec(?:ond)?s?)(?:_(?P
 _PART = re.compile(r"(?P<vector>.*?)[_.]?(?P<axis>[xyzw])", re.IGNORECASE)
 """A part of a vector: ``qw``, ``p_RS_R_x``, ``position.x``, ``x``."""
 _SYMBOLS = {symbol: unit for unit in UNITS for symbol in (unit.symbol, f"{unit.symbol}ec")}
-"""Units by what headings call them: ``ns`` and ``nsec``."""
+"""Units by their symbols, of which headings write some with "sec" at the end."""
 
 
 @dataclass(frozen=True)
