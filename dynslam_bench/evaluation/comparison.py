@@ -87,9 +87,12 @@ def compare(
         diagnostics: Takes a line on everything that the numbers depend on.
 
     Raises:
-        EvaluationError: Fewer than two poses have ground truth (with the measured gaps).
+        EvaluationError: Fewer than two poses have ground truth (with the measured gaps), or a position is so large that
+            its square is no number.
     """
     diagnostics = [] if diagnostics is None else diagnostics
+    for whose, trajectory in (("estimate", estimate), ("ground truth", ground_truth)):
+        _refuse_infinite(trajectory, whose)
     estimate, ground_truth = compared(estimate, ground_truth, protocol, input_timestamps, diagnostics)
     estimate_index, truth_index, association = match(estimate, ground_truth, protocol)
     dropped = association.describe(protocol.max_dt)
@@ -109,6 +112,20 @@ def compare(
         protocol, estimate, ground_truth, estimate_index, truth_index, association, similarity, input_timestamps,
         diagnostics,
     )  # fmt: skip
+
+
+LARGEST_M = 1e150
+"""Squares of larger numbers are no numbers any more."""
+
+
+def _refuse_infinite(trajectory: Trajectory, whose: str) -> None:
+    sizes = np.abs(trajectory.positions).max(axis=1, initial=0.0)
+    if len(sizes) and sizes.max() > LARGEST_M:
+        at = int(sizes.argmax())
+        raise EvaluationError(
+            f"the pose of the {whose} at the stamp {trajectory.timestamps[at]:.6f} lies {sizes[at]:.3g} m away",
+            "correct or remove it",
+        )
 
 
 # Association of the two, with the reasons for what was dropped.

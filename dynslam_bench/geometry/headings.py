@@ -1,7 +1,7 @@
 """Headings of tables of poses: which column holds what, and the unit of the stamps.
 
-A heading is a line of names: the first one is the stamp's, and among the others are the x, y, z of a position and the
-x, y, z, w of a quaternion. Prose is no heading, whatever words it has.
+A heading is a line of names, among which are the stamp's, the x, y, z of a position and the x, y, z, w of a quaternion.
+Prose is no heading, whatever words it has.
 """
 
 import re
@@ -35,24 +35,31 @@ class Heading:
 
 def parse_heading(text: str) -> Heading | None:
     """The heading that a line is, without its ``#``, with commas or spaces between the names; None if it is none."""
-    text = text.strip().lstrip("#%").strip()
-    cells = [cell.strip() for cell in text.rstrip(",").split(",")]
+    text = text.strip().lstrip("#%").strip().replace('"', "")
+    cells = [cell.strip() for cell in text.split(",")]
     if len(cells) == 1:
         cells = [match[0] for match in _NAME.finditer(text)]
-    names = [name for name in map(_NAME.fullmatch, cells) if name is not None]
-    stamp = _STAMP.fullmatch(names[0]["name"]) if names else None
-    if stamp is None or len(names) < len(cells):
+    if cells and not cells[-1]:  # a comma at the end
+        cells.pop()
+    # a column without a name numbers the rows, as pandas writes it
+    names = [_NAME.fullmatch(cell) for cell in cells]
+    if any(cell and name is None for cell, name in zip(cells, names, strict=True)):
         return None
-    # the parts of vectors, by the name that they share
+    # the stamp, and the parts of vectors by the name that they share
+    stamp_column, unit = None, ""
     vectors: dict[str, dict[str, int]] = {}
-    for column, name in enumerate(names[1:], start=1):
+    for column, name in enumerate(names):
+        if name is None:
+            continue
+        stamp = _STAMP.fullmatch(name["name"])
         part = _PART.fullmatch(name["name"])
-        if part is not None:
+        if stamp is not None and stamp_column is None:
+            stamp_column, unit = column, name["unit"] or stamp["unit"] or ""
+        elif part is not None:
             vectors.setdefault(part["vector"].lower(), {}).setdefault(part["axis"].lower(), column)
     position = next((axes for axes in vectors.values() if axes.keys() == set("xyz")), None)
     quaternion = next((axes for axes in vectors.values() if axes.keys() == set("xyzw")), None)
-    if position is None or quaternion is None:
+    if stamp_column is None or position is None or quaternion is None:
         return None
-    order = (0, *(position[axis] for axis in "xyz"), *(quaternion[axis] for axis in "xyzw"))
-    unit = names[0]["unit"] or stamp["unit"] or ""
+    order = (stamp_column, *(position[axis] for axis in "xyz"), *(quaternion[axis] for axis in "xyzw"))
     return Heading(len(cells), order, _SYMBOLS.get(unit.lower()))

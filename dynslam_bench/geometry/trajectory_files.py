@@ -114,8 +114,9 @@ def load_tum(path: str | Path) -> TumFile:
     """
     path = Path(path)
     heading, line_of_heading = _find_heading(path)
-    table = _read_table(path, heading.columns if heading else 8, _COLUMNS, without=line_of_heading)
-    values = table.values[:, list(heading.order)] if heading else table.values
+    heading = heading or Heading(8, tuple(range(8)), None)
+    table = _read_table(path, heading.columns, _COLUMNS, without=line_of_heading, stamp_column=heading.order[0])
+    values = table.values[:, list(heading.order)]
     # lines without a pose are left out
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
     norm = np.linalg.norm(np.where(finite[:, None], values[:, 4:8], 0.0), axis=1)
@@ -131,23 +132,38 @@ def load_tum(path: str | Path) -> TumFile:
     kept = values[valid]
     # stamps, exactly as they are written
     texts = [table.texts[row] for row in np.flatnonzero(valid)]
-    ns, unit_note = _stamps_of(texts, kept[:, 0], str(path), heading.unit if heading else None)
+    moved = (np.diff(kept[:, 1:], axis=0) != 0).any(axis=1)
+    ns, unit_note = _stamps_of(texts, kept[:, 0], str(path), stated=heading.unit, moved=moved)
     line_of = dict(zip(ns.tolist(), np.array(table.numbers)[valid].tolist(), strict=True))
     refuse_close(np.sort(ns), str(path), TrajectoryError, line_of.get)
     return ordered_file(ns, se3.from_quaternion(kept[:, 1:4], kept[:, 4:8]), replace(counted, stamps=unit_note))
 
 
 def _stamps_of(
-    texts: list[str], values: NDArray[np.float64], source: str, stated: StampUnit | None = None
+    texts: list[str],
+    values: NDArray[np.float64],
+    source: str,
+    *,
+    stated: StampUnit | None = None,
+    moved: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.int64], str]:
     """Stamps in nanoseconds ``[N]``, exactly, and a phrase on their unit (see `unit_of`).
 
+    Args:
+        texts: The stamps as they are written ``[N]``.
+        values: Their numbers.
+        source: The file.
+        stated: The unit that its heading states; None where it states none.
+        moved: Whether the pose of each line but the first differs from the one before ``[N - 1]``; None without poses.
+
     Raises:
-        TrajectoryError: Most stamps repeat the one before, their unit is not known, or one lies beyond the range of 64
-            bits.
+        TrajectoryError: Most stamps, or a third of them with other poses, repeat the one before; their unit is not
+            known; or one lies beyond the range of 64 bits.
     """
-    repeats = np.flatnonzero(np.diff(values) == 0)
-    if 2 * len(repeats) > len(values):
+    repeated = np.diff(values) == 0
+    repeats = np.flatnonzero(repeated)
+    others = 0 if moved is None else int((repeated & moved).sum())
+    if 2 * len(repeats) > len(values) or (others and 3 * others >= len(values)):
         raise TrajectoryError(
             f"{len(repeats)} of {len(values)} lines of {source} repeat the stamp of the line before, e.g. "
             f"{texts[repeats[0]][:40]}: digits were lost when they were written",
@@ -309,7 +325,7 @@ class _Table:
     Attributes:
         values: ``[N, K]``.
         numbers: Numbers of its lines ``[N]``.
-        texts: Its first column as it is written ``[N]``.
+        texts: Its stamps as they are written ``[N]``.
     """
 
     values: NDArray[np.float64]
@@ -317,7 +333,7 @@ class _Table:
     texts: list[str]
 
 
-def _read_table(path: Path, columns: int, meaning: str, *, without: int = 0) -> _Table:
+def _read_table(path: Path, columns: int, meaning: str, *, without: int = 0, stamp_column: int = 0) -> _Table:
     """The rows of a table; `without` is the number of a line that is none of them.
 
     Raises:
@@ -328,11 +344,11 @@ def _read_table(path: Path, columns: int, meaning: str, *, without: int = 0) -> 
         if number == without:
             continue
         numbers.append(number)
-        texts.append(parts[0])
         if len(parts) != columns:
             raise TrajectoryError(
                 f"{path} line {number} has {len(parts)} values, not the {columns} of '{meaning}'", _hint(parts)
             )
+        texts.append(parts[stamp_column])
         try:
             values.extend(map(float, parts))
         except ValueError:

@@ -1,5 +1,6 @@
 """Stamps and columns of trajectory files: their unit, their headings, digits that were lost; every cure is tried."""
 
+import itertools
 import re
 
 import numpy as np
@@ -182,6 +183,15 @@ def test_stamps_that_lost_their_digits_are_told_and_the_cure_works(tmp_path, for
     assert len(read_tum(tmp_path / "a.txt")) == 150
 
 
+@pytest.mark.parametrize("rate", [15.0, 20.0, 25.0])
+def test_digits_that_tell_some_poses_apart_are_too_few_as_well(tmp_path, rate):
+    texts = [f"{UNIX + n / rate:.1f}" for n in range(150)]
+    repeats = sum(later == earlier for earlier, later in itertools.pairwise(texts))
+    (tmp_path / "a.txt").write_text(rows_of(lap(), texts))
+    with pytest.raises(TrajectoryError, match=f"{repeats} of 150 lines .* digits were lost"):
+        read_tum(tmp_path / "a.txt")
+
+
 def test_the_times_of_kittis_poses_may_have_lost_them_too(tmp_path):
     write_kitti(tmp_path / "poses.txt", lap())
     (tmp_path / "times.txt").write_text("1.30503e+09\n" * 150)
@@ -217,6 +227,8 @@ def test_lines_that_are_written_twice_lost_nothing(tmp_path):
         ("# file: 'rgbd_dataset_freiburg3.bag'", None),
         ("# timestamp, position, orientation", None),
         ("timestamp,tx,ty,tz,q0,q1,q2,q3", None),
+        (",timestamp,x,y,z,qx,qy,qz,qw", Heading(9, (1, 2, 3, 4, 5, 6, 7, 8), None)),
+        ('frame,"t [s]","x","y","z","qx","qy","qz","qw",', Heading(9, (1, 2, 3, 4, 5, 6, 7, 8), SECONDS)),
         ("", None),
     ],
 )
@@ -258,6 +270,16 @@ def test_tables_are_read_by_their_headings(tmp_path, heading, order, unit, separ
     read = read_tum(tmp_path / "a.csv")
     assert np.allclose(read.T_world_cam, truth.T_world_cam, atol=1e-8)
     assert np.allclose(read.timestamps, UNIX + truth.timestamps, atol=2e-6)
+
+
+@pytest.mark.parametrize("heading", [",timestamp,x,y,z,qx,qy,qz,qw", "frame,time [s],x,y,z,qx,qy,qz,qw"])
+def test_a_column_that_numbers_the_rows_is_passed_over(tmp_path, heading):
+    truth = lap()
+    rows = rows_of(truth, written(truth.timestamps, SECONDS, UNIX), ",").splitlines()
+    (tmp_path / "a.csv").write_text("\n".join([heading, *(f"{number},{row}" for number, row in enumerate(rows))]))
+    read = read_tum(tmp_path / "a.csv")
+    assert np.allclose(read.T_world_cam, truth.T_world_cam, atol=1e-8)
+    assert np.allclose(read.timestamps, UNIX + truth.timestamps, atol=1e-6)
 
 
 def test_a_first_line_that_is_neither_a_pose_nor_a_heading_is_named_and_the_cure_works(tmp_path):
