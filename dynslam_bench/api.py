@@ -75,6 +75,11 @@ class RunResult:
         return dict(self.store.score(self.record, self.protocol).metrics)
 
     @property
+    def remarks(self) -> list[str]:
+        """What to know before the metrics are believed, a line each: warnings and hints."""
+        return self.store.score(self.record, self.protocol).remarks
+
+    @property
     def trajectory(self) -> Trajectory | None:
         """Poses of the tracked frames, each as it was when the frame came; None if no frame was tracked."""
         return self.store.trajectory(self.run_id)

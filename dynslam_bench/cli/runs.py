@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import product
 from operator import itemgetter
@@ -59,6 +59,8 @@ COLUMNS = {
     "study": "study",
 }
 """Headings of the table, the most important first, and the names of what stands below them (see `run_row`)."""
+MOST_REMARKS = 10
+"""Warnings and hints that are written below a table."""
 HINT_FRAMES = 60
 """Frames of a recording that are checked when a run on it fails: a few seconds."""
 COLOURS = {
@@ -152,7 +154,7 @@ def show(
                 table(("metric", "value"), sorted(evaluation.metrics.items())),
                 *evaluation.diagnostics,
             ]
-    lines += [f"hint: {line}" for line in metrics.hints]
+    lines += metrics.remarks
     present({"record": record, "metrics": metrics, "folder": store.place(record.run_id)}, *lines)
 
 
@@ -351,6 +353,25 @@ def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: 
         write(f"{worse} of {len(rows)} runs are worse than a static camera.")
     if any(None not in (row["ate_rmse_m"], row["coverage"]) and row["coverage"] < 1 for row in rows):
         write("ATE: of the tracked frames alone; static camera: of all. A report uses hold-last-pose.")
+    show_remarks(rows)
+
+
+def show_remarks(rows: Sequence[dict[str, Any]]) -> None:
+    """Write the warnings and hints of runs, one line for all runs that share one; `MOST_REMARKS` at most."""
+    runs_by_remark = defaultdict[str, list[dict[str, Any]]](list)
+    for row in rows:
+        for remark in row["remarks"]:
+            if row["tracker"] == "never-move" and remark.startswith("warning: static-camera:"):
+                continue  # it is that camera
+            runs_by_remark[remark].append(row)
+    for remark, (first, *others) in list(runs_by_remark.items())[:MOST_REMARKS]:
+        kind, _, text = remark.partition(": ")
+        more = f" and {len(others)} more run{'s' * (len(others) != 1)}" if others else ""
+        write(f"{kind}: {label_text(first['tracker'])} on {first['sequence']}{more}: {text}")
+    if len(runs_by_remark) > MOST_REMARKS:
+        write(
+            f"{len(runs_by_remark) - MOST_REMARKS} more such lines: `dynslam-bench runs show RUN` has those of a run."
+        )
 
 
 def shown_cell(name: str, value: Any) -> Any:

@@ -1,8 +1,10 @@
 """``eval``, ``protocols list|compare``, ``import`` and ``export``: trajectory files, scored and exchanged."""
 
+from __future__ import annotations
+
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Literal, Optional
+from typing import TYPE_CHECKING, Annotated, Literal, Optional
 
 import typer
 
@@ -21,12 +23,20 @@ from dynslam_bench.cli.options import (
 from dynslam_bench.cli.output import SOME_RUNS_FAILED, announce, present, table
 from dynslam_bench.cli.runs import show_runs
 
+if TYPE_CHECKING:
+    from dynslam_bench.evaluation import Evaluation, Hint
+    from dynslam_bench.geometry import TumFile
+
 protocols = typer.Typer(help="How errors are measured, and how much that alone changes.", no_args_is_help=True)
 Estimate = Annotated[
     Path,
     typer.Argument(help="A trajectory: TUM, EuRoC, VSLAM-LAB, a bag; KITTI or COLMAP with --timestamps."),
 ]
 GroundTruth = Annotated[Path, typer.Argument(help="Ground truth, in any of these formats.")]
+Topics = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option("--topic", help="Topic of a bag's poses; a second one for the truth's."),
+]
 
 
 def evaluate(
@@ -34,26 +44,49 @@ def evaluate(
     ground_truth: GroundTruth,
     protocol: ProtocolId = "tum-rgbd/v1",
     timestamps: Timestamps = None,
+    topic: Topics = None,
     as_json: AsJson = False,
 ) -> None:
     """Evaluate a trajectory file against a ground-truth file."""
-    from dynslam_bench.evaluation import get_protocol, hints
-    from dynslam_bench.evaluation.comparison import truth_of_file
-    from dynslam_bench.evaluation.evaluate import evaluate_loaded
-
-    loaded, truth = (runs.read_trajectory(path, timestamps) for path in (estimate, ground_truth))
-    result = evaluate_loaded(loaded, truth, protocol)
-    likely = hints(
-        loaded.trajectory, truth_of_file(truth.trajectory, get_protocol(protocol)), protocol, notes=loaded.notes
-    )
+    loaded, truth = read_pair(estimate, ground_truth, timestamps, topic)
+    result, likely = scored_with_hints(loaded, truth, protocol)
     present(
         {**result.model_dump(), "hints": likely},
         result.summary(),
         result.protocol,
         table(("metric", "value"), list(result.metrics.items())),
-        *result.diagnostics,
-        *(f"hint: {hint}" for hint in likely),
+        *remarks(result, likely),
     )
+
+
+def read_pair(
+    estimate: Path, ground_truth: Path, timestamps: Path | None, topics: list[str] | None
+) -> tuple[TumFile, TumFile]:
+    """An estimate and its ground truth; of several topics the first is the estimate's, the last the truth's."""
+    topics = topics or []
+    loaded = runs.read_trajectory(estimate, timestamps, *topics[:1])
+    truth = runs.read_trajectory(ground_truth, timestamps, *topics[-1:])
+    return loaded, truth
+
+
+def scored_with_hints(loaded: TumFile, truth: TumFile, protocol: str) -> tuple[Evaluation, tuple[Hint, ...]]:
+    """The evaluation of a file under a protocol, and the hints on it."""
+    from dynslam_bench.evaluation import get_protocol, hints
+    from dynslam_bench.evaluation.comparison import truth_of_file
+    from dynslam_bench.evaluation.evaluate import evaluate_loaded
+
+    result = evaluate_loaded(loaded, truth, protocol)
+    true_poses = truth_of_file(truth.trajectory, get_protocol(protocol))
+    return result, hints(loaded.trajectory, true_poses, protocol, notes=loaded.notes)
+
+
+def remarks(result: Evaluation, likely: tuple[Hint, ...]) -> list[str]:
+    """What a reader of the numbers needs to know, a line each."""
+    return [
+        *result.diagnostics,
+        *(f"warning: {line}" for line in result.warnings),
+        *(f"hint: {hint}" for hint in likely),
+    ]
 
 
 @protocols.command("list")
@@ -79,17 +112,19 @@ def compare(
         typer.Option(metavar="METRES", help="A published error as printed, e.g. 0.0733: mark the rows that agree."),
     ] = None,
     timestamps: Timestamps = None,
+    topic: Topics = None,
     as_json: AsJson = False,
 ) -> None:
     """Show how one trajectory scores under every protocol of the field."""
     from dynslam_bench.evaluation.compare_protocols import agrees, compare_protocols
 
-    estimated, truth = (runs.read_trajectory(path, timestamps) for path in (estimate, ground_truth))
-    scores = compare_protocols(estimated, truth)
+    loaded, truth = read_pair(estimate, ground_truth, timestamps, topic)
+    scores = compare_protocols(loaded, truth)
+    lines = remarks(*scored_with_hints(loaded, truth, "tum-rgbd/v1"))
     columns = ["metric", "protocol", "rmse (m)", "pairs", "note"]
     rows = [[score.metric, score.label, score.rmse_m, score.pairs, score.note] for score in scores]
     if published is None:
-        present(scores, table(columns, rows))
+        present(scores, table(columns, rows), *lines)
         return
     marks = [agrees(score, published) for score in scores]
     defined = [score for score in scores if score.rmse_m is not None]
@@ -100,6 +135,7 @@ def compare(
     present(
         [{**asdict(score), "agrees": mark} for score, mark in zip(scores, marks, strict=True)],
         table(columns, rows),
+        *lines,
         *filter(None, [last]),
     )
 
@@ -128,7 +164,7 @@ def import_(
     topic: Annotated[Optional[str], typer.Option(help="Of a bag: the topic of the poses.")] = None,  # noqa: UP045
     truth: Annotated[
         Optional[Path],  # noqa: UP045
-        typer.Option(help="Ground truth (TUM) of a sequence whose images are not here; coverage is unknown then."),
+        typer.Option(help="Ground truth of a sequence whose images are not here; coverage is unknown then."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

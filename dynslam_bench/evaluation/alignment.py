@@ -83,8 +83,10 @@ def align(estimate: Array, ground_truth: Array, mode: Alignment) -> Similarity:
         moved = ground_truth[0] @ se3.inverse(estimate[0])
         return Similarity(moved[:3, :3].copy(), moved[:3, 3].copy())
     source, target = estimate[:, :3, 3], ground_truth[:, :3, 3]
-    centre_source, centre_target = source.mean(axis=0), target.mean(axis=0)
-    covariance = (target - centre_target).T @ (source - centre_source) / len(source)
+    # positions about their centres, in units of their own sizes: so neither coordinates of a map nor the unit matter
+    centre_source, unit_source, size_source = _centred(source)
+    centre_target, unit_target, size_target = _centred(target)
+    covariance = unit_target.T @ unit_source / len(source)
     # how far the estimate's orientations are turned, summed: decides only what the positions leave open
     orientation = np.tensordot(ground_truth[:, :3, :3], estimate[:, :3, :3], axes=((0, 2), (0, 2))) / len(source)
     if mode == "yaw":
@@ -92,20 +94,48 @@ def align(estimate: Array, ground_truth: Array, mode: Alignment) -> Similarity:
         return Similarity(rotation, centre_target - rotation @ centre_source, 1.0, degenerate)
     rotation, weighted, degenerate = _nearest_rotation(covariance, orientation)
     scale = 1.0
-    if mode == "sim3":
-        variance = float(((source - centre_source) ** 2).sum() / len(source))
-        moves = variance > np.finfo(float).eps * max(1.0, float((source**2).max()))
-        scale = weighted / variance if moves else 1.0  # without motion every scale gives the same positions
+    if mode == "sim3" and size_source > 0:  # without motion every scale gives the same positions
+        variance = float((unit_source**2).sum() / len(source))
+        scale = weighted / variance * (size_target / size_source)
     fitted = None if degenerate else (source, target)
     return Similarity(rotation, centre_target - scale * rotation @ centre_source, scale, degenerate, fitted)
+
+
+def _centred(positions: Array) -> tuple[Array, Array, float]:
+    """Positions about their centre, divided by their size.
+
+    Args:
+        positions: ``[N, 3]``.
+
+    Returns:
+        The centre ``[3]``, the positions about it in units of their size ``[N, 3]``, and the size, the largest of
+        their coordinates: 0, with zeros, where they differ by no more than the rounding of their coordinates.
+    """
+    # first about one of them: means of large coordinates lose digits
+    apart = positions - positions[0]
+    mean = apart.mean(axis=0)
+    centre = positions[0] + mean
+    apart = apart - mean
+    size = float(np.abs(apart).max())
+    rounding = _ROUNDING * float(np.abs(positions).max())
+    if size <= rounding:
+        return centre, np.zeros_like(apart), 0.0
+    return centre, apart / size, size
+
+
+_ROUNDING = 8 * float(np.finfo(np.float64).eps)
+"""How much of a coordinate the rounding of differences may make up."""
+_ON_A_LINE = 1e-12
+"""Share of the first singular value below which the second one says that the positions lie on a line."""
 
 
 def _nearest_rotation(covariance: Array, orientation: Array) -> tuple[Array, float, bool]:
     """Rotation that maximises ``tr(R^T C)``, the maximum, and whether C alone does not determine it."""
     u, singular, vt = np.linalg.svd(covariance)
-    degenerate = bool(singular[1] <= 1e-12 * max(singular[0], 1e-12))
+    degenerate = bool(singular[1] <= _ON_A_LINE * singular[0])
     if degenerate:
-        u, _, vt = np.linalg.svd(covariance + 1e-7 * max(singular[0], 1e-12) * orientation)
+        weight = 1e-7 * singular[0] if singular[0] > 0 else 1.0
+        u, _, vt = np.linalg.svd(covariance + weight * orientation)
     sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = u @ sign @ vt
     return rotation, float(np.trace(rotation.T @ covariance)), degenerate

@@ -12,8 +12,16 @@ from dynslam_bench.core import EvaluationError
 from dynslam_bench.core.records import Record
 from dynslam_bench.evaluation.alignment import Similarity, align
 from dynslam_bench.evaluation.protocol import Protocol
-from dynslam_bench.geometry import Array, Trajectory, associate, nearest_gap
+from dynslam_bench.geometry import (
+    Array,
+    Trajectory,
+    are_frame_numbers,
+    associate,
+    describe_frame_numbers,
+    nearest_gap,
+)
 from dynslam_bench.geometry.rigs import BONN_R_BODY_CAM, bonn_as_droid_w, bonn_camera, in_camera_axes
+from dynslam_bench.geometry.stamp_units import LATEST_S, UNIX_S
 
 Index = NDArray[np.intp]
 
@@ -79,9 +87,12 @@ def compare(
         diagnostics: Takes a line on everything that the numbers depend on.
 
     Raises:
-        EvaluationError: Fewer than two poses have ground truth (with the measured gaps).
+        EvaluationError: Fewer than two poses have ground truth (with the measured gaps), or a position is so large that
+            its square is no number.
     """
     diagnostics = [] if diagnostics is None else diagnostics
+    for whose, trajectory in (("estimate", estimate), ("ground truth", ground_truth)):
+        _refuse_infinite(trajectory, whose)
     estimate, ground_truth = compared(estimate, ground_truth, protocol, input_timestamps, diagnostics)
     estimate_index, truth_index, association = match(estimate, ground_truth, protocol)
     dropped = association.describe(protocol.max_dt)
@@ -101,6 +112,20 @@ def compare(
         protocol, estimate, ground_truth, estimate_index, truth_index, association, similarity, input_timestamps,
         diagnostics,
     )  # fmt: skip
+
+
+LARGEST_M = 1e150
+"""Squares of larger numbers are no numbers any more."""
+
+
+def _refuse_infinite(trajectory: Trajectory, whose: str) -> None:
+    sizes = np.abs(trajectory.positions).max(axis=1, initial=0.0)
+    if len(sizes) and sizes.max() > LARGEST_M:
+        at = int(sizes.argmax())
+        raise EvaluationError(
+            f"the pose of the {whose} at the stamp {trajectory.timestamps[at]:.6f} lies {sizes[at]:.3g} m away",
+            "correct or remove it",
+        )
 
 
 # Association of the two, with the reasons for what was dropped.
@@ -169,16 +194,32 @@ def match(estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol) ->
     else:
         index_est, index_gt = nearest_match(t_est, t_gt, max_dt, strict=strict)
     if not len(index_est):
-        other_unit = not 1e-5 <= np.abs(t_est).max() / max(np.abs(t_gt).max(), 1e-9) <= 1e5
         raise EvaluationError(
             f"none of {len(t_est)} poses has ground truth within {max_dt:g} s: the nearest is "
             f"{nearest_gap(t_est, t_gt).min():.3f} s away; the estimate covers {t_est[0]:.3f} to {t_est[-1]:.3f} s, "
             f"the ground truth {t_gt[0]:.3f} to {t_gt[-1]:.3f} s",
-            "are the stamps of one file in nanoseconds or frame numbers?"
-            if other_unit
-            else "do the files belong together, and do their clocks agree?",
+            clock_hint(t_est, t_gt),
         )
     return index_est, index_gt, _record(t_est, t_gt, index_est, index_gt, max_dt, strict=strict)
+
+
+def clock_hint(stamps: ArrayLike, true_stamps: ArrayLike) -> str:
+    """How the stamps of an estimate and of its truth, seconds ``[N]`` and ``[M]``, may be put on one clock."""
+    own, true = (np.asarray(values, dtype=np.float64) for values in (stamps, true_stamps))
+    if are_frame_numbers(own) != are_frame_numbers(true):
+        whose, numbers = ("estimate", own) if are_frame_numbers(own) else ("ground truth", true)
+        return f"{describe_frame_numbers(numbers, whose)}: frame numbers? Then give the stamps of the images in seconds"
+    own_is_unix, true_is_unix = (UNIX_S <= float(np.abs(values).max()) <= LATEST_S for values in (own, true))
+    if own_is_unix != true_is_unix and max(np.abs(own).max(), np.abs(true).max()) <= LATEST_S:
+        whose, other = ("estimate", "ground truth") if own_is_unix else ("ground truth", "estimate")
+        later_s = abs(float(true.min() - own.min()))
+        return (
+            f"only the {whose} has Unix time: if both begin with the same frame, add {later_s:.6f} s to each stamp of "
+            f"the {other}"
+        )
+    if not 1e-5 <= np.abs(own).max() / max(np.abs(true).max(), 1e-9) <= 1e5:
+        return "are the stamps of one of them in nanoseconds? Give seconds"
+    return "do the files belong together, and do their clocks agree?"
 
 
 def nearest_match(stamps: Array, others: Array, max_dt: float, *, strict: bool) -> tuple[Index, Index]:

@@ -5,10 +5,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field
 
 from dynslam_bench.core.records import Record, schema
 from dynslam_bench.evaluation.ape import absolute_errors, absolute_metrics, false_motion_metrics, static_camera_metrics
 from dynslam_bench.evaluation.comparison import AssociationRecord, Comparison, apply_policy, compare, truth_of_file
+from dynslam_bench.evaluation.plausibility import warnings_of
 from dynslam_bench.evaluation.protocol import Alignment, Protocol, get_protocol
 from dynslam_bench.evaluation.rpe import relative_metrics, segment_metrics
 from dynslam_bench.geometry import Trajectory, TumFile, load_trajectory
@@ -57,6 +59,7 @@ class Evaluation(Record):
         alignment: How the estimate was aligned.
         association: What was associated and what was dropped.
         diagnostics: One line for each fact that the numbers depend on.
+        warnings: What makes the numbers doubtful, a line each.
     """
 
     schema_version: int = schema(SCHEMA_VERSION)
@@ -72,6 +75,7 @@ class Evaluation(Record):
     alignment: AlignmentRecord
     association: AssociationRecord
     diagnostics: list[str]
+    warnings: list[str] = Field(default_factory=list)
 
     def summary(self) -> str:
         """The ATE with what it depends on, e.g. ``ATE (rmse) 0.0142 m over 848 poses [tum-rgbd/v1 ...]``."""
@@ -111,6 +115,8 @@ def evaluate(
     diagnostics: list[str] = []
     estimate, tracked = apply_policy(estimate, protocol, input_timestamps, diagnostics)
     comparison = compare(estimate, ground_truth, protocol, input_timestamps, diagnostics)
+    if protocol.finds_scale:
+        diagnostics.append(f"the alignment scales the estimate by {comparison.similarity.scale:.6g}")
     diagnostics += comparison.similarity.doubts(comparison.truth)
     metrics = {name: value for metric in METRICS for name, value in metric(comparison).items()}
     similarity = comparison.similarity
@@ -134,6 +140,7 @@ def evaluate(
         ),
         association=comparison.association,
         diagnostics=diagnostics,
+        warnings=warnings_of(comparison, metrics),
     )
 
 
@@ -144,7 +151,7 @@ def evaluate_files(
     *,
     timestamps: str | Path | None = None,
 ) -> Evaluation:
-    """Evaluate a trajectory file against a ground-truth file, each in TUM's format or, with stamps, in KITTI's.
+    """Evaluate a trajectory file against a ground-truth file, each in a format of `load_trajectory`.
 
     The diagnostics count skipped, sorted and replaced lines.
 

@@ -35,6 +35,8 @@ SHORTEST_SHIFT_S = 0.03
 """The clocks of good recordings differ by up to 25 ms, and a rolling shutter adds half its readout time."""
 DISPLACEMENT_S = 0.5
 LAG_S = 0.04
+MOST_PLACES = 4096
+"""Places at which displacements are taken at most: more than two minutes at intervals of `LAG_S`."""
 SCALE_FACTOR = 1.15
 """Scales closer to 1 than this factor are errors of a tracker."""
 COPY_SHARE, COPY_M, EXACT_M = 1e-3, 1e-4, 1e-6
@@ -71,7 +73,8 @@ def hints(
     faults = _several_recordings(estimate, ground_truth, notes)
     truth = Track(ground_truth.timestamps, ground_truth.T_world_cam)
     inside = truth.covers(estimate.timestamps)
-    if inside.sum() < MIN_POSES or np.abs(estimate.positions).max() > FARTHEST_M:
+    farthest_m = max(np.abs(trajectory.positions).max(initial=0.0) for trajectory in (estimate, ground_truth))
+    if inside.sum() < MIN_POSES or farthest_m > FARTHEST_M:
         return tuple(faults)
     stamps, poses = estimate.timestamps[inside], estimate.T_world_cam[inside]
     shift, left = _time_shift(stamps, poses, truth)
@@ -126,19 +129,24 @@ def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float
     window = min(DISPLACEMENT_S, span / 6)
     step = min(LAG_S, window / 3)
     most = int(min(LONGEST_SHIFT_S, span / 4) / step)
-    grid = stamps[0] + step * np.arange(-most, int(span / step) + most + 1)
     track = Track(stamps, poses)
-    own, expected = (_displacements(one, grid, window) for one in (track, truth))
-    at = most + np.flatnonzero(np.isfinite(own[most : len(own) - most, 0]))
-    at = at[:: 1 + len(at) // 128]
-    length = np.linalg.norm(own[at], axis=1)
-    at = at[length <= 6 * np.median(length)] if len(at) else at  # without jumps
-    if len(at) < MIN_POSES:
+    # places on a grid of lags from which the estimate moves by a known displacement, some of them, without jumps
+    at = _grid_places(track, step)
+    moved = _displacements(track, stamps[0] + step * at, window)
+    usable = np.flatnonzero(np.isfinite(moved[:, 0]))
+    usable = usable[:: 1 + len(usable) // 128]
+    length = np.linalg.norm(moved[usable], axis=1)
+    usable = usable[length <= 6 * np.median(length)] if len(usable) else usable
+    if len(usable) < MIN_POSES:
         return 0.0, 1.0
+    at, moved = at[usable], moved[usable]
+    # the lag at which the true displacements agree best; each place of the grid is looked at once
     lags = np.arange(-most, most + 1)
-    lag = int(lags[np.argmin(_unexplained(own[at], expected[at + lags[:, None]]))])
+    places, place_of = np.unique(at + lags[:, None], return_inverse=True)
+    expected = _displacements(truth, stamps[0] + step * places, window)[place_of.reshape(len(lags), len(at))]
+    lag = int(lags[np.argmin(_unexplained(moved, expected))])
     fine = lag * step + np.linspace(-1, 1, 9) * step
-    begin, moved = grid[at], own[at]
+    begin = stamps[0] + step * at
     near = _unexplained(moved, _displacements(truth, begin + np.append(fine, 0.0)[:, None], window))
     now, near = float(near[-1]), near[:-1]
     best = int(np.argmin(near))
@@ -149,6 +157,23 @@ def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float
     visible = float(_unexplained(moved, shifted_self)[0])  # what such a shift does to a path of this shape
     clear = abs(shift) > SHORTEST_SHIFT_S and left < min(MOSTLY, 0.55 * now) and visible > 0.3 * now
     return (shift, left) if clear else (0.0, now)
+
+
+def _grid_places(track: Track, step: float) -> Array:
+    """Whole multiples of a step, from the first stamp on, that lie between poses without a hole: `MOST_PLACES` at most.
+
+    They are counted stretch by stretch, so that the work grows with the poses and not with the time that they span.
+    """
+    since = track.stamps - track.stamps[0]
+    ends = np.flatnonzero(track.holes)
+    starts = np.append(0, ends[:-1] + 1)
+    first, last = np.ceil(since[starts] / step), np.floor(since[ends] / step)
+    count = np.maximum(last - first + 1, 0)
+    before = np.cumsum(count) - count
+    ranks = np.arange(min(count.sum(), MOST_PLACES)) * max(1.0, np.ceil(count.sum() / MOST_PLACES))
+    ranks = ranks[ranks < count.sum()]
+    stretch = np.searchsorted(before + count, ranks, side="right")
+    return np.asarray(first[stretch] + ranks - before[stretch])
 
 
 def _displacements(track: Track, stamps: Array, window: float) -> Array:
@@ -302,6 +327,10 @@ class Track:
     Args:
         stamps: Seconds ``[N]``, ascending.
         poses: ``[N, 4, 4]``.
+
+    Attributes:
+        step: Median interval, seconds.
+        holes: Behind which poses a hole begins ``[N]``; behind the last one there is one.
     """
 
     def __init__(self, stamps: Array, poses: Array) -> None:
@@ -309,12 +338,12 @@ class Track:
         self.positions = np.ascontiguousarray(poses[:, :3, 3])
         steps = np.diff(self.stamps)
         self.step = float(np.median(steps)) if len(steps) else 0.0
-        self._holes = np.append(steps > max(0.1, 3 * self.step), True)
+        self.holes = np.append(steps > max(0.1, 3 * self.step), True)
 
     def covers(self, stamps: Array) -> NDArray[np.bool_]:
         """Whether stamps lie within its time and in no hole ``[...]``."""
         after = np.searchsorted(self.stamps, stamps, side="right") - 1
-        return np.asarray((after >= 0) & (~self._holes[after] | (self.stamps[after.clip(0)] == stamps)))
+        return np.asarray((after >= 0) & (~self.holes[after] | (self.stamps[after.clip(0)] == stamps)))
 
     def positions_at(self, stamps: Array) -> Array:
         """Positions ``[..., 3]``, on straight lines between the stamps."""

@@ -9,14 +9,14 @@ from dynslam_bench.core.seeding import stream
 from dynslam_bench.evaluation.ape import named, statistics
 from dynslam_bench.evaluation.comparison import Comparison, Index
 from dynslam_bench.evaluation.protocol import RPESpec
-from dynslam_bench.geometry import Array, nearest_gap, se3
+from dynslam_bench.geometry import Array, are_frame_numbers, describe_frame_numbers, nearest_gap, se3
 
 
 def relative_metrics(comparison: Comparison) -> dict[str, float]:
     """``rpe_<delta><unit>_trans_<statistic>_m`` and ``..._rot_<statistic>_deg`` for each relative error of a protocol.
 
-    The comparison takes the number of pairs of each; one without pairs is left out, and the diagnostics say so. A sum
-    of squared rates means nothing and is left out.
+    The comparison takes the number of pairs of each; one without pairs is left out, and so is one over seconds whose
+    pairs are not so far apart; the diagnostics say so. A sum of squared rates means nothing and is left out.
     """
     metrics: dict[str, float] = {}
     for spec in comparison.protocol.rpe:
@@ -24,15 +24,46 @@ def relative_metrics(comparison: Comparison) -> dict[str, float]:
         errors, seconds = take(comparison, spec)
         if spec.rate:  # across a gap TUM's rule pairs a pose with itself
             errors, seconds = errors[seconds > 0], seconds[seconds > 0]
-        comparison.n_pairs_rpe[spec.key] = len(errors)
-        if not len(errors):
+        if fault := _not_over_seconds(comparison, spec, seconds):
+            comparison.diagnostics.append(f"{fault}: the relative error over {spec.key} is left out")
+            errors, seconds = errors[:0], seconds[:0]
+        elif not len(errors):
             comparison.diagnostics.append(f"no pair of poses for the relative error over {spec.key}; it is left out")
+        elif spec.pairs == "tum-fixed" and spec.unit == "s" and not spec.rate and not seconds.all():
+            itself = f"{np.count_nonzero(seconds == 0)} of {len(seconds)} pairs over {spec.key} join a pose with itself"
+            comparison.diagnostics.append(f"{itself}, as TUM's script has it where the next pose is far")
+        comparison.n_pairs_rpe[spec.key] = len(errors)
         over = seconds if spec.rate else 1.0
         translation = np.linalg.norm(errors[:, :3, 3], axis=1) / over
         rotation = np.rad2deg(se3.rotation_angle(errors)) / over
         metrics |= named(f"rpe_{spec.key}_trans", translation, spec.unit_of("trans"))
         metrics |= named(f"rpe_{spec.key}_rot", rotation, spec.unit_of("rot"))
     return {name: value for name, value in metrics.items() if "_sse_m_per" not in name and "_sse_deg_per" not in name}
+
+
+def _not_over_seconds(comparison: Comparison, spec: RPESpec, seconds: Array) -> str:
+    """Why pairs that were chosen over seconds are not so far apart; empty where they are, and for other deltas.
+
+    TUM's rule takes the pose closest to a delta behind, however far it is from there: of poses in milliseconds that is
+    the pose itself, and the error is 0.
+
+    Args:
+        comparison: What is compared.
+        spec: How pairs were chosen.
+        seconds: Time between the two poses of each pair ``[P]``.
+    """
+    if spec.unit != "s" or not len(seconds):
+        return ""
+    if are_frame_numbers(comparison.estimate.timestamps):
+        return f"{describe_frame_numbers(comparison.estimate.timestamps, 'estimate')}, as frame numbers are"
+    apart_s = float(np.median(seconds))
+    if abs(apart_s - spec.delta) <= MOST_OFF * spec.delta:
+        return ""
+    return f"the pairs that are closest to {spec.delta:g} s apart are {apart_s:g} s apart by the median"
+
+
+MOST_OFF = 0.5
+"""Share of a delta in seconds by which the pairs may miss it, by the median."""
 
 
 def tum_relative_errors(comparison: Comparison, spec: RPESpec) -> tuple[Array, Array]:

@@ -3,6 +3,7 @@
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera, inside, pixel_index
 from dynslam_bench.geometry.se3 import Array
+from dynslam_bench.geometry.stamp_units import are_frame_numbers, describe_frame_numbers, median_step
 from dynslam_bench.geometry.stamps import (
     associate,
     format_ns,
@@ -37,7 +38,9 @@ __all__ = [
     "RepeatedStamps",
     "Trajectory",
     "TumFile",
+    "are_frame_numbers",
     "associate",
+    "describe_frame_numbers",
     "format_ns",
     "format_tum",
     "from_seconds",
@@ -45,6 +48,7 @@ __all__ = [
     "is_number",
     "load_trajectory",
     "load_tum",
+    "median_step",
     "nearest_gap",
     "ns_of",
     "ordered_file",

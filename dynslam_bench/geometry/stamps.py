@@ -26,18 +26,22 @@ _EXACT = Context(prec=400, rounding=ROUND_HALF_EVEN)
 _LARGEST_NS = 2**63 - 1
 
 
-def parse_ns(text: str) -> int:
+def parse_ns(text: str, digits: int = 0) -> int:
     """Integer nanoseconds of a number of seconds in decimal text; further digits are rounded to the nearest.
+
+    Args:
+        text: The number.
+        digits: Decimal digits that its unit is smaller than the second: 3 for milliseconds.
 
     Raises:
         ValueError: It is no finite number, or beyond the range of 64 bits (292 years from 0).
     """
     try:
-        seconds = Decimal(text)
+        stamp = Decimal(text)
     except InvalidOperation:
-        seconds = Decimal("nan")
-    if seconds.is_finite() and seconds.adjusted() <= 11:
-        ns = int(seconds.scaleb(9, _EXACT).to_integral_value(context=_EXACT))
+        stamp = Decimal("nan")
+    if stamp.is_finite() and stamp.adjusted() <= 11 + digits:
+        ns = int(stamp.scaleb(9 - digits, _EXACT).to_integral_value(context=_EXACT))
         if abs(ns) <= _LARGEST_NS:
             return ns
     raise ValueError(f"{text[:40]!r} is not a number of seconds that 64 bits of nanoseconds hold")

@@ -2,7 +2,11 @@
 
 Reading follows the benchmark's own tools: ``#`` begins a comment, commas and tabs separate like spaces. Lines with NaN
 or with an all-zero quaternion are skipped; quaternions are normalised. Lines may come in any order, and of several
-lines with one stamp the last holds. Whatever is not taken as it stands is counted in `FileNotes`.
+lines with one stamp the last holds. Stamps in another unit than seconds are recognised (`stamp_units`). Whatever is not
+taken as it stands is counted in `FileNotes`.
+
+A heading above the poses, behind ``#`` or not, puts the columns in another order or states the unit of the stamps: so
+the tables of EuRoC and VSLAM-LAB are read. A comment that is no heading of the rows below it is passed over.
 """
 
 from array import array
@@ -15,7 +19,9 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core import TrajectoryError, read_lines, write_atomic
 from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.headings import Heading, parse_heading
 from dynslam_bench.geometry.rigs import nearest_rotation
+from dynslam_bench.geometry.stamp_units import SECONDS, SLOWEST_S, StampUnit, median_step, unit_of
 from dynslam_bench.geometry.stamps import format_ns, parse_ns, refuse_close, to_seconds
 from dynslam_bench.geometry.trajectory import RepeatedStamps, Trajectory
 
@@ -24,8 +30,6 @@ MOST_LINES = 4_000_000
 """More than an hour at 1 kHz; a longer file is refused before it fills the memory."""
 _ZERO_NORM = 1e-8
 _UNIT_TOLERANCE = 0.01
-_LATEST_S = 9e9
-"""Seconds, the year 2255: larger stamps are nanoseconds or something else, and 64 bits of nanoseconds end there."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,7 @@ class FileNotes:
         out_of_order: Lines whose stamp is before the previous line's; they were sorted.
         renormalised: Quaternions whose norm was off by more than 1 %.
         back_s: Longest step back in time from one line to the next, seconds.
+        stamps: In which unit the stamps were taken and why, one phrase; empty for seconds.
     """
 
     lines: int = 0
@@ -49,6 +54,7 @@ class FileNotes:
     out_of_order: int = 0
     renormalised: int = 0
     back_s: float = 0.0
+    stamps: str = ""
 
     def describe(self, *, repeats: bool = False) -> list[str]:
         """One phrase for every count that is not zero, e.g. ``3 of 800 lines skipped: not finite``.
@@ -67,7 +73,7 @@ class FileNotes:
             (self.out_of_order, f"{self.out_of_order} {of} out of order, sorted"),
             (self.renormalised, f"{self.renormalised} {of} with a quaternion far from unit norm, normalised"),
         ]
-        return [phrase for count, phrase in phrases if count]
+        return [phrase for count, phrase in phrases if count] + [self.stamps] * bool(self.stamps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,8 +99,7 @@ def read_tum(path: str | Path) -> Trajectory:
     """The trajectory of a TUM file; see `load_tum` for the counts of what was skipped.
 
     Raises:
-        TrajectoryError: The file is missing, is no text, has a malformed line (named by its number), two stamps that
-            differ by less than 1 us, or no valid pose.
+        TrajectoryError: As `load_tum`.
     """
     return load_tum(path).trajectory
 
@@ -103,30 +108,111 @@ def load_tum(path: str | Path) -> TumFile:
     """Read a TUM trajectory file together with the counts of skipped, sorted and replaced lines.
 
     Raises:
-        TrajectoryError: As `read_tum`.
+        TrajectoryError: The file is missing, is no text, has a malformed line (named by its number), stamps of a unit
+            that is not known or that mostly repeat each other, two stamps that differ by less than 1 us, or no valid
+            pose.
     """
-    values, numbers, texts = _read_table(Path(path), 8, _COLUMNS)
+    path = Path(path)
+    heading, line_of_heading = _find_heading(path)
+    heading = heading or Heading(8, tuple(range(8)), None)
+    table = _read_table(path, heading.columns, _COLUMNS, without=line_of_heading, stamp_column=heading.order[0])
+    values = table.values[:, list(heading.order)]
+    # lines without a pose are left out
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
     norm = np.linalg.norm(np.where(finite[:, None], values[:, 4:8], 0.0), axis=1)
     valid = finite & (norm >= _ZERO_NORM)
-    counted = {
-        "lines": len(values),
-        "not_finite": int((~finite).sum()),
-        "zero_quaternions": int((finite & (norm < _ZERO_NORM)).sum()),
-        "renormalised": int((np.abs(norm[valid] - 1) > _UNIT_TOLERANCE).sum()),
-    }
+    counted = FileNotes(
+        lines=len(values),
+        not_finite=int((~finite).sum()),
+        zero_quaternions=int((finite & (norm < _ZERO_NORM)).sum()),
+        renormalised=int((np.abs(norm[valid] - 1) > _UNIT_TOLERANCE).sum()),
+    )
     if not valid.any():
-        raise TrajectoryError(f"{path} holds no valid pose", "; ".join(FileNotes(**counted).describe()))
+        raise TrajectoryError(f"{path} holds no valid pose", "; ".join(counted.describe()))
     kept = values[valid]
-    if (latest := float(np.abs(kept[:, 0]).max())) > _LATEST_S:
-        raise TrajectoryError(
-            f"{path} has stamps up to {latest:.4g}, which are no seconds",
-            "nanoseconds? EuRoC's tables are read by `eval` and `import` where their heading is left in",
-        )
-    ns = np.array([parse_ns(texts[row]) for row in np.flatnonzero(valid)], dtype=np.int64)
-    line_of = dict(zip(ns.tolist(), np.array(numbers)[valid].tolist(), strict=True))
+    # stamps, exactly as they are written
+    texts = [table.texts[row] for row in np.flatnonzero(valid)]
+    moved = (np.diff(kept[:, 1:], axis=0) != 0).any(axis=1)
+    ns, unit_note = _stamps_of(texts, kept[:, 0], str(path), stated=heading.unit, moved=moved)
+    line_of = dict(zip(ns.tolist(), np.array(table.numbers)[valid].tolist(), strict=True))
     refuse_close(np.sort(ns), str(path), TrajectoryError, line_of.get)
-    return ordered_file(ns, se3.from_quaternion(kept[:, 1:4], kept[:, 4:8]), FileNotes(**counted))
+    return ordered_file(ns, se3.from_quaternion(kept[:, 1:4], kept[:, 4:8]), replace(counted, stamps=unit_note))
+
+
+def _stamps_of(
+    texts: list[str],
+    values: NDArray[np.float64],
+    source: str,
+    *,
+    stated: StampUnit | None = None,
+    moved: NDArray[np.bool_] | None = None,
+) -> tuple[NDArray[np.int64], str]:
+    """Stamps in nanoseconds ``[N]``, exactly, and a phrase on their unit (see `unit_of`).
+
+    Args:
+        texts: The stamps as they are written ``[N]``.
+        values: Their numbers.
+        source: The file.
+        stated: The unit that its heading states; None where it states none.
+        moved: Whether the pose of each line but the first differs from the one before ``[N - 1]``; None without poses.
+
+    Raises:
+        TrajectoryError: Most stamps, or a third of them with other poses, repeat the one before; their unit is not
+            known; or one lies beyond the range of 64 bits.
+    """
+    repeated = np.diff(values) == 0
+    repeats = np.flatnonzero(repeated)
+    others = 0 if moved is None else int((repeated & moved).sum())
+    if 2 * len(repeats) > len(values) or (others and 3 * others >= len(values)):
+        raise TrajectoryError(
+            f"{len(repeats)} of {len(values)} lines of {source} repeat the stamp of the line before, e.g. "
+            f"{texts[repeats[0]][:40]}: digits were lost when they were written",
+            "write all digits of the stamps, e.g. with the format %.9f in place of %g, and no 32-bit floats",
+        )
+    unit, note = unit_of(values, source, stated)
+    try:
+        return np.array([parse_ns(text, unit.digits) for text in texts], dtype=np.int64), note
+    except ValueError as error:
+        raise TrajectoryError(f"{source}: {error}") from None
+
+
+def _find_heading(path: Path) -> tuple[Heading | None, int]:
+    """The heading above the first row, and the number of its line where it is no comment, else 0.
+
+    A comment counts only if it names as many columns as the first row has values. The last heading gives the columns,
+    and the unit of the stamps is what any of them states.
+
+    Raises:
+        TrajectoryError: The file cannot be read, or begins with a line that is neither a row nor a heading.
+    """
+    commented: list[Heading] = []
+    for number, line in enumerate(read_lines(path, kind=TrajectoryError), start=1):
+        text = line.strip()
+        if text.startswith(("#", "%")):
+            heading = parse_heading(text)
+            commented += [] if heading is None else [heading]
+            continue
+        parts = _parts(text)
+        if not parts:
+            continue
+        if is_number(parts[0]):
+            return _joined([heading for heading in commented if heading.columns == len(parts)]), 0
+        heading = parse_heading(text)
+        if heading is None:
+            raise TrajectoryError(
+                f"{path} line {number} is neither a pose nor a known heading: '{text[:100]}'",
+                f"a heading names the stamp, x y z of the position and x y z w of the quaternion, e.g. '{_COLUMNS}'",
+            )
+        return _joined([*commented, heading]), number
+    return None, 0
+
+
+def _joined(headings: list[Heading]) -> Heading | None:
+    """The last of several headings, with the unit that any of them states; None for none."""
+    if not headings:
+        return None
+    units = [heading.unit for heading in headings if heading.unit is not None]
+    return replace(headings[-1], unit=units[-1] if units else None)
 
 
 def ordered_file(ns: NDArray[np.int64], T_world_cam: NDArray[np.float64], notes: FileNotes) -> TumFile:
@@ -168,11 +254,16 @@ def write_tum(path: str | Path, trajectory: Trajectory, *, comment: str = "") ->
 
 
 def format_tum(trajectory: Trajectory, *, comment: str = "") -> str:
-    """The text of a TUM trajectory file: nine decimals for stamps (seconds) and all other numbers."""
+    """The text of a TUM trajectory file: nine decimals for stamps (seconds) and all other numbers.
+
+    The heading states the unit of the stamps where their steps do not tell it.
+    """
     stamps = [format_ns(ns) for ns in trajectory.timestamps_ns.tolist()]
     position, quaternion = se3.to_quaternion(trajectory.T_world_cam)
     rows = np.concatenate([position, quaternion], axis=1).tolist()
-    heading = [f"# {line}" for line in (*comment.splitlines(), _COLUMNS)]
+    is_sparse = (median_step(trajectory.timestamps) or 0.0) > SLOWEST_S
+    columns = _COLUMNS.replace("timestamp", f"timestamp [{SECONDS.symbol}]") if is_sparse else _COLUMNS
+    heading = [f"# {line}" for line in (*comment.splitlines(), columns)]
     lines = [" ".join([stamp, *map("{:.9f}".format, row)]) for stamp, row in zip(stamps, rows, strict=True)]
     return "\n".join([*heading, *lines]) + "\n"
 
@@ -183,22 +274,29 @@ def read_table(path: Path, columns: int, meaning: str) -> NDArray[np.float64]:
     Raises:
         TrajectoryError: The file cannot be read, is no text, or a line does not hold `columns` numbers.
     """
-    return _read_table(path, columns, meaning)[0]
+    return _read_table(path, columns, meaning).values
 
 
 def read_stamps(path: Path) -> NDArray[np.int64]:
-    """The first numbers of all lines, seconds, in nanoseconds ``[N]``; comments and blank lines are left out.
+    """The first numbers of all lines, in nanoseconds ``[N]``; comments and blank lines are left out.
 
     Raises:
-        TrajectoryError: The file cannot be read, or a line does not begin with a stamp.
+        TrajectoryError: The file cannot be read, a line does not begin with a stamp, or the unit of the stamps is not
+            known.
     """
-    stamps = []
+    return _load_stamps(path)[0]
+
+
+def _load_stamps(path: Path) -> tuple[NDArray[np.int64], str]:
+    """The stamps of `read_stamps`, and a phrase on their unit (see `unit_of`)."""
+    texts: list[str] = []
     for number, parts in _lines(path):
-        try:
-            stamps.append(parse_ns(parts[0]))
-        except ValueError:
-            raise TrajectoryError(f"{path} line {number}: '{parts[0][:40]}' is not a stamp in seconds") from None
-    return np.array(stamps, dtype=np.int64)
+        if not is_number(parts[0]) or not np.isfinite(float(parts[0])):
+            raise TrajectoryError(f"{path} line {number}: '{parts[0][:40]}' is not a stamp in seconds")
+        texts.append(parts[0])
+    if not texts:
+        return np.zeros(0, dtype=np.int64), ""
+    return _stamps_of(texts, np.array([float(text) for text in texts]), str(path))
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -210,21 +308,47 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     for number, line in enumerate(read_lines(path, kind=TrajectoryError), start=1):
         if number > MOST_LINES:
             raise TrajectoryError(f"{path} has more than {MOST_LINES} lines, too many for a trajectory")
-        parts = line.partition("#")[0].replace(",", " ").split()
+        parts = _parts(line)
         if parts:
             yield number, parts
 
 
-def _read_table(path: Path, columns: int, meaning: str) -> tuple[NDArray[np.float64], list[int], list[str]]:
-    """The numbers of a table, the numbers of its lines, and the texts of its first column."""
-    values, numbers, texts = array("d"), [], []
+def _parts(line: str) -> list[str]:
+    """What stands in a line before a comment, split at commas and spaces."""
+    return line.partition("#")[0].replace(",", " ").split()
+
+
+@dataclass(frozen=True, eq=False)
+class _Table:
+    """A table of numbers as a file has it.
+
+    Attributes:
+        values: ``[N, K]``.
+        numbers: Numbers of its lines ``[N]``.
+        texts: Its stamps as they are written ``[N]``.
+    """
+
+    values: NDArray[np.float64]
+    numbers: list[int]
+    texts: list[str]
+
+
+def _read_table(path: Path, columns: int, meaning: str, *, without: int = 0, stamp_column: int = 0) -> _Table:
+    """The rows of a table; `without` is the number of a line that is none of them.
+
+    Raises:
+        TrajectoryError: As `read_table`.
+    """
+    values, numbers, texts = array("d"), list[int](), list[str]()
     for number, parts in _lines(path):
+        if number == without:
+            continue
         numbers.append(number)
-        texts.append(parts[0])
         if len(parts) != columns:
             raise TrajectoryError(
                 f"{path} line {number} has {len(parts)} values, not the {columns} of '{meaning}'", _hint(parts)
             )
+        texts.append(parts[stamp_column])
         try:
             values.extend(map(float, parts))
         except ValueError:
@@ -232,7 +356,7 @@ def _read_table(path: Path, columns: int, meaning: str) -> tuple[NDArray[np.floa
             raise TrajectoryError(f"{path} line {number}: {bad[:40]!r} is not a number", meaning) from None
     if not values:
         raise TrajectoryError(f"{path} holds no poses", f"expected lines of '{meaning}'")
-    return np.frombuffer(values, dtype=np.float64).reshape(-1, columns), numbers, texts
+    return _Table(np.frombuffer(values, dtype=np.float64).reshape(-1, columns), numbers, texts)
 
 
 def is_number(text: str) -> bool:
@@ -246,7 +370,9 @@ def is_number(text: str) -> bool:
 
 def _hint(parts: list[str]) -> str:
     if len(parts) == 12:
-        return "12 values a line are KITTI's format: give their stamps with --timestamps FILE"
+        return "12 values a line are KITTI's format: `eval` and `import` take its stamps with --timestamps FILE"
+    if len(parts) == 17:
+        return "17 values a line are EuRoC's ground truth: leave its heading in, which says that qw comes first"
     if len(parts) == 2 and is_number(parts[0]) and not is_number(parts[1]):
         return "this looks like a list of images"
     return ""
@@ -270,17 +396,22 @@ def read_kitti(path: str | Path, times: str | Path) -> Trajectory:
     Raises:
         TrajectoryError: A file cannot be read, a line is malformed or no rigid pose, or the stamps do not fit.
     """
-    rows = read_table(Path(path), 12, _MEANING)
+    return _load_kitti(Path(path), Path(times)).trajectory
+
+
+def _load_kitti(path: Path, times: Path) -> TumFile:
+    """The trajectory of `read_kitti`, with the notes on both files."""
+    rows = read_table(path, 12, _MEANING)
     matrices = rows.reshape(-1, 3, 4)
     poses = se3.from_matrix(matrices[:, :, 3], matrices[:, :, :3])
     for index, pose in enumerate(poses):
         if not se3.is_pose(pose, tolerance=1e-3):
             raise TrajectoryError(f"{path}: pose {index} of {len(poses)} is no rigid transformation", _MEANING)
     poses = se3.with_rotation(poses, nearest_rotation(poses[:, :3, :3]))
-    ns = read_stamps(Path(times))
+    ns, unit_note = _load_stamps(times)
     if len(ns) != len(poses):
         raise TrajectoryError(f"{path} has {len(poses)} poses but {times} has {len(ns)} stamps")
-    return Trajectory(to_seconds(ns), poses, ns)
+    return TumFile(Trajectory(to_seconds(ns), poses, ns), FileNotes(lines=len(poses), stamps=unit_note))
 
 
 def write_kitti(path: str | Path, trajectory: Trajectory, times: str | Path | None = None) -> None:
@@ -302,9 +433,10 @@ def load_trajectory(path: str | Path, timestamps: str | Path | None = None) -> T
     """Read a trajectory with the counts of what was not taken as it stands.
 
     Args:
-        path: Lines of 8 values (TUM) or, where `timestamps` is given, of 12 (KITTI).
-        timestamps: A file whose lines begin with a stamp in seconds each: a ``times.txt``, or a list such as
-            ``rgb.txt``; used for lines of 12 values only.
+        path: Lines of 8 values (TUM), a table with a heading (EuRoC, VSLAM-LAB) or, where `timestamps` is given, lines
+            of 12 values (KITTI).
+        timestamps: A file whose lines begin with a stamp each: a ``times.txt``, or a list such as ``rgb.txt``; used
+            for lines of 12 values only.
 
     Raises:
         TrajectoryError: A file cannot be read, is malformed, or the stamps do not fit the poses.
@@ -312,5 +444,4 @@ def load_trajectory(path: str | Path, timestamps: str | Path | None = None) -> T
     path = Path(path)
     if timestamps is None or len(next(_lines(path), (0, []))[1]) != 12:
         return load_tum(path)
-    trajectory = read_kitti(path, timestamps)
-    return TumFile(trajectory, FileNotes(lines=len(trajectory)))
+    return _load_kitti(path, Path(timestamps))

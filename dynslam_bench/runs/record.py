@@ -376,6 +376,12 @@ class MetricRecord(Record):
         return self.online if self.trajectory == "online" else self.final
 
     @property
+    def remarks(self) -> list[str]:
+        """What to know before the numbers are believed, a line each: warnings on the primary evaluation, and hints."""
+        warnings = [] if self.primary is None else self.primary.warnings
+        return [*(f"warning: {line}" for line in warnings), *(f"hint: {line}" for line in self.hints)]
+
+    @property
     def metrics(self) -> dict[str, float]:
         """The primary evaluation's metrics; empty if there is none."""
         return {} if self.primary is None else self.primary.metrics

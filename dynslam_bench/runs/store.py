@@ -1025,7 +1025,7 @@ def _errors(text: str) -> object:
 FIELDS = (
     *("run_id", "tracker", "sequence", "frames", "seed", "offset", "noise", "repeat", "settings", "status"),
     *("ate_rmse_m", "static_camera_ate_rmse_m", "false_motion_max_m", "coverage", "frame_ms", "segmentation"),
-    *("seen_in_training", "study", "identity", "reason", "started"),
+    *("seen_in_training", "study", "identity", "reason", "remarks", "started"),
 )
 """Names of the values of a list's row, in order."""
 
@@ -1063,6 +1063,7 @@ def run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
         "study": record.trial_of,
         "identity": "" if record.verified else "unverified",
         "reason": record.reason or (not_scored if record.sequence.ground_truth else ""),
+        "remarks": [] if metrics is None or record.failed else metrics.remarks,
         "started": record.started,
     }
 

@@ -34,7 +34,10 @@ def motion_tags(truth: Trajectory) -> set[str]:
     if se3.stands_still(truth.T_world_cam):
         return {FIXED_CAMERA}
     times = truth.timestamps
-    index = np.unique(np.searchsorted(times, np.arange(times[0], times[-1] + STEP_S, STEP_S)).clip(max=len(times) - 1))
+    # the first pose of each step of time: work by poses, however long the holes between them are
+    step_s = (times[0] + STEP_S) - times[0]  # as the floats of Unix time resolve it
+    steps = np.floor((times - times[0]) / step_s)
+    index = np.unique(np.append(np.flatnonzero(np.append(True, np.diff(steps) > 0)), len(times) - 1))
     poses, duration_s = truth.T_world_cam[index], times[-1] - times[0]
     steps = se3.inverse(poses[:-1]) @ poses[1:]
     steps_m, turned_deg = np.linalg.norm(steps[:, :3, 3], axis=1), np.degrees(se3.rotation_angle(steps))

@@ -267,6 +267,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
     static_m = _static_camera_error(store, record, protocol, evaluation)
     trial = [f"trial of the study '{record.trial_of}'"] if record.trial_of else []
     diagnostics = [] if evaluation is None else evaluation.diagnostics
+    warnings = [] if evaluation is None else [f"warning: {line}" for line in evaluation.warnings]
     alignment = None if evaluation is None else evaluation.alignment
     scores: dict[str, Any] = dict(
         settings={name: record.settings[name] for name in record.overrides if name in record.settings},
@@ -282,7 +283,7 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         hold_last_pose_ate_m=_hold_last_pose_error(store, record, protocol, evaluation, static_m),
         static_camera_ate_rmse_m=static_m,
         seen_in_training=seen_in_training(record.segmentation, record.sequence.id),
-        notes=[*(f"hint: {hint}" for hint in scored.hints), *trial, *record.notes, *diagnostics],
+        notes=[*(f"hint: {hint}" for hint in scored.hints), *warnings, *trial, *record.notes, *diagnostics],
         hints=scored.hints,
         store=store,
     )

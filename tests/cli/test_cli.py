@@ -162,7 +162,10 @@ def test_run_show_report_compare_and_remove(cli, facts, walk, tmp_path):
     """One store through its life."""
     code, out, _ = cli("run", "never-move", walk, "--seed", "0", "1", "--frames", "0:3")
     shown = [re.split(r"\s{2,}", line) for line in out.splitlines()]
-    assert [(row[3], row[6], row[7]) for row in shown[1:]] == [("ok", "0:3", "seed 0"), ("ok", "0:3", "seed 1")]
+    assert [(row[3], row[6], row[7]) for row in shown[1:3]] == [("ok", "0:3", "seed 0"), ("ok", "0:3", "seed 1")]
+    remark = "warning: never-move on .* and 1 more run: little-truth: only 3 poses have ground truth: the alignment .*"
+    assert re.fullmatch(remark, "".join(shown[3]))
+    assert len(shown) == 4
     runs = facts("runs", "list")
     assert [(run["tracker"], run["seed"], run["coverage"]) for run in runs] == [
         ("never-move", 0, 1.0),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluation_walks import chained, noisy, walk
+from evaluation_walks import chained, followed, lap, noisy, walk
 from evo.core import metrics, sync
 from evo.core.trajectory import PoseTrajectory3D
 from evo.tools import file_interface
@@ -114,6 +114,58 @@ def test_relative_errors(estimate, truth, alignment, mode, delta):
         assert ours.n_pairs_rpe[spec.key] == len(rpe.error)
         found = statistics_of(ours, f"rpe_{spec.key}_{part}", ending)
         assert found == pytest.approx(rpe.get_all_statistics(), abs=1e-9, rel=1e-9)
+
+
+# Units and coordinates that are far from a metre: centred, in double precision, without absolute limits.
+
+
+UTM_M = np.array([4.1e5, 5.54e6, 210.0])
+
+
+def elsewhere(trajectory, unit, offset):
+    """The trajectory with its positions in another unit, in other coordinates."""
+    return trajectory.with_poses(
+        se3.from_matrix(offset + unit * trajectory.positions, trajectory.T_world_cam[:, :3, :3])
+    )
+
+
+@pytest.mark.parametrize("alignment", ["se3", "sim3"])
+@pytest.mark.parametrize("unit", [1.0, 1e-9, 1e6])
+@pytest.mark.parametrize("true_unit", [1.0, 0.1, 1e4])
+@pytest.mark.parametrize("offset", [0.0, UTM_M])
+def test_alignment_in_other_units_and_with_map_coordinates_is_evos(alignment, unit, true_unit, offset):
+    truth, estimate = elsewhere(lap(), true_unit, offset), elsewhere(followed(lap()), unit, 0.0)
+    protocol = Protocol(id="x", max_dt=0.01, strict=False, one_to_one=False, alignment=alignment)
+    ours = evaluate(estimate, truth, protocol)
+    error = metrics.APE(metrics.PoseRelation.translation_part)
+    error.process_data(evo_pair(estimate, truth, alignment, 0.01))
+    expected = error.get_statistic(metrics.StatisticsType.rmse)
+    assert ours.metrics["ate_rmse_m"] == pytest.approx(expected, rel=1e-6, abs=1e-8)
+    if alignment == "sim3":
+        assert ours.alignment.scale == pytest.approx(true_unit / unit, rel=0.01)
+
+
+@pytest.mark.parametrize("unit", [1e-150, 1e-9, 1e9, 1e140])
+@pytest.mark.parametrize("true_unit", [1e-9, 1.0, 1e9])
+def test_the_unit_of_either_side_makes_no_difference_where_the_scale_is_fitted(unit, true_unit):
+    """Also where evo finds no rotation, for the product of the two is too small."""
+    protocol = Protocol(id="x", alignment="sim3")
+    plain = evaluate(followed(lap()), lap(), protocol)
+    ours = evaluate(elsewhere(followed(lap()), unit, 0.0), elsewhere(lap(), true_unit, 0.0), protocol)
+    assert ours.metrics["ate_rmse_m"] == pytest.approx(true_unit * plain.metrics["ate_rmse_m"], rel=1e-9)
+    assert ours.alignment.scale == pytest.approx(true_unit / unit * plain.alignment.scale, rel=1e-9)
+    assert not ours.alignment.degenerate
+
+
+@pytest.mark.parametrize("offset", [0.0, 1.0, UTM_M])
+@pytest.mark.parametrize("alignment", ["se3", "sim3", "yaw"])
+def test_a_camera_that_stands_still_anywhere_does_not_move(offset, alignment):
+    """Rounding of its coordinates is no motion: no scale is fitted to it."""
+    truth = lap()
+    still = elsewhere(truth, 0.0, 0.3 + offset)
+    found = evaluate(still, truth, Protocol(id="x", alignment=alignment))
+    assert found.alignment.scale == 1.0
+    assert found.metrics["ate_rmse_m"] == pytest.approx(found.metrics["static_camera_ate_rmse_m"], abs=1e-8)
 
 
 # Published numbers from published trajectories, repeated stamps beside evo, rows that agree with a printed number.

@@ -211,10 +211,10 @@ def test_the_sequence_may_have_changed_or_gone(store: RunStore, run: RunRecord, 
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("ts (ns),a,b\n1,2,3\n", "has no column 'tx \\(m\\)'"),
-        ("#timestamp,x,y,z,q_x,q_y,q_z,q_w\n1,0,0,0,0,0,0,1\n", "neither EuRoC's nor VSLAM-LAB's"),
-        ("#timestamp,x,y,z,q_w,q_x,q_y,q_z\n1,0,0,0,1,0,0\n", "line 2 has 7 columns, the heading 8"),
-        ("#timestamp,x,y,z,q_w,q_x,q_y,q_z\n1,0,0,0,0,0,0,0\n", "no row of .* holds a rotation"),
+        ("ts (ns),a,b\n1,2,3\n", "line 1 is neither a pose nor a known heading: 'ts \\(ns\\),a,b'"),
+        ("ts (ns),tx (m),ty (m),tz (m),qx,qy,qz,qw\n1,0,0,0,0,0,1\n", "line 2 has 7 values, not the 8"),
+        ("#timestamp,x,y,z,q_w,q_x,q_y,q_z\n1,0,0,0,1,0,0\n", "line 2 has 7 values, not the 8"),
+        ("#timestamp,x,y,z,q_w,q_x,q_y,q_z\n1,0,0,0,0,0,0,0\n", "no valid pose .1 of 1 lines .* all-zero quaternion"),
     ],
 )
 def test_damaged_tables(tmp_path: Path, text: str, complaint: str) -> None:

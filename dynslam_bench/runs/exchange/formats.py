@@ -10,7 +10,7 @@ from dynslam_bench.core import RunError, TrajectoryError, raising, read_lines, t
 from dynslam_bench.core.version import install_hint
 from dynslam_bench.geometry import Array, Camera, FileNotes, Trajectory, TumFile, is_number, load_trajectory, se3
 from dynslam_bench.sequences.bags import read_bag_poses
-from dynslam_bench.sequences.readers.files import POSE, camera_truth, read_image_list, read_pose_table
+from dynslam_bench.sequences.readers.files import POSE, camera_truth, read_image_list
 from dynslam_bench.sequences.readers.layouts import is_bag
 from dynslam_bench.slam.map_files import Cloud
 
@@ -19,8 +19,8 @@ def read_trajectory(path: str | Path, timestamps: str | Path | None = None, topi
     """Read a trajectory with the counts of what was not taken as it stands.
 
     Args:
-        path: A file in TUM's or KITTI's format, a table of EuRoC or VSLAM-LAB, a folder of COLMAP's text files (or its
-            ``images.txt``), or a bag.
+        path: A file in TUM's or KITTI's format, a table with a heading such as EuRoC's or VSLAM-LAB's, a folder of
+            COLMAP's text files (or its ``images.txt``), or a bag.
         timestamps: Stamps where the format has none: for KITTI a file whose lines begin with one each, for COLMAP a
             list of stamps and images such as ``rgb.txt``.
         topic: Of a bag with several topics of poses, the one to take.
@@ -36,11 +36,6 @@ def read_trajectory(path: str | Path, timestamps: str | Path | None = None, topi
         return read_bag_trajectory(path, topic)
     if path.is_dir():
         raise TrajectoryError(f"the folder {path} holds neither {IMAGES} of COLMAP nor a bag of ROS 2")
-    if is_pose_table(path):
-        camera_poses = read_pose_table(path, np.eye(4))
-        if camera_poses is None:
-            raise TrajectoryError(f"no row of {path} holds a rotation")
-        return camera_poses
     return load_trajectory(path, timestamps)
 
 
@@ -49,16 +44,6 @@ def _stamps_by_name(path: Path) -> dict[str, float]:
     images = read_image_list(path.expanduser())
     stamps = dict(zip(images.files, images.stamps.tolist(), strict=True))
     return {Path(file).name: stamp for file, stamp in stamps.items()} | stamps
-
-
-def is_pose_table(path: Path) -> bool:
-    """Whether a file begins with the heading of such a table.
-
-    Raises:
-        TrajectoryError: It cannot be read.
-    """
-    first = next((line for line in read_lines(path, kind=TrajectoryError) if line.strip()), "").lower()
-    return "," in first and ("timestamp" in first or "(ns)" in first)
 
 
 POSE_TABLES = {

@@ -16,12 +16,11 @@ from dynslam_bench.core.fingerprint import versions
 from dynslam_bench.core.records import Record, digest
 from dynslam_bench.core.version import version
 from dynslam_bench.envs.slam_env import Frames, open_frames
-from dynslam_bench.evaluation.comparison import STAMP_TOLERANCE
+from dynslam_bench.evaluation.comparison import STAMP_TOLERANCE, clock_hint
 from dynslam_bench.geometry import (
     Array,
     Trajectory,
     associate,
-    load_tum,
     nearest_gap,
     to_seconds,
     write_kitti,
@@ -278,8 +277,8 @@ def import_trajectory(
         timestamps: Stamps where the format has none: for KITTI a file whose lines begin with one each, in seconds, for
             COLMAP a list of stamps and images.
         topic: Of a bag with several topics of poses, the one to take.
-        truth: Ground truth in TUM's format of a sequence whose images are not here. Its frames are not known then, and
-            so is the coverage.
+        truth: Ground truth of a sequence whose images are not here, in a format of `read_trajectory`, with the same
+            `timestamps` where it has none. Its frames are not known then, and so is the coverage.
 
     Returns:
         The record, ``lost`` by the rule of runs (`judge_coverage`); its notes count poses whose stamps are no frame's.
@@ -298,7 +297,8 @@ def import_trajectory(
         opened = open_frames(sequence, data_root, camera, frames, stride)
         part, stamps, poses = part_of(opened), timestamps_ns(opened), opened.ground_truth
     else:
-        file_of_truth = load_tum(Path(truth).expanduser())
+        file_of_truth = read_trajectory(Path(truth).expanduser(), timestamps)
+        notes += [f"ground truth: {phrase}" for phrase in file_of_truth.notes.describe(repeats=True)]
         stated, poses = file_of_truth.trajectory, file_of_truth.poses(repeats=True)
         part, stamps = _part_by_truth(sequence, poses), stated.timestamps_ns
     covered, odd, last = _join(loaded.trajectory, to_seconds(stamps), f"{file} shares", f"'{part.id}'")
@@ -388,8 +388,10 @@ def _join(trajectory: Trajectory, stamps: Array, shares: str, name: str) -> tupl
     if len(near) < 2:
         gap = float(np.min(nearest_gap(trajectory.timestamps, stamps)))
         raise RunError(
-            f"{shares} {len(near)} stamps with {name}, at least 2 are needed",
-            f"the nearest is {gap:.3f} s off; frames last from {stamps[0]:.6f} to {stamps[-1]:.6f}",
+            f"{shares} {len(near)} stamps with {name}, at least 2 are needed: the nearest is {gap:.3f} s off; its own "
+            f"last from {trajectory.timestamps[0]:.6f} to {trajectory.timestamps[-1]:.6f}, the frames from "
+            f"{stamps[0]:.6f} to {stamps[-1]:.6f}",
+            clock_hint(trajectory.timestamps, stamps),
         )
     odd = len(trajectory) - len(exact)
     return (len(near) if odd else len(exact)), odd, int(near[-1])

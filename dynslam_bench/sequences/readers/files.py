@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from dynslam_bench.core import MEGABYTE, SequenceError, TrajectoryError, raising, read_bytes, read_lines, read_text
+from dynslam_bench.core import MEGABYTE, SequenceError, raising, read_bytes, read_lines, read_text
 from dynslam_bench.core.images import image_size
 from dynslam_bench.geometry import (
     Array,
@@ -24,7 +24,7 @@ from dynslam_bench.geometry import (
     Trajectory,
     TumFile,
     format_ns,
-    is_number,
+    load_tum,
     ns_of,
     ordered_file,
     parse_ns,
@@ -367,34 +367,21 @@ POSE = ("ts (ns)", "tx (m)", "ty (m)", "tz (m)", "qx", "qy", "qz", "qw")
 """Heading of VSLAM-LAB's tables of poses."""
 
 
-def read_pose_table(path: Path, T_body_cam: Array) -> TumFile | None:
-    """The camera's poses of a table of EuRoC or VSLAM-LAB; None where no row holds a rotation.
+def read_pose_table(path: Path, T_body_cam: Array) -> TumFile:
+    """The camera's poses of a table of EuRoC or VSLAM-LAB.
 
     Args:
         path: The table.
         T_body_cam: The camera's pose on the body whose poses the table holds, ``[4, 4]``.
 
     Raises:
-        DynslamError: A row is malformed, or the heading is of neither kind.
+        TrajectoryError: A row is malformed, the heading is of neither kind, or no row holds a rotation.
     """
-    heading, rows = read_rows(path)
-    if POSE[0] in heading:
-        columns = pick(heading, rows, POSE, path)
-    elif len(heading) >= 8 and "w" in heading[4].lower():
-        columns = [[row[at] for row in rows] for at in (0, 1, 2, 3, 5, 6, 7, 4)]
-    else:
-        raise TrajectoryError(
-            f"{path} has the columns {', '.join(heading)[:200]}: neither EuRoC's nor VSLAM-LAB's",
-            "EuRoC's fifth is the quaternion's w; VSLAM-LAB's are " + ", ".join(POSE),
-        )
-    texts = [text for column in columns[1:] for text in column]
-    bad = next((text for text in texts if not is_number(text)), None)
-    if bad is not None:
-        raise SequenceError(f"{path}: '{bad[:40]}' is not a number")
-    values = np.array([float(text) for text in texts]).reshape(7, -1).T
-    if not np.isfinite(values).all():
-        raise SequenceError(f"{path} holds values that are not finite")
-    return camera_truth(nanoseconds(columns[0], path), values, T_body_cam, str(path))
+    file = load_tum(path)
+    trajectory = file.trajectory.with_poses(file.trajectory.T_world_cam @ T_body_cam)
+    if file.every_line is None:
+        return TumFile(trajectory, file.notes)
+    return TumFile(trajectory, file.notes, file.every_line.with_poses(file.every_line.T_world_cam @ T_body_cam))
 
 
 def read_rows(path: Path) -> tuple[list[str], list[list[str]]]:

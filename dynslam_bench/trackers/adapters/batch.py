@@ -15,7 +15,7 @@ import psutil
 from dynslam_bench.contracts import Frame, TrackerContext, TrackResult
 from dynslam_bench.core import TemporaryFolder, TrackerError, TrackerTimeoutError, TrajectoryError, raising
 from dynslam_bench.core.code_files import files_of_command
-from dynslam_bench.geometry import Camera, Trajectory, nearest_gap, read_table, read_tum, se3
+from dynslam_bench.geometry import Camera, Trajectory, load_tum, nearest_gap, read_table, se3
 from dynslam_bench.trackers.adapters.orbslam3 import settings_yaml
 from dynslam_bench.trackers.adapters.specs import BatchProgram, BatchSettings, OrbSlam3Settings
 from dynslam_bench.trackers.adapters.subprocess_tracker import LOGGER, end_with_parent, write_images
@@ -110,12 +110,13 @@ class BatchTracker:
         if not output.is_file():
             raise TrackerError(f"{program.name}: {ended}, and wrote no {program.output}; {words_said}", hint)
         try:
-            trajectory = self._read(output)
+            trajectory, read_notes = self._read(output)
         except TrajectoryError as error:
             text = str(error).replace(str(output), program.output)
             raise TrackerError(f"{program.name}: {text}; it {ended}; {words_said}") from None
         odd = code or len(trajectory) < len(self._stamps)
         self.measured["notes"] = [f"the program {ended}; {words_said}"] if odd else []
+        self.measured["notes"] += [f"{program.output}: {note}" for note in read_notes]
         return trajectory
 
     def close(self) -> None:
@@ -159,8 +160,8 @@ class BatchTracker:
         self.measured["program_memory_mb"] = peak / 1e6
         return code
 
-    def _read(self, output: Path) -> Trajectory:
-        """The trajectory that the program wrote.
+    def _read(self, output: Path) -> tuple[Trajectory, list[str]]:
+        """The trajectory that the program wrote, and what of the file was not taken as it stands, a line each.
 
         Raises:
             TrajectoryError: It is damaged, or of other frames.
@@ -171,8 +172,12 @@ class BatchTracker:
             index, first = np.unique(rows[:, 0], return_index=True)
             if not len(index) or not (np.isin(index, np.arange(len(stamps)))).all():
                 raise TrajectoryError(f"{output} does not hold indices of frames 0 to {len(stamps) - 1}")
-            return Trajectory(stamps[index.astype(int)], se3.from_quaternion(rows[first, 1:4], rows[first, 4:]))
-        trajectory = read_tum(output)
+            repeats = len(rows) - len(index)
+            repeated = [f"{repeats} of {len(rows)} lines repeat an index, the first of each is taken"] * (repeats > 0)
+            poses = se3.from_quaternion(rows[first, 1:4], rows[first, 4:])
+            return Trajectory(stamps[index.astype(int)], poses), repeated
+        file = load_tum(output)
+        trajectory = file.trajectory
         gap, interval = nearest_gap(trajectory.timestamps, stamps), float(np.median(np.diff(stamps)))
         if gap.min() > interval / 2:
             raise TrajectoryError(
@@ -181,7 +186,7 @@ class BatchTracker:
                 f"{stamps[0]:.3f} to {stamps[-1]:.3f} s",
                 "another clock, or format = 'indices'?",
             )
-        return trajectory
+        return trajectory, file.notes.describe()
 
 
 def camera_yaml(camera: Camera, fps: float) -> str:

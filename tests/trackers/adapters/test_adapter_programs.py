@@ -512,6 +512,28 @@ def test_a_program_that_crashes_behind_its_trajectory_is_taken_and_noted(toml, t
     assert "signal 6" in tracker.measured["notes"][0] and "'bye'" in tracker.measured["notes"][0]
 
 
+@pytest.mark.parametrize(
+    "code, note",
+    [
+        (
+            "write([[f'{float(row[0]) * 1e9:.0f}', 0] for row in rows])",
+            r"traj\.txt: stamps are 33333000 apart by the median: taken as nanoseconds \(30 Hz\)",
+        ),
+        ("write([[row[0], 0] for row in rows] + [['nan', 0]])", "traj.txt: 1 of 13 lines skipped: not finite"),
+    ],
+)
+def test_what_was_not_taken_as_it_stands_is_noted(toml, toy_folder, code, note):
+    trajectory, tracker, sequence = ran(toml(code, output="traj.txt"), toy_folder)
+    assert np.allclose(trajectory.timestamps, sequence.timestamps, atol=1e-6)
+    (found,) = tracker.measured["notes"]
+    assert re.fullmatch(note, found)
+
+
+def test_repeated_indices_are_noted(toml, toy_folder):
+    _, tracker, _ = ran(toml("write([[i // 2, i] for i in range(24)])", format="indices"), toy_folder)
+    assert tracker.measured["notes"] == ["trajectory.txt: 12 of 24 lines repeat an index, the first of each is taken"]
+
+
 BAD = {
     "writes no file": ("print('loading'); sys.exit('no licence')", {}, "exit code 1, and wrote no .*'no licence'"),
     "in colours": ("print('\\x1b[31mbroken\\x1b[0m\\n\\x1b[0;m'); sys.exit(2)", {}, "its last words: 'broken'"),
@@ -520,7 +542,17 @@ BAD = {
     "without stamps": ("write(rows, '1 0 0 0 0 1 0 0 0 0 1 0')", {}, "line 1"),
     "no pose": ("write([])", {}, "holds no poses"),
     "another clock": ("write([[9e5 + i, 0] for i in range(12)])", {}, "none of the 12 poses .*900000.000.*frames from"),
-    "nanoseconds": ("write([[int(float(row[0]) * 1e9), 0] for row in rows])", {}, "no seconds"),
+    "lost digits": (
+        "write([[f'{1e9 + float(row[0]):g}', 0] for row in rows])",
+        {},
+        "11 of 12 lines of .* digits were lost",
+    ),
+    "whole seconds": (
+        "write([[f'{float(row[0]):.0f}', 0] for row in rows])",
+        {},
+        "11 of 12 lines of .* digits were lost",
+    ),
+    "two units": ("write([[33.3 * i, 0] for i in range(60)])", {}, "milliseconds .* or seconds .* name the unit"),
     "index too large": ("write([[99, 0]])", {"format": "indices"}, "indices of frames 0 to 11"),
     "dies": ("os.abort()", {}, "killed by signal 6"),
 }
