@@ -5,7 +5,7 @@ that was read for it is unchanged.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -22,7 +22,7 @@ from dynslam_bench.core.fingerprint import (
     search_path,
     this_machine,
 )
-from dynslam_bench.core.module_graph import module_graph, read_module_graph
+from dynslam_bench.core.module_graph import ModuleGraph, module_graph, read_module_graph
 from dynslam_bench.core.plugins import load_object
 from dynslam_bench.core.settings import Settings, flatten
 from dynslam_bench.core.version import release
@@ -30,7 +30,7 @@ from dynslam_bench.envs import Degradation
 from dynslam_bench.envs.slam_env import check_frames, open_frames, preprocessing_of, resolve_device
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry import Camera
-from dynslam_bench.runs.own_code import is_foreign, modules_of_run, parts_of_run
+from dynslam_bench.runs.own_code import is_foreign, modules_by_part, parts_of_run
 from dynslam_bench.runs.record import IDENTITY_SCHEME, StartMap, asked_digest, run_id_of
 from dynslam_bench.runs.spec import MAP_SETTING, RunSpec
 from dynslam_bench.segmentation.build_segmenter import segmentation_source, weights_digest
@@ -166,7 +166,7 @@ class Resolver:
         read = {
             "tracker_version": tracker.version,
             "parts": parts,
-            "source": source_digest(parts),
+            "source": source_digests(parts),
             "requires": {module: library_identity(module) for module in sorted(tracker.requires)},
             "libraries": self._libraries(),
             **named,
@@ -236,10 +236,17 @@ def libraries() -> dict[str, str]:
     return found | search_path()
 
 
-def source_digest(parts: list[str]) -> str:
-    """Digest of the code of this package that a run's parts use; see `own_code.parts_of_run`."""
-    graph = module_graph()
-    return graph.code_digest(modules_of_run(graph, parts))[:16]
+def source_digests(parts: Iterable[str]) -> dict[str, str]:
+    """Digest of the code of this package that each part of a run uses; see `own_code.modules_by_part`.
+
+    Runs on sequences of two kinds share the parts of their tracker: by part it shows whether one program made both.
+    """
+    return dict(_code_digests(module_graph(), tuple(parts)))
+
+
+@lru_cache(maxsize=1024)
+def _code_digests(graph: ModuleGraph, parts: tuple[str, ...]) -> Mapping[str, str]:
+    return {part: graph.code_digest(modules)[:16] for part, modules in modules_by_part(graph, parts).items()}
 
 
 def check_unchanged(run: ResolvedRun, *, begun: bool = False) -> None:
@@ -253,8 +260,7 @@ def check_unchanged(run: ResolvedRun, *, begun: bool = False) -> None:
         RunError: Something has changed since.
         DynslamError: Something cannot be read any more.
     """
-    graph = read_module_graph()
-    if graph.code_digest(modules_of_run(graph, run.identity["parts"]))[:16] != run.identity["source"]:
+    if _code_digests(read_module_graph(), tuple(run.identity["parts"])) != run.identity["source"]:
         raise RunError("the code of dynslam-bench has changed since this process began", "start it again")
     before, now = run.identity, resolve(run.spec).identity
     with raising(PluginError, f"cannot read a file of tracker '{run.tracker.id}'"):

@@ -4,7 +4,7 @@ The parts are the tracker's entry point, its filters, features, flow and segment
 sequence, and the environment with the run's loop. A change of any other module changes no run.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterator
 
 from dynslam_bench.contracts import Sequence, TrackerSpec
 from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, ModuleGraph, module_graph
@@ -34,6 +34,12 @@ WITH_PLUGINS = (
 """The packages that a plug-in may use: what it imports of this package is known only while it runs."""
 
 
+ALWAYS_USED = "environment"
+"""Stands among the parts of a run for the environment with the run's loop."""
+PLUGINS = "what plug-ins may use"
+"""Stands among the parts of a run with plug-ins for the packages `WITH_PLUGINS`."""
+
+
 def parts_of_run(
     tracker: TrackerSpec, settings: Settings, source: str, sequence: Sequence, *, changes_frames: bool
 ) -> list[str]:
@@ -52,21 +58,25 @@ def parts_of_run(
     return sorted(parts)
 
 
-def modules_of_run(graph: ModuleGraph, parts: Iterable[str]) -> list[str]:
-    """The modules of this package that decide a run's result, sorted.
+def modules_by_part(graph: ModuleGraph, parts: Collection[str]) -> dict[str, list[str]]:
+    """The modules of this package that decide a run's result, by the part of the run that uses them.
 
     Args:
         graph: The package's modules.
         parts: See `parts_of_run`.
+
+    Returns:
+        The modules of each part, sorted; those of `ALWAYS_USED`, and those of `PLUGINS` where a part is foreign.
     """
     never = [PACKAGE, *PLUMBING, *(f"{PACKAGE}.{name}" for name in FINDERS)]
     environment = [f"{PACKAGE}.{name}" for name in ENVIRONMENT]
     beside_the_loop = [f"{PACKAGE}.{name}" for name in BESIDE_THE_LOOP]
-    modules = {*graph.closure(environment, [*never, *beside_the_loop])}
-    modules |= {*graph.closure(map(module_of, parts), never)}
+    modules = {ALWAYS_USED: graph.closure(environment, [*never, *beside_the_loop])}
+    for part in parts:
+        modules[part] = graph.closure([module_of(part)], never)
     if any(map(is_foreign, parts)):
-        modules |= {*modules_for_plugins(graph)}
-    return sorted(modules)
+        modules[PLUGINS] = sorted(modules_for_plugins(graph))
+    return modules
 
 
 def modules_for_plugins(graph: ModuleGraph) -> list[str]:
