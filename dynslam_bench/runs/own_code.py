@@ -34,7 +34,7 @@ WITH_PLUGINS = (
 """The packages that a plug-in may use: what it imports of this package is known only while it runs."""
 
 
-ALWAYS_USED = "environment"
+ALWAYS_USED = "the environment"
 """Stands among the parts of a run for the environment with the run's loop."""
 PLUGINS = "what plug-ins may use"
 """Stands among the parts of a run with plug-ins for the packages `WITH_PLUGINS`."""
