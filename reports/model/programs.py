@@ -5,11 +5,11 @@ that made some of them. The row of the program that is installed here ranks.
 """
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta, timezone
 from statistics import geometric_mean
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from dynslam_bench.core.records import digest
 from dynslam_bench.reports.model.row import RunRow, grouped
@@ -67,76 +67,68 @@ class ProgramRow:
 
     Attributes:
         programs: The programs, the preferred one first.
+        is_deterministic: Whether equal requests have equal results.
     """
 
-    programs: list[Program]
-    _results: dict[Repeat, dict[Result, RunRow]] = field(default_factory=dict, init=False)
+    programs: list[Program] = field(default_factory=list)
+    is_deterministic: bool = True
+    _results: dict[Repeat, dict[Result, RunRow]] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        for program in self.programs:
-            self._add_results(program)
-
-    def _add_results(self, program: Program) -> None:
-        for row in program.rows:
-            results = self._results.setdefault((row.column_id, row.repeat_key), {})
-            results.setdefault(_result(row), row)
-
-    def add(self, other: "ProgramRow") -> None:
-        """Take in the programs of another row."""
-        self.programs += other.programs
-        for program in other.programs:
-            self._add_results(program)
+    def add(self, programs: Iterable[Program]) -> None:
+        """Take in further programs."""
+        for program in programs:
+            self.programs.append(program)
+            for row in program.rows:
+                self.is_deterministic &= row.tracker.deterministic and not row.realtime
+                results = self._results.setdefault((row.column_id, row.repeat_key), {})
+                results.setdefault(_result_of(row), row)
 
     @property
     def is_verified(self) -> bool:
         """Whether the ids of its runs tell what it is."""
         return self.programs[0].is_verified
 
-    @property
-    def is_deterministic(self) -> bool:
-        """Whether equal requests have equal results."""
-        rows = (row for program in self.programs for row in program.rows)
-        return all(row.tracker.deterministic and not row.realtime for row in rows)
-
     def values(self) -> dict[Part, list[str]]:
         """Digests or versions of every part of its programs, sorted."""
-        found: dict[Part, set[str]] = {}
+        of_part: dict[Part, set[str]] = {}
         for program in self.programs:
             for part, value in program.parts.items():
-                found.setdefault(part, set()).add(value)
-        return {part: sorted(values) for part, values in sorted(found.items())}
+                of_part.setdefault(part, set()).add(value)
+        return {part: sorted(values) for part, values in sorted(of_part.items())}
 
-    def compare(self, other: "ProgramRow") -> "Agreement":
-        """Compare all runs that both rows have."""
-        equal: set[tuple[Any, ...]] = set()
-        different: set[tuple[Any, ...]] = set()
-        ratios = []
+    def outcomes(self, other: "ProgramRow") -> Iterator["Outcome"]:
+        """How each run compares with that of another row, of all runs that both have; copies are left out.
+
+        Copies are runs that differ in their seed only and have one result: they count once, as in a cell of a table.
+        """
+        compared = set()
         for repeat, results in self._results.items():
             other_results = other._results.get(repeat)
             if other_results is None:
                 continue
             column, (offset, noise, _, _) = repeat
             pair = (column, offset, noise, frozenset(results), frozenset(other_results))
-            if pair in equal or pair in different:
-                continue  # another seed with the same results
-            is_one_result = len(results) == 1 and results.keys() == other_results.keys()
-            status, checksums = next(iter(results))
-            if not is_one_result or (status == "ok" and not checksums):
-                different.add(pair)
-            elif status == "ok":
-                equal.add(pair)
-            error_m = next(iter(results.values())).score_m
-            other_error_m = next(iter(other_results.values())).score_m
-            if error_m is not None and other_error_m is not None:
-                ratios.append(max(error_m, FLOOR_M) / max(other_error_m, FLOOR_M))
-        return Agreement(len(equal), len(different), ratios)
+            if pair not in compared:
+                compared.add(pair)
+                yield _compare_results(results, other_results)
+
+    def compare(self, other: "ProgramRow") -> "Agreement":
+        """Count the outcomes of all runs that both rows have."""
+        outcomes = list(self.outcomes(other))
+        equal = sum(outcome.verdict == "equal" for outcome in outcomes)
+        different = sum(outcome.verdict == "different" for outcome in outcomes)
+        return Agreement(equal, different, [outcome.ratio for outcome in outcomes if outcome.ratio is not None])
 
     def is_equal_to(self, other: "ProgramRow") -> bool:
         """Whether both have equal results on all runs that both have, and enough of these."""
         if not (self.is_verified and other.is_verified and self.is_deterministic and other.is_deterministic):
             return False
-        agreement = self.compare(other)
-        return agreement.different == 0 and agreement.equal >= FEWEST_EQUAL
+        equal = 0
+        for outcome in self.outcomes(other):
+            if outcome.verdict == "different":
+                return False
+            equal += outcome.verdict == "equal"
+        return equal >= FEWEST_EQUAL
 
     def shared_results(self) -> int:
         """Results of runs that ended well which several of its programs have; other seeds' copies do not count."""
@@ -153,14 +145,41 @@ class ProgramRow:
         return len(shared)
 
 
-class Agreement(NamedTuple):
-    """How the results of two rows compare, on the runs that both have.
-
-    Runs that differ in their seed only and have one result count once, as in a cell of a table.
+class Outcome(NamedTuple):
+    """One run of two programs.
 
     Attributes:
-        equal: Runs that ended well with equal trajectories.
-        different: Runs with other trajectories, or of which one failed.
+        verdict: ``equal``: both ended well with equal trajectories; ``different``: other trajectories, or one of them
+            failed; empty: both failed alike, which says little.
+        ratio: Error of the first program's run over that of the second's; None where one has none.
+    """
+
+    verdict: Literal["equal", "different", ""]
+    ratio: float | None
+
+
+def _compare_results(first: Mapping[Result, RunRow], second: Mapping[Result, RunRow]) -> Outcome:
+    """Compare what two programs made of one request; each may have several results."""
+    error_m = next(iter(first.values())).score_m
+    other_error_m = next(iter(second.values())).score_m
+    ratio = None
+    if error_m is not None and other_error_m is not None:
+        ratio = max(error_m, FLOOR_M) / max(other_error_m, FLOOR_M)
+
+    status, checksums = next(iter(first))
+    if len(first) > 1 or first.keys() != second.keys():
+        return Outcome("different", ratio)
+    if status != "ok":
+        return Outcome("", ratio)
+    return Outcome("equal" if checksums else "different", ratio)  # without checksums nothing shows that they are equal
+
+
+class Agreement(NamedTuple):
+    """How the results of two rows compare, on the runs that both have; see `Outcome`.
+
+    Attributes:
+        equal: Runs with equal results.
+        different: Runs with different results.
         ratios: Error of the first row's run over that of the second's, of those that have errors.
     """
 
@@ -206,7 +225,7 @@ def choose_runs(rows: Iterable[RunRow]) -> Chosen:
     chosen = Chosen()
     for group in grouped(rows, lambda row: row.settings_key).values():
         programs = _find_programs(group, installation, now)
-        program_rows = _merge_equal([ProgramRow([program]) for program in programs])
+        program_rows = _merge_equal(programs)
         kept = _choose_of_each_repeat(program_rows, now)
         _mark(program_rows, kept)
         ranked = program_rows[0].programs[0]
@@ -228,14 +247,16 @@ def _find_programs(rows: Sequence[RunRow], installation: Installation, now: date
     are. Each program joins the first that it fits.
     """
     by_identity = grouped(rows, _program_text)
-    found = []
+    described = []
     for some in by_identity.values():
         by_change = grouped(some, installation.what_changed) if len(by_identity) > 1 else {"": some}
-        found += [Program(runs, _parts_of(runs[0]), changed) for changed, runs in by_change.items()]
-    found.sort(key=lambda program: max(_preference(row, program.changed, now) for row in program.rows), reverse=True)
+        described += [Program(runs, _parts_of(runs[0]), changed) for changed, runs in by_change.items()]
+    described.sort(
+        key=lambda program: max(_preference(row, program.changed, now) for row in program.rows), reverse=True
+    )
 
     programs: list[Program] = []
-    for program in found:
+    for program in described:
         fitting = next((earlier for earlier in programs if earlier.fits(program)), None)
         if fitting is None:
             programs.append(program)
@@ -245,8 +266,15 @@ def _find_programs(rows: Sequence[RunRow], installation: Installation, now: date
     return programs
 
 
-def _merge_equal(program_rows: list[ProgramRow]) -> list[ProgramRow]:
-    """Join the rows whose results are equal; the first stays the first."""
+def _merge_equal(programs: Iterable[Program]) -> list[ProgramRow]:
+    """The rows of programs: those whose results are equal share one; the row of the first is the first."""
+    program_rows = []
+    for program in programs:
+        program_row = ProgramRow()
+        program_row.add([program])
+        program_rows.append(program_row)
+
+    # a row that has grown may have enough in common with one that had too little before
     before = len(program_rows) + 1
     while len(program_rows) < before:
         before = len(program_rows)
@@ -257,7 +285,7 @@ def _merge_equal(program_rows: list[ProgramRow]) -> list[ProgramRow]:
             waiting = []
             for other in others:
                 if first.is_equal_to(other):
-                    first.add(other)
+                    first.add(other.programs)
                 else:
                     waiting.append(other)
             program_rows.append(first)
@@ -433,7 +461,7 @@ def _runs(count: int) -> str:
     return f"{count} run{'s' * (count != 1)}"
 
 
-def _result(row: RunRow) -> Result:
+def _result_of(row: RunRow) -> Result:
     """How a run ended, and the checksums of its trajectories."""
     checksums = tuple((name, row.files[name]) for name in (FINAL, ONLINE) if name in row.files)
     return row.status, checksums

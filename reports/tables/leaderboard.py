@@ -303,7 +303,8 @@ def time_marks(board: Board, ended: Sequence[RunRow]) -> tuple[str, str]:
     by_computer = grouped(timed(ended), lambda row: row.computer)
     if by_computer and by_computer.keys() != {board.timing_computer}:
         marks.append(COMPUTER_MARK)
-        for computer, rows in by_computer.items():
+        by_number = sorted(by_computer.items(), key=lambda entry: (-len(entry[1]), entry[0]))
+        for computer, rows in by_number:
             frame_ms = middle(row.frame_ms for row in rows) or 0.0
             tips.append(f"{frame_ms:.1f} ms on {computer_words(computer)} ({_count(len(rows), 'run')})")
     return "".join(marks), "; ".join(tips)
