@@ -283,9 +283,11 @@ def _write(
     speed = figures.speed_figure(board)
     caption = (
         f"{'All categories. ' * (len(boards) > 1)}Lower right is better. The dotted line joins ranked trackers that no "
-        "other beats in both; open ones are not ranked. Frame times hold for the machine named under Reproduce."
-        + f" {tables.CACHED_NOTE}"
-        * any(row.cached for row in board.rows)
+        "other beats in both; open ones are not ranked. Frame times hold for "
+        f"{tables.computer_words(board.timing_computer)}."
+        + f" {tables.COMPUTER_MARK} Timed on another computer, and not on the dotted line, or on several."
+        * bool(tables.computer_note(board))
+        + f" {tables.CACHED_NOTE}" * any(row.cached for row in board.rows)
     )
     first_page = render(
         "board.html.j2",
@@ -371,9 +373,14 @@ _MOST_COMMANDS = 200
 def _notes(board: Board, protocol: Protocol, loaded: Loaded, pageless: str) -> list[str]:
     conflicts = "; ".join(first_of(loaded.conflicts, _MOST_NOTES, "and {} more"))
     final_only = ", ".join(board.labels[key] for key in board.final_only)
-    older = sorted({board.labels[row.variant_key] for row in board.rows if not row.is_current})
+    others = sorted({board.labels[row.variant_key] for row in board.rows if not row.is_current})
+    in_future = [
+        f"{row.label} on {row.sequence.id}, {row.repeat} ({row.started[:10]}, run {row.run_id})"
+        for row in loaded.in_future
+    ]
+    absent = [f"{board.labels[key]} ({changed})" for key, changed in loaded.not_installed.items()]
     left_out = {
-        "older runs of the same tracker, settings, frames and repeat": loaded.superseded,
+        "further runs of the same tracker, settings, frames and repeat": loaded.superseded,
         "runs that were stopped on request": loaded.stopped,
         "folders without a valid record": len(loaded.unreadable),
     }
@@ -386,10 +393,19 @@ def _notes(board: Board, protocol: Protocol, loaded: Loaded, pageless: str) -> l
         else "",
         f"Without ground truth, and so in no table of errors: {', '.join(board.unscored)}." if board.unscored else "",
         f"Left out: {counts}." if counts else "",
-        "Not ranked, as a newer program has made runs of the same tracker and settings, or as the runs' ids are "
-        f"unverified: {', '.join(older)}."
-        if older
+        "Not ranked, as another program of the same tracker and settings ranks, or as the runs' ids are "
+        f"unverified: {', '.join(others)}."
+        if others
         else "",
+        "Ranked by the program of their newest run, as none of several is the one installed here: "
+        f"{', '.join(first_of(absent, _MOST_NOTES, 'and {} more'))}."
+        if absent
+        else "",
+        "Dated in the future, and so counted as the oldest: "
+        f"{'; '.join(first_of(in_future, _MOST_NOTES, 'and {} more'))}."
+        if in_future
+        else "",
+        tables.computer_note(board),
         f"Left out: {without_scale_words(loaded.without_scale, protocol)}." if loaded.without_scale else "",
         f"Left out: {trial_words(loaded.trials)}." if loaded.trials else "",
         pageless,

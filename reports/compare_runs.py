@@ -188,19 +188,27 @@ def _by_column(rows: Sequence[RunRow]) -> dict[str, list[RunRow]]:
 
 
 def pair_variants(a: Mapping[str, list[RunRow]], b: Mapping[str, list[RunRow]]) -> list[tuple[str, str]]:
-    """Variants of A and B that share a column: equal ones, then those that differ least, each at most once."""
+    """Variants of A and B that share a column: equal ones, then those that differ least, each at most once.
+
+    Of several programs those that rank come first.
+    """
     candidates = [
-        (one != other, len(_differences(a[one][0], b[other][0])), one, other)
+        (one != other, len(_differences(a[one][0], b[other][0])), _not_current(a[one][0], b[other][0]), one, other)
         for one, other in product(a, b)
         if (a[one][0].tracker.id, a[one][0].kind) == (b[other][0].tracker.id, b[other][0].kind)
         and (one == other or (one not in b and other not in a))
     ]
     pairs: list[tuple[str, str]] = []
-    for *_, one, other in sorted(candidates, key=itemgetter(0, 1)):
+    for *_, one, other in sorted(candidates, key=itemgetter(0, 1, 2)):
         unused = all(one != pair[0] and other != pair[1] for pair in pairs)
         if unused and _by_column(a[one]).keys() & _by_column(b[other]).keys():
             pairs.append((one, other))
     return pairs
+
+
+def _not_current(first: RunRow, second: RunRow) -> int:
+    """How many of two rows are by programs that do not rank."""
+    return (not first.is_current) + (not second.is_current)
 
 
 def _differences(first: RunRow, second: RunRow) -> list[str]:

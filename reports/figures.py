@@ -12,9 +12,9 @@ import plotly.graph_objects as go
 from numpy.typing import ArrayLike
 
 from dynslam_bench.core import label_text
-from dynslam_bench.reports.model.board import Board
+from dynslam_bench.reports.model.board import Board, timed_on_one
 from dynslam_bench.reports.model.statistics import FLOOR_M
-from dynslam_bench.reports.tables.leaderboard import CACHED_MARK, LOST_MARK, STATISTICS, has_lost, medians, timed
+from dynslam_bench.reports.tables.leaderboard import LOST_MARK, STATISTICS, has_lost, medians, time_marks
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a8a8a")
 """Okabe and Ito's, without black and yellow, which vanish on one of the two grounds."""
@@ -100,17 +100,24 @@ GUIDE: dict[str, Any] = {"line": {"color": NEUTRAL, "width": 1, "dash": "dash"},
 
 
 def speed_figure(board: Board) -> go.Figure | None:
-    """Accuracy against speed, the Pareto front drawn through the ranked trackers; None without timed runs."""
+    """Accuracy against speed, None without timed runs.
+
+    The Pareto front is drawn through the ranked trackers that were timed on the board's `timing_computer`.
+    """
     look, placed = looks(board), board.placed
     points = []
+    comparable: set[str] = set()
     for key in board.trackers:
-        rows = timed([row for row in board.runs(key) if row.real_time_factor and not row.failed])
+        ended = [row for row in board.runs(key) if row.real_time_factor and not row.failed]
+        rows = timed_on_one(ended, board.timing_computer)
         factors = [row.real_time_factor for row in rows if row.real_time_factor]
         if key in placed and factors and np.isfinite(placed[key].ratio.value):
-            mark = f" {CACHED_MARK}" if any(row.cached for row in rows) else ""
-            points.append((key, float(np.median(factors)), placed[key].ratio, mark))
+            marks, _ = time_marks(board, ended)
+            points.append((key, float(np.median(factors)), placed[key].ratio, f" {marks}" * bool(marks)))
+            if rows[0].computer == board.timing_computer:
+                comparable.add(key)
     traces: list[Any] = []
-    ranked = {(speed, ratio.value) for key, speed, ratio, _ in points if key in board.ranked}
+    ranked = {(speed, ratio.value) for key, speed, ratio, _ in points if key in board.ranked and key in comparable}
     front = sorted(p for p in ranked if not any(q != p and q[0] >= p[0] and q[1] <= p[1] for q in ranked))
     if len(front) > 1:
         x, y = (rounded(values) for values in zip(*front, strict=True))

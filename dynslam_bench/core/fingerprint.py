@@ -60,11 +60,29 @@ def named_digests(settings: Settings) -> dict[str, str]:
                 texts.setdefault(setting, text)
     digests = {}
     for name, text in texts.items():
-        path = Path(os.path.expandvars(text)).expanduser()
-        with raising(PluginError, f"cannot read {path}, which the setting '{name}' names"):
-            if path.exists():
-                digests[name] = path_digest(path)[:16]
+        digest_now = _digest_at(text, name)
+        if digest_now:
+            digests[name] = digest_now
     return digests
+
+
+def named_digest(name: str, value: str | Path) -> str:
+    """Digest of the content of the file or folder that one setting names; empty where there is none.
+
+    Args:
+        name: The setting, for messages.
+        value: Its value, as `named_digests` reads it.
+
+    Raises:
+        PluginError: It cannot be read.
+    """
+    return _digest_at(_path_in(value) or str(value), name)
+
+
+def _digest_at(text: str, setting: str) -> str:
+    path = Path(os.path.expandvars(text)).expanduser()
+    with raising(PluginError, f"cannot read {path}, which the setting '{setting}' names"):
+        return path_digest(path)[:16] if path.exists() else ""
 
 
 def _path_in(value: str | Path) -> str:

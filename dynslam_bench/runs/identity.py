@@ -7,7 +7,7 @@ that was read for it is unchanged.
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from dynslam_bench.core.fingerprint import (
     this_machine,
 )
 from dynslam_bench.core.libraries import library_identity, search_path
-from dynslam_bench.core.module_graph import module_graph, read_module_graph
+from dynslam_bench.core.module_graph import ModuleGraph, module_graph, read_module_graph
 from dynslam_bench.core.plugins import load_object
 from dynslam_bench.core.reads import Anchors
 from dynslam_bench.core.settings import Settings, flatten
@@ -30,7 +30,7 @@ from dynslam_bench.envs import Degradation
 from dynslam_bench.envs.slam_env import check_frames, open_frames, preprocessing_of, resolve_device
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry import Camera
-from dynslam_bench.runs.own_code import is_foreign, module_of, modules_of_run, parts_of_run
+from dynslam_bench.runs.own_code import anchors_of, is_foreign, module_of, modules_by_part, parts_of_run
 from dynslam_bench.runs.record import IDENTITY_SCHEME, StartMap, asked_digest, run_id_of
 from dynslam_bench.runs.spec import MAP_SETTING, RunSpec
 from dynslam_bench.segmentation.build_segmenter import segmentation_source, weights_digest
@@ -91,8 +91,7 @@ class ResolvedRun:
     @cached_property
     def anchors(self) -> Anchors:
         """The folders in which names of files begin that plug-ins and programs read."""
-        files = [Path(module_of(part)) for part in self.identity["parts"] if module_of(part).endswith(".py")]
-        return Anchors(plugin=files[0].parent if files else None, work=Path.cwd())
+        return anchors_of(self.identity["parts"])
 
     @cached_property
     def plugin_packages(self) -> list[str]:
@@ -174,7 +173,7 @@ class Resolver:
         read = {
             "tracker_version": tracker.version,
             "parts": parts,
-            "source": source_digest(parts),
+            "source": source_digests(parts),
             "requires": {module: library_identity(module) for module in sorted(tracker.requires)},
             "libraries": self._libraries(),
             **named,
@@ -242,15 +241,17 @@ def libraries() -> dict[str, str]:
     return found | search_path()
 
 
-def source_digest(parts: Iterable[str]) -> str:
-    """Digest of the code of this package that a run's parts use; see `own_code.parts_of_run`."""
-    return _source_digest(tuple(parts))
+def source_digests(parts: Iterable[str]) -> dict[str, str]:
+    """Digest of the code of this package that each part of a run uses; see `own_code.modules_by_part`.
+
+    Runs on sequences of two kinds share the parts of their tracker: by part it shows whether one program made both.
+    """
+    return dict(_code_digests(module_graph(), tuple(parts)))
 
 
-@cache
-def _source_digest(parts: tuple[str, ...]) -> str:
-    graph = module_graph()
-    return graph.code_digest(modules_of_run(graph, parts))[:16]
+@lru_cache(maxsize=1024)
+def _code_digests(graph: ModuleGraph, parts: tuple[str, ...]) -> Mapping[str, str]:
+    return {part: graph.code_digest(modules)[:16] for part, modules in modules_by_part(graph, parts).items()}
 
 
 def check_unchanged(run: ResolvedRun, *, begun: bool = False) -> None:
@@ -264,8 +265,7 @@ def check_unchanged(run: ResolvedRun, *, begun: bool = False) -> None:
         RunError: Something has changed since.
         DynslamError: Something cannot be read any more.
     """
-    graph = read_module_graph()
-    if graph.code_digest(modules_of_run(graph, run.identity["parts"]))[:16] != run.identity["source"]:
+    if _code_digests(read_module_graph(), tuple(run.identity["parts"])) != run.identity["source"]:
         raise RunError("the code of dynslam-bench has changed since this process began", "start it again")
     before, now = run.identity, resolve(run.spec).identity
     with raising(PluginError, f"cannot read a file of tracker '{run.tracker.id}'"):

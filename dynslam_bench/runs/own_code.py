@@ -4,12 +4,14 @@ The parts are the tracker's entry point, its filters, features, flow and segment
 sequence, and the environment with the run's loop. A change of any other module changes no run.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
 from dynslam_bench.contracts import Sequence, TrackerSpec
 from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, ModuleGraph, module_graph
 from dynslam_bench.core.plugins import Registry, used
+from dynslam_bench.core.reads import Anchors
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.features.registry import FEATURES
 from dynslam_bench.features.settings import FeatureSettings
@@ -38,6 +40,12 @@ WITH_PLUGINS = (
 """The packages that a plug-in may use: what it imports of this package is known only while it runs."""
 
 
+ALWAYS_USED = "the environment"
+"""Stands among the parts of a run for the environment with the run's loop."""
+PLUGINS = "what plug-ins may use"
+"""Stands among the parts of a run with plug-ins for the packages `WITH_PLUGINS`."""
+
+
 def parts_of_run(
     tracker: TrackerSpec, settings: Settings, source: str, sequence: Sequence, *, changes_frames: bool
 ) -> list[str]:
@@ -56,21 +64,30 @@ def parts_of_run(
     return sorted(parts)
 
 
-def modules_of_run(graph: ModuleGraph, parts: Iterable[str]) -> list[str]:
-    """The modules of this package that decide a run's result, sorted.
+def modules_by_part(graph: ModuleGraph, parts: Collection[str]) -> dict[str, list[str]]:
+    """The modules of this package that decide a run's result, by the part of the run that uses them.
 
     Args:
         graph: The package's modules.
         parts: See `parts_of_run`.
+
+    Returns:
+        The modules of each part, sorted; those of `ALWAYS_USED`, and those of `PLUGINS` where a part is foreign.
     """
     never = [PACKAGE, *PLUMBING, *(f"{PACKAGE}.{name}" for name in FINDERS)]
     environment = [f"{PACKAGE}.{name}" for name in ENVIRONMENT]
     beside_the_loop = [f"{PACKAGE}.{name}" for name in BESIDE_THE_LOOP]
-    modules = {*graph.closure(environment, [*never, *beside_the_loop])}
-    modules |= {*graph.closure(map(module_of, parts), never)}
+    modules = {ALWAYS_USED: graph.closure(environment, [*never, *beside_the_loop])}
+    for part in parts:
+        modules[part] = graph.closure([module_of(part)], never)
     if any(map(is_foreign, parts)):
-        modules |= {*modules_for_plugins(graph)}
-    return sorted(modules)
+        modules[PLUGINS] = sorted(modules_for_plugins(graph))
+    return modules
+
+
+def modules_of_run(graph: ModuleGraph, parts: Collection[str]) -> list[str]:
+    """The modules of this package that decide a run's result, sorted; see `modules_by_part`."""
+    return sorted({module for modules in modules_by_part(graph, parts).values() for module in modules})
 
 
 def modules_for_plugins(graph: ModuleGraph) -> list[str]:
@@ -136,6 +153,16 @@ def segmenter_of(source: str) -> str:
     """The id of the segmenter behind a source of masks: ``onnx`` of ``onnx:PATH``, ``mine`` of ``plugin:mine``."""
     kind, _, argument = source.partition(":")
     return argument if kind == "plugin" else kind
+
+
+def anchors_of(parts: Iterable[str]) -> Anchors:
+    """The folders in which names of files begin that a run's plug-ins and programs read, as they lie here.
+
+    Args:
+        parts: See `parts_of_run`.
+    """
+    files = [Path(module_of(part)) for part in parts if module_of(part).endswith(".py")]
+    return Anchors(plugin=files[0].parent if files else None, work=Path.cwd())
 
 
 def is_foreign(part: str) -> bool:

@@ -25,6 +25,8 @@ ASKED = (
 )
 """What of an identity was asked for; all else was read for it: code, data, weights, libraries, files."""
 _CODE = ("tracker_version", "source", "requires", "files", "reads")
+PROGRAM = ("parts", *_CODE, "libraries", "weights")
+"""What of an identity says by which program the run was made: its code, libraries and weights."""
 FAILED: tuple[Status, ...] = ("crashed", "timeout", "out-of-memory", "invalid")
 """Statuses of runs that did not come to their end."""
 LOST_COVERAGE = 0.5

@@ -14,8 +14,14 @@ from dynslam_bench.reports.figures import significant
 from dynslam_bench.reports.model.board import OVERALL, Board, Cell, compare_pairs
 from dynslam_bench.reports.model.row import SEEN, RunRow, grouped
 from dynslam_bench.reports.model.statistics import FLOOR_M, Interval, Standing, Verdict
-from dynslam_bench.reports.tables.leaderboard import leaderboard_cells, middle, rank_cell, run_link, timed
-from dynslam_bench.reports.tables.table import TableCell, number
+from dynslam_bench.reports.tables.leaderboard import (
+    frame_time_cell,
+    leaderboard_cells,
+    middle,
+    rank_cell,
+    run_link,
+)
+from dynslam_bench.reports.tables.table import TableCell
 
 _OPPOSITE: dict[Verdict, Verdict] = {"better": "worse", "worse": "better", "cannot tell": "cannot tell"}
 MOST_LISTED = 5000
@@ -67,13 +73,14 @@ def entries_of(
                 "group": 2 if first.tracker.provenance == "control" else int(key not in board.ranked),
                 "name": replace(cells["tracker"], text=board.names[key] + marks, link=run_link(start)),
                 "kind": TableCell("imported") if first.imported else cells["provenance"],
+                "remark": first.program_remark,
                 "rank": TableCell("–") if standing is None else rank_cell(standing),
                 "ratio": cells["ATE ratio"] if standing is None else _ratio_cell(board, standing, cells["ATE ratio"]),
                 "bar": {} if standing is None else _bar(standing.ratio, limits),
                 "verdict": TableCell("not ranked", why) if (why := board.unranked_why(key)) else cells["better?"],
                 "success": cells["success"],
                 "coverage": cells["coverage"],
-                "time": number(middle(run.frame_ms for run in timed(ended)), ".1f"),
+                "time": frame_time_cell(board, ended),
                 "memory": cells["MB"],
                 "by_category": _by_category(key, boards),
             }

@@ -144,6 +144,12 @@ class Board:
         """Variant key to its standing, in order."""
         return {standing.key: standing for standing in self.standings}
 
+    @cached_property
+    def timing_computer(self) -> str:
+        """The computer whose times are shown where runs were made on several: the one with most timed runs."""
+        counts = Counter(row.computer for row in timed([row for row in self.rows if not row.failed]))
+        return min(counts, key=lambda computer: (-counts[computer], computer), default="")
+
     @property
     def emphasised(self) -> set[str]:
         """Variant keys of those that may be first, unless that is most of them: then it would say nothing."""
@@ -163,7 +169,7 @@ class Board:
         return self._by_key[key][0]
 
     def is_rankable(self, key: str) -> bool:
-        """Whether a tracker could be ranked: a system, as its spec says, by the newest program."""
+        """Whether a tracker could be ranked: a system, as its spec says, by the program that ranks."""
         row = self.first(key)
         return row.ranked and row.is_current and row.tracker.provenance != "control"
 
@@ -176,7 +182,7 @@ class Board:
             "lacks sequences": key in self.incomplete,
             "in real time": row.realtime,
             "exact masks: a bound": row.segmentation == EXACT_MASKS,
-            "by an older program": not row.is_current,
+            "by another program": not row.is_current,
             "ablation" if row.tracker.provenance == "own" else row.tracker.provenance: not self.is_rankable(key),
         }
         return "" if key in self.ranked else next((words for words, holds in reasons.items() if holds), "")
@@ -220,7 +226,9 @@ class Board:
             run_id, kind (``run here``, ``imported``), tracker, label, settings (what sets the variant apart,
             ``name=value; ...``), provenance, sequence (name of the column in tables), column_id, frames, split, repeat,
             status, ending (of a failed run), study (of which the run is a trial), protocol_id, protocol_digest,
-            trajectory (``online``, ``final``: whose errors they are), segmentation.
+            trajectory (``online``, ``final``: whose errors they are), segmentation, computer (on which the times were
+            taken), program_remark (how many programs share the row, or how the results differ from those of the
+            program that ranks).
             ``Int64``: seed, offset, noise (missing for the sequence's own), n_frames, n_processed, n_tracked.
             ``boolean``: ranked, failed, cached (whether stage times come from the stage cache), seen_in_training
             (whether the masks come from a network that was trained on the scene). ``Float64``: coverage and
@@ -246,6 +254,8 @@ class Board:
                 "split": row.sequence.split,
                 "study": row.trial_of,
                 "noise": row.sequence.noise,
+                "computer": row.computer or None,
+                "program_remark": row.program_remark or None,
             }
             values |= {name: row.metrics.get(name) for name in metrics}
             lines.append([values[name] if name in values else getattr(row, name) for name in kinds])
@@ -280,8 +290,8 @@ def make_board(
     Args:
         rows: One a run.
         reference: Tracker id that errors are divided by; `DEFAULT_REFERENCE` where none is named. Real-time runs,
-            imports and runs by an older program are never it. Where it was not run on every ranked sequence, a static
-            camera takes its place.
+            imports and runs by another program than the one that ranks are never it. Where it was not run on every
+            ranked sequence, a static camera takes its place.
         on: ``common`` ranks on the sequences that all ranked trackers have, ``all`` only trackers that have all.
         rank_seen: Whether trackers are also ranked on scenes that the network behind their masks was trained on.
 
@@ -571,6 +581,25 @@ def make_cell(rows: Sequence[RunRow]) -> Cell:
     return Cell(tuple(ordered), tuple(kept))
 
 
+def timed(runs: Sequence[RunRow]) -> list[RunRow]:
+    """The runs with frame times: those that took them themselves, where there is one; else the cached ones."""
+    fresh = [row for row in runs if not row.cached and row.real_time_factor is not None]
+    return fresh or [row for row in runs if row.real_time_factor is not None]
+
+
+def timed_on_one(runs: Sequence[RunRow], computer: str) -> list[RunRow]:
+    """The runs whose times count: of those with frame times the ones on one computer.
+
+    Args:
+        runs: Some runs.
+        computer: Taken where it made one of the runs; else it is the one that made most of them.
+    """
+    by_computer = grouped(timed(runs), lambda row: row.computer)
+    if computer in by_computer:
+        return by_computer[computer]
+    return max(by_computer.values(), key=lambda rows: (len(rows), rows[0].computer), default=[])
+
+
 def mean_of(values: Iterable[float | None]) -> float | None:
     """Mean of what is known; None if nothing is."""
     present = [value for value in values if value is not None]
@@ -637,6 +666,7 @@ _COLUMNS = {
     "string": (
         *("run_id", "kind", "tracker", "label", "settings", "provenance", "sequence", "column_id", "frames", "split"),
         *("repeat", "status", "ending", "study", "protocol_id", "protocol_digest", "trajectory", "segmentation"),
+        *("computer", "program_remark"),
     ),
     "Int64": ("seed", "offset", "n_frames", "n_processed", "n_tracked", "noise"),
     "boolean": ("ranked", "failed", "cached", "seen_in_training"),

@@ -24,6 +24,7 @@ from pydantic import ValidationError
 from dynslam_bench.core import DynslamError, InfrastructureError, ReportError, raising
 from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, module_graph
 from dynslam_bench.evaluation.protocol import MONOCULAR, Protocol
+from dynslam_bench.reports.model.programs import choose_runs
 from dynslam_bench.reports.model.row import RunRow, grouped, make_row
 from dynslam_bench.runs.store import RunStore, open_store, warn_of_unreadable
 
@@ -153,8 +154,11 @@ class Loaded:
     """Everything read from the stores.
 
     Attributes:
-        rows: The newest run of every variant, column and repeat.
-        superseded: How many older ones there were.
+        rows: One run of every variant, column and repeat, see `model.programs.choose_runs`.
+        superseded: How many others of them there were.
+        in_future: Runs that started in the future by their records.
+        not_installed: What of a ranked program is another one here, by its variant key, where several programs made
+            runs and none of them is installed.
         stopped: How many runs were left out since they were ended on request.
         without_scale: How many were left out since their scale is unknown and the protocol's alignment finds none.
         trials: How many were left out since they are trials of studies.
@@ -164,6 +168,8 @@ class Loaded:
 
     rows: list[RunRow] = field(default_factory=list)
     superseded: int = 0
+    in_future: list[RunRow] = field(default_factory=list)
+    not_installed: dict[str, str] = field(default_factory=dict)
     stopped: int = 0
     without_scale: int = 0
     trials: int = 0
@@ -215,13 +221,12 @@ def load_runs(
     loaded.stopped = len(everything) - len(ended)
     loaded.without_scale, loaded.trials = len(ended) - len(scaled), len(scaled) - len(rows)
     loaded.conflicts = _two_results(rows)
-    newest: dict[tuple[object, ...], RunRow] = {}
-    for row in sorted(rows, key=lambda row: (row.started, row.run_id)):
-        newest[row.settings_key, row.column_id, row.repeat_key, row.trajectory] = row
-    _split_programs(newest.values())
-    loaded.superseded = len(rows) - len(newest)
-    loaded.rows = list(newest.values())
-    if newest:
+    chosen = choose_runs(rows)
+    loaded.rows = chosen.rows
+    loaded.superseded = len(rows) - len(chosen.rows)
+    loaded.in_future = chosen.in_future
+    loaded.not_installed = chosen.not_installed
+    if loaded.rows:
         return loaded
     if loaded.without_scale:
         raise ReportError(f"all {without_scale_words(loaded.without_scale, protocol)}")
@@ -245,21 +250,6 @@ def trial_words(count: int) -> str:
         f"{count} runs that studies made with settings of their own, by which such settings are chosen; "
         "'report --trials' shows them"
     )
-
-
-def _split_programs(rows: Iterable[RunRow]) -> None:
-    """Make the runs of each program a row of their own, where several made the runs of one tracker and its settings.
-
-    Runs by an older program are not ranked, nor are those whose identity is not verified, which are always marked.
-    """
-    for group in grouped(rows, lambda row: row.settings_key).values():
-        parts = {name: {row.program.get(name) for row in group} - {None} for row in group for name in row.program}
-        varying = {name for name, values in parts.items() if len(values) > 1 or name == "identity"}
-        for row in group:
-            row.split_by = {name: value for name, value in row.program.items() if name in varying}
-        last = max(group, key=lambda row: ("identity" not in row.split_by, row.started)).split_by
-        for row in group:
-            row.is_current = row.split_by == last and "identity" not in row.split_by
 
 
 def _two_results(rows: Iterable[RunRow]) -> list[str]:

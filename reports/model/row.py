@@ -53,9 +53,12 @@ class RunRow(RunRecord):
         seen_in_training: Whether the masks come from a network that was trained on this very scene: a best case, which
             does not rank unless that is asked for.
         hints: What is probably wrong with the trajectory, see `evaluation.hints`.
-        split_by: Parts of `program` in which the runs of this tracker and variant differ: each program has a line of
-            its own.
-        is_current: Whether its identity is verified, and no newer program has made runs of this tracker and variant.
+        split_by: Parts of their programs in which the rows of this tracker and variant differ, by name, see
+            `model.programs`.
+        is_current: Whether its row ranks: its identity is verified, and of the programs that made runs of this tracker
+            and variant its own is the one that is installed or, where none is, that of the newest run.
+        program_remark: How many programs share its row since their results are equal, or how the results differ from
+            those of the row that ranks; empty where there is one program.
         store: Where its files lie; not written.
     """
 
@@ -75,6 +78,7 @@ class RunRow(RunRecord):
     hints: list[str] = Field(default_factory=list)
     split_by: dict[str, str] = Field(default_factory=dict)
     is_current: bool = True
+    program_remark: str = ""
     store: RunStore = Field(default_factory=RunStore, exclude=True, repr=False)
 
     @property
@@ -206,14 +210,22 @@ class RunRow(RunRecord):
         return "not evaluated" if self.status == "ok" else f"{self.status} at {self.n_processed}/{self.n_frames}"
 
     @property
+    def computer(self) -> str:
+        """The machine in words, without its name; empty where it is not recorded."""
+        if self.machine is None:
+            return ""
+        machine = self.machine
+        words = [machine.cpu, f"{machine.cores} cores", f"{machine.memory_gb:g} GB", machine.system, machine.gpu]
+        return ", ".join(filter(None, words))
+
+    @property
     def machine_words(self) -> str:
         """Computer and versions in words."""
-        machine, git, versions = self.machine, self.git, dict(self.versions)
+        git, versions = self.git, dict(self.versions)
         if git is not None and "dynslam-bench" in versions:  # a checkout is older than its code: git's revision holds
             versions["dynslam-bench"] = versions["dynslam-bench"].partition("+")[0]
         parts = [
-            f"{machine.cpu}, {machine.cores} cores, {machine.memory_gb:g} GB, {machine.system}" if machine else "",
-            machine.gpu if machine else "",
+            self.computer,
             *(f"{name} {version}" for name, version in versions.items()),
             f"git {git.revision[:10]}{' (changed)' if git.dirty else ''}" if git else "",
         ]
@@ -252,12 +264,22 @@ class ReportData(Record):
     def write(self, path: Path) -> None:
         """Write it with a line for every row; it is never one text, since there may be a hundred thousand rows.
 
+        What plug-ins read, file by file, is left out: it is long, and names folders of the machine.
+
         Raises:
             DynslamError: The folder cannot be written.
         """
         head = self.model_copy(update={"rows": []}).to_line().removesuffix("]}")
-        rows = (row.to_line() + "," * (row is not self.rows[-1]) for row in self.rows)
+        rows = (_without_reads(row).to_line() + "," * (row is not self.rows[-1]) for row in self.rows)
         write_lines(path, chain([head], rows, ["]}"]))
+
+
+def _without_reads(row: RunRow) -> RunRow:
+    """A row whose identity does not say what plug-ins read; programs are compared before a report is written."""
+    if "reads" not in row.identity:
+        return row
+    identity = {name: value for name, value in row.identity.items() if name != "reads"}
+    return row.model_copy(update={"identity": identity})
 
 
 def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:

@@ -74,13 +74,13 @@ def reservations(rows: Sequence[RunRow]) -> list[str]:
     """What speaks against quoting numbers of these runs, or has to be said with them; in sentences."""
     cells = {(row.variant_key, row.column_id) for row in rows}
     rendered = any(row.sequence.id.startswith("synthetic/") for row in rows)
-    computers = {row.machine.cpu for row in rows if row.machine}
+    computers = {row.computer for row in rows if row.frame_ms is not None}
     sentences = {
         "One run of a tracker on a sequence: how far repeats lie apart is not known.": len(cells) == len(rows),
         "Parts of sequences: errors on the whole ones differ.": any(part_words(row) for row in rows),
         "Rendered scenes: not comparable with recordings.": rendered,
         "Frame times come from the stage cache, not from the runs.": any(row.cached for row in rows),
-        f"Frame times of {len(computers)} kinds of processors are not comparable.": len(computers) > 1,
+        f"Frame times of {len(computers)} computers are not comparable.": len(computers) > 1,
         "Made by code with changes that no revision holds.": any(row.git and row.git.dirty for row in rows),
         f"{SEEN} Masks of a network that was trained on the very scene.": any(row.seen_in_training for row in rows),
         f"{HINTED} Trajectories that are probably faulty, see Reproduce.": any(row.hints for row in rows),

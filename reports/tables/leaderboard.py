@@ -20,6 +20,8 @@ from dynslam_bench.reports.model.board import (
     compare_pairs,
     mean_of,
     rank,
+    timed,
+    timed_on_one,
 )
 from dynslam_bench.reports.model.published import ReportedCell
 from dynslam_bench.reports.model.row import HINTED, SEEN, RunRow, grouped
@@ -52,6 +54,8 @@ _PROVENANCE = {
 }
 _NAMES = {"own": "our composition"}
 CACHED_MARK = "†"
+COMPUTER_MARK = "‖"
+"""Behind times of trackers with runs on other computers than most."""
 CACHED_NOTE = f"{CACHED_MARK} Times of features and masks come from the stage cache, not from the run itself."
 SEEN_NOTE = (
     f"{SEEN} The masks come from a network that was trained on this very scene (the embedded one, on rendered "
@@ -129,7 +133,7 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
         f"A run that failed or was lost counts as a static camera, or worse ({failed} of "
         f"{_count(len(board.rows), 'run')}); trackers without any success stand below the last line.",
         "Grey rows are shown but not ranked: controls, inspired or assumed re-implementations, runs that begin "
-        "in the map of an earlier one or by an older program, real-time runs and exact masks beside others, "
+        "in the map of an earlier one or by another program, real-time runs and exact masks beside others, "
         "trackers that lack sequences, never succeeded, or are no better than a static camera.",
     ]
     counts = {key: sum(board.no_better_than_static(key, name) for name in board.sequences) for key in board.trackers}
@@ -146,11 +150,12 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
         "camera takes its place.": board.asked_reference and board.reference is None,
         "F skipped: frames on which an epipolar system did not use its fundamental matrix.": epipolar,
         CACHED_NOTE: any(row.cached for row in board.rows),
+        computer_note(board): True,
         f"{SEEN_NOTE} {rule} Instances 100-199 are held out.": any(row.seen_in_training for row in board.rows),
         f"{HINTED} The trajectories of {_count(sum(bool(row.hints) for row in board.rows), 'run')} are probably faulty "
         f"({hinted}), as the diagnostics say; no number is changed for that.": hinted,
     }
-    return " ".join(parts + [remark for remark, holds in remarks.items() if holds])
+    return " ".join(parts + [remark for remark, holds in remarks.items() if remark and holds])
 
 
 def _hinted(rows: Iterable[RunRow]) -> str:
@@ -172,9 +177,12 @@ def leaderboard_cells(board: Board, key: str) -> dict[str, TableCell]:
         "success": TableCell(f"{len(ended)}/{len(runs)}", value=len(ended) / len(runs)),
         "tracker": TableCell(board.labels[key] + f" {HINTED}" * bool(hinted), hinted, tip=tracker.id),
         "coverage": TableCell(coverage_text(coverage), value=coverage),
-        "× real time": speed_cell(ended),
+        "× real time": speed_cell(board, ended),
         "MB": number(middle(row.peak_memory_mb for row in ended), ".0f"),
-        "rows": TableCell(tag=" + ".join(f"{n} {origin}" for origin, n in Counter(row.origin for row in runs).items())),
+        "rows": TableCell(
+            small=runs[0].program_remark,
+            tag=" + ".join(f"{n} {origin}" for origin, n in Counter(row.origin for row in runs).items()),
+        ),
         "F skipped": TableCell() if skipped is None else TableCell(percent(skipped), value=skipped),
         "provenance": TableCell(
             _NAMES.get(tracker.provenance, tracker.provenance),
@@ -266,21 +274,56 @@ def pair_table(board: Board) -> Table | None:
     return Table("pairs", "All pairs", caption, columns, rows)
 
 
-def timed(runs: Sequence[RunRow]) -> list[RunRow]:
-    """The runs whose times count: those that took them themselves, where there is one; else the cached ones."""
-    fresh = [row for row in runs if not row.cached and row.real_time_factor is not None]
-    return fresh or [row for row in runs if row.real_time_factor is not None]
-
-
-def speed_cell(ended: Sequence[RunRow]) -> TableCell:
-    """Real-time factor and frame time, marked where they come from the stage cache."""
-    rows = timed(ended)
+def speed_cell(board: Board, ended: Sequence[RunRow]) -> TableCell:
+    """Real-time factor and frame time on one computer, with their marks (`time_marks`)."""
+    rows = timed_on_one(ended, board.timing_computer)
     factor, frame_ms = middle(row.real_time_factor for row in rows), middle(row.frame_ms for row in rows)
     if factor is None:
         return TableCell()
-    mark, tip = (CACHED_MARK, CACHED_NOTE) if any(row.cached for row in rows) else ("", "")
+    mark, tip = time_marks(board, ended)
     small = "" if frame_ms is None else f"{frame_ms:.1f} ms{mark}"
     return TableCell((f"{factor:.2f}" if factor < 100 else f"{factor:.0f}") + mark, small, factor, tip=tip)
+
+
+def frame_time_cell(board: Board, ended: Sequence[RunRow]) -> TableCell:
+    """Median frame time in milliseconds on one computer, with its marks (`time_marks`)."""
+    frame_ms = middle(row.frame_ms for row in timed_on_one(ended, board.timing_computer))
+    if frame_ms is None:
+        return TableCell()
+    mark, tip = time_marks(board, ended)
+    return TableCell(f"{frame_ms:.1f}{mark}", value=frame_ms, tip=tip)
+
+
+def time_marks(board: Board, ended: Sequence[RunRow]) -> tuple[str, str]:
+    """What stands behind the times of some runs, and why: the stage cache, and other computers than most runs had."""
+    marks, tips = [], []
+    if any(row.cached for row in timed_on_one(ended, board.timing_computer)):
+        marks.append(CACHED_MARK)
+        tips.append(CACHED_NOTE)
+    by_computer = grouped(timed(ended), lambda row: row.computer)
+    if by_computer and by_computer.keys() != {board.timing_computer}:
+        marks.append(COMPUTER_MARK)
+        by_number = sorted(by_computer.items(), key=lambda entry: (-len(entry[1]), entry[0]))
+        for computer, rows in by_number:
+            frame_ms = middle(row.frame_ms for row in rows) or 0.0
+            tips.append(f"{frame_ms:.1f} ms on {computer_words(computer)} ({_count(len(rows), 'run')})")
+    return "".join(marks), "; ".join(tips)
+
+
+def computer_words(computer: str) -> str:
+    """A computer (`RunRow.computer`), in words where it is not recorded."""
+    return computer or "a computer that is not recorded"
+
+
+def computer_note(board: Board) -> str:
+    """On which computer times were taken, and that some are of others; empty where all are of one."""
+    others = {row.computer for row in timed([row for row in board.rows if not row.failed])} - {board.timing_computer}
+    if not others:
+        return ""
+    return (
+        f"Times are those of {computer_words(board.timing_computer)}; {COMPUTER_MARK} of rows with runs on other "
+        "computers, whose times are never averaged with these: the cell's tip has the time on each."
+    )
 
 
 def rank_cell(standing: Standing) -> TableCell:
@@ -840,7 +883,7 @@ def time_table(board: Board) -> Table | None:
     measures = {
         "accuracy (%)": medians(board, lambda row: None if (share := _share(row)) is None else 100 - share),
         "error (%)": medians(board, _share),
-        "time (ms)": medians(board, lambda row: None if _share(row) is None else row.frame_ms),
+        "time (ms)": _frame_times(board),
     }
     if not measures["error (%)"]:
         return None
@@ -848,7 +891,8 @@ def time_table(board: Board) -> Table | None:
         "As the paper's Table 3. Error: the median ATE, lost frames held, in percent of that of a static camera"
         "; accuracy: what is left of 100 %, negative for a tracker that is worse than that. (The paper does "
         "not define its own; its numbers are 100 times one minus the standard deviation in metres.) Time: median of a "
-        "frame, segmentation included, decoding excluded. Runs that succeeded."
+        f"frame, segmentation included, decoding excluded, on {computer_words(board.timing_computer)} alone. Runs that "
+        "succeeded."
     )
     return _sequence_table(
         board,
@@ -860,6 +904,18 @@ def time_table(board: Board) -> Table | None:
         text="{:.1f}".format,
         marks={},
     )
+
+
+def _frame_times(board: Board) -> dict[tuple[str, str], float]:
+    """Median frame time in milliseconds by tracker and sequence, of runs on the board's `timing_computer`."""
+    times = {}
+    for key, cells in board.cells.items():
+        for name, cell in cells.items():
+            rows = [row for row in cell.succeeded if row.computer == board.timing_computer]
+            frame_ms = middle(row.frame_ms for row in timed(rows))
+            if frame_ms is not None:
+                times[key, name] = frame_ms
+    return times
 
 
 def _share(row: RunRow) -> float | None:

@@ -84,6 +84,8 @@ def add_run(
     given="",
     identity=None,
     run_id=None,
+    deterministic=True,
+    machine=MACHINE,
 ):
     """Store one run whose trajectory is the truth with noise of the given size.
 
@@ -96,7 +98,9 @@ def add_run(
     store.add_sequence(part, from_seconds(stamps.tolist()), truth if ground_truth else None)
     made_of = {"t": tracker, "s": sequence, "seed": seed, "o": overrides or {}, "started": started, "kind": kind,
                 "extra": (offset, noise, content, camera, frames, online, masks)}  # fmt: skip
-    run_id = run_id or hashlib.sha256(repr(made_of).encode()).hexdigest()[:16]
+    if identity is not None:
+        made_of["identity"] = repr(identity)
+    run_id = run_id or hashlib.sha256(repr(made_of).encode()).hexdigest()[:20]
     rng = np.random.default_rng(int(run_id[:8], 16) if copy_of is None else copy_of)
     nearest = np.abs(truth.timestamps[:, None] - stamps).argmin(0)
     drift = np.cumsum(rng.normal(0, 1, (n, 6)), axis=0)
@@ -106,7 +110,8 @@ def add_run(
     ok = ~np.isin(np.arange(n), lost) & (ended | (np.arange(n) < n // 4))
     record = RunRecord(
         kind=kind, run_id=run_id, status=status, reason=reason,
-        tracker=TrackerInfo(id=tracker, label=label or tracker, provenance=provenance, ranked=ranked, given=given),
+        tracker=TrackerInfo(id=tracker, label=label or tracker, provenance=provenance, ranked=ranked, given=given,
+                            deterministic=deterministic),
         overrides=overrides or {}, seed=seed, device="cpu",
         sequence=SequenceInfo(id=sequence, part=part, frames=n, duration_s=duration_s or n / 30, fps=30.0,
                               content=content or "", block=digest(block, 16) if block else "", noise=noise,
@@ -118,7 +123,7 @@ def add_run(
         n_frames=n, n_processed=n if ended or status == "lost" else n // 4,
         n_tracked=int(ok.sum()), n_lost=int((~ok).sum()), coverage=float(ok.mean()),
         timings={"total": StageTime(median_s=frame_s, p95_s=2 * frame_s, mean_s=frame_s)} if frame_s else {},
-        started=started, wall_s=3.0, peak_memory_mb=300.0, machine=MACHINE, versions={"python": "3.11", "numpy": "2.0"},
+        started=started, wall_s=3.0, peak_memory_mb=300.0, machine=machine, versions={"python": "3.11", "numpy": "2.0"},
         mask_iou=mask_iou, segmentation=masks, command=list(command), settings=settings or {}, study=study,
     )  # fmt: skip
     with store.work_folder(run_id) as work:

@@ -215,7 +215,7 @@ def test_a_study_of_older_code_can_be_read_but_not_continued(
 ) -> None:
     spec = make(folders, tune=folders[:1], trials=2)
     run_study(spec, results=tmp_path)
-    monkeypatch.setattr("dynslam_bench.runs.identity.source_digest", lambda _: "newer")
+    monkeypatch.setattr("dynslam_bench.runs.identity.source_digests", lambda _: {"all": "newer"})
     with pytest.raises(StudyError, match="stored with other code"):
         Study(spec, tmp_path)
     assert len(Study.open(spec, tmp_path).study.get_trials()) == 2

@@ -176,7 +176,7 @@ async function showRun(id) {
 }
 
 function startRun() {
-  const wanted = () => [...address.read().keys()].find((key) => /^[0-9a-f]{16}$/.test(key)) ?? "";
+  const wanted = () => [...address.read().keys()].find((key) => /^[0-9a-f]{16}([0-9a-f]{4})?$/.test(key)) ?? "";
   let shown = wanted();
   addEventListener("hashchange", () => { if (wanted() !== shown) showRun((shown = wanted())); });
   addEventListener("DOMContentLoaded", () => showRun(shown));
