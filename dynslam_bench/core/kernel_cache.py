@@ -32,6 +32,9 @@ UNUSED_S = 30 * 24 * 3600
 _DIGITS = 32
 """Of each digest in a name; two of 10^9 states would share 32 hexadecimal digits with a probability of 10^-21."""
 
+_NO_FOLDER = (OSError, RuntimeError)
+"""What is raised where sources cannot be read, or where the user has no home folder."""
+
 KERNELS: dict[FunctionType, Foreign] = {}
 """The kernels of this process that may lie on disk, by their Python functions."""
 
@@ -44,7 +47,7 @@ def remember_kernel(kernel: Foreign) -> None:
     """
     KERNELS[kernel.py_func] = kernel
     # the sources are read now: an edit between the import and the compilation of a module shows (`source_digest`)
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(*_NO_FOLDER):
         module_graph()
 
 
@@ -100,11 +103,13 @@ def kernel_file(kernel: Foreign, arguments: tuple[Foreign, ...], return_type: Fo
         flags: Likewise.
     """
     prefix = _name_prefix(kernel)
+    if not prefix:
+        return None
     try:
         signature = signature_digest(arguments, return_type, flags)
-    except (NotDescribedError, OSError):
+        return kernels_folder() / f"{prefix}{signature[:_DIGITS]}{SUFFIX}"
+    except (NotDescribedError, *_NO_FOLDER):
         return None
-    return kernels_folder() / f"{prefix}{signature[:_DIGITS]}{SUFFIX}" if prefix else None
 
 
 def _name_prefix(kernel: Foreign) -> str:
@@ -113,7 +118,7 @@ def _name_prefix(kernel: Foreign) -> str:
     name = f"{function.__module__}.{function.__qualname__}".removeprefix(f"{PACKAGE}.")
     try:
         return f"{re.sub('[^A-Za-z0-9_.]', '', name)[-100:]}-{kernel_digest(kernel)[:_DIGITS]}-"
-    except (NotDescribedError, OSError):
+    except (NotDescribedError, *_NO_FOLDER):
         return ""
 
 

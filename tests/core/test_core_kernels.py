@@ -318,6 +318,14 @@ def test_kernels_compile_where_nothing_can_be_written(monkeypatch: pytest.Monkey
     load_kernels()
 
 
+def test_kernels_compile_for_a_user_without_a_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def no_folder() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(kernel_cache, "kernels_folder", no_folder)
+    assert outer_kernel(write_toys(tmp_path / "toys"))(3.0) == 116.0
+
+
 def test_kernels_compile_on_a_full_disk_and_leave_nothing_behind(folder: Path, tmp_path: Path) -> None:
     kernel = outer_kernel(write_toys(tmp_path / "toys"))
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
