@@ -360,7 +360,7 @@ def show_remarks(rows: Sequence[dict[str, Any]]) -> None:
     """Write the warnings and hints of runs, one line for all runs that share one; `MOST_REMARKS` at most."""
     runs_by_remark = defaultdict[str, list[dict[str, Any]]](list)
     for row in rows:
-        for remark in row["remarks"]:
+        for remark in row.get("remarks", ()):
             if row["tracker"] == "never-move" and remark.startswith("warning: static-camera:"):
                 continue  # it is that camera
             runs_by_remark[remark].append(row)
