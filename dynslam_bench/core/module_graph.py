@@ -25,8 +25,18 @@ from dynslam_bench.core.folders import digest_cache_folder
 
 PACKAGE = "dynslam_bench"
 _PLUMBING = (
-    *("arguments", "code_files", "download", "errors", "files", "fingerprint", "folders", "libraries"),
-    *("module_graph", "plugins", "programs", "reads", "records", "sanitise", "version"),
+    *(
+        "arguments",
+        "code_files",
+        "download",
+        "errors",
+        "files",
+        "fingerprint",
+        "folders",
+        "kernel_cache",
+        "kernel_code",
+    ),
+    *("libraries", "module_graph", "plugins", "programs", "reads", "records", "sanitise", "version"),
 )
 PLUMBING = tuple(f"{PACKAGE}.core.{name}" for name in _PLUMBING)
 """Modules that name faults, find, fetch, store and digest files, and load plug-ins: no number passes through them."""
@@ -101,9 +111,9 @@ class ModuleGraph:
             source: The module that the import statement names.
             name: The name that is taken from it; empty for the module itself.
         """
-        seen: set[Reference] = set()
-        while (source, name) not in seen:  # two packages may pass a name on to each other
-            seen.add((source, name))
+        followed: set[Reference] = set()
+        while (source, name) not in followed:  # two packages may pass a name on to each other
+            followed.add((source, name))
             if name and f"{source}.{name}" in self.modules:
                 return f"{source}.{name}"
             if source not in self.modules:
