@@ -6,7 +6,7 @@ import re
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from itertools import product
+from itertools import pairwise, product
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Optional
@@ -70,7 +70,7 @@ COLOURS = {
 SORTED_BY = ("started", "tracker", "sequence", "status", "ate", "ms", "coverage")
 _SORT_KEYS = {"ate": "ate_rmse_m", "ms": "frame_ms"}
 _ID_DIGITS = 8
-"""Digits of an id on a terminal: enough to name the run."""
+"""Digits of an id that a terminal shows at least; runs of one request share their first twelve."""
 _NAME_WIDTH = 24
 """Characters that a sequence keeps on a terminal, so that rendered ones are told apart."""
 _FOLDERS = re.compile(r"(?<==)(\w+:)?(?:~|\.{0,2})/(?:[^,/]*/)*")
@@ -341,7 +341,11 @@ def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: 
         for title, name in COLUMNS.items()
         if any(row.get(name) not in (None, "") and row[name] is not False for row in rows)
     }
-    cells = [[shown_cell(name, row[name]) for name in columns.values()] for row in rows]
+    shown = list(rows)
+    if sys.stdout.isatty():
+        short = short_ids([*store.ids(), *(row["run_id"] for row in rows)])
+        shown = [row | {"run_id": short[row["run_id"]]} for row in rows]
+    cells = [[shown_cell(name, row[name]) for name in columns.values()] for row in shown]
     write(table(list(columns), cells, least=_NAME_WIDTH), colours=COLOURS)
     ended = Counter(row["status"] for row in rows if row["status"] != "ok")
     if ended:
@@ -374,10 +378,19 @@ def show_remarks(rows: Sequence[dict[str, Any]]) -> None:
         )
 
 
+def short_ids(run_ids: Iterable[str]) -> dict[str, str]:
+    """The first digits of each id: as many as no other id begins with, and at least `_ID_DIGITS`."""
+    ordered = sorted(set(run_ids))
+    digits = dict.fromkeys(ordered, _ID_DIGITS)
+    for run_id, following in pairwise(ordered):
+        shared = next(at for at in range(len(following) + 1) if run_id[: at + 1] != following[: at + 1])
+        digits[run_id] = max(digits[run_id], shared + 1)
+        digits[following] = max(digits[following], shared + 1)
+    return {run_id: run_id[:count] for run_id, count in digits.items()}
+
+
 def shown_cell(name: str, value: Any) -> Any:
-    """A cell of the table: paths without folders, a terminal's ids shortened; ``--json`` has them whole."""
-    if name == "run_id" and sys.stdout.isatty():
-        return value[:_ID_DIGITS]
+    """A cell of the table: paths without folders."""
     if name in ("tracker", "segmentation"):
         return label_text(value)
     return _FOLDERS.sub(r"\1", value) if name == "settings" else value

@@ -133,8 +133,8 @@ class RunRow(RunRecord):
 
     @property
     def repeat(self) -> str:
-        """The same in words, e.g. ``seed 0, offset 2``."""
-        return f"import {self.run_id[:6]}" if self.imported else super().repeat
+        """The same in words, e.g. ``seed 0, offset 2``; of an import the end of its id, which tells files apart."""
+        return f"import {self.run_id[-6:]}" if self.imported else super().repeat
 
     @cached_property
     def variant(self) -> dict[str, Any]:

@@ -502,6 +502,18 @@ def test_a_reports_table_has_no_markup():
     assert report_table(source) == "a_b\nx|y_*"
 
 
+def test_a_terminal_shows_as_many_digits_of_an_id_as_name_the_run():
+    """Runs of one request share twelve digits; older ids have sixteen, and none may begin like another."""
+    one, other, alone, old = "0123456789ab" + "c" * 8, "0123456789ab" + "cd" * 4, "f" * 20, "0123456a00000000"
+    assert runs.short_ids([one, other, alone, old, one]) == {
+        one: "0123456789abcc",
+        other: "0123456789abcd",
+        alone: "ffffffff",
+        old: "0123456a",
+    }
+    assert runs.short_ids([]) == {}
+
+
 def test_an_error_of_the_tracked_frames_alone_is_marked(capsys):
     for coverage in (0.5, 1.0):
         row = dict.fromkeys(runs.COLUMNS.values(), "x") | {"ate_rmse_m": 0.1, "coverage": coverage}

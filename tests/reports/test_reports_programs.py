@@ -494,6 +494,14 @@ def test_pages_lead_to_runs_whose_ids_have_20_digits_or_16(store: RunStore, tmp_
     assert not re.fullmatch(pattern, run_id + "0")
 
 
+def test_imports_of_several_files_have_names_of_their_own(store: RunStore) -> None:
+    """They are asked for alike, and their ids begin alike."""
+    for end in ("00000001", "00000002"):
+        add_run(store, "orb-slam3", "s/a", kind="imported", run_id=f"0123456789ab{end}")
+    repeats = load_board(store).frame()["repeat"]
+    assert sorted(repeats) == ["import 000001", "import 000002"]
+
+
 # -- times of several computers ----------------------------------------------------------------------------------------
 
 FAST = MACHINE.model_copy(update={"cpu": "Fast CPU"})
