@@ -2,13 +2,13 @@
 
     python tests/benchmarks/kills.py [--kills 10] [--seed 0] [--commands bench tune report merge bank]
 
-Each command does a small job: runs of a toy tracker on recordings of 12 images of 16 x 12 pixels. It is made
-once undisturbed. Then, so many times, it begins anew in an empty folder, its process group gets SIGKILL at a random
-moment between its first written file and its end, and the same command is given again. A kill that comes after the end
-is drawn again. The table gives the kills in the middle (some of the result was there, and not all), how many commands
-went on, with exit code 0, and how many gave an equal result: statuses, checksums of trajectories and errors of runs;
-trials, candidates and preset of a study; the files of a report, of merged results and of a bank. Times of the machine
-are not compared. The exit code is 1 unless all results are equal.
+Each command does a small job: runs of a toy tracker on recordings of 12 images of 16 x 12 pixels. It is done once
+undisturbed. Then, so many times, it begins anew in an empty folder; its process group gets SIGKILL when its result has
+come as far as a random number says, and a random moment later; and the same command is given again. A command that
+ends before its kill is drawn again. The table gives the kills in the middle (some of the result was there, and not
+all), how many commands went on, with exit code 0, and how many gave an equal result: statuses, checksums of
+trajectories and errors of runs; trials, candidates and preset of a study; the files of a report, of merged results and
+of a bank. Times of the machine are not compared. The exit code is 1 unless all results are equal.
 """
 
 from __future__ import annotations
@@ -94,6 +94,11 @@ include = ["gain", "wobble"]
 """
 
 
+JOURNAL = Path("studies/study/journal.log")
+LOOK_S = 0.005
+"""Seconds between two looks at how far a result has come."""
+
+
 def make_sequence(folder: Path, phase: float, frames: int = 12) -> Path:
     """A folder in TUM layout whose camera swings along x; the depth of the first pixel tells where it is."""
     lists: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
@@ -131,7 +136,7 @@ def runs_of(results: Path) -> list[Any]:
 
 def study_of(results: Path) -> list[Any]:
     """Trials, candidates and preset of the study, and the runs that it made."""
-    folder = results / "studies" / "study"
+    folder = (results / JOURNAL).parent
     stored = Study.open(folder)
     trials = [
         [trial.number, trial.state.name, trial.params, trial.values, trial.intermediate_values]
@@ -260,36 +265,46 @@ class Tally:
         )
 
 
-def first_write_s(target: Path, began: float) -> float:
-    """When the first file of a result was written, in seconds after the beginning."""
-    times = [path.lstat().st_mtime for path in target.rglob("*")]
-    return max(0.0, min(times) - began)
+def progress(target: Path) -> int:
+    """How far a result has come: its files and folders, unfinished ones too, and the lines of a study's journal."""
+    lines = 0
+    with suppress(OSError):
+        lines = (target / JOURNAL).read_bytes().count(b"\n")
+    return lines + sum(len(folders) + len(files) for _, folders, files in os.walk(target))
+
+
+def kill_when(program: subprocess.Popen[bytes], target: Path, count: int, delay_s: float) -> bool:
+    """Kill a program's group, so long after its result has come so far; False if it ends before."""
+    while program.poll() is None and progress(target) < count:
+        time.sleep(LOOK_S)
+    with suppress(subprocess.TimeoutExpired):
+        program.wait(delay_s)
+    if program.poll() is not None:
+        return False
+    os.killpg(program.pid, signal.SIGKILL)
+    program.wait()
+    return True
 
 
 def kill_and_repeat(name: str, command: Command, folder: Path, kills: int, random: Random) -> Tally:
     """Kill a command so many times, each time in an empty folder, and repeat it."""
     tally = Tally(name)
 
-    # undisturbed: its result, and from when to when it writes
+    # undisturbed: its result, and how far it comes
     whole = folder / f"{name}-whole"
     began = time.time()
     assert command.finish(whole) == 0, whole.with_suffix(".log").read_text()
     tally.undisturbed_s = time.time() - began
-    earliest_s = 0.95 * first_write_s(whole, began)
     expected = command.read(whole)
     count = len(files_of(whole))
+    end = progress(whole)
+    step_s = tally.undisturbed_s / end
 
     while tally.kills < kills:
         target = folder / f"{name}-{tally.kills}"
-        after_s = random.uniform(earliest_s, tally.undisturbed_s)
-        program = command.start(target)
-        with suppress(subprocess.TimeoutExpired):
-            program.wait(after_s)
-        is_running = program.poll() is None
-        with suppress(ProcessLookupError):
-            os.killpg(program.pid, signal.SIGKILL)
-        program.wait()
-        if not is_running:  # it was quicker this time
+        so_far = random.randrange(end)
+        delay_s = random.uniform(0.0, step_s)
+        if not kill_when(command.start(target), target, so_far, delay_s):
             shutil.rmtree(target, ignore_errors=True)
             continue
         tally.kills += 1
@@ -299,7 +314,7 @@ def kill_and_repeat(name: str, command: Command, folder: Path, kills: int, rando
         # the same command again
         code = command.finish(target)
         log = target.with_suffix(".log").read_text().strip()
-        where = f"{name}, killed after {after_s:.2f} s with {left} of {count} files there"
+        where = f"{name}, killed {delay_s:.3f} s after {so_far} of {end}, with {left} of {count} files there"
         if code:
             tally.faults.append(f"{where}: exit code {code}: {log[-500:]}")
             continue
