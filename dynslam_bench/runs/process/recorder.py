@@ -134,7 +134,7 @@ class ReadRecorder:
         self._ended.set()
 
     def finish(self) -> Reads:
-        """Record no more, and give what was read.
+        """Record no more, and give what was read; also of a run that failed.
 
         Raises:
             RunError: Something has changed while the run read it, so that nobody knows what it read.
@@ -229,7 +229,7 @@ class ReadRecorder:
         if mode is None and not os.path.isabs(name) and _is_in(frame, _RELATIVE_TO_DESCRIPTOR):
             return
         if not flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC):
-            self._read(frame, path)
+            self._read(frame, self._source_of(path))
             return
         if flags & os.O_RDWR and not flags & os.O_TRUNC:
             self._read(frame, path, whole=True)
@@ -259,7 +259,6 @@ class ReadRecorder:
             path: The file.
             whole: Whether its content is digested now, however large: it is about to be written, too.
         """
-        path = self._source_of(path)
         if self._collector.is_output(path):  # it may be a link to what is none
             path = os.path.realpath(path)
         stamp = stamp_of(path)
@@ -310,6 +309,8 @@ class ReadRecorder:
 
     def _make(self, path: str) -> None:
         """Note a file that is about to be written, moved or removed."""
+        if self._collector.is_output(path):
+            return
         note = self._notes.files.get(path)
         if note is not None and note.stamp is None:
             del self._notes.files[path]  # that it was missing is no input where the run makes it
