@@ -104,9 +104,14 @@ class Command:
             return os.path.normpath(os.path.join(self.folder, self.words[0]))
         return shutil.which(self.words[0], path=search_path) or ""
 
-    def named(self) -> set[str]:
-        """The files and folders that are there among its arguments, also behind ``=``."""
-        texts = {text for word in self.words[1:] for text in (word, word.partition("=")[2]) if text}
+    def named(self, words: Sequence[str] | None = None) -> set[str]:
+        """The files and folders that are there among its arguments, also behind ``=``.
+
+        Args:
+            words: Only these of them; None for all.
+        """
+        arguments = self.words[1:] if words is None else words
+        texts = {text for word in arguments for text in (word, word.partition("=")[2]) if text}
         paths = {os.path.normpath(os.path.join(self.folder, os.path.expanduser(text))) for text in texts}
         return {path for path in paths if is_file_name(path) and _is_there(path)}
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from dynslam_bench.core import DynslamError
 from dynslam_bench.core.plugins import ISOLATED_VARIABLE, load_object
-from dynslam_bench.core.reads import Anchors, digest_of
+from dynslam_bench.core.reads import Anchors, ImportPath, digest_of
 from dynslam_bench.runs.process.recorder import ReadRecorder
 
 
@@ -39,6 +39,7 @@ def record(job, answer):
     answer({"reads": reads.model_dump()})
 
 
+ImportPath(sys.path).read_all()
 for line in sys.stdin:
     received, sent = os.pipe()
     child = os.fork()

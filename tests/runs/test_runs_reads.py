@@ -232,6 +232,14 @@ def test_a_folder_that_a_text_names(read: str, bench: Bench) -> None:
     assert bench.changed(reads) == "the names in the folder maps"
 
 
+def test_a_folder_that_is_missing(bench: Bench) -> None:
+    source = "import os\ndef run(folder):\n    try:\n        os.listdir(folder)\n    except OSError:\n        pass\n"
+    reads = bench.record(source, folder="maps")
+    assert reads.folders == {"work:/maps": ""}
+    (bench.work / "maps").mkdir()
+    assert bench.changed(reads) == "the names in the folder maps"
+
+
 @pytest.mark.parametrize(
     "config", ["weights: net.bin", '{"weights": "net.bin"}', "[model]\nweights = '../work/net.bin'"]
 )
@@ -251,9 +259,9 @@ def test_a_configuration_that_names_weights(config: str, is_opened: bool, bench:
 def test_a_listed_folder_whose_images_are_opened_in_machine_code(name: str, bench: Bench) -> None:
     bench.write(f"work/masks/{name}", "1111")
     reads = bench.record("import os\ndef run(folder):\n    return os.listdir(folder)\n", folder="masks")
-    assert set(reads.files) == {"plugin:/mine.py", "work:/masks/"}
+    assert set(reads.files) == {"plugin:/mine.py", f"work:/masks/{name}"}
     edit(bench.work / "masks" / name, "2222")
-    assert bench.changed(reads) == "the content of the folder masks"
+    assert bench.changed(reads) == f"the file masks/{name}"
 
 
 def test_a_source_that_names_a_file_which_is_opened_in_machine_code(bench: Bench) -> None:
@@ -264,6 +272,14 @@ def test_a_source_that_names_a_file_which_is_opened_in_machine_code(bench: Bench
     assert set(reads.files) == {"plugin:/mine.py", "plugin:/mask.png"}
     edit(bench.plugin.parent / "mask.png", "2222")
     assert bench.changed(reads) == "the file mask.png"
+
+
+@pytest.mark.parametrize("name", ["a\\0b", "x" * 300, "loop", "."])
+def test_names_that_no_file_can_have(name: str, bench: Bench) -> None:
+    bench.write("work/b", "")
+    (bench.work / "loop").symlink_to("loop")
+    source = "def run(name):\n    try:\n        open(name)\n    except (OSError, ValueError):\n        pass\n"
+    bench.record(source, name=name.replace("\\0", "\0"))
 
 
 @pytest.mark.parametrize(
@@ -674,6 +690,7 @@ def test_the_snapshot_grows_with_what_is_read(bench: Bench) -> None:
         "open('/proc/self/maps').read(); open('/dev/null').read(); os.listdir('/proc/self')",
         "r, w = os.pipe(); os.close(w); open(r).read()",
         "import decimal, xml.dom.minidom, wsgiref; importlib.metadata.version('numpy'); inspect.getsource(inspect)",
+        "os.mkfifo(NAME); os.open(NAME, os.O_RDONLY | os.O_NONBLOCK); cache('/'); cache('.')",
         "traceback.format_stack(); warnings.warn('x')",
         "shutil.copytree(os.path.dirname(__file__), tempfile.mkdtemp() + '/x'); shutil.rmtree(tempfile.mkdtemp())",
     ],
@@ -686,6 +703,8 @@ NAME = 'net' + '.bin'
 def cache(name):
     try:
         return open(name).read()
+    except IsADirectoryError:
+        pass
     except OSError:
         open(name, 'w').write('1')
 def run():
@@ -759,6 +778,13 @@ def test_what_a_program_is_made_of(words: list[str], edited: str, bench: Bench) 
     assert bench.changed(reads).endswith(f"{shown} of a program")
 
 
+@pytest.mark.parametrize("words", [["ls", "/"], ["ls", "."], ["ls", ".."], ["true", "~"], ["true", sys.prefix]])
+def test_a_folder_that_is_too_wide_is_not_read_whole(words: list[str], bench: Bench) -> None:
+    bench.write("work/a", "1111")
+    reads = bench.record(START, words=words)
+    assert not [name for name in reads.programs if name.endswith("/") or name == "work:/a"]
+
+
 def test_a_program_is_searched_on_the_path(bench: Bench) -> None:
     tool = a_tool(bench, "second/tool")
     bench.environment["PATH"] = os.pathsep.join([str(bench.root / "first"), str(tool.parent), os.environ["PATH"]])
@@ -788,7 +814,28 @@ def run(words):
     assert bench.changed(reads) == f"the file sub/{NAME} of a program"
 
 
-def test_an_environment_variable_that_a_program_gets(bench: Bench) -> None:
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["/bin/sh", "-c", "echo $MY_SLAM_MODE"],
+        ["/bin/sh", "mode.sh"],
+        [sys.executable, "mode.py"],
+        [sys.executable, "-c", "import os; os.environ.get('MY_SLAM_MODE')"],
+    ],
+)
+@pytest.mark.parametrize("value", ["slow", None])
+def test_an_environment_variable_that_a_program_looks_up(words: list[str], value: str | None, bench: Bench) -> None:
+    bench.write("work/mode.sh", "echo ${MY_SLAM_MODE}")
+    bench.write("work/mode.py", "import os; os.getenv('MY_SLAM_MODE')")
+    bench.environment |= {"ANOTHER": "1"} | ({} if value is None else {"MY_SLAM_MODE": value})
+    reads = bench.record(START, words=words)
+    bench.environment["ANOTHER"] = "2"
+    assert bench.changed(reads) == ""
+    bench.environment["MY_SLAM_MODE"] = "fast"
+    assert bench.changed(reads) == "the environment variable MY_SLAM_MODE"
+
+
+def test_an_environment_variable_that_every_program_gets(bench: Bench) -> None:
     reads = bench.record(START, words=["true"])
     bench.environment["MY_SLAM_MODE"] = "fast"
     assert bench.changed(reads) == ""

@@ -9,11 +9,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dynslam_bench.core.code_files import files_of_command
-from dynslam_bench.core.programs import Command, ProgramReads, folders_of, is_file_name, mapped_files
+from dynslam_bench.core.programs import Command, ProgramReads, folders_of, is_counted, is_file_name, mapped_files
 from dynslam_bench.core.reads import (
     ABSENT,
     COMMAND,
     SEARCH_PATHS,
+    UNREADABLE,
     Anchors,
     ImportPath,
     Reads,
@@ -31,14 +32,32 @@ _LOADED_NS = time.time_ns()
 _LONGEST_TEXT = 1 << 16
 """Text files of up to so many bytes are searched for names of files; longer ones are data."""
 _LONGEST_SOURCE = 1 << 20
+_MANY_FILES = 10_000
+"""A folder with more files is not read whole where a program's arguments name it."""
 _TEXT = (".yaml", ".yml", ".toml", ".json", ".cfg", ".ini", ".conf", ".txt", ".xml")
 _READ_IN_MACHINE_CODE = (
     *(".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".exr", ".pgm", ".ppm", ".webp", ".mp4", ".avi", ".mkv"),
-    *(".onnx", ".pb", ".tflite", ".pt", ".pth", ".caffemodel", ".weights", ".engine", ".safetensors", ".ply", ".pcd"),
+    *(
+        ".onnx",
+        ".pb",
+        ".tflite",
+        ".pt",
+        ".pth",
+        ".caffemodel",
+        ".weights",
+        ".engine",
+        ".safetensors",
+        ".h5",
+        ".hdf5",
+        ".ply",
+        ".pcd",
+    ),
 )
-"""Images, networks and clouds: OpenCV, onnxruntime, torch and others open them without a word."""
+"""Images, networks, arrays and clouds: OpenCV, onnxruntime, torch and others open them without a word."""
 _WORD = re.compile(r"[\w./~+\-]*[A-Za-z][\w./~+\-]*")
 _QUOTED = re.compile(r"[\"']([^\"'\n]{1,200})[\"']")
+_VARIABLE = re.compile(r"[A-Z][A-Z0-9_]{2,}")
+"""A word in a text that can be the name of an environment variable."""
 _FILE_NAME = re.compile(r"[\w./~+\-]*\w\.[A-Za-z]\w{0,9}")
 """A text that can be the name of a file: it has a suffix."""
 _OF_PYTHON = re.compile(
@@ -143,6 +162,7 @@ class Collector:
         self._loaded = {name.partition(".")[0] for name in sys.modules}
         self._texts: dict[tuple[str, Stamp], set[str]] = {}
         self._commands: dict[Command, set[str]] = {}
+        self._variables: dict[Command, set[str]] = {}
 
     def collect(self, modules: Modules) -> Reads:
         """What was read so far.
@@ -159,25 +179,26 @@ class Collector:
             for path, note in dict(self.notes.files).items()
             if path in modules.files or not is_code(path) or not imports.distributions_at(path)
         }
-        files = opened | {path: content_now(path) for path in self._libraries() | set(modules.files) - opened.keys()}
+        unseen = self._libraries() | self._unseen_files(opened) | set(modules.files)
+        files = opened | {path: content_now(path) for path in unseen - opened.keys()}
         named, missing = self._named_files(files)
         files |= {path: content_now(path) for path in named - files.keys()}
         files |= dict.fromkeys(missing - files.keys(), ABSENT)
         folders = {path: self._folder(path, names) for path, names in dict(self.notes.folders).items()}
 
-        files |= {path: content_now(path) for path in self._unseen_folders(opened)}
+        variables = self.notes.variables.union(*map(self._variables_of, dict(self.notes.commands)))
 
-        name = self._name
+        name = self._anchors.name
         links = {path: link_now(path, self._anchors) for path in (*files, *folders, *programs)}
         return Reads(
             files={name(path): digest for path, digest in files.items()},
-            folders={self._anchors.name(path): digest for path, digest in folders.items()},
-            links={self._anchors.name(path): target for path, target in links.items() if target},
-            environment={f"${key}": value_digest(self.environment.get(key)) for key in set(self.notes.variables)},
+            folders={name(path): digest for path, digest in folders.items()},
+            links={name(path): target for path, target in links.items() if target},
+            environment={f"${key}": value_digest(self.environment.get(key)) for key in variables},
             search=self._search(),
             modules=modules.places,
             distributions={key: imports.distribution(key) for key in modules.distributions.keys() | distributions},
-            programs={name(path): content_now(path) for path in programs},
+            programs={self._name(path): content_now(path) for path in programs},
         )
 
     # -- what is an input ----------------------------------------------------------------------------------------------
@@ -202,7 +223,9 @@ class Collector:
         return self._anchors.name(path) + (os.sep if os.path.isdir(path) else "")
 
     def _content(self, path: str, note: FileNote) -> str:
-        return ABSENT if note.stamp is None else content_now(path)
+        """Digest of a file that was not taken when the file was opened."""
+        content = content_now(path)
+        return ABSENT if note.stamp is None and content != UNREADABLE else content
 
     def _folder(self, path: str, names: list[str] | None) -> str:
         """Digest of the names in a folder as it was listed, but with the files that the run itself has made or removed.
@@ -216,14 +239,16 @@ class Collector:
             names = sorted(set(names) - made | made.intersection(names_in(path)))
         return digest_of_names(names)
 
-    def _unseen_folders(self, opened: Mapping[str, str]) -> list[str]:
-        """The listed folders with images or networks that nobody was seen to open: libraries read them unannounced."""
-        unseen = []
-        for folder, names in dict(self.notes.folders).items():
-            files = [os.path.join(folder, name) for name in names or () if name.lower().endswith(_READ_IN_MACHINE_CODE)]
-            if set(files) - opened.keys() and self._unwritten(folder) == {folder}:
-                unseen.append(folder)
-        return unseen
+    def _unseen_files(self, opened: Mapping[str, str]) -> set[str]:
+        """The images and networks in listed folders that nobody was seen to open: libraries open them unannounced."""
+        return {
+            path
+            for folder, names in dict(self.notes.folders).items()
+            for name in names or ()
+            if name.lower().endswith(_READ_IN_MACHINE_CODE)
+            and (path := os.path.join(folder, name)) not in opened
+            and self._is_input(path)
+        }
 
     def _search(self) -> dict[str, str]:
         """The search paths, and where commands were found that were named without a folder."""
@@ -331,11 +356,39 @@ class Collector:
 
     def _files_of(self, command: Command) -> set[str]:
         """The executable of a command, the files and folders that it names, and what these name or import."""
-        named = command.named()
-        below = tuple(f"{path}{os.sep}" for path in named if os.path.isdir(path))
         executable = command.executable(self.environment.get("PATH"))
-        reached = (str(file) for file in files_of_command(command.words, Path(command.folder)))
-        return named | {path for path in (executable, *reached) if path and not path.startswith(below)}
+        arguments = [word for word in command.words[1:] if not any(map(os.path.isdir, command.named([word])))]
+        reached = files_of_command([command.words[0], *arguments], Path(command.folder))
+        files = {executable, *map(str, reached)} - {""}
+        return files | {path for path in command.named() if not self._is_too_wide(path)}
+
+    def _variables_of(self, command: Command) -> set[str]:
+        """The environment variables whose names are written in a command or in its files.
+
+        Those that are not set count, too, but in binary files: there thousands of words look like a variable's name.
+        """
+        if command not in self._variables:
+            names = set(_VARIABLE.findall(" ".join(command.words)))
+            for file in filter(os.path.isfile, self._commands[command]):
+                content = Path(file).read_bytes()
+                if b"\0" in content:
+                    names |= {name for name in self.environment if os.fsencode(name) in content}
+                elif len(content) <= _LONGEST_SOURCE:
+                    names |= set(_VARIABLE.findall(content.decode(errors="replace")))
+            self._variables[command] = {name for name in names if is_counted(name) and name not in SEARCH_PATHS}
+        return self._variables[command]
+
+    def _is_too_wide(self, folder: str) -> bool:
+        """Whether a folder holds so much that a program that is told of it does not read it all."""
+        places = [str(self._anchors.work), str(self._anchors.plugin), str(Path.home()), sys.prefix, *self._path]
+        if any(place == folder or place.startswith(folder.rstrip(os.sep) + os.sep) for place in places):
+            return True
+        count = 0
+        for _, _, names in os.walk(folder):
+            count += len(names)
+            if count > _MANY_FILES:
+                return True
+        return False
 
     def _unwritten(self, path: str) -> set[str]:
         """A file or folder, if nothing in it was written by the run; else the files in the folder that were not."""

@@ -5,9 +5,12 @@ Foreign are plug-ins, and libraries while a plug-in calls them (`origins`). Pyth
 
 Files that libraries open in machine code are not announced: by ``cv2.imread``, ``cv2.dnn.readNet``, ``onnxruntime``. In
 their place each file counts whose name is written in a plug-in's sources, or in a small text file that foreign code
-opened. Nor is it announced that a plug-in asks whether a file is there (``Path.exists``): a file that its sources name
-and that is not there counts as absent. Files that are named by a descriptor of their folder (``dir_fd``) are not seen.
-Of programs counts what `core.programs` shows, and what their command lines name.
+opened. So does each image and network in a folder that it listed. Nor is it announced that a plug-in asks whether a
+file is there (``Path.exists``): a file that its sources name and that is not there counts as absent. Files that are
+named by a descriptor of their folder (``dir_fd``) are not seen, nor is what comes from the network.
+
+Of programs counts what `core.programs` shows, what their command lines name, and the environment variables whose names
+are written in the command or in its files.
 
 What a run makes is no input of it: its private folders, files that it writes before it reads them, files that are
 written after a program was started.
@@ -131,7 +134,7 @@ class ReadRecorder:
         self._ended.set()
 
     def finish(self) -> Reads:
-        """Record no more, and give what was read.
+        """Record no more, and give what was read; also of a run that failed.
 
         Raises:
             RunError: Something has changed while the run read it, so that nobody knows what it read.
@@ -231,7 +234,7 @@ class ReadRecorder:
         if mode is None and not os.path.isabs(name) and _is_in(frame, _RELATIVE_TO_DESCRIPTOR):
             return
         if not flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC):
-            self._read(frame, path)
+            self._read(frame, self._source_of(path))
             return
         if flags & os.O_RDWR and not flags & os.O_TRUNC:
             self._read(frame, path, whole=True)
@@ -261,7 +264,6 @@ class ReadRecorder:
             path: The file.
             whole: Whether its content is digested now, however large: it is about to be written, too.
         """
-        path = self._source_of(path)
         if self._collector.is_output(path):  # it may be a link to what is none
             path = os.path.realpath(path)
         stamp = stamp_of(path)
@@ -269,7 +271,8 @@ class ReadRecorder:
         if note is not None:
             self._collector.compare(path, note, stamp)
             return
-        if not self._can_count(path) or os.path.isdir(path) or not self._is_foreign(frame):
+        is_special = stamp is not None and not os.path.isfile(path)  # a folder, a pipe, a socket
+        if is_special or not self._can_count(path) or not self._is_foreign(frame):
             return
         if self._collector.is_output(os.path.realpath(path)) or self._collector.is_of_program(stamp):
             return
@@ -311,6 +314,8 @@ class ReadRecorder:
 
     def _make(self, path: str) -> None:
         """Note a file that is about to be written, moved or removed."""
+        if self._collector.is_output(path):
+            return
         note = self._notes.files.get(path)
         if note is not None and note.stamp is None:
             del self._notes.files[path]  # that it was missing is no input where the run makes it
@@ -406,7 +411,7 @@ class ReadRecorder:
         if not self._is_foreign(frame) and not _is_adapter(frame):
             return
         texts = [os.fsdecode(word) for word in words]
-        if texts[1:2] == ["-c"]:  # what a shell's line names counts as what arguments name
+        if texts[1:2] == ["-c"] and texts[0].endswith("sh"):  # what a shell's line names counts as arguments do
             texts += _SHELL_WORD.findall(texts[2])
         command = Command(tuple(texts), _absolute("." if folder is None else folder) or os.getcwd())
         if command not in self._notes.commands:
@@ -491,6 +496,8 @@ def _absolute(name: Any, folder: int = -1) -> str | None:
     if isinstance(name, int):
         return _of_descriptor(name)
     path = os.fsdecode(name)
+    if "\0" in path:  # no file can have that name
+        return None
     if not os.path.isabs(path):
         base = os.getcwd() if folder == -1 else _of_descriptor(folder)
         if base is None:
