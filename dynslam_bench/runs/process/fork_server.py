@@ -36,6 +36,7 @@ import psutil
 from dynslam_bench.core import InfrastructureError, sweep
 from dynslam_bench.core.module_graph import module_graph
 from dynslam_bench.core.plugins import module_command
+from dynslam_bench.core.reads import ImportPath
 
 _CHILD = "dynslam_bench.runs.process.child"
 PRELOADED = (
@@ -324,6 +325,9 @@ def serve(fd: int, start: str) -> None:
         with contextlib.suppress(Exception):  # what is not loaded here each child loads itself
             importlib.import_module("dynslam_bench.core.kernel_cache").load_kernels()
             module_graph()  # remembered: the keys of the children's stage caches are of the code that is loaded here
+            # it dates what was loaded here; children that record what plug-ins read find the distributions read already
+            importlib.import_module("dynslam_bench.runs.process.recorder")
+            ImportPath(sys.path).read_all()
     adopt_orphans()
     _Server(control, start).run()
 

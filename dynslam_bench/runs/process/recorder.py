@@ -155,7 +155,7 @@ class ReadRecorder:
     def so_far(self) -> Reads:
         """What was read so far; it may change until the end."""
         with self._hearing_nothing():
-            return self._collector.collect()
+            return self._collector.collect(self._collector.modules())
 
     def snapshot(self) -> str:
         """Digest of everything that was read so far; costs nothing where nothing was read since the last call."""
