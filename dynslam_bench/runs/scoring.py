@@ -6,6 +6,7 @@ the patched functions.
 
 from collections.abc import Callable
 from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 from dynslam_bench.core import InfrastructureError, TemporaryFolder
@@ -32,6 +33,7 @@ def score_apart(store: RunStore, run_id: str, protocol: Protocol, *, again: bool
             folder.path,
             spec={"threads": 1},
             store=str(store.root),
+            source=str(store.source),
             run_id=run_id,
             protocol=protocol.model_dump(mode="json"),
             again=again,
@@ -49,6 +51,7 @@ def score_job(
 ) -> dict[str, Any]:
     """In the child: score a run of a store, which keeps the metrics."""
     store = RunStore(job["store"])
+    store.source = Path(job["source"])  # what messages call it
     record = store.read_whole(job["run_id"])
     metrics = store.score(record, Protocol.model_validate(job["protocol"]), again=job["again"])
     return {"type": "done", "metrics": metrics.to_line()}
