@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 import dynslam_bench
 from dynslam_bench.contracts import (
     Frame,
+    FrameMasks,
+    MaskSource,
     Tracker,
     TrackerContext,
     TrackerSpec,
@@ -31,6 +33,7 @@ from dynslam_bench.contracts import (
 )
 from dynslam_bench.contracts import Sequence as FrameSequence
 from dynslam_bench.contracts.checks import check_frame, check_result, check_sensors, check_trajectory, tracker_code
+from dynslam_bench.contracts.sequence import read_only, read_only_masks
 from dynslam_bench.core import (
     DynslamError,
     EvaluationError,
@@ -61,6 +64,7 @@ from dynslam_bench.evaluation.comparison import tracked_frames
 from dynslam_bench.geometry import refuse_close
 from dynslam_bench.segmentation.build_segmenter import segmentation_source
 from dynslam_bench.sequences import PreprocessingSettings, SequenceView, open_sequence
+from dynslam_bench.sequences.cameras import check_camera
 from dynslam_bench.sequences.catalogue import parse_frames
 from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_settings
 
@@ -143,13 +147,14 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             stage times are the same either way.
         fixed_info: Whether ``info`` has the same keys on every step, as Minari needs.
         memory_map: Whether all frames are decoded once into a file of the stage cache that environments and processes
-            share (2.2 MB a frame of 640 x 480); the tracker then gets arrays that cannot be written.
+            share (2.2 MB a frame of 640 x 480).
 
     Raises:
         DynslamError: Unknown or unfit sequence, tracker, setting, reward, protocol or device, or fewer than 2 frames.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
+    """An environment's own has the frame rate of its sequence, stride included."""
     sequence: FrameSequence
     """The frames of the episode."""
     window: tuple[int, int]
@@ -298,7 +303,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         super().reset(seed=seed)
         self.episode, self._final = Episode(), None
         before = {
-            name: vars(self)[name] for name in ("settings", "_actions", "sequence", "_whole", "window", "_source")
+            name: vars(self)[name]
+            for name in ("settings", "_actions", "sequence", "_whole", "window", "_source", "metadata")
         }
         try:
             self._apply_options(options or {})
@@ -505,6 +511,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
                 f"give window={len(opened)} or less",
             )
         self.sequence = self._whole = opened
+        self.metadata = {**type(self).metadata, "render_fps": _whole_or_float(opened.fps)}
         self.window = (0, len(opened))
         self._source = sequence
 
@@ -537,9 +544,10 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     def _ready_tracker(self) -> Tracker:
         """The tracker for the current settings and sequence."""
         if self._tracker is None:
+            masks = self.sequence.masks
             context = TrackerContext(
                 sequence_id=self.sequence.id,
-                masks=self.sequence.masks,
+                masks=None if masks is None else _ReadOnlyMasks(masks),
                 device=self.device,
                 threads=self._threads,
                 fps=self.sequence.fps,
@@ -572,6 +580,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         frame = _read_frame(self.sequence, index)
         for transform in self.frame_transforms:
             frame = transform(frame)
+        frame = read_only(frame)
         read, processor_began = time.perf_counter(), time.process_time()
         with tracker_code():
             result = tracker.track(frame)
@@ -621,6 +630,21 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 def _part(whole: FrameSequence, window: tuple[int, int]) -> FrameSequence:
     """The frames of a window."""
     return whole if window == (0, len(whole)) else cast("FrameSequence", SequenceView(whole, *window))
+
+
+@dataclass(frozen=True, eq=False)
+class _ReadOnlyMasks:
+    """A `MaskSource` whose masks a tracker cannot write."""
+
+    base: MaskSource
+
+    def __getitem__(self, index: int) -> FrameMasks:
+        return read_only_masks(self.base[index])
+
+
+def _whole_or_float(rate: float) -> int | float:
+    """A frame rate as an int where it is a whole number, as some of Gymnasium's tools want it."""
+    return int(rate) if float(rate).is_integer() else float(rate)
 
 
 def _read_frame(sequence: FrameSequence, index: int) -> Frame:
@@ -698,14 +722,17 @@ def parse_window(window: Frames, sequence: FrameSequence) -> tuple[int, int]:
 
 
 def check_frames(sequence: FrameSequence) -> None:
-    """Refuse a sequence that is too short for an episode, or whose stamps do not tell its frames or true poses apart.
+    """Refuse a sequence that is too short for an episode, or whose camera, frame rate or stamps nobody could mean.
 
     Raises:
-        SequenceError: It has fewer than two frames, stamps that do not increase, or two frames or true poses less than
-            1 us apart.
+        SequenceError: It has fewer than two frames, a camera that `check_camera` refuses, a frame rate that is no
+            number above 0, stamps that do not increase, or two frames or true poses less than 1 us apart.
     """
     if len(sequence) < 2:
         raise SequenceError(f"'{sequence.id}' has {len(sequence)} frames here, an episode needs 2 or more")
+    check_camera(sequence.camera, f"the camera of '{sequence.id}'")
+    if not 0 < sequence.fps < math.inf:
+        raise SequenceError(f"the frame rate of '{sequence.id}' is {sequence.fps} Hz", "it is a number above 0")
     stamps = np.asarray(sequence.timestamps, dtype=np.float64)
     wrong = np.flatnonzero(~(np.diff(stamps) > 0))
     if len(wrong):

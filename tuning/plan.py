@@ -528,7 +528,7 @@ def _alike(here: Frame, there: Frame, one: Camera, other: Camera) -> bool:
     ]
     if np.abs(colours[0] - colours[1]).mean() > _GREY_LEVELS:
         return False
-    raw = (here.depth * one.depth_factor, there.depth * other.depth_factor)
+    raw = (here.depth * one.written_depth_factor, there.depth * other.written_depth_factor)
     depths = [cv2.resize(depth.astype(np.float32), _THUMB, interpolation=cv2.INTER_NEAREST) for depth in raw]
     allowed = _DEPTH_SHARE * float(np.median(depths[0])) + 0.5
     return bool(np.median(np.abs(depths[0] - depths[1])) <= allowed)

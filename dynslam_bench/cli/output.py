@@ -78,11 +78,13 @@ def warn(text: str) -> None:
 
 
 def write_error(error: DynslamError) -> None:
-    """Write an error to standard error: its headline in one line, each cure below it."""
+    """Write an error to standard error: its headline in one line, each cure below it, then the file to copy."""
     line = printable(" ".join(f"error: {error.headline}".split()))
     sys.stderr.write(f"\033[31m{line}\033[0m\n" if sys.stderr.isatty() else f"{line}\n")
     for option in error.options:
         warn(f"  - {' '.join(option.split())}")
+    for line in error.template.splitlines():
+        warn(line)
 
 
 def is_interactive() -> bool:

@@ -1,7 +1,7 @@
 """The contract of data sets: what announces them, and what a sequence hands out."""
 
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,6 +94,25 @@ class Sequence(Protocol):
     def __len__(self) -> int: ...
 
     def __getitem__(self, index: int) -> Frame: ...
+
+
+def read_only(frame: Frame) -> Frame:
+    """The same frame with images that cannot be written, for code of others; no pixel is copied.
+
+    A data set may keep its frames, so that what one tracker writes into them would reach the next.
+    """
+    return replace(frame, rgb=_read_only_view(frame.rgb), depth=_read_only_view(frame.depth))
+
+
+def read_only_masks(masks: FrameMasks) -> FrameMasks:
+    """The same masks, which cannot be written."""
+    return replace(masks, instances=_read_only_view(masks.instances), class_names=dict(masks.class_names))
+
+
+def _read_only_view(image: Any) -> Any:
+    view = np.asarray(image).view()
+    view.flags.writeable = False
+    return view
 
 
 def timestamps_ns(sequence: Sequence) -> NDArray[np.int64]:

@@ -29,7 +29,10 @@ class Tracker(Protocol):
         """Begin a new sequence; all randomness must come from `rng`."""
 
     def track(self, frame: Frame) -> TrackResult:
-        """Process one frame and return its camera-to-world pose, causally: later frames change nothing."""
+        """Process one frame and return its camera-to-world pose, causally: later frames change nothing.
+
+        The frame's images cannot be written.
+        """
 
 
 @dataclass(frozen=True)

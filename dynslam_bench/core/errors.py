@@ -23,12 +23,14 @@ class DynslamError(Exception):
         message: One line with the measured numbers and the expectation.
         hint: One line that says how to cure it; empty if there is nothing to add.
         options: Several cures to choose from, a line each; the command line writes them below each other.
+        template: A file to copy and complete, of several lines; the command line writes it as it stands.
     """
 
-    def __init__(self, message: str, hint: str = "", *, options: Iterable[str] = ()) -> None:
+    def __init__(self, message: str, hint: str = "", *, options: Iterable[str] = (), template: str = "") -> None:
         super().__init__(_one_line(str(message)))
         self.hint = _one_line(hint)
         self.options = tuple(_one_line(option) for option in options)
+        self.template = template
 
     @property
     def headline(self) -> str:
@@ -37,10 +39,16 @@ class DynslamError(Exception):
         return f"{message} ({self.hint})" if self.hint else message
 
     def __str__(self) -> str:
-        return self.headline + (f" (choose: {'; '.join(self.options)})" if self.options else "")
+        text = self.headline
+        if self.options:
+            text += f" (choose: {'; '.join(self.options)})"
+        if self.template:
+            statements = [line.partition("  #")[0].strip() for line in self.template.splitlines()]
+            text += f" (template: {'; '.join(line for line in statements if '=' in line)})"
+        return text
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (str(self.args[0]), self.hint), {"options": self.options}
+        return type(self), (str(self.args[0]), self.hint), {"options": self.options, "template": self.template}
 
 
 LONGEST = 1000

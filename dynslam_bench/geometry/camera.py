@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+
+TUM_DEPTH_FACTOR = 5000.0
+"""Raw depth units a metre of TUM's files."""
 
 
 @dataclass(frozen=True)
@@ -21,12 +24,16 @@ class Camera:
         cx: Principal point x in pixels (centre of the top-left pixel is 0).
         cy: Principal point y in pixels.
         distortion: Radial-tangential coefficients ``(k1, k2, p1, p2, k3)``, OpenCV's order.
-        depth_factor: Raw 16-bit depth units a metre (5000 in TUM files).
+        depth_factor: Raw 16-bit depth units a metre (5000 in TUM files, 1000 for millimetres); None where nothing
+            states it. Depth images cannot be read without it.
         baseline_m: Baseline of the (virtual) stereo pair that turns depth into a right coordinate, in metres.
         readout_s: Seconds from the first row's exposure to the last one's, the frame's stamp being the middle row's
             time (rolling shutter); 0 is a global shutter, or one of which nothing is known.
         depth_delay_s: Seconds by which depth images are exposed later than their stamps say, beside the colour images;
             readers add it to the depth images' stamps before they pair them.
+        R_body_cam: Rotation from the camera's axes to those of the body whose poses ``groundtruth.txt`` holds, the rows
+            of a 3x3 matrix; the identity where these poses are the camera's. None where nothing states it: the data set
+            decides, else the poses are the camera's.
     """
 
     width: int
@@ -36,15 +43,24 @@ class Camera:
     cx: float
     cy: float
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    depth_factor: float = 5000.0
+    depth_factor: float | None = None
     baseline_m: float = 0.075
     readout_s: float = 0.0
     depth_delay_s: float = 0.0
+    # no part of a sequence's digest, which has the poses themselves
+    R_body_cam: tuple[tuple[float, float, float], ...] | None = field(default=None, repr=False)
 
     @cached_property
     def matrix(self) -> NDArray[np.float64]:
-        """The 3x3 calibration matrix K."""
-        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+        """The 3x3 calibration matrix K; it cannot be written, because all users of the camera share it."""
+        K = np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+        K.flags.writeable = False
+        return K
+
+    @property
+    def written_depth_factor(self) -> float:
+        """Raw units a metre in which depth is written for others: `depth_factor`, else TUM's 5000."""
+        return TUM_DEPTH_FACTOR if self.depth_factor is None else self.depth_factor
 
     @property
     def is_distorted(self) -> bool:

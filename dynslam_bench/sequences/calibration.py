@@ -360,7 +360,7 @@ def _factor(windows: list[Window], sequence: Sequence) -> Quantity:
         return Quantity(
             name, reason=f"interval of +- {share}, wanted +- {RESOLVED_FACTOR:.0%}: the camera's path is too short"
         )
-    factor = sequence.camera.depth_factor
+    factor = sequence.camera.written_depth_factor
     low, high = factor / (estimate.value + estimate.half), factor / (estimate.value - estimate.half)
     agrees, value = low <= factor <= high, factor / estimate.value
     reason = f"agrees with the camera's {factor:g}" if agrees else f"the camera states {factor:g}"

@@ -16,8 +16,8 @@ from dynslam_bench.core import SequenceError, did_you_mean, find_data_root, is_w
 from dynslam_bench.core.plugins import Registry, described, load_object
 from dynslam_bench.core.settings import Settings, build
 from dynslam_bench.geometry import Camera
-from dynslam_bench.sequences.cameras import CAMERAS, MARKER_TO_CAMERA, chosen_camera, find_camera
-from dynslam_bench.sequences.readers.layouts import find_layout, is_bag, layout_of
+from dynslam_bench.sequences.cameras import CAMERA_FILE, CAMERAS, camera_of, chosen_camera
+from dynslam_bench.sequences.readers.layouts import find_layout, is_bag, is_plain, layout_notes, layouts_of
 from dynslam_bench.sequences.settings import PreprocessingSettings
 from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS, open_synthetic, parse_synthetic_id
 from dynslam_bench.sequences.tags import Tag
@@ -79,8 +79,8 @@ class CatalogueEntry(Settings):
 
     def find(self, data_root: Path) -> Path | None:
         """The folder in which the sequence lies, None if it does not."""
-        layout = layout_of(self.layout)
-        return next((folder for folder in self.folders(data_root) if layout.fits(folder)), None)
+        places = self.folders(data_root)
+        return next((folder for folder in places if layouts_of(folder, self.layout) or is_plain(folder)), None)
 
     def how_to_get(self) -> str:
         """What a user does to have it, for the end of a message."""
@@ -221,21 +221,25 @@ def open_folder(
 
     settings = settings or PreprocessingSettings()
     entry = entry or entry_of(folder.resolve().name)
-    layout = find_layout(folder) if entry is None else layout_of(entry.layout)
+    catalogued = entry.layout if entry else ""
+    layout = find_layout(folder, catalogued)
     chosen = chosen_camera(folder, camera)
-    contents = layout.read(folder, (chosen[1] if chosen else None) or (entry.fps if entry else None))
-    otherwise = entry.camera if entry else None
-    intrinsics, fps = chosen or find_camera(folder, stated=contents.camera, otherwise=otherwise)
-    about: dict[str, Any] = {"id": f"folder/{folder.resolve().name}", "fps": fps or contents.fps}
+    fps = (chosen.fps if chosen else None) or (entry.fps if entry else None)
+    contents = layout.read(folder, fps)
+    notes = layout_notes(folder, layout, catalogued)
+    if camera is not None and (folder / CAMERA_FILE).exists():
+        notes = (*notes, f"{CAMERA_FILE} of the folder is not used: another camera was chosen")
+    about: dict[str, Any] = {"id": f"folder/{folder.resolve().name}"}
     if entry is not None:
-        about = {"id": entry.id, "fps": fps or entry.fps, "license": entry.license, "citation": entry.citation,
+        about = {"id": entry.id, "license": entry.license, "citation": entry.citation,
                  "tags": frozenset(entry.tags), "split": entry.split}  # fmt: skip
     return RecordedSequence(
         folder,
         contents,
-        intrinsics,
+        camera_of(folder, contents, chosen, entry.camera if entry else ""),
         **about,
-        R_body_cam=MARKER_TO_CAMERA.get(str(camera) if entry is None else entry.camera),
+        fps=contents.fps or fps,
+        notes=notes,
         max_time_difference_s=settings.max_time_difference_s,
         any_depth_size=settings.width is not None,
     )
@@ -246,6 +250,11 @@ def _open_whole(
 ) -> Sequence:
     path, is_path = Path(name).expanduser(), name.startswith((".", "/", "~", "\\"))
     entry = None if is_path else entry_of(name)
+    if entry is not None and path.is_dir() and entry.find(data_root) is None:
+        raise SequenceError(
+            f"'{name}' names the sequence '{entry.id}', which is not at {entry.folders(data_root)[0]}",
+            f"for the folder of that name here write ./{name}",
+        )
     if entry is not None:
         return open_public(entry.id, data_root=data_root, camera=camera, settings=settings)
     prefix, separator, _ = name.partition("/")

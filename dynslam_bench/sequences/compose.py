@@ -6,7 +6,7 @@ the host's world, hides what is behind it, is hidden by what is before it, and c
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from dynslam_bench.contracts import Frame, Sequence
 from dynslam_bench.core import SequenceError, atomic_folder, write_atomic
 from dynslam_bench.geometry import Array, Camera, Trajectory, se3, write_tum
-from dynslam_bench.sequences.cameras import write_camera
+from dynslam_bench.sequences.cameras import camera_by_name, write_camera
 from dynslam_bench.sequences.readers.layouts import PEOPLE_LIST
 
 _NEARER_M, _NEARER_SHARE = 0.08, 0.04
@@ -53,6 +53,8 @@ _SHIFT_PX = 1.5
 _SHADOW_BASELINE_M = 0.075
 """Distance between a Kinect's projector and its infrared camera."""
 _FURTHEST_SHADOW_PX = 80
+_IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+"""The poses that are written are the camera's, whatever body the host's data set tracks."""
 
 
 Cutout = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]
@@ -126,7 +128,7 @@ def compose(
             gain = np.clip(frame.rgb.reshape(-1, 3).mean(axis=0) / cutouts.tone, 0.4, 1.6)
             colour, z, ids = _nearest([actor.draw(i, host.camera) for actor in actors])
             rgb, depth, shown = paste(frame.rgb, frame.depth, colour * gain.astype(np.float32), z, host.camera)
-            raw = np.rint(depth * host.camera.depth_factor).clip(0, 65535).astype(np.uint16)
+            raw = np.rint(depth * host.camera.written_depth_factor).clip(0, 65535).astype(np.uint16)
             images = (rgb[..., ::-1], raw, np.where(shown, ids, 0).astype(np.uint8))
             for kind, image in zip(lists, images, strict=True):
                 data = cv2.imencode(".png", image)[1].tobytes()
@@ -134,7 +136,10 @@ def compose(
             shares.append(shown.mean())
             progress(i + 1, len(host))
         write_tum(work / "groundtruth.txt", host.ground_truth, comment=f"of {host.id}")
-        write_camera(work / "camera.toml", host.camera, fps=host.fps)
+        camera = replace(host.camera, depth_factor=host.camera.written_depth_factor)
+        if host.camera.R_body_cam is not None or camera_by_name(target) is not None:
+            camera = replace(camera, R_body_cam=_IDENTITY)
+        write_camera(work / "camera.toml", camera, fps=host.fps)
         if not max(shares):
             raise SequenceError(f"nobody can be seen in '{host.id}': all of its depth is missing or nearer than people")
     return Composed(target, len(host), float(np.mean(shares)), float(np.max(shares)))

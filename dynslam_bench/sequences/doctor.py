@@ -116,7 +116,7 @@ def examine(
     indices = [range(*stretch) for stretch in stretches(len(sequence), most_frames)]
     done, todo = 0, sum(map(len, indices))
     interval_s = np.median(np.diff(sequence.timestamps)) if len(sequence) > 1 else 1 / 30
-    streams = Streams(sequence.camera.depth_factor, float(interval_s))
+    streams = Streams(sequence.camera.written_depth_factor, float(interval_s))
     pairs, unreadable = list[RgbdPair](), list[str]()
     with_depth = bool(getattr(sequence, "has_depth", True))
     for stretch in indices:
@@ -854,7 +854,7 @@ def _scale(factor: float, camera: Camera, motions: Motions) -> Finding:
     if factor > 30 and 0.15 < motions.depth_m < 20:
         unit, divisor = ("millimetres", 1000) if factor > 300 else ("centimetres", 100)
         return finding_of("truth-scale", factor, depth_m=motions.depth_m, unit=unit, divisor=divisor)
-    new, old = camera.depth_factor / factor, camera.depth_factor
+    new, old = camera.written_depth_factor / factor, camera.written_depth_factor
     return finding_of("depth-factor/translations", factor, depth_m=motions.depth_m, new=new, old=old)
 
 
@@ -896,7 +896,8 @@ def _fitted(pairs: list[RgbdPair], relative: Array, camera: Camera) -> list[Find
     }[name]
     facts = {
         "sigma": sigma, "percent": 100 * sigma, "fx": camera.fx * by, "fy": camera.fy * by, "dx": dx, "dy": dy,
-        "cx": camera.cx + dx, "cy": camera.cy + dy, "new": camera.depth_factor / depth, "old": camera.depth_factor,
+        "cx": camera.cx + dx, "cy": camera.cy + dy,
+        "new": camera.written_depth_factor / depth, "old": camera.written_depth_factor,
         "matrix": _turn(turn), "lever": ", ".join(f"{metres:+.3f}" for metres in fit.value["lever"]),
         "errors": f"reprojection errors {before.residual_px:.1f} px -> {fit.residual_px:.1f} px",
     }  # fmt: skip

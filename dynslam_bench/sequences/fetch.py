@@ -32,9 +32,9 @@ from dynslam_bench.core import (
 )
 from dynslam_bench.core.download import CHUNK, MOST_BYTES, Progress, Report, download
 from dynslam_bench.core.records import Record, schema
-from dynslam_bench.sequences.cameras import chosen_camera, find_camera
+from dynslam_bench.sequences.cameras import CameraError
 from dynslam_bench.sequences.catalogue import CatalogueEntry, catalogue, entry_of, open_folder, open_sequence
-from dynslam_bench.sequences.readers.layouts import TUM, find_layout, layout_of
+from dynslam_bench.sequences.readers.layouts import layout_of
 
 RECEIPT = "fetched.json"
 MANIFEST = "manifest.sha256"
@@ -232,10 +232,10 @@ def verify(
     if folder is None or not folder.is_dir():
         open_sequence(name, data_root=data_root)  # says what is missing
         raise SequenceError(f"'{name}' is not a recorded sequence", "rendered sequences need no verification")
-    if (find_layout(folder) if entry is None else layout_of(entry.layout)) is TUM and not chosen_camera(folder, camera):
-        find_camera(folder, otherwise=None if entry is None else entry.camera)
     try:
         sequence = open_folder(folder, entry=entry, camera=camera)
+    except CameraError:
+        raise
     except DynslamError as error:
         return Verification(name, folder, 0, (str(error),), False, "")
     faults = []

@@ -109,7 +109,7 @@ class Part:
         id: Id without a length: ``synthetic/walking_xyz?scene=0`` for all its lengths; a noise seed stays in it.
         content: Digest of the whole content, however much of it is seen.
         scene: The same without the draw of the sensors' noise.
-        camera: Intrinsics of the camera before any preprocessing.
+        camera: The camera before any preprocessing, without what its ground truth tracks.
         start: First frame of the named part in the numbering of the whole sequence, before any offset.
         stop: One past its last frame, never past the end.
         stride: Every so many frames.
@@ -154,7 +154,7 @@ def part_of(sequence: Sequence, offset: int = 0) -> Part:
         id=str(getattr(base, "whole_id", base.id)),
         content=scene if noise is None else digest([scene, noise]),
         scene=scene,
-        camera=asdict(base.camera),
+        camera={name: value for name, value in asdict(base.camera).items() if name != "R_body_cam"},
         start=frames.start - offset,
         stop=frames.stop,
         stride=frames.step,

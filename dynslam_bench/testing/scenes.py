@@ -25,7 +25,7 @@ class CornerSequence:
     license = "CC0-1.0"
     citation = "dynslam-bench"
     fps = 30.0
-    camera = Camera(640, 480, 535.4, 539.2, 320.1, 247.6)
+    camera = Camera(640, 480, 535.4, 539.2, 320.1, 247.6, depth_factor=5000.0)
     has_panel = True
     detail = 1.0
     """Detail of the texture: small images hold less."""
@@ -72,7 +72,7 @@ class TurningSequence(CornerSequence):
     """
 
     id = "synthetic/conformance_turning"
-    camera = Camera(320, 240, 267.7, 269.6, 159.8, 123.6)
+    camera = Camera(320, 240, 267.7, 269.6, 159.8, 123.6, depth_factor=5000.0)
     has_panel = False
     detail = 1 / 3
 

@@ -14,7 +14,7 @@ from dynslam_bench.core.settings import Settings, tunable
 from dynslam_bench.geometry import Camera, Trajectory, se3, write_tum
 from dynslam_bench.sequences.cameras import write_camera
 
-CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
+CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5, depth_factor=5000.0)
 STEP_M = 0.01
 """The toy camera moves so far along x from frame to frame, in its own frame."""
 

@@ -352,7 +352,7 @@ def _read_folder(data: bytes | None, folder: Path) -> None:
         at(folder, f"rgb/{name}", _PNG)
         at(folder, f"depth/{name}", _DEPTH)
     sequence = reader.RecordedSequence(
-        folder, layouts.read_tum(folder, 30.0), Camera(8, 8, 8.0, 8.0, 4.0, 4.0), id="fuzz"
+        folder, layouts.read_tum(folder, 30.0), Camera(8, 8, 8.0, 8.0, 4.0, 4.0, depth_factor=5000.0), id="fuzz"
     )
     files = (*sequence._colour, *sequence._depth)
     assert files and all((folder / file).resolve().is_relative_to(folder.resolve()) for file in files)

@@ -131,6 +131,7 @@ def write_euroc(folder, poses, size=(64, 48)):
         "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v, v, v"
     )
     lines(base / "state_groundtruth_estimate0" / "data.csv", [heading, *rows])
+    (base / "depth0" / "sensor.yaml").write_text("sensor_type: depth-camera\ndepth_factor: 1000.0\n")
     (base / "cam0" / "sensor.yaml").write_text(
         "# General sensor definitions.\nsensor_type: camera\ncomment: VI-Sensor cam0 (MT9M034)\n\n# Extrinsics.\n"
         f"T_BS:\n  cols: 4\n  rows: 4\n  data: [{MATRIX}]\n\nrate_hz: 20\nresolution: [{size[0]}, {size[1]}]\n"

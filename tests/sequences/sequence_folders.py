@@ -30,7 +30,8 @@ def make_folder(folder, *, frames=4, width=32, height=24, rate=30, fps=30.0, sta
         (folder / f"{kind}.txt").write_text("".join(f"{stamp!r} {kind}/{i}.png\n" for i, stamp in enumerate(stamps)))
     poses = (f"{stamp!r} {i * 0.01} 0 0 0 0 0 1\n" for i, stamp in enumerate(stamps))
     (folder / "groundtruth.txt").write_text("".join(poses))
-    write_camera(folder / "camera.toml", Camera(width, height, 30.0, 30.5, 15.5, 11.5), fps=fps)
+    camera = Camera(width, height, 30.0, 30.5, 15.5, 11.5, depth_factor=5000.0)
+    write_camera(folder / "camera.toml", camera, fps=fps)
     return folder, rgb, depth
 
 

@@ -231,7 +231,7 @@ def test_real_recordings_have_no_fault(name):
 # Readout time, delay of depth and depth factor, of a rendered sequence and of what cannot tell them.
 
 
-PINHOLE = Camera(320, 240, 260.0, 262.0, 160.0, 118.0)
+PINHOLE = Camera(320, 240, 260.0, 262.0, 160.0, 118.0, depth_factor=5000.0)
 FPS = 30.0
 
 
@@ -299,7 +299,7 @@ def test_recordings_that_cannot_be_used_are_one_clear_line(still, kind, image, f
     assert error.value.hint
 
 
-ROOM_CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
+ROOM_CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5, depth_factor=5000.0)
 
 
 class Room:

@@ -1,6 +1,7 @@
 """What readers are made of: lists of images and counts of what was not used, YAML, CSV, poses of a body."""
 
 import math
+import os
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -35,6 +36,24 @@ from dynslam_bench.geometry import (
 
 MOST_LINES = 1_000_000
 """Nine hours at 30 frames a second; a longer list is refused before it fills the memory."""
+MILLIMETRES = 1000.0
+"""Units a metre."""
+
+
+def stated_file(folder: Path, *names: str) -> Path | None:
+    """The first of these files that a folder has; None where it has none.
+
+    Raises:
+        SequenceError: The name is there but is no file, e.g. a link to a file that is gone.
+    """
+    path = next((folder / name for name in names if os.path.lexists(folder / name)), None)
+    if path is None or path.is_file():
+        return path
+    if path.is_symlink() and not path.exists():
+        what = f"is a link to {path.readlink()}, which is not there"
+    else:
+        what = "is no file" if not path.is_dir() else "is a folder, not a file"
+    raise SequenceError(f"{path} {what}", "put the file there, or remove the name")
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,13 +111,18 @@ def read_associations(path: Path) -> tuple[ImageList, ImageList]:
     return colour, ImageList(np.array([stamp for stamp, _ in depth], np.int64), tuple(file for _, file in depth))
 
 
+LEFT_OUT = "frame numbers without an image"
+_IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+
+
 def list_folder(folder: Path, name: str, fps: float | None) -> ImageList:
     """The images of a folder without a list file, stamped by their names.
 
-    A name with a decimal point is a stamp in seconds; a whole number is a frame number, which `fps` turns into seconds.
+    A name with a decimal point is a stamp in seconds. Of whole numbers, those of the size of Unix time are stamps in
+    seconds, milliseconds, microseconds or nanoseconds; others are frame numbers, which `fps` turns into seconds.
 
     Raises:
-        SequenceError: The folder does not exist, or a name gives no stamp.
+        SequenceError: The folder does not exist, or the names give no stamps.
     """
     images = folder / name
     if not images.is_dir():
@@ -106,19 +130,117 @@ def list_folder(folder: Path, name: str, fps: float | None) -> ImageList:
             f"{folder} has neither {name}.txt nor a folder {name}",
             "a sequence in TUM layout holds rgb.txt, depth.txt, the images, and groundtruth.txt where there is one",
         )
-    rows: list[tuple[int | None, str]] = []
-    for path in sorted(images.iterdir()):
-        if path.suffix.lower() not in (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp") or path.name.startswith("."):
-            continue
-        digits = path.stem.lstrip("0123456789")
-        if digits == "" and fps is None:
-            raise SequenceError(
-                f"{name}/{path.name} of {folder} is named by a frame number, which has no time",
-                f"write {name}.txt with lines 'timestamp {name}/{path.name}', or 'fps = 30' into camera.toml",
-            )
-        stamp = ns_of(int(path.stem) / fps) if digits == "" and fps is not None else _number(path.stem, images)
-        rows.append((stamp, f"{name}/{path.name}"))
-    return make_image_list(sorted(rows, key=lambda row: (row[0] or 0, row[1])), described=str(images))
+    shown = sorted(path for path in images.iterdir() if not path.name.startswith("."))
+    paths = [path for path in shown if path.suffix.lower() in _IMAGES]
+    rows: list[tuple[int | None, str]]
+    missing = 0
+    if paths and all(path.stem.isascii() and path.stem.isdigit() for path in paths):
+        numbers = [int(path.stem) for path in paths]
+        stamps, missing = stamps_of_numbers(numbers, fps, [f"{name}/{path.name}" for path in paths], folder)
+        rows = [(stamp, f"{name}/{path.name}") for stamp, path in zip(stamps, paths, strict=True)]
+    else:
+        hint = f"write {name}.txt with lines 'timestamp {name}/FILE'"
+        rows = [(_number(path.stem, images, hint), f"{name}/{path.name}") for path in paths]
+    listed = make_image_list(sorted(rows, key=lambda row: (row[0] or 0, row[1])), described=str(images))
+    more = Counter({"files that are no images": len(shown) - len(paths), LEFT_OUT: missing})
+    return ImageList(listed.stamps_ns, listed.files, listed.irregular + more)
+
+
+def rate_of(images: ImageList) -> float | None:
+    """Frames a second by the median of the stamps, to 6 decimals; None for one image."""
+    return round(float(1 / np.median(np.diff(images.stamps))), 6) if len(images) > 1 else None
+
+
+# Images that are named by whole numbers: stamps, or frame numbers.
+
+_UNITS = {"seconds": 1, "milliseconds": 10**3, "microseconds": 10**6, "nanoseconds": 10**9}
+"""Units a second."""
+_UNIX_S = (900_000_000, 4_200_000_000)
+"""1998 and 2103: no clock of a recording shows other Unix time."""
+_CAMERA_HZ = (0.5, 250.0)
+"""Frame rates of cameras: a unit in which the steps of the names are another rate is not theirs."""
+_SLOWEST_BY_NUMBER_S = 0.5
+"""Frame numbers further apart than this, by the median, are more likely stamps in another unit."""
+_NO_VIDEO_S = 5.0
+"""Frame numbers further apart than this are none."""
+
+
+def unix_unit(number: int) -> str | None:
+    """The unit in which a whole number is Unix time of our days; None if it is in none."""
+    low, high = _UNIX_S
+    return next((unit for unit, per_s in _UNITS.items() if low * per_s <= number < high * per_s), None)
+
+
+def stamps_of_numbers(numbers: list[int], fps: float | None, files: list[str], folder: Path) -> tuple[list[int], int]:
+    """Stamps in nanoseconds of images that are named by whole numbers.
+
+    Args:
+        numbers: The names as numbers, in the order of `files`.
+        fps: Frame rate that turns frame numbers into seconds.
+        files: The images, relative to the folder.
+        folder: The sequence's folder.
+
+    Returns:
+        The stamps, and how many frame numbers are left out between the first and the last.
+
+    Raises:
+        SequenceError: The numbers are frame numbers and there is no `fps`; or they may be frame numbers or stamps.
+    """
+    # 1. Unix time has a size of its own.
+    units = {unix_unit(number) for number in numbers}
+    unit = units.pop() if len(units) == 1 else None
+    if unit is not None:
+        return [number * (10**9 // _UNITS[unit]) for number in numbers], 0
+
+    # 2. Frame numbers go up by one, or by a few; larger steps may be time.
+    ordered = sorted(set(numbers))
+    steps = [later - earlier for earlier, later in pairwise(ordered)]
+    step = float(np.median(steps)) if steps else 1.0
+    likely = _unit_of_steps(step, fps)
+    if likely is not None:
+        raise _which_reading(step, fps, likely, files, numbers, folder)
+    if fps is None:
+        kind = files[0].partition("/")[0]
+        raise SequenceError(
+            f"{files[0]} of {folder} is named by a frame number, which has no time",
+            f"write {kind}.txt with lines 'timestamp {files[0]}', or 'fps = 30' into the camera.toml that is used (the "
+            "folder's, or the one that --camera names)",
+        )
+    fault = f"{files[0]} of {folder} is no frame number at {fps:g} Hz"
+    with raising(SequenceError, fault, of=(ValueError, OverflowError)):
+        stamps = [ns_of(number / fps) for number in numbers]
+    return stamps, ordered[-1] - ordered[0] + 1 - len(ordered)
+
+
+def _unit_of_steps(step: float, fps: float | None) -> str | None:
+    """The unit of time in which names that go up by `step` are a camera's, where they are hardly frame numbers."""
+    low, high = _CAMERA_HZ
+    rates = {unit: _UNITS[unit] / step for unit in ("milliseconds", "microseconds", "nanoseconds")}
+    likely = next((unit for unit, rate in rates.items() if low <= rate <= high), None)
+    if likely is None or fps is None:
+        return likely
+    agrees_with_fps = 0.8 < rates[likely] / fps < 1.25
+    return likely if agrees_with_fps or step / fps > _SLOWEST_BY_NUMBER_S else None
+
+
+def _which_reading(
+    step: float, fps: float | None, unit: str, files: list[str], numbers: list[int], folder: Path
+) -> SequenceError:
+    """Names that are frame numbers or stamps: both readings, and the list that decides."""
+    per_s = _UNITS[unit]
+    readings = [f"{unit} would be {per_s / step:.3g} Hz"]
+    lines = [f"'{format_ns(numbers[0] * (10**9 // per_s))} {files[0]}' if the names are {unit}"]
+    if fps is None:
+        lines.append(f"'timestamp {files[0]}' if they are frame numbers")
+    else:
+        readings.append(f"frame numbers at fps = {fps:g} would be {step / fps:.3g} s apart")
+        if step / fps < _NO_VIDEO_S:
+            lines.append(f"'{numbers[0] / fps:.9f} {files[0]}' if they are frame numbers")
+    kind = files[0].partition("/")[0]
+    return SequenceError(
+        f"the names of the images {files[0]}, ... of {folder} go up by {step:.12g}: {', '.join(readings)}",
+        f"write {kind}.txt with a line an image, in seconds: {', '.join(lines)}",
+    )
 
 
 def make_image_list(rows: list[tuple[int | None, str]], *, described: str) -> ImageList:
@@ -161,11 +283,14 @@ def read_stamped_lines(path: Path) -> list[tuple[int | None, list[str]]]:
     return rows
 
 
-def _number(text: str, where: object) -> int | None:
+def _number(text: str, where: object, hint: str = "") -> int | None:
     try:
         return parse_ns(text) if math.isfinite(float(text)) else None
     except ValueError:
-        raise SequenceError(f"{where}: '{text[:40]}' is not a timestamp in seconds") from None
+        whole = re.fullmatch(r"([0-9]{1,24})(\.[0-9]*)?", text, re.ASCII)
+        unit = None if whole is None else unix_unit(int(whole[1]))
+        hint = hint if unit is None else f"it looks like {unit} of Unix time: divide by {_UNITS[unit]}"
+        raise SequenceError(f"{where}: '{text[:40]}' is not a timestamp in seconds", hint) from None
 
 
 # The result of every reader, from which `RecordedSequence` is made.
@@ -180,7 +305,10 @@ class Contents:
         depth: Depth images, registered to the colour images, and their stamps.
         paired: Whether the two lists are paired already, entry by entry; otherwise they are associated by time.
         truth: Camera-to-world poses; None if there are none.
+        truth_of_body: Whether `truth` is that of whatever body the data set tracks, so that the camera's `R_body_cam`
+            applies; otherwise it is the camera's already.
         truth_dropped: One phrase on the poses that were not taken as they stand; empty for none.
+        notes: Phrases on files that are there and were not used.
         camera: Intrinsics that the folder states; None where it does not.
         fps: Nominal frame rate in Hz that the folder or the layout states; None where neither does.
         furthest_m: Depth beyond this, in metres, is no measurement (a rendered sky); None for no limit.
@@ -196,6 +324,8 @@ class Contents:
     fps: float | None = None
     furthest_m: float | None = None
     people: ImageList | None = None
+    truth_of_body: bool = False
+    notes: tuple[str, ...] = ()
 
 
 # Images of folders without lists: found by their names, sized by their headers.
@@ -230,19 +360,20 @@ def stamped(files: list[str], stamps: NDArray[np.int64], where: str) -> ImageLis
 
 
 def checked_camera(
-    where: object, size: Sequence[float], focal: Sequence[float], centre: Sequence[float], depth_factor: float,
-    distortion: Sequence[float] = (),
+    where: object, size: Sequence[float], focal: Sequence[float], centre: Sequence[float],
+    depth_factor: float | None, distortion: Sequence[float] = (),
 ) -> Camera:  # fmt: skip
     """A camera by its size, focal lengths and principal point in pixels, and up to five coefficients of distortion.
 
     Raises:
         SequenceError: Size, focal length or depth factor is not positive.
     """
-    if not all(value > 0 for value in (*size, *focal, depth_factor)):
+    if not all(value > 0 for value in (*size, *focal)):
         raise SequenceError(
-            f"{where}: size {size[0]:g}x{size[1]:g}, focal lengths {focal[0]:g} and {focal[1]:g} and {depth_factor:g} "
-            "depth units a metre have to be above 0"
+            f"{where}: size {size[0]:g}x{size[1]:g} and focal lengths {focal[0]:g} and {focal[1]:g} have to be above 0"
         )
+    if depth_factor is not None and not depth_factor > 0:
+        raise SequenceError(f"{where}: depth_factor is {depth_factor:g} raw units a metre, expected more than 0")
     (width, height), (fx, fy), (cx, cy), (k1, k2, p1, p2, k3) = size, focal, centre, (*distortion, *[0.0] * 5)[:5]
     return Camera(int(width), int(height), fx, fy, cx, cy, (k1, k2, p1, p2, k3), depth_factor)
 
@@ -333,6 +464,11 @@ def rigid(values: Sequence[float], where: str) -> Array:
     if not se3.is_pose(pose, tolerance=1e-3):
         raise SequenceError(f"{where} holds no rigid transformation")
     return pose
+
+
+def is_identity(pose: Array) -> bool:
+    """Whether a pose ``[4, 4]`` states that two bodies are one."""
+    return bool(np.array_equal(pose, np.eye(4)))
 
 
 def camera_on_body(sensor: Mapping[str, Any], where: str) -> Array:

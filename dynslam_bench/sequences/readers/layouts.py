@@ -4,13 +4,15 @@ A new layout is a function ``read(folder, fps) -> Contents`` and a row of `LAYOU
 function raises a `SequenceError` for a file that is missing or malformed, a `TrajectoryError` for such a ground truth.
 """
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from dynslam_bench.core import SequenceError, TrajectoryError, read_text
+from dynslam_bench.core import SequenceError, TrajectoryError, raising, read_text
 from dynslam_bench.geometry import (
     Array,
     Camera,
@@ -24,16 +26,21 @@ from dynslam_bench.geometry import (
     se3,
     to_seconds,
 )
+from dynslam_bench.geometry.camera import TUM_DEPTH_FACTOR
 from dynslam_bench.sequences.readers.files import (
+    LEFT_OUT,
+    MILLIMETRES,
     Contents,
     ImageList,
     camera_on_body,
     checked_camera,
     find_names,
+    is_identity,
     list_folder,
     nanoseconds,
     numbers,
     pick,
+    rate_of,
     read_associations,
     read_image_list,
     read_pose_table,
@@ -43,12 +50,14 @@ from dynslam_bench.sequences.readers.files import (
     section,
     size_of_first,
     stamped,
+    stated_file,
 )
 
 PEOPLE_LIST = "people.txt"
 """List of exact masks, 8-bit images of the colour images' size and stamps: 0 is the scene, k > 0 is person k."""
-MILLIMETRES = 1000.0
-"""Units a metre."""
+ASSOCIATIONS = ("associations.txt", "associated.txt", "associate.txt", "association.txt")
+"""Names of a list of pairs."""
+TRUTHS = ("groundtruth.txt", "pose.txt")
 
 
 # TUM RGB-D, Bonn Dynamic, Wild-SLAM MoCap, and recordings of one's own.
@@ -57,29 +66,45 @@ MILLIMETRES = 1000.0
 def read_tum(folder: Path, fps: float | None) -> Contents:
     """Read the lists ``rgb.txt`` and ``depth.txt``, else an ``associations.txt``, else the names of the images.
 
-    `fps` makes stamps of images that are named by frame numbers.
+    `fps` makes stamps of images that are named by frame numbers. What is there and not used is said in the notes.
     """
     truth, dropped = _tum_truth(folder)
-    pairs = _first_file(folder, "associations.txt", "associated.txt", "associate.txt", "association.txt")
-    if pairs is not None and _first_file(folder, "rgb.txt", "depth.txt") is None:
-        return Contents(*read_associations(pairs), True, truth, dropped)
-    people = read_image_list(folder / PEOPLE_LIST) if (folder / PEOPLE_LIST).is_file() else None
-    colour, depth = (
-        read_image_list(folder / f"{name}.txt")
-        if (folder / f"{name}.txt").is_file()
-        else list_folder(folder, name, fps)
-        for name in ("rgb", "depth")
+    listed = stated_file(folder, PEOPLE_LIST)
+    people = None if listed is None else read_image_list(listed)
+    lists = {name: stated_file(folder, f"{name}.txt") for name in ("rgb", "depth")}
+    present = [path.name for path in lists.values() if path is not None]
+    pairs = stated_file(folder, *ASSOCIATIONS)
+    notes = [*_unused(folder, ASSOCIATIONS), *_unused(folder, TRUTHS)]
+    if pairs is not None and len(present) < len(lists):
+        paired = True
+        colour, depth = read_associations(pairs)
+        notes += [f"{name} is not used: {pairs.name} lists the images" for name in present]
+    else:
+        paired = False
+        colour, depth = (
+            list_folder(folder, name, fps) if path is None else read_image_list(path) for name, path in lists.items()
+        )
+        if pairs is not None:
+            notes.insert(0, f"{pairs.name} is not used: {' and '.join(present)} list the images")
+        elif len(present) == 1:
+            unlisted = next(name for name, path in lists.items() if path is None)
+            notes.append(f"there is no {unlisted}.txt: the images of {unlisted}/ are stamped by their names")
+    # a stated rate is that of the frame numbers, of which the images may be every n-th
+    rate = rate_of(colour) if colour.irregular[LEFT_OUT] else None
+    return Contents(
+        colour, depth, paired, truth, dropped, fps=rate, people=people, truth_of_body=True, notes=tuple(notes)
     )
-    return Contents(colour, depth, False, truth, dropped, people=people)
 
 
-def _first_file(folder: Path, *names: str) -> Path | None:
-    return next((folder / name for name in names if (folder / name).is_file()), None)
+def _unused(folder: Path, names: tuple[str, ...]) -> list[str]:
+    """A phrase on the files of these names, which mean the same, other than the first that is there."""
+    present = [name for name in names if (folder / name).exists()]
+    return [f"{name} is not used: {present[0]} is taken" for name in present[1:]]
 
 
 def _tum_truth(folder: Path) -> tuple[Trajectory | None, str]:
     """The ground truth, None if there is no file, and one phrase on the lines that were not taken as they stand."""
-    path = _first_file(folder, "groundtruth.txt", "pose.txt")
+    path = stated_file(folder, *TRUTHS)
     if path is None:
         return None, ""
     file = load_tum(path)
@@ -96,19 +121,20 @@ def read_eth3d(folder: Path, fps: float | None) -> Contents:
     A sequence is published as two archives of one folder: ``*_mono.zip`` (colour, lists, calibration, ground truth) and
     ``*_rgbd.zip`` (depth and ``associated.txt``).
     """
-    pairs = folder / "associated.txt"
-    if not pairs.is_file():
+    pairs = stated_file(folder, "associated.txt")
+    if pairs is None:
         raise SequenceError(
             f"{folder} has no associated.txt, that is no depth", "unpack the sequence's _rgbd archive into it as well"
         )
     colour, depth = read_associations(pairs)
-    fx, fy, cx, cy = read_table(folder / "calibration.txt", 4, "fx fy cx cy")[0].tolist()
-    camera = checked_camera(folder / "calibration.txt", size_of_first(folder, colour), (fx, fy), (cx, cy), 5000.0)
+    calibration = folder / "calibration.txt"
+    fx, fy, cx, cy = read_table(calibration, 4, "fx fy cx cy")[0].tolist()
+    camera = checked_camera(calibration, size_of_first(folder, colour), (fx, fy), (cx, cy), TUM_DEPTH_FACTOR)
     truth, dropped = _tum_truth(folder)
     return Contents(colour, depth, True, truth, dropped, camera, fps or 27.1)
 
 
-_ICL_CAMERA = Camera(640, 480, 481.20, 480.0, 319.5, 239.5)
+_ICL_CAMERA = Camera(640, 480, 481.20, 480.0, 319.5, 239.5, depth_factor=TUM_DEPTH_FACTOR)
 _ICL_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
@@ -143,7 +169,8 @@ def read_seven_scenes(folder: Path, fps: float | None) -> Contents:
     bad = [number for number in frames if not (number.isascii() and number.isdigit() and len(number) < 16)]
     if bad:
         raise SequenceError(f"frame-{bad[0][:40]}.color.png of {folder} is named by no number")
-    stamps = from_seconds(int(number) / rate for number in frames)
+    with raising(SequenceError, f"the numbers of the frames of {folder} are no frame numbers", of=ValueError):
+        stamps = from_seconds(int(number) / rate for number in frames)
     colour = stamped(files, stamps, str(folder))
     depth = stamped([f"frame-{number}.depth.png" for number in frames], stamps, str(folder))
     poses = [_kinect_fusion_pose(folder / f"frame-{number}.pose.txt") for number in frames]
@@ -239,9 +266,10 @@ def _mappings(value: object) -> list[dict[str, object]]:
 def read_vslam_lab(folder: Path, fps: float | None) -> Contents:
     """VSLAM-LAB: ``rgb.csv`` (stamps in nanoseconds, pairs), ``calibration.yaml``, ``groundtruth.csv``.
 
-    The ground truth is that of the body, on which ``T_BS`` places the camera.
+    The ground truth is that of the body, on which ``T_BS`` places the camera. VSLAM-LAB writes the identity where the
+    data set states nothing.
     """
-    table, poses, where = folder / "rgb.csv", folder / "groundtruth.csv", str(folder / "calibration.yaml")
+    table, where = folder / "rgb.csv", str(folder / "calibration.yaml")
     names = ("ts_rgb_0 (ns)", "path_rgb_0", "ts_depth_0 (ns)", "path_depth_0")
     stamps, files, depth_stamps, depth_files = pick(*read_rows(table), names, table)
     order = np.argsort(nanoseconds(stamps, table), kind="stable")
@@ -253,15 +281,36 @@ def read_vslam_lab(folder: Path, fps: float | None) -> Contents:
         raise SequenceError(f"{where} describes no camera 'rgb_0'")
     pairs = ("image_dimension", "focal_length", "principal_point")
     size, focal, centre = (numbers(stated, name, 2, where) for name in pairs)
-    (factor,) = numbers(stated, "depth_factor", 1, where)
+    factor = _depth_factor(stated, where)
     kind = stated.get("distortion_type")
     if kind not in (None, "radtan4", "radtan5"):
         raise SequenceError(f"{where}: the distortion '{str(kind)[:40]}' is not read, only radtan4 and radtan5")
     k = [] if kind is None else numbers(stated, "distortion_coefficients", 4 if kind == "radtan4" else 5, where)
     camera = checked_camera(where, size, focal, centre, factor, k)
-    file = read_pose_table(poses, camera_on_body(stated, where)) if poses.is_file() else None
-    truth = None if file is None else file.trajectory
-    return Contents(colour, depth, True, truth, camera=camera, fps=fps or _frame_rate(stated.get("fps")))
+    T_body_cam = camera_on_body(stated, where)
+    truth, dropped = _truth_of_table(stated_file(folder, "groundtruth.csv"), T_body_cam)
+    return Contents(
+        colour, depth, True, truth, dropped, camera, fps or _frame_rate(stated.get("fps")),
+        truth_of_body=is_identity(T_body_cam),
+    )  # fmt: skip
+
+
+def _depth_factor(mapping: object, where: str) -> float | None:
+    """The ``depth_factor`` of a mapping; None where it states none."""
+    if not isinstance(mapping, Mapping) or mapping.get("depth_factor") is None:
+        return None
+    (factor,) = numbers(mapping, "depth_factor", 1, where)
+    return factor
+
+
+def _truth_of_table(path: Path | None, T_body_cam: Array) -> tuple[Trajectory | None, str]:
+    """The camera's poses of a table of the body's, and one phrase on the rows that were not taken as they stand."""
+    if path is None:
+        return None, ""
+    file = read_pose_table(path, T_body_cam)
+    if file is None:
+        return None, f"ground truth: no row of {path.name} holds a rotation"
+    return file.trajectory, _not_taken(file)
 
 
 def read_euroc(folder: Path, fps: float | None) -> Contents:
@@ -269,25 +318,27 @@ def read_euroc(folder: Path, fps: float | None) -> Contents:
 
     The folder holds ``mav0`` or is ``mav0`` itself. Stamps are nanoseconds. The ground truth is the body's, its
     quaternion has w first, and ``T_BS`` of ``cam0`` places the camera on the body. EuRoC itself has no depth:
-    ``depth0`` is what others add, in millimetres unless its ``sensor.yaml`` states a ``depth_factor``.
+    ``depth0`` is what others add, and its ``sensor.yaml`` or a ``camera.toml`` states the ``depth_factor``.
     """
     base = "mav0/" if (folder / "mav0").is_dir() else ""
-    if not (folder / base / "depth0" / "data.csv").is_file():
+    if stated_file(folder, f"{base}depth0/data.csv") is None:
         raise SequenceError(
             f"{folder} has no {base}depth0/data.csv, that is no depth", "EuRoC's own sequences are stereo"
         )
     colour, depth = _euroc_images(folder, f"{base}cam0"), _euroc_images(folder, f"{base}depth0")
-    where, depth_file = str(folder / base / "cam0" / "sensor.yaml"), folder / base / "depth0" / "sensor.yaml"
+    where = str(folder / base / "cam0" / "sensor.yaml")
     sensor = read_yaml(Path(where))
     size, intrinsics = numbers(sensor, "resolution", 2, where), numbers(sensor, "intrinsics", 4, where)
     k = numbers(sensor, "distortion_coefficients", 4, where)
-    depth_sensor = {"depth_factor": MILLIMETRES, **(read_yaml(depth_file) if depth_file.is_file() else {})}
-    (factor,) = numbers(depth_sensor, "depth_factor", 1, str(depth_file))
+    depth_sensor = stated_file(folder, f"{base}depth0/sensor.yaml")
+    factor = None if depth_sensor is None else _depth_factor(read_yaml(depth_sensor), str(depth_sensor))
     camera = checked_camera(where, size, intrinsics[:2], intrinsics[2:], factor, k)
-    poses = folder / base / "state_groundtruth_estimate0" / "data.csv"
-    file = read_pose_table(poses, camera_on_body(sensor, where)) if poses.is_file() else None
-    truth = None if file is None else file.trajectory
-    return Contents(colour, depth, truth=truth, camera=camera, fps=fps or _frame_rate(sensor.get("rate_hz")))
+    T_body_cam = camera_on_body(sensor, where)
+    truth, dropped = _truth_of_table(stated_file(folder, f"{base}state_groundtruth_estimate0/data.csv"), T_body_cam)
+    return Contents(
+        colour, depth, False, truth, dropped, camera, fps or _frame_rate(sensor.get("rate_hz")),
+        truth_of_body=is_identity(T_body_cam),
+    )  # fmt: skip
 
 
 def _euroc_images(folder: Path, name: str) -> ImageList:
@@ -316,20 +367,27 @@ class Layout:
         read: Reads a folder of this layout, ``read(folder, fps)``, fps being the nominal frame rate in Hz, where the
             user or the catalogue states one. It raises a `SequenceError` where the folder is not in this layout or
             damaged, a `TrajectoryError` where its ground truth cannot be read.
+        holds: Name of the layout whose marks its folders have as well; empty for none.
     """
 
     name: str
     marks: tuple[str, ...]
     read: Callable[[Path, float | None], Contents]
+    holds: str = ""
 
     def fits(self, folder: Path) -> bool:
         """Whether a folder has this layout."""
-        return any(all(any(base.glob(mark)) for mark in self.marks) for base in (folder, folder / "mav0"))
+        return any(all(_has(base, mark) for mark in self.marks) for base in (folder, folder / "mav0"))
+
+
+def _has(folder: Path, mark: str) -> bool:
+    """Whether a folder has a file of this name or pattern, be it a link to a file that is gone: its reader says so."""
+    return any(folder.glob(mark)) if "*" in mark else os.path.lexists(folder / mark)
 
 
 TUM = Layout("tum", ("rgb.txt",), read_tum)
 LAYOUTS = (
-    Layout("eth3d", ("calibration.txt", "associated.txt"), read_eth3d),
+    Layout("eth3d", ("calibration.txt", "associated.txt"), read_eth3d, holds="tum"),
     Layout("icl-nuim", ("*.gt.freiburg",), read_icl_nuim),
     Layout("7-scenes", ("frame-*.color.png",), read_seven_scenes),
     Layout("tartanair-shibuya", ("gt_pose.txt", "times.txt"), read_tartanair_shibuya),
@@ -340,9 +398,65 @@ LAYOUTS = (
 )
 
 
-def find_layout(folder: Path) -> Layout:
-    """The layout of a folder; TUM's where no other fits."""
-    return next((layout for layout in LAYOUTS if layout.fits(folder)), TUM)
+def layouts_of(folder: Path, catalogued: str = "") -> list[Layout]:
+    """All layouts that a folder has, the one to take first; none where no mark is there.
+
+    Args:
+        folder: The folder.
+        catalogued: Name of the layout in which the data set is published. It comes first where the folder has it, and
+            what is a part of it is no layout of its own.
+    """
+    fitting = [layout for layout in LAYOUTS if layout.fits(folder)]
+    published = layout_of(catalogued) if catalogued else None
+    held = {layout.holds for layout in fitting}
+    if published is not None and published not in fitting:
+        held.add(published.holds)
+    fitting = [layout for layout in fitting if layout is published or layout.name not in held]
+    if published is TUM and len(fitting) > 1 and not _has_listed_images(folder):
+        return fitting  # of another layout, or changed by a tool that wrote another one
+    return sorted(fitting, key=lambda layout: layout is not published)
+
+
+def _has_listed_images(folder: Path) -> bool:
+    """Whether the first images of both of TUM's lists are there."""
+    with suppress(SequenceError):
+        firsts = [read_image_list(folder / f"{name}.txt").files[0] for name in ("rgb", "depth")]
+        return all((folder / first).is_file() for first in firsts)
+    return False
+
+
+def find_layout(folder: Path, catalogued: str = "") -> Layout:
+    """The layout of a folder, by its files; where no mark is there the catalogued one, else TUM's.
+
+    Args:
+        folder: The folder.
+        catalogued: See `layouts_of`.
+    """
+    fitting = layouts_of(folder, catalogued)
+    if fitting:
+        return fitting[0]
+    return layout_of(catalogued) if catalogued and not is_plain(folder) else TUM
+
+
+def is_plain(folder: Path) -> bool:
+    """Whether a folder holds what TUM's reader takes without lists: images in two folders, or a list of pairs."""
+    if (folder / "rgb").is_dir() and (folder / "depth").is_dir():
+        return True
+    return any(os.path.lexists(folder / name) for name in ASSOCIATIONS)
+
+
+def layout_notes(folder: Path, taken: Layout, catalogued: str = "") -> tuple[str, ...]:
+    """Phrases on what else a folder could be, and on a layout other than the one in which the data set is published."""
+    notes = []
+    if catalogued and taken.name != catalogued:
+        notes.append(f"read in the layout {taken.name}, by its files; the data set is published in {catalogued}")
+    for other in layouts_of(folder, catalogued):
+        if other is not taken:
+            notes.append(
+                f"read in the layout {taken.name} ({', '.join(taken.marks)}); {', '.join(other.marks)} of the layout "
+                f"{other.name} is not used"
+            )
+    return tuple(notes)
 
 
 def layout_of(name: str) -> Layout:

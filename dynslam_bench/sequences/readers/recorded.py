@@ -23,6 +23,12 @@ from dynslam_bench.sequences.view import Masks
 GROUND_TRUTH_DT_S = 0.02
 SLOWEST_S = 5.0
 """Frames further apart by the median are no video: their stamps are in another unit than seconds."""
+FASTEST_S = 0.0005
+"""Frames closer together by the median are no camera's: their stamps are in another unit than their layout says."""
+RATES_AGREE = 1.25
+"""A stated frame rate and the stamps' may differ by this factor: clocks drift. More is said."""
+RATES_CONTRADICT = 3.0
+"""Nobody means a frame rate that differs from the stamps' by this factor; the stamps' is taken."""
 MISSING_TOLERATED = 0.02
 """Part of a list's images that may be missing: Bonn's lists name a few images that its archives lack."""
 
@@ -36,15 +42,14 @@ class RecordedSequence:
     Args:
         folder: The sequence's folder.
         contents: What its reader found in it.
-        camera: Intrinsics of the colour images.
+        camera: Of the colour images; its `R_body_cam` is applied to the ground truth.
         id: For example ``tum/fr3/walking_xyz``.
-        fps: Nominal frame rate in Hz; None to take it from the stamps.
+        fps: Nominal frame rate in Hz; None to take it from the stamps, as is done where these contradict it.
         license: Licence of the data.
         citation: What to cite.
         tags: For example ``high-dynamic``.
         split: ``tune``, ``held-out`` or empty.
-        R_body_cam: Rotation from the camera's axes to those of the body that the ground truth tracks, rows of a 3x3
-            matrix; None where the ground truth is the camera's.
+        notes: Phrases for `dropped` on how the folder was read.
         max_time_difference_s: Colour and depth further apart are not paired (strictly less is).
         any_depth_size: True if the caller resizes, so that depth images may differ in size from colour images.
 
@@ -55,7 +60,8 @@ class RecordedSequence:
         depth_timestamps: Stamps of the frames' depth images in seconds ``[N]``, the camera's `depth_delay_s` added.
         ground_truth: Camera-to-world poses in the frame of the motion capture, at their own stamps; None without any.
         masks: Exact masks of people where the folder lists them (`PEOPLE_LIST`), else None.
-        fps: Nominal frame rate in Hz; where none is stated, the inverse of the median interval (30 for one frame).
+        fps: Nominal frame rate in Hz; where none is stated, or one that differs from the stamps' by `RATES_CONTRADICT`,
+            the inverse of the median interval (30 for one frame).
         dropped: One line on the frames, and on all that was not used or not taken as it stands.
 
     Raises:
@@ -74,7 +80,7 @@ class RecordedSequence:
         citation: str = "",
         tags: frozenset[str] = frozenset(),
         split: str = "",
-        R_body_cam: tuple[tuple[float, float, float], ...] | None = None,
+        notes: tuple[str, ...] = (),
         max_time_difference_s: float = 0.02,
         any_depth_size: bool = False,
     ) -> None:
@@ -100,7 +106,7 @@ class RecordedSequence:
         self.timestamps_ns, self.timestamps = colour.stamps_ns[first], colour.stamps[first]
         self.timestamps_ns.flags.writeable = self.timestamps.flags.writeable = False
         _check_unit(folder, self.timestamps)
-        self.fps = fps or (float(1 / np.median(np.diff(self.timestamps))) if len(first) > 1 else 30.0)
+        self.fps, rate_note = _frame_rate(fps, self.timestamps)
         self.depth_timestamps = depth.stamps[second]
         self._colour, self._depth = [colour.files[i] for i in first], [depth.files[i] for i in second]
         self._people: list[str] = []
@@ -113,9 +119,12 @@ class RecordedSequence:
             self._people = [people.files[i] for i in at]
         self.masks: MaskSource | None = Masks(self._masks_of) if self._people else None
         self.ground_truth = contents.truth
-        if contents.truth is not None and R_body_cam is not None:
+        R_body_cam = camera.R_body_cam
+        turned = ""
+        if contents.truth is not None and R_body_cam is not None and not np.array_equal(R_body_cam, np.eye(3)):
             poses = in_camera_axes(contents.truth.T_world_cam, R_body_cam)
             self.ground_truth = contents.truth.with_poses(poses)
+            turned = "ground truth: orientations of another body are turned into the camera's axes"
         counts = {
             "colour images without depth": len(colour) - len(self),
             "depth images unused": len(depth) - len(self),
@@ -128,6 +137,10 @@ class RecordedSequence:
             *(f"{count} {what}" for what, count in counts.items() if count),
             "" if self.ground_truth else "no ground truth",
             contents.truth_dropped,
+            turned,
+            *contents.notes,
+            *notes,
+            rate_note,
         ]
         self.dropped = "; ".join(part for part in parts if part)
         self[0]
@@ -197,9 +210,31 @@ class RecordedSequence:
         return f"<{type(self).__name__} {self.id}: {len(self)} frames in {self.folder}>"
 
 
+def _frame_rate(stated: float | None, stamps: NDArray[np.float64]) -> tuple[float, str]:
+    """The nominal frame rate in Hz, and a phrase where the stamps say another one than is stated."""
+    if len(stamps) < 2:
+        return stated or 30.0, ""
+    measured = float(1 / np.median(np.diff(stamps)))
+    if stated is None:
+        return measured, ""
+    factor = max(measured / stated, stated / measured)
+    if factor < RATES_AGREE:
+        return stated, ""
+    said = f"fps = {stated:g} is stated, the stamps say {measured:.4g}"
+    return (stated, said) if factor < RATES_CONTRADICT else (measured, f"{said}, which is taken")
+
+
 def _check_unit(folder: Path, stamps: NDArray[np.float64]) -> None:
-    """Refuse stamps in milliseconds, microseconds or nanoseconds: associations and RPE would be over other spans."""
-    interval = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+    """Refuse stamps in another unit than they are read in: associations and RPE would be over other spans."""
+    if len(stamps) < 2:
+        return
+    interval = float(np.median(np.diff(stamps)))
+    if interval < FASTEST_S:
+        raise SequenceError(
+            f"the colour images of {folder} are {interval:g} s apart by the median of their stamps "
+            f"({1 / interval:.3g} Hz), faster than any camera",
+            "stamps of .txt lists are seconds, those of .csv tables nanoseconds",
+        )
     if interval <= SLOWEST_S:
         return
     units = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
@@ -260,7 +295,7 @@ SATURATED = np.iinfo(np.uint16).max
 
 def read_depth(
     path: Path,
-    depth_factor: float,
+    depth_factor: float | None,
     *,
     size: tuple[int, int] | None = None,
     mismatch: str = "",
@@ -270,7 +305,7 @@ def read_depth(
 
     Args:
         path: A 16-bit image of one channel, or an ``.npy`` array of metres.
-        depth_factor: Raw units a metre of an image.
+        depth_factor: Raw units a metre of an image; an array of metres needs none.
         size: Width and height that it has to have; None for any.
         mismatch: Ends the message where it has another one.
         furthest_m: Depth beyond this is missing; None for no limit.
@@ -284,6 +319,8 @@ def read_depth(
     else:
         hint = "set the preprocessing's width and height to resize both"
         raw = read_image(path, size=size, mismatch=mismatch, hint=hint, kind=SequenceError)
+        if depth_factor is None:
+            raise SequenceError(f"nothing says how many units of the depth image {path} make a metre: no depth_factor")
         if raw.dtype != np.uint16 or raw.ndim != 2:
             channels = 1 if raw.ndim == 2 else raw.shape[2]
             raise SequenceError(

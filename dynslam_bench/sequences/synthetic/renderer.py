@@ -328,12 +328,13 @@ class Renderer:
     ) -> NDArray[np.uint16]:
         """The depth as the sensor measures it."""
         sensor, raw, seed = self.depth_sensor, np.empty(SIZE, np.uint16), self._noise_seed(2 * index)
+        factor = CAMERA.written_depth_factor
         if not sensor.noise:
-            return np.clip(np.floor(depth * CAMERA.depth_factor + 0.5), 0, 65535).astype(np.uint16)
+            return np.clip(np.floor(depth * factor + 0.5), 0, 65535).astype(np.uint16)
         values = sensor.disparity_noise_px, sensor.near_m, sensor.far_m, sensor.edge_px, sensor.dark
         self._rows(
             lambda a, b: kernels.measure_depth(
-                a, b, seed, CAMERA.fx, CAMERA.baseline_m, depth, cosine, color, *values, CAMERA.depth_factor, raw
+                a, b, seed, CAMERA.fx, CAMERA.baseline_m, depth, cosine, color, *values, factor, raw
             )
         )
         return raw

@@ -292,4 +292,4 @@ class SyntheticSequence:
 
 
 def _metres(raw: NDArray[np.uint16]) -> NDArray[np.float32]:
-    return raw.astype(np.float32) / np.float32(CAMERA.depth_factor)
+    return raw.astype(np.float32) / np.float32(CAMERA.written_depth_factor)

@@ -69,7 +69,7 @@ class BatchTracker:
         """
         name = f"{frame.timestamp:.6f}.png"
         rgb, depth = (self._open() / "sequence" / kind / name for kind in ("rgb", "depth"))
-        write_images(frame, rgb, None if self._program.sensors == "rgb" else depth, self._camera.depth_factor)
+        write_images(frame, rgb, None if self._program.sensors == "rgb" else depth, self._camera.written_depth_factor)
         self._stamps.append(frame.timestamp)
         return TrackResult(None, "initialising")
 
@@ -196,8 +196,8 @@ def camera_yaml(camera: Camera, fps: float) -> str:
     old = {f"Camera.{name}": value for name, value in values.items()}
     settings = OrbSlam3Settings()
     old |= {"Camera.bf": camera.fx * camera.baseline_m, "ThDepth": settings.close_depth_baselines}
-    old |= {"DepthMapFactor": camera.depth_factor}
-    text = settings_yaml(camera, settings, fps, depth_factor=camera.depth_factor)
+    old |= {"DepthMapFactor": camera.written_depth_factor}
+    text = settings_yaml(camera, settings, fps, depth_factor=camera.written_depth_factor)
     return text + "".join(f"{name}: {float(value)!r}\n" for name, value in old.items())
 
 

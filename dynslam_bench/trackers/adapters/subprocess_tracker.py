@@ -305,7 +305,7 @@ class ImageExchange:
     def announce(self) -> dict[str, Any]:
         """The part ``images`` of the ``reset`` request."""
         if self.mode == "png":
-            return {"mode": "png", "depth_factor": self.camera.depth_factor}
+            return {"mode": "png", "depth_factor": self.camera.written_depth_factor}
         return {
             "mode": "raw",
             "file": str(self.folder / FRAME_FILE),
@@ -327,7 +327,7 @@ class ImageExchange:
         for old in self.folder.glob("*.png"):
             old.unlink()
         rgb, depth = (self.folder / f"{kind}-{frame.index:06d}.png" for kind in ("rgb", "depth"))
-        write_images(frame, rgb, depth, self.camera.depth_factor)
+        write_images(frame, rgb, depth, self.camera.written_depth_factor)
         return {"rgb": str(rgb), "depth": str(depth)}
 
     def close(self) -> None:
