@@ -133,7 +133,8 @@ def test_any_executor(tmp_path: Path, toy_folder: str, monkeypatch: pytest.Monke
         assert kinds(events) == {"finished": 1, "started": 1}
         store = RunStore(tmp_path / f"there{number}")
         assert sorted(record.run_id for record in there) == store.ids()
-        assert outcomes(store) == outcomes(RunStore(tmp_path / "here"))
+        # the plug-in's process has loaded other modules here than there: another id, the same result
+        assert [*outcomes(store).values()] == [*outcomes(RunStore(tmp_path / "here")).values()]
         assert score(store, there[0], "evo-default").metrics["ate_rmse_m"] > 0
 
 
@@ -240,7 +241,7 @@ def test_import_with_stamps_of_its_own(store: RunStore, toy_folder: str, tmp_pat
 
 def test_import_of_something_else(store: RunStore, toy_folder: str, tmp_path: Path) -> None:
     far = write_estimate(tmp_path / "far.txt", shift_s=1000.0)
-    with pytest.raises(RunError, match=r"shares 0 stamps with .*, at least 2 are needed \(the nearest is 998"):
+    with pytest.raises(RunError, match=r"shares 0 stamps with .*, at least 2 are needed: the nearest is 998"):
         import_trajectory(far, "x", toy_folder, results=store)
     with pytest.raises(DynslamError, match="cannot read"):
         import_trajectory(tmp_path / "none.txt", "x", toy_folder, results=store)
@@ -266,7 +267,9 @@ def test_runs_are_made_waited_for_and_kept(store: RunStore, toy_folder: str) -> 
         call = pool.submit(run_many, specs, results=store)
         until(store.ids)
         RunStore(store.root).prepare()  # sweeps what nobody holds
-        assert work.is_dir() and store.ids() == [resolve(specs[1]).run_id]  # the other one is being made elsewhere
+        assert work.is_dir()
+        (run_id,) = store.ids()  # the other one is being made elsewhere
+        assert run_id.startswith(resolve(specs[1]).asked)
     made = call.result(300)
     assert [record.status for record in made] == ["ok", "ok"]
     assert all(0 < record.wall_s < 900 and 0 < record.timings["total"].mean_s < 900 for record in made)
