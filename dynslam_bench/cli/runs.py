@@ -192,13 +192,18 @@ def export(
     results: Results = Path("results"),
     protocol: ProtocolId = "tum-rgbd/v1",
 ) -> None:
-    """Write all runs but studies' trials, with their errors, into one table, as `RunStore.frame` has it."""
+    """Write all runs but studies' trials, with their errors, into one table, as `RunStore.frame` has it.
+
+    In a .csv, words that a spreadsheet would take for a formula begin with a quote, as in the reports' tables.
+    """
+    from dynslam_bench.reports.tables.table import csv_text
+
     kind = output.suffix.lower()
     if kind not in (".csv", ".parquet"):
         raise RunError(f"a table is not written as '{output.name}'", "name a .csv or .parquet file")
     frame = stored.open_store(results).frame(protocol)
     with raising(RunError, f"cannot write {output}", install_hint("parquet"), of=ImportError):
-        write_atomic(output, frame.to_csv(index=False) if kind == ".csv" else frame.to_parquet())
+        write_atomic(output, csv_text(frame) if kind == ".csv" else frame.to_parquet())
     write(str(output))
 
 
