@@ -192,10 +192,7 @@ def export(
     results: Results = Path("results"),
     protocol: ProtocolId = "tum-rgbd/v1",
 ) -> None:
-    """Write all runs but studies' trials, with their errors, into one table, as `RunStore.frame` has it.
-
-    In a .csv, words that a spreadsheet would take for a formula begin with a quote, as in the reports' tables.
-    """
+    """Write all runs but studies' trials, with their errors, into one table, as `RunStore.frame` has it."""
     from dynslam_bench.reports.tables.table import csv_text
 
     kind = output.suffix.lower()
