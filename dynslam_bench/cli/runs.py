@@ -195,12 +195,14 @@ def export(
     protocol: ProtocolId = "tum-rgbd/v1",
 ) -> None:
     """Write all runs but studies' trials, with their errors, into one table, as `RunStore.frame` has it."""
+    from dynslam_bench.reports.tables.table import csv_text
+
     kind = output.suffix.lower()
     if kind not in (".csv", ".parquet"):
         raise RunError(f"a table is not written as '{output.name}'", "name a .csv or .parquet file")
     frame = stored.open_store(results).frame(protocol)
     with raising(RunError, f"cannot write {output}", install_hint("parquet"), of=ImportError):
-        write_atomic(output, frame.to_csv(index=False) if kind == ".csv" else frame.to_parquet())
+        write_atomic(output, csv_text(frame) if kind == ".csv" else frame.to_parquet())
     write(str(output))
 
 

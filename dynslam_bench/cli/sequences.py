@@ -146,9 +146,9 @@ def doctor(
     with progress(name) as advance:
         diagnosis = diagnose(name, data_root=data_root, camera=camera, progress=advance)
     present(
-        {**asdict(diagnosis), "ok": diagnosis.ok},
-        f"{diagnosis.id}: {diagnosis.verdict}, {diagnosis.frames} frames compared",
-        *(f"  {f.severity} {f.id}: {f.text}\n    cure: {f.cure}" for f in diagnosis.findings),
+        {**asdict(diagnosis), "ok": diagnosis.ok, "verdict": diagnosis.verdict},
+        *(f"{f.severity} {f.id}: {f.text}\n  cure: {f.cure}" for f in diagnosis.findings),
+        f"{diagnosis.id}: {diagnosis.frames} frames compared, {diagnosis.verdict}",
         verified=diagnosis.ok,
     )
 
@@ -253,11 +253,12 @@ def _calibrated(quantity: Quantity) -> tuple[str, ...]:
     scale, unit = (1.0, "a metre") if quantity.name == "depth_factor" else (1e3, "ms")
     value = "" if quantity.value is None else f"{scale * quantity.value:.4g} {unit}"
     limits = [f"{scale * limit:.4g}" for limit in (quantity.low, quantity.high) if limit is not None]
-    written = "kept" if quantity.written is None else f"{quantity.written:g}"
+    kept = "kept" if quantity.observable else "not observable"
+    written = kept if quantity.written is None else f"{quantity.written:g}"
     return (
         quantity.name,
         value,
         " to ".join(limits),
-        written if quantity.observable else "not observable",
+        written,
         quantity.reason,
     )

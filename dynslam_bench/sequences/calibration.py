@@ -289,19 +289,30 @@ def _over_windows(
 
 
 def _readout(estimate: Estimate, windows: list[Window], camera: Camera) -> Quantity:
+    """The readout time; what is written is never longer than the time between two frames."""
     interval_s = float(np.median([np.median(np.diff(window.stamps)) for window in windows]))
-    change = float(np.median([window.turning_change() for window in windows]))
+    longest = np.floor(1e4 * interval_s) / 1e4
     value, low, high = estimate.value, estimate.value - estimate.half, estimate.value + estimate.half
-    slow = f"the turning rate changes by {change:.2f} rad/s within a window; turn the camera to and fro faster"
-    outside = f"outside of 0 to {1e3 * interval_s:.0f} ms, a frame's interval: check the stamps"
-    return _judged("readout_s", (value, low, high), (
-        (not estimate.resolved, False, None, _too_wide(estimate, slow)),
-        (high < 0 or value > interval_s + RESOLVED_S, False, None, outside),
-        (low <= 0, True, 0.0 if camera.readout_s > high else None,
-         "the interval contains 0: a global shutter, or as good as one"),
-        (low <= camera.readout_s <= high, True, None, f"agrees with the camera's {1e3 * camera.readout_s:g} ms"),
-        (True, True, round(value, 4), "a rolling shutter"),
-    ))  # fmt: skip
+    quantity = Quantity("readout_s", value, low, high)
+    frame = f"{1e3 * interval_s:.0f} ms, a frame's interval"
+    impossible = high < 0 or low > interval_s or value > interval_s + RESOLVED_S
+    if impossible or not estimate.resolved:
+        change = float(np.median([window.turning_change() for window in windows]))
+        slow = f"the turning rate changes by {change:.2f} rad/s within a window; turn the camera to and fro faster"
+        outside = f"outside of 0 to {frame}: check the stamps"
+        reason = outside if estimate.resolved else _too_wide(estimate, slow)
+        if camera.readout_s > interval_s:
+            stated = f"the camera's {1e3 * camera.readout_s:g} ms are more than {frame}, and 0 stands for not known"
+            return replace(quantity, written=0.0, reason=f"{reason}; {stated}")
+        return replace(quantity, reason=reason)
+    if low <= 0:
+        written = 0.0 if camera.readout_s > min(high, interval_s) else None
+        reason = "the interval contains 0: a global shutter, or as good as one"
+        return replace(quantity, written=written, observable=True, reason=reason)
+    if low <= camera.readout_s <= min(high, interval_s):
+        return replace(quantity, observable=True, reason=f"agrees with the camera's {1e3 * camera.readout_s:g} ms")
+    reason = "a rolling shutter" if value <= interval_s else f"a rolling shutter, at most {frame}"
+    return replace(quantity, written=min(round(value, 4), float(longest)), observable=True, reason=reason)
 
 
 def _delay(estimate: Estimate, camera: Camera) -> Quantity:

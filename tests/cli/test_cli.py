@@ -144,8 +144,15 @@ def test_a_faulty_recording_is_found_by_the_doctor_and_named_after_a_bad_run(cli
     sound = write_sequence(tmp_path / "sound", scene)
     scene.ground_truth = Trajectory(scene.timestamps, inverse(scene.ground_truth.T_world_cam))
     faulty = write_sequence(tmp_path / "faulty", scene)
-    findings = facts("sequences", "doctor", faulty, code=4)["findings"]
+    found = facts("sequences", "doctor", faulty, code=4)
+    findings = found["findings"]
     assert "truth-inverted" in {finding["id"] for finding in findings}
+    assert found["verdict"] == "1 fault: not ready"
+    code, out, _ = cli("sequences", "doctor", faulty)
+    assert (code, out.splitlines()[-1]) == (4, f"{faulty}: 34 frames compared, 1 fault: not ready")
+    code, out, _ = cli("sequences", "doctor", sound)
+    assert code == 0
+    assert out.endswith(": ready\n")
     _, _, err = cli("run", "constant-velocity", faulty)
     assert f"sequences doctor {faulty}" in err and findings[0]["text"] in err
     assert "sequences doctor" not in cli("run", "constant-velocity", sound)[2]

@@ -1,5 +1,6 @@
 """`run`, `bench` and `runs list`: what a row says of its run, limits, labels, refusals, progress off a terminal."""
 
+import csv
 import io
 import json
 import os
@@ -25,6 +26,7 @@ from dynslam_bench.cli.demo import compiled_ahead, tell
 from dynslam_bench.cli.output import report_table, table
 from dynslam_bench.core import WEIGHTS_VARIABLE, RunError
 from dynslam_bench.core.records import digest
+from dynslam_bench.core.sanitise import printable
 from dynslam_bench.geometry.trajectory_files import read_tum
 from dynslam_bench.reports.model.row import RunRow
 from dynslam_bench.reports.tables.table import Column, Table, TableCell
@@ -719,6 +721,24 @@ def test_all_runs_are_written_as_one_table(cli, stored: Path, tmp_path: Path, su
     read = pd.read_csv(target) if suffix != "parquet" else pd.read_parquet(target)
     assert list(read.columns) == list(frame.columns) and read["ate_rmse_m"].tolist() == frame["ate_rmse_m"].tolist()
     assert suffix != "parquet" or read.dtypes.equals(frame.dtypes)
+
+
+@pytest.mark.parametrize("word", ["=1+1", "+1", "-1", "@SUM(A1)", "\t=1", "\r=1", "=HYPERLINK('http://x')"])
+def test_no_cell_of_an_exported_table_is_a_formula(cli, results: Path, tmp_path: Path, word: str) -> None:
+    """Words of anybody's program and folder stand in the table that is opened in a spreadsheet."""
+    path = results / "runs" / hostile_run(results) / "run.json"
+    record = json.loads(path.read_text())
+    record |= {"reason": word, "status": "crashed", "overrides": {word: word}}
+    record["tracker"] |= {"id": word, "label": word}
+    path.write_text(json.dumps(record))
+    target = tmp_path / "runs.csv"
+    assert cli("runs", "export", target, "--results", results)[0] == 0
+    cells = [cell for row in csv.reader(target.read_text().splitlines()) for cell in row]
+    shown = [cell for cell in cells if "'" + printable(word) == cell]
+    assert len(shown) >= 3, "tracker, label and reason"
+    assert not any(cell.startswith(("=", "+", "@", "\t", "\r")) for cell in cells)
+    numbers = [cell for cell in cells if cell.startswith("-")]
+    assert all(re.fullmatch(r"-[\d.e+-]+", cell) for cell in numbers)
 
 
 def test_a_table_without_pyarrow_or_of_another_kind_is_one_line(cli, stored: Path, tmp_path: Path, monkeypatch) -> None:

@@ -200,7 +200,7 @@ def test_damaged_folders_never_raise(tmp_path, damage):
                                               (("fault", "note"), "1 fault")])  # fmt: skip
 def test_the_verdict_says_whether_the_truth_was_compared(ids, verdict):
     findings = tuple(Finding("truth-unclear", severity, 0.2, "", "unclear", "look") for severity in ids)
-    assert Diagnosis("x", 40, findings).verdict.endswith(verdict)
+    assert verdict in Diagnosis("x", 40, findings).verdict
 
 
 def matrix_of(text):

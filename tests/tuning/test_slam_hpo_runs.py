@@ -1,6 +1,9 @@
 """The runs that SLAM-HPO's tables are made of."""
 
 import importlib.util
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -10,7 +13,8 @@ import dynslam_bench as db
 from dynslam_bench.runs import RunStore
 from dynslam_bench.suites import load_suite
 
-PACKAGE = Path(__file__).parents[2] / "packaging" / "slam-hpo"
+ROOT = Path(__file__).parents[2]
+PACKAGE = ROOT / "packaging" / "slam-hpo"
 SEQUENCE = "synthetic/walking_xyz?scene=130"
 
 
@@ -39,3 +43,17 @@ def test_the_suite_holds_the_default_and_points_of_the_space(tmp_path):
     path.write_text(make_table.suite("mask-rcnn", "0", "3"))
     specs = list(load_suite(path).specs())
     assert len(specs) == 4 * 8 * 2 and len({str(spec.settings) for spec in specs}) == 4
+
+
+def test_the_package_s_equations_are_those_of_the_flow():
+    """SLAM-HPO is installed without this package, so it has a copy."""
+    own, copied = ROOT / "dynslam_bench/flow/moth_flame.py", PACKAGE / "slam_hpo/moth_flame.py"
+    assert own.read_bytes() == copied.read_bytes(), f"cp {own} {copied}"
+
+
+def test_a_copy_of_the_package_s_folder_is_complete(tmp_path):
+    copy = shutil.copytree(PACKAGE, tmp_path / "copy", symlinks=True)
+    assert [path for path in copy.rglob("*") if path.is_symlink()] == []
+    code = f"import sys; sys.path.insert(0, {str(copy)!r}); import slam_hpo.moth_flame as one; print(one.__file__)"
+    found = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert Path(found.stdout.strip()) == copy / "slam_hpo" / "moth_flame.py"

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import re
+import shutil
 import signal
 import subprocess
 import time
@@ -22,6 +23,7 @@ from dynslam_bench.trackers.adapters.subprocess_tracker import LOGGER, end_with_
 
 _POLL_S = 0.1
 _COLOUR = re.compile(r"\x1b\[[\d;]*m")
+WRITE_THERE = "let the command write to {output}, a new file in its working folder"
 LONGEST_TAIL = 1 << 16
 """Bytes of a program's output of which the end is kept."""
 
@@ -48,6 +50,7 @@ class BatchTracker:
 
     def __init__(self, settings: BatchSettings, context: TrackerContext) -> None:
         self._program, self._place = settings.read()
+        self._file = settings.path
         self._limit_s, self._context = settings.timeout_s, context
         self._folder: TemporaryFolder | None = None
         self.measured: dict[str, Any] = {}
@@ -58,8 +61,8 @@ class BatchTracker:
         self.close()
         self._camera, self._stamps, self.measured = camera, list[float](), {}
         self._folder = TemporaryFolder()
-        for name in ("sequence/rgb", "sequence/depth", "work"):
-            (self._folder.path / name).mkdir(parents=True)
+        for name in ("rgb", "depth"):
+            (self._folder.path / "sequence" / name).mkdir(parents=True)
 
     def track(self, frame: Frame) -> TrackResult:
         """Write the frame's images; no pose is known yet.
@@ -77,12 +80,16 @@ class BatchTracker:
         """Run the program and read what it wrote.
 
         Raises:
-            TrackerError: It cannot be started, wrote no trajectory, or one that is not of these frames; with its last
-                words.
+            TrackerError: It cannot be started, ended with an exit code that is not among the program's `exit_codes`,
+                wrote no trajectory, or one that is not of these frames or not of this run; with its last words.
             TrackerTimeoutError: It did not end in time.
         """
         folder, program = self._open(), self._program
-        output = folder / "work" / program.output
+        work = folder / "work"
+        if work.exists():  # of an earlier call
+            shutil.rmtree(work)
+        work.mkdir()
+        output = work / program.output
         settings = folder / "camera.yaml"
         places = {
             "sequence": folder / "sequence",
@@ -107,13 +114,18 @@ class BatchTracker:
                 f"{program.name}: not done within {self._limit_s:g} s, killed; {words_said}", hint
             )
         ended = f"killed by signal {-code} ({signal.strsignal(-code)})" if code < 0 else f"ended with exit code {code}"
-        if not output.is_file():
-            raise TrackerError(f"{program.name}: {ended}, and wrote no {program.output}; {words_said}", hint)
+        missing = "" if output.is_file() else f", and wrote no {program.output}"
+        if code not in program.exit_codes:
+            fine = f"if that is no failure: exit_codes = {[*program.exit_codes, code]} in {self._file.name}"
+            raise TrackerError(f"{program.name}: {ended}{missing}; {words_said}", hint or fine)
+        if missing:
+            raise TrackerError(f"{program.name}: {ended}{missing}; {words_said}", hint or WRITE_THERE)
+        self._check_own(output)
         try:
             trajectory, read_notes = self._read(output)
         except TrajectoryError as error:
-            text = str(error).replace(str(output), program.output)
-            raise TrackerError(f"{program.name}: {text}; it {ended}; {words_said}") from None
+            text = str(error.args[0]).replace(str(output), program.output)
+            raise TrackerError(f"{program.name}: {text}; it {ended}; {words_said}", error.hint) from None
         odd = code or len(trajectory) < len(self._stamps)
         self.measured["notes"] = [f"the program {ended}; {words_said}"] if odd else []
         self.measured["notes"] += [f"{program.output}: {note}" for note in read_notes]
@@ -124,6 +136,22 @@ class BatchTracker:
         if self._folder is not None:
             self._folder.close()
             self._folder = None
+
+    def _check_own(self, output: Path) -> None:
+        """Refuse a trajectory that the program did not write in this run.
+
+        Raises:
+            TrackerError: It is a link to a file elsewhere, or older than the program's start.
+        """
+        name, real = f"{self._program.name}: {self._program.output}", output.resolve()
+        if not real.is_relative_to(self._open().resolve() / "work"):
+            raise TrackerError(f"{name} is a link to {real}, outside of the working folder of this run", WRITE_THERE)
+        # Both stamps are of one file system; the log was made right before the program was started.
+        early_s = (self._started_ns - real.stat().st_mtime_ns) / 1e9
+        if early_s > 0:
+            raise TrackerError(
+                f"{name} was written {early_s:.3g} s before the program started: it is not of this run", WRITE_THERE
+            )
 
     def _open(self) -> Path:
         if self._folder is None:
@@ -141,6 +169,7 @@ class BatchTracker:
         """Run the program to its end; its exit code, or None if it had to be killed."""
         began, log = time.perf_counter(), folder / "log.txt"
         with log.open("wb") as out, raising(TrackerError, f"{self._program.name}: cannot start '{words[0]}'"):
+            self._started_ns = os.fstat(out.fileno()).st_mtime_ns
             process = subprocess.Popen(
                 words, stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT, cwd=folder / "work",
                 env=os.environ | {"OMP_NUM_THREADS": str(self._context.threads)}, start_new_session=True,

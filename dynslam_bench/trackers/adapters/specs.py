@@ -9,10 +9,10 @@ import shlex
 import shutil
 import sys
 from dataclasses import replace
-from pathlib import Path
-from typing import Literal
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, field_validator
 
 from dynslam_bench.contracts import TrackerSpec
 from dynslam_bench.core import SettingsError, raising, read_toml
@@ -53,6 +53,10 @@ class ReplaySettings(Settings):
         read_tum(Path(self.file).expanduser())
 
 
+ExitCode = Annotated[int, Field(ge=-64, le=255)]
+"""Of a program; ``-N`` if signal N killed it."""
+
+
 class ProgramSettings(Settings):
     """Time limits of an external program."""
 
@@ -72,6 +76,9 @@ class SubprocessSettings(ProgramSettings):
     folder: str = Field("", description="working folder of the program; empty for the current one")
     version: str = Field("", description="free text, part of a run's identity; change it with the program")
     final: bool = Field(False, description="whether the program answers `finalize` with a final trajectory")
+    exit_codes: tuple[ExitCode, ...] = Field(
+        (0,), min_length=1, description="exit codes after `close` that are no failure; -N: killed by signal N"
+    )
 
     def words(self) -> list[str]:
         """The command's words.
@@ -110,7 +117,8 @@ class BatchProgram(Record):
             (ORB-SLAM's YAML), ``{associations}``, ``{output}``, ``{folder}`` (which holds these), ``{threads}``,
             ``{here}`` (the TOML file's folder) and ``{python}`` (this one) are put in. A word that names a file below
             the TOML file's folder is that file.
-        output: What it writes, in its working folder, which is new for every run.
+        output: What it writes, a relative path in its working folder, which is new for every run.
+        exit_codes: Exit codes that are no failure; -N if signal N killed it.
         format: ``tum`` (stamp tx ty tz qx qy qz qw, camera to world), or ``indices``: the frame's index for the stamp.
         sensors: ``rgb`` for a program without depth.
         version: Part of a run's identity.
@@ -123,11 +131,25 @@ class BatchProgram(Record):
     name: str = Field(min_length=1)
     command: list[str] = Field(min_length=1)
     output: str = "trajectory.txt"
+    exit_codes: list[ExitCode] = Field(default=[0], min_length=1)
     format: Literal["tum", "indices"] = "tum"
     sensors: Literal["rgbd", "rgb"] = "rgbd"
     version: str = ""
     license: str = ""
     citation: str = ""
+
+    @field_validator("output")
+    @classmethod
+    def _in_the_working_folder(cls, output: str) -> str:
+        """Refuse a path that may hold the trajectory of another run, or of another program."""
+        path = PurePosixPath(output)
+        leaves = path.is_absolute() or ".." in path.parts or output.startswith("~")
+        if leaves or not path.parts or "\0" in output:
+            raise ValueError(
+                f"'{output}' is no file in the program's working folder, which is new for every run: write "
+                "output = 'trajectory.txt', and let the command write to {output}"
+            )
+        return output
 
     def words(self, here: Path, **places: str) -> list[str]:
         """The command with these paths for its placeholders."""

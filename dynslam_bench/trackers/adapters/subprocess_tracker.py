@@ -18,7 +18,7 @@ import tempfile
 import threading
 import time
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Literal, cast
 
@@ -134,13 +134,28 @@ class Program:
             raise TrackerError(f"{self.name} {doing}: {' '.join(str(answer['error']).split())[:400]}")
         return answer
 
-    def close(self, timeout_s: float) -> None:
-        """Ask it to end, wait, and kill it if it does not; may be called more than once."""
-        with contextlib.suppress(OSError, ValueError, subprocess.TimeoutExpired):
+    def close(self, timeout_s: float) -> int | None:
+        """Ask it to end, wait, and kill it if it does not; may be called more than once.
+
+        Returns:
+            The exit code with which it ended by itself; None if it has to be killed.
+        """
+        with contextlib.suppress(OSError, ValueError):
             self._write({"op": "close"})
             self._process.stdin.close()  # type: ignore[union-attr]
+        with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout_s)
+        code = self._process.returncode
         self.kill()
+        return code
+
+    def ending(self, code: int) -> str:
+        """How it ended, with its last line, in words."""
+        shown = f"its last line: '{self._last_line()}'" if self._last_line() else "it wrote no message"
+        ended = (
+            f"was killed by signal {-code} ({signal.strsignal(-code)})" if code < 0 else f"ended with exit code {code}"
+        )
+        return f"the program {ended}; {shown}"
 
     def kill(self) -> None:
         """End it and everything it started, at once."""
@@ -169,11 +184,7 @@ class Program:
         self.kill()
         if code is None:
             return TrackerError(f"{self.name} {doing}: closed its output without an answer")
-        shown = f"its last line: '{self._last_line()}'" if self._last_line() else "it wrote no message"
-        ended = (
-            f"was killed by signal {-code} ({signal.strsignal(-code)})" if code < 0 else f"ended with exit code {code}"
-        )
-        return TrackerError(f"{self.name} {doing}: the program {ended}; {shown}")
+        return TrackerError(f"{self.name} {doing}: {self.ending(code)}")
 
 
 def _read(
@@ -376,6 +387,7 @@ class ProgramTracker:
         command: Program and arguments.
         images: How it gets the images, see `ImageExchange`.
         folder: Its working folder; None for the current one.
+        exit_codes: Exit codes with which it may end after `close`; None for any.
     """
 
     def __init__(
@@ -387,7 +399,10 @@ class ProgramTracker:
         *,
         images: Literal["raw", "png"] = "raw",
         folder: Path | None = None,
+        exit_codes: Sequence[int] | None = None,
     ) -> None:
+        self._exit_codes = exit_codes
+        self._failed = False  # whether a fault of the program was raised
         self._images: Literal["raw", "png"] = images
         self.name, self.limits, self.context = name, settings, context
         self._command, self._folder = list(command), folder
@@ -408,7 +423,7 @@ class ProgramTracker:
         Raises:
             TrackerError: It cannot be started, dies, refuses, or does not answer in time.
         """
-        self.close()
+        self._end()
         names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
         environment = dict.fromkeys(names, str(self.context.threads))
         self._exchange = ImageExchange(camera, self._images)
@@ -427,12 +442,13 @@ class ProgramTracker:
             "sequence": self.context.sequence_id,
             "options": self.options(camera, self._exchange.folder),
         }
+        self._failed = False
         self._program = Program(self.name, self._command, folder=self._folder, environment=environment)
         try:
             if self._ask(request, self.limits.start_timeout_s, "at reset").get("ok") is False:
                 raise TrackerError(f"{self.name} answered reset with ok: false")
         except DynslamError:
-            self.close()
+            self._end()
             raise
 
     def options(self, camera: Camera, folder: Path) -> dict[str, Any]:
@@ -451,22 +467,53 @@ class ProgramTracker:
         doing = f"at frame {frame.index}"
         images = {} if self._exchange is None else self._exchange.put(frame)
         request = {"op": "track", "index": frame.index, "timestamp": frame.timestamp, **images}
-        answer = self._ask(request, self.limits.frame_timeout_s, doing)
-        if answer.get("index") != frame.index:
-            raise TrackerError(
-                f"{self.name} {doing}: answered index {str(answer.get('index'))[:20]}",
-                "each answer repeats the index of its track request",
-            )
-        return read_track_answer(answer, frame, f"{self.name} {doing}", lambda: time.perf_counter() - start)
+        with self._noting_failures():
+            answer = self._ask(request, self.limits.frame_timeout_s, doing)
+            if answer.get("index") != frame.index:
+                raise TrackerError(
+                    f"{self.name} {doing}: answered index {str(answer.get('index'))[:20]}",
+                    "each answer repeats the index of its track request",
+                )
+            return read_track_answer(answer, frame, f"{self.name} {doing}", lambda: time.perf_counter() - start)
 
     def close(self) -> None:
-        """End the program (killed if it does not end by itself) and remove the exchanged files."""
+        """End the program (killed if it does not end by itself) and remove the exchanged files.
+
+        Raises:
+            TrackerError: It ended by itself, with an exit code that counts as a failure, though it answered all.
+        """
+        program, code = self._program, self._end()
+        allowed = self._exit_codes
+        if program is None or code is None or allowed is None or code in allowed:
+            return
+        raise TrackerError(
+            f"{self.name} after its last answer: {program.ending(code)}",
+            f"if that is no failure: --set exit_codes={json.dumps([*allowed, code], separators=(',', ':'))}",
+        )
+
+    def _end(self) -> int | None:
+        """End the program and remove the exchanged files.
+
+        Returns:
+            Its exit code; None if it was killed, or after a fault that was raised.
+        """
+        code = None
         if self._program is not None:
-            self._program.close(self.limits.close_timeout_s)
+            code = self._program.close(self.limits.close_timeout_s)
             self._program = None
         if self._exchange is not None:
             self._exchange.close()
             self._exchange = None
+        return None if self._failed else code
+
+    @contextlib.contextmanager
+    def _noting_failures(self) -> Iterator[None]:
+        """Remember that a fault was raised: how the program ends then is no second one."""
+        try:
+            yield
+        except TrackerError:
+            self._failed = True
+            raise
 
     def _ask(self, request: Mapping[str, Any], timeout_s: float, doing: str) -> dict[str, Any]:
         if self._program is None:
@@ -483,8 +530,9 @@ class FinalizingProgramTracker(ProgramTracker):
         Raises:
             TrackerError: It dies, hangs, or does not answer with a trajectory.
         """
-        answer = self._ask({"op": "finalize"}, self.limits.final_timeout_s, "at finalize")
-        return read_final_answer(answer, f"{self.name} at finalize")
+        with self._noting_failures():
+            answer = self._ask({"op": "finalize"}, self.limits.final_timeout_s, "at finalize")
+            return read_final_answer(answer, f"{self.name} at finalize")
 
 
 def files(settings: SubprocessSettings) -> list[Path]:
@@ -500,4 +548,4 @@ def build(settings: SubprocessSettings, context: TrackerContext) -> ProgramTrack
     """
     command, kind = settings.words(), FinalizingProgramTracker if settings.final else ProgramTracker
     name, folder = Path(command[0]).name, settings.working_folder
-    return kind(name, settings, context, command, images=settings.images, folder=folder)
+    return kind(name, settings, context, command, images=settings.images, folder=folder, exit_codes=settings.exit_codes)

@@ -1,1 +1,166 @@
-../../../dynslam_bench/flow/moth_flame.py
+"""The moth-flame equations (Eq. 8-22), and the members of the moth-flame family.
+
+The Optuna sampler (`slam_hpo.moth_flame_sampler`) calls them. The flow's search is compiled: `move_moths` of
+`label_search` is `moth_positions` for one point, with `flight_table`, `spiral_table` and `cauchy_table` from here.
+Moths and flames are arrays of any leading shape with the dimensions of the problem last; `uniform(shape)` draws from
+[0, 1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Uniform = Callable[[tuple[int, ...]], Any]
+"""Draws numbers of a shape from [0, 1)."""
+
+
+class MothFlameRules(NamedTuple):
+    """A member of the moth-flame family.
+
+    Attributes:
+        opposition: Elite opposition-based learning of the first population (Eq. 19-22).
+        cauchy: Cauchy steps in the first half of the iterations (Eq. 13-16).
+        best_flame: Pull of the flames towards the best one in the second half (Eq. 17-18).
+        half: Divide Eq. 17 by two, as printed, which pulls every label towards zero.
+        as_printed: Eq. 9-11 with the signs as printed: t in [1, 2], flames counted down from the last count.
+    """
+
+    opposition: bool
+    cauchy: bool
+    best_flame: bool
+    half: bool
+    as_printed: bool
+
+
+EMFOA = MothFlameRules(opposition=True, cauchy=True, best_flame=True, half=False, as_printed=False)
+MFO = MothFlameRules(opposition=False, cauchy=False, best_flame=False, half=False, as_printed=False)
+EMFOA_LITERAL = MothFlameRules(opposition=True, cauchy=True, best_flame=True, half=True, as_printed=True)
+
+
+def flames_left(flames: int, iteration: int, iterations: int) -> int:
+    """Number of flames in iteration l of T (Eq. 11): ``round(N - l (N - 1) / T)``."""
+    return max(1, round(flames - iteration * (flames - 1) / iterations))
+
+
+def flame_counts(population: int, iterations: int, rules: MothFlameRules) -> NDArray[np.int64]:
+    """Number of flames in iterations 1..T (Eq. 11).
+
+    As printed, the count is taken from the last one instead of N, and collapses.
+    """
+    counts, last = [], population
+    for iteration in range(1, iterations + 1):
+        last = flames_left(last if rules.as_printed else population, iteration, iterations)
+        counts.append(last)
+    return np.asarray(counts or [1], dtype=np.int64)
+
+
+class Flight(NamedTuple):
+    """Coefficients of an iteration, the same for every moth.
+
+    Attributes:
+        span: ``r - 1`` (Eq. 9), so that ``t = span U + 1`` (Eq. 10) lies between r and 1.
+        own: Weight of a moth's own flame in its goal (a of Eq. 17-18).
+        best: Weight of the best flame; 0 leaves the own flame as it is.
+        stepping: Whether a Cauchy step is added (Eq. 13).
+    """
+
+    span: Any
+    own: Any
+    best: Any
+    stepping: bool
+
+
+def flight(progress: Any, rules: MothFlameRules) -> Flight:
+    """The coefficients at ``progress = l / T``, in the precision of `progress`."""
+    r = 1 + progress if rules.as_printed else -1 - progress  # Eq. 9
+    first_half = bool(progress <= 0.5)
+    stepping = rules.cauchy and first_half
+    if first_half or not rules.best_flame:
+        return Flight(r - 1, 1 + 0 * progress, 0 * progress, stepping)
+    a = 0.6 - 0.4 * progress  # Eq. 18
+    share = 0.5 if rules.half else 1.0
+    return Flight(r - 1, share * a, share * (1 - a), stepping)
+
+
+def spiral(distance: Any, t: Any) -> Any:
+    """``D e^(b t) cos(2 pi t)`` of Eq. 8 and 12, with b = 1."""
+    return distance * np.exp(t) * np.cos(2 * np.pi * t)
+
+
+def cauchy(uniform: Any) -> Any:
+    """A Cauchy number ``tan(pi (U - 1/2))`` (Eq. 14-16, g = 1)."""
+    return np.tan(np.pi * (uniform - 0.5))
+
+
+def moth_positions(moths: Any, own: Any, flames: Any, best: Any, now: Flight, scale: Any, uniform: Uniform) -> Any:
+    """New positions: a spiral around the flame, attraction to the best flame, a Cauchy step (Eq. 8, 10, 12, 13, 17).
+
+    Args:
+        moths: Where they are.
+        own: Flames of their own number, which the distance is taken from.
+        flames: The flames they fly around: their own, or the last that is left (Eq. 8).
+        best: The best flame.
+        now: Of the iteration.
+        scale: Of the Cauchy steps, per dimension.
+        uniform: Draws.
+    """
+    t = now.span * uniform(moths.shape) + 1  # Eq. 10
+    goal = now.own * flames + now.best * best if now.best else flames  # Eq. 17
+    position = spiral(np.abs(own - moths), t) + goal  # Eq. 8, 12
+    if now.stepping:
+        position = position + cauchy(uniform(moths.shape)) * scale  # Eq. 13
+    return position
+
+
+def opposites(members: Any, least: Any, greatest: Any, low: Any, high: Any, uniform: Uniform) -> Any:
+    """Elite opposition-based learning (Eq. 19-22).
+
+    Args:
+        members: Of the population.
+        least: Lower dynamic bounds of the population (dy of Eq. 20).
+        greatest: Upper dynamic bounds (dz).
+        low: Lower bounds; an opposite outside the bounds is replaced by a draw within them.
+        high: Upper bounds.
+        uniform: Draws.
+    """
+    opposite = uniform((*members.shape[:-1], 1)) * (least + greatest) - members  # Eq. 19
+    drawn = low + (high - low) * uniform(members.shape)
+    return np.where((opposite < low) | (opposite > high), drawn, opposite)  # Eq. 21-22
+
+
+class FlightTable(NamedTuple):
+    """Iterations 1..T of the compiled search.
+
+    Attributes:
+        counts: int64 ``[T]``, number of flames (Eq. 11).
+        coefficients: float32 ``[T, 4]``, the fields of `Flight`.
+        opposition: Of the first population.
+    """
+
+    counts: NDArray[np.int64]
+    coefficients: NDArray[np.float32]
+    opposition: bool
+
+
+@lru_cache(maxsize=64)
+def flight_table(population: int, iterations: int, rules: MothFlameRules) -> FlightTable:
+    """The flights of T iterations, computed in float32."""
+    rows = [flight(np.float32(k) / np.float32(iterations), rules) for k in range(1, iterations + 1)]
+    return FlightTable(flame_counts(population, iterations, rules), np.array(rows, np.float32), rules.opposition)
+
+
+@lru_cache(maxsize=1)
+def spiral_table() -> NDArray[np.float32]:
+    """`spiral` of distance 1 for t in [-2, 2), 1,024 steps a unit."""
+    return np.asarray(spiral(1.0, -2 + (np.arange(4 * 1024) + 0.5) / 1024), dtype=np.float32)
+
+
+@lru_cache(maxsize=1)
+def cauchy_table() -> NDArray[np.float32]:
+    """`cauchy` for 4,096 values of U."""
+    return np.asarray(cauchy((np.arange(4096) + 0.5) / 4096), dtype=np.float32)

@@ -212,8 +212,8 @@ def test_lost_and_initialising(program):
     text = """
     answers = iter([{"ok": True}, {"state": "initialising"}, {"state": "lost", "T_world_cam": None},
                     {"state": "lost", "T_world_cam": STILL}])
-    for request in requests:
-        say(next(answers))
+    for answer in answers:
+        next(requests); say(answer)
     """
     tracker = reset(program(text))
     results = [tracker.track(frame(index)) for index in range(3)]
@@ -241,6 +241,45 @@ def test_second_reset_starts_afresh(program):
     until(lambda: not alive(pids), 2)
     with pytest.raises(TrackerError, match="before reset"):
         tracker.track(frame(2))
+
+
+@pytest.mark.parametrize(
+    "end, words",
+    [
+        ("sys.exit('disk full')", "exit code 1; its last line: 'disk full'"),
+        ("os._exit(7)", "exit code 7; it wrote no message"),
+        ("os.kill(os.getpid(), 11)", "killed by signal 11 "),
+    ],
+)
+@pytest.mark.parametrize("when", ["close", "last answer"])
+def test_a_program_that_fails_behind_its_last_answer_fails(program, end, words, when):
+    text = f"""
+    for request in requests:
+        if request["op"] == "close":
+            {end}
+        say({{"state": "ok", "T_world_cam": STILL}})
+        if request.get("index") == 1 and {when == "last answer"}:
+            {end}
+    """
+    tracker = reset(program(text))
+    for index in range(2):
+        tracker.track(frame(index))
+    with pytest.raises(TrackerError, match=f"after its last answer: the program .*{words}") as raised:
+        tracker.close()
+    tracker.close()
+    code = int(re.search(r"exit_codes=\[0,(-?\d+)\]", raised.value.hint).group(1))
+    fine = reset(program(text, exit_codes=[0, code]))
+    for index in range(2):
+        fine.track(frame(index))
+    fine.close()
+
+
+def test_a_run_of_a_program_that_fails_behind_its_last_answer_has_crashed(toy_folder, tmp_path):
+    path = tmp_path / "program.py"
+    path.write_text(PRELUDE + textwrap.dedent(GOOD) + "sys.exit('cannot write the map')\n")
+    run = db.run(f"subprocess:{shlex.join([sys.executable, str(path)])}", toy_folder, frames=(0, 3), results=tmp_path)
+    assert run.status == "crashed"
+    assert "exit code 1; its last line: 'cannot write the map'" in run.record.reason
 
 
 # The example in C++: compiled with the system's compiler, run as anybody would.
@@ -506,10 +545,90 @@ def test_indices_stand_for_stamps(toml, toy_folder):
     assert np.allclose(trajectory.positions[:, 0], [0.0, 0.04, 0.08])
 
 
-def test_a_program_that_crashes_behind_its_trajectory_is_taken_and_noted(toml, toy_folder):
-    _, tracker, _ = ran(toml(GOOD_BATCH + "print('bye', flush=True); os.abort()"), toy_folder)
-    assert len(tracker.measured["notes"]) == 1 and "SIGABRT" not in tracker.measured["notes"][0]
-    assert "signal 6" in tracker.measured["notes"][0] and "'bye'" in tracker.measured["notes"][0]
+@pytest.mark.parametrize(
+    "end, code, words",
+    [
+        ("os.abort()", -6, "killed by signal 6 .*'bye'"),
+        ("sys.exit(3)", 3, "exit code 3; .*'bye'"),
+        ("os.kill(os.getpid(), 11)", -11, "killed by signal 11 "),
+    ],
+)
+def test_an_exit_code_other_than_0_is_a_failure_unless_the_file_names_it(toml, toy_folder, end, code, words):
+    program = GOOD_BATCH + f"print('bye', flush=True); {end}"
+    with pytest.raises(TrackerError, match=f"^Toy: .*{words}") as raised:
+        ran(toml(program), toy_folder)
+    assert raised.value.hint == f"if that is no failure: exit_codes = [0, {code}] in slam.toml"
+    trajectory, tracker, _ = ran(toml(program, exit_codes=[0, code]), toy_folder)
+    (note,) = tracker.measured["notes"]
+    assert len(trajectory) == 12 and re.search(words, note)
+    with pytest.raises(TrackerError, match="exit code 0"):
+        ran(toml(GOOD_BATCH, exit_codes=[code]), toy_folder)
+
+
+OLD = "1.0 0 0 0 0 0 0 1\n"
+LEFT_OVER = {
+    "a link": "os.symlink(old, output)",
+    "a link to a link": "os.symlink(old, 'one'); os.symlink('one', output)",
+    "a folder that is a link": "os.symlink(os.path.dirname(old), os.path.dirname(output))",
+    "an old file, moved": "shutil.move(old, output)",
+    "an old file, with its stamps": "shutil.copy2(old, output)",
+    "a second name of an old file": "os.link(old, output)",
+}
+
+
+@pytest.mark.parametrize("code", LEFT_OVER.values(), ids=LEFT_OVER)
+def test_a_trajectory_that_was_there_before_is_not_scored(toml, toy_folder, tmp_path, code):
+    old = tmp_path / "elsewhere" / "traj.txt"
+    old.parent.mkdir()
+    rows = [f"{stamp:.6f} 0 0 0 0 0 0 1\n" for stamp in open_sequence(toy_folder, frames=(0, 12)).timestamps]
+    old.write_text("".join(rows))
+    os.utime(old, (1.7e9, 1.7e9))
+    output = "traj.txt" if "dirname" not in code else "run/traj.txt"
+    with pytest.raises(TrackerError, match=r"outside of the working folder|before the program started") as raised:
+        ran(toml(f"import shutil; old = {str(old)!r}; {code}", output=output), toy_folder)
+    assert "{output}" in raised.value.hint
+
+
+def test_a_link_within_the_working_folder_is_taken(toml, toy_folder):
+    """Some programs keep their trajectories apart, and a link to the last one."""
+    trajectory, *_ = ran(toml(GOOD_BATCH + "os.rename(output, 'run-1'); os.symlink('run-1', output)"), toy_folder)
+    assert len(trajectory) == 12
+
+
+def test_each_call_of_a_program_begins_in_an_empty_folder(toml, toy_folder):
+    once = "assert not os.listdir() or sys.exit('not empty')\n" + GOOD_BATCH
+    sequence = open_sequence(toy_folder, frames=(0, 12))
+    path = toml(once)
+    tracker = build_tracker(f"batch:{path}")
+    with closing(tracker):
+        for _ in range(2):
+            tracker.reset(sequence.camera, rng=np.random.default_rng(0))
+            for index in range(12):
+                tracker.track(sequence[index])
+            assert len(tracker.finalize()) == len(tracker.finalize()) == 12
+        toml("pass")  # from now on it writes nothing
+        with pytest.raises(TrackerError, match=r"exit code 0, and wrote no trajectory\.txt"):
+            tracker.finalize()
+
+
+@pytest.mark.parametrize("digits", ["g", ".4g", ".0f"])
+def test_stamps_that_lost_their_digits_are_named(toml, toy_folder, tmp_path, digits):
+    write = f"write([[format(float(row[0]), {digits!r}), 0.01 * i] for i, row in enumerate(rows)])"
+    shifted = tmp_path / "late"
+    shutil.copytree(toy_folder, shifted)
+    for name in ("rgb.txt", "depth.txt", "groundtruth.txt"):
+        rows = [line.split(maxsplit=1) for line in (shifted / name).read_text().splitlines() if line[0] != "#"]
+        (shifted / name).write_text("".join(f"{1.3e9 + float(stamp):.6f} {rest}\n" for stamp, rest in rows))
+    with pytest.raises(TrackerError, match=r"^Toy: 11 of 12 lines .*repeat .*digits were lost") as raised:
+        ran(toml(write), shifted)
+    assert "%.9f" in raised.value.hint
+
+
+def test_what_was_not_taken_of_a_trajectory_is_noted(toml, toy_folder):
+    lost = "write([[row[0], 'nan' if 3 <= i < 5 else 0] for i, row in enumerate(rows)])"
+    trajectory, tracker, _ = ran(toml(lost), toy_folder)
+    assert len(trajectory) == 10
+    assert any("2 of 12 lines skipped: not finite" in note for note in tracker.measured["notes"])
 
 
 @pytest.mark.parametrize(
@@ -581,6 +700,14 @@ def test_one_that_never_ends_is_killed_with_what_it_started(toml, toy_folder, tm
         ({"command": ["nowhere-to-be-found"]}, "cannot start 'nowhere-to-be-found'"),
         ({"format": "kitti"}, "format"),
         ({"name": ""}, "name"),
+        ({"output": "/tmp/traj.txt"}, "output: '/tmp/traj.txt' is no file in the program's working folder"),
+        ({"output": "../traj.txt"}, "output: '../traj.txt' is no file in the program's working folder"),
+        ({"output": "a/../../traj.txt"}, "is no file in the program's working folder"),
+        ({"output": "~/traj.txt"}, "is no file in the program's working folder"),
+        ({"output": ""}, "is no file in the program's working folder"),
+        ({"exit_codes": []}, "exit_codes"),
+        ({"exit_codes": [300]}, "exit_codes"),
+        ({"exit_codes": ["ok"]}, "exit_codes"),
     ],
 )
 def test_files_that_describe_no_program(toml, fields, words):

@@ -1,0 +1,232 @@
+"""How many raw units of a recording's depth make a metre of its ground truth, with a 95 % interval.
+
+Between two frames the truth gives the rotation, the corners and their depth give the translation. Its length is
+compared with the true one. What else can lie between the two is estimated along: a lever arm, the turn of axes, a shift
+in time, and the readout of a rolling shutter, each within what published recordings show.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import t as student
+
+from dynslam_bench.geometry import Array, Camera, se3
+from dynslam_bench.sequences.rgbd_motion import RgbdPair, TruthMotion
+
+ROTATION_SIGMA = np.radians(0.1)
+"""Standard deviation of the truth's rotation between two frames.
+
+Of 0.05, 0.1, 0.2 degrees and no bound, 0.1 gives translations with the least errors on Bonn, fr1_xyz and fr1_rpy."""
+LEVER_SIGMA_M = 0.02
+"""Bonn's camera is 0.019 m from its markers."""
+TURN_SIGMA = np.radians(2.0)
+SHIFT_SIGMA_S = 0.01
+READOUT_S, READOUT_SIGMA_S = 0.013, 0.013
+"""Mean and standard deviation of a readout that the camera does not state: from a global shutter to most of a frame."""
+STATED_READOUT_SIGMA_S = 0.005
+SYSTEMATIC = 0.03
+"""Relative standard deviation of what all pairs share: Bonn's own calibration has a scale of 1.059."""
+CAUCHY = 2.5
+"""Scale of the robust kernels in standard deviations."""
+LEAST_PAIRS = 8
+BLOCK = 2
+"""Successive pairs that are left out together: they share an image, and often the same people."""
+_ROUNDS = 20
+_READOUT_STEP_S = 0.03
+_RATE_S = 0.015
+"""Half the time over which the truth's turning rate is taken."""
+_SHIFT_S = 0.01
+_LEAST_PX = 0.3
+"""Least standard deviation of a corner: below it the images' rounding counts."""
+_LEAST_Z_M = 0.05
+
+
+@dataclass(frozen=True)
+class DepthScale:
+    """Lengths that depth images give, as multiples of the truth's.
+
+    Attributes:
+        value: The estimate; 5 for depths that are five times too large.
+        low: Lower end of the 95 % interval, not below 0.
+        high: Its upper end.
+    """
+
+    value: float
+    low: float
+    high: float
+
+    def excludes(self, share: float) -> bool:
+        """Whether the interval lies outside of the lengths that are right within `share`."""
+        return self.low > 1 + share or self.high < 1 / (1 + share)
+
+
+def depth_scale(
+    pairs: list[RgbdPair], truth: TruthMotion, start: Array, end: Array, camera: Camera, first_guess: float
+) -> DepthScale | None:
+    """Estimate the scale of the depth images.
+
+    Args:
+        pairs: Pairs of frames whose rotations agree with the truth's.
+        truth: The ground truth.
+        start: Stamps ``[N]`` of the pairs' first frames, on the truth's clock.
+        end: Those of the second frames.
+        camera: The stated camera.
+        first_guess: A scale near which the translations are looked for.
+
+    Returns:
+        The scale; None where there are too few pairs, or the truth does not move.
+    """
+    if len(pairs) < LEAST_PAIRS:
+        return None
+    relative = truth.between(start, end)[1]
+    rates = _turning_rates(truth, start), _turning_rates(truth, end)
+
+    # Translations under a global shutter, and how they change with the readout time.
+    still, rolling = (
+        np.stack(
+            [
+                translation_of(pair, T, (first, second), camera, readout_s, first_guess)
+                for pair, T, first, second in zip(pairs, relative, *rates, strict=True)
+            ]
+        )
+        for readout_s in (0.0, _READOUT_STEP_S)
+    )
+    by_readout = (rolling - still) / _READOUT_STEP_S
+    readout_s = camera.readout_s if camera.readout_s > 0 else READOUT_S
+    readout_sigma_s = STATED_READOUT_SIGMA_S if camera.readout_s > 0 else READOUT_SIGMA_S
+
+    # How the true translations change with a shift in time.
+    later = truth.between(start + _SHIFT_S, end + _SHIFT_S)[1]
+    earlier = truth.between(start - _SHIFT_S, end - _SHIFT_S)[1]
+    by_shift = (later - earlier)[:, :3, 3] / (2 * _SHIFT_S)
+
+    true = relative[:, :3, 3]
+    if not (np.linalg.norm(true, axis=1) > 0).any():
+        return None
+    columns = np.concatenate(
+        [
+            true[..., None],
+            relative[:, :3, :3] - np.eye(3),  # by the lever arm
+            -se3.hat(true),  # by the turn of the axes
+            by_shift[..., None],
+            -by_readout[..., None],
+        ],
+        axis=-1,
+    )
+    scaled = np.array([0.0, *[LEVER_SIGMA_M] * 3, *[TURN_SIGMA] * 3, SHIFT_SIGMA_S, 0.0])
+    fixed = np.array([0.0] * 8 + [readout_sigma_s])
+    return _regression(columns, still + readout_s * by_readout, scaled, fixed)
+
+
+def translation_of(
+    pair: RgbdPair, T_true: Array, rates: tuple[Array, Array], camera: Camera, readout_s: float, first_guess: float
+) -> Array:
+    """Translation ``[3]`` from the first camera to the second, in metres of the depth images.
+
+    A robust least-squares fit of the reprojection errors of all corners that were followed, not only of those on which
+    most agree: these may lie on people. It begins at the true motion, and the rotation stays near the true one.
+
+    Args:
+        pair: The pair of frames.
+        T_true: The true motion ``[4, 4]``.
+        rates: The camera's turning rates ``[3]`` at both frames, rad/s in the camera's axes.
+        camera: Its intrinsics.
+        readout_s: Readout time that is taken into account.
+        first_guess: Length of the translation at the beginning, as a multiple of the true one.
+    """
+    points = camera.unproject(pair.pixels_first, pair.depth_first)
+    points = _at_middle_row(points, pair.pixels_first, rates[0], camera, readout_s)
+    rays = camera.unproject(pair.pixels_second, np.ones(len(pair.pixels_second)))
+    pixels = camera.project(_at_middle_row(rays, pair.pixels_second, rates[1], camera, readout_s))
+    focal = np.array([camera.fx, camera.fy])
+    back = se3.inverse(T_true)
+    R_true = back[:3, :3]
+    R = R_true
+    t = first_guess * back[:3, 3]
+    for _ in range(_ROUNDS):
+        turned = points @ R.T
+        moved = turned + t
+        z = np.maximum(moved[:, 2], _LEAST_Z_M)
+        errors = moved[:, :2] / z[:, None] * focal + (camera.cx, camera.cy) - pixels
+        # the slopes of the pixels by the moved points, then by rotation and translation
+        by_point = np.zeros((len(points), 2, 3))
+        by_point[:, 0, 0] = camera.fx / z
+        by_point[:, 1, 1] = camera.fy / z
+        by_point[:, :, 2] = -moved[:, :2] * focal / z[:, None] ** 2
+        slopes = np.concatenate([-by_point @ se3.hat(turned), by_point], axis=2)
+        # robust weights by the median error
+        size = np.linalg.norm(errors, axis=1)
+        sigma = max(float(np.median(size)) / 1.18, _LEAST_PX)
+        weight = 1 / (1 + (size / sigma / CAUCHY) ** 2) / sigma**2
+        normal = np.einsum("nki,n,nkj->ij", slopes, weight, slopes)
+        pull = np.einsum("nki,n,nk->i", slopes, weight, errors)
+        # the rotation stays near the truth's
+        normal[:3, :3] += np.eye(3) / ROTATION_SIGMA**2
+        pull[:3] += se3.rotation_vectors((R @ R_true.T)[None])[0] / ROTATION_SIGMA**2
+        step = -np.linalg.solve(normal, pull)
+        R = _rotation(step[:3]) @ R
+        t = t + step[3:]
+        if np.abs(step).max() < 1e-6:
+            break
+    return np.asarray(-R.T @ t)
+
+
+def _turning_rates(truth: TruthMotion, stamps: Array) -> Array:
+    """The truth's turning rates ``[N, 3]`` at stamps ``[N]``, rad/s in the camera's axes."""
+    return truth.between(stamps - _RATE_S, stamps + _RATE_S)[2] / (2 * _RATE_S)
+
+
+def _at_middle_row(points: Array, pixels: Array, rate: Array, camera: Camera, readout_s: float) -> Array:
+    """Points ``[N, 3]`` in the camera at the time of its middle row, which it saw at the times of their rows."""
+    late = ((pixels[:, 1] + 0.5) / camera.height - 0.5) * readout_s
+    return np.asarray(np.einsum("nij,nj->ni", _rotation(late[:, None] * rate), points))
+
+
+def _rotation(turn: Array) -> Array:
+    """Rotation matrices ``[..., 3, 3]`` of rotation vectors ``[..., 3]``."""
+    return se3.exp(np.concatenate([np.zeros_like(turn), turn], axis=-1))[..., :3, :3]
+
+
+def _regression(columns: Array, measured: Array, scaled: Array, fixed: Array) -> DepthScale | None:
+    """Robust least squares of translations ``[N, 3]`` by columns ``[N, 3, K]``, of which the first is the scale's.
+
+    The interval comes from a jackknife over blocks of successive pairs.
+
+    Args:
+        columns: What the translations consist of.
+        measured: The translations.
+        scaled: Standard deviations ``[K]`` about 0 of the other columns' factors, as multiples of the scale.
+        fixed: Standard deviations that do not depend on the scale; 0 in both: no bound.
+    """
+    lengths = np.linalg.norm(measured, axis=1)
+    scale = float(np.median(lengths) / np.median(np.linalg.norm(columns[..., 0], axis=1)))
+    sigma = float(np.median(lengths)) / 2
+    weight = np.ones(len(measured))
+    if not (np.isfinite(scale) and sigma > 0):
+        return None
+    for _ in range(_ROUNDS):
+        deviation = np.maximum(scaled * scale, fixed)
+        prior = np.diag(np.where(deviation > 0, 1 / np.maximum(deviation, 1e-12) ** 2, 0.0))
+        normals = np.einsum("nki,n,nkj->nij", columns, weight, columns) / sigma**2
+        pulls = np.einsum("nki,n,nk->ni", columns, weight, measured) / sigma**2
+        factors = np.linalg.solve(normals.sum(axis=0) + prior, pulls.sum(axis=0))
+        scale = max(float(factors[0]), 1e-3)
+        off = np.linalg.norm(measured - columns @ factors, axis=1)
+        sigma = max(float(np.median(off)) / 1.54, 1e-4)  # 1.54: median length of a normal vector in space
+        weight = 1 / (1 + (off / sigma / CAUCHY) ** 2)
+
+    # The variance: of the scale without one block after the other, and of what the bounds leave open.
+    blocks = np.arange(len(measured)) // BLOCK
+    count = int(blocks[-1]) + 1
+    parts = []
+    for block in range(count):
+        kept = blocks != block
+        part = np.linalg.solve(normals[kept].sum(axis=0) + prior, pulls[kept].sum(axis=0))
+        parts.append(float(part[0]))
+    without = np.array(parts)
+    inverse = np.linalg.inv(normals.sum(axis=0) + prior)
+    jackknife = (count - 1) / count * float(((without - without.mean()) ** 2).sum())
+    left_open = float((inverse @ prior @ inverse)[0, 0])
+    variance = max(jackknife + left_open, float(inverse[0, 0]))
+    half = float(np.hypot(student.ppf(0.975, count - 1) * np.sqrt(variance), 1.96 * SYSTEMATIC * factors[0]))
+    return DepthScale(float(factors[0]), max(float(factors[0]) - half, 0.0), max(float(factors[0]) + half, 0.0))
