@@ -284,6 +284,28 @@ def test_data_and_programs_that_change_meanwhile_are_noticed_but_no_output(tmp_p
             identity.check_unchanged(asked, begun=begun)
 
 
+PROGRAM = """
+import os, sys
+from pathlib import Path
+lines = [line.split() for line in Path(sys.argv[1], "rgb.txt").read_text().splitlines() if line[0] != "#"]
+x = float(os.environ.get("IDENTITY_TOY_GAIN", 0)) + float(os.environ.get("IDENTITY_TOY_OTHER", 0))
+Path("trajectory.txt").write_text("".join(f"{stamp} {x} 0 0 0 0 0 1\\n" for stamp, _ in lines))
+"""
+
+
+@pytest.mark.parametrize(("variable", "counts"), [("IDENTITY_TOY_GAIN", True), ("IDENTITY_TOY_OTHER", False)])
+def test_a_program_gets_the_variables_that_it_declares_and_their_values_count(
+    variable: str, counts: bool, tmp_path: Path, store: RunStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(tmp_path / "program" / "slam.py", PROGRAM)
+    lines = ['name = "toy"', 'command = ["{python}", "slam.py", "{sequence}"]', 'environment = ["IDENTITY_TOY_GAIN"]']
+    file = write(tmp_path / "program" / "toy.toml", "\n".join(lines))
+    spec = RunSpec(tracker=f"batch:{file}", sequence=str(write_folder(tmp_path / "toy", 4)))
+    assert made_again(spec, store, partial(monkeypatch.setenv, variable, "2")) is counts
+    trajectory = store.folder(store.ids()[-1]) / "trajectory_final.txt"
+    assert trajectory.is_file()
+
+
 @pytest.mark.parametrize("module", sorted(identity.LIBRARIES.values()))
 def test_another_module_before_an_installed_library_is_another_run(
     module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -393,9 +393,11 @@ class ReadRecorder:
 
     # -- programs ------------------------------------------------------------------------------------------------------
 
-    def _on_popen(self, frame: FrameType, executable: Any, words: Any, folder: Any, _: Any) -> None:
+    def _on_popen(self, frame: FrameType, executable: Any, words: Any, folder: Any, environment: Any) -> None:
         given = [words] if isinstance(words, str | bytes | os.PathLike) else list(words)
         self._start_program(frame, [executable, *given[1:]], folder)
+        if environment is not None and _is_adapter(frame):  # an adapter's program gets these variables and no others
+            self._note_variables([name for name in map(os.fsdecode, environment) if is_counted(name)])
 
     def _on_exec(self, frame: FrameType, path: Any, words: Any, _: Mapping[Any, Any] | None) -> None:
         self._start_program(frame, [path, *list(words)[1:]])

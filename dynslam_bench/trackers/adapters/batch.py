@@ -16,6 +16,7 @@ import psutil
 from dynslam_bench.contracts import Frame, TrackerContext, TrackResult
 from dynslam_bench.core import TemporaryFolder, TrackerError, TrackerTimeoutError, TrajectoryError, raising
 from dynslam_bench.core.code_files import files_of_command
+from dynslam_bench.core.programs import program_environment
 from dynslam_bench.geometry import Camera, Trajectory, load_tum, nearest_gap, read_table, se3
 from dynslam_bench.trackers.adapters.orbslam3 import settings_yaml
 from dynslam_bench.trackers.adapters.specs import BatchProgram, BatchSettings, OrbSlam3Settings
@@ -172,7 +173,8 @@ class BatchTracker:
             self._started_ns = os.fstat(out.fileno()).st_mtime_ns
             process = subprocess.Popen(
                 words, stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT, cwd=folder / "work",
-                env=os.environ | {"OMP_NUM_THREADS": str(self._context.threads)}, start_new_session=True,
+                env=program_environment(self._program.environment) | {"OMP_NUM_THREADS": str(self._context.threads)},
+                start_new_session=True,
                 preexec_fn=end_with_parent(),
             )  # fmt: skip
         code, peak = None, 0

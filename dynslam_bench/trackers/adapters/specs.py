@@ -79,6 +79,9 @@ class SubprocessSettings(ProgramSettings):
     exit_codes: tuple[ExitCode, ...] = Field(
         (0,), min_length=1, description="exit codes after `close` that are no failure; -N: killed by signal N"
     )
+    environment: tuple[str, ...] = Field(
+        (), description="names of environment variables that the program gets beside the usual ones; their values count"
+    )
 
     def words(self) -> list[str]:
         """The command's words.
@@ -119,6 +122,8 @@ class BatchProgram(Record):
             the TOML file's folder is that file.
         output: What it writes, a relative path in its working folder, which is new for every run.
         exit_codes: Exit codes that are no failure; -N if signal N killed it.
+        environment: Names of environment variables that it gets beside the usual ones; their values count in a run's
+            identity.
         format: ``tum`` (stamp tx ty tz qx qy qz qw, camera to world), or ``indices``: the frame's index for the stamp.
         sensors: ``rgb`` for a program without depth.
         version: Part of a run's identity.
@@ -132,6 +137,7 @@ class BatchProgram(Record):
     command: list[str] = Field(min_length=1)
     output: str = "trajectory.txt"
     exit_codes: list[ExitCode] = Field(default=[0], min_length=1)
+    environment: list[str] = Field(default=[])
     format: Literal["tum", "indices"] = "tum"
     sensors: Literal["rgbd", "rgb"] = "rgbd"
     version: str = ""

@@ -37,6 +37,7 @@ from dynslam_bench.core import (
     raising,
 )
 from dynslam_bench.core.code_files import files_of_command
+from dynslam_bench.core.programs import program_environment
 from dynslam_bench.core.seeding import derive_seed
 from dynslam_bench.geometry import Camera, Trajectory, se3
 from dynslam_bench.trackers.adapters.specs import ProgramSettings, SubprocessSettings
@@ -65,7 +66,7 @@ class Program:
         name: For messages.
         command: Program and arguments.
         folder: Its working folder; None for the current one.
-        environment: Variables to set beside the inherited ones.
+        environment: All environment variables that it gets; None for those of `program_environment`.
 
     Raises:
         TrackerError: The program cannot be started.
@@ -87,7 +88,7 @@ class Program:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 cwd=folder,
-                env={**os.environ, **(environment or {})},
+                env=dict(program_environment() if environment is None else environment),
                 start_new_session=True,
                 preexec_fn=end_with_parent(),
             )
@@ -388,6 +389,7 @@ class ProgramTracker:
         images: How it gets the images, see `ImageExchange`.
         folder: Its working folder; None for the current one.
         exit_codes: Exit codes with which it may end after `close`; None for any.
+        variables: Names of environment variables that it gets beside those of `program_environment`.
     """
 
     def __init__(
@@ -400,8 +402,10 @@ class ProgramTracker:
         images: Literal["raw", "png"] = "raw",
         folder: Path | None = None,
         exit_codes: Sequence[int] | None = None,
+        variables: Sequence[str] = (),
     ) -> None:
         self._exit_codes = exit_codes
+        self._variables = variables
         self._failed = False  # whether a fault of the program was raised
         self._images: Literal["raw", "png"] = images
         self.name, self.limits, self.context = name, settings, context
@@ -425,7 +429,7 @@ class ProgramTracker:
         """
         self._end()
         names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-        environment = dict.fromkeys(names, str(self.context.threads))
+        environment = program_environment(self._variables) | dict.fromkeys(names, str(self.context.threads))
         self._exchange = ImageExchange(camera, self._images)
         request = {
             "op": "reset",
@@ -548,4 +552,13 @@ def build(settings: SubprocessSettings, context: TrackerContext) -> ProgramTrack
     """
     command, kind = settings.words(), FinalizingProgramTracker if settings.final else ProgramTracker
     name, folder = Path(command[0]).name, settings.working_folder
-    return kind(name, settings, context, command, images=settings.images, folder=folder, exit_codes=settings.exit_codes)
+    return kind(
+        name,
+        settings,
+        context,
+        command,
+        images=settings.images,
+        folder=folder,
+        exit_codes=settings.exit_codes,
+        variables=settings.environment,
+    )
