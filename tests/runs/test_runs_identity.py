@@ -288,7 +288,7 @@ PROGRAM = """
 import os, sys
 from pathlib import Path
 lines = [line.split() for line in Path(sys.argv[1], "rgb.txt").read_text().splitlines() if line[0] != "#"]
-x = float(os.environ.get("IDENTITY_TOY_GAIN", 0)) + float(os.environ.get("IDENTITY_TOY_OTHER", 0))
+x = float(os.environ.get("IDENTITY_TOY_GAIN", 0)) + float(os.environ.get("IDENTITY_TOY_" + "OTHER", 0))
 Path("trajectory.txt").write_text("".join(f"{stamp} {x} 0 0 0 0 0 1\\n" for stamp, _ in lines))
 """
 
