@@ -9,6 +9,8 @@ clone_state  # on SlamEnv, for agents: a copy of the episode (docs/reference/env
 restore_state  # the same: back to it
 rtf  # on Outcome, for objectives of one's own (docs/how-to/study.md)
 
+modules_of_run  # runs.own_code: tests and a benchmark ask which modules count
+__class__  # runs.process.announcing: Python reads it
 compile_kernels  # cli.demo: .ci/run calls it, before the tests
 exact_depth  # on rendered sequences: depth without the sensor's noise, to judge measured depth by
 
@@ -18,6 +20,8 @@ opposites  # flow.moth_flame: the same
 # called by name: specs name their factories as "module:name"
 OrbExtractor  # features.registry
 build_daisy  # flow.daisy
+build_mask_stage  # trackers.systems.composition
+score_job  # runs.scoring
 build_recorded  # segmentation.registry
 build_oracle  # segmentation.registry
 build_embedded  # segmentation.registry

@@ -138,23 +138,10 @@ class ProgramReads:
     Attributes:
         files: Executables and everything that is mapped into memory.
         commands: The command of each process.
-        environment: The variables that the first process was started with.
     """
 
     files: set[str] = field(default_factory=set)
     commands: set[Command] = field(default_factory=set)
-    environment: dict[str, str] = field(default_factory=dict)
-
-
-def program_reads(pid: int) -> ProgramReads:
-    """What a program's process and all its descendants show now; nothing where it has ended."""
-    reads = ProgramReads()
-    with contextlib.suppress(psutil.Error):  # it has ended meanwhile
-        top = psutil.Process(pid)
-        reads.environment = top.environ()
-        for process in (top, *top.children(recursive=True)):
-            look_at(process, reads)
-    return reads
 
 
 def look_at(process: psutil.Process, reads: ProgramReads) -> None:

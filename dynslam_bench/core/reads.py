@@ -401,11 +401,6 @@ class Verifier:
         return content_now(anchors.path(name))
 
 
-def changed_reads(reads: Reads, anchors: Anchors) -> str:
-    """What `Verifier.changed` says of one run."""
-    return Verifier().changed(reads, anchors)
-
-
 _SECTIONS = ("search", "environment", "modules", "distributions", "folders", "files", "links", "programs")
 """The attributes of `Reads` in the order in which they are compared: what explains most comes first."""
 

@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core import TrajectoryError
 from dynslam_bench.geometry.stamps import LEAST_GAP_NS, NS_PER_S, format_ns, from_seconds, ns_of
+
+T = TypeVar("T", bound="Trajectory")
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +80,7 @@ class Trajectory:
         exact = None if self.exact_ns is None else self.exact_ns[index]
         return type(self)(self.timestamps[index], self.T_world_cam[index], exact)
 
-    def with_poses(self, T_world_cam: NDArray[np.float64]) -> Trajectory:
+    def with_poses(self: T, T_world_cam: NDArray[np.float64]) -> T:
         """Other poses ``[N, 4, 4]`` at the same stamps."""
         return type(self)(self.timestamps, T_world_cam, self.exact_ns)
 

@@ -289,7 +289,9 @@ def test_a_result_that_came_back_counts_in_place_of_one_between(store: RunStore)
     assert remark.startswith("2 programs, equal on 5 runs; superseded code: 6 of 6 runs differ, ATE × ")
 
 
-@pytest.mark.parametrize("started", ["2031-01-01T00:00:00+00:00", NEXT_YEAR, "2999-12-31T00:00:00Z"])
+@pytest.mark.parametrize(
+    "started", ["2031-01-01T00:00:00+00:00", NEXT_YEAR, "2999-12-31T00:00:00Z"], ids=["2031", "next year", "2999"]
+)
 def test_a_start_in_the_future_is_never_preferred_and_is_named(store: RunStore, tmp_path: Path, started: str) -> None:
     if datetime.now(timezone.utc) >= datetime.fromisoformat(started.replace("Z", "+00:00")):
         pytest.skip("it is no date in the future any more")

@@ -9,10 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
-from dynslam_bench.core.programs import is_counted, program_environment, program_reads
-from dynslam_bench.core.reads import Anchors, Reads, Verifier, changed_reads, digest_of, search_now
+from dynslam_bench.core.programs import ProgramReads, is_counted, look_at, program_environment
+from dynslam_bench.core.reads import Anchors, Reads, Verifier, digest_of, search_now
 
 SERVER = Path(__file__).with_name("reads_server.py")
 
@@ -858,11 +859,10 @@ def test_the_environment_of_a_program() -> None:
 
 
 def test_what_a_process_shows() -> None:
-    shown = program_reads(os.getpid())
+    shown = ProgramReads()
+    look_at(psutil.Process(), shown)
     assert os.path.realpath(sys.executable) in shown.files
-    assert shown.environment["PATH"] == os.environ["PATH"]
-    assert any(command.words[0] == sys.executable for command in shown.commands) or shown.commands
-    assert program_reads(2**22 + 1).files == set()
+    assert len(shown.commands) == 1
 
 
 # -- comparing many runs -----------------------------------------------------------------------------------------------
@@ -885,4 +885,4 @@ def test_a_verifier_looks_at_each_thing_once(tmp_path: Path, monkeypatch: pytest
     assert [verifier.changed(record, anchors) for record in records] == [""] * 4
     assert len(looked) == 5
     (tmp_path / "own2").write_text("another")
-    assert [changed_reads(record, anchors) for record in records] == ["", "", "the file own2", ""]
+    assert [Verifier().changed(record, anchors) for record in records] == ["", "", "the file own2", ""]
