@@ -38,5 +38,5 @@ def library_identity(module: str) -> str:
 def search_path() -> dict[str, str]:
     """The variables of the linker that are set."""
     anchors = Anchors(plugin=None, work=Path.cwd())
-    found = {name: search_now(name, os.environ, anchors) for name in SEARCH_VARIABLES}
-    return {name: folders for name, folders in found.items() if folders}
+    folders_by_name = {name: search_now(name, os.environ, anchors) for name in SEARCH_VARIABLES}
+    return {name: folders for name, folders in folders_by_name.items() if folders}

@@ -202,10 +202,10 @@ def value_digest(value: str | None) -> str:
 
 
 def search_now(name: str, environment: Mapping[str, str], anchors: Anchors) -> str:
-    """A search path, or the file that a command is found to be."""
+    """A search path, or the file that a command is command to be."""
     if name.startswith(COMMAND):
-        found = shutil.which(name[len(COMMAND) :], path=environment.get("PATH"))
-        return ABSENT if found is None else anchors.name(os.path.abspath(found))
+        command = shutil.which(name[len(COMMAND) :], path=environment.get("PATH"))
+        return ABSENT if command is None else anchors.name(os.path.abspath(command))
     return anchors.names(folders_of(environment.get(name, "")))
 
 
@@ -307,11 +307,11 @@ class ImportPath:
         return namespace
 
     def place(self, top: str, anchors: Anchors) -> str:
-        """Where a top-level module is found: `INSTALLED`, the name of its file or folder, or `ABSENT`."""
-        found = self.find(top)
-        if found and any(name.endswith(_METADATA) for name in self._names[os.path.dirname(found)]):
+        """Where a top-level module is module_file: `INSTALLED`, the name of its file or folder, or `ABSENT`."""
+        module_file = self.find(top)
+        if module_file and any(name.endswith(_METADATA) for name in self._names[os.path.dirname(module_file)]):
             return INSTALLED
-        return anchors.name(found)
+        return anchors.name(module_file)
 
 
 def _normalised(distribution: str) -> str:

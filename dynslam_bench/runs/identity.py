@@ -206,9 +206,9 @@ def check_degradation(strengths: Mapping[str, float]) -> None:
         RunError: Unknown name.
         DynslamError: A strength out of its range.
     """
-    known = set(Degradation.__dataclass_fields__) - {"seed"}
-    for unknown in sorted(set(strengths) - known):
-        raise RunError(f"unknown degradation '{unknown}'", did_you_mean(unknown, known))
+    degradations = set(Degradation.__dataclass_fields__) - {"seed"}
+    for unknown in sorted(set(strengths) - degradations):
+        raise RunError(f"unknown degradation '{unknown}'", did_you_mean(unknown, degradations))
     Degradation(seed=0, **strengths)
 
 
@@ -237,8 +237,8 @@ def _files_of(tracker: TrackerSpec, settings: Settings, source: str) -> tuple[di
 
 def libraries() -> dict[str, str]:
     """What computes with a run's data: versions of the modules that are imported, and what comes before them."""
-    found = {name: library_identity(module) for name, module in LIBRARIES.items()}
-    return found | search_path()
+    identities = {name: library_identity(module) for name, module in LIBRARIES.items()}
+    return identities | search_path()
 
 
 def source_digests(parts: Iterable[str]) -> dict[str, str]:

@@ -284,7 +284,7 @@ class Collector:
         if note.stamp is None and self.is_of_program(stamp):
             return
         if note.digest and content_now(path) == note.digest:
-            note.stamp = stamp  # it was written anew with the same content
+            note.stamp = stamp  # it was written again with the same content
         else:
             self.notes.changed.append(path)
 
@@ -315,8 +315,8 @@ class Collector:
                 modules.files[_on_disk(file)] = was_loaded
             files_of.setdefault(top, file)
         for top, file in files_of.items():
-            found = imports.find(top)
-            if found and file.startswith(found):  # else a plug-in has changed the path
+            module_file = imports.find(top)
+            if module_file and file.startswith(module_file):  # else a plug-in has changed the path
                 modules.places[top] = imports.place(top, self._anchors)
         for top in set(self.notes.modules) - sys.modules.keys():
             modules.places[top] = imports.place(top, self._anchors)

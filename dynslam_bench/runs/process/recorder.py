@@ -88,7 +88,7 @@ class ReadRecorder:
         self._anchors = anchors
         self._folders = list(private)
         self._plugins = plugins
-        self._unheard: set[int] = set()
+        self._ignored_threads: set[int] = set()
         self._error: Exception | None = None
         self._ended = threading.Event()
         self._looked: dict[tuple[int, float], float] = {}
@@ -154,14 +154,14 @@ class ReadRecorder:
 
     def so_far(self) -> Reads:
         """What was read so far; it may change until the end."""
-        with self._hearing_nothing():
+        with self._ignoring_own_reads():
             return self._collector.collect(self._collector.modules())
 
     def snapshot(self) -> str:
         """Digest of everything that was read so far; costs nothing where nothing was read since the last call."""
         count, value = self._snapshot
         if count != self.count:
-            with self._hearing_nothing():
+            with self._ignoring_own_reads():
                 count = self.count
                 value = digest_of(self._collector.collect(self._collector.modules()))
             self._snapshot = (count, value)
@@ -176,9 +176,9 @@ class ReadRecorder:
             FileNotFoundError: Byte code is not to be used.
         """
         thread = threading.get_ident()
-        if thread in self._unheard:
+        if thread in self._ignored_threads:
             return
-        self._unheard.add(thread)
+        self._ignored_threads.add(thread)
         try:
             self._handlers[event](frame, *arguments)
         except _StaleByteCode:
@@ -186,16 +186,16 @@ class ReadRecorder:
         except Exception as error:  # a fault of the recorder's own, which must not become one of the plug-in
             self._error = self._error or error
         finally:
-            self._unheard.discard(thread)
+            self._ignored_threads.discard(thread)
 
     @contextmanager
-    def _hearing_nothing(self) -> Iterator[None]:
+    def _ignoring_own_reads(self) -> Iterator[None]:
         thread = threading.get_ident()
-        self._unheard.add(thread)
+        self._ignored_threads.add(thread)
         try:
             yield
         finally:
-            self._unheard.discard(thread)
+            self._ignored_threads.discard(thread)
 
     def _note(self, kind: str, name: str) -> None:
         """Count what was read; a forked process writes it down for the one that makes the run."""
@@ -426,7 +426,7 @@ class ReadRecorder:
 
     def _watch(self) -> None:
         """Look at the programs until the end; runs in a thread of its own, as the run may wait for a program."""
-        self._unheard.add(threading.get_ident())
+        self._ignored_threads.add(threading.get_ident())
         while not self._ended.wait(_LOOK_S):
             self._look_at_programs(_LOOK_S / 2)
 
@@ -438,7 +438,7 @@ class ReadRecorder:
         """
         if not self._notes.commands:
             return
-        with self._hearing_nothing():
+        with self._ignoring_own_reads():
             own = psutil.Process().cmdline()
             for process in psutil.Process().children(recursive=True):
                 try:
@@ -455,8 +455,8 @@ class ReadRecorder:
 
     def begin_log(self) -> None:
         """In a forked process: write down what is read, as it ends without a word."""
-        self._unheard.clear()  # threads of the other process
-        with self._hearing_nothing():
+        self._ignored_threads.clear()  # threads of the other process
+        with self._ignoring_own_reads():
             path = self._folders[0] / _LOG.format(os.getpid())
             self._log = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
 
