@@ -31,6 +31,7 @@ from dynslam_bench.sequences.rgbd_motion import (
     RgbdPair,
     TruthMotion,
     agreement,
+    explained_share,
     match,
     motions_of,
     rgbd_pairs,
@@ -349,6 +350,12 @@ _FINDINGS: dict[str, tuple[str, str, str]] = {
         "to another recording",
         "make sure that groundtruth.txt is this recording's, or check a part with a clearer motion",
     ),
+    "truth-unclear/moving": (
+        "",
+        "the truth explains {share:.0f} % of the corners, with its motions in another order at most {by_chance:.0f} %: "
+        "it is of this recording, but moving things fill the view, and camera and depth factor were not compared",
+        "check a part with fewer people",
+    ),
     "truth-axes": (
         "degrees",
         "the truth's axes are turned by {value:.0f} degrees against the camera's: so they explain {then:.0f} % of the "
@@ -440,6 +447,7 @@ _NOT_COMPARED = {"too-short", "no-depth", "no-truth", "motion-unmeasured", "no-m
 _NOTES = {
     *_NOT_COMPARED,
     "motion-unmeasured/small",
+    "truth-unclear/moving",
     "truth-markers",
     "depth-factor-unmeasured",
     "depth-factor-unmeasured/apart",
@@ -745,6 +753,9 @@ LEAST_TIME_S = 0.05
 UNRELATED = 0.48
 """The best agreement of a truth of another recording stays below; where moving things fill the view it is 0.55."""
 LEAST_UNLIKE = 12
+LEAST_SHARE, BEYOND_CHANCE = 0.1, 1.3
+"""Share of the corners that a truth of this recording explains at least, also where people fill the view, and its ratio
+to the largest share with the truth's motions in another order: 1.4 and more on 55 recordings."""
 LEAST_UNIT = 30.0
 """Ratio of true to measured translations from which the truth's unit is no metre: no depth factor is that wrong."""
 _STEP_S = 0.025
@@ -828,11 +839,30 @@ def _compared(
     needed = GOOD if long or abs(best.shift_s) < LEAST_TIME_S else SURE
     now, then = stated.clearest, best.clearest
     if differs and then >= needed and 1 - then < 0.65 * (1 - now) and now < then - 0.05:
-        turned = None if best.reading == READINGS[0] else _turned(motions, readings[READINGS[0]], stated, best)
-        return _misread(motions, readings, stated, best) if turned is None else [turned]
+        as_stated = readings[stated.reading].between(motions.start + stated.shift_s, motions.end + stated.shift_s)[1]
+        as_best = readings[best.reading].between(motions.start + best.shift_s, motions.end + best.shift_s)[1]
+        # where people fill the view, another reading may fit their motion, but not that of the background
+        if explained_share(pairs, as_best, camera) > explained_share(pairs, as_stated, camera):
+            turned = None if best.reading == READINGS[0] else _turned(motions, readings[READINGS[0]], stated, best)
+            return _misread(motions, readings, stated, best) if turned is None else [turned]
     if stated.rotation >= UNLIKE and stated.weights[0] >= 0.3:
         return _measured(motions, readings[READINGS[0]], stated, camera, pairs)
+    share, by_chance = _in_other_orders(motions, readings[READINGS[0]], stated, camera, pairs)
+    if share > max(LEAST_SHARE, BEYOND_CHANCE * by_chance):
+        return [finding_of("truth-unclear/moving", share, share=100 * share, by_chance=100 * by_chance)]
     return _otherwise(motions, readings, stated, best, tried)
+
+
+def _in_other_orders(
+    motions: Motions, truth: TruthMotion, stated: Match, camera: Camera, pairs: list[RgbdPair]
+) -> tuple[float, float]:
+    """The share of corners that the truth explains, and the largest one with its motions in another order.
+
+    Of a truth of another recording all orders explain as much.
+    """
+    relative = truth.between(motions.start + stated.shift_s, motions.end + stated.shift_s)[1]
+    others = [explained_share(pairs, np.roll(relative, by, axis=0), camera) for by in range(1, len(pairs))]
+    return explained_share(pairs, relative, camera), max(others, default=1.0)
 
 
 def _is_turned(motions: Motions, turned: Trajectory, stated: Match) -> bool:
@@ -933,10 +963,11 @@ def _measured(
     if explained and best != "scale":
         return [_fitted(best, fits[best], before, camera)]
     if not explained and stated.weights[1] >= 0.4 and stated.translation < UNLIKE:
-        steps = motions.translation[agreeing]
-        in_other_axes = _positions(steps, first[agreeing, :3, :3], relative[:, :3, 3], stated)
-        if in_other_axes:
-            return in_other_axes
+        in_other_axes = _positions(motions.translation[agreeing], first[agreeing, :3, :3], relative, stated)
+        if in_other_axes is not None:
+            finding, turned = in_other_axes
+            if explained_share(used, turned, camera) > explained_share(used, relative, camera):
+                return [finding]
     first_guess = float(np.exp(-fits["scale"].value["scale"][0]))
     share = float(np.median([pair.depth_share for pair in used]))
     if share < _LEAST_DEPTH:
@@ -977,18 +1008,33 @@ def _three_digits(value: float) -> str:
     return f"{float(f'{value:.3g}'):g}"
 
 
-def _positions(steps: Array, R_world_first: Array, true_steps: Array, stated: Match) -> list[Finding]:
-    """Positions in other axes than the orientations, or mirrored, of translations in the camera's axes ``[N, 3]``."""
-    in_world = [np.einsum("nij,nj->ni", R_world_first, motion) for motion in (steps, true_steps)]
-    for measured, true, where in ((*in_world, "world"), (steps, true_steps, "camera")):
+def _positions(steps: Array, R_world_first: Array, relative: Array, stated: Match) -> tuple[Finding, Array] | None:
+    """Positions in other axes than the orientations, or mirrored.
+
+    Args:
+        steps: Measured translations in the first camera's axes ``[N, 3]``.
+        R_world_first: The truth's rotations at the first frames ``[N, 3, 3]``.
+        relative: The truth's motions ``[N, 4, 4]``.
+        stated: How well the truth agrees as it is.
+
+    Returns:
+        The finding, and the motions with positions in the orientations' axes; None where these explain little.
+    """
+    to_world = R_world_first, np.swapaxes(R_world_first, 1, 2)
+    stays = np.broadcast_to(np.eye(3), R_world_first.shape)
+    for where, (R, back) in (("world", to_world), ("camera", (stays, stays))):
+        measured = np.einsum("nij,nj->ni", R, steps)
+        true = np.einsum("nij,nj->ni", R, relative[:, :3, 3])
         W = rotation_between(measured, true, proper=False)
         alike = agreement(measured @ W.T, true)
         angle = _degrees(W)
         if alike >= GOOD and alike > stated.translation + 0.2 and (np.linalg.det(W) < 0 or angle > 15):
             how = "mirrored" if np.linalg.det(W) < 0 else f"turned by {angle:.0f} degrees"
             shares = {"then": 100 * alike, "now": 100 * stated.translation}
-            return [finding_of("truth-axes/positions", angle, how=how, where=where, **shares)]
-    return []
+            turned = relative.copy()
+            turned[:, :3, 3] = np.einsum("nij,nj->ni", back, true @ W)
+            return finding_of("truth-axes/positions", angle, how=how, where=where, **shares), turned
+    return None
 
 
 def _explains(name: str, fit: Fit, before: Fit, pairs: list[RgbdPair]) -> bool:

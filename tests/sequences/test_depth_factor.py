@@ -30,9 +30,11 @@ class Recording:
         scale: By which the depth is too large.
         readout_s: Of the rolling shutter.
         people: Part of the points that walk.
+        turning: Standard deviation of the people's turn from image to image, rad.
         lever_m: Of the camera from the body whose poses the truth holds.
         late_s: By which the truth is late.
         noise_px: Standard deviation of the corners.
+        followed: Whether the measured motions are those relative to the people: most corners lie on them.
     """
 
     def __init__(
@@ -44,9 +46,11 @@ class Recording:
         scale=1.0,
         readout_s=0.0,
         people=0.0,
+        turning=0.0,
         lever_m=0.0,
         late_s=0.0,
         noise_px=0.4,
+        followed=False,
     ):
         rng = np.random.default_rng(seed)
         frequency = rng.uniform(0.2, 0.9, 6)
@@ -68,13 +72,17 @@ class Recording:
             depth = rng.uniform(1.0, 4.0, 200)
             world = self._seen(pose, self.stamps[first], pixels, depth, readout_s)
             walking = rng.random(200) < people
-            world[walking] += rng.normal(0, 0.1, 3)
+            walk = se3.exp(np.concatenate([rng.normal(0, 0.1, 3), rng.normal(0, turning, 3)]))
+            world[walking] = world[walking] @ walk[:3, :3].T + walk[:3, 3]
             second = self._shown(pose, self.stamps[first + STEP], world, readout_s) + rng.normal(0, noise_px, (200, 2))
             measured = scale * depth * (1 + rng.normal(0, 0.01, 200))
-            motion = se3.inverse(pose(self.stamps[first])) @ pose(self.stamps[first + STEP])
+            walked = se3.inverse(walk) if followed else np.eye(4)
+            motion = se3.inverse(pose(self.stamps[first])) @ walked @ pose(self.stamps[first + STEP])
             motion[:3, 3] *= scale
             moved = float(np.median(np.linalg.norm(second - pixels, axis=1)))
-            self.pairs.append(RgbdPair(first, first + STEP, pixels, measured, second, ~walking, motion, moved, 0.9))
+            self.pairs.append(
+                RgbdPair(first, first + STEP, pixels, measured, second, walking == followed, motion, moved, 0.9)
+            )
 
     def _late(self, pixels, readout_s):
         return ((pixels[:, 1] + 0.5) / CAMERA.height - 0.5) * readout_s
@@ -232,6 +240,33 @@ def test_the_verdict_ends_with_whether_the_recording_is_ready(severities, ids, e
     diagnosis = Diagnosis("x", 40, tuple(found))
     assert diagnosis.verdict.endswith(end)
     assert diagnosis.ok == (not diagnosis.verdict.endswith("not ready"))
+
+
+@pytest.mark.parametrize("people", [0.55, 0.7, 0.8])
+def test_people_who_turn_and_fill_the_view_make_no_fault_of_the_truth(people):
+    """The motions that most corners agree on are the people's; the truth explains the other corners."""
+    for scale in (1.0, 0.2):
+        recording = Recording(0, people=people, turning=0.2, followed=True, scale=scale)
+        (finding,) = found_in(recording).values()
+        assert (finding.id, finding.severity) == ("truth-unclear", "note")
+        assert "it is of this recording" in finding.text
+
+
+@pytest.mark.parametrize("people", [0.55, 0.7])
+@pytest.mark.parametrize("speed", [0.1, 0.3])
+def test_people_who_walk_and_fill_the_view_make_no_fault_of_the_depth(people, speed):
+    sound = Recording(0, people=people, followed=True, speed=speed)
+    assert all(finding.severity == "note" for finding in found_in(sound).values())
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("people", [0.0, 0.7])
+def test_the_truth_of_another_recording_is_not_taken_for_one_with_people(seed, people):
+    recording = Recording(0, people=people, followed=people > 0)
+    recording.truth = Recording(seed).truth
+    findings = found_in(recording)
+    assert set(findings) <= {"truth-other-sequence", "truth-unclear", "truth-axes"}
+    assert all("it is of this recording" not in finding.text for finding in findings.values())
 
 
 PARTS = [("bonn/rgbd_bonn_crowd", 75, 195), ("bonn/rgbd_bonn_crowd", 0, 100), ("tum/rgbd_dataset_freiburg1_xyz", 0, 60)]
