@@ -837,7 +837,7 @@ def test_beside_tracking_the_segmenter_keeps_the_settings_that_it_began_with():
 
 def test_beside_tracking_nothing_comes_from_the_stage_cache(tmp_path):
     network = Square()
-    cached = CachedSegmenter(lambda: network, "test", StageCache(tmp_path))
+    cached = CachedSegmenter(lambda: network, "test", StageCache(tmp_path), lambda: "code")
     for _ in range(2):
         stage = MaskScheduler(ASYNC, ConfiguredSegmenter(cached, ASYNC, "test"))
         for index in range(5):

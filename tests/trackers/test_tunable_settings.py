@@ -28,6 +28,9 @@ from dynslam_bench.core.settings import (
     online_parameters,
     tunable,
 )
+from dynslam_bench.core.stage_cache import StageCache
+from dynslam_bench.features.registry import CachedExtractor, build_extractor
+from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.sequences.synthetic import open_synthetic
 from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
 from dynslam_bench.trackers.registry import all_specs, resolve_settings
@@ -334,15 +337,19 @@ ASK = """
 import sys
 from pathlib import Path
 import numpy as np
-from dynslam_bench.core.stage_cache import StageCache
-from dynslam_bench.features.registry import build_extractor
-from dynslam_bench.features.registry import CachedExtractor
+from dynslam_bench.core.stage_cache import StageCache, record_reads
+from dynslam_bench.features.registry import build_extractor, cached_extractor
 from dynslam_bench.features.settings import FeatureSettings
 
+plugin = Path(sys.argv[1].rpartition(":")[0])
 settings = FeatureSettings(extractor=sys.argv[1], options={"weights": sys.argv[3]})
+cache = StageCache(Path(sys.argv[2]))
+if cached_extractor(build_extractor(settings), settings, cache, 1) is not None:
+    print("a plug-in is cached although nothing records what it reads")
+record_reads(plugin.read_text)  # in a run its recorder gives a digest of all that was read
 for content in sys.argv[4:]:
     Path(sys.argv[3]).write_text(content)
-    cached = CachedExtractor(build_extractor(settings), settings, StageCache(Path(sys.argv[2])), 1)
+    cached = cached_extractor(build_extractor(settings), settings, cache, 1)
     print(len(cached.extract(np.zeros((60, 60), np.uint8)).xy), cached.hit)
 """
 
@@ -357,6 +364,17 @@ def test_an_edited_extractor_or_other_weights_get_no_old_keypoints(tmp_path: Pat
 
     assert ask(3, "one", "one") == ["3 False", "3 True"]
     assert ask(5, "one", "three") == ["5 False", "5 False"]
+
+
+def test_a_result_during_which_a_plug_in_reads_something_is_not_stored(tmp_path: Path) -> None:
+    settings = FeatureSettings()
+    digests = iter(["before", "after the weights were read", "after", "after"])
+    cached = CachedExtractor(build_extractor(settings), settings, StageCache(tmp_path), 1, lambda: next(digests))
+    image = np.zeros((60, 60), np.uint8)
+    cached.extract(image)
+    assert not list(tmp_path.rglob("*.npz"))
+    cached.extract(image)
+    assert len(list(tmp_path.rglob("*.npz"))) == 1
 
 
 def test_a_missing_file_is_an_error_at_once_with_the_cache_too(rendered, tmp_path: Path) -> None:
