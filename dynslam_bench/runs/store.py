@@ -14,7 +14,7 @@ import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -41,6 +41,7 @@ from dynslam_bench.core import (
 from dynslam_bench.core.errors import left_out_of_messages
 from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, module_graph
 from dynslam_bench.core.plugins import ISOLATED_VARIABLE, has_imported_plugins
+from dynslam_bench.core.reads import remembered
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation import PROTOCOLS, Evaluation, Protocol, evaluate, get_protocol, hints
 from dynslam_bench.geometry import Trajectory, TumFile, format_ns, format_tum, load_tum, read_tum
@@ -361,7 +362,8 @@ class RunStore:
             if not path.is_file():
                 continue
             with raising(RunError, f"cannot read {path}", _REMOVED):
-                checksums[path.name] = file_sha256(path)
+                # many runs share the files of a sequence: each is read once a process
+                checksums[path.name] = remembered("sha256", str(path), partial(file_sha256, path))
         return checksums
 
     def changed(self, record: RunRecord) -> str:
