@@ -11,6 +11,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -48,8 +49,7 @@ def stage_code(entry_point: str) -> ReadsSoFar | None:
     """
     module = entry_point.rpartition(":")[0]
     if module in module_graph().modules:
-        code = module_graph().digest([module], PLUMBING)
-        return lambda: code
+        return partial(str, module_graph().digest([module], PLUMBING))  # unlike a lambda it can be pickled
     return _RECORDING[0] if _RECORDING else None
 
 

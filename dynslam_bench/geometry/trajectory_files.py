@@ -95,6 +95,10 @@ class TumFile:
         return self.every_line if repeats and self.every_line is not None else self.trajectory
 
 
+class NoPoseError(TrajectoryError):
+    """A file of poses is sound, and no row of it holds a valid pose."""
+
+
 def read_tum(path: str | Path) -> Trajectory:
     """The trajectory of a TUM file; see `load_tum` for the counts of what was skipped.
 
@@ -128,7 +132,7 @@ def load_tum(path: str | Path) -> TumFile:
         renormalised=int((np.abs(norm[valid] - 1) > _UNIT_TOLERANCE).sum()),
     )
     if not valid.any():
-        raise TrajectoryError(f"{path} holds no valid pose", "; ".join(counted.describe()))
+        raise NoPoseError(f"{path} holds no valid pose", "; ".join(counted.describe()))
     kept = values[valid]
     # stamps, exactly as they are written
     texts = [table.texts[row] for row in np.flatnonzero(valid)]

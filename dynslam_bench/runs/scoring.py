@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from dynslam_bench.core import InfrastructureError, TemporaryFolder
+from dynslam_bench.core.errors import left_out_of_messages
 from dynslam_bench.evaluation import Protocol
 from dynslam_bench.runs.process.fork_server import Child, make_job
 from dynslam_bench.runs.process.supervisor import supervise
@@ -52,6 +53,9 @@ def score_job(
     """In the child: score a run of a store, which keeps the metrics."""
     store = RunStore(job["store"])
     store.source = Path(job["source"])  # what messages call it
+    for folder in store.root.parents:
+        if folder.name == store.source.name:  # an archive, unpacked into a folder of its name
+            left_out_of_messages(folder.parent)
     record = store.read_whole(job["run_id"])
     metrics = store.score(record, Protocol.model_validate(job["protocol"]), again=job["again"])
     return {"type": "done", "metrics": metrics.to_line()}

@@ -14,6 +14,7 @@ import pytest
 from envs_toys import TARGET, write_folder
 
 from dynslam_bench.core import PluginError, RunError
+from dynslam_bench.core.plugins import has_imported_plugins
 from dynslam_bench.runs import RunSpec, RunStore, identity, resolve, run_many, run_one
 from dynslam_bench.runs.record import run_id_of
 from dynslam_bench.trackers import TRACKERS
@@ -358,7 +359,10 @@ def test_one_run_id_with_two_results_is_said_and_another_scheme_is_unverified(
     assert any(record.run_id in message for message in caplog.messages)
 
 
-def test_a_plug_in_that_patches_numpy_changes_no_score(tmp_path: Path, store: RunStore) -> None:
+def test_a_plug_in_that_patches_numpy_changes_no_score(
+    tmp_path: Path, store: RunStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dynslam_bench.runs.store.has_imported_plugins", has_imported_plugins)
     patching = PLUGIN + "\nif 'dynslam_bench.envs' in __import__('sys').modules:\n    np.sqrt = lambda x: 2 * x\n"
     spec, _ = a_plug_in(tmp_path, patching)
     other = RunSpec(tracker="never-move", sequence=spec.sequence)

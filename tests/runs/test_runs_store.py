@@ -225,7 +225,6 @@ def test_an_edited_trajectory_or_truth_is_not_scored_until_it_is_put_back(filled
 
 
 def test_metrics_hold_for_one_version_of_the_code(filled, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(store_module, "has_imported_plugins", lambda: False)  # another process has another version
     store, ids = filled
     record = store.read_whole(ids[0])
     assert store.score(record) == store.metrics(record, PROTOCOL)

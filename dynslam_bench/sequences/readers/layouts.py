@@ -27,6 +27,7 @@ from dynslam_bench.geometry import (
     to_seconds,
 )
 from dynslam_bench.geometry.camera import TUM_DEPTH_FACTOR
+from dynslam_bench.geometry.trajectory_files import NoPoseError
 from dynslam_bench.sequences.readers.files import (
     LEFT_OUT,
     MILLIMETRES,
@@ -307,7 +308,10 @@ def _truth_of_table(path: Path | None, T_body_cam: Array) -> tuple[Trajectory | 
     """The camera's poses of a table of the body's, and one phrase on the rows that were not taken as they stand."""
     if path is None:
         return None, ""
-    file = read_pose_table(path, T_body_cam)
+    try:
+        file = read_pose_table(path, T_body_cam)
+    except NoPoseError:
+        return None, f"ground truth: no row of {path.name} holds a rotation"
     return file.trajectory, _not_taken(file)
 
 
