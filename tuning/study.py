@@ -746,6 +746,7 @@ class StreamedSampler(optuna.samplers.BaseSampler):
         seed = int(stream(self._spec.sampler_seed, "sampler", trial.number).integers(2**31))
         with quiet():
             self._sampler = _SAMPLERS[self._spec.sampler](self._spec, seed)
+        self._drawn = set[str]()
         self._sampler.before_trial(study, trial)
 
     def infer_relative_search_space(self, study: optuna.Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
@@ -761,7 +762,17 @@ class StreamedSampler(optuna.samplers.BaseSampler):
     def sample_independent(
         self, study: optuna.Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
     ) -> Any:
-        """See Optuna."""
+        """See Optuna.
+
+        Settings that a killed worker has drawn for this trial are drawn again, so that the others are what that worker
+        would have drawn after them.
+        """
+        given = trial.system_attrs.get("fixed_params", {})
+        for name, distribution in trial.distributions.items():
+            if name not in self._drawn and name not in given and not distribution.single():
+                self._drawn.add(name)
+                self._sampler.sample_independent(study, trial, name, distribution)
+        self._drawn.add(param_name)
         return self._sampler.sample_independent(study, trial, param_name, param_distribution)
 
 

@@ -24,7 +24,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -95,7 +95,7 @@ include = ["gain", "wobble"]
 
 
 JOURNAL = Path("studies/study/journal.log")
-LOOK_S = 0.005
+LOOK_S = 0.001
 """Seconds between two looks at how far a result has come."""
 
 
@@ -247,7 +247,6 @@ class Tally:
         middle: How many left some of the result, and not all.
         went_on: How often the same command then ended with exit code 0.
         equal: How often its result was that of the undisturbed one.
-        faults: What was wrong, a line each.
     """
 
     name: str
@@ -256,7 +255,6 @@ class Tally:
     middle: int = 0
     went_on: int = 0
     equal: int = 0
-    faults: list[str] = field(default_factory=list)
 
     def row(self) -> str:
         """A row of the table."""
@@ -287,21 +285,22 @@ def kill_when(program: subprocess.Popen[bytes], target: Path, count: int, delay_
 
 
 def kill_and_repeat(name: str, command: Command, folder: Path, kills: int, random: Random) -> Tally:
-    """Kill a command so many times, each time in an empty folder, and repeat it."""
+    """Kill a command so many times, each time in an empty folder, and repeat it; what is wrong goes to stderr."""
     tally = Tally(name)
 
-    # undisturbed: its result, and how far it comes
-    whole = folder / f"{name}-whole"
+    # undisturbed: its result, how far it comes, and what a step takes
+    target = folder / name  # always the same: a report shows the command that makes it
     began = time.time()
-    assert command.finish(whole) == 0, whole.with_suffix(".log").read_text()
+    assert command.finish(target) == 0, target.with_suffix(".log").read_text()
     tally.undisturbed_s = time.time() - began
-    expected = command.read(whole)
-    count = len(files_of(whole))
-    end = progress(whole)
-    step_s = tally.undisturbed_s / end
+    times = [path.lstat().st_ctime for path in target.rglob("*")]  # a copy has the time of content of its original
+    end = progress(target)
+    step_s = (max(times) - min(times)) / end
+    count = len(files_of(target))
+    expected = command.read(target)
+    shutil.rmtree(target)
 
     while tally.kills < kills:
-        target = folder / f"{name}-{tally.kills}"
         so_far = random.randrange(end)
         delay_s = random.uniform(0.0, step_s)
         if not kill_when(command.start(target), target, so_far, delay_s):
@@ -316,14 +315,13 @@ def kill_and_repeat(name: str, command: Command, folder: Path, kills: int, rando
         log = target.with_suffix(".log").read_text().strip()
         where = f"{name}, killed {delay_s:.3f} s after {so_far} of {end}, with {left} of {count} files there"
         if code:
-            tally.faults.append(f"{where}: exit code {code}: {log[-500:]}")
-            continue
-        tally.went_on += 1
-        result = command.read(target)
-        if result == expected:
-            tally.equal += 1
+            print(f"{where}: exit code {code}: {log[-500:]}", file=sys.stderr, flush=True)
         else:
-            tally.faults.append(f"{where}: {difference(expected, result)}")
+            tally.went_on += 1
+            result = command.read(target)
+            tally.equal += result == expected
+            if result != expected:
+                print(f"{where}: {difference(expected, result)}", file=sys.stderr, flush=True)
         shutil.rmtree(target)
     return tally
 
@@ -336,11 +334,15 @@ def difference(expected: Any, result: Any) -> str:
     if isinstance(expected, list) and isinstance(result, list) and len(expected) == len(result):
         at = next(at for at, pair in enumerate(zip(expected, result, strict=True)) if pair[0] != pair[1])
         return f"[{at}] {difference(expected[at], result[at])}"
-    return f"{str(expected)[:300]} undisturbed, {str(result)[:300]} after the kill"
+    one, other = str(expected), str(result)
+    differing = (at for at, pair in enumerate(zip(one, other, strict=False)) if pair[0] != pair[1])
+    at = next(differing, min(len(one), len(other)))
+    part = slice(max(0, at - 50), at + 100)
+    return f"{one[part]!r} undisturbed, {other[part]!r} after the kill"
 
 
 def main() -> int:
-    """Print the table, and what was wrong."""
+    """Print the table."""
     names = ["bench", "tune", "report", "merge", "bank"]
     options = parser_of(__doc__, kills=10, seed=0, commands=names).parse_args()
     print("| command | undisturbed, s | kills | in the middle | went on | equal results |\n" + "| --- " * 6 + "|")
@@ -353,8 +355,6 @@ def main() -> int:
             print(tallies[-1].row(), flush=True)
     kills, equal = sum(tally.kills for tally in tallies), sum(tally.equal for tally in tallies)
     print(f"\n{equal} of {kills} commands that were killed gave, when repeated, the result of an undisturbed one.")
-    for fault in (fault for tally in tallies for fault in tally.faults):
-        print(f"- {fault}")
     return 0 if equal == kills else 1
 
 

@@ -685,6 +685,25 @@ def test_a_trial_of_a_dead_worker_is_repeated(tmp_path: Path, dead: str) -> None
     assert [trial.params for trial in trials] == [trial.params for trial in undisturbed]
 
 
+@pytest.mark.parametrize("sampler", ["random", "tpe", "nsga2"])
+@pytest.mark.parametrize("drawn", [0, 1])
+def test_a_trial_gets_its_settings_where_its_worker_died_while_they_were_drawn(
+    tmp_path: Path, dead: str, sampler: str, drawn: int
+) -> None:
+    """So many of two settings were stored."""
+    spec = make_spec(trials=6, pruner="none", sampler=sampler)
+    undisturbed = SimulatedTuner(spec, tmp_path / "whole").run().study.get_trials()
+    tuner, other = (SimulatedTuner(spec, tmp_path, in_memory=False) for _ in range(2))
+
+    def dies(event: StudyEvent) -> None:
+        if event.kind == "finished" and event.number == 3:
+            some = dict(list(distributions(other.space).items())[:drawn])
+            other.study.ask(some).set_user_attr("worker", dead)
+
+    trials = tuner.run(on_event=dies).study.get_trials()
+    assert [trial.params for trial in trials] == [trial.params for trial in undisturbed]
+
+
 def test_a_trial_that_a_worker_begins_again_is_not_begun_by_another(tmp_path: Path, dead: str) -> None:
     """Both find its worker dead; the other one is quicker, and is running it, or has finished it."""
     for state in (TrialState.RUNNING, TrialState.COMPLETE):
