@@ -217,7 +217,7 @@ def test_a_killed_server_takes_everything_along_and_its_run_is_repeated(strays, 
         record = run.result()
     assert len(seen) == 8
     assert record.status == "crashed"
-    assert record.reason.startswith("the fork server was killed twice, the second time with this run alone, after")
+    assert record.reason.startswith("the fork server was killed twice, the second time with this run alone, ")
     assert [path.name for path in store.runs.iterdir()] == [record.run_id]
 
 
