@@ -310,9 +310,7 @@ def kill_and_repeat(name: str, command: Command, folder: Path, kills: int, rando
         left = len(files_of(target)) if target.is_dir() else 0
         tally.middle += 0 < left < count
 
-        # a minute later, when unfinished names that nobody has locked are no longer new, the same command again
-        for unlocked in target.rglob(".*.new"):
-            os.utime(unlocked, (0, 0))
+        # the same command again
         code = command.finish(target)
         log = target.with_suffix(".log").read_text().strip()
         where = f"{name}, killed {delay_s:.3f} s after {so_far} of {end}, with {left} of {count} files there"
