@@ -3,7 +3,7 @@
     python tests/benchmarks/kills.py [--kills 10] [--seed 0] [--commands bench tune report merge bank]
 
 Each command does a small job: runs of a toy tracker on recordings of 12 images of 16 x 12 pixels. It is done once
-undisturbed. Then, so many times, it begins anew in an empty folder; its process group gets SIGKILL when its result has
+undisturbed. Then, so many times, it begins again in an empty folder; its process group gets SIGKILL when its result has
 come as far as a random number says, and a random moment later; and the same command is given again. A command that
 ends before its kill is drawn again. The table gives the kills in the middle (some of the result was there, and not
 all), how many commands went on, with exit code 0, and how many gave an equal result: statuses, checksums of
