@@ -9,7 +9,9 @@ Sources count by their syntax: comments, layout and docstrings change nothing.
 
 import ast
 import hashlib
+import importlib.util
 import json
+import struct
 import sys
 import threading
 import time
@@ -19,7 +21,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from dynslam_bench.core.errors import DynslamError
+from dynslam_bench.core.errors import DynslamError, RunError
 from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.folders import digest_cache_folder
 
@@ -42,6 +44,8 @@ PLUMBING = tuple(f"{PACKAGE}.core.{name}" for name in _PLUMBING)
 """Modules that name faults, find, fetch, store and digest files, and load plug-ins: no number passes through them."""
 SETTLED_NS = 2_000_000_000
 """What was read of a younger file is not remembered: a change within the same tick of the clock would not show."""
+_BYTE_CODE_HEADER = struct.Struct("<4sIII")
+"""Python's magic number, flags, second of the source's modification and its size (PEP 552)."""
 _PARSING = threading.Lock()
 
 Reference = tuple[str, str]
@@ -178,6 +182,36 @@ def module_files() -> dict[str, Path]:
             if folder.name != PACKAGE and (folder / "__init__.py").is_file():
                 files |= {_module_name(file, place): file for file in sorted(folder.rglob("*.py"))}
     return files
+
+
+@cache
+def check_byte_code() -> None:
+    """Refuse byte code that is older than its source, once a process.
+
+    Python takes byte code for current while the source's size and its second of modification are those at which it was
+    compiled. It does not see an edit of equal length within that second: the old code would run under the new source's
+    digest.
+
+    Raises:
+        RunError: A module's byte code is older than its source.
+    """
+    for name, file in module_files().items():
+        byte_code = Path(importlib.util.cache_from_source(file))
+        try:
+            source = file.stat()
+            if byte_code.stat().st_mtime_ns >= source.st_mtime_ns:
+                continue
+            header = byte_code.read_bytes()[:_BYTE_CODE_HEADER.size]
+        except OSError:  # it was not compiled, or nothing was stored
+            continue
+        if len(header) < _BYTE_CODE_HEADER.size:
+            continue
+        _, _, second, size = _BYTE_CODE_HEADER.unpack(header)
+        if (second, size) == (int(source.st_mtime) & 0xFFFFFFFF, source.st_size & 0xFFFFFFFF):
+            raise RunError(
+                f"the byte code of {name} is older than its source, which was edited within a second after it was loaded",
+                f"touch {file}, and start again",
+            )
 
 
 def _module_name(file: Path, place: Path) -> str:

@@ -21,7 +21,7 @@ from dynslam_bench.core.fingerprint import (
     this_machine,
 )
 from dynslam_bench.core.libraries import library_identity, search_path
-from dynslam_bench.core.module_graph import ModuleGraph, module_graph, read_module_graph
+from dynslam_bench.core.module_graph import ModuleGraph, check_byte_code, module_graph, read_module_graph
 from dynslam_bench.core.plugins import load_object
 from dynslam_bench.core.reads import Anchors
 from dynslam_bench.core.settings import Settings, flatten
@@ -245,7 +245,11 @@ def source_digests(parts: Iterable[str]) -> dict[str, str]:
     """Digest of the code of this package that each part of a run uses; see `own_code.modules_by_part`.
 
     Runs on sequences of two kinds share the parts of their tracker: by part it shows whether one program made both.
+
+    Raises:
+        RunError: What is loaded may be older than the sources, see `module_graph.check_byte_code`.
     """
+    check_byte_code()
     return dict(_code_digests(module_graph(), tuple(parts)))
 
 

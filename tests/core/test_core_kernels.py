@@ -428,7 +428,8 @@ def copied_checkout(folder: Path) -> Path:
 
 def printed(code: str, checkout: Path) -> Any:
     """What code writes as JSON in a process that imports a checkout."""
-    environment = {**os.environ, "PYTHONPATH": str(checkout)}
+    # edits of equal length within a second would leave byte code that looks up to date
+    environment = {**os.environ, "PYTHONPATH": str(checkout), "PYTHONDONTWRITEBYTECODE": "1"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     return json.loads(done.stdout)
 

@@ -1,13 +1,24 @@
 """Which modules of this package count in a run's identity: those that it uses, and no others."""
 
 import json
+import os
+import py_compile
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, ModuleGraph, module_files, module_graph, read_module
+from dynslam_bench.core import RunError
+from dynslam_bench.core.module_graph import (
+    PACKAGE,
+    PLUMBING,
+    ModuleGraph,
+    check_byte_code,
+    module_files,
+    module_graph,
+    read_module,
+)
 from dynslam_bench.runs import RunSpec, resolve
 from dynslam_bench.runs.own_code import BESIDE_THE_LOOP, FINDERS, modules_of_run
 
@@ -165,3 +176,29 @@ def test_every_module_that_runs_is_one_that_counts(tracker: str, settings: dict[
     finding |= {f"{PACKAGE}.trackers.systems.published", f"{PACKAGE}.trackers.systems.composition"}
     counted = set(modules_of_run(module_graph(), run.identity["parts"]))
     assert executed - counted - beside - finding == set()
+
+
+# Three edits of a module within the second in which it was compiled; the first two leave its length.
+@pytest.mark.parametrize(("text", "is_stale"), [("VALUE = 2", True), ("VALUE = 3", True), ("VALUE = 20", False)])
+def test_byte_code_that_is_older_than_its_source_is_refused(
+    text: str, is_stale: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = tmp_path / "constants.py"
+    source.write_text("VALUE = 1")
+    second_ns = 1_700_000_000_000_000_000
+    os.utime(source, ns=(second_ns, second_ns))
+    byte_code = Path(py_compile.compile(str(source), doraise=True))
+    os.utime(byte_code, ns=(second_ns, second_ns + 100_000_000))
+    monkeypatch.setattr("dynslam_bench.core.module_graph.module_files", lambda: {"dynslam_bench.constants": source})
+    check_byte_code.__wrapped__()
+
+    source.write_text(text)
+    os.utime(source, ns=(second_ns, second_ns + 500_000_000))
+    if not is_stale:
+        check_byte_code.__wrapped__()
+        return
+    with pytest.raises(RunError, match=r"byte code of dynslam_bench\.constants is older") as caught:
+        check_byte_code.__wrapped__()
+    assert f"touch {source}" in str(caught.value.hint)
+    os.utime(source)  # the cure
+    check_byte_code.__wrapped__()

@@ -52,6 +52,8 @@ _SMALL = 1 << 20
 """Files of up to so many bytes are digested when they are opened; larger ones, which take time, at the end."""
 _LOOK_S = 0.5
 """Seconds between two looks at the programs. One that has ended before the first look counts by its command."""
+_FILE_CLOCK = 5 if sys.platform == "linux" else None
+"""The clock that stamps files, ``CLOCK_REALTIME_COARSE``; it moves on every 1 to 10 ms."""
 _CLOCK_NS = 10_000_000
 """So far the clock that stamps files may be behind that of the system."""
 _ADAPTERS = "dynslam_bench.trackers.adapters"
@@ -417,7 +419,7 @@ class ReadRecorder:
             texts += _SHELL_WORD.findall(texts[2])
         command = Command(tuple(texts), _absolute("." if folder is None else folder) or os.getcwd())
         if command not in self._notes.commands:
-            self._notes.commands[command] = time.time_ns() - _CLOCK_NS
+            self._notes.commands[command] = _time_after_files_so_far()
             self._note("command", json.dumps([texts, command.folder]))
         self._note_variables(RESULT_VARIABLES)
         if self._watcher is None:
@@ -516,6 +518,24 @@ def _of_descriptor(descriptor: int) -> str | None:
     except OSError:
         return None
     return path if is_file_name(path) else None
+
+
+def _time_after_files_so_far() -> int:
+    """A time in nanoseconds that is later than the stamps of all files written so far, and not of those written next.
+
+    It waits for the next tick of the clock that stamps files. Where that clock cannot be read it gives the time less
+    the most that the clock may be behind: files of the last moments then count as written next.
+    """
+    if _FILE_CLOCK is None:
+        return time.time_ns() - _CLOCK_NS
+    tick_ns = time.clock_gettime_ns(_FILE_CLOCK)
+    end_ns = time.monotonic_ns() + 2 * _CLOCK_NS
+    while time.monotonic_ns() < end_ns:
+        now_ns = time.clock_gettime_ns(_FILE_CLOCK)
+        if now_ns != tick_ns:
+            return now_ns
+        time.sleep(0.0005)
+    return time.time_ns() - _CLOCK_NS
 
 
 def _sha256(path: str) -> str:
