@@ -209,7 +209,7 @@ def check_byte_code() -> None:
         _, _, second, size = _BYTE_CODE_HEADER.unpack(header)
         if (second, size) == (int(source.st_mtime) & 0xFFFFFFFF, source.st_size & 0xFFFFFFFF):
             raise RunError(
-                f"the byte code of {name} is older than its source, which was edited within a second after it was loaded",
+                f"the byte code of {name} is older than its source: that was edited within a second after it was loaded",
                 f"touch {file}, and start again",
             )
 
