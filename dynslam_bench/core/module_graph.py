@@ -201,7 +201,7 @@ def check_byte_code() -> None:
             source = file.stat()
             if byte_code.stat().st_mtime_ns >= source.st_mtime_ns:
                 continue
-            header = byte_code.read_bytes()[:_BYTE_CODE_HEADER.size]
+            header = byte_code.read_bytes()[: _BYTE_CODE_HEADER.size]
         except OSError:  # it was not compiled, or nothing was stored
             continue
         if len(header) < _BYTE_CODE_HEADER.size:
@@ -209,7 +209,7 @@ def check_byte_code() -> None:
         _, _, second, size = _BYTE_CODE_HEADER.unpack(header)
         if (second, size) == (int(source.st_mtime) & 0xFFFFFFFF, source.st_size & 0xFFFFFFFF):
             raise RunError(
-                f"the byte code of {name} is older than its source: that was edited within a second after it was loaded",
+                f"the byte code of {name} is older than its source: that was edited within a second after it was read",
                 f"touch {file}, and start again",
             )
 
