@@ -30,7 +30,15 @@ from dynslam_bench.envs import Degradation
 from dynslam_bench.envs.slam_env import check_frames, open_frames, preprocessing_of, resolve_device
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry import Camera
-from dynslam_bench.runs.own_code import anchors_of, is_foreign, module_of, modules_by_part, parts_of_run
+from dynslam_bench.runs.own_code import (
+    anchors_of,
+    is_file,
+    is_foreign,
+    module_of,
+    modules_by_part,
+    named_part,
+    parts_of_run,
+)
 from dynslam_bench.runs.record import IDENTITY_SCHEME, StartMap, asked_digest, run_id_of
 from dynslam_bench.runs.spec import MAP_SETTING, RunSpec
 from dynslam_bench.segmentation.build_segmenter import segmentation_source, weights_digest
@@ -57,6 +65,7 @@ class ResolvedRun:
         device: ``cpu`` or ``cuda:N``.
         segmentation: Where the masks come from; empty for trackers without a semantic stage.
         identity: What is asked for, and what is known beforehand of what the run will read.
+        anchors: The folders in which names of files begin that plug-ins and programs read.
         foreign: Whether plug-ins or programs take part: what they read is known only after the run.
         start_map: The map that it begins in; None for a run that begins without one.
         files: Those that the tracker's command names, in the identity by their content.
@@ -69,6 +78,7 @@ class ResolvedRun:
     device: str
     segmentation: str
     identity: dict[str, Any]
+    anchors: Anchors
     foreign: bool = False
     start_map: StartMap | None = None
     files: tuple[Path, ...] = ()
@@ -89,15 +99,10 @@ class ResolvedRun:
         return dict(json.loads(json.dumps(self.identity, default=str)))
 
     @cached_property
-    def anchors(self) -> Anchors:
-        """The folders in which names of files begin that plug-ins and programs read."""
-        return anchors_of(self.identity["parts"])
-
-    @cached_property
     def plugin_packages(self) -> list[str]:
         """The top-level names of the installed modules that take part."""
-        modules = [module_of(part) for part in self.identity["parts"] if is_foreign(part)]
-        return sorted({module.partition(".")[0] for module in modules if not module.endswith(".py")})
+        parts = [part for part in self.identity["parts"] if is_foreign(part) and not is_file(part)]
+        return sorted({module_of(part).partition(".")[0] for part in parts})
 
     @property
     def distribution(self) -> str:
@@ -168,7 +173,9 @@ class Resolver:
             "degrade": {name: value for name, value in sorted(spec.degrade.items()) if value},
         }
         changes_frames = bool(asked["degrade"]) or spec.realtime or bool(spec.drop_share)
-        parts = parts_of_run(tracker, settings, source, sequence, changes_frames=changes_frames)
+        entry_points = parts_of_run(tracker, settings, source, sequence, changes_frames=changes_frames)
+        anchors = anchors_of(tracker, entry_points)
+        parts = sorted(named_part(part, anchors) for part in entry_points)
         foreign = any(map(is_foreign, parts)) or bool(tracker.files)
         read = {
             "tracker_version": tracker.version,
@@ -182,7 +189,9 @@ class Resolver:
             "camera": part.camera,
             **({"machine": this_machine().model_dump()} if spec.realtime else {}),
         }
-        return ResolvedRun(spec, tracker, settings, sequence, device, source, asked | read, foreign, start_map, files)
+        return ResolvedRun(
+            spec, tracker, settings, sequence, device, source, asked | read, anchors, foreign, start_map, files
+        )
 
     def _open_part(
         self,

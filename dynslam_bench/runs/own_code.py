@@ -155,17 +155,34 @@ def segmenter_of(source: str) -> str:
     return argument if kind == "plugin" else kind
 
 
-def anchors_of(parts: Iterable[str]) -> Anchors:
+def anchors_of(tracker: TrackerSpec, parts: Iterable[str]) -> Anchors:
     """The folders in which names of files begin that a run's plug-ins and programs read, as they lie here.
 
+    A plug-in's folder is that of the tracker's file. Where the tracker is none, it is that of the part whose file's
+    name comes first.
+
     Args:
+        tracker: The tracker.
         parts: See `parts_of_run`.
     """
-    files = [Path(module_of(part)) for part in parts if module_of(part).endswith(".py")]
-    return Anchors(plugin=files[0].parent if files else None, work=Path.cwd())
+    files = [Path(module_of(part)).absolute() for part in parts if is_file(part)]
+    if is_file(tracker.entry_point):
+        first = Path(module_of(tracker.entry_point)).absolute()
+    else:
+        first = min(files, key=lambda file: (file.name, file), default=None)
+    return Anchors(plugin=None if first is None else first.parent, work=Path.cwd())
+
+
+def named_part(part: str, anchors: Anchors) -> str:
+    """An entry point as it stands in identities: equal wherever the folder of its file lies."""
+    return anchors.name(str(Path(part).absolute())) if is_file(part) else part
+
+
+def is_file(part: str) -> bool:
+    """Whether an entry point is in a file that is not installed, ``file.py:Attr``."""
+    return module_of(part).endswith(".py")
 
 
 def is_foreign(part: str) -> bool:
     """Whether a part of a run lies outside this package."""
-    module = module_of(part)
-    return module.endswith(".py") or module.partition(".")[0] != PACKAGE
+    return is_file(part) or module_of(part).partition(".")[0] != PACKAGE

@@ -61,7 +61,7 @@ class TrackerInfo(Record):
     """The tracker, as its spec described it; see `TrackerSpec`.
 
     Beside that `given`: what it was named by where its id alone does not find it, ``/path/file.py:Attr`` or
-    ``module:Attr``; empty for an id.
+    ``module:Attr``; empty for an id. `folder` is that of the plug-in's file, where it is one.
     """
 
     id: str
@@ -77,6 +77,7 @@ class TrackerInfo(Record):
     sensors: Literal["rgbd", "rgb"] = "rgbd"
     online: bool = True
     given: str = ""
+    folder: str = ""
 
 
 class SequenceInfo(Record):
@@ -295,7 +296,7 @@ class RunRecord(Record):
 
         The path of a replayed file and the command of a program are what their trackers are called, and stay.
         """
-        tracker = self.tracker.model_copy(update={"given": Path(self.tracker.given).name})
+        tracker = self.tracker.model_copy(update={"given": Path(self.tracker.given).name, "folder": ""})
         return self.model_copy(update={"command": [], "place": "", "tracker": tracker})
 
     @property

@@ -287,7 +287,7 @@ def _record(
         tracker=TrackerInfo(
             label=spec.label or tracker.label,
             distribution=resolved.distribution,
-            given="" if spec.tracker == tracker.id else spec.tracker,
+            **_where_it_lies(resolved),
             **{name: getattr(tracker, name) for name in _OF_THE_TRACKER},
         ),
         overrides=asked,
@@ -321,6 +321,15 @@ def _record(
         notes=[*notes, *final.get("notes", [])],
         place=place_of(spec.sequence),
     )
+
+
+def _where_it_lies(run: ResolvedRun) -> dict[str, str]:
+    """Where a tracker is found that its id alone does not find, see `TrackerInfo`."""
+    folder = run.anchors.plugin
+    return {
+        "given": "" if run.spec.tracker == run.tracker.id else run.spec.tracker,
+        "folder": "" if folder is None else str(folder),
+    }
 
 
 _AS_ASKED = ("frames", "offset", "stride", "seed", "threads", "realtime", "drop_share", "study")
@@ -519,6 +528,9 @@ class _Bench:
             record = self.store.rewrite(record, tracker=record.tracker.model_copy(update={"label": run.spec.label}))
         if record.study and not run.spec.study:
             record = self.store.rewrite(record, study="")
+        place = _where_it_lies(run)
+        if place != {name: getattr(record.tracker, name) for name in place}:  # the plug-in lies in another folder now
+            record = self.store.rewrite(record, tracker=record.tracker.model_copy(update=place))
         self._take_in(run, record, "reused")
 
     def make_here(self) -> None:

@@ -1,7 +1,8 @@
 """Whether a stored run is what would be computed here: by the code, libraries and files that are installed now."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
@@ -9,12 +10,13 @@ from pydantic import ValidationError
 from dynslam_bench.core import DynslamError
 from dynslam_bench.core.fingerprint import named_digest
 from dynslam_bench.core.libraries import library_identity
-from dynslam_bench.core.reads import Reads, Verifier
+from dynslam_bench.core.reads import Anchors, Reads, Verifier
 from dynslam_bench.runs.identity import libraries, source_digests
-from dynslam_bench.runs.own_code import anchors_of, is_foreign, module_of
-from dynslam_bench.runs.record import PROGRAM, RunRecord
+from dynslam_bench.runs.own_code import is_file, is_foreign, module_of
+from dynslam_bench.runs.record import PROGRAM, RunRecord, TrackerInfo
 from dynslam_bench.segmentation.build_segmenter import weights_digest
 from dynslam_bench.segmentation.settings import SegmentationSettings
+from dynslam_bench.trackers.registry import TRACKERS
 
 NOT_RECORDED = "its record does not say what it was made by"
 _NETWORKS = ("embedded", "coco")
@@ -43,17 +45,26 @@ class Installation:
             return NOT_RECORDED
         program = {name: record.identity[name] for name in PROGRAM if name in record.identity}
         named = {name: record.settings.get(name) for name in _table(program.get("weights"))}
-        question = json.dumps([program, named], sort_keys=True, default=str)
+        question = json.dumps([program, named, record.tracker.folder], sort_keys=True, default=str)
         if question not in self._answers:
-            self._answers[question] = self._compare(program, named)
+            self._answers[question] = self._compare(program, named, self._plugin_folder(record.tracker))
         return self._answers[question]
 
-    def _compare(self, program: Mapping[str, Any], named: Mapping[str, Any]) -> str:
+    @staticmethod
+    def _plugin_folder(tracker: TrackerInfo) -> Path | None:
+        """The folder of a tracker's file: where the record has it, or, in a record of others, as it is listed here."""
+        if tracker.folder:
+            return Path(tracker.folder)
+        target = TRACKERS.target_of(tracker.id)
+        return Path(module_of(target)).absolute().parent if target is not None and is_file(target) else None
+
+    def _compare(self, program: Mapping[str, Any], named: Mapping[str, Any], plugin: Path | None) -> str:
         """The first part of a program that differs here.
 
         Args:
             program: The entries `PROGRAM` of a run's identity.
             named: The values of the settings that name its weights; None for a network that no setting names.
+            plugin: The folder of its plug-in's file.
         """
         parts = program.get("parts")
         if not isinstance(parts, list) or not isinstance(program.get("source"), dict):
@@ -81,15 +92,15 @@ class Installation:
             return f"the weights of {file}"
 
         runs_foreign_code = "files" in program or any(map(is_foreign, parts))
-        return self._what_was_read(program, parts) if runs_foreign_code else ""
+        return self._what_was_read(program, plugin) if runs_foreign_code else ""
 
-    def _what_was_read(self, program: Mapping[str, Any], parts: Sequence[str]) -> str:
+    def _what_was_read(self, program: Mapping[str, Any], plugin: Path | None) -> str:
         """What has changed of all that plug-ins and programs read."""
         try:
             reads = Reads.model_validate(program.get("reads"))
         except ValidationError:
             return NOT_RECORDED
-        return self._verifier.changed(reads, anchors_of(parts))
+        return self._verifier.changed(reads, Anchors(plugin=plugin, work=Path.cwd()))
 
 
 def _difference(before: object, now: Mapping[str, str]) -> str | None:

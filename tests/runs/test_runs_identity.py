@@ -17,6 +17,7 @@ from dynslam_bench.core import PluginError, RunError
 from dynslam_bench.core.plugins import has_imported_plugins
 from dynslam_bench.runs import RunSpec, RunStore, identity, resolve, run_many, run_one
 from dynslam_bench.runs.record import run_id_of
+from dynslam_bench.runs.validity import Installation
 from dynslam_bench.trackers import TRACKERS
 
 PLUGIN = """
@@ -163,6 +164,34 @@ def test_a_change_that_is_undone_finds_the_first_run_again(tmp_path: Path, store
     (third,) = run_many([spec], results=store)
     assert first.run_id == third.run_id
     assert second.run_id != first.run_id
+
+
+@pytest.mark.parametrize("how", ["copied", "moved", "moved into a folder of the working folder"])
+def test_a_plug_in_in_another_folder_finds_its_runs_again(
+    how: str, tmp_path: Path, store: RunStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec, folder = a_plug_in(tmp_path)
+    (first,) = run_many([spec], results=store)
+    assert first.tracker.folder == str(folder)
+    assert str(folder) not in first.public().to_json()
+
+    other = tmp_path / "elsewhere" / "copy"
+    shutil.copytree(folder, other)
+    if how != "copied":
+        shutil.rmtree(folder)
+    if how.endswith("working folder"):
+        monkeypatch.chdir(tmp_path / "elsewhere")
+    moved = spec.model_copy(update={"tracker": f"{other / 'mine.py'}:SPEC"})
+    (again,) = run_many([moved], results=store)
+    assert again.run_id == first.run_id
+    assert again.tracker.folder == str(other)
+    assert again.tracker.given == moved.tracker
+    assert Installation().what_changed(again) == ""
+
+    edit(other / "helper.py", "a note", "a word")()
+    assert Installation().what_changed(again) == "the file helper.py"
+    (changed,) = run_many([moved], results=store)
+    assert changed.run_id != first.run_id
 
 
 @pytest.mark.parametrize("value", ["fast", "exact"])

@@ -105,7 +105,8 @@ def test_what_a_plug_in_that_a_setting_names_reads_is_recorded(toy_folder: str, 
         )
         run = resolve(spec)
         assert run.foreign, name
-        assert f"{plugin}:build" in run.identity["parts"], name
+        assert "plugin:/mine.py:build" in run.identity["parts"], name
+        assert run.anchors.plugin == plugin.parent
 
 
 def test_listing_finding_and_removing(store: RunStore) -> None:

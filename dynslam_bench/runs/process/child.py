@@ -33,6 +33,7 @@ from dynslam_bench.core import (
     DynslamError,
     InfrastructureError,
     PluginError,
+    RunError,
     SegmentationError,
     SequenceError,
     SettingsError,
@@ -136,8 +137,13 @@ def recording_reads(job: dict[str, Any], temporary: Path) -> Iterator[Callable[[
     record_reads(recorder.snapshot)
     try:
         yield lambda: keep(recorder.so_far())
-    finally:
-        keep(recorder.finish())
+    except BaseException:
+        with contextlib.suppress(
+            RunError
+        ):  # the run's own error is the one to tell; what changed meanwhile shows at the look-up
+            keep(recorder.finish())
+        raise
+    keep(recorder.finish())
 
 
 def spare_ancestors() -> None:
