@@ -4,7 +4,8 @@
 read_kitti  # users with trajectories in KITTI's format
 write_kitti  # the same, the other way
 of_classes  # on Instances, for authors of filters and segmenters
-neutral_action  # on SlamEnv, for agents: the action that changes nothing (docs/reference/environments.md)
+# on SlamEnv, for agents: the action that changes nothing (docs/reference/environments.md)
+neutral_action
 clone_state  # on SlamEnv, for agents: a copy of the episode (docs/reference/environments.md)
 restore_state  # the same: back to it
 rtf  # on Outcome, for objectives of one's own (docs/how-to/study.md)
@@ -14,7 +15,8 @@ __class__  # runs.process.announcing: Python reads it
 compile_kernels  # cli.demo: .ci/run calls it, before the tests
 exact_depth  # on rendered sequences: depth without the sensor's noise, to judge measured depth by
 
-moth_positions  # flow.moth_flame: the equations as they read, beside the kernel that a test compares with them
+# flow.moth_flame: the equations as they read, beside the kernel that a test compares with them
+moth_positions
 opposites  # flow.moth_flame: the same
 
 # called by name: specs name their factories as "module:name"

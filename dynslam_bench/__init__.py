@@ -1,6 +1,7 @@
 """dynslam-bench: benchmark and tune visual SLAM in dynamic scenes through Gymnasium environments.
 
-The public interface is `run`, `bench`, `tune`, `report`, `load`, `sequence` and `trackers`, see `dynslam_bench.api`:
+The public interface is `run`, `bench`, `tune`, `report`, `load`, `sequence` and `trackers`, see
+`dynslam_bench.api`:
 
     import dynslam_bench as db
     db.run("emfoa-oft", "synthetic/walking_xyz?scene=100", frames=(0, 60)).metrics
@@ -20,7 +21,8 @@ __all__ = ["bench", "load", "report", "run", "sequence", "trackers", "tune"]
 
 _checkout = Path(__file__).resolve().parent.parent
 if (_checkout / "pyproject.toml").is_file() and (_checkout / "envs" / "__init__.py").is_file():
-    # In a bare checkout `envs/`, `tuning/` and `reports/` lie beside this package instead of inside it.
+    # In a bare checkout `envs/`, `tuning/` and `reports/` lie beside this package instead of inside
+    # it.
     __path__.append(str(_checkout))
 del _checkout
 

@@ -13,7 +13,8 @@
 >>> db.trackers.TRACKERS.get("emfoa-oft").sensors
 'rgbd'
 
-The names are loaded on first use, so that ``import dynslam_bench`` stays fast. The command line calls these functions.
+The names are loaded on first use, so that ``import dynslam_bench`` stays fast. The command line
+calls these functions.
 """
 
 from __future__ import annotations
@@ -28,7 +29,15 @@ from pydantic import ValidationError
 
 from dynslam_bench.core import RunError, SettingsError, did_you_mean
 from dynslam_bench.core.records import Record
-from dynslam_bench.runs import DEFAULT_PROTOCOL, Limits, RunRecord, RunSpec, RunStore, load_frames, run_many
+from dynslam_bench.runs import (
+    DEFAULT_PROTOCOL,
+    Limits,
+    RunRecord,
+    RunSpec,
+    RunStore,
+    load_frames,
+    run_many,
+)
 from dynslam_bench.trackers import TRACKERS
 
 if TYPE_CHECKING:
@@ -139,7 +148,9 @@ def run(
         DynslamError: The tracker, the sequence or an option is unknown or does not fit.
     """
     repeat = {"seeds": [options.pop("seed", 0)], "offsets": [options.pop("offset", 0)]}
-    specs = make_specs(tracker, [str(sequence)], settings=settings, preset=preset, **repeat, **options)
+    specs = make_specs(
+        tracker, [str(sequence)], settings=settings, preset=preset, **repeat, **options
+    )
     return run_specs(specs, results=results, protocol=protocol)[0]
 
 
@@ -161,10 +172,20 @@ def make_specs(
     """
     presets = TRACKERS.get(tracker).presets if preset is not None else {}
     if preset is not None and preset not in presets:
-        raise SettingsError(f"tracker '{tracker}' has no preset '{preset}'", did_you_mean(preset, presets))
+        raise SettingsError(
+            f"tracker '{tracker}' has no preset '{preset}'", did_you_mean(preset, presets)
+        )
     overrides = {**presets.get(preset or "", {}), **(settings or {})}
     return [
-        checked(RunSpec, tracker=tracker, sequence=sequence, settings=overrides, seed=seed, offset=offset, **options)
+        checked(
+            RunSpec,
+            tracker=tracker,
+            sequence=sequence,
+            settings=overrides,
+            seed=seed,
+            offset=offset,
+            **options,
+        )
         for sequence in sequences
         for seed in seeds
         for offset in offsets
@@ -213,7 +234,8 @@ def bench(
         retry: See `run_many`, as the callbacks `on_plan`, `on_event` and `on_fault`.
         time_limit_s: Seconds that a run may take, in place of the suite's limit.
         memory_limit_mb: Memory that a run may take, in place of the suite's limit.
-        shard: ``(k, n)``: only the k-th of n parts of the suite's runs, the k-th, (k + n)-th, ... of them, if any.
+        shard: ``(k, n)``: only the k-th of n parts of the suite's runs, the k-th, (k + n)-th, ...
+            of them, if any.
         on_workers: Called before the first run, with what each of the scheduler's workers has.
         on_plan: Called once, with the runs that are to be made.
         on_event: Called with every `RunEvent`.
@@ -228,7 +250,9 @@ def bench(
 
     asked = {"time_s": time_limit_s, "memory_mb": memory_limit_mb}
     chosen = load_suite(suite)
-    limits = chosen.limits.model_dump() | {name: value for name, value in asked.items() if value is not None}
+    limits = chosen.limits.model_dump() | {
+        name: value for name, value in asked.items() if value is not None
+    }
     every = chosen.model_copy(update={"limits": checked(Limits, **limits)}).specs(**choice)
     specs = islice(every, shard[0] - 1, None, shard[1])
     how: dict[str, Any] = {
@@ -268,7 +292,11 @@ def run_specs(
     """
     store = RunStore(results)
     records = run_many(specs, results=store, protocol=protocol, **how)
-    return [RunResult(run_id, store, protocol) for run_id in records.run_ids if run_id not in records.not_stored]
+    return [
+        RunResult(run_id, store, protocol)
+        for run_id in records.run_ids
+        if run_id not in records.not_stored
+    ]
 
 
 def tune(
@@ -304,14 +332,22 @@ def tune(
     spec = read_study(Path(study)) if isinstance(study, str | Path) else study
     spec = spec if trials is None else spec.model_copy(update={"trials": trials})
     tuner = run_study(
-        spec, results=results, jobs=jobs, scenes=more_scenes, trials=more_trials, on_event=on_event, on_run=on_run
+        spec,
+        results=results,
+        jobs=jobs,
+        scenes=more_scenes,
+        trials=more_trials,
+        on_event=on_event,
+        on_run=on_run,
     )
     summary = finish(tuner, on_note, jobs=jobs)
     return StudyResult(summary, write_page(tuner, summary), tuner)
 
 
 def report(
-    results: str | Path | Sequence[str | Path] = "results", output: str | Path | None = None, **options: Any
+    results: str | Path | Sequence[str | Path] = "results",
+    output: str | Path | None = None,
+    **options: Any,
 ) -> ReportPaths:
     """Write an offline HTML page of stored runs, with Markdown, CSV and LaTeX beside it.
 
@@ -326,10 +362,13 @@ def report(
     """
     from dynslam_bench.reports import build_report
 
-    folders = [Path(results)] if isinstance(results, str | Path) else [Path(folder) for folder in results]
+    folders = (
+        [Path(results)] if isinstance(results, str | Path) else [Path(folder) for folder in results]
+    )
     if output is None and folders[0].is_file():
         raise RunError(
-            f"{folders[0]} is an archive, which cannot hold its report", "name the report's folder: -o FOLDER"
+            f"{folders[0]} is an archive, which cannot hold its report",
+            "name the report's folder: -o FOLDER",
         )
     return build_report(folders, output or folders[0] / "report", **options)
 
@@ -356,7 +395,9 @@ def load(
     from dynslam_bench.reports import load_frame
 
     return load_frame(
-        [Path(results)] if isinstance(results, str | Path) else list(map(Path, results)), protocol, trials=trials
+        [Path(results)] if isinstance(results, str | Path) else list(map(Path, results)),
+        protocol,
+        trials=trials,
     )
 
 
@@ -364,7 +405,8 @@ def sequence(name: str | Path, **options: Any) -> FrameSequence:
     """Open a sequence by its id or folder.
 
     Args:
-        name: E.g. ``tum/fr3/walking_xyz``, ``synthetic/walking_xyz?scene=100``, or the path of a recording.
+        name: E.g. ``tum/fr3/walking_xyz``, ``synthetic/walking_xyz?scene=100``, or the path of a
+            recording.
         **options: Arguments of `sequences.open_sequence`: ``frames``, ``stride``, ``camera``, ``data_root``, ...
 
     Raises:

@@ -1,7 +1,8 @@
 """Gymnasium environments, wrappers and rendering.
 
-Importing this package registers ``dynslam/<sequence>-v0`` for every listed sequence, ``dynslam/Sequence-v0``, and the
-benchmarks ``dynslam/masks-v0``, ``dynslam/features-v0`` and ``dynslam/budget-v0``; in worker processes write
+Importing this package registers ``dynslam/<sequence>-v0`` for every listed sequence,
+``dynslam/Sequence-v0``, and the benchmarks ``dynslam/masks-v0``, ``dynslam/features-v0`` and
+``dynslam/budget-v0``; in worker processes write
 ``gym.make("dynslam_bench.envs:dynslam/Sequence-v0", sequence=...)``.
 """
 
@@ -9,8 +10,19 @@ import gymnasium as gym
 
 from dynslam_bench.contracts import TrackerContractError
 from dynslam_bench.core.arguments import names_wrong_arguments
-from dynslam_bench.envs.control_benchmarks import CONTROL_BENCHMARKS, ControlBenchmark, control_benchmark, make_control
-from dynslam_bench.envs.episode import REWARDS, AccuracyMinusCost, Episode, FrameOutcome, NegWindowError
+from dynslam_bench.envs.control_benchmarks import (
+    CONTROL_BENCHMARKS,
+    ControlBenchmark,
+    control_benchmark,
+    make_control,
+)
+from dynslam_bench.envs.episode import (
+    REWARDS,
+    AccuracyMinusCost,
+    Episode,
+    FrameOutcome,
+    NegWindowError,
+)
 from dynslam_bench.envs.slam_env import EpisodeState, SlamEnv, resolve_device
 from dynslam_bench.envs.spaces import KEYPOINT_LAYOUT, PRIVILEGED_LAYOUT, STATS_LAYOUT, ActionMap
 from dynslam_bench.envs.wrappers import (
@@ -68,8 +80,9 @@ def env_id(sequence: str) -> str:
 def register_envs() -> list[str]:
     """Register all environments that are not registered yet; calling it again changes nothing.
 
-    Every id makes a `SlamEnv`; the generic one needs ``sequence=``, that of a `ControlBenchmark` takes the arguments of
-    its `make`. There is no ``max_episode_steps``: the sequence ends the episode.
+    Every id makes a `SlamEnv`; the generic one needs ``sequence=``, that of a `ControlBenchmark`
+    takes the arguments of its `make`. There is no ``max_episode_steps``: the sequence ends the
+    episode.
 
     Returns:
         All ids: the generic one, those of the benchmarks, those of the sequences.

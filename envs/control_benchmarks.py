@@ -31,8 +31,8 @@ class ControlBenchmark:
         tracker: Id of the tracker.
         settings: What differs from its defaults.
         control: Online settings that actions change.
-        actions: For each discrete action the settings that it asks for, the default first; empty if actions are
-            continuous (`SlamEnv`).
+        actions: For each discrete action the settings that it asks for, the default first; empty if
+            actions are continuous (`SlamEnv`).
         reward: Of every frame.
         frames: Part of each sequence.
         stride: Every so many frames are taken.
@@ -59,20 +59,27 @@ class ControlBenchmark:
 
         Args:
             split: ``train``, ``test`` or ``recordings``.
-            index: Which sequence of the split, or which ones; None for all. Of several, every episode draws one.
+            index: Which sequence of the split, or which ones; None for all. Of several, every
+                episode draws one.
             **arguments: Other arguments of `SlamEnv`, e.g. ``observation`` or ``data_root``.
 
         Raises:
             SettingsError: No such split or sequence.
-            DynslamError: As `SlamEnv`; a recording that is not there names the command that fetches it.
+            DynslamError: As `SlamEnv`; a recording that is not there names the command that fetches
+                it.
         """
         splits = {"train": self.train, "test": self.test, "recordings": self.recordings}
         if split not in splits:
-            raise SettingsError(f"'{self.id}' has no split '{split}'", f"choose {', '.join(splits)}")
+            raise SettingsError(
+                f"'{self.id}' has no split '{split}'", f"choose {', '.join(splits)}"
+            )
         every = range(len(splits[split]))
         chosen = list(every if index is None else index if isinstance(index, Iterable) else [index])
         if not chosen or not all(number in every for number in chosen):
-            raise SettingsError(f"the split {split} of '{self.id}' has no sequence {index!r}", f"give 0 to {every[-1]}")
+            raise SettingsError(
+                f"the split {split} of '{self.id}' has no sequence {index!r}",
+                f"give 0 to {every[-1]}",
+            )
         sequences = [splits[split][int(number)] for number in chosen]
         given: dict[str, Any] = {
             "settings": dict(self.settings),
@@ -81,7 +88,8 @@ class ControlBenchmark:
             "frames": self.frames,
             "stride": self.stride,
             "device": "cpu",
-            "cache": self.reward.cost == "network_calls",  # keypoints under ever other settings are not found again
+            # keypoints under ever other settings are not found again
+            "cache": self.reward.cost == "network_calls",
             "memory_map": True,
         }
         env: gym.Env[Any, Any] = SlamEnv(sequences[0], self.tracker, **(given | arguments))
@@ -110,7 +118,9 @@ _BENCHMARKS = (
         settings=MappingProxyType({**_SMALL, "segmentation.n": _NEVER}),
         control=("segmentation.schedule", "segmentation.dilation_px"),
         actions=tuple(
-            MappingProxyType({"segmentation.schedule": schedule, "segmentation.dilation_px": dilation})
+            MappingProxyType(
+                {"segmentation.schedule": schedule, "segmentation.dilation_px": dilation}
+            )
             for schedule in ("every", "every_nth")
             for dilation in (15, 5, 25)
         ),
@@ -128,7 +138,11 @@ _BENCHMARKS = (
         tracker="orb-slam2",
         settings=MappingProxyType(_SMALL),
         control=(
-            *("features.n_features", "backend.tracking.radius_px", "backend.tracking.map_radius_px"),
+            *(
+                "features.n_features",
+                "backend.tracking.radius_px",
+                "backend.tracking.map_radius_px",
+            ),
             "backend.keyframes.tracked_share",
         ),
         actions=(),
@@ -143,7 +157,9 @@ _FALLING = replace(
     summary=f"{_BENCHMARKS[1].summary}, and keypoints cost five times as much at the end",
     reward=AccuracyMinusCost(weight=0.001, cost="keypoints", growth=4 / 119),
 )
-CONTROL_BENCHMARKS: Mapping[str, ControlBenchmark] = MappingProxyType({b.id: b for b in (*_BENCHMARKS, _FALLING)})
+CONTROL_BENCHMARKS: Mapping[str, ControlBenchmark] = MappingProxyType(
+    {b.id: b for b in (*_BENCHMARKS, _FALLING)}
+)
 """The benchmarks by id."""
 
 
@@ -155,7 +171,9 @@ def control_benchmark(id: str) -> ControlBenchmark:
         SettingsError: There is none.
     """
     if id not in CONTROL_BENCHMARKS:
-        raise SettingsError(f"unknown control benchmark '{id}'", f"known: {', '.join(CONTROL_BENCHMARKS)}")
+        raise SettingsError(
+            f"unknown control benchmark '{id}'", f"known: {', '.join(CONTROL_BENCHMARKS)}"
+        )
     return CONTROL_BENCHMARKS[id]
 
 

@@ -32,9 +32,10 @@ class FrameOutcome:
         state: The tracker's state, or ``dropped`` if the frame never reached it.
         T_world_cam: Tracked pose ``[4, 4]``; None unless the state is ``ok``.
         stats: The tracker's diagnostics.
-        timings: Seconds: ``read`` (decoding or rendering), ``total`` (the tracker's step, segmentation included,
-            reading excluded), ``processor`` (processor time of this process in that step, all threads together; what a
-            foreign program or a GPU does is no part of it) and the tracker's stages.
+        timings: Seconds: ``read`` (decoding or rendering), ``total`` (the tracker's step,
+            segmentation included, reading excluded), ``processor`` (processor time of this process
+            in that step, all threads together; what a foreign program or a GPU does is no part of
+            it) and the tracker's stages.
         error: Causal errors against the ground truth; None where there is none.
         reward: What the frame earned.
     """
@@ -59,8 +60,8 @@ class Episode:
 
     Attributes:
         outcomes: One entry a frame, in order.
-        lost_streak: Frames without a tracked pose in a row, up to the last one; an initialising tracker is not lost,
-            and a dropped frame changes nothing.
+        lost_streak: Frames without a tracked pose in a row, up to the last one; an initialising
+            tracker is not lost, and a dropped frame changes nothing.
         over: Whether the last step ended the episode.
         free_at: Seconds, when the tracker is done with the last frame; of `DropFrames`.
     """
@@ -101,7 +102,8 @@ _ERRORS = {
 def frame_info(outcome: FrameOutcome) -> dict[str, Any]:
     """Index, stamp, state and stats of a frame, its pose if it was tracked, its errors where they are defined.
 
-    What the stage cache answered is no part of the stats: it differs between two episodes that are otherwise equal.
+    What the stage cache answered is no part of the stats: it differs between two episodes that are
+    otherwise equal.
     """
     info: dict[str, Any] = {
         "frame_index": outcome.index,
@@ -139,7 +141,9 @@ def metric_names(protocol: Protocol) -> tuple[str, ...]:
     """The metrics that an episode may have: those of a long path and of a camera that stands still."""
     stamps = np.arange(2000) / 30.0
     turns = np.stack([0.0 * stamps, 0.1 * np.sin(stamps), 0.0 * stamps], axis=1)
-    moving = np.concatenate([np.stack([np.cos(stamps), np.sin(stamps), stamps], axis=1) * 40.0, turns], axis=1)
+    moving = np.concatenate(
+        [np.stack([np.cos(stamps), np.sin(stamps), stamps], axis=1) * 40.0, turns], axis=1
+    )
     names = ["coverage", "frames", "tracked_frames"]
     for twists in (moving, np.zeros_like(moving)):
         path = Trajectory(stamps, se3.exp(twists))
@@ -177,8 +181,8 @@ def neg_pose_error(episode: Episode) -> float:
 class NegWindowError:
     """Minus the translational error of the motion over the last `frames` frames, metres.
 
-    Drift that hides in the noise of one frame shows. Both ends need ground truth; the window is shorter where the
-    episode is. A frame without a tracked pose counts as standing at the last one.
+    Drift that hides in the noise of one frame shows. Both ends need ground truth; the window is
+    shorter where the episode is. A frame without a tracked pose counts as standing at the last one.
 
     Attributes:
         frames: Length of the window.
@@ -192,7 +196,8 @@ class NegWindowError:
 
     def __call__(self, episode: Episode) -> float:
         """What the newest frame earns."""
-        now, before = episode.outcomes[-1].error, episode.outcomes[-1 - self.frames :][0].error
+        now = episode.outcomes[-1].error
+        before = episode.outcomes[-1 - self.frames :][0].error
         if now is None or before is None:
             return 0.0
         moved = se3.inverse(before.T_world_true) @ now.T_world_true
@@ -207,9 +212,10 @@ class AccuracyMinusCost:
 
     Attributes:
         weight: Metres that one unit of the cost counts as on the episode's first frame.
-        cost: ``network_calls``: 1 where the segmentation network ran (``segmented`` of the tracker's stats);
-            ``keypoints``: thousands of extracted keypoints (``keypoints``), which processor time grows with; both are
-            the same on every machine. ``processor_s``: seconds of processor time, which differ from run to run.
+        cost: ``network_calls``: 1 where the segmentation network ran (``segmented`` of the
+            tracker's stats); ``keypoints``: thousands of extracted keypoints (``keypoints``), which
+            processor time grows with; both are the same on every machine. ``processor_s``: seconds
+            of processor time, which differ from run to run.
         growth: Share of `weight` that is added to it with every frame: the budget of a frame falls.
     """
 
@@ -219,9 +225,13 @@ class AccuracyMinusCost:
 
     def __post_init__(self) -> None:
         if self.cost not in get_args(Cost):
-            raise SettingsError(f"unknown cost '{self.cost}'", f"choose {', '.join(get_args(Cost))}")
+            raise SettingsError(
+                f"unknown cost '{self.cost}'", f"choose {', '.join(get_args(Cost))}"
+            )
         if not math.isfinite(self.weight * self.growth):
-            raise SettingsError(f"weight {self.weight} and growth {self.growth} are no finite numbers")
+            raise SettingsError(
+                f"weight {self.weight} and growth {self.growth} are no finite numbers"
+            )
 
     def __call__(self, episode: Episode) -> float:
         """What the newest frame earns."""
@@ -250,16 +260,20 @@ REWARDS: dict[str, Reward] = {
 """Reward in metres of a frame that has ground truth, by name; other frames earn 0.
 
 - ``neg_rpe``: minus the translational error of the motion since the previous frame; needs no alignment and adds up.
-  A frame without a tracked pose costs twice the true motion: it did not move, and it has to catch up. The first tracked
-  pose after it is a jump from the last one (see `OnlineError`), which costs only the error beyond the charged path. So
-  reporting a loss never earns more than repeating the last pose, and staying lost never more than recovering.
+  A frame without a tracked pose costs twice the true motion: it did not move, and it has to catch
+  up. The first tracked pose after it is a jump from the last one (see `OnlineError`), which costs
+  only the error beyond the charged path. So reporting a loss never earns more than repeating the
+  last pose, and staying lost never more than recovering.
 - ``neg_pose_error``: minus the causal translational pose error, at most the length of the true path so far (an error of
-  100 %). A frame without a tracked pose earns minus that length: no pose, however far it has drifted, earns less, so
-  that getting lost pays only before the first tracked pose, which begins the episode's frame of reference.
+  100 %). A frame without a tracked pose earns minus that length: no pose, however far it has
+  drifted, earns less, so that getting lost pays only before the first tracked pose, which begins
+  the episode's frame of reference.
 - ``neg_window_error``: see `NegWindowError`; a loss earns what repeating the last pose does.
 - ``accuracy_minus_cost``: see `AccuracyMinusCost`; 1 mm for every frame on which the segmentation network ran.
 
-A callable takes the `Episode` after each frame; ``episode.outcomes[-1]`` is the frame's `FrameOutcome`.
+A callable takes the `Episode` after each frame; ``episode.outcomes[-1]`` is the frame's
+`FrameOutcome`.
 
-The sum over an episode is not the ATE, which the last step's ``episode_metrics`` give under the protocol.
+The sum over an episode is not the ATE, which the last step's ``episode_metrics`` give under the
+protocol.
 """

@@ -26,16 +26,22 @@ TRUTH_AHEAD = (205, 205, 205)
 ESTIMATE = (20, 90, 220)
 _INK = (30, 30, 30)
 _PAPER = (250, 250, 250)
-_STATE_COLOUR = {"ok": (30, 140, 30), "lost": (200, 30, 30), "initialising": (190, 120, 0), "dropped": (120, 120, 120)}
+_STATE_COLOUR = {
+    "ok": (30, 140, 30),
+    "lost": (200, 30, 30),
+    "initialising": (190, 120, 0),
+    "dropped": (120, 120, 120),
+}
 
 
 class Canvas:
     """Draws the frames of one episode; all pictures of a sequence have the same even size, as video encoders want.
 
     Left: the image the tracker saw, see `annotated`.
-    Right: the estimated camera centres (blue), aligned, over the ground truth (grey), both in the first camera's frame,
-    with a scale bar, seen along the axis in which the true path spreads least: from above where there is no truth.
-    Below: state, counts, errors, and from `ALIGN_FROM` frames on the ATE of the frames so far.
+    Right: the estimated camera centres (blue), aligned, over the ground truth (grey), both in the
+    first camera's frame, with a scale bar, seen along the axis in which the true path spreads
+    least: from above where there is no truth. Below: state, counts, errors, and from `ALIGN_FROM`
+    frames on the ATE of the frames so far.
 
     Args:
         sequence: The sequence of the episode.
@@ -69,8 +75,10 @@ class Canvas:
         """A square plot of the estimated centres ``[N, 2]`` over the ground truth up to frame `now` and ahead."""
         plot = np.full((HEIGHT, HEIGHT, 3), _PAPER, np.uint8)
         points = np.concatenate([self._truth_path, estimate, np.zeros((1, 2))])
-        low, high = points.min(axis=0), points.max(axis=0)
-        centre, metres_a_pixel = (low + high) / 2, max(float((high - low).max()), 0.1) / (HEIGHT - 120)
+        low = points.min(axis=0)
+        high = points.max(axis=0)
+        metres_a_pixel = max(float((high - low).max()), 0.1) / (HEIGHT - 120)
+        centre = (low + high) / 2
 
         def to_pixels(points: Array) -> Array:
             offset = (points - centre) / metres_a_pixel
@@ -91,18 +99,32 @@ class Canvas:
         cv2.rectangle(plot, (0, 0), (HEIGHT - 1, HEIGHT - 1), (200, 200, 200), 1)
         return plot
 
-    def _strip(self, result: TrackResult, episode: Episode, ate_m: float | None, width: int) -> Image:
+    def _strip(
+        self, result: TrackResult, episode: Episode, ate_m: float | None, width: int
+    ) -> Image:
         strip = np.full((STRIP, width, 3), 235, np.uint8)
         last = episode.outcomes[-1]
         _text(strip, self._title, (10, 24), _INK, 0.5)
         _text(strip, last.state, (10, 50), _STATE_COLOUR[last.state], 0.5, 2)
-        parts = [f"frame {last.index + 1}/{self._frames}", f"t {last.timestamp - episode.outcomes[0].timestamp:.2f} s"]
-        names = {"keypoints": "features", "culled": "culled", "inliers": "inliers", "keyframes": "kf"}
-        parts += [f"{name} {result.stats[key]:.0f}" for key, name in names.items() if key in result.stats]
+        parts = [
+            f"frame {last.index + 1}/{self._frames}",
+            f"t {last.timestamp - episode.outcomes[0].timestamp:.2f} s",
+        ]
+        names = {
+            "keypoints": "features",
+            "culled": "culled",
+            "inliers": "inliers",
+            "keyframes": "kf",
+        }
+        parts += [
+            f"{name} {result.stats[key]:.0f}" for key, name in names.items() if key in result.stats
+        ]
         if last.error is None:
             parts.append("no ground truth here")
         else:
-            parts.append(f"pose error {100 * last.error.trans_m:.1f} cm, {last.error.rot_deg:.2f} deg")
+            parts.append(
+                f"pose error {100 * last.error.trans_m:.1f} cm, {last.error.rot_deg:.2f} deg"
+            )
             if last.error.frame_trans_m is not None:
                 parts.append(f"frame error {1000 * last.error.frame_trans_m:.1f} mm")
         if ate_m is not None:
@@ -130,18 +152,35 @@ def annotated(rgb: Image, result: TrackResult, width: int) -> Image:
     if result.dynamic_mask is not None and result.dynamic_mask.any():
         mask = np.asarray(result.dynamic_mask, dtype=bool)
         image[mask] = (0.6 * image[mask] + 0.4 * np.array(MASK)).astype(np.uint8)
-        outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+        outlines, _ = cv2.findContours(
+            mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE
+        )
         cv2.drawContours(image, outlines, -1, MASK, 1, cv2.LINE_AA)
-    size, radius = (width, round(image.shape[0] * scale)), max(round(width / 320), 1)
+    size = (width, round(image.shape[0] * scale))
+    radius = max(round(width / 320), 1)
     image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     if result.keypoints_xy is not None:
         points = np.asarray(result.keypoints_xy, dtype=np.float64).reshape(-1, 2)
-        kept = np.ones(len(points), bool) if result.keypoints_keep is None else np.asarray(result.keypoints_keep, bool)
-        for (x, y), static in zip((points * scale).round().astype(int).tolist(), kept.tolist(), strict=True):
+        kept = (
+            np.ones(len(points), bool)
+            if result.keypoints_keep is None
+            else np.asarray(result.keypoints_keep, bool)
+        )
+        for (x, y), static in zip(
+            (points * scale).round().astype(int).tolist(), kept.tolist(), strict=True
+        ):
             if static:
                 cv2.circle(image, (x, y), radius, KEPT, -1, cv2.LINE_AA)
             else:
-                cv2.drawMarker(image, (x, y), CULLED, cv2.MARKER_TILTED_CROSS, 2 * radius + 3, radius, cv2.LINE_AA)
+                cv2.drawMarker(
+                    image,
+                    (x, y),
+                    CULLED,
+                    cv2.MARKER_TILTED_CROSS,
+                    2 * radius + 3,
+                    radius,
+                    cv2.LINE_AA,
+                )
     return image
 
 
@@ -159,14 +198,17 @@ def main_view(positions: Array) -> str:
     return max(VIEWS, key=lambda view: float(np.round((np.abs(VIEWS[view]) @ spread).sum(), 9)))
 
 
-def align_to_truth(episode: Episode, truth: dict[int, Array]) -> tuple[Array, list[slice], float | None]:
+def align_to_truth(
+    episode: Episode, truth: dict[int, Array]
+) -> tuple[Array, list[slice], float | None]:
     """The estimate in the truth's frame.
 
-    They are joined at the first frame that has both, and aligned by least squares over all frames so far (as for the
-    ATE) from `ALIGN_FROM` frames on.
+    They are joined at the first frame that has both, and aligned by least squares over all frames
+    so far (as for the ATE) from `ALIGN_FROM` frames on.
 
     Returns:
-        Camera centres ``[N, 3]`` in metres, the pieces of them without a gap, and the ATE in metres where it is known.
+        Camera centres ``[N, 3]`` in metres, the pieces of them without a gap, and the ATE in metres
+        where it is known.
     """
     tracked = [(o.index, o.T_world_cam) for o in episode.outcomes if o.T_world_cam is not None]
     if not tracked:
@@ -177,7 +219,9 @@ def align_to_truth(episode: Episode, truth: dict[int, Array]) -> tuple[Array, li
     ate_m = None
     if len(both) >= ALIGN_FROM:
         placed = align(poses[both], true, "se3").apply(poses)
-        ate_m = float(np.sqrt(np.square(placed[both][:, :3, 3] - true[:, :3, 3]).sum(axis=1).mean()))
+        ate_m = float(
+            np.sqrt(np.square(placed[both][:, :3, 3] - true[:, :3, 3]).sum(axis=1).mean())
+        )
     elif both:
         placed = true[0] @ se3.inverse(poses[both[0]]) @ poses
     else:
@@ -199,7 +243,8 @@ def _nice_length(metres: float) -> float:
 
 
 def _grid(plot: Image, centre: Array, metres_a_pixel: float) -> None:
-    step, half = _nice_length(metres_a_pixel * HEIGHT / 4), HEIGHT / 2 * metres_a_pixel
+    step = _nice_length(metres_a_pixel * HEIGHT / 4)
+    half = HEIGHT / 2 * metres_a_pixel
     for axis, sign in ((0, 1), (1, -1)):
         first = np.ceil((centre[axis] - half) / step) * step
         for value in np.arange(first, centre[axis] + half, step):
@@ -215,10 +260,17 @@ def _scale_bar(plot: Image, metres_a_pixel: float) -> None:
     cv2.line(plot, (16, y), (16 + pixels, y), _INK, 2)
     for x in (16, 16 + pixels):
         cv2.line(plot, (x, y - 4), (x, y + 4), _INK, 2)
-    _text(plot, f"{length:g} m" if length >= 1 else f"{100 * length:g} cm", (16, y - 10), _INK, 0.45)
+    _text(
+        plot, f"{length:g} m" if length >= 1 else f"{100 * length:g} cm", (16, y - 10), _INK, 0.45
+    )
 
 
 def _text(
-    image: Image, text: str, at: tuple[int, int], colour: tuple[int, int, int], scale: float, thickness: int = 1
+    image: Image,
+    text: str,
+    at: tuple[int, int],
+    colour: tuple[int, int, int],
+    scale: float,
+    thickness: int = 1,
 ) -> None:
     cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, thickness, cv2.LINE_AA)

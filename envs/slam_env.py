@@ -32,7 +32,13 @@ from dynslam_bench.contracts import (
     timestamps_ns,
 )
 from dynslam_bench.contracts import Sequence as FrameSequence
-from dynslam_bench.contracts.checks import check_frame, check_result, check_sensors, check_trajectory, tracker_code
+from dynslam_bench.contracts.checks import (
+    check_frame,
+    check_result,
+    check_sensors,
+    check_trajectory,
+    tracker_code,
+)
 from dynslam_bench.contracts.sequence import read_only, read_only_masks
 from dynslam_bench.core import (
     DynslamError,
@@ -72,7 +78,17 @@ FrameTransform = Callable[[Frame], Frame]
 Frames = Sequence[int | None] | str | None
 """Part of a sequence: ``(start, stop)``, ``"start:stop"`` with either end open, or None for all."""
 _OF_AN_EPISODE = (
-    *("_tracker", "_errors", "episode", "frame", "result", "_final", "settings", "_actions", "window"),
+    *(
+        "_tracker",
+        "_errors",
+        "episode",
+        "frame",
+        "result",
+        "_final",
+        "settings",
+        "_actions",
+        "window",
+    ),
     *("_np_random", "_np_random_seed"),
 )
 """What of an environment belongs to its episode."""
@@ -94,35 +110,40 @@ class EpisodeState:
 class SlamEnv(gym.Env[Any, Any], EzPickle):
     """Visual SLAM on one sequence as an environment.
 
-    `reset` tracks frame 0; every `step` runs the full pipeline on the next frame, so an episode of a sequence with N
-    frames has N - 1 steps. All randomness of the tracker comes from the environment's seed.
+    `reset` tracks frame 0; every `step` runs the full pipeline on the next frame, so an episode of
+    a sequence with N frames has N - 1 steps. All randomness of the tracker comes from the
+    environment's seed.
 
     **Action.** ``Discrete(1)`` without `control` (pure evaluation); otherwise ``Box(-1, 1, (k,))`` over the named
-    online settings (see `ActionMap`), in force from the frame of the step on; an episode begins with `settings`.
-    The tracker then needs the method of `core.settings.Reconfigurable`, ``configure(settings)``: it takes the complete
-    settings, of which only online fields differ from those it was built with, and ``reset`` brings those back.
+    online settings (see `ActionMap`), in force from the frame of the step on; an episode begins
+    with `settings`. The tracker then needs the method of `core.settings.Reconfigurable`,
+    ``configure(settings)``: it takes the complete settings, of which only online fields differ from
+    those it was built with, and ``reset`` brings those back.
 
     **Observation.** ``stats``: float32 ``[24]`` (see `STATS_LAYOUT`); ``rgbd``: a dict with ``rgb``,
-    ``depth`` and ``stats``; a list of parts: a dict of them. The parts: ``stats``; ``rgb`` uint8 ``[H, W, 3]``;
-    ``depth`` float32 ``[H, W]`` metres, 0 missing; ``gray`` uint8 ``[60, 80, 1]``; ``keypoints`` float32 ``[256, 5]``
-    (see `KEYPOINT_LAYOUT`) with ``keypoints_mask`` int8 ``[256]``; ``privileged`` float32 ``[11]`` (see
-    `PRIVILEGED_LAYOUT`), which alone holds something of the ground truth, for a critic.
+    ``depth`` and ``stats``; a list of parts: a dict of them. The parts: ``stats``; ``rgb`` uint8
+    ``[H, W, 3]``; ``depth`` float32 ``[H, W]`` metres, 0 missing; ``gray`` uint8 ``[60, 80, 1]``;
+    ``keypoints`` float32 ``[256, 5]`` (see `KEYPOINT_LAYOUT`) with ``keypoints_mask`` int8
+    ``[256]``; ``privileged`` float32 ``[11]`` (see `PRIVILEGED_LAYOUT`), which alone holds
+    something of the ground truth, for a critic.
 
     **Reward** in metres: see `REWARDS`. Frames without a tracked pose, and all remaining ones when `lost_after` ends an
-    episode, cost twice the true motion (``neg_rpe``: not having moved, and having to catch up), or the length of the
-    true path so far (``neg_pose_error``).
+    episode, cost twice the true motion (``neg_rpe``: not having moved, and having to catch up), or
+    the length of the true path so far (``neg_pose_error``).
 
     **Info**: ``frame_index``, ``timestamp``, ``window`` (int64 ``[2]``: first frame of the episode and one past its
-    last), ``tracking_state`` (``initialising``, ``ok``, ``lost``), ``stats`` (the tracker's diagnostics); ``pose``
-    float64 ``[7]`` (tx ty tz qx qy qz qw, camera to world) of tracked frames; ``pose_error_trans_m`` and
-    ``pose_error_rot_deg`` (cumulative, causal: not an ATE), ``frame_error_trans_m`` and ``frame_error_rot_deg`` (motion
-    since the previous frame) where there is ground truth. The last step adds ``episode_metrics`` under the protocol
-    named by ``protocol``. What is not defined is left out, never NaN; with `fixed_info` it is 0 and its flag, ``has_``
-    before the name, False, so that keys and types are always the same. Wall-clock times are no part of it: see
-    `timings`.
+    last), ``tracking_state`` (``initialising``, ``ok``, ``lost``), ``stats`` (the tracker's
+    diagnostics); ``pose`` float64 ``[7]`` (tx ty tz qx qy qz qw, camera to world) of tracked
+    frames; ``pose_error_trans_m`` and ``pose_error_rot_deg`` (cumulative, causal: not an ATE),
+    ``frame_error_trans_m`` and ``frame_error_rot_deg`` (motion since the previous frame) where
+    there is ground truth. The last step adds ``episode_metrics`` under the protocol named by
+    ``protocol``. What is not defined is left out, never NaN; with `fixed_info` it is 0 and its
+    flag, ``has_`` before the name, False, so that keys and types are always the same. Wall-clock
+    times are no part of it: see `timings`.
 
     **Monocular trackers** (`TrackerSpec.sensors` is ``rgb``) give poses in a unit of their own. No pose error is known
-    as frames come: none is given, and the reward is 0. The last step's metrics need a protocol with Sim(3) alignment.
+    as frames come: none is given, and the reward is 0. The last step's metrics need a protocol with
+    Sim(3) alignment.
 
     **End**: ``truncated`` at the end of the sequence, ``terminated`` after `lost_after` lost frames in a row.
 
@@ -132,25 +153,31 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         settings: Overrides of the tracker's settings by dotted name, or its complete settings.
         control: Dotted names of the online settings that actions change.
         observation: ``stats``, ``rgbd``, or a list of parts.
-        reward: A name of `REWARDS`, or a callable ``reward(episode) -> float`` that is asked after every frame.
-        protocol: Id of the protocol of the episode's metrics; its tolerance also joins frames and ground truth.
+        reward: A name of `REWARDS`, or a callable ``reward(episode) -> float`` that is asked after
+            every frame.
+        protocol: Id of the protocol of the episode's metrics; its tolerance also joins frames and
+            ground truth.
         frames: Part of the sequence, ``(start, stop)`` or ``"start:stop"``; None for all.
         stride: Take every so many frames.
-        window: Frames of an episode: each `reset` draws a stretch of so many frames; None for all frames.
-        lost_after: End the episode after so many lost frames in a row, initialising ones not counted; None never.
+        window: Frames of an episode: each `reset` draws a stretch of so many frames; None for all
+            frames.
+        lost_after: End the episode after so many lost frames in a row, initialising ones not
+            counted; None never.
         device: ``auto``, ``cpu`` or ``cuda:N``.
         render_mode: ``rgb_array`` or None.
         data_root: Folder of the recorded sequences; None for the default one.
-        camera: Name or file of the camera for folders that do not say theirs; None to read it from the folder.
+        camera: Name or file of the camera for folders that do not say theirs; None to read it from
+            the folder.
         threads: Threads that the tracker may use.
-        cache: Whether features and network masks come from the stage cache where they are stored; poses and reported
-            stage times are the same either way.
+        cache: Whether features and network masks come from the stage cache where they are stored;
+            poses and reported stage times are the same either way.
         fixed_info: Whether ``info`` has the same keys on every step, as Minari needs.
-        memory_map: Whether all frames are decoded once into a file of the stage cache that environments and processes
-            share (2.2 MB a frame of 640 x 480).
+        memory_map: Whether all frames are decoded once into a file of the stage cache that
+            environments and processes share (2.2 MB a frame of 640 x 480).
 
     Raises:
-        DynslamError: Unknown or unfit sequence, tracker, setting, reward, protocol or device, or fewer than 2 frames.
+        DynslamError: Unknown or unfit sequence, tracker, setting, reward, protocol or device, or
+            fewer than 2 frames.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
@@ -184,13 +211,21 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         fixed_info: bool = False,
         memory_map: bool = False,
     ) -> None:
-        given = {name: value for name, value in locals().items() if name not in ("self", "__class__")}
+        given = {
+            name: value for name, value in locals().items() if name not in ("self", "__class__")
+        }
         EzPickle.__init__(self, given.pop("sequence"), given.pop("tracker"), **given)
         if render_mode not in (None, "rgb_array"):
             raise SettingsError(f"unknown render mode '{render_mode}'", "choose rgb_array")
         if not callable(reward) and reward not in REWARDS:
-            raise SettingsError(f"unknown reward '{reward}'", f"choose {' or '.join(REWARDS)}, or give a callable")
-        for title, number, least in (("lost_after", lost_after, 1), ("threads", threads, 1), ("window", window, 2)):
+            raise SettingsError(
+                f"unknown reward '{reward}'", f"choose {' or '.join(REWARDS)}, or give a callable"
+            )
+        for title, number, least in (
+            ("lost_after", lost_after, 1),
+            ("threads", threads, 1),
+            ("window", window, 2),
+        ):
             if number is not None and operator.index(number) < least:
                 raise SettingsError(f"{title} is {number}", f"give a number >= {least}")
         self.render_mode = render_mode
@@ -198,7 +233,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self.tracker_spec = TRACKERS.get(tracker) if isinstance(tracker, str) else tracker
         self.frame_transforms: list[FrameTransform] = []
         """Applied in order to every frame before the tracker sees it; wrappers add to it."""
-        self._observation, self._parts = observation, observation_parts(observation)
+        self._parts = observation_parts(observation)
+        self._observation = observation
         self._reward: Reward = reward if callable(reward) else REWARDS[reward]
         self._length = window
         self._fixed_info = fixed_info
@@ -207,7 +243,12 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self._threads = threads
         self._cache = str(stage_cache_folder()) if cache else None
         self._open = partial(
-            open_frames, data_root=data_root, camera=camera, frames=frames, stride=stride, memory_map=memory_map
+            open_frames,
+            data_root=data_root,
+            camera=camera,
+            frames=frames,
+            stride=stride,
+            memory_map=memory_map,
         )
         self._control = tuple(control) if not isinstance(control, str) else control
         self._tracker: Tracker | None = None
@@ -240,7 +281,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         """The action that asks for values of controlled settings, by dotted name; all others stay as they are.
 
         Raises:
-            SettingsError: A name is not in `control`, or a value is not within the range that actions span.
+            SettingsError: A name is not in `control`, or a value is not within the range that
+                actions span.
         """
         return self._actions.of(values)
 
@@ -258,7 +300,9 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         if self._final is None and finalize is not None:
             with tracker_code():
                 final = finalize()
-            self._final = check_trajectory(final, self.tracker_spec.id).with_exact(self.exact_stamps)
+            self._final = check_trajectory(final, self.tracker_spec.id).with_exact(
+                self.exact_stamps
+            )
         return self._final
 
     @property
@@ -286,33 +330,48 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             save(Path(path), made_by)
 
     @names_wrong_arguments
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode and track frame 0.
 
         Args:
             seed: Seed of everything random; None goes on from the previous episode.
-            options: ``sequence`` and ``settings`` replace those of the constructor from this episode on; ``window``,
-                ``(first, one past the last)``, says which of its frames this episode is made of.
+            options: ``sequence`` and ``settings`` replace those of the constructor from this
+                episode on; ``window``, ``(first, one past the last)``, says which of its frames
+                this episode is made of.
 
         Raises:
-            DynslamError: Unknown option, a window that does not fit, or a new sequence whose images do not fit the
-                observation space.
-            TrackerError: The tracker cannot be built or broke its contract. Whatever fails before frame 0 is tracked,
-                settings and sequence stay as they were, and no episode runs.
+            DynslamError: Unknown option, a window that does not fit, or a new sequence whose images
+                do not fit the observation space.
+            TrackerError: The tracker cannot be built or broke its contract. Whatever fails before
+                frame 0 is tracked, settings and sequence stay as they were, and no episode runs.
         """
         super().reset(seed=seed)
-        self.episode, self._final = Episode(), None
+        self.episode = Episode()
+        self._final = None
         before = {
             name: vars(self)[name]
-            for name in ("settings", "_actions", "sequence", "_whole", "window", "_source", "metadata")
+            for name in (
+                "settings",
+                "_actions",
+                "sequence",
+                "_whole",
+                "window",
+                "_source",
+                "metadata",
+            )
         }
         try:
             self._apply_options(options or {})
             tracker = self._ready_tracker()
             with tracker_code():
-                if self._actions.parameters:  # before the reset: whatever that copies is then the episode's own
+                # before the reset: whatever that copies is then the episode's own
+                if self._actions.parameters:
                     tracker.configure(self.settings)  # type: ignore[attr-defined]
-                tracker.reset(self.sequence.camera, rng=np.random.default_rng(derive_seed(self.np_random)))
+                tracker.reset(
+                    self.sequence.camera, rng=np.random.default_rng(derive_seed(self.np_random))
+                )
         except Exception:
             vars(self).update(before)
             self.close()
@@ -344,7 +403,9 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         truncated = len(outcomes) == self._count
         if terminated:
             rest = Episode(list(outcomes))
-            reward += sum(self._add_untracked(rest, "lost") for _ in self.sequence.timestamps[len(outcomes) :])
+            reward += sum(
+                self._add_untracked(rest, "lost") for _ in self.sequence.timestamps[len(outcomes) :]
+            )
         self.episode.over = terminated or truncated
         return self._observe(), float(reward), terminated, truncated, self._info()
 
@@ -385,8 +446,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         """Go back to a copied episode; the steps that follow are equal to the bit to those that followed the copy.
 
         Raises:
-            DynslamError: The state is of other frames, or of another tracker, control, reward, protocol, version, or of
-                other settings or another `lost_after`.
+            DynslamError: The state is of other frames, or of another tracker, control, reward,
+                protocol, version, or of other settings or another `lost_after`.
         """
         origin = self._origin()
         for name, value in state.origin.items():
@@ -418,12 +479,16 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     def episode_metrics(self) -> dict[str, float]:
         """The metrics of the frames so far under the protocol: plain floats by name, without undefined ones.
 
-        ``coverage``, ``frames`` and ``tracked_frames`` of the scored trajectory, and the metrics of `evaluate` where
-        there is ground truth and the protocol finds something to evaluate.
+        ``coverage``, ``frames`` and ``tracked_frames`` of the scored trajectory, and the metrics of
+        `evaluate` where there is ground truth and the protocol finds something to evaluate.
         """
         final = self.final_trajectory() if self.protocol.trajectory == "final" else None
         trajectory = self.online_trajectory() if final is None else final
-        due = self.sequence.timestamps if self.episode.over else self.sequence.timestamps[: self.episode.next_index]
+        due = (
+            self.sequence.timestamps
+            if self.episode.over
+            else self.sequence.timestamps[: self.episode.next_index]
+        )
         tracked = 0
         with suppress(EvaluationError):  # a final trajectory whose stamps are of no frame
             tracked = int(tracked_frames(trajectory, due).sum())
@@ -437,13 +502,17 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             return counts
         with suppress(EvaluationError):  # too little was tracked; the coverage says so
             metrics = evaluate(trajectory, truth, self.protocol, input_timestamps=due).metrics
-            counts |= {name: float(value) for name, value in metrics.items() if math.isfinite(value)}
+            counts |= {
+                name: float(value) for name, value in metrics.items() if math.isfinite(value)
+            }
         return counts
 
     def render(self) -> NDArray[np.uint8] | None:
         """The current frame with its features and masks beside the trajectory, uint8 ``[H, W, 3]``."""
         if self.render_mode is None:
-            gym.logger.warn("render() was called without a render mode: make the environment with 'rgb_array'")
+            gym.logger.warn(
+                "render() was called without a render mode: make the environment with 'rgb_array'"
+            )
             return None
         if not self.episode.outcomes:
             raise DynslamError("render() was called before reset()")
@@ -453,7 +522,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     def close(self) -> None:
         """Close the tracker; the environment may be reset again."""
-        tracker, self._tracker = self._tracker, None
+        tracker = self._tracker
+        self._tracker = None
         close = getattr(tracker, "close", None)
         if close is not None:
             with tracker_code():
@@ -474,7 +544,14 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     def _copied(self, parts: Mapping[str, Any], memo: dict[int, Any]) -> dict[str, Any]:
         """Deep copies of attributes, which share what is never changed."""
-        shared = (self.sequence, self._whole, self._source, self.tracker_spec, self.protocol, self.settings)
+        shared = (
+            self.sequence,
+            self._whole,
+            self._source,
+            self.tracker_spec,
+            self.protocol,
+            self.settings,
+        )
         memo |= {id(value): value for value in (*shared, self.sequence.ground_truth)}
         try:
             deepcopy(parts["_tracker"], memo)
@@ -486,10 +563,16 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         return deepcopy(dict(parts), memo)
 
     @names_wrong_arguments
-    def _use_settings(self, settings: Mapping[str, Any] | Settings | None, before: Settings | None = None) -> None:
+    def _use_settings(
+        self, settings: Mapping[str, Any] | Settings | None, before: Settings | None = None
+    ) -> None:
         if not isinstance(settings, Settings):
             spec = self.tracker_spec
-            settings = resolve_settings(spec, settings) if before is None else apply_overrides(before, settings or {})
+            settings = (
+                resolve_settings(spec, settings)
+                if before is None
+                else apply_overrides(before, settings or {})
+            )
         if not isinstance(settings, self.tracker_spec.settings):
             raise SettingsError(
                 f"tracker '{self.tracker_spec.id}' takes {self.tracker_spec.settings.__name__}, "
@@ -517,10 +600,13 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     def _apply_options(self, options: Mapping[str, Any]) -> None:
         for unknown in sorted(set(options) - {"sequence", "settings", "window"}):
-            raise SettingsError(f"unknown reset option '{unknown}'", "known: sequence, settings, window")
+            raise SettingsError(
+                f"unknown reset option '{unknown}'", "known: sequence, settings, window"
+            )
         if {"sequence", "settings"} & set(options):
             self.close()  # the next tracker is built for other settings or another sequence
-        preprocessing, camera = preprocessing_of(self.settings), self.sequence.camera
+        preprocessing = preprocessing_of(self.settings)
+        camera = self.sequence.camera
         if "settings" in options:
             self._use_settings(options["settings"], self.settings)
             if preprocessing_of(self.settings) != preprocessing:
@@ -529,7 +615,9 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             self._use_sequence(options["sequence"])
             size, new_size = ((c.width, c.height) for c in (camera, self.sequence.camera))
             if {"rgb", "depth"} & set(self._parts) and size != new_size:
-                raise SequenceError(f"images of {new_size} pixels do not fit the observation space of {size}")
+                raise SequenceError(
+                    f"images of {new_size} pixels do not fit the observation space of {size}"
+                )
         window = (0, len(self._whole))
         if options.get("window") is not None:
             window = parse_window(options["window"], self._whole)
@@ -538,8 +626,10 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             window = (first, first + self._length)
         if window != self.window:
             if self._whole.masks is not None:
-                self.close()  # the tracker may hold the exact masks, which are numbered as the frames
-            self.sequence, self.window = _part(self._whole, window), window
+                # the tracker may hold the exact masks, which are numbered as the frames
+                self.close()
+            self.sequence = _part(self._whole, window)
+            self.window = window
 
     def _ready_tracker(self) -> Tracker:
         """The tracker for the current settings and sequence."""
@@ -566,7 +656,9 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         if self._tracker is None or not self.episode.outcomes:
             raise DynslamError("step() was called before reset()")
         if self.episode.over:
-            raise DynslamError(f"the episode is over after frame {self.episode.next_index - 1}", "call reset()")
+            raise DynslamError(
+                f"the episode is over after frame {self.episode.next_index - 1}", "call reset()"
+            )
         return self._tracker
 
     def _track_next(self, tracker: Tracker) -> None:
@@ -576,26 +668,40 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             SequenceError: The frame cannot be read, or does not fit the sequence's camera.
             TrackerContractError: The tracker broke its contract.
         """
-        index, self._final, began = self.episode.next_index, None, time.perf_counter()
+        index = self.episode.next_index
+        began = time.perf_counter()
+        self._final = None
         frame = _read_frame(self.sequence, index)
         for transform in self.frame_transforms:
             frame = transform(frame)
         frame = read_only(frame)
-        read, processor_began = time.perf_counter(), time.process_time()
+        read = time.perf_counter()
+        processor_began = time.process_time()
         with tracker_code():
             result = tracker.track(frame)
-        total, processor = time.perf_counter() - read, time.process_time() - processor_began
+        total = time.perf_counter() - read
+        processor = time.process_time() - processor_began
         result = check_result(result, frame, self.tracker_spec.id)
         if result.stats.get("cached_stages"):  # the stages report their times without the cache
-            inside = (seconds for stage, seconds in result.timings.items() if stage != "detector")  # which works beside
+            # which works beside
+            inside = (seconds for stage, seconds in result.timings.items() if stage != "detector")
             uncached = max(total, sum(inside))
-            total, processor = uncached, processor + uncached - total
+            processor = processor + uncached - total
+            total = uncached
         timings = {"read": read - began, "total": total, "processor": processor}
-        timings |= {stage: float(seconds) for stage, seconds in result.timings.items() if stage not in timings}
-        self.frame, self.result = frame, result
+        timings |= {
+            stage: float(seconds)
+            for stage, seconds in result.timings.items()
+            if stage not in timings
+        }
+        self.frame = frame
+        self.result = result
         pose = np.array(result.T_world_cam, dtype=np.float64) if result.state == "ok" else None
         error = self._errors.update(frame.timestamp, pose)
-        self._add(self.episode, FrameOutcome(index, frame.timestamp, result.state, pose, result.stats, timings, error))
+        self._add(
+            self.episode,
+            FrameOutcome(index, frame.timestamp, result.state, pose, result.stats, timings, error),
+        )
 
     def _add(self, episode: Episode, outcome: FrameOutcome) -> float:
         """Append a frame's outcome with what it earns, which is returned."""
@@ -608,7 +714,10 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         """Append the next frame as one without a pose; returns what it earns."""
         index = episode.next_index
         stamp = float(self.sequence.timestamps[index])
-        return self._add(episode, FrameOutcome(index, stamp, state, None, {}, {}, self._errors.update(stamp, None)))
+        return self._add(
+            episode,
+            FrameOutcome(index, stamp, state, None, {}, {}, self._errors.update(stamp, None)),
+        )
 
     @property
     def _count(self) -> int:
@@ -629,7 +738,9 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
 def _part(whole: FrameSequence, window: tuple[int, int]) -> FrameSequence:
     """The frames of a window."""
-    return whole if window == (0, len(whole)) else cast("FrameSequence", SequenceView(whole, *window))
+    return (
+        whole if window == (0, len(whole)) else cast("FrameSequence", SequenceView(whole, *window))
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -658,7 +769,9 @@ def _read_frame(sequence: FrameSequence, index: int) -> Frame:
         ours = isinstance(error, DynslamError)
         fault = error.args[0] if ours else f"{type(error).__name__}: {error}".rstrip(": ")
         hint = getattr(error, "hint", "") if ours else ""
-        raise SequenceError(f"frame {index} of '{sequence.id}' cannot be read: {fault}", hint) from error
+        raise SequenceError(
+            f"frame {index} of '{sequence.id}' cannot be read: {fault}", hint
+        ) from error
     return frame
 
 
@@ -691,7 +804,9 @@ def open_frames(
     """
     start, stop = parse_frames(frames)
     if isinstance(sequence, str | Path):
-        sequence = open_sequence(sequence, data_root=data_root, camera=camera, preprocessing=preprocessing)
+        sequence = open_sequence(
+            sequence, data_root=data_root, camera=camera, preprocessing=preprocessing
+        )
     elif preprocessing is not None and preprocessing.changes_images:
         from dynslam_bench.sequences.preprocessing import Preprocessed
 
@@ -725,14 +840,19 @@ def check_frames(sequence: FrameSequence) -> None:
     """Refuse a sequence that is too short for an episode, or whose camera, frame rate or stamps nobody could mean.
 
     Raises:
-        SequenceError: It has fewer than two frames, a camera that `check_camera` refuses, a frame rate that is no
-            number above 0, stamps that do not increase, or two frames or true poses less than 1 us apart.
+        SequenceError: It has fewer than two frames, a camera that `check_camera` refuses, a frame
+            rate that is no number above 0, stamps that do not increase, or two frames or true poses
+            less than 1 us apart.
     """
     if len(sequence) < 2:
-        raise SequenceError(f"'{sequence.id}' has {len(sequence)} frames here, an episode needs 2 or more")
+        raise SequenceError(
+            f"'{sequence.id}' has {len(sequence)} frames here, an episode needs 2 or more"
+        )
     check_camera(sequence.camera, f"the camera of '{sequence.id}'")
     if not 0 < sequence.fps < math.inf:
-        raise SequenceError(f"the frame rate of '{sequence.id}' is {sequence.fps} Hz", "it is a number above 0")
+        raise SequenceError(
+            f"the frame rate of '{sequence.id}' is {sequence.fps} Hz", "it is a number above 0"
+        )
     stamps = np.asarray(sequence.timestamps, dtype=np.float64)
     wrong = np.flatnonzero(~(np.diff(stamps) > 0))
     if len(wrong):
@@ -744,7 +864,9 @@ def check_frames(sequence: FrameSequence) -> None:
         )
     refuse_close(timestamps_ns(sequence), f"frames of '{sequence.id}'", SequenceError)
     if sequence.ground_truth is not None:
-        refuse_close(sequence.ground_truth.timestamps_ns, f"ground truth of '{sequence.id}'", SequenceError)
+        refuse_close(
+            sequence.ground_truth.timestamps_ns, f"ground truth of '{sequence.id}'", SequenceError
+        )
 
 
 def preprocessing_of(settings: Settings) -> PreprocessingSettings | None:
@@ -757,7 +879,8 @@ def preprocessing_of(settings: Settings) -> PreprocessingSettings | None:
 def resolve_device(device: str = "auto") -> str:
     """``cpu`` or ``cuda:N`` for ``auto``, ``cpu``, ``cuda`` or ``cuda:N``.
 
-    ``auto`` is the first CUDA device, or the CPU where there is none. Torch is imported only if a driver is present.
+    ``auto`` is the first CUDA device, or the CPU where there is none. Torch is imported only if a
+    driver is present.
 
     Raises:
         SettingsError: The name is not understood, or the machine has no such device.
@@ -776,6 +899,7 @@ def resolve_device(device: str = "auto") -> str:
     index = int(device.partition(":")[2] or 0)
     if index >= count:
         raise SettingsError(
-            f"device '{device}' was asked for, this machine has {count} CUDA devices", "use --device cpu"
+            f"device '{device}' was asked for, this machine has {count} CUDA devices",
+            "use --device cpu",
         )
     return f"cuda:{index}"

@@ -31,30 +31,35 @@ from dynslam_bench.geometry import se3
 class ActionMap:
     """Maps actions to settings.
 
-    Without controlled settings the action space is ``Discrete(1)``: its action changes nothing. Otherwise it is
-    ``Box(-1, 1, (k,), float32)``, one coordinate a setting, in the order of `control`. With ``u = (a + 1) / 2``:
+    Without controlled settings the action space is ``Discrete(1)``: its action changes nothing.
+    Otherwise it is ``Box(-1, 1, (k,), float32)``, one coordinate a setting, in the order of
+    `control`. With ``u = (a + 1) / 2``:
 
     - float: ``low + u * (high - low)``, or ``low * (high / low) ** u`` on a log scale;
     - int: the same, rounded to the nearest integer;
     - bool and categorical: the ``floor(u * n)``-th of the n choices, each with an equal share of the axis.
 
-    A coordinate that is that of the neutral action leaves its setting exactly as it is in `settings`; an action has 24
-    bits a coordinate, from which most values come back changed in the last places.
+    A coordinate that is that of the neutral action leaves its setting exactly as it is in
+    `settings`; an action has 24 bits a coordinate, from which most values come back changed in the
+    last places.
 
     Args:
         settings: The settings of the episode; all others keep these values.
         control: Dotted names of online settings.
 
     Raises:
-        SettingsError: A name is unknown or given twice, or its setting may not change in mid-episode, has no effect
-            with these settings, or has a value outside the range that actions span.
+        SettingsError: A name is unknown or given twice, or its setting may not change in
+            mid-episode, has no effect with these settings, or has a value outside the range that
+            actions span.
     """
 
     @names_wrong_arguments
     def __init__(self, settings: Settings, control: Sequence[str]) -> None:
         self.base = settings
         self.parameters: tuple[Parameter, ...] = _select(settings, control)
-        self._values = {parameter.name: attrgetter(parameter.name)(settings) for parameter in self.parameters}
+        self._values = {
+            parameter.name: attrgetter(parameter.name)(settings) for parameter in self.parameters
+        }
         self._neutral = self.encode(settings)
 
     @property
@@ -75,7 +80,8 @@ class ActionMap:
             action: float ``[k]``; values beyond [-1, 1] are clipped. Without controlled settings 0.
 
         Raises:
-            SettingsError: The action is none of the space: not 0, of another shape, no numbers, or NaN.
+            SettingsError: The action is none of the space: not 0, of another shape, no numbers, or
+                NaN.
         """
         if self.parameters:
             return apply_overrides(self.base, self.values(action))
@@ -103,48 +109,68 @@ class ActionMap:
         if np.isnan(vector).any():
             raise SettingsError(f"the action holds NaN: {vector.tolist()}")
         shares = (np.clip(vector, -1.0, 1.0) + 1.0) / 2.0
-        asked = zip(self.parameters, shares, vector.astype(np.float32) == self._neutral, strict=True)
-        return {p.name: self._values[p.name] if same else _decode(p, float(u)) for p, u, same in asked}
+        asked = zip(
+            self.parameters, shares, vector.astype(np.float32) == self._neutral, strict=True
+        )
+        return {
+            p.name: self._values[p.name] if same else _decode(p, float(u)) for p, u, same in asked
+        }
 
     def of(self, values: Mapping[str, Any]) -> NDArray[np.float32]:
         """The action ``[k]`` that asks for values of controlled settings; see `SlamEnv.action_of`."""
         for name in values:
             if name not in self._values:
-                raise SettingsError(f"setting '{name}' is not in control", did_you_mean(name, self._values))
+                raise SettingsError(
+                    f"setting '{name}' is not in control", did_you_mean(name, self._values)
+                )
         settings = apply_overrides(self.base, values)
         for parameter in self.parameters:
-            _check_range(parameter, attrgetter(parameter.name)(settings), f"setting '{parameter.name}'")
+            _check_range(
+                parameter, attrgetter(parameter.name)(settings), f"setting '{parameter.name}'"
+            )
         return self.encode(settings)
 
     def encode(self, settings: Settings) -> NDArray[np.float32]:
         """The action ``[k]`` that asks for given settings; values beyond the search range are clipped to its ends."""
         flat = flatten(settings)
         shares = [_encode(p, flat[p.name]) for p in self.parameters]
-        return np.asarray(np.clip(2.0 * np.array(shares, dtype=np.float64) - 1.0, -1.0, 1.0), dtype=np.float32)
+        return np.asarray(
+            np.clip(2.0 * np.array(shares, dtype=np.float64) - 1.0, -1.0, 1.0), dtype=np.float32
+        )
 
 
 def _select(settings: Settings, control: Sequence[str]) -> tuple[Parameter, ...]:
     if isinstance(control, str):
         raise SettingsError(f"control is the string '{control}'", "give a list of setting names")
-    online = {parameter.name: parameter for parameter in parameters(type(settings), online_only=True)}
+    online = {
+        parameter.name: parameter for parameter in parameters(type(settings), online_only=True)
+    }
     chosen = []
     for name in control:
         if name not in online:
             fixed = f"setting '{name}' may not change in mid-episode"
             fault = fixed if name in flatten(settings) else f"unknown setting '{name}' in control"
-            raise SettingsError(fault, did_you_mean(name, online) or "this tracker has no online settings")
+            raise SettingsError(
+                fault, did_you_mean(name, online) or "this tracker has no online settings"
+            )
         parameter = online[name]
         if parameter in chosen:
             raise SettingsError(f"setting '{name}' is given twice in control")
         if reason := why_unused(settings, name):
-            raise SettingsError(f"setting '{name}' in control has no effect: {reason}", "leave it out of control")
+            raise SettingsError(
+                f"setting '{name}' in control has no effect: {reason}", "leave it out of control"
+            )
         _check_range(parameter, attrgetter(name)(settings), f"setting '{name}' in control")
         chosen.append(parameter)
     return tuple(chosen)
 
 
 def _check_range(parameter: Parameter, value: Any, title: str) -> None:
-    if parameter.low is not None and parameter.high is not None and not parameter.low <= value <= parameter.high:
+    if (
+        parameter.low is not None
+        and parameter.high is not None
+        and not parameter.low <= value <= parameter.high
+    ):
         raise SettingsError(
             f"{title} is {value:g}, actions span {parameter.low:g} to {parameter.high:g}",
             "set it within, or leave it out of control",
@@ -153,8 +179,11 @@ def _check_range(parameter: Parameter, value: Any, title: str) -> None:
 
 def _decode(parameter: Parameter, share: float) -> Scalar:
     if parameter.low is None or parameter.high is None:
-        return parameter.choices[min(int(share * len(parameter.choices)), len(parameter.choices) - 1)]
-    low, high = float(parameter.low), float(parameter.high)
+        return parameter.choices[
+            min(int(share * len(parameter.choices)), len(parameter.choices) - 1)
+        ]
+    low = float(parameter.low)
+    high = float(parameter.high)
     value = low * (high / low) ** share if parameter.scale == "log" else low + share * (high - low)
     value = min(max(value, low), high)  # rounding may put a power slightly beyond its end
     return round(value) if parameter.kind == "int" else value
@@ -163,7 +192,9 @@ def _decode(parameter: Parameter, share: float) -> Scalar:
 def _encode(parameter: Parameter, value: Scalar) -> float:
     if parameter.low is None or parameter.high is None:
         return (parameter.choices.index(value) + 0.5) / len(parameter.choices)
-    low, high, x = float(parameter.low), float(parameter.high), float(value)
+    low = float(parameter.low)
+    high = float(parameter.high)
+    x = float(value)
     if parameter.scale == "log":
         return math.log(max(x, low) / low) / math.log(high / low)
     return (x - low) / (high - low)
@@ -189,7 +220,10 @@ PRIVILEGED_LAYOUT: tuple[tuple[str, str], ...] = (
     ("pose_error_rot", "causal rotational pose error / 180 degrees"),
     ("frame_error_trans", "tanh(e / 0.1 m) of the frame-to-frame translational error e"),
     ("frame_error_rot", "frame-to-frame rotational error / 180 degrees"),
-    ("motion_x", "tanh(x / 0.1 m) of the true motion since the previous frame, in the previous camera frame"),
+    (
+        "motion_x",
+        "tanh(x / 0.1 m) of the true motion since the previous frame, in the previous camera frame",
+    ),
     ("motion_y", "likewise, y"),
     ("motion_z", "likewise, z (forward)"),
     ("motion_rx", "tanh(r / 0.1 rad) of the rotation vector of that motion"),
@@ -213,7 +247,10 @@ STATS_LAYOUT: tuple[tuple[str, str], ...] = (
     ("map_points", "n / (n + 5000) of the map points"),
     ("keyframes", "n / (n + 100) of the keyframes"),
     ("keyframe", "1 if this frame became a keyframe, else 0"),
-    ("motion_x", "tanh(x / 0.1 m) of the estimated motion since the previous frame, in the previous camera frame"),
+    (
+        "motion_x",
+        "tanh(x / 0.1 m) of the estimated motion since the previous frame, in the previous camera frame",
+    ),
     ("motion_y", "likewise, y"),
     ("motion_z", "likewise, z (forward)"),
     ("motion_rx", "tanh(r / 0.1 rad) of the rotation vector of that motion"),
@@ -243,7 +280,8 @@ def observation_space(observation: str | Sequence[str], camera: Camera) -> space
     """
     if observation == "stats":
         return stats_space()
-    size, most = (camera.height, camera.width), MOST_KEYPOINTS
+    size = (camera.height, camera.width)
+    most = MOST_KEYPOINTS
     part_spaces: dict[str, dict[str, spaces.Space[Any]]] = {
         "stats": {"stats": stats_space()},
         "rgb": {"rgb": spaces.Box(0, 255, (*size, 3), np.uint8)},
@@ -258,7 +296,10 @@ def observation_space(observation: str | Sequence[str], camera: Camera) -> space
     parts = observation_parts(observation)
     for part in parts:
         if part not in part_spaces:
-            raise SettingsError(f"unknown observation '{part}'", f"stats, rgbd, or a list of {', '.join(part_spaces)}")
+            raise SettingsError(
+                f"unknown observation '{part}'",
+                f"stats, rgbd, or a list of {', '.join(part_spaces)}",
+            )
     return spaces.Dict({key: space for part in parts for key, space in part_spaces[part].items()})
 
 
@@ -269,7 +310,9 @@ def observation_parts(observation: str | Sequence[str]) -> tuple[str, ...]:
     return (observation,) if isinstance(observation, str) else tuple(observation)
 
 
-def observe(parts: Iterable[str], frame: Frame, result: TrackResult, episode: Episode, progress: float) -> Any:
+def observe(
+    parts: Iterable[str], frame: Frame, result: TrackResult, episode: Episode, progress: float
+) -> Any:
     """The parts of the observation of the last frame, by key; what is asked for alone is computed."""
     observed: dict[str, Any] = {}
     for part in parts:
@@ -286,7 +329,9 @@ def observe(parts: Iterable[str], frame: Frame, result: TrackResult, episode: Ep
                 observed[part] = np.clip(depth, 0.0, MAX_DEPTH_M).astype(np.float32)
             case "gray":
                 gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-                observed[part] = cv2.resize(gray, GRAY_SIZE[::-1], interpolation=cv2.INTER_AREA)[..., None]
+                observed[part] = cv2.resize(gray, GRAY_SIZE[::-1], interpolation=cv2.INTER_AREA)[
+                    ..., None
+                ]
             case "keypoints":
                 observed[part], observed["keypoints_mask"] = keypoint_tokens(frame, result)
             case "privileged":
@@ -296,26 +341,37 @@ def observe(parts: Iterable[str], frame: Frame, result: TrackResult, episode: Ep
 
 def _estimated_motion(episode: Episode) -> NDArray[np.float64]:
     """Twist ``[6]`` of the estimated motion since the previous frame; 0 if either has no pose."""
-    poses = [outcome.T_world_cam for outcome in episode.outcomes[-2:] if outcome.T_world_cam is not None]
+    poses = [
+        outcome.T_world_cam for outcome in episode.outcomes[-2:] if outcome.T_world_cam is not None
+    ]
     return se3.log(se3.inverse(poses[0]) @ poses[1]) if len(poses) == 2 else np.zeros(6)
 
 
-def keypoint_tokens(frame: Frame, result: TrackResult) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
+def keypoint_tokens(
+    frame: Frame, result: TrackResult
+) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
     """The tracker's keypoints as a set of fixed size; of more than `MOST_KEYPOINTS`, evenly many along their list.
 
     Returns:
-        float32 ``[N, 5]`` (`KEYPOINT_LAYOUT`), rows beyond the keypoints 0, and int8 ``[N]``, 1 where there is one.
+        float32 ``[N, 5]`` (`KEYPOINT_LAYOUT`), rows beyond the keypoints 0, and int8 ``[N]``, 1
+        where there is one.
     """
-    tokens, mask = np.zeros((MOST_KEYPOINTS, len(KEYPOINT_LAYOUT)), np.float32), np.zeros(MOST_KEYPOINTS, np.int8)
+    tokens = np.zeros((MOST_KEYPOINTS, len(KEYPOINT_LAYOUT)), np.float32)
+    mask = np.zeros(MOST_KEYPOINTS, np.int8)
     xy = np.zeros((0, 2)) if result.keypoints_xy is None else np.asarray(result.keypoints_xy)
     keep = np.ones(len(xy)) if result.keypoints_keep is None else np.asarray(result.keypoints_keep)
     rows = np.linspace(0, len(xy) - 1, min(len(xy), MOST_KEYPOINTS)).astype(np.intp)
     height, width = frame.depth.shape
     x, y = xy[rows].T
-    at = np.rint(y).astype(np.intp).clip(0, height - 1), np.rint(x).astype(np.intp).clip(0, width - 1)
+    at = (
+        np.rint(y).astype(np.intp).clip(0, height - 1),
+        np.rint(x).astype(np.intp).clip(0, width - 1),
+    )
     z = np.nan_to_num(frame.depth[at], nan=0.0, posinf=MAX_DEPTH_M).clip(0, MAX_DEPTH_M)
     masked = np.zeros(len(rows)) if result.dynamic_mask is None else result.dynamic_mask[at]
-    tokens[: len(rows)] = np.stack([x / width, y / height, z / (z + 3.0), keep[rows], masked], axis=1).clip(0, 1)
+    tokens[: len(rows)] = np.stack(
+        [x / width, y / height, z / (z + 3.0), keep[rows], masked], axis=1
+    ).clip(0, 1)
     mask[: len(rows)] = 1
     return tokens, mask
 
@@ -334,7 +390,12 @@ def privileged_observation(episode: Episode) -> NDArray[np.float32]:
 
 
 def stats_observation(
-    frame: Frame, result: TrackResult, *, progress: float, lost_streak: int, motion: NDArray[np.float64]
+    frame: Frame,
+    result: TrackResult,
+    *,
+    progress: float,
+    lost_streak: int,
+    motion: NDArray[np.float64],
 ) -> NDArray[np.float32]:
     """The vector of `STATS_LAYOUT` for one tracked frame; finite whatever the tracker reports.
 
@@ -343,10 +404,14 @@ def stats_observation(
         result: What the tracker gave for it.
         progress: Index of the frame, over that of the sequence's last one.
         lost_streak: Frames lost in a row, this one included.
-        motion: Twist ``[6]`` of the estimated motion since the previous frame; 0 if either frame has no pose.
+        motion: Twist ``[6]`` of the estimated motion since the previous frame; 0 if either frame
+            has no pose.
     """
-    stats = defaultdict(float, {name: float(value) for name, value in result.stats.items() if np.isfinite(value)})
-    keypoints, matches = stats["keypoints"], stats["matches"]
+    stats = defaultdict(
+        float, {name: float(value) for name, value in result.stats.items() if np.isfinite(value)}
+    )
+    keypoints = stats["keypoints"]
+    matches = stats["matches"]
     gray = frame.rgb[::4, ::4].mean(axis=2, dtype=np.float32)
     depth = frame.depth[::4, ::4]
     valid = depth[(depth > 0) & np.isfinite(depth)]
@@ -371,7 +436,9 @@ def stats_observation(
         valid.size / max(depth.size, 1),
         _saturate(float(np.median(valid)), 3.0) if valid.size else 0.0,
     ]
-    return np.clip(np.asarray(values, dtype=np.float32), np.where(_SIGNED, -1.0, 0.0), 1.0).astype(np.float32)
+    return np.clip(np.asarray(values, dtype=np.float32), np.where(_SIGNED, -1.0, 0.0), 1.0).astype(
+        np.float32
+    )
 
 
 def _saturate(value: float, scale: float) -> float:

@@ -39,20 +39,25 @@ class SlamWrapper(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         RecordConstructorArgs.__init__(self, **arguments)
         gym.Wrapper.__init__(self, env)
         if not isinstance(env.unwrapped, SlamEnv):
-            raise SettingsError(f"{type(self).__name__} wraps a SlamEnv, not a {type(env.unwrapped).__name__}")
+            raise SettingsError(
+                f"{type(self).__name__} wraps a SlamEnv, not a {type(env.unwrapped).__name__}"
+            )
         self._base = env.unwrapped
 
 
 class RecordTimings(SlamWrapper):
     """Adds ``info["timings"]``: seconds of the frame by stage (see `FrameOutcome.timings`).
 
-    Times differ from run to run, so an environment with this wrapper is not deterministic in its ``info``.
+    Times differ from run to run, so an environment with this wrapper is not deterministic in its
+    ``info``.
 
     Args:
         env: A `SlamEnv`, wrapped or not.
     """
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         """Reset, with the times of frame 0 in ``info``."""
         observation, info = self.env.reset(seed=seed, options=options)
         return observation, info | {"timings": self._base.timings[-1]}
@@ -60,13 +65,21 @@ class RecordTimings(SlamWrapper):
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Step, with the frame's times in ``info``."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        return observation, reward, terminated, truncated, info | {"timings": self._base.timings[-1]}
+        return (
+            observation,
+            reward,
+            terminated,
+            truncated,
+            info | {"timings": self._base.timings[-1]},
+        )
 
     def summary(self) -> dict[str, dict[str, float]]:
         """``median`` and ``p95`` of every stage over the episode so far, seconds (0 where a stage did not run)."""
         return {
             stage: {"median": float(np.median(seconds)), "p95": float(np.percentile(seconds, 95))}
-            for stage, seconds in stage_seconds([frame for frame in self._base.timings if frame]).items()
+            for stage, seconds in stage_seconds(
+                [frame for frame in self._base.timings if frame]
+            ).items()
         }
 
 
@@ -75,17 +88,20 @@ class RecordTrajectory(SlamWrapper):
 
     Args:
         env: A `SlamEnv`, wrapped or not.
-        path: Target file; ``{episode}`` in its name becomes the episode's number, from 0. Without it, a later episode
-            replaces the file of an earlier one.
+        path: Target file; ``{episode}`` in its name becomes the episode's number, from 0. Without
+            it, a later episode replaces the file of an earlier one.
     """
 
     def __init__(self, env: gym.Env[Any, Any], path: str | Path) -> None:
         super().__init__(env, path=str(path))
-        self._pattern, self._episode = str(path), -1
+        self._pattern = str(path)
+        self._episode = -1
         self.written: list[Path] = []
         """The files so far, in order."""
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode."""
         self._episode += 1
         return self.env.reset(seed=seed, options=options)
@@ -112,9 +128,9 @@ class SequenceSampler(SlamWrapper):
     Args:
         env: A `SlamEnv`, wrapped or not.
         sequences: Ids or folders; with ``rgbd`` observations all must have the same image size.
-        mode: ``round_robin`` takes them in order, from the ``seed``-th on (cyclic), so that sub-environments of a
-            vector environment, whose seeds follow each other, begin apart; ``random`` draws from the wrapper's own
-            generator, which a `reset` with a seed seeds.
+        mode: ``round_robin`` takes them in order, from the ``seed``-th on (cyclic), so that
+            sub-environments of a vector environment, whose seeds follow each other, begin apart;
+            ``random`` draws from the wrapper's own generator, which a `reset` with a seed seeds.
 
     Raises:
         SettingsError: No sequences, or an unknown mode.
@@ -131,10 +147,14 @@ class SequenceSampler(SlamWrapper):
         super().__init__(env, sequences=list(sequences), mode=mode)
         if mode not in ("round_robin", "random"):
             raise SettingsError(f"unknown mode '{mode}'", "known: round_robin, random")
-        self._sequences, self._mode, self._next = tuple(sequences), mode, 0
+        self._sequences = tuple(sequences)
+        self._mode = mode
+        self._next = 0
         self._rng = gym.utils.seeding.np_random(None)[0]
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode on the next sequence; ``options["sequence"]`` wins over the sampler.
 
         A seed also sets the sampler: to the seed's sequence, or to its first draw.
@@ -143,7 +163,9 @@ class SequenceSampler(SlamWrapper):
             self._next = seed
             self._rng = stream(seed, "sequences")  # apart from the environment's own numbers
         count = len(self._sequences)
-        number = self._next % count if self._mode == "round_robin" else int(self._rng.integers(count))
+        number = (
+            self._next % count if self._mode == "round_robin" else int(self._rng.integers(count))
+        )
         self._next += 1
         options = {"sequence": self._sequences[number]} | (options or {})
         self._shown = str(options["sequence"])
@@ -160,14 +182,16 @@ class SequenceSampler(SlamWrapper):
 class DiscreteActions(SlamWrapper, gym.ActionWrapper[Any, Any, Any]):
     """Makes the action the choice of one of a few settings, ``Discrete(n)``.
 
-    "Segment now?" is ``[{"segmentation.schedule": "every_nth"}, {"segmentation.schedule": "every"}]`` with a setting
-    ``segmentation.n`` that no episode reaches. "Keyframe now?" is ``[{"backend.keyframes.schedule": "none"},
-    {"backend.keyframes.schedule": "every"}]``: the frame of the step becomes one if it is tracked with more than 15
-    inliers.
+    "Segment now?" is
+    ``[{"segmentation.schedule": "every_nth"}, {"segmentation.schedule": "every"}]`` with a setting
+    ``segmentation.n`` that no episode reaches. "Keyframe now?" is
+    ``[{"backend.keyframes.schedule": "none"}, {"backend.keyframes.schedule": "every"}]``: the frame
+    of the step becomes one if it is tracked with more than 15 inliers.
 
     Args:
         env: A `SlamEnv`, wrapped or not, made with ``control``.
-        actions: For each action the values of controlled settings by dotted name; the others stay as they are.
+        actions: For each action the values of controlled settings by dotted name; the others stay
+            as they are.
 
     Raises:
         SettingsError: No actions, or one that `SlamEnv.action_of` refuses.
@@ -175,7 +199,9 @@ class DiscreteActions(SlamWrapper, gym.ActionWrapper[Any, Any, Any]):
 
     def __init__(self, env: gym.Env[Any, Any], actions: Sequence[Mapping[str, Any]]) -> None:
         if not actions or not all(isinstance(values, Mapping) for values in actions):
-            raise SettingsError(f"DiscreteActions takes a list of settings by name, one an action, not {actions!r}")
+            raise SettingsError(
+                f"DiscreteActions takes a list of settings by name, one an action, not {actions!r}"
+            )
         super().__init__(env, actions=[dict(values) for values in actions])
         for values in actions:
             self._base.action_of(values)
@@ -193,9 +219,9 @@ class DiscreteActions(SlamWrapper, gym.ActionWrapper[Any, Any, Any]):
 class SmallImages(SlamWrapper, gym.ObservationWrapper[Any, Any, Any]):
     """Makes ``rgbd`` observations small 8-bit images, colour and depth, as stable-baselines3 expects images.
 
-    ``rgb`` becomes uint8 ``[height, width, 3]``, averaged over the pixels that fall together; ``depth`` becomes uint8
-    ``[height, width, 1]``, the nearest pixel's, in steps of 20 m / 254: 0 is missing, 255 is 20 m or more. ``stats``
-    stays.
+    ``rgb`` becomes uint8 ``[height, width, 3]``, averaged over the pixels that fall together;
+    ``depth`` becomes uint8 ``[height, width, 1]``, the nearest pixel's, in steps of 20 m / 254: 0
+    is missing, 255 is 20 m or more. ``stats`` stays.
 
     Args:
         env: A `SlamEnv`, wrapped or not, made with ``observation="rgbd"``.
@@ -210,7 +236,9 @@ class SmallImages(SlamWrapper, gym.ObservationWrapper[Any, Any, Any]):
         super().__init__(env, width=width, height=height)
         space = env.observation_space
         if not isinstance(space, spaces.Dict) or not {"rgb", "depth"} <= set(space):
-            raise SettingsError("SmallImages needs the images rgb and depth", 'use observation="rgbd"')
+            raise SettingsError(
+                "SmallImages needs the images rgb and depth", 'use observation="rgbd"'
+            )
         if min(width, height) < 1:
             raise SettingsError(f"an image of {width} x {height} pixels has none")
         self._size = (width, height)
@@ -231,8 +259,9 @@ class SmallImages(SlamWrapper, gym.ObservationWrapper[Any, Any, Any]):
 class DegradeFrames(SlamWrapper):
     """Adds seeded lighting changes, glare, shadow, motion blur and noise to every frame.
 
-    The degradation of a frame depends on the seed, the strengths and the frame's index only, so all trackers see the
-    same images. Strength 0 leaves the frame alone, 1 is the worst. Colour is degraded; depth only by `depth_noise`.
+    The degradation of a frame depends on the seed, the strengths and the frame's index only, so all
+    trackers see the same images. Strength 0 leaves the frame alone, 1 is the worst. Colour is
+    degraded; depth only by `depth_noise`.
 
     Args:
         env: A `SlamEnv`, wrapped or not.
@@ -253,13 +282,17 @@ class Degradation:
     """Degrades frames, the same way for the same index.
 
     Attributes:
-        lighting: Brightness and colour balance drift slowly and flicker: gain between 1 and ``1 - 0.75 * lighting``.
-        glare: A bright blob that wanders over the image and saturates it: up to ``0.45 * glare`` of the image's width.
-        shadow: A soft-edged half plane that sweeps over the image and darkens it to ``1 - 0.85 * shadow``.
-        blur: Linear motion blur of up to ``25 * blur`` pixels, in a direction that changes from frame to frame.
+        lighting: Brightness and colour balance drift slowly and flicker: gain between 1 and
+            ``1 - 0.75 * lighting``.
+        glare: A bright blob that wanders over the image and saturates it: up to ``0.45 * glare`` of
+            the image's width.
+        shadow: A soft-edged half plane that sweeps over the image and darkens it to
+            ``1 - 0.85 * shadow``.
+        blur: Linear motion blur of up to ``25 * blur`` pixels, in a direction that changes from
+            frame to frame.
         noise: Gaussian noise of standard deviation ``40 * noise`` grey levels.
-        depth_noise: Depth noise of standard deviation ``0.02 * depth_noise * z^2`` metres (z in metres), and a share
-            ``0.3 * depth_noise`` of the pixels loses its depth.
+        depth_noise: Depth noise of standard deviation ``0.02 * depth_noise * z^2`` metres (z in
+            metres), and a share ``0.3 * depth_noise`` of the pixels loses its depth.
         seed: Seed of the degradation, apart from the tracker's.
     """
 
@@ -273,10 +306,14 @@ class Degradation:
 
     def __post_init__(self) -> None:
         if operator.index(self.seed) < 0:
-            raise SettingsError(f"the seed of the degradation is {self.seed}, expected a whole number >= 0")
+            raise SettingsError(
+                f"the seed of the degradation is {self.seed}, expected a whole number >= 0"
+            )
         for name, value in vars(self).items():
             if name != "seed" and not 0.0 <= value <= 1.0:
-                raise SettingsError(f"degradation '{name}' is {value}, expected a strength in [0, 1]")
+                raise SettingsError(
+                    f"degradation '{name}' is {value}, expected a strength in [0, 1]"
+                )
 
     def __call__(self, frame: Frame) -> Frame:
         """The degraded copy of a frame."""
@@ -294,14 +331,20 @@ class Degradation:
         if self.noise:
             image = image + rng.normal(0.0, 40.0 * self.noise, image.shape).astype(np.float32)
         depth = self._noisy_depth(frame.depth, rng) if self.depth_noise else frame.depth
-        return dataclasses.replace(frame, rgb=np.clip(np.rint(image), 0, 255).astype(np.uint8), depth=depth)
+        return dataclasses.replace(
+            frame, rgb=np.clip(np.rint(image), 0, 255).astype(np.uint8), depth=depth
+        )
 
     def _phase(self, name: str, count: int) -> NDArray[np.float64]:
         return stream(self.seed, "degrade", name).uniform(0.0, 2.0 * math.pi, count)
 
     def _gain(self, index: int) -> NDArray[np.float32]:
         slow, colour, flicker = self._phase("lighting", 3)
-        level = 0.5 + 0.4 * math.sin(2 * math.pi * index / 90.0 + slow) + 0.1 * math.sin(1.9 * index + flicker)
+        level = (
+            0.5
+            + 0.4 * math.sin(2 * math.pi * index / 90.0 + slow)
+            + 0.1 * math.sin(1.9 * index + flicker)
+        )
         tint = 0.1 * self.lighting * math.sin(2 * math.pi * index / 150.0 + colour)
         gain = 1.0 - 0.75 * self.lighting * level
         return np.array([gain * (1 + tint), gain, gain * (1 - tint)], np.float32)
@@ -319,13 +362,26 @@ class Degradation:
         along, up, pulse = self._phase("glare", 3)
         centre_x = width * (0.5 + 0.4 * math.sin(2 * math.pi * index / 140.0 + along))
         centre_y = height * (0.5 + 0.35 * math.sin(2 * math.pi * index / 100.0 + up))
-        radius = 0.45 * self.glare * width * (0.75 + 0.25 * math.sin(2 * math.pi * index / 60.0 + pulse)) / 2
+        radius = (
+            0.45
+            * self.glare
+            * width
+            * (0.75 + 0.25 * math.sin(2 * math.pi * index / 60.0 + pulse))
+            / 2
+        )
         y, x = np.mgrid[0:height, 0:width].astype(np.float32)
         distance = ((x - centre_x) ** 2 + (y - centre_y) ** 2) / max(radius, 1.0) ** 2
         return np.asarray(510.0 * np.exp(-distance), dtype=np.float32)
 
-    def _noisy_depth(self, depth: NDArray[np.float32], rng: np.random.Generator) -> NDArray[np.float32]:
-        noisy = depth + rng.normal(size=depth.shape) * (0.02 * self.depth_noise) * depth.astype(np.float64) ** 2
+    def _noisy_depth(
+        self, depth: NDArray[np.float32], rng: np.random.Generator
+    ) -> NDArray[np.float32]:
+        noisy = (
+            depth
+            + rng.normal(size=depth.shape)
+            * (0.02 * self.depth_noise)
+            * depth.astype(np.float64) ** 2
+        )
         lost = (rng.random(depth.shape) < 0.3 * self.depth_noise) | (depth <= 0)
         return np.where(lost, 0.0, np.maximum(noisy, 1e-3)).astype(np.float32)
 
@@ -350,14 +406,15 @@ WARM_UP_FRAMES = 12
 class DropFrames(SlamWrapper):
     """Feeds the tracker only the frames that a live camera would have left it, or drops frames at random.
 
-    Real-time mode: frame i arrives at its stamp. When the tracker is done with a frame it takes the newest one that
-    has arrived, or waits for the next; those in between are dropped. They count as not tracked (coverage) and cost
-    what lost ones do, added to the reward of the step that dropped them. The last frame is never dropped. With
-    measured times the episode depends on the machine, and `step` waits for the frame: what works beside tracking (a
-    network, threads of an external system) has the time that it has live. `frame_time_s` makes it reproducible.
+    Real-time mode: frame i arrives at its stamp. When the tracker is done with a frame it takes the
+    newest one that has arrived, or waits for the next; those in between are dropped. They count as
+    not tracked (coverage) and cost what lost ones do, added to the reward of the step that dropped
+    them. The last frame is never dropped. With measured times the episode depends on the machine,
+    and `step` waits for the frame: what works beside tracking (a network, threads of an external
+    system) has the time that it has live. `frame_time_s` makes it reproducible.
 
-    Compiling kernels and loading networks is no work of a frame: before the first measured episode the tracker tracks
-    the first `WARM_UP_FRAMES` frames off the clock and is reset.
+    Compiling kernels and loading networks is no work of a frame: before the first measured episode
+    the tracker tracks the first `WARM_UP_FRAMES` frames off the clock and is reset.
 
     Args:
         env: A `SlamEnv`, wrapped or not.
@@ -382,22 +439,33 @@ class DropFrames(SlamWrapper):
         super().__init__(env, speed=speed, frame_time_s=frame_time_s, share=share, seed=seed)
         for name, value, fits, expected in (
             ("speed", speed, speed > 0, "a number > 0"),
-            ("frame_time_s", frame_time_s, frame_time_s is None or frame_time_s >= 0, "seconds >= 0"),
+            (
+                "frame_time_s",
+                frame_time_s,
+                frame_time_s is None or frame_time_s >= 0,
+                "seconds >= 0",
+            ),
             ("share", share, share is None or 0 <= share < 1, "a probability in [0, 1)"),
         ):
             if not fits:
                 raise SettingsError(f"{name} is {value}, expected {expected}")
-        self._speed, self._frame_time_s, self._share, self._seed = speed, frame_time_s, share, seed
+        self._speed = speed
+        self._frame_time_s = frame_time_s
+        self._share = share
+        self._seed = seed
         self._live = share is None and frame_time_s is None
         self._warm = not self._live
-        self._overhead_s = 0.0  # seconds of the latest step outside of tracking; the wait is shorter by them
+        # seconds of the latest step outside of tracking; the wait is shorter by them
+        self._overhead_s = 0.0
 
     @property
     def dropped(self) -> int:
         """Frames dropped in this episode so far."""
         return sum(outcome.state == "dropped" for outcome in self._base.episode.outcomes)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; the clock starts when frame 0 arrives, and the tracker is warm then."""
         base = self._base
         if not self._warm:
@@ -405,7 +473,9 @@ class DropFrames(SlamWrapper):
             base.reset(seed=0, options=options)
             while not base.episode.over and base.episode.next_index < WARM_UP_FRAMES:
                 base.step(base.neutral_action)
-            base.np_random, self._warm = numbers, True  # the random numbers go on from where they were
+            # the random numbers go on from where they were
+            base.np_random = numbers
+            self._warm = True
         outcome = self.env.reset(seed=seed, options=options)
         base.episode.free_at = self._arrivals()[0] + self._busy_s()
         return outcome
@@ -425,10 +495,16 @@ class DropFrames(SlamWrapper):
         return observation, float(reward) + charged, terminated, truncated, info
 
     def _next_frame(self, index: int) -> int:
-        last, share = len(self._base.sequence) - 1, self._share
+        last = len(self._base.sequence) - 1
+        share = self._share
         if share is not None:
-            return next((i for i in range(index, last) if stream(self._seed, "drop", i).random() >= share), last)
-        newest = int(np.searchsorted(self._arrivals(), self._base.episode.free_at, side="right")) - 1
+            return next(
+                (i for i in range(index, last) if stream(self._seed, "drop", i).random() >= share),
+                last,
+            )
+        newest = (
+            int(np.searchsorted(self._arrivals(), self._base.episode.free_at, side="right")) - 1
+        )
         return min(max(newest, index), last)
 
     def _arrivals(self) -> Any:

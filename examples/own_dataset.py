@@ -15,7 +15,10 @@ import dynslam_bench as db
 from dynslam_bench.contracts import Trajectory
 from dynslam_bench.geometry.trajectory_files import write_tum
 
-FPS, FX, DEPTH_M, STEP_PX = 30.0, 300.0, 2.0, 3
+FPS = 30.0
+FX = 300.0
+DEPTH_M = 2.0
+STEP_PX = 3
 CAMERA = f"""width = 320
 height = 240
 fx = {FX}

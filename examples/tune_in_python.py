@@ -2,7 +2,8 @@
 
     python examples/tune_in_python.py [RESULTS]
 
-The tracker assumes that the camera keeps its velocity, so it takes seconds; any other goes the same way.
+The tracker assumes that the camera keeps its velocity, so it takes seconds; any other goes the same
+way.
 """
 
 import sys

@@ -1,11 +1,11 @@
 """Leaderboards: one offline HTML page with Markdown, CSV and LaTeX beside it, and pandas frames to go on with.
 
-`build_report` writes the page, `publish` makes a site of it, `compare` holds two results folders against each other,
-`load_frame` gives every run as a row of a pandas frame, and `make_board` orders rows into the board that tables and
-figures are made of.
+`build_report` writes the page, `publish` makes a site of it, `compare` holds two results folders
+against each other, `load_frame` gives every run as a row of a pandas frame, and `make_board` orders
+rows into the board that tables and figures are made of.
 
-How a metric, which is a function in `evaluation.evaluate.METRICS`, comes from ``run.json`` to a cell of the
-leaderboard:
+How a metric, which is a function in `evaluation.evaluate.METRICS`, comes from ``run.json`` to a
+cell of the leaderboard:
 
 1. `model.row.make_row`: a `RunRecord` and its stored trajectories, scored under the protocol, become a `RunRow`
    (`RunRow.score_m` is the error that ranks).

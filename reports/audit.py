@@ -1,7 +1,7 @@
 """An audit of the paper's own Tables 1 to 3: what can be true of them by arithmetic alone.
 
-Nothing is run. The printed numbers are compared with identities that every such table obeys, with the numbers that the
-compared systems' authors published, and with a static camera.
+Nothing is run. The printed numbers are compared with identities that every such table obeys, with
+the numbers that the compared systems' authors published, and with a static camera.
 """
 
 import math
@@ -81,7 +81,12 @@ class AuditReport:
     def summary(self) -> Table:
         """How many numbers pass each check."""
         rows = [
-            [TableCell(check), TableCell(meaning), number(len(self.of(check))), number(len(self.failed(check)))]
+            [
+                TableCell(check),
+                TableCell(meaning),
+                number(len(self.of(check))),
+                number(len(self.failed(check))),
+            ]
             for check, meaning in CHECKS.items()
         ]
         return Table(
@@ -115,7 +120,11 @@ class AuditReport:
             *numbers("printed", "held against"), *texts("remark"),
         ]  # fmt: skip
         return Table(
-            "audit_findings", "Numbers that do not hold", "Metres, percent or milliseconds, as printed.", columns, rows
+            "audit_findings",
+            "Numbers that do not hold",
+            "Metres, percent or milliseconds, as printed.",
+            columns,
+            rows,
         )
 
     def to_markdown(self) -> str:
@@ -127,13 +136,17 @@ def audit_paper(ground_truth: Mapping[str, Trajectory] | None = None) -> AuditRe
     """Audit Tables 1 to 3 of the paper.
 
     Args:
-        ground_truth: Sequence id to ground truth, to recompute the error of not moving there; without it the stored
-            values are used (from the published ground truth of sitting_xyz and a surrogate for walking_xyz).
+        ground_truth: Sequence id to ground truth, to recompute the error of not moving there;
+            without it the stored values are used (from the published ground truth of sitting_xyz
+            and a surrogate for walking_xyz).
 
     Returns:
         One finding for every number that a check applies to.
     """
-    values = {(c.table, c.system, c.sequence, c.quantity): c for c in lines_of(claimed().query("kind == 'value'"))}
+    values = {
+        (c.table, c.system, c.sequence, c.quantity): c
+        for c in lines_of(claimed().query("kind == 'value'"))
+    }
     static = static_camera_errors() | _computed_static_camera(ground_truth or {})
     findings = [
         Finding(check, *key, printed.value, expected, holds, remark)
@@ -142,7 +155,9 @@ def audit_paper(ground_truth: Mapping[str, Trajectory] | None = None) -> AuditRe
     ]
     findings += _improvements(values)
     order = list(CHECKS)
-    return AuditReport(tuple(sorted(findings, key=lambda finding: (order.index(finding.check), finding.table))))
+    return AuditReport(
+        tuple(sorted(findings, key=lambda finding: (order.index(finding.check), finding.table)))
+    )
 
 
 Key = tuple[int, str, str, str]
@@ -157,17 +172,23 @@ def _checks(
     """The checks of one printed number: the check, what the number has to be, whether it holds, and why."""
     table, system, sequence, quantity = key
     printed = values[key].value
-    if quantity.endswith("_rmse"):  # RMSE^2 = mean^2 + StD^2, up to the rounding of all three; hence RMSE >= mean
+    # RMSE^2 = mean^2 + StD^2, up to the rounding of all three; hence RMSE >= mean
+    if quantity.endswith("_rmse"):
         metric = quantity.removesuffix("_rmse")
-        mean, std = (values[table, system, sequence, f"{metric}_{name}"].value for name in ("mean", "std"))
+        mean, std = (
+            values[table, system, sequence, f"{metric}_{name}"].value for name in ("mean", "std")
+        )
         expected = math.hypot(mean, std)
         rounding = _HALF_DIGIT * 10.0 ** -values[key].digits
-        tolerance = rounding * (1 + (mean + std) / expected)  # of the printed RMSE, and of what follows from the others
+        # of the printed RMSE, and of what follows from the others
+        tolerance = rounding * (1 + (mean + std) / expected)
         off = printed - expected
         yield "rmse-identity", expected, abs(off) <= tolerance, f"off by {1000 * off:+.1f} mm"
         possible = printed >= mean - 2 * rounding
         yield "rmse-at-least-mean", mean, possible, "" if possible else "below the mean"
-    static_m = static.get((sequence, {"ape_rmse": "ape_rmse", "rpe_rmse": "rpe_1s"}.get(quantity, "")))
+    static_m = static.get(
+        (sequence, {"ape_rmse": "ape_rmse", "rpe_rmse": "rpe_1s"}.get(quantity, ""))
+    )
     if static_m is not None:
         remark = "" if quantity == "ape_rmse" else "held against 1 s; the paper states no delta"
         if quantity == "rpe_rmse" and (sequence, "rpe_1f") in static:
@@ -176,7 +197,8 @@ def _checks(
     frame = published().query("metric == 'ate_rmse_m'")
     elsewhere = frame[(frame["system"] == system) & (frame["sequence"] == sequence)]["value"]
     if quantity == "ape_rmse" and len(elsewhere):
-        low, high = float(elsewhere.min()), float(elsewhere.max())
+        low = float(elsewhere.min())
+        high = float(elsewhere.max())
         nearest = min(max(printed, low), high)
         factor = printed / nearest
         span = f"{low:g}" if low == high else f"{low:g} to {high:g}"
@@ -188,7 +210,9 @@ def _checks(
     if quantity == "error_percent":
         expected = 100 * values[1, system, sequence, "ape_std"].value
         same = abs(printed - expected) <= _ERROR_TOLERANCE
-        remark = "it is 100 times the StD of Table 1 in metres, which is no accuracy" if same else ""
+        remark = (
+            "it is 100 times the StD of Table 1 in metres, which is no accuracy" if same else ""
+        )
         yield "accuracy", expected, not same, remark
     if quantity == "time_ms" and system == OURS:
         remark = "less than the published time of its Mask R-CNN alone (DynaSLAM's: 195 ms)"
@@ -198,7 +222,10 @@ def _checks(
 def _improvements(values: Values) -> Iterator[Finding]:
     printed = claimed().query("kind == 'improvement_percent'")
     for row in lines_of(printed):
-        baseline, ours = (values[row.table, system, row.sequence, row.quantity].value for system in (row.system, OURS))
+        baseline, ours = (
+            values[row.table, system, row.sequence, row.quantity].value
+            for system in (row.system, OURS)
+        )
         expected = 100 * (baseline - ours) / baseline
         holds = abs(row.value - expected) <= _PERCENT_TOLERANCE
         same = printed[
@@ -208,7 +235,11 @@ def _improvements(values: Values) -> Iterator[Finding]:
             & (printed["sequence"] != row.sequence)
             & ((printed["value"] - row.value).abs() <= _PERCENT_TOLERANCE)
         ]
-        why = f"repeats the column of {same['sequence'].iloc[0]}" if len(same) else "does not follow from the table"
+        why = (
+            f"repeats the column of {same['sequence'].iloc[0]}"
+            if len(same)
+            else "does not follow from the table"
+        )
         key = (row.table, row.system, row.sequence, row.quantity)
         yield Finding("improvement", *key, row.value, expected, holds, "" if holds else why)
 
@@ -217,7 +248,9 @@ def _computed_static_camera(ground_truth: Mapping[str, Trajectory]) -> dict[tupl
     errors: dict[tuple[str, str], float] = {}
     for sequence, truth in ground_truth.items():
         errors[sequence, "ape_rmse"] = static_camera(truth)["constant_rmse_m"]
-        pairs = select_pairs(truth.timestamps, truth.T_world_cam, RPESpec(delta=1, unit="s", max_pairs=0))
+        pairs = select_pairs(
+            truth.timestamps, truth.T_world_cam, RPESpec(delta=1, unit="s", max_pairs=0)
+        )
         if len(pairs):
             moved = truth.positions[pairs[:, 1]] - truth.positions[pairs[:, 0]]
             errors[sequence, "rpe_1s"] = float(math.sqrt((moved**2).sum(axis=1).mean()))

@@ -26,7 +26,13 @@ from dynslam_bench.reports.html.page import (
     write_assets,
     write_side,
 )
-from dynslam_bench.reports.html.run_pages import RUN_PAGE, SHARE_EDGES, RunPage, error_by_share, write_run_pages
+from dynslam_bench.reports.html.run_pages import (
+    RUN_PAGE,
+    SHARE_EDGES,
+    RunPage,
+    error_by_share,
+    write_run_pages,
+)
 from dynslam_bench.reports.model.board import (
     OVERALL,
     Board,
@@ -125,18 +131,23 @@ def build_report(
 ) -> ReportPaths:
     """Make offline HTML pages of stored runs, with Markdown, CSV and LaTeX beside them.
 
-    SLAM is not run; metrics that are missing under the protocol are computed from the stored trajectories.
+    SLAM is not run; metrics that are missing under the protocol are computed from the stored
+    trajectories.
 
     Args:
         runs: Results folders, or a store.
         output: Folder of the report; files in it that the report does not make are left alone.
         protocol: How to evaluate.
-        reference: Tracker id that errors are divided by; `DEFAULT_REFERENCE` where none is named. Where it was not
-            run on every ranked sequence, a static camera takes its place.
-        on: ``common`` ranks on the sequences that all ranked trackers have, ``all`` only the trackers that have all.
-        rank_seen: Whether trackers are also ranked on scenes that the network behind their masks was trained on.
-        trials: Whether the trials of studies count like other runs; without, they are left out and counted.
-        most_pages: Runs that have a page of their own, typical ones of their cells first; None for `pages_for`.
+        reference: Tracker id that errors are divided by; `DEFAULT_REFERENCE` where none is named.
+            Where it was not run on every ranked sequence, a static camera takes its place.
+        on: ``common`` ranks on the sequences that all ranked trackers have, ``all`` only the
+            trackers that have all.
+        rank_seen: Whether trackers are also ranked on scenes that the network behind their masks
+            was trained on.
+        trials: Whether the trials of studies count like other runs; without, they are left out and
+            counted.
+        most_pages: Runs that have a page of their own, typical ones of their cells first; None for
+            `pages_for`.
         title: Heading.
         command: Command that makes this report again, shown in it; empty for a derived one.
         on_progress: Told of what is done, of how much, and what is going on, see `OnProgress`.
@@ -161,15 +172,21 @@ def build_report(
         )  # fmt: skip
     on_progress(0, None, "putting the tables and figures together")
     pageless = _pageless(len(paged), len(board.rows))
-    again = command or _command([store.source for store in stores], output, board, most_pages, trials=trials)
+    again = command or _command(
+        [store.source for store in stores], output, board, most_pages, trials=trials
+    )
     none_failed = [Block(entries=[f"None of {len(board.rows)} runs failed."])]
     boards = category_boards(board)
     sections = {
         "errors.html": [errors_section(board, protocol), categories_section(boards, protocol)],
         "paper.html": [paper_section(board, protocol)],
         "diagnostics.html": [
-            Section("failures", "Failures", blocks=table_blocks(tables.failures(board)) or none_failed),
-            Section("repeatability", "Repeatability", blocks=table_blocks(tables.repeatability(board))),
+            Section(
+                "failures", "Failures", blocks=table_blocks(tables.failures(board)) or none_failed
+            ),
+            Section(
+                "repeatability", "Repeatability", blocks=table_blocks(tables.repeatability(board))
+            ),
             masks_section(board),
             share_section(board, pages),
         ],
@@ -177,7 +194,9 @@ def build_report(
     }
     on_progress(0, None, "writing")
     paged_ids = {row.run_id for row in paged}
-    write_side(output, "board", side_content(board, boards, protocol, paged_ids, pictured, pageless))
+    write_side(
+        output, "board", side_content(board, boards, protocol, paged_ids, pictured, pageless)
+    )
     write_side(output, "ratios", ratios_content(board))
     notes = _notes(board, protocol, loaded, pageless)
     return _write(sections, board, boards, protocol, output, title, notes, loaded.trials, paged_ids)
@@ -199,10 +218,14 @@ def _paged(board: Board, typical: set[str], most: int | None) -> list[RunRow]:
     if len(board.rows) <= most:
         return board.rows
     cells = [cell.rows for cells in board.cells.values() for cell in cells.values()]
-    turn = {row.run_id: at for rows in cells for at, row in enumerate(rows)} | dict.fromkeys(typical, -1)
+    turn = {row.run_id: at for rows in cells for at, row in enumerate(rows)} | dict.fromkeys(
+        typical, -1
+    )
     rows = sorted(board.rows, key=lambda row: (turn[row.run_id], not row.failed))
     place = {
-        row.run_id: at for some in grouped(rows, lambda row: row.variant_key).values() for at, row in enumerate(some)
+        row.run_id: at
+        for some in grouped(rows, lambda row: row.variant_key).values()
+        for at, row in enumerate(some)
     }
     return sorted(rows, key=lambda row: (turn[row.run_id], place[row.run_id]))[:most]
 
@@ -217,10 +240,15 @@ def _pageless(pages: int, runs: int) -> str:
     )
 
 
-def _command(roots: Sequence[Path], output: Path, board: Board, most_pages: int | None, *, trials: bool) -> str:
+def _command(
+    roots: Sequence[Path], output: Path, board: Board, most_pages: int | None, *, trials: bool
+) -> str:
     """The command that makes the report again."""
     folder = Path.cwd()
-    paths = [path.relative_to(folder) if path.is_relative_to(folder) else path for path in (*roots, output)]
+    paths = [
+        path.relative_to(folder) if path.is_relative_to(folder) else path
+        for path in (*roots, output)
+    ]
     words = ["dynslam-bench", "report", *map(str, paths[:-1]), "-o", str(paths[-1])]
     words += ["--on", board.on] if board.on != "common" else []
     words += ["--reference", board.asked_reference] if board.asked_reference else []
@@ -242,9 +270,13 @@ def _write(
     """Write the pages, and the tables in all formats."""
     now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
     footer = f"Made by dynslam-bench {dynslam_bench.__version__} on {now}. These pages work without a network."
-    blocks = [block for sections in pages.values() for section in sections for block in section.blocks]
+    blocks = [
+        block for sections in pages.values() for section in sections for block in section.blocks
+    ]
     shown = {
-        t.id: t for t in (tables.leaderboard(board, protocol), *(block.table for block in blocks)) if t is not None
+        t.id: t
+        for t in (tables.leaderboard(board, protocol), *(block.table for block in blocks))
+        if t is not None
     }
     paths = ReportPaths(
         html=output / "index.html",
@@ -262,7 +294,10 @@ def _write(
     write_atomic(paths.csv["runs"], csv_text(board.frame()))
     facts = facts_of(board, protocol)
     counted = ", ".join(f"{value} {name}" for value, name, _ in facts)
-    all_notes = [*notes, *(note for sections in pages.values() for section in sections for note in section.notes)]
+    all_notes = [
+        *notes,
+        *(note for sections in pages.values() for section in sections for note in section.notes),
+    ]
     notes_text = "".join(f"> {prose(note)}\n\n" for note in [how_to_read(board), *all_notes])
     texts = "\n".join(map(to_markdown, shown.values()))
     head = f"# {prose(title)}\n\n{prose(headline(board))}\n\n{protocol.describe()}\n\n{counted}\n\n"
@@ -270,7 +305,13 @@ def _write(
     write_atomic(
         paths.latex,
         "% needs \\usepackage{booktabs}\n"
-        + "\n".join([to_latex(table, protocol.id) for name, table in shown.items() if name not in _NOT_IN_LATEX]),
+        + "\n".join(
+            [
+                to_latex(table, protocol.id)
+                for name, table in shown.items()
+                if name not in _NOT_IN_LATEX
+            ]
+        ),
     )
     ReportData(
         title=title,
@@ -315,9 +356,20 @@ def _write(
             errors_table=page == "errors.html", scripts=["errors.js"] if page == "errors.html" else [],
         )  # fmt: skip
         write_atomic(output / page, text)
-    write_atomic(paths.run, render("run.html.j2", title=title, links=LINKS, footer=footer, scripts=["run.js"]))
-    compare = {"title": "Two trackers side by side", "links": LINKS, "here": COMPARE_PAGE, "footer": footer}
-    write_atomic(output / COMPARE_PAGE, render("compare.html.j2", scripts=["run.js", "compare.js"], **compare))
+    write_atomic(
+        paths.run,
+        render("run.html.j2", title=title, links=LINKS, footer=footer, scripts=["run.js"]),
+    )
+    compare = {
+        "title": "Two trackers side by side",
+        "links": LINKS,
+        "here": COMPARE_PAGE,
+        "footer": footer,
+    }
+    write_atomic(
+        output / COMPARE_PAGE,
+        render("compare.html.j2", scripts=["run.js", "compare.js"], **compare),
+    )
     return paths
 
 
@@ -342,10 +394,15 @@ def facts_of(board: Board, protocol: Protocol) -> list[Fact]:
     """What the board stands on."""
     names = [*board.sequences, *board.unscored]
     by_group = grouped(names, lambda name: board.groups[name])
-    sequences = [f"{group}: {', '.join(some)}" if group else ", ".join(some) for group, some in by_group.items()]
+    sequences = [
+        f"{group}: {', '.join(some)}" if group else ", ".join(some)
+        for group, some in by_group.items()
+    ]
     repeats = sorted({len(cell.rows) for cells in board.cells.values() for cell in cells.values()})
     failed = [row for row in board.rows if row.failed]
-    endings = [f"{board.labels[row.variant_key]} on {board.sequence(row)}: {row.ending}" for row in failed]
+    endings = [
+        f"{board.labels[row.variant_key]} on {board.sequence(row)}: {row.ending}" for row in failed
+    ]
     doubts = reservations(board.rows)
     quoting = [f"Name the protocol, {protocol.id}{', and say:' if doubts else '.'}", *doubts]
     several = f"{repeats[0]}–{repeats[-1]}" if len(repeats) > 1 else str(repeats[0])
@@ -354,7 +411,11 @@ def facts_of(board: Board, protocol: Protocol) -> list[Fact]:
         (str(len(board.labels)), "tracker" + "s" * (len(board.labels) != 1), []),
         (several, "run a cell" if several == "1" else "runs a cell", []),
         (str(len(board.rows)), "run" + "s" * (len(board.rows) != 1), []),
-        (str(len(failed)), "failed", first_of(endings, _MOST_NOTES, "and {} more, see Diagnostics")),
+        (
+            str(len(failed)),
+            "failed",
+            first_of(endings, _MOST_NOTES, "and {} more, see Diagnostics"),
+        ),
         (
             str(len(doubts)),
             "reservation" + "s" * (len(doubts) != 1) + " when quoting",
@@ -386,12 +447,16 @@ def _notes(board: Board, protocol: Protocol, loaded: Loaded, pageless: str) -> l
     }
     counts = ", ".join(f"{count} {words}" for words, count in left_out.items() if count)
     notes = [
-        f"Runs with one id must be equal, but these have different results: {conflicts}." if conflicts else "",
+        f"Runs with one id must be equal, but these have different results: {conflicts}."
+        if conflicts
+        else "",
         missing_note(board),
         f"Only in the table of final trajectories, as nothing else is known of them: {final_only}."
         if final_only
         else "",
-        f"Without ground truth, and so in no table of errors: {', '.join(board.unscored)}." if board.unscored else "",
+        f"Without ground truth, and so in no table of errors: {', '.join(board.unscored)}."
+        if board.unscored
+        else "",
         f"Left out: {counts}." if counts else "",
         "Not ranked, as another program of the same tracker and settings ranks, or as the runs' ids are "
         f"unverified: {', '.join(others)}."
@@ -406,7 +471,9 @@ def _notes(board: Board, protocol: Protocol, loaded: Loaded, pageless: str) -> l
         if in_future
         else "",
         tables.computer_note(board),
-        f"Left out: {without_scale_words(loaded.without_scale, protocol)}." if loaded.without_scale else "",
+        f"Left out: {without_scale_words(loaded.without_scale, protocol)}."
+        if loaded.without_scale
+        else "",
         f"Left out: {trial_words(loaded.trials)}." if loaded.trials else "",
         pageless,
     ]
@@ -429,15 +496,27 @@ def errors_section(board: Board, protocol: Protocol) -> Section:
     """Errors by sequence, absolute and relative, with what they owe to lost frames and failures."""
     if not board.sequences:
         return Section("errors", "Tables")
-    excerpts = {board.sequence(row) for row in board.rows if is_excerpt(row.sequence.id, row.sequence.duration_s)}
-    shortened = {board.sequence(r) for r in board.rows if part_words(r) and not r.sequence.id.startswith("synthetic/")}
+    excerpts = {
+        board.sequence(row)
+        for row in board.rows
+        if is_excerpt(row.sequence.id, row.sequence.duration_s)
+    }
+    shortened = {
+        board.sequence(r)
+        for r in board.rows
+        if part_words(r) and not r.sequence.id.startswith("synthetic/")
+    }
     parts = sorted(excerpts | shortened)
     whole = [name for name in board.sequences if name not in parts]
     lines = published_for(whole, protocol)
     published = reported_for(whole, protocol) + records_for(whole, protocol)
     beside = {cell.sequence for cell in published}
     unsure = sorted(
-        {r.sequence.id for r in board.rows if board.sequence(r) in beside and not least_length_s(r.sequence.id)}
+        {
+            r.sequence.id
+            for r in board.rows
+            if board.sequence(r) in beside and not least_length_s(r.sequence.id)
+        }
     )
     notes = {
         f"Parts of recordings, beside which no published number stands: {', '.join(parts)}.": parts,
@@ -465,14 +544,23 @@ def masks_section(board: Board) -> Section:
     thinned = any(len(board.runs(key)) > figures.MOST_POINTS for key in board.trackers)
     fewer = f" Of trackers with more than {figures.MOST_POINTS} runs fewer are drawn, from the best to the worst."
     caption = "One point a run." + fewer * thinned
-    blocks = figure_blocks(figures.mask_figure(board), caption) + table_blocks(tables.mask_quality(board))
+    blocks = figure_blocks(figures.mask_figure(board), caption) + table_blocks(
+        tables.mask_quality(board)
+    )
     return Section("masks", "Mask quality and pose error", blocks=blocks)
 
 
 def share_section(board: Board, pages: Sequence[RunPage]) -> Section:
     """Frame-to-frame error against the share of people."""
-    bins = {key: error_by_share(some) for key, some in grouped(pages, lambda page: page.variant_key).items()}
-    which = "all successful runs" if len(pages) == len(board.rows) else f"the {len(pages)} runs with pictures here"
+    bins = {
+        key: error_by_share(some)
+        for key, some in grouped(pages, lambda page: page.variant_key).items()
+    }
+    which = (
+        "all successful runs"
+        if len(pages) == len(board.rows)
+        else f"the {len(pages)} runs with pictures here"
+    )
     caption = (
         f"Frame-to-frame error (translation, RMSE) over the frames of {which}, by the share of the image that shows "
         "people (exact masks)."
@@ -491,12 +579,21 @@ def provenance_section(board: Board, loaded: Loaded, again: str) -> Section:
     }
     places = grouped(((text, row) for row in board.rows for text in row.notes), itemgetter(0))
     names = {
-        text: [f"{board.labels[row.variant_key]} on {board.sequence(row)}, {row.repeat}" for _, row in runs]
+        text: [
+            f"{board.labels[row.variant_key]} on {board.sequence(row)}, {row.repeat}"
+            for _, row in runs
+        ]
         for text, runs in places.items()
     }
-    notes = [f"{text}: {'; '.join(first_of(runs, 2, 'and {} more'))}" for text, runs in names.items()]
+    notes = [
+        f"{text}: {'; '.join(first_of(runs, 2, 'and {} more'))}" for text, runs in names.items()
+    ]
     lists = (
-        ("Left out: no valid record", loaded.unreadable, "... and {} more, which `runs list` names"),
+        (
+            "Left out: no valid record",
+            loaded.unreadable,
+            "... and {} more, which `runs list` names",
+        ),
         ("Diagnostics", notes, "... and {} more on the pages of the runs"),
     )
     blocks = table_blocks(tables.machines(board))
@@ -511,7 +608,9 @@ def provenance_section(board: Board, loaded: Loaded, again: str) -> Section:
 
 def first_of(entries: list[str], most: int, others: str) -> list[str]:
     """The first entries; how many others there are stands behind them."""
-    return entries if len(entries) <= most else [*entries[:most], others.format(len(entries) - most)]
+    return (
+        entries if len(entries) <= most else [*entries[:most], others.format(len(entries) - most)]
+    )
 
 
 def paper_section(board: Board, protocol: Protocol) -> Section:
@@ -570,12 +669,13 @@ def publish(
 ) -> Site:
     """Make the report of some results folders, take the pages of studies beside it, and write a first page for all.
 
-    The site needs nothing outside of its folder, and the command that it shows for itself names no path of this
-    machine.
+    The site needs nothing outside of its folder, and the command that it shows for itself names no
+    path of this machine.
 
     Args:
         runs: Results folders.
-        output: The site's folder; what it holds of an earlier site is replaced, other files are left alone.
+        output: The site's folder; what it holds of an earlier site is replaced, other files are
+            left alone.
         studies: Folders of studies with their pages.
         title: Heading.
         note: What a reader should know, shown on the first page.
@@ -590,7 +690,9 @@ def publish(
     output = output.expanduser().absolute()
     for study in studies:
         if not (study / STUDY_PAGE).is_file():
-            raise ReportError(f"{study} holds no {STUDY_PAGE}", "make it with: dynslam-bench tune run STUDY.toml")
+            raise ReportError(
+                f"{study} holds no {STUDY_PAGE}", "make it with: dynslam-bench tune run STUDY.toml"
+            )
     for part in ("leaderboard/data", "leaderboard/csv", "leaderboard/frames", "study"):
         shutil.rmtree(output / part, ignore_errors=True)
     report = build_report(
@@ -605,7 +707,10 @@ def publish(
     made = f"Made by dynslam-bench report publish, version {dynslam_bench.__version__}."
     site = sections_page([], title=title, pages=pages, protocol=note, footer=made)
     write_atomic(output / "index.html", site.replace(f'="{ASSETS}/', f'="leaderboard/{ASSETS}/'))
-    lines = [f"- [{prose(name)}]({quote(str(Path(href).parent))}): {prose(words)}" for href, name, words in pages]
+    lines = [
+        f"- [{prose(name)}]({quote(str(Path(href).parent))}): {prose(words)}"
+        for href, name, words in pages
+    ]
     how = "The pages are HTML: get the repository, and open `index.html` in a browser."
     text = [f"# {prose(title)}", prose(note), *lines, how, made]
     write_atomic(output / README, "\n\n".join(filter(None, text)) + "\n")
@@ -616,18 +721,24 @@ def publish(
 
 def _publish_study(study: Path, output: Path) -> tuple[str, str, str]:
     """Copy the pages of a study into a site; returns the address of the first one, its name, and its verdict."""
-    folder, inside = output / "study" / study.name, study.resolve()
+    folder = output / "study" / study.name
+    inside = study.resolve()
     sources = {path for pattern in _PUBLISHED for path in study.glob(pattern) if path.is_file()}
-    for source in sorted(path for path in sources if path.resolve().is_relative_to(inside)):  # no link to elsewhere
+    # no link to elsewhere
+    for source in sorted(path for path in sources if path.resolve().is_relative_to(inside)):
         target = folder / source.relative_to(study)
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(source, target)
     for page in folder.glob("*.html"):
         shared = f'="../../leaderboard/{ASSETS}/'
-        page.write_text(page.read_text(encoding="utf-8").replace(f'="{ASSETS}/', shared), encoding="utf-8")
+        page.write_text(
+            page.read_text(encoding="utf-8").replace(f'="{ASSETS}/', shared), encoding="utf-8"
+        )
     lists = r'"(pictures|files)":\[(?:[^\[\]]|\[[^\[\]]*\])*\]'
     for path in folder.glob("data/run-*.js"):  # pictures and files of runs are not published
-        path.write_text(re.sub(lists, r'"\1":[]', path.read_text(encoding="utf-8")), encoding="utf-8")
+        path.write_text(
+            re.sub(lists, r'"\1":[]', path.read_text(encoding="utf-8")), encoding="utf-8"
+        )
     summary = study / "summary.json"
     words = read_json(summary)["conclusion"] if summary.is_file() else ""
     return f"study/{study.name}/{STUDY_PAGE}", f"Study {study.name}", words

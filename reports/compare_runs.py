@@ -32,13 +32,13 @@ class Comparison:
     """What changed from A to B.
 
     Attributes:
-        overall: Tracker and what differs to the geometric mean over sequences of B's median ATE over A's, with an
-            interval from `FEWEST` sequences on; all categories weigh the same.
+        overall: Tracker and what differs to the geometric mean over sequences of B's median ATE
+            over A's, with an interval from `FEWEST` sequences on; all categories weigh the same.
         table: Every tracker and sequence with both medians.
         only_a: Runs that only A has.
         only_b: Runs that only B has.
-        differences: Tracker, as in `overall`, to the settings that differ, e.g. ``epipolar.threshold_px: default in A,
-            2 in B``; empty where the settings are the same.
+        differences: Tracker, as in `overall`, to the settings that differ, e.g.
+            ``epipolar.threshold_px: default in A, 2 in B``; empty where the settings are the same.
         page: The page that shows it; None where none was asked for.
     """
 
@@ -59,8 +59,9 @@ def compare(
 ) -> Comparison:
     """Compare two results folders, or two reports, on the sequences that both have.
 
-    A tracker with the same settings on both sides is compared with itself. Settings that only one side has are compared
-    with those of the same tracker that only the other has and that differ in the fewest values.
+    A tracker with the same settings on both sides is compared with itself. Settings that only one
+    side has are compared with those of the same tracker that only the other has and that differ in
+    the fewest values.
 
     Args:
         a: Results folder, store, or folder of a report (``report.json``).
@@ -69,27 +70,37 @@ def compare(
         output: Folder of a page that shows it; None for none.
 
     Raises:
-        ReportError: One holds no runs, nothing is in both, or their numbers stem from different protocols.
+        ReportError: One holds no runs, nothing is in both, or their numbers stem from different
+            protocols.
     """
     protocol = get_protocol(protocol)
-    (rows_a, evaluated), (rows_b, _) = _read(a, protocol), _read(b, protocol)
+    (rows_a, evaluated) = _read(a, protocol)
+    (rows_b, _) = _read(b, protocol)
     check_one_protocol([*rows_a, *rows_b])
-    variants_a, variants_b = (grouped(rows, lambda row: row.variant_key) for rows in (rows_a, rows_b))
+    variants_a, variants_b = (
+        grouped(rows, lambda row: row.variant_key) for rows in (rows_a, rows_b)
+    )
     pairs = pair_variants(variants_a, variants_b)
-    name_a, name_b = (str(source.root if isinstance(source, RunStore) else source) for source in (a, b))
+    name_a, name_b = (
+        str(source.root if isinstance(source, RunStore) else source) for source in (a, b)
+    )
     if not pairs:
         raise ReportError(
             f"{name_a} ({len(rows_a)} runs) and {name_b} ({len(rows_b)} runs) have no tracker and sequence in common",
             "compare results of the same suite",
         )
     columns = name_columns([*rows_a, *rows_b])
-    labels = make_labels([row for one, other in pairs for row in (*variants_a[one], *variants_b[other])])
+    labels = make_labels(
+        [row for one, other in pairs for row in (*variants_a[one], *variants_b[other])]
+    )
     compared: dict[str, list[Paired]] = {}
     differences: dict[str, list[str]] = {}
-    only_a, only_b = len(rows_a), len(rows_b)
+    only_a = len(rows_a)
+    only_b = len(rows_b)
     for one, other in pairs:
         name = labels[one] if one == other else f"{labels[one]} → {labels[other]}"
-        by_column_a, by_column_b = _by_column(variants_a[one]), _by_column(variants_b[other])
+        by_column_a = _by_column(variants_a[one])
+        by_column_b = _by_column(variants_b[other])
         shared = by_column_a.keys() & by_column_b.keys()
         only_a -= sum(len(by_column_a[column]) for column in shared)
         only_b -= sum(len(by_column_b[column]) for column in shared)
@@ -97,7 +108,10 @@ def compare(
         for column in shared:
             sides = by_column_a[column], by_column_b[column]
             repeats = {row.repeat_key for row in sides[0]} & {row.repeat_key for row in sides[1]}
-            a_cell, b_cell = (make_cell([row for row in side if row.repeat_key in repeats] or side) for side in sides)
+            a_cell, b_cell = (
+                make_cell([row for row in side if row.repeat_key in repeats] or side)
+                for side in sides
+            )
             if a_cell.scores and b_cell.scores:
                 mark = f" {SEEN}" * (a_cell.in_training or b_cell.in_training)
                 paired.append((columns[column] + mark, a_cell, b_cell))
@@ -107,7 +121,9 @@ def compare(
     if not compared:
         raise ReportError("none of the runs in common has ground truth", "nothing can be compared")
     overall = {name: overall_ratio(paired) for name, paired in compared.items()}
-    changed = "; ".join(f"{name}: {', '.join(words)}" for name, words in differences.items() if words)
+    changed = "; ".join(
+        f"{name}: {', '.join(words)}" for name, words in differences.items() if words
+    )
     caption = (
         f"{evaluated}. Median ATE (millimetres), lost frames held, over the repeats that both have, or all where they "
         "share none; failures count as a static camera, or worse. B / A below 1: B is better; all categories weigh the "
@@ -115,7 +131,11 @@ def compare(
         f"Student's 95 % interval over sequences, from {FEWEST} of them on. "
         + (f"What differs: {changed}." if changed else "The settings are the same.")
     )
-    page = None if output is None else _write_page(Path(output), protocol, evaluated, compared, overall)
+    page = (
+        None
+        if output is None
+        else _write_page(Path(output), protocol, evaluated, compared, overall)
+    )
     table = _table(f"{name_a} (A) against {name_b} (B)", caption, compared, overall)
     return Comparison(overall, table, only_a, only_b, differences, page)
 
@@ -134,16 +154,30 @@ def _write_page(
         for name, pairs in compared.items()
         for at, side in enumerate("AB")
     }
-    typical = {cell.typical.run_id: cell.typical for some in cells.values() for cell in some.values()}
-    paged = {run_id: row for run_id, row in typical.items() if row.folder.is_dir()}  # a report alone brings no files
+    typical = {
+        cell.typical.run_id: cell.typical for some in cells.values() for cell in some.values()
+    }
+    # a report alone brings no files
+    paged = {run_id: row for run_id, row in typical.items() if row.folder.is_dir()}
     write_run_pages(list(paged.values()), paged, protocol, output)
     names = sorted({name for some in cells.values() for name in some})
-    contents, runs = [], []
+    contents = []
+    runs = []
     for at, some in enumerate(cells.values()):
         for name, cell in some.items():
-            metric, run = {"key": "ate_rmse_m", "which": cell.rows[0].trajectory}, cell.typical
+            metric = {"key": "ate_rmse_m", "which": cell.rows[0].trajectory}
+            run = cell.typical
             contents.append(cell_content(cell, at, names.index(name), [metric], rank_seen=True))
-            runs.append([run.run_id, at, names.index(name), run.repeat, run.ending, 3 * (run.run_id in paged)])
+            runs.append(
+                [
+                    run.run_id,
+                    at,
+                    names.index(name),
+                    run.repeat,
+                    run.ending,
+                    3 * (run.run_id in paged),
+                ]
+            )
     board = {
         "protocol": evaluated,
         "pageless": "",
@@ -167,7 +201,11 @@ def _write_page(
     write_assets(output)
     shown = {"links": [("index.html", "Comparison")], "scripts": ["run.js"]}
     write_atomic(output / RUN_PAGE, render("run.html.j2", title="Run", **shown))
-    compare_page = {"title": "B against A", "here": "index.html", "scripts": ["run.js", "compare.js"]}
+    compare_page = {
+        "title": "B against A",
+        "here": "index.html",
+        "scripts": ["run.js", "compare.js"],
+    }
     write_atomic(output / "index.html", render("compare.html.j2", **(shown | compare_page)))
     return output / "index.html"
 
@@ -187,13 +225,21 @@ def _by_column(rows: Sequence[RunRow]) -> dict[str, list[RunRow]]:
     return grouped(rows, lambda row: row.column_id)
 
 
-def pair_variants(a: Mapping[str, list[RunRow]], b: Mapping[str, list[RunRow]]) -> list[tuple[str, str]]:
+def pair_variants(
+    a: Mapping[str, list[RunRow]], b: Mapping[str, list[RunRow]]
+) -> list[tuple[str, str]]:
     """Variants of A and B that share a column: equal ones, then those that differ least, each at most once.
 
     Of several programs those that rank come first.
     """
     candidates = [
-        (one != other, len(_differences(a[one][0], b[other][0])), _not_current(a[one][0], b[other][0]), one, other)
+        (
+            one != other,
+            len(_differences(a[one][0], b[other][0])),
+            _not_current(a[one][0], b[other][0]),
+            one,
+            other,
+        )
         for one, other in product(a, b)
         if (a[one][0].tracker.id, a[one][0].kind) == (b[other][0].tracker.id, b[other][0].kind)
         and (one == other or (one not in b and other not in a))
@@ -214,9 +260,14 @@ def _not_current(first: RunRow, second: RunRow) -> int:
 def _differences(first: RunRow, second: RunRow) -> list[str]:
     """The settings that set a variant of A apart from one of B, in words."""
     names = sorted(
-        name for name in {*first.variant, *second.variant} if first.variant.get(name) != second.variant.get(name)
+        name
+        for name in {*first.variant, *second.variant}
+        if first.variant.get(name) != second.variant.get(name)
     )
-    sides = [{name: setting_text(row.variant.get(name, "default")) for name in names} for row in (first, second)]
+    sides = [
+        {name: setting_text(row.variant.get(name, "default")) for name in names}
+        for row in (first, second)
+    ]
     return [f"{name}: {sides[0][name]} in A, {sides[1][name]} in B" for name in names]
 
 
@@ -232,7 +283,10 @@ def overall_ratio(paired: Sequence[Paired]) -> Interval:
 
 
 def _table(
-    title: str, caption: str, compared: Mapping[str, Sequence[Paired]], overall: Mapping[str, Interval]
+    title: str,
+    caption: str,
+    compared: Mapping[str, Sequence[Paired]],
+    overall: Mapping[str, Interval],
 ) -> Table:
     """Every tracker and sequence with both medians, and one line a tracker over all sequences."""
     rows: list[list[TableCell]] = []
@@ -257,12 +311,18 @@ def _table(
         verdict = TableCell(_verdict(overall[name], wins, len(paired)))
         words = [TableCell(name), TableCell(f"all {len(paired)} sequences")]
         rows.append([*words, *[TableCell()] * 2, ratio, verdict, *[TableCell()] * 3])
-    columns = [*texts("tracker", "sequence"), *numbers("ATE A", "ATE B", "B / A"), *texts("verdict")]
+    columns = [
+        *texts("tracker", "sequence"),
+        *numbers("ATE A", "ATE B", "B / A"),
+        *texts("verdict"),
+    ]
     columns += numbers("coverage A", "coverage B", "runs")
     return Table("paired", title, caption, columns, rows, separators=separators - {0})
 
 
 def _verdict(ratio: Interval, wins: int, sequences: int) -> str:
     if sequences < FEWEST:
-        return "equal" if ratio.value == 1 else f"B better on {wins} of {sequences}, too few to tell"
+        return (
+            "equal" if ratio.value == 1 else f"B better on {wins} of {sequences}, too few to tell"
+        )
     return "better" if ratio.high < 1 else "worse" if ratio.low > 1 else "no difference shown"

@@ -14,11 +14,28 @@ from numpy.typing import ArrayLike
 from dynslam_bench.core import label_text
 from dynslam_bench.reports.model.board import Board, timed_on_one
 from dynslam_bench.reports.model.statistics import FLOOR_M
-from dynslam_bench.reports.tables.leaderboard import LOST_MARK, STATISTICS, has_lost, medians, time_marks
+from dynslam_bench.reports.tables.leaderboard import (
+    LOST_MARK,
+    STATISTICS,
+    has_lost,
+    medians,
+    time_marks,
+)
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a8a8a")
 """Okabe and Ito's, without black and yellow, which vanish on one of the two grounds."""
-SYMBOLS = ("circle", "square", "diamond", "triangle-up", "cross", "x", "star", "pentagon", "hexagon", "bowtie")
+SYMBOLS = (
+    "circle",
+    "square",
+    "diamond",
+    "triangle-up",
+    "cross",
+    "x",
+    "star",
+    "pentagon",
+    "hexagon",
+    "bowtie",
+)
 DASHES = ("solid", "dash", "dot", "dashdot")
 NEUTRAL = "#8a8a8a"
 MOST_POINTS = 400
@@ -30,7 +47,11 @@ def _theme(ink: str, grid: str, paper: str) -> dict[str, Any]:
     walls = line | {"showbackground": False}
     return {
         "layout": {
-            "font": {"family": "Inter, system-ui, 'Segoe UI', Roboto, sans-serif", "size": 13, "color": ink},
+            "font": {
+                "family": "Inter, system-ui, 'Segoe UI', Roboto, sans-serif",
+                "size": 13,
+                "color": ink,
+            },
             "paper_bgcolor": "rgba(0,0,0,0)",
             "plot_bgcolor": "rgba(0,0,0,0)",
             "colorway": COLOURS,
@@ -44,7 +65,10 @@ def _theme(ink: str, grid: str, paper: str) -> dict[str, Any]:
     }
 
 
-THEMES = {"light": _theme("#1b2430", "#e3e7ec", "#ffffff"), "dark": _theme("#e7eaf0", "#2b323d", "#1f252e")}
+THEMES = {
+    "light": _theme("#1b2430", "#e3e7ec", "#ffffff"),
+    "dark": _theme("#e7eaf0", "#2b323d", "#1f252e"),
+}
 """Plotly templates by the colour scheme of the page."""
 
 
@@ -62,7 +86,10 @@ def looks(board: Board) -> dict[str, dict[str, str]]:
 
 def packed(values: ArrayLike, kind: str = "f4") -> dict[str, str]:
     """Numbers as plotly's JSON holds them in few characters; nan is a gap."""
-    return {"dtype": kind, "bdata": base64.b64encode(np.asarray(values, dtype=f"<{kind}").tobytes()).decode()}
+    return {
+        "dtype": kind,
+        "bdata": base64.b64encode(np.asarray(values, dtype=f"<{kind}").tobytes()).decode(),
+    }
 
 
 def significant(value: float | None, digits: int = 5) -> float | None:
@@ -82,12 +109,16 @@ def safe(text: str) -> str:
 
 def wrapped(text: str) -> str:
     """A label broken into lines of 34 characters at blanks."""
-    return "<br>".join(map(safe, textwrap.wrap(text, 34, break_long_words=False, break_on_hyphens=False)))
+    return "<br>".join(
+        map(safe, textwrap.wrap(text, 34, break_long_words=False, break_on_hyphens=False))
+    )
 
 
 def figure_of(traces: Sequence[Any], height: int, **layout: Any) -> go.Figure | None:
     """A figure in the theme of its page; None without traces."""
-    return go.Figure(list(traces), go.Layout(height=height, template={}, **layout)) if traces else None
+    return (
+        go.Figure(list(traces), go.Layout(height=height, template={}, **layout)) if traces else None
+    )
 
 
 def log_axis(title: str) -> dict[str, Any]:
@@ -102,9 +133,11 @@ GUIDE: dict[str, Any] = {"line": {"color": NEUTRAL, "width": 1, "dash": "dash"},
 def speed_figure(board: Board) -> go.Figure | None:
     """Accuracy against speed, None without timed runs.
 
-    The Pareto front is drawn through the ranked trackers that were timed on the board's `timing_computer`.
+    The Pareto front is drawn through the ranked trackers that were timed on the board's
+    `timing_computer`.
     """
-    look, placed = looks(board), board.placed
+    look = looks(board)
+    placed = board.placed
     points = []
     comparable: set[str] = set()
     for key in board.trackers:
@@ -113,19 +146,30 @@ def speed_figure(board: Board) -> go.Figure | None:
         factors = [row.real_time_factor for row in rows if row.real_time_factor]
         if key in placed and factors and np.isfinite(placed[key].ratio.value):
             marks, _ = time_marks(board, ended)
-            points.append((key, float(np.median(factors)), placed[key].ratio, f" {marks}" * bool(marks)))
+            points.append(
+                (key, float(np.median(factors)), placed[key].ratio, f" {marks}" * bool(marks))
+            )
             if rows[0].computer == board.timing_computer:
                 comparable.add(key)
     traces: list[Any] = []
-    ranked = {(speed, ratio.value) for key, speed, ratio, _ in points if key in board.ranked and key in comparable}
-    front = sorted(p for p in ranked if not any(q != p and q[0] >= p[0] and q[1] <= p[1] for q in ranked))
+    ranked = {
+        (speed, ratio.value)
+        for key, speed, ratio, _ in points
+        if key in board.ranked and key in comparable
+    }
+    front = sorted(
+        p for p in ranked if not any(q != p and q[0] >= p[0] and q[1] <= p[1] for q in ranked)
+    )
     if len(front) > 1:
         x, y = (rounded(values) for values in zip(*front, strict=True))
         line = {"color": NEUTRAL, "width": 1.5, "dash": "dot"}
-        traces.append(go.Scatter(x=x, y=y, mode="lines", line=line, name="Pareto front", hoverinfo="skip"))
+        traces.append(
+            go.Scatter(x=x, y=y, mode="lines", line=line, name="Pareto front", hoverinfo="skip")
+        )
     for key, speed, ratio, mark in points:
         symbol = look[key]["symbol"] + "-open" * (key not in board.ranked)
-        above, below = rounded([ratio.high - ratio.value]), rounded([ratio.value - ratio.low])
+        above = rounded([ratio.high - ratio.value])
+        below = rounded([ratio.value - ratio.low])
         traces.append(
             go.Scatter(
                 x=[significant(speed)],
@@ -152,7 +196,8 @@ def speed_figure(board: Board) -> go.Figure | None:
 
 def mask_figure(board: Board) -> go.Figure | None:
     """Quality of the masks against the pose error, one point a run; None where no run has it."""
-    look, traces = looks(board), []
+    look = looks(board)
+    traces = []
     for key in board.trackers:
         points = [
             (
@@ -173,17 +218,31 @@ def mask_figure(board: Board) -> go.Figure | None:
                     text=[words for _, _, words in points],
                     mode="markers",
                     name=wrapped(board.names[key]),
-                    marker={"size": 8, "opacity": 0.85, "color": look[key]["color"], "symbol": look[key]["symbol"]},
+                    marker={
+                        "size": 8,
+                        "opacity": 0.85,
+                        "color": look[key]["color"],
+                        "symbol": look[key]["symbol"],
+                    },
                     hovertemplate="%{text}<br>IoU %{x:.3f}<br>ATE %{y:.3g} mm<extra>%{fullData.name}</extra>",
                 )
             )
-    overlap = {"title": "overlap (IoU) of the mask, dilated, with the exact one", "range": [-0.02, 1.02]}
+    overlap = {
+        "title": "overlap (IoU) of the mask, dilated, with the exact one",
+        "range": [-0.02, 1.02],
+    }
     return figure_of(
-        traces, max(420, 110 + 21 * len(traces)), showlegend=True, xaxis=overlap, yaxis=log_axis("ATE (mm)")
+        traces,
+        max(420, 110 + 21 * len(traces)),
+        showlegend=True,
+        xaxis=overlap,
+        yaxis=log_axis("ATE (mm)"),
     )
 
 
-def share_figure(board: Board, bins: Mapping[str, Sequence[Sequence[float | None]]], edges: Sequence[float]) -> Any:
+def share_figure(
+    board: Board, bins: Mapping[str, Sequence[Sequence[float | None]]], edges: Sequence[float]
+) -> Any:
     """Frame-to-frame error by the share of the image that shows people; None where nothing is known of it.
 
     Args:
@@ -209,7 +268,9 @@ def share_figure(board: Board, bins: Mapping[str, Sequence[Sequence[float | None
     ]
     shares = {"title": "share of the image that shows people (%)", "type": "category"}
     errors = log_axis("frame-to-frame error, RMSE (mm)")
-    return figure_of(traces, max(420, 110 + 21 * len(traces)), showlegend=True, xaxis=shares, yaxis=errors)
+    return figure_of(
+        traces, max(420, 110 + 21 * len(traces)), showlegend=True, xaxis=shares, yaxis=errors
+    )
 
 
 FIGURES = {"mean": 9, "median": 10, "rmse": 11, "std": 12}
@@ -225,7 +286,9 @@ def bar_figure(board: Board, statistic: str) -> go.Figure | None:
     """
     look = looks(board)
     errors = medians(board, lambda row: row.metrics.get(f"ate_{statistic}_m"))
-    measured = {key: [name for name in board.sequences if (key, name) in errors] for key in board.trackers}
+    measured = {
+        key: [name for name in board.sequences if (key, name) in errors] for key in board.trackers
+    }
     traces = [
         go.Bar(
             x=[safe(board.short[name]) for name in names],

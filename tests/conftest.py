@@ -20,13 +20,18 @@ image, points = rng.integers(0, 256, (240, 320), np.uint8), rng.uniform(60, 180,
 for flow in map(build_flow, (FlowSettings(), DenseFlowSettings(terms=3))):
     flow.track(flow.prepare(image), flow.prepare(np.roll(image, 3, 1)), points)
 """
-KERNELS = (TRACKER.format("orb-slam2"), FLOWS), (TRACKER.format("emfoa-oft?masks=none"), TRACKER.format("dynaslam"))
+KERNELS = (
+    (TRACKER.format("orb-slam2"), FLOWS),
+    (TRACKER.format("emfoa-oft?masks=none"), TRACKER.format("dynaslam")),
+)
 """What compiles the kernels in two rounds of two processes: rendering and SLAM, flow; then those that use both."""
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile the kernels once, on two cores: several workers would each compile all of them."""
-    if getattr(session.config.option, "numprocesses", None) and not hasattr(session.config, "workerinput"):
+    if getattr(session.config.option, "numprocesses", None) and not hasattr(
+        session.config, "workerinput"
+    ):
         for codes in KERNELS:
             for process in [subprocess.Popen([sys.executable, "-c", code]) for code in codes]:
                 process.wait()
@@ -39,7 +44,9 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     ids: list[str] = []
     read_whole = RunStore.read_whole
-    monkeypatch.setattr(RunStore, "read_whole", lambda self, run_id: ids.append(run_id) or read_whole(self, run_id))
+    monkeypatch.setattr(
+        RunStore, "read_whole", lambda self, run_id: ids.append(run_id) or read_whole(self, run_id)
+    )
     return ids
 
 

@@ -1,8 +1,9 @@
 """Optuna studies over the environments: search space, trials as runs, held-out check, presets.
 
-`Study` is all of it from Python: preview, run or ask and tell, extend, finish, and a stored one as a pandas frame.
-Its steps: `read_study` reads a study's TOML, `run_study` makes its trials, `finish` judges the best of them on
-held-out instances, `write_page` shows it all. `search_space` and `distributions` serve studies of your own.
+`Study` is all of it from Python: preview, run or ask and tell, extend, finish, and a stored one as
+a pandas frame. Its steps: `read_study` reads a study's TOML, `run_study` makes its trials, `finish`
+judges the best of them on held-out instances, `write_page` shows it all. `search_space` and
+`distributions` serve studies of your own.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,13 @@ if TYPE_CHECKING:
     from dynslam_bench.tuning.page import write_page
     from dynslam_bench.tuning.plan import Plan, Preview, distributions, search_space
     from dynslam_bench.tuning.study import Evaluation, Study, StudyEvent, run_study
-    from dynslam_bench.tuning.study_file import ProblemInstance, SpaceSpec, StudySpec, parse_instances, read_study
+    from dynslam_bench.tuning.study_file import (
+        ProblemInstance,
+        SpaceSpec,
+        StudySpec,
+        parse_instances,
+        read_study,
+    )
 
 _HOMES = {
     "Evaluation": "study",

@@ -33,7 +33,13 @@ from dynslam_bench.tuning.objectives import (
     violations,
 )
 from dynslam_bench.tuning.plan import held_settings, seen_note, splits_seen
-from dynslam_bench.tuning.storage import Importance, best_trials, count_states, importances, scene_ratios
+from dynslam_bench.tuning.storage import (
+    Importance,
+    best_trials,
+    count_states,
+    importances,
+    scene_ratios,
+)
 from dynslam_bench.tuning.study import StoredStudy, Study
 from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec
 
@@ -49,14 +55,17 @@ class Ratio(Record):
     """A ratio to the baseline, of the ATE or whatever a study is after, with its 95 % interval.
 
     Attributes:
-        ratio: Geometric mean over the scenes, trimmed from ten on; below 1 is better than the baseline.
-        low: Lower end of the interval over scenes (`objectives.bounds`); below three scenes over starts, which tells
-            nothing of other scenes. None for a single run.
+        ratio: Geometric mean over the scenes, trimmed from ten on; below 1 is better than the
+            baseline.
+        low: Lower end of the interval over scenes (`objectives.bounds`); below three scenes over
+            starts, which tells nothing of other scenes. None for a single run.
         high: Upper end.
         n: Paired runs.
         sequences: How many scenes they come from.
-        bound: Upper end of an interval that is wide enough for all candidates compared; None for a single run.
-        spread: Standard deviation of the logarithm over what the interval is over; None for a single run.
+        bound: Upper end of an interval that is wide enough for all candidates compared; None for a
+            single run.
+        spread: Standard deviation of the logarithm over what the interval is over; None for a
+            single run.
         what: What the ratio is one of.
     """
 
@@ -93,24 +102,35 @@ class Ratio(Record):
         return f"{self.what} x {self.ratio:.3f} {self.interval or 'without an interval'}"
 
 
-def compared(outcomes: Outcomes, baseline: Outcomes, *, objective: Objective = ACCURACY, candidates: int = 1) -> Ratio:
+def compared(
+    outcomes: Outcomes, baseline: Outcomes, *, objective: Objective = ACCURACY, candidates: int = 1
+) -> Ratio:
     """A configuration beside the baseline on the same instances.
 
     Args:
         outcomes: Of the configuration.
         baseline: Of the baseline.
         objective: What is compared.
-        candidates: How many configurations are compared for one choice; the bound allows for all of them (Bonferroni).
+        candidates: How many configurations are compared for one choice; the bound allows for all of
+            them (Bonferroni).
     """
     scenes = objective.ratios(outcomes, baseline)
-    sample = list(scenes.values()) if len(scenes) >= FEWEST_SCENES else objective.by_start(outcomes, baseline)
+    sample = (
+        list(scenes.values())
+        if len(scenes) >= FEWEST_SCENES
+        else objective.by_start(outcomes, baseline)
+    )
     sample = objective.counted(sample)
-    ratio = Ratio(ratio=_ratio(centre(sample)), n=len(outcomes), sequences=len(scenes), what=objective.what)
+    ratio = Ratio(
+        ratio=_ratio(centre(sample)), n=len(outcomes), sequences=len(scenes), what=objective.what
+    )
     if len(sample) < 2:
         return ratio
     low, high = map(_ratio, bounds(sample))
     bound = _ratio(bounds(sample, 1 - ERROR / candidates)[1])
-    return ratio.model_copy(update={"low": low, "high": high, "bound": bound, "spread": float(np.std(sample, ddof=1))})
+    return ratio.model_copy(
+        update={"low": low, "high": high, "bound": bound, "spread": float(np.std(sample, ddof=1))}
+    )
 
 
 def _ratio(logarithm: float) -> float:
@@ -142,7 +162,8 @@ class Candidate(Record):
         recorded: ATE on recordings; None without any, or if it is not the best.
         on_confirm: ATE and processor time on the instances for the choice, by objective.
         on_held_out: The same on the held-out split.
-        ate_margin: What it may lose of accuracy, as a share; None where its own ratio is one of errors.
+        ate_margin: What it may lose of accuracy, as a share; None where its own ratio is one of
+            errors.
         feasible: Whether the constraints hold in the new runs.
         failed: Why it could not be run again; empty if it could.
     """
@@ -162,7 +183,11 @@ class Candidate(Record):
     @property
     def bound(self) -> float:
         """Upper confidence bound of its ratio; infinite if it cannot be chosen."""
-        return _bound(self.confirm) if self.feasible and self.nothing_lost(self.on_confirm) else math.inf
+        return (
+            _bound(self.confirm)
+            if self.feasible and self.nothing_lost(self.on_confirm)
+            else math.inf
+        )
 
     @property
     def chosen(self) -> bool:
@@ -189,17 +214,21 @@ class StudySummary(Record):
         baseline: What ratios are to, in words.
         protocol: Description of the protocol.
         trials: Trials by state.
-        candidates: The best configurations, judged again; the best one, whose settings became the preset, first.
+        candidates: The best configurations, judged again; the best one, whose settings became the
+            preset, first.
         verdict: What the study says of the best candidate.
         conclusion: A few short sentences, see `judge`.
-        p_value: Of the test whether the settings matter at all (`objectives.spread_test`); None without a test.
-        shipped: The default settings, where the baseline is something else, on ``confirm`` and ``held_out``.
+        p_value: Of the test whether the settings matter at all (`objectives.spread_test`); None
+            without a test.
+        shipped: The default settings, where the baseline is something else, on ``confirm`` and
+            ``held_out``.
         importances: Optuna's importances of the parameters, see `storage.importances`.
         tune: The instances that trials ran on.
         confirm: Those of the choice.
         held_out: Those that judged it.
         recorded: Recordings that it was checked on.
-        seen: Splits with scenes that the network behind the masks was trained on, see `plan.seen_note`.
+        seen: Splits with scenes that the network behind the masks was trained on, see
+            `plan.seen_note`.
     """
 
     name: str
@@ -239,9 +268,9 @@ def judge(
 
     *Proven*: it was chosen, the whole interval on held-out scenes lies below 1, nothing is lost of accuracy where that
     is asked, and recordings are not worse. *Worse*: an interval lies above 1, a constraint fails,
-    or the settings matter and the estimate is not below 1. *Does not matter here*: the trials differ by no more than
-    chance (`objectives.spread_test`), or the whole interval lies above 1 - `NEGLIGIBLE`, or the estimate does and
-    nothing was chosen. *Promising* is what is left.
+    or the settings matter and the estimate is not below 1. *Does not matter here*: the trials
+    differ by no more than chance (`objectives.spread_test`), or the whole interval lies above 1 -
+    `NEGLIGIBLE`, or the estimate does and nothing was chosen. *Promising* is what is left.
 
     Args:
         candidates: The best one first.
@@ -258,24 +287,38 @@ def _judged(candidates: Sequence[Candidate], p_value: float | None) -> tuple[Ver
     if not candidates:
         return Verdict.NOT_JUDGED, "no trial with other settings came to its end"
     best = candidates[0]
-    name, ratio = f"trial {best.trial}", best.evidence
+    name = f"trial {best.trial}"
+    ratio = best.evidence
     if best.failed:
         return Verdict.NOT_JUDGED, f"{name} failed when it was run again: {best.failed}"
     if ratio is None or best.confirm is None:
         return Verdict.NOT_JUDGED, f"no frames are left to confirm {name} on; name some as confirm"
     if ratio.sequences < FEWEST_SCENES:
-        return Verdict.NOT_JUDGED, f"{name} has {ratio} on {_scenes(ratio)} only, and {FEWEST_SCENES} are the fewest"
+        return (
+            Verdict.NOT_JUDGED,
+            f"{name} has {ratio} on {_scenes(ratio)} only, and {FEWEST_SCENES} are the fewest",
+        )
     numbers = f"{ratio} on {_scenes(ratio)} that no trial saw"
-    numbers += f" (where it was chosen {', '.join(map(str, best.on_confirm.values()))})" if best.ate_margin else ""
+    numbers += (
+        f" (where it was chosen {', '.join(map(str, best.on_confirm.values()))})"
+        if best.ate_margin
+        else ""
+    )
     gain = f"{100 * (1 - ratio.ratio):.1f} % less {ratio.what}: {numbers}"
     no_better = f"the best, {name}, is not better than the baseline: {numbers}"
     unsettled = _unsettled(best)
-    p, low = math.nan if p_value is None else p_value, math.nan if ratio.low is None else ratio.low
-    recorded_low = 0.0 if best.recorded is None else best.recorded.low or 0.0  # over starts, if need be
+    p = math.nan if p_value is None else p_value
+    low = math.nan if ratio.low is None else ratio.low
+    # over starts, if need be
+    recorded_low = 0.0 if best.recorded is None else best.recorded.low or 0.0
     by_chance = p > MATTER_LEVEL and (not best.chosen or ratio.ratio >= 1) and not ratio.shows_gain
     small = ratio.ratio > 1 - NEGLIGIBLE and not best.chosen and not ratio.shows_gain
     verdicts = (
-        (not best.feasible, Verdict.WORSE, f"{name} violates a constraint when it is run again ({numbers})"),
+        (
+            not best.feasible,
+            Verdict.WORSE,
+            f"{name} violates a constraint when it is run again ({numbers})",
+        ),
         (recorded_low > 1, Verdict.WORSE, f"{name} has {best.recorded} on recordings ({numbers})"),
         (
             ratio.shows_loss,
@@ -332,7 +375,8 @@ def beside_default(baseline: str, shipped: Mapping[str, Ratio], best: Candidate 
         best: The best candidate.
     """
     split = "held_out" if "held_out" in shipped else "confirm"
-    default, mine = shipped.get(split), getattr(best, split, None)
+    default = shipped.get(split)
+    mine = getattr(best, split, None)
     if default is None or mine is None:
         return ""
     keep = ", so keep them" if default.ratio <= mine.ratio else ""
@@ -341,7 +385,9 @@ def beside_default(baseline: str, shipped: Mapping[str, Ratio], best: Candidate 
 
 def _unsettled(best: Candidate) -> str:
     """Why the best candidate is not proven; empty if it is."""
-    as_accurate = best.nothing_lost(best.on_confirm) and best.nothing_lost(best.on_held_out or best.on_confirm)
+    as_accurate = best.nothing_lost(best.on_confirm) and best.nothing_lost(
+        best.on_held_out or best.on_confirm
+    )
     held = best.held_out
     reasons = {
         f"it is not shown to be as accurate (the bound has to lie below {1 + (best.ate_margin or 0.0):.2f})": (
@@ -364,11 +410,14 @@ def _bound(ratio: Ratio | None) -> float:
     return math.inf if ratio is None or ratio.bound is None else ratio.bound
 
 
-def finish(tuner: Study, on_note: Callable[[str], None] | None = None, *, jobs: int = 1) -> StudySummary:
+def finish(
+    tuner: Study, on_note: Callable[[str], None] | None = None, *, jobs: int = 1
+) -> StudySummary:
     """Judge the best trials on the `confirm` instances and the best of them on the others; write preset and summary.
 
-    The best has the smallest upper confidence bound of its ratio to the baseline on `confirm`, allowing for the number
-    of candidates; where that bound lies below 1 it is the choice. The held-out split and the recordings only judge.
+    The best has the smallest upper confidence bound of its ratio to the baseline on `confirm`,
+    allowing for the number of candidates; where that bound lies below 1 it is the choice. The
+    held-out split and the recordings only judge.
 
     Args:
         tuner: A study with finished trials.
@@ -381,28 +430,46 @@ def finish(tuner: Study, on_note: Callable[[str], None] | None = None, *, jobs: 
     Raises:
         StudyError: No trial has finished, or the baseline fails.
     """
-    spec, design = tuner.spec, tuner.design
+    spec = tuner.spec
+    design = tuner.design
     note = on_note or (lambda _: None)
     finished = best_trials(tuner.study, spec.top + 1)
     if not finished:
-        raise StudyError(f"study '{spec.name}' has no finished trial", "run it first, or see why its trials failed")
-    is_rival = tuner.baseline.tracker != spec.tracker  # then trial 0, the default settings, is a candidate too
-    margin, shipped = spec.ate_margin if spec.at_equal_accuracy else None, dict[str, Ratio]()
+        raise StudyError(
+            f"study '{spec.name}' has no finished trial",
+            "run it first, or see why its trials failed",
+        )
+    # then trial 0, the default settings, is a candidate too
+    is_rival = tuner.baseline.tracker != spec.tracker
+    margin = spec.ate_margin if spec.at_equal_accuracy else None
+    shipped = dict[str, Ratio]()
     candidates = [
-        Candidate(trial=trial.number, params=trial.params, values=list(trial.values or ()), ate_margin=margin)
+        Candidate(
+            trial=trial.number,
+            params=trial.params,
+            values=list(trial.values or ()),
+            ate_margin=margin,
+        )
         for trial in finished
         if trial.number > 0 or is_rival
     ][: spec.top]
     if candidates and design.confirm:
-        note(f"the baseline and {len(candidates)} trials on {len(design.confirm)} instances that no trial has seen")
+        note(
+            f"the baseline and {len(candidates)} trials on {len(design.confirm)} instances that no trial has seen"
+        )
     candidates = _judge(tuner, "confirm", candidates, jobs, shipped)
-    candidates.sort(key=lambda candidate: (candidate.bound, bool(candidate.failed), not candidate.feasible))
+    candidates.sort(
+        key=lambda candidate: (candidate.bound, bool(candidate.failed), not candidate.feasible)
+    )
     if candidates and design.confirm and not candidates[0].failed:
         note(f"trial {candidates[0].trial} on the held-out instances")
         for split in ("held_out", "recorded"):
             candidates[:1] = _judge(tuner, split, candidates[:1], jobs, shipped)
     p_value = spread_test(list(scene_ratios(tuner.study).values()))
-    reasons = [trial.user_attrs.get("reason", "") for trial in tuner.study.get_trials(states=(TrialState.FAIL,))]
+    reasons = [
+        trial.user_attrs.get("reason", "")
+        for trial in tuner.study.get_trials(states=(TrialState.FAIL,))
+    ]
     verdict, conclusion = judge(candidates, p_value, reasons)
     conclusion += beside_default(spec.baseline, shipped, candidates[0] if candidates else None)
     summary = StudySummary(
@@ -448,7 +515,10 @@ def _judge(
     if not instances or not candidates:
         return list(candidates)
     objective = ACCURACY if split == "recorded" else together(tuner.objectives)
-    tuned = [Configuration(tuner.spec.tracker, {**tuner.held, **candidate.params}) for candidate in candidates]
+    tuned = [
+        Configuration(tuner.spec.tracker, {**tuner.held, **candidate.params})
+        for candidate in candidates
+    ]
     default = [] if tuner.shipped is None else [tuner.shipped]
     baseline, runs = tuner.evaluate_beside([*tuned, *default], instances, jobs=jobs)
     if default and not isinstance(outcomes := runs.pop(), InstanceFailedError):
@@ -457,18 +527,25 @@ def _judge(
     for candidate, outcomes in zip(candidates, runs, strict=True):
         update: dict[str, Any] = {"failed": str(outcomes), "feasible": False}
         if not isinstance(outcomes, InstanceFailedError):
-            update = {split: compared(outcomes, baseline, objective=objective, candidates=len(candidates))}
+            update = {
+                split: compared(outcomes, baseline, objective=objective, candidates=len(candidates))
+            }
             if split != "recorded":
                 update[f"on_{split}"] = {
-                    one.name: compared(outcomes, baseline, objective=one) for one in (ACCURACY, SPEED)
+                    one.name: compared(outcomes, baseline, objective=one)
+                    for one in (ACCURACY, SPEED)
                 }
             if split == "confirm":
-                update["feasible"] = all(value <= 0 for value in violations(tuner.spec, outcomes).values())
+                update["feasible"] = all(
+                    value <= 0 for value in violations(tuner.spec, outcomes).values()
+                )
         judged.append(candidate.model_copy(update=update))
     return judged
 
 
-def read_preset_text(spec: StudySpec, results: Path | str = "results", trial: int | None = None) -> str:
+def read_preset_text(
+    spec: StudySpec, results: Path | str = "results", trial: int | None = None
+) -> str:
     """The preset of a study, as text; of one that is not finished the best trial so far.
 
     Args:
@@ -480,14 +557,17 @@ def read_preset_text(spec: StudySpec, results: Path | str = "results", trial: in
         StudyError: There is no such study or trial.
     """
     stored = StoredStudy(spec, results)
-    preset, trials = stored.folder / "best.toml", best_trials(stored.study, 1)
+    preset = stored.folder / "best.toml"
+    trials = best_trials(stored.study, 1)
     if trial is None and preset.is_file():
         return read_text(preset, kind=StudyError)
     if trial is not None:
         trials = [one for one in stored.study.get_trials(deepcopy=False) if one.number == trial]
     if not trials:
         absent = "finished trial" if trial is None else f"trial {trial}"
-        raise StudyError(f"study '{spec.name}' has no {absent}", "dynslam-bench tune status STUDY.toml")
+        raise StudyError(
+            f"study '{spec.name}' has no {absent}", "dynslam-bench tune status STUDY.toml"
+        )
     remark = f"Trial {trials[0].number}{', the best so far' * (trial is None)}; not judged on scenes that no trial saw."
     return preset_text(spec, trials[0].params, remark)
 
@@ -506,8 +586,8 @@ def preset_text(
 ) -> str:
     """TOML text of tuned settings: their status, then a dotted name and its value a line under ``[settings]``.
 
-    The settings of a baseline that is a preset are among them. What a study had fixed, for example the source of its
-    masks, is only a comment, so that the preset runs wherever the tracker does.
+    The settings of a baseline that is a preset are among them. What a study had fixed, for example
+    the source of its masks, is only a comment, so that the preset runs wherever the tracker does.
 
     Args:
         spec: The study.
@@ -524,9 +604,20 @@ def preset_text(
         f"Judged on {_listed(judged_on)}.": judged_on,
         f"Fixed in that study, not part of these settings: {', '.join(_lines(fixed))}.": fixed,
     }
-    shown = [f"# {line}" for text, holds in remarks.items() if holds for line in textwrap.wrap(text, 100)]
-    settings = {name: value for name, value in {**held_settings(spec), **tuned}.items() if name not in fixed}
-    head = [f"# settings of {spec.tracker}", *shown, "", f"status = {json.dumps(status)}", "", "[settings]"]
+    shown = [
+        f"# {line}" for text, holds in remarks.items() if holds for line in textwrap.wrap(text, 100)
+    ]
+    settings = {
+        name: value for name, value in {**held_settings(spec), **tuned}.items() if name not in fixed
+    }
+    head = [
+        f"# settings of {spec.tracker}",
+        *shown,
+        "",
+        f"status = {json.dumps(status)}",
+        "",
+        "[settings]",
+    ]
     return "\n".join([*head, *_lines(settings), ""])
 
 

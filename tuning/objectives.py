@@ -1,8 +1,9 @@
 """Outcomes of configurations, and objectives over them: each is a cost of a run, compared with the baseline's.
 
-A configuration runs on each instance in its own process; the run store makes no run twice. All objectives are natural
-logarithms of ratios to the baseline: less is better, 0 is the baseline's own. Below them the statistics of such ratios:
-interval, power, and the test of whether settings matter at all.
+A configuration runs on each instance in its own process; the run store makes no run twice. All
+objectives are natural logarithms of ratios to the baseline: less is better, 0 is the baseline's
+own. Below them the statistics of such ratios: interval, power, and the test of whether settings
+matter at all.
 """
 
 import math
@@ -33,8 +34,9 @@ class Outcome:
         ate_m: ATE RMSE in metres, lost frames held at the last pose.
         coverage: Share of frames that were tracked.
         frame_s: Mean seconds a frame, segmentation included.
-        processor_s: Mean processor seconds of that, all threads together; `frame_s` where the work is done elsewhere (a
-            foreign program, a GPU). Unlike `frame_s` it hardly depends on what else the machine does.
+        processor_s: Mean processor seconds of that, all threads together; `frame_s` where the work
+            is done elsewhere (a foreign program, a GPU). Unlike `frame_s` it hardly depends on what
+            else the machine does.
         rtf: Real-time factor: duration of the instance's frames over the time they took.
     """
 
@@ -67,7 +69,11 @@ class CancelledError(StudyError):
 
 
 def outcome(
-    store: RunStore, record: RunRecord, instance: ProblemInstance, protocol: Protocol, data_root: str | None
+    store: RunStore,
+    record: RunRecord,
+    instance: ProblemInstance,
+    protocol: Protocol,
+    data_root: str | None,
 ) -> Outcome:
     """The outcome of a stored run; one in which nothing was tracked has the error of a static camera.
 
@@ -80,12 +86,19 @@ def outcome(
     if record.failed:
         raise InstanceFailedError(f"{instance}: {record.status}: {record.reason}")
     evaluation = score(store, record, protocol).online
-    ate = static_camera_m(instance, data_root) if evaluation is None else float(evaluation.metrics["ate_rmse_m"])
-    total, elsewhere = record.timings["total"], record.device.startswith("cuda") or FOREIGN in record.timings
+    ate = (
+        static_camera_m(instance, data_root)
+        if evaluation is None
+        else float(evaluation.metrics["ate_rmse_m"])
+    )
+    total = record.timings["total"]
+    elsewhere = record.device.startswith("cuda") or FOREIGN in record.timings
     processor = total if elsewhere else record.timings.get("processor", total)
     period = record.sequence.duration_s / max(record.sequence.frames - 1, 1)
     rtf = period / total.mean_s
-    return Outcome(instance, record.run_id, ate, record.coverage or 0.0, total.mean_s, processor.mean_s, rtf)
+    return Outcome(
+        instance, record.run_id, ate, record.coverage or 0.0, total.mean_s, processor.mean_s, rtf
+    )
 
 
 def held_protocol(protocol: Protocol | str) -> Protocol:
@@ -99,7 +112,8 @@ def held_protocol(protocol: Protocol | str) -> Protocol:
 def static_camera_m(instance: ProblemInstance, data_root: str | None) -> float:
     """ATE RMSE in metres of a static camera on an instance, from the ground truth of its frames alone."""
     sequence: Any = instance.open(data_root)
-    truth, stamps = sequence.ground_truth, sequence.timestamps
+    truth = sequence.ground_truth
+    stamps = sequence.timestamps
     positions = truth.positions[(truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])]
     return float(np.sqrt(np.square(positions - positions.mean(axis=0)).sum(axis=1).mean()))
 
@@ -145,7 +159,11 @@ class Objective:
         return by_scene(self._costs(outcomes), self._costs(baseline))
 
     def _costs(self, outcomes: Outcomes) -> dict[ProblemInstance, float]:
-        return {instance: self.cost(outcome) for instance, outcome in outcomes.items() if self.counts(instance)}
+        return {
+            instance: self.cost(outcome)
+            for instance, outcome in outcomes.items()
+            if self.counts(instance)
+        }
 
     def value(self, outcomes: Outcomes, baseline: Outcomes) -> float:
         """Natural logarithm of the ratio to the baseline over the scenes; below 0 is better.
@@ -175,14 +193,18 @@ OBJECTIVES = {
     objective.name: objective
     for objective in (
         Objective("accuracy", "ATE", lambda run: run.ate_m),
-        Objective("speed", "processor time", lambda run: 1000 * run.processor_s),  # ms: all are above FLOOR_M
-        Objective("worst", "ATE in the worst quarter of the scenes", lambda run: run.ate_m, worst=True),
+        # ms: all are above FLOOR_M
+        Objective("speed", "processor time", lambda run: 1000 * run.processor_s),
+        Objective(
+            "worst", "ATE in the worst quarter of the scenes", lambda run: run.ate_m, worst=True
+        ),
         Objective("robustness", "ATE on degraded instances", lambda run: run.ate_m, degraded=True),
         Objective("coverage", "share of lost frames", lambda run: 1 - run.coverage + _LOST_FLOOR),
     )
 }
 """Objectives by name."""
-ACCURACY, SPEED = OBJECTIVES["accuracy"], OBJECTIVES["speed"]
+ACCURACY = OBJECTIVES["accuracy"]
+SPEED = OBJECTIVES["speed"]
 
 
 def together(objectives: Sequence[Objective]) -> Objective:
@@ -192,7 +214,9 @@ def together(objectives: Sequence[Objective]) -> Objective:
     return Objective(
         "balance",
         f"geometric mean of {' and '.join(objective.what for objective in objectives)}",
-        lambda run: math.exp(sum(math.log(objective.cost(run)) for objective in objectives) / len(objectives)),
+        lambda run: math.exp(
+            sum(math.log(objective.cost(run)) for objective in objectives) / len(objectives)
+        ),
     )
 
 
@@ -211,15 +235,20 @@ def own_objective(cost: Cost) -> Objective:
     """A user's objective, from what a run costs.
 
     Args:
-        cost: Positive number of a run, less is better, e.g. ``lambda run: run.ate_m * run.processor_s``.
+        cost: Positive number of a run, less is better, e.g.
+            ``lambda run: run.ate_m * run.processor_s``.
     """
     name = getattr(cost, "__name__", "own").strip("<>")
 
     def checked(run: Outcome) -> float:
         value = float(cost(run))
         if not (math.isfinite(value) and value > 0):
-            raise StudyError(f"objective '{name}' gives {value:g} on instance '{run.instance}'", "give numbers above 0")
-        return _MANY * value  # the floor of errors in metres does not apply; ratios stay as they are
+            raise StudyError(
+                f"objective '{name}' gives {value:g} on instance '{run.instance}'",
+                "give numbers above 0",
+            )
+        # the floor of errors in metres does not apply; ratios stay as they are
+        return _MANY * value
 
     return Objective(name, name.replace("_", " "), checked)
 
@@ -237,16 +266,21 @@ def fps(outcomes: Outcomes) -> float:
     return 1.0 / float(np.mean([outcome.frame_s for outcome in outcomes.values()]))
 
 
-def violations(spec: StudySpec, outcomes: Outcomes, baseline: Outcomes | None = None) -> dict[str, float]:
+def violations(
+    spec: StudySpec, outcomes: Outcomes, baseline: Outcomes | None = None
+) -> dict[str, float]:
     """How far each constraint is violated, relatively; <= 0 is fulfilled.
 
     Args:
-        spec: The study. One of anything but error alone must not pay for its gain with accuracy: the ATE ratio has to
-            stay below 1 + `StudySpec.ate_margin`; a front of several objectives holds the error itself.
+        spec: The study. One of anything but error alone must not pay for its gain with accuracy:
+            the ATE ratio has to stay below 1 + `StudySpec.ate_margin`; a front of several
+            objectives holds the error itself.
         outcomes: Of a configuration.
         baseline: Outcomes of the baseline at the same places, for that ratio; None to leave it out.
     """
-    values = {} if spec.min_coverage is None else {"coverage": spec.min_coverage - coverage(outcomes)}
+    values = (
+        {} if spec.min_coverage is None else {"coverage": spec.min_coverage - coverage(outcomes)}
+    )
     if spec.min_fps is not None:
         values["fps"] = (spec.min_fps - fps(outcomes)) / spec.min_fps
     if baseline is not None and spec.at_equal_accuracy and len(spec.objectives) == 1:
@@ -254,7 +288,8 @@ def violations(spec: StudySpec, outcomes: Outcomes, baseline: Outcomes | None = 
     return values
 
 
-# Comparing a configuration with the baseline: paired by place, robust to single runs, with intervals that cover.
+# Comparing a configuration with the baseline: paired by place, robust to single runs, with
+# intervals that cover.
 
 FLOOR_M = 1e-4
 """Errors below a tenth of a millimetre count as that: a ratio of two perfect runs tells nothing."""
@@ -275,8 +310,8 @@ def place_of(instance: ProblemInstance) -> ProblemInstance:
 def by_scene(errors: Errors, baseline: Errors) -> dict[str, float]:
     """Log ATE ratio of a configuration to the baseline in each scene.
 
-    At each place the median over the configuration's starts is compared with the median over all of the baseline's, so
-    that no single start decides; a scene is the mean of its places.
+    At each place the median over the configuration's starts is compared with the median over all of
+    the baseline's, so that no single start decides; a scene is the mean of its places.
 
     Args:
         errors: Of the configuration.
@@ -286,14 +321,23 @@ def by_scene(errors: Errors, baseline: Errors) -> dict[str, float]:
         Natural logarithm by scene, below 0 is better than the baseline.
     """
     reference = log_errors(baseline)
-    ratios = {place: np.median(logs) - np.median(reference[place]) for place, logs in log_errors(errors).items()}
-    return {scene: float(np.mean([ratios[place] for place in places])) for scene, places in scenes(ratios).items()}
+    ratios = {
+        place: np.median(logs) - np.median(reference[place])
+        for place, logs in log_errors(errors).items()
+    }
+    return {
+        scene: float(np.mean([ratios[place] for place in places]))
+        for scene, places in scenes(ratios).items()
+    }
 
 
 def log_errors(errors: Errors) -> dict[ProblemInstance, list[float]]:
     """Natural logarithms of the errors in metres, by place."""
     groups = grouped(errors, place_of).items()
-    return {place: [math.log(max(errors[instance], FLOOR_M)) for instance in group] for place, group in groups}
+    return {
+        place: [math.log(max(errors[instance], FLOOR_M)) for instance in group]
+        for place, group in groups
+    }
 
 
 def centre(values: Iterable[float]) -> float:
@@ -311,7 +355,8 @@ def bounds(values: Iterable[float], confidence: float = 0.95) -> tuple[float, fl
         confidence: Of both sides together.
     """
     sample = np.sort(list(values))
-    cut, count = int(TRIMMED * len(sample)), len(sample)
+    cut = int(TRIMMED * len(sample))
+    count = len(sample)
     kept = count - 2 * cut
     winsorised = np.clip(sample, sample[cut], sample[-1 - cut])
     error = float(winsorised.std(ddof=1)) * math.sqrt(count) / kept
@@ -341,7 +386,9 @@ def detectable(spread: float, count: int) -> float:
 
 def scenes_needed(gain: float, spread: float) -> int:
     """The fewest scenes that tell a gain from nothing, at most `_MOST_SCENES`; see `detectable`."""
-    return 2 + bisect_left(range(2, _MOST_SCENES), True, key=lambda count: detectable(spread, count) <= gain)
+    return 2 + bisect_left(
+        range(2, _MOST_SCENES), True, key=lambda count: detectable(spread, count) <= gain
+    )
 
 
 MATTER_LEVEL = 0.01
@@ -352,22 +399,29 @@ MATTER_LEVEL = 0.01
 def spread_test(trials: Sequence[Mapping[str, float]]) -> float | None:
     """Whether trials differ by more than chance: the p-value of an F-test for trials x scenes (additive model).
 
-    Chance is what is left of the log ratios once each trial and each scene has its mean: the scatter between starts,
-    and what any change does to one scene but not to another. Pruned trials count with the scenes that they ran on.
+    Chance is what is left of the log ratios once each trial and each scene has its mean: the
+    scatter between starts, and what any change does to one scene but not to another. Pruned trials
+    count with the scenes that they ran on.
 
     Args:
         trials: Log ratio by scene of each trial.
 
     Returns:
-        Above `MATTER_LEVEL` the settings do not matter on these scenes; None with too few trials or scenes for a test.
+        Above `MATTER_LEVEL` the settings do not matter on these scenes; None with too few trials or
+        scenes for a test.
     """
     names = sorted({scene for trial in trials for scene in trial})
-    cells = [(row, names.index(scene), value) for row, trial in enumerate(trials) for scene, value in trial.items()]
+    cells = [
+        (row, names.index(scene), value)
+        for row, trial in enumerate(trials)
+        for scene, value in trial.items()
+    ]
     free = len(cells) - len(names) - len(trials) + 1
     if len(trials) < 2 or free < 1:
         return None
     rows, columns, values = (np.array(column) for column in zip(*cells, strict=True))
-    by_scene, by_trial = np.eye(len(names))[columns], np.eye(len(trials))[rows]
+    by_scene = np.eye(len(names))[columns]
+    by_trial = np.eye(len(trials))[rows]
     left, chance = (
         float(np.square(values - model @ np.linalg.lstsq(model, values)[0]).sum())
         for model in (by_scene, np.hstack([by_scene, by_trial]))

@@ -40,8 +40,10 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
         Path of ``index.html`` in the study's folder; its tables lie beside it as CSV.
     """
     spec = tuner.spec
-    candidates, trials = _candidates(summary), _trials(tuner, summary)
-    params, proven = summary.best.params if summary.best else {}, summary.verdict == Verdict.PROVEN
+    candidates = _candidates(summary)
+    trials = _trials(tuner, summary)
+    params = summary.best.params if summary.best else {}
+    proven = summary.verdict == Verdict.PROVEN
     settings = settings_table(tuner.space, tuner.base, params, proven)
     for table in (candidates, trials, settings):
         write_atomic(tuner.folder / "csv" / f"{table.id}.csv", csv_text(table.frame()))
@@ -80,15 +82,23 @@ def _asked(tuner: Study, summary: StudySummary) -> str:
     goals = " and ".join(objective.what for objective in tuner.objectives)
     trials = ", ".join(f"{count} {state}" for state, count in summary.trials.items() if count)
     design = tuner.design
-    splits = {"to tune on": design.tune, "to choose on": design.confirm, "held out": design.held_out}
+    splits = {
+        "to tune on": design.tune,
+        "to choose on": design.confirm,
+        "held out": design.held_out,
+    }
     sizes = ", ".join(
-        f"{name} {len(instances)} runs, {len(scenes(instances))} scenes" for name, instances in splits.items()
+        f"{name} {len(instances)} runs, {len(scenes(instances))} scenes"
+        for name, instances in splits.items()
     )
     limits = {"coverage": tuner.spec.min_coverage, "frames a second": tuner.spec.min_fps}
-    named = ", ".join(f"{name} of {least:g} or more" for name, least in limits.items() if least is not None)
+    named = ", ".join(
+        f"{name} of {least:g} or more" for name, least in limits.items() if least is not None
+    )
     return (
         f"Do other values of {len(tuner.space)} settings give {tuner.spec.tracker} less {goals} than "
-        f"{summary.baseline}? Trials: {trials}. Runs: {sizes}." + (f" Constraints: {named}." if named else "")
+        f"{summary.baseline}? Trials: {trials}. Runs: {sizes}."
+        + (f" Constraints: {named}." if named else "")
     )
 
 
@@ -97,7 +107,10 @@ def _plots(tuner: Study, summary: StudySummary) -> list[Block]:
     from optuna import visualization
 
     names = [f"ratio of {objective.what} to the baseline" for objective in tuner.objectives]
-    target: dict[str, Any] = {"target": lambda trial: math.exp(trial.values[0]), "target_name": names[0]}
+    target: dict[str, Any] = {
+        "target": lambda trial: math.exp(trial.values[0]),
+        "target_name": names[0],
+    }
     important = list(summary.importances)
     params = important or [parameter.name for parameter in tuner.space]
     with quiet():
@@ -105,18 +118,26 @@ def _plots(tuner: Study, summary: StudySummary) -> list[Block]:
             "History": visualization.plot_optimization_history(tuner.study, **target),
             "Parallel coordinates": visualization.plot_parallel_coordinate(tuner.study, **target),
             "Slices": visualization.plot_slice(tuner.study, **target),
-            "Contours": visualization.plot_contour(tuner.study, params=params[:_CONTOURS], **target),
+            "Contours": visualization.plot_contour(
+                tuner.study, params=params[:_CONTOURS], **target
+            ),
         }
         if important:
             evaluator = optuna.importance.PedAnovaImportanceEvaluator()
-            figures["Importances"] = visualization.plot_param_importances(tuner.study, evaluator=evaluator, **target)
+            figures["Importances"] = visualization.plot_param_importances(
+                tuner.study, evaluator=evaluator, **target
+            )
         if len(names) == 1:
-            figures["Intermediate values"] = steps = visualization.plot_intermediate_values(tuner.study)
+            figures["Intermediate values"] = steps = visualization.plot_intermediate_values(
+                tuner.study
+            )
             steps.for_each_trace(lambda trace: trace.update(y=np.exp(np.asarray(trace.y, float))))
             steps.update_yaxes(title=names[0])
         elif len(names) < 4:
             figures["Pareto front"] = visualization.plot_pareto_front(
-                tuner.study, targets=lambda trial: list(map(math.exp, trial.values)), target_names=names
+                tuner.study,
+                targets=lambda trial: list(map(math.exp, trial.values)),
+                target_names=names,
             )
     blocks = []
     for title, figure in figures.items():
@@ -124,14 +145,17 @@ def _plots(tuner: Study, summary: StudySummary) -> list[Block]:
         figure.update_layout(title=None, template={}, height=figure.layout.height or height)
         if title in ("Contours", "Slices"):  # whole names of settings overlap
             for axis in (*figure.select_xaxes(), *figure.select_yaxes()):
-                axis.update(title={"text": (axis.title.text or "").rpartition(".")[2], "font": {"size": 11}})
+                axis.update(
+                    title={"text": (axis.title.text or "").rpartition(".")[2], "font": {"size": 11}}
+                )
         blocks += figure_blocks(figure, f"{title}, as Optuna draws it.", title)
     return blocks
 
 
 def _preset(tuner: Study, summary: StudySummary, settings: Table) -> list[Block]:
     """The best settings with their status, and how to use them only if they are proven."""
-    shown, text = Block(table=settings), read_text(tuner.folder / "best.toml")
+    shown = Block(table=settings)
+    text = read_text(tuner.folder / "best.toml")
     if summary.verdict == Verdict.PROVEN and not summary.keeps_default:
         command = f"dynslam-bench run {tuner.spec.tracker} SEQUENCE --settings best.toml"
         return [shown, Block(text=text), Block(title="Use them", text=command)]
@@ -161,18 +185,27 @@ def _funnel_figure(tuner: Study, summary: StudySummary) -> go.Figure:
     splits = {"confirm": "confirmed", "held_out": "held out", "recorded": "recordings"}
     for (split, words), colour in zip(splits.items(), COLOURS, strict=False):
         judged: list[tuple[Candidate, Ratio]] = [
-            (candidate, ratio) for candidate in summary.candidates if (ratio := getattr(candidate, split)) is not None
+            (candidate, ratio)
+            for candidate in summary.candidates
+            if (ratio := getattr(candidate, split)) is not None
         ]
         if not judged:
             continue
         at = len(stages) + 0.5 * (np.linspace(0, 1, len(judged) + 2)[1:-1] - 0.5)
         stages.append(f"{words}: {len(judged)}")
-        symbols = ["star" if candidate is summary.best and candidate.chosen else "circle" for candidate, _ in judged]
+        symbols = [
+            "star" if candidate is summary.best and candidate.chosen else "circle"
+            for candidate, _ in judged
+        ]
         bars = {
             "type": "data",
             "symmetric": False,
-            "array": [0.0 if ratio.high is None else ratio.high - ratio.ratio for _, ratio in judged],
-            "arrayminus": [0.0 if ratio.low is None else ratio.ratio - ratio.low for _, ratio in judged],
+            "array": [
+                0.0 if ratio.high is None else ratio.high - ratio.ratio for _, ratio in judged
+            ],
+            "arrayminus": [
+                0.0 if ratio.low is None else ratio.ratio - ratio.low for _, ratio in judged
+            ],
         }
         traces.append(
             go.Scatter(
@@ -182,7 +215,11 @@ def _funnel_figure(tuner: Study, summary: StudySummary) -> go.Figure:
                 hovertemplate="%{text}: %{y:.3f}<extra></extra>",
             )
         )  # fmt: skip
-    axis = {"tickvals": list(range(len(stages))), "ticktext": stages, "range": [-0.5, len(stages) - 0.5]}
+    axis = {
+        "tickvals": list(range(len(stages))),
+        "ticktext": stages,
+        "range": [-0.5, len(stages) - 0.5],
+    }
     layout = {"height": 420, "template": {}, "showlegend": False, "xaxis": axis}
     figure = go.Figure(traces, go.Layout(yaxis={"title": "ratio to the baseline"}, **layout))
     figure.add_hline(1.0, **GUIDE)
@@ -205,7 +242,8 @@ def warnings_of(tuner: Study) -> list[str]:
     complete = tuner.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     infeasible = sum(not is_feasible(trial) for trial in complete)
     notes = {
-        f"Only {len(complete)} trials were finished: the best value is partly luck.": len(complete) < 20,
+        f"Only {len(complete)} trials were finished: the best value is partly luck.": len(complete)
+        < 20,
         f"{infeasible} of {len(complete)} trials violate a constraint. They are candidates only where all do, and "
         "then have to fulfil it on unseen instances.": infeasible,
         "Trials ran at different times, so their ratios of processor time depend on the machine's other load. On the "
@@ -246,7 +284,9 @@ def _candidates(summary: StudySummary) -> Table:
         f"judge it. Processor times are on unseen instances, without the stage cache. {seen_note(summary.seen)}"
     )
     optimistic = "the trial's own value, optimistic: the trial was selected for it"
-    widened = "upper end of an interval that is wider than 95 % for the number of candidates (Bonferroni)"
+    widened = (
+        "upper end of an interval that is wider than 95 % for the number of candidates (Bonferroni)"
+    )
     tune, confirm, held_out = _marked(
         summary, ("in the trial", "tune"), ("unseen instances", "confirm"), ("held-out", "held_out")
     )
@@ -260,7 +300,9 @@ def _candidates(summary: StudySummary) -> Table:
 
 def _marked(summary: StudySummary, *headings: tuple[str, str]) -> list[str]:
     """Headings of columns, with `SEEN` behind those of a split whose scenes the masks' network was trained on."""
-    return [f"{heading} {SEEN}" if split in summary.seen else heading for heading, split in headings]
+    return [
+        f"{heading} {SEEN}" if split in summary.seen else heading for heading, split in headings
+    ]
 
 
 def _trials(tuner: Study, summary: StudySummary) -> Table:
@@ -268,7 +310,10 @@ def _trials(tuner: Study, summary: StudySummary) -> Table:
     rows = [
         [
             TableCell(str(trial.number), value=trial.number),
-            TableCell(trial.state.name.lower(), trial.user_attrs.get("reason") or trial.user_attrs.get(EARLIER, "")),
+            TableCell(
+                trial.state.name.lower(),
+                trial.user_attrs.get("reason") or trial.user_attrs.get(EARLIER, ""),
+            ),
             *(number(math.exp(value), ".3f") for value in trial.values or ()),
             *(TableCell() for _ in tuner.objectives if not trial.values),
             number(trial.user_attrs.get("coverage"), ".3f"),
@@ -277,13 +322,21 @@ def _trials(tuner: Study, summary: StudySummary) -> Table:
         ]
         for trial in tuner.study.get_trials(deepcopy=False)
     ]
-    headings = _marked(summary, *((f"ratio of {objective.what}", "tune") for objective in tuner.objectives))
-    columns = [Column("trial"), Column("state", numeric=False), *numbers(*headings, "coverage", "fps", *names)]
+    headings = _marked(
+        summary, *((f"ratio of {objective.what}", "tune") for objective in tuner.objectives)
+    )
+    columns = [
+        Column("trial"),
+        Column("state", numeric=False),
+        *numbers(*headings, "coverage", "fps", *names),
+    ]
     caption = f"Pages of its runs: dynslam-bench report --trials.{fewer_starts(tuner.design)} {seen_note(summary.seen)}"
     return Table("trials", "All trials", caption, columns, rows)
 
 
-def settings_table(space: Sequence[Parameter], baseline: dict[str, Any], best: dict[str, Any], proven: bool) -> Table:
+def settings_table(
+    space: Sequence[Parameter], baseline: dict[str, Any], best: dict[str, Any], proven: bool
+) -> Table:
     """Every tuned setting: the baseline's value, the best trial's, and the range that was searched."""
     rows = [
         [
@@ -297,7 +350,9 @@ def settings_table(space: Sequence[Parameter], baseline: dict[str, Any], best: d
     ]
     setting, searched, unit = (Column(name, numeric=False) for name in ("setting", "range", "unit"))
     columns = [setting, Column("baseline"), Column("best trial"), searched, unit]
-    caption = "What was searched." + ("" if proven else " The best trial is not proven: keep the baseline.")
+    caption = "What was searched." + (
+        "" if proven else " The best trial is not proven: keep the baseline."
+    )
     return Table("settings", "Baseline, best trial and range", caption, columns, rows)
 
 

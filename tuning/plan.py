@@ -1,6 +1,7 @@
 """A study before it runs: its space, baseline and instances, what they could show, and how long that takes.
 
-The instances come in splits: to tune on, to choose on and to judge on. It is checked that these are apart.
+The instances come in splits: to tune on, to choose on and to judge on. It is checked that these are
+apart.
 """
 
 import itertools
@@ -64,7 +65,9 @@ from dynslam_bench.tuning.study_file import (
 )
 
 
-def search_space(settings: Settings, spec: SpaceSpec, sequences: Iterable[str] = ()) -> list[Parameter]:
+def search_space(
+    settings: Settings, spec: SpaceSpec, sequences: Iterable[str] = ()
+) -> list[Parameter]:
     """The parameters of a study; what has no effect with the baseline's settings is no part of it.
 
     Args:
@@ -73,13 +76,18 @@ def search_space(settings: Settings, spec: SpaceSpec, sequences: Iterable[str] =
         sequences: What the study runs on, which decides what the source of masks ``auto`` is.
 
     Raises:
-        StudyError: A pattern matches nothing, names a setting that has no effect, or nothing is left to tune.
+        StudyError: A pattern matches nothing, names a setting that has no effect, or nothing is
+            left to tune.
     """
     every = parameters(type(settings))
     for pattern in (*spec.include, *spec.exclude):
         if not any(fnmatchcase(parameter.name, pattern) for parameter in every):
             similar = did_you_mean(pattern, [parameter.name for parameter in every])
-            hint = "it exists, but is not tunable" if pattern in field_names(type(settings)) else similar
+            hint = (
+                "it exists, but is not tunable"
+                if pattern in field_names(type(settings))
+                else similar
+            )
             raise StudyError(f"'{pattern}' matches no tunable setting", hint)
     chosen = [
         parameter
@@ -89,15 +97,22 @@ def search_space(settings: Settings, spec: SpaceSpec, sequences: Iterable[str] =
         and parameter.name not in spec.fixed
     ]
     if hasattr(settings, "segmentation"):  # "auto" stands for a source
-        settings = apply_overrides(settings, {"segmentation.source": source_of_masks(settings, list(sequences))})
-    unused = {parameter.name: why for parameter in chosen if (why := why_unused(settings, parameter.name))}
+        settings = apply_overrides(
+            settings, {"segmentation.source": source_of_masks(settings, list(sequences))}
+        )
+    unused = {
+        parameter.name: why for parameter in chosen if (why := why_unused(settings, parameter.name))
+    }
     chosen = [parameter for parameter in chosen if parameter.name not in unused]
     if not chosen:
-        raise StudyError("the space is empty: all that matches is excluded, fixed, or switched off by a fixed value")
+        raise StudyError(
+            "the space is empty: all that matches is excluded, fixed, or switched off by a fixed value"
+        )
     for name in spec.include:
         if name in unused:
             raise StudyError(
-                f"'{name}' has no effect in this study: {unused[name]}", "leave it out, or fix that otherwise"
+                f"'{name}' has no effect in this study: {unused[name]}",
+                "leave it out, or fix that otherwise",
             )
     return chosen
 
@@ -112,12 +127,17 @@ def distribution(parameter: Parameter) -> optuna.distributions.BaseDistribution:
     if parameter.low is None or parameter.high is None:
         return optuna.distributions.CategoricalDistribution(parameter.choices)
     if parameter.kind == "int":
-        low, high = int(parameter.low), int(parameter.high)
+        low = int(parameter.low)
+        high = int(parameter.high)
         return optuna.distributions.IntDistribution(low, high, log=parameter.scale == "log")
-    return optuna.distributions.FloatDistribution(parameter.low, parameter.high, log=parameter.scale == "log")
+    return optuna.distributions.FloatDistribution(
+        parameter.low, parameter.high, log=parameter.scale == "log"
+    )
 
 
-def starting_point(preset: Mapping[str, Any], space: Sequence[Parameter], base: Mapping[str, Any]) -> dict[str, Scalar]:
+def starting_point(
+    preset: Mapping[str, Any], space: Sequence[Parameter], base: Mapping[str, Any]
+) -> dict[str, Scalar]:
     """A preset as a configuration of a study; what it does not say is as the baseline has it.
 
     Args:
@@ -126,12 +146,15 @@ def starting_point(preset: Mapping[str, Any], space: Sequence[Parameter], base: 
         base: Values of all settings that are not tuned.
 
     Raises:
-        StudyError: The preset sets what the study does not tune to something else, or to a value out of its range.
+        StudyError: The preset sets what the study does not tune to something else, or to a value
+            out of its range.
     """
     tuned = {parameter.name: parameter for parameter in space}
     for name, value in preset.items():
         if name not in base:
-            raise StudyError(f"the preset to start from sets an unknown '{name}'", did_you_mean(name, list(base)))
+            raise StudyError(
+                f"the preset to start from sets an unknown '{name}'", did_you_mean(name, list(base))
+            )
         if name not in tuned and base[name] != value:
             raise StudyError(
                 f"the preset to start from sets {name} = {value!r}, but the study holds it at {base[name]!r}",
@@ -139,11 +162,14 @@ def starting_point(preset: Mapping[str, Any], space: Sequence[Parameter], base: 
             )
     point = {name: preset.get(name, base[name]) for name in tuned}
     for name, value in point.items():
-        span, fits = distribution(tuned[name]), False
+        span = distribution(tuned[name])
+        fits = False
         with suppress(ValueError):  # no number, or none of the choices
             fits = span._contains(span.to_internal_repr(value))
         if not fits:
-            raise StudyError(f"the preset to start from sets {name} = {value!r}, out of the range that the study tunes")
+            raise StudyError(
+                f"the preset to start from sets {name} = {value!r}, out of the range that the study tunes"
+            )
     return point
 
 
@@ -157,7 +183,8 @@ GAIN = 0.10
 """The gain of which a preview says how many scenes would show it."""
 SPREAD = 0.31
 """Standard deviation of the log ratio of two runs of one scene, where no runs are stored: measured 0.24 to 0.31."""
-START_S, FRAME_S = 0.5, 0.05
+START_S = 0.5
+FRAME_S = 0.05
 """Seconds of a run and of a frame of it, where no runs are stored."""
 FLOW_FILTERS = {"box_epipolar", "class_rule", "correlation", "epipolar", "motion", "probability"}
 """Filters that judge the optical flow."""
@@ -168,12 +195,14 @@ class Preview(Record):
 
     Attributes:
         scenes: Scenes that judge it: held-out ones, or those of the choice.
-        runs: Stored runs of the baseline that the figures come from; 0 for figures of other trackers.
+        runs: Stored runs of the baseline that the figures come from; 0 for figures of other
+            trackers.
         spread: Standard deviation over scenes of the log ratio of two equal configurations.
         detectable: Smallest gain, as a share, that so many scenes can show.
         needed: Scenes that show a gain of `GAIN`.
         minutes: Of the whole study if no trial is pruned.
-        unused: Settings of the space that belong to a part whose verdicts are not used on these scenes, and why.
+        unused: Settings of the space that belong to a part whose verdicts are not used on these
+            scenes, and why.
         include: The space without them, as a study names it; empty where nothing is unused.
     """
 
@@ -189,11 +218,17 @@ class Preview(Record):
     @property
     def figures(self) -> list[str]:
         """What the scenes could show and how long it takes, for people."""
-        source = f"{self.runs} stored runs of the baseline" if self.runs else "other trackers' runs, none is stored yet"
+        source = (
+            f"{self.runs} stored runs of the baseline"
+            if self.runs
+            else "other trackers' runs, none is stored yet"
+        )
         needed = f"A gain of {100 * GAIN:.0f} % takes {self.needed} scenes to show"
         shown = f"the {self.scenes} that judge this study show {100 * self.detectable:.0f} %"
         if self.scenes < FEWEST_SCENES:
-            shown = f"{self.scenes} can judge this study, and below {FEWEST_SCENES} it claims nothing"
+            shown = (
+                f"{self.scenes} can judge this study, and below {FEWEST_SCENES} it claims nothing"
+            )
         return [
             f"{needed}; {shown} (spread {self.spread:.2f} over scenes, from {source}).",
             f"The study takes about {max(1, math.ceil(self.minutes))} min if no trial is pruned.",
@@ -240,13 +275,20 @@ class Plan:
         objectives: Sequence[Objective] | None = None,
     ) -> None:
         self.spec, self.results, self.store = spec, Path(results), RunStore(results)
-        self.objectives = [find_objective(name) for name in spec.objectives] if objectives is None else list(objectives)
-        fixed, settings = spec.space.fixed, TRACKERS.get(spec.tracker).settings
+        self.objectives = (
+            [find_objective(name) for name in spec.objectives]
+            if objectives is None
+            else list(objectives)
+        )
+        fixed = spec.space.fixed
+        settings = TRACKERS.get(spec.tracker).settings
         self.held = held_settings(spec)
         self.baseline = Configuration(spec.tracker, self.held)
         if spec.baseline and not spec.baseline.endswith(".toml"):
             names = field_names(TRACKERS.get(spec.baseline).settings)
-            self.baseline = Configuration(spec.baseline, {name: fixed[name] for name in fixed if name in names})
+            self.baseline = Configuration(
+                spec.baseline, {name: fixed[name] for name in fixed if name in names}
+            )
         held_protocol(spec.protocol).check_scale(spec.tracker, TRACKERS.get(spec.tracker).sensors)
         self.shipped = Configuration(spec.tracker, fixed) if spec.baseline else None
         self.defaults: Settings = apply_overrides(settings(), self.held)
@@ -258,15 +300,22 @@ class Plan:
 
     def preview(self, jobs: int = 1) -> Preview:
         """What the study could show, from the baseline's stored runs where there are some."""
-        design, spec = self.design, self.spec
-        records = {instance: record for instance in design.reference if (record := self._stored(instance)) is not None}
+        design = self.design
+        spec = self.spec
+        records = {
+            instance: record
+            for instance in design.reference
+            if (record := self._stored(instance)) is not None
+        }
         judged = scenes(design.held_out or design.confirm if design.confirm else ())
         starts = sum(map(len, judged.values())) / len(judged) if judged else 1.0
         spread = (self._scatter(records) or SPREAD) / math.sqrt(starts)
         run_s = START_S + FRAME_S * len(design.tune[0].open(spec.data_root))
         if records:
             run_s = float(np.mean([record.wall_s for record in records.values()]))
-        chosen = (spec.top + 1) * len(design.confirm) + 2 * (len(design.held_out) + len(design.recorded))
+        chosen = (spec.top + 1) * len(design.confirm) + 2 * (
+            len(design.held_out) + len(design.recorded)
+        )
         runs = len(design.reference) + spec.trials * len(design.tune) + chosen
         unused = self._unused(list(records.values()))
         return Preview(
@@ -279,9 +328,16 @@ class Plan:
         self, instance: ProblemInstance, configuration: Configuration, *, cache: bool | None = None
     ) -> RunSpec:
         """The run of a configuration on an instance; with the stage cache as the study says, unless `cache` does."""
-        spec, settings = self.spec, dict(configuration.settings)
-        how = {"study": spec.name, "threads": spec.threads, "cache": spec.cache if cache is None else cache}
-        return instance.run_spec(configuration.tracker, settings=settings, data_root=spec.data_root, **how)
+        spec = self.spec
+        settings = dict(configuration.settings)
+        how = {
+            "study": spec.name,
+            "threads": spec.threads,
+            "cache": spec.cache if cache is None else cache,
+        }
+        return instance.run_spec(
+            configuration.tracker, settings=settings, data_root=spec.data_root, **how
+        )
 
     def _stored(self, instance: ProblemInstance) -> RunRecord | None:
         """The baseline's run on an instance, if it is stored and came to its end."""
@@ -291,7 +347,8 @@ class Plan:
     def check_plugins(self) -> None:
         """Refuse to go on where what the plug-ins read has changed since the baseline ran.
 
-        What a plug-in reads is known only from its runs, so that the study's identity cannot hold it.
+        What a plug-in reads is known only from its runs, so that the study's identity cannot hold
+        it.
 
         Raises:
             StudyError: It names what has changed.
@@ -306,11 +363,19 @@ class Plan:
 
     def _scatter(self, records: dict[ProblemInstance, RunRecord]) -> float:
         """Standard deviation between starts of the log ratio of two runs; 0 where no scene has two stored runs."""
-        protocol, root = held_protocol(self.spec.protocol), self.spec.data_root
-        errors = {at: outcome(self.store, record, at, protocol, root).ate_m for at, record in records.items()}
+        protocol = held_protocol(self.spec.protocol)
+        root = self.spec.data_root
+        errors = {
+            at: outcome(self.store, record, at, protocol, root).ate_m
+            for at, record in records.items()
+        }
         logs = log_errors(errors).values()
         free = sum(len(values) - 1 for values in logs)
-        return math.sqrt(2 * sum(float(np.var(values)) * len(values) for values in logs) / free) if free else 0.0
+        return (
+            math.sqrt(2 * sum(float(np.var(values)) * len(values) for values in logs) / free)
+            if free
+            else 0.0
+        )
 
     def _unused(self, records: list[RunRecord]) -> dict[str, str]:
         """Settings of parts that dropped no feature on any frame of the baseline's runs."""
@@ -319,7 +384,9 @@ class Plan:
         frames = pd.concat([load_frames(record, self.store) for record in records])
         most = frames.filter(regex="^stat_.*_dropped$").max()
         most.index = most.index.str.removeprefix("stat_").str.removesuffix("_dropped")
-        idle = dict.fromkeys(most.index[most == 0], f"its test dropped no feature in {len(records)} runs")
+        idle = dict.fromkeys(
+            most.index[most == 0], f"its test dropped no feature in {len(records)} runs"
+        )
         if all(record.epipolar_skipped == 1 for record in records):
             idle["epipolar"] = "F was skipped on all frames"
         if "semantic" in idle:
@@ -336,7 +403,8 @@ FEWEST_STARTS = 3
 """The baseline runs from so many starts at every place: all trials would share the luck of a single one."""
 CONFIRM_SCENES = 18
 """Scenes at least that are made for the choice; half as many as to tune on where that is more."""
-RECORDED_FRAMES, RECORDED_STARTS = 120, 4
+RECORDED_FRAMES = 120
+RECORDED_STARTS = 4
 
 
 @dataclass(frozen=True)
@@ -345,9 +413,10 @@ class Design:
 
     Attributes:
         tune: What trials run on, in the order of all trials.
-        reference: What the baseline runs on beforehand: `tune`, and more starts where those are few.
-        confirm: What the best trials and the baseline run on for the choice; shares no frame with `tune`. Empty where
-            recordings have no further frames: then nothing can be claimed.
+        reference: What the baseline runs on beforehand: `tune`, and more starts where those are
+            few.
+        confirm: What the best trials and the baseline run on for the choice; shares no frame with
+            `tune`. Empty where recordings have no further frames: then nothing can be claimed.
         held_out: What judges the choice.
         recorded: Recordings on which the choice must not be worse.
     """
@@ -369,23 +438,37 @@ def design_of(spec: StudySpec, *, further: int = 0) -> Design:
     Raises:
         DynslamError: See `plan.check_splits`; or further scenes cannot be made.
     """
-    tune, confirm, held_out = (spec.instances(*texts) for texts in (spec.tune, spec.confirm, spec.held_out))
+    tune, confirm, held_out = (
+        spec.instances(*texts) for texts in (spec.tune, spec.confirm, spec.held_out)
+    )
     taken = {instance.scene for instance in (*tune, *confirm, *held_out)}
     if not confirm:
-        rendered = {instance.scene for instance in tune if instance.sequence.startswith("synthetic/")}
+        rendered = {
+            instance.scene for instance in tune if instance.sequence.startswith("synthetic/")
+        }
         count = max(CONFIRM_SCENES, (len(rendered) + 1) // 2) if rendered else 0
-        confirm = further_scenes(tune, count, taken, TUNE_SCENES) + stretches_behind(tune, spec.data_root)
+        confirm = further_scenes(tune, count, taken, TUNE_SCENES) + stretches_behind(
+            tune, spec.data_root
+        )
     if further:
         taken |= {instance.scene for instance in confirm}
         confirm += further_scenes(confirm, further, taken, TUNE_SCENES)
         held_out += further_scenes(held_out, further, taken, HELD_OUT_SCENES) if held_out else []
-    splits: dict[Split, list[ProblemInstance]] = {"tune": tune, "confirm": confirm, "held_out": held_out}
+    splits: dict[Split, list[ProblemInstance]] = {
+        "tune": tune,
+        "confirm": confirm,
+        "held_out": held_out,
+    }
     check_splits(spec.name, splits, data_root=spec.data_root)
     recorded = _recordings(spec, taken) if spec.recorded is None else spec.instances(*spec.recorded)
     if spec.recorded:
-        check_splits(spec.name, {"tune": [*tune, *confirm], "held_out": recorded}, data_root=spec.data_root)
+        check_splits(
+            spec.name, {"tune": [*tune, *confirm], "held_out": recorded}, data_root=spec.data_root
+        )
     tune = running_order(tune, spec.sampler_seed)
-    return Design(tuple(tune), tuple(with_more_starts(tune)), tuple(confirm), tuple(held_out), tuple(recorded))
+    return Design(
+        tuple(tune), tuple(with_more_starts(tune)), tuple(confirm), tuple(held_out), tuple(recorded)
+    )
 
 
 def running_order(instances: Sequence[ProblemInstance], seed: int) -> list[ProblemInstance]:
@@ -401,7 +484,10 @@ def with_more_starts(instances: Sequence[ProblemInstance]) -> list[ProblemInstan
     for repeats in grouped(instances, place_of).values():
         used = {instance.offset for instance in repeats}
         unused = (offset for offset in itertools.count() if offset not in used)
-        more += [replace(repeats[0], offset=offset) for offset in islice(unused, max(FEWEST_STARTS - len(used), 0))]
+        more += [
+            replace(repeats[0], offset=offset)
+            for offset in islice(unused, max(FEWEST_STARTS - len(used), 0))
+        ]
     return more
 
 
@@ -410,8 +496,12 @@ def _recordings(spec: StudySpec, taken: set[str]) -> list[ProblemInstance]:
     root = find_data_root(spec.data_root)
     for entry in catalogue().values():
         if entry.split == "held-out" and entry.id not in taken and entry.find(root) is not None:
-            frames = min(RECORDED_FRAMES + RECORDED_STARTS - 1, len(open_public(entry.id, data_root=root)))
-            return [ProblemInstance(entry.id, (0, frames), offset) for offset in range(RECORDED_STARTS)]
+            frames = min(
+                RECORDED_FRAMES + RECORDED_STARTS - 1, len(open_public(entry.id, data_root=root))
+            )
+            return [
+                ProblemInstance(entry.id, (0, frames), offset) for offset in range(RECORDED_STARTS)
+            ]
     return []
 
 
@@ -428,10 +518,11 @@ def check_splits(
 ) -> None:
     """Open every instance of a study and compare its splits.
 
-    Two splits overlap if they film the same content, however it is called: other frames or another draw of the noise of
-    a sequence are no other sequence, nor is a copy or an excerpt of a recording in another folder, with other file
-    names, other stamps or other image files (`same_recording`). `tune` and `confirm` may share a recording, but no
-    frame. A sequence that the catalogue, or its scene, gives to one split must not stand in the other.
+    Two splits overlap if they film the same content, however it is called: other frames or another
+    draw of the noise of a sequence are no other sequence, nor is a copy or an excerpt of a
+    recording in another folder, with other file names, other stamps or other image files
+    (`same_recording`). `tune` and `confirm` may share a recording, but no frame. A sequence that
+    the catalogue, or its scene, gives to one split must not stand in the other.
 
     Args:
         name: Of the study.
@@ -439,14 +530,17 @@ def check_splits(
         data_root: Folder of the recorded sequences.
 
     Raises:
-        StudyError: They are not apart, a split names the same frames twice, or an instance is too long, too short or
-            without ground truth; names both spellings.
+        StudyError: They are not apart, a split names the same frames twice, or an instance is too
+            long, too short or without ground truth; names both spellings.
         SequenceError: A sequence is unknown or missing.
     """
-    tune, held_out = [*splits.get("tune", ()), *splits.get("confirm", ())], list(splits.get("held_out", ()))
+    tune = [*splits.get("tune", ()), *splits.get("confirm", ())]
+    held_out = list(splits.get("held_out", ()))
     tuned = dict.fromkeys(instance.sequence for instance in tune)
     judged = dict.fromkeys(instance.sequence for instance in held_out)
-    opened: dict[str, Any] = {name: open_sequence(name, data_root=data_root) for name in (*tuned, *judged)}
+    opened: dict[str, Any] = {
+        name: open_sequence(name, data_root=data_root) for name in (*tuned, *judged)
+    }
     for instances in (tune, held_out):
         _check_repeats(instances, opened, apart=set(splits.get("confirm", ())))
     scenes_of = {name: part_of(sequence).scene for name, sequence in opened.items()}
@@ -456,9 +550,15 @@ def check_splits(
         if scenes_of[one] == scenes_of[other] or same_recording(opened[one], opened[other])
     ]
     for names, used, own in ((tuned, "tune", "held-out"), (judged, "held-out", "tune")):
-        faults += [_misplaced(name, used, own) for name in names if getattr(opened[name], "split", "") == own]
+        faults += [
+            _misplaced(name, used, own)
+            for name in names
+            if getattr(opened[name], "split", "") == own
+        ]
     if faults:
-        raise StudyError(f"the splits of study '{name}' are not apart: {faults[0]}", "leave one out")
+        raise StudyError(
+            f"the splits of study '{name}' are not apart: {faults[0]}", "leave one out"
+        )
 
 
 def _check_repeats(
@@ -469,7 +569,9 @@ def _check_repeats(
     for instance in instances:
         if instance in parts:
             raise StudyError(f"instance '{instance}' is named twice", "leave one out")
-        parts[instance] = part_of(cast("Any", instance.cut(opened[instance.sequence])), instance.offset)
+        parts[instance] = part_of(
+            cast("Any", instance.cut(opened[instance.sequence])), instance.offset
+        )
     for (one, here), (other, there) in combinations(parts.items(), 2):
         if here.scene != there.scene:
             continue
@@ -480,14 +582,24 @@ def _check_repeats(
         if same[0] == same[1]:
             raise StudyError(f"'{one}' and '{other}' are the same frames", "leave one out")
         shared = min(here.stop, there.stop) - max(here.start, there.start)
-        repeats = place_of(one) == place_of(other) or (here.start, here.stop) == (there.start, there.stop)
+        repeats = place_of(one) == place_of(other) or (here.start, here.stop) == (
+            there.start,
+            there.stop,
+        )
         if shared > 0 and not (repeats and (one in apart) == (other in apart)):
-            raise StudyError(f"'{one}' and '{other}' share {shared} frames", "write instances of a sequence apart")
+            raise StudyError(
+                f"'{one}' and '{other}' share {shared} frames",
+                "write instances of a sequence apart",
+            )
 
 
 def _misplaced(name: str, used: str, own: str) -> str:
     numbers = HELD_OUT_SCENES if own == "held-out" else TUNE_SCENES
-    who = f"its scene ({numbers.start}-{numbers.stop - 1})" if name.startswith("synthetic/") else "the catalogue"
+    who = (
+        f"its scene ({numbers.start}-{numbers.stop - 1})"
+        if name.startswith("synthetic/")
+        else "the catalogue"
+    )
     return f"'{name}' is used as {used}, but {who} puts it into the {own} split"
 
 
@@ -505,9 +617,9 @@ _DEPTH_SHARE = 0.002
 def same_recording(one: Frames, other: Frames) -> bool:
     """Whether frames of one recording are frames of the other; of two rendered scenes never: their digests tell.
 
-    Of a few frames with equal stamps (without any, of frames spread evenly over both) the decoded images are compared,
-    reduced to `_THUMB` pixels. Other names, other image files and a smaller size leave a copy a copy, and so do frames
-    that are left out or other stamps, one of the two.
+    Of a few frames with equal stamps (without any, of frames spread evenly over both) the decoded
+    images are compared, reduced to `_THUMB` pixels. Other names, other image files and a smaller
+    size leave a copy a copy, and so do frames that are left out or other stamps, one of the two.
     """
     if hasattr(one, "scene_digest") and hasattr(other, "scene_digest"):
         return False
@@ -515,26 +627,35 @@ def same_recording(one: Frames, other: Frames) -> bool:
     _, *frames = np.intersect1d(*stamps, assume_unique=True, return_indices=True)
     if not len(frames[0]):
         frames = [np.arange(len(one)), np.arange(len(other))]
-    chosen = (numbers[np.linspace(0, len(numbers) - 1, _PAIRS).astype(int)].tolist() for numbers in frames)
+    chosen = (
+        numbers[np.linspace(0, len(numbers) - 1, _PAIRS).astype(int)].tolist() for numbers in frames
+    )
     pairs = set(zip(*chosen, strict=True))
-    alike = sum(_alike(one[first], other[second], one.camera, other.camera) for first, second in pairs)
+    alike = sum(
+        _alike(one[first], other[second], one.camera, other.camera) for first, second in pairs
+    )
     return alike >= min(_ENOUGH, len(one), len(other))
 
 
 def _alike(here: Frame, there: Frame, one: Camera, other: Camera) -> bool:
     """Whether two frames show the same colour, and depth in the numbers that their files hold."""
     colours = [
-        cv2.resize(frame.rgb.astype(np.float32), _THUMB, interpolation=cv2.INTER_AREA) for frame in (here, there)
+        cv2.resize(frame.rgb.astype(np.float32), _THUMB, interpolation=cv2.INTER_AREA)
+        for frame in (here, there)
     ]
     if np.abs(colours[0] - colours[1]).mean() > _GREY_LEVELS:
         return False
     raw = (here.depth * one.written_depth_factor, there.depth * other.written_depth_factor)
-    depths = [cv2.resize(depth.astype(np.float32), _THUMB, interpolation=cv2.INTER_NEAREST) for depth in raw]
+    depths = [
+        cv2.resize(depth.astype(np.float32), _THUMB, interpolation=cv2.INTER_NEAREST)
+        for depth in raw
+    ]
     allowed = _DEPTH_SHARE * float(np.median(depths[0])) + 0.5
     return bool(np.median(np.abs(depths[0] - depths[1])) <= allowed)
 
 
-# Which instances of a study show scenes that the network behind the masks was trained on: a best case there.
+# Which instances of a study show scenes that the network behind the masks was trained on: a best
+# case there.
 
 
 def source_of_masks(settings: Settings, sequences: Sequence[str]) -> str:
@@ -555,7 +676,9 @@ def source_of_masks(settings: Settings, sequences: Sequence[str]) -> str:
 def splits_seen(settings: Settings, design: Design) -> list[str]:
     """Names of a study's splits with a scene that the network behind the masks was trained on, in their order."""
     splits = {"tune": design.tune, "confirm": design.confirm, "held_out": design.held_out}
-    names = {split: {instance.sequence for instance in instances} for split, instances in splits.items()}
+    names = {
+        split: {instance.sequence for instance in instances} for split, instances in splits.items()
+    }
     return [
         split
         for split, sequences in names.items()

@@ -52,15 +52,26 @@ def is_feasible(trial: FrozenTrial) -> bool:
 def best_trials(study: optuna.Study, count: int) -> list[FrozenTrial]:
     """The best complete trials that fulfil the constraints, without repeats of the same settings.
 
-    Several objectives count together (geometric mean of their ratios). If no trial is feasible, the least bad ones.
-    Where they are too few, pruned ones follow, those that came furthest first.
+    Several objectives count together (geometric mean of their ratios). If no trial is feasible, the
+    least bad ones. Where they are too few, pruned ones follow, those that came furthest first.
     """
-    trials = [trial for trial in study.get_trials(deepcopy=False) if EARLIER not in trial.user_attrs]
+    trials = [
+        trial for trial in study.get_trials(deepcopy=False) if EARLIER not in trial.user_attrs
+    ]
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
     candidates = [trial for trial in complete if is_feasible(trial)] or complete
-    pruned = [trial for trial in trials if trial.state == TrialState.PRUNED and trial.user_attrs.get("scenes")]
+    pruned = [
+        trial
+        for trial in trials
+        if trial.state == TrialState.PRUNED and trial.user_attrs.get("scenes")
+    ]
     candidates.sort(key=lambda trial: sum(trial.values))
-    pruned.sort(key=lambda trial: (-len(trial.user_attrs["instances"]), centre(trial.user_attrs["scenes"].values())))
+    pruned.sort(
+        key=lambda trial: (
+            -len(trial.user_attrs["instances"]),
+            centre(trial.user_attrs["scenes"].values()),
+        )
+    )
     distinct: dict[tuple[Any, ...], FrozenTrial] = {}
     for trial in [*candidates, *pruned]:
         distinct.setdefault(tuple(sorted(trial.params.items())), trial)
@@ -84,16 +95,17 @@ def trials_frame(spec: StudySpec, study: optuna.Study) -> pd.DataFrame:
     """All trials.
 
     Returns:
-        One row a trial, in order; what is missing is ``pd.NA``. ``Int64``: trial (0 is the baseline's settings), runs
-        (that it was evaluated on). ``string``: state (``complete``, ``pruned``, ``fail``, ``running``, ``waiting``),
-        reason (why it was pruned or failed; missing else), earlier (the study that it was taken from, and whether its
-        code was another; missing for the study's own). ``boolean``: feasible (all constraints hold; missing for
-        incomplete trials). ``Float64``: one column for each objective, named after ``value_``, as Optuna has them
-        (natural logarithms of ratios to the baseline, less is better), ratio (the ATE ratio, below 1 is better
-        than the baseline; missing if accuracy is no objective), coverage (share, 0 to 1), fps (frames a second),
-        duration_s (seconds from the start of the trial to its end). Then a column ``params.NAME`` for each tuned
-        setting, in its own unit: ``Float64``, ``Int64``, ``boolean`` or ``string``, missing where its condition did
-        not hold.
+        One row a trial, in order; what is missing is ``pd.NA``. ``Int64``: trial (0 is the
+        baseline's settings), runs (that it was evaluated on). ``string``: state (``complete``,
+        ``pruned``, ``fail``, ``running``, ``waiting``), reason (why it was pruned or failed;
+        missing else), earlier (the study that it was taken from, and whether its code was another;
+        missing for the study's own). ``boolean``: feasible (all constraints hold; missing for
+        incomplete trials). ``Float64``: one column for each objective, named after ``value_``, as
+        Optuna has them (natural logarithms of ratios to the baseline, less is better), ratio (the
+        ATE ratio, below 1 is better than the baseline; missing if accuracy is no objective),
+        coverage (share, 0 to 1), fps (frames a second), duration_s (seconds from the start of the
+        trial to its end). Then a column ``params.NAME`` for each tuned setting, in its own unit:
+        ``Float64``, ``Int64``, ``boolean`` or ``string``, missing where its condition did not hold.
     """
     trials = study.get_trials(deepcopy=False)
     objectives = [f"value_{objective}" for objective in spec.objectives]
@@ -144,19 +156,24 @@ class Importance(Record):
 def scene_ratios(study: optuna.Study) -> dict[int, dict[str, float]]:
     """Log ratio by scene, of all objectives together, of each complete or pruned trial of the study itself."""
     trials = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE, TrialState.PRUNED))
-    return {trial.number: trial.user_attrs["scenes"] for trial in trials if "scenes" in trial.user_attrs}
+    return {
+        trial.number: trial.user_attrs["scenes"] for trial in trials if "scenes" in trial.user_attrs
+    }
 
 
 def importances(study: optuna.Study) -> dict[str, Importance]:
     """Optuna's importances for all objectives together (PED-ANOVA, Watanabe et al. 2023), largest first.
 
     Returns:
-        Shares that add up to 1; empty below `FEWEST_TRIALS` complete or pruned trials, or where their values are equal.
+        Shares that add up to 1; empty below `FEWEST_TRIALS` complete or pruned trials, or where
+        their values are equal.
     """
     trials = study.get_trials(deepcopy=False)
     copies = [
         create_trial(
-            params=trials[number].params, distributions=trials[number].distributions, value=centre(ratios.values())
+            params=trials[number].params,
+            distributions=trials[number].distributions,
+            value=centre(ratios.values()),
         )
         for number, ratios in scene_ratios(study).items()
     ]
@@ -165,11 +182,16 @@ def importances(study: optuna.Study) -> dict[str, Importance]:
     rng = np.random.default_rng(0)
     whole, *resampled = [
         _shares([copies[index] for index in chosen])
-        for chosen in (range(len(copies)), *rng.integers(len(copies), size=(_RESAMPLES, len(copies))))
+        for chosen in (
+            range(len(copies)),
+            *rng.integers(len(copies), size=(_RESAMPLES, len(copies))),
+        )
     ]
     table = pd.DataFrame(resampled).fillna(0.0).quantile([0.025, 0.975])
     return {
-        name: Importance(share=share, low=float(table[name].iloc[0]), high=float(table[name].iloc[1]))
+        name: Importance(
+            share=share, low=float(table[name].iloc[0]), high=float(table[name].iloc[1])
+        )
         for name, share in whole.items()
     }
 
@@ -219,7 +241,9 @@ def open_storage(results: Path, spec: StudySpec) -> BaseStorage:
         return optuna.storages.GrpcStorageProxy(host=host, port=int(port))
     except Exception as error:  # each driver raises errors of its own
         line = (str(error).strip() or type(error).__name__).splitlines()[0]
-        text = without_password(f"cannot open the storage {spec.storage or folder}: {line}", spec.storage)
+        text = without_password(
+            f"cannot open the storage {spec.storage or folder}: {line}", spec.storage
+        )
         raise StudyError(text, "check the address and the permissions") from None
 
 
@@ -234,10 +258,12 @@ def read_stored(folder: Path) -> tuple[StudySpec, Path]:
     """
     stored = folder / SPEC_FILE
     if not stored.is_file():
-        raise StudyError(f"{folder} holds no study: it has no {SPEC_FILE}", "name results/studies/NAME")
-    return validated(StudySpec, read_json(stored, kind=StudyError), str(stored), StudyError), folder.absolute().parents[
-        1
-    ]
+        raise StudyError(
+            f"{folder} holds no study: it has no {SPEC_FILE}", "name results/studies/NAME"
+        )
+    return validated(
+        StudySpec, read_json(stored, kind=StudyError), str(stored), StudyError
+    ), folder.absolute().parents[1]
 
 
 def load_study(results: Path, spec: StudySpec) -> optuna.Study:
@@ -250,7 +276,9 @@ def load_study(results: Path, spec: StudySpec) -> optuna.Study:
     Raises:
         StudyError: There is none; nothing is made then.
     """
-    absent = StudyError(f"there is no study '{spec.name}' in {results}", "dynslam-bench tune run STUDY.toml")
+    absent = StudyError(
+        f"there is no study '{spec.name}' in {results}", "dynslam-bench tune run STUDY.toml"
+    )
     if not spec.storage and not study_folder(results, spec).is_dir():
         raise absent
     try:
@@ -288,7 +316,8 @@ class PatientStorage(RDBStorage):
     """
 
 
-ATTEMPTS, PATIENCE_S = 10, 60.0
+ATTEMPTS = 10
+PATIENCE_S = 60.0
 _NO_ANSWER = (OperationalError, InterfaceError, PendingRollbackError)
 """Errors of a database that is away; the last one where it went within a transaction."""
 
@@ -296,7 +325,8 @@ _NO_ANSWER = (OperationalError, InterfaceError, PendingRollbackError)
 def _patient(method: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(method)
     def call(storage: PatientStorage, *arguments: Any, **named: Any) -> Any:
-        began, failed = time.monotonic(), False
+        began = time.monotonic()
+        failed = False
         while True:
             try:
                 return method(storage, *arguments, **named)
@@ -305,12 +335,18 @@ def _patient(method: Callable[..., Any]) -> Callable[..., Any]:
                     raise
                 return True  # the call before had arrived, its answer had not
             except (DBAPIError, StorageInternalError) as error:
-                if not isinstance(error, _NO_ANSWER) and not isinstance(error.__cause__, _NO_ANSWER):
+                if not isinstance(error, _NO_ANSWER) and not isinstance(
+                    error.__cause__, _NO_ANSWER
+                ):
                     raise
                 if time.monotonic() - began > PATIENCE_S:
                     line = str(error.__cause__ or error).splitlines()[0]
-                    text = without_password(f"the study's database does not answer: {line}", storage.url)
-                    raise StudyError(text, "finished trials are stored; the same command goes on from there") from error
+                    text = without_password(
+                        f"the study's database does not answer: {line}", storage.url
+                    )
+                    raise StudyError(
+                        text, "finished trials are stored; the same command goes on from there"
+                    ) from error
             failed = True
             time.sleep(random.uniform(0.2, 2.0))
 
@@ -337,7 +373,8 @@ def without_password(text: str, address: str) -> str:
 def worker_name() -> str:
     """Names this process: host, boot and process namespace, process number, and when the process started.
 
-    The number alone is not enough: the system gives that of a process which has ended to another one.
+    The number alone is not enough: the system gives that of a process which has ended to another
+    one.
     """
     return f"{_machine()}:{os.getpid()}.{started(os.getpid())}"
 
@@ -372,7 +409,8 @@ def _machine() -> str:
     return "-".join(names)
 
 
-HEARTBEAT_S, GRACE_S = 20.0, 120.0
+HEARTBEAT_S = 20.0
+GRACE_S = 120.0
 """A worker counts up so often, and is dead elsewhere once it has not for so long."""
 NAMELESS_S = 5.0
 """A trial gets its worker's name at once."""
@@ -382,22 +420,26 @@ _ALIVE = "alive "
 class Heartbeats:
     """Which workers of a study live.
 
-    One of this machine is dead once its process is, any other one once the number that it counts up in the study's
-    attributes has stood still for `GRACE_S` on this process' clock.
+    One of this machine is dead once its process is, any other one once the number that it counts up
+    in the study's attributes has stood still for `GRACE_S` on this process' clock.
 
     Args:
         study: The study.
     """
 
     def __init__(self, study: optuna.Study) -> None:
-        self._study, self._name, self._count = study, worker_name(), 0
+        self._name = worker_name()
+        self._study = study
+        self._count = 0
         self._seen: dict[str, tuple[int | None, float]] = {}
 
     def is_dead(self, trial: FrozenTrial) -> bool:
         """Whether the worker of a running trial has ended; of a trial that has not been given its name, all others."""
         if worker := trial.user_attrs.get("worker"):
             return self._has_ended(worker)
-        alive = {key.removeprefix(_ALIVE) for key in self._study.user_attrs if key.startswith(_ALIVE)}
+        alive = {
+            key.removeprefix(_ALIVE) for key in self._study.user_attrs if key.startswith(_ALIVE)
+        }
         others_ended = all(map(self._has_ended, alive - {self._name}))  # starts their clocks
         return self._stands_still(f"trial {trial.number}", None) > NAMELESS_S and others_ended
 
@@ -425,16 +467,20 @@ class Heartbeats:
     def running(self) -> dict[int, str]:
         """The running trials, each with its worker and whether that is alive.
 
-        A worker elsewhere is silent if it does not count up while this waits, a little longer than `HEARTBEAT_S`.
+        A worker elsewhere is silent if it does not count up while this waits, a little longer than
+        `HEARTBEAT_S`.
         """
         trials = self._study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
         workers = {trial.number: trial.user_attrs.get("worker", "") for trial in trials}
-        counts, deadline = self._study.user_attrs, time.monotonic() + 1.25 * HEARTBEAT_S
+        counts = self._study.user_attrs
+        deadline = time.monotonic() + 1.25 * HEARTBEAT_S
         silent = {name for name in workers.values() if name.rpartition(":")[0] != _machine()}
         while silent and time.monotonic() < deadline:
             time.sleep(0.2)
             now = self._study.user_attrs
-            silent = {name for name in silent if now.get(_ALIVE + name) == counts.get(_ALIVE + name)}
+            silent = {
+                name for name in silent if now.get(_ALIVE + name) == counts.get(_ALIVE + name)
+            }
         return {
             number: f"{name}, {'silent' if name in silent else 'dead' if self._has_ended(name) else 'alive'}"
             for number, name in workers.items()
@@ -458,9 +504,10 @@ class Heartbeats:
 class JournalFile(journal.JournalFileBackend):
     """Optuna's journal file, to which whole lines are appended or nothing.
 
-    A line that a killed process left unfinished is cut off before the next one is written: Optuna appends to it, and
-    can never read the file again. What did not fit on the disk is taken back. The lock is on the file itself and ends
-    with its process; Optuna's own outlives a killed process by 30 s.
+    A line that a killed process left unfinished is cut off before the next one is written: Optuna
+    appends to it, and can never read the file again. What did not fit on the disk is taken back.
+    The lock is on the file itself and ends with its process; Optuna's own outlives a killed process
+    by 30 s.
 
     Args:
         path: The file; begun if it is missing.
@@ -471,7 +518,10 @@ class JournalFile(journal.JournalFileBackend):
 
     def __init__(self, path: Path) -> None:
         if path.is_symlink():
-            raise StudyError(f"{path} is a link: a study is written in its own folder", "put the file in its place")
+            raise StudyError(
+                f"{path} is a link: a study is written in its own folder",
+                "put the file in its place",
+            )
         with _writing(path):
             super().__init__(str(path))
         self.path = path
@@ -482,7 +532,9 @@ class JournalFile(journal.JournalFileBackend):
         Raises:
             StudyError: They cannot be written; then the file is as it was.
         """
-        rest = memoryview("".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs).encode())
+        rest = memoryview(
+            "".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs).encode()
+        )
         with _writing(self.path), self.path.open("r+b", buffering=0) as file:
             fcntl.flock(file, fcntl.LOCK_EX)
             end = file.readall().rfind(b"\n") + 1
@@ -498,4 +550,6 @@ class JournalFile(journal.JournalFileBackend):
 
 
 def _writing(path: Path) -> AbstractContextManager[None]:
-    return raising(StudyError, f"cannot write {path}", "free some space, or check the folder; then go on")
+    return raising(
+        StudyError, f"cannot write {path}", "free some space, or check the folder; then go on"
+    )

@@ -69,7 +69,13 @@ from dynslam_bench.tuning.storage import (
     without_password,
     worker_name,
 )
-from dynslam_bench.tuning.study_file import ProblemInstance, PrunerName, SamplerName, StudySpec, read_study
+from dynslam_bench.tuning.study_file import (
+    ProblemInstance,
+    PrunerName,
+    SamplerName,
+    StudySpec,
+    read_study,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -90,8 +96,8 @@ class StudyEvent:
     """Something happened in a study.
 
     Attributes:
-        kind: ``preview`` (what it could show), ``reference`` (runs of the baseline), ``started`` or ``finished`` (a
-            trial).
+        kind: ``preview`` (what it could show), ``reference`` (runs of the baseline), ``started`` or
+            ``finished`` (a trial).
         number: Of the trial.
         total: How many there are to be.
         text: One line.
@@ -115,7 +121,8 @@ class Evaluation:
     Attributes:
         state: Complete, pruned or failed; waiting if it was interrupted, and is to be run again.
         text: In words.
-        values: The objectives' (natural logarithms of ratios to the baseline, less is better); None if it failed.
+        values: The objectives' (natural logarithms of ratios to the baseline, less is better); None
+            if it failed.
     """
 
     state: TrialState
@@ -143,8 +150,8 @@ class Study(Plan):
         on_run: Called with every event of every run from now on; None for no calls.
 
     Raises:
-        DynslamError: Anything in the spec is unknown, unfit, missing or does not agree with what is stored under the
-            study's name; nothing has run then.
+        DynslamError: Anything in the spec is unknown, unfit, missing or does not agree with what is
+            stored under the study's name; nothing has run then.
     """
 
     def __init__(
@@ -158,7 +165,8 @@ class Study(Plan):
         **fields: Any,
     ) -> None:
         base = read_study(spec) if isinstance(spec, Path | str) else spec
-        changes, objectives = {key: _texts(value) for key, value in fields.items()}, _objectives(objective)
+        changes = {key: _texts(value) for key, value in fields.items()}
+        objectives = _objectives(objective)
         if objectives is not None:
             changes["objectives"] = tuple(objective.name for objective in objectives)
         if base is None or changes:
@@ -194,7 +202,10 @@ class Study(Plan):
         Raises:
             StudyError: So many scenes cannot be made.
         """
-        total = {"scenes": self.extension["scenes"] + scenes, "trials": self.extension["trials"] + trials}
+        total = {
+            "scenes": self.extension["scenes"] + scenes,
+            "trials": self.extension["trials"] + trials,
+        }
         self.design = design_of(self.spec, further=total["scenes"])
         self.study.set_user_attr("extension", total)
 
@@ -221,22 +232,33 @@ class Study(Plan):
                 if trial is None:
                     if not self._others_run():
                         return
-                    self._interrupted.wait(_WAIT_S)  # should one of their workers end, its trial is made again here
+                    # should one of their workers end, its trial is made again here
+                    self._interrupted.wait(_WAIT_S)
                     continue
                 tell(StudyEvent("started", trial.number, self.trials, f"trial {trial.number}"))
                 try:
                     evaluation = self.evaluate(trial)
                     self.tell(trial, evaluation)
-                except UpdateFinishedTrialError:  # another worker took this one for dead, and was quicker
+                # another worker took this one for dead, and was quicker
+                except UpdateFinishedTrialError:
                     continue
-                tell(StudyEvent("finished", trial.number, self.trials, f"trial {trial.number}: {evaluation.text}"))
+                tell(
+                    StudyEvent(
+                        "finished",
+                        trial.number,
+                        self.trials,
+                        f"trial {trial.number}: {evaluation.text}",
+                    )
+                )
                 for callback in self._callbacks:
                     callback(self.study, self.study.get_trials(deepcopy=False)[trial.number])
 
         self._in_threads(jobs, work, [()] * jobs)
         return self
 
-    def _in_threads(self, jobs: int, work: Callable[..., None], tasks: Iterable[tuple[Any, ...]]) -> None:
+    def _in_threads(
+        self, jobs: int, work: Callable[..., None], tasks: Iterable[tuple[Any, ...]]
+    ) -> None:
         """Do work several tasks at a time; whatever interrupts the waiting ends the runs of all threads at once."""
         with ThreadPoolExecutor(jobs, thread_name_prefix="dynslam-tune") as pool:
             try:
@@ -246,13 +268,17 @@ class Study(Plan):
                 self._interrupted.set()
                 raise
 
-    def reference(self, on_event: OnEvent | None = None, jobs: int = 1) -> dict[ProblemInstance, Outcome]:
+    def reference(
+        self, on_event: OnEvent | None = None, jobs: int = 1
+    ) -> dict[ProblemInstance, Outcome]:
         """The baseline's outcomes on the tune split, to which every trial is compared.
 
         Raises:
             StudyError: The baseline fails; says where and why.
         """
-        missing = [instance for instance in self.design.reference if instance not in self._reference]
+        missing = [
+            instance for instance in self.design.reference if instance not in self._reference
+        ]
         if on_event is not None and missing:
             on_event(StudyEvent("reference", 0, len(missing), "the baseline"))
         self._reference |= self.evaluate_beside([], missing, jobs=jobs, cache=self.spec.cache)[0]
@@ -272,22 +298,30 @@ class Study(Plan):
             settings: Overrides, dotted name to value.
             instances: Where.
             tracker: Whose; the study's if empty.
-            cache: Whether to use the stage cache, whose times are those of when its entries were made; None for what
-                the study says.
+            cache: Whether to use the stage cache, whose times are those of when its entries were
+                made; None for what the study says.
 
         Raises:
             InstanceFailedError: A run crashed, timed out, ran out of memory or was invalid.
             CancelledError: The study was interrupted.
             DynslamError: Settings or an instance are unknown or unfit.
         """
-        spec, results = self.spec, dict[ProblemInstance, Outcome]()
-        protocol, interrupted = held_protocol(spec.protocol), self._interrupted.is_set
+        spec = self.spec
+        results = dict[ProblemInstance, Outcome]()
+        protocol = held_protocol(spec.protocol)
+        interrupted = self._interrupted.is_set
         for instance in instances:
             if interrupted():
                 raise CancelledError(f"interrupted before {instance}")
-            run = self.run_spec(instance, Configuration(tracker or spec.tracker, settings), cache=cache)
+            run = self.run_spec(
+                instance, Configuration(tracker or spec.tracker, settings), cache=cache
+            )
             (record,) = run_many(
-                [run], results=self.store, protocol=protocol, cancelled=interrupted, on_event=self.on_run
+                [run],
+                results=self.store,
+                protocol=protocol,
+                cancelled=interrupted,
+                on_event=self.on_run,
             )
             results[instance] = outcome(self.store, record, instance, protocol, spec.data_root)
         return results
@@ -299,7 +333,9 @@ class Study(Plan):
         *,
         jobs: int = 1,
         cache: bool = False,
-    ) -> tuple[dict[ProblemInstance, Outcome], list[dict[ProblemInstance, Outcome] | InstanceFailedError]]:
+    ) -> tuple[
+        dict[ProblemInstance, Outcome], list[dict[ProblemInstance, Outcome] | InstanceFailedError]
+    ]:
         """Run the baseline and configurations instance by instance: other load on the machine slows all of them alike.
 
         Args:
@@ -309,8 +345,8 @@ class Study(Plan):
             cache: Whether to use the stage cache, with which times cannot be compared.
 
         Returns:
-            The outcomes of the baseline, and for each configuration its outcomes, or the error of its first failed run;
-            it runs on no instance after it.
+            The outcomes of the baseline, and for each configuration its outcomes, or the error of
+            its first failed run; it runs on no instance after it.
 
         Raises:
             StudyError: The baseline fails; says where and why.
@@ -362,7 +398,8 @@ class Study(Plan):
         """The next trial: the first is the baseline's, then come those that wait, then the sampler's.
 
         Args:
-            settings: A configuration to wait in line; what it does not say is as the baseline has it.
+            settings: A configuration to wait in line; what it does not say is as the baseline has
+                it.
 
         Raises:
             StudyError: It sets what the study does not tune, or is out of range.
@@ -380,25 +417,41 @@ class Study(Plan):
         outcomes: dict[ProblemInstance, Outcome] = {}
         self.check_plugins()
         # of a trial whose worker was killed: it was not pruned before that step
-        passed = max(self.study.get_trials(deepcopy=False)[trial.number].intermediate_values, default=0)
+        passed = max(
+            self.study.get_trials(deepcopy=False)[trial.number].intermediate_values, default=0
+        )
         with self._heartbeats.beating():
-            reference, pruned = self._reference or self.reference(), False
+            reference = self._reference or self.reference()
+            pruned = False
             try:
                 for instance in self.design.tune:
                     outcomes |= self.outcomes(self.configuration_of(trial).settings, [instance])
-                    if len(outcomes) >= passed and (pruned := self._prune(trial, outcomes, instance)):
+                    if len(outcomes) >= passed and (
+                        pruned := self._prune(trial, outcomes, instance)
+                    ):
                         break
             except CancelledError:
                 return Evaluation(TrialState.WAITING, "interrupted, it waits to be run again")
             except InstanceFailedError as error:
                 return Evaluation(TrialState.FAIL, str(error))
-        rows = [[str(place), run.run_id, run.ate_m, run.coverage, run.frame_s] for place, run in outcomes.items()]
+        rows = [
+            [str(place), run.run_id, run.ate_m, run.coverage, run.frame_s]
+            for place, run in outcomes.items()
+        ]
         scenes = together(self.objectives).ratios(outcomes, reference)
-        facts = {"coverage": coverage(outcomes), "fps": fps(outcomes), "scenes": scenes, "instances": rows}
+        facts = {
+            "coverage": coverage(outcomes),
+            "fps": fps(outcomes),
+            "scenes": scenes,
+            "instances": rows,
+        }
         for name, fact in facts.items():
             trial.set_user_attr(name, fact)
         if pruned:
-            return Evaluation(TrialState.PRUNED, f"pruned after {len(outcomes)} of {len(self.design.tune)} instances")
+            return Evaluation(
+                TrialState.PRUNED,
+                f"pruned after {len(outcomes)} of {len(self.design.tune)} instances",
+            )
         values = [objective.value(outcomes, reference) for objective in self.objectives]
         violated = violations(self.spec, outcomes, reference)
         for name, value in violated.items():
@@ -412,10 +465,12 @@ class Study(Plan):
     def _prune(self, trial: optuna.Trial, outcomes: Outcomes, last: ProblemInstance) -> bool:
         """Report a trial's value after its last instance, and ask Optuna's pruner, which takes one objective.
 
-        For Wilcoxon's test that is the instance's own value. Optuna's pruners know no constraints: a trial that
-        violates one takes no part in the comparison of successive halving.
+        For Wilcoxon's test that is the instance's own value. Optuna's pruners know no constraints:
+        a trial that violates one takes no part in the comparison of successive halving.
         """
-        objective, reference, step = self.objectives[0], self._reference, len(outcomes)
+        objective = self.objectives[0]
+        reference = self._reference
+        step = len(outcomes)
         if trial.user_attrs.get(_PRUNED_AFTER) == step:  # its worker was killed after that
             return True
         if self.spec.pruner == "none" or len(self.objectives) > 1 or not objective.counts(last):
@@ -439,7 +494,8 @@ class Study(Plan):
         if evaluation.state != TrialState.COMPLETE:
             trial.set_user_attr("reason", evaluation.text)
         with self._lock:
-            if self.study.get_trials(deepcopy=False)[trial.number].state == TrialState.WAITING:  # it was put back
+            # it was put back
+            if self.study.get_trials(deepcopy=False)[trial.number].state == TrialState.WAITING:
                 self.study._storage.set_trial_state_values(trial._trial_id, TrialState.RUNNING)
             self.study.tell(trial, evaluation.values, state=evaluation.state, skip_if_finished=True)
 
@@ -448,7 +504,8 @@ class Study(Plan):
 
         Nothing is done where another worker has run it meanwhile, or runs it.
         """
-        storage, worker = self.study._storage, trial.user_attrs.get("worker", "")
+        storage = self.study._storage
+        worker = trial.user_attrs.get("worker", "")
         with self._turn("put-back"), suppress(UpdateFinishedTrialError):
             now = storage.get_trial(trial._trial_id)
             if now.state != TrialState.RUNNING or now.user_attrs.get("worker", "") != worker:
@@ -464,7 +521,9 @@ class Study(Plan):
         """
         if self.spec.storage:
             return nullcontext()
-        with raising(StudyError, f"cannot write {self.folder}", "check the permissions and the free space"):
+        with raising(
+            StudyError, f"cannot write {self.folder}", "check the permissions and the free space"
+        ):
             self.folder.mkdir(parents=True, exist_ok=True)
         return turn(self.folder / f".{what}")
 
@@ -515,29 +574,44 @@ class Study(Plan):
         spec, results = read_stored(folder)
         study = load_study(results, spec)
         if spec.objectives != self.spec.objectives:
-            raise StudyError(f"the earlier study '{spec.name}' has other objectives: {', '.join(spec.objectives)}")
+            raise StudyError(
+                f"the earlier study '{spec.name}' has other objectives: {', '.join(spec.objectives)}"
+            )
         other = study.user_attrs.get("identity", {}).get("code") != self._identity["code"]
         marks = {EARLIER: f"study {spec.name}{', other code' * other}"}
-        spans, again = distributions(self.space), {trial.number for trial in best_trials(study, self.spec.top)}
+        spans = distributions(self.space)
+        again = {trial.number for trial in best_trials(study, self.spec.top)}
         for trial in study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
             params = {name: value for name, value in trial.params.items() if name in spans}
             with suppress(StudyError):  # out of this study's range
                 params = starting_point(params, self.space, self.base)
                 if trial.number in again:
                     yield params
-                yield create_trial(params=params, distributions=spans, values=trial.values, user_attrs=marks)
+                yield create_trial(
+                    params=params, distributions=spans, values=trial.values, user_attrs=marks
+                )
 
     def _open(
-        self, sampler: optuna.samplers.BaseSampler, beginnings: Sequence[FrozenTrial | dict[str, Scalar]]
+        self,
+        sampler: optuna.samplers.BaseSampler,
+        beginnings: Sequence[FrozenTrial | dict[str, Scalar]],
     ) -> optuna.Study:
         """The stored study, or a new one whose first trial is the baseline, whatever is enqueued later."""
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        storage, pruner = open_storage(self.results, self.spec), build_pruner(self.spec.pruner)
-        how: Any = {"storage": storage, "study_name": self.spec.name, "sampler": sampler, "pruner": pruner}
+        storage = open_storage(self.results, self.spec)
+        pruner = build_pruner(self.spec.pruner)
+        how: Any = {
+            "storage": storage,
+            "study_name": self.spec.name,
+            "sampler": sampler,
+            "pruner": pruner,
+        }
         try:
             with self._turn("begin"):
                 try:
-                    study = optuna.create_study(directions=["minimize"] * len(self.objectives), **how)
+                    study = optuna.create_study(
+                        directions=["minimize"] * len(self.objectives), **how
+                    )
                     self._begin(study, beginnings)
                 except optuna.exceptions.DuplicatedStudyError:
                     study = optuna.load_study(**how)
@@ -553,10 +627,14 @@ class Study(Plan):
         if study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
             self.check_plugins()
         if not self.spec.storage:
-            write_atomic(self.folder / SPEC_FILE, json.dumps(self.spec.for_others(), indent=2) + "\n")
+            write_atomic(
+                self.folder / SPEC_FILE, json.dumps(self.spec.for_others(), indent=2) + "\n"
+            )
         return study
 
-    def _begin(self, study: optuna.Study, beginnings: Sequence[FrozenTrial | dict[str, Scalar]]) -> None:
+    def _begin(
+        self, study: optuna.Study, beginnings: Sequence[FrozenTrial | dict[str, Scalar]]
+    ) -> None:
         """What a new study begins with; the identity comes last, other workers wait for it.
 
         Where a process was killed that began the study, this goes on from there.
@@ -593,18 +671,23 @@ class Study(Plan):
         """Whether a process was killed that began this study; a study of others has trials, or facts of its own."""
         facts = study.user_attrs
         is_ours = facts.get("spec") == json.loads(json.dumps(self.spec.for_others()))
-        return "identity" not in facts and (is_ours or not (facts or study.get_trials(deepcopy=False)))
+        return "identity" not in facts and (
+            is_ours or not (facts or study.get_trials(deepcopy=False))
+        )
 
     def _check_identity(self, study: optuna.Study) -> None:
         """Refuse a stored study that was made with something else; data and program count only to go on with it."""
         stored = study.user_attrs.get("identity")
         if stored is None:
             raise StudyError(
-                f"the storage holds a study '{self.spec.name}' that is none of this toolkit", "give yours another name"
+                f"the storage holds a study '{self.spec.name}' that is none of this toolkit",
+                "give yours another name",
             )
         changed = [key for key, value in self._identity.items() if stored.get(key) != value]
         if changed:
-            there, here = (json.dumps(values.get(changed[0]))[:80] for values in (stored, self._identity))
+            there, here = (
+                json.dumps(values.get(changed[0]))[:80] for values in (stored, self._identity)
+            )
             more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
             raise StudyError(
                 f"study '{self.spec.name}' is stored with other {changed[0]}{more}: {there} there, {here} here",
@@ -614,14 +697,20 @@ class Study(Plan):
     def _identify(self) -> dict[str, Any]:
         """What must be the same when a study is resumed, by name.
 
-        Beside the study's fields these are the baseline's settings, the content of its sequences, and the program that
-        runs on them: code, weights, libraries, device.
+        Beside the study's fields these are the baseline's settings, the content of its sequences,
+        and the program that runs on them: code, weights, libraries, device.
         """
         spec = self.spec
-        identity = spec.model_dump(mode="json", exclude={"trials", "top", "storage", "start", "baseline"})
+        identity = spec.model_dump(
+            mode="json", exclude={"trials", "top", "storage", "start", "baseline"}
+        )
         instances = spec.instances(*spec.tune, *spec.confirm, *spec.held_out)
-        for sequence, instance in {instance.sequence: instance for instance in reversed(instances)}.items():
-            run = resolve(self.run_spec(instance, Configuration(spec.tracker, self.held), cache=False)).identity
+        for sequence, instance in {
+            instance.sequence: instance for instance in reversed(instances)
+        }.items():
+            run = resolve(
+                self.run_spec(instance, Configuration(spec.tracker, self.held), cache=False)
+            ).identity
             identity[f"content of {sequence}"] = digest([run["content"], run["camera"]])
             identity |= program_of(run) | {"device": run["device"]}
         identity["baseline settings"] = [self.baseline.tracker, dict(self.baseline.settings)]
@@ -721,9 +810,9 @@ def run_study(
     return tuner.run(jobs=jobs, on_event=on_event)
 
 
-# Samplers and pruners by name. All trials meet the same growing sets of instances, on which Optuna's pruners end the
-# worse ones early: asynchronous successive halving (Li et al. 2020) or Wilcoxon's signed-rank test against the best
-# trial. Optuna prunes no trials of several objectives.
+# Samplers and pruners by name. All trials meet the same growing sets of instances, on which
+# Optuna's pruners end the worse ones early: asynchronous successive halving (Li et al. 2020) or
+# Wilcoxon's signed-rank test against the best trial. Optuna prunes no trials of several objectives.
 
 _STARTUP_TRIALS = 8
 
@@ -731,8 +820,9 @@ _STARTUP_TRIALS = 8
 class StreamedSampler(optuna.samplers.BaseSampler):
     """Makes a sampler for each trial, seeded by the study's seed and the trial's number.
 
-    Numbers are given out by the storage, so no two workers, and no worker that goes on later, draw from one stream, and
-    a study with one worker gives the same trials again. `Study.ask` draws all settings of a trial before the next.
+    Numbers are given out by the storage, so no two workers, and no worker that goes on later, draw
+    from one stream, and a study with one worker gives the same trials again. `Study.ask` draws all
+    settings of a trial before the next.
 
     Args:
         spec: The study; what a sampler knows of earlier trials it reads from Optuna's study.
@@ -749,7 +839,9 @@ class StreamedSampler(optuna.samplers.BaseSampler):
         self._drawn = set[str]()
         self._sampler.before_trial(study, trial)
 
-    def infer_relative_search_space(self, study: optuna.Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
+    def infer_relative_search_space(
+        self, study: optuna.Study, trial: FrozenTrial
+    ) -> dict[str, BaseDistribution]:
         """See Optuna."""
         return self._sampler.infer_relative_search_space(study, trial)
 
@@ -760,12 +852,16 @@ class StreamedSampler(optuna.samplers.BaseSampler):
         return self._sampler.sample_relative(study, trial, search_space)
 
     def sample_independent(
-        self, study: optuna.Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
+        self,
+        study: optuna.Study,
+        trial: FrozenTrial,
+        param_name: str,
+        param_distribution: BaseDistribution,
     ) -> Any:
         """See Optuna.
 
-        Settings that a killed worker has drawn for this trial are drawn again, so that the others are what that worker
-        would have drawn after them.
+        Settings that a killed worker has drawn for this trial are drawn again, so that the others
+        are what that worker would have drawn after them.
         """
         given = trial.system_attrs.get("fixed_params", {})
         for name, distribution in trial.distributions.items():
@@ -781,7 +877,9 @@ _SAMPLERS: dict[SamplerName, Callable[[StudySpec, int], optuna.samplers.BaseSamp
     "tpe": lambda spec, seed: optuna.samplers.TPESampler(
         n_startup_trials=min(_STARTUP_TRIALS, spec.trials // 2), constant_liar=True, seed=seed
     ),
-    "nsga2": lambda spec, seed: optuna.samplers.NSGAIISampler(population_size=max(8, spec.trials // 5), seed=seed),
+    "nsga2": lambda spec, seed: optuna.samplers.NSGAIISampler(
+        population_size=max(8, spec.trials // 5), seed=seed
+    ),
     "gp": lambda spec, seed: optuna.samplers.GPSampler(n_startup_trials=_STARTUP_TRIALS, seed=seed),
 }
 
@@ -791,8 +889,12 @@ FIRST_STEP = 3
 WILCOXON_LEVEL = 0.1
 
 _PRUNERS: dict[PrunerName, Callable[[], optuna.pruners.BasePruner]] = {
-    "halving": lambda: optuna.pruners.SuccessiveHalvingPruner(min_resource=FIRST_STEP, reduction_factor=2),
-    "wilcoxon": lambda: optuna.pruners.WilcoxonPruner(p_threshold=WILCOXON_LEVEL, n_startup_steps=FIRST_STEP),
+    "halving": lambda: optuna.pruners.SuccessiveHalvingPruner(
+        min_resource=FIRST_STEP, reduction_factor=2
+    ),
+    "wilcoxon": lambda: optuna.pruners.WilcoxonPruner(
+        p_threshold=WILCOXON_LEVEL, n_startup_steps=FIRST_STEP
+    ),
     "none": optuna.pruners.NopPruner,
 }
 

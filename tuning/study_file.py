@@ -23,14 +23,17 @@ from dynslam_bench.sequences.synthetic import parse_synthetic_id
 FEWEST_FRAMES = 2
 """A shorter instance has no motion."""
 _TEXT = re.compile(r"(?P<name>[^\[\]?]+)(?:\[(?P<frames>[^\]]*)\])?(?:\?(?P<query>.*))?")
-_NUMBER, _NUMBERS = "[1-9][0-9]{0,8}", "[0-9]{1,9}(-[0-9]{1,9})?(,[0-9]{1,9}(-[0-9]{1,9})?)*"
+_NUMBER = "[1-9][0-9]{0,8}"
+_NUMBERS = "[0-9]{1,9}(-[0-9]{1,9})?(,[0-9]{1,9}(-[0-9]{1,9})?)*"
 _STRENGTHS = r"[a-z]+:[0-9]*\.?[0-9]+(,[a-z]+:[0-9]*\.?[0-9]+)*"
 _OPTIONS = {
     "scene": _NUMBERS, "frames": _NUMBER, "offsets": _NUMBERS, "stride": _NUMBER, "seeds": _NUMBERS,
     "degrade": _STRENGTHS, "noise": "[0-9]{1,9}",
 }  # fmt: skip
 """What may stand behind the question mark, and how its value is written."""
-_FORM = 'write it as "bonn/crowd[0:120]" or "synthetic/walking_xyz?scene=0-19&frames=80&offsets=0-4"'
+_FORM = (
+    'write it as "bonn/crowd[0:120]" or "synthetic/walking_xyz?scene=0-19&frames=80&offsets=0-4"'
+)
 
 
 @dataclass(frozen=True, order=True)
@@ -40,7 +43,8 @@ class ProblemInstance:
     Attributes:
         sequence: Id or folder of the sequence.
         frames: First frame and one past the last (None: the end); None for the whole sequence.
-        offset: So many leading frames of that part are left out: a repeat of the same scene from another start.
+        offset: So many leading frames of that part are left out: a repeat of the same scene from
+            another start.
         stride: Every so many frames.
         degradation: Kinds and strengths of `DegradeFrames`, for example ``(("blur", 0.5),)``.
         seed: Seed of the run; changes nothing for a tracker that draws nothing from it.
@@ -56,7 +60,11 @@ class ProblemInstance:
     def __str__(self) -> str:
         """The text that `parse_instances` reads as this instance alone."""
         name, _, query = self.sequence.partition("?")
-        part = "" if self.frames is None else f"[{':'.join('' if end is None else str(end) for end in self.frames)}]"
+        part = (
+            ""
+            if self.frames is None
+            else f"[{':'.join('' if end is None else str(end) for end in self.frames)}]"
+        )
         degradation = ",".join(f"{kind}:{strength:g}" for kind, strength in self.degradation)
         options = (
             query,
@@ -87,7 +95,8 @@ class ProblemInstance:
         """The instance of an opened sequence.
 
         Raises:
-            StudyError: The instance is longer than the sequence or too short, or the sequence has no ground truth.
+            StudyError: The instance is longer than the sequence or too short, or the sequence has
+                no ground truth.
         """
         first, last = self.frames or (0, None)
         stop = len(whole) if last is None else last
@@ -97,9 +106,13 @@ class ProblemInstance:
             )
         cut = SequenceView(whole, first + self.offset, stop, self.stride)
         if len(cut) < FEWEST_FRAMES:
-            raise StudyError(f"instance '{self}' holds {len(cut)} frames, it needs {FEWEST_FRAMES} or more")
+            raise StudyError(
+                f"instance '{self}' holds {len(cut)} frames, it needs {FEWEST_FRAMES} or more"
+            )
         if whole.ground_truth is None:
-            raise StudyError(f"'{whole.id}' has no ground truth, so nothing can be tuned on it", "leave it out")
+            raise StudyError(
+                f"'{whole.id}' has no ground truth, so nothing can be tuned on it", "leave it out"
+            )
         return cut
 
 
@@ -108,8 +121,8 @@ def parse_instances(
 ) -> tuple[ProblemInstance, ...]:
     """Read one text of a study file.
 
-    ``[A:B]`` takes a part of any sequence, ``?frames=N`` its first N frames (a rendered one is made that long).
-    ``?scene=0-19`` names scenes of a rendered one, ``noise=SEED`` a draw of its noise.
+    ``[A:B]`` takes a part of any sequence, ``?frames=N`` its first N frames (a rendered one is made
+    that long). ``?scene=0-19`` names scenes of a rendered one, ``noise=SEED`` a draw of its noise.
     ``scene``, ``offsets`` and ``seeds`` are numbers and ranges (``0-4,7``), ``degrade`` strengths
     (``blur:0.5,glare:0.2``), ``stride`` a step between frames.
 
@@ -125,11 +138,15 @@ def parse_instances(
         StudyError: It cannot be read; says how it is written.
     """
     if os.path.isdir(os.path.expanduser(text)):  # noqa: PTH111, PTH112  # no error for what cannot be a path
-        return tuple(ProblemInstance(text, offset=offset, seed=seed) for offset, seed in product(offsets, seeds))
+        return tuple(
+            ProblemInstance(text, offset=offset, seed=seed)
+            for offset, seed in product(offsets, seeds)
+        )
     match = _TEXT.fullmatch(text)
     if match is None:
         raise StudyError(f"'{text}' names no instances", _FORM)
-    name, options = match["name"], _options(match["query"] or "", text)
+    name = match["name"]
+    options = _options(match["query"] or "", text)
     try:
         frames = None if match["frames"] in (None, ":") else parse_frames(match["frames"])
     except SequenceError as error:
@@ -145,7 +162,8 @@ def parse_instances(
     for option in options.keys() & {"scene", "noise", "frames"}:
         raise StudyError(f"'{text}' may not have a {option}", _FORM)
     starts, draws = (_numbers(options.get(key, ""), text) for key in ("offsets", "seeds"))
-    stride, strengths = int(options.get("stride", 1)), _strengths(options.get("degrade", ""), text)
+    stride = int(options.get("stride", 1))
+    strengths = _strengths(options.get("degrade", ""), text)
     return tuple(
         ProblemInstance(name, frames, offset, stride, strengths, seed)
         for name, offset, seed in product(names, starts or offsets, draws or seeds)
@@ -185,11 +203,15 @@ def further_scenes(
     Raises:
         StudyError: None of the instances is rendered, or the numbers are used up.
     """
-    rendered = [group for group in scenes(instances).values() if group[0].sequence.startswith("synthetic/")]
+    rendered = [
+        group for group in scenes(instances).values() if group[0].sequence.startswith("synthetic/")
+    ]
     by_name = grouped(rendered, lambda group: parse_synthetic_id(group[0].sequence).name)
     moved = (
         [
-            replace(instance, sequence=str(replace(parse_synthetic_id(instance.sequence), scene=number)))
+            replace(
+                instance, sequence=str(replace(parse_synthetic_id(instance.sequence), scene=number))
+            )
             for instance in group
         ]
         for number, (group, *_) in product(numbers, by_name.values())
@@ -204,7 +226,9 @@ def further_scenes(
     return [instance for group in added for instance in group]
 
 
-def stretches_behind(instances: Iterable[ProblemInstance], data_root: str | None) -> list[ProblemInstance]:
+def stretches_behind(
+    instances: Iterable[ProblemInstance], data_root: str | None
+) -> list[ProblemInstance]:
     """The parts of recordings moved behind the last frame that is named of each, as far as the recording goes."""
     parts: dict[str, list[tuple[ProblemInstance, int, int]]] = {}
     for instance in instances:
@@ -228,7 +252,9 @@ def _options(query: str, text: str) -> dict[str, str]:
     for option in query.split("&") if query else ():
         key, _, value = option.partition("=")
         if key not in _OPTIONS or not value:
-            raise StudyError(f"'{text}' has an unknown option '{option}'", did_you_mean(key, list(_OPTIONS)))
+            raise StudyError(
+                f"'{text}' has an unknown option '{option}'", did_you_mean(key, list(_OPTIONS))
+            )
         if key in options:
             raise StudyError(f"'{text}' names {key} twice", "leave one out")
         if not re.fullmatch(_OPTIONS[key], value):
@@ -244,7 +270,9 @@ def _numbers(text: str, whole: str) -> list[int]:
         first, _, last = piece.partition("-")
         chosen = range(int(first), int(last or first) + 1)
         if not chosen or not set(numbers).isdisjoint(chosen):
-            raise StudyError(f"'{piece}' of '{whole}' is no range of numbers, or repeats one", "write 0-4,7")
+            raise StudyError(
+                f"'{piece}' of '{whole}' is no range of numbers, or repeats one", "write 0-4,7"
+            )
         numbers += chosen
     return numbers
 
@@ -253,7 +281,10 @@ def _strengths(text: str, whole: str) -> tuple[tuple[str, float], ...]:
     from dynslam_bench.envs import Degradation
 
     kinds = [name for name in Degradation.__dataclass_fields__ if name != "seed"]
-    strengths = {kind: float(strength) for kind, strength in (piece.split(":") for piece in text.split(",") if piece)}
+    strengths = {
+        kind: float(strength)
+        for kind, strength in (piece.split(":") for piece in text.split(",") if piece)
+    }
     for kind in strengths.keys() - set(kinds):
         raise StudyError(f"'{whole}': unknown degradation '{kind}'", did_you_mean(kind, kinds))
     Degradation(**strengths)  # type: ignore[arg-type]  # refuses a strength out of range
@@ -287,38 +318,42 @@ class StudySpec(Record, frozen=True):
     Attributes:
         name: Of the study; names its folder ``studies/<name>`` under the results.
         tracker: Id, ``module:Attr`` or ``file.py:Attr``.
-        baseline: What ratios are to: empty for the tracker's default settings, a preset (a TOML file), on which trials
-            then build, or another tracker with its default settings.
-        start: What a new study tries right after its baseline: presets (TOML files, or settings by dotted name), and
-            the best trials of earlier studies (``results/studies/NAME``), whose trials the sampler learns from.
+        baseline: What ratios are to: empty for the tracker's default settings, a preset (a TOML
+            file), on which trials then build, or another tracker with its default settings.
+        start: What a new study tries right after its baseline: presets (TOML files, or settings by
+            dotted name), and the best trials of earlier studies (``results/studies/NAME``), whose
+            trials the sampler learns from.
         tune: Instances that trials run on, written as `parse_instances` reads them:
             ``synthetic/walking_xyz?scene=0-19&frames=80&offsets=0-4``.
-        confirm: Instances without a frame of `tune`. The best trials are judged again on them, and one is chosen. Empty
-            for further scenes of rendered sequences, and for the frames behind the named part of a recording.
-        held_out: Instances that decide at the end whether tuning helped; neither trials nor the choice see them.
-        recorded: Instances of recordings that the choice must not be worse on; None for the first frames of a held-out
-            recording where one is present.
+        confirm: Instances without a frame of `tune`. The best trials are judged again on them, and
+            one is chosen. Empty for further scenes of rendered sequences, and for the frames behind
+            the named part of a recording.
+        held_out: Instances that decide at the end whether tuning helped; neither trials nor the
+            choice see them.
+        recorded: Instances of recordings that the choice must not be worse on; None for the first
+            frames of a held-out recording where one is present.
         space: Which settings are tuned.
-        objectives: ``accuracy``: geometric mean over scenes of the ATE ratio to the baseline (its logarithm is
-            minimised, see `objectives.by_scene`); ``speed``: the same of the processor time a frame; ``worst``: ATE in
-            the worst quarter of the scenes; ``robustness``: ATE on the degraded instances; ``coverage``: share of lost
-            frames.
-        ate_margin: What a study of anything but error alone may lose of accuracy, as a share: the upper bound of the
-            ATE ratio must lie below 1 + this.
+        objectives: ``accuracy``: geometric mean over scenes of the ATE ratio to the baseline (its
+            logarithm is minimised, see `objectives.by_scene`); ``speed``: the same of the processor
+            time a frame; ``worst``: ATE in the worst quarter of the scenes; ``robustness``: ATE on
+            the degraded instances; ``coverage``: share of lost frames.
+        ate_margin: What a study of anything but error alone may lose of accuracy, as a share: the
+            upper bound of the ATE ratio must lie below 1 + this.
         min_coverage: Hard constraint on the mean coverage; None for none.
         min_fps: Hard constraint on frames a second, segmentation included; None for none.
-        seeds: Seeds of the instances that name none. A seed changes nothing for a tracker that draws nothing from it.
+        seeds: Seeds of the instances that name none. A seed changes nothing for a tracker that
+            draws nothing from it.
         offsets: Start offsets of the instances that name none: so many leading frames are left out.
         trials: Finished trials, trial 0 (the baseline's settings) included.
         top: How many of the best configurations are judged again on `confirm`.
         sampler: Who proposes settings.
         sampler_seed: Seed of the sampler.
         pruner: ``wilcoxon`` is Optuna's `WilcoxonPruner` over the single instances, ``halving`` its
-            `SuccessiveHalvingPruner` over growing sets of them, ``none`` its `NopPruner`. Trials of several objectives
-            are not pruned.
-        storage: Empty for a journal file beside the study, else an Optuna storage URL (``sqlite:///``,
-            ``postgresql://``, ``grpc://host:port``). A password is better left to the driver (``PGPASSWORD``,
-            ``~/.pgpass``): it is in no file that is written.
+            `SuccessiveHalvingPruner` over growing sets of them, ``none`` its `NopPruner`. Trials of
+            several objectives are not pruned.
+        storage: Empty for a journal file beside the study, else an Optuna storage URL
+            (``sqlite:///``, ``postgresql://``, ``grpc://host:port``). A password is better left to
+            the driver (``PGPASSWORD``, ``~/.pgpass``): it is in no file that is written.
         protocol: Protocol of the errors; lost frames are always held at the last pose.
         cache: Whether trials use the stage cache.
         threads: Threads of a run.
@@ -365,7 +400,9 @@ class StudySpec(Record, frozen=True):
             StudyError: One cannot be read.
         """
         return [
-            instance for text in texts for instance in parse_instances(text, offsets=self.offsets, seeds=self.seeds)
+            instance
+            for text in texts
+            for instance in parse_instances(text, offsets=self.offsets, seeds=self.seeds)
         ]
 
     @property
@@ -382,7 +419,10 @@ def read_study(path: str | Path) -> StudySpec:
     """Read a study file.
 
     Raises:
-        StudyError: No such file, no TOML, an unknown key (with a did-you-mean) or an unfit value, in one line.
+        StudyError: No such file, no TOML, an unknown key (with a did-you-mean) or an unfit value,
+            in one line.
     """
     path = Path(path)
-    return validated(StudySpec, {"name": path.stem, **read_toml(path, kind=StudyError)}, str(path), StudyError)
+    return validated(
+        StudySpec, {"name": path.stem, **read_toml(path, kind=StudyError)}, str(path), StudyError
+    )

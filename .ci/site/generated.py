@@ -27,7 +27,13 @@ PACKAGES = {
     "contracts": ("Contracts, settings, errors", ["contracts", "core.settings", "core.errors"]),
     "sequences": (
         "Sequences and geometry",
-        ["sequences", "sequences.synthetic", "geometry.camera", "geometry.trajectory", "geometry.se3"],
+        [
+            "sequences",
+            "sequences.synthetic",
+            "geometry.camera",
+            "geometry.trajectory",
+            "geometry.se3",
+        ],
     ),
     "evaluation": ("Evaluation", ["evaluation"]),
     "trackers": (
@@ -54,7 +60,12 @@ MANY = 6
 
 def reference_pages() -> dict[str, str]:
     """Markdown of the pages that the repository holds, by their path below ``docs/``."""
-    pages = {"settings": settings(), "commands": commands(), "systems": systems(), "protocols": protocols()}
+    pages = {
+        "settings": settings(),
+        "commands": commands(),
+        "systems": systems(),
+        "protocols": protocols(),
+    }
     pages |= {"columns": columns(), "published": published()}
     return {f"reference/{name}.md": MADE + text.strip() + "\n" for name, text in pages.items()}
 
@@ -88,7 +99,9 @@ def settings() -> str:
     ):
         text += [f"## {name}\n"] if name != last else []
         last = name
-        text.append(f"### {cls.__name__} {{ #{anchor(name, cls)} }}\n\n{(cls.__doc__ or '').strip()}\n")
+        text.append(
+            f"### {cls.__name__} {{ #{anchor(name, cls)} }}\n\n{(cls.__doc__ or '').strip()}\n"
+        )
         text.append(f"{_held_by(sorted(held))}\n\n{settings_table(cls)}")
         text += _other_defaults(cls, held)
     return "\n".join(text)
@@ -98,7 +111,11 @@ def _other_defaults(cls: type[Settings], held: dict[str, Settings]) -> list[str]
     usual = flatten(cls())
     lines = [
         f"- `{tracker}`: "
-        + ", ".join(f"`{name}` is `{value}`" for name, value in flatten(group).items() if usual[name] != value)
+        + ", ".join(
+            f"`{name}` is `{value}`"
+            for name, value in flatten(group).items()
+            if usual[name] != value
+        )
         for tracker, group in sorted(held.items())
         if flatten(group) != usual
     ]
@@ -122,7 +139,13 @@ def systems() -> str:
         f"| [`{s.id}`](#{slug(s.id)}) | {s.label} | {s.provenance} | {'yes' if s.ranked else 'no'} | {s.summary} |"
         for s in specs
     ]
-    table = "\n".join(["| id | label | provenance | ranked | what it does |", "| --- | --- | --- | --- | --- |", *rows])
+    table = "\n".join(
+        [
+            "| id | label | provenance | ranked | what it does |",
+            "| --- | --- | --- | --- | --- |",
+            *rows,
+        ]
+    )
     intro = "Every built-in tracker. [What the provenance means](../explanation/baselines.md)"
     return f"# Systems\n\n{intro}\n\n{table}\n\n" + "\n".join(_system(spec) for spec in specs)
 
@@ -130,7 +153,9 @@ def systems() -> str:
 def _system(spec: TrackerSpec) -> str:
     root = spec.settings()
     groups = [
-        f"[{name}](settings.md#{anchor(name, type(value))})" for name, value in root if isinstance(value, Settings)
+        f"[{name}](settings.md#{anchor(name, type(value))})"
+        for name, value in root
+        if isinstance(value, Settings)
     ]
     alone = [f"`{name}`" for name, value in root if not isinstance(value, Settings)]
     facts = {
@@ -148,11 +173,17 @@ def _system(spec: TrackerSpec) -> str:
 
 def protocols() -> str:
     """Every named protocol with all of its fields."""
-    text = ["# Protocols\n\nEvery named protocol with its fields. [Why numbers differ](../explanation/protocols.md)\n"]
+    text = [
+        "# Protocols\n\nEvery named protocol with its fields. [Why numbers differ](../explanation/protocols.md)\n"
+    ]
     for name, protocol in PROTOCOLS.items():
         values = protocol.model_dump(mode="json")
-        lines = "\n".join(f"| `{field}` | `{value}` |" for field, value in values.items() if value not in ("", []))
-        text.append(f"## {name}\n\n{protocol.describe()}\n\n| field | value |\n| --- | --- |\n{lines}\n")
+        lines = "\n".join(
+            f"| `{field}` | `{value}` |" for field, value in values.items() if value not in ("", [])
+        )
+        text.append(
+            f"## {name}\n\n{protocol.describe()}\n\n| field | value |\n| --- | --- |\n{lines}\n"
+        )
     return "\n".join(text)
 
 
@@ -164,12 +195,20 @@ def columns() -> str:
         "Rows of a report": ("load_board(results).frame()", inspect.getdoc(Board.frame)),
         "Trials of a study": ("Study.open(folder).frame()", inspect.getdoc(trials_frame)),
     }
-    text = ["# Columns\n\nColumns, units and types of every pandas frame, and the fields of `run.json`.\n"]
+    text = [
+        "# Columns\n\nColumns, units and types of every pandas frame, and the fields of `run.json`.\n"
+    ]
     for title, (call, docstring) in frames.items():
         text.append(f"## {title}\n\n`{call}`\n\n{_section(docstring or '', 'Returns')}\n")
-    text.append("## The observation `stats`\n\nEntries lie in [0, 1], those of the motion in [-1, 1].\n")
-    text.append("What a tracker does not report is 0.\n\n| index | name | meaning |\n| --- | --- | --- |")
-    text += [f"| {index} | `{name}` | {meaning} |" for index, (name, meaning) in enumerate(STATS_LAYOUT)]
+    text.append(
+        "## The observation `stats`\n\nEntries lie in [0, 1], those of the motion in [-1, 1].\n"
+    )
+    text.append(
+        "What a tracker does not report is 0.\n\n| index | name | meaning |\n| --- | --- | --- |"
+    )
+    text += [
+        f"| {index} | `{name}` | {meaning} |" for index, (name, meaning) in enumerate(STATS_LAYOUT)
+    ]
     text.append("\n## The record of a run\n\n`run.json`\n\n| field | meaning |\n| --- | --- |")
     for entry in re.split(r"\n(?=\w+: )", _section(inspect.getdoc(RunRecord) or "", "Attributes")):
         name, _, meaning = entry.partition(": ")
@@ -185,7 +224,9 @@ def published() -> str:
     text.append("[How to read them](../how-to/published.md#read-the-numbers)\n")
     frame = records()
     for kind, title in KINDS.items():
-        text.append(f"## {title[0].upper()}{title[1:]}\n\n| {' | '.join(HEADER)} |\n|{' --- |' * len(HEADER)}")
+        text.append(
+            f"## {title[0].upper()}{title[1:]}\n\n| {' | '.join(HEADER)} |\n|{' --- |' * len(HEADER)}"
+        )
         for r in lines_of(frame[frame["kind"] == kind]):
             protocol = f"`{r.protocol}`" if r.protocol else "-"
             cells = (r.system, r.input, r.alignment, protocol, r.hardware, r.source, r.how)
@@ -210,13 +251,19 @@ def commands() -> str:
 
     command = typer.main.get_command(app)
     with command.make_context("dynslam-bench", [], resilient_parsing=True) as context:
-        return typer.cli.get_docs_for_click(obj=command, ctx=context, name="dynslam-bench", title="Commands")
+        return typer.cli.get_docs_for_click(
+            obj=command, ctx=context, name="dynslam-bench", title="Commands"
+        )
 
 
 def _held_by(trackers: list[str]) -> str:
     if len(trackers) > MANY:
         return f"{len(trackers)} [systems](systems.md) have it."
-    return "Systems that have it: " + ", ".join(f"[`{name}`](systems.md#{slug(name)})" for name in trackers) + "."
+    return (
+        "Systems that have it: "
+        + ", ".join(f"[`{name}`](systems.md#{slug(name)})" for name in trackers)
+        + "."
+    )
 
 
 if __name__ == "__main__":

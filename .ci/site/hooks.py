@@ -52,17 +52,23 @@ def _stage(source: Path, target: Path) -> None:
     for file in source.rglob("*.py"):
         copy = target / file.relative_to(source)
         copy.parent.mkdir(parents=True, exist_ok=True)
-        copy.write_text(re.sub(r"^( *)Example:$", r"\1Examples:", file.read_text(encoding="utf-8"), flags=re.M))
+        copy.write_text(
+            re.sub(r"^( *)Example:$", r"\1Examples:", file.read_text(encoding="utf-8"), flags=re.M)
+        )
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages of the top level, those of docstrings, and what pages link to outside of `docs/`."""
     for page, source in ELSEWHERE.items():
-        files.append(File.generated(config, page, content=(ROOT / source).read_text(encoding="utf-8")))
+        files.append(
+            File.generated(config, page, content=(ROOT / source).read_text(encoding="utf-8"))
+        )
     for page, text in docstring_pages().items():
         files.append(File.generated(config, page, content=text))
     for source in sorted({path for file in files.documentation_pages() for path in _outside(file)}):
-        files.append(File.generated(config, f"files/{source.as_posix()}", abs_src_path=str(ROOT / source)))
+        files.append(
+            File.generated(config, f"files/{source.as_posix()}", abs_src_path=str(ROOT / source))
+        )
     return files
 
 
@@ -75,7 +81,10 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
 
     def link(found: re.Match[str]) -> str:
         named = found["name"].removeprefix("docs/")
-        named = next((page for page, source in ELSEWHERE.items() if source == named and page != "index.md"), named)
+        named = next(
+            (page for page, source in ELSEWHERE.items() if source == named and page != "index.md"),
+            named,
+        )
         if named == here or files.get_file_from_path(named) is None:
             return found.group()
         return f"[{found.group()}]({_relative(named, here)})"
@@ -109,15 +118,24 @@ def _outside(file: File) -> list[Path]:
     """Files, no pages, that a page links to and that do not lie in `docs/`."""
     targets = [_target(file.src_uri, link) for link in LINK.findall(file.content_string)]
     held = set(ELSEWHERE.values())
-    return [t for t in targets if t and (ROOT / t).is_file() and t.parts[0] != "docs" and t.as_posix() not in held]
+    return [
+        t
+        for t in targets
+        if t and (ROOT / t).is_file() and t.parts[0] != "docs" and t.as_posix() not in held
+    ]
 
 
 def _on_site(target: Path | None, link: str) -> str:
     """Where a file of the repository is on the site, from its top; the link as it stands where it is nowhere."""
-    if target is not None and target.parts[:2] == ("docs", "example"):  # on the site its HTML, on GitHub its README
+    # on the site its HTML, on GitHub its README
+    if target is not None and target.parts[:2] == ("docs", "example"):
         target = target.with_name(target.name.replace("README.md", "index.html"))
     if target is None or not (ROOT / target).is_file():
-        return link if target is None or target.parts[:1] != ("docs",) else target.relative_to("docs").as_posix()
+        return (
+            link
+            if target is None or target.parts[:1] != ("docs",)
+            else target.relative_to("docs").as_posix()
+        )
     name = target.as_posix()
     page = next((page for page, source in ELSEWHERE.items() if source == name), None)
     return page or (name.removeprefix("docs/") if target.parts[0] == "docs" else f"files/{name}")

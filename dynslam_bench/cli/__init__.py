@@ -19,14 +19,16 @@ _received: list[int] = []
 def main() -> None:
     """Entry point of ``dynslam-bench``.
 
-    Exit codes: 0 done, 1 user error (one line, no traceback), 2 usage, 3 some runs failed or were lost (or could not
-    write the map that was asked for), 4 verification failed, 128 plus the signal's number after one (130 for Ctrl-C).
+    Exit codes: 0 done, 1 user error (one line, no traceback), 2 usage, 3 some runs failed or were
+    lost (or could not write the map that was asked for), 4 verification failed, 128 plus the
+    signal's number after one (130 for Ctrl-C).
     """
     for number in _SIGNALS:  # an ignored signal, e.g. SIGHUP below `nohup`, stays ignored
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _interrupt)
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # a terminal of another encoding shows ? for characters that it lacks
+        # a terminal of another encoding shows ? for characters that it lacks
+        if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="replace")
     try:
         from dynslam_bench.cli.app import start

@@ -22,7 +22,15 @@ from dynslam_bench.cli import (
     trajectories,
 )
 from dynslam_bench.cli.options import CARE, MEASURE, REPORT, START, AsJson, ShortHelp
-from dynslam_bench.cli.output import download_bar, present, set_json_mode, table, warn, write, write_error
+from dynslam_bench.cli.output import (
+    download_bar,
+    present,
+    set_json_mode,
+    table,
+    warn,
+    write,
+    write_error,
+)
 from dynslam_bench.core import DynslamError
 
 INTERRUPT_CODE = 130
@@ -52,7 +60,8 @@ app.add_typer(reports.app, name="report", rich_help_panel=REPORT)
 app.command(rich_help_panel=REPORT)(reports.published)
 app.add_typer(segmenters.app, name="segmenter", rich_help_panel=CARE)
 cache = typer.Typer(
-    help="The stage cache: results that do not depend on the settings under study.", no_args_is_help=True
+    help="The stage cache: results that do not depend on the settings under study.",
+    no_args_is_help=True,
 )
 app.add_typer(cache, name="cache", rich_help_panel=CARE)
 
@@ -68,7 +77,7 @@ def _version(asked: bool) -> None:
 @app.callback()
 def _root(
     version: Annotated[
-        Optional[bool],  # noqa: UP045
+        Optional[bool],
         typer.Option("--version", callback=_version, is_eager=True, help="Show the version."),
     ] = None,
 ) -> None:
@@ -96,7 +105,9 @@ def doctor(as_json: AsJson = False) -> None:
     rows = [(finding.part, finding.name, finding.state) for finding in findings]
     missing = [f"- {f.part} {f.name}: {f.hint or f.state}" for f in findings if f.missing]
     heading = "\nMissing, and how to get it (of this, rendered sequences need the packages alone):"
-    present(findings, table(("part", "name", "found"), rows), *([heading, *missing] if missing else []))
+    present(
+        findings, table(("part", "name", "found"), rows), *([heading, *missing] if missing else [])
+    )
 
 
 @cache.command()
@@ -105,7 +116,8 @@ def info(as_json: AsJson = False) -> None:
     from dynslam_bench.core.stage_cache import StageCache
 
     usage = StageCache().info()
-    sizes, entries = usage["bytes_by_stage"], usage["entries_by_stage"]
+    sizes = usage["bytes_by_stage"]
+    entries = usage["entries_by_stage"]
     rows = [(stage, entries[stage], size / 1e6) for stage, size in sizes.items()]
     total = sum(sizes.values())
     present(

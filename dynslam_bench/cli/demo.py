@@ -25,11 +25,19 @@ if TYPE_CHECKING:
 PROTOCOL = "tum-rgbd/v1"
 STUDIED = "emfoa-oft?masks=none"
 """The tracker of the study: without masks, the flow alone decides what moves."""
-TUNED = ("flow.budget", "flow.sweeps", "flow.min_correlation", "epipolar.threshold_px", "motion.threshold_px")
+TUNED = (
+    "flow.budget",
+    "flow.sweeps",
+    "flow.min_correlation",
+    "epipolar.threshold_px",
+    "motion.threshold_px",
+)
 """The settings of the study: the flow's search, and the thresholds of moving features."""
-STUDY_SHARE, MIN_STUDY_FRAMES = 0.25, 20
+STUDY_SHARE = 0.25
+MIN_STUDY_FRAMES = 20
 """Frames of a problem instance of the study, as a share of the runs' frames, and at least."""
-STATIC, CULLING = "orb-slam2", {"mask-rcnn": "masks of people", "emfoa-oft": "masks, flow and depth tests"}
+STATIC = "orb-slam2"
+CULLING = {"mask-rcnn": "masks of people", "emfoa-oft": "masks, flow and depth tests"}
 """The tracker without culling, and those with it."""
 MIN_FACTOR = 1.5
 """Single runs scatter by some 30 %: a smaller ratio of errors shows nothing."""
@@ -63,15 +71,30 @@ def demo(
     write(f"{len(specs)} runs of {frames} frames, and a study of {trials} trials: some minutes")
     with compiled_ahead():
         render({spec.sequence for spec in specs})
-    made = WatchedRuns(store, jobs, PROTOCOL).make(partial(run_specs, specs, results=store.root, jobs=jobs))
+    made = WatchedRuns(store, jobs, PROTOCOL).make(
+        partial(run_specs, specs, results=store.root, jobs=jobs)
+    )
     note("making the report")
     paths = report(store.root, title="Demo: walking and sitting people, rendered")
     silence_optuna()
-    render({instance.sequence for instance in study.instances(*study.tune, *study.confirm, *study.held_out)})
+    render(
+        {
+            instance.sequence
+            for instance in study.instances(*study.tune, *study.confirm, *study.held_out)
+        }
+    )
     with progress(f"study {study.name}") as advance:
         bar = StudyBar(advance)
-        tuned = tune(study, results=store.root / "study", jobs=jobs, on_event=bar.event, on_run=bar.run, on_note=note)
-    board, protocol = load_board(store), get_protocol(PROTOCOL)
+        tuned = tune(
+            study,
+            results=store.root / "study",
+            jobs=jobs,
+            on_event=bar.event,
+            on_run=bar.run,
+            on_note=note,
+        )
+    board = load_board(store)
+    protocol = get_protocol(PROTOCOL)
     for table in (paths.leaderboard, per_sequence(board, protocol)):
         write(f"\n{table.title}\n{report_table(table)}")
     write(f"\nProtocol: {protocol.describe()}\n")
@@ -119,7 +142,9 @@ def tell(rows: Iterable[RunRow]) -> list[str]:
     errors: dict[str, dict[str, float]] = defaultdict(dict)
     for row in rows:
         if row.score_m is not None:
-            errors[row.sequence.id.partition("&")[0].rpartition("/")[2]][row.tracker.id] = row.score_m
+            errors[row.sequence.id.partition("&")[0].rpartition("/")[2]][row.tracker.id] = (
+                row.score_m
+            )
     lines = []
     for name, by_tracker in sorted(errors.items(), reverse=True):
         culled = {tracker: by_tracker[tracker] for tracker in CULLING if tracker in by_tracker}
@@ -131,10 +156,16 @@ def tell(rows: Iterable[RunRow]) -> list[str]:
             verdict = f"Culling makes the error {factor:.1f} times smaller."
         elif factor <= 1 / MIN_FACTOR:
             verdict = f"Culling makes the error {1 / factor:.1f} times larger."
-        shown = [f"{1e3 * error:.1f} mm with {CULLING[tracker]} ({tracker})" for tracker, error in culled.items()]
+        shown = [
+            f"{1e3 * error:.1f} mm with {CULLING[tracker]} ({tracker})"
+            for tracker, error in culled.items()
+        ]
         without = f"{1e3 * by_tracker[STATIC]:.1f} mm without culling ({STATIC})"
         lines.append(f"{name}: {without}, {', '.join(shown)}. {verdict}")
-    return [*lines, "One run each shows, and proves nothing: `dynslam-bench bench dynamic` repeats."]
+    return [
+        *lines,
+        "One run each shows, and proves nothing: `dynslam-bench bench dynamic` repeats.",
+    ]
 
 
 def compile_kernels(tracker: str = STUDIED) -> None:
@@ -154,8 +185,8 @@ def compile_kernels(tracker: str = STUDIED) -> None:
 def compiled_ahead() -> Iterator[None]:
     """Compile the kernels in a process while the body runs; stop it if the body fails.
 
-    Two runs at a time would otherwise compile the same kernels twice. Kernels that cannot be compiled here are left to
-    the first runs, which report it.
+    Two runs at a time would otherwise compile the same kernels twice. Kernels that cannot be
+    compiled here are left to the first runs, which report it.
     """
     command = python_command(f"from {__name__} import compile_kernels; compile_kernels()")
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:

@@ -16,11 +16,15 @@ from dynslam_bench.core import DynslamError, read_settings
 if TYPE_CHECKING:
     from dynslam_bench.contracts import TrackerSpec
 
-START, MEASURE = "Begin here", "Run and measure"
-REPORT, CARE = "Report and tune", "Extend and care"
+START = "Begin here"
+MEASURE = "Run and measure"
+REPORT = "Report and tune"
+CARE = "Extend and care"
 """Headings below which the program's help lists its verbs."""
-FRAMES, SETTINGS = "Which frames, how often", "The tracker's settings"
-MACHINE, OUTPUT = "The machine, and how much of it", "What is kept and shown"
+FRAMES = "Which frames, how often"
+SETTINGS = "The tracker's settings"
+MACHINE = "The machine, and how much of it"
+OUTPUT = "What is kept and shown"
 """Headings of the options' help."""
 
 
@@ -113,10 +117,13 @@ def _tracker(ctx: typer.Context) -> TrackerSpec | None:
 
 
 HelpAll = Annotated[
-    bool, typer.Option("--help-all", is_eager=True, callback=_help_all, help="Show all options and exit.")
+    bool,
+    typer.Option(
+        "--help-all", is_eager=True, callback=_help_all, help="Show all options and exit."
+    ),
 ]
 DataRoot = Annotated[
-    Optional[Path],  # noqa: UP045 - typer reads it at run time, on Python 3.10 too
+    Optional[Path],
     typer.Option(
         "--data-root",
         help="Folder of the sequences; default DYNSLAM_BENCH_DATA, else the user's cache.",
@@ -127,19 +134,29 @@ Results = Annotated[Path, typer.Option("--results", help="Results folder.", rich
 AsJson = Annotated[
     bool,
     typer.Option(
-        "--json", callback=set_json_mode, help="Write JSON for scripts, and nothing else.", rich_help_panel=OUTPUT
+        "--json",
+        callback=set_json_mode,
+        help="Write JSON for scripts, and nothing else.",
+        rich_help_panel=OUTPUT,
     ),
 ]
 Camera = Annotated[
-    Optional[str],  # noqa: UP045
-    typer.Option("--camera", help="tum-fr1, tum-fr2, tum-fr3, bonn or a camera.toml.", rich_help_panel=FRAMES),
+    Optional[str],
+    typer.Option(
+        "--camera", help="tum-fr1, tum-fr2, tum-fr3, bonn or a camera.toml.", rich_help_panel=FRAMES
+    ),
 ]
 Yes = Annotated[
     bool,
-    typer.Option("--yes", "-y", help="Download the network for masks without asking.", rich_help_panel=MACHINE),
+    typer.Option(
+        "--yes",
+        "-y",
+        help="Download the network for masks without asking.",
+        rich_help_panel=MACHINE,
+    ),
 ]
 Frames = Annotated[
-    Optional[str],  # noqa: UP045
+    Optional[str],
     typer.Option(
         "--frames",
         metavar="A:B",
@@ -147,22 +164,34 @@ Frames = Annotated[
         rich_help_panel=FRAMES,
     ),
 ]
-Stride = Annotated[int, typer.Option("--stride", min=1, help="Take every so many frames.", rich_help_panel=FRAMES)]
-Device = Annotated[str, typer.Option("--device", help="auto, cpu or cuda:N.", rich_help_panel=MACHINE)]
-Threads = Annotated[int, typer.Option("--threads", min=1, help="Threads of a run.", rich_help_panel=MACHINE)]
+Stride = Annotated[
+    int, typer.Option("--stride", min=1, help="Take every so many frames.", rich_help_panel=FRAMES)
+]
+Device = Annotated[
+    str, typer.Option("--device", help="auto, cpu or cuda:N.", rich_help_panel=MACHINE)
+]
+Threads = Annotated[
+    int, typer.Option("--threads", min=1, help="Threads of a run.", rich_help_panel=MACHINE)
+]
 Snapshots = Annotated[
     bool,
     typer.Option(
-        "--snapshots", help="Keep pictures, features and masks of some frames, for reports.", rich_help_panel=OUTPUT
+        "--snapshots",
+        help="Keep pictures, features and masks of some frames, for reports.",
+        rich_help_panel=OUTPUT,
     ),
 ]
-Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Runs at a time.", rich_help_panel=MACHINE)]
+Jobs = Annotated[
+    int, typer.Option("--jobs", "-j", min=1, help="Runs at a time.", rich_help_panel=MACHINE)
+]
 Seeds = Annotated[
-    Optional[list[int]],  # noqa: UP045
-    typer.Option("--seed", min=0, help="Seeds, several allowed: --seed 0 1 2.", rich_help_panel=FRAMES),
+    Optional[list[int]],
+    typer.Option(
+        "--seed", min=0, help="Seeds, several allowed: --seed 0 1 2.", rich_help_panel=FRAMES
+    ),
 ]
 Offsets = Annotated[
-    Optional[list[int]],  # noqa: UP045
+    Optional[list[int]],
     typer.Option(
         "--offset",
         min=0,
@@ -171,7 +200,7 @@ Offsets = Annotated[
     ),
 ]
 Assignments = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    Optional[list[str]],
     typer.Option(
         "--set",
         metavar="NAME=VALUE",
@@ -181,13 +210,15 @@ Assignments = Annotated[
     ),
 ]
 SettingsFile = Annotated[
-    Optional[Path],  # noqa: UP045
+    Optional[Path],
     typer.Option(
-        "--settings", help="TOML file of settings, e.g. a preset that `tune best` wrote.", rich_help_panel=SETTINGS
+        "--settings",
+        help="TOML file of settings, e.g. a preset that `tune best` wrote.",
+        rich_help_panel=SETTINGS,
     ),
 ]
 Timestamps = Annotated[
-    Optional[Path],  # noqa: UP045
+    Optional[Path],
     typer.Option(
         "--timestamps",
         metavar="FILE",
@@ -204,7 +235,7 @@ ProtocolId = Annotated[
     ),
 ]
 Retry = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    Optional[list[str]],
     typer.Option(
         "--retry",
         help="Run again what ended so: failed, or a status.",
@@ -213,7 +244,7 @@ Retry = Annotated[
     ),
 ]
 TimeLimit = Annotated[
-    Optional[float],  # noqa: UP045
+    Optional[float],
     typer.Option(
         "--time-limit",
         help="Seconds that a run may take; default is no limit on the whole run.",
@@ -221,7 +252,7 @@ TimeLimit = Annotated[
     ),
 ]
 MemoryLimit = Annotated[
-    Optional[float],  # noqa: UP045
+    Optional[float],
     typer.Option(
         "--memory-limit",
         min=0,

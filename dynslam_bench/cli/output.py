@@ -50,7 +50,8 @@ def write(text: str = "", *, colours: Mapping[str, int] | None = None) -> None:
 
     Args:
         text: The line, or lines.
-        colours: ANSI codes of words that are coloured on a terminal where they fill a cell of a table.
+        colours: ANSI codes of words that are coloured on a terminal where they fill a cell of a
+            table.
     """
     text = printable(text)
     if colours and sys.stdout.isatty() and "NO_COLOR" not in os.environ:
@@ -100,7 +101,8 @@ def present(value: Any, *lines: str, verified: bool = True) -> None:
     """
     if _json_mode:
         text = to_json(value, inf_nan_mode="null", fallback=_plain)
-        sys.stdout.write(json.dumps(from_json(text), indent=2) + "\n")  # escapes what a terminal would execute
+        # escapes what a terminal would execute
+        sys.stdout.write(json.dumps(from_json(text), indent=2) + "\n")
     else:
         for line in lines:
             write(line)
@@ -112,11 +114,13 @@ def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
-def table(columns: Sequence[str], rows: Sequence[Sequence[object]], *, least: int = _MIN_WIDTH) -> str:
+def table(
+    columns: Sequence[str], rows: Sequence[Sequence[object]], *, least: int = _MIN_WIDTH
+) -> str:
     """Aligned text, the headings first.
 
-    On a terminal it is no wider than that: the last columns are left out and named, then the widest names are shortened
-    in the middle. Numbers are never shortened.
+    On a terminal it is no wider than that: the last columns are left out and named, then the widest
+    names are shortened in the middle. Numbers are never shortened.
 
     Args:
         columns: The headings.
@@ -129,7 +133,9 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[object]], *, least: in
     room = _terminal_width() if sys.stdout.isatty() else sys.maxsize
     while len(widths) > 1 and _line_width(needed[: len(widths)]) > room:
         widths.pop()
-    while _line_width(widths) > room and (wider := [at for at, width in enumerate(widths) if width > needed[at]]):
+    while _line_width(widths) > room and (
+        wider := [at for at, width in enumerate(widths) if width > needed[at]]
+    ):
         widths[max(wider, key=widths.__getitem__)] -= 1
     lines = ["  ".join(map(_fitted, row, widths)).rstrip() for row in cells]
     left_out = cells[0][len(widths) :]
@@ -154,7 +160,11 @@ def _fitted(text: str, width: int) -> str:
 
 def fields(facts: Mapping[str, object]) -> str:
     """Names and values below each other; empty values are left out."""
-    shown = {name: cell_text(value) for name, value in facts.items() if value not in (None, "", (), [], {})}
+    shown = {
+        name: cell_text(value)
+        for name, value in facts.items()
+        if value not in (None, "", (), [], {})
+    }
     width = max(map(len, shown), default=0)
     return "\n".join(f"{name.ljust(width)}  {value}" for name, value in shown.items())
 
@@ -216,27 +226,41 @@ def progress(label: str, *, unit: str = "") -> Iterator[Advance]:
     from rich.console import Console
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
-    amount = DownloadColumn() if unit == "bytes" else TextColumn("{task.completed:.0f}/{task.total:.0f}")
-    columns = [TextColumn("{task.description}", markup=False), BarColumn(), amount, TimeRemainingColumn()]
+    amount = (
+        DownloadColumn() if unit == "bytes" else TextColumn("{task.completed:.0f}/{task.total:.0f}")
+    )
+    columns = [
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        amount,
+        TimeRemainingColumn(),
+    ]
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(printable(label), total=1)
 
         def update(done: float, total: float | None, step: str = "") -> None:
             text = printable(f"{label}: {step}" if step else label)
-            bar.update(task, completed=done, total=done + 1 if total is None else total, description=text)
+            bar.update(
+                task, completed=done, total=done + 1 if total is None else total, description=text
+            )
 
         yield update
 
 
 @contextmanager
 def _progress_lines(label: str) -> Iterator[Advance]:
-    began, text = time.monotonic(), label
+    began = time.monotonic()
+    text = label
 
     def update(done: float, total: float | None, step: str = "") -> None:
         nonlocal text
         share = f": {done:{'.0f' if done >= 100 else '.3g'}} of {total:.0f}" if total else ""
         spent_s = time.monotonic() - began
-        left = f", about {spent_s * (total - done) / done:.0f} s left" if total and 0 < done < total else ""
+        left = (
+            f", about {spent_s * (total - done) / done:.0f} s left"
+            if total and 0 < done < total
+            else ""
+        )
         text = f"{label}{share}{left}" + (f" ({step})" if step else "")
 
     with repeating(HEARTBEAT_S, lambda: warn(f"{text}, {time.monotonic() - began:.0f} s so far")):

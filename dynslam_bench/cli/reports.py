@@ -18,29 +18,46 @@ app = typer.Typer(
 
 
 MostPages = Annotated[
-    Optional[int],  # noqa: UP045
-    typer.Option(min=0, help="Runs that have a page of their own; default all of up to 5000, of more some 2000."),
+    Optional[int],
+    typer.Option(
+        min=0,
+        help="Runs that have a page of their own; default all of up to 5000, of more some 2000.",
+    ),
 ]
 
 
 @app.command()
 def make(
-    results: Annotated[Optional[list[Path]], typer.Argument(help="Results folders; default ./results.")] = None,  # noqa: UP045
-    output: Annotated[Optional[Path], typer.Option("-o", "--output", help="Folder of the report.")] = None,  # noqa: UP045
+    results: Annotated[
+        Optional[list[Path]], typer.Argument(help="Results folders; default ./results.")
+    ] = None,
+    output: Annotated[
+        Optional[Path], typer.Option("-o", "--output", help="Folder of the report.")
+    ] = None,
     protocol: ProtocolId = "tum-rgbd/v1",
     reference: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(help="Tracker that errors are divided by; default orb-slam2, else a static camera."),
+        Optional[str],
+        typer.Option(
+            help="Tracker that errors are divided by; default orb-slam2, else a static camera."
+        ),
     ] = None,
     on: Annotated[
         str,
-        typer.Option(help="common: rank on the sequences that all have; all: only trackers that have all."),
+        typer.Option(
+            help="common: rank on the sequences that all have; all: only trackers that have all."
+        ),
     ] = "common",
     rank_seen: Annotated[
-        bool, typer.Option("--rank-seen", help="Rank also where the network behind the masks was trained.")
+        bool,
+        typer.Option(
+            "--rank-seen", help="Rank also where the network behind the masks was trained."
+        ),
     ] = False,
     trials: Annotated[
-        bool, typer.Option("--trials", help="Show the trials of studies, too, which are left out otherwise.")
+        bool,
+        typer.Option(
+            "--trials", help="Show the trials of studies, too, which are left out otherwise."
+        ),
     ] = False,
     most_pages: MostPages = None,
     title: Annotated[str, typer.Option(help="Heading.")] = "Visual SLAM in dynamic scenes",
@@ -71,7 +88,10 @@ def make(
     more = len(board.rows) - MOST_ROWS
     left_out = [wrapped(f"Left out: {trial_words(paths.trials)}.")] if paths.trials else []
     present(
-        {name: getattr(paths, name) for name in ("headline", "html", "markdown", "latex", "csv", "data")},
+        {
+            name: getattr(paths, name)
+            for name in ("headline", "html", "markdown", "latex", "csv", "data")
+        },
         wrapped(paths.headline),
         report_table(board, top, MOST_ROWS),
         (f"... and {more} more; " if more > 0 else "") + board.brief,
@@ -88,22 +108,32 @@ def failure_lines(file: Path | None) -> list[str]:
     if file is None:
         return []
     failed = pd.read_csv(file, dtype=str, keep_default_na=False)
-    counts = (failed["tracker"] + " " + failed["ended"].str.extract(r"(.*?)(?:,| at |$)")[0]).value_counts()
+    counts = (
+        failed["tracker"] + " " + failed["ended"].str.extract(r"(.*?)(?:,| at |$)")[0]
+    ).value_counts()
     words = [f"{name} ({count})" for name, count in counts.head(MOST_ROWS).items()]
     more = f" and {len(counts) - MOST_ROWS} more" * (len(counts) > MOST_ROWS)
-    return [wrapped(f"{len(failed)} run{'s' * (len(failed) > 1)} failed: {', '.join(words)}{more}.")]
+    return [
+        wrapped(f"{len(failed)} run{'s' * (len(failed) > 1)} failed: {', '.join(words)}{more}.")
+    ]
 
 
 @app.command()
 def publish(
     results: Annotated[list[Path], typer.Argument(help="Results folders.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="The site's folder, e.g. docs/example.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="The site's folder, e.g. docs/example.")
+    ],
     study: Annotated[
-        Optional[list[Path]],  # noqa: UP045
-        typer.Option(help="Folder of a study with its page, as `tune run` names it; once for each study."),
+        Optional[list[Path]],
+        typer.Option(
+            help="Folder of a study with its page, as `tune run` names it; once for each study."
+        ),
     ] = None,
     title: Annotated[str, typer.Option(help="Heading.")] = "Visual SLAM in dynamic scenes",
-    remark: Annotated[str, typer.Option(help="What a reader should know, for the first page.")] = "",
+    remark: Annotated[
+        str, typer.Option(help="What a reader should know, for the first page.")
+    ] = "",
     protocol: ProtocolId = "tum-rgbd/v1",
     most_pages: MostPages = None,
     as_json: AsJson = False,
@@ -124,8 +154,12 @@ def compare(
     a: Annotated[Path, typer.Argument(help="Results folder, or folder of a report.")],
     b: Annotated[Path, typer.Argument(help="The other one.")],
     output: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option("-o", "--output", help="Folder of the page that shows it; default compare in the folder B."),
+        Optional[Path],
+        typer.Option(
+            "-o",
+            "--output",
+            help="Folder of the page that shows it; default compare in the folder B.",
+        ),
     ] = None,
     protocol: ProtocolId = "tum-rgbd/v1",
     as_json: AsJson = False,
@@ -133,7 +167,9 @@ def compare(
     """Compare two results folders on the sequences that both have, with the same settings or with others."""
     from dynslam_bench.reports import compare as compare_results
 
-    result = compare_results(a, b, protocol=protocol, output=output or (b if b.is_dir() else b.parent) / "compare")
+    result = compare_results(
+        a, b, protocol=protocol, output=output or (b if b.is_dir() else b.parent) / "compare"
+    )
     facts = {"differences": result.differences, "only_a": result.only_a, "only_b": result.only_b}
     lines = [result.table.title, report_table(result.table), "", wrapped(result.table.caption)]
     if result.only_a or result.only_b:
@@ -144,7 +180,7 @@ def compare(
 @app.command("audit-paper")
 def audit_paper(
     data_root: DataRoot = None,
-    output: Annotated[Optional[Path], typer.Option("-o", "--output", help="Markdown file.")] = None,  # noqa: UP045
+    output: Annotated[Optional[Path], typer.Option("-o", "--output", help="Markdown file.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Hold the numbers that the paper prints against arithmetic, and against a static camera."""
@@ -162,7 +198,13 @@ def audit_paper(
     findings = audit(truth)
     lines = []
     for findings_table in (findings.summary(), findings.details()):
-        lines += [findings_table.title, report_table(findings_table), "", wrapped(findings_table.caption), ""]
+        lines += [
+            findings_table.title,
+            report_table(findings_table),
+            "",
+            wrapped(findings_table.caption),
+            "",
+        ]
     if output is not None:
         write_atomic(output, findings.to_markdown())
         lines = [str(output)]
@@ -172,10 +214,13 @@ def audit_paper(
 def published(
     sequence: Annotated[
         str,
-        typer.Argument(help="Id or published folder name.", autocompletion=names_of("cli.reports:published_sequences")),
+        typer.Argument(
+            help="Id or published folder name.",
+            autocompletion=names_of("cli.reports:published_sequences"),
+        ),
     ],
     protocol: Annotated[
-        Optional[str],  # noqa: UP045
+        Optional[str],
         typer.Option(
             "--protocol",
             help="Only what is known to be scored alike; see `protocols list`.",
@@ -193,17 +238,29 @@ def published(
     entry = entry_of(sequence)
     name = sequence if entry is None else entry.id
     if name not in published_sequences():
-        raise ReportError(f"no published number of '{name}' was read", did_you_mean(name, published_sequences()))
+        raise ReportError(
+            f"no published number of '{name}' was read", did_you_mean(name, published_sequences())
+        )
     lines = published_for([name], None if protocol is None else get_protocol(protocol))
     errors = published_table(lines)
     if errors is None:
         raise ReportError(
-            f"no published number of '{name}' is known to be scored as {protocol}", "leave --protocol out"
+            f"no published number of '{name}' is known to be scored as {protocol}",
+            "leave --protocol out",
         )
     differing = spans(lines)
     span = span_table(differing)
-    text = [] if span is None else [f"{span.title}, on {name}:", report_table(span.without("sequence")), ""]
-    text += [f"{errors.title} of {name}:", report_table(errors.without("sequence")), "", wrapped(errors.caption)]
+    text = (
+        []
+        if span is None
+        else [f"{span.title}, on {name}:", report_table(span.without("sequence")), ""]
+    )
+    text += [
+        f"{errors.title} of {name}:",
+        report_table(errors.without("sequence")),
+        "",
+        wrapped(errors.caption),
+    ]
     present({"spans": differing.to_dict("records"), "numbers": lines.to_dict("records")}, *text)
 
 

@@ -38,12 +38,17 @@ if TYPE_CHECKING:
 def run(
     tracker: Annotated[
         str,
-        typer.Argument(help="Id, replay:FILE, module:Attr or file.py:Attr.", autocompletion=opts.complete_trackers),
+        typer.Argument(
+            help="Id, replay:FILE, module:Attr or file.py:Attr.",
+            autocompletion=opts.complete_trackers,
+        ),
     ],
     sequences: Annotated[
         list[str],
         typer.Argument(
-            metavar="SEQUENCE...", help="Ids or folders in TUM layout.", autocompletion=opts.complete_sequences
+            metavar="SEQUENCE...",
+            help="Ids or folders in TUM layout.",
+            autocompletion=opts.complete_sequences,
         ),
     ],
     seed: opts.Seeds = None,
@@ -51,7 +56,7 @@ def run(
     assignments: opts.Assignments = None,
     settings: opts.SettingsFile = None,
     preset: Annotated[
-        Optional[str],  # noqa: UP045
+        Optional[str],
         typer.Option(
             "--preset",
             help="A preset of the tracker.",
@@ -68,16 +73,23 @@ def run(
     threads: opts.Threads = 1,
     jobs: opts.Jobs = 1,
     realtime: Annotated[
-        bool, typer.Option("--realtime", help="Drop frames while the tracker is busy.", rich_help_panel=opts.FRAMES)
+        bool,
+        typer.Option(
+            "--realtime", help="Drop frames while the tracker is busy.", rich_help_panel=opts.FRAMES
+        ),
     ] = False,
     drop: Annotated[
         float,
         typer.Option(
-            "--drop", min=0.0, max=0.99, help="Drop this share of the frames at random.", rich_help_panel=opts.FRAMES
+            "--drop",
+            min=0.0,
+            max=0.99,
+            help="Drop this share of the frames at random.",
+            rich_help_panel=opts.FRAMES,
         ),
     ] = 0.0,
     degrade: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        Optional[list[str]],
         typer.Option(
             "--degrade",
             metavar="KIND=STRENGTH",
@@ -87,11 +99,18 @@ def run(
     ] = None,
     cache: Annotated[
         bool,
-        typer.Option("--cache", help="Take features and masks from the stage cache.", rich_help_panel=opts.MACHINE),
+        typer.Option(
+            "--cache",
+            help="Take features and masks from the stage cache.",
+            rich_help_panel=opts.MACHINE,
+        ),
     ] = False,
     snapshots: opts.Snapshots = False,
     video: Annotated[
-        bool, typer.Option("--video", help="Write video.webm beside the run.", rich_help_panel=opts.OUTPUT)
+        bool,
+        typer.Option(
+            "--video", help="Write video.webm beside the run.", rich_help_panel=opts.OUTPUT
+        ),
     ] = False,
     sheet: Annotated[
         bool,
@@ -104,17 +123,21 @@ def run(
     rrd: Annotated[
         bool,
         typer.Option(
-            "--rrd", help="Write recording.rrd beside the run, for rerun's viewer.", rich_help_panel=opts.OUTPUT
+            "--rrd",
+            help="Write recording.rrd beside the run, for rerun's viewer.",
+            rich_help_panel=opts.OUTPUT,
         ),
     ] = False,
     save_map: Annotated[
         bool,
         typer.Option(
-            "--save-map", help="Write map.npz beside the run, for --map of a later one.", rich_help_panel=opts.OUTPUT
+            "--save-map",
+            help="Write map.npz beside the run, for --map of a later one.",
+            rich_help_panel=opts.OUTPUT,
         ),
     ] = False,
     start_map: Annotated[
-        Optional[Path],  # noqa: UP045
+        Optional[Path],
         typer.Option(
             "--map",
             metavar="FILE",
@@ -125,17 +148,24 @@ def run(
     localisation_only: Annotated[
         bool,
         typer.Option(
-            "--localisation-only", help="Leave that map as it is: poses alone.", rich_help_panel=opts.SETTINGS
+            "--localisation-only",
+            help="Leave that map as it is: poses alone.",
+            rich_help_panel=opts.SETTINGS,
         ),
     ] = False,
     retry: opts.Retry = None,
     label: Annotated[
-        str, typer.Option("--label", help="Name in tables, in place of the tracker's.", rich_help_panel=opts.SETTINGS)
+        str,
+        typer.Option(
+            "--label",
+            help="Name in tables, in place of the tracker's.",
+            rich_help_panel=opts.SETTINGS,
+        ),
     ] = "",
     time_limit: opts.TimeLimit = None,
     memory_limit: opts.MemoryLimit = None,
     protocol: Annotated[
-        Optional[str],  # noqa: UP045
+        Optional[str],
         typer.Option(
             "--protocol",
             help="How to evaluate; default tum-rgbd/v1, of a monocular tracker its Sim(3) variant.",
@@ -164,7 +194,9 @@ def run(
         limits=checked(runs.Limits, time_s=time_limit, memory_mb=memory_limit),
     )  # fmt: skip
     scored_under = protocol or default_protocol(tracker)
-    make = partial(run_specs, specs, results=results, jobs=jobs, retry=retry or (), protocol=scored_under)
+    make = partial(
+        run_specs, specs, results=results, jobs=jobs, retry=retry or (), protocol=scored_under
+    )
     finish(make, results, jobs, scored_under, yes, runs.pictures_asked(specs[0]))
 
 
@@ -175,7 +207,9 @@ def default_protocol(tracker: str) -> str:
 
     if TRACKERS.get(tracker).sensors != "rgb":
         return "tum-rgbd/v1"
-    announce(f"'{tracker}' is monocular, its scale is unknown: scored under {MONOCULAR}, which finds the scale")
+    announce(
+        f"'{tracker}' is monocular, its scale is unknown: scored under {MONOCULAR}, which finds the scale"
+    )
     return MONOCULAR
 
 
@@ -190,19 +224,21 @@ def bench(
     results: opts.Results = Path("results"),
     data_root: opts.DataRoot = None,
     tracker: Annotated[
-        Optional[list[str]],  # noqa: UP045
+        Optional[list[str]],
         typer.Option(
-            "--tracker", help="Only this tracker, or another one; repeatable.", autocompletion=opts.complete_trackers
+            "--tracker",
+            help="Only this tracker, or another one; repeatable.",
+            autocompletion=opts.complete_trackers,
         ),
     ] = None,
     seed: opts.Seeds = None,
     offset: opts.Offsets = None,
     frames: opts.Frames = None,
     device: opts.Device = "auto",
-    threads: Annotated[Optional[int], typer.Option(min=1, help="Threads of a run.")] = None,  # noqa: UP045
+    threads: Annotated[Optional[int], typer.Option(min=1, help="Threads of a run.")] = None,
     jobs: opts.Jobs = 1,
     scheduler: Annotated[
-        Optional[str],  # noqa: UP045
+        Optional[str],
         typer.Option(
             "--scheduler",
             metavar="ADDRESS",
@@ -213,7 +249,9 @@ def bench(
     shard: Annotated[
         str,
         typer.Option(
-            metavar="K/N", help="Only the K-th of N parts of the runs; see `runs merge`.", rich_help_panel=opts.MACHINE
+            metavar="K/N",
+            help="Only the K-th of N parts of the runs; see `runs merge`.",
+            rich_help_panel=opts.MACHINE,
         ),
     ] = "1/1",
     snapshots: opts.Snapshots = False,
@@ -255,7 +293,11 @@ def bench(
 
 def show_workers(rows: Sequence[dict[str, object]]) -> None:
     """What each worker of a scheduler has, on standard error."""
-    announce(table(list(rows[0]), [list(row.values()) for row in rows]) if rows else "the scheduler has no worker yet")
+    announce(
+        table(list(rows[0]), [list(row.values()) for row in rows])
+        if rows
+        else "the scheduler has no worker yet"
+    )
 
 
 def parse_shard(text: str) -> tuple[int, int]:
@@ -264,7 +306,9 @@ def parse_shard(text: str) -> tuple[int, int]:
     Raises:
         RunError: It is not written so, or K is not 1 to N.
     """
-    if not (match := re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)) or not 1 <= int(match[1]) <= int(match[2]):
+    if not (match := re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)) or not 1 <= int(
+        match[1]
+    ) <= int(match[2]):
         raise RunError(f"--shard is '{text}'", "write K/N with K from 1 to N, e.g. 3/64")
     return int(match[1]), int(match[2])
 
@@ -300,10 +344,16 @@ def finish(
     missing = show_files(rows, store, pictures)
     if caution := training_scene_note(rows):
         note(caution)
-    unscored = (row for row in rows if row["status"] in ("ok", "lost") and row["ate_rmse_m"] is None)
-    if (first := next(unscored, None)) and not store.read_whole(first["run_id"]).sequence.ground_truth:
+    unscored = (
+        row for row in rows if row["status"] in ("ok", "lost") and row["ate_rmse_m"] is None
+    )
+    if (first := next(unscored, None)) and not store.read_whole(
+        first["run_id"]
+    ).sequence.ground_truth:
         path = store.folder(first["run_id"]) / "trajectory_online.txt"
-        announce(f"{first['sequence']} has no ground truth, so nothing is scored; the estimated trajectory: {path}")
+        announce(
+            f"{first['sequence']} has no ground truth, so nothing is scored; the estimated trajectory: {path}"
+        )
     if not json_mode() and (fault := recording_note(watched.opened, rows)):
         announce(fault)
     note(f"{len(rows)} runs in {store.root}; report them with: dynslam-bench report {results}")
@@ -337,7 +387,9 @@ class WatchedRuns:
     """
 
     def __init__(self, store: runs.RunStore, jobs: int, protocol: str) -> None:
-        self.store, self.jobs, self.protocol = store, jobs, protocol
+        self.store = store
+        self.jobs = jobs
+        self.protocol = protocol
         self.opened: dict[str, tuple[str, str | None, str | None]] = {}
         self.reused: set[str] = set()
         self.faults: set[str] = set()
@@ -356,13 +408,19 @@ class WatchedRuns:
     def _event(self, event: runs.RunEvent) -> None:
         before = self._shares.pop(event.run_id, 0.0)
         if event.record is not None:
-            self.opened[event.record.run_id] = (event.spec.sequence, event.spec.data_root, event.spec.camera)
+            self.opened[event.record.run_id] = (
+                event.spec.sequence,
+                event.spec.data_root,
+                event.spec.camera,
+            )
             self._done += 1.0 - before
             if event.kind == "reused":
                 self.reused.add(event.record.run_id)
             note(event.record.describe() + (" (stored)" if event.kind == "reused" else ""))
         elif event.partial is not None:
-            self._shares[event.run_id] = event.partial["frames_done"] / max(event.partial["frames"], 1)
+            self._shares[event.run_id] = event.partial["frames_done"] / max(
+                event.partial["frames"], 1
+            )
             self._done += self._shares[event.run_id] - before
         self._advance(self._done, event.total, event_text(event))
 
@@ -377,7 +435,8 @@ def event_text(event: runs.RunEvent) -> str:
     text = f"{label_text(event.spec.tracker)} on {label_text(event.spec.sequence)}"
     if event.kind != "progress" or event.partial is None:
         return text
-    done, frames = event.partial["frames_done"], event.partial["frames"]
+    done = event.partial["frames_done"]
+    frames = event.partial["frames"]
     if done < frames:
         return f"{text}, frame {done} of {frames}"
     return f"{text}, writing {', '.join(['trajectories', *runs.pictures_asked(event.spec)])}"

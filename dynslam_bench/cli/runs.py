@@ -33,7 +33,14 @@ from dynslam_bench.cli.output import (
     warn,
     write,
 )
-from dynslam_bench.core import RunError, assignments, did_you_mean, label_text, raising, write_atomic
+from dynslam_bench.core import (
+    RunError,
+    assignments,
+    did_you_mean,
+    label_text,
+    raising,
+    write_atomic,
+)
 from dynslam_bench.core.version import install_hint
 
 if TYPE_CHECKING:
@@ -77,7 +84,8 @@ _FOLDERS = re.compile(r"(?<==)(\w+:)?(?:~|\.{0,2})/(?:[^,/]*/)*")
 
 app = typer.Typer(help="Stored runs.", no_args_is_help=True)
 banks = typer.Typer(
-    help="Banks: archives of trajectories with checksums, which are results folders.", no_args_is_help=True
+    help="Banks: archives of trajectories with checksums, which are results folders.",
+    no_args_is_help=True,
 )
 Folder = Annotated[Path, typer.Argument(metavar="BANK", help="Folder of the bank.")]
 
@@ -86,16 +94,22 @@ Folder = Annotated[Path, typer.Argument(metavar="BANK", help="Folder of the bank
 def list_(
     results: Results = Path("results"),
     status: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(help="Only runs that ended so, e.g. ok or crashed.", autocompletion=complete_statuses),
+        Optional[str],
+        typer.Option(
+            help="Only runs that ended so, e.g. ok or crashed.", autocompletion=complete_statuses
+        ),
     ] = None,
     tracker: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(help="Only trackers of this id, or with this in it.", autocompletion=complete_trackers),
+        Optional[str],
+        typer.Option(
+            help="Only trackers of this id, or with this in it.", autocompletion=complete_trackers
+        ),
     ] = None,
     sequence: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(help="Only sequences of this id, or with this in it.", autocompletion=complete_sequences),
+        Optional[str],
+        typer.Option(
+            help="Only sequences of this id, or with this in it.", autocompletion=complete_sequences
+        ),
     ] = None,
     sort: Annotated[
         str,
@@ -119,10 +133,16 @@ def list_(
     chosen = [
         row
         for row in rows
-        if status in (None, row["status"]) and (tracker or "") in row["tracker"] and (sequence or "") in row["sequence"]
+        if status in (None, row["status"])
+        and (tracker or "") in row["tracker"]
+        and (sequence or "") in row["sequence"]
     ]
     key = _SORT_KEYS.get(column, column)
-    valued = sorted((row for row in chosen if row[key] is not None), key=itemgetter(key), reverse=sort.startswith("-"))
+    valued = sorted(
+        (row for row in chosen if row[key] is not None),
+        key=itemgetter(key),
+        reverse=sort.startswith("-"),
+    )
     show_rows(valued + [row for row in chosen if row[key] is None], store, protocol)
     for file in unreadable:
         warn(f"unreadable: {file.path}: {file.reason}")
@@ -130,7 +150,9 @@ def list_(
 
 @app.command()
 def show(
-    run: Annotated[str, typer.Argument(help="The run's id, its first digits, or latest.")] = "latest",
+    run: Annotated[
+        str, typer.Argument(help="The run's id, its first digits, or latest.")
+    ] = "latest",
     results: Results = Path("results"),
     protocol: ProtocolId = "tum-rgbd/v1",
     as_json: AsJson = False,
@@ -142,7 +164,10 @@ def show(
     lines = [fields(run_facts(store, record))]
     if record.timings:
         stages = record.timings.items()
-        rows = [(name, 1000 * stage.median_s, 1000 * stage.p95_s, 1000 * stage.mean_s) for name, stage in stages]
+        rows = [
+            (name, 1000 * stage.median_s, 1000 * stage.p95_s, 1000 * stage.mean_s)
+            for name, stage in stages
+        ]
         lines += ["", table(("stage", "median ms", "p95 ms", "mean ms"), rows)]
     for which, evaluation in (("online", metrics.online), ("final", metrics.final)):
         if evaluation is None:
@@ -161,7 +186,7 @@ def show(
 @app.command()
 def rescore(
     results: Results = Path("results"),
-    protocol: Annotated[Optional[str], typer.Option(help="Only under this one.")] = None,  # noqa: UP045
+    protocol: Annotated[Optional[str], typer.Option(help="Only under this one.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Compute the errors of all runs again from their trajectories, and list those that have changed."""
@@ -171,7 +196,9 @@ def rescore(
     for outcome in outcomes:
         changed = f": {', '.join(outcome.changed)}" if outcome.changed else ""
         count = f"{len(outcome.changed)} with other errors than stored{changed}"
-        lines.append(f"{outcome.protocol}: {outcome.runs} run{'s' * (outcome.runs != 1)} scored, {count}")
+        lines.append(
+            f"{outcome.protocol}: {outcome.runs} run{'s' * (outcome.runs != 1)} scored, {count}"
+        )
     present(outcomes, *lines)
     for reason in outcomes[0].unreadable if outcomes else ():
         announce(f"unreadable: {reason}")
@@ -179,8 +206,13 @@ def rescore(
 
 @app.command()
 def merge(
-    sources: Annotated[list[Path], typer.Argument(metavar="RESULTS...", help="Results folders, or archives of them.")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Results folder that gets the runs.")],
+    sources: Annotated[
+        list[Path],
+        typer.Argument(metavar="RESULTS...", help="Results folders, or archives of them."),
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Results folder that gets the runs.")
+    ],
     as_json: AsJson = False,
 ) -> None:
     """Copy the runs of results folders into one; exit with 3 if another result of a run is there, which stays."""
@@ -190,7 +222,9 @@ def merge(
 
 @app.command()
 def export(
-    output: Annotated[Path, typer.Argument(metavar="FILE", help="A .csv, or a .parquet (extra \\[parquet]).")],
+    output: Annotated[
+        Path, typer.Argument(metavar="FILE", help="A .csv, or a .parquet (extra \\[parquet]).")
+    ],
     results: Results = Path("results"),
     protocol: ProtocolId = "tum-rgbd/v1",
 ) -> None:
@@ -208,7 +242,7 @@ def export(
 
 @app.command()
 def rm(
-    runs: Annotated[Optional[list[str]], typer.Argument(help="Ids or their first digits.")] = None,  # noqa: UP045
+    runs: Annotated[Optional[list[str]], typer.Argument(help="Ids or their first digits.")] = None,
     results: Results = Path("results"),
     failed: Annotated[bool, typer.Option("--failed", help="All runs that failed.")] = False,
 ) -> None:
@@ -229,7 +263,10 @@ def rm(
 @banks.command()
 def add(
     sources: Annotated[
-        list[Path], typer.Argument(metavar="SOURCE...", help="Results folders, and manifests of trajectories (.toml).")
+        list[Path],
+        typer.Argument(
+            metavar="SOURCE...", help="Results folders, and manifests of trajectories (.toml)."
+        ),
     ],
     bank: Folder,
     as_json: AsJson = False,
@@ -246,12 +283,20 @@ def verify(bank: Folder, as_json: AsJson = False) -> None:
     from dynslam_bench.runs.bank import verify
 
     faults = verify(bank)
-    present({"faults": faults}, *faults, f"{bank}: {len(faults)} fault{'s' * (len(faults) != 1)}", verified=not faults)
+    present(
+        {"faults": faults},
+        *faults,
+        f"{bank}: {len(faults)} fault{'s' * (len(faults) != 1)}",
+        verified=not faults,
+    )
 
 
 @banks.command()
 def pull(
-    source: Annotated[str, typer.Argument(help="A bank: a folder, a git repository, or an archive's https address.")],
+    source: Annotated[
+        str,
+        typer.Argument(help="A bank: a folder, a git repository, or an archive's https address."),
+    ],
     bank: Folder,
     as_json: AsJson = False,
 ) -> None:
@@ -264,7 +309,9 @@ def pull(
 @banks.command()
 def push(
     bank: Folder,
-    target: Annotated[str, typer.Argument(help="A folder, or a git repository, which gets a commit.")],
+    target: Annotated[
+        str, typer.Argument(help="A folder, or a git repository, which gets a commit.")
+    ],
     as_json: AsJson = False,
 ) -> None:
     """Add the runs of a bank to another one; refuse if either has faults."""
@@ -276,7 +323,10 @@ def push(
 def show_merged(merged: Merged, target: str) -> None:
     """What was copied into a store; exit with 3 if something was left out."""
     counts = f"{len(merged.stored)} were there already, {len(merged.left_out)} left out"
-    present(merged, f"{len(merged.added)} run{'s' * (len(merged.added) != 1)} copied to {target}, {counts}")
+    present(
+        merged,
+        f"{len(merged.added)} run{'s' * (len(merged.added) != 1)} copied to {target}, {counts}",
+    )
     for entry in merged.left_out:
         warn(f"left out {entry.path}: {entry.reason}")
     if merged.left_out:
@@ -288,7 +338,9 @@ def run_facts(store: stored.RunStore, record: stored.RunRecord) -> dict[str, Any
     return {
         "run": record.run_id,
         "folder": store.place(record.run_id),
-        "identity": "" if record.verified else "unverified: its id does not tell the contents of data and code",
+        "identity": ""
+        if record.verified
+        else "unverified: its id does not tell the contents of data and code",
         "status": record.status,
         "reason": record.reason,
         "tracker": f"{record.tracker.label} [{record.tracker.id}, {record.tracker.provenance}]",
@@ -317,7 +369,10 @@ def run_facts(store: stored.RunStore, record: stored.RunRecord) -> dict[str, Any
 
 
 def show_runs(
-    records: Iterable[stored.RunRecord], store: stored.RunStore, protocol: str, reused: Collection[str] = ()
+    records: Iterable[stored.RunRecord],
+    store: stored.RunStore,
+    protocol: str,
+    reused: Collection[str] = (),
 ) -> list[dict[str, Any]]:
     """A table, or JSON, of runs with their errors under a protocol; runs in `reused` are marked as from the store.
 
@@ -325,7 +380,9 @@ def show_runs(
         The table's rows, see `run_row`.
     """
     rows = [
-        stored.run_row(record, None if record.status == "stopped" else store.score(record, protocol))
+        stored.run_row(
+            record, None if record.status == "stopped" else store.score(record, protocol)
+        )
         | {"from_store": record.run_id in reused}
         for record in records
     ]
@@ -336,7 +393,9 @@ def show_runs(
 def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: str) -> None:
     """The same for rows that `list_runs` gave; the table has the columns in which a run has a value."""
     if json_mode():
-        present([row | {"protocol": protocol, "folder": store.place(row["run_id"])} for row in rows])
+        present(
+            [row | {"protocol": protocol, "folder": store.place(row["run_id"])} for row in rows]
+        )
         return
     columns = {
         title: name
@@ -351,14 +410,20 @@ def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: 
     write(table(list(columns), cells, least=_NAME_WIDTH), colours=COLOURS)
     ended = Counter(row["status"] for row in rows if row["status"] != "ok")
     if ended:
-        write(f"{ended.total()} of {len(rows)} runs are not ok: {', '.join(f'{n} {s}' for s, n in ended.items())}.")
+        write(
+            f"{ended.total()} of {len(rows)} runs are not ok: {', '.join(f'{n} {s}' for s, n in ended.items())}."
+        )
     moving = (row for row in rows if row["false_motion_max_m"] is None)
     pairs = ((row["ate_rmse_m"], row["static_camera_ate_rmse_m"]) for row in moving)
     worse = sum(None not in pair and pair[0] > (1 + 1e-9) * pair[1] for pair in pairs)
     if worse:
         write(f"{worse} of {len(rows)} runs are worse than a static camera.")
-    if any(None not in (row["ate_rmse_m"], row["coverage"]) and row["coverage"] < 1 for row in rows):
-        write("ATE: of the tracked frames alone; static camera: of all. A report uses hold-last-pose.")
+    if any(
+        None not in (row["ate_rmse_m"], row["coverage"]) and row["coverage"] < 1 for row in rows
+    ):
+        write(
+            "ATE: of the tracked frames alone; static camera: of all. A report uses hold-last-pose."
+        )
     show_remarks(rows)
 
 
@@ -385,7 +450,9 @@ def short_ids(run_ids: Iterable[str]) -> dict[str, str]:
     ordered = sorted(set(run_ids))
     digits = dict.fromkeys(ordered, _ID_DIGITS)
     for run_id, following in pairwise(ordered):
-        shared = next(at for at in range(len(following) + 1) if run_id[: at + 1] != following[: at + 1])
+        shared = next(
+            at for at in range(len(following) + 1) if run_id[: at + 1] != following[: at + 1]
+        )
         digits[run_id] = max(digits[run_id], shared + 1)
         digits[following] = max(digits[following], shared + 1)
     return {run_id: run_id[:count] for run_id, count in digits.items()}
@@ -398,7 +465,9 @@ def shown_cell(name: str, value: Any) -> Any:
     return _FOLDERS.sub(r"\1", value) if name == "settings" else value
 
 
-def show_files(rows: Sequence[dict[str, Any]], store: stored.RunStore, names: Sequence[str]) -> set[str]:
+def show_files(
+    rows: Sequence[dict[str, Any]], store: stored.RunStore, names: Sequence[str]
+) -> set[str]:
     """Write the paths of the requested pictures and maps, and to standard error why a run has none.
 
     Returns:
@@ -410,7 +479,9 @@ def show_files(rows: Sequence[dict[str, Any]], store: stored.RunStore, names: Se
         path = store.folder(run_id) / name
         if not path.is_file():
             missing.add(name)
-            reasons = [text for text in store.read_whole(run_id).notes if text.startswith(f"no {name}")]
+            reasons = [
+                text for text in store.read_whole(run_id).notes if text.startswith(f"no {name}")
+            ]
             warn(f"{[*reasons, f'no {name}: the run ended early, {status}'][0]} ({run_id})")
         elif not json_mode():
             write(str(path))
@@ -429,7 +500,9 @@ def training_scene_note(rows: Sequence[dict[str, Any]]) -> str:
     )
 
 
-def recording_note(opened: Mapping[str, tuple[str, str | None, str | None]], rows: Sequence[dict[str, Any]]) -> str:
+def recording_note(
+    opened: Mapping[str, tuple[str, str | None, str | None]], rows: Sequence[dict[str, Any]]
+) -> str:
     """One line on a fault of the first recording whose run failed, was lost or was no better than a static camera.
 
     Empty without such a run, or where a short check of the recording finds no fault.
@@ -442,7 +515,8 @@ def recording_note(opened: Mapping[str, tuple[str, str | None, str | None]], row
 
     for row in rows:
         sequence, data_root, camera = opened[row["run_id"]]
-        error, bound = row["ate_rmse_m"], row["static_camera_ate_rmse_m"]
+        error = row["ate_rmse_m"]
+        bound = row["static_camera_ate_rmse_m"]
         may_move = row["tracker"] != "never-move" and row["false_motion_max_m"] is None
         static = may_move and None not in (error, bound) and error >= bound
         if sequence.startswith("synthetic/") or not (row["status"] != "ok" or static):

@@ -18,27 +18,38 @@ from dynslam_bench.cli.options import (
 from dynslam_bench.cli.output import fields, present, progress, table, write
 
 MaskAssignments = Annotated[
-    Optional[list[str]],  # noqa: UP045
-    typer.Option("--set", metavar="NAME=VALUE", help="Set one of the masks', e.g. classes=person; repeatable."),
+    Optional[list[str]],
+    typer.Option(
+        "--set",
+        metavar="NAME=VALUE",
+        help="Set one of the masks', e.g. classes=person; repeatable.",
+    ),
 ]
 
-app = typer.Typer(help="Train, measure and export segmentation networks, record their masks.", no_args_is_help=True)
+app = typer.Typer(
+    help="Train, measure and export segmentation networks, record their masks.",
+    no_args_is_help=True,
+)
 
 
 @app.command()
 def train(
     output: Annotated[Path, typer.Argument(help="Folder of the training run.")],
     assignments: Annotated[
-        Optional[list[str]],  # noqa: UP045 - typer reads it at run time, on Python 3.10 too
+        Optional[list[str]],
         typer.Option(
-            "--set", metavar="NAME=VALUE", help="Set one of the training's, e.g. iterations=1200; repeatable."
+            "--set",
+            metavar="NAME=VALUE",
+            help="Set one of the training's, e.g. iterations=1200; repeatable.",
         ),
     ] = None,
     settings: Annotated[
-        Optional[Path],  # noqa: UP045
+        Optional[Path],
         typer.Option("--settings", help="TOML file of the training's settings."),
     ] = None,
-    data_cache: Annotated[Optional[Path], typer.Option(help="Where prepared images are kept.")] = None,  # noqa: UP045
+    data_cache: Annotated[
+        Optional[Path], typer.Option(help="Where prepared images are kept.")
+    ] = None,
     device: Device = "auto",
     threads: Threads = 1,
     resume: Annotated[bool, typer.Option(help="Go on where an earlier call stopped.")] = True,
@@ -67,11 +78,17 @@ def train(
 
 @app.command()
 def evaluate(
-    data: Annotated[str, typer.Argument(help="synthetic:..., sequence:ID, coco:FILE[:IMAGES] or yolo:DIR.")],
-    source: Annotated[str, typer.Option(help="embedded, coco, weights:PATH, onnx:PATH, recorded:DIR ...")] = "embedded",
+    data: Annotated[
+        str, typer.Argument(help="synthetic:..., sequence:ID, coco:FILE[:IMAGES] or yolo:DIR.")
+    ],
+    source: Annotated[
+        str, typer.Option(help="embedded, coco, weights:PATH, onnx:PATH, recorded:DIR ...")
+    ] = "embedded",
     assignments: MaskAssignments = None,
-    output: Annotated[Optional[Path], typer.Option("-o", "--output", help="JSON file of the scores.")] = None,  # noqa: UP045
-    limit: Annotated[Optional[int], typer.Option(min=1, help="Only so many images.")] = None,  # noqa: UP045
+    output: Annotated[
+        Optional[Path], typer.Option("-o", "--output", help="JSON file of the scores.")
+    ] = None,
+    limit: Annotated[Optional[int], typer.Option(min=1, help="Only so many images.")] = None,
     min_area: Annotated[int, typer.Option(min=0, help="Leave out objects with fewer pixels.")] = 0,
     device: Device = "auto",
     threads: Threads = 1,
@@ -83,7 +100,9 @@ def evaluate(
     from dynslam_bench.segmentation.settings import SegmentationSettings
     from dynslam_bench.segmentation.training.evaluate_masks import evaluate_segmenter
 
-    settings = apply_overrides(SegmentationSettings(), {"source": source, **gather_settings(assignments)})
+    settings = apply_overrides(
+        SegmentationSettings(), {"source": source, **gather_settings(assignments)}
+    )
     with progress(data) as advance:
         score = evaluate_segmenter(
             settings,
@@ -106,7 +125,9 @@ def evaluate(
 @app.command()
 def record(
     sequence: Annotated[str, typer.Argument(help="Id or path.", autocompletion=complete_sequences)],
-    output: Annotated[Path, typer.Argument(help="Folder of the masks, for segmentation.source=recorded:DIR.")],
+    output: Annotated[
+        Path, typer.Argument(help="Folder of the masks, for segmentation.source=recorded:DIR.")
+    ],
     source: Annotated[str, typer.Option(help="coco, weights:PATH, onnx:PATH, oracle ...")] = "auto",
     assignments: MaskAssignments = None,
     frames: Frames = None,
@@ -122,21 +143,37 @@ def record(
     from dynslam_bench.segmentation.settings import SegmentationSettings
     from dynslam_bench.sequences import open_sequence
 
-    settings = apply_overrides(SegmentationSettings(), {"source": source, **gather_settings(assignments)})
+    settings = apply_overrides(
+        SegmentationSettings(), {"source": source, **gather_settings(assignments)}
+    )
     opened = open_sequence(sequence, data_root=data_root, camera=camera, frames=frames)
     with progress(f"masks of {opened.id}") as advance:
-        made = record_masks(opened, output, settings, device=resolve_device(device), threads=threads, progress=advance)
-    write(f"{made} of {len(opened)} frames segmented now; use them with --set segmentation.source=recorded:{output}")
+        made = record_masks(
+            opened,
+            output,
+            settings,
+            device=resolve_device(device),
+            threads=threads,
+            progress=advance,
+        )
+    write(
+        f"{made} of {len(opened)} frames segmented now; use them with --set segmentation.source=recorded:{output}"
+    )
 
 
 @app.command()
 def export(
     source: Annotated[str, typer.Argument(help="embedded, coco or weights:PATH.")],
-    output: Annotated[Path, typer.Argument(help="ONNX file to write, for segmentation.source=onnx:FILE.")],
+    output: Annotated[
+        Path, typer.Argument(help="ONNX file to write, for segmentation.source=onnx:FILE.")
+    ],
     size: Annotated[str, typer.Option(metavar="WxH", help="Size of the images.")] = "640x480",
     side: Annotated[
-        Optional[int],  # noqa: UP045
-        typer.Option(min=0, help="Shorter side at which the network works; default as in a run, 0 for its own."),
+        Optional[int],
+        typer.Option(
+            min=0,
+            help="Shorter side at which the network works; default as in a run, 0 for its own.",
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

@@ -18,14 +18,20 @@ if TYPE_CHECKING:
     from dynslam_bench.sequences.calibration import Quantity
 
 app = typer.Typer(help="Find, fetch, check and render sequences.", no_args_is_help=True)
-Name = Annotated[str, typer.Argument(help="Id, published folder name or path.", autocompletion=complete_sequences)]
+Name = Annotated[
+    str,
+    typer.Argument(help="Id, published folder name or path.", autocompletion=complete_sequences),
+]
 
 
 @app.command("list")
 def list_(
     pattern: Annotated[str, typer.Argument(help="Which, e.g. tum/fr3 or 'tum/fr3/*xyz'.")] = "*",
     tag: Annotated[
-        str | None, typer.Option(help="Only those with a tag: static, low-dynamic, high-dynamic, unknown-objects.")
+        str | None,
+        typer.Option(
+            help="Only those with a tag: static, low-dynamic, high-dynamic, unknown-objects."
+        ),
     ] = None,
     here: Annotated[bool, typer.Option("--here", help="Only those on this machine.")] = False,
     data_root: DataRoot = None,
@@ -39,24 +45,40 @@ def list_(
     if tag is not None and tag not in tags:
         raise SequenceError(f"no sequence has the tag '{tag}'", f"known: {', '.join(tags)}")
     patterns = (pattern, f"{pattern.rstrip('/')}/*")
-    matches = [summary for summary in everything if any(fnmatch(summary["id"], glob) for glob in patterns)]
+    matches = [
+        summary for summary in everything if any(fnmatch(summary["id"], glob) for glob in patterns)
+    ]
     if not matches:
         raise SequenceError(
-            f"no sequence matches '{pattern}'", did_you_mean(pattern, [summary["id"] for summary in everything])
+            f"no sequence matches '{pattern}'",
+            did_you_mean(pattern, [summary["id"] for summary in everything]),
         )
     matches = [s for s in matches if (tag is None or tag in s["tags"]) and (s["here"] or not here)]
     lines = []
     for title, members in groupby(matches, key=lambda summary: summary["dataset"]):
         group = list(members)
-        facts = [f"{len(group)} listed, {sum(s['here'] for s in group)} here", f"licence: {group[0]['license']}"]
-        facts += [f"layout: {group[0]['layout']} on the publisher's files"] if group[0]["layout"] else []
+        facts = [
+            f"{len(group)} listed, {sum(s['here'] for s in group)} here",
+            f"licence: {group[0]['license']}",
+        ]
+        facts += (
+            [f"layout: {group[0]['layout']} on the publisher's files"] if group[0]["layout"] else []
+        )
         facts += [f"by hand: {group[0]['by_hand']}"] if group[0]["by_hand"] else []
         columns = ("sequence", "here", "size", "tags", "split", "ground truth", "checksum")
-        rows = [(s["id"], s["here"], s["size"], s["tags"], s["split"], s["ground_truth"], s["checksum"]) for s in group]
+        rows = [
+            (s["id"], s["here"], s["size"], s["tags"], s["split"], s["ground_truth"], s["checksum"])
+            for s in group
+        ]
         lines += [f"{title} ({'; '.join(facts)})", table(columns, rows), ""]
     present(
         matches,
-        *(lines or [f"none of these is here or has the tag; all {len(everything)}: dynslam-bench sequences list"]),
+        *(
+            lines
+            or [
+                f"none of these is here or has the tag; all {len(everything)}: dynslam-bench sequences list"
+            ]
+        ),
     )
 
 
@@ -77,12 +99,17 @@ def info(
 @app.command()
 def fetch(
     names: Annotated[
-        list[str], typer.Argument(help="Ids or patterns such as 'bonn/*'.", autocompletion=complete_sequences)
+        list[str],
+        typer.Argument(help="Ids or patterns such as 'bonn/*'.", autocompletion=complete_sequences),
     ],
     data_root: DataRoot = None,
-    url: Annotated[Optional[str], typer.Option(help="A mirror's address of the archive.")] = None,  # noqa: UP045
-    checksum: Annotated[bool, typer.Option(help="Refuse an archive whose checksum is not the known one.")] = True,
-    keep_archive: Annotated[bool, typer.Option("--keep-archive", help="Keep the archive, too.")] = False,
+    url: Annotated[Optional[str], typer.Option(help="A mirror's address of the archive.")] = None,
+    checksum: Annotated[
+        bool, typer.Option(help="Refuse an archive whose checksum is not the known one.")
+    ] = True,
+    keep_archive: Annotated[
+        bool, typer.Option("--keep-archive", help="Keep the archive, too.")
+    ] = False,
 ) -> None:
     """Download public sequences; a call that was cut short goes on where it stopped."""
     from dynslam_bench.sequences.catalogue import expand
@@ -110,7 +137,9 @@ def fetch(
 
 @app.command()
 def verify(
-    names: Annotated[list[str], typer.Argument(help="Ids, patterns or paths.", autocompletion=complete_sequences)],
+    names: Annotated[
+        list[str], typer.Argument(help="Ids, patterns or paths.", autocompletion=complete_sequences)
+    ],
     data_root: DataRoot = None,
     camera: Camera = None,
     as_json: AsJson = False,
@@ -119,13 +148,20 @@ def verify(
     from dynslam_bench.sequences.catalogue import expand
     from dynslam_bench.sequences.fetch import verify as verify_one
 
-    reports, lines = [], []
+    reports = []
+    lines = []
     for name in expand(names):
         with progress(name) as advance:
             report = verify_one(name, data_root=data_root, camera=camera, progress=advance)
         reports.append(report)
-        verdict = "ok" if report.ok else f"{len(report.faults)} fault{'s' * (len(report.faults) != 1)}"
-        how = "every file as fetched" if report.manifest else "not fetched by this program, frames decoded only"
+        verdict = (
+            "ok" if report.ok else f"{len(report.faults)} fault{'s' * (len(report.faults) != 1)}"
+        )
+        how = (
+            "every file as fetched"
+            if report.manifest
+            else "not fetched by this program, frames decoded only"
+        )
         lines.append(f"{report.id}: {verdict}, {report.frames} frames, {how}")
         lines += [f"  {report.dropped}"] if report.dropped else []
         lines += [f"  {fault}" for fault in report.faults]
@@ -155,11 +191,15 @@ def doctor(
 
 @app.command()
 def unpack(
-    bag: Annotated[Path, typer.Argument(help="A ROS 1 .bag, a ROS 2 folder, an .mcap or .db3 file.")],
+    bag: Annotated[
+        Path, typer.Argument(help="A ROS 1 .bag, a ROS 2 folder, an .mcap or .db3 file.")
+    ],
     folder: Annotated[Path, typer.Argument(help="The folder to make, in TUM layout.")],
-    colour: Annotated[Optional[str], typer.Option(help="Topic of the colour images.")] = None,  # noqa: UP045
-    depth: Annotated[Optional[str], typer.Option(help="Topic of registered depth images.")] = None,  # noqa: UP045
-    truth: Annotated[Optional[str], typer.Option(help="Topic of the camera's true poses, or none.")] = None,  # noqa: UP045
+    colour: Annotated[Optional[str], typer.Option(help="Topic of the colour images.")] = None,
+    depth: Annotated[Optional[str], typer.Option(help="Topic of registered depth images.")] = None,
+    truth: Annotated[
+        Optional[str], typer.Option(help="Topic of the camera's true poses, or none.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Unpack a ROS bag or MCAP file into a folder that is a sequence."""
@@ -175,16 +215,22 @@ def unpack(
 
 @app.command()
 def render(
-    names: Annotated[list[str], typer.Argument(help="Such as 'synthetic/walking_xyz?scene=0&frames=600'.")],
+    names: Annotated[
+        list[str], typer.Argument(help="Such as 'synthetic/walking_xyz?scene=0&frames=600'.")
+    ],
     data_root: DataRoot = None,
-    threads: Annotated[Optional[int], typer.Option(min=1, help="Frames rendered at a time.")] = None,  # noqa: UP045
+    threads: Annotated[
+        Optional[int], typer.Option(min=1, help="Frames rendered at a time.")
+    ] = None,
 ) -> None:
     """Render sequences now, in place of when they are first read."""
     from dynslam_bench.sequences.synthetic import render_synthetic
 
     for name in names:
         with progress(name) as advance:
-            folder = render_synthetic(name, find_data_root(data_root), threads=threads, progress=advance)
+            folder = render_synthetic(
+                name, find_data_root(data_root), threads=threads, progress=advance
+            )
         note(f"{name} is in")
         write(str(folder))
 
@@ -193,8 +239,12 @@ def render(
 def compose(
     host: Name,
     folder: Annotated[Path, typer.Argument(help="The folder to make, in TUM layout.")],
-    people: Annotated[str, typer.Option("--with", help="Recording of people by a camera that does not move.")],
-    instance: Annotated[int, typer.Option(min=0, help="Which placement of one to three people.")] = 0,
+    people: Annotated[
+        str, typer.Option("--with", help="Recording of people by a camera that does not move.")
+    ],
+    instance: Annotated[
+        int, typer.Option(min=0, help="Which placement of one to three people.")
+    ] = 0,
     frames: Frames = None,
     data_root: DataRoot = None,
     as_json: AsJson = False,
@@ -203,23 +253,30 @@ def compose(
     from dynslam_bench.sequences import open_sequence
     from dynslam_bench.sequences.compose import compose as paste
 
-    opened = open_sequence(host, data_root=data_root, frames=frames), open_sequence(people, data_root=data_root)
+    opened = (
+        open_sequence(host, data_root=data_root, frames=frames),
+        open_sequence(people, data_root=data_root),
+    )
     with progress(str(folder)) as advance:
         made = paste(*opened, folder, instance, progress=advance)
-    share = (
-        f"people fill {100 * made.share:.0f} % of the pixels on average and {100 * made.largest_share:.0f} % at most"
+    average = f"{100 * made.share:.0f} % of the pixels on average"
+    largest = f"{100 * made.largest_share:.0f} % at most"
+    present(
+        made,
+        f"{made.folder}: {made.frames} frames, people fill {average} and {largest}",
     )
-    present(made, f"{made.folder}: {made.frames} frames, {share}")
 
 
 @app.command()
 def calibrate(
-    name: Annotated[str, typer.Argument(help="Path or id of a recording.", autocompletion=complete_sequences)],
+    name: Annotated[
+        str, typer.Argument(help="Path or id of a recording.", autocompletion=complete_sequences)
+    ],
     data_root: DataRoot = None,
     camera: Camera = None,
     frames: Frames = None,
     output: Annotated[
-        Optional[Path],  # noqa: UP045
+        Optional[Path],
         typer.Option(help="Write the camera, with what was measured, to this camera.toml."),
     ] = None,
     as_json: AsJson = False,
@@ -252,7 +309,9 @@ def _calibrated(quantity: Quantity) -> tuple[str, ...]:
     """A row of the table of `calibrate`."""
     scale, unit = (1.0, "a metre") if quantity.name == "depth_factor" else (1e3, "ms")
     value = "" if quantity.value is None else f"{scale * quantity.value:.4g} {unit}"
-    limits = [f"{scale * limit:.4g}" for limit in (quantity.low, quantity.high) if limit is not None]
+    limits = [
+        f"{scale * limit:.4g}" for limit in (quantity.low, quantity.high) if limit is not None
+    ]
     kept = "kept" if quantity.observable else "not observable"
     written = kept if quantity.written is None else f"{quantity.written:g}"
     return (

@@ -12,7 +12,16 @@ import typer
 
 from dynslam_bench import tuning
 from dynslam_bench.cli.options import AsJson, Jobs, Results
-from dynslam_bench.cli.output import Advance, announce, fields, note, present, progress, table, write
+from dynslam_bench.cli.output import (
+    Advance,
+    announce,
+    fields,
+    note,
+    present,
+    progress,
+    table,
+    write,
+)
 from dynslam_bench.cli.running import event_text
 from dynslam_bench.cli.trackers import range_text
 from dynslam_bench.core import write_atomic
@@ -20,7 +29,9 @@ from dynslam_bench.core import write_atomic
 if TYPE_CHECKING:
     from dynslam_bench.runs import RunEvent
 
-app = typer.Typer(help="Studies: tune a tracker's settings through its environment.", no_args_is_help=True)
+app = typer.Typer(
+    help="Studies: tune a tracker's settings through its environment.", no_args_is_help=True
+)
 Study = Annotated[Path, typer.Argument(metavar="STUDY.toml", help="The study.")]
 
 
@@ -30,19 +41,24 @@ def silence_optuna() -> None:
     import optuna
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    logging.getLogger("optuna.visualization").setLevel(logging.ERROR)  # it warns of trials that pruning never saw
+    # it warns of trials that pruning never saw
+    logging.getLogger("optuna.visualization").setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
 
 
 @app.command()
-def space(study: Study, results: Results = Path("results"), jobs: Jobs = 1, as_json: AsJson = False) -> None:
+def space(
+    study: Study, results: Results = Path("results"), jobs: Jobs = 1, as_json: AsJson = False
+) -> None:
     """Show which settings a study tunes, what its scenes could show, and how long it takes."""
     plan = tuning.Plan(tuning.read_study(study), results)
     preview = plan.preview(jobs)
 
     rows = [(p.name, range_text(p), plan.base[p.name], p.unit, p.meaning) for p in plan.space]
     shown = table(("setting", "range", "baseline", "unit", "meaning"), rows)
-    present({"settings": plan.space, "preview": preview}, shown, "", *preview.figures, *preview.proposal)
+    present(
+        {"settings": plan.space, "preview": preview}, shown, "", *preview.figures, *preview.proposal
+    )
 
 
 @app.command()
@@ -50,7 +66,9 @@ def run(
     study: Study,
     results: Results = Path("results"),
     jobs: Jobs = 1,
-    trials: Annotated[Optional[int], typer.Option(min=2, help="Finished trials, in place of the file's.")] = None,  # noqa: UP045
+    trials: Annotated[
+        Optional[int], typer.Option(min=2, help="Finished trials, in place of the file's.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Run a study or continue it; then check the best on the held-out split, and write the page."""
@@ -62,7 +80,9 @@ def extend(
     study: Study,
     results: Results = Path("results"),
     jobs: Jobs = 1,
-    scenes: Annotated[int, typer.Option(min=0, help="Further rendered scenes to choose and to judge on.")] = 0,
+    scenes: Annotated[
+        int, typer.Option(min=0, help="Further rendered scenes to choose and to judge on.")
+    ] = 0,
     trials: Annotated[int, typer.Option(min=0, help="Further trials.")] = 0,
     as_json: AsJson = False,
 ) -> None:
@@ -76,7 +96,15 @@ def _tune(study: Path, results: Path, jobs: int, **how: Any) -> None:
     spec = tuning.read_study(study)
     with progress(f"study {spec.name}") as advance:
         bar = StudyBar(advance)
-        outcome = tune(spec, results=results, jobs=jobs, on_event=bar.event, on_run=bar.run, on_note=bar.note, **how)
+        outcome = tune(
+            spec,
+            results=results,
+            jobs=jobs,
+            on_event=bar.event,
+            on_run=bar.run,
+            on_note=bar.note,
+            **how,
+        )
     show_summary(outcome.tuner, outcome.summary, outcome.page)
 
 
@@ -86,7 +114,9 @@ def worker(study: Study, results: Results = Path("results"), jobs: Jobs = 1) -> 
     spec = tuning.read_study(study)
     with progress(f"study {spec.name}") as advance:
         bar = StudyBar(advance)
-        tuner = tuning.run_study(spec, results=results, jobs=jobs, on_event=bar.event, on_run=bar.run)
+        tuner = tuning.run_study(
+            spec, results=results, jobs=jobs, on_event=bar.event, on_run=bar.run
+        )
     write(f"study '{spec.name}' has its {tuner.trials} trials")
 
 
@@ -102,7 +132,9 @@ def status(study: Study, results: Results = Path("results"), as_json: AsJson = F
         "asked_for": stored.spec.trials + extension_of(stored.study)["trials"],
     }
     facts |= count_states(stored.study)
-    facts["running_trials"] = [f"{number} ({state})" for number, state in Heartbeats(stored.study).running().items()]
+    facts["running_trials"] = [
+        f"{number} ({state})" for number, state in Heartbeats(stored.study).running().items()
+    ]
     settings: dict[str, Any] = {}
     summary = stored.folder / "summary.json"
     conclusion = tuning.StudySummary.read(summary) if summary.is_file() else None
@@ -111,7 +143,10 @@ def status(study: Study, results: Results = Path("results"), as_json: AsJson = F
         settings = conclusion.best.params
     else:
         for trial in best_trials(stored.study, 1):
-            facts |= {"best_trial": trial.number, "best_ratios": [math.exp(value) for value in trial.values]}
+            facts |= {
+                "best_trial": trial.number,
+                "best_ratios": [math.exp(value) for value in trial.values],
+            }
             settings = trial.params
     lines = ["", table(("setting", "value"), list(settings.items()))] if settings else []
     present(facts | {"best_settings": settings}, fields(facts), *lines)
@@ -121,8 +156,12 @@ def status(study: Study, results: Results = Path("results"), as_json: AsJson = F
 def best(
     study: Study,
     results: Results = Path("results"),
-    trial: Annotated[Optional[int], typer.Option(min=0, help="Of a trial, in place of the best.")] = None,  # noqa: UP045
-    output: Annotated[Optional[Path], typer.Option("-o", "--output", help="Write the preset there.")] = None,  # noqa: UP045
+    trial: Annotated[
+        Optional[int], typer.Option(min=0, help="Of a trial, in place of the best.")
+    ] = None,
+    output: Annotated[
+        Optional[Path], typer.Option("-o", "--output", help="Write the preset there.")
+    ] = None,
 ) -> None:
     """Write a study's settings as a preset that `run --settings` takes."""
     text = tuning.read_preset_text(tuning.read_study(study), results, trial)
@@ -139,8 +178,10 @@ class StudyBar:
     """
 
     def __init__(self, advance: Advance) -> None:
-        self._advance, self._runs = advance, 0
-        self._part, self._at = "baseline", (0.0, None)
+        self._advance = advance
+        self._runs = 0
+        self._part = "baseline"
+        self._at = (0.0, None)
 
     def event(self, event: tuning.StudyEvent) -> None:
         """A trial has started or finished, or the study has begun another part."""
@@ -159,10 +200,14 @@ class StudyBar:
     def run(self, event: RunEvent) -> None:
         """A run has started, progressed or finished."""
         self._runs += event.kind == "finished"
-        self._advance(*self._at, f"{self._part}, {self._runs} run{'s' * (self._runs != 1)} made: {event_text(event)}")
+        self._advance(
+            *self._at,
+            f"{self._part}, {self._runs} run{'s' * (self._runs != 1)} made: {event_text(event)}",
+        )
 
     def _begin(self, part: str, done: float, total: Any) -> None:
-        self._part, self._at = part, (done, total)
+        self._part = part
+        self._at = (done, total)
         self._advance(done, total, part)
 
 

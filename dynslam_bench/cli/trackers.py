@@ -25,9 +25,13 @@ if TYPE_CHECKING:
     from dynslam_bench.testing import Check
     from dynslam_bench.trackers import TrackerSpec
 
-Tracker = Annotated[str, typer.Argument(help="Id, module:Attr or file.py:Attr.", autocompletion=complete_trackers)]
+Tracker = Annotated[
+    str, typer.Argument(help="Id, module:Attr or file.py:Attr.", autocompletion=complete_trackers)
+]
 
-app = typer.Typer(help="Trackers: what there is, why one is missing, how to make one.", no_args_is_help=True)
+app = typer.Typer(
+    help="Trackers: what there is, why one is missing, how to make one.", no_args_is_help=True
+)
 
 
 @app.command("list")
@@ -53,9 +57,13 @@ def list_(as_json: AsJson = False) -> None:
     for kind, families in tracker_groups().items():
         lines += [f"{kind}:"] if families else []
         for spec, *variants in families:
-            lines.append(f"  {spec.id:18} {spec.label}{'' if spec.missing() == [] else ' (not installed)'}")
+            lines.append(
+                f"  {spec.id:18} {spec.label}{'' if spec.missing() == [] else ' (not installed)'}"
+            )
             if variants:
-                lines.append(f"  {'':18} {'  '.join(variant.id.removeprefix(spec.id) for variant in variants)}")
+                lines.append(
+                    f"  {'':18} {'  '.join(variant.id.removeprefix(spec.id) for variant in variants)}"
+                )
     present(rows, *lines)
 
 
@@ -67,9 +75,14 @@ def info(tracker: Tracker, as_json: AsJson = False) -> None:
     from dynslam_bench.trackers import TRACKERS
 
     spec = TRACKERS.get(tracker)
-    reported, defaults = _published(spec), flatten(spec.settings())
+    reported = _published(spec)
+    defaults = flatten(spec.settings())
     shown = parameters(spec.settings)
-    shown += [parameter for parameter in parameters(spec.settings, online_only=True) if not parameter.tunable]
+    shown += [
+        parameter
+        for parameter in parameters(spec.settings, online_only=True)
+        if not parameter.tunable
+    ]
     described = {parameter.name: asdict(parameter) for parameter in shown}
     facts: dict[str, Any] = {
         "id": spec.id,
@@ -91,20 +104,38 @@ def info(tracker: Tracker, as_json: AsJson = False) -> None:
         "remarks": spec.remarks,
         "settings": defaults,
         "parameters": [
-            {"name": name, "default": default, "tunable": False, "online": False} | described.get(name, {})
+            {"name": name, "default": default, "tunable": False, "online": False}
+            | described.get(name, {})
             for name, default in defaults.items()
         ],
         "reported": reported,
     }
     fixed = len(defaults) - len(shown)
-    sources = [f"{source} ({count})" for source, count in Counter(row["source"] for row in reported).items()]
+    sources = [
+        f"{source} ({count})"
+        for source, count in Counter(row["source"] for row in reported).items()
+    ]
     rows = [(p.name, p.default, range_text(p), p.unit, p.online, p.meaning) for p in shown]
     present(
         facts | details,
-        fields(facts | {f"preset {name}": ", ".join(assignments(values)) for name, values in spec.presets.items()}),
-        *([table(("setting", "default", "range", "unit", "online", "meaning"), rows)] if rows else []),
+        fields(
+            facts
+            | {
+                f"preset {name}": ", ".join(assignments(values))
+                for name, values in spec.presets.items()
+            }
+        ),
+        *(
+            [table(("setting", "default", "range", "unit", "online", "meaning"), rows)]
+            if rows
+            else []
+        ),
         *([f"and {fixed} more settings that no study tunes: see --json"] if fixed else []),
-        *([wrapped(f"numbers reported in: {', '.join(sources)}; --json lists them")] if sources else []),
+        *(
+            [wrapped(f"numbers reported in: {', '.join(sources)}; --json lists them")]
+            if sources
+            else []
+        ),
     )
 
 
@@ -120,15 +151,29 @@ def _published(spec: TrackerSpec) -> list[dict[str, Any]]:
     from dynslam_bench.reports.model.published import CLAIMED, claimed, published
 
     stated = [
-        (name, metric, value, "its spec", "") for name, row in spec.reported.items() for metric, value in row.items()
+        (name, metric, value, "its spec", "")
+        for name, row in spec.reported.items()
+        for metric, value in row.items()
     ]
     measured = [
-        (p.sequence, p.metric, p.value, p.source, "; ".join(str(text) for text in (p.alignment, p.remarks) if text))
+        (
+            p.sequence,
+            p.metric,
+            p.value,
+            p.source,
+            "; ".join(str(text) for text in (p.alignment, p.remarks) if text),
+        )
         for p in published().itertuples()
         if p.system in spec.published_as
     ]
     paper = [
-        (c.sequence, c.quantity, c.value, f"EMFOA-OFT-SLAM, table {c.table}", f"{CLAIMED}: see 'report audit-paper'")
+        (
+            c.sequence,
+            c.quantity,
+            c.value,
+            f"EMFOA-OFT-SLAM, table {c.table}",
+            f"{CLAIMED}: see 'report audit-paper'",
+        )
         for c in claimed().itertuples()
         if c.system in spec.published_as and c.kind == "value"
     ]
@@ -142,7 +187,13 @@ def doctor(as_json: AsJson = False) -> None:
     from dynslam_bench.testing.installation import unavailable_plugins
 
     plugins = unavailable_plugins()
-    present(plugins, *([f"{plugin.name}: {plugin.hint}" for plugin in plugins] or ["all plug-ins are available"]))
+    present(
+        plugins,
+        *(
+            [f"{plugin.name}: {plugin.hint}" for plugin in plugins]
+            or ["all plug-ins are available"]
+        ),
+    )
 
 
 @app.command()
@@ -152,7 +203,10 @@ def test(
     settings: SettingsFile = None,
     frames: Annotated[int, typer.Option(min=2, help="Frames of each check.")] = 6,
     time_limit: Annotated[
-        float, typer.Option(min=0.1, help="Seconds for a frame or another step; five times that for the first.")
+        float,
+        typer.Option(
+            min=0.1, help="Seconds for a frame or another step; five times that for the first."
+        ),
     ] = 60.0,
     memory_limit: MemoryLimit = None,
     as_json: AsJson = False,

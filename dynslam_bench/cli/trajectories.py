@@ -27,14 +27,18 @@ if TYPE_CHECKING:
     from dynslam_bench.evaluation import Evaluation, Hint
     from dynslam_bench.geometry import TumFile
 
-protocols = typer.Typer(help="How errors are measured, and how much that alone changes.", no_args_is_help=True)
+protocols = typer.Typer(
+    help="How errors are measured, and how much that alone changes.", no_args_is_help=True
+)
 Estimate = Annotated[
     Path,
-    typer.Argument(help="A trajectory: TUM, EuRoC, VSLAM-LAB, a bag; KITTI or COLMAP with --timestamps."),
+    typer.Argument(
+        help="A trajectory: TUM, EuRoC, VSLAM-LAB, a bag; KITTI or COLMAP with --timestamps."
+    ),
 ]
 GroundTruth = Annotated[Path, typer.Argument(help="Ground truth, in any of these formats.")]
 Topics = Annotated[
-    Optional[list[str]],  # noqa: UP045
+    Optional[list[str]],
     typer.Option("--topic", help="Topic of a bag's poses; a second one for the truth's."),
 ]
 
@@ -69,7 +73,9 @@ def read_pair(
     return loaded, truth
 
 
-def scored_with_hints(loaded: TumFile, truth: TumFile, protocol: str) -> tuple[Evaluation, tuple[Hint, ...]]:
+def scored_with_hints(
+    loaded: TumFile, truth: TumFile, protocol: str
+) -> tuple[Evaluation, tuple[Hint, ...]]:
     """The evaluation of a file under a protocol, and the hints on it."""
     from dynslam_bench.evaluation import get_protocol, hints
     from dynslam_bench.evaluation.comparison import truth_of_file
@@ -98,7 +104,10 @@ def list_(as_json: AsJson = False) -> None:
         [{"digest": protocol.digest(), **protocol.model_dump()} for protocol in PROTOCOLS.values()],
         table(
             ("id", "digest", "meaning"),
-            [(protocol.id, protocol.digest(), protocol.describe()) for protocol in PROTOCOLS.values()],
+            [
+                (protocol.id, protocol.digest(), protocol.describe())
+                for protocol in PROTOCOLS.values()
+            ],
         ),
     )
 
@@ -108,8 +117,11 @@ def compare(
     estimate: Estimate,
     ground_truth: GroundTruth,
     published: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option(metavar="METRES", help="A published error as printed, e.g. 0.0733: mark the rows that agree."),
+        Optional[str],
+        typer.Option(
+            metavar="METRES",
+            help="A published error as printed, e.g. 0.0733: mark the rows that agree.",
+        ),
     ] = None,
     timestamps: Timestamps = None,
     topic: Topics = None,
@@ -129,9 +141,15 @@ def compare(
     marks = [agrees(score, published) for score in scores]
     defined = [score for score in scores if score.rmse_m is not None]
     nearest = min(defined, key=lambda score: abs((score.rmse_m or 0.0) - float(published)))
-    last = f"No row agrees with {published}; the nearest is {nearest.label}, {nearest.rmse_m:.6f}." * (not any(marks))
+    last = (
+        f"No row agrees with {published}; the nearest is {nearest.label}, {nearest.rmse_m:.6f}."
+        * (not any(marks))
+    )
     columns.insert(2, "published")
-    rows = [[*row[:2], "agrees" if mark else "", *row[2:]] for row, mark in zip(rows, marks, strict=True)]
+    rows = [
+        [*row[:2], "agrees" if mark else "", *row[2:]]
+        for row, mark in zip(rows, marks, strict=True)
+    ]
     present(
         [{**asdict(score), "agrees": mark} for score, mark in zip(scores, marks, strict=True)],
         table(columns, rows),
@@ -143,13 +161,20 @@ def compare(
 def import_(
     trajectory: Annotated[
         Path,
-        typer.Argument(help="TUM's, KITTI's (--timestamps), EuRoC's or VSLAM-LAB's csv, COLMAP's text, a bag, MCAP."),
+        typer.Argument(
+            help="TUM's, KITTI's (--timestamps), EuRoC's or VSLAM-LAB's csv, COLMAP's text, a bag, MCAP."
+        ),
     ],
     tracker: Annotated[str, typer.Option(help="Name of the system that made it.")],
-    sequence: Annotated[str, typer.Option(help="Id or folder of the sequence that it was made on.")],
+    sequence: Annotated[
+        str, typer.Option(help="Id or folder of the sequence that it was made on.")
+    ],
     label: Annotated[str, typer.Option(help="Name for tables.")] = "",
     provenance: Annotated[
-        str, typer.Option(help="Where it comes from, e.g. a URL; an export's own provenance.json says it, too.")
+        str,
+        typer.Option(
+            help="Where it comes from, e.g. a URL; an export's own provenance.json says it, too."
+        ),
     ] = "",
     online: Annotated[
         bool, typer.Option("--online/--final", help="Causal poses, or those after optimisation.")
@@ -161,10 +186,12 @@ def import_(
     stride: Stride = 1,
     protocol: ProtocolId = "tum-rgbd/v1",
     timestamps: Timestamps = None,
-    topic: Annotated[Optional[str], typer.Option(help="Of a bag: the topic of the poses.")] = None,  # noqa: UP045
+    topic: Annotated[Optional[str], typer.Option(help="Of a bag: the topic of the poses.")] = None,
     truth: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option(help="Ground truth of a sequence whose images are not here; coverage is unknown then."),
+        Optional[Path],
+        typer.Option(
+            help="Ground truth of a sequence whose images are not here; coverage is unknown then."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -200,14 +227,22 @@ def export(
             autocompletion=names_of("runs.exchange.transfer:FORMATS"),
         ),
     ],
-    run: Annotated[str, typer.Argument(help="The run's id, its first digits, or latest.")] = "latest",
+    run: Annotated[
+        str, typer.Argument(help="The run's id, its first digits, or latest.")
+    ] = "latest",
     output: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option("--output", "-o", help="Folder to write; default exports/RUN/FORMAT of the results folder."),
+        Optional[Path],
+        typer.Option(
+            "--output",
+            "-o",
+            help="Folder to write; default exports/RUN/FORMAT of the results folder.",
+        ),
     ] = None,
     online: Annotated[
-        Optional[bool],  # noqa: UP045
-        typer.Option("--online/--final", help="Which trajectory; default the final one, else the online one."),
+        Optional[bool],
+        typer.Option(
+            "--online/--final", help="Which trajectory; default the final one, else the online one."
+        ),
     ] = None,
     results: Results = Path("results"),
     data_root: DataRoot = None,
@@ -215,8 +250,12 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write a stored run in a format of other tools, with its provenance beside it."""
-    which: Literal["online", "final"] | None = None if online is None else ("online" if online else "final")
-    exported = runs.export_run(run, form, output, results=results, which=which, data_root=data_root, camera=camera)
+    which: Literal["online", "final"] | None = (
+        None if online is None else ("online" if online else "final")
+    )
+    exported = runs.export_run(
+        run, form, output, results=results, which=which, data_root=data_root, camera=camera
+    )
     present(exported, *(str(exported.folder / name) for name in exported.files))
     for line in exported.notes:
         announce(line)

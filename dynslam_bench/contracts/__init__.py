@@ -11,8 +11,8 @@ Importing this package loads neither torch nor OpenCV, numba, scipy, Gymnasium o
 | features | `FeatureSpec` | `FeatureExtractor` | a grey image; `Keypoints` |
 | filter | none: a tracker is composed of filters | `DynamicFilter` | `FrameBundle`, `FilterState`; `FilterResult` |
 
-`docs/reference/plugins.md` lists them, the pages in `docs/how-to/` show one of each. The registries, which find
-plug-ins by id, are in the packages of their kind.
+`docs/reference/plugins.md` lists them, the pages in `docs/how-to/` show one of each. The
+registries, which find plug-ins by id, are in the packages of their kind.
 
 Example:
     >>> from dynslam_bench.contracts import TrackerSpec
@@ -21,8 +21,20 @@ Example:
 """
 
 from dynslam_bench.contracts.checks import TrackerContractError
-from dynslam_bench.contracts.features import FeatureExtractor, FeatureSpec, Keypoints, MaskedExtractor
-from dynslam_bench.contracts.filter import DynamicFilter, FilterResult, FilterState, FrameBundle, KeyframeView, Need
+from dynslam_bench.contracts.features import (
+    FeatureExtractor,
+    FeatureSpec,
+    Keypoints,
+    MaskedExtractor,
+)
+from dynslam_bench.contracts.filter import (
+    DynamicFilter,
+    FilterResult,
+    FilterState,
+    FrameBundle,
+    KeyframeView,
+    Need,
+)
 from dynslam_bench.contracts.flow import FlowEstimator, FlowResult, FlowSpec
 from dynslam_bench.contracts.segmenter import Instances, Segmenter, SegmenterContext, SegmenterSpec
 from dynslam_bench.contracts.sequence import (

@@ -1,7 +1,7 @@
 """What is demanded of a tracker's results: written once, for the environment and for the conformance suite.
 
-A *fault* makes a run ``invalid``: the environment refuses the result. A *blemish* is refused by the conformance suite
-only: no number is wrong because of it.
+A *fault* makes a run ``invalid``: the environment refuses the result. A *blemish* is refused by the
+conformance suite only: no number is wrong because of it.
 """
 
 import math
@@ -49,21 +49,31 @@ def check_frame(frame: Frame, camera: Camera) -> None:
     """Refuse what is no frame of this camera.
 
     Raises:
-        SequenceError: Colour is not uint8, depth no floating point in metres, sizes differ from the camera's, or the
-            timestamp is not finite.
+        SequenceError: Colour is not uint8, depth no floating point in metres, sizes differ from the
+            camera's, or the timestamp is not finite.
     """
-    rgb, depth = np.asarray(frame.rgb), np.asarray(frame.depth)
+    rgb = np.asarray(frame.rgb)
+    depth = np.asarray(frame.depth)
     if rgb.dtype != np.uint8:
-        raise SequenceError(f"frame {frame.index} has colour of type {rgb.dtype}", "it must be uint8")
+        raise SequenceError(
+            f"frame {frame.index} has colour of type {rgb.dtype}", "it must be uint8"
+        )
     if depth.dtype.kind != "f":
-        raise SequenceError(f"frame {frame.index} has depth of type {depth.dtype}", "it must be float32, in metres")
-    if rgb.shape != (camera.height, camera.width, 3) or depth.shape != (camera.height, camera.width):
+        raise SequenceError(
+            f"frame {frame.index} has depth of type {depth.dtype}", "it must be float32, in metres"
+        )
+    if rgb.shape != (camera.height, camera.width, 3) or depth.shape != (
+        camera.height,
+        camera.width,
+    ):
         raise SequenceError(
             f"frame {frame.index} has colour {rgb.shape} and depth {depth.shape}, "
             f"the camera is {camera.width}x{camera.height}"
         )
     if not np.isfinite(frame.timestamp):
-        raise SequenceError(f"frame {frame.index} has the timestamp {frame.timestamp}", "it must be finite seconds")
+        raise SequenceError(
+            f"frame {frame.index} has the timestamp {frame.timestamp}", "it must be finite seconds"
+        )
 
 
 @dataclass(frozen=True)
@@ -103,10 +113,15 @@ def faults(result: object, frame: Frame) -> Iterator[Fault]:
     for name, values in numbers.items():
         if not isinstance(values, Mapping):
             yield Fault(f"{name} of type {type(values).__name__}", "expected numbers by name")
-        elif bad := {key: value for key, value in values.items() if not isinstance(value, Real | np.bool_)}:
+        elif bad := {
+            key: value for key, value in values.items() if not isinstance(value, Real | np.bool_)
+        }:
             yield Fault(f"{name} with values that are no numbers: {bad}")
-    xy, keep = result.keypoints_xy, result.keypoints_keep
-    if xy is not None and (not isinstance(xy, np.ndarray) or xy.dtype.kind not in "fiu" or xy.shape[1:] != (2,)):
+    xy = result.keypoints_xy
+    keep = result.keypoints_keep
+    if xy is not None and (
+        not isinstance(xy, np.ndarray) or xy.dtype.kind not in "fiu" or xy.shape[1:] != (2,)
+    ):
         yield Fault(
             f"keypoints_xy of shape {np.shape(xy)} as {getattr(xy, 'dtype', type(xy).__name__)}",
             "expected numbers [N, 2]",
@@ -127,7 +142,9 @@ def blemishes(result: TrackResult) -> Iterator[Fault]:
         yield Fault("a timing that is negative")
     mask = result.dynamic_mask
     if mask is not None and getattr(mask, "dtype", None) != np.bool_:
-        yield Fault(f"a dynamic mask of type {getattr(mask, 'dtype', type(mask).__name__)}, expected bool")
+        yield Fault(
+            f"a dynamic mask of type {getattr(mask, 'dtype', type(mask).__name__)}, expected bool"
+        )
 
 
 def trajectory_faults(trajectory: object) -> Iterator[Fault]:
@@ -151,7 +168,9 @@ def check_result(result: object, frame: Frame, tracker: str) -> TrackResult:
         TrackerContractError: It has a fault.
     """
     for fault in faults(result, frame):
-        raise TrackerContractError(f"tracker '{tracker}' at frame {frame.index} returned {fault.found}", fault.cause)
+        raise TrackerContractError(
+            f"tracker '{tracker}' at frame {frame.index} returned {fault.found}", fault.cause
+        )
     assert isinstance(result, TrackResult)
     stats = {str(key): float(value) for key, value in result.stats.items() if math.isfinite(value)}
     pose = None if result.T_world_cam is None else np.asarray(result.T_world_cam, dtype=np.float64)
@@ -178,17 +197,27 @@ def check_trajectory(trajectory: object, tracker: str) -> Trajectory:
         TrackerContractError: It has one.
     """
     for fault in trajectory_faults(trajectory):
-        raise TrackerContractError(f"tracker '{tracker}' in finalize() returned {fault.found}", fault.cause)
+        raise TrackerContractError(
+            f"tracker '{tracker}' in finalize() returned {fault.found}", fault.cause
+        )
     assert isinstance(trajectory, Trajectory)
     return trajectory
 
 
 def _pose_faults(pose: object) -> Iterator[Fault]:
     if not isinstance(pose, np.ndarray) or pose.shape != (4, 4):
-        kind = f"an array of shape {pose.shape}" if isinstance(pose, np.ndarray) else f"a {type(pose).__name__}"
+        kind = (
+            f"an array of shape {pose.shape}"
+            if isinstance(pose, np.ndarray)
+            else f"a {type(pose).__name__}"
+        )
         yield Fault(f"{kind} as pose, expected a 4x4 matrix")
-    elif pose.dtype.kind not in "fiu" or pose.dtype == np.float16:  # positions in float16 are rounded to millimetres
-        yield Fault(f"a pose of the type {pose.dtype}, expected real numbers of enough digits", "return float64")
+    # positions in float16 are rounded to millimetres
+    elif pose.dtype.kind not in "fiu" or pose.dtype == np.float16:
+        yield Fault(
+            f"a pose of the type {pose.dtype}, expected real numbers of enough digits",
+            "return float64",
+        )
     elif not np.isfinite(pose).all():
         yield Fault(
             f"a pose with {np.count_nonzero(~np.isfinite(pose))} values that are not finite",

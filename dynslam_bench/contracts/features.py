@@ -33,7 +33,11 @@ class Keypoints:
     def select(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> Keypoints:
         """The keypoints at an index or mask."""
         return Keypoints(
-            self.xy[index], self.octave[index], self.angle[index], self.response[index], self.descriptors[index]
+            self.xy[index],
+            self.octave[index],
+            self.angle[index],
+            self.response[index],
+            self.descriptors[index],
         )
 
 
@@ -43,8 +47,8 @@ class FeatureSpec:
 
     Attributes:
         id: Name that `FeatureSettings.extractor` takes.
-        entry_point: ``"module:factory"``; called as ``factory(settings: FeatureSettings)``, returns a
-            `FeatureExtractor`.
+        entry_point: ``"module:factory"``; called as ``factory(settings: FeatureSettings)``, returns
+            a `FeatureExtractor`.
         summary: One line.
         descriptor_bytes: Length of a descriptor, packed bits compared by Hamming distance.
         license: SPDX id or remark.
@@ -69,7 +73,9 @@ class FeatureExtractor(Protocol):
 class MaskedExtractor(FeatureExtractor, Protocol):
     """An extractor that can see to it that what lies on a mask takes no place of what lies outside."""
 
-    def extract_masked(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float) -> Keypoints:
+    def extract_masked(
+        self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float
+    ) -> Keypoints:
         """As `extract`; where less than a share of the keypoints sought lies outside, all are sought there too.
 
         Args:
@@ -78,6 +84,6 @@ class MaskedExtractor(FeatureExtractor, Protocol):
             share: In [0, 1].
 
         Returns:
-            The keypoints of `extract` on the mask, and outside it those of `extract` or as many as it would find if
-            nothing else were in the image; in the order of `extract`.
+            The keypoints of `extract` on the mask, and outside it those of `extract` or as many as
+            it would find if nothing else were in the image; in the order of `extract`.
         """

@@ -16,7 +16,9 @@ from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.geometry import Camera
 
-Need = Literal["masks", "boxes", "depth", "previous", "flow", "prediction", "keyframes", "map_points"]
+Need = Literal[
+    "masks", "boxes", "depth", "previous", "flow", "prediction", "keyframes", "map_points"
+]
 """What a filter asks for: `FilterState` and `FrameBundle` hold it."""
 
 
@@ -34,7 +36,8 @@ class FrameBundle:
         xy: float64 ``[N, 2]``, undistorted pixels of the keypoints.
         z: float32 ``[N]``, depth at the keypoints, metres, 0 missing.
         instances: What the segmenter found; None if no segmenter ran.
-        mask: bool ``[H, W]``, the pixels held for dynamic because of what they show, dilated; None if nobody asked.
+        mask: bool ``[H, W]``, the pixels held for dynamic because of what they show, dilated; None
+            if nobody asked.
     """
 
     index: int
@@ -59,7 +62,8 @@ class KeyframeView:
     Attributes:
         T_world_cam: Camera-to-world pose ``[4, 4]``.
         keypoints: Its features (raw pixels).
-        xy: float64 ``[N, 2]`` undistorted pixels; of a rolling shutter as the middle row's camera would have seen them.
+        xy: float64 ``[N, 2]`` undistorted pixels; of a rolling shutter as the middle row's camera
+            would have seen them.
         z: float32 ``[N]`` depth at the keypoints in metres, 0 missing; likewise.
         depth: float32 ``[H, W]`` metres, or None where the keyframe no longer keeps its image.
         timestamp: Seconds.
@@ -83,12 +87,16 @@ class FilterState:
         previous: The previous frame, None on the first.
         previous_keep: bool, which keypoints of the previous frame were kept.
         T_world_prev: Pose of the previous frame, None if it was not tracked.
-        T_world_pred: Pose predicted for this frame by the motion model; None without one, and while the camera is lost.
-        motion_covariance: Covariance ``[6, 6]`` of the predicted motion since the previous frame: position in the world
-            (m), rotation in the camera's frame (rad); None where the motion model knows nothing.
-        flow: Flow of this frame's keypoints *to the previous image* (raw pixels); None until the flow stage ran.
+        T_world_pred: Pose predicted for this frame by the motion model; None without one, and while
+            the camera is lost.
+        motion_covariance: Covariance ``[6, 6]`` of the predicted motion since the previous frame:
+            position in the world (m), rotation in the camera's frame (rad); None where the motion
+            model knows nothing.
+        flow: Flow of this frame's keypoints *to the previous image* (raw pixels); None until the
+            flow stage ran.
         keyframes: The latest keyframes of the map that the camera is in, newest first.
-        map_points: int64 ``[M]`` ids and float64 ``[M, 3]`` positions of that map's points, or None.
+        map_points: int64 ``[M]`` ids and float64 ``[M, 3]`` positions of that map's points, or
+            None.
         seed: Seed of everything random a filter does on this frame.
     """
 
@@ -116,13 +124,17 @@ class FilterResult:
     """A filter's verdict.
 
     Attributes:
-        keep: bool ``[N]``; False = dynamic. A filter only judges; what earlier filters dropped stays dropped.
-        weight: float32 ``[N]`` in [0, 1], confidence that the point is static: scales what the point tells the pose
-            optimiser, and with it, as in g2o, the error at which it counts as an outlier.
-        stats: Counts and reasons, e.g. ``{"dropped": 41.0, "degenerate": 0.0}``; the same keys on every frame. A filter
-            that tests against a fundamental matrix says with ``f_asked`` (1 where there was something to test) and
-            ``f_judged`` (1 where the matrix was used) on how many frames it did.
-        mask: bool ``[H, W]`` of pixels that the filter holds for dynamic, where it has an opinion on pixels.
+        keep: bool ``[N]``; False = dynamic. A filter only judges; what earlier filters dropped
+            stays dropped.
+        weight: float32 ``[N]`` in [0, 1], confidence that the point is static: scales what the
+            point tells the pose optimiser, and with it, as in g2o, the error at which it counts as
+            an outlier.
+        stats: Counts and reasons, e.g. ``{"dropped": 41.0, "degenerate": 0.0}``; the same keys on
+            every frame. A filter that tests against a fundamental matrix says with ``f_asked`` (1
+            where there was something to test) and ``f_judged`` (1 where the matrix was used) on how
+            many frames it did.
+        mask: bool ``[H, W]`` of pixels that the filter holds for dynamic, where it has an opinion
+            on pixels.
     """
 
     keep: NDArray[np.bool_]
@@ -149,8 +161,10 @@ class DynamicFilter(Protocol):
 
     Attributes:
         name: Short name, the prefix of its stats.
-        needs: What must be there for it to work; `FilterState` fields that are None make it keep all.
-        stats_names: Names of the stats that every verdict holds, with the ``dropped`` that `FilterResult.of` adds.
+        needs: What must be there for it to work; `FilterState` fields that are None make it keep
+            all.
+        stats_names: Names of the stats that every verdict holds, with the ``dropped`` that
+            `FilterResult.of` adds.
     """
 
     name: str

@@ -13,9 +13,11 @@ class FlowResult:
     """Correspondences of N points.
 
     Attributes:
-        xy: float32 ``[N, 2]``, where each point lies in the target image, pixels; undefined where not valid.
+        xy: float32 ``[N, 2]``, where each point lies in the target image, pixels; undefined where
+            not valid.
         valid: bool ``[N]``, found and consistent (forward-backward check where the method has one).
-        cost: float32 ``[N]``, the method's matching cost (lower is better), comparable within one result only.
+        cost: float32 ``[N]``, the method's matching cost (lower is better), comparable within one
+            result only.
         stats: Diagnostics, e.g. ``{"evaluations": 120000.0, "valid": 931.0}``.
     """
 
@@ -31,8 +33,9 @@ class FlowSpec:
 
     Attributes:
         id: Name that `FlowSettings.method` (built in) or `FlowSettings.plugin` takes.
-        entry_point: ``"module:factory"``; called as ``factory(settings: FlowSettings, *, device: str, threads: int)``,
-            returns a `FlowEstimator`.
+        entry_point: ``"module:factory"``; called as
+            ``factory(settings: FlowSettings, *, device: str, threads: int)``, returns a
+            `FlowEstimator`.
         summary: One line.
         license: SPDX id or remark.
     """
@@ -47,11 +50,11 @@ class FlowSpec:
 class FlowEstimator(Protocol):
     """Sparse optical flow between two images.
 
-    `prepare` does what depends on one image only (pyramids, descriptor maps), so that a frame that is first target
-    and then reference is prepared once.
+    `prepare` does what depends on one image only (pyramids, descriptor maps), so that a frame that
+    is first target and then reference is prepared once.
 
-    Optional attribute, found by name: ``stats_names``, the names of the stats that every result holds (see
-    `stats_names_of`).
+    Optional attribute, found by name: ``stats_names``, the names of the stats that every result
+    holds (see `stats_names_of`).
     """
 
     def prepare(self, gray: NDArray[np.uint8]) -> Any:
@@ -72,12 +75,13 @@ class FlowEstimator(Protocol):
             reference: `prepare`d image that holds the points.
             target: `prepare`d image in which they are looked for.
             points: float32 ``[N, 2]`` pixels; N = 0 gives an empty result.
-            guess: float32 ``[N, 2]`` predicted positions in the target; rows that are not finite mean "no guess".
+            guess: float32 ``[N, 2]`` predicted positions in the target; rows that are not finite
+                mean "no guess".
             seed: Everything random is a function of this number (and of the point's index).
 
         Returns:
-            One row a point; degenerate input (black, identical, textureless images) gives rows that are not valid,
-            never an exception or NaN in valid rows.
+            One row a point; degenerate input (black, identical, textureless images) gives rows that
+            are not valid, never an exception or NaN in valid rows.
         """
 
 

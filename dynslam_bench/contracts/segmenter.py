@@ -19,7 +19,8 @@ class Instances:
     Attributes:
         masks: bool ``[K, H, W]`` at the frame's resolution.
         boxes: float32 ``[K, 4]``: x0, y0, x1, y1 in pixels (x1, y1 exclusive).
-        class_names: Class of each object, e.g. ``"person"``: COCO's name where there is one. Case does not matter.
+        class_names: Class of each object, e.g. ``"person"``: COCO's name where there is one. Case
+            does not matter.
         scores: float32 ``[K]`` in [0, 1].
     """
 
@@ -36,7 +37,8 @@ class Instances:
     @classmethod
     def empty(cls, height: int, width: int) -> Instances:
         """No objects in an image of this size."""
-        masks, boxes = np.zeros((0, height, width), bool), np.zeros((0, 4), np.float32)
+        masks = np.zeros((0, height, width), bool)
+        boxes = np.zeros((0, 4), np.float32)
         return cls(masks, boxes, (), np.zeros(0, np.float32))
 
     def of_classes(self, names: Collection[str]) -> Instances:
@@ -70,7 +72,8 @@ class SegmenterContext:
         device: ``cpu`` or ``cuda:N``.
         threads: Threads it may use.
         argument: What stands after the colon of the source, e.g. a path.
-        floor: Least score of a detection that is returned; the settings' confidence is applied afterwards.
+        floor: Least score of a detection that is returned; the settings' confidence is applied
+            afterwards.
     """
 
     sequence_id: str = ""
@@ -86,9 +89,10 @@ class SegmenterSpec:
     """Announces a segmenter; importable without torch or OpenCV.
 
     Attributes:
-        id: For example ``embedded``; users write ``segmentation.source = plugin:ID`` for those that are not built in.
-        entry_point: ``"module:factory"``, called as ``factory(settings, context)`` with `SegmentationSettings` and
-            `SegmenterContext`; returns a `Segmenter`.
+        id: For example ``embedded``; users write ``segmentation.source = plugin:ID`` for those that
+            are not built in.
+        entry_point: ``"module:factory"``, called as ``factory(settings, context)`` with
+            `SegmentationSettings` and `SegmenterContext`; returns a `Segmenter`.
         summary: One line.
         license: Of code and weights, SPDX id or remark.
         citation: What to cite.

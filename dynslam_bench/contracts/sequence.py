@@ -32,7 +32,8 @@ class FrameMasks:
 
     Attributes:
         instances: uint8 or int32 ``[H, W]``: 0 is background, k > 0 is instance k.
-        class_names: Class name of each instance id that can occur, e.g. ``{1: "person", 3: "chair"}`` (COCO names).
+        class_names: Class name of each instance id that can occur, e.g.
+            ``{1: "person", 3: "chair"}`` (COCO names).
         moving: Ids of the instances that move in this frame (relative to the previous one).
     """
 
@@ -52,8 +53,9 @@ class MaskSource(Protocol):
 class Sequence(Protocol):
     """A recorded or rendered RGB-D sequence; frames are decoded (or rendered) when they are asked for.
 
-    One without depth images says so with an attribute ``has_depth`` that is False; its frames' depth is 0 everywhere.
-    One whose stamps are known to more digits than a float holds has an attribute ``timestamps_ns``, int64 ``[N]``.
+    One without depth images says so with an attribute ``has_depth`` that is False; its frames'
+    depth is 0 everywhere. One whose stamps are known to more digits than a float holds has an
+    attribute ``timestamps_ns``, int64 ``[N]``.
     """
 
     @property
@@ -106,7 +108,9 @@ def read_only(frame: Frame) -> Frame:
 
 def read_only_masks(masks: FrameMasks) -> FrameMasks:
     """The same masks, which cannot be written."""
-    return replace(masks, instances=_read_only_view(masks.instances), class_names=dict(masks.class_names))
+    return replace(
+        masks, instances=_read_only_view(masks.instances), class_names=dict(masks.class_names)
+    )
 
 
 def _read_only_view(image: Any) -> Any:
@@ -132,8 +136,8 @@ class DatasetSpec:
 
     Attributes:
         id: Prefix of its sequences: the data set ``mine`` serves ``mine/anything``.
-        entry_point: ``"module:factory"``, called as ``factory(sequence_id, data_root=Path)``; it returns a
-            `Sequence` or raises a `SequenceError`.
+        entry_point: ``"module:factory"``, called as ``factory(sequence_id, data_root=Path)``; it
+            returns a `Sequence` or raises a `SequenceError`.
         sequences: Ids that are listed; the factory may accept more.
         summary: One line.
         license: SPDX id or remark.

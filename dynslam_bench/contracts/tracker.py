@@ -19,10 +19,11 @@ from dynslam_bench.geometry import Camera
 class Tracker(Protocol):
     """A SLAM or odometry system that is fed one frame at a time.
 
-    Optional methods, found by name: ``finalize() -> Trajectory`` (as it is after the last optimisation of the map; runs
-    ask once, at the end, `SlamEnv.final_trajectory` after any frame, and a tracker that cannot go on then says so),
-    ``map_outputs() -> MapOutputs`` (keyframes and map points, for ``keyframes.csv`` and ``map.ply``),
-    ``save_map(path, made_by)`` (the map as a file from which a later run may start) and ``close()``.
+    Optional methods, found by name: ``finalize() -> Trajectory`` (as it is after the last
+    optimisation of the map; runs ask once, at the end, `SlamEnv.final_trajectory` after any frame,
+    and a tracker that cannot go on then says so), ``map_outputs() -> MapOutputs`` (keyframes and
+    map points, for ``keyframes.csv`` and ``map.ply``), ``save_map(path, made_by)`` (the map as a
+    file from which a later run may start) and ``close()``.
     """
 
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
@@ -62,13 +63,14 @@ class TrackerSpec:
 
     Attributes:
         id: For example ``orb-slam2``.
-        entry_point: ``"module:factory"``; the factory is called as ``factory(settings)`` or, if it has a parameter of
-            that name, ``factory(settings, context=TrackerContext(...))``.
+        entry_point: ``"module:factory"``; the factory is called as ``factory(settings)`` or, if it
+            has a parameter of that name, ``factory(settings, context=TrackerContext(...))``.
         label: Shown in tables, e.g. ``ORB-SLAM2 (our back end)``.
         settings: Class of its settings; the default instance is the default configuration.
         summary: One line.
-        sensors: What it looks at: ``rgbd``; or ``rgb``, colour alone: it runs without depth, and the unit of length of
-            its poses is its own, so that it is scored under protocols with Sim(3) alignment only.
+        sensors: What it looks at: ``rgbd``; or ``rgb``, colour alone: it runs without depth, and
+            the unit of length of its poses is its own, so that it is scored under protocols with
+            Sim(3) alignment only.
         deterministic: Same seed, same bits.
         provenance: How closely it follows its source.
         ranked: Whether leaderboards rank it by default.
@@ -79,18 +81,22 @@ class TrackerSpec:
         assumptions: What was assumed where the source is silent.
         requires: Modules that must be importable, each with the command that installs it.
         reported: Numbers that its authors report: sequence id to metric to value.
-        published_as: Names under which the product's own table of published numbers lists it, each with its source.
+        published_as: Names under which the product's own table of published numbers lists it, each
+            with its source.
         remarks: Name collisions and known limits, e.g. "marks nothing as lost".
-        parameter: Name of the setting that takes what follows the id in ``id:value`` (``replay:FILE``); empty if the
-            tracker takes none.
-        bound: Settings fixed by the way it was named, dotted name to value; ``TRACKERS.get("id:value")`` fills it in.
-        check: ``"module:function"``; the function returns an install hint if the tracker cannot run here although all
-            of `requires` can be imported, else an empty string.
-        online: Whether it gives poses frame by frame; of a batch program only the final trajectory exists.
-        describe: ``"module:function"``; called with the file behind ``id:``, the function returns what the file
-            tells of this spec, by field; empty if there is none.
-        files: ``"module:function"``; called with the settings, the function returns the files whose content decides
-            what the tracker does and that no setting names by itself, for a run's identity; empty if there are none.
+        parameter: Name of the setting that takes what follows the id in ``id:value``
+            (``replay:FILE``); empty if the tracker takes none.
+        bound: Settings fixed by the way it was named, dotted name to value;
+            ``TRACKERS.get("id:value")`` fills it in.
+        check: ``"module:function"``; the function returns an install hint if the tracker cannot run
+            here although all of `requires` can be imported, else an empty string.
+        online: Whether it gives poses frame by frame; of a batch program only the final trajectory
+            exists.
+        describe: ``"module:function"``; called with the file behind ``id:``, the function returns
+            what the file tells of this spec, by field; empty if there is none.
+        files: ``"module:function"``; called with the settings, the function returns the files whose
+            content decides what the tracker does and that no setting names by itself, for a run's
+            identity; empty if there are none.
     """
 
     id: str
@@ -145,13 +151,15 @@ class TrackResult:
     """One frame's outcome.
 
     Attributes:
-        T_world_cam: Camera-to-world pose, float64 ``[4, 4]``; None if the tracker has none. A pose given while
-            `state` is ``lost`` is a prediction and enters no trajectory.
+        T_world_cam: Camera-to-world pose, float64 ``[4, 4]``; None if the tracker has none. A pose
+            given while `state` is ``lost`` is a prediction and enters no trajectory.
         state: ``ok`` (tracked), ``lost`` or ``initialising``.
-        stats: Diagnostics, plain floats, the same keys on every frame of a tracker. Keys the environment knows:
-            ``keypoints``, ``culled``, ``matches``, ``inliers``, ``map_points``, ``keyframes``, ``keyframe``
-            (1 on frames that became keyframes), ``residual_px``, ``mask_fraction``.
-        timings: Seconds by stage, in the order of the pipeline (``features``, ``segmentation``, ``flow``, ...).
+        stats: Diagnostics, plain floats, the same keys on every frame of a tracker. Keys the
+            environment knows: ``keypoints``, ``culled``, ``matches``, ``inliers``, ``map_points``,
+            ``keyframes``, ``keyframe`` (1 on frames that became keyframes), ``residual_px``,
+            ``mask_fraction``.
+        timings: Seconds by stage, in the order of the pipeline (``features``, ``segmentation``,
+            ``flow``, ...).
         dynamic_mask: bool ``[H, W]``, pixels held for dynamic, or None.
         keypoints_xy: float32 ``[N, 2]``, raw pixels of the features, for rendering; or None.
         keypoints_keep: bool ``[N]``, which of them were kept; or None.
@@ -174,10 +182,12 @@ def stage_seconds(timings: Sequence[Mapping[str, float]]) -> dict[str, NDArray[n
 
 # How closely a re-implementation follows its source.
 
-Provenance = Literal["own", "faithful-code", "faithful-paper", "inspired", "assumed", "external", "control"]
+Provenance = Literal[
+    "own", "faithful-code", "faithful-paper", "inspired", "assumed", "external", "control"
+]
 """``faithful-code``: as the authors' code does; ``faithful-paper``: as the paper says; ``inspired``: its idea in
-another form; ``assumed``: the source is silent on what matters; ``own``: put together here, no one paper or
-program describes the whole; ``external``: another project's program;
+another form; ``assumed``: the source is silent on what matters; ``own``: put together here, no one
+paper or program describes the whole; ``external``: another project's program;
 ``control``: a reference, no system."""
 
 
@@ -195,7 +205,8 @@ class KeyframeRecord:
         T_world_cam: Camera-to-world pose ``[4, 4]``.
         features: Features it holds.
         observations: Map points it observes.
-        map: 0 for the map that the trajectory is in; another number for one that began after a loss and never met it.
+        map: 0 for the map that the trajectory is in; another number for one that began after a loss
+            and never met it.
     """
 
     id: int
@@ -213,7 +224,8 @@ class MapOutputs:
 
     Attributes:
         keyframes: All keyframes.
-        ids: int64 ``[M]`` ids of the points; of maps that never met the first one none: where they lie is unknown.
+        ids: int64 ``[M]`` ids of the points; of maps that never met the first one none: where they
+            lie is unknown.
         positions: float64 ``[M, 3]`` world coordinates, metres.
         colours: uint8 ``[M, 3]`` red, green, blue.
         observations: int64 ``[M]``, keyframes that observe each point.

@@ -1,6 +1,7 @@
 """The lowest layer: errors, annotated settings, plug-in discovery, seeding and atomic records.
 
-What is here by name loads nothing but the standard library; settings and records, which need pydantic, have modules.
+What is here by name loads nothing but the standard library; settings and records, which need
+pydantic, have modules.
 """
 
 from dynslam_bench.core.errors import (
@@ -70,7 +71,14 @@ from dynslam_bench.core.sanitise import (
     without_passwords,
     words_without_passwords,
 )
-from dynslam_bench.core.toml import assignments, label_text, parse_toml, read_settings, read_toml, setting_text
+from dynslam_bench.core.toml import (
+    assignments,
+    label_text,
+    parse_toml,
+    read_settings,
+    read_toml,
+    setting_text,
+)
 
 __all__ = [
     "HIDDEN",

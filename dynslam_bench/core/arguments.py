@@ -21,7 +21,8 @@ def names_wrong_arguments(target: C) -> C:
     """Decorates a function, or a class for its constructor: when it fails, arguments are compared with annotations.
 
     Raises:
-        SettingsError: The call failed and an argument is not of the annotated type. Other errors pass as they are.
+        SettingsError: The call failed and an argument is not of the annotated type. Other errors
+            pass as they are.
     """
     if isinstance(target, type):
         target.__init__ = names_wrong_arguments(target.__init__)  # type: ignore[misc]
@@ -35,9 +36,12 @@ def names_wrong_arguments(target: C) -> C:
             raise
         except Exception as error:
             wrong = None
-            with suppress(Exception):  # names that do not fit, or annotations that cannot be checked
+            # names that do not fit, or annotations that cannot be checked
+            with suppress(Exception):
                 if _is_ours(error):
-                    wrong = _wrong_argument(target, inspect.signature(target).bind(*args, **kwargs).arguments)
+                    wrong = _wrong_argument(
+                        target, inspect.signature(target).bind(*args, **kwargs).arguments
+                    )
             if wrong is not None:
                 raise wrong from error
             raise
@@ -47,7 +51,9 @@ def names_wrong_arguments(target: C) -> C:
 
 def _is_ours(error: Exception) -> bool:
     """Whether an error passed through this package and its libraries alone: no plug-in, nor a user's callable."""
-    modules = (str(frame.f_globals.get("__name__")) for frame, _ in traceback.walk_tb(error.__traceback__))
+    modules = (
+        str(frame.f_globals.get("__name__")) for frame, _ in traceback.walk_tb(error.__traceback__)
+    )
     packages = {module.partition(".")[0] for module in modules}
     return packages <= {"dynslam_bench", "gymnasium", "numpy", *sys.stdlib_module_names}
 
@@ -56,7 +62,9 @@ def _wrong_argument(function: Callable[..., Any], given: dict[str, Any]) -> Sett
     """The line on the first argument that is not of the annotated type; None if all are."""
     hints = get_type_hints(function)
     fields: dict[str, Any] = {name: (hints[name], ...) for name in given if name in hints}
-    model = create_model("Arguments", __config__=ConfigDict(arbitrary_types_allowed=True, strict=True), **fields)
+    model = create_model(
+        "Arguments", __config__=ConfigDict(arbitrary_types_allowed=True, strict=True), **fields
+    )
     try:
         model.model_validate({name: given[name] for name in fields})
     except ValidationError as wrong:

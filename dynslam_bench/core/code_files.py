@@ -21,7 +21,18 @@ _WORD = re.compile(rb"[\w./~+\-]+")
 _QUOTED = re.compile(rb"[\"']([\w.+\-]+)(?:/[^\"'\n]*)?[\"']")
 """A text in quotes that could be a path, of which the first part is taken."""
 _FORMAT = re.compile(rb"%[-+0-9.]*[a-zA-Z]")
-_SYSTEM = ("/usr/", "/bin/", "/sbin/", "/lib", "/etc/", "/dev/", "/proc/", "/sys/", "/opt/local/", "/System/")
+_SYSTEM = (
+    "/usr/",
+    "/bin/",
+    "/sbin/",
+    "/lib",
+    "/etc/",
+    "/dev/",
+    "/proc/",
+    "/sys/",
+    "/opt/local/",
+    "/System/",
+)
 _STORE = ("index.sqlite", "sequences", "latest")
 _RECORDING = ("rgb.txt", "groundtruth.txt", "rgb.csv", "mav0", "color.txt", "associations.txt")
 
@@ -40,14 +51,16 @@ def foreign_modules(file: Path) -> set[str]:
     Raises:
         OSError: A file cannot be read.
     """
-    own, foreign = set[str](), set[str]()
+    own = set[str]()
+    foreign = set[str]()
     waiting = [file]
     while waiting:
         names = imported_modules(waiting) - own
         own |= names
         waiting = []
         for name in names:
-            module, package = file.parent / f"{name}.py", file.parent / name
+            module = file.parent / f"{name}.py"
+            package = file.parent / name
             if module.is_file():
                 waiting.append(module)
             elif package.is_dir():
@@ -60,10 +73,11 @@ def foreign_modules(file: Path) -> set[str]:
 def program_files(folder: Path) -> list[Path]:
     """The files below a folder that decide what its code does.
 
-    These are all code files, and each other file of which the name, or its end with a dot in it, is written in one of
-    the text files among them: ``"net.onnx"``, ``HERE / "params" / "slam.yaml"``, ``f"{name}_v2.yaml"``. So are all
-    files of a folder whose name a Python source quotes: ``glob("weights/*")``. Hidden folders, virtual environments,
-    results folders and recordings are left out.
+    These are all code files, and each other file of which the name, or its end with a dot in it, is
+    written in one of the text files among them: ``"net.onnx"``, ``HERE / "params" / "slam.yaml"``,
+    ``f"{name}_v2.yaml"``. So are all files of a folder whose name a Python source quotes:
+    ``glob("weights/*")``. Hidden folders, virtual environments, results folders and recordings are
+    left out.
 
     Args:
         folder: For example that of a plug-in's file.
@@ -73,8 +87,16 @@ def program_files(folder: Path) -> list[Path]:
     """
     everything = list(files_below(folder))
     code = [file for file in everything if is_code(file)]
-    quoted = {name.decode() for file in filter(is_python, code) for name in _QUOTED.findall(file.read_bytes())}
-    sure = [file for file in everything if file in set(code) or file.relative_to(folder).parts[0] in quoted]
+    quoted = {
+        name.decode()
+        for file in filter(is_python, code)
+        for name in _QUOTED.findall(file.read_bytes())
+    }
+    sure = [
+        file
+        for file in everything
+        if file in set(code) or file.relative_to(folder).parts[0] in quoted
+    ]
     return sure + _named(sure, [file for file in everything if file not in set(sure)])
 
 
@@ -95,8 +117,12 @@ def imported_modules(files: Iterable[Path]) -> set[str]:
                 modules |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and not node.level:
                 modules.add(node.module or "")
-            elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("import_module", "__import__")):
-                modules |= {str(first.value) for first in node.args[:1] if isinstance(first, ast.Constant)}
+            elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(
+                ("import_module", "__import__")
+            ):
+                modules |= {
+                    str(first.value) for first in node.args[:1] if isinstance(first, ast.Constant)
+                }
     return {name.partition(".")[0].partition(" ")[0] for name in modules} - {""}
 
 
@@ -129,10 +155,10 @@ def files_below(folder: Path) -> Iterator[Path]:
 def files_of_command(command: Sequence[str], folder: Path | None = None) -> list[Path]:
     """The files that decide what a command does.
 
-    These are its program with the libraries it is linked with, and the files and folders among its arguments (also
-    behind ``=``). The code of ``python -m MODULE`` counts, and so does what scripts and configuration files name. With
-    a Python script all code in its folder counts, and what it imports from elsewhere but installed distributions. Files
-    of the operating system are left out.
+    These are its program with the libraries it is linked with, and the files and folders among its
+    arguments (also behind ``=``). The code of ``python -m MODULE`` counts, and so does what scripts
+    and configuration files name. With a Python script all code in its folder counts, and what it
+    imports from elsewhere but installed distributions. Files of the operating system are left out.
 
     Args:
         command: Program and arguments.
@@ -141,35 +167,70 @@ def files_of_command(command: Sequence[str], folder: Path | None = None) -> list
     if not command:
         return []
     base = Path() if folder is None else folder
-    first = str(base / Path(command[0]).expanduser()) if os.sep in command[0] else shutil.which(command[0])
+    first = (
+        str(base / Path(command[0]).expanduser())
+        if os.sep in command[0]
+        else shutil.which(command[0])
+    )
     program = None if first is None else Path(first)
-    files = [] if program is None or not _is_file(program) else [program, *_linked_libraries(program.resolve())]
+    files = (
+        []
+        if program is None or not _is_file(program)
+        else [program, *_linked_libraries(program.resolve())]
+    )
     for word in command[1:]:
-        for path in {base / Path(text).expanduser() for text in (word, word.partition("=")[2]) if text}:
+        for path in {
+            base / Path(text).expanduser() for text in (word, word.partition("=")[2]) if text
+        }:
             files += files_below(path) if os.path.isdir(path) else [path] if _is_file(path) else []  # noqa: PTH112
     if program is not None and program.name.startswith("python") and "-m" in command[:-1]:
         files += _module_files(command[command.index("-m") + 1], base)
     named = _with_named_files(files, base)
-    shells = [file for file in named if file.suffix in (".sh", ".bash") or (not file.suffix and _words(file))]
-    named += [data_file for file in shells for data_file in _named([file], list(files_below(file.parent)))]
+    shells = [
+        file
+        for file in named
+        if file.suffix in (".sh", ".bash") or (not file.suffix and _words(file))
+    ]
+    named += [
+        data_file for file in shells for data_file in _named([file], list(files_below(file.parent)))
+    ]
     scripts = [file for file in named if is_python(file) and not _is_of_system(file)]
-    own = [file for folder in sorted({script.parent for script in scripts}) for file in program_files(folder)]
-    modules = {name for script in scripts for name in foreign_modules(script)} - set(sys.stdlib_module_names)
-    own += [file for name in sorted(modules) for file in _module_files(name, base) if not is_installed(file)]
+    own = [
+        file
+        for folder in sorted({script.parent for script in scripts})
+        for file in program_files(folder)
+    ]
+    modules = {name for script in scripts for name in foreign_modules(script)} - set(
+        sys.stdlib_module_names
+    )
+    own += [
+        file
+        for name in sorted(modules)
+        for file in _module_files(name, base)
+        if not is_installed(file)
+    ]
     return list(dict.fromkeys(file.resolve() for file in (*named, *own)))
 
 
 def _module_files(module: str, base: Path) -> list[Path]:
     """The code of a module in the working folder or on ``PYTHONPATH``, else as this interpreter finds it."""
     top = module.partition(".")[0]
-    for place in (base, *map(Path, filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep)))):
+    for place in (
+        base,
+        *map(Path, filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))),
+    ):
         if (place / top).is_dir():
             return program_files(place / top)
         if (place / f"{top}.py").is_file():
             return program_files(place)
     with suppress(ImportError, ValueError):
         folders = getattr(find_spec(top), "submodule_search_locations", None) or ()
-        return [file for place in map(Path, folders) if not is_installed(place) for file in files_below(place)]
+        return [
+            file
+            for place in map(Path, folders)
+            if not is_installed(place)
+            for file in files_below(place)
+        ]
     return []
 
 
@@ -182,7 +243,9 @@ def _linked_libraries(program: Path) -> list[Path]:
     """The shared libraries of a program that are none of the operating system's, as ``ldd`` finds them."""
     if _is_of_system(program) or shutil.which("ldd") is None:
         return []
-    listed = subprocess.run(["ldd", str(program)], capture_output=True, text=True, check=False).stdout
+    listed = subprocess.run(
+        ["ldd", str(program)], capture_output=True, text=True, check=False
+    ).stdout
     paths = [Path(match) for match in re.findall(r"=> (/.+) \(0x", listed)]
     return [path for path in paths if not _is_of_system(path) and path.is_file()]
 

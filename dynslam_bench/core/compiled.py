@@ -18,9 +18,9 @@ annotation can say which. Arrays, records and counts are annotated as they are."
 def kernel(function: Function) -> Function:
     """Compile a function, cached on disk and without the GIL.
 
-    The compiled code lies in the user's cache folder (`core.kernel_cache`); where that cannot be written it is compiled
-    again in every process. Sums of floats keep their written order (no fast-math), so that a result does not depend on
-    the processor's vector width.
+    The compiled code lies in the user's cache folder (`core.kernel_cache`); where that cannot be
+    written it is compiled again in every process. Sums of floats keep their written order (no
+    fast-math), so that a result does not depend on the processor's vector width.
     """
     return _compiled(function, error_model="python")
 
@@ -38,14 +38,17 @@ def spliced(function: Function) -> Function:
 def inlined(function: Function) -> Function:
     """Compile a small function of scalars and arrays, which makes no arrays, into its callers' machine code.
 
-    References to arrays are not counted in it: numba's atomic counts took a third of the flow's search.
+    References to arrays are not counted in it: numba's atomic counts took a third of the flow's
+    search.
     """
     return cast("Function", numba.njit(nogil=True, forceinline=True, _nrt=False)(function))
 
 
 def _compiled(function: Function, *, error_model: str, **options: Any) -> Function:
     # numba would give a kernel without an error model that of the kernel which calls it first
-    compiled = numba.njit(nogil=True, pipeline_class=KernelCompiler, error_model=error_model, **options)(function)
+    compiled = numba.njit(
+        nogil=True, pipeline_class=KernelCompiler, error_model=error_model, **options
+    )(function)
     if is_jitted(compiled):  # not under NUMBA_DISABLE_JIT
         remember_kernel(compiled)
     return cast("Function", compiled)

@@ -66,7 +66,8 @@ def download(
 ) -> str:
     """Download a file; what an earlier call got is kept, and the download goes on where that stopped.
 
-    The bytes gather in ``<target>.part``; `target` appears only when it is whole and its checksum fits.
+    The bytes gather in ``<target>.part``; `target` appears only when it is whole and its checksum
+    fits.
 
     Args:
         url: An ``https`` address, or an ``http`` one where the checksum is known.
@@ -82,9 +83,10 @@ def download(
         SHA-256 of the file.
 
     Raises:
-        DownloadError: The address is none; the server cannot be reached, refuses, redirects to something else than the
-            web, or announces another length than it sends; the file is too long; the disk is full; the checksum is
-            wrong (then the bytes are thrown away), or another process downloads the same file.
+        DownloadError: The address is none; the server cannot be reached, refuses, redirects to
+            something else than the web, or announces another length than it sends; the file is too
+            long; the disk is full; the checksum is wrong (then the bytes are thrown away), or
+            another process downloads the same file.
         DynslamError: The folder cannot be written.
     """
     check_address(url, checked=sha256 is not None)
@@ -94,9 +96,12 @@ def download(
         with contextlib.ExitStack() as stack:
             if not stack.enter_context(claimed(part.with_name(part.name + ".lock"))):
                 raise DownloadError(
-                    f"another process is downloading {url}", "wait for it, then run the same command again"
+                    f"another process is downloading {url}",
+                    "wait for it, then run the same command again",
                 )
-            report = progress or (stack.enter_context(_display[0](target.name)) if _display else lambda _: None)
+            report = progress or (
+                stack.enter_context(_display[0](target.name)) if _display else lambda _: None
+            )
             partial = _Partial(url, part, report, timeout_s, most_bytes)
             if not target.is_file():
                 partial.complete(attempts, wait_s)
@@ -131,7 +136,10 @@ class _Partial:
         Raises:
             DownloadError: It does not become so.
         """
-        fruitless, best, total, reason = 0, self._size(), None, ""
+        fruitless = 0
+        best = self._size()
+        total = None
+        reason = ""
         while fruitless < attempts:
             try:
                 with self._connect() as response:
@@ -141,20 +149,26 @@ class _Partial:
                 reason = "the server closed the connection early"
             except HTTPError as error:
                 if error.code == 416 and self._size():
-                    if error.headers.get("Content-Range", "").rpartition("/")[2] == str(self._size()):
+                    if error.headers.get("Content-Range", "").rpartition("/")[2] == str(
+                        self._size()
+                    ):
                         return
-                    self.forget()  # longer than the file on the server, or the server does not say: begin again
+                    # longer than the file on the server, or the server does not say: begin again
+                    self.forget()
                 reason = f"the server answers {error.code} {error.reason}"
                 if error.code < 500 and error.code not in (408, 416, 429):
                     raise DownloadError(f"{reason} for {self.url}") from error
-            except (OSError, HTTPException, ValueError) as error:  # no route, time-out, TLS, odd redirect
+            # no route, time-out, TLS, odd redirect
+            except (OSError, HTTPException, ValueError) as error:
                 reason = str(getattr(error, "reason", "") or error) or type(error).__name__
             fruitless = 0 if self._size() > best else fruitless + 1
             best = max(best, self._size())
             if 0 < fruitless < attempts:
                 time.sleep(min(2 ** (fruitless - 1) * wait_s, _LONGEST_PAUSE_S))
         expected = f" of {total}" if total else ""
-        raise DownloadError(f"download of {self.url} stopped at {self._size()}{expected} bytes: {reason}", _GO_ON)
+        raise DownloadError(
+            f"download of {self.url} stopped at {self._size()}{expected} bytes: {reason}", _GO_ON
+        )
 
     def forget(self) -> None:
         """Remove the file and its notes."""
@@ -169,7 +183,9 @@ class _Partial:
             notes = {}
         if notes.get("url") != without_passwords(self.url):
             self.forget()
-        request = Request(self.url, headers={"User-Agent": "dynslam-bench", "Accept-Encoding": "identity"})
+        request = Request(
+            self.url, headers={"User-Agent": "dynslam-bench", "Accept-Encoding": "identity"}
+        )
         if self._size():
             request.add_header("Range", f"bytes={self._size()}-")
             if notes.get("version"):
@@ -185,12 +201,17 @@ class _Partial:
         if response.status == 206 and not is_rest:
             raise ValueError("the server sends another range than was asked for")
         etag = headers.get("ETag") or "W/"
-        version = headers.get("Last-Modified") if etag.startswith("W/") else etag  # a weak one validates no range
-        with contextlib.suppress(OSError):  # without notes the next call begins again, which is safe
-            self._notes.write_text(json.dumps({"url": without_passwords(self.url), "version": version}))
+        # a weak one validates no range
+        version = headers.get("Last-Modified") if etag.startswith("W/") else etag
+        # without notes the next call begins again, which is safe
+        with contextlib.suppress(OSError):
+            self._notes.write_text(
+                json.dumps({"url": without_passwords(self.url), "version": version})
+            )
         if not headers.get("Content-Length", "").isdigit():
             return None
-        missing, free = int(headers["Content-Length"]), shutil.disk_usage(self.part.parent).free
+        missing = int(headers["Content-Length"])
+        free = shutil.disk_usage(self.part.parent).free
         self._check(self._size() + missing)
         if missing > free:
             raise DownloadError(
@@ -246,21 +267,30 @@ def check_address(url: str, *, checked: bool) -> None:
     shown = f"cannot download {url[:200]!r}"
     with raising(DownloadError, f"{shown}", of=ValueError):
         parts = urlsplit(url)
-        host, port = (parts.hostname or "").encode("idna").decode(), parts.port
+        host = (parts.hostname or "").encode("idna").decode()
+        port = parts.port
     if parts.scheme not in ("http", "https"):
         raise DownloadError(shown, "the address has to begin with http:// or https://")
     if not host or port == 0 or not url.isascii() or not url.isprintable() or " " in url:
         raise DownloadError(f"{shown}: it is no web address", "for example https://host/name.tgz")
     if parts.username is not None or parts.password is not None:
-        raise DownloadError(f"cannot download from {host}: the address holds a name or password", "leave them out")
+        raise DownloadError(
+            f"cannot download from {host}: the address holds a name or password", "leave them out"
+        )
     if parts.scheme == "http" and not checked and host not in _LOOPBACK:
-        raise DownloadError(f"{shown}: http without a known checksum could bring anything", "use https")
+        raise DownloadError(
+            f"{shown}: http without a known checksum could bring anything", "use https"
+        )
 
 
 class _Redirect(HTTPRedirectHandler):
     """Follows redirects to https, and from http to http, and to no other scheme."""
 
-    def redirect_request(self, req: Request, fp: Any, code: int, msg: str, headers: Any, newurl: str) -> Any:
+    def redirect_request(
+        self, req: Request, fp: Any, code: int, msg: str, headers: Any, newurl: str
+    ) -> Any:
         if newurl.partition(":")[0].lower() not in ("https", req.type):
-            raise DownloadError(f"the server redirects {req.full_url} to {newurl[:200]!r}, refused", "name a mirror")
+            raise DownloadError(
+                f"the server redirects {req.full_url} to {newurl[:200]!r}, refused", "name a mirror"
+            )
         return super().redirect_request(req, fp, code, msg, headers, newurl)

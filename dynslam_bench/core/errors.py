@@ -1,6 +1,7 @@
 """The errors a user can cause; everything else is a bug and keeps its traceback.
 
-Each message is one line: what was found (with the measured numbers), what was expected. The `hint` says what to do.
+Each message is one line: what was found (with the measured numbers), what was expected. The `hint`
+says what to do.
 """
 
 import difflib
@@ -17,16 +18,21 @@ from dynslam_bench.core.sanitise import without_passwords
 class DynslamError(Exception):
     """Base of all errors that the user of the toolkit can cause and cure.
 
-    Whatever the message names, it is one line of bounded length, and the passwords of addresses are left out.
+    Whatever the message names, it is one line of bounded length, and the passwords of addresses are
+    left out.
 
     Args:
         message: One line with the measured numbers and the expectation.
         hint: One line that says how to cure it; empty if there is nothing to add.
-        options: Several cures to choose from, a line each; the command line writes them below each other.
-        template: A file to copy and complete, of several lines; the command line writes it as it stands.
+        options: Several cures to choose from, a line each; the command line writes them below each
+            other.
+        template: A file to copy and complete, of several lines; the command line writes it as it
+            stands.
     """
 
-    def __init__(self, message: str, hint: str = "", *, options: Iterable[str] = (), template: str = "") -> None:
+    def __init__(
+        self, message: str, hint: str = "", *, options: Iterable[str] = (), template: str = ""
+    ) -> None:
         super().__init__(_one_line(str(message)))
         self.hint = _one_line(hint)
         self.options = tuple(_one_line(option) for option in options)
@@ -48,7 +54,11 @@ class DynslamError(Exception):
         return text
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (str(self.args[0]), self.hint), {"options": self.options, "template": self.template}
+        return (
+            type(self),
+            (str(self.args[0]), self.hint),
+            {"options": self.options, "template": self.template},
+        )
 
 
 LONGEST = 1000
@@ -158,7 +168,11 @@ def reason_of(error: BaseException) -> str:
     if isinstance(error, shutil.Error) and error.args and isinstance(error.args[0], list):
         source, _, reason = error.args[0][0]  # a folder could not be copied: the first of its files
         return f"{reason} ({source})"
-    return getattr(error, "strerror", None) or " ".join(str(error).split())[:200] or type(error).__name__
+    return (
+        getattr(error, "strerror", None)
+        or " ".join(str(error).split())[:200]
+        or type(error).__name__
+    )
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
@@ -172,9 +186,13 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
         For example ``"did you mean 'epipolar.threshold_px'?"``; empty if nothing is known.
     """
     names = sorted(set(known))
-    close = difflib.get_close_matches(name.lower(), {candidate.lower() for candidate in names}, n=3, cutoff=0.5)
+    close = difflib.get_close_matches(
+        name.lower(), {candidate.lower() for candidate in names}, n=3, cutoff=0.5
+    )
     if close:
-        meant = [repr(candidate) for match in close for candidate in names if candidate.lower() == match]
+        meant = [
+            repr(candidate) for match in close for candidate in names if candidate.lower() == match
+        ]
         return f"did you mean {' or '.join(meant)}?"
     if 0 < len(names) <= 16:
         return "known: " + ", ".join(names)

@@ -24,15 +24,16 @@ _NEW_S = 60.0
 """A temporary name ends in ``.new`` until it is locked, which takes no time, and in ``.tmp`` from then on."""
 _TURN_S = 0.1
 _CURE = "check the permissions and the free space"
-_AT_FDCWD, _RENAME_EXCHANGE = -100, 2
+_AT_FDCWD = -100
+_RENAME_EXCHANGE = 2
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A temporary file beside `path` that becomes `path` when the block ends without an error.
 
-    The parent folder is made if need be. If the block raises, `path` is as it was and nothing is left beside it; what
-    a killed process leaves is removed by `sweep_temporary`.
+    The parent folder is made if need be. If the block raises, `path` is as it was and nothing is
+    left beside it; what a killed process leaves is removed by `sweep_temporary`.
 
     Raises:
         OSError: The folder cannot be written.
@@ -52,10 +53,13 @@ def write_atomic(path: Path, content: str | bytes | memoryview) -> None:
     """Write a file under a temporary name beside its target, then rename it into place.
 
     Raises:
-        InfrastructureError: The folder cannot be written (full disk, permissions); nothing is left behind.
+        InfrastructureError: The folder cannot be written (full disk, permissions); nothing is left
+            behind.
     """
     with raising(InfrastructureError, f"cannot write {path}", _CURE), replacing(path) as temporary:
-        temporary.write_bytes(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
+        temporary.write_bytes(
+            content.encode(errors="backslashreplace") if isinstance(content, str) else content
+        )
 
 
 def write_lines(path: Path, lines: Iterable[str]) -> None:
@@ -75,8 +79,9 @@ def write_lines(path: Path, lines: Iterable[str]) -> None:
 def replace_folder(work: Path, target: Path) -> None:
     """Rename a finished folder to `target`, on the same file system; what `target` held before is deleted.
 
-    At every moment `target` is what it was or what it is to be, even if others replace it at the same time (where the
-    system can exchange two names at once: Linux, on its own file systems; elsewhere it is missing for a moment).
+    At every moment `target` is what it was or what it is to be, even if others replace it at the
+    same time (where the system can exchange two names at once: Linux, on its own file systems;
+    elsewhere it is missing for a moment).
 
     Raises:
         OSError: It cannot be renamed; then `target` is as it was.
@@ -156,8 +161,8 @@ def temporary_folder(target: Path) -> Iterator[Path]:
 def atomic_folder(target: Path) -> Iterator[Path]:
     """A temporary folder beside `target` that becomes `target` when the block ends without an error.
 
-    An existing target is replaced. If the block raises, or the process dies, `target` is as it was; what a killed
-    process left is swept up by the next one.
+    An existing target is replaced. If the block raises, or the process dies, `target` is as it was;
+    what a killed process left is swept up by the next one.
 
     Raises:
         InfrastructureError: The parent folder cannot be written, or was removed meanwhile.
@@ -169,7 +174,7 @@ def atomic_folder(target: Path) -> Iterator[Path]:
             replace_folder(work, target)
 
 
-# -- locks, which the system releases when their holder dies -----------------------------------------------------------
+# -- locks, which the system releases when their holder dies ---------------------------------------
 
 
 @contextmanager
@@ -188,7 +193,8 @@ def claimed(path: Path) -> Iterator[bool]:
     with raising(InfrastructureError, f"cannot write {path}", "check the permissions and the disk"):
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     try:
-        mine = _lock(handle) is not False and _is_at(handle, path)  # else its last holder has just removed it
+        # else its last holder has just removed it
+        mine = _lock(handle) is not False and _is_at(handle, path)
         try:
             yield mine
         finally:
@@ -252,7 +258,7 @@ def _lock(handle: int) -> bool | None:
     return True
 
 
-# -- private temporary folders, which are removed with the process that made them, also when that is killed ------------
+# -- private temporary folders, which are removed with the process that made them, also when that is killed ---
 
 _PRIVATE = "dynslam-private"
 SHARED_MEMORY = Path("/dev/shm")

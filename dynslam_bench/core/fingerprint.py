@@ -1,7 +1,7 @@
 """What a result was made of: digests of code, weights, machine and content.
 
-Run ids and the stage cache's keys are made of these, of the code in `core.module_graph`, and of what plug-ins read
-(`core.reads`), so that what is another run is another entry.
+Run ids and the stage cache's keys are made of these, of the code in `core.module_graph`, and of
+what plug-ins read (`core.reads`), so that what is another run is another entry.
 """
 
 import contextlib
@@ -31,23 +31,29 @@ from dynslam_bench.core.records import Record, digest
 from dynslam_bench.core.settings import Settings, field_names, named
 from dynslam_bench.core.version import release
 
-OPENCV = ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python")
+OPENCV = (
+    "opencv-python-headless",
+    "opencv-python",
+    "opencv-contrib-python-headless",
+    "opencv-contrib-python",
+)
 """The distributions that bring OpenCV; more than one may be installed, over each other."""
 _STAGES_NEED = ("numpy", "torch", "numba")
 """Further distributions whose version may change a stage's result."""
 _FILE_PREFIXES = ("onnx", "weights", "recorded")
 
 
-# -- what settings name ------------------------------------------------------------------------------------------------
+# -- what settings name ----------------------------------------------------------------------------
 
 
 def named_digests(settings: Settings) -> dict[str, str]:
     """Digest of the content of every file and folder that settings name and that is there, by the setting's name.
 
-    A setting counts that is declared to name a file (`core.settings.names`), a path in it at any depth of lists and
-    tables, and a text with the prefix ``onnx:``, ``weights:`` or ``recorded:``. So does a text that is written as a
-    path, with a separator, or as a file's name with an ending, where that is there. ``~`` and ``$VARIABLE`` are
-    replaced. A bare word without an ending is a word, whatever lies in the working folder.
+    A setting counts that is declared to name a file (`core.settings.names`), a path in it at any
+    depth of lists and tables, and a text with the prefix ``onnx:``, ``weights:`` or ``recorded:``.
+    So does a text that is written as a path, with a separator, or as a file's name with an ending,
+    where that is there. ``~`` and ``$VARIABLE`` are replaced. A bare word without an ending is a
+    word, whatever lies in the working folder.
 
     Raises:
         PluginError: One cannot be read.
@@ -117,7 +123,7 @@ def _leaves_of(name: str, value: object) -> Iterator[tuple[str, str | Path]]:
             yield from _leaves_of(f"{name}.{index}", inner)
 
 
-# -- installed distributions ------------------------------------------------------------------------------------------
+# -- installed distributions -----------------------------------------------------------------------
 
 
 def distribution_of_module(module: str) -> tuple[str, str]:
@@ -129,7 +135,7 @@ def distribution_of_module(module: str) -> tuple[str, str]:
 _distributions = cache(importlib.metadata.packages_distributions)
 
 
-# -- machine and content -----------------------------------------------------------------------------------------------
+# -- machine and content ---------------------------------------------------------------------------
 
 
 @cache
@@ -168,7 +174,7 @@ def content_digest(*arrays: NDArray[Any]) -> str:
     return state.hexdigest()
 
 
-# -- file contents, whose digests are remembered while the files are unchanged ----------------------------------------
+# -- file contents, whose digests are remembered while the files are unchanged ---------------------
 
 _SETTLED_NS = 2_000_000_000
 """Digests of files that are younger are not stored: a change within the same tick of the clock would not show."""
@@ -241,7 +247,7 @@ def _files_state(files: Sequence[str | Path]) -> tuple[str, int]:
     return hashlib.sha256("".join(texts).encode(errors="surrogateescape")).hexdigest(), newest
 
 
-# -- where and with what a run was made --------------------------------------------------------------------------------
+# -- where and with what a run was made ------------------------------------------------------------
 
 PACKAGES = ("numpy", "scipy", "torch", "numba", "gtsam", "gymnasium", "optuna")
 
@@ -292,7 +298,9 @@ def this_machine() -> Machine:
 def versions() -> dict[str, str]:
     """Versions of Python, of this package and of those that a result depends on; missing ones are left out."""
     environment = {"python": platform.python_version(), "dynslam-bench": dynslam_bench.__version__}
-    environment |= {name: distribution_version(name) for name in PACKAGES} | {"opencv": opencv_version()}
+    environment |= {name: distribution_version(name) for name in PACKAGES} | {
+        "opencv": opencv_version()
+    }
     return {name: number for name, number in environment.items() if number}
 
 
@@ -310,7 +318,9 @@ def git_revision() -> GitRevision | None:
 
 
 def _output_of(*command: str) -> str:
-    return subprocess.run(command, check=True, capture_output=True, text=True, timeout=10).stdout.strip()
+    return subprocess.run(
+        command, check=True, capture_output=True, text=True, timeout=10
+    ).stdout.strip()
 
 
 def _cpu_model() -> str:

@@ -1,8 +1,9 @@
 """Every folder outside the working directory that this package reads or writes, and the variable that moves it.
 
-Below the user's cache folder lie ``data/`` (sequences), ``stages/`` (the stage cache), ``digests/`` (digests of file
-contents, see `core.fingerprint`), ``kernels/`` (compiled kernels, see `core.kernel_cache`), ``weights/`` (downloaded
-checkpoints) and ``vocabularies/`` (decompressed ORB vocabularies).
+Below the user's cache folder lie ``data/`` (sequences), ``stages/`` (the stage cache), ``digests/``
+(digests of file contents, see `core.fingerprint`), ``kernels/`` (compiled kernels, see
+`core.kernel_cache`), ``weights/`` (downloaded checkpoints) and ``vocabularies/`` (decompressed ORB
+vocabularies).
 """
 
 import os
@@ -20,14 +21,17 @@ def user_cache() -> Path:
     if base:
         return Path(base).expanduser() / "dynslam-bench"
     home = Path.home()
-    return (home / "Library" / "Caches" if sys.platform == "darwin" else home / ".cache") / "dynslam-bench"
+    return (
+        home / "Library" / "Caches" if sys.platform == "darwin" else home / ".cache"
+    ) / "dynslam-bench"
 
 
 def find_data_root(argument: str | Path | None = None) -> Path:
     """The folder that holds the sequences; it need not exist yet.
 
     Args:
-        argument: What the user named (``--data-root``); it wins over ``DYNSLAM_BENCH_DATA``, which wins over the cache.
+        argument: What the user named (``--data-root``); it wins over ``DYNSLAM_BENCH_DATA``, which
+            wins over the cache.
     """
     if argument is not None:
         return Path(argument).expanduser().absolute()

@@ -24,12 +24,15 @@ def image_size(data: bytes) -> tuple[int, int] | None:
     """Width and height in pixels that the header of a PNG, JPEG, TIFF, BMP or PNM file states; None if it is none."""
     from PIL import BmpImagePlugin, JpegImagePlugin, PngImagePlugin, PpmImagePlugin, TiffImagePlugin
 
-    png, jpeg, tiff = PngImagePlugin.PngImageFile, JpegImagePlugin.JpegImageFile, TiffImagePlugin.TiffImageFile
+    png = PngImagePlugin.PngImageFile
+    jpeg = JpegImagePlugin.JpegImageFile
+    tiff = TiffImagePlugin.TiffImageFile
     for reader in (png, jpeg, tiff, BmpImagePlugin.BmpImageFile, PpmImagePlugin.PpmImageFile):
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of damaged metadata
-                image = reader(io.BytesIO(data))  # not `PIL.Image.open`, which does not state a size that is too large
+                # not `PIL.Image.open`, which does not state a size that is too large
+                image = reader(io.BytesIO(data))
             tile = [getattr(image, "tag_v2", {}).get(tag, 0) for tag in _TILE_SIZE]
             return max(image.width, int(tile[0])), max(image.height, int(tile[1]))
         except Exception:  # Pillow raises almost anything over damaged headers
@@ -60,7 +63,8 @@ def read_image(
         ``[H, W]`` or ``[H, W, C]`` with blue first, as OpenCV gives it.
 
     Raises:
-        DynslamError: Of the given kind: the file is missing, empty, truncated, of another size or no image.
+        DynslamError: Of the given kind: the file is missing, empty, truncated, of another size or
+            no image.
     """
     import cv2
 
@@ -77,12 +81,15 @@ def read_image(
         raise kind(f"image {path} ({len(data)} bytes) claims to be {stated[0]}x{stated[1]}, {most}")
     as_stored = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        image = stated and cv2.imdecode(np.frombuffer(data, np.uint8), as_stored if flags is None else flags)
+        image = stated and cv2.imdecode(
+            np.frombuffer(data, np.uint8), as_stored if flags is None else flags
+        )
     except cv2.error:
         image = None
     if image is None or 0 in image.shape:
         raise kind(
-            f"image {path} cannot be decoded ({len(data)} bytes)", "it is damaged, or no PNG, JPEG, TIFF, BMP or PNM"
+            f"image {path} cannot be decoded ({len(data)} bytes)",
+            "it is damaged, or no PNG, JPEG, TIFF, BMP or PNM",
         )
     return np.asarray(image)
 
@@ -90,15 +97,18 @@ def read_image(
 def _is_whole(data: bytes) -> bool:
     """Whether a PNG or JPEG file has its end.
 
-    OpenCV fills what is missing of a JPEG, and some versions of it of a PNG; some take the memory that a chunk claims.
+    OpenCV fills what is missing of a JPEG, and some versions of it of a PNG; some take the memory
+    that a chunk claims.
     """
-    if data.startswith(b"\xff\xd8\xff"):  # the end marker does not occur within the image data that it ends
+    # the end marker does not occur within the image data that it ends
+    if data.startswith(b"\xff\xd8\xff"):
         return data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda") > 0
     if not data.startswith(_PNG_START):
         return True
     position = len(_PNG_START)
     while position + 12 <= len(data):
-        (length,), kind = struct.unpack_from(">I", data, position), data[position + 4 : position + 8]
+        (length,) = struct.unpack_from(">I", data, position)
+        kind = data[position + 4 : position + 8]
         position += 12 + int(length)
         if kind == b"IEND":
             return position <= len(data)

@@ -1,9 +1,10 @@
 """Compiled kernels on disk: each file is named after what was compiled into it.
 
-The name holds the digest of the kernel's code and of all that it uses, of the types of its arguments, of numba,
-llvmlite, numpy and Python, and of the processor (see `core.kernel_code`). Checkouts and environments of which all of
-this is equal share files; an edit of anything that is compiled into a kernel leads to another file. Only whole files
-are used. See ``docs/decisions/kernel-cache.md``.
+The name holds the digest of the kernel's code and of all that it uses, of the types of its
+arguments, of numba, llvmlite, numpy and Python, and of the processor (see `core.kernel_code`).
+Checkouts and environments of which all of this is equal share files; an edit of anything that is
+compiled into a kernel leads to another file. Only whole files are used. See
+``docs/decisions/kernel-cache.md``.
 """
 
 import contextlib
@@ -23,7 +24,12 @@ from numba.core.serialize import dumps
 from dynslam_bench.core.errors import DynslamError
 from dynslam_bench.core.files import sweep_temporary, write_atomic
 from dynslam_bench.core.folders import kernels_folder
-from dynslam_bench.core.kernel_code import Foreign, NotDescribedError, kernel_digest, signature_digest
+from dynslam_bench.core.kernel_code import (
+    Foreign,
+    NotDescribedError,
+    kernel_digest,
+    signature_digest,
+)
 from dynslam_bench.core.module_graph import PACKAGE, module_graph
 
 SUFFIX = ".kernel"
@@ -46,7 +52,8 @@ def remember_kernel(kernel: Foreign) -> None:
         kernel: What `numba.njit` made, with `KernelCompiler` as its ``pipeline_class``.
     """
     KERNELS[kernel.py_func] = kernel
-    # the sources are read now: an edit between the import and the compilation of a module shows (`source_digest`)
+    # the sources are read now: an edit between the import and the compilation of a module shows
+    # (`source_digest`)
     with contextlib.suppress(*_NO_FOLDER):
         module_graph()
 
@@ -87,13 +94,16 @@ def load_kernels() -> None:
         for file in files:
             content = _read(file) if prefix and file.name.startswith(prefix) else None
             if content is not None:
-                kernel.compile(pickle.loads(content))  # the first of the two objects in it: the types
+                # the first of the two objects in it: the types
+                kernel.compile(pickle.loads(content))
 
 
-# -- names -------------------------------------------------------------------------------------------------------------
+# -- names -----------------------------------------------------------------------------------------
 
 
-def kernel_file(kernel: Foreign, arguments: tuple[Foreign, ...], return_type: Foreign, flags: Foreign) -> Path | None:
+def kernel_file(
+    kernel: Foreign, arguments: tuple[Foreign, ...], return_type: Foreign, flags: Foreign
+) -> Path | None:
     """Where a kernel lies that is compiled for some types; None if it is compiled in memory only.
 
     Args:
@@ -122,7 +132,7 @@ def _name_prefix(kernel: Foreign) -> str:
         return ""
 
 
-# -- files -------------------------------------------------------------------------------------------------------------
+# -- files -----------------------------------------------------------------------------------------
 
 
 class _Portable(CompileResultCacheImpl):
@@ -178,6 +188,7 @@ def remove_unused(folder: Path, now: float) -> None:
     """
     sweep_temporary(folder)
     for file in folder.glob(f"*{SUFFIX}"):
-        with contextlib.suppress(OSError):  # another process has removed it, or the folder can only be read
+        # another process has removed it, or the folder can only be read
+        with contextlib.suppress(OSError):
             if now - file.stat().st_mtime > UNUSED_S:
                 file.unlink()

@@ -1,9 +1,10 @@
 """What is compiled into a kernel, as a digest.
 
-A kernel's machine code holds the kernels that it calls, the constants that they use, wherever these are defined, and
-the instructions of `core.simd`. Kernels and constants are described as they are in memory when the kernel is compiled:
-by bytecode and value, without comments, docstrings and line numbers. What only numba can look into (its types,
-instructions in LLVM's language) is described by the source of its module and of all that this module imports.
+A kernel's machine code holds the kernels that it calls, the constants that they use, wherever these
+are defined, and the instructions of `core.simd`. Kernels and constants are described as they are in
+memory when the kernel is compiled: by bytecode and value, without comments, docstrings and line
+numbers. What only numba can look into (its types, instructions in LLVM's language) is described by
+the source of its module and of all that this module imports.
 """
 
 import hashlib
@@ -29,7 +30,16 @@ Described: TypeAlias = dict[Any, int]
 
 VERSIONED = {"numba", "llvmlite", "numpy", *sys.stdlib_module_names}
 """Packages whose versions are part of every digest: what they define is described by its name."""
-NO_CODE = ("CACHE", "COLOR", "CUDA", "DEBUG_CACHE", "DISABLE_PERFORMANCE", "NUMBA", "SHOW_HELP", "THREADING")
+NO_CODE = (
+    "CACHE",
+    "COLOR",
+    "CUDA",
+    "DEBUG_CACHE",
+    "DISABLE_PERFORMANCE",
+    "NUMBA",
+    "SHOW_HELP",
+    "THREADING",
+)
 """How those settings of numba begin that do not change what is compiled."""
 _PLAIN = (bool, int, float, complex, str, bytes, type(None), type(...))
 
@@ -57,13 +67,17 @@ def signature_digest(arguments: tuple[Foreign, ...], return_type: Foreign, flags
     Args:
         arguments: Numba's types of the arguments.
         return_type: Numba's type of the result, where the caller asks for one; else None.
-        flags: Numba's flags of this compilation: a kernel takes over some of the kernel that calls it.
+        flags: Numba's flags of this compilation: a kernel takes over some of the kernel that calls
+            it.
 
     Raises:
         NotDescribedError: One of the types cannot be described.
         OSError: A source cannot be read.
     """
-    words = [str(return_type), *(f"{name}={value}" for name, value in sorted(flags.values().items()))]
+    words = [
+        str(return_type),
+        *(f"{name}={value}" for name, value in sorted(flags.values().items())),
+    ]
     for kind in arguments:
         words += _type_words(kind)
     return _digest(words)
@@ -80,7 +94,8 @@ def _target_words(kernel: Foreign) -> Iterator[str]:
     """Versions, processor and settings of numba."""
     yield from (numba.__version__, llvmlite.__version__, np.__version__)
     yield str(sysconfig.get_config_var("SOABI") or sys.implementation.cache_tag)
-    yield repr(kernel.targetctx.codegen().magic_tuple())  # operating system, processor and its instructions
+    # operating system, processor and its instructions
+    yield repr(kernel.targetctx.codegen().magic_tuple())
     for name, value in sorted(vars(numba.config).items()):
         if name.isupper() and not name.startswith(NO_CODE):
             yield f"{name}={value!r}"
@@ -105,7 +120,9 @@ def _function_words(function: FunctionType, described: Described) -> Iterator[st
     try:
         enclosed = tuple(cell.cell_contents for cell in function.__closure__ or ())
     except ValueError as error:
-        raise NotDescribedError(f"{function.__qualname__} uses a variable that has no value yet") from error
+        raise NotDescribedError(
+            f"{function.__qualname__} uses a variable that has no value yet"
+        ) from error
     yield from _value_words((function.__defaults__, enclosed), (), described)
     yield from _value_words(tuple(sorted((function.__kwdefaults__ or {}).items())), (), described)
 
@@ -182,7 +199,9 @@ def _value_words(value: Any, names: tuple[str, ...], described: Described) -> It
         yield from _named_words(value)
 
 
-def _module_words(module: ModuleType, names: tuple[str, ...], described: Described) -> Iterator[str]:
+def _module_words(
+    module: ModuleType, names: tuple[str, ...], described: Described
+) -> Iterator[str]:
     yield f"module {module.__name__}"
     is_versioned = module.__name__.partition(".")[0] in VERSIONED
     if not is_versioned and (id(module), names) not in described:
@@ -218,7 +237,8 @@ def _named_words(value: Any) -> Iterator[str]:
     """Something that is described by where it is defined."""
     module = getattr(value, "__module__", None) or type(value).__module__
     if _is_own(module):
-        # one inner function may make several instructions: they differ by the names that their module gives them
+        # one inner function may make several instructions: they differ by the names that their
+        # module gives them
         names = sorted(name for name, other in vars(sys.modules[module]).items() if other is value)
         yield source_digest(module)
     elif module.partition(".")[0] in VERSIONED:
@@ -243,8 +263,8 @@ def source_digest(module: str) -> str:
         module: One that is imported already.
 
     Raises:
-        NotDescribedError: Its source has changed since this process first looked at the sources, so that it may not
-            be what was imported; or it is none of this package's sources.
+        NotDescribedError: Its source has changed since this process first looked at the sources, so
+            that it may not be what was imported; or it is none of this package's sources.
         OSError: A source cannot be read.
     """
     digest = module_graph().digest([module])

@@ -1,8 +1,9 @@
 """Which modules of this package a module uses, and the digest of their code.
 
-The closure of a module holds itself and all modules of this package that it reaches by import statements,
-wherever in the source they stand. A package's ``__init__`` that passes a name on is looked through: the name counts
-with the module that defines it. What a text names is no import: entry points of plug-ins, tables of lazy names.
+The closure of a module holds itself and all modules of this package that it reaches by import
+statements, wherever in the source they stand. A package's ``__init__`` that passes a name on is
+looked through: the name counts with the module that defines it. What a text names is no import:
+entry points of plug-ins, tables of lazy names.
 
 Sources count by their syntax: comments, layout and docstrings change nothing.
 """
@@ -38,7 +39,16 @@ _PLUMBING = (
         "kernel_cache",
         "kernel_code",
     ),
-    *("libraries", "module_graph", "plugins", "programs", "reads", "records", "sanitise", "version"),
+    *(
+        "libraries",
+        "module_graph",
+        "plugins",
+        "programs",
+        "reads",
+        "records",
+        "sanitise",
+        "version",
+    ),
 )
 PLUMBING = tuple(f"{PACKAGE}.core.{name}" for name in _PLUMBING)
 """Modules that name faults, find, fetch, store and digest files, and load plug-ins: no number passes through them."""
@@ -59,7 +69,8 @@ class ModuleCode:
     Attributes:
         digest: Of its syntax, see `syntax_digest`.
         imports: What it imports from this package.
-        names: What each name stands for that it imports at its top level, by the name that it has in this module.
+        names: What each name stands for that it imports at its top level, by the name that it has
+            in this module.
     """
 
     digest: str
@@ -93,7 +104,9 @@ class ModuleGraph:
             if module in reached or module in left_out:
                 continue
             reached.add(module)
-            defining = [self.defining_module(*reference) for reference in self.modules[module].imports]
+            defining = [
+                self.defining_module(*reference) for reference in self.modules[module].imports
+            ]
             waiting += [source for source in defining if source is not None]
         return sorted(reached)
 
@@ -142,14 +155,16 @@ def module_graph() -> ModuleGraph:
 def read_module_graph() -> ModuleGraph:
     """The graph of this package as it lies on the disk now.
 
-    What was read of a file is remembered in the user's cache while the file's size and times stay the same: parsing all
-    files takes more than a second.
+    What was read of a file is remembered in the user's cache while the file's size and times stay
+    the same: parsing all files takes more than a second.
 
     Raises:
         OSError: A source cannot be read.
     """
     places = [str(place) for place in sys.modules[PACKAGE].__path__]
-    name_of_places = hashlib.sha256("\0".join(places).encode(errors="surrogateescape")).hexdigest()[:16]
+    name_of_places = hashlib.sha256("\0".join(places).encode(errors="surrogateescape")).hexdigest()[
+        :16
+    ]
     memory = digest_cache_folder() / f"modules-{name_of_places}.json"
     remembered = _read_remembered(memory)
 
@@ -178,7 +193,8 @@ def module_files() -> dict[str, Path]:
         if place.name == PACKAGE:
             files |= {_module_name(file, place): file for file in place.glob("*.py")}
         for folder in sorted(place.iterdir()):
-            # in a checkout the folders beside the package are on its path, the package itself among them
+            # in a checkout the folders beside the package are on its path, the package itself among
+            # them
             if folder.name != PACKAGE and (folder / "__init__.py").is_file():
                 files |= {_module_name(file, place): file for file in sorted(folder.rglob("*.py"))}
     return files
@@ -188,9 +204,9 @@ def module_files() -> dict[str, Path]:
 def check_byte_code() -> None:
     """Refuse byte code that is older than its source, once a process.
 
-    Python takes byte code for current while the source's size and its second of modification are those at which it was
-    compiled. It does not see an edit of equal length within that second: the old code would run under the new source's
-    digest.
+    Python takes byte code for current while the source's size and its second of modification are
+    those at which it was compiled. It does not see an edit of equal length within that second: the
+    old code would run under the new source's digest.
 
     Raises:
         RunError: A module's byte code is older than its source.
@@ -232,12 +248,16 @@ def _read_remembered(memory: Path) -> dict[str, tuple[str, ModuleCode]]:
                 ModuleCode(
                     digest=entry["digest"],
                     imports=[(source, imported) for source, imported in entry["imports"]],
-                    names={own: (source, imported) for own, (source, imported) in entry["names"].items()},
+                    names={
+                        own: (source, imported)
+                        for own, (source, imported) in entry["names"].items()
+                    },
                 ),
             )
             for name, entry in stored.items()
         }
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # it is missing, cut off or of another version
+    # it is missing, cut off or of another version
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}
 
 
@@ -249,7 +269,7 @@ def _remember(memory: Path, entries: Mapping[str, tuple[str, ModuleCode]]) -> No
         return  # a cache that cannot be written costs time only
 
 
-# -- one source --------------------------------------------------------------------------------------------------------
+# -- one source ------------------------------------------------------------------------------------
 
 
 def read_module(name: str, source: bytes) -> ModuleCode:
@@ -263,7 +283,11 @@ def read_module(name: str, source: bytes) -> ModuleCode:
         tree = parsed(source)
     except (SyntaxError, ValueError, RecursionError):
         return ModuleCode(hashlib.sha256(source).hexdigest(), [], {})
-    imports = [reference for statement in _import_statements(tree) for reference in _references(statement).values()]
+    imports = [
+        reference
+        for statement in _import_statements(tree)
+        for reference in _references(statement).values()
+    ]
     names: dict[str, Reference] = {}
     for statement in tree.body:
         names |= _references(statement)
@@ -290,8 +314,14 @@ def _references(statement: ast.AST) -> dict[str, Reference]:
             for alias in statement.names
             if alias.name.partition(".")[0] == PACKAGE
         }
-    if isinstance(statement, ast.ImportFrom) and (statement.module or "").partition(".")[0] == PACKAGE:
-        return {alias.asname or alias.name: (str(statement.module), alias.name) for alias in statement.names}
+    if (
+        isinstance(statement, ast.ImportFrom)
+        and (statement.module or "").partition(".")[0] == PACKAGE
+    ):
+        return {
+            alias.asname or alias.name: (str(statement.module), alias.name)
+            for alias in statement.names
+        }
     return {}
 
 
@@ -308,7 +338,8 @@ def parsed(source: bytes) -> ast.Module:
 def syntax_digest(source: bytes) -> str:
     """SHA-256 of a Python source's syntax tree without comments, layout and docstrings.
 
-    It does not depend on the version of Python that parses it. What cannot be parsed counts by its bytes.
+    It does not depend on the version of Python that parses it. What cannot be parsed counts by its
+    bytes.
     """
     try:
         words = "\0".join(_tokens_of(parsed(source)))
@@ -336,4 +367,8 @@ def _tokens_of(node: Any) -> Iterator[str]:
 
 def _is_docstring(node: Any) -> bool:
     """Whether a statement is a string alone, which does nothing."""
-    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+    return (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    )

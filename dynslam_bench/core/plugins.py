@@ -1,10 +1,11 @@
 """Guarded discovery of plug-ins: one scheme for trackers, segmenters, features, flows, filters and sequences.
 
-A plug-in is a light *spec* (importable without torch or OpenCV) with an `id` and an `entry_point` ``"module:Attr"``
-that loads the heavy part. Specs are found by ``module:Attr`` or ``file.py:Attr`` of the user, and by id: the built-in
-ones, those of the environment variable ``DYNSLAM_BENCH_PLUGINS``, and those of the entry-point groups
-``dynslam_bench.<kind>``. No plug-in may take the id of a built-in one. A plug-in that fails to load never breaks the
-rest; the reason is kept and shown by ``trackers doctor``.
+A plug-in is a light *spec* (importable without torch or OpenCV) with an `id` and an `entry_point`
+``"module:Attr"`` that loads the heavy part. Specs are found by ``module:Attr`` or ``file.py:Attr``
+of the user, and by id: the built-in ones, those of the environment variable
+``DYNSLAM_BENCH_PLUGINS``, and those of the entry-point groups ``dynslam_bench.<kind>``. No plug-in
+may take the id of a built-in one. A plug-in that fails to load never breaks the rest; the reason is
+kept and shown by ``trackers doctor``.
 """
 
 import importlib.util
@@ -68,7 +69,8 @@ class Listed:
     Attributes:
         target: ``module:Attr`` or ``file.py:Attr`` of its spec.
         source: Who lists it, in words.
-        name: What the list calls it: the name of an entry point, by custom the spec's id; empty where there is none.
+        name: What the list calls it: the name of an entry point, by custom the spec's id; empty
+            where there is none.
     """
 
     target: str
@@ -79,8 +81,9 @@ class Listed:
 class Registry(Generic[P]):
     """All plug-ins of one kind.
 
-    A plug-in that is only listed is imported when it is asked for by its id, or when all are asked for: what another
-    plug-in does at its import, such as patching numpy, must not reach runs and scores that do not use it.
+    A plug-in that is only listed is imported when it is asked for by its id, or when all are asked
+    for: what another plug-in does at its import, such as patching numpy, must not reach runs and
+    scores that do not use it.
 
     Args:
         kind: Which entry-point group to read.
@@ -115,22 +118,31 @@ class Registry(Generic[P]):
         """The spec of an id, or of ``module:Attr`` / ``file.py:Attr``; imports no other plug-in.
 
         Raises:
-            PluginError: Unknown id (with a did-you-mean), or the named object cannot be loaded or is no spec.
+            PluginError: Unknown id (with a did-you-mean), or the named object cannot be loaded or
+                is no spec.
         """
         spec = self.find(name)
         if spec is not None:
             return spec
         if ":" in name:
             spec = self._check(load_object(name), name)
-            builtin = self.builtin().get(spec.id)  # under a built-in id tables could not tell them apart
+            # under a built-in id tables could not tell them apart
+            builtin = self.builtin().get(spec.id)
             if builtin is not None and builtin != spec:
-                raise PluginError(f"{name} has the id '{spec.id}', which is built in", "give the plug-in another id")
+                raise PluginError(
+                    f"{name} has the id '{spec.id}', which is built in",
+                    "give the plug-in another id",
+                )
             return spec
         plugins = self._discover()
-        broken = [f"{failure.source} failed to load: {failure.reason}" for failure in self._failures]
+        broken = [
+            f"{failure.source} failed to load: {failure.reason}" for failure in self._failures
+        ]
         named = [line for line in broken if name in line]
         hints = named[:1] or [did_you_mean(name, plugins), *broken[:1]]
-        raise PluginError(f"unknown {self.kind.rstrip('s')} '{name}'", "; ".join(filter(None, hints)))
+        raise PluginError(
+            f"unknown {self.kind.rstrip('s')} '{name}'", "; ".join(filter(None, hints))
+        )
 
     def find(self, name: str) -> P | None:
         """The spec of an id, None where no plug-in has it; imports no other plug-in."""
@@ -159,9 +171,13 @@ class Registry(Generic[P]):
     def listed(self) -> list[Listed]:
         """What the environment variable and the installed distributions list; nothing is imported.
 
-        In the process of a run the variable lists what the run uses, and installed ones are left out; see `used`.
+        In the process of a run the variable lists what the run uses, and installed ones are left
+        out; see `used`.
         """
-        targets = [Listed(target, f"{ENVIRONMENT_VARIABLE}: {target}") for target in _environment_targets(self.kind)]
+        targets = [
+            Listed(target, f"{ENVIRONMENT_VARIABLE}: {target}")
+            for target in _environment_targets(self.kind)
+        ]
         if os.environ.get(ISOLATED_VARIABLE):
             return targets
         return targets + self._installed()
@@ -199,7 +215,9 @@ class Registry(Generic[P]):
         try:
             spec = self._check(load_object(plugin) if isinstance(plugin, str) else plugin, source)
             if spec.id in self._found:
-                raise PluginError(f"id '{spec.id}' is already taken by {self._found[spec.id].source}")
+                raise PluginError(
+                    f"id '{spec.id}' is already taken by {self._found[spec.id].source}"
+                )
         except Exception as error:  # a foreign plug-in may raise anything
             self._failures.append(Failure(source, _reason(error)))
         else:
@@ -209,7 +227,8 @@ class Registry(Generic[P]):
         if isinstance(value, self._spec_type):
             return value
         raise PluginError(
-            f"{source} is a {type(value).__name__}, not a {self._spec_type.__name__}", "name the spec, not the class"
+            f"{source} is a {type(value).__name__}, not a {self._spec_type.__name__}",
+            "name the spec, not the class",
         )
 
 
@@ -241,13 +260,14 @@ def load_object(target: str) -> Any:
     """Import ``package.module:Attr`` or ``path/to/file.py:Attr``.
 
     Raises:
-        PluginError: The module cannot be imported, would end this process, or lacks the attribute; carries the original
-            reason.
+        PluginError: The module cannot be imported, would end this process, or lacks the attribute;
+            carries the original reason.
     """
     location, separator, attribute = target.rpartition(":")
     if not separator or not location or not attribute:
         raise PluginError(
-            f"'{target}' is not module:Attr", "for example my_package.trackers:SPEC or my_tracker.py:SPEC"
+            f"'{target}' is not module:Attr",
+            "for example my_package.trackers:SPEC or my_tracker.py:SPEC",
         )
     if not _is_imported(location):
         check_import(location)
@@ -261,11 +281,17 @@ def load_object(target: str) -> Any:
         return attrgetter(attribute)(module)
     except AttributeError:
         public = [name for name in vars(module) if not name.startswith("_")]
-        raise PluginError(f"{location} has no '{attribute}'", did_you_mean(attribute, public)) from None
+        raise PluginError(
+            f"{location} has no '{attribute}'", did_you_mean(attribute, public)
+        ) from None
 
 
 def build_plugin(
-    kind: str, spec: Spec, protocol: type[B], fault: type[DynslamError], call: Callable[[Any], object]
+    kind: str,
+    spec: Spec,
+    protocol: type[B],
+    fault: type[DynslamError],
+    call: Callable[[Any], object],
 ) -> B:
     """Load a plug-in's factory, call it, and check what it gives.
 
@@ -277,7 +303,8 @@ def build_plugin(
         call: Calls the factory that it is given.
 
     Raises:
-        DynslamError: Of the type `fault` where the factory fails or gives something else; its own pass unchanged.
+        DynslamError: Of the type `fault` where the factory fails or gives something else; its own
+            pass unchanged.
     """
     factory = load_object(spec.entry_point)
     try:
@@ -285,15 +312,23 @@ def build_plugin(
     except DynslamError:
         raise
     except Exception as error:  # a plug-in may raise anything
-        raise fault(f"{kind} '{spec.id}' cannot be built: {type(error).__name__}: {error}") from error
+        raise fault(
+            f"{kind} '{spec.id}' cannot be built: {type(error).__name__}: {error}"
+        ) from error
     if not isinstance(built, protocol):
-        raise fault(f"'{spec.entry_point}' gave a {type(built).__name__}, not a {protocol.__name__}")
+        raise fault(
+            f"'{spec.entry_point}' gave a {type(built).__name__}, not a {protocol.__name__}"
+        )
     return built
 
 
 def import_module(location: str) -> ModuleType:
     """The module of a name, or of the path of a ``.py`` file; whatever the import raises."""
-    return _load_file(Path(location)) if location.endswith(".py") else importlib.import_module(location)
+    return (
+        _load_file(Path(location))
+        if location.endswith(".py")
+        else importlib.import_module(location)
+    )
 
 
 def _is_imported(location: str) -> bool:
@@ -321,7 +356,9 @@ def _load_file(path: Path) -> ModuleType:
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
-    try:  # from its text: byte code of an edit of equal length in the same second would pass for that of this one
+    # from its text: byte code of an edit of equal length in the same second would pass for that of
+    # this one
+    try:
         exec(compile(resolved.read_bytes(), resolved, "exec"), module.__dict__)
     except BaseException:
         del sys.modules[name]
@@ -332,7 +369,9 @@ def _load_file(path: Path) -> ModuleType:
 def _environment_targets(kind: Kind) -> list[str]:
     """Targets of ``DYNSLAM_BENCH_PLUGINS="trackers=my.py:SPEC,flow=pkg.mod:SPEC"``; no ``kind=`` means a tracker."""
     items = [item.strip() for item in os.environ.get(ENVIRONMENT_VARIABLE, "").split(",")]
-    pairs = [item.partition("=") if "=" in item else ("trackers", "=", item) for item in items if item]
+    pairs = [
+        item.partition("=") if "=" in item else ("trackers", "=", item) for item in items if item
+    ]
     return [target for prefix, _, target in pairs if prefix == kind]
 
 
@@ -341,7 +380,7 @@ def _reason(error: BaseException) -> str:
     return ": ".join(filter(None, [name, *str(error).strip().splitlines()[-1:]]))
 
 
-# -- whether a module can be imported at all: tried in a process of its own, which that may end ------------------------
+# -- whether a module can be imported at all: tried in a process of its own, which that may end ----
 
 ISOLATED_VARIABLE = "DYNSLAM_BENCH_ISOLATED"
 """Set in processes that may end by an import without harm: the children of runs, and the probes themselves."""
@@ -366,8 +405,8 @@ os._exit(int(code))
 def python_command(code: str) -> list[str]:
     """The command of a Python process that imports what this process imports.
 
-    ``python -m`` and ``python -c`` import from the working folder first: in a checkout they would run its code
-    instead of the installed package's.
+    ``python -m`` and ``python -c`` import from the working folder first: in a checkout they would
+    run its code instead of the installed package's.
     """
     return [sys.executable, "-c", f"import sys; sys.path[:] = {sys.path!r}\n{code}"]
 
@@ -381,9 +420,9 @@ def module_command(module: str) -> list[str]:
 def check_import(location: str) -> None:
     """Import a plug-in's module in a process of its own, once for every location.
 
-    What the import raises is left to the caller's own import; here counts that it comes to an end and that the process
-    lives on: ``sys.exit``, ``os._exit``, a crash of a native library or an endless loop would end, or hang, the
-    importing process.
+    What the import raises is left to the caller's own import; here counts that it comes to an end
+    and that the process lives on: ``sys.exit``, ``os._exit``, a crash of a native library or an
+    endless loop would end, or hang, the importing process.
 
     Args:
         location: Name of a module, or path of a ``.py`` file.
@@ -443,7 +482,9 @@ def _probe(location: str, target: str) -> bytes:
                 pass_fds=[writing],
             ).returncode
         except subprocess.TimeoutExpired:
-            raise PluginError(f"cannot import {location}: it is not done after {LIMIT_S} s") from None
+            raise PluginError(
+                f"cannot import {location}: it is not done after {LIMIT_S} s"
+            ) from None
         finally:
             os.close(writing)
         if code != _IMPORTED:

@@ -1,7 +1,8 @@
 """What the processes of a program are made of, and which environment variables a program gets.
 
-What a program opens cannot be seen from outside. What its processes show can: the executable, the libraries and other
-files that are mapped into memory, the files and folders that the command line names.
+What a program opens cannot be seen from outside. What its processes show can: the executable, the
+libraries and other files that are mapped into memory, the files and folders that the command line
+names.
 """
 
 import contextlib
@@ -16,34 +17,99 @@ import psutil
 
 RESULT_VARIABLES = (
     # where libraries and modules are searched
-    *("LD_LIBRARY_PATH", "LD_PRELOAD", "DYLD_LIBRARY_PATH", "PYTHONPATH", "PYTHONHOME", "PYTHONHASHSEED"),
+    *(
+        "LD_LIBRARY_PATH",
+        "LD_PRELOAD",
+        "DYLD_LIBRARY_PATH",
+        "PYTHONPATH",
+        "PYTHONHOME",
+        "PYTHONHASHSEED",
+    ),
     # how numbers and times are read and written: a decimal comma cuts numbers short
     *("LANG", "LANGUAGE", "LC_ALL", "LC_CTYPE", "LC_NUMERIC", "LC_TIME", "LC_COLLATE", "TZ"),
     # on what is computed, and in which order sums are made
-    *("CUDA_VISIBLE_DEVICES", "CUDA_LAUNCH_BLOCKING", "CUBLAS_WORKSPACE_CONFIG", "NVIDIA_TF32_OVERRIDE"),
-    *("OMP_DYNAMIC", "OMP_SCHEDULE", "OPENBLAS_CORETYPE", "MKL_CBWR", "MKL_DYNAMIC", "OPENCV_CPU_DISABLE"),
+    *(
+        "CUDA_VISIBLE_DEVICES",
+        "CUDA_LAUNCH_BLOCKING",
+        "CUBLAS_WORKSPACE_CONFIG",
+        "NVIDIA_TF32_OVERRIDE",
+    ),
+    *(
+        "OMP_DYNAMIC",
+        "OMP_SCHEDULE",
+        "OPENBLAS_CORETYPE",
+        "MKL_CBWR",
+        "MKL_DYNAMIC",
+        "OPENCV_CPU_DISABLE",
+    ),
     *("OPENCV_OPENCL_DEVICE", "OPENCV_OPENCL_RUNTIME", "LIBGL_ALWAYS_SOFTWARE"),
 )
 """Programs get these variables, and their values count: each can change a result."""
 RUN_VARIABLES = (
-    *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "BLIS_NUM_THREADS"),
+    *(
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "VECLIB_MAXIMUM_THREADS",
+        "BLIS_NUM_THREADS",
+    ),
     *("NUMBA_NUM_THREADS", "NUMBA_CACHE_DIR", "TMPDIR"),
-    *("DYNSLAM_BENCH_ISOLATED", "DYNSLAM_BENCH_CACHE", "DYNSLAM_BENCH_DATA", "DYNSLAM_BENCH_WEIGHTS"),
+    *(
+        "DYNSLAM_BENCH_ISOLATED",
+        "DYNSLAM_BENCH_CACHE",
+        "DYNSLAM_BENCH_DATA",
+        "DYNSLAM_BENCH_WEIGHTS",
+    ),
 )
 """Programs get these variables. A run sets them by its settings, or they name places of data that counts by itself."""
 PLACE_VARIABLES = (
     # found through these, programs and files count by their content
     *("PATH", "HOME", "USER", "LOGNAME", "SHELL", "VIRTUAL_ENV", "CONDA_PREFIX"),
-    *("XDG_CACHE_HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_DATA_DIRS", "XDG_CONFIG_DIRS", "XDG_RUNTIME_DIR"),
+    *(
+        "XDG_CACHE_HOME",
+        "XDG_CONFIG_HOME",
+        "XDG_DATA_HOME",
+        "XDG_DATA_DIRS",
+        "XDG_CONFIG_DIRS",
+        "XDG_RUNTIME_DIR",
+    ),
     # where windows are shown, without which viewers do not start
     *("DISPLAY", "WAYLAND_DISPLAY", "XAUTHORITY", "QT_QPA_PLATFORM", "TERM"),
     *("PYTHONUNBUFFERED", "PYTHONDONTWRITEBYTECODE", "PYTHONSAFEPATH"),
 )
 """Programs get these variables, and their values do not count."""
 SESSION_VARIABLES = (
-    *("_", "PWD", "OLDPWD", "SHLVL", "TEMP", "TMP", "COLORTERM", "COLUMNS", "LINES", "LS_COLORS", "WINDOWID"),
-    *("SSH_CLIENT", "SSH_CONNECTION", "SSH_TTY", "SSH_AUTH_SOCK", "DBUS_SESSION_BUS_ADDRESS", "SESSION_MANAGER"),
-    *("XDG_SESSION_ID", "XDG_VTNR", "XDG_SEAT", "TMUX", "TMUX_PANE", "STY", "INVOCATION_ID", "JOURNAL_STREAM"),
+    *(
+        "_",
+        "PWD",
+        "OLDPWD",
+        "SHLVL",
+        "TEMP",
+        "TMP",
+        "COLORTERM",
+        "COLUMNS",
+        "LINES",
+        "LS_COLORS",
+        "WINDOWID",
+    ),
+    *(
+        "SSH_CLIENT",
+        "SSH_CONNECTION",
+        "SSH_TTY",
+        "SSH_AUTH_SOCK",
+        "DBUS_SESSION_BUS_ADDRESS",
+        "SESSION_MANAGER",
+    ),
+    *(
+        "XDG_SESSION_ID",
+        "XDG_VTNR",
+        "XDG_SEAT",
+        "TMUX",
+        "TMUX_PANE",
+        "STY",
+        "INVOCATION_ID",
+        "JOURNAL_STREAM",
+    ),
     *("TERM_SESSION_ID", "VSCODE_IPC_HOOK_CLI", "PYTEST_CURRENT_TEST"),
 )
 """These name the terminal, the login or the moment. Programs do not get them, and their values do not count."""
@@ -59,11 +125,14 @@ def is_counted(variable: str) -> bool:
     return variable not in _UNCOUNTED
 
 
-def program_environment(declared: Iterable[str] = (), environment: Mapping[str, str] | None = None) -> dict[str, str]:
+def program_environment(
+    declared: Iterable[str] = (), environment: Mapping[str, str] | None = None
+) -> dict[str, str]:
     """The environment variables that a program gets; a result cannot depend on others without a word.
 
     Args:
-        declared: Names of further variables that the program's settings declare; their values count.
+        declared: Names of further variables that the program's settings declare; their values
+            count.
         environment: Where values are taken from; None for this process's variables.
     """
     source = os.environ if environment is None else environment
@@ -76,10 +145,14 @@ def program_environment(declared: Iterable[str] = (), environment: Mapping[str, 
 
 def folders_of(search_path: str) -> list[str]:
     """The folders of a search path, but for those that ``import cv2`` adds to ``LD_LIBRARY_PATH`` in its process."""
-    return [folder for folder in search_path.split(os.pathsep) if folder and not _OF_OPENCV.search(folder)]
+    return [
+        folder
+        for folder in search_path.split(os.pathsep)
+        if folder and not _OF_OPENCV.search(folder)
+    ]
 
 
-# -- what a command names ----------------------------------------------------------------------------------------------
+# -- what a command names --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -112,7 +185,9 @@ class Command:
         """
         arguments = self.words[1:] if words is None else words
         texts = {text for word in arguments for text in (word, word.partition("=")[2]) if text}
-        paths = {os.path.normpath(os.path.join(self.folder, os.path.expanduser(text))) for text in texts}
+        paths = {
+            os.path.normpath(os.path.join(self.folder, os.path.expanduser(text))) for text in texts
+        }
         return {path for path in paths if is_file_name(path) and _is_there(path)}
 
 
@@ -128,7 +203,7 @@ def _is_there(path: str) -> bool:
         return False
 
 
-# -- what processes show -----------------------------------------------------------------------------------------------
+# -- what processes show ---------------------------------------------------------------------------
 
 
 @dataclass

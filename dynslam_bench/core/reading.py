@@ -1,7 +1,7 @@
 """Read files that others may have written: bounded in size, and one clear error for any fault.
 
-Every reader of text, JSON, arrays or bytes uses this module, so that the message is the same everywhere for files that
-are not UTF-8, nested too deeply, too long or not readable.
+Every reader of text, JSON, arrays or bytes uses this module, so that the message is the same
+everywhere for files that are not UTF-8, nested too deeply, too long or not readable.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ _MOST_FILES = 1 << 16
 """Bytes that hold most files whole."""
 
 
-def read_bytes(path: Path, *, limit: int = RECORD_BYTES, kind: type[DynslamError] = DynslamError) -> bytes:
+def read_bytes(
+    path: Path, *, limit: int = RECORD_BYTES, kind: type[DynslamError] = DynslamError
+) -> bytes:
     """The content of a file of at most `limit` bytes.
 
     Args:
@@ -52,7 +54,9 @@ def read_bytes(path: Path, *, limit: int = RECORD_BYTES, kind: type[DynslamError
     return data
 
 
-def read_text(path: Path, *, limit: int = RECORD_BYTES, kind: type[DynslamError] = DynslamError) -> str:
+def read_text(
+    path: Path, *, limit: int = RECORD_BYTES, kind: type[DynslamError] = DynslamError
+) -> str:
     """The content of a UTF-8 file of at most `limit` bytes; a byte order mark is left out.
 
     Raises:
@@ -62,11 +66,14 @@ def read_text(path: Path, *, limit: int = RECORD_BYTES, kind: type[DynslamError]
         return read_bytes(path, limit=limit, kind=kind).decode("utf-8-sig")
 
 
-def read_lines(path: Path, *, limit: int = TABLE_BYTES, kind: type[DynslamError] = DynslamError) -> Iterator[str]:
+def read_lines(
+    path: Path, *, limit: int = TABLE_BYTES, kind: type[DynslamError] = DynslamError
+) -> Iterator[str]:
     """The lines of a UTF-8 file, one after the other, so that a long file needs no memory of its own size.
 
     Raises:
-        DynslamError: Of the given kind: it cannot be read, has more than `limit` bytes, or is no UTF-8.
+        DynslamError: Of the given kind: it cannot be read, has more than `limit` bytes, or is no
+            UTF-8.
     """
     done = 0
     with (
@@ -81,11 +88,14 @@ def read_lines(path: Path, *, limit: int = TABLE_BYTES, kind: type[DynslamError]
             yield line
 
 
-def read_json(path: Path, *, limit: int = RECORD_BYTES, kind: type[DynslamError] = DynslamError) -> Any:
+def read_json(
+    path: Path, *, limit: int = RECORD_BYTES, kind: type[DynslamError] = DynslamError
+) -> Any:
     """The value in a JSON file.
 
     Raises:
-        DynslamError: Of the given kind: it cannot be read, is larger than `limit` bytes, or is no JSON.
+        DynslamError: Of the given kind: it cannot be read, is larger than `limit` bytes, or is no
+            JSON.
     """
     return parse_json(read_text(path, limit=limit, kind=kind), str(path), kind=kind)
 
@@ -99,7 +109,8 @@ def parse_json(text: str, where: str, *, kind: type[DynslamError] = DynslamError
         kind: What is raised.
 
     Raises:
-        DynslamError: Of the given kind: it is no JSON, nested too deeply, or holds a number of thousands of digits.
+        DynslamError: Of the given kind: it is no JSON, nested too deeply, or holds a number of
+            thousands of digits.
     """
     with raising(kind, f"{where} is no valid JSON", of=(ValueError, RecursionError)):
         return json.loads(text)
@@ -113,7 +124,8 @@ def read_npz(path: Path, *, kind: type[DynslamError] = DynslamError) -> dict[str
         kind: What is raised.
 
     Raises:
-        DynslamError: Of the given kind: it cannot be read, is damaged, or holds or claims more than `MOST_BYTES`.
+        DynslamError: Of the given kind: it cannot be read, is damaged, or holds or claims more than
+            `MOST_BYTES`.
     """
     import numpy as np
 
@@ -125,14 +137,18 @@ def read_npz(path: Path, *, kind: type[DynslamError] = DynslamError) -> dict[str
     ):
         claimed = sum(entry.file_size for entry in archive.zip.infolist())
         if claimed > MOST_BYTES:
-            raise ValueError(f"it claims {claimed / 1e6:.0f} MB, at most {MOST_BYTES / 1e6:.0f} are read")
+            raise ValueError(
+                f"it claims {claimed / 1e6:.0f} MB, at most {MOST_BYTES / 1e6:.0f} are read"
+            )
         arrays = dict(archive)
     if not all(isinstance(array, np.ndarray) for array in arrays.values()):
         raise kind(f"{path} holds something else than arrays")
     return arrays
 
 
-def file_sha256(path: Path, progress: Callable[[int, int], object] = lambda done, total: None) -> str:
+def file_sha256(
+    path: Path, progress: Callable[[int, int], object] = lambda done, total: None
+) -> str:
     """SHA-256 of a file; `progress` is called with the bytes done and their total.
 
     Raises:
@@ -156,7 +172,8 @@ def compare_sums(folder: Path, sums: Path, kind: type[DynslamError] = DynslamErr
         kind: What is raised.
 
     Raises:
-        DynslamError: Of the given kind: the list or a file cannot be read, or a name leads out of the folder.
+        DynslamError: Of the given kind: the list or a file cannot be read, or a name leads out of
+            the folder.
     """
     faults = []
     for line in read_lines(sums, kind=kind):

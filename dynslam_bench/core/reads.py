@@ -1,7 +1,8 @@
 """What foreign code read while a run was made, and whether it is still the same.
 
-A run is valid as long as all that it read is unchanged. `runs.process.recorder` records what plug-ins and programs
-read. This module holds the record (`Reads`) and compares it with what is there now (`Verifier`).
+A run is valid as long as all that it read is unchanged. `runs.process.recorder` records what
+plug-ins and programs read. This module holds the record (`Reads`) and compares it with what is
+there now (`Verifier`).
 """
 
 import hashlib
@@ -54,14 +55,17 @@ class Reads(Record):
     Names of files begin in the folders of `Anchors`.
 
     Attributes:
-        files: SHA-256 of each file's bytes. A name that ends in a slash is that of a folder whose whole content counts.
+        files: SHA-256 of each file's bytes. A name that ends in a slash is that of a folder whose
+            whole content counts.
         folders: Digest of the names in each folder that was listed.
         links: Where each file or folder lies that was reached through symbolic links.
-        environment: Digest of the value of each environment variable, by ``$NAME``. Values may be secrets: eight digits
-            show that one has changed and are too few to find it.
-        search: The paths on which libraries and modules are searched; what each command was found to be.
+        environment: Digest of the value of each environment variable, by ``$NAME``. Values may be
+            secrets: eight digits show that one has changed and are too few to find it.
+        search: The paths on which libraries and modules are searched; what each command was found
+            to be.
         modules: Where each module that was asked for was found, by its top-level name.
-        distributions: Version and digest of the RECORD of each distribution whose modules were imported.
+        distributions: Version and digest of the RECORD of each distribution whose modules were
+            imported.
         programs: The same of each file and folder that the processes of programs were made of.
     """
 
@@ -80,7 +84,7 @@ def digest_of(reads: Reads) -> str:
     return digest(reads, 16)
 
 
-# -- names -------------------------------------------------------------------------------------------------------------
+# -- names -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -89,8 +93,8 @@ class Anchors:
 
     Args:
         plugin: The folder of the plug-in's file; None for a plug-in that is installed.
-        work: The working folder. It is no anchor where the home folder lies in it, e.g. ``/``: what lies there would
-            have another name in each working folder.
+        work: The working folder. It is no anchor where the home folder lies in it, e.g. ``/``: what
+            lies there would have another name in each working folder.
     """
 
     plugin: Path | None
@@ -129,7 +133,7 @@ class Anchors:
         return os.pathsep.join(map(self.name, folders))
 
 
-# -- what is there now -------------------------------------------------------------------------------------------------
+# -- what is there now -----------------------------------------------------------------------------
 
 _DIGESTS: dict[tuple[str, str, int, int, int, int], str] = {}
 """Digests by kind, path, size, times and inode, for the life of this process."""
@@ -235,7 +239,9 @@ class ImportPath:
         for folder, names in self._names.items():
             for name in sorted(names):
                 if name.endswith(_METADATA):
-                    metadata.setdefault(_normalised(name.partition("-")[0]), os.path.join(folder, name))
+                    metadata.setdefault(
+                        _normalised(name.partition("-")[0]), os.path.join(folder, name)
+                    )
         return metadata
 
     def distribution(self, name: str) -> str:
@@ -275,7 +281,9 @@ class ImportPath:
             top: Its top-level name.
             file: Its file.
         """
-        return [name for name, beginning in self._of_module.get(top, ()) if file.startswith(beginning)]
+        return [
+            name for name, beginning in self._of_module.get(top, ()) if file.startswith(beginning)
+        ]
 
     def distributions_at(self, file: str) -> list[str]:
         """The names of the distributions that bring the module in which a file lies; empty where there is none."""
@@ -309,7 +317,9 @@ class ImportPath:
     def place(self, top: str, anchors: Anchors) -> str:
         """Where a top-level module is module_file: `INSTALLED`, the name of its file or folder, or `ABSENT`."""
         module_file = self.find(top)
-        if module_file and any(name.endswith(_METADATA) for name in self._names[os.path.dirname(module_file)]):
+        if module_file and any(
+            name.endswith(_METADATA) for name in self._names[os.path.dirname(module_file)]
+        ):
             return INSTALLED
         return anchors.name(module_file)
 
@@ -325,7 +335,8 @@ def _record_digest(file: str) -> str:
     lines = [
         line
         for line in text.splitlines()
-        if links not in line and byte_code not in line and metadata not in line  # any() takes five times as long
+        # any() takes five times as long
+        if links not in line and byte_code not in line and metadata not in line
     ]
     return hashlib.sha256("\n".join(sorted(lines)).encode()).hexdigest()[:12]
 
@@ -343,10 +354,13 @@ def _top_level_names(metadata: str) -> set[str]:
 def _first_parts(record: Path) -> set[str]:
     """The names of the modules that lie where the files of a RECORD begin."""
     parts = set(_FIRST_PART.findall(record.read_text(encoding="utf-8", errors="replace")))
-    return {part.partition(".")[0] for part in parts if not part.endswith(_METADATA)} - {"", BYTE_CODE_FOLDER}
+    return {part.partition(".")[0] for part in parts if not part.endswith(_METADATA)} - {
+        "",
+        BYTE_CODE_FOLDER,
+    }
 
 
-# -- comparing ---------------------------------------------------------------------------------------------------------
+# -- comparing -------------------------------------------------------------------------------------
 
 
 class Verifier:
@@ -357,7 +371,9 @@ class Verifier:
         environment: Their environment variables; None for those of this process.
     """
 
-    def __init__(self, path: Sequence[str] | None = None, environment: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self, path: Sequence[str] | None = None, environment: Mapping[str, str] | None = None
+    ) -> None:
         self._imports = ImportPath(sys.path if path is None else path)
         self._environment = dict(os.environ if environment is None else environment)
         self._now: dict[tuple[str, str, Anchors], str] = {}
@@ -372,7 +388,8 @@ class Verifier:
         """
         for section in _SECTIONS:
             entries = getattr(reads, section)
-            if self._unchanged.get((section, anchors)) == entries:  # most runs of a plug-in read the same
+            # most runs of a plug-in read the same
+            if self._unchanged.get((section, anchors)) == entries:
                 continue
             for name, before in entries.items():
                 key = (section, name, anchors)
@@ -401,7 +418,16 @@ class Verifier:
         return content_now(anchors.path(name))
 
 
-_SECTIONS = ("search", "environment", "modules", "distributions", "folders", "files", "links", "programs")
+_SECTIONS = (
+    "search",
+    "environment",
+    "modules",
+    "distributions",
+    "folders",
+    "files",
+    "links",
+    "programs",
+)
 """The attributes of `Reads` in the order in which they are compared: what explains most comes first."""
 
 
@@ -423,5 +449,9 @@ def _in_words(section: str, name: str, before: str) -> str:
             return f"the names in the folder {short}"
         case "links":
             return f"the target of the link {short}"
-    what = f"the content of the folder {short.rstrip(os.sep)}" if name.endswith(os.sep) else f"the file {short}"
+    what = (
+        f"the content of the folder {short.rstrip(os.sep)}"
+        if name.endswith(os.sep)
+        else f"the file {short}"
+    )
     return f"{what} of a program" if section == "programs" else what

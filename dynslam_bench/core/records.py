@@ -41,7 +41,11 @@ class Record(BaseModel):
         try:
             text = self.model_dump_json(indent=indent)
         except ValueError:  # half characters, e.g. of a foreign command line
-            text = type(self).model_validate(storable(self.model_dump())).model_dump_json(indent=indent)
+            text = (
+                type(self)
+                .model_validate(storable(self.model_dump()))
+                .model_dump_json(indent=indent)
+            )
         return json_without_passwords(text)
 
     @classmethod
@@ -49,8 +53,8 @@ class Record(BaseModel):
         """Read and validate a record.
 
         Raises:
-            DynslamError: The file is missing, too large, no UTF-8, no JSON or does not fit the schema; names file and
-                first fault.
+            DynslamError: The file is missing, too large, no UTF-8, no JSON or does not fit the
+                schema; names file and first fault.
         """
         return cls.parse(read_text(path, limit=cls.most_bytes), str(path))
 
@@ -68,7 +72,9 @@ class Record(BaseModel):
             place = ".".join(map(str, first["loc"])) or "file"
             newer = place.endswith("schema_version") and first["type"] == "less_than_equal"
             hint = "a newer dynslam-bench wrote it: upgrade" if newer else ""
-            raise DynslamError(f"{where} is not a valid {cls.__name__}: {place}: {first['msg']}", hint) from error
+            raise DynslamError(
+                f"{where} is not a valid {cls.__name__}: {place}: {first['msg']}", hint
+            ) from error
 
 
 def validated(cls: type[M], values: Any, where: str, kind: type[DynslamError]) -> M:
@@ -81,7 +87,8 @@ def validated(cls: type[M], values: Any, where: str, kind: type[DynslamError]) -
         kind: What is raised.
 
     Raises:
-        DynslamError: Of the given kind: an unknown key (with a did-you-mean) or an unfit value, in one line.
+        DynslamError: Of the given kind: an unknown key (with a did-you-mean) or an unfit value, in
+            one line.
     """
     try:
         return cls.model_validate(values)

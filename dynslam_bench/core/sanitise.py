@@ -9,7 +9,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-_CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff\ud800-\udfff]")
+_CONTROL = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff\ud800-\udfff]"
+)
 """Characters that a terminal acts upon (escape sequences, directions of writing) or that no encoding takes."""
 _SURROGATE = re.compile("[\ud800-\udfff]")
 LONGEST_NAME = 255
@@ -66,16 +68,25 @@ def inside(folder: Path, name: str, *, where: str, kind: Callable[[str, str], Ex
         DynslamError: Of the given kind: the name is absolute, leads outside, or cannot be a file's.
     """
     if not is_inside(name):
-        raise kind(f"{where} names {name[:100]!r}, which does not lie in {folder}", "names are relative, without '..'")
+        raise kind(
+            f"{where} names {name[:100]!r}, which does not lie in {folder}",
+            "names are relative, without '..'",
+        )
     return folder / name
 
 
 _ADDRESS = re.compile(r"((?<![\w+.-])[A-Za-z][\w+.-]*://[^\s/?#:@\"']*):[^\s\"']{0,999}@")
-_PARAMETER = re.compile(r"([?&;](?:password|passwd|pwd|token|secret|sslpassword)=)[^&;#\s\"']+", re.IGNORECASE)
+_PARAMETER = re.compile(
+    r"([?&;](?:password|passwd|pwd|token|secret|sslpassword)=)[^&;#\s\"']+", re.IGNORECASE
+)
 HIDDEN = "***"
-_HINT = re.compile(r"passw|passp|pwd|token|secret|credential|(?:api|access|private)[-_]?key", re.IGNORECASE)
+_HINT = re.compile(
+    r"passw|passp|pwd|token|secret|credential|(?:api|access|private)[-_]?key", re.IGNORECASE
+)
 """Is in every text that holds a secret by name, and is found fast."""
-_NAME = r"(?:password|passwd|passphrase|pwd|token|secret|credentials?|(?:api|access|private)[-_]?key)"
+_NAME = (
+    r"(?:password|passwd|passphrase|pwd|token|secret|credentials?|(?:api|access|private)[-_]?key)"
+)
 _TEXT = r"(?:[^\"\\]|\\.)"
 """A character of a text in JSON."""
 _BARE = r"(?:[^\s\"'\\&;#]|\\[^\"'])+"
@@ -86,7 +97,8 @@ _ASSIGNED = tuple(
         rf"(\"-{{0,2}}[\w.-]{{0,60}}{_NAME}=){_TEXT}+(?=\")",  # a word of a command in JSON
         rf"({_NAME}=)(?:{_QUOTED}|{_BARE})",
         rf"(\"[\w.-]{{0,60}}{_NAME}\"\s*:\s*\"){_TEXT}+(?=\")",  # a setting in JSON
-        rf"((?<![\w-])--?[\w-]{{0,60}}{_NAME}\",\s*\")(?!-){_TEXT}+(?=\")",  # an option and its value in a list in JSON
+        # an option and its value in a list in JSON
+        rf"((?<![\w-])--?[\w-]{{0,60}}{_NAME}\",\s*\")(?!-){_TEXT}+(?=\")",
         rf"((?<![\w-])--?[\w-]{{0,60}}{_NAME}(?:\s+|',\s*'))(?!-)(?:{_QUOTED}|{_BARE})",
     )
 )
@@ -95,7 +107,8 @@ _ASSIGNED = tuple(
 def without_passwords(text: str) -> str:
     """The text with every password in an address, and every value that its name calls a secret, replaced by ``***``.
 
-    Names end in ``password``, ``token``, ``secret``, ``api-key`` or the like; a value stands behind ``=`` or an option.
+    Names end in ``password``, ``token``, ``secret``, ``api-key`` or the like; a value stands behind
+    ``=`` or an option.
 
     >>> without_passwords("cannot reach postgresql://me:secret@db/studies?sslmode=require")
     'cannot reach postgresql://me:***@db/studies?sslmode=require'

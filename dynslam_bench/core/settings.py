@@ -1,12 +1,14 @@
 """Settings: nested pydantic models whose tunable fields are annotated once.
 
-From the one annotation come validation, ``--set a.b=1`` on the command line, the search space of a study, the action
-space of an environment and the table in the documentation. Nothing here knows Optuna or Gymnasium.
+From the one annotation come validation, ``--set a.b=1`` on the command line, the search space of a
+study, the action space of an environment and the table in the documentation. Nothing here knows
+Optuna or Gymnasium.
 
 Example:
     >>> class Epipolar(Settings):
-    ...     threshold_px: float = tunable(1.0, low=0.1, high=5.0, scale="log", unit="px", online=True,
-    ...                                   meaning="distance to the epipolar line above which a point is dynamic")
+    ...     threshold_px: float = tunable(1.0, low=0.1, high=5.0, scale="log", unit="px",
+    online=True, ...                                   meaning="distance to the epipolar line above
+    which a point is dynamic")
     >>> class Tracker(Settings):
     ...     epipolar: Epipolar = Epipolar()
     >>> apply_overrides(Tracker(), {"epipolar.threshold_px": "1.5"}).epipolar.threshold_px
@@ -38,7 +40,9 @@ _NAMES = "names"
 class Settings(BaseModel):
     """Base of all settings: immutable, JSON-able, unknown keys are errors."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False
+    )
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
@@ -47,7 +51,12 @@ class Settings(BaseModel):
             if _annotation(field) is None:
                 continue
             p = _describe(name, field, default)
-            if p.low is not None and p.high is not None and default is not None and not p.low <= default <= p.high:
+            if (
+                p.low is not None
+                and p.high is not None
+                and default is not None
+                and not p.low <= default <= p.high
+            ):
                 raise TypeError(
                     f"{cls.__name__}: the default of '{name}' is {default!r}, outside its range {p.low:g} to {p.high:g}"
                 )
@@ -112,7 +121,8 @@ def tunable(
         low: Lower end of the search range, inclusive.
         high: Upper end of the search range, inclusive.
         scale: ``log`` for values whose ratio matters; needs ``low > 0``.
-        limits: What validation accepts, where that is wider than the search range; None leaves an end open.
+        limits: What validation accepts, where that is wider than the search range; None leaves an
+            end open.
         unit: Physical unit, e.g. ``px``.
         online: True if the field may change in mid-episode.
         tuned: False if no study tunes the field: it is online, and a decision for single frames.
@@ -128,15 +138,20 @@ def tunable(
         "tunable": tuned,
     }
     least, most = (low, high) if limits is None else limits
-    return Field(default, description=meaning, json_schema_extra={_KEY: annotation}, ge=least, le=most)
+    return Field(
+        default, description=meaning, json_schema_extra={_KEY: annotation}, ge=least, le=most
+    )
 
 
-def names(default: str, kind: Literal["file", "features", "flow"], *, meaning: str, otherwise: str = "") -> Any:
+def names(
+    default: str, kind: Literal["file", "features", "flow"], *, meaning: str, otherwise: str = ""
+) -> Any:
     """A field of text that names something else, whose content decides the result as well.
 
     Args:
         default: The default value.
-        kind: ``file``: a path of a file or folder; else a plug-in of that kind, by id or ``module:Attr``.
+        kind: ``file``: a path of a file or folder; else a plug-in of that kind, by id or
+            ``module:Attr``.
         meaning: One line for the documentation table.
         otherwise: Environment variable that names it where the field is empty.
     """
@@ -151,7 +166,8 @@ def named(settings: Settings) -> dict[str, tuple[str, str]]:
     """
     values: dict[str, tuple[str, str]] = {}
     for name, field, _ in _leaves(type(settings)):
-        note, value = _annotation(field, _NAMES), attrgetter(name)(settings)
+        note = _annotation(field, _NAMES)
+        value = attrgetter(name)(settings)
         if note is not None:
             values[name] = (note["kind"], value or os.environ.get(note["otherwise"], ""))
         elif isinstance(value, Path):
@@ -163,7 +179,8 @@ def build(cls: type[S], values: Mapping[str, Any] | None = None) -> S:
     """Validate a nested mapping into settings.
 
     Raises:
-        SettingsError: One line naming the first offending field by its dotted path, its value and what is expected.
+        SettingsError: One line naming the first offending field by its dotted path, its value and
+            what is expected.
     """
     try:
         return cls.model_validate(dict(values or {}))
@@ -222,7 +239,11 @@ def field_names(cls: type[Settings]) -> list[str]:
 
 def parameters(cls: type[Settings], *, online_only: bool = False) -> list[Parameter]:
     """The tunable fields of a settings class, or all online ones, in order of definition."""
-    return [parameter for parameter in _parameters(cls) if (parameter.online if online_only else parameter.tunable)]
+    return [
+        parameter
+        for parameter in _parameters(cls)
+        if (parameter.online if online_only else parameter.tunable)
+    ]
 
 
 @cache
@@ -233,11 +254,16 @@ def _parameters(cls: type[Settings]) -> tuple[Parameter, ...]:
 def settings_table(cls: type[Settings]) -> str:
     """Markdown table of every leaf field: name, default, range, unit, online, meaning."""
     described = {parameter.name: parameter for parameter in _parameters(cls)}
-    rows = ["| setting | default | range | unit | online | meaning |", "| --- | --- | --- | --- | --- | --- |"]
+    rows = [
+        "| setting | default | range | unit | online | meaning |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
     for name, field, default in _leaves(cls):
         p = described.get(name)
         more = f"{_span(p)} | {p.unit} | {'yes' if p.online else ''}" if p else " |  | "
-        rows.append(f"| `{name}` | `{json.dumps(default, default=str)}` | {more} | {field.description or ''} |")
+        rows.append(
+            f"| `{name}` | `{json.dumps(default, default=str)}` | {more} | {field.description or ''} |"
+        )
     return "\n".join(rows) + "\n"
 
 
@@ -257,14 +283,20 @@ def _leaves(
         nested = _nested(field)
         default = getattr(defaults, key) if defaults is not None else _default(field)
         if nested is not None:
-            yield from _leaves(nested, f"{prefix}{key}.", default if isinstance(default, Settings) else None)
+            yield from _leaves(
+                nested, f"{prefix}{key}.", default if isinstance(default, Settings) else None
+            )
         else:
             yield f"{prefix}{key}", field, default
 
 
 def _default(field: FieldInfo) -> Any:
     """A field's default; pydantic's own way to ask copies whole groups, which cannot change."""
-    return field.default if isinstance(field.default, Settings) else field.get_default(call_default_factory=True)
+    return (
+        field.default
+        if isinstance(field.default, Settings)
+        else field.get_default(call_default_factory=True)
+    )
 
 
 def _nested(field: FieldInfo) -> type[Settings] | None:
@@ -285,9 +317,17 @@ def _describe(name: str, field: FieldInfo, default: Any) -> Parameter:
     assert note is not None
     kinds = [kind for kind in _alternatives(field.annotation) if kind is not type(None)]
     base = kinds[0] if len(kinds) == 1 else field.annotation
-    choices = (False, True) if base is bool else typing.get_args(base) if typing.get_origin(base) is Literal else ()
+    choices = (
+        (False, True)
+        if base is bool
+        else typing.get_args(base)
+        if typing.get_origin(base) is Literal
+        else ()
+    )
     if not choices and (base not in (int, float) or note["low"] is None or note["high"] is None):
-        raise TypeError(f"tunable field '{name}' of type {base} needs low and high, or a bool or Literal type")
+        raise TypeError(
+            f"tunable field '{name}' of type {base} needs low and high, or a bool or Literal type"
+        )
     kind: Any = base.__name__ if base in (bool, int, float) else "categorical"
     return Parameter(name, kind, default, choices=choices, meaning=field.description or "", **note)
 
@@ -303,8 +343,15 @@ def _parse(value: Any, annotation: Any) -> Any:
     if not isinstance(value, str):
         return value
     kinds = _alternatives(annotation)
-    texts = [choice for kind in kinds if typing.get_origin(kind) is Literal for choice in typing.get_args(kind)]
-    if (str in kinds or Path in kinds or value in texts) and not (value == "null" and type(None) in kinds):
+    texts = [
+        choice
+        for kind in kinds
+        if typing.get_origin(kind) is Literal
+        for choice in typing.get_args(kind)
+    ]
+    if (str in kinds or Path in kinds or value in texts) and not (
+        value == "null" and type(None) in kinds
+    ):
         return value
     try:
         return json.loads(value)
@@ -330,7 +377,7 @@ def shown(value: Any) -> str:
     return text if len(text) <= 200 else f"{text[:200]}..."
 
 
-# -- online reconfiguration -------------------------------------------------------------------------------------------
+# -- online reconfiguration ------------------------------------------------------------------------
 
 
 @runtime_checkable
@@ -341,8 +388,8 @@ class Reconfigurable(Protocol):
         """Put settings into force from the next frame on.
 
         Args:
-            settings: All settings of the part, of the class that it was built with; only fields marked ``online``
-                differ from those in force.
+            settings: All settings of the part, of the class that it was built with; only fields
+                marked ``online`` differ from those in force.
         """
 
 
@@ -375,7 +422,9 @@ class OnlineSettings:
         SettingsError: An online setting that has an effect lies in a group that no part takes.
     """
 
-    def __init__(self, settings: Settings, parts: Iterable[tuple[str, Callable[[Any], None]]]) -> None:
+    def __init__(
+        self, settings: Settings, parts: Iterable[tuple[str, Callable[[Any], None]]]
+    ) -> None:
         self._built = self._in_force = settings
         self._parts = tuple(parts)
         for parameter in online_parameters(settings):

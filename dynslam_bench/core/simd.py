@@ -1,10 +1,10 @@
 """SIMD vectors inside compiled kernels: 8 float64, 16 float32, 32 uint16 or 64 uint8 numbers as one value.
 
-Written as generic vector code of fixed width (llvmlite): LLVM maps it to the processor's instructions. A lane is the
-place of one number in a vector, as in SIMD hardware. The order of
-every sum is part of the program, so that results do not depend on the processor. The uint16 operations are exact but
-for one square root and division, which IEEE 754 defines to the last bit; `tests/flow/exact_reference.py` gives the same
-bytes.
+Written as generic vector code of fixed width (llvmlite): LLVM maps it to the processor's
+instructions. A lane is the place of one number in a vector, as in SIMD hardware. The order of
+every sum is part of the program, so that results do not depend on the processor. The uint16
+operations are exact but for one square root and division, which IEEE 754 defines to the last bit;
+`tests/flow/exact_reference.py` gives the same bytes.
 """
 
 from __future__ import annotations
@@ -44,8 +44,15 @@ def instruction(define: Callable[..., Definition]) -> Code:
     return intrinsic(define)
 
 
-FLOAT_LANES, UINT16_LANES = 16, 32
-_FLOAT, _INT64, _INT32, _UINT16, _BYTE = ir.FloatType(), ir.IntType(64), ir.IntType(32), ir.IntType(16), ir.IntType(8)
+FLOAT_LANES = 16
+UINT16_LANES = 32
+_FLOAT, _INT64, _INT32, _UINT16, _BYTE = (
+    ir.FloatType(),
+    ir.IntType(64),
+    ir.IntType(32),
+    ir.IntType(16),
+    ir.IntType(8),
+)
 _FLOATS, _INTS = ir.VectorType(_FLOAT, FLOAT_LANES), ir.VectorType(_INT32, FLOAT_LANES)
 _BYTES16 = ir.VectorType(_BYTE, FLOAT_LANES)
 _HALVES, _BYTES32 = ir.VectorType(_UINT16, UINT16_LANES), ir.VectorType(_BYTE, UINT16_LANES)
@@ -79,7 +86,8 @@ class _SimdModel(models.PrimitiveModel):
         super().__init__(manager, kind, kind.vector)
 
 
-FLOAT32X16, UINT16X32 = SimdType("Float32x16", _FLOATS), SimdType("UInt16x32", _HALVES)
+FLOAT32X16 = SimdType("Float32x16", _FLOATS)
+UINT16X32 = SimdType("UInt16x32", _HALVES)
 SUMS = types.UniTuple(SimdType("Float64x8", _DOUBLES), 6)
 """Of normal equations: six rows of six numbers of the matrix, one of the vector and a zero."""
 
@@ -92,13 +100,17 @@ class _Arithmetic(AbstractTemplate):
 for _symbol, _operation in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul")):
     infer_global(_symbol)(type(f"_Lanes_{_operation}", (_Arithmetic,), {}))
 
-    def _lower(context: Code, builder: Code, kind: Code, arguments: Code, operation: str = _operation) -> Code:
+    def _lower(
+        context: Code, builder: Code, kind: Code, arguments: Code, operation: str = _operation
+    ) -> Code:
         return getattr(builder, operation)(*arguments)
 
     lower_builtin(_symbol, SimdType, SimdType)(_lower)
 
 
-def pointer_to(context: Code, builder: Code, kind: Code, array: Code, index: Code, vector: ir.VectorType) -> Code:
+def pointer_to(
+    context: Code, builder: Code, kind: Code, array: Code, index: Code, vector: ir.VectorType
+) -> Code:
     """Code for the address of an array's element, as the address of a vector."""
     data = context.make_array(kind)(context, builder, array).data
     return builder.bitcast(builder.gep(data, [index]), vector.as_pointer())
@@ -120,11 +132,19 @@ _EACH_EIGHT_TIMES = _places(*(pixel for pixel in range(4) for _ in range(8)))
 def splat(builder: Code, kind: ir.VectorType, value: Code) -> Code:
     """Code for a vector of equal numbers."""
     first = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(_INT32, 0))
-    return builder.shuffle_vector(first, ir.Constant(kind, ir.Undefined), _places(*([0] * kind.count)))
+    return builder.shuffle_vector(
+        first, ir.Constant(kind, ir.Undefined), _places(*([0] * kind.count))
+    )
 
 
 def load_vector(
-    context: Code, builder: Code, kind: Code, array: Code, index: Code, vector: ir.VectorType, align: int
+    context: Code,
+    builder: Code,
+    kind: Code,
+    array: Code,
+    index: Code,
+    vector: ir.VectorType,
+    align: int,
 ) -> Code:
     """Code that reads adjacent elements of an array from an index on."""
     loaded = builder.load(pointer_to(context, builder, kind, array, index, vector))
@@ -132,13 +152,17 @@ def load_vector(
     return loaded
 
 
-def _loading(result: SimdType, vector: ir.VectorType, align: int, convert: Callable[[Code, Code], Code]) -> Code:
+def _loading(
+    result: SimdType, vector: ir.VectorType, align: int, convert: Callable[[Code, Code], Code]
+) -> Code:
     """The instruction ``load(array, index)``; nothing is checked."""
 
     def load(typing_context: Code, array: Code, index: Code) -> Definition:
         def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
             array, index = arguments
-            return convert(builder, load_vector(context, builder, kind.args[0], array, index, vector, align))
+            return convert(
+                builder, load_vector(context, builder, kind.args[0], array, index, vector, align)
+            )
 
         return result(array, types.int64), generate
 
@@ -151,7 +175,11 @@ def _storing(value: SimdType, align: int) -> Code:
     def store(typing_context: Code, array: Code, index: Code, vector: Code) -> Definition:
         def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
             array, index, vector = arguments
-            builder.store(vector, pointer_to(context, builder, kind.args[0], array, index, value.vector), align=align)
+            builder.store(
+                vector,
+                pointer_to(context, builder, kind.args[0], array, index, value.vector),
+                align=align,
+            )
             return context.get_dummy_value()
 
         return types.void(array, types.int64, value), generate
@@ -162,7 +190,10 @@ def _storing(value: SimdType, align: int) -> Code:
 load = _loading(FLOAT32X16, _FLOATS, 4, lambda builder, loaded: loaded)
 """Sixteen adjacent numbers of a flat float32 array."""
 load_bytes = _loading(
-    FLOAT32X16, _BYTES16, 1, lambda builder, loaded: builder.sitofp(builder.zext(loaded, _INTS), _FLOATS)
+    FLOAT32X16,
+    _BYTES16,
+    1,
+    lambda builder, loaded: builder.sitofp(builder.zext(loaded, _INTS), _FLOATS),
 )
 """Sixteen adjacent numbers of a flat uint8 array, as floats."""
 load_uint16 = _loading(UINT16X32, _HALVES, 2, lambda builder, loaded: loaded)
@@ -178,7 +209,12 @@ def _sum_of_lanes(builder: Code, vector: Code, add: Callable[[Code, Code], Code]
     width = vector.type.count
     while width > 1:
         width //= 2
-        vector = add(*(builder.shuffle_vector(vector, vector, _places(*range(k, k + width))) for k in (0, width)))
+        vector = add(
+            *(
+                builder.shuffle_vector(vector, vector, _places(*range(k, k + width)))
+                for k in (0, width)
+            )
+        )
     return builder.extract_element(vector, ir.Constant(_INT32, 0))
 
 
@@ -204,8 +240,11 @@ def total(typing_context: Code, vector: Code) -> Definition:
 
 def _grid_places(context: Code, builder: Code, kinds: Code, grid: Code) -> tuple[Code, Code]:
     """Code for columns and rows, in 65536ths of a pixel, of sixteen places of a rotated and scaled grid (`sample`)."""
-    at, origin_and_steps = grid[2], grid[3:]
-    right, down = (load_vector(context, builder, kinds[k], grid[k - 1], at, _INTS, 4) for k in (1, 2))
+    at = grid[2]
+    origin_and_steps = grid[3:]
+    right, down = (
+        load_vector(context, builder, kinds[k], grid[k - 1], at, _INTS, 4) for k in (1, 2)
+    )
     column, row, dx, dy = (splat(builder, _INTS, value) for value in origin_and_steps)
     x = builder.sub(builder.add(column, builder.mul(right, dx)), builder.mul(down, dy))
     y = builder.add(builder.add(row, builder.mul(right, dy)), builder.mul(down, dx))
@@ -224,9 +263,14 @@ def store_offsets(
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         offsets, *grid, stride = arguments
-        x, y = (builder.ashr(c, constant(_INTS, 16)) for c in _grid_places(context, builder, kind.args, grid))
+        x, y = (
+            builder.ashr(c, constant(_INTS, 16))
+            for c in _grid_places(context, builder, kind.args, grid)
+        )
         offset = builder.add(builder.mul(y, splat(builder, _INTS, stride)), x)
-        builder.store(offset, pointer_to(context, builder, kind.args[0], offsets, grid[2], _INTS), align=4)
+        builder.store(
+            offset, pointer_to(context, builder, kind.args[0], offsets, grid[2], _INTS), align=4
+        )
         return context.get_dummy_value()
 
     return types.void(offsets, columns, rows, types.int64, *([types.int32] * 5)), generate
@@ -242,7 +286,9 @@ def square(typing_context: Code, image: Code, at: Code, stride: Code) -> Definit
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         image, at, stride = arguments
         above, below = (
-            builder.zext(load_vector(context, builder, kind.args[0], image, index, _UINT16, 1), _INT32)
+            builder.zext(
+                load_vector(context, builder, kind.args[0], image, index, _UINT16, 1), _INT32
+            )
             for index in (at, builder.add(at, stride))
         )
         return builder.or_(above, builder.shl(below, ir.Constant(_INT32, 16)))
@@ -269,22 +315,30 @@ def sample(
         step_y: Image rows a grid column (and minus the columns a grid row), likewise.
 
     Returns:
-        Grey levels. The places must lie inside the image by at least one row and one column: nothing is checked.
+        Grey levels. The places must lie inside the image by at least one row and one column:
+        nothing is checked.
     """
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         squares, *grid = arguments
         right, down = (
-            builder.fmul(builder.sitofp(builder.and_(c, constant(_INTS, 65535)), _FLOATS), constant(_FLOATS, 1 / 65536))
+            builder.fmul(
+                builder.sitofp(builder.and_(c, constant(_INTS, 65535)), _FLOATS),
+                constant(_FLOATS, 1 / 65536),
+            )
             for c in _grid_places(context, builder, kind.args, grid)
         )
         pixels = load_vector(context, builder, kind.args[0], squares, grid[2], _INTS, 4)
         corners = [
-            builder.sitofp(builder.and_(builder.lshr(pixels, constant(_INTS, 8 * k)), constant(_INTS, 255)), _FLOATS)
+            builder.sitofp(
+                builder.and_(builder.lshr(pixels, constant(_INTS, 8 * k)), constant(_INTS, 255)),
+                _FLOATS,
+            )
             for k in range(4)
         ]
         above, below = (
-            builder.fadd(corners[k], builder.fmul(right, builder.fsub(corners[k + 1], corners[k]))) for k in (0, 2)
+            builder.fadd(corners[k], builder.fmul(right, builder.fsub(corners[k + 1], corners[k])))
+            for k in (0, 2)
         )
         return builder.fadd(above, builder.fmul(down, builder.fsub(below, above)))
 
@@ -314,7 +368,9 @@ def average_of_pairs(typing_context: Code, first: Code, second: Code) -> Definit
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         parts = [
-            builder.shuffle_vector(*arguments, _places(*(16 * pair + odd + b for pair in range(4) for b in range(8))))
+            builder.shuffle_vector(
+                *arguments, _places(*(16 * pair + odd + b for pair in range(4) for b in range(8)))
+            )
             for odd in (0, 8)
         ]
         return _average(builder, *parts)
@@ -323,7 +379,9 @@ def average_of_pairs(typing_context: Code, first: Code, second: Code) -> Definit
 
 
 @instruction
-def derivatives(typing_context: Code, sums: Code, here: Code, above: Code, below: Code) -> Definition:
+def derivatives(
+    typing_context: Code, sums: Code, here: Code, above: Code, below: Code
+) -> Definition:
     """Rectified directional derivatives of four adjacent pixels.
 
     Args:
@@ -341,24 +399,34 @@ def derivatives(typing_context: Code, sums: Code, here: Code, above: Code, below
         four, wide = ir.VectorType(_UINT16, 4), ir.VectorType(_INT32, 4)
 
         def pixels(index: Code) -> Code:
-            return builder.zext(load_vector(context, builder, kind.args[0], arguments[0], index, four, 2), wide)
+            return builder.zext(
+                load_vector(context, builder, kind.args[0], arguments[0], index, four, 2), wide
+            )
 
         one = ir.Constant(ir.IntType(64), 1)
-        gx = builder.sub(pixels(builder.add(arguments[1], one)), pixels(builder.sub(arguments[1], one)))
+        gx = builder.sub(
+            pixels(builder.add(arguments[1], one)), pixels(builder.sub(arguments[1], one))
+        )
         gy = builder.sub(pixels(arguments[3]), pixels(arguments[2]))
         gx, gy = (builder.shuffle_vector(g, g, _EACH_EIGHT_TIMES) for g in (gx, gy))
-        cosines, sines = (_places(*(COSINES[(b - turn) % 8] for b in range(UINT16_LANES))) for turn in (0, 2))
+        cosines, sines = (
+            _places(*(COSINES[(b - turn) % 8] for b in range(UINT16_LANES))) for turn in (0, 2)
+        )
         along = builder.add(builder.mul(gx, cosines), builder.mul(gy, sines))
         rounded = builder.add(along, constant(cosines.type, 1 << (DERIVATIVE_SHIFT - 1)))
         value = builder.ashr(rounded, constant(cosines.type, DERIVATIVE_SHIFT))
         zero = constant(cosines.type, 0)
-        return builder.trunc(builder.select(builder.icmp_signed(">", value, zero), value, zero), _HALVES)
+        return builder.trunc(
+            builder.select(builder.icmp_signed(">", value, zero), value, zero), _HALVES
+        )
 
     return UINT16X32(sums, types.int64, types.int64, types.int64), generate
 
 
 @instruction
-def store_normalised(typing_context: Code, array: Code, index: Code, halves: Code, floor: Code) -> Definition:
+def store_normalised(
+    typing_context: Code, array: Code, index: Code, halves: Code, floor: Code
+) -> Definition:
     """Write four histograms as 32 bytes: each divided by its Euclidean norm plus `floor`, times 255, rounded."""
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
@@ -367,13 +435,22 @@ def store_normalised(typing_context: Code, array: Code, index: Code, halves: Cod
         wide = builder.zext(halves, ints)
         squares = builder.mul(wide, wide)
         for count in (32, 16, 8):
-            parts = (builder.shuffle_vector(squares, squares, _places(*range(odd, count, 2))) for odd in (0, 1))
+            parts = (
+                builder.shuffle_vector(squares, squares, _places(*range(odd, count, 2)))
+                for odd in (0, 1)
+            )
             squares = builder.add(*parts)
         floats = ir.VectorType(_FLOAT, 4)
-        root = cgutils.get_or_insert_function(builder.module, ir.FunctionType(floats, [floats]), "llvm.sqrt.v4f32")
+        root = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(floats, [floats]), "llvm.sqrt.v4f32"
+        )
         norm = builder.call(root, [builder.sitofp(squares, floats)])
-        gain = builder.fdiv(constant(floats, 255.0), builder.fadd(norm, splat(builder, floats, floor)))
-        scaled = builder.fmul(builder.sitofp(wide, many), builder.shuffle_vector(gain, gain, _EACH_EIGHT_TIMES))
+        gain = builder.fdiv(
+            constant(floats, 255.0), builder.fadd(norm, splat(builder, floats, floor))
+        )
+        scaled = builder.fmul(
+            builder.sitofp(wide, many), builder.shuffle_vector(gain, gain, _EACH_EIGHT_TIMES)
+        )
         rounded = builder.fptosi(builder.fadd(scaled, constant(many, 0.5)), ints)
         pointer = pointer_to(context, builder, kind.args[0], array, index, _BYTES32)
         builder.store(builder.trunc(rounded, _BYTES32), pointer, align=1)
@@ -385,7 +462,8 @@ def store_normalised(typing_context: Code, array: Code, index: Code, halves: Cod
 def _histogram_distances(builder: Code, first: Code, second: Code, count: int) -> Code:
     """L1 distances of `count` histograms of eight bytes, as ``count`` 64-bit lanes."""
     bytes_ = ir.VectorType(_BYTE, 8 * count)
-    first, second = builder.bitcast(first, bytes_), builder.bitcast(second, bytes_)
+    second = builder.bitcast(second, bytes_)
+    first = builder.bitcast(first, bytes_)
     above = builder.icmp_unsigned(">", first, second)
     total = builder.sub(builder.select(above, first, second), builder.select(above, second, first))
     for bits in (8, 16, 32):  # add neighbours until a histogram is one number
@@ -417,7 +495,9 @@ def descriptor_sum(
         at: Index of the first of its 136 bytes.
         truncation: Largest distance counted for one histogram.
     """
-    signature = types.int64(image, samples, *([types.int64] * 4), descriptor, types.int64, types.int64)
+    signature = types.int64(
+        image, samples, *([types.int64] * 4), descriptor, types.int64, types.int64
+    )
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         image, samples, near_row, far_row, near, far, descriptor, at, truncation = arguments
@@ -427,7 +507,11 @@ def descriptor_sum(
         )
         mine = builder.gep(mine, [at])
         total = ir.Constant(_INT64, 0)
-        for first, count, cell, row in ((0, 1, near, near_row), (1, 8, near, near_row), (9, 8, far, far_row)):
+        for first, count, cell, row in (
+            (0, 1, near, near_row),
+            (1, 8, near, near_row),
+            (9, 8, far, far_row),
+        ):
             lanes = ir.VectorType(_INT64, count)
             base, theirs = builder.gep(cells, [cell]), ir.Constant(lanes, ir.Undefined)
             line = builder.gep(offsets, [builder.mul(row, ir.Constant(_INT64, 17))])
@@ -437,7 +521,11 @@ def descriptor_sum(
                 histogram = builder.load(builder.bitcast(place, _INT64.as_pointer()))
                 histogram.align = 1
                 theirs = builder.insert_element(theirs, histogram, ir.Constant(_INT32, k))
-            own = builder.load(builder.bitcast(builder.gep(mine, [ir.Constant(_INT64, 8 * first)]), lanes.as_pointer()))
+            own = builder.load(
+                builder.bitcast(
+                    builder.gep(mine, [ir.Constant(_INT64, 8 * first)]), lanes.as_pointer()
+                )
+            )
             own.align = 1
             distances = _histogram_distances(builder, theirs, own, count)
             limit = splat(builder, lanes, truncation)
@@ -457,11 +545,14 @@ def _larger(builder: Code, first: Code, second: Code) -> Code:
 
 
 @instruction
-def store_corner_scores(typing_context: Code, scores: Code, image: Code, at: Code, circle: Code) -> Definition:
+def store_corner_scores(
+    typing_context: Code, scores: Code, image: Code, at: Code, circle: Code
+) -> Definition:
     """Write the FAST scores of sixty-four adjacent pixels (Rosten and Drummond 2006).
 
-    The score is the largest threshold at which the pixel is a corner: nine adjacent pixels of the circle around it are
-    all brighter, or all darker, by more than the threshold. It is 0 where there is none.
+    The score is the largest threshold at which the pixel is a corner: nine adjacent pixels of the
+    circle around it are all brighter, or all darker, by more than the threshold. It is 0 where
+    there is none.
 
     Args:
         typing_context: Numba's.
@@ -476,15 +567,23 @@ def store_corner_scores(typing_context: Code, scores: Code, image: Code, at: Cod
         offsets = context.make_array(kind.args[3])(context, builder, circle).data
         load = partial(load_vector, context, builder, kind.args[1], image, vector=_BYTES64, align=1)
         ring = [
-            load(index=builder.add(at, builder.load(builder.gep(offsets, [ir.Constant(_INT64, k)])))) for k in range(16)
+            load(
+                index=builder.add(at, builder.load(builder.gep(offsets, [ir.Constant(_INT64, k)])))
+            )
+            for k in range(16)
         ]
-        smaller, larger, centre = partial(_smaller, builder), partial(_larger, builder), load(index=at)
+        smaller, larger, centre = (
+            partial(_smaller, builder),
+            partial(_larger, builder),
+            load(index=at),
+        )
 
         def best_arc(worse: Callable[..., Code], better: Callable[..., Code]) -> Code:
             """The grey level that all pixels of the best arc of nine reach."""
             twos = [worse(ring[k], ring[(k + 1) % 16]) for k in range(1, 16, 2)]
             fours = [worse(twos[k], twos[(k + 1) % 8]) for k in range(8)]
-            eights = [worse(fours[k], fours[(k + 2) % 8]) for k in range(8)]  # with one more pixel at either end
+            # with one more pixel at either end
+            eights = [worse(fours[k], fours[(k + 2) % 8]) for k in range(8)]
             arcs = [worse(eights[k], better(ring[2 * k], ring[(2 * k + 9) % 16])) for k in range(8)]
             return reduce(better, arcs)
 
@@ -492,14 +591,18 @@ def store_corner_scores(typing_context: Code, scores: Code, image: Code, at: Cod
         darker = builder.sub(centre, smaller(best_arc(larger, smaller), centre))
         one = constant(_BYTES64, 1)
         score = builder.sub(larger(larger(brighter, darker), one), one)
-        builder.store(score, pointer_to(context, builder, kind.args[0], scores, at, _BYTES64), align=1)
+        builder.store(
+            score, pointer_to(context, builder, kind.args[0], scores, at, _BYTES64), align=1
+        )
         return context.get_dummy_value()
 
     return types.void(scores, image, types.int64, circle), generate
 
 
 @instruction
-def store_maxima(typing_context: Code, maxima: Code, scores: Code, at: Code, width: Code, least: Code) -> Definition:
+def store_maxima(
+    typing_context: Code, maxima: Code, scores: Code, at: Code, width: Code, least: Code
+) -> Definition:
     """Write sixty-four adjacent scores, those that are below `least` or not above all eight around them as 0.
 
     Args:
@@ -513,7 +616,9 @@ def store_maxima(typing_context: Code, maxima: Code, scores: Code, at: Code, wid
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         maxima, scores, at, width, least = arguments
-        load = partial(load_vector, context, builder, kind.args[1], scores, vector=_BYTES64, align=1)
+        load = partial(
+            load_vector, context, builder, kind.args[1], scores, vector=_BYTES64, align=1
+        )
         steps = [builder.sub(at, width), at, builder.add(at, width)]
         around = [
             load(index=builder.add(step, ir.Constant(_INT64, dx)))
@@ -521,17 +626,25 @@ def store_maxima(typing_context: Code, maxima: Code, scores: Code, at: Code, wid
             for dx in (-1, 0, 1)
             if dx or step is not at
         ]
-        limit = builder.sub(splat(builder, _BYTES64, builder.trunc(least, _BYTE)), constant(_BYTES64, 1))
+        limit = builder.sub(
+            splat(builder, _BYTES64, builder.trunc(least, _BYTE)), constant(_BYTES64, 1)
+        )
         score, bound = load(index=at), reduce(partial(_larger, builder), around, limit)
-        kept = builder.select(builder.icmp_unsigned(">", score, bound), score, constant(_BYTES64, 0))
-        builder.store(kept, pointer_to(context, builder, kind.args[0], maxima, at, _BYTES64), align=1)
+        kept = builder.select(
+            builder.icmp_unsigned(">", score, bound), score, constant(_BYTES64, 0)
+        )
+        builder.store(
+            kept, pointer_to(context, builder, kind.args[0], maxima, at, _BYTES64), align=1
+        )
         return context.get_dummy_value()
 
     return types.void(maxima, scores, types.int64, types.int64, types.int64), generate
 
 
 @instruction
-def patch_sum(typing_context: Code, image: Code, at: Code, width: Code, weights: Code) -> Definition:
+def patch_sum(
+    typing_context: Code, image: Code, at: Code, width: Code, weights: Code
+) -> Definition:
     """Weighted sum of a patch of `PATCH_ROWS` rows and `UINT16_LANES` columns, exact in 32 bits.
 
     Args:
@@ -549,7 +662,9 @@ def patch_sum(typing_context: Code, image: Code, at: Code, width: Code, weights:
             pixels = load_vector(context, builder, kind.args[0], image, at, _BYTES32, 1)
             first = ir.Constant(_INT64, UINT16_LANES * row)
             factors = load_vector(context, builder, kind.args[3], weights, first, _HALVES, 2)
-            total = builder.add(total, builder.mul(builder.zext(pixels, _INTS32), builder.sext(factors, _INTS32)))
+            total = builder.add(
+                total, builder.mul(builder.zext(pixels, _INTS32), builder.sext(factors, _INTS32))
+            )
             at = builder.add(at, width)
         return _sum_of_lanes(builder, total, builder.add)
 
@@ -581,20 +696,26 @@ def add_normal_equation(
         scaled = builder.fmul(splat(builder, _DOUBLES, weight), row)
         factors = [builder.shuffle_vector(scaled, scaled, _places(*([m] * 8))) for m in range(6)]
         rows = cgutils.unpack_tuple(builder, sums, 6)
-        added = [builder.fadd(old, builder.fmul(factor, row)) for old, factor in zip(rows, factors, strict=True)]
+        added = [
+            builder.fadd(old, builder.fmul(factor, row))
+            for old, factor in zip(rows, factors, strict=True)
+        ]
         return context.make_tuple(builder, kind.return_type, added)
 
     return SUMS(SUMS, *([types.float64] * 8)), generate
 
 
 @instruction
-def store_normal_equations(typing_context: Code, sums: Code, matrix: Code, vector: Code) -> Definition:
+def store_normal_equations(
+    typing_context: Code, sums: Code, matrix: Code, vector: Code
+) -> Definition:
     """Write the matrix ``[6, 6]`` and the vector ``[6]`` of the sums into float64 arrays."""
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         sums, *arrays = arguments
         data = [
-            context.make_array(k)(context, builder, array).data for k, array in zip(kind.args[1:], arrays, strict=True)
+            context.make_array(k)(context, builder, array).data
+            for k, array in zip(kind.args[1:], arrays, strict=True)
         ]
         for m, row in enumerate(cgutils.unpack_tuple(builder, sums, 6)):
             for n in range(7):

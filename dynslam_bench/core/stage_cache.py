@@ -1,9 +1,9 @@
 """The stage cache: what does not depend on the settings under study is computed once and stored with its cost.
 
-Entries are addressed by content: the key digests the stage, its code (a plug-in's too), its settings, the machine, the
-threads and the input itself (see `core.fingerprint`), so that nothing stale is ever returned. Each entry is one file
-that appears by atomic rename, so many processes may share a cache; the least recently used entries go when it grows
-over its bound.
+Entries are addressed by content: the key digests the stage, its code (a plug-in's too), its
+settings, the machine, the threads and the input itself (see `core.fingerprint`), so that nothing
+stale is ever returned. Each entry is one file that appears by atomic rename, so many processes may
+share a cache; the least recently used entries go when it grows over its bound.
 """
 
 import contextlib
@@ -38,8 +38,8 @@ def record_reads(reads_so_far: ReadsSoFar) -> None:
 def stage_code(entry_point: str) -> ReadsSoFar | None:
     """Gives the digest of the code of a stage, of a plug-in with all that it has read so far.
 
-    It is asked before and after a stage computes: what a plug-in reads meanwhile, such as its weights at its first
-    frame, makes the result one of an unknown state, which is not stored.
+    It is asked before and after a stage computes: what a plug-in reads meanwhile, such as its
+    weights at its first frame, makes the result one of an unknown state, which is not stored.
 
     Args:
         entry_point: ``module:Attr`` or ``file.py:Attr`` of the stage.
@@ -49,7 +49,8 @@ def stage_code(entry_point: str) -> ReadsSoFar | None:
     """
     module = entry_point.rpartition(":")[0]
     if module in module_graph().modules:
-        return partial(str, module_graph().digest([module], PLUMBING))  # unlike a lambda it can be pickled
+        # unlike a lambda it can be pickled
+        return partial(str, module_graph().digest([module], PLUMBING))
     return _RECORDING[0] if _RECORDING else None
 
 
@@ -78,7 +79,8 @@ class StageCache:
 
     Args:
         folder: Where; created when first written to.
-        max_bytes: Bound; when it is passed, the least recently used entries go until four fifths are left.
+        max_bytes: Bound; when it is passed, the least recently used entries go until four fifths
+            are left.
     """
 
     def __init__(self, folder: Path | None = None, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
@@ -94,7 +96,8 @@ class StageCache:
             entry = Entry(arrays, float(arrays.pop("cost_s")))
         except (DynslamError, KeyError):
             entry = None
-        with contextlib.suppress(OSError):  # a cache that can only be read, or one that another process has evicted of
+        # a cache that can only be read, or one that another process has evicted of
+        with contextlib.suppress(OSError):
             if entry is None:
                 path.unlink()
             else:
@@ -129,11 +132,17 @@ class StageCache:
 
     def info(self) -> dict[str, Any]:
         """How full the cache is: ``folder``, ``max_bytes``, ``bytes_by_stage`` and ``entries_by_stage``."""
-        sizes, counts = Counter[str](), Counter[str]()
+        sizes = Counter[str]()
+        counts = Counter[str]()
         for _, path, size in sorted(self._entries(), key=itemgetter(1)):
             sizes[path.parent.parent.name] += size
             counts[path.parent.parent.name] += 1
-        return {"folder": self.folder, "max_bytes": self.max_bytes, "bytes_by_stage": sizes, "entries_by_stage": counts}
+        return {
+            "folder": self.folder,
+            "max_bytes": self.max_bytes,
+            "bytes_by_stage": sizes,
+            "entries_by_stage": counts,
+        }
 
     def clear(self) -> int:
         """Delete every entry; returns the bytes freed. Entries that other processes write meanwhile stay."""
@@ -141,8 +150,13 @@ class StageCache:
 
     def _shrink(self, most_bytes: float) -> int:
         entries = sorted(self._entries(), key=itemgetter(0))
-        left = np.cumsum([size for _, _, size in entries[::-1]])[::-1]  # of an entry and all that were used later
-        going = [(path, size) for (_, path, size), rest in zip(entries, left, strict=True) if rest > most_bytes]
+        # of an entry and all that were used later
+        left = np.cumsum([size for _, _, size in entries[::-1]])[::-1]
+        going = [
+            (path, size)
+            for (_, path, size), rest in zip(entries, left, strict=True)
+            if rest > most_bytes
+        ]
         for path, _ in going:
             path.unlink(missing_ok=True)
         return sum(size for _, size in going)

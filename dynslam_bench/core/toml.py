@@ -33,7 +33,9 @@ def read_toml(path: Path, *, kind: type[DynslamError] = SequenceError) -> dict[s
     return parse_toml(read_text(path, kind=kind), str(path), kind=kind)
 
 
-def parse_toml(text: str, where: str, *, kind: type[DynslamError] = SequenceError) -> dict[str, Any]:
+def parse_toml(
+    text: str, where: str, *, kind: type[DynslamError] = SequenceError
+) -> dict[str, Any]:
     """A TOML text as nested dictionaries.
 
     Args:
@@ -42,9 +44,12 @@ def parse_toml(text: str, where: str, *, kind: type[DynslamError] = SequenceErro
         kind: What is raised.
 
     Raises:
-        DynslamError: Of the given kind: it is no TOML, nested too deeply, or holds a number of thousands of digits.
+        DynslamError: Of the given kind: it is no TOML, nested too deeply, or holds a number of
+            thousands of digits.
     """
-    with raising(kind, f"{where} is not valid TOML", of=(ValueError, OverflowError, RecursionError)):
+    with raising(
+        kind, f"{where} is not valid TOML", of=(ValueError, OverflowError, RecursionError)
+    ):
         return tomllib.loads(text)
 
 
@@ -89,5 +94,9 @@ def assignments(values: Mapping[str, Any]) -> list[str]:
 def _flatten(values: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
     items: list[tuple[str, Any]] = []
     for key, value in values.items():
-        items += _flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else [(f"{prefix}{key}", value)]
+        items += (
+            _flatten(value, f"{prefix}{key}.")
+            if isinstance(value, dict)
+            else [(f"{prefix}{key}", value)]
+        )
     return items

@@ -25,7 +25,8 @@ def install_hint(extra: str) -> str:
 def release() -> str:
     """The release that the version belongs to, three numbers such as ``0.1.0``: the same for all its development.
 
-    Runs and cached stages are identified by it and by the code itself, not by the number of commits.
+    Runs and cached stages are identified by it and by the code itself, not by the number of
+    commits.
     """
     numbers = re.match(r"\d+(?:\.\d+)*", version())
     return ".".join([*(numbers[0].split(".") if numbers else []), "0", "0", "0"][:3])

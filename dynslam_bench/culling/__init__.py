@@ -1,7 +1,7 @@
 """Dynamic feature filters: published rejection rules.
 
-The building blocks are numbered as in `docs/explanation/baselines.md` (B1 to B15). All filters receive the same
-keypoints and share the starvation guard (`guard`).
+The building blocks are numbered as in `docs/explanation/baselines.md` (B1 to B15). All filters
+receive the same keypoints and share the starvation guard (`guard`).
 """
 
 from typing import Any, Generic, TypeAlias, TypeVar

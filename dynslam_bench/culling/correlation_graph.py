@@ -23,16 +23,19 @@ _WEIGHT = np.array([1, 2, 1, 2, 4, 2, 1, 2, 1]) / 16
 class CorrelationFilter(Rule[CorrelationSettings]):
     """Drops the points outside the largest rigid component of a Delaunay graph.
 
-    An edge compares the vector between its two points now with that in the oldest frame, at most `window` frames ago,
-    in which both were observed. It is cut where the Mahalanobis distance of the difference exceeds the chi-square
-    quantile. Vectors are compared in the world frame: only the rotations of the poses matter.
+    An edge compares the vector between its two points now with that in the oldest frame, at most
+    `window` frames ago, in which both were observed. It is cut where the Mahalanobis distance of
+    the difference exceeds the chi-square quantile. Vectors are compared in the world frame: only
+    the rotations of the poses matter.
 
-    Components are formed by settled points only, those observed over at least `settled` frames: a younger edge shows
-    too little motion and could connect two bodies. A younger point is static if it agrees with at least as many of its
-    settled neighbours as it contradicts. A point that continues a keypoint of the last frame takes over its
-    observations; any other point was at the end of its flow, at the depth that the last frame has there.
+    Components are formed by settled points only, those observed over at least `settled` frames: a
+    younger edge shows too little motion and could connect two bodies. A younger point is static if
+    it agrees with at least as many of its settled neighbours as it contradicts. A point that
+    continues a keypoint of the last frame takes over its observations; any other point was at the
+    end of its flow, at the depth that the last frame has there.
 
-    Stats: ``dropped``, ``tracked`` (points judged), ``settled``, ``edges``, ``cut``, ``components`` (of the settled).
+    Stats: ``dropped``, ``tracked`` (points judged), ``settled``, ``edges``, ``cut``, ``components``
+    (of the settled).
     """
 
     name = "correlation"
@@ -41,7 +44,8 @@ class CorrelationFilter(Rule[CorrelationSettings]):
 
     def reset(self, camera: Camera | None = None) -> None:
         """Forget all tracks."""
-        self._past = np.zeros((0, 0, 12))  # [frames ago - 1, point of the previous frame, position and covariance]
+        # [frames ago - 1, point of the previous frame, position and covariance]
+        self._past = np.zeros((0, 0, 12))
         self._last = np.zeros((0, 12))  # the previous frame's points in its camera
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
@@ -49,7 +53,8 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         keep = np.ones(len(frame.xy), dtype=bool)
         local = self._observe(frame.xy, frame.keypoints.xy, frame.z, frame.depth, state.camera)
         past = self._past_observations(frame, state)
-        self._past, self._last = past, local
+        self._past = past
+        self._last = local
         if state.T_world_pred is None or not len(past):
             return self.verdict(keep)
         now = _in_world(local, state.T_world_pred)
@@ -57,8 +62,13 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         rows = np.flatnonzero(observed.any(axis=0))
         if len(rows) < MIN_POINTS:
             return self.verdict(keep)
-        settled = len(past) - observed[::-1, rows].argmax(axis=0) >= min(self.settings.settled, len(past))
-        now, past, observed, xy = now[rows], past[:, rows], observed[:, rows], frame.xy[rows]
+        settled = len(past) - observed[::-1, rows].argmax(axis=0) >= min(
+            self.settings.settled, len(past)
+        )
+        now = now[rows]
+        past = past[:, rows]
+        observed = observed[:, rows]
+        xy = frame.xy[rows]
         old = np.flatnonzero(settled)
         if len(old) < MIN_POINTS:
             return self.verdict(keep, tracked=len(rows), settled=len(old))
@@ -66,32 +76,43 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         edges = _delaunay_edges(xy[old])
         uncut = self._agree(now[old], past[:, old], observed[:, old], edges)
         static[old], components = self._static_component(edges[uncut], now[old, :3])
-        total, cut = len(edges), np.count_nonzero(~uncut)
+        total = len(edges)
+        cut = np.count_nonzero(~uncut)
         if len(old) < len(rows):
             edges = _delaunay_edges(xy)
             edges = edges[settled[edges].sum(axis=1) == 1]
-            edges = np.where(settled[edges[:, :1]], edges[:, ::-1], edges)  # the younger point first
+            # the younger point first
+            edges = np.where(settled[edges[:, :1]], edges[:, ::-1], edges)
             uncut = self._agree(now, past, observed, edges)
-            total, cut = total + len(edges), cut + np.count_nonzero(~uncut)
+            total = total + len(edges)
+            cut = cut + np.count_nonzero(~uncut)
             vote = np.where(static[edges[:, 1]], np.where(uncut, 1, -1), np.where(uncut, -1, 0))
             static[~settled] = np.bincount(edges[:, 0], vote, len(rows))[~settled] >= 0
         keep[rows[~static]] = False
-        return self.verdict(keep, tracked=len(rows), settled=len(old), edges=total, cut=cut, components=components)
+        return self.verdict(
+            keep, tracked=len(rows), settled=len(old), edges=total, cut=cut, components=components
+        )
 
     def _past_observations(self, frame: FrameBundle, state: FilterState) -> NDArray[np.float64]:
         """This frame's points in earlier frames: world positions and covariances ``[K, N, 3 + 9]``; NaN unobserved."""
-        previous, pose, flow = state.previous, state.T_world_prev, state.flow
+        previous = state.previous
+        pose = state.T_world_prev
+        flow = state.flow
         if previous is None or pose is None or flow is None or len(self._last) != len(previous.xy):
             return np.zeros((0, len(frame.xy), 12))
         link = link_to_previous(frame, state)
-        before = np.concatenate([_in_world(self._last, pose)[None], self._past])[: self.settings.window]
+        before = np.concatenate([_in_world(self._last, pose)[None], self._past])[
+            : self.settings.window
+        ]
         past = np.full((len(before), len(frame.xy), 12), np.nan)
         past[:, link >= 0] = before[:, link[link >= 0]]
         loose = np.flatnonzero((link < 0) & flow.valid & np.isfinite(flow.xy).all(axis=1))
         raw = flow.xy[loose]
         at, visible = pixel_index(raw, previous.depth.shape)
         z = np.where(visible, previous.depth[at], 0)
-        observations = self._observe(state.camera.undistort_points(raw), raw, z, previous.depth, state.camera)
+        observations = self._observe(
+            state.camera.undistort_points(raw), raw, z, previous.depth, state.camera
+        )
         past[0, loose] = _in_world(observations, pose)
         return past
 
@@ -99,14 +120,22 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         self, xy: Numbers, raw: Numbers, z: Numbers, depth: NDArray[np.float32], camera: Camera
     ) -> NDArray[np.float64]:
         """Points of the camera frame and their covariances ``[N, 3 + 9]``; NaN without depth."""
-        points, valid = np.full((len(xy), 12), np.nan), np.isfinite(z) & (z > 0)
-        pixels, z = np.asarray(xy[valid], np.float64), z[valid]
-        covariance = point_covariance(pixels, z, depth_variance(depth, raw[valid]), camera, self.settings.pixel_sigma)
+        points = np.full((len(xy), 12), np.nan)
+        valid = np.isfinite(z) & (z > 0)
+        pixels = np.asarray(xy[valid], np.float64)
+        z = z[valid]
+        covariance = point_covariance(
+            pixels, z, depth_variance(depth, raw[valid]), camera, self.settings.pixel_sigma
+        )
         points[valid] = np.column_stack([camera.unproject(pixels, z), covariance.reshape(-1, 9)])
         return points
 
     def _agree(
-        self, now: NDArray[np.float64], past: NDArray[np.float64], observed: NDArray[np.bool_], edges: NDArray[np.intp]
+        self,
+        now: NDArray[np.float64],
+        past: NDArray[np.float64],
+        observed: NDArray[np.bool_],
+        edges: NDArray[np.intp],
     ) -> NDArray[np.bool_]:
         """Which edges ``[E]`` keep their vector since the oldest frame in which both ends were observed."""
         both = observed[:, edges[:, 0]] & observed[:, edges[:, 1]]
@@ -114,14 +143,20 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         first, second = edges.T
         then = past[oldest, first], past[oldest, second]
         change = now[first, :3] - now[second, :3] - then[0][:, :3] + then[1][:, :3]
-        total = (now[first, 3:] + now[second, 3:] + then[0][:, 3:] + then[1][:, 3:]).reshape(-1, 3, 3)
+        total = (now[first, 3:] + now[second, 3:] + then[0][:, 3:] + then[1][:, 3:]).reshape(
+            -1, 3, 3
+        )
         comparable = both.any(axis=0)
         solved = np.linalg.solve(total[comparable], change[comparable, :, None])[:, :, 0]
         cut = np.zeros(len(edges), bool)
-        cut[comparable] = (change[comparable] * solved).sum(axis=1) > chi2.ppf(self.settings.quantile, 3)
+        cut[comparable] = (change[comparable] * solved).sum(axis=1) > chi2.ppf(
+            self.settings.quantile, 3
+        )
         return ~cut
 
-    def _static_component(self, edges: NDArray[np.intp], points: NDArray[np.float64]) -> tuple[NDArray[np.bool_], int]:
+    def _static_component(
+        self, edges: NDArray[np.intp], points: NDArray[np.float64]
+    ) -> tuple[NDArray[np.bool_], int]:
         graph = coo_matrix((np.ones(len(edges)), tuple(edges.T)), shape=(len(points), len(points)))
         _, label = connected_components(graph, directed=False)
         size = np.bincount(label)
@@ -145,26 +180,34 @@ def _delaunay_edges(xy: NDArray[np.float64]) -> NDArray[np.intp]:
         simplices = Delaunay(xy, qhull_options="QJ").simplices
     except QhullError:
         return np.zeros((0, 2), np.intp)
-    pairs = np.sort(np.concatenate([simplices[:, [0, 1]], simplices[:, [1, 2]], simplices[:, [0, 2]]]), axis=1)
+    pairs = np.sort(
+        np.concatenate([simplices[:, [0, 1]], simplices[:, [1, 2]], simplices[:, [0, 2]]]), axis=1
+    )
     return np.asarray(np.unique(pairs, axis=0), dtype=np.intp)
 
 
 def depth_variance(depth: NDArray[np.float32], xy: NDArray[np.floating]) -> NDArray[np.float64]:
     """Variance of the depth at raw pixels ``[N, 2]``, m^2: a Gaussian mixture over the 3x3 neighbourhood.
 
-    The mixture's weights are [1 2 1; 2 4 2; 1 2 1] / 16 over the pixels that have depth, its components' variances
-    those of the sensor. Depth edges thus get a large variance.
+    The mixture's weights are [1 2 1; 2 4 2; 1 2 1] / 16 over the pixels that have depth, its
+    components' variances those of the sensor. Depth edges thus get a large variance.
     """
     at, _ = pixel_index(np.rint(xy)[:, None] + NEAR, depth.shape)
     z = np.nan_to_num(depth[at].astype(np.float64), posinf=0.0, neginf=0.0)
     weight = np.where(z > 0, _WEIGHT, 0.0)
     weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
     mean = (weight * z).sum(axis=1)
-    return np.asarray((weight * (np.square(depth_sigma(z)) + np.square(z - mean[:, None]))).sum(axis=1))
+    return np.asarray(
+        (weight * (np.square(depth_sigma(z)) + np.square(z - mean[:, None]))).sum(axis=1)
+    )
 
 
 def point_covariance(
-    xy: NDArray[np.float64], z: NDArray[np.floating], variance: NDArray[np.float64], camera: Camera, pixel_sigma: float
+    xy: NDArray[np.float64],
+    z: NDArray[np.floating],
+    variance: NDArray[np.float64],
+    camera: Camera,
+    pixel_sigma: float,
 ) -> NDArray[np.float64]:
     """Covariances ``[N, 3, 3]`` of unprojected points in the camera frame, m^2.
 
@@ -177,8 +220,11 @@ def point_covariance(
     """
     depth = np.asarray(z, dtype=np.float64)
     jacobian = np.zeros((len(depth), 3, 3))
-    jacobian[:, 0, 0], jacobian[:, 1, 1] = depth / camera.fx, depth / camera.fy
-    jacobian[:, 0, 2], jacobian[:, 1, 2] = ((xy - (camera.cx, camera.cy)) / (camera.fx, camera.fy)).T
+    jacobian[:, 0, 0] = depth / camera.fx
+    jacobian[:, 1, 1] = depth / camera.fy
+    jacobian[:, 0, 2], jacobian[:, 1, 2] = (
+        (xy - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    ).T
     jacobian[:, 2, 2] = 1.0
     noise = np.column_stack([np.full((len(depth), 2), pixel_sigma**2), np.maximum(variance, 1e-12)])
     return np.asarray((jacobian * noise[:, None]) @ jacobian.transpose(0, 2, 1))

@@ -33,17 +33,21 @@ class DepthRansacFilter(ObjectRule[DepthRansacSettings]):
         member = in_boxes(frame.keypoints.xy, boxes)
         for number, in_box in enumerate(member):
             measured = np.flatnonzero(in_box & (frame.z > 0))
-            person = person_set(frame.z[measured], self.settings, stream(state.seed, self.name, number))
+            person = person_set(
+                frame.z[measured], self.settings, stream(state.seed, self.name, number)
+            )
             keep[measured[person]] = False
             keep[in_box & ~(frame.z > 0)] = False
         return self.verdict(keep, objects=len(boxes), in_boxes=np.count_nonzero(member.any(axis=0)))
 
 
-def person_set(z: NDArray[np.floating], settings: DepthRansacSettings, rng: np.random.Generator) -> NDArray[np.bool_]:
+def person_set(
+    z: NDArray[np.floating], settings: DepthRansacSettings, rng: np.random.Generator
+) -> NDArray[np.bool_]:
     """The largest set of features whose depth variance stays below the limit.
 
-    From each drawn pair, the set grows by the nearest depths while its variance stays below the limit. The paper
-    does not state the order; nearest first gives the largest set from that pair.
+    From each drawn pair, the set grows by the nearest depths while its variance stays below the
+    limit. The paper does not state the order; nearest first gives the largest set from that pair.
 
     Args:
         z: Depths ``[N]`` of the features in one box, metres, all valid.
@@ -53,7 +57,9 @@ def person_set(z: NDArray[np.floating], settings: DepthRansacSettings, rng: np.r
     Returns:
         Bool ``[N]``.
     """
-    count, draws, drawn = len(z), settings.max_draws, 0
+    count = len(z)
+    draws = settings.max_draws
+    drawn = 0
     best = np.zeros(count, dtype=bool)
     while drawn < draws and count >= MIN_POINTS:
         drawn += 1
@@ -65,8 +71,13 @@ def person_set(z: NDArray[np.floating], settings: DepthRansacSettings, rng: np.r
         variance = np.cumsum(chosen**2) / n - np.square(np.cumsum(chosen) / n)
         size = int(np.argmax(np.append(variance, np.inf) >= settings.variance_m2))
         if size > np.count_nonzero(best):
-            best, share = np.isin(np.arange(count), order[:size]), size / count
-            needed = np.log(1 - settings.confidence) / np.log(max(1 - share**2, 1e-12)) if share < 1 else 0
+            best = np.isin(np.arange(count), order[:size])
+            share = size / count
+            needed = (
+                np.log(1 - settings.confidence) / np.log(max(1 - share**2, 1e-12))
+                if share < 1
+                else 0
+            )
             draws = min(draws, max(drawn, int(np.ceil(needed))))
     return best
 
@@ -87,11 +98,18 @@ class BoxDepthFilter(ObjectRule[BoxDepthSettings]):
         depth = np.nan_to_num(frame.depth)
         boxes = dynamic_boxes(frame, self.segmentation)
         people = [mask for mask in (self._segment(box, depth) for box in boxes) if mask is not None]
-        mask = dilate(np.logical_or.reduce([np.zeros(depth.shape, bool), *people]), self.settings.dilation_px)
-        keep, ignored = ~inside(mask, frame.keypoints.xy), len(boxes) - len(people)
-        return self.verdict(keep, mask, objects=len(boxes), ignored=ignored, mask_fraction=float(mask.mean()))
+        mask = dilate(
+            np.logical_or.reduce([np.zeros(depth.shape, bool), *people]), self.settings.dilation_px
+        )
+        keep = ~inside(mask, frame.keypoints.xy)
+        ignored = len(boxes) - len(people)
+        return self.verdict(
+            keep, mask, objects=len(boxes), ignored=ignored, mask_fraction=float(mask.mean())
+        )
 
-    def _segment(self, box: NDArray[np.float32], depth: NDArray[np.float32]) -> NDArray[np.bool_] | None:
+    def _segment(
+        self, box: NDArray[np.float32], depth: NDArray[np.float32]
+    ) -> NDArray[np.bool_] | None:
         """The mask ``[H, W]`` of the person in a box; None where the box is ignored."""
         x0, y0, x1, y1 = box.astype(np.float64)
         shrink = (1 - self.settings.core) / 2
@@ -102,7 +120,9 @@ class BoxDepthFilter(ObjectRule[BoxDepthSettings]):
         place = _window(box, self.settings.margin_px, self.settings.margin_px, depth.shape)
         window = depth[place]
         near = (window > 0) & (np.abs(window - np.median(valid)) <= self.settings.depth_m)
-        count, label, stats, _ = cv2.connectedComponentsWithStats(near.astype(np.uint8), connectivity=8)
+        count, label, stats, _ = cv2.connectedComponentsWithStats(
+            near.astype(np.uint8), connectivity=8
+        )
         if count < 2:
             return None
         person = np.zeros(depth.shape, bool)
@@ -110,7 +130,9 @@ class BoxDepthFilter(ObjectRule[BoxDepthSettings]):
         return person if person.mean() <= self.settings.max_cover else None
 
 
-def _window(box: NDArray[np.float32], grow_x: float, grow_y: float, shape: tuple[int, ...]) -> tuple[slice, slice]:
+def _window(
+    box: NDArray[np.float32], grow_x: float, grow_y: float, shape: tuple[int, ...]
+) -> tuple[slice, slice]:
     """Rows and columns of a box that is grown on all sides, within an image of a shape."""
     x0, y0, x1, y1 = box.astype(np.float64)
     low = np.clip((y0 - grow_y, x0 - grow_x), 0, shape).astype(int)
@@ -121,10 +143,10 @@ def _window(box: NDArray[np.float32], grow_x: float, grow_y: float, shape: tuple
 class DepthBlockFilter(ObjectRule[DepthBlockSettings]):
     """B9, Blitz-SLAM: drops the features on people, whose masks depth completes, and on movable objects they touch.
 
-    The depth image is divided into blocks along its edges. A block of which enough lies on the mask is added to the
-    mask as a whole. A person in front of a wall is a block; a person on a floor forms one block with the floor.
-    Stats: ``dropped``, ``objects``, ``touched`` (movable objects that a person touches), ``blocks`` (added as a
-    whole), ``mask_fraction``.
+    The depth image is divided into blocks along its edges. A block of which enough lies on the mask
+    is added to the mask as a whole. A person in front of a wall is a block; a person on a floor
+    forms one block with the floor. Stats: ``dropped``, ``objects``, ``touched`` (movable objects
+    that a person touches), ``blocks`` (added as a whole), ``mask_fraction``.
     """
 
     name = "depth_blocks"
@@ -136,17 +158,27 @@ class DepthBlockFilter(ObjectRule[DepthBlockSettings]):
         if frame.instances is None or not len(frame.instances):
             return self.verdict(np.ones(len(frame.xy), dtype=bool))
         people = select(frame.instances, self.segmentation)
-        mask, blocks = people.union(), 0
-        movable = select(frame.instances, self.segmentation.model_copy(update={"classes": self.settings.movable}))
+        mask = people.union()
+        blocks = 0
+        movable = select(
+            frame.instances, self.segmentation.model_copy(update={"classes": self.settings.movable})
+        )
         neighbourhood = dilate(mask, 1) if len(movable) else mask
-        touched = [other for other in movable.masks if (other & neighbourhood).any() and (other & ~mask).any()]
+        touched = [
+            other
+            for other in movable.masks
+            if (other & neighbourhood).any() and (other & ~mask).any()
+        ]
         mask = np.logical_or.reduce([mask, *touched])
         if mask.any():
             whole, blocks = covered_blocks(mask, frame.depth, self.settings)
             mask = dilate(mask | whole, self.segmentation.dilation_px)
-        keep, objects = ~inside(mask, frame.keypoints.xy), len(people)
+        keep = ~inside(mask, frame.keypoints.xy)
+        objects = len(people)
         share = float(mask.mean())
-        return self.verdict(keep, mask, objects=objects, touched=len(touched), blocks=blocks, mask_fraction=share)
+        return self.verdict(
+            keep, mask, objects=objects, touched=len(touched), blocks=blocks, mask_fraction=share
+        )
 
 
 def covered_blocks(
@@ -163,7 +195,8 @@ def covered_blocks(
         Bool ``[H, W]`` of the pixels in such blocks, and the number of blocks.
     """
     valid = (depth > 0) & (depth <= settings.max_depth_m)
-    z, square = np.where(valid, depth, 0).astype(np.float32), np.ones((2, 2), np.uint8)
+    z = np.where(valid, depth, 0).astype(np.float32)
+    square = np.ones((2, 2), np.uint8)
     edge = cv2.dilate(z, square) - cv2.erode(z, square) > settings.edge_m
     count, label = cv2.connectedComponents((valid & ~edge).view(np.uint8), connectivity=4)
     size = np.bincount(label.ravel(), minlength=count)

@@ -1,6 +1,7 @@
 """The camera's motion since the previous frame from optical flow and depth, and the rigid-motion test that uses it.
 
-The test finds motion along epipolar lines, and any motion while the camera only rotates or stands still.
+The test finds motion along epipolar lines, and any motion while the camera only rotates or stands
+still.
 """
 
 import cv2
@@ -49,11 +50,13 @@ MEAN_S = 0.07
 """Time constant of the mean residual, which finds slow steady motion."""
 MEMORY_S = 1.65
 """Time constant with which the count of a point's failures decays."""
-NEARBY_PX, SIMILAR_DEPTH = 24.0, 0.1
+NEARBY_PX = 24.0
+SIMILAR_DEPTH = 0.1
 """Points within this distance share their counts if their depths differ by no more than this share."""
 MAX_FAILURES = 2.5
 """Above this count a point is dropped although it passes now: from the third failure in a row on, and for some seconds
-after an object has stopped. It would otherwise become a part of the map, and take the camera along when it moves on. A
+after an object has stopped. It would otherwise become a part of the map, and take the camera along
+when it moves on. A
 whole image that fails in a frame or two, as after a wrong stamp, stays below."""
 
 CELL = 16
@@ -71,7 +74,9 @@ def depth_sigma(z: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.asarray(0.0012 + 0.0019 * np.square(np.maximum(z, 0.4) - 0.4), dtype=np.float64)
 
 
-def static_share(frame: FrameBundle, state: FilterState, before: NDArray[np.floating]) -> NDArray[np.float64]:
+def static_share(
+    frame: FrameBundle, state: FilterState, before: NDArray[np.floating]
+) -> NDArray[np.float64]:
     """Share of static keypoints around each point's origin in the previous frame.
 
     Args:
@@ -80,7 +85,8 @@ def static_share(frame: FrameBundle, state: FilterState, before: NDArray[np.floa
         before: Raw pixels of the points in the previous image, ``[N, 2]``.
 
     Returns:
-        Share of kept keypoints in the cell of the previous image, ``[N]`` in [0, 1]; 1 where there were none.
+        Share of kept keypoints in the cell of the previous image, ``[N]`` in [0, 1]; 1 where there
+        were none.
     """
     if state.previous is None or state.previous_keep is None:
         return np.ones(len(before))
@@ -102,9 +108,11 @@ def rigid_flow(
         rows: bool ``[N]``, K points, all with depth.
 
     Returns:
-        Points ``[K, 3]`` in the previous camera's frame, metres, and their undistorted pixels ``[K, 2]``.
+        Points ``[K, 3]`` in the previous camera's frame, metres, and their undistorted pixels
+        ``[K, 2]``.
     """
-    assert state.T_world_prev is not None and state.T_world_pred is not None
+    assert state.T_world_prev is not None
+    assert state.T_world_pred is not None
     points = state.camera.unproject(frame.xy[rows], frame.z[rows])
     moved = se3.transform(se3.inverse(state.T_world_prev) @ state.T_world_pred, points)
     return moved, state.camera.project(moved)
@@ -113,13 +121,15 @@ def rigid_flow(
 def refine_prediction(frame: FrameBundle, state: FilterState) -> NDArray[np.float64] | None:
     """The pose predicted for this frame, refined by the flow to the previous image.
 
-    Iteratively reweighted Gauss-Newton on the reprojection error of the current points in the previous image, with a
-    redescending (Geman-McClure) kernel. It starts at the motion model's prediction, which is also the prior (maximum a
-    posteriori). Without the prior a person nearby would bias the estimate even where most points are static: a far
-    background of one depth hardly separates rotation from sideways translation, so that near points determine the
-    translation. For the same reason the first steps, with a wide kernel, change the rotation only. An object nearby
-    that begins to move takes this estimate along all the same, and then the prior. A second one therefore begins with
-    the distant points alone, without the prior. It is taken if clearly more points agree with it.
+    Iteratively reweighted Gauss-Newton on the reprojection error of the current points in the
+    previous image, with a redescending (Geman-McClure) kernel. It starts at the motion model's
+    prediction, which is also the prior (maximum a posteriori). Without the prior a person nearby
+    would bias the estimate even where most points are static: a far background of one depth hardly
+    separates rotation from sideways translation, so that near points determine the translation. For
+    the same reason the first steps, with a wide kernel, change the rotation only. An object nearby
+    that begins to move takes this estimate along all the same, and then the prior. A second one
+    therefore begins with the distant points alone, without the prior. It is taken if clearly more
+    points agree with it.
 
     Args:
         frame: The current frame.
@@ -134,25 +144,36 @@ def refine_prediction(frame: FrameBundle, state: FilterState) -> NDArray[np.floa
     use = flow.valid & state.keep & (frame.z > 0)
     if np.count_nonzero(use) < MIN_POINTS:
         return state.T_world_pred
-    start, prior, share = np.eye(4), NO_PRIOR, static_share(frame, state, flow.xy[use])
+    start = np.eye(4)
+    prior = NO_PRIOR
+    share = static_share(frame, state, flow.xy[use])
     points = state.camera.unproject(frame.xy[use], frame.z[use])
     before = state.flow_xy[use]
     if state.T_world_pred is not None:
         start = se3.inverse(state.T_world_prev) @ state.T_world_pred
         prior = prior_information(state, start)
     lens = state.camera.fx, state.camera.fy, state.camera.cx, state.camera.cy
-    T_prev_cur, agreeing = _align(start, points, before, share, prior, STEPS_PX, len(TURN_PX), *lens)
+    T_prev_cur, agreeing = _align(
+        start, points, before, share, prior, STEPS_PX, len(TURN_PX), *lens
+    )
     if agreeing < MIN_AGREEING:
         return state.T_world_pred
     return state.T_world_prev @ _compared(T_prev_cur, points, before, start, share, lens)
 
 
 def _compared(
-    T_prev_cur: Array, points: Array, pixels: Array, start: Array, weight: Array, lens: tuple[float, ...]
+    T_prev_cur: Array,
+    points: Array,
+    pixels: Array,
+    start: Array,
+    weight: Array,
+    lens: tuple[float, ...],
 ) -> Array:
     """The given motion, or that of the distant points if clearly more agree with it; arguments as of `_align`."""
     far = points[:, 2] > np.sqrt(np.prod(np.quantile(points[:, 2], NEAR_FAR)))
-    other, agreeing = _align(start, points[far], pixels[far], weight[far], NO_PRIOR, STEPS_PX, len(TURN_PX), *lens)
+    other, agreeing = _align(
+        start, points[far], pixels[far], weight[far], NO_PRIOR, STEPS_PX, len(TURN_PX), *lens
+    )
     if agreeing < MIN_AGREEING:
         return T_prev_cur
     noise = np.sqrt(np.median(_squared_errors(other, points[far], pixels[far], *lens)))
@@ -170,16 +191,17 @@ def _compared(
 def prior_information(state: FilterState, T_prev_cur: NDArray[np.float64]) -> NDArray[np.float64]:
     """Information of the motion model on the motion since the previous frame.
 
-    The model's rotation error r turns the world-to-camera rotation from the left, in the camera frame. To first order
-    it is the twist ``((R r) x t, -R r)`` of the motion (R, t) from this camera frame to the previous one.
+    The model's rotation error r turns the world-to-camera rotation from the left, in the camera
+    frame. To first order it is the twist ``((R r) x t, -R r)`` of the motion (R, t) from this
+    camera frame to the previous one.
 
     Args:
         state: With the covariance of the predicted motion.
         T_prev_cur: The predicted motion.
 
     Returns:
-        Information ``[6, 6]`` of (translation, rotation), both in the previous camera's frame, times `CORRELATION`;
-        0 without a covariance of the motion model.
+        Information ``[6, 6]`` of (translation, rotation), both in the previous camera's frame,
+        times `CORRELATION`; 0 without a covariance of the motion model.
     """
     if state.motion_covariance is None or state.T_world_prev is None:
         return NO_PRIOR
@@ -198,10 +220,13 @@ def _align(
 ) -> tuple[Array, float]:  # fmt: skip
     """The pose T that projects ``T @ points`` ``[N, 3]`` onto `pixels` ``[N, 2]``, and the sum of the points' weights.
 
-    `information` ``[6, 6]`` is that of the prior, the start pose. `scales` are the kernel's, one a step, of which the
-    first `turns` change the rotation only. Where the system cannot be solved the sum is 0.
+    `information` ``[6, 6]`` is that of the prior, the start pose. `scales` are the kernel's, one a
+    step, of which the first `turns` change the rotation only. Where the system cannot be solved the
+    sum is 0.
     """
-    pose, total, inverse_start = start, 0.0, start.copy()
+    pose = start
+    total = 0.0
+    inverse_start = start.copy()
     inverse_start[:3, :3] = start[:3, :3].T
     inverse_start[:3, 3] = -inverse_start[:3, :3] @ np.ascontiguousarray(start[:3, 3])
     shutter = ROLLING_SHUTTER_SHARE**2 * _squared_errors(np.eye(4), points, pixels, fx, fy, cx, cy)
@@ -212,7 +237,9 @@ def _align(
         hessian += information
         gradient += information @ twist_of(pose @ inverse_start)
         if number < turns:
-            hessian[:3], hessian[:, :3], gradient[:3] = 0.0, 0.0, 0.0
+            hessian[:3] = 0.0
+            hessian[:, :3] = 0.0
+            gradient[:3] = 0.0
             hessian[:3, :3] = np.trace(hessian) * np.eye(3)
         step = -gradient
         solved = cholesky_solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), step)
@@ -223,13 +250,17 @@ def _align(
 
 
 @kernel
-def _squared_errors(pose: Array, points: Array, pixels: Array, fx: float, fy: float, cx: float, cy: float) -> Array:
+def _squared_errors(
+    pose: Array, points: Array, pixels: Array, fx: float, fy: float, cx: float, cy: float
+) -> Array:
     """Squared distances ``[N]`` of the projected points ``pose @ points`` from their pixels; inf behind the camera."""
     errors = np.full(len(points), np.inf)
     for i in range(len(points)):
         x, y, z = moved_point(pose, points[i])
         if z > 0:
-            errors[i] = (fx * (x / z) + cx - pixels[i, 0]) ** 2 + (fy * (y / z) + cy - pixels[i, 1]) ** 2
+            errors[i] = (fx * (x / z) + cx - pixels[i, 0]) ** 2 + (
+                fy * (y / z) + cy - pixels[i, 1]
+            ) ** 2
     return errors
 
 
@@ -239,19 +270,28 @@ def _linearise(
     fx: float, fy: float, cx: float, cy: float,
 ) -> tuple[Array, Array, float]:  # fmt: skip
     """Gauss-Newton matrix ``[6, 6]``, gradient ``[6]`` of a left twist, sum of the weights."""
-    hessian, gradient = np.empty((6, 6)), np.empty(6)
-    sums, total = normal_equations(), 0.0
+    hessian = np.empty((6, 6))
+    gradient = np.empty(6)
+    sums = normal_equations()
+    total = 0.0
     for i in range(len(points)):
         x, y, z = moved_point(pose, points[i])
         if z <= NEAR_M:
             continue
-        x, y = x / z, y / z
-        du, dv = fx * x + cx - pixels[i, 0], fy * y + cy - pixels[i, 1]
+        x = x / z
+        y = y / z
+        du = fx * x + cx - pixels[i, 0]
+        dv = fy * y + cy - pixels[i, 1]
         weight = prior_weight[i] / (1 + (du * du + dv * dv) / (scale2 + shutter[i])) ** 2
         total += weight
-        a, b = fx / z, fy / z
-        sums = add_normal_equation(sums, weight, a, 0.0, -fx * x / z, -fx * x * y, fx * (1 + x * x), -fx * y, du)
-        sums = add_normal_equation(sums, weight, 0.0, b, -fy * y / z, -fy * (1 + y * y), fy * x * y, fy * x, dv)
+        a = fx / z
+        b = fy / z
+        sums = add_normal_equation(
+            sums, weight, a, 0.0, -fx * x / z, -fx * x * y, fx * (1 + x * x), -fx * y, du
+        )
+        sums = add_normal_equation(
+            sums, weight, 0.0, b, -fy * y / z, -fy * (1 + y * y), fy * x * y, fy * x, dv
+        )
     store_normal_equations(sums, hessian, gradient)
     return hessian, gradient, total
 
@@ -259,10 +299,11 @@ def _linearise(
 class RigidMotionFilter(Rule[RigidMotionSettings]):
     """Drops points whose flow or depth does not fit the camera's rigid motion since the previous frame.
 
-    A point fails by its residual in this frame, or by the mean of the last few, in which slow motion adds up and noise
-    does not. Points are dropped that fail now, or failed more than `MAX_FAILURES` times before, so that people and
-    objects that pause stay culled. Mean and count decay and follow the flow; points nearby share them at similar depth.
-    Stats: ``dropped``, ``tested``, ``failed`` (in this frame alone).
+    A point fails by its residual in this frame, or by the mean of the last few, in which slow
+    motion adds up and noise does not. Points are dropped that fail now, or failed more than
+    `MAX_FAILURES` times before, so that people and objects that pause stay culled. Mean and count
+    decay and follow the flow; points nearby share them at similar depth. Stats: ``dropped``,
+    ``tested``, ``failed`` (in this frame alone).
     """
 
     name = "motion"
@@ -271,26 +312,39 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
 
     def reset(self, camera: Camera | None = None) -> None:
         """Forget the previous sequence."""
-        self._memory: Array | None = None  # [N, 3] of the previous points: failures, mean residual over its limit
+        # [N, 3] of the previous points: failures, mean residual over its limit
+        self._memory: Array | None = None
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Test the points that have flow and depth."""
-        flow, xy, shape = state.flow, frame.keypoints.xy, frame.gray.shape
-        if flow is None or state.previous is None or state.T_world_prev is None or state.T_world_pred is None:
+        flow = state.flow
+        xy = frame.keypoints.xy
+        shape = frame.gray.shape
+        if (
+            flow is None
+            or state.previous is None
+            or state.T_world_prev is None
+            or state.T_world_pred is None
+        ):
             self._memory = None
             return self.verdict(np.ones(len(xy), dtype=bool))
         tested = flow.valid & (frame.z > 0)
-        failed, residual = np.zeros(len(xy), dtype=bool), np.zeros((len(xy), 2))
+        failed = np.zeros(len(xy), dtype=bool)
+        residual = np.zeros((len(xy), 2))
         failed[tested], residual[tested], allowed = self._fails(frame, state, tested)
-        before, dt = np.zeros((len(xy), 3)), frame.timestamp - state.previous.timestamp
+        before = np.zeros((len(xy), 3))
+        dt = frame.timestamp - state.previous.timestamp
         if self._memory is not None:
             origin = np.where(flow.valid[:, None], flow.xy, xy)
-            before = nearby_mean(state.previous.keypoints.xy, state.previous.z, self._memory, origin, frame.z)
+            before = nearby_mean(
+                state.previous.keypoints.xy, state.previous.z, self._memory, origin, frame.z
+            )
         carried = np.exp(-dt / MEAN_S)
         noise = np.sqrt((1 - carried) / (1 + carried))  # of the mean, as a share of one residual's
         step = (1 - carried) * residual
         step[tested] /= (noise * self.settings.threshold_px + allowed)[:, None]
-        step /= np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1)  # after one bad frame the mean passes
+        # after one bad frame the mean passes
+        step /= np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1)
         mean = step + carried * before[:, 1:]
         failed |= tested & (np.linalg.norm(mean, axis=1) > 1)
         failed = failing_regions(failed, tested, xy, self.settings.min_share, shape)
@@ -303,7 +357,8 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
         self, frame: FrameBundle, state: FilterState, tested: NDArray[np.bool_]
     ) -> tuple[NDArray[np.bool_], Array, Array]:
         """Which of K tested points fail now, residuals ``[K, 2]`` and what is added to a threshold ``[K]``, pixels."""
-        assert state.flow is not None and state.previous is not None
+        assert state.flow is not None
+        assert state.previous is not None
         moved, expected = rigid_flow(frame, state, tested)
         residual = expected - state.flow_xy[tested]
         distance = np.linalg.norm(residual, axis=1)
@@ -329,15 +384,23 @@ def nearby_mean(xy: Floats, z: Floats, values: Array, at: Floats, at_z: Floats) 
         Means ``[M, K]``; 0 where there is no such point.
     """
     order = np.argsort(xy[:, 1])
-    columns, rows, depths, sorted_values = xy[order, 0].copy(), xy[order, 1].copy(), z[order], values[order]
+    columns = xy[order, 0].copy()
+    rows = xy[order, 1].copy()
+    depths = z[order]
+    sorted_values = values[order]
     means = np.zeros((len(at), values.shape[1]))
     for i in range(len(at)):
-        column, depth, tolerance, last = at[i, 0], at_z[i], SIMILAR_DEPTH * at_z[i], at[i, 1] + NEARBY_PX
+        column = at[i, 0]
+        depth = at_z[i]
+        tolerance = SIMILAR_DEPTH * at_z[i]
+        last = at[i, 1] + NEARBY_PX
         count = 0
         for k in range(np.searchsorted(rows, at[i, 1] - NEARBY_PX), len(rows)):
             if rows[k] > last:
                 break
-            if abs(columns[k] - column) <= NEARBY_PX and (depth <= 0 or abs(depths[k] - depth) <= tolerance):
+            if abs(columns[k] - column) <= NEARBY_PX and (
+                depth <= 0 or abs(depths[k] - depth) <= tolerance
+            ):
                 for j in range(means.shape[1]):
                     means[i, j] += sorted_values[k, j]
                 count += 1
@@ -371,9 +434,12 @@ def nearest_depth(
 # The region rule: in a moving region many points fail, and a lone failure is noise.
 
 
-def cell_index(xy: NDArray[np.floating], size: int, shape: tuple[int, ...]) -> tuple[NDArray[np.intp], tuple[int, int]]:
+def cell_index(
+    xy: NDArray[np.floating], size: int, shape: tuple[int, ...]
+) -> tuple[NDArray[np.intp], tuple[int, int]]:
     """Cell of each pixel ``[N, 2]`` in a grid over an image ``(H, W)``, row by row, and the grid's rows and columns."""
-    rows, columns = -(-shape[0] // size), -(-shape[1] // size)
+    rows = -(-shape[0] // size)
+    columns = -(-shape[1] // size)
     cell = np.floor(xy / size).astype(np.intp)
     return cell[:, 1].clip(0, rows - 1) * columns + cell[:, 0].clip(0, columns - 1), (rows, columns)
 
@@ -383,7 +449,9 @@ def _neighbourhood_sum(
 ) -> NDArray[np.float64]:
     """Sum of values ``[N]`` in the neighbourhood of each cell of a grid; cells as in `cell_index`."""
     total = np.bincount(cell, weights=values, minlength=grid[0] * grid[1]).reshape(grid)
-    summed = cv2.boxFilter(total, -1, NEIGHBOURHOOD, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    summed = cv2.boxFilter(
+        total, -1, NEIGHBOURHOOD, normalize=False, borderType=cv2.BORDER_CONSTANT
+    )
     return np.asarray(summed, dtype=np.float64).ravel()
 
 
@@ -409,5 +477,7 @@ def failing_regions(
     if share <= 0 or not failing.any():
         return failing
     index, grid = cell_index(xy, CELL, size)
-    failures, tests = (_neighbourhood_sum(flags, index, grid)[index] for flags in (failing & tested, tested))
+    failures, tests = (
+        _neighbourhood_sum(flags, index, grid)[index] for flags in (failing & tested, tested)
+    )
     return np.asarray(failing & (failures >= MIN_FAILING) & (failures >= share * tests))

@@ -55,8 +55,8 @@ def fundamental_matrix(
         inlier_px: Distance in pixels up to which a match agrees with F.
         max_draws: Most samples that RANSAC draws.
         min_matches: Fewer matches give no F.
-        refits: How often F is fitted again to all matches that agree: the F of the minimal sample is noisy at the
-            image's border.
+        refits: How often F is fitted again to all matches that agree: the F of the minimal sample
+            is noisy at the image's border.
 
     Returns:
         F ``[3, 3]``, or None where it cannot be estimated (too few points, degenerate).
@@ -66,7 +66,9 @@ def fundamental_matrix(
         if np.count_nonzero(agree) < min_matches:
             return None
         if fit == 0:
-            matrix, _ = cv2.findFundamentalMat(first, second, cv2.FM_RANSAC, inlier_px, CONFIDENCE, max_draws)
+            matrix, _ = cv2.findFundamentalMat(
+                first, second, cv2.FM_RANSAC, inlier_px, CONFIDENCE, max_draws
+            )
         else:
             matrix, _ = cv2.findFundamentalMat(first[agree], second[agree], cv2.FM_8POINT)
         if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
@@ -106,41 +108,56 @@ class Matches(NamedTuple):
         if matrix is None:
             return None
         distance = np.zeros(len(fit))
-        distance[self.tested] = epipolar_distance(matrix, self.before[self.tested], self.now[self.tested])
+        distance[self.tested] = epipolar_distance(
+            matrix, self.before[self.tested], self.now[self.tested]
+        )
         return distance
 
 
-def matches_by_flow(frame: FrameBundle, state: FilterState, unmatched: Unmatched | None = None) -> Matches | None:
+def matches_by_flow(
+    frame: FrameBundle, state: FilterState, unmatched: Unmatched | None = None
+) -> Matches | None:
     """The keypoints' matches; None without flow or without a previous frame.
 
     Args:
         frame: The current frame.
         state: With the flow.
-        unmatched: None tests every valid match. Else only keypoints that earlier filters kept are tested; ``judge``
-            includes those whose flow failed, at the place where it lost them.
+        unmatched: None tests every valid match. Else only keypoints that earlier filters kept are
+            tested; ``judge`` includes those whose flow failed, at the place where it lost them.
     """
     flow = state.flow
     if flow is None or state.previous is None:
         return None
     tested = flow.valid
     if unmatched is not None:
-        tested = state.keep & (np.isfinite(flow.xy).all(axis=1) if unmatched == "judge" else flow.valid)
+        tested = state.keep & (
+            np.isfinite(flow.xy).all(axis=1) if unmatched == "judge" else flow.valid
+        )
     return Matches(state.flow_xy, frame.xy, flow.valid, tested)
 
 
 class EpipolarFilter(Rule[EpipolarSettings]):
     """Drops points, or objects, whose flow leaves the epipolar line.
 
-    F is fitted to the flow of the points that earlier filters kept; all points with a valid flow are tested.
-    Stats: ``dropped``, ``matches``, ``inliers`` (of F), ``parallax_px``, ``homography_share`` (0 where the parallax
-    is too small), ``contradiction`` (see `contradiction`), ``degenerate`` (1 where the test was skipped),
-    ``moving_objects``, ``f_asked`` and ``f_judged`` (see `filter.FilterResult`).
+    F is fitted to the flow of the points that earlier filters kept; all points with a valid flow
+    are tested. Stats: ``dropped``, ``matches``, ``inliers`` (of F), ``parallax_px``,
+    ``homography_share`` (0 where the parallax is too small), ``contradiction`` (see
+    `contradiction`), ``degenerate`` (1 where the test was skipped), ``moving_objects``, ``f_asked``
+    and ``f_judged`` (see `filter.FilterResult`).
     """
 
     name = "epipolar"
     needs: frozenset[Need] = frozenset({"flow", "previous"})
     stats_names = (
-        *("dropped", "matches", "inliers", "parallax_px", "homography_share", "contradiction", "degenerate"),
+        *(
+            "dropped",
+            "matches",
+            "inliers",
+            "parallax_px",
+            "homography_share",
+            "contradiction",
+            "degenerate",
+        ),
         *("moving_objects", "f_asked", "f_judged"),
     )
 
@@ -167,10 +184,15 @@ class EpipolarFilter(Rule[EpipolarSettings]):
         if self.settings.mode == "object":
             keep, stats["moving_objects"] = vote_on_objects(frame, failing, matches.valid)
             return self.verdict(keep, **stats)
-        xy, shape = frame.keypoints.xy, frame.gray.shape
-        return self.verdict(~failing_regions(failing, matches.valid, xy, self.settings.min_share, shape), **stats)
+        xy = frame.keypoints.xy
+        shape = frame.gray.shape
+        return self.verdict(
+            ~failing_regions(failing, matches.valid, xy, self.settings.min_share, shape), **stats
+        )
 
-    def _is_degenerate(self, before: Points, now: Points, camera: Camera, stats: dict[str, Number]) -> bool:
+    def _is_degenerate(
+        self, before: Points, now: Points, camera: Camera, stats: dict[str, Number]
+    ) -> bool:
         """Whether matches or parallax are too small or one homography explains the view; fills in both stats."""
         if len(before) < MIN_MATCHES:
             return True
@@ -186,8 +208,10 @@ def rotation_residual(first: Points, second: Points, camera: Camera) -> float:
     """Median distance in pixels between matches ``[N, 2]`` and the best pure rotation: the parallax."""
     rays = camera.unproject(np.stack([first, second]), np.ones((2, len(first))))
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-    weight, residual = np.ones(len(first)), np.zeros(len(first))
-    for _ in range(3):  # iteratively reweighted, so that moving objects do not influence the rotation
+    weight = np.ones(len(first))
+    residual = np.zeros(len(first))
+    # iteratively reweighted, so that moving objects do not influence the rotation
+    for _ in range(3):
         u, _, vt = np.linalg.svd((rays[1] * weight[:, None]).T @ rays[0])
         rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
         residual = np.linalg.norm(camera.project(rays[0] @ rotation.T) - second, axis=1)
@@ -198,18 +222,21 @@ def rotation_residual(first: Points, second: Points, camera: Camera) -> float:
 def homography_share(first: Points, second: Points) -> float:
     """Share of the matches ``[N, 2]`` within 1 px of one homography: 1 for a plane or a pure rotation.
 
-    Of a homography with the share 0.8 that matters, one of 50 draws of four matches is free of outliers but for once in
-    10^11.
+    Of a homography with the share 0.8 that matters, one of 50 draws of four matches is free of
+    outliers but for once in 10^11.
     """
     matrix, mask = cv2.findHomography(first, second, cv2.RANSAC, 1.0, maxIters=50, confidence=0.99)
     return 0.0 if matrix is None else float(np.mean(mask))
 
 
-def contradiction(frame: FrameBundle, state: FilterState, failing: Flags, matches: Matches) -> float:
+def contradiction(
+    frame: FrameBundle, state: FilterState, failing: Flags, matches: Matches
+) -> float:
     """Share of the points that fit the camera's motion in depth and fail the epipolar test.
 
-    Where a person fills the image, the largest consistent set of matches may lie on the person. The camera's motion is
-    known from `ego_motion`: an F that rejects many of the points that follow it is not the F of the static scene.
+    Where a person fills the image, the largest consistent set of matches may lie on the person. The
+    camera's motion is known from `ego_motion`: an F that rejects many of the points that follow it
+    is not the F of the static scene.
 
     Args:
         frame: The current frame.
@@ -223,7 +250,9 @@ def contradiction(frame: FrameBundle, state: FilterState, failing: Flags, matche
     if state.T_world_prev is None or state.T_world_pred is None:
         return 0.0
     rows = matches.valid & state.keep & (frame.z > 0)
-    rows[rows] = np.linalg.norm(rigid_flow(frame, state, rows)[1] - matches.before[rows], axis=1) < RIGID_PX
+    rows[rows] = (
+        np.linalg.norm(rigid_flow(frame, state, rows)[1] - matches.before[rows], axis=1) < RIGID_PX
+    )
     return float(failing[rows].mean()) if np.count_nonzero(rows) >= MIN_MATCHES else 0.0
 
 
@@ -238,7 +267,8 @@ def vote_on_objects(frame: FrameBundle, failing: Flags, tested: Flags) -> tuple[
     Returns:
         bool ``[N]`` keep, and the number of moving objects.
     """
-    keep, moving = np.ones(len(frame.xy), dtype=bool), 0
+    keep = np.ones(len(frame.xy), dtype=bool)
+    moving = 0
     for mask in () if frame.instances is None else frame.instances.masks:
         on_object = inside(mask, frame.keypoints.xy)
         voters = on_object & tested
@@ -251,9 +281,10 @@ def vote_on_objects(frame: FrameBundle, failing: Flags, tested: Flags) -> tuple[
 class BoxEpipolarFilter(ObjectRule[BoxEpipolarSettings]):
     """B3 with boxes: drops points off their epipolar line, with one limit inside dynamic boxes and another outside.
 
-    Unlike `EpipolarFilter` it has no degeneracy guard: the published systems have none, and fail where F is degenerate.
-    The setting ``unmatched`` decides about features whose flow failed. Stats: ``dropped``, ``matches``, ``boxes``,
-    ``lost`` (features whose flow failed), ``failed`` (1 where F could not be estimated).
+    Unlike `EpipolarFilter` it has no degeneracy guard: the published systems have none, and fail
+    where F is degenerate. The setting ``unmatched`` decides about features whose flow failed.
+    Stats: ``dropped``, ``matches``, ``boxes``, ``lost`` (features whose flow failed), ``failed`` (1
+    where F could not be estimated).
     """
 
     name = "box_epipolar"
@@ -262,12 +293,14 @@ class BoxEpipolarFilter(ObjectRule[BoxEpipolarSettings]):
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Test the flow of this frame's keypoints to the previous image."""
-        settings, keep = self.settings, np.ones(len(frame.xy), dtype=bool)
+        settings = self.settings
+        keep = np.ones(len(frame.xy), dtype=bool)
         matches = matches_by_flow(frame, state, settings.unmatched)
         boxes = dynamic_boxes(frame, self.segmentation)
         if matches is None or state.flow is None or state.previous is None:
             return self.verdict(keep, boxes=len(boxes))
-        lost, tested = state.keep & ~matches.valid, matches.tested
+        lost = state.keep & ~matches.valid
+        tested = matches.tested
         if settings.unmatched == "drop":
             keep &= ~lost
         in_box = in_boxes(frame.keypoints.xy, boxes).any(axis=0)
@@ -279,12 +312,17 @@ class BoxEpipolarFilter(ObjectRule[BoxEpipolarSettings]):
             fit = tested & ~in_boxes(np.nan_to_num(state.flow.xy, nan=-1e6), previous).any(axis=0)
         if np.count_nonzero(fit) < MIN_OUTSIDE:
             fit = tested
-        stats: dict[str, Number] = {"matches": np.count_nonzero(fit), "lost": np.count_nonzero(lost)}
+        stats: dict[str, Number] = {
+            "matches": np.count_nonzero(fit),
+            "lost": np.count_nonzero(lost),
+        }
         stats |= {"boxes": len(boxes), "f_asked": 1}
         distance = matches.distances(fit, settings.inlier_px)
         if distance is None:
             return self.verdict(keep, failed=1, **stats)
-        limit = np.where(in_box, settings.inside_px, settings.outside_px if settings.test_outside else np.inf)
+        limit = np.where(
+            in_box, settings.inside_px, settings.outside_px if settings.test_outside else np.inf
+        )
         keep[tested] = (distance <= limit)[tested]
         return self.verdict(keep, f_judged=1, **stats)
 
@@ -293,37 +331,61 @@ class ClassRuleFilter(ObjectRule[ClassRuleSettings]):
     """B15, class, depth and epipolar line (SEG-SLAM): drops people, and points on movable objects that fail a test.
 
     The setting ``unmatched`` decides about a feature on a movable object whose flow failed.
-    Stats: ``dropped``, ``on_people``, ``on_movable``, ``moving_objects``, ``lost`` (features whose flow failed).
+    Stats: ``dropped``, ``on_people``, ``on_movable``, ``moving_objects``, ``lost`` (features whose
+    flow failed).
     """
 
     name = "class_rule"
     needs: frozenset[Need] = frozenset({"masks", "flow", "previous", "depth"})
-    stats_names = ("dropped", "on_people", "on_movable", "moving_objects", "lost", "f_asked", "f_judged")
+    stats_names = (
+        "dropped",
+        "on_people",
+        "on_movable",
+        "moving_objects",
+        "lost",
+        "f_asked",
+        "f_judged",
+    )
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Drop by class first, then test movable objects by geometry."""
-        settings, xy = self.settings, frame.keypoints.xy
-        keep, none = np.ones(len(xy), dtype=bool), np.zeros(len(xy), dtype=bool)
+        settings = self.settings
+        xy = frame.keypoints.xy
+        keep = np.ones(len(xy), dtype=bool)
+        none = np.zeros(len(xy), dtype=bool)
         matches = matches_by_flow(frame, state, settings.unmatched)
-        stats: dict[str, Number] = {"f_asked": matches is not None, "on_movable": 0, "moving_objects": 0}
+        stats: dict[str, Number] = {
+            "f_asked": matches is not None,
+            "on_movable": 0,
+            "moving_objects": 0,
+        }
         if frame.instances is None or not len(frame.instances):
             return self.verdict(keep, **stats)
         people = dynamic_mask(frame.instances, self.segmentation, frame.depth)
         keep &= ~inside(people, xy)
         stats["on_people"] = np.count_nonzero(~keep)
-        movable = select(frame.instances, self.segmentation.model_copy(update={"classes": settings.movable}))
-        off_line, tested, lost = none, none, none
+        movable = select(
+            frame.instances, self.segmentation.model_copy(update={"classes": settings.movable})
+        )
+        off_line = none
+        tested = none
+        lost = none
         if matches is not None:
             lost = state.keep & ~matches.valid
             distance = matches.distances(matches.tested & keep & ~inside(movable.union(), xy))
             if distance is not None:
-                off_line, tested = distance > settings.threshold_px, matches.tested
+                off_line = distance > settings.threshold_px
+                tested = matches.tested
         stats |= {"lost": np.count_nonzero(lost), "f_judged": tested.any()}
         for mask in movable.masks:
             on_object = inside(mask, xy) & keep
             stats["on_movable"] += np.count_nonzero(on_object)
             voters = on_object & tested
-            drop = on_object & (off_line | lost) if settings.unmatched == "drop" else on_object & off_line
+            drop = (
+                on_object & (off_line | lost)
+                if settings.unmatched == "drop"
+                else on_object & off_line
+            )
             if voters.any() and off_line[voters].mean() >= settings.vote_share:
                 stats["moving_objects"] += 1
                 depth = frame.depth[mask]
@@ -349,7 +411,8 @@ class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
     """DS-SLAM's moving consistency check: corners of its own, pyramidal Lucas-Kanade, F by RANSAC, one global vote.
 
     It has no degeneracy guard; the published system fails on `walking_rpy` without one.
-    Stats: ``dropped``, ``corners`` (tracked), ``moving`` (off their line), ``votes`` (of those, near a person).
+    Stats: ``dropped``, ``corners`` (tracked), ``moving`` (off their line), ``votes`` (of those,
+    near a person).
     """
 
     name = "moving_vote"
@@ -358,19 +421,30 @@ class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Vote, and drop the points on people if enough moving corners lie near them."""
-        keep, asked = np.ones(len(frame.xy), dtype=bool), state.previous is not None
+        keep = np.ones(len(frame.xy), dtype=bool)
+        asked = state.previous is not None
         if state.previous is None or frame.instances is None:
             return self.verdict(keep, f_asked=asked)
         people = select(frame.instances, self.segmentation).union()
-        moving, corners, judged = self._moving_corners(state.previous.gray, frame.gray, state.camera)
+        moving, corners, judged = self._moving_corners(
+            state.previous.gray, frame.gray, state.camera
+        )
         side = 2 * self.settings.radius_px + 1  # a square window, as in the authors' code
-        near_people = cv2.dilate(people.view(np.uint8), np.ones((side, side), np.uint8)).astype(bool)
+        near_people = cv2.dilate(people.view(np.uint8), np.ones((side, side), np.uint8)).astype(
+            bool
+        )
         votes = np.count_nonzero(inside(near_people, moving))
         mask = people if votes >= self.settings.min_votes else None
         if mask is not None:
             keep = ~inside(people, frame.keypoints.xy)
         return self.verdict(
-            keep, mask, corners=corners, moving=len(moving), votes=votes, f_asked=asked, f_judged=judged
+            keep,
+            mask,
+            corners=corners,
+            moving=len(moving),
+            votes=votes,
+            f_asked=asked,
+            f_judged=judged,
         )
 
     def _moving_corners(
@@ -379,7 +453,13 @@ class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
         """Pixels ``[M, 2]`` of the corners off their line, the number of tracked corners, whether F was estimated."""
         no_corners = np.zeros((0, 2), np.float32)
         corners = cv2.goodFeaturesToTrack(
-            previous, self.settings.corners, 0.01, 8, blockSize=3, useHarrisDetector=True, k=HARRIS_K
+            previous,
+            self.settings.corners,
+            0.01,
+            8,
+            blockSize=3,
+            useHarrisDetector=True,
+            k=HARRIS_K,
         )
         if corners is None or len(corners) < VOTE_MATCHES:
             return no_corners, 0, False
@@ -394,25 +474,39 @@ class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
             maxLevel=VOTE_LEVELS,
             criteria=(criteria[0], 20, 0.01),
         )
-        before, after = corners.reshape(-1, 2), tracked.reshape(-1, 2)
-        low, high = VOTE_BORDER_PX, np.array(current.shape[::-1]) - VOTE_BORDER_PX - 1
+        before = corners.reshape(-1, 2)
+        after = tracked.reshape(-1, 2)
+        low = VOTE_BORDER_PX
+        high = np.array(current.shape[::-1]) - VOTE_BORDER_PX - 1
         good = status.ravel().astype(bool)
         for xy in (before, after):
             good &= (xy >= low).all(axis=1) & (xy <= high).all(axis=1)
-        good[good] = _patch_difference(previous, current, before[good], after[good]) <= self.settings.sad_limit
-        before, after = before[good], after[good]
-        first, second = camera.undistort_points(before), camera.undistort_points(after)
+        good[good] = (
+            _patch_difference(previous, current, before[good], after[good])
+            <= self.settings.sad_limit
+        )
+        before = before[good]
+        after = after[good]
+        first = camera.undistort_points(before)
+        second = camera.undistort_points(after)
         inlier_px = self.settings.inlier_px
         matrix = fundamental_matrix(
             first, second, inlier_px=inlier_px, max_draws=1000, min_matches=VOTE_MATCHES, refits=0
         )
         if matrix is None:
             return no_corners, len(before), False
-        return after[epipolar_distance(matrix, first, second) > self.settings.threshold_px], len(before), True
+        return (
+            after[epipolar_distance(matrix, first, second) > self.settings.threshold_px],
+            len(before),
+            True,
+        )
 
 
 def _patch_difference(
-    first: NDArray[np.uint8], second: NDArray[np.uint8], xy1: NDArray[np.float32], xy2: NDArray[np.float32]
+    first: NDArray[np.uint8],
+    second: NDArray[np.uint8],
+    xy1: NDArray[np.float32],
+    xy2: NDArray[np.float32],
 ) -> NDArray[np.int64]:
     """Sum of absolute differences of the 3x3 patches around truncated pixels inside both images, ``[N]``."""
     a, b = (

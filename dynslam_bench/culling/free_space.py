@@ -22,7 +22,8 @@ PATCH = np.ones((7, 7), np.uint8)
 class FreeSpaceFilter(Rule[FreeSpaceSettings]):
     """Drops points that violate the free space of several keyframes.
 
-    Stats: ``dropped``, ``asked`` (keyframes compared), ``tested`` (points in the view of at least one of them).
+    Stats: ``dropped``, ``asked`` (keyframes compared), ``tested`` (points in the view of at least
+    one of them).
     """
 
     name = "free_space"
@@ -35,9 +36,11 @@ class FreeSpaceFilter(Rule[FreeSpaceSettings]):
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Count for each point the keyframes that measured beyond it."""
-        camera, recent = state.camera, [v for v in state.keyframes if frame.timestamp - v.timestamp <= MAX_AGE_S]
+        camera = state.camera
+        recent = [v for v in state.keyframes if frame.timestamp - v.timestamp <= MAX_AGE_S]
         keyframes = [(v.T_world_cam, v.depth) for v in recent if v.depth is not None][:KEYFRAMES]
-        xy, rows = frame.keypoints.xy, np.flatnonzero(frame.z > 0)
+        xy = frame.keypoints.xy
+        rows = np.flatnonzero(frame.z > 0)
         if state.T_world_pred is None or not keyframes or not len(rows):
             return self.verdict(np.ones(len(xy), dtype=bool))
         poses = np.stack([pose for pose, _ in keyframes])
@@ -48,15 +51,20 @@ class FreeSpaceFilter(Rule[FreeSpaceSettings]):
         pixels[ahead] = camera.distort_points(camera.project(local[ahead]))
         at, visible = pixel_index(pixels, (camera.height, camera.width))
         observed = ahead & visible
-        surface, smallest = np.empty(ahead.shape, np.float32), {}
+        surface = np.empty(ahead.shape, np.float32)
+        smallest = {}
         for number, (_, depth) in enumerate(keyframes):
-            kept = self._smallest.get(id(depth), (None, None))  # in a copied episode the id may be another image's
+            # in a copied episode the id may be another image's
+            kept = self._smallest.get(id(depth), (None, None))
             smallest[id(depth)] = kept if kept[0] is depth else (depth, cv2.erode(depth, PATCH))
             surface[number] = smallest[id(depth)][1][at[0][number], at[1][number]]
         self._smallest = smallest
-        limit = np.maximum(self.settings.threshold_m, self.settings.threshold_sigma * depth_sigma(surface))
+        limit = np.maximum(
+            self.settings.threshold_m, self.settings.threshold_sigma * depth_sigma(surface)
+        )
         violated = observed & (surface > 0) & (surface - local[..., 2] > limit)
-        votes, tested = np.zeros(len(xy), dtype=int), np.zeros(len(xy), dtype=bool)
+        votes = np.zeros(len(xy), dtype=int)
+        tested = np.zeros(len(xy), dtype=bool)
         votes[rows], tested[rows] = violated.sum(axis=0), observed.any(axis=0)
         violating = votes >= min(self.settings.min_votes, len(keyframes))
         moving = failing_regions(violating, tested, xy, self.settings.min_share, frame.gray.shape)

@@ -39,7 +39,10 @@ class ProbabilityFilter(ObjectRule[ProbabilitySettings]):
     stats_names = ("dropped", "linked", "mean_probability")
 
     def __init__(
-        self, settings: ProbabilitySettings, segmentation: SegmentationSettings, evidence: str = "masks"
+        self,
+        settings: ProbabilitySettings,
+        segmentation: SegmentationSettings,
+        evidence: str = "masks",
     ) -> None:
         super().__init__(settings, segmentation)
         self._boxes = evidence == "boxes"
@@ -50,7 +53,8 @@ class ProbabilityFilter(ObjectRule[ProbabilitySettings]):
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Update the probabilities by this frame's masks."""
-        settings, xy = self.settings, frame.keypoints.xy
+        settings = self.settings
+        xy = frame.keypoints.xy
         link = link_to_previous(frame, state, settings.link_px)
         if state.previous is None or len(self._probability) != len(state.previous.xy):
             link[:] = -1
@@ -63,7 +67,9 @@ class ProbabilityFilter(ObjectRule[ProbabilitySettings]):
             if self._boxes:
                 on_object = in_boxes(xy, dynamic_boxes(frame, self.segmentation)).any(axis=0)
             else:
-                on_object = inside(dynamic_mask(frame.instances, self.segmentation, frame.depth), xy)
+                on_object = inside(
+                    dynamic_mask(frame.instances, self.segmentation, frame.depth), xy
+                )
             if settings.rule == "average":
                 moving = (1 - RATE) * moving + RATE * on_object
             else:
@@ -72,13 +78,17 @@ class ProbabilityFilter(ObjectRule[ProbabilitySettings]):
                 moving = (evidence / (evidence + (1 - likelihood) * (1 - moving))).clip(0.01, 0.99)
         self._probability = moving
         mean = moving.mean() if len(moving) else UNKNOWN
-        verdict = self.verdict(moving <= settings.threshold, linked=np.count_nonzero(linked), mean_probability=mean)
+        verdict = self.verdict(
+            moving <= settings.threshold, linked=np.count_nonzero(linked), mean_probability=mean
+        )
         if settings.soft:
             return replace(verdict, weight=np.where(verdict.keep, 1 - moving, 0).astype(np.float32))
         return verdict
 
 
-def link_to_previous(frame: FrameBundle, state: FilterState, radius_px: float = 2.5) -> NDArray[np.intp]:
+def link_to_previous(
+    frame: FrameBundle, state: FilterState, radius_px: float = 2.5
+) -> NDArray[np.intp]:
     """Index of the previous frame's keypoint that each keypoint continues, ``[N]``; -1 for none.
 
     Args:
@@ -90,14 +100,19 @@ def link_to_previous(frame: FrameBundle, state: FilterState, radius_px: float = 
     if state.flow is None or state.previous is None or not len(state.previous.xy):
         return link
     rows = np.flatnonzero(state.flow.valid & np.isfinite(state.flow.xy).all(axis=1))
-    distance, nearest = cKDTree(state.previous.keypoints.xy).query(state.flow.xy[rows], distance_upper_bound=radius_px)
+    distance, nearest = cKDTree(state.previous.keypoints.xy).query(
+        state.flow.xy[rows], distance_upper_bound=radius_px
+    )
     near = np.isfinite(distance)
     link[rows[near]] = np.asarray(nearest)[near]
     return link
 
 
 def expand(
-    xy: NDArray[np.floating], probability: NDArray[np.float64], linked: NDArray[np.bool_], radius_px: float
+    xy: NDArray[np.floating],
+    probability: NDArray[np.float64],
+    linked: NDArray[np.bool_],
+    radius_px: float,
 ) -> NDArray[np.float64]:
     """Matching point expansion: a new feature takes a share of the nearest certain feature's probability.
 
@@ -116,5 +131,7 @@ def expand(
     distance, nearest = cKDTree(xy[certain]).query(xy[new], distance_upper_bound=radius_px)
     near = np.isfinite(distance)
     influence = np.exp(-0.5 * np.square(np.asarray(distance)[near] / (0.5 * radius_px)))
-    expanded[new[near]] = UNKNOWN + influence * (probability[certain[np.asarray(nearest)[near]]] - UNKNOWN)
+    expanded[new[near]] = UNKNOWN + influence * (
+        probability[certain[np.asarray(nearest)[near]]] - UNKNOWN
+    )
     return expanded

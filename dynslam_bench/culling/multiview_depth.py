@@ -6,7 +6,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts import FilterResult, FilterState, FlowResult, FrameBundle, KeyframeView, Need
+from dynslam_bench.contracts import (
+    FilterResult,
+    FilterState,
+    FlowResult,
+    FrameBundle,
+    KeyframeView,
+    Need,
+)
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.culling import Rule
 from dynslam_bench.culling.ego_motion import refine_prediction
@@ -15,7 +22,8 @@ from dynslam_bench.features.matching import CellGrid, Features, as_words, search
 from dynslam_bench.geometry import Camera, inside, se3
 from dynslam_bench.segmentation.postprocess import dilate
 
-MAX_REFERENCE_DEPTH_M, MAX_PROJECTED_DEPTH_M = 6.0, 7.0
+MAX_REFERENCE_DEPTH_M = 6.0
+MAX_PROJECTED_DEPTH_M = 7.0
 MAX_DEPTH_M = 40.0
 """Measured depth beyond this counts as missing, as in the back end."""
 GROW_M = 0.2
@@ -27,9 +35,10 @@ MARGIN_PX = 20
 class MultiViewFilter(Rule[MultiViewSettings]):
     """Drops the features on objects that hide points which earlier keyframes observed.
 
-    A region of similar depth grows around every hidden point; features on it and within `border_px` of it are dropped.
-    Difference from the authors' code: the parallax angle is taken between the camera centres (the code uses a
-    translation in the wrong frame). Stats: ``dropped``, ``references``, ``seeds`` (hidden points), ``mask_fraction``.
+    A region of similar depth grows around every hidden point; features on it and within `border_px`
+    of it are dropped. Difference from the authors' code: the parallax angle is taken between the
+    camera centres (the code uses a translation in the wrong frame). Stats: ``dropped``,
+    ``references``, ``seeds`` (hidden points), ``mask_fraction``.
     """
 
     name = "multiview"
@@ -56,10 +65,16 @@ class MultiViewFilter(Rule[MultiViewSettings]):
         mask = dilate(region.astype(bool), self.settings.dilation_px)
         dropped = inside(dilate(mask, self.settings.border_px), frame.keypoints.xy)
         return self.verdict(
-            ~dropped, mask, references=len(references), seeds=len(seeds), mask_fraction=float(mask.mean())
+            ~dropped,
+            mask,
+            references=len(references),
+            seeds=len(seeds),
+            mask_fraction=float(mask.mean()),
         )
 
-    def _choose(self, views: tuple[KeyframeView, ...], pose: NDArray[np.float64]) -> list[KeyframeView]:
+    def _choose(
+        self, views: tuple[KeyframeView, ...], pose: NDArray[np.float64]
+    ) -> list[KeyframeView]:
         """At most `references` keyframes by 0.7 normalised distance + 0.3 normalised rotation."""
         relative = np.stack([se3.inverse(view.T_world_cam) @ pose for view in views])
         distance = np.linalg.norm(relative[:, :3, 3], axis=1)
@@ -69,15 +84,23 @@ class MultiViewFilter(Rule[MultiViewSettings]):
         return [views[i] for i in ranked[: self.settings.references]]
 
     def _seeds(
-        self, views: list[KeyframeView], depth: NDArray[np.float32], pose: NDArray[np.float64], camera: Camera
+        self,
+        views: list[KeyframeView],
+        depth: NDArray[np.float32],
+        pose: NDArray[np.float64],
+        camera: Camera,
     ) -> NDArray[np.int64]:
         """Pixels ``[M, 2]`` at which an object hides the references' points, reference by reference."""
-        world, from_view = [], []
+        world = []
+        from_view = []
         for view in views:
             usable = (view.z > 0) & (view.z <= MAX_REFERENCE_DEPTH_M)
-            world.append(se3.transform(view.T_world_cam, camera.unproject(view.xy[usable], view.z[usable])))
+            world.append(
+                se3.transform(view.T_world_cam, camera.unproject(view.xy[usable], view.z[usable]))
+            )
             from_view.append(world[-1] - view.T_world_cam[:3, 3])
-        from_frame, from_reference = np.concatenate(world) - pose[:3, 3], np.concatenate(from_view)
+        from_frame = np.concatenate(world) - pose[:3, 3]
+        from_reference = np.concatenate(from_view)
         norms = np.linalg.norm(from_reference, axis=1) * np.linalg.norm(from_frame, axis=1)
         cosine = (from_reference * from_frame).sum(axis=1) / np.maximum(norms, 1e-12)
         local = from_frame @ pose[:3, :3]
@@ -99,16 +122,19 @@ def _depth_variance(depth: NDArray[np.float32], xy: NDArray[np.int64]) -> NDArra
     Missing depth counts as 0, as in the authors' code: no seed lies beside missing depth.
     """
     height, width = depth.shape
-    (x0, y0), (x1, y1) = (xy - MARGIN_PX).clip(0).T, np.minimum(xy + MARGIN_PX + 1, (width, height)).T
+    (x0, y0) = (xy - MARGIN_PX).clip(0).T
+    (x1, y1) = np.minimum(xy + MARGIN_PX + 1, (width, height)).T
     n = (x1 - x0) * (y1 - y0)
     total, squares = (
-        np.asarray(table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0], dtype=np.float64) / n
+        np.asarray(table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0], dtype=np.float64)
+        / n
         for table in cv2.integral2(depth, sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
     )
     return np.asarray(squares - np.square(total))
 
 
-# Compiled loops of DynaSLAM's multi-view geometry: which projected points are hidden, and what hides them.
+# Compiled loops of DynaSLAM's multi-view geometry: which projected points are hidden, and what
+# hides them.
 
 BIN_M = 0.005
 """Depth resolution at which the next pixel of a region is chosen: the one nearest to the region's mean comes first."""
@@ -116,29 +142,37 @@ BIN_M = 0.005
 
 @kernel
 def hidden(
-    depth: NDArray[np.float32], centre: NDArray[np.int64], expected: NDArray[np.float64], tau: float, radius: int
+    depth: NDArray[np.float32],
+    centre: NDArray[np.int64],
+    expected: NDArray[np.float64],
+    tau: float,
+    radius: int,
 ) -> NDArray[np.bool_]:
     """Which points are hidden by a nearer object, robustly against small projection errors.
 
-    A point is compared with the depth in the window that is nearest to the expected depth, among those in front of it.
-    So a point beside an object is not hidden, only one well inside its outline is.
+    A point is compared with the depth in the window that is nearest to the expected depth, among
+    those in front of it. So a point beside an object is not hidden, only one well inside its
+    outline is.
 
     Args:
         depth: float32 ``[H, W]`` metres, 0 missing.
-        centre: int64 ``[N, 2]`` pixels (column, row) of the projected points, at least `radius` from the border.
+        centre: int64 ``[N, 2]`` pixels (column, row) of the projected points, at least `radius`
+            from the border.
         expected: float64 ``[N]`` depth at which the points should be seen, metres.
         tau: Least distance of all nearer depths in front of the point, metres.
         radius: Half side of the window, pixels.
 
     Returns:
-        Bool ``[N]``; False also where the point's own pixel has no depth, or nothing in the window is nearer.
+        Bool ``[N]``; False also where the point's own pixel has no depth, or nothing in the window
+        is nearer.
     """
     is_hidden = np.zeros(len(centre), np.bool_)
     for i in range(len(centre)):
         column, row = centre[i]
         if not depth[row, column] > 0:
             continue
-        nearer, all_far = False, True
+        nearer = False
+        all_far = True
         for y in range(row - radius, row + radius + 1):
             for x in range(column - radius, column + radius + 1):
                 z = depth[y, x]
@@ -154,11 +188,14 @@ def hidden(
 
 
 @kernel
-def grow(depth: NDArray[np.float32], seeds: NDArray[np.int64], step: float, bin_m: float) -> NDArray[np.uint8]:
+def grow(
+    depth: NDArray[np.float32], seeds: NDArray[np.int64], step: float, bin_m: float
+) -> NDArray[np.uint8]:
     """Regions of similar depth around seeds: neighbours join while they are within `step` of the region's mean.
 
-    Of all neighbours of a region the one nearest to its mean joins next (to `bin_m`), and the mean is updated. Pixels
-    without depth never join. A seed within an earlier region starts no new region.
+    Of all neighbours of a region the one nearest to its mean joins next (to `bin_m`), and the mean
+    is updated. Pixels without depth never join. A seed within an earlier region starts no new
+    region.
 
     Args:
         depth: float32 ``[H, W]`` metres, 0 missing, at most a few ten metres.
@@ -176,19 +213,23 @@ def grow(depth: NDArray[np.float32], seeds: NDArray[np.int64], step: float, bin_
     bins = int(np.ceil(depth.max() / bin_m)) + 2
     head = np.full(bins, -1, np.int64)
     reach = int(np.ceil(step / bin_m)) + 1
-    flat, out = depth.ravel(), mask.ravel()
+    flat = depth.ravel()
+    out = mask.ravel()
     for k in range(len(seeds)):
         start = seeds[k, 1] * width + seeds[k, 0]
         if out[start] or not flat[start] > 0:
             continue
         head[:] = -1
-        mean, size, pixel = 0.0, 0, start
+        mean = 0.0
+        size = 0
+        pixel = start
         visited[start] = k + 1
         while pixel >= 0:
             out[pixel] = 1
             mean = (mean * size + flat[pixel]) / (size + 1)
             size += 1
-            row, column = pixel // width, pixel % width
+            row = pixel // width
+            column = pixel % width
             for side in range(4):
                 r = row + (side == 0) - (side == 1)
                 c = column + (side == 2) - (side == 3)
@@ -220,11 +261,13 @@ MAX_DISTANCE = 100
 """Largest Hamming distance of a match."""
 
 
-def refine_by_matches(frame: FrameBundle, state: FilterState, radius_px: float = 15.0) -> NDArray[np.float64] | None:
+def refine_by_matches(
+    frame: FrameBundle, state: FilterState, radius_px: float = 15.0
+) -> NDArray[np.float64] | None:
     """DynaSLAM's low-cost tracking: the predicted pose, refined on matches of features that earlier filters kept.
 
-    The previous frame's features are projected under constant velocity and matched by descriptor within `radius_px`.
-    The authors match the local map instead of the last frame.
+    The previous frame's features are projected under constant velocity and matched by descriptor
+    within `radius_px`. The authors match the local map instead of the last frame.
 
     Args:
         frame: The current frame.
@@ -232,28 +275,45 @@ def refine_by_matches(frame: FrameBundle, state: FilterState, radius_px: float =
         radius_px: Half side of the search windows (DynaSLAM: 15, doubled with too few matches).
 
     Returns:
-        Camera-to-world pose ``[4, 4]``; the prediction itself (or None) where there are fewer than 20 matches, or
-        where an optical flow has refined it already.
+        Camera-to-world pose ``[4, 4]``; the prediction itself (or None) where there are fewer than
+        20 matches, or where an optical flow has refined it already.
     """
     previous = state.previous
-    if state.flow is not None or previous is None or state.T_world_prev is None or state.T_world_pred is None:
+    if (
+        state.flow is not None
+        or previous is None
+        or state.T_world_prev is None
+        or state.T_world_pred is None
+    ):
         return state.T_world_pred
-    trusted = previous.z > 0 if state.previous_keep is None else state.previous_keep & (previous.z > 0)
+    trusted = (
+        previous.z > 0 if state.previous_keep is None else state.previous_keep & (previous.z > 0)
+    )
     rows = np.flatnonzero(trusted)
     if len(rows) < MIN_MATCHES or np.count_nonzero(state.keep) < MIN_MATCHES:
         return state.T_world_pred
-    camera, xy = state.camera, np.ascontiguousarray(frame.xy, dtype=np.float64)
+    camera = state.camera
+    xy = np.ascontiguousarray(frame.xy, dtype=np.float64)
     T_cur_prev = se3.inverse(state.T_world_pred) @ state.T_world_prev
     points = se3.transform(T_cur_prev, camera.unproject(previous.xy[rows], previous.z[rows]))
-    rows, points = rows[points[:, 2] > 0.1], points[points[:, 2] > 0.1]
+    rows = rows[points[:, 2] > 0.1]
+    points = points[points[:, 2] > 0.1]
     expected = np.asarray(camera.project(points), dtype=np.float64)
-    octave, before = (keypoints.octave.astype(np.int64) for keypoints in (frame.keypoints, previous.keypoints))
-    grid, words = CellGrid.of(xy, camera.width, camera.height), as_words(previous.keypoints.descriptors[rows])
-    features = Features(xy, np.full(len(xy), np.nan), octave, as_words(frame.keypoints.descriptors), grid)
+    octave, before = (
+        keypoints.octave.astype(np.int64) for keypoints in (frame.keypoints, previous.keypoints)
+    )
+    grid = CellGrid.of(xy, camera.width, camera.height)
+    words = as_words(previous.keypoints.descriptors[rows])
+    features = Features(
+        xy, np.full(len(xy), np.nan), octave, as_words(frame.keypoints.descriptors), grid
+    )
     for radius in (radius_px, 2 * radius_px):
         windows = expected, np.full(len(rows), np.nan), np.full(len(rows), radius)
-        match = search_in_radius(features, state.keep, windows, before[rows], words, max_distance=MAX_DISTANCE)
-        rows_matched, now = rows[match >= 0], match[match >= 0]
+        match = search_in_radius(
+            features, state.keep, windows, before[rows], words, max_distance=MAX_DISTANCE
+        )
+        rows_matched = rows[match >= 0]
+        now = match[match >= 0]
         if len(now) >= MIN_MATCHES:
             ends = np.full((len(xy), 2), np.nan, np.float32)
             ends[now] = previous.keypoints.xy[rows_matched]

@@ -16,13 +16,14 @@ ORIGIN = EDGE - 3
 class ReseedingFilter(Rule[ReseedingSettings]):
     """Uses the best `budget` of the features that earlier filters kept.
 
-    The extractor finds more features than the budget (x1.5 in NGD-SLAM). The budget is divided among pyramid levels and
-    image cells as in the extractor. A frame without dynamic objects thus gives exactly the features of an extractor
-    with ``n_features = budget``, those of the other systems.
+    The extractor finds more features than the budget (x1.5 in NGD-SLAM). The budget is divided
+    among pyramid levels and image cells as in the extractor. A frame without dynamic objects thus
+    gives exactly the features of an extractor with ``n_features = budget``, those of the other
+    systems.
 
     It must be the last filter. The features that it drops are surplus, not dynamic.
-    Stats: ``dropped`` (the surplus), ``static`` (kept by earlier filters), ``reseeded`` (used features that replace
-    dynamic ones), ``missing`` (unused part of the budget).
+    Stats: ``dropped`` (the surplus), ``static`` (kept by earlier filters), ``reseeded`` (used
+    features that replace dynamic ones), ``missing`` (unused part of the budget).
 
     Args:
         settings: The budget.
@@ -53,18 +54,26 @@ class ReseedingFilter(Rule[ReseedingSettings]):
         """At most `budget` of the allowed features, bool ``[N]``, shared among levels and cells."""
         if np.count_nonzero(allowed) <= self.settings.budget:
             return allowed.copy()
-        octave, chosen, missing = frame.keypoints.octave, np.zeros(len(allowed), dtype=bool), 0
+        octave = frame.keypoints.octave
+        chosen = np.zeros(len(allowed), dtype=bool)
+        missing = 0
         levels = max(self._features.levels, int(octave.max()) + 1)
         quotas = level_quotas(self.settings.budget, levels, self._features.scale_factor)
         for level in range(levels - 1, -1, -1):
             rows = np.flatnonzero((octave == level) & allowed)
             quota = quotas[level] + missing
-            xy = np.rint(frame.keypoints.xy[rows] / self._features.scale_factor**level - ORIGIN).clip(0)
+            xy = np.rint(
+                frame.keypoints.xy[rows] / self._features.scale_factor**level - ORIGIN
+            ).clip(0)
             column, row = (xy / self._features.cell_px).astype(np.int64).T
             # ranks of the responses, so that equal ones stay equal and keep their order
-            strength = np.unique(frame.keypoints.response[rows], return_inverse=True)[1].astype(np.int16)
-            cells, everyone = row * (column.max(initial=0) + 1) + column, np.ones(len(rows), dtype=bool)
+            strength = np.unique(frame.keypoints.response[rows], return_inverse=True)[1].astype(
+                np.int16
+            )
+            cells = row * (column.max(initial=0) + 1) + column
+            everyone = np.ones(len(rows), dtype=bool)
             picked = rows[spread(cells, strength, everyone, quota)]
-            missing = quota - len(picked)  # a coarse level's missing features are added to the next finer level
+            # a coarse level's missing features are added to the next finer level
+            missing = quota - len(picked)
             chosen[picked] = True
         return chosen

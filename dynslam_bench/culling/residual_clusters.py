@@ -22,9 +22,9 @@ STATIC_PRIOR = 0.05
 class ResidualFilter(ObjectRule[ResidualSettings]):
     """Drops the features on clusters that the camera's motion does not explain.
 
-    The residual of a sample is ``|I - I'| / 255 + weight |Z - Z'| / Z`` after warping by the predicted motion; a
-    cluster's mean residual is judged by a two-component exponential mixture with a semantic prior.
-    Stats: ``dropped``, ``clusters``, ``moving``, ``mask_fraction``.
+    The residual of a sample is ``|I - I'| / 255 + weight |Z - Z'| / Z`` after warping by the
+    predicted motion; a cluster's mean residual is judged by a two-component exponential mixture
+    with a semantic prior. Stats: ``dropped``, ``clusters``, ``moving``, ``mask_fraction``.
     """
 
     name = "residual"
@@ -36,7 +36,9 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
         keep = np.ones(len(frame.xy), dtype=bool)
         if state.previous is None or state.T_world_prev is None or state.T_world_pred is None:
             return self.verdict(keep)
-        rows, columns = np.mgrid[STEP // 2 : frame.depth.shape[0] : STEP, STEP // 2 : frame.depth.shape[1] : STEP]
+        rows, columns = np.mgrid[
+            STEP // 2 : frame.depth.shape[0] : STEP, STEP // 2 : frame.depth.shape[1] : STEP
+        ]
         z = np.nan_to_num(frame.depth[rows, columns]).ravel()
         valid = z > 0
         if np.count_nonzero(valid) < 4 * self.settings.clusters:
@@ -51,45 +53,71 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
         sampled = np.zeros(rows.size, dtype=np.uint8)
         sampled[valid] = moving[label]
         size = frame.depth.shape[::-1]
-        mask = cv2.resize(sampled.reshape(rows.shape), size, interpolation=cv2.INTER_NEAREST).astype(bool)
-        keep, moves = ~inside(mask, frame.keypoints.xy), np.count_nonzero(moving)
-        return self.verdict(keep, mask, clusters=len(moving), moving=moves, mask_fraction=float(mask.mean()))
+        mask = cv2.resize(
+            sampled.reshape(rows.shape), size, interpolation=cv2.INTER_NEAREST
+        ).astype(bool)
+        keep = ~inside(mask, frame.keypoints.xy)
+        moves = np.count_nonzero(moving)
+        return self.verdict(
+            keep, mask, clusters=len(moving), moving=moves, mask_fraction=float(mask.mean())
+        )
 
     def _residual(
-        self, frame: FrameBundle, state: FilterState, xy: NDArray[np.float64], z: NDArray[np.floating]
+        self,
+        frame: FrameBundle,
+        state: FilterState,
+        xy: NDArray[np.float64],
+        z: NDArray[np.floating],
     ) -> NDArray[np.float64]:
         """Residuals ``[N]`` of raw pixels ``[N, 2]`` against the previous frame; NaN where they leave it."""
-        assert state.previous is not None and state.T_world_prev is not None and state.T_world_pred is not None
+        assert state.previous is not None
+        assert state.T_world_prev is not None
+        assert state.T_world_pred is not None
         T_prev_cur = se3.inverse(state.T_world_prev) @ state.T_world_pred
-        points = se3.transform(T_prev_cur, state.camera.unproject(state.camera.undistort_points(xy), z))
+        points = se3.transform(
+            T_prev_cur, state.camera.unproject(state.camera.undistort_points(xy), z)
+        )
         pixels = state.camera.distort_points(state.camera.project(points))
         at, visible = pixel_index(pixels, frame.gray.shape)
         x, y = xy.astype(np.intp).T
         colour = np.abs(frame.gray[y, x].astype(np.float64) - state.previous.gray[at]) / 255
         before = np.nan_to_num(state.previous.depth[at])
         depth = np.where(before > 0, np.abs(points[:, 2] - before) / np.maximum(z, 0.1), 0.0)
-        return np.where(visible & (points[:, 2] > 0.1), colour + self.settings.depth_weight * depth, np.nan)
+        return np.where(
+            visible & (points[:, 2] > 0.1), colour + self.settings.depth_weight * depth, np.nan
+        )
 
-    def _cluster(self, xy: NDArray[np.float64], z: NDArray[np.floating], seed: int) -> NDArray[np.intp]:
+    def _cluster(
+        self, xy: NDArray[np.float64], z: NDArray[np.floating], seed: int
+    ) -> NDArray[np.intp]:
         features = np.column_stack([xy / 160.0, np.asarray(z) / 0.5]).astype(np.float32)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 6, 0.05)
-        centres = stream(seed, self.name).choice(len(features), self.settings.clusters, replace=False)
+        centres = stream(seed, self.name).choice(
+            len(features), self.settings.clusters, replace=False
+        )
         distance = ((features[:, None] - features[None, centres]) ** 2).sum(axis=2)
         start = distance.argmin(axis=1).astype(np.int32)[:, None]
-        _, label, _ = cv2.kmeans(features, self.settings.clusters, start, criteria, 1, cv2.KMEANS_USE_INITIAL_LABELS)
+        _, label, _ = cv2.kmeans(
+            features, self.settings.clusters, start, criteria, 1, cv2.KMEANS_USE_INITIAL_LABELS
+        )
         return np.asarray(label.ravel(), dtype=np.intp)
 
     def _moving_clusters(
         self, residual: NDArray[np.float64], label: NDArray[np.intp], people: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
         """Which clusters move, ``[K]``: posterior of the two-component mixture above the threshold."""
-        count, measured = self.settings.clusters, np.isfinite(residual)
+        count = self.settings.clusters
+        measured = np.isfinite(residual)
         if not measured.any():
             return np.zeros(count, dtype=bool)
         members = np.bincount(label[measured], minlength=count)
-        mean = np.bincount(label[measured], weights=residual[measured], minlength=count) / np.maximum(members, 1)
+        mean = np.bincount(
+            label[measured], weights=residual[measured], minlength=count
+        ) / np.maximum(members, 1)
         static = max(float(np.median(mean[members > 0])), 1e-4)
-        share = np.bincount(label, weights=people, minlength=count) / np.maximum(np.bincount(label, minlength=count), 1)
+        share = np.bincount(label, weights=people, minlength=count) / np.maximum(
+            np.bincount(label, minlength=count), 1
+        )
         prior = STATIC_PRIOR + (self.settings.prior - STATIC_PRIOR) * share
         likelihood = np.exp(-mean / (RATIO * static)) / RATIO
         posterior = prior * likelihood / (prior * likelihood + (1 - prior) * np.exp(-mean / static))

@@ -26,8 +26,14 @@ class SemanticFilter(Rule[SegmentationSettings]):
         if frame.instances is None or not frame.instances.class_names:
             return self.verdict(np.ones(len(frame.xy), bool))
         objects = np.count_nonzero(dynamic_objects(frame.instances, self.settings))
-        mask = dynamic_mask(frame.instances, self.settings, frame.depth) if frame.mask is None else frame.mask
-        return self.verdict(~inside(mask, frame.keypoints.xy), mask, objects=objects, mask_fraction=mask.mean())
+        mask = (
+            dynamic_mask(frame.instances, self.settings, frame.depth)
+            if frame.mask is None
+            else frame.mask
+        )
+        return self.verdict(
+            ~inside(mask, frame.keypoints.xy), mask, objects=objects, mask_fraction=mask.mean()
+        )
 
 
 # B2: drop the features inside the boxes of a-priori dynamic classes.
@@ -42,6 +48,7 @@ def dynamic_boxes(frame: FrameBundle, settings: SegmentationSettings) -> NDArray
 
 def in_boxes(xy: NDArray[np.floating], boxes: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Bool ``[K, N]``: which raw pixels ``[N, 2]`` lie in which box ``[K, 4]`` (x0, y0, x1, y1)."""
-    x, y = np.asarray(xy)[:, 0], np.asarray(xy)[:, 1]
+    x = np.asarray(xy)[:, 0]
+    y = np.asarray(xy)[:, 1]
     x0, y0, x1, y1 = (column[:, None] for column in np.asarray(boxes).reshape(-1, 4).T)
     return np.asarray((x >= x0) & (x < x1) & (y >= y0) & (y < y1))

@@ -31,11 +31,14 @@ class TemplateFilter(ObjectRule[TemplateSettings]):
         self._window = self._window[: self.settings.window]
         xy = frame.keypoints.xy
         boxed = in_boxes(xy, dynamic_boxes(frame, self.segmentation)).any(axis=0)
-        keep, rows = np.asarray(~boxed), np.flatnonzero(boxed & (frame.z > 0))
+        keep = np.asarray(~boxed)
+        rows = np.flatnonzero(boxed & (frame.z > 0))
         stats: dict[str, Number] = {"in_boxes": float(np.count_nonzero(boxed))}
         if state.T_world_pred is None or not self._window or not len(rows):
             return self.verdict(keep, **stats)
-        world = se3.transform(state.T_world_pred, state.camera.unproject(frame.xy[rows], frame.z[rows]))
+        world = se3.transform(
+            state.T_world_pred, state.camera.unproject(frame.xy[rows], frame.z[rows])
+        )
         current = patches(frame.gray, xy[rows].astype(np.float64), self.settings.patch_px)
         scores = np.full((len(self._window), len(rows)), np.nan)
         for number, (gray, pose) in enumerate(self._window):
@@ -44,17 +47,22 @@ class TemplateFilter(ObjectRule[TemplateSettings]):
             pixels = np.full((len(rows), 2), -1e3)
             pixels[ahead] = state.camera.distort_points(state.camera.project(local[ahead]))
             scores[number] = zncc(current, patches(gray, pixels, self.settings.patch_px))
-        tested, median = np.isfinite(scores).any(axis=0), np.full(len(rows), -1.0)
+        tested = np.isfinite(scores).any(axis=0)
+        median = np.full(len(rows), -1.0)
         median[tested] = np.nanmedian(scores[:, tested], axis=0)
         keep[rows] = median >= self.settings.zncc
         if tested.any():
-            stats |= {"tested": np.count_nonzero(tested), "median_zncc": float(np.median(median[tested]))}
+            stats |= {
+                "tested": np.count_nonzero(tested),
+                "median_zncc": float(np.median(median[tested])),
+            }
         return self.verdict(keep, **stats)
 
 
 def patches(gray: NDArray[np.uint8], xy: NDArray[np.float64], size: int) -> NDArray[np.float64]:
     """Square patches ``[N, size * size]`` around rounded pixels ``[N, 2]``; NaN where they leave the image."""
-    half, (height, width) = size // 2, gray.shape
+    half = size // 2
+    (height, width) = gray.shape
     centre = np.rint(xy.clip(-1e6, 1e6)).astype(np.intp)
     fits = ((centre >= half) & (centre < (width - half, height - half))).all(axis=1)
     span = np.arange(-half, half + 1)

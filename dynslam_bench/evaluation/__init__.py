@@ -1,6 +1,7 @@
 """Protocol, association, alignment, APE, RPE, coverage and mask quality.
 
-A new metric is a function in `evaluate.METRICS`; its column in reports is one of `reports.tables.leaderboard`.
+A new metric is a function in `evaluate.METRICS`; its column in reports is one of
+`reports.tables.leaderboard`.
 """
 
 from dynslam_bench.evaluation.ape import static_camera

@@ -18,11 +18,11 @@ class Similarity:
         rotation: ``[3, 3]``.
         translation: Metres ``[3]``.
         scale: Factor applied to the estimate's positions first.
-        degenerate: Whether the positions did not determine the rotation (no motion, or motion on a line); it then
-            follows from the orientations, which leaves translational errors at their minimum all the same. Of a
-            camera that does not move the scale is 1.
-        fitted: Positions of the estimate and of the truth ``[N, 3]`` in metres that alone determined the rotation; None
-            where they did not.
+        degenerate: Whether the positions did not determine the rotation (no motion, or motion on a
+            line); it then follows from the orientations, which leaves translational errors at their
+            minimum all the same. Of a camera that does not move the scale is 1.
+        fitted: Positions of the estimate and of the truth ``[N, 3]`` in metres that alone
+            determined the rotation; None where they did not.
     """
 
     rotation: Array
@@ -34,7 +34,9 @@ class Similarity:
     @cached_property
     def uncertainty_deg(self) -> float | None:
         """Standard error of the rotation, see `rotation_uncertainty_deg`; None where too few positions determine it."""
-        return None if self.fitted is None else rotation_uncertainty_deg(*self.fitted, self.rotation)
+        return (
+            None if self.fitted is None else rotation_uncertainty_deg(*self.fitted, self.rotation)
+        )
 
     def doubts(self, truth: Array) -> list[str]:
         """Why absolute rotational errors under this alignment may not be errors of the estimate, a line each.
@@ -43,7 +45,9 @@ class Similarity:
             truth: True poses that the estimate was aligned with ``[N, 4, 4]``.
         """
         if self.degenerate:
-            return ["the estimated positions do not determine a rotation; it was taken from the orientations"]
+            return [
+                "the estimated positions do not determine a rotation; it was taken from the orientations"
+            ]
         if self.uncertainty_deg is None or self.uncertainty_deg <= RELIABLE_DEG:
             return []
         positions = truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0)
@@ -70,7 +74,8 @@ def align(estimate: Array, ground_truth: Array, mode: Alignment) -> Similarity:
         mode: See `Protocol.alignment`.
 
     Returns:
-        For ``se3`` and ``sim3`` the least-squares solution over the positions (Umeyama 1991, Eq. 39-43).
+        For ``se3`` and ``sim3`` the least-squares solution over the positions (Umeyama 1991, Eq.
+        39-43).
 
     Raises:
         EvaluationError: There are no poses.
@@ -82,13 +87,18 @@ def align(estimate: Array, ground_truth: Array, mode: Alignment) -> Similarity:
     if mode == "origin":
         moved = ground_truth[0] @ se3.inverse(estimate[0])
         return Similarity(moved[:3, :3].copy(), moved[:3, 3].copy())
-    source, target = estimate[:, :3, 3], ground_truth[:, :3, 3]
-    # positions about their centres, in units of their own sizes: so neither coordinates of a map nor the unit matter
+    source = estimate[:, :3, 3]
+    target = ground_truth[:, :3, 3]
+    # positions about their centres, in units of their own sizes: so neither coordinates of a map
+    # nor the unit matter
     centre_source, unit_source, size_source = _centred(source)
     centre_target, unit_target, size_target = _centred(target)
     covariance = unit_target.T @ unit_source / len(source)
-    # how far the estimate's orientations are turned, summed: decides only what the positions leave open
-    orientation = np.tensordot(ground_truth[:, :3, :3], estimate[:, :3, :3], axes=((0, 2), (0, 2))) / len(source)
+    # how far the estimate's orientations are turned, summed: decides only what the positions leave
+    # open
+    orientation = np.tensordot(
+        ground_truth[:, :3, :3], estimate[:, :3, :3], axes=((0, 2), (0, 2))
+    ) / len(source)
     if mode == "yaw":
         rotation, degenerate = _yaw(covariance, orientation)
         return Similarity(rotation, centre_target - rotation @ centre_source, 1.0, degenerate)
@@ -98,7 +108,9 @@ def align(estimate: Array, ground_truth: Array, mode: Alignment) -> Similarity:
         variance = float((unit_source**2).sum() / len(source))
         scale = weighted / variance * (size_target / size_source)
     fitted = None if degenerate else (source, target)
-    return Similarity(rotation, centre_target - scale * rotation @ centre_source, scale, degenerate, fitted)
+    return Similarity(
+        rotation, centre_target - scale * rotation @ centre_source, scale, degenerate, fitted
+    )
 
 
 def _centred(positions: Array) -> tuple[Array, Array, float]:
@@ -108,8 +120,9 @@ def _centred(positions: Array) -> tuple[Array, Array, float]:
         positions: ``[N, 3]``.
 
     Returns:
-        The centre ``[3]``, the positions about it in units of their size ``[N, 3]``, and the size, the largest of
-        their coordinates: 0, with zeros, where they differ by no more than the rounding of their coordinates.
+        The centre ``[3]``, the positions about it in units of their size ``[N, 3]``, and the size,
+        the largest of their coordinates: 0, with zeros, where they differ by no more than the
+        rounding of their coordinates.
     """
     # first about one of them: means of large coordinates lose digits
     apart = positions - positions[0]
@@ -143,10 +156,13 @@ def _nearest_rotation(covariance: Array, orientation: Array) -> tuple[Array, flo
 
 def _yaw(covariance: Array, orientation: Array) -> tuple[Array, bool]:
     """Rotation about z that maximises ``tr(R^T C)``."""
-    degenerate = np.hypot(covariance[1, 0] - covariance[0, 1], covariance[0, 0] + covariance[1, 1]) < 1e-15
+    degenerate = (
+        np.hypot(covariance[1, 0] - covariance[0, 1], covariance[0, 0] + covariance[1, 1]) < 1e-15
+    )
     matrix = orientation if degenerate else covariance
     angle = np.arctan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1])
-    c, s = np.cos(angle), np.sin(angle)
+    c = np.cos(angle)
+    s = np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), bool(degenerate)
 
 
@@ -170,18 +186,26 @@ def rotation_uncertainty_deg(source: Array, target: Array, rotation: Array) -> f
         rotation: The rotation found from all of them ``[3, 3]``.
 
     Returns:
-        From half-paths where there are two positions a block, else by leaving out one position at a time (the
-        jackknife); None for fewer than three positions.
+        From half-paths where there are two positions a block, else by leaving out one position at a
+        time (the jackknife); None for fewer than three positions.
     """
     if len(source) < 3:
         return None
     if len(source) < 2 * BLOCKS:
         pairs = [(source[rows], target[rows]) for rows in ~np.eye(len(source), dtype=bool)]
-        covariances = np.array([(to - to.mean(axis=0)).T @ (at - at.mean(axis=0)) for at, to in pairs])
-        return float(np.sqrt((len(source) - 1) / len(source) * (_turned_deg(covariances, rotation) ** 2).sum()))
-    size, more = divmod(len(source), BLOCKS)  # the first blocks are longer by one where it does not come out even
+        covariances = np.array(
+            [(to - to.mean(axis=0)).T @ (at - at.mean(axis=0)) for at, to in pairs]
+        )
+        return float(
+            np.sqrt(
+                (len(source) - 1) / len(source) * (_turned_deg(covariances, rotation) ** 2).sum()
+            )
+        )
+    # the first blocks are longer by one where it does not come out even
+    size, more = divmod(len(source), BLOCKS)
     starts = np.arange(BLOCKS) * size + np.minimum(np.arange(BLOCKS), more)
-    source, target = source - source.mean(axis=0), target - target.mean(axis=0)
+    source = source - source.mean(axis=0)
+    target = target - target.mean(axis=0)
     count = _HALVES @ np.diff(starts, append=len(source))
     sums = _HALVES @ np.add.reduceat(source, starts)
     target_sums = _HALVES @ np.add.reduceat(target, starts)

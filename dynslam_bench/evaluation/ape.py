@@ -19,7 +19,8 @@ def absolute_errors(estimate: Array, ground_truth: Array) -> tuple[Array, Array]
         ground_truth: True poses ``[N, 4, 4]``.
 
     Returns:
-        Length of the translation of E_i in metres ``[N]`` and its rotation angle in degrees ``[N]``.
+        Length of the translation of E_i in metres ``[N]`` and its rotation angle in degrees
+        ``[N]``.
     """
     translation = np.linalg.norm(estimate[:, :3, 3] - ground_truth[:, :3, 3], axis=1)
     return translation, np.rad2deg(se3.rotation_angle(se3.inverse(ground_truth) @ estimate))
@@ -37,7 +38,8 @@ def absolute_metrics(comparison: Comparison) -> dict[str, float]:
 def statistics(error: Array) -> dict[str, float]:
     """RMSE, mean, median, population standard deviation, minimum, maximum and sum of squares of errors ``[N]``.
 
-    ``rmse**2 == mean**2 + std**2`` holds (a published table that breaks it is wrong). Empty input gives an empty dict.
+    ``rmse**2 == mean**2 + std**2`` holds (a published table that breaks it is wrong). Empty input
+    gives an empty dict.
     """
     if not len(error):
         return {}
@@ -55,14 +57,21 @@ def statistics(error: Array) -> dict[str, float]:
 
 def named(prefix: str, error: Array, unit: str) -> dict[str, float]:
     """The statistics under their metric names, e.g. ``ate_rmse_m``; the sum of squares has the unit squared."""
-    return {f"{prefix}_{name}_{unit}{'2' if name == 'sse' else ''}": value for name, value in statistics(error).items()}
+    return {
+        f"{prefix}_{name}_{unit}{'2' if name == 'sse' else ''}": value
+        for name, value in statistics(error).items()
+    }
 
 
 # The ATE alone, which reports compute thousands of times.
 
 
 def ate_rmse_m(
-    estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol, *, held_at: ArrayLike | None = None
+    estimate: Trajectory,
+    ground_truth: Trajectory,
+    protocol: Protocol,
+    *,
+    held_at: ArrayLike | None = None,
 ) -> float:
     """The metric ``ate_rmse_m`` in metres, as `evaluate` takes it.
 
@@ -70,13 +79,16 @@ def ate_rmse_m(
         estimate: Estimated poses of the tracked frames.
         ground_truth: True poses.
         protocol: How to evaluate; what it makes of lost frames is left out.
-        held_at: Stamps in seconds of all input frames: those that were lost stay at the last tracked pose. Without
-            them lost frames take no part.
+        held_at: Stamps in seconds of all input frames: those that were lost stay at the last
+            tracked pose. Without them lost frames take no part.
 
     Raises:
-        EvaluationError: Fewer than two poses have ground truth, or the poses belong to no input frames.
+        EvaluationError: Fewer than two poses have ground truth, or the poses belong to no input
+            frames.
     """
-    comparison = compare(estimate if held_at is None else hold(estimate, held_at), ground_truth, protocol, held_at)
+    comparison = compare(
+        estimate if held_at is None else hold(estimate, held_at), ground_truth, protocol, held_at
+    )
     left = comparison.aligned[:, :3, 3] - comparison.truth[:, :3, 3]
     return math.sqrt(float((left * left).sum()) / len(left))
 
@@ -84,17 +96,21 @@ def ate_rmse_m(
 # The static-camera baseline: an error above it says nothing.
 
 
-def static_camera(ground_truth: Trajectory, stamps: ArrayLike | None = None, max_dt: float = 0.02) -> dict[str, float]:
+def static_camera(
+    ground_truth: Trajectory, stamps: ArrayLike | None = None, max_dt: float = 0.02
+) -> dict[str, float]:
     """Translational errors of not moving, from the ground truth alone.
 
     Args:
         ground_truth: True poses.
-        stamps: Stamps of the input frames in seconds; only true poses associated with them count. None for all.
+        stamps: Stamps of the input frames in seconds; only true poses associated with them count.
+            None for all.
         max_dt: Tolerance of that association in seconds, strict.
 
     Returns:
-        ``constant_<statistic>_m`` for the best constant position (what an SE(3) or Sim(3) alignment leaves) and
-        ``first_<statistic>_m`` for staying at the first pose (what joining the origins leaves).
+        ``constant_<statistic>_m`` for the best constant position (what an SE(3) or Sim(3) alignment
+        leaves) and ``first_<statistic>_m`` for staying at the first pose (what joining the origins
+        leaves).
 
     Raises:
         EvaluationError: No true pose counts.
@@ -111,14 +127,18 @@ def static_camera(ground_truth: Trajectory, stamps: ArrayLike | None = None, max
 
 def static_camera_metrics(comparison: Comparison) -> dict[str, float]:
     """``static_camera_ate_rmse_m``: what a camera that does not move scores under the same alignment."""
-    truth, protocol = comparison.ground_truth, comparison.protocol
+    truth = comparison.ground_truth
+    protocol = comparison.protocol
     stamps = comparison.input_timestamps
     if stamps is None or protocol.thins:
-        truth, stamps = truth.select(np.unique(comparison.truth_index)), None
+        truth = truth.select(np.unique(comparison.truth_index))
+        stamps = None
     return {"static_camera_ate_rmse_m": static_camera_rmse_m(truth, stamps, protocol)}
 
 
-def static_camera_rmse_m(ground_truth: Trajectory, stamps: ArrayLike | None, protocol: Protocol) -> float:
+def static_camera_rmse_m(
+    ground_truth: Trajectory, stamps: ArrayLike | None, protocol: Protocol
+) -> float:
     """The RMSE of `static_camera` in metres that a protocol's alignment leaves."""
     fit = "first" if protocol.alignment in ("none", "origin") else "constant"
     return static_camera(ground_truth, stamps, protocol.max_dt)[f"{fit}_rmse_m"]
@@ -127,8 +147,8 @@ def static_camera_rmse_m(ground_truth: Trajectory, stamps: ArrayLike | None, pro
 def false_motion_metrics(comparison: Comparison) -> dict[str, float]:
     """``false_motion_path_m`` and ``false_motion_max_m``, where the true camera stands still; else nothing.
 
-    They are the length of the estimated path and its largest distance from its first pose. Alignment does not change
-    them; where it would fit the scale, they are left out.
+    They are the length of the estimated path and its largest distance from its first pose.
+    Alignment does not change them; where it would fit the scale, they are left out.
     """
     if comparison.protocol.finds_scale or not se3.stands_still(comparison.truth):
         return {}

@@ -46,11 +46,17 @@ def compare_protocols(estimate: P, ground_truth: P) -> list[ComparisonRow]:
     Raises:
         EvaluationError: The trajectory cannot be evaluated under `tum-rgbd/v1` either.
     """
-    evaluation: Callable[..., Evaluation] = evaluate if isinstance(estimate, Trajectory) else evaluate_loaded
+    evaluation: Callable[..., Evaluation] = (
+        evaluate if isinstance(estimate, Trajectory) else evaluate_loaded
+    )
     score = partial(evaluation, estimate, ground_truth)
     score(_TUM)  # whatever cannot be scored so has no rows
     habits = (("ATE", ABSOLUTE), ("RPE", RELATIVE))
-    return [_row(metric, label, score, protocol) for metric, labels in habits for label, protocol in labels]
+    return [
+        _row(metric, label, score, protocol)
+        for metric, labels in habits
+        for label, protocol in labels
+    ]
 
 
 def agrees(row: ComparisonRow, printed: str) -> bool:
@@ -67,15 +73,22 @@ def agrees(row: ComparisonRow, printed: str) -> bool:
         number = Decimal(printed)
         half_digit = Decimal(5).scaleb(int(number.as_tuple().exponent) - 1)
     except (InvalidOperation, ValueError):
-        raise EvaluationError(f"'{printed}' is not a number in metres as it was printed, e.g. 0.0733") from None
+        raise EvaluationError(
+            f"'{printed}' is not a number in metres as it was printed, e.g. 0.0733"
+        ) from None
     return row.rmse_m is not None and abs(Decimal(row.rmse_m) - number) <= half_digit
 
 
-_TUM, _EVO = PROTOCOLS["tum-rgbd/v1"], PROTOCOLS["evo-default"]
+_TUM = PROTOCOLS["tum-rgbd/v1"]
+_EVO = PROTOCOLS["evo-default"]
 
 
-def _variant(base: Protocol, name: str, *rpe: RPESpec, alignment: Alignment | None = None) -> Protocol:
-    return base.model_copy(update={"id": name, "rpe": rpe, "alignment": alignment or base.alignment})
+def _variant(
+    base: Protocol, name: str, *rpe: RPESpec, alignment: Alignment | None = None
+) -> Protocol:
+    return base.model_copy(
+        update={"id": name, "rpe": rpe, "alignment": alignment or base.alignment}
+    )
 
 
 ABSOLUTE = (
@@ -99,12 +112,20 @@ RELATIVE = (
     ("MonST3R (90 frames), 1 frame", PROTOCOLS["tum-dynamics-90/v1"]),
     ("TUM's default, random pairs", PROTOCOLS["tum-rgbd/v1-random-pairs"]),
     ("evo_rpe, 1 frame", _EVO),
-    ("evo_rpe, 30 frames", _variant(_EVO, "evo 30f", RPESpec(delta=30, unit="f", pairs="consecutive"))),
-    ("evo_rpe, 30 frames, all pairs", _variant(_EVO, "evo 30f all", RPESpec(delta=30, unit="f", pairs="all"))),
+    (
+        "evo_rpe, 30 frames",
+        _variant(_EVO, "evo 30f", RPESpec(delta=30, unit="f", pairs="consecutive")),
+    ),
+    (
+        "evo_rpe, 30 frames, all pairs",
+        _variant(_EVO, "evo 30f all", RPESpec(delta=30, unit="f", pairs="all")),
+    ),
 )
 
 
-def _row(metric: str, label: str, score: Callable[[Protocol], Evaluation], protocol: Protocol) -> ComparisonRow:
+def _row(
+    metric: str, label: str, score: Callable[[Protocol], Evaluation], protocol: Protocol
+) -> ComparisonRow:
     row = partial(ComparisonRow, metric, label, protocol=protocol.describe())
     try:
         result = score(protocol)

@@ -20,7 +20,12 @@ from dynslam_bench.geometry import (
     describe_frame_numbers,
     nearest_gap,
 )
-from dynslam_bench.geometry.rigs import BONN_R_BODY_CAM, bonn_as_droid_w, bonn_camera, in_camera_axes
+from dynslam_bench.geometry.rigs import (
+    BONN_R_BODY_CAM,
+    bonn_as_droid_w,
+    bonn_camera,
+    in_camera_axes,
+)
 from dynslam_bench.geometry.stamp_units import LATEST_S, UNIX_S
 
 Index = NDArray[np.intp]
@@ -32,7 +37,8 @@ class Comparison:
 
     Attributes:
         protocol: How they are compared.
-        estimate: All poses that take part, also those without ground truth (TUM's relative errors need them).
+        estimate: All poses that take part, also those without ground truth (TUM's relative errors
+            need them).
         ground_truth: All true poses, corrected as the protocol has it.
         estimate_index: Associated poses of the estimate ``[K]``.
         truth_index: Their counterparts in the ground truth ``[K]``.
@@ -87,13 +93,15 @@ def compare(
         diagnostics: Takes a line on everything that the numbers depend on.
 
     Raises:
-        EvaluationError: Fewer than two poses have ground truth (with the measured gaps), or a position is so large that
-            its square is no number.
+        EvaluationError: Fewer than two poses have ground truth (with the measured gaps), or a
+            position is so large that its square is no number.
     """
     diagnostics = [] if diagnostics is None else diagnostics
     for whose, trajectory in (("estimate", estimate), ("ground truth", ground_truth)):
         _refuse_infinite(trajectory, whose)
-    estimate, ground_truth = compared(estimate, ground_truth, protocol, input_timestamps, diagnostics)
+    estimate, ground_truth = compared(
+        estimate, ground_truth, protocol, input_timestamps, diagnostics
+    )
     estimate_index, truth_index, association = match(estimate, ground_truth, protocol)
     dropped = association.describe(protocol.max_dt)
     if len(estimate_index) < 2:
@@ -106,7 +114,8 @@ def compare(
             f"{len(estimate_index)} pairs are made of {taken} estimated poses: the estimate has more poses than the "
             "ground truth, so each true pose takes its nearest one"
         )
-    matched, truth = estimate.T_world_cam[estimate_index], ground_truth.T_world_cam[truth_index]
+    matched = estimate.T_world_cam[estimate_index]
+    truth = ground_truth.T_world_cam[truth_index]
     similarity = align(matched, truth, protocol.alignment)
     return Comparison(
         protocol, estimate, ground_truth, estimate_index, truth_index, association, similarity, input_timestamps,
@@ -137,10 +146,12 @@ class AssociationRecord(Record):
     Attributes:
         n_estimate: Poses of the estimate.
         n_ground_truth: Poses of the ground truth.
-        outside: Estimated poses dropped because they lie before the first or behind the last true pose.
+        outside: Estimated poses dropped because they lie before the first or behind the last true
+            pose.
         in_holes: Estimated poses dropped because they lie in a hole of the ground truth.
-        taken: Estimated poses dropped because a closer one had already taken their true pose (or, for evo's rule,
-            because the ground truth is the shorter trajectory and no pose of it chose them).
+        taken: Estimated poses dropped because a closer one had already taken their true pose (or,
+            for evo's rule, because the ground truth is the shorter trajectory and no pose of it
+            chose them).
         median_dt_s: Median |dt| of the pairs.
         largest_hole_s: Largest distance between true poses within the time of the estimate.
         hole_at_s: Stamp at which that hole begins.
@@ -173,23 +184,34 @@ class AssociationRecord(Record):
         )
 
 
-def match(estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol) -> tuple[Index, Index, AssociationRecord]:
+def match(
+    estimate: Trajectory, ground_truth: Trajectory, protocol: Protocol
+) -> tuple[Index, Index, AssociationRecord]:
     """Associate two trajectories under a protocol.
 
     Returns:
-        Indices into the estimate and into the ground truth ``[K]``, ascending in the estimate, and what was dropped.
+        Indices into the estimate and into the ground truth ``[K]``, ascending in the estimate, and
+        what was dropped.
 
     Raises:
-        EvaluationError: A trajectory is empty or no pair is close enough; the message carries the measured gap.
+        EvaluationError: A trajectory is empty or no pair is close enough; the message carries the
+            measured gap.
     """
     if not (len(estimate) and len(ground_truth)):
-        raise EvaluationError(f"the {'ground truth' if len(estimate) else 'estimate'} holds no poses")
-    t_est, t_gt, max_dt, strict = estimate.timestamps, ground_truth.timestamps, protocol.max_dt, protocol.strict
+        raise EvaluationError(
+            f"the {'ground truth' if len(estimate) else 'estimate'} holds no poses"
+        )
+    t_est = estimate.timestamps
+    t_gt = ground_truth.timestamps
+    max_dt = protocol.max_dt
+    strict = protocol.strict
     if protocol.one_to_one:
         index_gt, index_est = associate(t_gt, t_est, max_dt, strict=strict)
         order = np.argsort(index_est, kind="stable")
-        index_gt, index_est = index_gt[order], index_est[order]
-    elif len(t_est) > len(t_gt):  # evo starts from the shorter one, and from the second of equal ones
+        index_gt = index_gt[order]
+        index_est = index_est[order]
+    # evo starts from the shorter one, and from the second of equal ones
+    elif len(t_est) > len(t_gt):
         index_gt, index_est = nearest_match(t_gt, t_est, max_dt, strict=strict)
     else:
         index_est, index_gt = nearest_match(t_est, t_gt, max_dt, strict=strict)
@@ -209,7 +231,9 @@ def clock_hint(stamps: ArrayLike, true_stamps: ArrayLike) -> str:
     if are_frame_numbers(own) != are_frame_numbers(true):
         whose, numbers = ("estimate", own) if are_frame_numbers(own) else ("ground truth", true)
         return f"{describe_frame_numbers(numbers, whose)}: frame numbers? Then give the stamps of the images in seconds"
-    own_is_unix, true_is_unix = (UNIX_S <= float(np.abs(values).max()) <= LATEST_S for values in (own, true))
+    own_is_unix, true_is_unix = (
+        UNIX_S <= float(np.abs(values).max()) <= LATEST_S for values in (own, true)
+    )
     if own_is_unix != true_is_unix and max(np.abs(own).max(), np.abs(true).max()) <= LATEST_S:
         whose, other = ("estimate", "ground truth") if own_is_unix else ("ground truth", "estimate")
         later_s = abs(float(true.min() - own.min()))
@@ -222,7 +246,9 @@ def clock_hint(stamps: ArrayLike, true_stamps: ArrayLike) -> str:
     return "do the files belong together, and do their clocks agree?"
 
 
-def nearest_match(stamps: Array, others: Array, max_dt: float, *, strict: bool) -> tuple[Index, Index]:
+def nearest_match(
+    stamps: Array, others: Array, max_dt: float, *, strict: bool
+) -> tuple[Index, Index]:
     """For every stamp the nearest of the others, the earlier on a tie (evo's rule: stamps may be used repeatedly).
 
     Args:
@@ -273,8 +299,9 @@ def _record(
 def truth_of_file(truth: Trajectory, protocol: Protocol) -> Trajectory:
     """A ground-truth file's poses as `evaluate` takes them.
 
-    Bonn's files hold the orientations of the markers, its sequences those of the camera; the protocols that move the
-    positions start from the latter. For all others a file is taken as it stands.
+    Bonn's files hold the orientations of the markers, its sequences those of the camera; the
+    protocols that move the positions start from the latter. For all others a file is taken as it
+    stands.
     """
     if protocol.truth == "as-is":
         return truth
@@ -294,7 +321,8 @@ def compared(
         estimate: Estimated poses.
         ground_truth: True poses, with the camera's orientations.
         protocol: The protocol.
-        input_timestamps: Stamps in seconds of all input frames; without them those of the estimate count.
+        input_timestamps: Stamps in seconds of all input frames; without them those of the estimate
+            count.
         diagnostics: Takes a line on what was left out.
 
     Raises:
@@ -305,8 +333,14 @@ def compared(
         ground_truth = ground_truth.with_poses(correct(ground_truth.T_world_cam))
     if not protocol.thins:
         return estimate, ground_truth
-    stamps = estimate.timestamps if input_timestamps is None else np.asarray(input_timestamps, np.float64).reshape(-1)
-    matched = np.sort(associate(ground_truth.timestamps, stamps, protocol.max_dt, strict=protocol.strict)[1])
+    stamps = (
+        estimate.timestamps
+        if input_timestamps is None
+        else np.asarray(input_timestamps, np.float64).reshape(-1)
+    )
+    matched = np.sort(
+        associate(ground_truth.timestamps, stamps, protocol.max_dt, strict=protocol.strict)[1]
+    )
     chosen = stamps[matched[:: protocol.every][: protocol.most_frames or None]]
     index = associate(chosen, estimate.timestamps, STAMP_TOLERANCE, strict=False)[1]
     if not len(index):
@@ -329,7 +363,8 @@ def apply_policy(
     """The estimate with its lost frames held or left out, as the protocol has it.
 
     Returns:
-        The estimate, and which input frames were tracked ``[N]``; None where the input frames are not known.
+        The estimate, and which input frames were tracked ``[N]``; None where the input frames are
+        not known.
 
     Raises:
         EvaluationError: The policy needs the input frames.
@@ -342,7 +377,8 @@ def apply_policy(
             )
         return estimate, None
     tracked = tracked_frames(estimate, input_timestamps)
-    n_input, n_tracked = len(tracked), int(tracked.sum())
+    n_input = len(tracked)
+    n_tracked = int(tracked.sum())
     if n_tracked == n_input:
         return estimate, tracked
     lost = f"{n_input - n_tracked} of {n_input} frames were lost (coverage {100 * n_tracked / n_input:.1f} %)"
@@ -360,13 +396,14 @@ STAMP_TOLERANCE = 1e-3
 def tracked_frames(estimate: Trajectory, input_timestamps: ArrayLike) -> NDArray[np.bool_]:
     """Which input frames ``[N]`` have a pose in the estimate.
 
-    A pose belongs to the frame nearest in time, one-to-one, within half a frame interval: some systems write the depth
-    image's stamp, and files round.
+    A pose belongs to the frame nearest in time, one-to-one, within half a frame interval: some
+    systems write the depth image's stamp, and files round.
 
     Raises:
         EvaluationError: The estimate has poses at stamps that are no input frame's.
     """
-    poses, stamps = estimate.timestamps, np.asarray(input_timestamps, dtype=np.float64).reshape(-1)
+    poses = estimate.timestamps
+    stamps = np.asarray(input_timestamps, dtype=np.float64).reshape(-1)
     interval = float(np.median(np.diff(np.sort(stamps)))) if len(stamps) > 1 else 0.0
     index, _ = associate(stamps, poses, max(interval / 2, STAMP_TOLERANCE), strict=False)
     if len(index) < len(poses):
@@ -388,4 +425,6 @@ def hold(estimate: Trajectory, input_timestamps: ArrayLike) -> Trajectory:
     if not len(estimate):
         raise EvaluationError("no frame was tracked, so there is no pose to hold")
     stamps = np.asarray(input_timestamps, dtype=np.float64).reshape(-1)
-    return Trajectory(stamps, estimate.T_world_cam[np.maximum(np.cumsum(tracked_frames(estimate, stamps)) - 1, 0)])
+    return Trajectory(
+        stamps, estimate.T_world_cam[np.maximum(np.cumsum(tracked_frames(estimate, stamps)) - 1, 0)]
+    )

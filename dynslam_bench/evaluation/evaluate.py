@@ -8,8 +8,19 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from dynslam_bench.core.records import Record, schema
-from dynslam_bench.evaluation.ape import absolute_errors, absolute_metrics, false_motion_metrics, static_camera_metrics
-from dynslam_bench.evaluation.comparison import AssociationRecord, Comparison, apply_policy, compare, truth_of_file
+from dynslam_bench.evaluation.ape import (
+    absolute_errors,
+    absolute_metrics,
+    false_motion_metrics,
+    static_camera_metrics,
+)
+from dynslam_bench.evaluation.comparison import (
+    AssociationRecord,
+    Comparison,
+    apply_policy,
+    compare,
+    truth_of_file,
+)
 from dynslam_bench.evaluation.plausibility import warnings_of
 from dynslam_bench.evaluation.protocol import Alignment, Protocol, get_protocol
 from dynslam_bench.evaluation.rpe import relative_metrics, segment_metrics
@@ -45,12 +56,14 @@ class Evaluation(Record):
         protocol_id: Id of the protocol.
         protocol_digest: Its digest; numbers of different digests are not comparable.
         protocol: Its one-line description.
-        metrics: Plain floats. Absolute errors ``ate_<statistic>_m`` (translation) and ``ape_rot_<statistic>_deg``,
-            relative ones ``rpe_<delta><unit>_trans_<statistic>_m`` and ``..._rot_<statistic>_deg``, KITTI's
-            ``kitti_trans_percent`` and ``kitti_rot_deg_per_m``, and ``static_camera_ate_rmse_m``: what a camera that
-            does not move scores under the same alignment. The statistics are rmse, mean, median, std, min, max, sse.
-            Where the true camera stands still, the false motion: ``false_motion_path_m``, the length of the estimated
-            path, and ``false_motion_max_m``, its largest distance from its first pose.
+        metrics: Plain floats. Absolute errors ``ate_<statistic>_m`` (translation) and
+            ``ape_rot_<statistic>_deg``, relative ones ``rpe_<delta><unit>_trans_<statistic>_m`` and
+            ``..._rot_<statistic>_deg``, KITTI's ``kitti_trans_percent`` and
+            ``kitti_rot_deg_per_m``, and ``static_camera_ate_rmse_m``: what a camera that does not
+            move scores under the same alignment. The statistics are rmse, mean, median, std, min,
+            max, sse. Where the true camera stands still, the false motion: ``false_motion_path_m``,
+            the length of the estimated path, and ``false_motion_max_m``, its largest distance from
+            its first pose.
         n_pairs: Pairs of poses that the absolute error is taken over.
         n_pairs_rpe: The same for each relative error.
         n_input: Input frames; None where they are not known.
@@ -97,26 +110,29 @@ def evaluate(
     """Absolute and relative pose errors of a trajectory.
 
     Args:
-        estimate: Camera-to-world poses of the tracked frames, in any world frame that the protocol's alignment undoes.
+        estimate: Camera-to-world poses of the tracked frames, in any world frame that the
+            protocol's alignment undoes.
         ground_truth: True camera-to-world poses at their own stamps; may have holes.
         protocol: A protocol or the id of a registered one.
-        input_timestamps: Stamps in seconds of all input frames; needed for coverage and for the lost-frame policy
-            ``hold``.
+        input_timestamps: Stamps in seconds of all input frames; needed for coverage and for the
+            lost-frame policy ``hold``.
 
     Returns:
-        Every metric that is defined. A relative error whose delta is longer than the trajectory is left out and the
-        diagnostics say so.
+        Every metric that is defined. A relative error whose delta is longer than the trajectory is
+        left out and the diagnostics say so.
 
     Raises:
-        EvaluationError: Fewer than two poses have ground truth (with the measured gaps), or the policy needs the
-            input frames.
+        EvaluationError: Fewer than two poses have ground truth (with the measured gaps), or the
+            policy needs the input frames.
     """
     protocol = get_protocol(protocol)
     diagnostics: list[str] = []
     estimate, tracked = apply_policy(estimate, protocol, input_timestamps, diagnostics)
     comparison = compare(estimate, ground_truth, protocol, input_timestamps, diagnostics)
     if protocol.finds_scale:
-        diagnostics.append(f"the alignment scales the estimate by {comparison.similarity.scale:.6g}")
+        diagnostics.append(
+            f"the alignment scales the estimate by {comparison.similarity.scale:.6g}"
+        )
     diagnostics += comparison.similarity.doubts(comparison.truth)
     metrics = {name: value for metric in METRICS for name, value in metric(comparison).items()}
     similarity = comparison.similarity
@@ -159,16 +175,21 @@ def evaluate_files(
         estimate: The trajectory.
         ground_truth: The truth, as its publisher wrote it.
         protocol: How to evaluate.
-        timestamps: A file whose lines begin with the stamps of the poses in KITTI's format, in seconds.
+        timestamps: A file whose lines begin with the stamps of the poses in KITTI's format, in
+            seconds.
 
     Raises:
         TrajectoryError: A file cannot be read.
         EvaluationError: As `evaluate`.
     """
-    return evaluate_loaded(load_trajectory(estimate, timestamps), load_trajectory(ground_truth, timestamps), protocol)
+    return evaluate_loaded(
+        load_trajectory(estimate, timestamps), load_trajectory(ground_truth, timestamps), protocol
+    )
 
 
-def evaluate_loaded(estimate: TumFile, ground_truth: TumFile, protocol: Protocol | str) -> Evaluation:
+def evaluate_loaded(
+    estimate: TumFile, ground_truth: TumFile, protocol: Protocol | str
+) -> Evaluation:
     """Evaluate a trajectory that was read against a truth that was, with the notes on both files.
 
     Under evo's association all lines with the same stamp take part, else the last of them.
@@ -180,10 +201,14 @@ def evaluate_loaded(estimate: TumFile, ground_truth: TumFile, protocol: Protocol
     loaded = {"estimate": estimate, "ground truth": ground_truth}
     poses, truth = (file.poses(repeats=not protocol.one_to_one) for file in loaded.values())
     result = evaluate(poses, truth_of_file(truth, protocol), protocol)
-    described = {name: file.notes.describe(repeats=not protocol.one_to_one) for name, file in loaded.items()}
+    described = {
+        name: file.notes.describe(repeats=not protocol.one_to_one) for name, file in loaded.items()
+    }
     notes = [f"{name}: {note}" for name, lines in described.items() for note in lines]
     if protocol.only_for:
-        notes.append(f"{protocol.id} means something for {protocol.only_for}* only, which files do not tell")
+        notes.append(
+            f"{protocol.id} means something for {protocol.only_for}* only, which files do not tell"
+        )
     return result.model_copy(update={"diagnostics": notes + result.diagnostics})
 
 
@@ -193,8 +218,8 @@ def pose_errors(
     """The aligned estimate, its true counterparts, and the absolute error of every associated pose, for plots.
 
     Returns:
-        Aligned estimated poses and true poses (both at the estimate's stamps), and the series ``trans_m``,
-        ``rot_deg`` ``[K]`` each.
+        Aligned estimated poses and true poses (both at the estimate's stamps), and the series
+        ``trans_m``, ``rot_deg`` ``[K]`` each.
 
     Raises:
         EvaluationError: Nothing can be associated.

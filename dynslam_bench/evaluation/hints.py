@@ -1,13 +1,14 @@
 """Hints: faults of a trajectory file that its numbers show, each with the measured evidence and the cure.
 
-An estimate may be scored without a word although its stamps are late, its unit is the millimetre or its poses are
-world-to-camera: an alignment and a short path hide much of it. Here the same trajectory is compared with the truth as
-if one such fault were undone. A hint is given only where that explains the true motion and the trajectory as it stands
-does not; a tracker that is merely bad gets none. Hints never change a number.
+An estimate may be scored without a word although its stamps are late, its unit is the millimetre or
+its poses are world-to-camera: an alignment and a short path hide much of it. Here the same
+trajectory is compared with the truth as if one such fault were undone. A hint is given only where
+that explains the true motion and the trajectory as it stands does not; a tracker that is merely bad
+gets none. Hints never change a number.
 
-Motions are compared from pose to pose, over some seconds at most, so that drift and the choice of the world frame do
-not matter. Time shifts follow from the correlation of displacements over lags, coarse to fine, scales from Umeyama's
-alignment.
+Motions are compared from pose to pose, over some seconds at most, so that drift and the choice of
+the world frame do not matter. Time shifts follow from the correlation of displacements over lags,
+coarse to fine, scales from Umeyama's alignment.
 """
 
 from __future__ import annotations
@@ -39,7 +40,9 @@ MOST_PLACES = 4096
 """Places at which displacements are taken at most: more than two minutes at intervals of `LAG_S`."""
 SCALE_FACTOR = 1.15
 """Scales closer to 1 than this factor are errors of a tracker."""
-COPY_SHARE, COPY_M, EXACT_M = 1e-3, 1e-4, 1e-6
+COPY_SHARE = 1e-3
+COPY_M = 1e-4
+EXACT_M = 1e-6
 """No tracker is as accurate as a thousandth of the extent of the path and a tenth of a millimetre at once. Where the
 truth shows no noise of its own, as that of rendered images, it is a thousandth of a millimetre."""
 NOISE_M = 1e-5
@@ -67,16 +70,20 @@ def hints(
         notes: What the estimate's file held in disorder.
 
     Returns:
-        One hint a fault, by `Hint.id`; none where the estimate is healthy, or where nothing explains why it is bad.
+        One hint a fault, by `Hint.id`; none where the estimate is healthy, or where nothing
+        explains why it is bad.
     """
     sim3 = get_protocol(protocol).alignment == "sim3"
     faults = _several_recordings(estimate, ground_truth, notes)
     truth = Track(ground_truth.timestamps, ground_truth.T_world_cam)
     inside = truth.covers(estimate.timestamps)
-    farthest_m = max(np.abs(trajectory.positions).max(initial=0.0) for trajectory in (estimate, ground_truth))
+    farthest_m = max(
+        np.abs(trajectory.positions).max(initial=0.0) for trajectory in (estimate, ground_truth)
+    )
     if inside.sum() < MIN_POSES or farthest_m > FARTHEST_M:
         return tuple(faults)
-    stamps, poses = estimate.timestamps[inside], estimate.T_world_cam[inside]
+    stamps = estimate.timestamps[inside]
+    poses = estimate.T_world_cam[inside]
     shift, left = _time_shift(stamps, poses, truth)
     wrong, poses = _wrong_convention(stamps, poses, truth, shift)
     if wrong:
@@ -85,20 +92,25 @@ def hints(
     faults += wrong + late
     shift = shift if late else 0.0
     covered = truth.covers(stamps + shift)
-    stamps, poses = stamps[covered] + shift, poses[covered]
+    stamps = stamps[covered] + shift
+    poses = poses[covered]
     if not sim3 and left < MOSTLY:
         faults += _scale(stamps, poses, truth)
     return (*faults, *_below_noise(stamps, poses, truth))
 
 
-# -- several recordings --------------------------------------------------------------------------------------------
+# -- several recordings ----------------------------------------------------------------------------
 
 
-def _several_recordings(estimate: Trajectory, truth: Trajectory, notes: FileNotes | None) -> list[Hint]:
+def _several_recordings(
+    estimate: Trajectory, truth: Trajectory, notes: FileNotes | None
+) -> list[Hint]:
     """Stretches of stamps that lie wholly outside of the truth's time, and lines that go back in time."""
     stamps = estimate.timestamps
     parts = np.split(stamps, np.flatnonzero(np.diff(stamps) > OTHER_RECORDING_S) + 1)
-    outside = [part for part in parts if part[-1] < truth.timestamps[0] or part[0] > truth.timestamps[-1]]
+    outside = [
+        part for part in parts if part[-1] < truth.timestamps[0] or part[0] > truth.timestamps[-1]
+    ]
     evidence: list[str] = []
     numbers: dict[str, float] = {}
     if 0 < len(outside) < len(parts):
@@ -109,28 +121,34 @@ def _several_recordings(estimate: Trajectory, truth: Trajectory, notes: FileNote
         )
         numbers |= {"poses_outside": float(rows), "stretches_outside": float(len(outside))}
     if notes is not None and notes.back_s > OTHER_RECORDING_S:
-        repeated = f", {notes.duplicates} of {notes.lines} lines repeat a stamp" if notes.duplicates else ""
+        repeated = (
+            f", {notes.duplicates} of {notes.lines} lines repeat a stamp"
+            if notes.duplicates
+            else ""
+        )
         evidence.append(f"the stamps of the file go back by {notes.back_s:.0f} s{repeated}")
         numbers |= {"back_s": notes.back_s, "repeated_stamps": float(notes.duplicates)}
     text = f"the file seems to hold several recordings: {'; '.join(evidence)}; keep the rows of one"
     return [Hint("several-recordings", text, numbers)] if evidence else []
 
 
-# -- time ----------------------------------------------------------------------------------------------------------
+# -- time ------------------------------------------------------------------------------------------
 
 
 def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float]:
     """How late the truth has to be read for displacements to agree, and the share of them that then stays unexplained.
 
     Returns:
-        Seconds to add to the stamps, 0 without clear evidence, and the share in [0, 1], at any scale.
+        Seconds to add to the stamps, 0 without clear evidence, and the share in [0, 1], at any
+        scale.
     """
     span = float(stamps[-1] - stamps[0])
     window = min(DISPLACEMENT_S, span / 6)
     step = min(LAG_S, window / 3)
     most = int(min(LONGEST_SHIFT_S, span / 4) / step)
     track = Track(stamps, poses)
-    # places on a grid of lags from which the estimate moves by a known displacement, some of them, without jumps
+    # places on a grid of lags from which the estimate moves by a known displacement, some of them,
+    # without jumps
     at = _grid_places(track, step)
     moved = _displacements(track, stamps[0] + step * at, window)
     usable = np.flatnonzero(np.isfinite(moved[:, 0]))
@@ -139,22 +157,28 @@ def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float
     usable = usable[length <= 6 * np.median(length)] if len(usable) else usable
     if len(usable) < MIN_POSES:
         return 0.0, 1.0
-    at, moved = at[usable], moved[usable]
+    at = at[usable]
+    moved = moved[usable]
     # the lag at which the true displacements agree best; each place of the grid is looked at once
     lags = np.arange(-most, most + 1)
     places, place_of = np.unique(at + lags[:, None], return_inverse=True)
-    expected = _displacements(truth, stamps[0] + step * places, window)[place_of.reshape(len(lags), len(at))]
+    expected = _displacements(truth, stamps[0] + step * places, window)[
+        place_of.reshape(len(lags), len(at))
+    ]
     lag = int(lags[np.argmin(_unexplained(moved, expected))])
     fine = lag * step + np.linspace(-1, 1, 9) * step
     begin = stamps[0] + step * at
     near = _unexplained(moved, _displacements(truth, begin + np.append(fine, 0.0)[:, None], window))
-    now, near = float(near[-1]), near[:-1]
+    now = float(near[-1])
+    near = near[:-1]
     best = int(np.argmin(near))
-    shift, left = float(fine[best]), float(near[best])
+    shift = float(fine[best])
+    left = float(near[best])
     if 0 < best < len(fine) - 1 and (bend := near[best - 1] - 2 * left + near[best + 1]) > 0:
         shift += float(0.5 * (near[best - 1] - near[best + 1]) / bend * (fine[1] - fine[0]))
     shifted_self = _displacements(track, begin[None] + shift, window)
-    visible = float(_unexplained(moved, shifted_self)[0])  # what such a shift does to a path of this shape
+    # what such a shift does to a path of this shape
+    visible = float(_unexplained(moved, shifted_self)[0])
     clear = abs(shift) > SHORTEST_SHIFT_S and left < min(MOSTLY, 0.55 * now) and visible > 0.3 * now
     return (shift, left) if clear else (0.0, now)
 
@@ -162,12 +186,14 @@ def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float
 def _grid_places(track: Track, step: float) -> Array:
     """Whole multiples of a step, from the first stamp on, that lie between poses without a hole: `MOST_PLACES` at most.
 
-    They are counted stretch by stretch, so that the work grows with the poses and not with the time that they span.
+    They are counted stretch by stretch, so that the work grows with the poses and not with the time
+    that they span.
     """
     since = track.stamps - track.stamps[0]
     ends = np.flatnonzero(track.holes)
     starts = np.append(0, ends[:-1] + 1)
-    first, last = np.ceil(since[starts] / step), np.floor(since[ends] / step)
+    first = np.ceil(since[starts] / step)
+    last = np.floor(since[ends] / step)
     count = np.maximum(last - first + 1, 0)
     before = np.cumsum(count) - count
     ranks = np.arange(min(count.sum(), MOST_PLACES)) * max(1.0, np.ceil(count.sum() / MOST_PLACES))
@@ -210,7 +236,9 @@ def _shift_hint(stamps: Array, poses: Array, truth: Track, shift: float, left: f
     both = truth.covers(stamps) & truth.covers(stamps + shift)
     if both.sum() < MIN_POSES:
         return []
-    error, undone = (fit(poses[both], truth.at(stamps[both] + late)).sim3_m for late in (0.0, shift))
+    error, undone = (
+        fit(poses[both], truth.at(stamps[both] + late)).sim3_m for late in (0.0, shift)
+    )
     if not undone < (0.9 if left < 0.05 else 0.5) * error:
         return []
     return [
@@ -224,20 +252,27 @@ def _shift_hint(stamps: Array, poses: Array, truth: Track, shift: float, left: f
     ]
 
 
-# -- scale and noise ---
+# -- scale and noise -------------------------------------------------------------------------------
 
 
 def _scale(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
     best = fit(poses, truth.at(stamps))
-    scale, error, undone = best.scale, best.se3_m, best.sim3_m
-    if not (scale > 0 and abs(np.log(scale)) > np.log(SCALE_FACTOR) and undone < min(0.4 * error, 0.2 * best.extent_m)):
+    scale = best.scale
+    error = best.se3_m
+    undone = best.sim3_m
+    if not (
+        scale > 0
+        and abs(np.log(scale)) > np.log(SCALE_FACTOR)
+        and undone < min(0.4 * error, 0.2 * best.extent_m)
+    ):
         return []
     window = min(DISPLACEMENT_S, (stamps[-1] - stamps[0]) / 6)
     moved, true = (_displacements(track, stamps, window) for track in (Track(stamps, poses), truth))
     both = np.isfinite(moved[:, 0]) & np.isfinite(true[:, 0])
     varying, varied = (steps[both] - steps[both].mean(axis=0) for steps in (moved, true))
     steady = both.sum() < MIN_POSES or (varying**2).sum() < STEADY * (moved[both] ** 2).sum()
-    if steady or _unexplained(varying, varied[None])[0] > MOSTLY:  # a steady motion fits many paths at some scale
+    # a steady motion fits many paths at some scale
+    if steady or _unexplained(varying, varied[None])[0] > MOSTLY:
         return []
     unit = next((name for name, size in _UNITS.items() if abs(np.log(scale / size)) < 0.1), "")
     cure = (
@@ -255,7 +290,13 @@ def _scale(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
     ]
 
 
-_UNITS = {"millimetres": 1e-3, "centimetres": 1e-2, "feet": 0.3048, "inches": 0.0254, "kilometres": 1e3}
+_UNITS = {
+    "millimetres": 1e-3,
+    "centimetres": 1e-2,
+    "feet": 0.3048,
+    "inches": 0.0254,
+    "kilometres": 1e3,
+}
 
 
 def _below_noise(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
@@ -271,7 +312,8 @@ def _below_noise(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
         text = f"the error of {1000 * error:.3g} mm is below what trackers reach: were the poses read from the truth?"
         return [Hint("below-truth-noise", text, {"error_m": error, "least_m": least})]
     own = min(
-        _jitter(align(poses, true, "se3").apply(poses)[:, :3, 3] - true[:, :3, 3], 3) for true in (between, nearest)
+        _jitter(align(poses, true, "se3").apply(poses)[:, :3, 3] - true[:, :3, 3], 3)
+        for true in (between, nearest)
     )
     if own < 0.5 * noise and noise > NOISE_M:
         text = (
@@ -286,7 +328,10 @@ def _jitter(positions: Array, order: int) -> float:
     """Standard deviation of white noise, per axis, that differences of some order show; metres, nan of few."""
     if len(positions) < 30:
         return float("nan")
-    return float(np.median(np.abs(np.diff(positions, order, axis=0))) / (0.6745 * np.sqrt(comb(2 * order, order))))
+    return float(
+        np.median(np.abs(np.diff(positions, order, axis=0)))
+        / (0.6745 * np.sqrt(comb(2 * order, order)))
+    )
 
 
 # What hints are made from: poses between their stamps, and how well positions can be aligned.
@@ -334,7 +379,8 @@ class Track:
     """
 
     def __init__(self, stamps: Array, poses: Array) -> None:
-        self.stamps, self.poses = stamps, poses
+        self.stamps = stamps
+        self.poses = poses
         self.positions = np.ascontiguousarray(poses[:, :3, 3])
         steps = np.diff(self.stamps)
         self.step = float(np.median(steps)) if len(steps) else 0.0
@@ -343,11 +389,15 @@ class Track:
     def covers(self, stamps: Array) -> NDArray[np.bool_]:
         """Whether stamps lie within its time and in no hole ``[...]``."""
         after = np.searchsorted(self.stamps, stamps, side="right") - 1
-        return np.asarray((after >= 0) & (~self.holes[after] | (self.stamps[after.clip(0)] == stamps)))
+        return np.asarray(
+            (after >= 0) & (~self.holes[after] | (self.stamps[after.clip(0)] == stamps))
+        )
 
     def positions_at(self, stamps: Array) -> Array:
         """Positions ``[..., 3]``, on straight lines between the stamps."""
-        return np.stack([np.interp(stamps, self.stamps, self.positions[:, axis]) for axis in range(3)], axis=-1)
+        return np.stack(
+            [np.interp(stamps, self.stamps, self.positions[:, axis]) for axis in range(3)], axis=-1
+        )
 
     def at(self, stamps: Array) -> Array:
         """Poses ``[N, 4, 4]``: these positions, with the rotation of the pose that is nearest in time."""
@@ -385,32 +435,45 @@ class Fit:
 
 def fit(poses: Array, truth: Array) -> Fit:
     """How well the positions of poses ``[N, 4, 4]`` can be aligned with those of the true ones."""
-    own, true = (matrices[:, :3, 3] - matrices[:, :3, 3].mean(axis=0) for matrices in (poses, truth))
+    own, true = (
+        matrices[:, :3, 3] - matrices[:, :3, 3].mean(axis=0) for matrices in (poses, truth)
+    )
     u, singular, vt = np.linalg.svd(true.T @ own / len(own))
-    explained = singular[0] + singular[1] + np.sign(np.linalg.det(u) * np.linalg.det(vt)) * singular[2]
-    size, extent = float((own**2).sum() / len(own)), float((true**2).sum() / len(own))
+    explained = (
+        singular[0] + singular[1] + np.sign(np.linalg.det(u) * np.linalg.det(vt)) * singular[2]
+    )
+    size = float((own**2).sum() / len(own))
+    extent = float((true**2).sum() / len(own))
     scale = max(float(explained), 0.0) / size if size > 0 else 1.0
     errors = (size + extent - 2 * explained, extent - scale * explained)
     se3_m, sim3_m = (float(np.sqrt(max(error, 0.0))) for error in errors)
     return Fit(scale, se3_m, sim3_m, float(np.sqrt(extent)))
 
 
-# Conventions of poses that an estimate may have in place of camera-to-world matrices, found by its motions.
+# Conventions of poses that an estimate may have in place of camera-to-world matrices, found by its
+# motions.
 
 MIN_POSES = 8
 """With fewer poses that have truth nothing is said of their motion."""
 PAIR_S = 2.0
 """Motions from pose to pose are taken over a third of the trajectory, at most over this many seconds."""
-ROTATES_DEG, MOVES_M = 1.5, 0.01
+ROTATES_DEG = 1.5
+MOVES_M = 0.01
 """Motions smaller than this are not distinguished from noise."""
-EXPLAINED, UNEXPLAINED, CLEARLY = 0.4, 0.25, 4.0
+EXPLAINED = 0.4
+UNEXPLAINED = 0.25
+CLEARLY = 4.0
 """Median error of the motions over the motions themselves: below the first they may be explained, above the second they
-may not. An undone fault has to be better than the trajectory as it stands by the third, a factor."""
-VARIES, TIE = 0.7, 0.1
+may not. An undone fault has to be better than the trajectory as it stands by the third, a
+factor."""
+VARIES = 0.7
+TIE = 0.1
 """Least correlation of motions that are explained, and the errors between which the path does not tell."""
 
 
-def _wrong_convention(stamps: Array, poses: Array, truth: Track, shift: float) -> tuple[list[Hint], Array]:
+def _wrong_convention(
+    stamps: Array, poses: Array, truth: Track, shift: float
+) -> tuple[list[Hint], Array]:
     """The convention that explains motions which the poses as they stand do not, and the poses brought in order.
 
     Args:
@@ -430,7 +493,11 @@ def _wrong_convention(stamps: Array, poses: Array, truth: Track, shift: float) -
         covered = truth.covers(stamps + shift)
         covered_pairs = pairs[covered[pairs].all(axis=1)]
         limit = min(
-            limit, _compare(se3.between(poses, covered_pairs), se3.between(truth.at(stamps + shift), covered_pairs))[0]
+            limit,
+            _compare(
+                se3.between(poses, covered_pairs),
+                se3.between(truth.at(stamps + shift), covered_pairs),
+            )[0],
         )
     candidates: list[tuple[float, Convention, Array]] = []
     for convention in CONVENTIONS:
@@ -442,7 +509,11 @@ def _wrong_convention(stamps: Array, poses: Array, truth: Track, shift: float) -
     if not candidates:
         return [], poses
     misfit = [error + fit(undone, true_poses).misfit for error, _, undone in candidates]
-    best = [candidate for candidate, score in zip(candidates, misfit, strict=True) if score < min(misfit) + TIE]
+    best = [
+        candidate
+        for candidate, score in zip(candidates, misfit, strict=True)
+        if score < min(misfit) + TIE
+    ]
     error, convention, undone = best[0]
     return [
         Hint(
@@ -500,9 +571,10 @@ def _compare(motions: Array, true: Array, R_est_cam: Array | None = None) -> tup
         R_est_cam: Rotation from the camera's axes to those that the motions are given in.
 
     Returns:
-        Median error over the median motion, of the moving half of the pairs, rotations or translations, whichever
-        is worse: infinite if nothing moves. And the best correlation of the two about their means: low where the
-        motion is always the same, and then many wrong poses explain it.
+        Median error over the median motion, of the moving half of the pairs, rotations or
+        translations, whichever is worse: infinite if nothing moves. And the best correlation of the
+        two about their means: low where the motion is always the same, and then many wrong poses
+        explain it.
     """
     if R_est_cam is not None:
         motions = se3.with_rotation(motions, R_est_cam.T @ motions[:, :3, :3] @ R_est_cam)
@@ -514,17 +586,29 @@ def _compare(motions: Array, true: Array, R_est_cam: Array | None = None) -> tup
     moving = angle >= np.median(angle)
     if (turned := float(np.median(angle[moving]))) > ROTATES_DEG:
         off = np.rad2deg(se3.rotation_angle(se3.inverse(motions[moving]) @ true[moving]))
-        scores.append((float(np.median(off)) / turned, _correlation(se3.sine_axes(motions)[0], se3.sine_axes(true)[0])))
+        scores.append(
+            (
+                float(np.median(off)) / turned,
+                _correlation(se3.sine_axes(motions)[0], se3.sine_axes(true)[0]),
+            )
+        )
     length = np.linalg.norm(true[:, :3, 3], axis=1)
     moving = length >= np.median(length)
-    moved, estimated = true[moving, :3, 3], motions[moving, :3, 3]
+    moved = true[moving, :3, 3]
+    estimated = motions[moving, :3, 3]
     own_length = float(np.median(np.linalg.norm(estimated, axis=1)))
     if (true_length := float(np.median(length[moving]))) > MOVES_M:
         off = (
-            np.linalg.norm(estimated * (true_length / own_length) - moved, axis=1) if own_length > 0 else length[moving]
+            np.linalg.norm(estimated * (true_length / own_length) - moved, axis=1)
+            if own_length > 0
+            else length[moving]
         )
-        scores.append((float(np.median(off)) / true_length, _correlation(motions[:, :3, 3], true[:, :3, 3])))
-    return max((error for error, _ in scores), default=np.inf), max((good for _, good in scores), default=0.0)
+        scores.append(
+            (float(np.median(off)) / true_length, _correlation(motions[:, :3, 3], true[:, :3, 3]))
+        )
+    return max((error for error, _ in scores), default=np.inf), max(
+        (good for _, good in scores), default=0.0
+    )
 
 
 @dataclass(frozen=True)
@@ -573,7 +657,9 @@ CONVENTIONS = (
         "camera-axes",
         "the orientations seem to have the axes x forward, y left, z up (ROS)",
         "after turning them; give those of a camera with x right, y down, z forward",
-        lambda poses: se3.with_rotation(poses, poses[:, :3, :3] @ [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]),
+        lambda poses: se3.with_rotation(
+            poses, poses[:, :3, :3] @ [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+        ),
     ),
 )
 """The likeliest first."""

@@ -37,7 +37,9 @@ class MaskCounts:
     @property
     def iou(self) -> float | None:
         """Intersection over union; None where both masks are empty (nothing to find, nothing found)."""
-        return _ratio(self.true_positive, self.true_positive + self.false_positive + self.false_negative)
+        return _ratio(
+            self.true_positive, self.true_positive + self.false_positive + self.false_negative
+        )
 
     @property
     def precision(self) -> float | None:
@@ -60,10 +62,13 @@ def compare_masks(predicted: NDArray[np.bool_], truth: NDArray[np.bool_]) -> Mas
     Raises:
         EvaluationError: The masks differ in shape.
     """
-    p, t = np.asarray(predicted, dtype=bool), np.asarray(truth, dtype=bool)
+    p = np.asarray(predicted, dtype=bool)
+    t = np.asarray(truth, dtype=bool)
     if p.shape != t.shape:
         raise EvaluationError(f"masks differ in shape: {p.shape} and {t.shape}")
-    return MaskCounts(int((p & t).sum()), int((p & ~t).sum()), int((~p & t).sum()), int((~p & ~t).sum()))
+    return MaskCounts(
+        int((p & t).sum()), int((p & ~t).sum()), int((~p & t).sum()), int((~p & ~t).sum())
+    )
 
 
 def _ratio(part: int, whole: int) -> float | None:

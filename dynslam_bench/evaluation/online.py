@@ -12,19 +12,20 @@ class OnlineSample:
     """The pose error at one frame that has ground truth.
 
     Attributes:
-        trans_m: Cumulative translational error in metres, estimate and truth joined at the first frame that has both.
+        trans_m: Cumulative translational error in metres, estimate and truth joined at the first
+            frame that has both.
         rot_deg: Cumulative rotational error in degrees.
-        frame_trans_m: Frame-to-frame translational error in metres (Eq. 26 over one frame); None where the frame
-            before has no ground truth.
+        frame_trans_m: Frame-to-frame translational error in metres (Eq. 26 over one frame); None
+            where the frame before has no ground truth.
         frame_rot_deg: Frame-to-frame rotational error in degrees, likewise.
-        way_m: Length in metres of the true path since the first frame with ground truth, straight across frames that
-            have none (it was at least that); no tracker changes it.
+        way_m: Length in metres of the true path since the first frame with ground truth, straight
+            across frames that have none (it was at least that); no tracker changes it.
         tracked: Whether the frame was tracked.
-        lost_way_m: Metres that the camera truly moved over the lost frames since the last tracked pose, where its
-            frame-to-frame motion is known; 0 without lost frames in between.
+        lost_way_m: Metres that the camera truly moved over the lost frames since the last tracked
+            pose, where its frame-to-frame motion is known; 0 without lost frames in between.
         T_world_true: True pose ``[4, 4]``, camera to world of the ground truth.
-        T_world_held: The estimate in the same world: of the last tracked frame; the first true pose before there is
-            one.
+        T_world_held: The estimate in the same world: of the last tracked frame; the first true pose
+            before there is one.
     """
 
     trans_m: float
@@ -48,12 +49,14 @@ def truths_at(truth: Trajectory | None, stamps: Array) -> dict[int, Array]:
 class OnlineError:
     """Follows the pose error of a running tracker; what is known at a frame never changes later.
 
-    A frame that is lost counts as not having moved: it stays at the last tracked pose, cumulatively and frame to frame,
-    as if the tracker had repeated that pose. The first tracked pose after it is a jump from there. Until a first pose
-    is tracked the camera counts as standing at the first true pose, and where it then is joins estimate and truth.
+    A frame that is lost counts as not having moved: it stays at the last tracked pose, cumulatively
+    and frame to frame, as if the tracker had repeated that pose. The first tracked pose after it is
+    a jump from there. Until a first pose is tracked the camera counts as standing at the first true
+    pose, and where it then is joins estimate and truth.
 
     Args:
-        ground_truth: True camera-to-world poses at their own stamps, possibly with holes; None if there are none.
+        ground_truth: True camera-to-world poses at their own stamps, possibly with holes; None if
+            there are none.
         max_dt: A frame has ground truth if a true pose is closer in time than this, in seconds.
     """
 
@@ -93,7 +96,8 @@ class OnlineError:
         sample = None if truth is None else self._sample(truth, pose)
         self._previous_truth = truth
         if pose is not None:
-            self._previous_pose, self._lost_way_m = pose, 0.0
+            self._previous_pose = pose
+            self._lost_way_m = 0.0
         return sample
 
     def _sample(self, truth: Array, pose: Array | None) -> OnlineSample:
@@ -103,7 +107,8 @@ class OnlineError:
             self._way_m += float(np.linalg.norm(truth[:3, 3] - self._last_truth[:3, 3]))
         self._last_truth = truth
         error = se3.inverse(truth) @ self._held
-        trans, rot = float(np.linalg.norm(error[:3, 3])), float(np.rad2deg(se3.rotation_angle(error)))
+        trans = float(np.linalg.norm(error[:3, 3]))
+        rot = float(np.rad2deg(se3.rotation_angle(error)))
         frame_trans = frame_rot = None
         if self._previous_truth is not None:
             moved = se3.inverse(self._previous_truth) @ truth
@@ -111,9 +116,18 @@ class OnlineError:
             if pose is not None and self._previous_pose is not None:
                 estimated = se3.inverse(self._previous_pose) @ pose
             gap = se3.inverse(moved) @ estimated
-            frame_trans, frame_rot = float(np.linalg.norm(gap[:3, 3])), float(np.rad2deg(se3.rotation_angle(gap)))
+            frame_trans = float(np.linalg.norm(gap[:3, 3]))
+            frame_rot = float(np.rad2deg(se3.rotation_angle(gap)))
             if pose is None:
                 self._lost_way_m += frame_trans
         return OnlineSample(
-            trans, rot, frame_trans, frame_rot, self._way_m, pose is not None, self._lost_way_m, truth, self._held
+            trans,
+            rot,
+            frame_trans,
+            frame_rot,
+            self._way_m,
+            pose is not None,
+            self._lost_way_m,
+            truth,
+            self._held,
         )

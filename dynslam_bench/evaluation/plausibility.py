@@ -1,17 +1,24 @@
 """What makes the numbers of an evaluation doubtful: values that nobody could mean, too little truth.
 
-Hints look for one fault that explains a whole trajectory. A warning states a measured fact and changes no number. Like
-a hint it is one line that begins with its id: ``frame-numbers``, ``slow-stamps``, ``far-stamp``, ``far-positions``,
-``little-truth`` or ``static-camera``.
+Hints look for one fault that explains a whole trajectory. A warning states a measured fact and
+changes no number. Like a hint it is one line that begins with its id: ``frame-numbers``,
+``slow-stamps``, ``far-stamp``, ``far-positions``, ``little-truth`` or ``static-camera``.
 """
 
 import numpy as np
 
 from dynslam_bench.evaluation.comparison import Comparison
-from dynslam_bench.geometry import Trajectory, are_frame_numbers, describe_frame_numbers, median_step, se3
+from dynslam_bench.geometry import (
+    Trajectory,
+    are_frame_numbers,
+    describe_frame_numbers,
+    median_step,
+    se3,
+)
 from dynslam_bench.geometry.stamp_units import SLOWEST_S
 
-FASTEST_M_S, LONGEST_STEP_M = 100.0, 1.0
+FASTEST_M_S = 100.0
+LONGEST_STEP_M = 1.0
 """No camera goes faster than the first and as far as the second from one pose to the next."""
 LONGEST_HOLE_S = 86_400.0
 """A day: no recording has such a hole."""
@@ -28,7 +35,10 @@ def warnings_of(comparison: Comparison, metrics: dict[str, float]) -> list[str]:
         comparison: What was compared.
         metrics: Its metrics.
     """
-    lines = [*_of_stamps(comparison.estimate, "estimate"), *_of_stamps(comparison.ground_truth, "ground truth")]
+    lines = [
+        *_of_stamps(comparison.estimate, "estimate"),
+        *_of_stamps(comparison.ground_truth, "ground truth"),
+    ]
     lines += _of_motion(comparison.ground_truth, "ground truth")
     if not comparison.protocol.finds_scale:
         lines += _of_motion(comparison.estimate, "estimate")
@@ -40,7 +50,9 @@ def _of_stamps(trajectory: Trajectory, whose: str) -> list[str]:
     stamps = trajectory.timestamps
     if are_frame_numbers(stamps):
         fault = describe_frame_numbers(stamps, whose)
-        return [f"frame-numbers: {fault}: frame numbers? Then give the stamps of the images in seconds"]
+        return [
+            f"frame-numbers: {fault}: frame numbers? Then give the stamps of the images in seconds"
+        ]
     lines = []
     step_s = median_step(stamps)
     if step_s is not None and step_s > SLOWEST_S:
@@ -54,7 +66,9 @@ def _of_stamps(trajectory: Trajectory, whose: str) -> list[str]:
         count = behind if before_is_smaller else len(stamps) - behind
         stamp = stamps[behind - 1] if before_is_smaller else stamps[behind]
         apart = f"{count} of {len(stamps)} poses of the {whose} lie {holes_s.max():.3g} s apart from the others"
-        lines.append(f"far-stamp: {apart}, at the stamp {stamp:.6f}: remove the lines of another recording")
+        lines.append(
+            f"far-stamp: {apart}, at the stamp {stamp:.6f}: remove the lines of another recording"
+        )
     return lines
 
 
@@ -69,7 +83,9 @@ def _of_motion(trajectory: Trajectory, whose: str) -> list[str]:
     if 2 * fast.sum() > len(fast):
         fault = f"the {whose} moves at {np.median(speeds):.3g} m/s by the median"
         return [f"far-positions: {fault}: are its positions in millimetres? Give metres"]
-    distances_m = np.linalg.norm(trajectory.positions - np.median(trajectory.positions, axis=0), axis=1)
+    distances_m = np.linalg.norm(
+        trajectory.positions - np.median(trajectory.positions, axis=0), axis=1
+    )
     farthest = int(distances_m.argmax())
     fault = f"{fast.sum()} of {len(fast)} steps of the {whose} are faster than {FASTEST_M_S:g} m/s"
     where = f"the pose at the stamp {trajectory.timestamps[farthest]:.6f} lies {distances_m[farthest]:.3g} m"
@@ -78,19 +94,25 @@ def _of_motion(trajectory: Trajectory, whose: str) -> list[str]:
 
 def _of_pairs(comparison: Comparison) -> list[str]:
     """Too few poses with ground truth."""
-    poses, compared = len(comparison.estimate), len(np.unique(comparison.estimate_index))
+    poses = len(comparison.estimate)
+    compared = len(np.unique(comparison.estimate_index))
     if 2 * compared < poses:
         only = f"only {compared} of {poses} poses have ground truth within {comparison.protocol.max_dt:g} s"
         return [f"little-truth: {only}: the absolute errors are over those alone"]
     if compared < FEWEST_PAIRS and comparison.protocol.alignment in ("se3", "sim3", "yaw"):
-        return [f"little-truth: only {compared} poses have ground truth: the alignment fits most of their error"]
+        return [
+            f"little-truth: only {compared} poses have ground truth: the alignment fits most of their error"
+        ]
     return []
 
 
 def _of_static_camera(comparison: Comparison, metrics: dict[str, float]) -> list[str]:
     """An error that hardly differs from that of a camera that does not move."""
-    error, static = metrics["ate_rmse_m"], metrics["static_camera_ate_rmse_m"]
+    error = metrics["ate_rmse_m"]
+    static = metrics["static_camera_ate_rmse_m"]
     if static == 0 or error < NEARLY_STATIC * static or se3.stands_still(comparison.truth):
         return []
     share = f"{100 * error / static:.0f} %"
-    return [f"static-camera: the error of {error:.4g} m is {share} of a static camera's, {static:.4g} m"]
+    return [
+        f"static-camera: the error of {error:.4g} m is {share} of a static camera's, {static:.4g} m"
+    ]

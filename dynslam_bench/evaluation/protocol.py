@@ -1,7 +1,7 @@
 """The evaluation protocol: everything besides the two trajectories that an error depends on.
 
-The same trajectory scores tenfold different numbers under two options of one official script; therefore a metric is
-stored with its protocol's digest, and tables refuse to mix digests.
+The same trajectory scores tenfold different numbers under two options of one official script;
+therefore a metric is stored with its protocol's digest, and tables refuse to mix digests.
 """
 
 from __future__ import annotations
@@ -47,11 +47,12 @@ class RPESpec(_Frozen):
 
     Attributes:
         delta: Distance between the poses of a pair; ignored by ``tum-random``.
-        unit: Its unit: ``f`` frames, ``s`` seconds, ``m`` metres of path, ``rad`` or ``deg`` of rotation. Pairs of
-            evo's are taken over frames alone.
-        pairs: ``tum-fixed``: for every pose the one closest to `delta` further along the estimate, unless that is the
-            last pose. ``tum-random``: `max_pairs` seeded random pairs (every pair of a trajectory shorter than the
-            square root of that). ``consecutive`` and ``all``: evo's non-overlapping and overlapping pairs.
+        unit: Its unit: ``f`` frames, ``s`` seconds, ``m`` metres of path, ``rad`` or ``deg`` of
+            rotation. Pairs of evo's are taken over frames alone.
+        pairs: ``tum-fixed``: for every pose the one closest to `delta` further along the estimate,
+            unless that is the last pose. ``tum-random``: `max_pairs` seeded random pairs (every
+            pair of a trajectory shorter than the square root of that). ``consecutive`` and ``all``:
+            evo's non-overlapping and overlapping pairs.
         max_pairs: At most so many pairs in the two TUM modes, a seeded sample of them; 0 for all.
         rate: Whether each error is divided by the time between its two poses: m/s and degrees/s.
     """
@@ -81,7 +82,11 @@ class RPESpec(_Frozen):
     @property
     def key(self) -> str:
         """Part of the metrics' names: ``1s`` in ``rpe_1s_trans_rmse_m``, or ``random``."""
-        return "random" if self.pairs == "tum-random" else f"{self.delta:g}{self.unit}{'_rate' if self.rate else ''}"
+        return (
+            "random"
+            if self.pairs == "tum-random"
+            else f"{self.delta:g}{self.unit}{'_rate' if self.rate else ''}"
+        )
 
     def unit_of(self, part: str) -> str:
         """Unit of the error as metrics name it: m, deg, m_per_s or deg_per_s."""
@@ -106,19 +111,20 @@ class Protocol(_Frozen):
         id: Name and version.
         max_dt: Largest time difference in seconds between an estimated and a true pose.
         strict: True for ``|dt| < max_dt``, False for ``<=``.
-        one_to_one: True for TUM's greedy one-to-one association; False for evo's: every pose of the shorter trajectory
-            takes its nearest neighbour in the other, which may be taken repeatedly. Of a file evo's takes all lines
-            with the same stamp, TUM's the last.
-        alignment: How the estimate is moved onto the ground truth before absolute errors are taken: ``none``,
-            ``origin`` (first associated pose), ``se3`` and ``sim3`` (least squares over the positions), ``yaw``
-            (translation and rotation about the world's z axis).
+        one_to_one: True for TUM's greedy one-to-one association; False for evo's: every pose of the
+            shorter trajectory takes its nearest neighbour in the other, which may be taken
+            repeatedly. Of a file evo's takes all lines with the same stamp, TUM's the last.
+        alignment: How the estimate is moved onto the ground truth before absolute errors are taken:
+            ``none``, ``origin`` (first associated pose), ``se3`` and ``sim3`` (least squares over
+            the positions), ``yaw`` (translation and rotation about the world's z axis).
         rpe: The relative pose errors.
         segments_m: Lengths of KITTI's segments in metres; empty for none.
         trajectory: Whether the online or the final trajectory of a run is evaluated.
-        lost_frames: ``exclude``: frames without a tracked pose take no part. ``hold``: the camera counts as not having
-            moved since the last tracked frame.
-        truth: ``as-is``; ``bonn-camera``: Bonn's positions moved from the markers to the camera (18.6 mm);
-            ``bonn-droid-w``: Bonn's poses as WildGS-SLAM and DROID-W correct them, which makes them 5.6 % smaller.
+        lost_frames: ``exclude``: frames without a tracked pose take no part. ``hold``: the camera
+            counts as not having moved since the last tracked frame.
+        truth: ``as-is``; ``bonn-camera``: Bonn's positions moved from the markers to the camera
+            (18.6 mm); ``bonn-droid-w``: Bonn's poses as WildGS-SLAM and DROID-W correct them, which
+            makes them 5.6 % smaller.
         every: Only every so many of the frames that have a true pose are compared.
         most_frames: At most so many of those, the first ones; 0 for all.
         only_for: Beginning of the ids of the sequences that it holds for; empty for all.
@@ -141,7 +147,8 @@ class Protocol(_Frozen):
     def digest(self) -> str:
         """Twelve hexadecimal digits that stand for every field; stored with every metric.
 
-        What came after the first protocols counts where it is used only: digests that are stored stay what they were.
+        What came after the first protocols counts where it is used only: digests that are stored
+        stay what they were.
         """
         return _digest(self)
 
@@ -157,7 +164,9 @@ class Protocol(_Frozen):
             EvaluationError: It is one.
         """
         if not sequence.startswith(self.only_for):
-            raise EvaluationError(f"protocol {self.id} holds for {self.only_for}* only, not for '{sequence}'")
+            raise EvaluationError(
+                f"protocol {self.id} holds for {self.only_for}* only, not for '{sequence}'"
+            )
 
     @property
     def finds_scale(self) -> bool:
@@ -185,10 +194,22 @@ class Protocol(_Frozen):
         parts = [
             _PHRASES[self.alignment],
             f"|dt| {'<' if self.strict else '<='} {self.max_dt:g} s {'one-to-one' if self.one_to_one else 'nearest'}",
-            *(["RPE over " + " and ".join(spec.describe() for spec in self.rpe)] if self.rpe else []),
-            *(["segments of " + ", ".join(f"{s:g}" for s in self.segments_m) + " m"] if self.segments_m else []),
+            *(
+                ["RPE over " + " and ".join(spec.describe() for spec in self.rpe)]
+                if self.rpe
+                else []
+            ),
+            *(
+                ["segments of " + ", ".join(f"{s:g}" for s in self.segments_m) + " m"]
+                if self.segments_m
+                else []
+            ),
             *([_PHRASES[self.truth]] if self.truth != "as-is" else []),
-            *([f"every {self.every} matched frames, at most {self.most_frames or 'all'}"] if self.thins else []),
+            *(
+                [f"every {self.every} matched frames, at most {self.most_frames or 'all'}"]
+                if self.thins
+                else []
+            ),
             f"{self.trajectory} trajectory",
             _PHRASES[self.lost_frames],
         ]
@@ -200,7 +221,11 @@ PROTOCOLS: dict[str, Protocol] = {
     for protocol in (
         Protocol(id="tum-rgbd/v1", rpe=(RPESpec(delta=1, unit="s"), RPESpec(delta=1, unit="f"))),
         # relative errors are taken under the alignment's scale, too
-        Protocol(id=MONOCULAR, alignment="sim3", rpe=(RPESpec(delta=1, unit="s"), RPESpec(delta=1, unit="f"))),
+        Protocol(
+            id=MONOCULAR,
+            alignment="sim3",
+            rpe=(RPESpec(delta=1, unit="s"), RPESpec(delta=1, unit="f")),
+        ),
         Protocol(id="tum-rgbd/v1-random-pairs", rpe=(RPESpec(pairs="tum-random"),)),
         Protocol(
             id="evo-default",
@@ -210,9 +235,24 @@ PROTOCOLS: dict[str, Protocol] = {
             alignment="none",
             rpe=(RPESpec(delta=1, unit="f", pairs="consecutive"),),
         ),
-        # evo_ape tum -as and -a, at evo's own tolerance: the convention of most tables that were made with evo
-        Protocol(id="evo-as/v1", max_dt=0.01, strict=False, one_to_one=False, alignment="sim3", trajectory="final"),
-        Protocol(id="evo-as/v1-se3", max_dt=0.01, strict=False, one_to_one=False, alignment="se3", trajectory="final"),
+        # evo_ape tum -as and -a, at evo's own tolerance: the convention of most tables that were
+        # made with evo
+        Protocol(
+            id="evo-as/v1",
+            max_dt=0.01,
+            strict=False,
+            one_to_one=False,
+            alignment="sim3",
+            trajectory="final",
+        ),
+        Protocol(
+            id="evo-as/v1-se3",
+            max_dt=0.01,
+            strict=False,
+            one_to_one=False,
+            alignment="se3",
+            trajectory="final",
+        ),
         # evo_ape -as with a tolerance of ten frames at 30 Hz, whatever the sensor
         Protocol(id="vslam-lab", max_dt=1 / 3, strict=False, one_to_one=False, alignment="sim3"),
         Protocol(
@@ -229,8 +269,11 @@ PROTOCOLS: dict[str, Protocol] = {
             only_for="bonn/",
             rpe=(RPESpec(delta=1, unit="s"), RPESpec(delta=1, unit="f")),
         ),
-        # as WildGS-SLAM and DROID-W score their last trajectory: images with the nearest true pose, aligned with scale
-        Protocol(id="droid-w/v1", max_dt=0.08, one_to_one=False, alignment="sim3", trajectory="final"),
+        # as WildGS-SLAM and DROID-W score their last trajectory: images with the nearest true pose,
+        # aligned with scale
+        Protocol(
+            id="droid-w/v1", max_dt=0.08, one_to_one=False, alignment="sim3", trajectory="final"
+        ),
         Protocol(
             id="droid-w/v1-bonn",
             max_dt=0.08,
@@ -257,10 +300,21 @@ PROTOCOLS: dict[str, Protocol] = {
 def _digest(protocol: Protocol) -> str:
     """Taken once: lists of a hundred thousand runs ask for it as often."""
     fields = protocol.model_dump(mode="json")
-    defaults = {name: Protocol.model_fields[name].default for name in ("truth", "every", "most_frames", "only_for")}
-    used = {name: value for name, value in fields.items() if name not in defaults or value != defaults[name]}
-    rpe = [spec.model_dump(mode="json", exclude=set() if spec.rate else {"rate"}) for spec in protocol.rpe]
-    used["rpe"] = [spec | {"tolerance": 0.1} for spec in rpe]  # a field once: stored metrics keep their digest
+    defaults = {
+        name: Protocol.model_fields[name].default
+        for name in ("truth", "every", "most_frames", "only_for")
+    }
+    used = {
+        name: value
+        for name, value in fields.items()
+        if name not in defaults or value != defaults[name]
+    }
+    rpe = [
+        spec.model_dump(mode="json", exclude=set() if spec.rate else {"rate"})
+        for spec in protocol.rpe
+    ]
+    # a field once: stored metrics keep their digest
+    used["rpe"] = [spec | {"tolerance": 0.1} for spec in rpe]
     return digest(used)
 
 

@@ -9,43 +9,62 @@ from dynslam_bench.core.seeding import stream
 from dynslam_bench.evaluation.ape import named, statistics
 from dynslam_bench.evaluation.comparison import Comparison, Index
 from dynslam_bench.evaluation.protocol import RPESpec
-from dynslam_bench.geometry import Array, are_frame_numbers, describe_frame_numbers, nearest_gap, se3
+from dynslam_bench.geometry import (
+    Array,
+    are_frame_numbers,
+    describe_frame_numbers,
+    nearest_gap,
+    se3,
+)
 
 
 def relative_metrics(comparison: Comparison) -> dict[str, float]:
     """``rpe_<delta><unit>_trans_<statistic>_m`` and ``..._rot_<statistic>_deg`` for each relative error of a protocol.
 
-    The comparison takes the number of pairs of each; one without pairs is left out, and so is one over seconds whose
-    pairs are not so far apart; the diagnostics say so. A sum of squared rates means nothing and is left out.
+    The comparison takes the number of pairs of each; one without pairs is left out, and so is one
+    over seconds whose pairs are not so far apart; the diagnostics say so. A sum of squared rates
+    means nothing and is left out.
     """
     metrics: dict[str, float] = {}
     for spec in comparison.protocol.rpe:
         take = tum_relative_errors if spec.pairs.startswith("tum") else evo_relative_errors
         errors, seconds = take(comparison, spec)
         if spec.rate:  # across a gap TUM's rule pairs a pose with itself
-            errors, seconds = errors[seconds > 0], seconds[seconds > 0]
+            errors = errors[seconds > 0]
+            seconds = seconds[seconds > 0]
         if fault := _not_over_seconds(comparison, spec, seconds):
-            comparison.diagnostics.append(f"{fault}: the relative error over {spec.key} is left out")
-            errors, seconds = errors[:0], seconds[:0]
+            comparison.diagnostics.append(
+                f"{fault}: the relative error over {spec.key} is left out"
+            )
+            errors = errors[:0]
+            seconds = seconds[:0]
         elif not len(errors):
-            comparison.diagnostics.append(f"no pair of poses for the relative error over {spec.key}; it is left out")
+            comparison.diagnostics.append(
+                f"no pair of poses for the relative error over {spec.key}; it is left out"
+            )
         elif spec.pairs == "tum-fixed" and spec.unit == "s" and not spec.rate and not seconds.all():
             itself = f"{np.count_nonzero(seconds == 0)} of {len(seconds)} pairs over {spec.key} join a pose with itself"
-            comparison.diagnostics.append(f"{itself}, as TUM's script has it where the next pose is far")
+            comparison.diagnostics.append(
+                f"{itself}, as TUM's script has it where the next pose is far"
+            )
         comparison.n_pairs_rpe[spec.key] = len(errors)
         over = seconds if spec.rate else 1.0
         translation = np.linalg.norm(errors[:, :3, 3], axis=1) / over
         rotation = np.rad2deg(se3.rotation_angle(errors)) / over
         metrics |= named(f"rpe_{spec.key}_trans", translation, spec.unit_of("trans"))
         metrics |= named(f"rpe_{spec.key}_rot", rotation, spec.unit_of("rot"))
-    return {name: value for name, value in metrics.items() if "_sse_m_per" not in name and "_sse_deg_per" not in name}
+    return {
+        name: value
+        for name, value in metrics.items()
+        if "_sse_m_per" not in name and "_sse_deg_per" not in name
+    }
 
 
 def _not_over_seconds(comparison: Comparison, spec: RPESpec, seconds: Array) -> str:
     """Why pairs that were chosen over seconds are not so far apart; empty where they are, and for other deltas.
 
-    TUM's rule takes the pose closest to a delta behind, however far it is from there: of poses in milliseconds that is
-    the pose itself, and the error is 0.
+    TUM's rule takes the pose closest to a delta behind, however far it is from there: of poses in
+    milliseconds that is the pose itself, and the error is 0.
 
     Args:
         comparison: What is compared.
@@ -69,19 +88,22 @@ MOST_OFF = 0.5
 def tum_relative_errors(comparison: Comparison, spec: RPESpec) -> tuple[Array, Array]:
     """RPE as TUM's ``evaluate_rpe.py`` takes it.
 
-    Pairs are chosen on the whole estimate. Each pose is compared with the true pose nearest in time; a pair takes part
-    if both lie within twice the median interval of the ground truth (not within the tolerance of the ATE). With
-    ``A = P_i^-1 P_j`` estimated and ``B = Q_i^-1 Q_j`` true the error is ``E = A B^-1``; its rotation angle equals
-    that of the paper's ``E = B^-1 A`` (Eq. 26), its translation differs by a rotation of its parts.
+    Pairs are chosen on the whole estimate. Each pose is compared with the true pose nearest in
+    time; a pair takes part if both lie within twice the median interval of the ground truth (not
+    within the tolerance of the ATE). With ``A = P_i^-1 P_j`` estimated and ``B = Q_i^-1 Q_j`` true
+    the error is ``E = A B^-1``; its rotation angle equals that of the paper's ``E = B^-1 A`` (Eq.
+    26), its translation differs by a rotation of its parts.
 
     Args:
-        comparison: The scale of its alignment is that of the estimate's steps, which need no alignment besides.
+        comparison: The scale of its alignment is that of the estimate's steps, which need no
+            alignment besides.
         spec: A ``tum-fixed`` or ``tum-random`` selection.
 
     Returns:
         Errors ``[P, 4, 4]``, and the seconds between the two poses of each pair ``[P]``.
     """
-    estimate, truth = comparison.estimate, comparison.ground_truth
+    estimate = comparison.estimate
+    truth = comparison.ground_truth
     pairs = select_pairs(estimate.timestamps, estimate.T_world_cam, spec)
     nearest = closest(truth.timestamps, estimate.timestamps)
     tolerance = 2 * float(np.median(np.diff(truth.timestamps))) if len(truth) > 1 else 0.0
@@ -104,7 +126,9 @@ def evo_relative_errors(comparison: Comparison, spec: RPESpec) -> tuple[Array, A
         As `tum_relative_errors`.
     """
     pairs = select_pairs(comparison.stamps, comparison.aligned, spec)
-    errors = se3.inverse(se3.between(comparison.truth, pairs)) @ se3.between(comparison.aligned, pairs)
+    errors = se3.inverse(se3.between(comparison.truth, pairs)) @ se3.between(
+        comparison.aligned, pairs
+    )
     return errors, np.diff(comparison.stamps[pairs], axis=1)[:, 0]
 
 
@@ -120,7 +144,8 @@ def select_pairs(stamps: Array, poses: Array, spec: RPESpec) -> Index:
         spec: Mode, delta and unit.
 
     Returns:
-        Possibly none. In mode ``tum-random`` pairs come in both directions and may join a pose with itself.
+        Possibly none. In mode ``tum-random`` pairs come in both directions and may join a pose with
+        itself.
     """
     if not len(poses):
         return np.zeros((0, 2), dtype=np.intp)
@@ -155,8 +180,8 @@ def path_index(stamps: Array, poses: Array, spec: RPESpec) -> Array:
 def closest(values: Array, targets: Array) -> Index:
     """Index of the value closest to each target, found by bisection as TUM's scripts do it.
 
-    The bisection decides which of equal values, and which of two equally distant ones, is taken: the one it meets
-    first (a standing camera makes equal values common).
+    The bisection decides which of equal values, and which of two equally distant ones, is taken:
+    the one it meets first (a standing camera makes equal values common).
 
     Args:
         values: Ascending ``[N]``, at least one.
@@ -165,13 +190,17 @@ def closest(values: Array, targets: Array) -> Index:
     Returns:
         ``[M]``; read-only, as equal stamps share one result.
     """
-    return _closest(np.asarray(values, np.float64).tobytes(), np.asarray(targets, np.float64).tobytes())
+    return _closest(
+        np.asarray(values, np.float64).tobytes(), np.asarray(targets, np.float64).tobytes()
+    )
 
 
 @lru_cache(maxsize=256)
 def _closest(value_bytes: bytes, target_bytes: bytes) -> Index:
-    values, targets = np.frombuffer(value_bytes), np.frombuffer(target_bytes)
-    low, best = np.zeros(len(targets), dtype=np.intp), np.zeros(len(targets), dtype=np.intp)
+    values = np.frombuffer(value_bytes)
+    targets = np.frombuffer(target_bytes)
+    low = np.zeros(len(targets), dtype=np.intp)
+    best = np.zeros(len(targets), dtype=np.intp)
     high = np.full(len(targets), len(values), dtype=np.intp)
     distance = np.abs(values[0] - targets)
     while (active := low < high).any():
@@ -181,7 +210,9 @@ def _closest(value_bytes: bytes, target_bytes: bytes) -> Index:
         best = np.where(better, middle, best)
         distance = np.where(better, np.abs(value - targets), distance)
         high = np.where(active & (value > targets), middle, high)
-        low = np.where(active & (value < targets), middle + 1, np.where(value == targets, high, low))
+        low = np.where(
+            active & (value < targets), middle + 1, np.where(value == targets, high, low)
+        )
     best.flags.writeable = False
     return best
 
@@ -189,12 +220,14 @@ def _closest(value_bytes: bytes, target_bytes: bytes) -> Index:
 def random_pairs(n: int, count: int) -> Index:
     """`count` random pairs of `n` poses; every pair where ``n < sqrt(count)`` or `count` is 0.
 
-    Drawn from raw PCG64 words, so that every version of Python and NumPy gives the same ones (TUM's script draws
-    from Python's generator, whose sequence changed between versions).
+    Drawn from raw PCG64 words, so that every version of Python and NumPy gives the same ones (TUM's
+    script draws from Python's generator, whose sequence changed between versions).
     """
     if count == 0 or n < np.sqrt(count):
         return np.ascontiguousarray(np.indices((n, n)).reshape(2, -1).T).astype(np.intp)
-    return np.minimum((_uniform("rpe random pairs", 2 * count) * n).astype(np.intp), n - 1).reshape(count, 2)
+    return np.minimum((_uniform("rpe random pairs", 2 * count) * n).astype(np.intp), n - 1).reshape(
+        count, 2
+    )
 
 
 def _uniform(purpose: str, count: int) -> Array:
@@ -208,7 +241,9 @@ def _uniform(purpose: str, count: int) -> Array:
 STEP = 10
 
 
-def segment_errors(estimate: Array, ground_truth: Array, lengths_m: Sequence[float]) -> tuple[Array, Array]:
+def segment_errors(
+    estimate: Array, ground_truth: Array, lengths_m: Sequence[float]
+) -> tuple[Array, Array]:
     """Drift over segments that begin at every tenth pose and end where the true path has grown by a length.
 
     Args:
@@ -217,28 +252,38 @@ def segment_errors(estimate: Array, ground_truth: Array, lengths_m: Sequence[flo
         lengths_m: Lengths in metres.
 
     Returns:
-        Translational drift in percent ``[K]`` and rotational drift in degrees a metre ``[K]``; empty where the path is
-        shorter than the shortest length.
+        Translational drift in percent ``[K]`` and rotational drift in degrees a metre ``[K]``;
+        empty where the path is shorter than the shortest length.
     """
-    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(ground_truth[:, :3, 3], axis=0), axis=1))])
-    grid = np.meshgrid(np.arange(0, len(travelled), STEP), np.array(lengths_m, np.float64), indexing="ij")
+    travelled = np.concatenate(
+        [[0.0], np.cumsum(np.linalg.norm(np.diff(ground_truth[:, :3, 3], axis=0), axis=1))]
+    )
+    grid = np.meshgrid(
+        np.arange(0, len(travelled), STEP), np.array(lengths_m, np.float64), indexing="ij"
+    )
     starts, metres = (values.ravel() for values in grid)
     ends = np.searchsorted(travelled, travelled[starts] + metres, side="right")
     inside = ends < len(travelled)
-    metres, pairs = metres[inside], np.stack([starts, ends], axis=1)[inside]
+    metres = metres[inside]
+    pairs = np.stack([starts, ends], axis=1)[inside]
     error = se3.inverse(se3.between(estimate, pairs)) @ se3.between(ground_truth, pairs)
-    return np.linalg.norm(error[:, :3, 3], axis=1) / metres * 100, np.rad2deg(se3.rotation_angle(error)) / metres
+    return np.linalg.norm(error[:, :3, 3], axis=1) / metres * 100, np.rad2deg(
+        se3.rotation_angle(error)
+    ) / metres
 
 
 def segment_metrics(comparison: Comparison) -> dict[str, float]:
     """KITTI's drift over segments; empty, with a line in the diagnostics, where the path is too short for any."""
-    lengths, truth = comparison.protocol.segments_m, comparison.truth
+    lengths = comparison.protocol.segments_m
+    truth = comparison.truth
     if not lengths:
         return {}
     translation, rotation = segment_errors(comparison.aligned, truth, lengths)
     if not len(translation):
         path = float(np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum())
-        comparison.diagnostics.append(f"the path of {path:.1f} m is shorter than a segment of {min(lengths):g} m")
+        comparison.diagnostics.append(
+            f"the path of {path:.1f} m is shorter than a segment of {min(lengths):g} m"
+        )
         return {}
     return {
         "kitti_trans_percent": statistics(translation)["mean"],

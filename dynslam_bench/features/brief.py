@@ -21,7 +21,9 @@ _LETTERS = (
     "XTYFTVVBGXHSKEKWMAMSKGKRFLFQRPZZPIQYTEYAQMUZYMZRKNKTRCRZPJPODHFOAUCOAZCATNYANMORAQELEVHKAHFLSEVX"
     "PUQEMHMMWSYLYKZFQNQSMRNXQHRSANDSSVZYVWWHUJVBDRDWUQZRWGXLUNZLMHNC"
 )
-PATTERN = (np.frombuffer(_LETTERS.encode(), np.uint8).astype(np.float32) - ord("N")).reshape(256, 2, 2)
+PATTERN = (np.frombuffer(_LETTERS.encode(), np.uint8).astype(np.float32) - ord("N")).reshape(
+    256, 2, 2
+)
 """The 256 pairs of places that are compared (learned by Rublee et al.), (column, row) from the keypoint each."""
 
 _GAUSSIAN = cv2.getGaussianKernel(7, 2.0, cv2.CV_32F)
@@ -56,12 +58,17 @@ def _rotated_brief(
     px: NDArray[np.float32],
     py: NDArray[np.float32],
 ) -> NDArray[np.uint8]:
-    pixels, width = smoothed.reshape(-1), smoothed.shape[1]
-    offsets, values, darker = np.empty(512, np.int32), np.empty(512, np.uint8), np.empty(256, np.uint8)
-    words, out = darker.view(np.uint64), np.empty((len(xy), 32), np.uint8)
+    pixels = smoothed.reshape(-1)
+    width = smoothed.shape[1]
+    offsets = np.empty(512, np.int32)
+    values = np.empty(512, np.uint8)
+    darker = np.empty(256, np.uint8)
+    words = darker.view(np.uint64)
+    out = np.empty((len(xy), 32), np.uint8)
     for i in range(len(xy)):
         radians = np.float32(angle[i]) * np.float32(math.pi / 180)
-        cosine, sine = np.float32(math.cos(radians)), np.float32(math.sin(radians))
+        cosine = np.float32(math.cos(radians))
+        sine = np.float32(math.sin(radians))
         for k in range(512):
             column = np.rint(px[k] * cosine - py[k] * sine)
             row = np.rint(px[k] * sine + py[k] * cosine)

@@ -1,7 +1,7 @@
 """Matching of binary descriptors: Hamming distances, brute force, search in a radius, rotation consistency.
 
-Descriptors are compared as 64-bit words (`as_words`); rows of equal length are comparable, whatever the extractor.
-All functions are pure and deterministic; ties are broken by the lower index.
+Descriptors are compared as 64-bit words (`as_words`); rows of equal length are comparable, whatever
+the extractor. All functions are pure and deterministic; ties are broken by the lower index.
 """
 
 from __future__ import annotations
@@ -20,7 +20,10 @@ _M1 = np.uint64(0x5555555555555555)
 _M2 = np.uint64(0x3333333333333333)
 _M4 = np.uint64(0x0F0F0F0F0F0F0F0F)
 _H01 = np.uint64(0x0101010101010101)
-_ONE, _TWO, _FOUR, _TOP = np.uint64(1), np.uint64(2), np.uint64(4), np.uint64(56)
+_ONE = np.uint64(1)
+_TWO = np.uint64(2)
+_FOUR = np.uint64(4)
+_TOP = np.uint64(56)
 FAR = 1 << 20
 """A distance above that of any two descriptors."""
 
@@ -50,7 +53,8 @@ def distance(a: Words, b: Words) -> Scalar:
 def _brute_force(
     a: Words, b: Words
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    n, m = a.shape[0], b.shape[0]
+    n = a.shape[0]
+    m = b.shape[0]
     best = np.full(n, -1, np.int64)
     first = np.full(n, FAR, np.int64)
     second = np.full(n, FAR, np.int64)
@@ -80,7 +84,8 @@ def match_brute_force(
         a: Descriptors ``[N, W]``.
         b: Descriptors ``[M, W]``.
         max_distance: Largest Hamming distance of a match.
-        ratio: The nearest must be nearer than `ratio` times the second nearest, and nearest in both directions.
+        ratio: The nearest must be nearer than `ratio` times the second nearest, and nearest in both
+            directions.
 
     Returns:
         Indices into `a` and indices into `b` of the matches, ordered by the first.
@@ -114,7 +119,8 @@ class CellGrid:
     @classmethod
     def of(cls, xy: NDArray[np.float64], width: int, height: int, cell: float = 20.0) -> CellGrid:
         """Sort the points ``[N, 2]`` into cells; points outside the image go to the nearest border cell."""
-        columns, rows = max(1, int(np.ceil(width / cell))), max(1, int(np.ceil(height / cell)))
+        columns = max(1, int(np.ceil(width / cell)))
+        rows = max(1, int(np.ceil(height / cell)))
         return cls(cell, columns, rows, *_sorted_into_cells(xy, cell, columns, rows))
 
 
@@ -123,13 +129,16 @@ def _sorted_into_cells(
     xy: NDArray[np.float64], cell: float, columns: int, rows: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """`CellGrid.start` and `CellGrid.order`."""
-    cells, start = np.empty(len(xy), np.int64), np.zeros(rows * columns + 1, np.int64)
+    cells = np.empty(len(xy), np.int64)
+    start = np.zeros(rows * columns + 1, np.int64)
     for i in range(len(xy)):
-        column, row = min(max(xy[i, 0] // cell, 0), columns - 1), min(max(xy[i, 1] // cell, 0), rows - 1)
+        column = min(max(xy[i, 0] // cell, 0), columns - 1)
+        row = min(max(xy[i, 1] // cell, 0), rows - 1)
         cells[i] = int(row) * columns + int(column)
         start[cells[i] + 1] += 1
     start = np.cumsum(start)
-    order, place = np.empty(len(xy), np.int64), start.copy()
+    order = np.empty(len(xy), np.int64)
+    place = start.copy()
     for i in range(len(xy)):
         order[place[cells[i]]] = i
         place[cells[i]] += 1
@@ -168,12 +177,22 @@ def _search(
     match_distance = np.full(count, FAR, np.int64)
     owner = np.full(xy.shape[0], -1, np.int64)
     for i in range(count):
-        x, y, r = target[i, 0], target[i, 1], radius[i]
-        c0, c1 = int((x - r) // cell), int((x + r) // cell)
-        r0, r1 = int((y - r) // cell), int((y + r) // cell)
-        c0, c1 = min(max(c0, 0), columns - 1), min(max(c1, 0), columns - 1)
-        r0, r1 = min(max(r0, 0), rows - 1), min(max(r1, 0), rows - 1)
-        best, first, second, first_octave, second_octave = -1, FAR, FAR, -1, -2
+        x = target[i, 0]
+        y = target[i, 1]
+        r = radius[i]
+        c0 = int((x - r) // cell)
+        c1 = int((x + r) // cell)
+        r0 = int((y - r) // cell)
+        r1 = int((y + r) // cell)
+        c0 = min(max(c0, 0), columns - 1)
+        c1 = min(max(c1, 0), columns - 1)
+        r0 = min(max(r0, 0), rows - 1)
+        r1 = min(max(r1, 0), rows - 1)
+        best = -1
+        first = FAR
+        second = FAR
+        first_octave = -1
+        second_octave = -2
         for row in range(r0, r1 + 1):
             for k in range(start[row * columns + c0], start[row * columns + c1 + 1]):
                 j = order[k]
@@ -186,10 +205,14 @@ def _search(
                         continue
                 d = distance(target_words[i], words[j])
                 if d < first:
-                    second, second_octave = first, first_octave
-                    first, first_octave, best = d, octave[j], j
+                    second = first
+                    second_octave = first_octave
+                    first = d
+                    first_octave = octave[j]
+                    best = j
                 elif d < second:
-                    second, second_octave = d, octave[j]
+                    second = d
+                    second_octave = octave[j]
         if best < 0 or first > max_distance:
             continue
         if ratio < 1.0 and first_octave == second_octave and first > ratio * second:
@@ -220,18 +243,20 @@ def search_in_radius(
     Args:
         features: `Features`, or anything with their attributes.
         free: bool ``[N]``, features that may be matched.
-        windows: Expected pixels ``[M, 2]``, expected right coordinates ``[M]`` (NaN: not compared) and half sides of
-            the search windows ``[M]``, pixels.
+        windows: Expected pixels ``[M, 2]``, expected right coordinates ``[M]`` (NaN: not compared)
+            and half sides of the search windows ``[M]``, pixels.
         octave: Expected octaves ``[M]``; the feature's may be one off.
         words: Descriptors of the targets ``[M, W]``.
         max_distance: Largest Hamming distance of a match.
-        ratio: Nearest over second nearest, tested where both come from one octave; 1 switches the test off.
+        ratio: Nearest over second nearest, tested where both come from one octave; 1 switches the
+            test off.
 
     Returns:
-        int64 ``[M]``, matched feature or -1. Where two targets claim one feature the smaller distance wins, then the
-        lower index.
+        int64 ``[M]``, matched feature or -1. Where two targets claim one feature the smaller
+        distance wins, then the lower index.
     """
-    f, grid = features, features.grid
+    f = features
+    grid = features.grid
     return _search(
         grid.cell, grid.columns, grid.rows, grid.start, grid.order, f.xy, f.right, f.octave, f.words, free,
         *windows, octave - 1, octave + 1, words, max_distance, ratio,
@@ -239,7 +264,11 @@ def search_in_radius(
 
 
 def rotation_consistent(
-    angle_a: NDArray[np.floating], angle_b: NDArray[np.floating], *, bins: int = 30, share: float = 0.1
+    angle_a: NDArray[np.floating],
+    angle_b: NDArray[np.floating],
+    *,
+    bins: int = 30,
+    share: float = 0.1,
 ) -> NDArray[np.bool_]:
     """Which matches agree with the rotation in the image plane that most matches show.
 
@@ -247,7 +276,8 @@ def rotation_consistent(
         angle_a: Keypoint orientations in the one image, degrees ``[N]``.
         angle_b: Keypoint orientations in the other, degrees ``[N]``.
         bins: Number of bins of the histogram of differences.
-        share: The second and third fullest bin count only if they hold at least this share of the fullest one.
+        share: The second and third fullest bin count only if they hold at least this share of the
+            fullest one.
 
     Returns:
         bool ``[N]``, True for matches in the (up to three) fullest bins.

@@ -1,8 +1,9 @@
 """ORB features that are spread evenly over the image and the scales.
 
-FAST corners (Rosten and Drummond, 2006) of each pyramid level are ranked by strength within the cells of a grid. The
-strongest of every cell come first, then the second strongest, until the level's share is full. Orientation is the
-intensity centroid and the descriptor the rotated BRIEF of Rublee et al. (2011).
+FAST corners (Rosten and Drummond, 2006) of each pyramid level are ranked by strength within the
+cells of a grid. The strongest of every cell come first, then the second strongest, until the
+level's share is full. Orientation is the intensity centroid and the descriptor the rotated BRIEF of
+Rublee et al. (2011).
 """
 
 from __future__ import annotations
@@ -18,7 +19,14 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts import Keypoints
 from dynslam_bench.core import SettingsError
 from dynslam_bench.core.compiled import kernel
-from dynslam_bench.core.simd import BYTE_LANES, PATCH_ROWS, UINT16_LANES, patch_sum, store_corner_scores, store_maxima
+from dynslam_bench.core.simd import (
+    BYTE_LANES,
+    PATCH_ROWS,
+    UINT16_LANES,
+    patch_sum,
+    store_corner_scores,
+    store_maxima,
+)
 from dynslam_bench.features.brief import rotated_brief, smooth
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry import inside
@@ -85,14 +93,20 @@ class OrbExtractor:
     def extract(self, gray: NDArray[np.uint8]) -> Keypoints:
         """The keypoints of a uint8 ``[H, W]`` image, ordered by level; none is an empty result."""
         levels = self._levels(gray)
-        return self._describe(levels, self._choose(levels, [np.ones(len(level.xy), bool) for level in levels]))
+        return self._describe(
+            levels, self._choose(levels, [np.ones(len(level.xy), bool) for level in levels])
+        )
 
-    def extract_masked(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float) -> Keypoints:
+    def extract_masked(
+        self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float
+    ) -> Keypoints:
         """As `extract`; with less than a share of `n_features` outside the mask, all of them are extracted there."""
         levels = self._levels(gray)
         chosen = self._choose(levels, [np.ones(len(level.xy), bool) for level in levels])
         outside = [~inside(mask, level.xy * level.scale) for level in levels]
-        count = sum(np.count_nonzero(out[index]) for out, index in zip(outside, chosen, strict=True))
+        count = sum(
+            np.count_nonzero(out[index]) for out, index in zip(outside, chosen, strict=True)
+        )
         if count < share * self.settings.n_features:
             triples = zip(outside, chosen, self._choose(levels, outside), strict=True)
             chosen = [np.concatenate([index[~out[index]], more]) for out, index, more in triples]
@@ -108,11 +122,15 @@ class OrbExtractor:
             if min(size) <= 2 * EDGE:
                 break
             if number > 0:
-                image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8)
+                image = np.asarray(
+                    cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8
+                )
             levels.append(self._corners(image, scale))
         return levels
 
-    def _choose(self, levels: Sequence[_Level], allowed: Sequence[NDArray[np.bool_]]) -> list[NDArray[np.int64]]:
+    def _choose(
+        self, levels: Sequence[_Level], allowed: Sequence[NDArray[np.bool_]]
+    ) -> list[NDArray[np.int64]]:
         """Indices of up to `n_features` allowed corners, by level, spread over the cells of each.
 
         A corner below the first threshold is taken only in a cell without a stronger one.
@@ -125,25 +143,34 @@ class OrbExtractor:
             filled = np.bincount(level.cells[strong], minlength=level.cells.max(initial=0) + 1) > 0
             eligible = strong | among & ~filled[level.cells]
             chosen.append(spread(level.cells, level.response, eligible, quota + missing))
-            missing += quota - len(chosen[-1])  # a coarse level's missing features are added to the next finer level
+            # a coarse level's missing features are added to the next finer level
+            missing += quota - len(chosen[-1])
         return chosen[::-1]
 
     def _corners(self, image: NDArray[np.uint8], scale: float) -> _Level:
         at, response = fast_corners(image, self.settings.fast_threshold_min)
         row, column = np.divmod(at, image.shape[1])
-        cell, origin = self.settings.cell_px, EDGE - 3
+        cell = self.settings.cell_px
+        origin = EDGE - 3
         columns = -(-(image.shape[1] - 2 * origin) // cell)
         cells = (row - origin) // cell * columns + (column - origin) // cell
-        return _Level(image, scale, np.stack([column, row], axis=1).astype(np.float32), response, cells)
+        return _Level(
+            image, scale, np.stack([column, row], axis=1).astype(np.float32), response, cells
+        )
 
     def _describe(self, levels: Sequence[_Level], chosen: Sequence[NDArray[np.int64]]) -> Keypoints:
         octave = np.repeat(np.arange(len(levels), dtype=np.int32), [len(index) for index in chosen])
-        xy, descriptors = np.empty((len(octave), 2)), np.empty((len(octave), 32), np.uint8)
+        xy = np.empty((len(octave), 2))
+        descriptors = np.empty((len(octave), 32), np.uint8)
         angle, response = np.empty((2, len(octave)), np.float32)
         end = 0
         for level, index in zip(levels, chosen, strict=True):
-            at, rows = level.xy[index], slice(end, end := end + len(index))
-            xy[rows], response[rows] = np.multiply(at, level.scale, dtype=np.float64), level.response[index]
+            at = level.xy[index]
+            rows = slice(end, end := end + len(index))
+            xy[rows], response[rows] = (
+                np.multiply(at, level.scale, dtype=np.float64),
+                level.response[index],
+            )
             angle[rows] = orientations(level.image, at, *_DISC)
             descriptors[rows] = rotated_brief(smooth(level.image), at, angle[rows])
         return Keypoints(xy.astype(np.float32), octave, angle, response, descriptors)
@@ -170,13 +197,15 @@ def spread(
         quota: How many points to choose at most.
 
     Returns:
-        Indices of the chosen points, at most `quota`, in order of rank within the cell, then of strength.
+        Indices of the chosen points, at most `quota`, in order of rank within the cell, then of
+        strength.
     """
     index = np.flatnonzero(allowed)
     if len(index) == 0:
         return index
     index = index[_stable_order(-response[index])]
-    taken, rank = np.zeros(cells.max() + 1, np.int64), np.empty(len(index), np.int64)
+    taken = np.zeros(cells.max() + 1, np.int64)
+    rank = np.empty(len(index), np.int64)
     for i, cell in enumerate(cells[index]):
         rank[i] = taken[cell]
         taken[cell] += 1
@@ -187,7 +216,8 @@ def spread(
 def _stable_order(keys: NDArray[np.signedinteger]) -> NDArray[np.int64]:
     """Indices that sort integers of a small range; equal ones keep their order."""
     lowest = keys.min()
-    start, order = np.zeros(keys.max() - lowest + 2, np.int64), np.empty(len(keys), np.int64)
+    start = np.zeros(keys.max() - lowest + 2, np.int64)
+    order = np.empty(len(keys), np.int64)
     for key in keys:
         start[key - lowest + 1] += 1
     start = np.cumsum(start)
@@ -198,20 +228,26 @@ def _stable_order(keys: NDArray[np.signedinteger]) -> NDArray[np.int64]:
 
 
 @kernel
-def fast_corners(image: NDArray[np.uint8], threshold: int) -> tuple[NDArray[np.int64], NDArray[np.int16]]:
+def fast_corners(
+    image: NDArray[np.uint8], threshold: int
+) -> tuple[NDArray[np.int64], NDArray[np.int16]]:
     """FAST corners that are stronger than their eight neighbours, row by row; the same as OpenCV's.
 
     Args:
-        image: uint8 ``[H, W]``, more than twice `EDGE` wide and high; corners nearer to its border are left out.
+        image: uint8 ``[H, W]``, more than twice `EDGE` wide and high; corners nearer to its border
+            are left out.
         threshold: Least score, at least 1.
 
     Returns:
         Indices ``[N]`` into the flat image, and their scores ``[N]``.
     """
     height, width = image.shape
-    pixels, scores, maxima = image.reshape(-1), np.zeros(image.size, np.uint8), np.zeros(image.size, np.uint8)
+    pixels = image.reshape(-1)
+    scores = np.zeros(image.size, np.uint8)
+    maxima = np.zeros(image.size, np.uint8)
     circle = CIRCLE[:, 0] + CIRCLE[:, 1] * width
-    first, last = EDGE * width, (height - EDGE) * width
+    first = EDGE * width
+    last = (height - EDGE) * width
     for at in range(first, last, BYTE_LANES):
         store_corner_scores(scores, pixels, at, circle)
     for y in range(EDGE, height - EDGE):
@@ -221,7 +257,9 @@ def fast_corners(image: NDArray[np.uint8], threshold: int) -> tuple[NDArray[np.i
         scores[at] = 0
     for at in range(first, last, BYTE_LANES):
         store_maxima(maxima, scores, at, width, threshold)
-    corners, count = np.empty(image.size // 4, np.int64), 0  # of four adjacent pixels one at most is a maximum
+    # of four adjacent pixels one at most is a maximum
+    corners = np.empty(image.size // 4, np.int64)
+    count = 0
     for at in range(first, last):
         corners[count] = at
         count += maxima[at] > 0
@@ -231,21 +269,28 @@ def fast_corners(image: NDArray[np.uint8], threshold: int) -> tuple[NDArray[np.i
 
 @kernel
 def orientations(
-    image: NDArray[np.uint8], xy: NDArray[np.float32], columns: NDArray[np.int16], rows: NDArray[np.int16]
+    image: NDArray[np.uint8],
+    xy: NDArray[np.float32],
+    columns: NDArray[np.int16],
+    rows: NDArray[np.int16],
 ) -> NDArray[np.float32]:
     """Orientations of discs by their intensity centroid (Rublee et al., 2011, Section 3.2), degrees in [0, 360).
 
     Args:
         image: uint8 ``[H, W]``.
-        xy: Integer-valued pixels, float32 ``[N, 2]``, more than the disc's radius away from the border.
-        columns: Column of each pixel of the disc from its centre, flat int16, as `patch_sum` reads it; 0 outside ...
+        xy: Integer-valued pixels, float32 ``[N, 2]``, more than the disc's radius away from the
+            border.
+        columns: Column of each pixel of the disc from its centre, flat int16, as `patch_sum` reads
+            it; 0 outside ...
         rows: ... and its row.
     """
     out = np.zeros(len(xy), np.float32)
-    pixels, width = image.reshape(-1), image.shape[1]
+    pixels = image.reshape(-1)
+    width = image.shape[1]
     for i in range(len(xy)):
         first = (int(xy[i, 1]) - PATCH_RADIUS) * width + int(xy[i, 0]) - PATCH_RADIUS
-        m10, m01 = patch_sum(pixels, first, width, columns), patch_sum(pixels, first, width, rows)
+        m10 = patch_sum(pixels, first, width, columns)
+        m01 = patch_sum(pixels, first, width, rows)
         out[i] = math.degrees(math.atan2(float(m01), float(m10))) % 360.0
         if out[i] >= 360.0:  # rounded up by float32
             out[i] = 0.0

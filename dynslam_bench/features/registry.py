@@ -40,7 +40,9 @@ def build_extractor(settings: FeatureSettings | None = None) -> FeatureExtractor
     """
     settings = settings or FeatureSettings()
     spec = FEATURES.get(settings.extractor)
-    return build_plugin("extractor", spec, FeatureExtractor, PluginError, lambda build: build(settings))  # type: ignore[type-abstract]
+    return build_plugin(
+        "extractor", spec, FeatureExtractor, PluginError, lambda build: build(settings)
+    )  # type: ignore[type-abstract]
 
 
 # Keypoints from the stage cache.
@@ -58,12 +60,17 @@ class CachedExtractor:
 
     Attributes:
         hit: Whether the last call's result was stored.
-        saved_s: Difference in seconds between the last call's cost without the cache and its wall time: the stored cost
-            less the look-up, or minus the time of storing.
+        saved_s: Difference in seconds between the last call's cost without the cache and its wall
+            time: the stored cost less the look-up, or minus the time of storing.
     """
 
     def __init__(
-        self, extractor: FeatureExtractor, settings: Settings, cache: StageCache, threads: int, code: ReadsSoFar
+        self,
+        extractor: FeatureExtractor,
+        settings: Settings,
+        cache: StageCache,
+        threads: int,
+        code: ReadsSoFar,
     ) -> None:
         self._extractor = extractor
         self._cache = cache
@@ -81,7 +88,9 @@ class CachedExtractor:
 
     def _address(self, settings: Settings) -> None:
         weights = named_digests(settings)
-        self._prefix = digest([weights, settings.model_dump(mode="json"), machine_digest(), self._threads])
+        self._prefix = digest(
+            [weights, settings.model_dump(mode="json"), machine_digest(), self._threads]
+        )
 
     def extract(self, gray: NDArray[np.uint8]) -> Keypoints:
         """The keypoints of a uint8 ``[H, W]`` image."""
@@ -94,7 +103,8 @@ class CachedExtractor:
         entry = self._cache.get("features", key)
         self.hit = entry is not None
         if entry is not None:
-            keypoints, cost = Keypoints(**entry.arrays), entry.cost_s
+            keypoints = Keypoints(**entry.arrays)
+            cost = entry.cost_s
         else:
             start = time.perf_counter()
             keypoints = compute()
@@ -110,7 +120,9 @@ class CachedMaskedExtractor(CachedExtractor):
 
     _extractor: MaskedExtractor
 
-    def extract_masked(self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float) -> Keypoints:
+    def extract_masked(
+        self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float
+    ) -> Keypoints:
         """The keypoints of a uint8 ``[H, W]`` image with a mask; see `MaskedExtractor`."""
         inputs = [content_digest(gray), content_digest(mask), share]
         return self._answer(inputs, lambda: self._extractor.extract_masked(gray, mask, share))

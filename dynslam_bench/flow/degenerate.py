@@ -13,7 +13,9 @@ STATS_NAMES = ("points", "valid", "evaluations", "degenerate")
 """Of `flow_stats`."""
 
 
-def flow_stats(points: int, valid: int = 0, evaluations: int = 0, *, degenerate: bool = False) -> dict[str, float]:
+def flow_stats(
+    points: int, valid: int = 0, evaluations: int = 0, *, degenerate: bool = False
+) -> dict[str, float]:
     """The stats of all built-in flows, the same keys in every result.
 
     Args:
@@ -29,7 +31,9 @@ def invalid_result(points: NDArray[np.float32], *, degenerate: bool) -> FlowResu
     """The result where no point can be tracked: each stays at its place, or at 0 where it is not finite."""
     n = len(points)
     xy = np.where(np.isfinite(points), points, 0).astype(np.float32)
-    return FlowResult(xy, np.zeros(n, np.bool_), np.ones(n, np.float32), flow_stats(n, degenerate=degenerate))
+    return FlowResult(
+        xy, np.zeros(n, np.bool_), np.ones(n, np.float32), flow_stats(n, degenerate=degenerate)
+    )
 
 
 def usable_points(points: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.bool_]:
@@ -44,8 +48,8 @@ def clean_points(
     """The points as a method may use them, or the result where there is nothing to track.
 
     Returns:
-        float32 ``[N, 2]``, 0 where a point is not usable, and bool ``[N]``, usable; a result for no points and for
-        degenerate images: equal pixel by pixel, or one of them without texture.
+        float32 ``[N, 2]``, 0 where a point is not usable, and bool ``[N]``, usable; a result for no
+        points and for degenerate images: equal pixel by pixel, or one of them without texture.
 
     Raises:
         ValueError: The images differ in size, or are no uint8 ``[H, W]`` images.
@@ -53,12 +57,18 @@ def clean_points(
     if reference.shape != target.shape:
         raise ValueError(f"images differ in size: {reference.shape} and {target.shape}")
     if reference.dtype != np.uint8 or target.dtype != np.uint8 or reference.ndim != 2:
-        raise ValueError(f"images must be uint8 [H, W], got {reference.dtype} {reference.shape} and {target.dtype}")
+        raise ValueError(
+            f"images must be uint8 [H, W], got {reference.dtype} {reference.shape} and {target.dtype}"
+        )
     points = np.ascontiguousarray(points, dtype=np.float32).reshape(-1, 2)
     images = (reference, target)
     if not len(points) or not reference.size:
         return invalid_result(points, degenerate=bool(len(points)))
-    if reference is target or any(np.ptp(image) <= FLAT_RANGE for image in images) or np.array_equal(*images):
+    if (
+        reference is target
+        or any(np.ptp(image) <= FLAT_RANGE for image in images)
+        or np.array_equal(*images)
+    ):
         return invalid_result(points, degenerate=True)
     usable = usable_points(points, reference.shape)
     return np.where(usable[:, None], points, 0).astype(np.float32), usable

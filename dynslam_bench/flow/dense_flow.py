@@ -3,8 +3,9 @@
 1. Superpixels; one label search per superpixel at its centre, with propagation between adjacent ones (as in `sparse`).
 2. Labels are refined photometrically (`refinement`). A label is a similarity and thus sub-pixel exact over its region.
 3. For each superpixel, its own label and its neighbours' are tried on every pixel of its bounding box extended by the
-   filter's radius. The raw costs (Eq. 1) are aggregated by the guided filter (Eq. 2), each pixel takes the label of the
-   lowest cost (Eq. 3). This works at half resolution: the orientation maps are no finer.
+   filter's radius. The raw costs (Eq. 1) are aggregated by the guided filter (Eq. 2), each pixel
+   takes the label of the lowest cost (Eq. 3). This works at half resolution: the orientation maps
+   are no finer.
 4. A pixel is valid if the flow of the other direction leads back. The others take an affine motion that is fitted to
    the consistent regions around them, but stay marked as not valid.
 """
@@ -74,9 +75,10 @@ class DenseFlow:
 class DenseDaisyFlow:
     """The paper's flow (Eq. 1-3 over every pixel), read at points; see `contracts.flow.FlowEstimator`.
 
-    The field is read at the pixel that contains a point and not interpolated: at the border of a moving object the mean
-    of two motions is wrong. A point is valid if its pixel is consistent (`consistency_px`), if its forward-backward
-    error is at most `forward_backward_px`, and if its aggregated cost is low. On the processor, whatever the device.
+    The field is read at the pixel that contains a point and not interpolated: at the border of a
+    moving object the mean of two motions is wrong. A point is valid if its pixel is consistent
+    (`consistency_px`), if its forward-backward error is at most `forward_backward_px`, and if its
+    aggregated cost is low. On the processor, whatever the device.
 
     Args:
         settings: Search, aggregation and checks.
@@ -94,7 +96,9 @@ class DenseDaisyFlow:
         self.settings = settings
         common = {name: getattr(settings, name) for name in DaisySettings.model_fields}
         self._sparse.configure(
-            FlowSettings(**common, support=5, support_spacing_px=max(1, settings.superpixel_px // 2))
+            FlowSettings(
+                **common, support=5, support_spacing_px=max(1, settings.superpixel_px // 2)
+            )
         )
 
     def prepare(self, gray: NDArray[np.uint8]) -> DescribedImage:
@@ -119,26 +123,40 @@ class DenseDaisyFlow:
         pixel, _ = pixel_index(clean, target.maps.gray.shape)
         xy = (clean + dense.flow[pixel]).astype(np.float32)
         cost = dense.cost[pixel]
-        valid = usable & dense.valid[pixel] & usable_points(xy, target.maps.gray.shape) & (cost < MAX_COST)
+        valid = (
+            usable
+            & dense.valid[pixel]
+            & usable_points(xy, target.maps.gray.shape)
+            & (cost < MAX_COST)
+        )
         if self.settings.forward_backward_px > 0:
             ends = np.where(valid[:, None], xy, clean)
-            error = np.linalg.norm(ends + dense.back[pixel_index(ends, target.maps.gray.shape)[0]] - clean, axis=1)
+            error = np.linalg.norm(
+                ends + dense.back[pixel_index(ends, target.maps.gray.shape)[0]] - clean, axis=1
+            )
             valid &= error <= self.settings.forward_backward_px
-        return FlowResult(xy, valid, cost, flow_stats(len(clean), int(valid.sum()), dense.evaluations))
+        return FlowResult(
+            xy, valid, cost, flow_stats(len(clean), int(valid.sum()), dense.evaluations)
+        )
 
-    def flow(self, reference: DescribedImage, target: DescribedImage, *, seed: int = 0) -> DenseFlow:
+    def flow(
+        self, reference: DescribedImage, target: DescribedImage, *, seed: int = 0
+    ) -> DenseFlow:
         """Flow of every pixel from the reference to the target."""
         forward = _RegionLabels(self.settings, self._sparse, reference, target, seed)
         backward = _RegionLabels(self.settings, self._sparse, target, reference, seed + 1)
-        flow, back = forward.flow(), backward.flow()
+        flow = forward.flow()
+        back = backward.flow()
         if self.settings.second_round:
             forward.try_regional_motion(self._consistent(flow, back))
             backward.try_regional_motion(self._consistent(back, flow))
-            flow, back = forward.flow(), backward.flow()
+            flow = forward.flow()
+            back = backward.flow()
         valid = self._consistent(flow, back)
         fitted = fit_regional_motion(flow, valid, reference.regions, reference.half)
         if fitted is not None:
-            height, smooth = len(flow), np.empty_like(flow)
+            height = len(flow)
+            smooth = np.empty_like(flow)
             self._sparse.workers.run(
                 fill_and_smooth,
                 0,
@@ -151,7 +169,9 @@ class DenseDaisyFlow:
                 smooth,
             )
             flow = smooth
-        return DenseFlow(flow, valid, forward.cost(), forward.evaluations + backward.evaluations, back)
+        return DenseFlow(
+            flow, valid, forward.cost(), forward.evaluations + backward.evaluations, back
+        )
 
     def _consistent(self, forward: Floats, backward: Floats) -> Flags:
         valid = np.empty(forward.shape[:2], dtype=np.bool_)
@@ -183,7 +203,9 @@ class DescribedImage:
     descriptors: NDArray[np.uint64]
 
 
-def describe_image(maps: OrientationMaps, settings: DenseFlowSettings, sparse: SparseDaisyFlow) -> DescribedImage:
+def describe_image(
+    maps: OrientationMaps, settings: DenseFlowSettings, sparse: SparseDaisyFlow
+) -> DescribedImage:
     """Compute superpixels and descriptors of an image."""
     half = np.ascontiguousarray(maps.framed_half[BORDER:-BORDER, BORDER:-BORDER])
     regions = superpixels(half, max(2, settings.superpixel_px // 2))
@@ -192,13 +214,22 @@ def describe_image(maps: OrientationMaps, settings: DenseFlowSettings, sparse: S
     descriptors = np.empty(half.size * layout.HISTOGRAMS, dtype=np.uint64)
     sparse.workers.run(read_descriptors, 0, *half.shape, maps.side, tables, descriptors)
     neighbours = nearest(centres, sparse.workers.run)
-    return DescribedImage(maps, half, regions, centres, neighbours, sparse.describe(maps, centres, tables), descriptors)
+    return DescribedImage(
+        maps,
+        half,
+        regions,
+        centres,
+        neighbours,
+        sparse.describe(maps, centres, tables),
+        descriptors,
+    )
 
 
 class _RegionLabels:
     """The labels of one direction; sizes are those of the half-resolution image.
 
-    A label is searched for each region; the region's pixels take the best of it and its neighbours'.
+    A label is searched for each region; the region's pixels take the best of it and its
+    neighbours'.
     """
 
     def __init__(
@@ -209,12 +240,15 @@ class _RegionLabels:
         target: DescribedImage,
         seed: int,
     ) -> None:
-        self.settings, self._sparse, self._image = settings, sparse, reference
+        self.settings = settings
+        self._sparse = sparse
+        self._image = reference
         self._pair = pair = sparse.pair(reference.maps, target.maps)
         self._tables = cost_tables(reference.maps.gray.shape, settings.terms)
         self._best = np.full(reference.half.shape, np.inf, dtype=np.float32)
         self._winner = np.zeros((*reference.half.shape, 4), dtype=np.float32)
-        centres, neighbours = reference.centres, reference.neighbours
+        centres = reference.centres
+        neighbours = reference.neighbours
         costs = reference.described, side_of(pair.target, pair.tables), pair.tables
         state = search_labels(sparse.settings, sparse.workers.run, costs, neighbours, None, seed)
         labels = np.ascontiguousarray(state.flames[:, 0])
@@ -222,14 +256,17 @@ class _RegionLabels:
             sparse.refine_together(centres, labels, neighbours, pair)
         self.evaluations = int(state.used.sum())
         near = np.ascontiguousarray(neighbours[:, : settings.candidates - 1])
-        self._choose(np.concatenate([labels[:, None], labels_as_seen(centres, labels, near)], axis=1))
+        self._choose(
+            np.concatenate([labels[:, None], labels_as_seen(centres, labels, near)], axis=1)
+        )
 
     def try_regional_motion(self, valid: NDArray[np.bool_]) -> None:
         """Try, on every region with an inconsistent pixel, the motion of the regions around it, fitted and refined.
 
         One pixel in four is looked at: those of even rows and columns.
         """
-        regions, (height, width) = self._image.regions, self._image.half.shape
+        regions = self._image.regions
+        (height, width) = self._image.half.shape
         fitted = fit_regional_motion(self.flow(), valid, regions, self._image.half)
         if fitted is None:
             return
@@ -244,15 +281,28 @@ class _RegionLabels:
 
     def _choose(self, candidates: NDArray[np.float32]) -> None:
         """Let every pixel take the best of its region's candidates ``[K, C, 4]``, if it beats the label it has."""
-        image, centres, pair = self._image, self._image.centres, self._pair
+        image = self._image
+        centres = self._image.centres
+        pair = self._pair
         evaluations = np.zeros(len(centres), dtype=np.int64)
         regions = (image.regions.members, image.regions.starts, centres, candidates)
-        sides = (*(side_of(maps, self._tables) for maps in (pair.reference, pair.target)), self._tables)
-        guide, radius = image.half.astype(np.float32) / np.float32(255), max(1, self.settings.filter_radius_px // 2)
+        sides = (
+            *(side_of(maps, self._tables) for maps in (pair.reference, pair.target)),
+            self._tables,
+        )
+        guide = image.half.astype(np.float32) / np.float32(255)
+        radius = max(1, self.settings.filter_radius_px // 2)
         smoothing = (guide, radius, np.float32(self.settings.filter_epsilon))
         chosen = (self._best, self._winner, evaluations)
         self._sparse.workers.run(
-            aggregate_and_choose, 0, len(centres), *regions, *sides, image.descriptors, *smoothing, *chosen
+            aggregate_and_choose,
+            0,
+            len(centres),
+            *regions,
+            *sides,
+            image.descriptors,
+            *smoothing,
+            *chosen,
         )
         self.evaluations += int(evaluations.sum())
 
@@ -261,19 +311,27 @@ class _RegionLabels:
         image = self._image
         height, width = image.maps.gray.shape
         flow = np.empty((height, width, 2), dtype=np.float32)
-        self._sparse.workers.run(spread_labels, 0, height, self._winner, image.regions.labels, image.centres, flow)
+        self._sparse.workers.run(
+            spread_labels, 0, height, self._winner, image.regions.labels, image.centres, flow
+        )
         return flow
 
     def cost(self) -> NDArray[np.float32]:
         """Aggregated cost of every full-image pixel, as a share of the largest possible."""
-        full, half = self._image.maps.gray.shape, self._image.half.shape
-        rows, columns = (np.minimum(np.arange(n) // 2, h - 1) for n, h in zip(full, half, strict=True))
+        full = self._image.maps.gray.shape
+        half = self._image.half.shape
+        rows, columns = (
+            np.minimum(np.arange(n) // 2, h - 1) for n, h in zip(full, half, strict=True)
+        )
         share = self._best[np.ix_(rows, columns)]
-        return np.asarray(np.clip(share / np.float32(self._tables.ceiling), 0, 1), dtype=np.float32)  # may overshoot
+        # may overshoot
+        return np.asarray(np.clip(share / np.float32(self._tables.ceiling), 0, 1), dtype=np.float32)
 
 
 @kernel
-def consistent(start: int, stop: int, forward: Floats, backward: Floats, tolerance: Scalar, valid: Flags) -> None:
+def consistent(
+    start: int, stop: int, forward: Floats, backward: Floats, tolerance: Scalar, valid: Flags
+) -> None:
     """Mark pixels whose flow, followed by the backward flow where it ends, returns to within `tolerance` pixels.
 
     Args:
@@ -288,11 +346,14 @@ def consistent(start: int, stop: int, forward: Floats, backward: Floats, toleran
     limit = tolerance * tolerance
     for y in range(start, stop):
         for x in range(width):
-            u, v = forward[y, x, 0], forward[y, x, 1]
-            column, row = np.int64(np.rint(np.float32(x) + u)), np.int64(np.rint(np.float32(y) + v))
+            u = forward[y, x, 0]
+            v = forward[y, x, 1]
+            column = np.int64(np.rint(np.float32(x) + u))
+            row = np.int64(np.rint(np.float32(y) + v))
             valid[y, x] = False
             if 0 <= column < width and 0 <= row < height:
-                dx, dy = u + backward[row, column, 0], v + backward[row, column, 1]
+                dx = u + backward[row, column, 0]
+                dy = v + backward[row, column, 1]
                 valid[y, x] = dx * dx + dy * dy <= limit
 
 
@@ -300,12 +361,16 @@ def nearest_similarities(motion: NDArray[np.float64]) -> NDArray[np.float32]:
     """The similarities nearest to affine motions ``[K, 3, 2]`` at their centres, as labels ``[K, 4]``."""
     a = 1 + 0.5 * (motion[:, 1, 0] + motion[:, 2, 1])
     b = 0.5 * (motion[:, 1, 1] - motion[:, 2, 0])
-    s, theta = np.log2(np.maximum(np.hypot(a, b), 0.25)), np.arctan2(b, a)
+    s = np.log2(np.maximum(np.hypot(a, b), 0.25))
+    theta = np.arctan2(b, a)
     return np.column_stack([motion[:, 0], s, theta]).astype(np.float32)
 
 
 def fit_regional_motion(
-    flow: NDArray[np.float32], valid: NDArray[np.bool_], regions: Superpixels, guide: NDArray[np.uint8]
+    flow: NDArray[np.float32],
+    valid: NDArray[np.bool_],
+    regions: Superpixels,
+    guide: NDArray[np.uint8],
 ) -> NDArray[np.float64] | None:
     """Fit an affine motion to the reliable regions around each region, robustly.
 
@@ -316,8 +381,8 @@ def fit_regional_motion(
         guide: uint8 ``[H / 2, W / 2]``, their image; regions of similar grey level count more.
 
     Returns:
-        float64 ``[K, 3, 2]``, flow at the centre, and its change per pixel along x and y; None where fewer than three
-        regions are reliable.
+        float64 ``[K, 3, 2]``, flow at the centre, and its change per pixel along x and y; None
+        where fewer than three regions are reliable.
     """
     count = len(regions.centres)
     sums = np.zeros((count, 6))
@@ -326,7 +391,8 @@ def fit_regional_motion(
     reliable = np.flatnonzero((consistent >= SHARE * np.maximum(sums[:, 0], 1)) & (consistent > 0))
     if len(reliable) < 3:
         return None
-    mean = sums[:, 2:] / np.maximum(consistent, 1)[:, None]  # position and flow of each region's consistent pixels
+    # position and flow of each region's consistent pixels
+    mean = sums[:, 2:] / np.maximum(consistent, 1)[:, None]
     centres = regions.centres.astype(np.float64) * 2 + 0.5
     total = np.bincount(regions.labels.ravel(), weights=guide.ravel(), minlength=count)
     grey = total / np.maximum(np.bincount(regions.labels.ravel(), minlength=count), 1)
@@ -335,7 +401,9 @@ def fit_regional_motion(
     chosen = reliable[np.asarray(index).reshape(count, near)]
     distance = np.asarray(distance).reshape(count, near)
     spread = np.maximum(distance.mean(axis=1, keepdims=True), 1.0)
-    weight = np.exp(-0.5 * (distance / spread) ** 2 - np.abs(grey[chosen] - grey[:, None]) / 20.0) + 1e-6
+    weight = (
+        np.exp(-0.5 * (distance / spread) ** 2 - np.abs(grey[chosen] - grey[:, None]) / 20.0) + 1e-6
+    )
     offset = (mean[chosen, :2] - centres[:, None]) / spread[..., None]
     basis = np.concatenate([np.ones((count, near, 1)), offset], axis=2)
     values = mean[chosen, 2:]
@@ -368,7 +436,14 @@ def sum_regions(flow: Floats, valid: Flags, labels: Ints, sums: Doubles) -> None
 
 @kernel
 def fill_and_smooth(
-    start: int, stop: int, flow: Floats, valid: Flags, labels: Ints, centres: Floats, motion: Floats, out: Floats
+    start: int,
+    stop: int,
+    flow: Floats,
+    valid: Flags,
+    labels: Ints,
+    centres: Floats,
+    motion: Floats,
+    out: Floats,
 ) -> None:
     """Copy rows start..stop; pixels not valid, or within `SMOOTH_PX` of it, take their region's fitted motion.
 
@@ -387,11 +462,15 @@ def fill_and_smooth(
         row = labels[min(y // 2, len(labels) - 1)]
         for x in range(flow.shape[1]):
             r = row[min(x // 2, len(row) - 1)]
-            dx, dy = np.float32(x) - centres[r, 0], np.float32(y) - centres[r, 1]
+            dx = np.float32(x) - centres[r, 0]
+            dy = np.float32(y) - centres[r, 1]
             u = motion[r, 0, 0] + dx * motion[r, 1, 0] + dy * motion[r, 2, 0]
             v = motion[r, 0, 1] + dx * motion[r, 1, 1] + dy * motion[r, 2, 1]
-            own_u, own_v = flow[y, x, 0], flow[y, x, 1]
-            replaced = not valid[y, x] or (u - own_u) * (u - own_u) + (v - own_v) * (v - own_v) < limit
+            own_u = flow[y, x, 0]
+            own_v = flow[y, x, 1]
+            replaced = (
+                not valid[y, x] or (u - own_u) * (u - own_u) + (v - own_v) * (v - own_v) < limit
+            )
             out[y, x, 0], out[y, x, 1] = (u, v) if replaced else (own_u, own_v)
 
 
@@ -415,7 +494,9 @@ class Superpixels:
     starts: NDArray[np.int64]
 
 
-def superpixels(gray: NDArray[np.uint8], size: int, *, compactness: float = 20.0, iterations: int = 4) -> Superpixels:
+def superpixels(
+    gray: NDArray[np.uint8], size: int, *, compactness: float = 20.0, iterations: int = 4
+) -> Superpixels:
     """Divide a uint8 ``[H, W]`` image into regions of about ``size * size`` pixels.
 
     Args:
@@ -425,7 +506,8 @@ def superpixels(gray: NDArray[np.uint8], size: int, *, compactness: float = 20.0
         iterations: Of k-means.
     """
     height, width = gray.shape
-    rows, columns = max(1, round(height / size)), max(1, round(width / size))
+    rows = max(1, round(height / size))
+    columns = max(1, round(width / size))
     y = (np.arange(rows) + 0.5) * height / rows - 0.5
     x = (np.arange(columns) + 0.5) * width / columns - 0.5
     centres = np.zeros((rows * columns, 3), dtype=np.float64)
@@ -440,7 +522,9 @@ def superpixels(gray: NDArray[np.uint8], size: int, *, compactness: float = 20.0
 
 
 @kernel
-def assign_pixels(gray: Bytes, centres: Doubles, size: int, weight: float, iterations: int, labels: Ints) -> None:
+def assign_pixels(
+    gray: Bytes, centres: Doubles, size: int, weight: float, iterations: int, labels: Ints
+) -> None:
     """K-means: each centre competes for the pixels within `size` of it; fills `labels`, moves `centres`."""
     height, width = gray.shape
     distance = np.empty((height, width), dtype=np.float64)
@@ -449,13 +533,18 @@ def assign_pixels(gray: Bytes, centres: Doubles, size: int, weight: float, itera
         distance[:] = np.inf
         labels[:] = -1
         for k in range(len(centres)):
-            cx, cy, cg = centres[k, 0], centres[k, 1], centres[k, 2]
+            cx = centres[k, 0]
+            cy = centres[k, 1]
+            cg = centres[k, 2]
             for y in range(max(0, int(cy - size)), min(height, int(cy + size) + 2)):
                 for x in range(max(0, int(cx - size)), min(width, int(cx + size) + 2)):
-                    dx, dy, dg = x - cx, y - cy, gray[y, x] - cg
+                    dx = x - cx
+                    dy = y - cy
+                    dg = gray[y, x] - cg
                     d = dx * dx + dy * dy + weight * dg * dg
                     if d < distance[y, x]:
-                        distance[y, x], labels[y, x] = d, k
+                        distance[y, x] = d
+                        labels[y, x] = k
         sums[:] = 0
         for y in range(height):
             for x in range(width):
@@ -465,7 +554,8 @@ def assign_pixels(gray: Bytes, centres: Doubles, size: int, weight: float, itera
                     for other in range(len(centres)):
                         d = (x - centres[other, 0]) ** 2 + (y - centres[other, 1]) ** 2
                         if d < best:
-                            best, k = d, other
+                            best = d
+                            k = other
                     labels[y, x] = k
                 sums[k, 0] += x
                 sums[k, 1] += y
@@ -481,7 +571,9 @@ def assign_pixels(gray: Bytes, centres: Doubles, size: int, weight: float, itera
 
 
 @inlined
-def box_mean(values: Floats, pitch: int, radius: int, share: Floats, line: Floats, out: Floats) -> None:
+def box_mean(
+    values: Floats, pitch: int, radius: int, share: Floats, line: Floats, out: Floats
+) -> None:
     """Means over windows clipped at the edges: columns, then rows, as flat vector code over a framed patch.
 
     Args:
@@ -492,7 +584,8 @@ def box_mean(values: Floats, pitch: int, radius: int, share: Floats, line: Float
         line: float32, flat, scratch, zero in the first and last `radius` rows and in the corners.
         out: float32, flat, filled but for the outermost rows.
     """
-    first, last = radius * pitch, len(values) - radius * pitch
+    first = radius * pitch
+    last = len(values) - radius * pitch
     for k in range(first, last):
         line[k] = values[k]
     for d in range(1, radius + 1):
@@ -509,7 +602,14 @@ def box_mean(values: Floats, pitch: int, radius: int, share: Floats, line: Float
 
 @kernel
 def frame_patch(
-    guide: Floats, top: int, left: int, height: int, width: int, radius: int, patch: Floats, work: Floats
+    guide: Floats,
+    top: int,
+    left: int,
+    height: int,
+    width: int,
+    radius: int,
+    patch: Floats,
+    work: Floats,
 ) -> None:
     """Read a patch of the guide and what `filter_patch` needs of it.
 
@@ -520,20 +620,29 @@ def frame_patch(
         height: Of the patch.
         width: Of the patch.
         radius: Of the window, pixels.
-        patch: float32, flat ``[(height + 2 radius) * (width + 2 radius)]``, the patch in a frame of zeros.
-        work: float32 ``[8, ...]``, scratch of at least that length; rows 0 to 2: share, mean and variance of the guide.
+        patch: float32, flat ``[(height + 2 radius) * (width + 2 radius)]``, the patch in a frame of
+            zeros.
+        work: float32 ``[8, ...]``, scratch of at least that length; rows 0 to 2: share, mean and
+            variance of the guide.
     """
     pitch = width + 2 * radius
     n = len(patch)
     patch[:] = 0
     work[:, :n] = 0
-    share, mean, variance, line, square = work[0, :n], work[1, :n], work[2, :n], work[3, :n], work[4, :n]
+    share = work[0, :n]
+    mean = work[1, :n]
+    variance = work[2, :n]
+    line = work[3, :n]
+    square = work[4, :n]
     for y in range(height):
         rows = np.float32(min(y + radius, height - 1) - max(y - radius, 0) + 1)
         at = (y + radius) * pitch + radius
         for x in range(width):
             columns = np.float32(min(x + radius, width - 1) - max(x - radius, 0) + 1)
-            patch[at + x], share[at + x] = guide[top + y, left + x], np.float32(1) / (rows * columns)
+            patch[at + x], share[at + x] = (
+                guide[top + y, left + x],
+                np.float32(1) / (rows * columns),
+            )
     box_mean(patch, pitch, radius, share, line, mean)
     for k in range(n):
         square[k] = patch[k] * patch[k]
@@ -543,11 +652,13 @@ def frame_patch(
 
 
 @kernel
-def filter_patch(patch: Floats, values: Floats, pitch: int, radius: int, epsilon: Scalar, work: Floats) -> None:
+def filter_patch(
+    patch: Floats, values: Floats, pitch: int, radius: int, epsilon: Scalar, work: Floats
+) -> None:
     """The guided filter (He, Sun, Tang 2010): an average of `values` that preserves the edges of the guide, in place.
 
-    Within each ``(2 radius + 1)**2`` window (clipped at the patch's edge) the output is a linear function of the guide;
-    overlapping windows are averaged.
+    Within each ``(2 radius + 1)**2`` window (clipped at the patch's edge) the output is a linear
+    function of the guide; overlapping windows are averaged.
 
     Args:
         patch: float32, flat, the guide of `frame_patch`.
@@ -558,8 +669,13 @@ def filter_patch(patch: Floats, values: Floats, pitch: int, radius: int, epsilon
         work: Of `frame_patch`.
     """
     n = len(patch)
-    share, mean, variance, line = work[0, :n], work[1, :n], work[2, :n], work[3, :n]
-    offset, slope, product = work[4, :n], work[5, :n], work[6, :n]
+    share = work[0, :n]
+    mean = work[1, :n]
+    variance = work[2, :n]
+    line = work[3, :n]
+    offset = work[4, :n]
+    slope = work[5, :n]
+    product = work[6, :n]
     box_mean(values, pitch, radius, share, line, offset)
     for k in range(n):
         product[k] = patch[k] * values[k]
@@ -576,11 +692,14 @@ def filter_patch(patch: Floats, values: Floats, pitch: int, radius: int, epsilon
 
 
 @kernel
-def read_descriptors(start: int, stop: int, columns: int, image: Side, tables: CostTables, out: Words) -> None:
+def read_descriptors(
+    start: int, stop: int, columns: int, image: Side, tables: CostTables, out: Words
+) -> None:
     """Fill rows start..stop of ``out``, uint64, flat ``[h, columns, 17]``, with half-resolution pixels' descriptors."""
     for y in range(start, stop):
         for x in range(columns):
-            px, py = np.float32(2 * x) + np.float32(0.5), np.float32(2 * y) + np.float32(0.5)
+            px = np.float32(2 * x) + np.float32(0.5)
+            py = np.float32(2 * y) + np.float32(0.5)
             read_descriptor(px, py, image, tables, out, (y * columns + x) * 17)
 
 
@@ -611,14 +730,18 @@ def aggregate_and_choose(
         radius: Of the guided filter, half-resolution pixels.
         epsilon: Of the guided filter.
         best: float32 ``[h, w]``, lowest aggregated cost, changed in place.
-        winner: float32 ``[h, w, 4]``, its label around the region's centre: displacement, and ``2**s (cos, sin)``.
+        winner: float32 ``[h, w, 4]``, its label around the region's centre: displacement, and
+            ``2**s (cos, sin)``.
         evaluations: int64 ``[K]``, raw costs computed.
     """
     rows, columns = guide.shape
-    rotated, turned = np.empty(0, dtype=np.uint8), np.empty((2, 17), dtype=np.uint64)
+    rotated = np.empty(0, dtype=np.uint8)
+    turned = np.empty((2, 17), dtype=np.uint64)
     size = 0
     described = np.zeros(13, dtype=np.bool_)
-    values, patch, work = np.empty(0, np.float32), np.empty(0, np.float32), np.empty((8, 0), np.float32)
+    values = np.empty(0, np.float32)
+    patch = np.empty(0, np.float32)
+    work = np.empty((8, 0), np.float32)
     for r in range(start, stop):
         if starts[r] == starts[r + 1]:
             continue
@@ -629,16 +752,23 @@ def aggregate_and_choose(
         if n > size:
             size = n
             rotated = np.empty(13 * n * 136, dtype=np.uint8)
-            values, patch, work = np.empty(n, np.float32), np.empty(n, np.float32), np.empty((8, n), np.float32)
+            values = np.empty(n, np.float32)
+            patch = np.empty(n, np.float32)
+            work = np.empty((8, n), np.float32)
         described[:] = False
         framed = False
         for c in range(candidates.shape[1]):
-            u, v, s, theta = candidates[r, c, 0], candidates[r, c, 1], candidates[r, c, 2], candidates[r, c, 3]
+            u = candidates[r, c, 0]
+            v = candidates[r, c, 1]
+            s = candidates[r, c, 2]
+            theta = candidates[r, c, 3]
             scale = np.float32(np.exp2(s))
-            a, b = scale * np.float32(np.cos(theta)), scale * np.float32(np.sin(theta))
+            a = scale * np.float32(np.cos(theta))
+            b = scale * np.float32(np.sin(theta))
             if not np.isfinite(u + v + a + b):
                 continue
-            centre, corner = (centres[r, 0], centres[r, 1]), (left, top, wide, high)
+            centre = (centres[r, 0], centres[r, 1])
+            corner = (left, top, wide, high)
             if not differs((u, v, a, b), centre, region, columns, best, winner):
                 continue
             if not framed:
@@ -655,27 +785,40 @@ def aggregate_and_choose(
             evaluations[r] += high * wide
             filter_patch(patch[:n], values[:n], pitch, radius, epsilon, work)
             for member in region:
-                y, x = member // columns, member % columns
+                y = member // columns
+                x = member % columns
                 cost = values[(y - top + radius) * pitch + x - left + radius]
                 if cost < best[y, x]:
                     best[y, x] = cost
-                    winner[y, x, 0], winner[y, x, 1], winner[y, x, 2], winner[y, x, 3] = u, v, a, b
+                    winner[y, x, 0] = u
+                    winner[y, x, 1] = v
+                    winner[y, x, 2] = a
+                    winner[y, x, 3] = b
 
 
 @inlined
 def differs(
-    label: Label, centre: tuple[Scalar, Scalar], region: Longs, columns: int, best: Floats, winner: Floats
+    label: Label,
+    centre: tuple[Scalar, Scalar],
+    region: Longs,
+    columns: int,
+    best: Floats,
+    winner: Floats,
 ) -> bool:
     """Whether a label moves a pixel of the region by more than `SAME_PX` from where its label so far does."""
     u, v, a, b = label
     limit = np.float32(SAME_PX * SAME_PX)
     for member in region:
-        y, x = member // columns, member % columns
+        y = member // columns
+        x = member % columns
         if best[y, x] == np.inf:
             return True
-        dx, dy = np.float32(2 * x) + np.float32(0.5) - centre[0], np.float32(2 * y) + np.float32(0.5) - centre[1]
-        da, db = a - winner[y, x, 2], b - winner[y, x, 3]
-        ex, ey = u - winner[y, x, 0] + da * dx - db * dy, v - winner[y, x, 1] + db * dx + da * dy
+        dx = np.float32(2 * x) + np.float32(0.5) - centre[0]
+        dy = np.float32(2 * y) + np.float32(0.5) - centre[1]
+        da = a - winner[y, x, 2]
+        db = b - winner[y, x, 3]
+        ex = u - winner[y, x, 0] + da * dx - db * dy
+        ey = v - winner[y, x, 1] + db * dx + da * dy
         if ex * ex + ey * ey > limit:
             return True
     return False
@@ -684,12 +827,21 @@ def differs(
 @inlined
 def patch_around(members: Longs, rows: int, columns: int, margin: int) -> tuple[int, int, int, int]:
     """Top, left, height and width of the box around pixels, with a margin, clipped at the image's edge."""
-    top, bottom, left, right = rows, -1, columns, -1
+    top = rows
+    bottom = -1
+    left = columns
+    right = -1
     for member in members:
-        y, x = member // columns, member % columns
-        top, bottom, left, right = min(top, y), max(bottom, y), min(left, x), max(right, x)
-    top, left = max(top - margin, 0), max(left - margin, 0)
-    bottom, right = min(bottom + margin, rows - 1), min(right + margin, columns - 1)
+        y = member // columns
+        x = member % columns
+        top = min(top, y)
+        bottom = max(bottom, y)
+        left = min(left, x)
+        right = max(right, x)
+    top = max(top - margin, 0)
+    left = max(left - margin, 0)
+    bottom = min(bottom + margin, rows - 1)
+    right = min(right + margin, columns - 1)
     return top, left, bottom - top + 1, right - left + 1
 
 
@@ -716,21 +868,27 @@ def raw_costs(
         turned: uint64 ``[2, 17]``, scratch.
         raw: float32, flat ``[(height + 2 radius) * (width + 2 radius)]``, filled inside the frame.
     """
-    (u, v, a, b), (left, top, wide, high), (reference, target, tables), (si, ti) = label, patch, sides, index
+    (u, v, a, b) = label
+    (left, top, wide, high) = patch
+    (reference, target, tables) = sides
+    (si, ti) = index
     height, width = target.gray.shape
     neutral = ti == -layout.ANGLE_LOW
     own = straight.view(np.uint8) if neutral else rotated
     for y in range(high):
         for x in range(wide):
-            px, py = np.float32(2 * (left + x)) + np.float32(0.5), np.float32(2 * (top + y)) + np.float32(0.5)
+            px = np.float32(2 * (left + x)) + np.float32(0.5)
+            py = np.float32(2 * (top + y)) + np.float32(0.5)
             at = (top + y) * columns + left + x
             mine = at * 136
             if not neutral:
                 mine = (ti * size + y * wide + x) * 136
                 if not described[ti]:
                     rotate_descriptor(straight, at * 17, ti, turned, rotated, mine)
-            dx, dy = px - centre[0], py - centre[1]
-            tx, ty = centre[0] + u + a * dx - b * dy, centre[1] + v + b * dx + a * dy
+            dx = px - centre[0]
+            dy = py - centre[1]
+            tx = centre[0] + u + a * dx - b * dy
+            ty = centre[1] + v + b * dx + a * dy
             cost = np.int64(tables.ceiling)
             if tx >= 0 and ty >= 0 and tx <= width - 1 and ty <= height - 1:
                 cost = np.int64(descriptor_distance(tx, ty, si, ti, mine, own, target, tables))
@@ -743,7 +901,9 @@ def raw_costs(
 
 
 @kernel
-def spread_labels(start: int, stop: int, winner: Floats, regions: Ints, centres: Floats, flow: Floats) -> None:
+def spread_labels(
+    start: int, stop: int, winner: Floats, regions: Ints, centres: Floats, flow: Floats
+) -> None:
     """Displacement of full-image rows start..stop from the half-resolution labels around the regions' centres."""
     for y in range(start, stop):
         row = min(y // 2, winner.shape[0] - 1)
@@ -751,6 +911,7 @@ def spread_labels(start: int, stop: int, winner: Floats, regions: Ints, centres:
             column = min(x // 2, winner.shape[1] - 1)
             u, v, a, b = winner[row, column]
             r = regions[row, column]
-            dx, dy = np.float32(x) - centres[r, 0], np.float32(y) - centres[r, 1]
+            dx = np.float32(x) - centres[r, 0]
+            dy = np.float32(y) - centres[r, 1]
             flow[y, x, 0] = u + a * dx - b * dy - dx
             flow[y, x, 1] = v + b * dx + a * dy - dy

@@ -1,9 +1,10 @@
 """The label search: searches and their phases, the kernels that run a phase, and propagation between neighbours.
 
-Positions are labels; a moth's fitness is the matching cost of its label (Eq. 5-7). The moth-flame equations (Eq. 4-22,
-corrected Algorithm 1) are those of `moth_flame`: values that depend on the iteration alone come from there as a table,
-and `move_moths` is `moth_flame.moth_positions` for one point, with spirals and Cauchy numbers from tables. Between the
-phases neighbouring points exchange their best labels, and points try the motions with which most of them agree.
+Positions are labels; a moth's fitness is the matching cost of its label (Eq. 5-7). The moth-flame
+equations (Eq. 4-22, corrected Algorithm 1) are those of `moth_flame`: values that depend on the
+iteration alone come from there as a table, and `move_moths` is `moth_flame.moth_positions` for one
+point, with spirals and Cauchy numbers from tables. Between the phases neighbouring points exchange
+their best labels, and points try the motions with which most of them agree.
 """
 
 from __future__ import annotations
@@ -42,8 +43,9 @@ class Strategy(NamedTuple):
 
     Attributes:
         rules: The moth-flame equations in force; None for random searches.
-        shrink: Factor of the random window an evaluation: 0.5 PatchMatch, 1 uniform random search of the whole box, 0
-            draws nothing: only start labels and those of the neighbours are tried.
+        shrink: Factor of the random window an evaluation: 0.5 PatchMatch, 1 uniform random search
+            of the whole box, 0 draws nothing: only start labels and those of the neighbours are
+            tried.
         propagates: Whether neighbours exchange their labels between phases.
     """
 
@@ -70,8 +72,8 @@ def make_plan(settings: DaisySettings) -> tuple[int, tuple[int, ...], tuple[Any,
     """Divide `FlowSettings.budget`; small budgets get fewer sweeps and smaller populations.
 
     Returns:
-        The number of labels kept a point; the evaluations a point at which each phase ends (between phases labels are
-        exchanged); the last arguments of `run_phase`.
+        The number of labels kept a point; the evaluations a point at which each phase ends (between
+        phases labels are exchanged); the last arguments of `run_phase`.
     """
     budget = settings.budget
     rules, shrink, propagates = STRATEGIES[settings.search]
@@ -132,14 +134,18 @@ def search_labels(
         offset = guess - points
         start[:, 0, :2] = np.where(np.isfinite(offset).all(axis=1, keepdims=True), offset, 0)
     rotation = np.deg2rad(settings.rotation_range_deg)
-    extent = np.array([settings.range_px, settings.range_px, settings.scale_range_octaves, rotation], np.float32)
-    lower, upper = start[:, 0] - extent, start[:, 0] + extent
+    extent = np.array(
+        [settings.range_px, settings.range_px, settings.scale_range_octaves, rotation], np.float32
+    )
+    lower = start[:, 0] - extent
+    upper = start[:, 0] + extent
     population, ends, options = make_plan(settings)
     flames = np.repeat(start, population, axis=1)
     unknown = np.full((n, population), tables.ceiling, np.int64)  # nothing has been evaluated
     state = SearchState(np.zeros_like(flames), flames, unknown, np.zeros(n, np.int64), lower, upper)
     candidates = start
-    if STRATEGIES[settings.search].shrink == 0:  # nothing is drawn: zero flow is tried beside the prediction
+    # nothing is drawn: zero flow is tried beside the prediction
+    if STRATEGIES[settings.search].shrink == 0:
         zero = np.where(start.any(axis=2, keepdims=True), np.float32(0), np.float32(np.nan))
         candidates = np.concatenate([start, np.broadcast_to(zero, start.shape)], axis=1)
     neighbours = np.ascontiguousarray(neighbours[:, : settings.neighbours])
@@ -173,7 +179,9 @@ def advance(state: Scalar) -> Scalar:
 @inlined
 def uniform(bits: Scalar, quarter: int) -> Scalar:
     """One of the four float32 in [0, 1) that `scrambled` bits make, in steps of 2**-16."""
-    return np.float32(np.int32((bits >> np.uint64(16 * quarter)) & np.uint64(65535))) * np.float32(1.0 / 65536)
+    return np.float32(np.int32((bits >> np.uint64(16 * quarter)) & np.uint64(65535))) * np.float32(
+        1.0 / 65536
+    )
 
 
 @inlined
@@ -208,7 +216,10 @@ def widen(lower: Floats, upper: Floats, flames: Floats) -> None:
         upper[j] = max(upper[j], flames[0, j] + np.float32(8))
 
 
-CANDIDATES, INITIAL, OPPOSITES, SEARCH = 0, 1, 2, 3
+CANDIDATES = 0
+INITIAL = 1
+OPPOSITES = 2
+SEARCH = 3
 """Stages of a phase; the second and the third belong to phase 0 of a moth-flame search."""
 
 
@@ -226,8 +237,10 @@ def run_phase(
         reference: `matching_cost.Reference`.
         target: `orientation_maps.Side`.
         tables: `matching_cost.CostTables`.
-        state: `SearchState`, changed in place; a search that is no moth-flame search has a population of one.
-        candidates: float32 ``[N, C, 4]``, labels to try first (neighbours', the guess, ...); not finite means none.
+        state: `SearchState`, changed in place; a search that is no moth-flame search has a
+            population of one.
+        candidates: float32 ``[N, C, 4]``, labels to try first (neighbours', the guess, ...); not
+            finite means none.
         end: Evaluations a point, counted from the very start, at which the phase ends.
         phase: Number of the phase; 0 initialises the population.
         seed: Of the frame.
@@ -236,18 +249,31 @@ def run_phase(
         cauchy: `moth_flame.cauchy_table`.
         steps: float32 ``[4]``, scale of the Cauchy steps.
         moth_flame: Whether moths fly; else labels are drawn from a window that shrinks.
-        shrink: Factor of that window an evaluation, see `Strategy.shrink`; with 0 the rest of the budget is left.
+        shrink: Factor of that window an evaluation, see `Strategy.shrink`; with 0 the rest of the
+            budget is left.
     """
-    population, iterations = state.costs.shape[1], len(table.counts)
+    population = state.costs.shape[1]
+    iterations = len(table.counts)
     initial = population * (2 if table.opposition else 1)
-    low, high = np.empty(4, dtype=np.float32), np.empty(4, dtype=np.float32)
+    low = np.empty(4, dtype=np.float32)
+    high = np.empty(4, dtype=np.float32)
     trials = np.empty((max(population, candidates.shape[1]), 4), dtype=np.float32)
     for i in range(start, stop):
-        lower, upper, moths = state.lower[i], state.upper[i], state.moths[i]
-        flames, costs = state.flames[i], state.costs[i]
-        random = scrambled(np.uint64(seed) + _GOLDEN * (np.uint64(i) * np.uint64(64) + np.uint64(phase) + np.uint64(1)))
-        used, placed, stage, window = state.used[i], 0, CANDIDATES, np.float32(0.5)
-        while True:  # costs are computed in one place; the stages differ in the labels that are tried
+        lower = state.lower[i]
+        upper = state.upper[i]
+        moths = state.moths[i]
+        flames = state.flames[i]
+        costs = state.costs[i]
+        random = scrambled(
+            np.uint64(seed)
+            + _GOLDEN * (np.uint64(i) * np.uint64(64) + np.uint64(phase) + np.uint64(1))
+        )
+        used = state.used[i]
+        placed = 0
+        stage = CANDIDATES
+        window = np.float32(0.5)
+        # costs are computed in one place; the stages differ in the labels that are tried
+        while True:
             count = population
             if stage == CANDIDATES:
                 count = finite_labels(candidates[i], trials)
@@ -264,7 +290,17 @@ def run_phase(
             elif moth_flame:
                 iteration = min(max((used - initial) // population, 0), iterations - 1)
                 random = move_moths(
-                    moths, flames, lower, upper, iteration, table, spiral, cauchy, steps, trials, random
+                    moths,
+                    flames,
+                    lower,
+                    upper,
+                    iteration,
+                    table,
+                    spiral,
+                    cauchy,
+                    steps,
+                    trials,
+                    random,
                 )
             elif shrink == 0:
                 break
@@ -275,8 +311,13 @@ def run_phase(
                 if window * (upper[0] - lower[0]) < np.float32(1):
                     window = np.float32(0.5)
             for k in range(min(count, end - used)):
-                u, v, s, theta = trials[k, 0], trials[k, 1], trials[k, 2], trials[k, 3]
-                cost = label_cost(i, u, v, s, theta, reference, target, tables, costs[population - 1])
+                u = trials[k, 0]
+                v = trials[k, 1]
+                s = trials[k, 2]
+                theta = trials[k, 3]
+                cost = label_cost(
+                    i, u, v, s, theta, reference, target, tables, costs[population - 1]
+                )
                 insert(flames, costs, trials, k, cost)
                 used += 1
             if stage == CANDIDATES:
@@ -299,12 +340,16 @@ def finite_labels(candidates: Floats, trials: Floats) -> int:
     for c in range(len(candidates)):
         for j in range(4):
             trials[count, j] = candidates[c, j]
-        count += np.isfinite(candidates[c, 0] + candidates[c, 1] + candidates[c, 2] + candidates[c, 3])
+        count += np.isfinite(
+            candidates[c, 0] + candidates[c, 1] + candidates[c, 2] + candidates[c, 3]
+        )
     return count
 
 
 @inlined
-def place_moths(moths: Floats, placed: int, lower: Floats, upper: Floats, trials: Floats, random: Scalar) -> Scalar:
+def place_moths(
+    moths: Floats, placed: int, lower: Floats, upper: Floats, trials: Floats, random: Scalar
+) -> Scalar:
     """Draw the moths from `placed` on within the bounds, and try them; returns the next random state."""
     for m in range(placed, len(moths)):
         random = advance(random)
@@ -317,7 +362,13 @@ def place_moths(moths: Floats, placed: int, lower: Floats, upper: Floats, trials
 
 @inlined
 def oppose(
-    moths: Floats, lower: Floats, upper: Floats, low: Floats, high: Floats, trials: Floats, random: Scalar
+    moths: Floats,
+    lower: Floats,
+    upper: Floats,
+    low: Floats,
+    high: Floats,
+    trials: Floats,
+    random: Scalar,
 ) -> Scalar:
     """Fill `trials` with the moths' opposites (`moth_flame.opposites`); returns the next random state."""
     population = len(moths)
@@ -350,32 +401,50 @@ def move_moths(
     """
     population = len(moths)
     now = table.coefficients[iteration]
-    span, own, best, stepping, pulling = now[0], now[1], now[2], now[3] > 0, now[2] > 0
+    span = now[0]
+    own = now[1]
+    best = now[2]
+    stepping = now[3] > 0
+    pulling = now[2] > 0
     fewest = table.counts[iteration] - 1
     for m in range(population):
         flame = min(m, fewest)  # Eq. 8
         random = advance(random)
-        bits, jumps = scrambled(random), np.uint64(0)
+        bits = scrambled(random)
+        jumps = np.uint64(0)
         if stepping:
             random = advance(random)
             jumps = scrambled(random)
         for j in range(4):
             t = span * uniform(bits, j) + np.float32(1)  # Eq. 10
-            turn = spiral[min(max(np.int64((t + np.float32(2)) * np.float32(1024)), np.int64(0)), np.int64(4095))]
+            turn = spiral[
+                min(
+                    max(np.int64((t + np.float32(2)) * np.float32(1024)), np.int64(0)),
+                    np.int64(4095),
+                )
+            ]
             distance = abs(flames[m, j] - moths[m, j])
             goal = flames[flame, j]
             if pulling:  # Eq. 17
                 goal = own * goal + best * flames[0, j]
             position = distance * turn + goal
             if stepping:  # Eq. 13
-                position += cauchy[np.int64((jumps >> np.uint64(16 * j)) & np.uint64(4095))] * steps[j]
+                position += (
+                    cauchy[np.int64((jumps >> np.uint64(16 * j)) & np.uint64(4095))] * steps[j]
+                )
             moths[m, j] = trials[m, j] = min(max(position, lower[j]), upper[j])
     return random
 
 
 @inlined
 def draw(
-    label: Floats, bits: Scalar, lower: Floats, upper: Floats, flames: Floats, window: Scalar, shrink: Scalar
+    label: Floats,
+    bits: Scalar,
+    lower: Floats,
+    upper: Floats,
+    flames: Floats,
+    window: Scalar,
+    shrink: Scalar,
 ) -> None:
     """Fill a label: anywhere in the box (`shrink` 1), or in a window of it around the best label."""
     for j in range(4):
@@ -406,7 +475,10 @@ def parabola(
     """
     far = np.int64(1 << 40)
     for i in range(start, stop):
-        u, v, s, theta = labels[i, 0], labels[i, 1], labels[i, 2], labels[i, 3]
+        u = labels[i, 0]
+        v = labels[i, 1]
+        s = labels[i, 2]
+        theta = labels[i, 3]
         middle = label_cost(i, u, v, s, theta, reference, target, tables, far)
         left = label_cost(i, u - step, v, s, theta, reference, target, tables, far)
         right = label_cost(i, u + step, v, s, theta, reference, target, tables, far)
@@ -423,10 +495,13 @@ def vertex(before: Scalar, middle: Scalar, after: Scalar) -> Scalar:
     curvature = before + after - 2 * middle
     if curvature <= 0:
         return np.float32(0)
-    return min(max(np.float32(before - after) / np.float32(2 * curvature), np.float32(-1)), np.float32(1))
+    return min(
+        max(np.float32(before - after) / np.float32(2 * curvature), np.float32(-1)), np.float32(1)
+    )
 
 
-# ------------------------------------------------------------------ propagation between neighbouring points
+# ------------------------------------------------------------------ propagation between
+# neighbouring points
 
 
 @kernel
@@ -436,9 +511,10 @@ def transported_labels(
 ) -> None:  # fmt: skip
     """Labels of neighbours and of common motions, as seen from each point.
 
-    A neighbour's label is a similarity around the neighbour; at point p it means the displacement that this similarity
-    gives p. Scale and rotation are clipped to the point's bounds; the displacement is not: a label of a neighbour
-    is a tested match, and the bounds limit only where the search draws.
+    A neighbour's label is a similarity around the neighbour; at point p it means the displacement
+    that this similarity gives p. Scale and rotation are clipped to the point's bounds; the
+    displacement is not: a label of a neighbour is a tested match, and the bounds limit only where
+    the search draws.
 
     Args:
         start: First point.
@@ -447,41 +523,58 @@ def transported_labels(
         labels: float32 ``[N, 4]``, best labels of the previous phase.
         turns: float32 ``[N, 2]`` of `label_turns`.
         neighbours: int64 ``[N, K]``, indices; negative means none.
-        motions: float32 ``[M, 4]``, similarities ``(a, b, tx, ty)``: ``p' = [[a, -b], [b, a]] p + t``; NaN means none.
+        motions: float32 ``[M, 4]``, similarities ``(a, b, tx, ty)``:
+            ``p' = [[a, -b], [b, a]] p + t``; NaN means none.
         lower: float32 ``[N, 4]``.
         upper: float32 ``[N, 4]``.
         out: float32 ``[N, K + M, 4]``, NaN where there is none.
     """
     count = neighbours.shape[1]
-    sizes, angles = np.empty(len(motions), dtype=np.float32), np.empty(len(motions), dtype=np.float32)
+    sizes = np.empty(len(motions), dtype=np.float32)
+    angles = np.empty(len(motions), dtype=np.float32)
     for m in range(len(motions)):
-        a, b = motions[m, 0], motions[m, 1]
+        a = motions[m, 0]
+        b = motions[m, 1]
         sizes[m] = np.float32(0.5) * np.float32(np.log2(max(a * a + b * b, np.float32(1e-12))))
         angles[m] = np.float32(np.arctan2(b, a))
     for i in range(start, stop):
-        x, y = points[i, 0], points[i, 1]
+        x = points[i, 0]
+        y = points[i, 1]
         for k in range(count):
             j = neighbours[i, k]
             if j < 0:
                 out[i, k, 0] = np.nan
                 continue
-            c, n = turns[j, 0], turns[j, 1]
-            dx, dy = x - points[j, 0], y - points[j, 1]
+            c = turns[j, 0]
+            n = turns[j, 1]
+            dx = x - points[j, 0]
+            dy = y - points[j, 1]
             u = points[j, 0] + labels[j, 0] + c * dx - n * dy - x
             v = points[j, 1] + labels[j, 1] + n * dx + c * dy - y
             admit(out, i, k, u, v, labels[j, 2], labels[j, 3], lower, upper)
         for m in range(len(motions)):
-            a, b = motions[m, 0], motions[m, 1]
-            u, v = a * x - b * y + motions[m, 2] - x, b * x + a * y + motions[m, 3] - y
+            a = motions[m, 0]
+            b = motions[m, 1]
+            u = a * x - b * y + motions[m, 2] - x
+            v = b * x + a * y + motions[m, 3] - y
             admit(out, i, count + m, u, v, sizes[m], angles[m], lower, upper)
 
 
 @inlined
 def admit(
-    out: Floats, i: int, k: int, u: Scalar, v: Scalar, s: Scalar, theta: Scalar, lower: Floats, upper: Floats
+    out: Floats,
+    i: int,
+    k: int,
+    u: Scalar,
+    v: Scalar,
+    s: Scalar,
+    theta: Scalar,
+    lower: Floats,
+    upper: Floats,
 ) -> None:
     """Store a candidate."""
-    out[i, k, 0], out[i, k, 1] = u, v
+    out[i, k, 0] = u
+    out[i, k, 1] = v
     out[i, k, 2] = min(max(s, lower[i, 2]), upper[i, 2])
     out[i, k, 3] = min(max(theta, lower[i, 3]), upper[i, 3])
 
@@ -497,12 +590,16 @@ def label_turns(labels: Floats) -> Floats:
     return turns
 
 
-def labels_as_seen(points: Floats, labels: Floats, neighbours: Longs, motions: Floats = NO_MOTION) -> Floats:
+def labels_as_seen(
+    points: Floats, labels: Floats, neighbours: Longs, motions: Floats = NO_MOTION
+) -> Floats:
     """`transported_labels` without bounds that matter, float32 ``[N, K + M, 4]``."""
     count = len(points)
     extent = np.full((count, 4), 8.0, dtype=np.float32)
     out = np.empty((count, neighbours.shape[1] + len(motions), 4), dtype=np.float32)
-    transported_labels(0, count, points, labels, label_turns(labels), neighbours, motions, -extent, extent, out)
+    transported_labels(
+        0, count, points, labels, label_turns(labels), neighbours, motions, -extent, extent, out
+    )
     return out
 
 
@@ -525,7 +622,8 @@ def common_motions(points: Floats, labels: Floats, costs: Longs, seed: int) -> F
     keys = costs * len(costs) + np.arange(len(costs))  # of equal costs the first
     # partitioned in numpy: in a kernel it would add a tenth to the compile time of all kernels
     good = np.sort(np.argpartition(keys, half - 1)[:half])
-    # where the good points lie and where their labels take them, one coordinate after the other for vector code
+    # where the good points lie and where their labels take them, one coordinate after the other for
+    # vector code
     tracks = np.concatenate([points[good], points[good] + labels[good, :2]], axis=1).T.copy()
     random = np.uint64(seed) ^ np.uint64(0x5DEECE66D)
     for motion in motions:
@@ -534,14 +632,22 @@ def common_motions(points: Floats, labels: Floats, costs: Longs, seed: int) -> F
         voters = tracks[:, :: -(-tracks.shape[1] // VOTERS)].copy()
         random = np.uint64(vote(tracks, voters, *VOTE, random, motion))
         # the second motion is fitted to the points that do not follow the first
-        (x, y, to_x, to_y), (a, b, tx, ty) = tracks, motion
+        (x, y, to_x, to_y) = tracks
+        (a, b, tx, ty) = motion
         missed = (a * x - b * y + tx - to_x) ** 2 + (b * x + a * y + ty - to_y) ** 2
         tracks = np.compress(missed >= 4 * VOTE[1] ** 2, tracks, axis=1)
     return motions
 
 
 @kernel
-def vote(tracks: Floats, voters: Floats, hypotheses: int, tolerance: Scalar, random: Scalar, motion: Floats) -> Scalar:
+def vote(
+    tracks: Floats,
+    voters: Floats,
+    hypotheses: int,
+    tolerance: Scalar,
+    random: Scalar,
+    motion: Floats,
+) -> Scalar:
     """Choose the similarity, of those through two tracks, with which most voters agree.
 
     Args:
@@ -555,37 +661,53 @@ def vote(tracks: Floats, voters: Floats, hypotheses: int, tolerance: Scalar, ran
     Returns:
         The next state of the draws.
     """
-    x, y, to_x, to_y = tracks[0], tracks[1], tracks[2], tracks[3]
-    count, limit, most = np.uint64(len(x)), np.float32(tolerance * tolerance), 5
+    x = tracks[0]
+    y = tracks[1]
+    to_x = tracks[2]
+    to_y = tracks[3]
+    count = np.uint64(len(x))
+    limit = np.float32(tolerance * tolerance)
+    most = 5
     for _ in range(hypotheses):
         random = advance(random)
         bits = scrambled(random)
         i = np.int64(((bits & np.uint64(0xFFFFFFFF)) * count) >> np.uint64(32))
         j = np.int64(((bits >> np.uint64(32)) * count) >> np.uint64(32))
-        dx, dy = x[j] - x[i], y[j] - y[i]
+        dx = x[j] - x[i]
+        dy = y[j] - y[i]
         length = dx * dx + dy * dy
         if length < 400:
             continue
-        ex, ey = to_x[j] - to_x[i], to_y[j] - to_y[i]
-        a, b = (ex * dx + ey * dy) / length, (ey * dx - ex * dy) / length
+        ex = to_x[j] - to_x[i]
+        ey = to_y[j] - to_y[i]
+        a = (ex * dx + ey * dy) / length
+        b = (ey * dx - ex * dy) / length
         grown = a * a + b * b
         if grown < 0.15 or grown > 6.5:
             continue
-        tx, ty = to_x[i] - a * x[i] + b * y[i], to_y[i] - b * x[i] - a * y[i]
+        tx = to_x[i] - a * x[i] + b * y[i]
+        ty = to_y[i] - b * x[i] - a * y[i]
         votes = count_votes(voters, a, b, tx, ty, limit)
         if votes > most:
             most = votes
-            motion[0], motion[1], motion[2], motion[3] = a, b, tx, ty
+            motion[0] = a
+            motion[1] = b
+            motion[2] = tx
+            motion[3] = ty
     return random
 
 
 @inlined
 def count_votes(voters: Floats, a: Scalar, b: Scalar, tx: Scalar, ty: Scalar, limit: Scalar) -> int:
     """How many voters a motion takes to where their labels do, by squared distance."""
-    from_x, from_y, goal_x, goal_y = voters[0], voters[1], voters[2], voters[3]
+    from_x = voters[0]
+    from_y = voters[1]
+    goal_x = voters[2]
+    goal_y = voters[3]
     votes = np.int32(0)
     for k in range(voters.shape[1]):
-        rx, ry = a * from_x[k] - b * from_y[k] + tx - goal_x[k], b * from_x[k] + a * from_y[k] + ty - goal_y[k]
+        rx = a * from_x[k] - b * from_y[k] + tx - goal_x[k]
+        ry = b * from_x[k] + a * from_y[k] + ty - goal_y[k]
         votes = np.int32(votes + np.int32(rx * rx + ry * ry < limit))
     return int(votes)
 
@@ -601,7 +723,9 @@ def nearest(points: Floats, run: Run) -> Longs:
 
 
 @kernel
-def nearest_neighbours(start: int, stop: int, ordered: Floats, order: Longs, width: int, out: Longs) -> None:
+def nearest_neighbours(
+    start: int, stop: int, ordered: Floats, order: Longs, width: int, out: Longs
+) -> None:
     """The nearest other points of each point, in an approximate but deterministic search over rows of equal bands.
 
     Args:
@@ -610,20 +734,25 @@ def nearest_neighbours(start: int, stop: int, ordered: Floats, order: Longs, wid
         ordered: float32 ``[N, 2]``, the points sorted by x.
         order: int64 ``[N]``, their indices.
         width: Number of points compared on each side in that order.
-        out: int64 ``[N, K]``, nearest first; -1 where there are fewer. Rows are points, not positions in the order.
+        out: int64 ``[N, K]``, nearest first; -1 where there are fewer. Rows are points, not
+            positions in the order.
     """
     n, count = out.shape
     best = np.empty(count, dtype=np.float32)
     distances = np.empty(2 * width + 1, dtype=np.float32)
     for place in range(start, stop):
-        x, y = ordered[place, 0], ordered[place, 1]
-        first, last = max(0, place - width), min(n, place + width + 1)
+        x = ordered[place, 0]
+        y = ordered[place, 1]
+        first = max(0, place - width)
+        last = min(n, place + width + 1)
         for k in range(last - first):
-            dx, dy = ordered[first + k, 0] - x, ordered[first + k, 1] - y
+            dx = ordered[first + k, 0] - x
+            dy = ordered[first + k, 1] - y
             distances[k] = dx * dx + dy * dy
         distances[place - first] = np.inf
         index = out[order[place]]
-        best[:], index[:] = np.inf, -1
+        best[:] = np.inf
+        index[:] = -1
         worst = np.float32(np.inf)
         for k in range(last - first):
             distance = distances[k]
@@ -632,27 +761,35 @@ def nearest_neighbours(start: int, stop: int, ordered: Floats, order: Longs, wid
                 while slot > 0 and best[slot - 1] > distance:
                     best[slot], index[slot] = best[slot - 1], index[slot - 1]
                     slot -= 1
-                best[slot], index[slot] = distance, order[first + k]
+                index[slot] = order[first + k]
+                best[slot] = distance
                 worst = best[count - 1]
 
 
-def dissenting_labels(predictions: Floats, labels: Floats, tolerance: Scalar) -> tuple[Floats, Flags]:
+def dissenting_labels(
+    predictions: Floats, labels: Floats, tolerance: Scalar
+) -> tuple[Floats, Flags]:
     """Find points whose neighbours agree with each other but not with the point, e.g. one period off on a texture.
 
     Args:
-        predictions: float32 ``[N, K, 4]``, the neighbours' labels as seen from each point; NaN means none.
+        predictions: float32 ``[N, K, 4]``, the neighbours' labels as seen from each point; NaN
+            means none.
         labels: float32 ``[N, 4]``, the points' own labels.
         tolerance: Displacements this close agree, pixels.
 
     Returns:
-        float32 ``[N, 4]``, the prediction on which most neighbours agree, and bool ``[N]``, whether it has more support
-        than the point's own label.
+        float32 ``[N, 4]``, the prediction on which most neighbours agree, and bool ``[N]``, whether
+        it has more support than the point's own label.
     """
-    limit, (u, v) = tolerance * tolerance, np.ascontiguousarray(predictions[:, :, :2].T)
-    du, dv = u[:, None] - u, v[:, None] - v
+    limit = tolerance * tolerance
+    (u, v) = np.ascontiguousarray(predictions[:, :, :2].T)
+    du = u[:, None] - u
+    dv = v[:, None] - v
     support = np.count_nonzero(du * du + dv * dv < limit, axis=1)
-    du, dv = u - labels[:, 0], v - labels[:, 1]
+    du = u - labels[:, 0]
+    dv = v - labels[:, 1]
     away = du * du + dv * dv
     choice = support.argmax(axis=0), np.arange(len(labels))
-    most, own = support[choice], np.count_nonzero(away < limit, axis=0)
+    most = support[choice]
+    own = np.count_nonzero(away < limit, axis=0)
     return predictions[choice[::-1]], (most > 1) & (most > own) & (away[choice] >= limit)

@@ -1,7 +1,8 @@
 """The DAISY descriptor's sampling pattern for every quantised label, and the arrangement of the orientation maps.
 
-The layout is DAISY Filter Flow's: radius 16 px, two rings of eight histograms around a centre, eight bins each:
-(2 * 8 + 1) * 8 = 136 numbers. The Gaussian of ring r has sigma (r + 1) * 16 / 4 = 4, 8 px; the centre shares ring 0's.
+The layout is DAISY Filter Flow's: radius 16 px, two rings of eight histograms around a centre,
+eight bins each: (2 * 8 + 1) * 8 = 136 numbers. The Gaussian of ring r has sigma (r + 1) * 16 / 4 =
+4, 8 px; the centre shares ring 0's.
 """
 
 from __future__ import annotations
@@ -21,10 +22,12 @@ RING_RADII = (8.0, 16.0)
 RING_SIGMAS = (4.0, 8.0)
 
 SCALE_STEP_OCTAVES = 0.25
-SCALE_LOW, SCALE_HIGH = -4, 5
+SCALE_LOW = -4
+SCALE_HIGH = 5
 """Scale indices: s = 2 ** (k / 4) for k in -4..5, that is 0.5 to 2.38."""
 ANGLE_STEP_DEG = 7.5
-ANGLE_LOW, ANGLE_HIGH = -6, 6
+ANGLE_LOW = -6
+ANGLE_HIGH = 6
 """Rotation indices: 7.5 degrees each, -45 to 45."""
 ROTATIONS = ANGLE_HIGH - ANGLE_LOW + 1
 
@@ -35,8 +38,8 @@ LEVEL_STEPS = (2, 2, 2, 4, 4, 4, 4)
 LEVEL_BLURS = ((5, 1), (5, 1), (3, 2), (5, 1), (3, 2), (5, 2), (3, 4))
 """Each level's blur of the one before: taps of a binomial and their distance in map pixels.
 
-Its variance is ``(taps - 1) / 4 * distance ** 2``: 1, 1, 2 at half resolution, that is sigmas of 2, 2.83 and 4 px; the
-mean of 2 x 2 brings 4.12 px, and 1, 2, 4, 8 at quarter resolution make 5.7, 8.1, 11.4 and 16.1.
+Its variance is ``(taps - 1) / 4 * distance ** 2``: 1, 1, 2 at half resolution, that is sigmas of 2,
+2.83 and 4 px; the mean of 2 x 2 brings 4.12 px, and 1, 2, 4, 8 at quarter resolution make 5.7, 8.1, 11.4 and 16.1.
 """
 MARGIN = 48
 """Empty border around each map in full-image pixels: the outermost sample lies 16 * 2.38 = 38 px from the centre."""
@@ -56,13 +59,15 @@ def sampling_table() -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     """The pattern for every scale and rotation index: ``s * R(theta) * g_k`` (Eq. 1's D_{s,theta}).
 
     Returns:
-        int32 ``[scales, ROTATIONS, HISTOGRAMS, 2]``, displacement (x, y) from the centre in quarter pixels, and int64
-        ``[scales, RINGS]``, map level of each ring at each scale: the one whose Gaussian is closest in ratio.
+        int32 ``[scales, ROTATIONS, HISTOGRAMS, 2]``, displacement (x, y) from the centre in quarter
+        pixels, and int64 ``[scales, RINGS]``, map level of each ring at each scale: the one whose
+        Gaussian is closest in ratio.
     """
     pattern = unit_pattern()
     scales = 2.0 ** (np.arange(SCALE_LOW, SCALE_HIGH + 1) * SCALE_STEP_OCTAVES)
     theta = np.deg2rad(np.arange(ANGLE_LOW, ANGLE_HIGH + 1) * ANGLE_STEP_DEG)
-    c, s = np.cos(theta), np.sin(theta)
+    c = np.cos(theta)
+    s = np.sin(theta)
     rotation = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
     points = np.einsum("s,rij,kj->srki", scales, rotation, pattern)
     sigmas = scales[:, None] * RING_SIGMAS
@@ -76,7 +81,8 @@ class MapGeometry(NamedTuple):
     Attributes:
         base: int64 ``[LEVELS]``, index of each level's first histogram (the corner of its margin).
         stride: int64 ``[LEVELS]``, histograms a row, margins included.
-        shift: int64 ``[LEVELS]``, quarter pixels to map pixels: ``index = (position + bias) >> shift``.
+        shift: int64 ``[LEVELS]``, quarter pixels to map pixels:
+            ``index = (position + bias) >> shift``.
         bias: int64 ``[LEVELS]``, rounding and margin.
         total: Number of histograms.
     """
@@ -91,12 +97,16 @@ class MapGeometry(NamedTuple):
 @lru_cache(maxsize=16)
 def map_geometry(height: int, width: int) -> MapGeometry:
     """The arrangement of the seven levels for an image size in pixels."""
-    levels, total = [], 0
+    levels = []
+    total = 0
     for step in LEVEL_STEPS:
-        rows, columns = max(1, height // step), max(1, width // step)  # an odd last row or column is dropped
+        # an odd last row or column is dropped
+        rows = max(1, height // step)
+        columns = max(1, width // step)
         margin = MARGIN // step
         # full-image x (pixel centres at integers) lies in map pixel floor((x + 0.5) / step)
-        shift, bias = int(np.log2(step * SUBPIXEL)), SUBPIXEL // 2 + margin * step * SUBPIXEL
+        shift = int(np.log2(step * SUBPIXEL))
+        bias = SUBPIXEL // 2 + margin * step * SUBPIXEL
         levels.append((total, columns + 2 * margin, shift, bias))
         total += (rows + 2 * margin) * (columns + 2 * margin)
     base, stride, shift, bias = np.array(levels, dtype=np.int64).T.copy()

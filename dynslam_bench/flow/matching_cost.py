@@ -1,11 +1,12 @@
 """The matching cost (Eq. 1) of labels at sparse points, for the processor.
 
-A label is ``(u, v, s, theta)``: displacement in pixels, log2 scale, rotation in radians. It maps the neighbourhood of a
-point p by ``p' = p + (u, v) + 2**s R(theta) (q - p)``. The target is sampled at the label's scale and rotation; the
-rotation of the *bins* is applied to the reference descriptor, once for each of the 13 quantised angles.
+A label is ``(u, v, s, theta)``: displacement in pixels, log2 scale, rotation in radians. It maps
+the neighbourhood of a point p by ``p' = p + (u, v) + 2**s R(theta) (q - p)``. The target is sampled
+at the label's scale and rotation; the rotation of the *bins* is applied to the reference
+descriptor, once for each of the 13 quantised angles.
 
-Costs are whole numbers (255 = Euclidean length of a histogram), so that they do not depend on summation order,
-vector width or device.
+Costs are whole numbers (255 = Euclidean length of a histogram), so that they do not depend on
+summation order, vector width or device.
 """
 
 from __future__ import annotations
@@ -37,13 +38,17 @@ class CostTables(NamedTuple):
     """Tables of the cost that depend on the image size and the weights only.
 
     Attributes:
-        samples: int32 ``[scales, ROTATIONS, 4, 17]``, byte offset of each histogram from the centre's cell, for the
-            four half-cell positions (2 * lower half + right half) of the centre within its cell.
-        ring0: int64 ``[scales, 4]``, base, stride, shift, bias of the centre's and first ring's level.
+        samples: int32 ``[scales, ROTATIONS, 4, 17]``, byte offset of each histogram from the
+            centre's cell, for the four half-cell positions (2 * lower half + right half) of the
+            centre within its cell.
+        ring0: int64 ``[scales, 4]``, base, stride, shift, bias of the centre's and first ring's
+            level.
         ring1: int64 ``[scales, 4]``, of the second ring's level.
         truncation: Largest cost of one histogram (t of Eq. 1, times 255).
-        intensity: int32 ``[256]``, cost of an absolute grey-level difference: ``alpha * min(d, t1)``.
-        gradient: int32 ``[256]``, cost of an absolute difference of gradient magnitudes: ``beta * min(d, t2)``.
+        intensity: int32 ``[256]``, cost of an absolute grey-level difference:
+            ``alpha * min(d, t1)``.
+        gradient: int32 ``[256]``, cost of an absolute difference of gradient magnitudes:
+            ``beta * min(d, t2)``.
         appearance: Whether either of the two is not zero.
         support: int64 ``[S, 2]``, points around p over which the cost is summed, pixels.
         ceiling: Largest cost of a label inside the image.
@@ -75,7 +80,9 @@ class Reference(NamedTuple):
 
 
 @lru_cache(maxsize=32)
-def cost_tables(shape: tuple[int, int], terms: int = 1, support: int = 1, spacing: int = 4) -> CostTables:
+def cost_tables(
+    shape: tuple[int, int], terms: int = 1, support: int = 1, spacing: int = 4
+) -> CostTables:
     """Tables for an image size and the terms and support of Eq. 1.
 
     Args:
@@ -89,11 +96,15 @@ def cost_tables(shape: tuple[int, int], terms: int = 1, support: int = 1, spacin
     per_level = np.stack([geometry.base, geometry.stride, geometry.shift, geometry.bias], axis=1)
     level = np.repeat(ring_level, (9, 8), axis=1)  # [scales, 17]
     steps = np.asarray(layout.LEVEL_STEPS)[level][:, None, None, :, None]
-    half_cell = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])[None, None, :, None, :]
+    half_cell = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])[
+        None, None, :, None, :
+    ]
     cells = np.floor(half_cell + offsets[:, :, None] / (layout.SUBPIXEL * steps)).astype(np.int64)
     samples = 8 * (cells[..., 1] * geometry.stride[level][:, None, None, :] + cells[..., 0])
     grey = np.arange(256) / 255.0
-    square = [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)][:support]
+    square = [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)][
+        :support
+    ]
     intensity, gradient = (
         np.rint(255 * weight * np.minimum(grey, limit) * (terms == 3)).astype(np.int32)
         for weight, limit in (INTENSITY, GRADIENT)
@@ -118,14 +129,19 @@ def cell_of(x: Scalar, y: Scalar, level: Longs) -> tuple[Scalar, Scalar]:
     xq = np.int64(x * np.float32(4) + np.float32(0.5)) + level[3]
     yq = np.int64(y * np.float32(4) + np.float32(0.5)) + level[3]
     finer = level[2] - 1
-    xh, yh = xq >> finer, yq >> finer
+    xh = xq >> finer
+    yh = yq >> finer
     return 8 * (level[0] + (yh >> 1) * level[1] + (xh >> 1)), 2 * (yh & 1) + (xh & 1)
 
 
 @inlined
-def read_descriptor(x: Scalar, y: Scalar, image: Side, tables: CostTables, out: Words, first: int) -> None:
+def read_descriptor(
+    x: Scalar, y: Scalar, image: Side, tables: CostTables, out: Words, first: int
+) -> None:
     """Write the unrotated descriptor of a position: 17 histograms, a number each, of `out` from `first` on."""
-    neutral, straight, histograms = -layout.SCALE_LOW, -layout.ANGLE_LOW, image.histograms.view(np.uint64)
+    neutral = -layout.SCALE_LOW
+    straight = -layout.ANGLE_LOW
+    histograms = image.histograms.view(np.uint64)
     near, near_phase = cell_of(x, y, tables.ring0[neutral])
     far, far_phase = cell_of(x, y, tables.ring1[neutral])
     for k in range(9):
@@ -135,7 +151,9 @@ def read_descriptor(x: Scalar, y: Scalar, image: Side, tables: CostTables, out: 
 
 
 @inlined
-def rotate_descriptor(descriptor: Words, at: int, a: int, turned: Words, out: Bytes, first: int) -> None:
+def rotate_descriptor(
+    descriptor: Words, at: int, a: int, turned: Words, out: Bytes, first: int
+) -> None:
     """Write a descriptor for rotation index `a`: 136 bytes of `out` from `first` on.
 
     Args:
@@ -156,14 +174,22 @@ def rotate_descriptor(descriptor: Words, at: int, a: int, turned: Words, out: By
         right = np.uint64(-8 * (whole + turn) & 63)
         for k in range(17):
             turned[turn, k] = descriptor[at + k] << left | descriptor[at + k] >> right
-    near, far, rotated = turned[0].view(np.uint8), turned[1].view(np.uint8), out[first : first + 136]
+    near = turned[0].view(np.uint8)
+    far = turned[1].view(np.uint8)
+    rotated = out[first : first + 136]
     for b in range(136):
         rotated[b] = np.uint8((near_weight * near[b] + far_weight * far[b] + np.int32(512)) >> 10)
 
 
 @kernel
 def describe(
-    start: int, stop: int, points: Floats, image: Side, tables: CostTables, out: Bytes, appearances: Ints
+    start: int,
+    stop: int,
+    points: Floats,
+    image: Side,
+    tables: CostTables,
+    out: Bytes,
+    appearances: Ints,
 ) -> None:
     """Reference descriptors of points, with their bins rotated by each quantised angle, and their appearance.
 
@@ -174,39 +200,63 @@ def describe(
         image: `Side` of the reference.
         tables: `CostTables`.
         out: uint8, flat ``[N, S, ROTATIONS, 17 * 8]``.
-        appearances: int32 ``[N, S, 2]``, filled with grey levels and gradient magnitudes where the terms need them.
+        appearances: int32 ``[N, S, 2]``, filled with grey levels and gradient magnitudes where the
+            terms need them.
     """
     height, width = image.gray.shape
-    descriptor, turned = np.empty(17, dtype=np.uint64), np.empty((2, 17), dtype=np.uint64)
+    descriptor = np.empty(17, dtype=np.uint64)
+    turned = np.empty((2, 17), dtype=np.uint64)
     supports = len(tables.support)
     for i in range(start, stop):
         for q in range(supports):
-            x = min(max(points[i, 0] + np.float32(tables.support[q, 0]), np.float32(0)), np.float32(width - 1))
-            y = min(max(points[i, 1] + np.float32(tables.support[q, 1]), np.float32(0)), np.float32(height - 1))
+            x = min(
+                max(points[i, 0] + np.float32(tables.support[q, 0]), np.float32(0)),
+                np.float32(width - 1),
+            )
+            y = min(
+                max(points[i, 1] + np.float32(tables.support[q, 1]), np.float32(0)),
+                np.float32(height - 1),
+            )
             read_descriptor(x, y, image, tables, descriptor, 0)
             for a in range(13):
-                rotate_descriptor(descriptor, 0, a, turned, out, ((i * supports + q) * 13 + a) * 136)
+                rotate_descriptor(
+                    descriptor, 0, a, turned, out, ((i * supports + q) * 13 + a) * 136
+                )
             if tables.appearance:
                 appearances[i, q, 0], appearances[i, q, 1] = appearance(image, x, y)
 
 
 @inlined
 def descriptor_distance(
-    x: Scalar, y: Scalar, si: int, ti: int, mine: int, descriptor: Bytes, target: Side, tables: CostTables
+    x: Scalar,
+    y: Scalar,
+    si: int,
+    ti: int,
+    mine: int,
+    descriptor: Bytes,
+    target: Side,
+    tables: CostTables,
 ) -> Scalar:
     """First term of Eq. 1: truncated distance of 136 bytes at `mine` to the target at (x, y), scale si, rotation ti."""
     near, near_phase = cell_of(x, y, tables.ring0[si])
     far, far_phase = cell_of(x, y, tables.ring1[si])
     row = 4 * (si * layout.ROTATIONS + ti)
-    theirs, near_row, far_row = target.histograms, row + near_phase, row + far_phase
-    return descriptor_sum(theirs, tables.samples, near_row, far_row, near, far, descriptor, mine, tables.truncation)
+    theirs = target.histograms
+    near_row = row + near_phase
+    far_row = row + far_phase
+    return descriptor_sum(
+        theirs, tables.samples, near_row, far_row, near, far, descriptor, mine, tables.truncation
+    )
 
 
 @inlined
 def quantised(s: Scalar, theta: Scalar) -> tuple[Scalar, Scalar]:
     """Scale and rotation index of a label."""
     si = np.int64(np.floor(s * np.float32(4) + np.float32(0.5))) - layout.SCALE_LOW
-    ti = np.int64(np.floor(theta * np.float32(7.639437268410976) + np.float32(0.5))) - layout.ANGLE_LOW
+    ti = (
+        np.int64(np.floor(theta * np.float32(7.639437268410976) + np.float32(0.5)))
+        - layout.ANGLE_LOW
+    )
     return min(max(si, 0), 9), min(max(ti, 0), 12)
 
 
@@ -229,19 +279,25 @@ def label_cost(
         bound: A cost from which on the exact value does not matter.
     """
     height, width = target.gray.shape
-    cx, cy = reference.points[i, 0] + u, reference.points[i, 1] + v
+    cx = reference.points[i, 0] + u
+    cy = reference.points[i, 1] + v
     if not (cx >= 0 and cy >= 0 and cx <= width - 1 and cy <= height - 1):
         return np.int64(OUTSIDE)
     si, ti = quantised(s, theta)
     supports = len(tables.support)
-    total, c, n = np.int64(0), np.float32(0), np.float32(0)
+    total = np.int64(0)
+    c = np.float32(0)
+    n = np.float32(0)
     if supports > 1:
         scale = np.float32(np.exp2(s))
-        c, n = np.cos(theta) * scale, np.sin(theta) * scale
+        c = np.cos(theta) * scale
+        n = np.sin(theta) * scale
     for q in range(supports):
-        tx, ty = cx, cy
+        tx = cx
+        ty = cy
         if q > 0:
-            dx, dy = np.float32(tables.support[q, 0]), np.float32(tables.support[q, 1])
+            dx = np.float32(tables.support[q, 0])
+            dy = np.float32(tables.support[q, 1])
             tx = min(max(cx + c * dx - n * dy, np.float32(0)), np.float32(width - 1))
             ty = min(max(cy + n * dx + c * dy, np.float32(0)), np.float32(height - 1))
         mine = ((i * supports + q) * 13 + ti) * 136

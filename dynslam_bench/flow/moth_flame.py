@@ -1,9 +1,9 @@
 """The moth-flame equations (Eq. 8-22), and the members of the moth-flame family.
 
-The Optuna sampler (`slam_hpo.moth_flame_sampler`) calls them. The flow's search is compiled: `move_moths` of
-`label_search` is `moth_positions` for one point, with `flight_table`, `spiral_table` and `cauchy_table` from here.
-Moths and flames are arrays of any leading shape with the dimensions of the problem last; `uniform(shape)` draws from
-[0, 1).
+The Optuna sampler (`slam_hpo.moth_flame_sampler`) calls them. The flow's search is compiled:
+`move_moths` of `label_search` is `moth_positions` for one point, with `flight_table`,
+`spiral_table` and `cauchy_table` from here. Moths and flames are arrays of any leading shape with
+the dimensions of the problem last; `uniform(shape)` draws from [0, 1).
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ class MothFlameRules(NamedTuple):
         cauchy: Cauchy steps in the first half of the iterations (Eq. 13-16).
         best_flame: Pull of the flames towards the best one in the second half (Eq. 17-18).
         half: Divide Eq. 17 by two, as printed, which pulls every label towards zero.
-        as_printed: Eq. 9-11 with the signs as printed: t in [1, 2], flames counted down from the last count.
+        as_printed: Eq. 9-11 with the signs as printed: t in [1, 2], flames counted down from the
+            last count.
     """
 
     opposition: bool
@@ -39,7 +40,9 @@ class MothFlameRules(NamedTuple):
 
 EMFOA = MothFlameRules(opposition=True, cauchy=True, best_flame=True, half=False, as_printed=False)
 MFO = MothFlameRules(opposition=False, cauchy=False, best_flame=False, half=False, as_printed=False)
-EMFOA_LITERAL = MothFlameRules(opposition=True, cauchy=True, best_flame=True, half=True, as_printed=True)
+EMFOA_LITERAL = MothFlameRules(
+    opposition=True, cauchy=True, best_flame=True, half=True, as_printed=True
+)
 
 
 def flames_left(flames: int, iteration: int, iterations: int) -> int:
@@ -52,7 +55,8 @@ def flame_counts(population: int, iterations: int, rules: MothFlameRules) -> NDA
 
     As printed, the count is taken from the last one instead of N, and collapses.
     """
-    counts, last = [], population
+    counts = []
+    last = population
     for iteration in range(1, iterations + 1):
         last = flames_left(last if rules.as_printed else population, iteration, iterations)
         counts.append(last)
@@ -97,7 +101,9 @@ def cauchy(uniform: Any) -> Any:
     return np.tan(np.pi * (uniform - 0.5))
 
 
-def moth_positions(moths: Any, own: Any, flames: Any, best: Any, now: Flight, scale: Any, uniform: Uniform) -> Any:
+def moth_positions(
+    moths: Any, own: Any, flames: Any, best: Any, now: Flight, scale: Any, uniform: Uniform
+) -> Any:
     """New positions: a spiral around the flame, attraction to the best flame, a Cauchy step (Eq. 8, 10, 12, 13, 17).
 
     Args:
@@ -117,7 +123,9 @@ def moth_positions(moths: Any, own: Any, flames: Any, best: Any, now: Flight, sc
     return position
 
 
-def opposites(members: Any, least: Any, greatest: Any, low: Any, high: Any, uniform: Uniform) -> Any:
+def opposites(
+    members: Any, least: Any, greatest: Any, low: Any, high: Any, uniform: Uniform
+) -> Any:
     """Elite opposition-based learning (Eq. 19-22).
 
     Args:
@@ -151,7 +159,9 @@ class FlightTable(NamedTuple):
 def flight_table(population: int, iterations: int, rules: MothFlameRules) -> FlightTable:
     """The flights of T iterations, computed in float32."""
     rows = [flight(np.float32(k) / np.float32(iterations), rules) for k in range(1, iterations + 1)]
-    return FlightTable(flame_counts(population, iterations, rules), np.array(rows, np.float32), rules.opposition)
+    return FlightTable(
+        flame_counts(population, iterations, rules), np.array(rows, np.float32), rules.opposition
+    )
 
 
 @lru_cache(maxsize=1)

@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts.flow import FlowResult
-from dynslam_bench.flow.degenerate import STATS_NAMES, clean_points, flow_stats, invalid_result, usable_points
+from dynslam_bench.flow.degenerate import (
+    STATS_NAMES,
+    clean_points,
+    flow_stats,
+    invalid_result,
+    usable_points,
+)
 from dynslam_bench.flow.settings import FlowMethodSettings
 
 Image = NDArray[np.uint8]
@@ -40,7 +46,9 @@ class LucasKanadeFlow:
     stats_names = STATS_NAMES
     smallest_side = 1
 
-    def __init__(self, settings: FlowMethodSettings | None = None, *, device: str = "cpu", threads: int = 1) -> None:
+    def __init__(
+        self, settings: FlowMethodSettings | None = None, *, device: str = "cpu", threads: int = 1
+    ) -> None:
         self.settings = settings or FlowMethodSettings()
 
     def configure(self, settings: FlowMethodSettings) -> None:
@@ -52,7 +60,13 @@ class LucasKanadeFlow:
         return np.ascontiguousarray(gray)
 
     def track(
-        self, reference: Image, target: Image, points: Points, *, guess: Points | None = None, seed: int = 0
+        self,
+        reference: Image,
+        target: Image,
+        points: Points,
+        *,
+        guess: Points | None = None,
+        seed: int = 0,
     ) -> FlowResult:
         """Find points of the reference in the target; see `FlowEstimator.track`."""
         cleaned = clean_points(reference, target, points)
@@ -68,7 +82,9 @@ class LucasKanadeFlow:
         xy, tracked, cost = self._follow(reference, target, clean, initial)
         valid = usable & tracked & usable_points(xy, target.shape)
         if self.settings.forward_backward_px > 0:
-            back, returned, _ = self._follow(target, reference, np.where(valid[:, None], xy, clean), clean)
+            back, returned, _ = self._follow(
+                target, reference, np.where(valid[:, None], xy, clean), clean
+            )
             valid &= returned & (np.hypot(*(back - clean).T) <= self.settings.forward_backward_px)
         xy = np.where(np.isfinite(xy), xy, clean).astype(np.float32)
         return FlowResult(xy, valid, cost, flow_stats(len(clean), int(valid.sum())))
@@ -92,7 +108,9 @@ class DisFlow(LucasKanadeFlow):
 
     smallest_side = SMALLEST_SIDE
 
-    def __init__(self, settings: FlowMethodSettings | None = None, *, device: str = "cpu", threads: int = 1) -> None:
+    def __init__(
+        self, settings: FlowMethodSettings | None = None, *, device: str = "cpu", threads: int = 1
+    ) -> None:
         super().__init__(settings)
         self._dis = cv2.DISOpticalFlow.create(PRESETS[self.settings.dis_preset])
 

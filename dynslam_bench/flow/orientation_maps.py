@@ -1,14 +1,15 @@
 """Convolved orientation maps for the processor: what DAISY needs of one image, computed once a frame.
 
-Eight rectified directional derivatives are blurred in a cascade of seven Gaussians. Maps of small Gaussians are stored
-at half, of large ones at quarter resolution. Each histogram is normalised on its own (partial normalisation) and stored
-as eight adjacent bytes, so that one descriptor histogram is one 64-bit load. `tests/flow/test_flow_daisy.py` follows
-the definition.
+Eight rectified directional derivatives are blurred in a cascade of seven Gaussians. Maps of small
+Gaussians are stored at half, of large ones at quarter resolution. Each histogram is normalised on
+its own (partial normalisation) and stored as eight adjacent bytes, so that one descriptor histogram
+is one 64-bit load. `tests/flow/test_flow_daisy.py` follows the definition.
 
-A Gaussian is replaced by the binomial of equal variance, made of rounded means: ``[1 4 6 4 1] / 16`` has variance 1 and
-``[1 2 1] / 4`` one half, times the square of the taps' distance (which may exceed one where the rows are smooth enough
-already). Rows move through short rings of lines that stay in the cache; neighbouring stripes compute the few lines that
-they share twice.
+A Gaussian is replaced by the binomial of equal variance, made of rounded means:
+``[1 4 6 4 1] / 16`` has variance 1 and ``[1 2 1] / 4`` one half, times the square of the taps'
+distance (which may exceed one where the rows are smooth enough already). Rows move through short
+rings of lines that stay in the cache; neighbouring stripes compute the few lines that they share
+twice.
 """
 
 from __future__ import annotations
@@ -68,8 +69,8 @@ class OrientationMaps:
         gray: uint8 ``[H, W]``, the image.
         framed: uint8 ``[H + 96, W + 96]``, the image with its edges repeated (`refinement.BORDER`).
         framed_half: uint8 ``[H / 2 + 96, W / 2 + 96]``, its mean over 2 x 2 pixels, likewise.
-        histograms: uint8 ``[total, 8]``, all levels as `layout.map_geometry` arranges them; a unit-norm histogram has
-            Euclidean length 255.
+        histograms: uint8 ``[total, 8]``, all levels as `layout.map_geometry` arranges them; a
+            unit-norm histogram has Euclidean length 255.
         side: Histograms and image for the kernels, without gradients.
         full_side: The same with gradients.
     """
@@ -88,8 +89,11 @@ class OrientationMaps:
 def gradient_magnitudes(gray: Bytes) -> Bytes:
     """The gradients' rounded magnitudes, uint8 ``[H, W]``, by central differences, edges repeated."""
     levels = np.pad(gray, 1, mode="edge").astype(np.float32)
-    gx, gy = levels[1:-1, 2:] - levels[1:-1, :-2], levels[2:, 1:-1] - levels[:-2, 1:-1]
-    return np.asarray(np.sqrt(gx * gx + gy * gy) * np.float32(0.5) + np.float32(0.5), dtype=np.uint8)
+    gx = levels[1:-1, 2:] - levels[1:-1, :-2]
+    gy = levels[2:, 1:-1] - levels[:-2, 1:-1]
+    return np.asarray(
+        np.sqrt(gx * gx + gy * gy) * np.float32(0.5) + np.float32(0.5), dtype=np.uint8
+    )
 
 
 def orientation_maps(
@@ -100,18 +104,25 @@ def orientation_maps(
     Args:
         gray: The image.
         workers: Threads over which rows are divided; None for the calling thread alone.
-        buffers: Takes the memory of maps once they are deleted, and gives it to the next ones of that size.
+        buffers: Takes the memory of maps once they are deleted, and gives it to the next ones of
+            that size.
     """
-    run, buffers = (workers or Workers()).run, [] if buffers is None else buffers
+    run = (workers or Workers()).run
+    buffers = [] if buffers is None else buffers
     gray = np.ascontiguousarray(gray)
     height, width = gray.shape
     geometry = map_geometry(height, width)
-    (rows, quarter_rows), (columns, quarter_columns) = ((max(1, n // 2), max(1, n // 4)) for n in gray.shape)
-    framed, framed_half = (height + 2 * BORDER, width + 2 * BORDER), (rows + 2 * BORDER, columns + 2 * BORDER)
+    (rows, quarter_rows), (columns, quarter_columns) = (
+        (max(1, n // 2), max(1, n // 4)) for n in gray.shape
+    )
+    framed = (height + 2 * BORDER, width + 2 * BORDER)
+    framed_half = (rows + 2 * BORDER, columns + 2 * BORDER)
     shapes = (geometry.total, layout.BINS), framed, framed_half
     while buffers and tuple(array.shape for array in buffers[-1]) != shapes:
         buffers.pop()
-    arrays = buffers.pop() if buffers else tuple(np.zeros(shape, dtype=np.uint8) for shape in shapes)
+    arrays = (
+        buffers.pop() if buffers else tuple(np.zeros(shape, dtype=np.uint8) for shape in shapes)
+    )
     histograms, whole, half = arrays  # used ones keep the zeros of their margins
     coarse = np.empty((quarter_rows, 32 * -(-8 * quarter_columns // 32)), dtype=np.uint16)
     floor = np.float32(NORM_FLOOR * FIXED_POINT)
@@ -119,7 +130,18 @@ def orientation_maps(
     fine = layout.LEVEL_STEPS.count(2)
     cells = histograms.reshape(-1)
     run(fine_levels, 0, -(-rows // 2), gray, half, blurs[:fine], geometry, floor, cells, coarse)
-    run(coarse_levels, 0, quarter_rows, coarse, quarter_columns, blurs[fine:], fine, geometry, floor, cells)
+    run(
+        coarse_levels,
+        0,
+        quarter_rows,
+        coarse,
+        quarter_columns,
+        blurs[fine:],
+        fine,
+        geometry,
+        floor,
+        cells,
+    )
     whole[BORDER:-BORDER, BORDER:-BORDER] = gray
     repeat_edges(half)
     repeat_edges(whole)
@@ -131,7 +153,10 @@ def orientation_maps(
 def repeat_edges(framed: NDArray[np.uint8]) -> None:
     """Fill the border of an image, `BORDER` wide, with its outermost pixels."""
     rows = framed[BORDER:-BORDER]
-    rows[:, :BORDER], rows[:, -BORDER:] = rows[:, BORDER : BORDER + 1], rows[:, -BORDER - 1 : -BORDER]
+    rows[:, :BORDER], rows[:, -BORDER:] = (
+        rows[:, BORDER : BORDER + 1],
+        rows[:, -BORDER - 1 : -BORDER],
+    )
     framed[:BORDER], framed[-BORDER:] = rows[0], rows[-1]
 
 
@@ -170,21 +195,38 @@ def smooth_line(
         out: uint16, flat, receives the row ...
         out_at: ... from this index on.
     """
-    length, pad = 8 * columns, 16 * distance
-    last, wrap = rows - 1, RING - 1
-    above, below = (max(row - distance, 0) & wrap) * pitch, (min(row + distance, last) & wrap) * pitch
-    far = (max(row - 2 * distance, 0) & wrap) * pitch, (min(row + 2 * distance, last) & wrap) * pitch
+    length = 8 * columns
+    pad = 16 * distance
+    last = rows - 1
+    wrap = RING - 1
+    above = (max(row - distance, 0) & wrap) * pitch
+    below = (min(row + distance, last) & wrap) * pitch
+    far = (
+        (max(row - 2 * distance, 0) & wrap) * pitch,
+        (min(row + 2 * distance, last) & wrap) * pitch,
+    )
     blur(ring, (row & wrap) * pitch, (above, below), far, taps, line, pad, length)
     for t in range(0, pad, 8):
         for k in range(8):
             line[t + k] = line[pad + k]
             line[pad + length + t + k] = line[pad + length - 8 + k]
     step = 8 * distance
-    blur(line, pad, (pad - step, pad + step), (pad - 2 * step, pad + 2 * step), taps, out, out_at, length)
+    blur(
+        line,
+        pad,
+        (pad - step, pad + step),
+        (pad - 2 * step, pad + 2 * step),
+        taps,
+        out,
+        out_at,
+        length,
+    )
 
 
 @inlined
-def normalise_line(line: Halves, at: int, columns: int, floor: float, cells: Bytes, first: int) -> None:
+def normalise_line(
+    line: Halves, at: int, columns: int, floor: float, cells: Bytes, first: int
+) -> None:
     """Partially normalised bytes of one row; bytes that the last vector writes into the margin are cleared."""
     length = 8 * columns
     for i in range(0, length, 32):
@@ -197,7 +239,8 @@ def normalise_line(line: Halves, at: int, columns: int, floor: float, cells: Byt
 def sum_line(gray: Bytes, row: int, sums: Halves, at: int, columns: int) -> None:
     """Sums over 2 x 2 pixels of one half-resolution row, with one repeated number on either side."""
     height, width = gray.shape
-    upper, lower = gray[min(2 * row, height - 1)], gray[min(2 * row + 1, height - 1)]
+    upper = gray[min(2 * row, height - 1)]
+    lower = gray[min(2 * row + 1, height - 1)]
     for x in range(min(columns, width // 2)):
         sums[at + x] = np.uint16(
             (np.uint16(upper[2 * x]) + np.uint16(upper[2 * x + 1]))
@@ -216,7 +259,9 @@ def quarter_line(rows: Halves, upper: int, lower: int, columns: int, target: Hal
             rows[row + 8 * columns + k] = rows[row + 8 * columns - 8 + k]
     for i in range(0, len(target) - 31, 32):
         left = average(load_uint16(rows, upper + 2 * i), load_uint16(rows, lower + 2 * i))
-        right = average(load_uint16(rows, upper + 2 * i + 32), load_uint16(rows, lower + 2 * i + 32))
+        right = average(
+            load_uint16(rows, upper + 2 * i + 32), load_uint16(rows, lower + 2 * i + 32)
+        )
         store_uint16(target, i, average_of_pairs(left, right))
 
 
@@ -255,12 +300,15 @@ def blur_cascade(
     """
     y = row
     for level in range(len(blurs)):
-        taps, distance = blurs[level, 0], blurs[level, 1]
+        taps = blurs[level, 0]
+        distance = blurs[level, 1]
         y -= (taps // 2) * distance
         if not (max(top - reach[level + 1], 0) <= y < min(bottom + reach[level + 1], rows)):
             continue
         at = (y & (RING - 1)) * pitch
-        smooth_line(rings[level], pitch, y, rows, columns, taps, distance, line, rings[level + 1], at)
+        smooth_line(
+            rings[level], pitch, y, rows, columns, taps, distance, line, rings[level + 1], at
+        )
         if top <= y < bottom:
             number = first_level + level
             cell = geometry.base[number] + (margin + y) * geometry.stride[number] + margin
@@ -284,17 +332,23 @@ def fine_levels(
         geometry: `layout.MapGeometry`.
         floor: Added to norms.
         cells: uint8, flat, all levels' histograms.
-        coarse: uint16 ``[quarter rows, >= 8 quarter columns]``, receives the means of 2 x 2 histograms.
+        coarse: uint16 ``[quarter rows, >= 8 quarter columns]``, receives the means of 2 x 2
+            histograms.
     """
-    rows, columns = half.shape[0] - 2 * BORDER, half.shape[1] - 2 * BORDER
-    levels, length = len(blurs), 32 * ((8 * columns + 31) // 32)
-    pitch, sum_pitch = length + SPILL, columns + 2 + SPILL
+    rows = half.shape[0] - 2 * BORDER
+    columns = half.shape[1] - 2 * BORDER
+    levels = len(blurs)
+    length = 32 * ((8 * columns + 31) // 32)
+    pitch = length + SPILL
+    sum_pitch = columns + 2 + SPILL
     rings = np.zeros((levels + 1, RING * pitch), dtype=np.uint16)
     line = np.zeros(length + 32 * np.max(blurs[:, 1]) + SPILL, dtype=np.uint16)
     sums = np.zeros(4 * sum_pitch, dtype=np.uint16)
-    top, bottom = 2 * start, min(2 * stop, rows)
+    top = 2 * start
+    bottom = min(2 * stop, rows)
     reach = level_reach(blurs)
-    first, summed = max(top - reach[0], 0), max(top - reach[0] - 1, 0)
+    first = max(top - reach[0], 0)
+    summed = max(top - reach[0] - 1, 0)
     for row in range(first, bottom + reach[0]):
         if row < min(bottom + reach[0], rows):
             while summed <= min(row + 1, rows - 1):
@@ -306,16 +360,20 @@ def fine_levels(
                         target[BORDER + x] = np.uint8((sums[at + x] + np.uint16(2)) >> np.uint16(2))
                 summed += 1
             here = (row & 3) * sum_pitch + 1
-            above, below = (max(row - 1, 0) & 3) * sum_pitch + 1, (min(row + 1, rows - 1) & 3) * sum_pitch + 1
+            above = (max(row - 1, 0) & 3) * sum_pitch + 1
+            below = (min(row + 1, rows - 1) & 3) * sum_pitch + 1
             at = (row & (RING - 1)) * pitch
             for x in range(0, columns, 4):
-                store_uint16(rings[0], at + 8 * x, derivatives(sums, here + x, above + x, below + x))
+                store_uint16(
+                    rings[0], at + 8 * x, derivatives(sums, here + x, above + x, below + x)
+                )
         y = blur_cascade(
             rings, pitch, row, rows, columns, top, bottom, blurs, reach, 0, geometry, layout.MARGIN // 2, floor, cells,
             line,
         )  # fmt: skip
         if top <= y < bottom and (y & 1 or rows == 1) and y // 2 < len(coarse):
-            upper, lower = ((y & ~1) & (RING - 1)) * pitch, (y & (RING - 1)) * pitch
+            upper = ((y & ~1) & (RING - 1)) * pitch
+            lower = (y & (RING - 1)) * pitch
             quarter_line(rings[levels], upper, lower, columns, coarse[y // 2])
 
 
@@ -337,14 +395,16 @@ def coarse_levels(
         floor: Added to norms.
         cells: uint8, flat, all levels' histograms.
     """
-    rows, length = len(coarse), 32 * ((8 * columns + 31) // 32)
+    rows = len(coarse)
+    length = 32 * ((8 * columns + 31) // 32)
     pitch = length + SPILL
     rings = np.zeros((len(blurs) + 1, RING * pitch), dtype=np.uint16)
     line = np.zeros(length + 32 * np.max(blurs[:, 1]) + SPILL, dtype=np.uint16)
     reach = level_reach(blurs)
     for row in range(max(start - reach[0], 0), stop + reach[0]):
         if row < rows:
-            source, at = coarse[row], (row & (RING - 1)) * pitch
+            source = coarse[row]
+            at = (row & (RING - 1)) * pitch
             for i in range(0, length, 32):
                 store_uint16(rings[0], at + i, load_uint16(source, i))
         blur_cascade(

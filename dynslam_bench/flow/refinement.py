@@ -1,7 +1,8 @@
 """Photometric refinement of labels: Lucas-Kanade with four degrees of freedom.
 
-Inverse compositional (Baker and Matthews 2004): template gradients and Hessian are computed once a point, the label's
-warp is updated until it converges. Patch means are removed, so that a change of brightness has no influence.
+Inverse compositional (Baker and Matthews 2004): template gradients and Hessian are computed once a
+point, the label's warp is updated until it converges. Patch means are removed, so that a change of
+brightness has no influence.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ class Window(NamedTuple):
         step: Full-image pixels a pixel of the images.
         radius: In pixels of the images.
         margin: Largest translation within one warp, in their pixels, at least 1.
-        warps: Times the target is warped, at most: once, or twice with a change of scale and rotation between.
+        warps: Times the target is warped, at most: once, or twice with a change of scale and
+            rotation between.
         iterations: Translations a warp, at most.
         tolerance: Stop below this change, in their pixels.
     """
@@ -59,9 +61,12 @@ class Window(NamedTuple):
 @inlined
 def read_frame(image: Bytes, x: Scalar, y: Scalar, rows: int, pitch: int, out: Floats) -> None:
     """Bilinear samples, one pixel apart, of `rows` rows of `pitch` columns from position (x, y) on."""
-    flat, stride = image.reshape(-1), np.int64(image.shape[1])
-    column, row = np.int64(x), np.int64(y)
-    right, lower = spread(x - np.float32(column)), spread(y - np.float32(row))
+    flat = image.reshape(-1)
+    stride = np.int64(image.shape[1])
+    column = np.int64(x)
+    row = np.int64(y)
+    right = spread(x - np.float32(column))
+    lower = spread(y - np.float32(row))
     for block in range((pitch + 15) // 16):
         first = min(16 * block, max(pitch - 16, 0))
         at = row * stride + column + first
@@ -81,10 +86,14 @@ def warp_patch(
     out: Floats,
 ) -> None:  # fmt: skip
     """Samples of a square patch of radius `reach` under the similarity ``[[a, -b], [b, a]]`` around (x, y)."""
-    one, far = np.float32(65536), np.float32(reach)
-    column, row = np.int32((x - a * far + b * far) * one), np.int32((y - b * far - a * far) * one)
-    step_x, step_y = np.int32(a * one), np.int32(b * one)
-    flat, stride = image.reshape(-1), np.int64(image.shape[1])
+    one = np.float32(65536)
+    far = np.float32(reach)
+    column = np.int32((x - a * far + b * far) * one)
+    row = np.int32((y - b * far - a * far) * one)
+    step_x = np.int32(a * one)
+    step_y = np.int32(b * one)
+    flat = image.reshape(-1)
+    stride = np.int64(image.shape[1])
     for k in range(0, len(columns), 16):
         store_offsets(scratch, columns, rows, k, column, row, step_x, step_y, np.int32(stride))
     for k in range(len(columns)):
@@ -100,46 +109,60 @@ def similarity_lucas_kanade(
 ) -> None:  # fmt: skip
     """Refine labels by photometric alignment of a square window.
 
-    The target is warped by the label into the template's frame. Within that patch only the translation changes (cheap);
-    between two warps scale and rotation are corrected as well. A label changes only if the windows'
-    correlation grows.
+    The target is warped by the label into the template's frame. Within that patch only the
+    translation changes (cheap); between two warps scale and rotation are corrected as well. A label
+    changes only if the windows' correlation grows.
 
-    All windows are flat arrays at the patch's pitch, so that a shift by whole pixels is an offset. Elements outside the
-    window have zero gradients and mask.
+    All windows are flat arrays at the patch's pitch, so that a shift by whole pixels is an offset.
+    Elements outside the window have zero gradients and mask.
 
     Args:
         start: First point.
         stop: One past the last.
         points: float32 ``[N, 2]``, full-image pixels of the template image.
         labels: float32 ``[N, 4]``, changed in place.
-        template_image: uint8 ``[h + 2 BORDER, w + 2 BORDER]``, at 1 / `step` of the full resolution, edges repeated.
+        template_image: uint8 ``[h + 2 BORDER, w + 2 BORDER]``, at 1 / `step` of the full
+            resolution, edges repeated.
         target_image: Likewise.
         window: `Window`, and when to stop.
-        correlation: float32 ``[N]``, filled with the windows' zero-mean normalised correlation, -1 if flat or outside.
+        correlation: float32 ``[N]``, filled with the windows' zero-mean normalised correlation, -1
+            if flat or outside.
     """
     step, radius, margin, warps, iterations, tolerance = window
     border = BORDER
-    side, reach = 2 * radius + 1, radius + margin
+    side = 2 * radius + 1
+    reach = radius + margin
     pitch = 2 * reach + 1
     length = 16 * ((side * pitch + 15) // 16)
     slack = 2 * pitch + 32
     patch = np.zeros(16 * ((pitch * pitch + 15) // 16) + slack, dtype=np.float32)
-    grid_columns, grid_rows = np.zeros(len(patch) - slack, dtype=np.int32), np.zeros(len(patch) - slack, dtype=np.int32)
+    grid_columns = np.zeros(len(patch) - slack, dtype=np.int32)
+    grid_rows = np.zeros(len(patch) - slack, dtype=np.int32)
     scratch = np.empty(len(patch) - slack, dtype=np.int32)
     for k in range(pitch * pitch):
-        grid_columns[k], grid_rows[k] = k % pitch, k // pitch
+        grid_columns[k] = k % pitch
+        grid_rows[k] = k // pitch
     frame = np.zeros((side + 2) * pitch + slack, dtype=np.float32)
-    template, mask = np.zeros(length, dtype=np.float32), np.zeros(length, dtype=np.float32)
-    gradient_x, gradient_y = np.zeros(length, dtype=np.float32), np.zeros(length, dtype=np.float32)
-    right, down = np.zeros(length, dtype=np.float32), np.zeros(length, dtype=np.float32)
+    template = np.zeros(length, dtype=np.float32)
+    mask = np.zeros(length, dtype=np.float32)
+    gradient_x = np.zeros(length, dtype=np.float32)
+    gradient_y = np.zeros(length, dtype=np.float32)
+    right = np.zeros(length, dtype=np.float32)
+    down = np.zeros(length, dtype=np.float32)
     for y in range(side):
         for x in range(side):
             k = y * pitch + x
-            mask[k], right[k], down[k] = np.float32(1), np.float32(x - radius), np.float32(y - radius)
-    h, g = np.empty((4, 4), dtype=np.float64), np.empty(4, dtype=np.float64)
+            mask[k], right[k], down[k] = (
+                np.float32(1),
+                np.float32(x - radius),
+                np.float32(y - radius),
+            )
+    h = np.empty((4, 4), dtype=np.float64)
+    g = np.empty(4, dtype=np.float64)
     rows, columns = target_image.shape
     n = np.float64(side * side)
-    half, zero = np.float32(0.5), spread(np.float32(0))
+    half = np.float32(0.5)
+    zero = spread(np.float32(0))
     scale_down = np.float32(1) / np.float32(step)
     limit = np.float32(margin) - np.float32(0.01)
     room = np.float32(radius + 2)
@@ -149,62 +172,119 @@ def similarity_lucas_kanade(
         py = (points[i, 1] + half) * scale_down - half + border
         if not (px >= room and py >= room and px < columns - room - 17 and py < rows - room - 2):
             continue
-        read_frame(template_image, px - np.float32(radius + 1), py - np.float32(radius + 1), side + 2, pitch, frame)
-        sum_t, sum_x, sum_y, xx, xy, yy = zero, zero, zero, zero, zero, zero
+        read_frame(
+            template_image,
+            px - np.float32(radius + 1),
+            py - np.float32(radius + 1),
+            side + 2,
+            pitch,
+            frame,
+        )
+        sum_t = zero
+        sum_x = zero
+        sum_y = zero
+        xx = zero
+        xy = zero
+        yy = zero
         for k in range(0, length, 16):
             inside = load(mask, k)
             gx = inside * (load(frame, k + pitch + 2) - load(frame, k + pitch))
             gy = inside * (load(frame, k + 2 * pitch + 1) - load(frame, k + 1))
             sum_t = sum_t + inside * load(frame, k + pitch + 1)
-            sum_x, sum_y = sum_x + gx, sum_y + gy
-            xx, xy, yy = xx + gx * gx, xy + gx * gy, yy + gy * gy
+            sum_x = sum_x + gx
+            sum_y = sum_y + gy
+            xx = xx + gx * gx
+            xy = xy + gx * gy
+            yy = yy + gy * gy
             store(gradient_x, k, gx)
             store(gradient_y, k, gy)
-        j0, j1 = np.float64(total(sum_x)), np.float64(total(sum_y))
+        j0 = np.float64(total(sum_x))
+        j1 = np.float64(total(sum_y))
         # differences over two pixels
-        h00, h01, h11 = total(xx) - j0 * j0 / n, total(xy) - j0 * j1 / n, total(yy) - j1 * j1 / n
-        trace, determinant = h00 + h11, h00 * h11 - h01 * h01
+        h00 = total(xx) - j0 * j0 / n
+        h01 = total(xy) - j0 * j1 / n
+        h11 = total(yy) - j1 * j1 / n
+        trace = h00 + h11
+        determinant = h00 * h11 - h01 * h01
         smaller = 0.5 * (trace - np.sqrt(max(trace * trace - 4 * determinant, 0.0)))
         if not smaller >= n * FLAT_GRADIENT:
             continue
         mean_t = spread(np.float32(total(sum_t) / n))
-        tt, xt, yt = zero, zero, zero
+        tt = zero
+        xt = zero
+        yt = zero
         for k in range(0, length, 16):
             t = load(mask, k) * (load(frame, k + pitch + 1) - mean_t)
-            tt, xt, yt = tt + t * t, xt + t * load(gradient_x, k), yt + t * load(gradient_y, k)
+            tt = tt + t * t
+            xt = xt + t * load(gradient_x, k)
+            yt = yt + t * load(gradient_y, k)
             store(template, k, t)
-        energy, rest0, rest1 = np.float64(total(tt)), np.float64(total(xt)), np.float64(total(yt))
+        energy = np.float64(total(tt))
+        rest0 = np.float64(total(xt))
+        rest1 = np.float64(total(yt))
         if energy < n * FLAT_VARIANCE:
             continue
         scale = np.float32(np.exp2(labels[i, 2]))
-        a, b = scale * np.float32(np.cos(labels[i, 3])), scale * np.float32(np.sin(labels[i, 3]))
+        a = scale * np.float32(np.cos(labels[i, 3]))
+        b = scale * np.float32(np.sin(labels[i, 3]))
         tx = (points[i, 0] + labels[i, 0] + half) * scale_down - half + border
         ty = (points[i, 1] + labels[i, 1] + half) * scale_down - half + border
-        first, best = np.float32(-1), np.float32(-1)
-        best_a, best_b, best_x, best_y = a, b, tx, ty
+        first = np.float32(-1)
+        best = np.float32(-1)
+        best_a = a
+        best_b = b
+        best_x = tx
+        best_y = ty
         for warp in range(warps):
             span = (abs(a) + abs(b)) * np.float32(reach) + np.float32(2)
-            least, most_x, most_y = max(span, np.float32(border)), columns - border - 1, rows - border - 1
-            if not (least <= tx <= most_x and least <= ty <= most_y and tx < columns - span and ty < rows - span):
+            least = max(span, np.float32(border))
+            most_x = columns - border - 1
+            most_y = rows - border - 1
+            if not (
+                least <= tx <= most_x
+                and least <= ty <= most_y
+                and tx < columns - span
+                and ty < rows - span
+            ):
                 break
             warp_patch(target_image, tx, ty, a, b, reach, grid_columns, grid_rows, scratch, patch)
             ox = oy = np.float32(0)
             mean = 0.0
-            at, w00, w01, w10, w11 = np.int64(0), zero, zero, zero, zero
+            at = np.int64(0)
+            w00 = zero
+            w01 = zero
+            w10 = zero
+            w11 = zero
             for iteration in range(iterations + 1):
-                left, top = ox + np.float32(margin), oy + np.float32(margin)
-                column, row = np.int64(left), np.int64(top)
-                fx, fy = left - np.float32(column), top - np.float32(row)
-                at, w11 = row * pitch + column, spread(fx * fy)
-                w01, w10 = spread(fx - fx * fy), spread(fy - fx * fy)
+                left = ox + np.float32(margin)
+                top = oy + np.float32(margin)
+                column = np.int64(left)
+                row = np.int64(top)
+                fx = left - np.float32(column)
+                fy = top - np.float32(row)
+                at = row * pitch + column
+                w11 = spread(fx * fy)
+                w01 = spread(fx - fx * fy)
+                w10 = spread(fy - fx * fy)
                 w00 = spread(np.float32(1) - fx - fy + fx * fy)
-                sum_w, ww, wt, wx, wy = zero, zero, zero, zero, zero
+                sum_w = zero
+                ww = zero
+                wt = zero
+                wx = zero
+                wy = zero
                 for k in range(0, length, 16):
                     j = at + k
-                    w = w00 * load(patch, j) + w01 * load(patch, j + 1) + w10 * load(patch, j + pitch)
+                    w = (
+                        w00 * load(patch, j)
+                        + w01 * load(patch, j + 1)
+                        + w10 * load(patch, j + pitch)
+                    )
                     w = load(mask, k) * (w + w11 * load(patch, j + pitch + 1) - mean_t)
-                    sum_w, ww, wt = sum_w + w, ww + w * w, wt + w * load(template, k)
-                    wx, wy = wx + w * load(gradient_x, k), wy + w * load(gradient_y, k)
+                    sum_w = sum_w + w
+                    ww = ww + w * w
+                    wt = wt + w * load(template, k)
+                    wx = wx + w * load(gradient_x, k)
+                    wy = wy + w * load(gradient_y, k)
                 sum_of_w = np.float64(total(sum_w))
                 mean = sum_of_w / n
                 variance = total(ww) - mean * sum_of_w
@@ -214,39 +294,77 @@ def similarity_lucas_kanade(
                 if warp == 0 and iteration == 0:
                     first = score
                 if score > best:
-                    best, best_a, best_b = score, a, b
-                    best_x, best_y = tx + a * ox - b * oy, ty + b * ox + a * oy
+                    best = score
+                    best_a = a
+                    best_b = b
+                    best_x = tx + a * ox - b * oy
+                    best_y = ty + b * ox + a * oy
                 g[0], g[1] = total(wx) - mean * j0 - rest0, total(wy) - mean * j1 - rest1
                 if iteration == iterations:
                     break
                 d0 = np.float32(2 * (h11 * g[0] - h01 * g[1]) / determinant)
                 d1 = np.float32(2 * (h00 * g[1] - h01 * g[0]) / determinant)
-                ox, oy = ox - d0, oy - d1
+                ox = ox - d0
+                oy = oy - d1
                 if not (abs(ox) < limit and abs(oy) < limit):
-                    ox, oy = min(max(ox, -limit), limit), min(max(oy, -limit), limit)
+                    ox = min(max(ox, -limit), limit)
+                    oy = min(max(oy, -limit), limit)
                     break
                 if d0 * d0 + d1 * d1 < tolerance * tolerance:
                     break
-            mx, my = a * ox - b * oy, b * ox + a * oy
-            tx, ty = tx + mx, ty + my
+            mx = a * ox - b * oy
+            my = b * ox + a * oy
+            tx = tx + mx
+            ty = ty + my
             if warp == warps - 1:
                 break
             # the change of scale and rotation
-            sum_s, sum_r, sx, sy, rx, ry = zero, zero, zero, zero, zero, zero
-            ss, rr, rs, st, rt, ws, wr = zero, zero, zero, zero, zero, zero, zero
+            sum_s = zero
+            sum_r = zero
+            sx = zero
+            sy = zero
+            rx = zero
+            ry = zero
+            ss = zero
+            rr = zero
+            rs = zero
+            st = zero
+            rt = zero
+            ws = zero
+            wr = zero
             for k in range(0, length, 16):
                 j = at + k
                 w = w00 * load(patch, j) + w01 * load(patch, j + 1) + w10 * load(patch, j + pitch)
                 w = w + w11 * load(patch, j + pitch + 1) - mean_t
-                gx, gy, dx, dy = load(gradient_x, k), load(gradient_y, k), load(right, k), load(down, k)
-                swell, turn, t = gx * dx + gy * dy, gy * dx - gx * dy, load(template, k)
-                sum_s, sum_r = sum_s + swell, sum_r + turn
-                sx, sy, rx, ry = sx + swell * gx, sy + swell * gy, rx + turn * gx, ry + turn * gy
-                ss, rr, rs = ss + swell * swell, rr + turn * turn, rs + turn * swell
-                st, rt, ws, wr = st + swell * t, rt + turn * t, ws + w * swell, wr + w * turn
-            j2, j3 = np.float64(total(sum_s)), np.float64(total(sum_r))
-            g[2], g[3] = total(ws) - mean * j2 - np.float64(total(st)), total(wr) - mean * j3 - np.float64(total(rt))
-            h[0, 0], h[1, 0], h[1, 1] = h00, h01, h11
+                gx = load(gradient_x, k)
+                gy = load(gradient_y, k)
+                dx = load(right, k)
+                dy = load(down, k)
+                swell = gx * dx + gy * dy
+                turn = gy * dx - gx * dy
+                t = load(template, k)
+                sum_s = sum_s + swell
+                sum_r = sum_r + turn
+                sx = sx + swell * gx
+                sy = sy + swell * gy
+                rx = rx + turn * gx
+                ry = ry + turn * gy
+                ss = ss + swell * swell
+                rr = rr + turn * turn
+                rs = rs + turn * swell
+                st = st + swell * t
+                rt = rt + turn * t
+                ws = ws + w * swell
+                wr = wr + w * turn
+            j2 = np.float64(total(sum_s))
+            j3 = np.float64(total(sum_r))
+            g[2], g[3] = (
+                total(ws) - mean * j2 - np.float64(total(st)),
+                total(wr) - mean * j3 - np.float64(total(rt)),
+            )
+            h[0, 0] = h00
+            h[1, 0] = h01
+            h[1, 1] = h11
             h[2, 0], h[2, 1] = total(sx) - j2 * j0 / n, total(sy) - j2 * j1 / n
             h[3, 0], h[3, 1] = total(rx) - j3 * j0 / n, total(ry) - j3 * j1 / n
             damping = SIMILARITY_DAMPING * trace * (radius * radius)
@@ -254,7 +372,8 @@ def similarity_lucas_kanade(
             h[3, 2] = total(rs) - j3 * j2 / n
             if not cholesky_solve(h, g):
                 break
-            da, db = np.float32(1) + 2 * np.float32(g[2]), 2 * np.float32(g[3])
+            da = np.float32(1) + 2 * np.float32(g[2])
+            db = 2 * np.float32(g[3])
             size = da * da + db * db
             if not 0.25 < size < 4:
                 break

@@ -22,7 +22,9 @@ BUILT_IN = (
         "pyramidal Lucas-Kanade (OpenCV)",
         "Apache-2.0",
     ),
-    FlowSpec("dis", "dynslam_bench.flow.opencv:DisFlow", "dense inverse search (OpenCV)", "Apache-2.0"),
+    FlowSpec(
+        "dis", "dynslam_bench.flow.opencv:DisFlow", "dense inverse search (OpenCV)", "Apache-2.0"
+    ),
 )
 
 FLOWS: Registry[FlowSpec] = Registry("flow", FlowSpec, lambda: BUILT_IN)
@@ -37,7 +39,9 @@ def spec_of(settings: FlowMethodSettings) -> FlowSpec:
     return FLOWS.get(settings.plugin or settings.method)
 
 
-def build_flow(settings: FlowMethodSettings | None = None, *, device: str = "cpu", threads: int = 1) -> FlowEstimator:
+def build_flow(
+    settings: FlowMethodSettings | None = None, *, device: str = "cpu", threads: int = 1
+) -> FlowEstimator:
     """Load and construct the flow that the settings name.
 
     Args:

@@ -18,12 +18,17 @@ class FlowMethodSettings(Settings):
     """What every flow has, and the few options of the OpenCV flows; enough for Lucas-Kanade and DIS."""
 
     method: Literal["daisy", "lucas-kanade", "dis"] = Field(
-        "daisy", description="DAISY Filter Flow with a label search, pyramidal Lucas-Kanade, or dense inverse search"
+        "daisy",
+        description="DAISY Filter Flow with a label search, pyramidal Lucas-Kanade, or dense inverse search",
     )
     plugin: str = names(
-        "", "flow", meaning="id, module:Attr or file.py:Attr of a flow plug-in that takes the place of `method`"
+        "",
+        "flow",
+        meaning="id, module:Attr or file.py:Attr of a flow plug-in that takes the place of `method`",
     )
-    window_px: int = Field(21, ge=3, le=101, description="Lucas-Kanade: side of the window in pixels, odd")
+    window_px: int = Field(
+        21, ge=3, le=101, description="Lucas-Kanade: side of the window in pixels, odd"
+    )
     dis_preset: Literal["ultrafast", "fast", "medium"] = Field(
         "medium", description="dense inverse search: OpenCV's preset"
     )
@@ -45,29 +50,48 @@ class DaisySettings(FlowMethodSettings):
         64, low=24, high=384, limits=(8, 4096), scale="log", online=True,
         meaning="cost evaluations a point in the label search",
     )  # fmt: skip
-    population: int = tunable(6, low=4, high=16, limits=(2, 32), meaning="moths (and flames) a point or superpixel")
-    sweeps: int = tunable(4, low=1, high=8, limits=(1, 32), meaning="times neighbours exchange their best labels")
+    population: int = tunable(
+        6, low=4, high=16, limits=(2, 32), meaning="moths (and flames) a point or superpixel"
+    )
+    sweeps: int = tunable(
+        4, low=1, high=8, limits=(1, 32), meaning="times neighbours exchange their best labels"
+    )
     cauchy_step_px: float = tunable(
-        2.0, low=0.25, high=16.0, scale="log", unit="px", meaning="scale of the Cauchy steps of Eq. 13"
+        2.0,
+        low=0.25,
+        high=16.0,
+        scale="log",
+        unit="px",
+        meaning="scale of the Cauchy steps of Eq. 13",
     )
     range_px: float = tunable(
         96.0, low=16.0, high=192.0, limits=(1.0, 1024.0), scale="log", unit="px", online=True,
         meaning="largest displacement searched, around the guess where there is one",
     )  # fmt: skip
-    neighbours: int = Field(4, ge=0, le=8, description="neighbours whose labels are tried in each sweep")
-    similarity_seeds: bool = Field(
-        True, description="between sweeps, try the two similarity motions with which most points agree"
+    neighbours: int = Field(
+        4, ge=0, le=8, description="neighbours whose labels are tried in each sweep"
     )
-    scale_range_octaves: float = Field(1.0, ge=0.0, le=1.25, description="largest change of scale searched, both ways")
-    rotation_range_deg: float = Field(45.0, ge=0.0, le=45.0, description="largest rotation searched, both ways")
+    similarity_seeds: bool = Field(
+        True,
+        description="between sweeps, try the two similarity motions with which most points agree",
+    )
+    scale_range_octaves: float = Field(
+        1.0, ge=0.0, le=1.25, description="largest change of scale searched, both ways"
+    )
+    rotation_range_deg: float = Field(
+        45.0, ge=0.0, le=45.0, description="largest rotation searched, both ways"
+    )
     terms: Literal[1, 3] = Field(
-        1, description="terms of Eq. 1: the descriptors' alone, as in DAISY Filter Flow, or grey level and gradient too"
+        1,
+        description="terms of Eq. 1: the descriptors' alone, as in DAISY Filter Flow, or grey level and gradient too",
     )
     refinement: Literal["none", "lucas-kanade"] = Field(
         "lucas-kanade",
         description="sub-pixel step: none, or a parabola through the costs and a similarity Lucas-Kanade",
     )
-    refinement_window_px: int = Field(17, ge=5, le=41, description="side of the refinement's window, odd")
+    refinement_window_px: int = Field(
+        17, ge=5, le=41, description="side of the refinement's window, odd"
+    )
 
 
 class FlowSettings(DaisySettings):
@@ -77,7 +101,9 @@ class FlowSettings(DaisySettings):
         0.85, low=0.5, high=0.97, limits=(-1.0, 1.0), online=True,
         meaning="zero-mean normalised correlation of the refined windows below which a point is not valid",
     )  # fmt: skip
-    support: Literal[1, 5, 9] = Field(1, description="points around each point over which Eq. 1 is summed (Eq. 6)")
+    support: Literal[1, 5, 9] = Field(
+        1, description="points around each point over which Eq. 1 is summed (Eq. 6)"
+    )
     support_spacing_px: int = Field(4, ge=1, le=64, description="distance of those points")
 
 
@@ -92,20 +118,29 @@ class DenseFlowSettings(DaisySettings):
         96, low=24, high=384, limits=(8, 4096), scale="log", online=True,
         meaning="cost evaluations a superpixel in the label search",
     )  # fmt: skip
-    sweeps: int = tunable(6, low=1, high=8, limits=(1, 32), meaning="times neighbours exchange their best labels")
+    sweeps: int = tunable(
+        6, low=1, high=8, limits=(1, 32), meaning="times neighbours exchange their best labels"
+    )
     superpixel_px: int = Field(16, ge=4, le=128, description="side of a superpixel")
     candidates: int = Field(
-        2, ge=1, le=9, description="labels tried at each pixel: its superpixel's own and its neighbours'"
+        2,
+        ge=1,
+        le=9,
+        description="labels tried at each pixel: its superpixel's own and its neighbours'",
     )
     filter_radius_px: int = Field(5, ge=2, le=32, description="guided filter's radius (Eq. 2)")
     filter_epsilon: float = Field(
-        0.01, ge=1e-9, le=10.0, description="guided filter's regularisation, images in [0, 1] (Eq. 2)"
+        0.01,
+        ge=1e-9,
+        le=10.0,
+        description="guided filter's regularisation, images in [0, 1] (Eq. 2)",
     )
     consistency_px: float = Field(
         3.0, gt=0.0, le=100.0, description="largest forward-backward error of a consistent pixel"
     )
     second_round: bool = Field(
-        True, description="try on regions with inconsistent pixels the motion that regions nearby suggest"
+        True,
+        description="try on regions with inconsistent pixels the motion that regions nearby suggest",
     )
 
 
@@ -116,5 +151,8 @@ class PublishedFlowSettings(FlowMethodSettings):
         "lucas-kanade", description="which flow; the published one is Lucas-Kanade"
     )
     forward_backward_px: float = Field(
-        0.0, ge=0.0, le=100.0, description="largest forward-backward error in pixels; 0, no check, as published"
+        0.0,
+        ge=0.0,
+        le=100.0,
+        description="largest forward-backward error in pixels; 0, no check, as published",
     )

@@ -1,7 +1,7 @@
 """DAISY Filter Flow at sparse points, as SLAM needs it: no labels are computed for other pixels.
 
-For each point: a label search over the matching cost (Eq. 1) with propagation between neighbouring points, then
-sub-pixel refinement, then a forward-backward check.
+For each point: a label search over the matching cost (Eq. 1) with propagation between neighbouring
+points, then sub-pixel refinement, then a forward-backward check.
 """
 
 from __future__ import annotations
@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts.flow import FlowResult
 from dynslam_bench.flow import layout
-from dynslam_bench.flow.degenerate import STATS_NAMES, clean_points, flow_stats, invalid_result, usable_points
+from dynslam_bench.flow.degenerate import (
+    STATS_NAMES,
+    clean_points,
+    flow_stats,
+    invalid_result,
+    usable_points,
+)
 from dynslam_bench.flow.label_search import (
     STRATEGIES,
     common_motions,
@@ -33,7 +39,8 @@ from dynslam_bench.flow.workers import Workers
 PARABOLA_STEP_PX = np.float32(2.0)
 COARSE = Window(step=2, radius=7, margin=3, warps=2)
 """The refinement at half resolution."""
-CONSENSUS_PX, CONSENSUS_MARGIN = 3.0, 0.02
+CONSENSUS_PX = 3.0
+CONSENSUS_MARGIN = 0.02
 
 
 class Pair(NamedTuple):
@@ -92,54 +99,84 @@ class SparseDaisyFlow:
         xy, usable = cleaned
         if not usable.any():
             return invalid_result(xy, degenerate=False)
-        settings, points = self.settings, xy[usable]
+        settings = self.settings
+        points = xy[usable]
         pair = self.pair(reference, target)
         if guess is not None:
             guess = np.asarray(guess, dtype=np.float32).reshape(-1, 2)[usable]
-        costs = self.describe(reference, points, pair.tables), side_of(target, pair.tables), pair.tables
+        costs = (
+            self.describe(reference, points, pair.tables),
+            side_of(target, pair.tables),
+            pair.tables,
+        )
         neighbours = nearest(points, self.workers.run)
         state = search_labels(settings, self.workers.run, costs, neighbours, guess, seed)
-        labels, cost, evaluations = state.flames[:, 0].copy(), state.costs[:, 0], state.used
+        labels = state.flames[:, 0].copy()
+        cost = state.costs[:, 0]
+        evaluations = state.used
         if settings.refinement == "lucas-kanade":
-            self.workers.run(parabola, 0, len(points), labels, PARABOLA_STEP_PX, *costs, evaluations)
+            self.workers.run(
+                parabola, 0, len(points), labels, PARABOLA_STEP_PX, *costs, evaluations
+            )
         good = (cost < MAX_COST * pair.tables.ceiling) & (evaluations > 0)
         if settings.refinement == "lucas-kanade":
-            good &= self.refine_together(points, labels, neighbours, pair) > settings.min_correlation
+            good &= (
+                self.refine_together(points, labels, neighbours, pair) > settings.min_correlation
+            )
         ends = points + labels[:, :2]
         if settings.forward_backward_px > 0:
             rows = np.flatnonzero(good)
-            inverse, window = -labels[rows], Window(1, settings.refinement_window_px // 2, margin=3, warps=1)
+            inverse = -labels[rows]
+            window = Window(1, settings.refinement_window_px // 2, margin=3, warps=1)
             back = target.framed, reference.framed, window, np.empty(len(rows), np.float32)
             self.workers.run(similarity_lucas_kanade, 0, len(rows), ends[rows], inverse, *back)
             error = np.hypot(*(ends[rows] + inverse[:, :2] - points[rows]).T)
             good[rows] = error <= settings.forward_backward_px
         good &= usable_points(ends, target.gray.shape)
-        valid, share = np.zeros(len(xy), np.bool_), np.ones(len(xy), np.float32)
-        xy[usable], valid[usable], share[usable] = ends, good, cost / pair.tables.ceiling
-        return FlowResult(xy, valid, share, flow_stats(len(xy), int(good.sum()), int(evaluations.sum())))
+        valid = np.zeros(len(xy), np.bool_)
+        share = np.ones(len(xy), np.float32)
+        xy[usable] = ends
+        valid[usable] = good
+        share[usable] = cost / pair.tables.ceiling
+        return FlowResult(
+            xy, valid, share, flow_stats(len(xy), int(good.sum()), int(evaluations.sum()))
+        )
 
     def pair(self, reference: OrientationMaps, target: OrientationMaps) -> Pair:
         """Two images with the tables of the settings' terms and support of Eq. 1."""
-        settings, shape = self.settings, reference.gray.shape
+        settings = self.settings
+        shape = reference.gray.shape
         return Pair(
-            reference, target, cost_tables(shape, settings.terms, settings.support, settings.support_spacing_px)
+            reference,
+            target,
+            cost_tables(shape, settings.terms, settings.support, settings.support_spacing_px),
         )
 
-    def describe(self, image: OrientationMaps, points: NDArray[np.float32], tables: CostTables) -> Reference:
+    def describe(
+        self, image: OrientationMaps, points: NDArray[np.float32], tables: CostTables
+    ) -> Reference:
         """What the search needs of the reference points: their rotated descriptors and appearance."""
-        count, supports = len(points), len(tables.support)
+        count = len(points)
+        supports = len(tables.support)
         descriptors = np.empty(count * supports * layout.ROTATIONS * layout.LENGTH, dtype=np.uint8)
         appearance = np.zeros((count, supports, 2), dtype=np.int32)
-        self.workers.run(describe, 0, count, points, side_of(image, tables), tables, descriptors, appearance)
+        self.workers.run(
+            describe, 0, count, points, side_of(image, tables), tables, descriptors, appearance
+        )
         return Reference(points, descriptors, appearance)
 
     def refine_together(
-        self, points: NDArray[np.float32], labels: NDArray[np.float32], neighbours: NDArray[np.int64], pair: Pair
+        self,
+        points: NDArray[np.float32],
+        labels: NDArray[np.float32],
+        neighbours: NDArray[np.int64],
+        pair: Pair,
     ) -> NDArray[np.float32]:
         """Refine labels in place; where neighbours agree on another one, try that. Returns the correlation ``[N]``.
 
-        The label of agreeing neighbours, then the common motion, is taken where it contradicts a point's own label and
-        its refined correlation is as high: repetitive textures match one period off.
+        The label of agreeing neighbours, then the common motion, is taken where it contradicts a
+        point's own label and its refined correlation is as high: repetitive textures match one
+        period off.
         """
         correlation = self.refine(points, labels, pair)
         if not STRATEGIES[self.settings.search].propagates or len(points) < 3:
@@ -148,8 +185,12 @@ class SparseDaisyFlow:
         alternative, dissents = dissenting_labels(predictions, labels, np.float32(CONSENSUS_PX))
         self._take_better(points, labels, correlation, alternative, dissents, pair)
         if self.settings.similarity_seeds:
-            motions = common_motions(points, labels, np.rint(1000 * (1 - correlation)).astype(np.int64), 1)
-            alternative = labels_as_seen(points, labels, np.empty((len(points), 0), np.int64), motions)[:, 0]
+            motions = common_motions(
+                points, labels, np.rint(1000 * (1 - correlation)).astype(np.int64), 1
+            )
+            alternative = labels_as_seen(
+                points, labels, np.empty((len(points), 0), np.int64), motions
+            )[:, 0]
             with np.errstate(invalid="ignore"):
                 dissents = np.hypot(*(alternative[:, :2] - labels[:, :2]).T) > CONSENSUS_PX
             self._take_better(points, labels, correlation, alternative, dissents, pair)
@@ -170,11 +211,17 @@ class SparseDaisyFlow:
             other = alternative[rows]
             other_correlation = self.refine(points[rows], other, pair)
             better = other_correlation > correlation[rows] - CONSENSUS_MARGIN
-            labels[rows[better]], correlation[rows[better]] = other[better], other_correlation[better]
+            labels[rows[better]], correlation[rows[better]] = (
+                other[better],
+                other_correlation[better],
+            )
 
-    def refine(self, points: NDArray[np.float32], labels: NDArray[np.float32], pair: Pair) -> NDArray[np.float32]:
+    def refine(
+        self, points: NDArray[np.float32], labels: NDArray[np.float32], pair: Pair
+    ) -> NDArray[np.float32]:
         """Refine labels in place at half, then full resolution; returns the windows' correlation ``[N]``."""
-        reference, target = pair.reference, pair.target
+        reference = pair.reference
+        target = pair.target
         correlation = np.empty(len(points), dtype=np.float32)
         arguments = (similarity_lucas_kanade, 0, len(points), points, labels)
         self.workers.run(*arguments, reference.framed_half, target.framed_half, COARSE, correlation)

@@ -3,7 +3,11 @@
 from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.camera import Camera, inside, pixel_index
 from dynslam_bench.geometry.se3 import Array
-from dynslam_bench.geometry.stamp_units import are_frame_numbers, describe_frame_numbers, median_step
+from dynslam_bench.geometry.stamp_units import (
+    are_frame_numbers,
+    describe_frame_numbers,
+    median_step,
+)
 from dynslam_bench.geometry.stamps import (
     associate,
     format_ns,

@@ -24,16 +24,19 @@ class Camera:
         cx: Principal point x in pixels (centre of the top-left pixel is 0).
         cy: Principal point y in pixels.
         distortion: Radial-tangential coefficients ``(k1, k2, p1, p2, k3)``, OpenCV's order.
-        depth_factor: Raw 16-bit depth units a metre (5000 in TUM files, 1000 for millimetres); None where nothing
-            states it. Depth images cannot be read without it.
-        baseline_m: Baseline of the (virtual) stereo pair that turns depth into a right coordinate, in metres.
-        readout_s: Seconds from the first row's exposure to the last one's, the frame's stamp being the middle row's
-            time (rolling shutter); 0 is a global shutter, or one of which nothing is known.
-        depth_delay_s: Seconds by which depth images are exposed later than their stamps say, beside the colour images;
-            readers add it to the depth images' stamps before they pair them.
-        R_body_cam: Rotation from the camera's axes to those of the body whose poses ``groundtruth.txt`` holds, the rows
-            of a 3x3 matrix; the identity where these poses are the camera's. None where nothing states it: the data set
-            decides, else the poses are the camera's.
+        depth_factor: Raw 16-bit depth units a metre (5000 in TUM files, 1000 for millimetres); None
+            where nothing states it. Depth images cannot be read without it.
+        baseline_m: Baseline of the (virtual) stereo pair that turns depth into a right coordinate,
+            in metres.
+        readout_s: Seconds from the first row's exposure to the last one's, the frame's stamp being
+            the middle row's time (rolling shutter); 0 is a global shutter, or one of which nothing
+            is known.
+        depth_delay_s: Seconds by which depth images are exposed later than their stamps say, beside
+            the colour images; readers add it to the depth images' stamps before they pair them.
+        R_body_cam: Rotation from the camera's axes to those of the body whose poses
+            ``groundtruth.txt`` holds, the rows of a 3x3 matrix; the identity where these poses are
+            the camera's. None where nothing states it: the data set decides, else the poses are the
+            camera's.
     """
 
     width: int
@@ -76,7 +79,8 @@ class Camera:
 
         Pixel centres are at integer coordinates, as in `cv2.resize`: ``u' = (u + 0.5) * s - 0.5``.
         """
-        sx, sy = width / self.width, height / self.height
+        sx = width / self.width
+        sy = height / self.height
         return replace(
             self,
             width=width,
@@ -108,7 +112,9 @@ class Camera:
         size = self.width + margin_px, self.height + margin_px
         return uv, ahead & (uv >= -margin_px).all(axis=1) & (uv < size).all(axis=1)
 
-    def unproject(self, pixels: NDArray[np.floating], depth: NDArray[np.floating]) -> NDArray[np.float64]:
+    def unproject(
+        self, pixels: NDArray[np.floating], depth: NDArray[np.floating]
+    ) -> NDArray[np.float64]:
         """Points ``[..., 3]`` of the camera frame (metres) at undistorted pixels ``[..., 2]`` and z-depth ``[...]``."""
         z = np.asarray(depth, dtype=np.float64)[..., None]
         rays = (np.asarray(pixels, dtype=np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
@@ -124,9 +130,13 @@ class Camera:
         coefficients = np.asarray(self.distortion)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-9)
         undistorted = (
-            cv2.undistortPointsIter(pixels[:, None], self.matrix, coefficients, np.eye(3), self.matrix, criteria)
+            cv2.undistortPointsIter(
+                pixels[:, None], self.matrix, coefficients, np.eye(3), self.matrix, criteria
+            )
             if hasattr(cv2, "undistortPointsIter")
-            else cv2.undistortPoints(pixels[:, None], self.matrix, coefficients, None, self.matrix, criteria=criteria)
+            else cv2.undistortPoints(
+                pixels[:, None], self.matrix, coefficients, None, self.matrix, criteria=criteria
+            )
         )
         return np.asarray(undistorted, dtype=np.float64).reshape(-1, 2)
 
@@ -134,8 +144,12 @@ class Camera:
         """Where each pixel of an undistorted image lies in the distorted one: columns and rows, ``[H, W]``."""
         import cv2
 
-        distortion, turn, size = np.asarray(self.distortion), np.eye(3), (self.width, self.height)
-        columns, rows = cv2.initUndistortRectifyMap(self.matrix, distortion, turn, self.matrix, size, cv2.CV_32FC1)
+        distortion = np.asarray(self.distortion)
+        turn = np.eye(3)
+        size = (self.width, self.height)
+        columns, rows = cv2.initUndistortRectifyMap(
+            self.matrix, distortion, turn, self.matrix, size, cv2.CV_32FC1
+        )
         return np.asarray(columns, dtype=np.float32), np.asarray(rows, dtype=np.float32)
 
     def distort_points(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -157,8 +171,11 @@ def pixel_index(
     xy: NDArray[np.floating], shape: tuple[int, ...]
 ) -> tuple[tuple[NDArray[np.intp], NDArray[np.intp]], NDArray[np.bool_]]:
     """Rows and columns of pixels ``[..., 2]``, rounded and moved into an image ``(H, W)``, and which lie in it."""
-    rounded = np.rint(np.nan_to_num(xy, nan=-1.0, posinf=-1.0, neginf=-1.0).clip(-1, 1e6)).astype(np.intp)
-    column, row = rounded[..., 0], rounded[..., 1]
+    rounded = np.rint(np.nan_to_num(xy, nan=-1.0, posinf=-1.0, neginf=-1.0).clip(-1, 1e6)).astype(
+        np.intp
+    )
+    column = rounded[..., 0]
+    row = rounded[..., 1]
     visible = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
     return (row.clip(0, shape[0] - 1), column.clip(0, shape[1] - 1)), visible
 

@@ -11,7 +11,9 @@ Array = NDArray[np.float64]
 @inlined
 def moved_point(pose: Array, point: Array) -> tuple[float, float, float]:
     """Coordinates of a point ``[3]`` that is moved by a pose ``[4, 4]``."""
-    x, y, z = point[0], point[1], point[2]
+    x = point[0]
+    y = point[1]
+    z = point[2]
     return (
         pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3],
         pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3],
@@ -56,9 +58,13 @@ def apply_twist(pose: Array, xi: Array) -> Array:
     theta2 = xi[3] * xi[3] + xi[4] * xi[4] + xi[5] * xi[5]
     theta = np.sqrt(theta2)
     if theta < 1e-8:
-        a, b, c = 1.0 - theta2 / 6.0, 0.5 - theta2 / 24.0, 1.0 / 6.0 - theta2 / 120.0
+        a = 1.0 - theta2 / 6.0
+        b = 0.5 - theta2 / 24.0
+        c = 1.0 / 6.0 - theta2 / 120.0
     else:
-        a, b, c = np.sin(theta) / theta, (1.0 - np.cos(theta)) / theta2, (theta - np.sin(theta)) / (theta2 * theta)
+        a = np.sin(theta) / theta
+        b = (1.0 - np.cos(theta)) / theta2
+        c = (theta - np.sin(theta)) / (theta2 * theta)
     k = np.zeros((3, 3))
     k[0, 1], k[0, 2], k[1, 2] = -xi[5], xi[4], -xi[3]
     k[1, 0], k[2, 0], k[2, 1] = xi[5], -xi[4], xi[3]
@@ -110,7 +116,8 @@ def twist_of(pose: Array) -> Array:
     else:
         out[3:] *= theta / sine
         factor = (1.0 - 0.5 * theta / np.tan(0.5 * theta)) / (theta * theta)
-    phi, t = out[3:], pose[:3, 3]
+    phi = out[3:]
+    t = pose[:3, 3]
     once = np.cross(phi, t)
     out[:3] = t - 0.5 * once + factor * np.cross(phi, once)
     return out

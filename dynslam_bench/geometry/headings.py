@@ -1,7 +1,7 @@
 """Headings of tables of poses: which column holds what, and the unit of the stamps.
 
-A heading is a line of names, among which are the stamp's, the x, y, z of a position and the x, y, z, w of a quaternion.
-Prose is no heading, whatever words it has.
+A heading is a line of names, among which are the stamp's, the x, y, z of a position and the x, y,
+z, w of a quaternion. Prose is no heading, whatever words it has.
 """
 
 import re
@@ -11,7 +11,9 @@ from dynslam_bench.geometry.stamp_units import UNITS, StampUnit
 
 _NAME = re.compile(r"(?P<name>[^\s\[(]+)\s*(?:[\[(]\s*(?P<unit>[^\])]*?)\s*[\])])?")
 """A name, and its unit in brackets: ``tx (m)``, ``timestamp [ns]``, ``q_RS_w []``."""
-_STAMP = re.compile(r"(?:time_?stamps?|times?|ts|t|stamps?|sec(?:ond)?s?)(?:_(?P<unit>[a-z]+))?", re.IGNORECASE)
+_STAMP = re.compile(
+    r"(?:time_?stamps?|times?|ts|t|stamps?|sec(?:ond)?s?)(?:_(?P<unit>[a-z]+))?", re.IGNORECASE
+)
 _PART = re.compile(r"(?P<vector>.*?)[_.]?(?P<axis>[xyzw])", re.IGNORECASE)
 """A part of a vector: ``qw``, ``p_RS_R_x``, ``position.x``, ``x``."""
 _SYMBOLS = {symbol: unit for unit in UNITS for symbol in (unit.symbol, f"{unit.symbol}ec")}
@@ -46,7 +48,8 @@ def parse_heading(text: str) -> Heading | None:
     if any(cell and name is None for cell, name in zip(cells, names, strict=True)):
         return None
     # the stamp, and the parts of vectors by the name that they share
-    stamp_column, unit = None, ""
+    stamp_column = None
+    unit = ""
     vectors: dict[str, dict[str, int]] = {}
     for column, name in enumerate(names):
         if name is None:
@@ -54,12 +57,17 @@ def parse_heading(text: str) -> Heading | None:
         stamp = _STAMP.fullmatch(name["name"])
         part = _PART.fullmatch(name["name"])
         if stamp is not None and stamp_column is None:
-            stamp_column, unit = column, name["unit"] or stamp["unit"] or ""
+            stamp_column = column
+            unit = name["unit"] or stamp["unit"] or ""
         elif part is not None:
             vectors.setdefault(part["vector"].lower(), {}).setdefault(part["axis"].lower(), column)
     position = next((axes for axes in vectors.values() if axes.keys() == set("xyz")), None)
     quaternion = next((axes for axes in vectors.values() if axes.keys() == set("xyzw")), None)
     if stamp_column is None or position is None or quaternion is None:
         return None
-    order = (stamp_column, *(position[axis] for axis in "xyz"), *(quaternion[axis] for axis in "xyzw"))
+    order = (
+        stamp_column,
+        *(position[axis] for axis in "xyz"),
+        *(quaternion[axis] for axis in "xyzw"),
+    )
     return Heading(len(cells), order, _SYMBOLS.get(unit.lower()))

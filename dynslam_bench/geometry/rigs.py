@@ -7,8 +7,8 @@ from dynslam_bench.geometry.se3 import Array
 
 Matrix = tuple[tuple[float, float, float], ...]
 
-# Bonn RGB-D Dynamic: the markers on the camera. The publisher states T_ROS and T_m; a camera pose is
-# T_ROS^-1 T_marker T_ROS T_m. The linear part of T_m is a rotation times 1.059.
+# Bonn RGB-D Dynamic: the markers on the camera. The publisher states T_ROS and T_m; a camera pose
+# is T_ROS^-1 T_marker T_ROS T_m. The linear part of T_m is a rotation times 1.059.
 BONN_T_ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 BONN_T_M = np.array(
     [
@@ -41,7 +41,8 @@ def bonn_camera(poses: Array) -> Array:
     """Bonn's poses moved to the camera's centre by the rigid part of the calibration: a lever arm of 18.6 mm.
 
     Args:
-        poses: Positions of the markers with the camera's orientations ``[N, 4, 4]``, as Bonn's sequences give them.
+        poses: Positions of the markers with the camera's orientations ``[N, 4, 4]``, as Bonn's
+            sequences give them.
     """
     lever_cam = nearest_rotation(BONN_R_BODY_CAM).T @ (BONN_T_ROS[:3, :3] @ BONN_T_M[:3, 3])
     moved = poses.copy()
@@ -52,11 +53,12 @@ def bonn_camera(poses: Array) -> Array:
 def bonn_as_droid_w(poses: Array) -> Array:
     """Bonn's poses as WildGS-SLAM and DROID-W score against them: ``T_ROS^T T T_ROS T_m``, relative to the first.
 
-    They take T_m as it is printed and invert the first pose as a matrix, so that T_m's scale of 1.059 divides every
-    position: the truth, and with it every error, comes out 5.6 % smaller.
+    They take T_m as it is printed and invert the first pose as a matrix, so that T_m's scale of
+    1.059 divides every position: the truth, and with it every error, comes out 5.6 % smaller.
 
     Args:
-        poses: Positions of the markers with the camera's orientations ``[N, 4, 4]``, as Bonn's sequences give them.
+        poses: Positions of the markers with the camera's orientations ``[N, 4, 4]``, as Bonn's
+            sequences give them.
     """
     markers = se3.with_rotation(poses, poses[:, :3, :3] @ nearest_rotation(BONN_R_BODY_CAM).T)
     corrected = BONN_T_ROS.T @ markers @ BONN_T_ROS @ BONN_T_M

@@ -19,7 +19,8 @@ def hat(v: Array) -> Array:
 def exp(xi: Array) -> Array:
     """Poses ``[..., 4, 4]`` of twists ``[..., 6]`` = (translation rho, rotation phi in rad)."""
     xi = np.asarray(xi, dtype=np.float64)
-    rho, phi = xi[..., :3], xi[..., 3:]
+    rho = xi[..., :3]
+    phi = xi[..., 3:]
     theta = np.linalg.norm(phi, axis=-1)[..., None, None]
     small = theta < 1e-5
     safe = np.where(small, 1.0, theta)
@@ -54,10 +55,14 @@ def inverse(pose: Array) -> Array:
     return from_matrix(-(rotation_t @ pose[..., :3, 3:])[..., 0], rotation_t)
 
 
-def from_matrix(translation: NDArray[np.integer | np.floating], rotation: NDArray[np.integer | np.floating]) -> Array:
+def from_matrix(
+    translation: NDArray[np.integer | np.floating], rotation: NDArray[np.integer | np.floating]
+) -> Array:
     """Poses ``[..., 4, 4]`` of translations ``[..., 3]`` and rotation matrices ``[..., 3, 3]``."""
     pose = np.zeros((*rotation.shape[:-2], 4, 4))
-    pose[..., :3, :3], pose[..., :3, 3], pose[..., 3, 3] = rotation, translation, 1.0
+    pose[..., :3, :3] = rotation
+    pose[..., :3, 3] = translation
+    pose[..., 3, 3] = 1.0
     return pose
 
 
@@ -66,7 +71,8 @@ def from_quaternion(translation: Array, quaternion: Array) -> Array:
 
     Quaternions of any length but 0 are rotations, also of one whose square is no number any more.
     """
-    from scipy.spatial.transform import Rotation  # loaded when needed: code that only copies poses does not load it
+    # loaded when needed: code that only copies poses does not load it
+    from scipy.spatial.transform import Rotation
 
     quaternion = np.asarray(quaternion, dtype=np.float64)
     largest = np.abs(quaternion).max(axis=-1, keepdims=True, initial=0.0)
@@ -100,7 +106,9 @@ def rotation_vectors(pose: Array) -> Array:
         rotation = Rotation.from_matrix(pose[..., :3, :3].reshape(-1, 3, 3))
         return np.asarray(rotation.as_rotvec().reshape(*angle.shape, 3))
     sine = np.sin(angle)
-    return np.asarray(axes * np.where(sine > 1e-9, angle / np.where(sine > 1e-9, sine, 1.0), 1.0)[..., None])
+    return np.asarray(
+        axes * np.where(sine > 1e-9, angle / np.where(sine > 1e-9, sine, 1.0), 1.0)[..., None]
+    )
 
 
 def sine_axes(pose: Array) -> tuple[Array, Array]:
@@ -114,7 +122,8 @@ def sine_axes(pose: Array) -> tuple[Array, Array]:
     return 0.5 * np.stack([x, y, z], axis=-1), np.asarray(angle)
 
 
-STILL_M, STILL_DEG = 1e-3, 0.1
+STILL_M = 1e-3
+STILL_DEG = 0.1
 """How far the poses of a camera that stands still may lie apart: the noise of a motion capture system."""
 
 
@@ -150,7 +159,11 @@ def with_rotation(pose: Array, rotation: Array) -> Array:
 
 def is_pose(pose: object, tolerance: float = 1e-4) -> bool:
     """Whether the value is a finite 4x4 rigid transformation: orthonormal rotation, determinant 1, last row 0 0 0 1."""
-    if not isinstance(pose, np.ndarray) or pose.shape != (4, 4) or not np.issubdtype(pose.dtype, np.floating):
+    if (
+        not isinstance(pose, np.ndarray)
+        or pose.shape != (4, 4)
+        or not np.issubdtype(pose.dtype, np.floating)
+    ):
         return False
     rotation = pose[:3, :3]
     return bool(

@@ -1,9 +1,10 @@
 """In which unit the stamps of a file are written: seconds, milliseconds, microseconds or nanoseconds.
 
-Most files do not say it. The median step from one pose to the next tells it: cameras and motion capture systems give
-from one pose in a few seconds to a thousand poses a second. The size of Unix time tells it, too. Stamps that can be
-seconds are seconds. Where one other unit is possible, it is taken, with a phrase that says so. Where several are
-possible, the file is refused, all of them are named, and its heading decides.
+Most files do not say it. The median step from one pose to the next tells it: cameras and motion
+capture systems give from one pose in a few seconds to a thousand poses a second. The size of Unix
+time tells it, too. Stamps that can be seconds are seconds. Where one other unit is possible, it is
+taken, with a phrase that says so. Where several are possible, the file is refused, all of them are
+named, and its heading decides.
 """
 
 from dataclasses import dataclass
@@ -45,7 +46,8 @@ LATEST_S = 9e9
 """The year 2255. Later stamps are no seconds, and 64 bits of nanoseconds end there."""
 SLOWEST_S = 5.0
 """Poses further apart by the median are no video and no motion capture."""
-FASTEST_FINE_S, SLOWEST_FINE_S = 0.9e-3, 4.0
+FASTEST_FINE_S = 0.9e-3
+SLOWEST_FINE_S = 4.0
 """The same for units smaller than the second: from a little more than 1000 Hz to 0.25 Hz. At 200 Hz, a frequent rate of
 motion capture, these limits leave one unit."""
 SPARSE_S = 60.0
@@ -54,7 +56,8 @@ SHORTEST_S = 0.5
 """Where a smaller unit would make a shorter recording than this, the stamps are sparse keyframes."""
 UNIX_S = 1e9
 """Unix time of the year 2001: stamps between it and `LATEST_S` are Unix time."""
-LEAST_STATED_S, MOST_STATED_S = 1e-6, 1e5
+LEAST_STATED_S = 1e-6
+MOST_STATED_S = 1e5
 """A heading whose unit makes steps beyond these limits contradicts the stamps."""
 MOST_FRAMES = 1e8
 """Forty days at 30 frames a second: larger whole numbers are no numbers of frames."""
@@ -83,7 +86,9 @@ def median_step(stamps: ArrayLike) -> float | None:
     return float(np.median(np.diff(distinct))) if len(distinct) > 1 else None
 
 
-def unit_of(stamps: ArrayLike, source: str, stated: StampUnit | None = None) -> tuple[StampUnit, str]:
+def unit_of(
+    stamps: ArrayLike, source: str, stated: StampUnit | None = None
+) -> tuple[StampUnit, str]:
     """The unit of a file's stamps.
 
     Args:
@@ -92,7 +97,8 @@ def unit_of(stamps: ArrayLike, source: str, stated: StampUnit | None = None) -> 
         stated: The unit that its heading states; None where it states none.
 
     Returns:
-        The unit, and a phrase that says what was taken and why: empty for seconds, and for a unit that is stated.
+        The unit, and a phrase that says what was taken and why: empty for seconds, and for a unit
+        that is stated.
 
     Raises:
         TrajectoryError: No unit is possible, several are, or the stated one is not.
@@ -111,12 +117,16 @@ def unit_of(stamps: ArrayLike, source: str, stated: StampUnit | None = None) -> 
     if possible == [SECONDS]:
         return SECONDS, ""
     if len(possible) == 1:
-        return possible[0], f"stamps {_described(measured)}: taken as {_with_rate(possible[0], step)}"
+        return possible[
+            0
+        ], f"stamps {_described(measured)}: taken as {_with_rate(possible[0], step)}"
     if not possible:
         one_is_far = measured.usual <= LATEST_S and step is not None and step <= SLOWEST_S
         raise TrajectoryError(
             f"the stamps of {source} {_described(measured)}: in no unit are they those of a trajectory",
-            f"remove the line with the stamp {measured.latest:.10g}" if one_is_far else "write seconds",
+            f"remove the line with the stamp {measured.latest:.10g}"
+            if one_is_far
+            else "write seconds",
         )
     example = f"# timestamp [{possible[0].symbol}] tx ty tz qx qy qz qw"
     raise TrajectoryError(
@@ -178,7 +188,11 @@ def _with_rate(unit: StampUnit, step: float | None) -> str:
     if step is None:
         return unit.name
     step_s = step / unit.per_s
-    return f"{unit.name} ({1 / step_s:.3g} Hz)" if step_s < 1 else f"{unit.name} (one pose in {step_s:.3g} s)"
+    return (
+        f"{unit.name} ({1 / step_s:.3g} Hz)"
+        if step_s < 1
+        else f"{unit.name} (one pose in {step_s:.3g} s)"
+    )
 
 
 # Numbers of frames in place of stamps.
@@ -187,9 +201,15 @@ def _with_rate(unit: StampUnit, step: float | None) -> str:
 def are_frame_numbers(stamps: ArrayLike) -> bool:
     """Whether stamps ``[N]`` in seconds may be the numbers of frames: three or more whole numbers, no Unix time."""
     values = np.asarray(stamps, dtype=np.float64)
-    return len(values) > 2 and bool((values == np.round(values)).all()) and float(np.abs(values).max()) < MOST_FRAMES
+    return (
+        len(values) > 2
+        and bool((values == np.round(values)).all())
+        and float(np.abs(values).max()) < MOST_FRAMES
+    )
 
 
 def describe_frame_numbers(stamps: ArrayLike, whose: str) -> str:
     """One phrase where `are_frame_numbers` holds: ``the stamps of the estimate are whole numbers, 1 apart by ...``."""
-    return f"the stamps of the {whose} are whole numbers, {median_step(stamps):g} apart by the median"
+    return (
+        f"the stamps of the {whose} are whole numbers, {median_step(stamps):g} apart by the median"
+    )

@@ -1,9 +1,9 @@
 """Stamps: decimal seconds in text files, integer nanoseconds inside, float64 seconds for arithmetic.
 
-A float64 of today's Unix time resolves 0.24 us, so it cannot hold the nanoseconds of EuRoC's tables and of ROS bags.
-What is read from a text and written to one goes through integers. Arithmetic on differences (association, speeds) uses
-float64 seconds, as TUM's scripts and evo do: the float of a stamp of up to nine decimals is the one
-nearest to its text.
+A float64 of today's Unix time resolves 0.24 us, so it cannot hold the nanoseconds of EuRoC's tables
+and of ROS bags. What is read from a text and written to one goes through integers. Arithmetic on
+differences (association, speeds) uses float64 seconds, as TUM's scripts and evo do: the float of a
+stamp of up to nine decimals is the one nearest to its text.
 """
 
 from collections.abc import Callable, Iterable
@@ -20,7 +20,8 @@ NS_PER_S = 1_000_000_000
 LEAST_GAP_NS = 1000
 """Stamps of one list that are closer, and not equal, are refused.
 
-No camera and no motion capture is so fast, float64 seconds hardly tell them apart, and files of six decimals do not.
+No camera and no motion capture is so fast, float64 seconds hardly tell them apart, and files of six
+decimals do not.
 """
 _EXACT = Context(prec=400, rounding=ROUND_HALF_EVEN)
 _LARGEST_NS = 2**63 - 1
@@ -76,7 +77,10 @@ def to_seconds(ns: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def refuse_close(
-    ns: NDArray[np.int64], source: str, kind: type[DynslamError], line_of: Callable[[int], int | None] = lambda _: None
+    ns: NDArray[np.int64],
+    source: str,
+    kind: type[DynslamError],
+    line_of: Callable[[int], int | None] = lambda _: None,
 ) -> None:
     """Refuse stamps that differ by less than `LEAST_GAP_NS`; equal ones are not looked at.
 
@@ -103,14 +107,18 @@ def refuse_close(
     )
 
 
-# One-to-one association of two lists of stamps, as the TUM RGB-D benchmark's ``associate.py`` does it.
+# One-to-one association of two lists of stamps, as the TUM RGB-D benchmark's ``associate.py`` does
+# it.
 
 
-def associate(first: ArrayLike, second: ArrayLike, max_dt: float, *, strict: bool = True) -> tuple[Index, Index]:
+def associate(
+    first: ArrayLike, second: ArrayLike, max_dt: float, *, strict: bool = True
+) -> tuple[Index, Index]:
     """Greedy one-to-one association by absolute time difference.
 
-    All pairs closer than `max_dt` are taken in order of ``(|dt|, first stamp, second stamp)``; a pair counts if neither
-    stamp was used before (the rule of TUM's ``associate.py``, including its order on ties).
+    All pairs closer than `max_dt` are taken in order of ``(|dt|, first stamp, second stamp)``; a
+    pair counts if neither stamp was used before (the rule of TUM's ``associate.py``, including its
+    order on ties).
 
     Args:
         first: Stamps in seconds ``[N]``, in any order.
@@ -134,7 +142,9 @@ def _associate(first: bytes, second: bytes, max_dt: float, strict: bool) -> tupl
     a, order_a = _sorted_stamps(np.frombuffer(first))
     b, order_b = _sorted_stamps(np.frombuffer(second))
     if not max_dt >= 0:
-        raise TrajectoryError(f"the largest time difference is {max_dt!r}, not a number of seconds >= 0")
+        raise TrajectoryError(
+            f"the largest time difference is {max_dt!r}, not a number of seconds >= 0"
+        )
     candidate_a, candidate_b, dt = _candidates(a, b, max_dt, strict=strict)
     pairs = np.stack([candidate_a, candidate_b], axis=1)
     if not (np.diff(pairs, axis=0) > 0).all():  # some stamp has several candidates
@@ -145,7 +155,8 @@ def _associate(first: bytes, second: bytes, max_dt: float, strict: bool) -> tupl
                 match_of[i] = j
                 taken.add(j)
         pairs = np.array(sorted(match_of.items()), dtype=np.intp).reshape(-1, 2)
-    index_a, index_b = order_a[pairs[:, 0]], order_b[pairs[:, 1]]
+    index_a = order_a[pairs[:, 0]]
+    index_b = order_b[pairs[:, 1]]
     index_a.flags.writeable = index_b.flags.writeable = False
     return index_a, index_b
 
@@ -153,7 +164,9 @@ def _associate(first: bytes, second: bytes, max_dt: float, strict: bool) -> tupl
 def nearest_gap(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
     """Distance in seconds ``[N]`` of every (finite) stamp of `first` to the nearest of `second`; inf without any."""
     a = np.asarray(first, dtype=np.float64).reshape(-1)
-    b = np.concatenate([[-np.inf], np.sort(np.asarray(second, dtype=np.float64).reshape(-1)), [np.inf]])
+    b = np.concatenate(
+        [[-np.inf], np.sort(np.asarray(second, dtype=np.float64).reshape(-1)), [np.inf]]
+    )
     after = np.searchsorted(b, a)
     return np.asarray(np.minimum(a - b[after - 1], b[after] - a))
 
@@ -161,7 +174,9 @@ def nearest_gap(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
 def _sorted_stamps(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], Index]:
     if not np.isfinite(values).all():
         at = int(np.argmin(np.isfinite(values)))
-        raise TrajectoryError(f"stamp {at} of {len(values)} is {values[at]}, not a finite number of seconds")
+        raise TrajectoryError(
+            f"stamp {at} of {len(values)} is {values[at]}, not a finite number of seconds"
+        )
     order = np.argsort(values, kind="stable")
     return values[order], order
 
@@ -174,7 +189,9 @@ def _candidates(
     low = np.searchsorted(b, a - max_dt - slack, side="left")
     count = np.searchsorted(b, a + max_dt + slack, side="right") - low
     index_a = np.repeat(np.arange(len(a)), count)
-    index_b = np.repeat(low, count) + (np.arange(len(index_a)) - np.repeat(np.cumsum(count) - count, count))
+    index_b = np.repeat(low, count) + (
+        np.arange(len(index_a)) - np.repeat(np.cumsum(count) - count, count)
+    )
     dt = np.abs(a[index_a] - b[index_b])
     keep = dt < max_dt if strict else dt <= max_dt
     return index_a[keep], index_b[keep], dt[keep]

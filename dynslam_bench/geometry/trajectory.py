@@ -23,8 +23,8 @@ class Trajectory:
     Attributes:
         timestamps: Seconds, float64 ``[N]``, strictly increasing.
         T_world_cam: Camera-to-world poses, float64 ``[N, 4, 4]``.
-        exact_ns: The same stamps in nanoseconds where they are known to more digits than a float holds, int64 ``[N]``;
-            None where the floats are all that is known.
+        exact_ns: The same stamps in nanoseconds where they are known to more digits than a float
+            holds, int64 ``[N]``; None where the floats are all that is known.
     """
 
     timestamps: NDArray[np.float64]
@@ -43,19 +43,27 @@ class Trajectory:
         wrong = steps < 0 if self._may_repeat else steps <= 0
         if wrong.any():
             at = int(np.argmax(wrong))
-            raise TrajectoryError(f"stamps are not strictly increasing: {stamps[at]:.9f} then {stamps[at + 1]:.9f}")
+            raise TrajectoryError(
+                f"stamps are not strictly increasing: {stamps[at]:.9f} then {stamps[at + 1]:.9f}"
+            )
         object.__setattr__(self, "timestamps", stamps)
         object.__setattr__(self, "T_world_cam", poses)
         if self.exact_ns is not None:
-            object.__setattr__(self, "exact_ns", np.ascontiguousarray(self.exact_ns, dtype=np.int64))
+            object.__setattr__(
+                self, "exact_ns", np.ascontiguousarray(self.exact_ns, dtype=np.int64)
+            )
             if len(self.timestamps_ns) != len(stamps):
-                raise TrajectoryError(f"a trajectory has {stamps.size} stamps but {len(self.timestamps_ns)} in ns")
+                raise TrajectoryError(
+                    f"a trajectory has {stamps.size} stamps but {len(self.timestamps_ns)} in ns"
+                )
         if len(stamps) > 1 and steps.min() * NS_PER_S < LEAST_GAP_NS and not self._may_repeat:
             gaps = np.diff(self.timestamps_ns)
             at = int(gaps.argmin())
             if gaps[at] <= 0:
                 first, second = (format_ns(int(ns)) for ns in self.timestamps_ns[at : at + 2])
-                raise TrajectoryError(f"stamps are not strictly increasing in nanoseconds: {first} then {second}")
+                raise TrajectoryError(
+                    f"stamps are not strictly increasing in nanoseconds: {first} then {second}"
+                )
 
     def __len__(self) -> int:
         return len(self.timestamps)

@@ -1,12 +1,14 @@
 """Trajectory files of the TUM RGB-D benchmark: ``timestamp tx ty tz qx qy qz qw``, one pose a line.
 
-Reading follows the benchmark's own tools: ``#`` begins a comment, commas and tabs separate like spaces. Lines with NaN
-or with an all-zero quaternion are skipped; quaternions are normalised. Lines may come in any order, and of several
-lines with one stamp the last holds. Stamps in another unit than seconds are recognised (`stamp_units`). Whatever is not
-taken as it stands is counted in `FileNotes`.
+Reading follows the benchmark's own tools: ``#`` begins a comment, commas and tabs separate like
+spaces. Lines with NaN or with an all-zero quaternion are skipped; quaternions are normalised. Lines
+may come in any order, and of several lines with one stamp the last holds. Stamps in another unit
+than seconds are recognised (`stamp_units`). Whatever is not taken as it stands is counted in
+`FileNotes`.
 
-A heading above the poses, behind ``#`` or not, puts the columns in another order or states the unit of the stamps: so
-the tables of EuRoC and VSLAM-LAB are read. A comment that is no heading of the rows below it is passed over.
+A heading above the poses, behind ``#`` or not, puts the columns in another order or states the unit
+of the stamps: so the tables of EuRoC and VSLAM-LAB are read. A comment that is no heading of the
+rows below it is passed over.
 """
 
 from array import array
@@ -63,7 +65,9 @@ class FileNotes:
             repeats: Whether all lines with the same stamp were taken, not only the last.
         """
         duplicates = (
-            "repeat the next line's stamp, all are taken" if repeats else "replaced by a later line with the same stamp"
+            "repeat the next line's stamp, all are taken"
+            if repeats
+            else "replaced by a later line with the same stamp"
         )
         of = f"of {self.lines} lines"
         phrases = [
@@ -71,7 +75,10 @@ class FileNotes:
             (self.zero_quaternions, f"{self.zero_quaternions} {of} skipped: all-zero quaternion"),
             (self.duplicates, f"{self.duplicates} {of} {duplicates}"),
             (self.out_of_order, f"{self.out_of_order} {of} out of order, sorted"),
-            (self.renormalised, f"{self.renormalised} {of} with a quaternion far from unit norm, normalised"),
+            (
+                self.renormalised,
+                f"{self.renormalised} {of} with a quaternion far from unit norm, normalised",
+            ),
         ]
         return [phrase for count, phrase in phrases if count] + [self.stamps] * bool(self.stamps)
 
@@ -112,14 +119,16 @@ def load_tum(path: str | Path) -> TumFile:
     """Read a TUM trajectory file together with the counts of skipped, sorted and replaced lines.
 
     Raises:
-        TrajectoryError: The file is missing, is no text, has a malformed line (named by its number), stamps of a unit
-            that is not known or that mostly repeat each other, two stamps that differ by less than 1 us, or no valid
-            pose.
+        TrajectoryError: The file is missing, is no text, has a malformed line (named by its
+            number), stamps of a unit that is not known or that mostly repeat each other, two stamps
+            that differ by less than 1 us, or no valid pose.
     """
     path = Path(path)
     heading, line_of_heading = _find_heading(path)
     heading = heading or Heading(8, tuple(range(8)), None)
-    table = _read_table(path, heading.columns, _COLUMNS, without=line_of_heading, stamp_column=heading.order[0])
+    table = _read_table(
+        path, heading.columns, _COLUMNS, without=line_of_heading, stamp_column=heading.order[0]
+    )
     values = table.values[:, list(heading.order)]
     # lines without a pose are left out
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
@@ -140,7 +149,9 @@ def load_tum(path: str | Path) -> TumFile:
     ns, unit_note = _stamps_of(texts, kept[:, 0], str(path), stated=heading.unit, moved=moved)
     line_of = dict(zip(ns.tolist(), np.array(table.numbers)[valid].tolist(), strict=True))
     refuse_close(np.sort(ns), str(path), TrajectoryError, line_of.get)
-    return ordered_file(ns, se3.from_quaternion(kept[:, 1:4], kept[:, 4:8]), replace(counted, stamps=unit_note))
+    return ordered_file(
+        ns, se3.from_quaternion(kept[:, 1:4], kept[:, 4:8]), replace(counted, stamps=unit_note)
+    )
 
 
 def _stamps_of(
@@ -158,11 +169,12 @@ def _stamps_of(
         values: Their numbers.
         source: The file.
         stated: The unit that its heading states; None where it states none.
-        moved: Whether the pose of each line but the first differs from the one before ``[N - 1]``; None without poses.
+        moved: Whether the pose of each line but the first differs from the one before ``[N - 1]``;
+            None without poses.
 
     Raises:
-        TrajectoryError: Most stamps, or a third of them with other poses, repeat the one before; their unit is not
-            known; or one lies beyond the range of 64 bits.
+        TrajectoryError: Most stamps, or a third of them with other poses, repeat the one before;
+            their unit is not known; or one lies beyond the range of 64 bits.
     """
     repeated = np.diff(values) == 0
     repeats = np.flatnonzero(repeated)
@@ -183,11 +195,12 @@ def _stamps_of(
 def _find_heading(path: Path) -> tuple[Heading | None, int]:
     """The heading above the first row, and the number of its line where it is no comment, else 0.
 
-    A comment counts only if it names as many columns as the first row has values. The last heading gives the columns,
-    and the unit of the stamps is what any of them states.
+    A comment counts only if it names as many columns as the first row has values. The last heading
+    gives the columns, and the unit of the stamps is what any of them states.
 
     Raises:
-        TrajectoryError: The file cannot be read, or begins with a line that is neither a row nor a heading.
+        TrajectoryError: The file cannot be read, or begins with a line that is neither a row nor a
+            heading.
     """
     commented: list[Heading] = []
     for number, line in enumerate(read_lines(path, kind=TrajectoryError), start=1):
@@ -219,7 +232,9 @@ def _joined(headings: list[Heading]) -> Heading | None:
     return replace(headings[-1], unit=units[-1] if units else None)
 
 
-def ordered_file(ns: NDArray[np.int64], T_world_cam: NDArray[np.float64], notes: FileNotes) -> TumFile:
+def ordered_file(
+    ns: NDArray[np.int64], T_world_cam: NDArray[np.float64], notes: FileNotes
+) -> TumFile:
     """Poses in the order of their stamps, with the counts of sorted and replaced lines.
 
     Args:
@@ -238,7 +253,9 @@ def ordered_file(ns: NDArray[np.int64], T_world_cam: NDArray[np.float64], notes:
     )
     every_line = RepeatedStamps(to_seconds(exact), T_world_cam[order], exact)
     trajectory = Trajectory(
-        every_line.timestamps[last_of_stamp], every_line.T_world_cam[last_of_stamp], exact[last_of_stamp]
+        every_line.timestamps[last_of_stamp],
+        every_line.T_world_cam[last_of_stamp],
+        exact[last_of_stamp],
     )
     return TumFile(trajectory, notes, every_line if notes.duplicates else None)
 
@@ -266,9 +283,14 @@ def format_tum(trajectory: Trajectory, *, comment: str = "") -> str:
     position, quaternion = se3.to_quaternion(trajectory.T_world_cam)
     rows = np.concatenate([position, quaternion], axis=1).tolist()
     is_sparse = (median_step(trajectory.timestamps) or 0.0) > SLOWEST_S
-    columns = _COLUMNS.replace("timestamp", f"timestamp [{SECONDS.symbol}]") if is_sparse else _COLUMNS
+    columns = (
+        _COLUMNS.replace("timestamp", f"timestamp [{SECONDS.symbol}]") if is_sparse else _COLUMNS
+    )
     heading = [f"# {line}" for line in (*comment.splitlines(), columns)]
-    lines = [" ".join([stamp, *map("{:.9f}".format, row)]) for stamp, row in zip(stamps, rows, strict=True)]
+    lines = [
+        " ".join([stamp, *map("{:.9f}".format, row)])
+        for stamp, row in zip(stamps, rows, strict=True)
+    ]
     return "\n".join([*heading, *lines]) + "\n"
 
 
@@ -276,7 +298,8 @@ def read_table(path: Path, columns: int, meaning: str) -> NDArray[np.float64]:
     """Numbers ``[N, columns]`` of a text file; comments and blank lines are left out.
 
     Raises:
-        TrajectoryError: The file cannot be read, is no text, or a line does not hold `columns` numbers.
+        TrajectoryError: The file cannot be read, is no text, or a line does not hold `columns`
+            numbers.
     """
     return _read_table(path, columns, meaning).values
 
@@ -285,8 +308,8 @@ def read_stamps(path: Path) -> NDArray[np.int64]:
     """The first numbers of all lines, in nanoseconds ``[N]``; comments and blank lines are left out.
 
     Raises:
-        TrajectoryError: The file cannot be read, a line does not begin with a stamp, or the unit of the stamps is not
-            known.
+        TrajectoryError: The file cannot be read, a line does not begin with a stamp, or the unit of
+            the stamps is not known.
     """
     return _load_stamps(path)[0]
 
@@ -296,7 +319,9 @@ def _load_stamps(path: Path) -> tuple[NDArray[np.int64], str]:
     texts: list[str] = []
     for number, parts in _lines(path):
         if not is_number(parts[0]) or not np.isfinite(float(parts[0])):
-            raise TrajectoryError(f"{path} line {number}: '{parts[0][:40]}' is not a stamp in seconds")
+            raise TrajectoryError(
+                f"{path} line {number}: '{parts[0][:40]}' is not a stamp in seconds"
+            )
         texts.append(parts[0])
     if not texts:
         return np.zeros(0, dtype=np.int64), ""
@@ -311,7 +336,9 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """
     for number, line in enumerate(read_lines(path, kind=TrajectoryError), start=1):
         if number > MOST_LINES:
-            raise TrajectoryError(f"{path} has more than {MOST_LINES} lines, too many for a trajectory")
+            raise TrajectoryError(
+                f"{path} has more than {MOST_LINES} lines, too many for a trajectory"
+            )
         parts = _parts(line)
         if parts:
             yield number, parts
@@ -337,27 +364,34 @@ class _Table:
     texts: list[str]
 
 
-def _read_table(path: Path, columns: int, meaning: str, *, without: int = 0, stamp_column: int = 0) -> _Table:
+def _read_table(
+    path: Path, columns: int, meaning: str, *, without: int = 0, stamp_column: int = 0
+) -> _Table:
     """The rows of a table; `without` is the number of a line that is none of them.
 
     Raises:
         TrajectoryError: As `read_table`.
     """
-    values, numbers, texts = array("d"), list[int](), list[str]()
+    values = array("d")
+    numbers = list[int]()
+    texts = list[str]()
     for number, parts in _lines(path):
         if number == without:
             continue
         numbers.append(number)
         if len(parts) != columns:
             raise TrajectoryError(
-                f"{path} line {number} has {len(parts)} values, not the {columns} of '{meaning}'", _hint(parts)
+                f"{path} line {number} has {len(parts)} values, not the {columns} of '{meaning}'",
+                _hint(parts),
             )
         texts.append(parts[stamp_column])
         try:
             values.extend(map(float, parts))
         except ValueError:
             bad = next(part for part in parts if not is_number(part))
-            raise TrajectoryError(f"{path} line {number}: {bad[:40]!r} is not a number", meaning) from None
+            raise TrajectoryError(
+                f"{path} line {number}: {bad[:40]!r} is not a number", meaning
+            ) from None
     if not values:
         raise TrajectoryError(f"{path} holds no poses", f"expected lines of '{meaning}'")
     return _Table(np.frombuffer(values, dtype=np.float64).reshape(-1, columns), numbers, texts)
@@ -382,7 +416,8 @@ def _hint(parts: list[str]) -> str:
     return ""
 
 
-# Trajectory files of the KITTI odometry benchmark: the 3x4 matrix ``[R|t]`` in row order, twelve numbers a line.
+# Trajectory files of the KITTI odometry benchmark: the 3x4 matrix ``[R|t]`` in row order, twelve
+# numbers a line.
 
 _MEANING = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
 
@@ -395,10 +430,12 @@ def read_kitti(path: str | Path, times: str | Path) -> Trajectory:
         times: A file whose lines begin with the stamps in seconds, one a pose.
 
     Returns:
-        Camera-to-world poses; rotations are made orthonormal exactly (files hold about seven digits).
+        Camera-to-world poses; rotations are made orthonormal exactly (files hold about seven
+        digits).
 
     Raises:
-        TrajectoryError: A file cannot be read, a line is malformed or no rigid pose, or the stamps do not fit.
+        TrajectoryError: A file cannot be read, a line is malformed or no rigid pose, or the stamps
+            do not fit.
     """
     return _load_kitti(Path(path), Path(times)).trajectory
 
@@ -410,12 +447,16 @@ def _load_kitti(path: Path, times: Path) -> TumFile:
     poses = se3.from_matrix(matrices[:, :, 3], matrices[:, :, :3])
     for index, pose in enumerate(poses):
         if not se3.is_pose(pose, tolerance=1e-3):
-            raise TrajectoryError(f"{path}: pose {index} of {len(poses)} is no rigid transformation", _MEANING)
+            raise TrajectoryError(
+                f"{path}: pose {index} of {len(poses)} is no rigid transformation", _MEANING
+            )
     poses = se3.with_rotation(poses, nearest_rotation(poses[:, :3, :3]))
     ns, unit_note = _load_stamps(times)
     if len(ns) != len(poses):
         raise TrajectoryError(f"{path} has {len(poses)} poses but {times} has {len(ns)} stamps")
-    return TumFile(Trajectory(to_seconds(ns), poses, ns), FileNotes(lines=len(poses), stamps=unit_note))
+    return TumFile(
+        Trajectory(to_seconds(ns), poses, ns), FileNotes(lines=len(poses), stamps=unit_note)
+    )
 
 
 def write_kitti(path: str | Path, trajectory: Trajectory, times: str | Path | None = None) -> None:
@@ -425,22 +466,27 @@ def write_kitti(path: str | Path, trajectory: Trajectory, times: str | Path | No
         DynslamError: A file cannot be written.
     """
     rows = trajectory.T_world_cam[:, :3].reshape(-1, 12).tolist()
-    write_atomic(Path(path), "".join(" ".join(f"{value:.9e}" for value in row) + "\n" for row in rows))
+    write_atomic(
+        Path(path), "".join(" ".join(f"{value:.9e}" for value in row) + "\n" for row in rows)
+    )
     if times is not None:
-        write_atomic(Path(times), "".join(f"{format_ns(ns)}\n" for ns in trajectory.timestamps_ns.tolist()))
+        write_atomic(
+            Path(times), "".join(f"{format_ns(ns)}\n" for ns in trajectory.timestamps_ns.tolist())
+        )
 
 
-# Trajectory files of either format: TUM's, which carry their stamps, and KITTI's, whose stamps lie in another file.
+# Trajectory files of either format: TUM's, which carry their stamps, and KITTI's, whose stamps lie
+# in another file.
 
 
 def load_trajectory(path: str | Path, timestamps: str | Path | None = None) -> TumFile:
     """Read a trajectory with the counts of what was not taken as it stands.
 
     Args:
-        path: Lines of 8 values (TUM), a table with a heading (EuRoC, VSLAM-LAB) or, where `timestamps` is given, lines
-            of 12 values (KITTI).
-        timestamps: A file whose lines begin with a stamp each: a ``times.txt``, or a list such as ``rgb.txt``; used
-            for lines of 12 values only.
+        path: Lines of 8 values (TUM), a table with a heading (EuRoC, VSLAM-LAB) or, where
+            `timestamps` is given, lines of 12 values (KITTI).
+        timestamps: A file whose lines begin with a stamp each: a ``times.txt``, or a list such as
+            ``rgb.txt``; used for lines of 12 values only.
 
     Raises:
         TrajectoryError: A file cannot be read, is malformed, or the stamps do not fit the poses.

@@ -1,8 +1,8 @@
 """Runs: a child process that steps an environment; the run store; parallel execution.
 
-`run_many` and `run_one` make runs, `RunStore` keeps them, `score` evaluates them under a protocol, `RunStore.frame` and
-`load_frames` give them as pandas frames, `import_trajectory` puts trajectories from elsewhere beside them, and
-`export_run` writes them in the formats of others.
+`run_many` and `run_one` make runs, `RunStore` keeps them, `score` evaluates them under a protocol,
+`RunStore.frame` and `load_frames` give them as pandas frames, `import_trajectory` puts trajectories
+from elsewhere beside them, and `export_run` writes them in the formats of others.
 """
 
 from typing import TYPE_CHECKING, Any

@@ -30,7 +30,8 @@ WORST = 6
 """Frames that are kept besides: those with the largest frame-to-frame error, and as many on which tracking was lost."""
 PICTURE = "frame_{:06d}.webp"
 """Name of the picture of a frame, as its tracker saw it, in the folder of its run."""
-_PICTURE_WIDTH, _PICTURE_QUALITY = 400, 55
+_PICTURE_WIDTH = 400
+_PICTURE_QUALITY = 55
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +42,8 @@ class Snapshot:
         index: Index of the frame in the run's part of the sequence.
         points: int16 ``[N, 2]``, pixels of the features.
         kept: bool ``[N]``, which of them were kept.
-        packed: uint8 ``[H, ceil(W / 8)]``, eight pixels of the mask a byte; None where the tracker gave no mask.
+        packed: uint8 ``[H, ceil(W / 8)]``, eight pixels of the mask a byte; None where the tracker
+            gave no mask.
         width: W, pixels of a line of the mask.
     """
 
@@ -54,18 +56,25 @@ class Snapshot:
     @property
     def mask(self) -> NDArray[np.bool_] | None:
         """Pixels held for dynamic, bool ``[H, W]``; None where the tracker gave no mask."""
-        return None if self.packed is None else np.unpackbits(self.packed, axis=1, count=self.width).view(np.bool_)
+        return (
+            None
+            if self.packed is None
+            else np.unpackbits(self.packed, axis=1, count=self.width).view(np.bool_)
+        )
 
 
 def spread(frames: int, count: int = SPREAD) -> list[int]:
     """At most `count` frames evenly spread over so many, the first and the last among them."""
-    return sorted({int(index) for index in np.linspace(0, max(frames - 1, 0), min(count, frames)).round()})
+    return sorted(
+        {int(index) for index in np.linspace(0, max(frames - 1, 0), min(count, frames)).round()}
+    )
 
 
 class SnapshotWriter:
     """Keeps frames while a run goes on: pictures, and snapshots of trackers that show features or masks.
 
-    Pictures of the worst frames are written at the end, all others at once: a run that is killed leaves them.
+    Pictures of the worst frames are written at the end, all others at once: a run that is killed
+    leaves them.
 
     Args:
         folder: The run's.
@@ -73,16 +82,19 @@ class SnapshotWriter:
     """
 
     def __init__(self, folder: Path, frames: int) -> None:
-        self._folder, self._spread = folder, set(spread(frames))
+        self._spread = set(spread(frames))
+        self._folder = folder
         self._even: list[Snapshot] = []
         self._worst: list[tuple[float, Snapshot | None, int, Image]] = []
         self._size = (0, 0)
-        self._state, self._losses = "", 0
+        self._state = ""
+        self._losses = 0
 
     def add(self, outcome: FrameOutcome, rgb: Image, result: TrackResult) -> None:
         """Keep the frame if it is one of those spread over the run, of the worst so far, or the first of a loss."""
         error = None if outcome.error is None else outcome.error.frame_trans_m
-        lost, self._state = outcome.state == "lost" and self._state == "ok", outcome.state
+        lost = outcome.state == "lost" and self._state == "ok"
+        self._state = outcome.state
         self._losses += lost
         kept = outcome.index in self._spread or (lost and self._losses <= WORST)
         bad = error is not None and (len(self._worst) < WORST or error > self._worst[-1][0])
@@ -128,8 +140,13 @@ def snapshot_of(index: int, result: TrackResult) -> Snapshot | None:
     """The snapshot of a frame that was tracked; None if its tracker shows neither features nor a mask."""
     if result.keypoints_xy is None and result.dynamic_mask is None:
         return None
-    points = np.zeros((0, 2)) if result.keypoints_xy is None else np.asarray(result.keypoints_xy).reshape(-1, 2)
-    kept, mask = result.keypoints_keep, result.dynamic_mask
+    points = (
+        np.zeros((0, 2))
+        if result.keypoints_xy is None
+        else np.asarray(result.keypoints_xy).reshape(-1, 2)
+    )
+    kept = result.keypoints_keep
+    mask = result.dynamic_mask
     return Snapshot(
         index,
         np.clip(points.round(), -(2**15), 2**15 - 1).astype(np.int16),
@@ -146,8 +163,8 @@ def read_snapshots(folder: Path) -> tuple[tuple[int, int], list[Snapshot]]:
         folder: The run's.
 
     Returns:
-        Height and width of the images in pixels, and the snapshots in order; none for runs without any (imported, of
-        older versions, of trackers that show neither features nor masks).
+        Height and width of the images in pixels, and the snapshots in order; none for runs without
+        any (imported, of older versions, of trackers that show neither features nor masks).
 
     Raises:
         RunError: The file is damaged.
@@ -156,10 +173,18 @@ def read_snapshots(folder: Path) -> tuple[tuple[int, int], list[Snapshot]]:
     if not path.is_file():
         return (0, 0), []
     arrays = read_npz(path, kind=RunError)
-    with raising(RunError, f"{path} holds no snapshots", of=(LookupError, ValueError, TypeError, ArithmeticError)):
+    with raising(
+        RunError,
+        f"{path} holds no snapshots",
+        of=(LookupError, ValueError, TypeError, ArithmeticError),
+    ):
         height, width = map(int, arrays["size"])
-        index, count, points, kept = arrays["index"], arrays["count"], arrays["points"], arrays["kept"]
-        masks, masked = arrays["masks"], arrays["masked"]
+        index = arrays["index"]
+        count = arrays["count"]
+        points = arrays["points"]
+        kept = arrays["kept"]
+        masks = arrays["masks"]
+        masked = arrays["masked"]
         if not (
             masks.dtype == np.uint8
             and masks.shape[1:] == (height, -(-width // 8))
@@ -171,7 +196,9 @@ def read_snapshots(folder: Path) -> tuple[tuple[int, int], list[Snapshot]]:
             and kept.dtype == masked.dtype == np.bool_
         ):
             raise ValueError(f"its arrays do not fit each other and {width} x {height} pixels")
-        parts = zip(*(np.split(array, np.cumsum(count)[:-1]) for array in (points, kept)), strict=True)
+        parts = zip(
+            *(np.split(array, np.cumsum(count)[:-1]) for array in (points, kept)), strict=True
+        )
         shots = [
             Snapshot(int(index[at]), place, keep, masks[at] if masked[at] else None, width)
             for at, (place, keep) in enumerate(parts)
@@ -179,12 +206,14 @@ def read_snapshots(folder: Path) -> tuple[tuple[int, int], list[Snapshot]]:
     return (height, width), shots
 
 
-def keep_map(env: SlamEnv, folder: Path, spec: RunSpec) -> tuple[MapOutputs | None, dict[str, int | None], list[str]]:
+def keep_map(
+    env: SlamEnv, folder: Path, spec: RunSpec
+) -> tuple[MapOutputs | None, dict[str, int | None], list[str]]:
     """Write ``keyframes.csv``, ``map.ply`` and, if it was asked for, ``map.npz``.
 
     Returns:
-        Keyframes and points, None if the tracker offers none; ``keyframes``, ``map_points`` and ``maps`` for the
-        record, None for what the tracker does not say; and notes for a reader.
+        Keyframes and points, None if the tracker offers none; ``keyframes``, ``map_points`` and
+        ``maps`` for the record, None for what the tracker does not say; and notes for a reader.
 
     Raises:
         DynslamError: A file cannot be written.
@@ -208,14 +237,21 @@ def keep_map(env: SlamEnv, folder: Path, spec: RunSpec) -> tuple[MapOutputs | No
             "the first, whose place in it is unknown; frames tracked there count as lost, and no points of it are in "
             "map.ply"
         )
-    return outputs, {"keyframes": len(numbers), "map_points": len(outputs.positions), "maps": maps}, notes
+    return (
+        outputs,
+        {"keyframes": len(numbers), "map_points": len(outputs.positions), "maps": maps},
+        notes,
+    )
 
 
 def _origin_of_map(env: SlamEnv, spec: RunSpec) -> str:
     """Which run made a map, in words."""
     start, stop = spec.frames_seen or (0, None)
     asked = spec.settings | {f"degrade.{kind}": strength for kind, strength in spec.degrade.items()}
-    words = [f"{env.tracker_spec.id} on {env.sequence.id}", f"frames {start}:{'' if stop is None else stop}"]
+    words = [
+        f"{env.tracker_spec.id} on {env.sequence.id}",
+        f"frames {start}:{'' if stop is None else stop}",
+    ]
     words += [f"stride {spec.stride}"] * (spec.stride != 1) + [f"seed {spec.seed}"]
     return ", ".join([*words, *(f"{name}={value}" for name, value in asked.items())])
 
@@ -235,7 +271,8 @@ class SheetWriter:
     """
 
     def __init__(self, path: Path, env: SlamEnv) -> None:
-        self._path, self._env = path, env
+        self._path = path
+        self._env = env
         self._canvas = Canvas(env.sequence, env.tracker_spec.label)
         self._wanted = set(spread(len(env.sequence), SHOWN))
         self._frames: list[Image] = []
@@ -253,13 +290,23 @@ class SheetWriter:
             track: The run's final trajectory, or the online one.
         """
         sequence = self._env.sequence
-        own = [record.frame for record in outputs.keyframes if record.frame >= 0]  # others are of an earlier run
+        # others are of an earlier run
+        own = [record.frame for record in outputs.keyframes if record.frame >= 0]
         shown = [own[row] for row in spread(len(own), SHOWN)]
         title = f"{self._env.tracker_spec.label}  |  {sequence.id}"
         keyframes = [sequence[index].rgb for index in shown]
         truth, ate_m = aligned_truth(sequence.ground_truth, track)
         write_run_figure(
-            self._path, title, sequence[0].rgb, self._frames, keyframes, outputs, track, truth, ate_m, FEATURES
+            self._path,
+            title,
+            sequence[0].rgb,
+            self._frames,
+            keyframes,
+            outputs,
+            track,
+            truth,
+            ate_m,
+            FEATURES,
         )
 
 
@@ -275,7 +322,8 @@ class VideoWriter:
     """
 
     def __init__(self, folder: Path, env: SlamEnv) -> None:
-        self._path, self._env = folder / VIDEO_FILE, env
+        self._path = folder / VIDEO_FILE
+        self._env = env
         self._writer: Any = None
 
     def add(self) -> None:
@@ -303,7 +351,9 @@ class VideoWriter:
             self._writer.release()
 
 
-def aligned_truth(truth: Trajectory | None, track: Trajectory) -> tuple[Trajectory | None, float | None]:
+def aligned_truth(
+    truth: Trajectory | None, track: Trajectory
+) -> tuple[Trajectory | None, float | None]:
     """The ground truth at the track's stamps, moved onto the track by least squares, and what is left in metres (RMSE).
 
     Both are None without enough of it.
@@ -311,9 +361,13 @@ def aligned_truth(truth: Trajectory | None, track: Trajectory) -> tuple[Trajecto
     by_row = truths_at(truth, track.timestamps)
     if len(by_row) < 3:
         return None, None
-    rows, true = list(by_row), np.array(list(by_row.values()))
+    rows = list(by_row)
+    true = np.array(list(by_row.values()))
     fit = align(track.T_world_cam[rows], true, "se3")
     move = np.eye(4)
-    move[:3, :3], move[:3, 3] = fit.rotation, fit.translation
+    move[:3, :3] = fit.rotation
+    move[:3, 3] = fit.translation
     moved = Trajectory(track.timestamps[rows], se3.inverse(move) @ true)
-    return moved, float(np.sqrt(np.square(moved.positions - track.positions[rows]).sum(axis=1).mean()))
+    return moved, float(
+        np.sqrt(np.square(moved.positions - track.positions[rows]).sum(axis=1).mean())
+    )

@@ -1,11 +1,13 @@
 """A bank of trajectories: a results folder of text files alone, with checksums, that is exchanged and scored again.
 
-It holds ``runs/<run_id>/`` with ``run.json`` and the trajectories, ``sequences/<part>/`` with stamps and ground truth,
-and ``SHA256SUMS`` of them all, in the format of ``sha256sum -c``. Whatever reads a results folder reads a bank.
+It holds ``runs/<run_id>/`` with ``run.json`` and the trajectories, ``sequences/<part>/`` with
+stamps and ground truth, and ``SHA256SUMS`` of them all, in the format of ``sha256sum -c``. Whatever
+reads a results folder reads a bank.
 
-Runs are added in four steps: an empty file `UNFINISHED` is written, the runs are copied, each of which appears whole or
-not at all, the checksums are written, the empty file is removed. Where a process was killed in between, the file says
-that there may be runs without checksums, and the next one that adds goes on from there.
+Runs are added in four steps: an empty file `UNFINISHED` is written, the runs are copied, each of
+which appears whole or not at all, the checksums are written, the empty file is removed. Where a
+process was killed in between, the file says that there may be runs without checksums, and the next
+one that adds goes on from there.
 """
 
 import re
@@ -37,7 +39,17 @@ from dynslam_bench.core.errors import left_out_of_messages
 from dynslam_bench.core.records import Record, digest, validated
 from dynslam_bench.runs.exchange.transfer import import_trajectory
 from dynslam_bench.runs.record import RunRecord, run_id_of
-from dynslam_bench.runs.store import FINAL, ONLINE, RUN_FILE, Merged, RunStore, Unreadable, Which, merge, open_store
+from dynslam_bench.runs.store import (
+    FINAL,
+    ONLINE,
+    RUN_FILE,
+    Merged,
+    RunStore,
+    Unreadable,
+    Which,
+    merge,
+    open_store,
+)
 
 SUMS = "SHA256SUMS"
 UNFINISHED = ".unfinished"
@@ -64,7 +76,11 @@ class Bank(RunStore):
                         shutil.copyfile(file, work / file.name)
                 (work / RUN_FILE).write_text(record.public().to_json(), encoding="utf-8")
             self.check_copy(work, record)
-            with raising(InfrastructureError, f"cannot write {self.folder(record.run_id)}", "check the free space"):
+            with raising(
+                InfrastructureError,
+                f"cannot write {self.folder(record.run_id)}",
+                "check the free space",
+            ):
                 replace_folder(work, self.folder(record.run_id))
         return record
 
@@ -136,7 +152,8 @@ def add(sources: Iterable[str | Path], bank: str | Path) -> Merged:
         DynslamError: The bank cannot be written.
     """
     with ExitStack() as stack:
-        stores, left_out = [], list[Unreadable]()
+        stores = []
+        left_out = list[Unreadable]()
         for source in map(Path, sources):
             if source.suffix.lower() == ".toml":
                 stores.append(RunStore(stack.enter_context(closing(TemporaryFolder())).path))
@@ -162,7 +179,11 @@ def _import(manifest: Path, store: RunStore) -> Iterator[Unreadable]:
         for entry in read_manifest(manifest):
             try:
                 file = _fetched(entry.file, entry.sha256, manifest.parent, folder.path)
-                truth = _fetched(entry.truth, entry.truth_sha256, manifest.parent, folder.path) if entry.truth else None
+                truth = (
+                    _fetched(entry.truth, entry.truth_sha256, manifest.parent, folder.path)
+                    if entry.truth
+                    else None
+                )
                 import_trajectory(
                     file, entry.tracker, entry.sequence, results=store, label=entry.label, which=entry.which,
                     provenance=entry.provenance or entry.file, truth=truth,
@@ -195,29 +216,43 @@ def verify(bank: str | Path) -> list[str]:
     store = Bank(bank)
     if (store.root / UNFINISHED).exists():
         text = f"runs were being added when the process ended, or still are: {SUMS} may lack some of them"
-        return [f"{text} (repeat the command, or add any other run)", *_faults(store, unfinished=True)]
+        return [
+            f"{text} (repeat the command, or add any other run)",
+            *_faults(store, unfinished=True),
+        ]
     if not (store.root / SUMS).is_file():
-        raise RunError(f"{store.root} is no bank: it has no {SUMS}", "make one: dynslam-bench bank add RESULTS BANK")
+        raise RunError(
+            f"{store.root} is no bank: it has no {SUMS}",
+            "make one: dynslam-bench bank add RESULTS BANK",
+        )
     return _faults(store)
 
 
 def _faults(store: Bank, *, unfinished: bool = False) -> list[str]:
     """See `verify`; in a bank to which runs are still to be added, files may be without a checksum."""
-    sums, faults, listed = store.root / SUMS, list[str](), set[str]()
+    sums = store.root / SUMS
+    faults = list[str]()
+    listed = set[str]()
     if sums.is_file() or not unfinished:
         faults = compare_sums(store.root, sums, RunError)
         listed = {line.rstrip("\n").partition("  ")[2] for line in read_lines(sums, kind=RunError)}
     names = store.files()
-    faults += [f"{name} is a link" for name in (*_PARTS, *names) if (store.root / name).is_symlink()]
+    faults += [
+        f"{name} is a link" for name in (*_PARTS, *names) if (store.root / name).is_symlink()
+    ]
     if unfinished:
         listed.update(names)
     faults += [f"{name} is not listed in {SUMS}" for name in names if name not in listed]
     records, unreadable = store.all()
     faults += [f"{entry.path}: {entry.reason}" for entry in unreadable]
     for record in records:
-        if record.run_id not in (run_id_of(record.identity), digest(record.identity, 16)):  # the second of older runs
+        # the second of older runs
+        if record.run_id not in (run_id_of(record.identity), digest(record.identity, 16)):
             faults.append(f"runs/{record.run_id}: its id is not that of what it says of itself")
-        faults += [f"runs/{record.run_id}: its {name} is not that of its identity" for name in _contradicted(record)]
+        faults += [
+            f"runs/{record.run_id}: its {name} is not that of its identity"
+            for name in _contradicted(record)
+        ]
         if f"sequences/{record.sequence.part}/timestamps.txt" not in listed:
             faults.append(f"runs/{record.run_id}: the stamps of its sequence are missing")
             continue
@@ -230,9 +265,20 @@ def _faults(store: Bank, *, unfinished: bool = False) -> list[str]:
 
 def _contradicted(record: RunRecord) -> list[str]:
     """Fields of a record that are part of its identity, and differ from it."""
-    stated = {name: getattr(record, name) for name in ("offset", "stride", "seed", "device", "threads", "realtime")}
-    stated |= {"tracker": record.tracker.id, "tracker_version": record.tracker.version, "drop_share": record.drop_share}
-    stated |= {"sequence": record.sequence.id, "content": record.sequence.content, "degrade": record.degrade}
+    stated = {
+        name: getattr(record, name)
+        for name in ("offset", "stride", "seed", "device", "threads", "realtime")
+    }
+    stated |= {
+        "tracker": record.tracker.id,
+        "tracker_version": record.tracker.version,
+        "drop_share": record.drop_share,
+    }
+    stated |= {
+        "sequence": record.sequence.id,
+        "content": record.sequence.content,
+        "degrade": record.degrade,
+    }
     return [name for name, value in stated.items() if record.identity.get(name, value) != value]
 
 
@@ -240,7 +286,8 @@ def pull(source: str, bank: str | Path) -> Merged:
     """Add the runs of another bank.
 
     Args:
-        source: A folder, a git repository, or the address of an archive (``.zip``, ``.tgz``, ``.tar``).
+        source: A folder, a git repository, or the address of an archive (``.zip``, ``.tgz``,
+            ``.tar``).
         bank: The bank that gets them.
 
     Raises:
@@ -250,12 +297,16 @@ def pull(source: str, bank: str | Path) -> Merged:
     with ExitStack() as stack:
         store = RunStore(source)
         if _ARCHIVE.fullmatch(source):
-            archive = stack.enter_context(closing(TemporaryFolder())).path / Path(source.partition("?")[0]).name
+            archive = (
+                stack.enter_context(closing(TemporaryFolder())).path
+                / Path(source.partition("?")[0]).name
+            )
             download(source, archive)
             store = open_store(archive)
         elif _is_repository(source):
             store = RunStore(stack.enter_context(_cloned(source)))
-        store.source = Path(source) if Path(source).exists() else Path(Path(source).name)  # an address's end
+        # an address's end
+        store.source = Path(source) if Path(source).exists() else Path(Path(source).name)
         if not (store.root / SUMS).is_file():
             raise RunError(f"{source} is no bank: it has no {SUMS}")
         _check(store.root)
@@ -277,10 +328,15 @@ def push(bank: str | Path, target: str) -> Merged:
     if not _is_repository(target):
         return _merge([RunStore(bank)], target)
     with _cloned(target) as clone:
-        others = [path.name for path in clone.iterdir() if not path.name.startswith((".", "README", "LICENSE"))]
+        others = [
+            path.name
+            for path in clone.iterdir()
+            if not path.name.startswith((".", "README", "LICENSE"))
+        ]
         if others and SUMS not in others:
             raise RunError(
-                f"{target} is no bank: it has no {SUMS}, and holds {others[0]}", "push to an empty repository"
+                f"{target} is no bank: it has no {SUMS}, and holds {others[0]}",
+                "push to an empty repository",
             )
         merged = _merge([RunStore(bank)], clone)
         if merged.added:
@@ -332,20 +388,35 @@ def _check(bank: str | Path) -> None:
 
 def _refuse(bank: str | Path, faults: Sequence[str]) -> None:
     if faults:
-        raise RunError(f"{bank} has faults, of {len(faults)} the first: {faults[0]}", "bank verify lists all")
+        raise RunError(
+            f"{bank} has faults, of {len(faults)} the first: {faults[0]}", "bank verify lists all"
+        )
 
 
 def _is_repository(place: str) -> bool:
     """Whether a place is a git repository that has to be cloned: an address, or a bare one."""
-    return _ADDRESS.fullmatch(place) is not None or (Path(place, "HEAD").is_file() and Path(place, "objects").is_dir())
+    return _ADDRESS.fullmatch(place) is not None or (
+        Path(place, "HEAD").is_file() and Path(place, "objects").is_dir()
+    )
 
 
 @contextmanager
 def _cloned(repository: str) -> Iterator[Path]:
     with closing(TemporaryFolder()) as folder:
         origin = repository if _ADDRESS.fullmatch(repository) else str(Path(repository).absolute())
-        clone = left_out_of_messages(folder.path) / (re.sub(r"[^\w.-]", "-", Path(origin).resolve().name) or "bank")
-        _git(folder.path, "clone", "--quiet", "--config", "core.autocrlf=false", "--", origin, str(clone))
+        clone = left_out_of_messages(folder.path) / (
+            re.sub(r"[^\w.-]", "-", Path(origin).resolve().name) or "bank"
+        )
+        _git(
+            folder.path,
+            "clone",
+            "--quiet",
+            "--config",
+            "core.autocrlf=false",
+            "--",
+            origin,
+            str(clone),
+        )
         yield clone
 
 
@@ -357,7 +428,14 @@ def _git(folder: Path, verb: str, *words: str) -> None:
     """
     with raising(RunError, "cannot start git", "install it"):
         done = subprocess.run(
-            ["git", verb, *words], cwd=folder, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL
+            ["git", verb, *words],
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            check=False,
+            stdin=subprocess.DEVNULL,
         )
     if done.returncode:
-        raise RunError(f"git {verb} ended with exit code {done.returncode}: {' '.join(done.stderr.split())[-400:]}")
+        raise RunError(
+            f"git {verb} ended with exit code {done.returncode}: {' '.join(done.stderr.split())[-400:]}"
+        )

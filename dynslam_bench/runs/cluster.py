@@ -19,7 +19,17 @@ from dynslam_bench.runs.own_code import package_code
 from dynslam_bench.segmentation.networks.checkpoints import COCO, cached_checkpoint
 from dynslam_bench.sequences.catalogue import entry_of
 
-_KIND = ("tracker", "settings", "sequence", "data_root", "camera", "device", "frames", "offset", "stride")
+_KIND = (
+    "tracker",
+    "settings",
+    "sequence",
+    "data_root",
+    "camera",
+    "device",
+    "frames",
+    "offset",
+    "stride",
+)
 """What decides whether a host can make a run."""
 _LOOK_EVERY_S = 5.0
 
@@ -35,34 +45,51 @@ class DaskWorkers(Executor):
     """
 
     def __init__(self, address: str) -> None:
-        with raising(RunError, "a scheduler needs the package distributed", install_hint("cluster"), of=ImportError):
+        with raising(
+            RunError,
+            "a scheduler needs the package distributed",
+            install_hint("cluster"),
+            of=ImportError,
+        ):
             from distributed import Client
-        for name in ("distributed", "distributed.client"):  # a lost scheduler is logged with tracebacks
+        # a lost scheduler is logged with tracebacks
+        for name in ("distributed", "distributed.client"):
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         hint = "for example tcp://host:8786"
-        with raising(RunError, f"no Dask scheduler answers at {address}", hint, of=(OSError, ValueError)):
+        with raising(
+            RunError, f"no Dask scheduler answers at {address}", hint, of=(OSError, ValueError)
+        ):
             self._client = Client(address, timeout="10s")
         self._executor = self._client.get_executor(pure=False)
         self._slots, self._look_again = Counter[str](), float("-inf")
         self._refused: dict[str, dict[str, RunError]] = defaultdict(dict)
         self._strangers: set[str] = set()
 
-    def describe(self, sequences: Sequence[str], data_root: str | None = None) -> list[dict[str, object]]:
+    def describe(
+        self, sequences: Sequence[str], data_root: str | None = None
+    ) -> list[dict[str, object]]:
         """What each worker has, as rows of a table; one that does not know this package gets no runs.
 
         Args:
             sequences: Ids or folders that runs will need.
             data_root: Folder of the recorded sequences.
         """
-        own, workers = _facts(sequences, data_root), self._workers()
+        own = _facts(sequences, data_root)
+        workers = self._workers()
         answers = self._client.run(_facts, sequences, data_root, on_error="ignore")
         self._strangers = {_host(address) for address in workers.keys() - answers.keys()}
         unknown = {"code": "", "packages": set(), "device": "", "lacking": set()}
         return [
             {
                 "worker": address,
-                "code": "the same" if facts["code"] == own["code"] else "other" if facts["code"] else "none",
-                "other packages": [" ".join(pair) for pair in sorted(facts["packages"] - own["packages"])],
+                "code": "the same"
+                if facts["code"] == own["code"]
+                else "other"
+                if facts["code"]
+                else "none",
+                "other packages": [
+                    " ".join(pair) for pair in sorted(facts["packages"] - own["packages"])
+                ],
                 "device": facts["device"],
                 "runs at a time": worker["nthreads"],
                 "memory (GB)": (worker["memory_limit"] or 0) / 1e9,
@@ -81,8 +108,11 @@ class DaskWorkers(Executor):
             self._look_again, self._slots = time.monotonic() + _LOOK_EVERY_S, Counter()
             for address, worker in self._workers().items():
                 self._slots[_host(address)] += worker["nthreads"]
-        named, outcome = json.loads(spec), Future[bytes]()
-        self._send(outcome, json.dumps([named[name] for name in _KIND]), set(), make, spec, *arguments)
+        named = json.loads(spec)
+        outcome = Future[bytes]()
+        self._send(
+            outcome, json.dumps([named[name] for name in _KIND]), set(), make, spec, *arguments
+        )
         return outcome
 
     def _send(self, outcome: Future[bytes], kind: str, refusers: set[str], *call: Any) -> None:
@@ -100,10 +130,17 @@ class DaskWorkers(Executor):
         sent.add_done_callback(partial(self._take, outcome, kind, refusers, call))
 
     def _take(
-        self, outcome: Future[bytes], kind: str, refusers: set[str], call: tuple[Any, ...], sent: Future[Any]
+        self,
+        outcome: Future[bytes],
+        kind: str,
+        refusers: set[str],
+        call: tuple[Any, ...],
+        sent: Future[Any],
     ) -> None:
         if error := CancelledError() if sent.cancelled() else sent.exception():
-            died = RunError(f"every worker that was given the run died: {error}", "see the workers' logs")
+            died = RunError(
+                f"every worker that was given the run died: {error}", "see the workers' logs"
+            )
             outcome.set_exception(died if type(error).__name__ == "KilledWorker" else error)
         elif isinstance(answer := sent.result(), bytes):
             outcome.set_result(answer)
@@ -122,7 +159,9 @@ def _host(address: str) -> str:
     return urlsplit(address).hostname or ""
 
 
-def _answer(at_a_time: int, make: Callable[..., bytes], *arguments: str) -> bytes | tuple[str, RunError]:
+def _answer(
+    at_a_time: int, make: Callable[..., bytes], *arguments: str
+) -> bytes | tuple[str, RunError]:
     """On a worker: the run, or which host refuses it and why."""
     from distributed import get_worker
 

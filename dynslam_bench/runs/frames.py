@@ -51,19 +51,23 @@ class FrameRow:
     Attributes:
         index: Index of the frame in the run's part of the sequence.
         timestamp: Seconds; ``frames.csv`` holds them to the nanosecond.
-        state: ``initialising``, ``ok``, ``lost``, or ``dropped`` if the frame never reached the tracker.
-        frame_error_trans_m: Frame-to-frame translational error in metres; None without ground truth at both frames.
+        state: ``initialising``, ``ok``, ``lost``, or ``dropped`` if the frame never reached the
+            tracker.
+        frame_error_trans_m: Frame-to-frame translational error in metres; None without ground truth
+            at both frames.
         frame_error_rot_deg: Frame-to-frame rotational error in degrees, likewise.
-        pose_error_trans_m: Cumulative translational error in metres, see `OnlineError`; None without ground truth.
+        pose_error_trans_m: Cumulative translational error in metres, see `OnlineError`; None
+            without ground truth.
         pose_error_rot_deg: Cumulative rotational error in degrees, likewise.
         reward_m: What the frame earned.
-        mask_iou: Overlap of the dynamic mask with the exact masks of people, 0 to 1; None where either is missing or
-            neither has a pixel.
+        mask_iou: Overlap of the dynamic mask with the exact masks of people, 0 to 1; None where
+            either is missing or neither has a pixel.
         timings: Seconds by stage; empty for a frame that was dropped.
         stats: The tracker's diagnostics by name.
-        pose: Tracked camera-to-world pose ``tx ty tz qx qy qz qw``; None unless the state is ``ok``. Not in
-            ``frames.csv``: ``trajectory_online.txt`` holds it.
-        dynamic_share: Share of the pixels that show people, by the exact masks, 0 to 1; None without such masks.
+        pose: Tracked camera-to-world pose ``tx ty tz qx qy qz qw``; None unless the state is
+            ``ok``. Not in ``frames.csv``: ``trajectory_online.txt`` holds it.
+        dynamic_share: Share of the pixels that show people, by the exact masks, 0 to 1; None
+            without such masks.
     """
 
     index: Annotated[int, Field(ge=0, lt=MOST_FRAMES)]
@@ -83,14 +87,22 @@ class FrameRow:
     @field_validator("pose")
     @classmethod
     def _is_pose(cls, pose: list[float] | None) -> list[float] | None:
-        if pose is not None and (len(pose) != 7 or not np.isfinite(pose).all() or math.hypot(*pose[3:]) < 1e-8):
+        if pose is not None and (
+            len(pose) != 7 or not np.isfinite(pose).all() or math.hypot(*pose[3:]) < 1e-8
+        ):
             raise ValueError("it holds no pose")
         return pose
 
     @classmethod
-    def of(cls, outcome: FrameOutcome, mask_iou: float | None = None, dynamic_share: float | None = None) -> FrameRow:
+    def of(
+        cls,
+        outcome: FrameOutcome,
+        mask_iou: float | None = None,
+        dynamic_share: float | None = None,
+    ) -> FrameRow:
         """The row of a frame that an environment has tracked."""
-        error, pose = outcome.error, outcome.T_world_cam
+        error = outcome.error
+        pose = outcome.T_world_cam
         return cls(
             index=outcome.index,
             timestamp=outcome.timestamp,
@@ -129,7 +141,9 @@ def column_names(rows: Iterable[FrameRow]) -> list[str]:
     return [*FIXED, *sorted(others, key=lambda name: name.startswith(_STAT))]
 
 
-def write_csv(path: Path, rows: Sequence[FrameRow], exact: Mapping[float, int] | None = None) -> None:
+def write_csv(
+    path: Path, rows: Sequence[FrameRow], exact: Mapping[float, int] | None = None
+) -> None:
     """Write ``frames.csv``; `exact` gives the nanoseconds of stamps by their seconds."""
     columns = column_names(rows)
     with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
@@ -150,7 +164,9 @@ def read_csv(path: Path) -> list[FrameRow]:
     try:
         rows.extend(map(_parse, csv.DictReader(read_lines(path, kind=RunError))))
     except (TypeError, ValueError, csv.Error) as error:
-        raise RunError(f"{path} is no table of frames: row {len(rows) + 1} is damaged ({reason_of(error)})") from error
+        raise RunError(
+            f"{path} is no table of frames: row {len(rows) + 1} is damaged ({reason_of(error)})"
+        ) from error
     return rows
 
 
@@ -159,8 +175,14 @@ def _parse(line: dict[str, str]) -> FrameRow:
         raise ValueError("another number of cells than the heading has")
     cells = {name: text for name, text in line.items() if text}
     fixed: dict[str, Any] = {name: cells.pop(name) for name in (*FIXED, _SHARE) if name in cells}
-    stats = {name.removeprefix(_STAT): text for name, text in cells.items() if name.startswith(_STAT)}
-    times = {name: text for name, text in cells.items() if name.endswith(_SECONDS) and not name.startswith(_STAT)}
+    stats = {
+        name.removeprefix(_STAT): text for name, text in cells.items() if name.startswith(_STAT)
+    }
+    times = {
+        name: text
+        for name, text in cells.items()
+        if name.endswith(_SECONDS) and not name.startswith(_STAT)
+    }
     timings = {name.removesuffix(_SECONDS): text for name, text in times.items()}
     return _LINE.validate_python(fixed | {"stats": stats, "timings": timings})
 
@@ -203,15 +225,22 @@ class FrameLog:
         tracked = [(row.timestamp, row.pose) for row in self.rows if row.pose is not None]
         stamps = np.array([stamp for stamp, _ in tracked], dtype=np.float64)
         poses = np.array([pose for _, pose in tracked], dtype=np.float64).reshape(-1, 7)
-        return Trajectory(stamps, se3.from_quaternion(poses[:, :3], poses[:, 3:]) if tracked else np.zeros((0, 4, 4)))
+        return Trajectory(
+            stamps,
+            se3.from_quaternion(poses[:, :3], poses[:, 3:]) if tracked else np.zeros((0, 4, 4)),
+        )
 
     def timings(self) -> dict[str, StageTime]:
         """Median, p95 and mean of every stage over the frames that reached the tracker."""
         return {
             stage: StageTime(
-                median_s=float(np.median(values)), p95_s=float(np.percentile(values, 95)), mean_s=float(values.mean())
+                median_s=float(np.median(values)),
+                p95_s=float(np.percentile(values, 95)),
+                mean_s=float(values.mean()),
             )
-            for stage, values in stage_seconds([row.timings for row in self.rows if row.timings]).items()
+            for stage, values in stage_seconds(
+                [row.timings for row in self.rows if row.timings]
+            ).items()
         }
 
     def mask_iou(self) -> float | None:
@@ -222,11 +251,15 @@ class FrameLog:
     def epipolar_skipped(self) -> float | None:
         """Share of the tracked frames on which no fundamental matrix judged, of those with an image to compare with.
 
-        Asks the stats ``*_f_asked`` and ``*_f_judged`` of the filters; None for systems without such a filter.
+        Asks the stats ``*_f_asked`` and ``*_f_judged`` of the filters; None for systems without
+        such a filter.
         """
         tracked = [row.stats for row in self.rows if row.state == "ok"]
         asked, judged = (
-            sum(any(value for name, value in stats.items() if name.endswith(ending)) for stats in tracked)
+            sum(
+                any(value for name, value in stats.items() if name.endswith(ending))
+                for stats in tracked
+            )
             for ending in ("_f_asked", "_f_judged")
         )
         return 1 - judged / asked if asked else None
@@ -237,7 +270,8 @@ class FrameLog:
         Args:
             folder: Where.
             comment: Head of the trajectory.
-            exact: The nanoseconds of the frames' stamps by their seconds, where a float does not hold them.
+            exact: The nanoseconds of the frames' stamps by their seconds, where a float does not
+                hold them.
         """
         write_tum(folder / ONLINE, self.trajectory().with_exact(exact or {}), comment=comment)
         write_csv(folder / CSV_FILE, self.rows, exact)
@@ -247,25 +281,29 @@ _KINDS = {"index": "int64", "timestamp": "float64", "state": "string", "reward_m
 """Columns that are never missing; all others are ``Float64``."""
 
 
-def load_frames(run: RunRecord | Path | str, results: RunStore | Path | str = "results") -> pd.DataFrame:
+def load_frames(
+    run: RunRecord | Path | str, results: RunStore | Path | str = "results"
+) -> pd.DataFrame:
     """The frames of a run.
 
     Args:
-        run: A record; the run's id, its first digits or ``latest``; or a path: the run's folder (``results/latest``) or
-            a ``frames.csv``.
+        run: A record; the run's id, its first digits or ``latest``; or a path: the run's folder
+            (``results/latest``) or a ``frames.csv``.
         results: The results folder, or a store; not looked at if `run` is a path.
 
     Returns:
-        One row a frame, in order. Columns that are always present: index (``int64``, in the run's part of the
-        sequence), timestamp (``float64``, seconds), state (``string``: ``initialising``, ``ok``, ``lost`` or
-        ``dropped``), reward_m (``float64``, metres). ``Float64``, missing (``pd.NA``) where there is no ground truth,
-        no mask, or the stage did not run: frame_error_trans_m and frame_error_rot_deg (frame to frame, metres and
-        degrees), pose_error_trans_m and pose_error_rot_deg (cumulative), mask_iou (0 to 1), dynamic_share (0 to 1, only
-        where the sequence has exact masks), ``<stage>_s`` (seconds of each stage; ``total_s`` is the frame time;
-        ``read`` is decoding), ``stat_<name>`` (diagnostics).
+        One row a frame, in order. Columns that are always present: index (``int64``, in the run's
+        part of the sequence), timestamp (``float64``, seconds), state (``string``:
+        ``initialising``, ``ok``, ``lost`` or ``dropped``), reward_m (``float64``, metres).
+        ``Float64``, missing (``pd.NA``) where there is no ground truth, no mask, or the stage did
+        not run: frame_error_trans_m and frame_error_rot_deg (frame to frame, metres and degrees),
+        pose_error_trans_m and pose_error_rot_deg (cumulative), mask_iou (0 to 1), dynamic_share (0
+        to 1, only where the sequence has exact masks), ``<stage>_s`` (seconds of each stage;
+        ``total_s`` is the frame time; ``read`` is decoding), ``stat_<name>`` (diagnostics).
 
     Raises:
-        RunError: There is no such run, it has no frames (an imported trajectory), or its table is damaged.
+        RunError: There is no such run, it has no frames (an imported trajectory), or its table is
+            damaged.
     """
     import pandas as pd
 

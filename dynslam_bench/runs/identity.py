@@ -1,7 +1,7 @@
 """What makes two runs the same run: what was asked for, and what was read for it.
 
-A run's id has twelve digits of what was asked for and eight of what was read. A stored run is taken again while all
-that was read for it is unchanged.
+A run's id has twelve digits of what was asked for and eight of what was read. A stored run is taken
+again while all that was read for it is unchanged.
 """
 
 import json
@@ -21,7 +21,12 @@ from dynslam_bench.core.fingerprint import (
     this_machine,
 )
 from dynslam_bench.core.libraries import library_identity, search_path
-from dynslam_bench.core.module_graph import ModuleGraph, check_byte_code, module_graph, read_module_graph
+from dynslam_bench.core.module_graph import (
+    ModuleGraph,
+    check_byte_code,
+    module_graph,
+    read_module_graph,
+)
 from dynslam_bench.core.plugins import load_object
 from dynslam_bench.core.reads import Anchors
 from dynslam_bench.core.settings import Settings, flatten
@@ -49,7 +54,13 @@ from dynslam_bench.slam.map_files import MapFeatures, Sensors, read_map
 from dynslam_bench.slam.settings import BackendSettings
 from dynslam_bench.trackers.registry import TRACKERS, resolve_settings
 
-LIBRARIES = {"numpy": "numpy", "scipy": "scipy", "opencv": "cv2", "torch": "torch", "numba": "numba"}
+LIBRARIES = {
+    "numpy": "numpy",
+    "scipy": "scipy",
+    "opencv": "cv2",
+    "torch": "torch",
+    "numba": "numba",
+}
 """The modules that compute with a run's data, by the name that tables give them."""
 
 
@@ -117,9 +128,10 @@ def resolve(spec: RunSpec) -> ResolvedRun:
     """Look up everything that a run names, before anything runs.
 
     Raises:
-        DynslamError: Unknown tracker, setting, sequence, device or degradation; a sequence that is missing or has fewer
-            than two frames; a semantic source that is not available; a tracker that needs a missing package, or
-            depth that the sequence has not; a map to begin in that does not fit.
+        DynslamError: Unknown tracker, setting, sequence, device or degradation; a sequence that is
+            missing or has fewer than two frames; a semantic source that is not available; a tracker
+            that needs a missing package, or depth that the sequence has not; a map to begin in that
+            does not fit.
     """
     return Resolver()(spec)
 
@@ -159,7 +171,8 @@ class Resolver:
         asked = {
             "scheme": IDENTITY_SCHEME,
             "tracker": tracker.id,
-            "settings": flat if start_map is None else flat | {MAP_SETTING: ""},  # its digest is among the weights
+            # its digest is among the weights
+            "settings": flat if start_map is None else flat | {MAP_SETTING: ""},
             "sequence": part.id,
             "frames": [part.start, part.stop],
             "offset": spec.offset,
@@ -173,7 +186,9 @@ class Resolver:
             "degrade": {name: value for name, value in sorted(spec.degrade.items()) if value},
         }
         changes_frames = bool(asked["degrade"]) or spec.realtime or bool(spec.drop_share)
-        entry_points = parts_of_run(tracker, settings, source, sequence, changes_frames=changes_frames)
+        entry_points = parts_of_run(
+            tracker, settings, source, sequence, changes_frames=changes_frames
+        )
         anchors = anchors_of(tracker, entry_points)
         parts = sorted(named_part(part, anchors) for part in entry_points)
         foreign = any(map(is_foreign, parts)) or bool(tracker.files)
@@ -190,7 +205,17 @@ class Resolver:
             **({"machine": this_machine().model_dump()} if spec.realtime else {}),
         }
         return ResolvedRun(
-            spec, tracker, settings, sequence, device, source, asked | read, anchors, foreign, start_map, files
+            spec,
+            tracker,
+            settings,
+            sequence,
+            device,
+            source,
+            asked | read,
+            anchors,
+            foreign,
+            start_map,
+            files,
         )
 
     def _open_part(
@@ -225,12 +250,16 @@ def _configured(spec: RunSpec) -> tuple[TrackerSpec, Settings, dict[str, Any]]:
     """The tracker of a run, its complete settings, and these by dotted name."""
     tracker = TRACKERS.get(spec.tracker)
     if missing := tracker.missing():
-        raise RunError(f"tracker '{tracker.id}' needs a package that is not installed", "; ".join(missing))
+        raise RunError(
+            f"tracker '{tracker.id}' needs a package that is not installed", "; ".join(missing)
+        )
     settings = resolve_settings(tracker, spec.settings)
     return tracker, settings, flatten(settings)
 
 
-def _files_of(tracker: TrackerSpec, settings: Settings, source: str) -> tuple[dict[str, Any], tuple[Path, ...]]:
+def _files_of(
+    tracker: TrackerSpec, settings: Settings, source: str
+) -> tuple[dict[str, Any], tuple[Path, ...]]:
     """What of a run's identity says by which weights and files it is made; and the files of its program."""
     weights = named_digests(settings)
     group = getattr(settings, "segmentation", None)
@@ -253,7 +282,8 @@ def libraries() -> dict[str, str]:
 def source_digests(parts: Iterable[str]) -> dict[str, str]:
     """Digest of the code of this package that each part of a run uses; see `own_code.modules_by_part`.
 
-    Runs on sequences of two kinds share the parts of their tracker: by part it shows whether one program made both.
+    Runs on sequences of two kinds share the parts of their tracker: by part it shows whether one
+    program made both.
 
     Raises:
         RunError: What is loaded may be older than the sources, see `module_graph.check_byte_code`.
@@ -264,7 +294,10 @@ def source_digests(parts: Iterable[str]) -> dict[str, str]:
 
 @lru_cache(maxsize=1024)
 def _code_digests(graph: ModuleGraph, parts: tuple[str, ...]) -> Mapping[str, str]:
-    return {part: graph.code_digest(modules)[:16] for part, modules in modules_by_part(graph, parts).items()}
+    return {
+        part: graph.code_digest(modules)[:16]
+        for part, modules in modules_by_part(graph, parts).items()
+    }
 
 
 def check_unchanged(run: ResolvedRun, *, begun: bool = False) -> None:
@@ -279,11 +312,19 @@ def check_unchanged(run: ResolvedRun, *, begun: bool = False) -> None:
         DynslamError: Something cannot be read any more.
     """
     if _code_digests(read_module_graph(), tuple(run.identity["parts"])) != run.identity["source"]:
-        raise RunError("the code of dynslam-bench has changed since this process began", "start it again")
-    before, now = run.identity, resolve(run.spec).identity
+        raise RunError(
+            "the code of dynslam-bench has changed since this process began", "start it again"
+        )
+    before = run.identity
+    now = resolve(run.spec).identity
     with raising(PluginError, f"cannot read a file of tracker '{run.tracker.id}'"):
-        now |= {"files": contents_digest(run.files) if run.files and not begun else before.get("files")}
-    now["weights"] = {name: now["weights"].get(name) if value else value for name, value in before["weights"].items()}
+        now |= {
+            "files": contents_digest(run.files) if run.files and not begun else before.get("files")
+        }
+    now["weights"] = {
+        name: now["weights"].get(name) if value else value
+        for name, value in before["weights"].items()
+    }
     changed = [name for name in before if now.get(name) != before[name]]
     if changed:
         words = {
@@ -296,7 +337,9 @@ def check_unchanged(run: ResolvedRun, *, begun: bool = False) -> None:
         raise RunError(f"{what} has changed since the run was asked for", hint)
 
 
-def start_map_of(settings: Settings, camera: Camera, sensors: Sensors, digests: dict[str, str]) -> StartMap | None:
+def start_map_of(
+    settings: Settings, camera: Camera, sensors: Sensors, digests: dict[str, str]
+) -> StartMap | None:
     """The map that settings name; None where they name none.
 
     Args:
@@ -306,17 +349,22 @@ def start_map_of(settings: Settings, camera: Camera, sensors: Sensors, digests: 
         digests: Of the files that the settings name, by the setting's name.
 
     Raises:
-        SettingsError: The tracker has features of its own; the file is no map, or one of another camera, other features
-            or another sensor.
+        SettingsError: The tracker has features of its own; the file is no map, or one of another
+            camera, other features or another sensor.
     """
-    backend, features = getattr(settings, "backend", None), getattr(settings, "features", None)
+    backend = getattr(settings, "backend", None)
+    features = getattr(settings, "features", None)
     if not isinstance(backend, BackendSettings) or not backend.map.file:
         return None
     if not isinstance(features, FeatureSettings):
-        raise SettingsError(f"'{MAP_SETTING}' is set, and the tracker's features are none that maps are made of")
+        raise SettingsError(
+            f"'{MAP_SETTING}' is set, and the tracker's features are none that maps are made of"
+        )
     path = Path(backend.map.file).expanduser()
     saved = read_map(path)
-    made_of = MapFeatures(extractor=features.extractor, levels=features.levels, scale_factor=features.scale_factor)
+    made_of = MapFeatures(
+        extractor=features.extractor, levels=features.levels, scale_factor=features.scale_factor
+    )
     saved.check(camera, made_of, sensors, str(path))
     return StartMap(
         digest=digests[MAP_SETTING],

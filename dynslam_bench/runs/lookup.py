@@ -9,9 +9,9 @@ from dynslam_bench.runs.store import RunStore
 class LookUp:
     """Finds stored runs.
 
-    A run of built-in parts is known by its id: all that it reads is known beforehand. What plug-ins and programs read
-    stands in the record of each run that they made; of the runs of one request the one is taken whose files,
-    environment variables and packages are unchanged.
+    A run of built-in parts is known by its id: all that it reads is known beforehand. What plug-ins
+    and programs read stands in the record of each run that they made; of the runs of one request
+    the one is taken whose files, environment variables and packages are unchanged.
 
     Args:
         store: Where the runs lie.
@@ -30,24 +30,36 @@ class LookUp:
             record = self._store.get(run.run_id)
             if record is not None and record.identity == run.stated:
                 return record
-        candidates = [record for record in map(self._store.get, self._store.ids_of(run.asked)) if record is not None]
+        candidates = [
+            record
+            for record in map(self._store.get, self._store.ids_of(run.asked))
+            if record is not None
+        ]
         valid = [record for record in candidates if self._holds(record, run)]
         return max(valid, key=lambda record: record.started, default=None)
 
     def changed(self, run: ResolvedRun) -> str:
         """Why none of the stored runs of a request can be taken; empty where one can, or none is stored."""
-        candidates = [record for record in map(self._store.get, self._store.ids_of(run.asked)) if record is not None]
+        candidates = [
+            record
+            for record in map(self._store.get, self._store.ids_of(run.asked))
+            if record is not None
+        ]
         if not candidates or self.find(run) is not None:
             return ""
         newest = max(candidates, key=lambda record: record.started)
-        differing = [name for name, value in run.stated.items() if newest.identity.get(name) != value]
+        differing = [
+            name for name, value in run.stated.items() if newest.identity.get(name) != value
+        ]
         if differing:
             return ", ".join(differing)
         return "" if newest.reads is None else self._verifier.changed(newest.reads, run.anchors)
 
     def _holds(self, record: RunRecord, run: ResolvedRun) -> bool:
         """Whether a stored run is what is asked for, and nothing that it read has changed."""
-        known_before = {name: value for name, value in record.identity.items() if name in run.stated}
+        known_before = {
+            name: value for name, value in record.identity.items() if name in run.stated
+        }
         if known_before != run.stated:
             return False
         if not run.foreign:

@@ -83,7 +83,8 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
     with contextlib.closing(recorder):
         with at(position):
             env.reset(seed=spec.seed)
-        over, reported = False, 0
+        over = False
+        reported = 0
         while True:
             done = base.episode.next_index
             with at(lambda: f"frame {base.episode.next_index - 1} of {total}"):
@@ -101,7 +102,8 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
                 _, _, terminated, truncated, _ = env.step(0)
             over = terminated or truncated
         signs: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
-        if not base.tracker_spec.online:  # a batch program, which has a time limit of its own, is at work
+        # a batch program, which has a time limit of its own, is at work
+        if not base.tracker_spec.online:
             signs = repeating(_BEAT_S, lambda: send({"type": "frame", "index": total - 1}))
         with at(lambda: "after the last frame"), signs:
             outcome = recorder.finish()
@@ -129,7 +131,9 @@ class _Recorder:
     """
 
     def __init__(self, env: SlamEnv, spec: RunSpec, folder: Path) -> None:
-        self._env, self._spec, self._folder = env, spec, folder
+        self._env = env
+        self._spec = spec
+        self._folder = folder
         self._title = f"{env.tracker_spec.label} on {env.sequence.id}"
         self._log = (folder / FRAMES_FILE).open("w")
         self._logged = 0
@@ -142,7 +146,8 @@ class _Recorder:
 
     def add(self) -> None:
         """Keep the frames since the last call: the one just tracked, and those that were dropped before it."""
-        env, result = self._env, self._env.result
+        env = self._env
+        result = self._env.result
         outcomes = env.episode.outcomes
         *dropped, outcome = outcomes[self._logged :]
         self._log.writelines(FrameRow.of(frame).to_json() for frame in dropped)
@@ -158,14 +163,18 @@ class _Recorder:
         if self._spec.rrd:
             shot = snapshot_of(outcome.index, result)
             error_m = None if outcome.error is None else outcome.error.trans_m
-            image, pose = encode(env.frame.rgb), outcome.T_world_cam
+            image = encode(env.frame.rgb)
+            pose = outcome.T_world_cam
             self._recorded.append(
-                RecordedFrame(outcome.index, outcome.timestamp, image, pose, shot, outcome.state, error_m)
+                RecordedFrame(
+                    outcome.index, outcome.timestamp, image, pose, shot, outcome.state, error_m
+                )
             )
 
     def finish(self) -> dict[str, Any]:
         """Write what is known at the end, and return what goes into the record."""
-        env, folder = self._env, self._folder
+        env = self._env
+        folder = self._folder
         began = time.perf_counter()
         final = env.final_trajectory()
         outcome: dict[str, Any] = {}
@@ -174,9 +183,13 @@ class _Recorder:
             write_tum(folder / FINAL, final)
         outputs, counts, notes = keep_map(env, folder, self._spec)
         if not env.tracker_spec.online and final is not None:
-            measured, tracked = env.measured, tracked_frames(final, env.sequence.timestamps)
+            measured = env.measured
+            tracked = tracked_frames(final, env.sequence.timestamps)
             notes += measured.pop("notes")
-            outcome |= measured | {"tracked": int(tracked.sum()), "lost_at_end": int(tracked[::-1].argmax())}
+            outcome |= measured | {
+                "tracked": int(tracked.sum()),
+                "lost_at_end": int(tracked[::-1].argmax()),
+            }
         track = env.online_trajectory() if final is None else final
         if self._sheet is not None and outputs is not None:
             self._sheet.write(outputs, track)
@@ -184,7 +197,8 @@ class _Recorder:
             notes.append(f"no {SHEET_FILE}: the tracker offers neither keyframes nor a map")
         if self._spec.rrd:
             truth = aligned_truth(env.sequence.ground_truth, track)[0] if len(track) else None
-            path, camera = folder / RECORDING_FILE, env.sequence.camera
+            path = folder / RECORDING_FILE
+            camera = env.sequence.camera
             write_recording(path, camera, self._title, self._recorded, (track, truth), outputs)
         if env.device.startswith("cuda"):
             import torch
@@ -211,6 +225,11 @@ class _Recorder:
             return None, None
         truth = masks[index]
         people = [number for number, name in truth.class_names.items() if name == "person"]
-        exact, predicted = np.isin(truth.instances, people), self._env.result.dynamic_mask
-        overlap = None if predicted is None else compare_masks(np.asarray(predicted, dtype=bool), exact).iou
+        exact = np.isin(truth.instances, people)
+        predicted = self._env.result.dynamic_mask
+        overlap = (
+            None
+            if predicted is None
+            else compare_masks(np.asarray(predicted, dtype=bool), exact).iou
+        )
         return overlap, float(exact.mean())

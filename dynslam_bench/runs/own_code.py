@@ -1,7 +1,8 @@
 """Which modules of this package decide the result of a run: those that its parts import.
 
-The parts are the tracker's entry point, its filters, features, flow and segmenter, the reader or renderer of the
-sequence, and the environment with the run's loop. A change of any other module changes no run.
+The parts are the tracker's entry point, its filters, features, flow and segmenter, the reader or
+renderer of the sequence, and the environment with the run's loop. A change of any other module
+changes no run.
 """
 
 from collections.abc import Collection, Iterable, Iterator
@@ -29,12 +30,29 @@ DEGRADED_FRAMES = "envs.wrappers"
 FINDERS = ("trackers.registry", "sequences.catalogue", "sequences.synthetic")
 """They look up what a name stands for; what they find is part of the identity by itself."""
 BESIDE_THE_LOOP = (
-    *("envs.rendering", "runs.artifacts", "runs.exchange.recording", "runs.process.child", "runs.record", "runs.store"),
+    *(
+        "envs.rendering",
+        "runs.artifacts",
+        "runs.exchange.recording",
+        "runs.process.child",
+        "runs.record",
+        "runs.store",
+    ),
     *("envs.wrappers", "segmentation.build_segmenter", "sequences.decoded"),
 )
 """What the environment and the loop use to draw and to store; masks count with the systems that have them."""
 WITH_PLUGINS = (
-    *("contracts", "core", "culling", "envs", "evaluation", "features", "flow", "geometry", "segmentation"),
+    *(
+        "contracts",
+        "core",
+        "culling",
+        "envs",
+        "evaluation",
+        "features",
+        "flow",
+        "geometry",
+        "segmentation",
+    ),
     *("sequences", "slam", "trackers"),
 )
 """The packages that a plug-in may use: what it imports of this package is known only while it runs."""
@@ -47,7 +65,12 @@ PLUGINS = "what plug-ins may use"
 
 
 def parts_of_run(
-    tracker: TrackerSpec, settings: Settings, source: str, sequence: Sequence, *, changes_frames: bool
+    tracker: TrackerSpec,
+    settings: Settings,
+    source: str,
+    sequence: Sequence,
+    *,
+    changes_frames: bool,
 ) -> list[str]:
     """What a run is made of beside the environment: entry points, and modules of the sequence, sorted.
 
@@ -72,7 +95,8 @@ def modules_by_part(graph: ModuleGraph, parts: Collection[str]) -> dict[str, lis
         parts: See `parts_of_run`.
 
     Returns:
-        The modules of each part, sorted; those of `ALWAYS_USED`, and those of `PLUGINS` where a part is foreign.
+        The modules of each part, sorted; those of `ALWAYS_USED`, and those of `PLUGINS` where a
+        part is foreign.
     """
     never = [PACKAGE, *PLUMBING, *(f"{PACKAGE}.{name}" for name in FINDERS)]
     environment = [f"{PACKAGE}.{name}" for name in ENVIRONMENT]
@@ -87,7 +111,9 @@ def modules_by_part(graph: ModuleGraph, parts: Collection[str]) -> dict[str, lis
 
 def modules_of_run(graph: ModuleGraph, parts: Collection[str]) -> list[str]:
     """The modules of this package that decide a run's result, sorted; see `modules_by_part`."""
-    return sorted({module for modules in modules_by_part(graph, parts).values() for module in modules})
+    return sorted(
+        {module for modules in modules_by_part(graph, parts).values() for module in modules}
+    )
 
 
 def modules_for_plugins(graph: ModuleGraph) -> list[str]:
@@ -111,7 +137,10 @@ def plugins_of_run(tracker: str, settings: Settings, source: str, sequence: str)
         source: Where its masks come from.
         sequence: As it was asked for.
     """
-    names: list[tuple[Registry[Any], str]] = [(TRACKERS, tracker), (DATASETS, sequence.partition("/")[0])]
+    names: list[tuple[Registry[Any], str]] = [
+        (TRACKERS, tracker),
+        (DATASETS, sequence.partition("/")[0]),
+    ]
     for group in groups_of(settings):
         if isinstance(group, FeatureSettings):
             names.append((FEATURES, group.extractor))
@@ -158,8 +187,8 @@ def segmenter_of(source: str) -> str:
 def anchors_of(tracker: TrackerSpec, parts: Iterable[str]) -> Anchors:
     """The folders in which names of files begin that a run's plug-ins and programs read, as they lie here.
 
-    A plug-in's folder is that of the tracker's file. Where the tracker is none, it is that of the part whose file's
-    name comes first.
+    A plug-in's folder is that of the tracker's file. Where the tracker is none, it is that of the
+    part whose file's name comes first.
 
     Args:
         tracker: The tracker.

@@ -20,7 +20,19 @@ Status = Literal["ok", "lost", "crashed", "timeout", "out-of-memory", "invalid",
 IDENTITY_SCHEME = 2
 """Raised when run ids are made of other things. Stored runs of another scheme are shown as unverified."""
 ASKED = (
-    *("scheme", "tracker", "settings", "sequence", "frames", "offset", "stride", "seed", "device", "threads", "cache"),
+    *(
+        "scheme",
+        "tracker",
+        "settings",
+        "sequence",
+        "frames",
+        "offset",
+        "stride",
+        "seed",
+        "device",
+        "threads",
+        "cache",
+    ),
     *("realtime", "drop_share", "degrade"),
 )
 """What of an identity was asked for; all else was read for it: code, data, weights, libraries, files."""
@@ -53,15 +65,18 @@ def program_of(identity: Mapping[str, Any]) -> dict[str, str]:
     """Code, weights and library versions in a run's identity, by name, as short texts."""
     code = digest([identity.get(name) for name in _CODE], 8)
     libraries = {name: str(value) for name, value in identity.get("libraries", {}).items()}
-    weights = {f"weights of {name}": str(value)[:8] for name, value in identity.get("weights", {}).items()}
+    weights = {
+        f"weights of {name}": str(value)[:8] for name, value in identity.get("weights", {}).items()
+    }
     return {"code": code} | libraries | weights
 
 
 class TrackerInfo(Record):
     """The tracker, as its spec described it; see `TrackerSpec`.
 
-    Beside that `given`: what it was named by where its id alone does not find it, ``/path/file.py:Attr`` or
-    ``module:Attr``; empty for an id. `folder` is that of the plug-in's file, where it is one.
+    Beside that `given`: what it was named by where its id alone does not find it,
+    ``/path/file.py:Attr`` or ``module:Attr``; empty for an id. `folder` is that of the plug-in's
+    file, where it is one.
     """
 
     id: str
@@ -87,8 +102,9 @@ class SequenceInfo(Record):
         id: Its id.
         content: Digest of its content.
         part: Digest of content and frames: names the folder with the stamps and the ground truth.
-        block: Digest of what is filmed, camera, frames and stride, without the start offset and the noise seed: one
-            column of a table. Empty for imported trajectories whose record does not say it.
+        block: Digest of what is filmed, camera, frames and stride, without the start offset and the
+            noise seed: one column of a table. Empty for imported trajectories whose record does not
+            say it.
         noise: Seed of the sensors' noise; None for the sequence's own.
         frames: Frames of the run's part.
         duration_s: Time between its first and last frame.
@@ -144,9 +160,13 @@ class StartMap(Record):
 
     def describe(self) -> str:
         """One line: which map, of which run, and whether it stayed as it was."""
-        what = f"begun in the map {self.digest[:8]} ({self.keyframes} keyframes, {self.points} points)"
+        what = (
+            f"begun in the map {self.digest[:8]} ({self.keyframes} keyframes, {self.points} points)"
+        )
         of = f" of {self.made_by}" if self.made_by else ""
-        return what + of + (", localisation only" if self.localisation_only else "") + f": {self.file}"
+        return (
+            what + of + (", localisation only" if self.localisation_only else "") + f": {self.file}"
+        )
 
 
 class RunRecord(Record):
@@ -156,9 +176,9 @@ class RunRecord(Record):
         schema_version: Of this record.
         kind: ``run`` (made here) or ``imported`` (a trajectory from elsewhere).
         run_id: Digest of `identity`.
-        status: ``ok``; ``lost``: came to the end without being able to track it (see `reason`); ``crashed``,
-            ``timeout``, ``out-of-memory``; ``invalid``: the tracker broke its contract; ``stopped``: ended early
-            on request.
+        status: ``ok``; ``lost``: came to the end without being able to track it (see `reason`);
+            ``crashed``, ``timeout``, ``out-of-memory``; ``invalid``: the tracker broke its
+            contract; ``stopped``: ended early on request.
         reason: One line, empty for ``ok``.
         tracker: The tracker.
         overrides: The settings that were asked for, dotted name to value.
@@ -173,25 +193,28 @@ class RunRecord(Record):
         realtime: Whether frames were dropped while the tracker was busy.
         drop_share: Share of the frames dropped at random.
         degrade: Degradation of the images.
-        segmentation: Where the masks came from: ``oracle``, ``embedded``, ...; empty without a semantic stage.
+        segmentation: Where the masks came from: ``oracle``, ``embedded``, ...; empty without a
+            semantic stage.
         n_frames: Input frames.
         n_processed: Frames that the tracker saw.
         n_tracked: Frames with state ``ok``.
         n_lost: Frames with state ``lost``.
         n_initialising: Frames with state ``initialising``.
         n_dropped: Frames that never reached the tracker.
-        coverage: ``n_tracked / n_frames``; None where the frames are not known, see `import_trajectory`.
+        coverage: ``n_tracked / n_frames``; None where the frames are not known, see
+            `import_trajectory`.
         keyframes: Keyframes at the end, None if the tracker does not say.
         map_points: Map points at the end, None if the tracker does not say.
-        maps: Maps at the end that never met, those of their own begun after a loss among them; None if the tracker does
-            not say.
+        maps: Maps at the end that never met, those of their own begun after a loss among them; None
+            if the tracker does not say.
         start_map: The map that the run began in; None for one that began without.
-        epipolar_skipped: Share of the tracked frames on which the fundamental matrix was not used; None for systems
-            without an epipolar test.
-        mask_iou: Mean over frames of the overlap of the tracker's dynamic mask with the exact masks of people; None
-            where either is missing.
-        timings: By stage; ``total`` is the frame time: segmentation included, decoding (``read``) excluded;
-            ``processor`` the processor time of the run's own process in it; ``detector`` is a network beside it.
+        epipolar_skipped: Share of the tracked frames on which the fundamental matrix was not used;
+            None for systems without an epipolar test.
+        mask_iou: Mean over frames of the overlap of the tracker's dynamic mask with the exact masks
+            of people; None where either is missing.
+        timings: By stage; ``total`` is the frame time: segmentation included, decoding (``read``)
+            excluded; ``processor`` the processor time of the run's own process in it; ``detector``
+            is a network beside it.
         finalize_s: Time of the final optimisation.
         started: UTC, ISO 8601.
         wall_s: Wall-clock time of the whole run.
@@ -204,7 +227,8 @@ class RunRecord(Record):
         identity: What `run_id` stands for.
         provenance: For imported trajectories: where it came from.
         place: Folder of the sequence where it was named by its path; empty for an id.
-        stamps_match: Whether all poses carry the stamps of input frames; False only for imported trajectories.
+        stamps_match: Whether all poses carry the stamps of input frames; False only for imported
+            trajectories.
         study: Study that made it, if it was not asked for without the study; else empty.
         notes: Anything a reader should know, one line each.
         files: SHA-256 of the trajectories, the stamps and the ground truth, by the file's name.
@@ -294,9 +318,12 @@ class RunRecord(Record):
     def public(self) -> RunRecord:
         """The record for others: without the command line and the folders of the machine that made it.
 
-        The path of a replayed file and the command of a program are what their trackers are called, and stay.
+        The path of a replayed file and the command of a program are what their trackers are called,
+        and stay.
         """
-        tracker = self.tracker.model_copy(update={"given": Path(self.tracker.given).name, "folder": ""})
+        tracker = self.tracker.model_copy(
+            update={"given": Path(self.tracker.given).name, "folder": ""}
+        )
         return self.model_copy(update={"command": [], "place": "", "tracker": tracker})
 
     @property
@@ -308,7 +335,9 @@ class RunRecord(Record):
         asked = {name: self.settings.get(name, value) for name, value in self.overrides.items()}
         if self.start_map is None:
             return asked
-        named = {name: value for name, value in asked.items() if not name.startswith("backend.map.")}
+        named = {
+            name: value for name, value in asked.items() if not name.startswith("backend.map.")
+        }
         alone = {"backend.map.localisation_only": True} if self.start_map.localisation_only else {}
         return named | {"map": self.start_map.digest[:8]} | alone
 
@@ -335,11 +364,15 @@ class RunRecord(Record):
     def real_time_factor(self) -> float | None:
         """Sensor's frame interval over the mean frame time: above 1 the tracker keeps up."""
         total = self.timings.get("total")
-        return None if total is None or total.mean_s <= 0 else 1.0 / (self.sequence.fps * total.mean_s)
+        return (
+            None if total is None or total.mean_s <= 0 else 1.0 / (self.sequence.fps * total.mean_s)
+        )
 
     def describe(self) -> str:
         """One line: tracker, sequence, seed, status, coverage, frame time."""
-        parts = [f"{self.run_id}  {self.tracker.id} on {self.sequence.id}, {self.repeat}: {self.status}"]
+        parts = [
+            f"{self.run_id}  {self.tracker.id} on {self.sequence.id}, {self.repeat}: {self.status}"
+        ]
         parts.append(f"coverage {coverage_text(self.coverage)}")
         if self.frame_time_s is not None:
             parts.append(f"{1000 * self.frame_time_s:.1f} ms a frame")
@@ -359,7 +392,8 @@ class MetricRecord(Record):
         online: Evaluation of the online trajectory; None if it cannot be evaluated.
         final: Evaluation of the final trajectory; None if there is none or it cannot be evaluated.
         reasons: Why an evaluation is missing, by ``online`` and ``final``.
-        hints: What is probably wrong with the trajectory that the protocol asks for, a line each; see `hints`.
+        hints: What is probably wrong with the trajectory that the protocol asks for, a line each;
+            see `hints`.
     """
 
     schema_version: int = schema(METRIC_SCHEMA)
@@ -382,7 +416,10 @@ class MetricRecord(Record):
     def remarks(self) -> list[str]:
         """What to know before the numbers are believed, a line each: warnings on the primary evaluation, and hints."""
         warnings = [] if self.primary is None else self.primary.warnings
-        return [*(f"warning: {line}" for line in warnings), *(f"hint: {line}" for line in self.hints)]
+        return [
+            *(f"warning: {line}" for line in warnings),
+            *(f"hint: {line}" for line in self.hints),
+        ]
 
     @property
     def metrics(self) -> dict[str, float]:

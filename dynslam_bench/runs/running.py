@@ -12,7 +12,14 @@ import time
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, as_completed, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    Executor,
+    Future,
+    ThreadPoolExecutor,
+    as_completed,
+    wait,
+)
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
@@ -83,8 +90,8 @@ LOST_AT_END = 10
 OnProgress = Callable[[str, dict[str, Any]], bool]
 """Called as ``on_progress(run_id, partial)`` every `PROGRESS_EVERY` frames; returning False stops the run.
 
-`partial` holds ``frames_done``, ``frames``, ``metrics`` (of the frames so far under the protocol), ``frame_time_s`` and
-``pose_error_trans_m``.
+`partial` holds ``frames_done``, ``frames``, ``metrics`` (of the frames so far under the protocol),
+``frame_time_s`` and ``pose_error_trans_m``.
 """
 
 
@@ -100,8 +107,9 @@ def run_one(
 ) -> RunRecord:
     """Make a run in a child process and store it, whatever becomes of it.
 
-    A tracker that raises, hangs, breaks its contract, takes too much or dies gives a record with that status and the
-    reason; only a request that cannot begin at all is an error. A run that `on_progress` stopped is not stored.
+    A tracker that raises, hangs, breaks its contract, takes too much or dies gives a record with
+    that status and the reason; only a request that cannot begin at all is an error. A run that
+    `on_progress` stopped is not stored.
 
     Args:
         run: What to run.
@@ -116,9 +124,10 @@ def run_one(
         The record.
 
     Raises:
-        DynslamError: The request names something unknown or unfit, something other than the tracker's own code raised
-            (an image, a mask or a file that cannot be read), the store cannot be written, or what a run needs broke
-            (`InfrastructureError`); nothing is stored then.
+        DynslamError: The request names something unknown or unfit, something other than the
+            tracker's own code raised (an image, a mask or a file that cannot be read), the store
+            cannot be written, or what a run needs broke (`InfrastructureError`); nothing is stored
+            then.
     """
     resolved = resolve(run) if isinstance(run, RunSpec) else run
     if resolved is run:
@@ -147,7 +156,9 @@ def run_one(
 
         def watch(child: Child) -> Verdict:
             tick = partial(bound_log, log, LONGEST_YET)
-            return supervise(child, job, resolved.spec.limits, report, cancelled, tick=tick, at_a_time=at_a_time)
+            return supervise(
+                child, job, resolved.spec.limits, report, cancelled, tick=tick, at_a_time=at_a_time
+            )
 
         verdict = _watched(work, watch)
         if not (work / FRAMES_FILE).is_file():
@@ -157,7 +168,8 @@ def run_one(
             )
         if verdict.refused:
             raise RunError(
-                f"{resolved.tracker.id} cannot run on {resolved.sequence.id}: {verdict.reason}", "nothing is stored"
+                f"{resolved.tracker.id} cannot run on {resolved.sequence.id}: {verdict.reason}",
+                "nothing is stored",
             )
         with raising(InfrastructureError, f"cannot write {work}", "the run is not stored"):
             bound_log(log, LONGEST_LOG)
@@ -167,9 +179,15 @@ def run_one(
             (work / FRAMES_FILE).unlink()  # it fails where the folder was removed after all
         check_unchanged(resolved, begun=True)
         reads = read_reads(work) if resolved.foreign else None
-        record = _record(resolved, verdict, frames, reads, started, time.perf_counter() - clock).normalised()
+        record = _record(
+            resolved, verdict, frames, reads, started, time.perf_counter() - clock
+        ).normalised()
         if record.status != "stopped":
-            store.add_sequence(record.sequence.part, timestamps_ns(resolved.sequence), resolved.sequence.ground_truth)
+            store.add_sequence(
+                record.sequence.part,
+                timestamps_ns(resolved.sequence),
+                resolved.sequence.ground_truth,
+            )
             record = store.publish(work, record)
     return record
 
@@ -195,7 +213,8 @@ def read_reads(work: Path) -> Reads | None:
 def _watched(work: Path, watch: Callable[[Child], Verdict]) -> Verdict:
     """The verdict on a run; when its fork server dies, the run is repeated with a fork server of its own.
 
-    No other run is there then. If that server dies, too, it is this run that has killed it: the run has crashed.
+    No other run is there then. If that server dies, too, it is this run that has killed it: the run
+    has crashed.
 
     Args:
         work: Its work folder, which is emptied before each try.
@@ -220,7 +239,9 @@ def _watched(work: Path, watch: Callable[[Child], Verdict]) -> Verdict:
 
 def _empty(work: Path) -> None:
     """Leave in a work folder an empty log of frames and nothing else."""
-    with raising(InfrastructureError, f"cannot write {work}", "check the free space; nothing is stored"):
+    with raising(
+        InfrastructureError, f"cannot write {work}", "check the free space; nothing is stored"
+    ):
         for path in work.iterdir():
             if path.is_dir():
                 shutil.rmtree(path)
@@ -231,7 +252,8 @@ def _empty(work: Path) -> None:
 
 def sequence_info(sequence: Any, content: str, part: str, offset: int = 0) -> SequenceInfo:
     """What a record keeps of a sequence that was cut to its part without `offset` leading frames."""
-    input_part, stamps = part_of(sequence, offset), sequence.timestamps
+    input_part = part_of(sequence, offset)
+    stamps = sequence.timestamps
     return SequenceInfo(
         id=sequence.id,
         content=content,
@@ -251,28 +273,57 @@ def sequence_info(sequence: Any, content: str, part: str, offset: int = 0) -> Se
 
 def part_digest(identity: dict[str, Any]) -> str:
     """Names what of the sequence a run saw: content and frames."""
-    return digest({key: identity[key] for key in ("sequence", "content", "frames", "offset", "stride")}, 16)
+    return digest(
+        {key: identity[key] for key in ("sequence", "content", "frames", "offset", "stride")}, 16
+    )
 
 
 def _record(
-    resolved: ResolvedRun, verdict: Verdict, frames: FrameLog, reads: Reads | None, started: str, wall_s: float
+    resolved: ResolvedRun,
+    verdict: Verdict,
+    frames: FrameLog,
+    reads: Reads | None,
+    started: str,
+    wall_s: float,
 ) -> RunRecord:
-    spec, tracker, final = resolved.spec, resolved.tracker, verdict.final
-    identity = resolved.stated if reads is None else resolved.stated | {"reads": reads.model_dump(mode="json")}
-    total, states = len(resolved.sequence), Counter(row.state for row in frames.rows)
-    status, reason, dropped = verdict.status, verdict.reason, states["dropped"]
-    tracked, lost, initialising = states["ok"], states["lost"], states["initialising"]
+    spec = resolved.spec
+    tracker = resolved.tracker
+    final = verdict.final
+    identity = (
+        resolved.stated
+        if reads is None
+        else resolved.stated | {"reads": reads.model_dump(mode="json")}
+    )
+    total = len(resolved.sequence)
+    states = Counter(row.state for row in frames.rows)
+    status = verdict.status
+    reason = verdict.reason
+    dropped = states["dropped"]
+    tracked = states["ok"]
+    lost = states["lost"]
+    initialising = states["initialising"]
     lost_at_end = frames.lost_streak()
-    flat, default = flatten(resolved.settings), flatten(resolve_settings(tracker, {}))
-    asked = {name: value for name, value in spec.settings.items() if name not in default or flat[name] != default[name]}
-    timings, batch = frames.timings(), not tracker.online
+    flat = flatten(resolved.settings)
+    default = flatten(resolve_settings(tracker, {}))
+    asked = {
+        name: value
+        for name, value in spec.settings.items()
+        if name not in default or flat[name] != default[name]
+    }
+    timings = frames.timings()
+    batch = not tracker.online
     if batch:
-        tracked, lost_at_end = final.get("tracked", 0), final.get("lost_at_end", total)
-        lost, initialising = total - dropped - tracked, 0
+        tracked = final.get("tracked", 0)
+        lost_at_end = final.get("lost_at_end", total)
+        lost = total - dropped - tracked
+        initialising = 0
         each_s = final.get("program_s", 0.0) / total
-        timings = {"total": StageTime(median_s=each_s, p95_s=each_s, mean_s=each_s)} if each_s else {}
+        timings = (
+            {"total": StageTime(median_s=each_s, p95_s=each_s, mean_s=each_s)} if each_s else {}
+        )
     if status == "ok" and frames.damage:
-        status, reason = "invalid", frames.damage
+        status = "invalid"
+        reason = frames.damage
     elif status == "ok":  # it may still have lost its way
         status, reason = judge_coverage(tracked, total - dropped, lost_at_end, total)
     if status == "ok" and spec.realtime and dropped:
@@ -292,7 +343,9 @@ def _record(
         ),
         overrides=asked,
         settings=flat,
-        sequence=sequence_info(resolved.sequence, identity["content"], part_digest(identity), spec.offset),
+        sequence=sequence_info(
+            resolved.sequence, identity["content"], part_digest(identity), spec.offset
+        ),
         **{name: getattr(spec, name) for name in _AS_ASKED},
         device=resolved.device,
         degrade=identity["degrade"],
@@ -335,7 +388,18 @@ def _where_it_lies(run: ResolvedRun) -> dict[str, str]:
 _AS_ASKED = ("frames", "offset", "stride", "seed", "threads", "realtime", "drop_share", "study")
 """What a record takes from the request as it is."""
 _OF_THE_TRACKER = (
-    *("id", "version", "provenance", "ranked", "deterministic", "license", "citation", "remarks", "sensors", "online"),
+    *(
+        "id",
+        "version",
+        "provenance",
+        "ranked",
+        "deterministic",
+        "license",
+        "citation",
+        "remarks",
+        "sensors",
+        "online",
+    ),
 )
 """What a record takes from the tracker's spec as it is."""
 
@@ -352,11 +416,14 @@ def judge_coverage(tracked: int, due: int, lost_at_end: int, total: int) -> tupl
     if tracked < LOST_COVERAGE * due:
         return "lost", f"tracked on {tracked} of {due} frames"
     if lost_at_end >= LOST_AT_END:
-        return "lost", f"lost from frame {total - lost_at_end} to the end, tracked on {tracked} of {due} frames"
+        return (
+            "lost",
+            f"lost from frame {total - lost_at_end} to the end, tracked on {tracked} of {due} frames",
+        )
     return "ok", ""
 
 
-# -- many runs ---------------------------------------------------------------------------------------------------------
+# -- many runs -------------------------------------------------------------------------------------
 
 OnFault = Callable[[RunSpec, DynslamError], None]
 """Called as ``on_fault(spec, error)`` for a run that cannot be made; nothing of it is stored."""
@@ -372,7 +439,8 @@ class RunEvent:
 
     Attributes:
         kind: ``reused`` (it was stored already), ``started``, ``progress`` or ``finished``.
-        run_id: The run. One with plug-ins or programs gets its final id, that of `record`, when it is finished.
+        run_id: The run. One with plug-ins or programs gets its final id, that of `record`, when it
+            is finished.
         spec: What was asked for.
         total: How many runs there are, of those looked up so far while some are ``reused``.
         record: The outcome, with ``reused`` and ``finished``.
@@ -416,41 +484,51 @@ def run_many(
 ) -> Records:
     """Make the runs that are not stored yet, and score them.
 
-    A stored run is made again if snapshots, a video, a sheet or its map are asked for that it lacks. One that is given
-    another label gets that. One that a study made is an ordinary run once it is asked for without the study. A failure
-    is a record and stops nothing; after an interrupt the call goes on. A run that cannot be made stops no other, and
-    nothing of it is stored. Several processes may share a results folder (without `executor`): each run is made by one
-    of them.
+    A stored run is made again if snapshots, a video, a sheet or its map are asked for that it
+    lacks. One that is given another label gets that. One that a study made is an ordinary run once
+    it is asked for without the study. A failure is a record and stops nothing; after an interrupt
+    the call goes on. A run that cannot be made stops no other, and nothing of it is stored. Several
+    processes may share a results folder (without `executor`): each run is made by one of them.
 
     Args:
         specs: What to run; runs that are the same are made once.
         results: The results folder, or a store.
         jobs: Runs at a time on this machine.
-        executor: Where to make them instead, e.g. Dask's ``client.get_executor()``. Its workers return records as bytes
-            and need the sequences, not the results folder; partial metrics stay there: `on_progress` is not called.
-        retry: Statuses to run again although they are stored; ``failed`` stands for all of `FAILED`.
+        executor: Where to make them instead, e.g. Dask's ``client.get_executor()``. Its workers
+            return records as bytes and need the sequences, not the results folder; partial metrics
+            stay there: `on_progress` is not called.
+        retry: Statuses to run again although they are stored; ``failed`` stands for all of
+            `FAILED`.
         on_plan: Called once, when all are looked up, with the runs that are to be made, if any.
         on_event: Told of everything that happens, from several threads but never two at a time.
-        on_progress: Told of partial metrics; returning False stops that run, which is then not stored.
+        on_progress: Told of partial metrics; returning False stops that run, which is then not
+            stored.
         protocol: Protocol to score under.
-        cancelled: Asked many times a second; True ends the runs on this machine at once, as stopped.
-        on_fault: Told of every run that cannot be made, by one thread at a time. Without it the first such fault is
-            raised when all other runs are stored, and at once where a name or a setting is wrong.
+        cancelled: Asked many times a second; True ends the runs on this machine at once, as
+            stopped.
+        on_fault: Told of every run that cannot be made, by one thread at a time. Without it the
+            first such fault is raised when all other runs are stored, and at once where a name or a
+            setting is wrong.
 
     Returns:
         The records in the order of `specs`, without those of runs that cannot be made.
 
     Raises:
-        DynslamError: The results folder cannot be written, what runs need broke, a network has to be fetched first, or,
-            without `on_fault`, a run cannot be made.
+        DynslamError: The results folder cannot be written, what runs need broke, a network has to
+            be fetched first, or, without `on_fault`, a run cannot be made.
     """
     store = results if isinstance(results, RunStore) else RunStore(results)
     again = set(FAILED).union(retry) - {"failed"} if "failed" in retry else set(retry)
     for unknown in sorted(again - {"ok", "lost", *FAILED}):
-        raise RunError(f"unknown status '{unknown}' to retry", f"known: failed, {', '.join(('lost', 'ok', *FAILED))}")
+        raise RunError(
+            f"unknown status '{unknown}' to retry",
+            f"known: failed, {', '.join(('lost', 'ok', *FAILED))}",
+        )
     if jobs < 1:
         raise RunError(f"jobs is {jobs}", "give a number >= 1")
-    bench = _Bench(store, get_protocol(protocol), jobs, on_plan, on_event, on_progress, cancelled, on_fault)
+    bench = _Bench(
+        store, get_protocol(protocol), jobs, on_plan, on_event, on_progress, cancelled, on_fault
+    )
     bench.look_up(specs, again)
     if executor is None:
         bench.make_here()
@@ -497,7 +575,9 @@ class _Bench:
             except (NetworkNotFetched, InfrastructureError):
                 raise
             except DynslamError as error:
-                if self.on_fault is None and not isinstance(error, (SequenceError, TrajectoryError)):
+                if self.on_fault is None and not isinstance(
+                    error, (SequenceError, TrajectoryError)
+                ):
                     raise
                 self._fault(spec, error)
                 continue
@@ -508,10 +588,16 @@ class _Bench:
                 continue
             run_ids.add(run.run_id)
             stored = stored_runs.find(run)
-            if stored is not None and stored.status not in again and not _lacks_pictures(self.store, run, stored):
+            if (
+                stored is not None
+                and stored.status not in again
+                and not _lacks_pictures(self.store, run, stored)
+            ):
                 fault = self.store.changed(stored)
-                if fault:  # the sequence's files are put back; where the run's differ, it is made again
-                    stamps, truth = timestamps_ns(run.sequence), run.sequence.ground_truth
+                # the sequence's files are put back; where the run's differ, it is made again
+                if fault:
+                    stamps = timestamps_ns(run.sequence)
+                    truth = run.sequence.ground_truth
                     self.store.add_sequence(stored.sequence.part, stamps, truth)
                     fault = self.store.changed(stored)
                 if not fault:
@@ -525,11 +611,14 @@ class _Bench:
 
     def _reuse(self, run: ResolvedRun, record: RunRecord) -> None:
         if run.spec.label not in ("", record.tracker.label):
-            record = self.store.rewrite(record, tracker=record.tracker.model_copy(update={"label": run.spec.label}))
+            record = self.store.rewrite(
+                record, tracker=record.tracker.model_copy(update={"label": run.spec.label})
+            )
         if record.study and not run.spec.study:
             record = self.store.rewrite(record, study="")
         place = _where_it_lies(run)
-        if place != {name: getattr(record.tracker, name) for name in place}:  # the plug-in lies in another folder now
+        # the plug-in lies in another folder now
+        if place != {name: getattr(record.tracker, name) for name in place}:
             record = self.store.rewrite(record, tracker=record.tracker.model_copy(update=place))
         self._take_in(run, record, "reused")
 
@@ -537,7 +626,9 @@ class _Bench:
         """Make the waiting runs, so many at a time."""
         with ThreadPoolExecutor(self.jobs, thread_name_prefix="dynslam-run") as pool:
             try:
-                for maker in as_completed([pool.submit(self._make_waiting) for _ in range(self.jobs)]):
+                for maker in as_completed(
+                    [pool.submit(self._make_waiting) for _ in range(self.jobs)]
+                ):
                     maker.result()
             except BaseException:
                 self.aborted.set()
@@ -588,7 +679,8 @@ class _Bench:
     def make_remotely(self, executor: Executor) -> None:
         """Have an executor make the waiting runs."""
         protocol = self.protocol.model_dump_json()
-        sent: dict[Future[Any], ResolvedRun] = {}  # a future holds all bytes of its run, so few are kept
+        # a future holds all bytes of its run, so few are kept
+        sent: dict[Future[Any], ResolvedRun] = {}
         try:
             while sent or self.waiting:
                 for _ in range(min(_SENT - len(sent), len(self.waiting))):
@@ -678,7 +770,9 @@ def _lacks_pictures(store: RunStore, run: ResolvedRun, stored: RunRecord) -> boo
 _ENTRY = re.compile(r"(runs|sequences)/([0-9a-f]{16}(?:[0-9a-f]{4})?)/([A-Za-z0-9_]+\.[a-z0-9]+)")
 
 
-def run_packed(spec_json: str, protocol_json: str, identity_json: str, *, at_a_time: int = 1) -> bytes:
+def run_packed(
+    spec_json: str, protocol_json: str, identity_json: str, *, at_a_time: int = 1
+) -> bytes:
     """Make a run on a worker that does not share the results folder; the function that executors are handed.
 
     Args:
@@ -688,24 +782,31 @@ def run_packed(spec_json: str, protocol_json: str, identity_json: str, *, at_a_t
         at_a_time: Runs that share this machine.
 
     Returns:
-        A zip archive with the run's folder and its sequence's stamps and ground truth, for `unpack`.
+        A zip archive with the run's folder and its sequence's stamps and ground truth, for
+        `unpack`.
 
     Raises:
-        RunError: The request names something that this worker does not have, or its code, packages or data are others.
+        RunError: The request names something that this worker does not have, or its code, packages
+            or data are others.
     """
     name = f"worker {socket.gethostname()}"
     try:
         resolved = resolve(RunSpec.model_validate_json(spec_json))
     except DynslamError as error:
         raise RunError(f"{name} cannot make the run: {error.args[0]}", error.hint) from error
-    asked, own = json.loads(identity_json), resolved.stated
-    differing = [key for key in sorted(asked | own) if asked.get(key) != own.get(key) and key != "machine"]
+    asked = json.loads(identity_json)
+    own = resolved.stated
+    differing = [
+        key for key in sorted(asked | own) if asked.get(key) != own.get(key) and key != "machine"
+    ]
     if differing:
         raise RunError(
             f"{name} would make another run: {', '.join(differing)} differ",
             "give all workers the same code, packages and data",
         )
-    no_space = raising(InfrastructureError, f"{name} cannot write its temporary files", "check the free space")
+    no_space = raising(
+        InfrastructureError, f"{name} cannot write its temporary files", "check the free space"
+    )
     with no_space, contextlib.closing(TemporaryFolder()) as folder:
         store = RunStore(folder.path)
         store.prepare()
@@ -717,7 +818,10 @@ def pack(store: RunStore, record: RunRecord) -> bytes:
     """A stored run with its sequence's part as a zip archive."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for folder in (store.folder(record.run_id), store.root / "sequences" / record.sequence.part):
+        for folder in (
+            store.folder(record.run_id),
+            store.root / "sequences" / record.sequence.part,
+        ):
             for file in sorted(folder.iterdir()):
                 archive.write(file, str(file.relative_to(store.root)))
     return buffer.getvalue()
@@ -729,7 +833,9 @@ def unpack(data: bytes, store: RunStore) -> RunRecord:
     Raises:
         RunError: The bytes are no packed run, or hold names that do not belong there.
     """
-    no_space = raising(InfrastructureError, "cannot unpack a run that a worker has made", "check the free space")
+    no_space = raising(
+        InfrastructureError, "cannot unpack a run that a worker has made", "check the free space"
+    )
     with no_space, contextlib.closing(TemporaryFolder()) as folder:
         sent = RunStore(folder.path)
         with (  # zipfile raises almost anything over damaged archives

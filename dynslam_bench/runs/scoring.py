@@ -1,7 +1,7 @@
 """Scores runs in a process that has imported no plug-in.
 
-A plug-in may patch numpy when it is imported. A process that has imported one to run it would score all trackers with
-the patched functions.
+A plug-in may patch numpy when it is imported. A process that has imported one to run it would score
+all trackers with the patched functions.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,9 @@ from dynslam_bench.runs.store import RunStore
 _WORK = f"{__name__}:score_job"
 
 
-def score_apart(store: RunStore, run_id: str, protocol: Protocol, *, again: bool = False) -> MetricRecord:
+def score_apart(
+    store: RunStore, run_id: str, protocol: Protocol, *, again: bool = False
+) -> MetricRecord:
     """What `RunStore.score` gives, computed in a process of its own.
 
     Raises:

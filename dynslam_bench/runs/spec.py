@@ -21,10 +21,12 @@ class Limits(Record):
 
     Attributes:
         time_s: Wall-clock time of the whole run; None for no limit.
-        start_s: Time until frame 0 is tracked, and until frame 1 is: loading networks, compiling kernels.
+        start_s: Time until frame 0 is tracked, and until frame 1 is: loading networks, compiling
+            kernels.
         frame_s: Time for any later frame, and for the final optimisation.
-        memory_mb: Memory of the run's process and its children, shared pages counted once; None for the default, a
-            share of the machine's memory (see `memory.memory_limit`), 0 for no limit.
+        memory_mb: Memory of the run's process and its children, shared pages counted once; None for
+            the default, a share of the machine's memory (see `memory.memory_limit`), 0 for no
+            limit.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -43,23 +45,26 @@ class RunSpec(Record):
         sequence: Id or path of a folder in TUM layout.
         settings: Overrides of the tracker's settings, dotted name to value.
         frames: Part of the sequence, ``(start, stop)`` or ``"start:stop"``; None for all.
-        offset: So many leading frames of that part are left out: a repeat on the same frames from a later start.
+        offset: So many leading frames of that part are left out: a repeat on the same frames from a
+            later start.
         stride: Take every so many frames.
         seed: Seed of everything random.
         device: ``auto``, ``cpu`` or ``cuda:N``.
         threads: Threads of the run.
-        cache: Take features and network masks from the stage cache where they are stored. Part of the run's identity:
-            its stage times are those of the time when the entries were made.
+        cache: Take features and network masks from the stage cache where they are stored. Part of
+            the run's identity: its stage times are those of the time when the entries were made.
         realtime: Drop the frames that arrive while the tracker is busy.
         drop_share: Drop this share of the frames at random.
         degrade: Strengths of `DegradeFrames`, e.g. ``{"blur": 0.5}``.
         data_root: Folder of the recorded sequences; None for the default one.
         camera: Camera of a folder that does not say its own.
-        snapshots: Whether to keep some frames as the tracker saw them: ``frame_*.webp`` and ``snapshots.npz``.
+        snapshots: Whether to keep some frames as the tracker saw them: ``frame_*.webp`` and
+            ``snapshots.npz``.
         video: Whether to write ``video.webm``.
         sheet: Whether to write ``sheet.png``: input, frames, keyframes, map and track on one page.
         rrd: Whether to write ``recording.rrd`` for rerun's viewer.
-        save_map: Whether to write ``map.npz``, from which a later run may start (setting ``backend.map.file``).
+        save_map: Whether to write ``map.npz``, from which a later run may start (setting
+            ``backend.map.file``).
         label: Name in tables, in place of the tracker's; no part of the run's identity.
         study: Study that makes it; empty for any other run; no part of the run's identity.
         limits: What it may take.
@@ -108,21 +113,30 @@ class RunSpec(Record):
         """
         start, stop = self.frames or (0, None)
         if stop is not None and start + self.offset >= stop:
-            raise SequenceError(f"offset {self.offset} leaves none of the {stop - start} frames {start}:{stop}")
+            raise SequenceError(
+                f"offset {self.offset} leaves none of the {stop - start} frames {start}:{stop}"
+            )
         return (start + self.offset, stop) if self.offset else self.frames
 
     def absolute(self) -> RunSpec:
         """The same run, named independently of the working folder."""
         camera = None if self.camera is None else Path(self.camera).expanduser()
         settings = self.settings
-        if settings.get(MAP_SETTING):  # with its links followed: ``latest`` is another run's folder soon
-            settings = settings | {MAP_SETTING: str(Path(settings[MAP_SETTING]).expanduser().resolve())}
+        # with its links followed: ``latest`` is another run's folder soon
+        if settings.get(MAP_SETTING):
+            settings = settings | {
+                MAP_SETTING: str(Path(settings[MAP_SETTING]).expanduser().resolve())
+            }
         return self.model_copy(
             update={
                 "tracker": absolute_target(self.tracker),
                 "sequence": _absolute_folder(self.sequence),
-                "data_root": None if self.data_root is None else str(Path(self.data_root).expanduser().absolute()),
-                "camera": str(camera.absolute()) if camera is not None and camera.is_file() else self.camera,
+                "data_root": None
+                if self.data_root is None
+                else str(Path(self.data_root).expanduser().absolute()),
+                "camera": str(camera.absolute())
+                if camera is not None and camera.is_file()
+                else self.camera,
                 "settings": settings,
             }
         )
@@ -142,7 +156,9 @@ def _absolute_folder(sequence: str) -> str:
     if sequence.startswith((".", "~", os.sep)):
         return str(Path(sequence).expanduser().absolute())
     catalogued = sequence.startswith("synthetic/") or entry_of(sequence) is not None
-    return str(Path(sequence).absolute()) if not catalogued and Path(sequence).is_dir() else sequence
+    return (
+        str(Path(sequence).absolute()) if not catalogued and Path(sequence).is_dir() else sequence
+    )
 
 
 def place_of(sequence: str) -> str:

@@ -60,12 +60,16 @@ OnProgress = Callable[[int, int], None]
 
 
 INDEX_FILE = "index.sqlite"
-RUN_FILE, ONLINE, FINAL = "run.json", "trajectory_online.txt", "trajectory_final.txt"
+RUN_FILE = "run.json"
+ONLINE = "trajectory_online.txt"
+FINAL = "trajectory_final.txt"
 _TABLE = (
     "CREATE TABLE IF NOT EXISTS computed "
     "(name TEXT, run_id TEXT, version TEXT, state TEXT, value TEXT, PRIMARY KEY (name, run_id))"
 )
-_KEEP = "INSERT OR REPLACE INTO computed (name, run_id, version, state, value) VALUES (?, ?, ?, ?, ?)"
+_KEEP = (
+    "INSERT OR REPLACE INTO computed (name, run_id, version, state, value) VALUES (?, ?, ?, ?, ?)"
+)
 _VALUES = "SELECT run_id, state, value FROM computed WHERE name = ? AND version = ?"
 _LOCKED_S = 10.0
 """Other processes keep the index for milliseconds."""
@@ -76,19 +80,20 @@ Row = dict[str, Any]
 class RunIndex:
     """What was computed from the runs of a store: metrics, rows of lists and rows of reports, in one SQLite file.
 
-    Each value holds for one version of the code that computed it and for one state (times and sizes) of the files that
-    it was computed from. The file may be deleted at any time; values that are missing, damaged or out of date are
-    computed again from the run folders.
+    Each value holds for one version of the code that computed it and for one state (times and
+    sizes) of the files that it was computed from. The file may be deleted at any time; values that
+    are missing, damaged or out of date are computed again from the run folders.
 
-    An index that another process has locked is waited for once, for `_LOCKED_S`. After that this process goes on
-    without it, with a warning: what it holds can be computed.
+    An index that another process has locked is waited for once, for `_LOCKED_S`. After that this
+    process goes on without it, with a warning: what it holds can be computed.
 
     Args:
         root: Folder of the store.
     """
 
     def __init__(self, root: Path) -> None:
-        self.root, self.path = root, root / INDEX_FILE
+        self.root = root
+        self.path = root / INDEX_FILE
         self._is_locked = False
 
     def state(self, run_id: str, part: str, record_stamp: str = "") -> str:
@@ -97,11 +102,20 @@ class RunIndex:
         Args:
             run_id: The run.
             part: Its part of a sequence.
-            record_stamp: `file_stamp` of its record before that was read; empty for the present one.
+            record_stamp: `file_stamp` of its record before that was read; empty for the present
+                one.
         """
-        run, sequence = f"{self.root}/runs/{run_id}", f"{self.root}/sequences/{part}"
-        files = (f"{run}/{ONLINE}", f"{run}/{FINAL}", f"{sequence}/groundtruth.txt", f"{sequence}/timestamps.txt")
-        return " ".join([part, record_stamp or file_stamp(f"{run}/{RUN_FILE}"), *map(file_stamp, files)])
+        run = f"{self.root}/runs/{run_id}"
+        sequence = f"{self.root}/sequences/{part}"
+        files = (
+            f"{run}/{ONLINE}",
+            f"{run}/{FINAL}",
+            f"{sequence}/groundtruth.txt",
+            f"{sequence}/timestamps.txt",
+        )
+        return " ".join(
+            [part, record_stamp or file_stamp(f"{run}/{RUN_FILE}"), *map(file_stamp, files)]
+        )
 
     def get(self, name: str, version: str, run_id: str) -> str | None:
         """The value of one run, as `read` gives it."""
@@ -113,14 +127,17 @@ class RunIndex:
         rows = self._query("SELECT value FROM computed WHERE name = ? AND run_id = ?", name, run_id)
         return rows[0][0] if rows else None
 
-    def read(self, name: str, version: str, run_ids: Iterable[str], *, check_links: bool = False) -> dict[str, str]:
+    def read(
+        self, name: str, version: str, run_ids: Iterable[str], *, check_links: bool = False
+    ) -> dict[str, str]:
         """The values that hold, by run.
 
         Args:
             name: What they are, e.g. ``metrics`` with a protocol's digest.
             version: Digest of the code that computes them.
             run_ids: Runs that are stored.
-            check_links: Whether runs whose folders hold links to elsewhere or pipes are left out, too.
+            check_links: Whether runs whose folders hold links to elsewhere or pipes are left out,
+                too.
         """
         stored = set(run_ids)
         return {
@@ -140,7 +157,9 @@ class RunIndex:
 
     def _holds(self, run_id: str, state: Any, value: Any) -> bool:
         return (
-            isinstance(value, str) and isinstance(state, str) and state == self.state(run_id, state.partition(" ")[0])
+            isinstance(value, str)
+            and isinstance(state, str)
+            and state == self.state(run_id, state.partition(" ")[0])
         )
 
     def write(self, name: str, version: str, entries: Iterable[tuple[str, str, str]]) -> None:
@@ -175,7 +194,8 @@ class RunIndex:
         """The database; no link is followed, and no pipe is opened.
 
         Raises:
-            sqlite3.OperationalError: It is not there, cannot be opened, or was locked when it was waited for.
+            sqlite3.OperationalError: It is not there, cannot be opened, or was locked when it was
+                waited for.
         """
         if self._is_locked:
             raise sqlite3.OperationalError(f"{self.path} is left alone")
@@ -183,7 +203,8 @@ class RunIndex:
         if self.path.is_symlink() or not (is_free or self.path.is_file()):
             raise sqlite3.OperationalError(f"{self.path} is no database")
         with contextlib.closing(sqlite3.connect(self.path, timeout=_LOCKED_S)) as connection:
-            connection.execute("PRAGMA synchronous = OFF")  # a power cut costs an index, which is made again
+            # a power cut costs an index, which is made again
+            connection.execute("PRAGMA synchronous = OFF")
             if create:
                 connection.execute(_TABLE)
             yield connection
@@ -227,7 +248,9 @@ def check_plain(folder: Path, root: Path) -> None:
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
             if entry.is_symlink() and not Path(entry.path).resolve().is_relative_to(root.resolve()):
-                raise RunError(f"{entry.path} is a link that leads out of {root}", "put the file in its place")
+                raise RunError(
+                    f"{entry.path} is a link that leads out of {root}", "put the file in its place"
+                )
             if not entry.is_file() and not entry.is_dir():
                 raise RunError(f"{entry.path} is no plain file")
 
@@ -243,10 +266,10 @@ class Unreadable:
 class RunStore:
     """Runs and the sequences' ground truth below one folder.
 
-    ``runs/<run_id>/`` holds ``run.json``, ``trajectory_online.txt``, ``trajectory_final.txt``, ``frames.csv``,
-    ``keyframes.csv``, ``map.ply`` and ``log.txt``; ``sequences/<part>/`` stamps and ground truth, so that a run can be
-    scored again without its data; ``index.sqlite`` metrics and rows of tables, which are computed from these;
-    ``latest`` links the newest run.
+    ``runs/<run_id>/`` holds ``run.json``, ``trajectory_online.txt``, ``trajectory_final.txt``,
+    ``frames.csv``, ``keyframes.csv``, ``map.ply`` and ``log.txt``; ``sequences/<part>/`` stamps and
+    ground truth, so that a run can be scored again without its data; ``index.sqlite`` metrics and
+    rows of tables, which are computed from these; ``latest`` links the newest run.
 
     Args:
         root: The folder; it is made when something is written.
@@ -267,8 +290,8 @@ class RunStore:
         """Folder of one run, whether it exists or not.
 
         Raises:
-            RunError: It is no run's id, which is 20 hexadecimal digits (16 of older runs): anything else could lead
-                out of the store.
+            RunError: It is no run's id, which is 20 hexadecimal digits (16 of older runs): anything
+                else could lead out of the store.
         """
         return self.runs / _checked(run_id, "a run's id")
 
@@ -280,7 +303,7 @@ class RunStore:
         """Folder of the stamps and the ground truth of a sequence's part."""
         return self.root / "sequences" / _checked(part, "the part of a sequence")
 
-    # -- writing ---------------------------------------------------------------------------------------------------
+    # -- writing -----------------------------------------------------------------------------------
 
     def prepare(self) -> None:
         """Make sure that runs can be stored, and remove what killed processes left behind.
@@ -336,7 +359,8 @@ class RunStore:
     def link_latest(self, run_id: str) -> None:
         """Let ``latest`` lead to a run."""
         link = self.root / "latest"
-        with contextlib.suppress(OSError), temporary_folder(link) as folder:  # a file system may have no links
+        # a file system may have no links
+        with contextlib.suppress(OSError), temporary_folder(link) as folder:
             fresh = folder / link.name
             fresh.symlink_to(self.folder(run_id).relative_to(self.root))
             fresh.replace(link)
@@ -356,7 +380,12 @@ class RunStore:
         Raises:
             RunError: One cannot be read.
         """
-        paths = [run / ONLINE, run / FINAL, self._part(part) / "groundtruth.txt", self._part(part) / "timestamps.txt"]
+        paths = [
+            run / ONLINE,
+            run / FINAL,
+            self._part(part) / "groundtruth.txt",
+            self._part(part) / "timestamps.txt",
+        ]
         checksums = {}
         for path in paths:
             if not path.is_file():
@@ -417,12 +446,18 @@ class RunStore:
         """
         source = other.folder(record.run_id)
         try:
-            with raising(InfrastructureError, f"cannot write {self.folder(record.run_id)}", "check the free space"):
+            with raising(
+                InfrastructureError,
+                f"cannot write {self.folder(record.run_id)}",
+                "check the free space",
+            ):
                 yield
         except InfrastructureError as error:
             if (source / RUN_FILE).is_file():
                 raise
-            raise RunError(f"{other.place(record.run_id)} was removed while it was copied") from error
+            raise RunError(
+                f"{other.place(record.run_id)} was removed while it was copied"
+            ) from error
 
     def check_copy(self, work: Path, record: RunRecord) -> None:
         """Check that a copied run has the trajectories that it was stored with.
@@ -433,7 +468,9 @@ class RunStore:
         copied = self._files(record.sequence.part, work)
         for name in (ONLINE, FINAL):
             if copied.get(name) != record.files.get(name, copied.get(name)):
-                raise RunError(f"{name} of run {record.run_id} was removed or changed while it was copied")
+                raise RunError(
+                    f"{name} of run {record.run_id} was removed or changed while it was copied"
+                )
 
     def copy_part(self, other: RunStore, record: RunRecord) -> None:
         """Copy the ground truth and then the stamps of a run's part of a sequence, if its stamps are not here.
@@ -449,7 +486,9 @@ class RunStore:
                     content = file.read_bytes()
                 write_atomic(folder / file.name, content)
 
-    def add_sequence(self, part: str, timestamps_ns: NDArray[np.int64], ground_truth: Trajectory | None) -> None:
+    def add_sequence(
+        self, part: str, timestamps_ns: NDArray[np.int64], ground_truth: Trajectory | None
+    ) -> None:
         """Keep the stamps of a sequence's frames, in nanoseconds, and its ground truth, in place of other ones."""
         folder = self._part(part)
         texts = {"timestamps.txt": "".join(f"{format_ns(ns)}\n" for ns in timestamps_ns.tolist())}
@@ -485,13 +524,17 @@ class RunStore:
         if latest.is_symlink() and not latest.exists():
             latest.unlink(missing_ok=True)
 
-    # -- reading ---------------------------------------------------------------------------------------------------
+    # -- reading -----------------------------------------------------------------------------------
 
     def ids(self) -> list[str]:
         """Ids of all stored runs, sorted."""
         try:
             with os.scandir(self.runs) as entries:
-                return sorted(entry.name for entry in entries if _RUN_ID.fullmatch(entry.name) and entry.is_dir())
+                return sorted(
+                    entry.name
+                    for entry in entries
+                    if _RUN_ID.fullmatch(entry.name) and entry.is_dir()
+                )
         except (FileNotFoundError, NotADirectoryError):
             return []
 
@@ -519,7 +562,8 @@ class RunStore:
         """The record of a run by its full id.
 
         Raises:
-            DynslamError: It is missing or damaged, names itself otherwise, or its folder holds more than plain files.
+            DynslamError: It is missing or damaged, names itself otherwise, or its folder holds more
+                than plain files.
         """
         path = self.folder(run_id) / RUN_FILE
         check_plain(path.parent, self.root)
@@ -530,7 +574,10 @@ class RunStore:
                 raise
             raise RunError(f"run {run_id} is not in {self.source}", _REMOVED) from error
         if record.run_id != run_id:
-            raise RunError(f"{path} names itself {record.run_id}, not as its folder", "it was copied or made by hand")
+            raise RunError(
+                f"{path} names itself {record.run_id}, not as its folder",
+                "it was copied or made by hand",
+            )
         return record
 
     def read_with_state(self, run_id: str) -> tuple[RunRecord, str]:
@@ -541,7 +588,8 @@ class RunStore:
 
     def all(self) -> tuple[Records, list[Unreadable]]:
         """All runs from the oldest to the newest, and the folders that hold no valid record, with reasons."""
-        started, unreadable = [], []
+        started = []
+        unreadable = []
         for run_id in self.ids():
             try:
                 started.append((self.read_whole(run_id).started, run_id))
@@ -569,7 +617,9 @@ class RunStore:
     def trajectory(self, run_id: str, which: str = "online") -> Trajectory | None:
         """The ``online`` or ``final`` trajectory of a run; None if there is none or no frame was tracked."""
         path = self.folder(run_id) / f"trajectory_{which}.txt"
-        if not path.is_file() or not any(line.strip() and line[0] != "#" for line in read_lines(path, kind=RunError)):
+        if not path.is_file() or not any(
+            line.strip() and line[0] != "#" for line in read_lines(path, kind=RunError)
+        ):
             return None
         return read_tum(path)
 
@@ -577,7 +627,9 @@ class RunStore:
         """The ground truth of a sequence's part, with `repeats` all poses of a repeated stamp; None if it has none."""
         path = self._part(part) / "groundtruth.txt"
         check_plain(path.parent, self.root)
-        return _read_truth(path, file_stamp(path)).poses(repeats=repeats) if path.is_file() else None
+        return (
+            _read_truth(path, file_stamp(path)).poses(repeats=repeats) if path.is_file() else None
+        )
 
     def timestamps(self, part: str) -> NDArray[np.float64]:
         """Stamps in seconds of all input frames of a sequence's part.
@@ -600,23 +652,35 @@ class RunStore:
         if fault := self.changed(record):
             raise RunError(fault)
 
-    # -- scores ----------------------------------------------------------------------------------------------------
+    # -- scores ------------------------------------------------------------------------------------
 
     def metrics(self, record: RunRecord, protocol: Protocol) -> MetricRecord | None:
         """A run's stored metrics under a protocol; None if it was not scored under it, or they are out of date.
 
-        Metrics hold for one version of the evaluation code and one state of the trajectories and the ground truth.
+        Metrics hold for one version of the evaluation code and one state of the trajectories and
+        the ground truth.
         """
         text = self.index.get(_metrics_of(protocol), evaluation_code(), record.run_id)
         with contextlib.suppress(DynslamError):  # damaged: the run is scored again
-            metrics = None if text is None else MetricRecord.parse(text, f"metrics of run {record.run_id}")
-            if metrics and (metrics.run_id, metrics.protocol_digest) == (record.run_id, protocol.digest()):
+            metrics = (
+                None
+                if text is None
+                else MetricRecord.parse(text, f"metrics of run {record.run_id}")
+            )
+            if metrics and (metrics.run_id, metrics.protocol_digest) == (
+                record.run_id,
+                protocol.digest(),
+            ):
                 return metrics
         return None
 
     def add_metrics(self, record: RunRecord, metrics: MetricRecord, state: str = "") -> None:
         """Keep a run's metrics under a protocol, for its state when they were computed or, without one, the present."""
-        entry = (record.run_id, state or self.index.state(record.run_id, record.sequence.part), metrics.to_line())
+        entry = (
+            record.run_id,
+            state or self.index.state(record.run_id, record.sequence.part),
+            metrics.to_line(),
+        )
         self.index.write(f"metrics {metrics.protocol_digest}", metrics.code, [entry])
 
     def score(
@@ -642,7 +706,8 @@ class RunStore:
             return score_apart(self, record.run_id, protocol, again=again)
         state = self.index.state(record.run_id, record.sequence.part)  # before the files are read
         evaluations: dict[Which, Evaluation | None] = {"online": None, "final": None}
-        reasons, lines = dict[str, str](), list[str]()
+        lines = list[str]()
+        reasons = dict[str, str]()
         for which in evaluations:
             try:
                 trajectory, truth, stamps = self._inputs(record, protocol, which)
@@ -674,8 +739,8 @@ class RunStore:
         """One of a run's trajectories, the ground truth, and the stamps of the input frames where its own are theirs.
 
         Raises:
-            DynslamError: One is missing, damaged or was changed, or the protocol does not fit the sequence or the
-                tracker.
+            DynslamError: One is missing, damaged or was changed, or the protocol does not fit the
+                sequence or the tracker.
         """
         protocol.check_sequence(record.sequence.id)
         protocol.check_scale(record.tracker.id, record.tracker.sensors)
@@ -688,14 +753,21 @@ class RunStore:
         trajectory = self.trajectory(record.run_id, which)
         if trajectory is None:
             raise EvaluationError("there is no such trajectory, or it holds no tracked frame")
-        return trajectory, truth, self.timestamps(record.sequence.part) if record.stamps_match else None
+        return (
+            trajectory,
+            truth,
+            self.timestamps(record.sequence.part) if record.stamps_match else None,
+        )
 
-    def frame(self, protocol: Protocol | str = DEFAULT_PROTOCOL, *, trials: bool = False) -> pd.DataFrame:
+    def frame(
+        self, protocol: Protocol | str = DEFAULT_PROTOCOL, *, trials: bool = False
+    ) -> pd.DataFrame:
         """All runs, scored under one protocol, as a pandas frame: one row a run, from the oldest to the newest.
 
         Args:
             protocol: How to evaluate; SLAM is never run again for it.
-            trials: Whether the trials of studies are listed, too: their settings are candidates, no results.
+            trials: Whether the trials of studies are listed, too: their settings are candidates, no
+                results.
 
         Returns:
             The columns that `runs_frame` describes.
@@ -708,7 +780,10 @@ class RunStore:
                 try:
                     record = self.read_whole(run_id)
                     if trials or not record.trial_of:
-                        yield record, None if record.status == "stopped" else self.score(record, protocol)
+                        yield (
+                            record,
+                            None if record.status == "stopped" else self.score(record, protocol),
+                        )
                 except DynslamError as error:
                     reasons.append(f"{self.place(run_id)}: {error}")
 
@@ -771,11 +846,16 @@ def open_store(results: str | Path) -> RunStore:
             unpacked.mkdir()
             extract(store.root, unpacked)
         roots = [path.parent for path in unpacked.rglob("runs") if path.is_dir()]
-        depth = min((len(root.parts) for root in roots), default=0)  # below it, e.g. a study's own runs
+        # below it, e.g. a study's own runs
+        depth = min((len(root.parts) for root in roots), default=0)
         roots = [root for root in roots if len(root.parts) == depth]
         if len(roots) > 1:
-            raise RunError(f"{results} holds {len(roots)} results folders", "pack each into an archive of its own")
-        archive, store = store.root, RunStore(roots[0] if roots else unpacked)
+            raise RunError(
+                f"{results} holds {len(roots)} results folders",
+                "pack each into an archive of its own",
+            )
+        archive = store.root
+        store = RunStore(roots[0] if roots else unpacked)
         store.source = archive
         weakref.finalize(store, temporary.close)
     if not store.runs.is_dir():
@@ -796,7 +876,9 @@ def _metrics_of(protocol: Protocol) -> str:
 def _checked(name: str, what: str) -> str:
     """A name that data gives to a folder of the store, if it is one that this package makes."""
     if not _RUN_ID.fullmatch(name):
-        raise RunError(f"{name[:100]!r} is not {what}: expected 20 hexadecimal digits, or 16 of older runs")
+        raise RunError(
+            f"{name[:100]!r} is not {what}: expected 20 hexadecimal digits, or 16 of older runs"
+        )
     return name
 
 
@@ -812,14 +894,23 @@ def _read_truth(path: Path, _stamp: str) -> TumFile:
 @lru_cache(maxsize=64)
 def _read_stamps(path: Path, _stamp: str) -> NDArray[np.float64]:
     """The stamps of a part, likewise shared."""
-    with raising(RunError, f"cannot read {path}", "the results folder is incomplete", of=ValueError):
-        stamps = np.array([float(line) for line in read_lines(path, kind=RunError) if line.strip()], dtype=np.float64)
+    with raising(
+        RunError, f"cannot read {path}", "the results folder is incomplete", of=ValueError
+    ):
+        stamps = np.array(
+            [float(line) for line in read_lines(path, kind=RunError) if line.strip()],
+            dtype=np.float64,
+        )
     stamps.flags.writeable = False
     return stamps
 
 
 def score(
-    store: RunStore, record: RunRecord, protocol: Protocol | str = DEFAULT_PROTOCOL, *, again: bool = False
+    store: RunStore,
+    record: RunRecord,
+    protocol: Protocol | str = DEFAULT_PROTOCOL,
+    *,
+    again: bool = False,
 ) -> MetricRecord:
     """The metrics of a stored run under a protocol, see `RunStore.score`."""
     return store.score(record, protocol, again=again)
@@ -843,9 +934,9 @@ class Merged:
 def merge(sources: Iterable[RunStore], store: RunStore, *, trials: bool = True) -> Merged:
     """Copy the runs of stores into one, with or without the trials of studies; nothing that it holds is changed.
 
-    A run is left out if its record is damaged, its stamps are lost or it is removed meanwhile, or if the store holds
-    another result under its id, other stamps or another ground truth of its sequence. ``latest`` leads to the newest of
-    the others afterwards.
+    A run is left out if its record is damaged, its stamps are lost or it is removed meanwhile, or
+    if the store holds another result under its id, other stamps or another ground truth of its
+    sequence. ``latest`` leads to the newest of the others afterwards.
 
     Raises:
         InfrastructureError: The store cannot be written; the runs that were copied before stay.
@@ -888,10 +979,15 @@ def _why_left_out(source: RunStore, record: RunRecord, store: RunStore) -> str:
         return str(error)
     if not (part / "timestamps.txt").is_file():
         return f"{source.source} has lost the stamps of its sequence"
-    if (there / "timestamps.txt").is_file() and not _equal(part, there, "timestamps.txt", "groundtruth.txt"):
+    if (there / "timestamps.txt").is_file() and not _equal(
+        part, there, "timestamps.txt", "groundtruth.txt"
+    ):
         return f"{store.source} holds other stamps or truth of its sequence"
-    earlier, folders = store.get(record.run_id), (source.folder(record.run_id), store.folder(record.run_id))
-    if earlier is not None and (earlier.status != record.status or not _equal(*folders, ONLINE, FINAL)):
+    earlier = store.get(record.run_id)
+    folders = (source.folder(record.run_id), store.folder(record.run_id))
+    if earlier is not None and (
+        earlier.status != record.status or not _equal(*folders, ONLINE, FINAL)
+    ):
         return f"{store.source} holds another result of this run"
     return source.changed(record)
 
@@ -914,12 +1010,15 @@ def _content(file: Path) -> bytes:
 
 
 def list_runs(
-    store: RunStore, protocol: Protocol | str = DEFAULT_PROTOCOL, *, on_progress: OnProgress = lambda done, total: None
+    store: RunStore,
+    protocol: Protocol | str = DEFAULT_PROTOCOL,
+    *,
+    on_progress: OnProgress = lambda done, total: None,
 ) -> tuple[list[Row], list[Unreadable]]:
     """Every run as `run_row` gives it, from the oldest to the newest, and the folders that hold no valid record.
 
-    Rows are taken from the store's index while the files of their run are the same; a store that cannot be written is
-    read without it.
+    Rows are taken from the store's index while the files of their run are the same; a store that
+    cannot be written is read without it.
 
     Args:
         store: The store.
@@ -930,7 +1029,11 @@ def list_runs(
     name = f"list {protocol.digest()}"
     version = digest([module_graph().digest([__name__], PLUMBING), *FIELDS])
     ids = store.ids()
-    rows = {run_id: row for run_id, text in store.index.read(name, version, ids).items() if (row := _row(run_id, text))}
+    rows = {
+        run_id: row
+        for run_id, text in store.index.read(name, version, ids).items()
+        if (row := _row(run_id, text))
+    }
     entries: list[tuple[str, str, str]] = []
     unreadable: list[Unreadable] = []
     for position, run_id in enumerate(ids):
@@ -940,7 +1043,9 @@ def list_runs(
             continue
         try:
             record, state = store.read_with_state(run_id)
-            rows[run_id] = run_row(record, None if record.status == "stopped" else store.score(record, protocol))
+            rows[run_id] = run_row(
+                record, None if record.status == "stopped" else store.score(record, protocol)
+            )
             entries.append((run_id, state, json.dumps(list(rows[run_id].values()))))
         except DynslamError as error:
             unreadable.append(Unreadable(store.place(run_id), str(error)))
@@ -965,7 +1070,8 @@ class Rescored:
         protocol: Id of the protocol.
         runs: Runs that were scored.
         changed: Ids of those whose stored metrics had other values.
-        unreadable: Folders without a valid record, or with a damaged trajectory, with reasons; they are not scored.
+        unreadable: Folders without a valid record, or with a damaged trajectory, with reasons; they
+            are not scored.
     """
 
     protocol: str
@@ -975,13 +1081,17 @@ class Rescored:
 
 
 def rescore(
-    store: RunStore, protocol: Protocol | str | None = None, *, on_progress: OnProgress = lambda done, total: None
+    store: RunStore,
+    protocol: Protocol | str | None = None,
+    *,
+    on_progress: OnProgress = lambda done, total: None,
 ) -> list[Rescored]:
     """Compute the metrics of all stored runs again, whatever is stored.
 
     Args:
         store: The store.
-        protocol: The protocol; None for every known one under which the store has metrics, at least the default one.
+        protocol: The protocol; None for every known one under which the store has metrics, at least
+            the default one.
         on_progress: Called after every run.
 
     Returns:
@@ -997,9 +1107,14 @@ def rescore(
             readable.append(record.run_id)
         except DynslamError as error:
             unreadable.append(Unreadable(store.place(record.run_id), str(error)))
-    ended, reasons = Records(store, readable), tuple(f"{bad.path}: {bad.reason}" for bad in unreadable)
+    ended = Records(store, readable)
+    reasons = tuple(f"{bad.path}: {bad.reason}" for bad in unreadable)
     names = store.index.names()
-    chosen = [option for option in PROTOCOLS.values() if option.id == DEFAULT_PROTOCOL or _metrics_of(option) in names]
+    chosen = [
+        option
+        for option in PROTOCOLS.values()
+        if option.id == DEFAULT_PROTOCOL or _metrics_of(option) in names
+    ]
     chosen = chosen if protocol is None else [get_protocol(protocol)]
     outcomes: list[Rescored] = []
     for current in chosen:
@@ -1022,11 +1137,29 @@ def _errors(text: str) -> object:
         return text
 
 
-# -- runs as rows of tables --------------------------------------------------------------------------------------------
+# -- runs as rows of tables ------------------------------------------------------------------------
 
 FIELDS = (
-    *("run_id", "tracker", "sequence", "frames", "seed", "offset", "noise", "repeat", "settings", "status"),
-    *("ate_rmse_m", "static_camera_ate_rmse_m", "false_motion_max_m", "coverage", "frame_ms", "segmentation"),
+    *(
+        "run_id",
+        "tracker",
+        "sequence",
+        "frames",
+        "seed",
+        "offset",
+        "noise",
+        "repeat",
+        "settings",
+        "status",
+    ),
+    *(
+        "ate_rmse_m",
+        "static_camera_ate_rmse_m",
+        "false_motion_max_m",
+        "coverage",
+        "frame_ms",
+        "segmentation",
+    ),
     *("seen_in_training", "study", "identity", "reason", "remarks", "started"),
 )
 """Names of the values of a list's row, in order."""
@@ -1039,9 +1172,11 @@ def run_row(record: RunRecord, metrics: MetricRecord | None) -> Row:
         record: The run.
         metrics: Its errors under some protocol; None without.
     """
-    from dynslam_bench.segmentation.training_scenes import seen_in_training  # loads the catalogue of all sequences
+    # loads the catalogue of all sequences
+    from dynslam_bench.segmentation.training_scenes import seen_in_training
 
-    errors = {} if metrics is None or record.failed else metrics.metrics  # what a part of a run scores says nothing
+    # what a part of a run scores says nothing
+    errors = {} if metrics is None or record.failed else metrics.metrics
     not_scored = "" if metrics is None or errors else metrics.reasons.get(metrics.trajectory, "")
     final = metrics.final if metrics is not None and metrics.trajectory == "final" else None
     return {
@@ -1087,7 +1222,17 @@ _TEXT = (
     *("device", "segmentation", "protocol_id", "protocol_digest", "trajectory"),
 )
 _WHOLE = (
-    *("seed", "offset", "noise", "stride", "threads", "n_frames", "n_processed", "n_tracked", "n_lost"),
+    *(
+        "seed",
+        "offset",
+        "noise",
+        "stride",
+        "threads",
+        "n_frames",
+        "n_processed",
+        "n_tracked",
+        "n_lost",
+    ),
     *("keyframes", "map_points", "maps"),
 )
 _NUMBERS = (
@@ -1103,25 +1248,29 @@ def runs_frame(runs: Iterable[tuple[RunRecord, MetricRecord | None]]) -> pd.Data
         runs: Records with their metrics; None for a run that was not scored.
 
     Returns:
-        One row a run, in their order. Whatever may be missing is ``pd.NA``, never nan or an empty string.
+        One row a run, in their order. Whatever may be missing is ``pd.NA``, never nan or an empty
+        string.
 
         - ``string``: run_id, kind (``run``, ``imported``), tracker, label (its name in tables), settings (those that
-          were asked for, ``name=value; ...``), provenance, sequence, frames (``A:B, every 2nd``, missing for all),
-          split, repeat (``seed 0, offset 2``), status, reason (missing for ``ok``), study (of which the run is a trial,
-          missing for any other run), identity (``unverified`` for runs of an older scheme of ids, else missing),
-          device, segmentation (source of the masks), protocol_id, protocol_digest and trajectory (``online``,
+          were asked for, ``name=value; ...``), provenance, sequence, frames (``A:B, every 2nd``,
+          missing for all), split, repeat (``seed 0, offset 2``), status, reason (missing for
+          ``ok``), study (of which the run is a trial, missing for any other run), identity
+          (``unverified`` for runs of an older scheme of ids, else missing), device, segmentation
+          (source of the masks), protocol_id, protocol_digest and trajectory (``online``,
           ``final``): what the errors hold under and are of.
         - ``Int64``: seed, offset, noise (missing for the sequence's own), stride, threads, n_frames, n_processed,
           n_tracked, n_lost, keyframes, map_points, maps.
         - ``Float64``: coverage (0 to 1), frame_ms (median, milliseconds, segmentation included, decoding excluded),
-          real_time_factor, finalize_s and wall_s (seconds), peak_memory_mb (MB), mask_iou and epipolar_skipped (0 to
-          1), and every metric under its own name with its unit (``ate_rmse_m``, ``rpe_1s_rot_rmse_deg``, see
-          `Evaluation`); ``ate_rmse_m`` is there even if no run has one.
+          real_time_factor, finalize_s and wall_s (seconds), peak_memory_mb (MB), mask_iou and
+          epipolar_skipped (0 to 1), and every metric under its own name with its unit
+          (``ate_rmse_m``, ``rpe_1s_rot_rmse_deg``, see `Evaluation`); ``ate_rmse_m`` is there even
+          if no run has one.
         - ``datetime64[us, UTC]``: started.
     """
     import pandas as pd
 
-    rows, metrics = list[Row](), {"ate_rmse_m"}
+    rows = list[Row]()
+    metrics = {"ate_rmse_m"}
     for record, scored in runs:
         rows.append(_cells(record, scored))
         metrics.update(scored.metrics if scored is not None else ())
@@ -1133,7 +1282,11 @@ def runs_frame(runs: Iterable[tuple[RunRecord, MetricRecord | None]]) -> pd.Data
 
 
 def _cells(record: RunRecord, metrics: MetricRecord | None) -> Row:
-    cells = {name: getattr(record, name) for name in (*_WHOLE, *_NUMBERS, *_TEXT) if hasattr(record, name)}
+    cells = {
+        name: getattr(record, name)
+        for name in (*_WHOLE, *_NUMBERS, *_TEXT)
+        if hasattr(record, name)
+    }
     cells |= run_row(record, metrics)
     cells |= {
         "label": record.tracker.label or record.tracker.id,
@@ -1142,6 +1295,9 @@ def _cells(record: RunRecord, metrics: MetricRecord | None) -> Row:
         "reason": record.reason,
     }
     if metrics is not None:
-        cells |= {name: getattr(metrics, name) for name in ("protocol_id", "protocol_digest", "trajectory")}
+        cells |= {
+            name: getattr(metrics, name)
+            for name in ("protocol_id", "protocol_digest", "trajectory")
+        }
         cells |= metrics.metrics
     return {name: None if value == "" else value for name, value in cells.items()}

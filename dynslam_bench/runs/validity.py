@@ -26,7 +26,8 @@ _NETWORKS = ("embedded", "coco")
 class Installation:
     """What is installed here; each thing is looked at once, however many runs are compared with it.
 
-    No plug-in is imported. A run's data are no part of the comparison: runs on other data are other columns of a table.
+    No plug-in is imported. A run's data are no part of the comparison: runs on other data are other
+    columns of a table.
     """
 
     def __init__(self) -> None:
@@ -47,7 +48,9 @@ class Installation:
         named = {name: record.settings.get(name) for name in _table(program.get("weights"))}
         question = json.dumps([program, named, record.tracker.folder], sort_keys=True, default=str)
         if question not in self._answers:
-            self._answers[question] = self._compare(program, named, self._plugin_folder(record.tracker))
+            self._answers[question] = self._compare(
+                program, named, self._plugin_folder(record.tracker)
+            )
         return self._answers[question]
 
     @staticmethod
@@ -56,14 +59,21 @@ class Installation:
         if tracker.folder:
             return Path(tracker.folder)
         target = TRACKERS.target_of(tracker.id)
-        return Path(module_of(target)).absolute().parent if target is not None and is_file(target) else None
+        return (
+            Path(module_of(target)).absolute().parent
+            if target is not None and is_file(target)
+            else None
+        )
 
-    def _compare(self, program: Mapping[str, Any], named: Mapping[str, Any], plugin: Path | None) -> str:
+    def _compare(
+        self, program: Mapping[str, Any], named: Mapping[str, Any], plugin: Path | None
+    ) -> str:
         """The first part of a program that differs here.
 
         Args:
             program: The entries `PROGRAM` of a run's identity.
-            named: The values of the settings that name its weights; None for a network that no setting names.
+            named: The values of the settings that name its weights; None for a network that no
+                setting names.
             plugin: The folder of its plug-in's file.
         """
         parts = program.get("parts")

@@ -12,7 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from dynslam_bench.contracts import Frame, Instances, MaskSource, Segmenter, SegmenterContext, SegmenterSpec, Sequence
+from dynslam_bench.contracts import (
+    Frame,
+    Instances,
+    MaskSource,
+    Segmenter,
+    SegmenterContext,
+    SegmenterSpec,
+    Sequence,
+)
 from dynslam_bench.core import SegmentationError, raising
 from dynslam_bench.core.fingerprint import content_digest, machine_digest, path_digest
 from dynslam_bench.core.plugins import Registry, build_plugin
@@ -26,7 +34,12 @@ from dynslam_bench.segmentation.networks.checkpoints import (
     embedded_weights,
     fetch_checkpoint,
 )
-from dynslam_bench.segmentation.settings import COCO_NAMES, SegmentationSettings, canonical_name, check_classes
+from dynslam_bench.segmentation.settings import (
+    COCO_NAMES,
+    SegmentationSettings,
+    canonical_name,
+    check_classes,
+)
 
 __all__ = ["SEGMENTERS", "SegmenterContext", "SegmenterSpec"]
 
@@ -68,7 +81,11 @@ class NetworkNotFetched(SegmentationError):
 
 
 def resolve_source(
-    settings: SegmentationSettings, sequence_id: str = "", masks: MaskSource | None = None, *, optional: bool = False
+    settings: SegmentationSettings,
+    sequence_id: str = "",
+    masks: MaskSource | None = None,
+    *,
+    optional: bool = False,
 ) -> str:
     """What `settings.source` means for a sequence; the label stored with results.
 
@@ -82,7 +99,8 @@ def resolve_source(
         ``auto`` becomes ``embedded`` or ``coco``; everything else stays as it is.
 
     Raises:
-        NetworkNotFetched: ``auto`` needs the COCO checkpoint, which is not in the cache; lists the alternatives.
+        NetworkNotFetched: ``auto`` needs the COCO checkpoint, which is not in the cache; lists the
+            alternatives.
     """
     if settings.source != "auto":
         return settings.source
@@ -90,7 +108,11 @@ def resolve_source(
         return "embedded"
     if cached_checkpoint(COCO) is not None:
         return "coco"
-    without = "segmentation.source=none" if optional else "a tracker such as 'emfoa-oft?masks=none' or orb-slam2"
+    without = (
+        "segmentation.source=none"
+        if optional
+        else "a tracker such as 'emfoa-oft?masks=none' or orb-slam2"
+    )
     raise NetworkNotFetched(
         f"no masks for '{sequence_id or 'this sequence'}': segmentation.source=auto needs "
         f"the COCO checkpoint ({COCO.megabytes} MB), which is not in the cache",
@@ -98,7 +120,11 @@ def resolve_source(
             "--yes (run, bench) or segmentation.source=coco downloads it once",
             "segmentation.source=onnx:PATH takes your export of a network, e.g. of YOLO-seg",
             "segmentation.source=recorded:DIR takes masks that were stored before",
-            *(["segmentation.source=oracle takes the sequence's exact masks"] if masks is not None else []),
+            *(
+                ["segmentation.source=oracle takes the sequence's exact masks"]
+                if masks is not None
+                else []
+            ),
             f"without masks: {without}",
         ],
     )
@@ -116,8 +142,8 @@ def segmentation_source(settings: Settings, sequence: Sequence, *, fetch: bool =
         The resolved source; empty for a tracker without a semantic stage.
 
     Raises:
-        SegmentationError: The file is missing or holds no network, masks of frames are missing, the sequence has no
-            exact masks, or ``auto`` has no source.
+        SegmentationError: The file is missing or holds no network, masks of frames are missing, the
+            sequence has no exact masks, or ``auto`` has no source.
         PluginError: ``plugin:ID`` names no segmenter.
     """
     group = getattr(settings, "segmentation", None)
@@ -137,7 +163,9 @@ def segmentation_source(settings: Settings, sequence: Sequence, *, fetch: bool =
         stat = path.stat() if path.is_file() else None
         _check_network(kind, argument, group, stat and (stat.st_size, stat.st_mtime_ns))
     elif kind == "embedded" and not embedded_weights().is_file():
-        raise SegmentationError("the embedded network's weights are missing from this installation", "reinstall it")
+        raise SegmentationError(
+            "the embedded network's weights are missing from this installation", "reinstall it"
+        )
     elif kind == "coco" and fetch:
         fetch_checkpoint(COCO)
     elif kind == "plugin":
@@ -149,9 +177,12 @@ def _check_recorded(folder: Path, settings: SegmentationSettings, sequence: Sequ
     from dynslam_bench.segmentation.recorded import RecordedSegmenter
 
     recorded = RecordedSegmenter(folder)
-    check_classes(recorded.class_names, settings, str(recorded.folder), "the folder of recorded masks")
+    check_classes(
+        recorded.class_names, settings, str(recorded.folder), "the folder of recorded masks"
+    )
     missing = recorded.missing(sequence.timestamps)
-    if settings.schedule == "every_nth" and settings.crowded_share >= 1:  # the only schedule that is known beforehand
+    # the only schedule that is known beforehand
+    if settings.schedule == "every_nth" and settings.crowded_share >= 1:
         missing = [index for index in missing if index % settings.n == 0]
     if missing:
         raise SegmentationError(
@@ -160,7 +191,9 @@ def _check_recorded(folder: Path, settings: SegmentationSettings, sequence: Sequ
             "is it of another sequence, or of another part?",
         )
     stamps = tuple(sequence.timestamps.tolist())
-    if not _shows_objects(recorded.folder, recorded.folder.stat().st_mtime_ns, settings.class_names(), stamps):
+    if not _shows_objects(
+        recorded.folder, recorded.folder.stat().st_mtime_ns, settings.class_names(), stamps
+    ):
         warnings.warn(
             f"the recorded masks in {recorded.folder} show no object of the classes {settings.classes} in any of "
             f"{len(sequence)} frames of '{sequence.id}'",
@@ -169,7 +202,9 @@ def _check_recorded(folder: Path, settings: SegmentationSettings, sequence: Sequ
 
 
 @lru_cache(maxsize=16)
-def _shows_objects(folder: Path, changed: int, classes: frozenset[str], stamps: tuple[float, ...]) -> bool:
+def _shows_objects(
+    folder: Path, changed: int, classes: frozenset[str], stamps: tuple[float, ...]
+) -> bool:
     """Whether recorded masks show an object; read once a process, as long as no file comes or goes (`changed`)."""
     from dynslam_bench.segmentation.recorded import RecordedSegmenter
 
@@ -197,7 +232,9 @@ def _check_oracle(kind: str, settings: SegmentationSettings, sequence: Sequence)
 
 
 @lru_cache(maxsize=16)
-def _check_network(kind: str, argument: str, settings: SegmentationSettings, stamp: tuple[int, int] | None) -> None:
+def _check_network(
+    kind: str, argument: str, settings: SegmentationSettings, stamp: tuple[int, int] | None
+) -> None:
     """Load a network once a process, as long as size and time of its file (`stamp`) stay."""
     _load(kind, settings, SegmenterContext(argument=argument))
 
@@ -220,9 +257,11 @@ def build_segmenter(
         masks: Exact masks of the sequence, for ``oracle``.
         device: ``cpu`` or ``cuda:N``, for networks that run in torch.
         threads: Threads a network may use.
-        cache: Where the masks of networks are stored; selection by class and confidence comes after it, so that studies
-            over them share its entries. A network whose file exists is loaded only when a frame needs it.
-        also: Further classes whose objects are returned, although they are not dynamic by themselves.
+        cache: Where the masks of networks are stored; selection by class and confidence comes after
+            it, so that studies over them share its entries. A network whose file exists is loaded
+            only when a frame needs it.
+        also: Further classes whose objects are returned, although they are not dynamic by
+            themselves.
 
     Raises:
         SegmentationError: The source is not available here, or its file does not fit.
@@ -236,8 +275,14 @@ def build_segmenter(
     floor = min(LOWEST_CONFIDENCE, settings.confidence)
     context = SegmenterContext(sequence_id, masks, device, threads, argument, floor)
     # a network looks for the further classes, too
-    sought = settings.model_copy(update={"classes": ",".join(sorted(settings.class_names() | also))})
-    code = None if cache is None or kind not in NETWORKS else stage_code(SEGMENTERS.get(name).entry_point)
+    sought = settings.model_copy(
+        update={"classes": ",".join(sorted(settings.class_names() | also))}
+    )
+    code = (
+        None
+        if cache is None or kind not in NETWORKS
+        else stage_code(SEGMENTERS.get(name).entry_point)
+    )
     if cache is None or code is None:
         return ConfiguredSegmenter(_load(name, sought, context), settings, source, also)
     identity = {
@@ -245,7 +290,13 @@ def build_segmenter(
         "weights": weights_digest(settings, sequence_id),
         "confidence": floor,
         "settings": sought.model_dump(
-            include={"mask_threshold", "classes", "network_side", "onnx_normalisation", "onnx_layout"}
+            include={
+                "mask_threshold",
+                "classes",
+                "network_side",
+                "onnx_normalisation",
+                "onnx_layout",
+            }
         ),
         "device": device,
         "threads": threads,
@@ -260,7 +311,9 @@ def _load(name: str, settings: SegmentationSettings, context: SegmenterContext) 
     """Construct a registered segmenter."""
     spec = SEGMENTERS.get(name)
     protocol: type[Segmenter] = Segmenter  # type: ignore[type-abstract]
-    return build_plugin("segmenter", spec, protocol, SegmentationError, lambda build: build(settings, context))
+    return build_plugin(
+        "segmenter", spec, protocol, SegmentationError, lambda build: build(settings, context)
+    )
 
 
 class SharedNetwork:
@@ -292,7 +345,8 @@ class CachedSegmenter:
 
     Args:
         load: Loads the network, when a frame needs it.
-        identity: JSON-able description of network, weights and settings that change its masks, and of its cost.
+        identity: JSON-able description of network, weights and settings that change its masks, and
+            of its cost.
         cache: Where results are stored.
         code: Gives the digest of its code, see `stage_code`.
 
@@ -302,7 +356,9 @@ class CachedSegmenter:
         saved_s: Seconds to add to the last call's wall time to get its cost without the cache.
     """
 
-    def __init__(self, load: Callable[[], Segmenter], identity: object, cache: StageCache, code: ReadsSoFar) -> None:
+    def __init__(
+        self, load: Callable[[], Segmenter], identity: object, cache: StageCache, code: ReadsSoFar
+    ) -> None:
         self.network = SharedNetwork(load)
         self._cache = cache
         self._code = code
@@ -318,7 +374,8 @@ class CachedSegmenter:
         entry = self._cache.get("masks", key)
         self.hit = entry is not None
         if entry is not None:
-            instances, cost = _unpack(entry.arrays), entry.cost_s
+            instances = _unpack(entry.arrays)
+            cost = entry.cost_s
         else:
             network = self.network()  # loading is no part of the frame's cost
             start = time.perf_counter()
@@ -359,32 +416,48 @@ class ConfiguredSegmenter:
     """
 
     def __init__(
-        self, inner: Segmenter, settings: SegmentationSettings, source: str, also: frozenset[str] = frozenset()
+        self,
+        inner: Segmenter,
+        settings: SegmentationSettings,
+        source: str,
+        also: frozenset[str] = frozenset(),
     ) -> None:
-        self.inner, self.settings, self.source, self.also = inner, settings, source, also
+        self.inner = inner
+        self.settings = settings
+        self.source = source
+        self.also = also
         self._foreign: set[str] = set()
 
     def segment(self, frame: Frame) -> Instances:
         """The objects of the frame that count: see `postprocess.select`.
 
         Raises:
-            SegmentationError: The segmenter gave no `Instances`, or masks of another size than the frame.
+            SegmentationError: The segmenter gave no `Instances`, or masks of another size than the
+                frame.
         """
-        from dynslam_bench.segmentation.postprocess import select  # needs OpenCV, which the registry does not
+        # needs OpenCV, which the registry does not
+        from dynslam_bench.segmentation.postprocess import select
 
         instances = self.inner.segment(frame)
         if not isinstance(instances, Instances):
-            raise SegmentationError(f"{self.source} gave {type(instances).__name__} instead of Instances")
-        count, size = len(instances.class_names), frame.rgb.shape[:2]
+            raise SegmentationError(
+                f"{self.source} gave {type(instances).__name__} instead of Instances"
+            )
+        count = len(instances.class_names)
+        size = frame.rgb.shape[:2]
         shapes = [np.shape(part) for part in (instances.masks, instances.boxes, instances.scores)]
-        if shapes != [(count, *size), (count, 4), (count,)] or not isinstance(instances.masks, np.ndarray):
+        if shapes != [(count, *size), (count, 4), (count,)] or not isinstance(
+            instances.masks, np.ndarray
+        ):
             raise SegmentationError(
                 f"{self.source} gave {count} objects with masks of shape {shapes[0]}, boxes of shape {shapes[1]} and "
                 f"scores of shape {shapes[2]}, the frame is {size[1]}x{size[0]}",
                 "masks must be an array [K, H, W] at the frame's size, boxes [K, 4], scores [K]",
             )
         if not np.isfinite(instances.boxes).all():
-            raise SegmentationError(f"{self.source} gave boxes that are not finite", "give every object a finite box")
+            raise SegmentationError(
+                f"{self.source} gave boxes that are not finite", "give every object a finite box"
+            )
         names = tuple(canonical_name(str(name)) for name in instances.class_names)
         instances = replace(instances, class_names=names)
         self._warn_of_foreign(names)
@@ -404,12 +477,14 @@ class ConfiguredSegmenter:
             )
 
 
-def weights_digest(settings: SegmentationSettings, sequence_id: str = "", masks: MaskSource | None = None) -> str:
+def weights_digest(
+    settings: SegmentationSettings, sequence_id: str = "", masks: MaskSource | None = None
+) -> str:
     """Digest of the segmenter's file; part of a run's identity.
 
     Returns:
-        The first 12 hexadecimal digits of the SHA-256 of the network's file, or of the names and contents of recorded
-        masks; empty for sources without a file.
+        The first 12 hexadecimal digits of the SHA-256 of the network's file, or of the names and
+        contents of recorded masks; empty for sources without a file.
 
     Raises:
         SegmentationError: The file cannot be read.

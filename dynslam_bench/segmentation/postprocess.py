@@ -13,7 +13,9 @@ HOLE_RADIUS_PX = 3
 
 def boxes_of(masks: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Tight boxes x0, y0, x1, y1 (x1, y1 exclusive) of bool ``[K, H, W]`` masks; an empty mask gives zeros."""
-    boxes = np.array([cv2.boundingRect(mask.view(np.uint8)) for mask in masks], np.float32).reshape(-1, 4)
+    boxes = np.array([cv2.boundingRect(mask.view(np.uint8)) for mask in masks], np.float32).reshape(
+        -1, 4
+    )
     boxes[:, 2:] += boxes[:, :2]  # from width and height
     return boxes
 
@@ -29,7 +31,9 @@ def dynamic_objects(
     return np.asarray(wanted & (instances.scores >= settings.confidence))
 
 
-def select(instances: Instances, settings: SegmentationSettings, also: frozenset[str] = frozenset()) -> Instances:
+def select(
+    instances: Instances, settings: SegmentationSettings, also: frozenset[str] = frozenset()
+) -> Instances:
     """The objects that count, see `dynamic_objects`."""
     return instances.select(dynamic_objects(instances, settings, also))
 
@@ -42,7 +46,8 @@ def dynamic_mask(
     Args:
         instances: The objects that the segmenter returned.
         settings: Classes, confidence, repair and dilation.
-        depth: float32 ``[H, W]`` metres, 0 missing, of the masks' size, for ``repair = depth``; None fills holes only.
+        depth: float32 ``[H, W]`` metres, 0 missing, of the masks' size, for ``repair = depth``;
+            None fills holes only.
 
     Returns:
         Bool ``[H, W]``; all false without dynamic objects.
@@ -57,29 +62,39 @@ def dynamic_mask(
 def dilate(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
     """Grow a bool ``[H, W]`` mask by a disc of `radius` pixels.
 
-    A pixel is set if a set pixel lies within `radius` of it (Euclidean distance between pixel centres). For radius 15,
-    DynaSLAM's 31 x 31 ellipse approximates this disc.
+    A pixel is set if a set pixel lies within `radius` of it (Euclidean distance between pixel
+    centres). For radius 15, DynaSLAM's 31 x 31 ellipse approximates this disc.
     """
     part = region(mask, radius + 1)
     if radius <= 0 or part is None:
         return mask
     grown = mask.copy()
-    distance = cv2.distanceTransform((~mask[part]).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    distance = cv2.distanceTransform(
+        (~mask[part]).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
+    )
     grown[part] = distance <= radius + 1e-3
     return grown
 
 
-def repair(mask: NDArray[np.bool_], depth: NDArray[np.float32] | None, step_m: float) -> NDArray[np.bool_]:
+def repair(
+    mask: NDArray[np.bool_], depth: NDArray[np.float32] | None, step_m: float
+) -> NDArray[np.bool_]:
     """Fill the holes of one object's mask; with depth, also fit its border to the depth edges.
 
-    Within `REPAIR_BAND_PX` of the mask's edge, a pixel with valid depth belongs to the object if its depth is within
-    `step_m` of the mean depth of the object's core nearby. This is mask repair by depth fusion as in Blitz-SLAM and
-    MOR-SLAM; band and local mean are assumptions. Pixels without depth stay as they are.
+    Within `REPAIR_BAND_PX` of the mask's edge, a pixel with valid depth belongs to the object if
+    its depth is within `step_m` of the mean depth of the object's core nearby. This is mask repair
+    by depth fusion as in Blitz-SLAM and MOR-SLAM; band and local mean are assumptions. Pixels
+    without depth stay as they are.
     """
     if (part := region(mask, REPAIR_BAND_PX + HOLE_RADIUS_PX + 1)) is None:
         return mask
-    patch, repaired = fill_holes(mask[part]), mask.copy()
-    repaired[part] = patch if depth is None else _fit_to_depth(patch, np.asarray(depth[part], np.float32), step_m)
+    patch = fill_holes(mask[part])
+    repaired = mask.copy()
+    repaired[part] = (
+        patch
+        if depth is None
+        else _fit_to_depth(patch, np.asarray(depth[part], np.float32), step_m)
+    )
     return repaired
 
 
@@ -95,7 +110,9 @@ def fill_holes(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(filled[inner, inner] | mask)
 
 
-def _fit_to_depth(mask: NDArray[np.bool_], depth: NDArray[np.float32], step_m: float) -> NDArray[np.bool_]:
+def _fit_to_depth(
+    mask: NDArray[np.bool_], depth: NDArray[np.float32], step_m: float
+) -> NDArray[np.bool_]:
     band = REPAIR_BAND_PX
     valid = np.isfinite(depth) & (depth > 0)
     inside = cv2.distanceTransform(np.pad(mask, 1).view(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
@@ -104,9 +121,15 @@ def _fit_to_depth(mask: NDArray[np.bool_], depth: NDArray[np.float32], step_m: f
     if np.count_nonzero(core) < 20:
         return mask
     window = (4 * band + 1, 4 * band + 1)
-    weight = cv2.boxFilter(core.astype(np.float32), -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    weight = cv2.boxFilter(
+        core.astype(np.float32), -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT
+    )
     total = cv2.boxFilter(
-        np.where(core, depth, 0).astype(np.float32), -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT
+        np.where(core, depth, 0).astype(np.float32),
+        -1,
+        window,
+        normalize=False,
+        borderType=cv2.BORDER_CONSTANT,
     )
     judged = valid & (weight >= 1) & (inside <= band) & (outside <= band) & ~core
     near = np.abs(depth - total / np.maximum(weight, 1)) <= step_m

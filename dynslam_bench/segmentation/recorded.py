@@ -12,7 +12,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts import Frame, FrameMasks, Instances, MaskSource, SegmenterContext, Sequence
+from dynslam_bench.contracts import (
+    Frame,
+    FrameMasks,
+    Instances,
+    MaskSource,
+    SegmenterContext,
+    Sequence,
+)
 from dynslam_bench.core import SegmentationError, raising, read_json, write_atomic
 from dynslam_bench.core.images import read_image
 from dynslam_bench.segmentation.build_segmenter import build_segmenter, weights_digest
@@ -31,12 +38,14 @@ MISSPELLED = 0.8
 class RecordedSegmenter:
     """Reads label images ``DIR/<stamp>.png`` or ``DIR/<index>.png``.
 
-    A label image is 8 or 16 bit, one channel (or several equal ones): 0 is background, every other value one object. A
-    file with the values 0 and 255 (or 0 and 1) holds one object. Objects are persons unless ``DIR/classes.json`` maps
-    values to class names, e.g. ``{"1": "person", "7": "chair"}``.
+    A label image is 8 or 16 bit, one channel (or several equal ones): 0 is background, every other
+    value one object. A file with the values 0 and 255 (or 0 and 1) holds one object. Objects are
+    persons unless ``DIR/classes.json`` maps values to class names, e.g.
+    ``{"1": "person", "7": "chair"}``.
 
-    File names with a decimal point are stamps in seconds, matched to the nearest within 0.02 s; names without are
-    indices into the sequence as it is run (from 0): prefer stamps where only part of a sequence is run.
+    File names with a decimal point are stamps in seconds, matched to the nearest within 0.02 s;
+    names without are indices into the sequence as it is run (from 0): prefer stamps where only part
+    of a sequence is run.
 
     Args:
         folder: Where the files are.
@@ -45,7 +54,8 @@ class RecordedSegmenter:
         class_names: The names that objects may have.
 
     Raises:
-        SegmentationError: No such folder, no PNG files in it, names of both kinds or of none, a bad ``classes.json``.
+        SegmentationError: No such folder, no PNG files in it, names of both kinds or of none, a bad
+            ``classes.json``.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -71,20 +81,25 @@ class RecordedSegmenter:
             "for example 1311868164.363181.png or 000012.png",
             of=(ValueError, OverflowError),
         ):
-            numbers = np.array([float(file.stem if self.by_stamp else int(file.stem)) for file in files])
+            numbers = np.array(
+                [float(file.stem if self.by_stamp else int(file.stem)) for file in files]
+            )
             if not np.isfinite(numbers).all():
                 raise ValueError("a stamp is not finite")
         order = np.argsort(numbers, kind="stable")
         self._keys: NDArray[np.float64] = numbers[order]
         self._files = [files[i] for i in order]
-        self._names = read_classes(self.folder / CLASSES_FILE) or dict.fromkeys(range(1 << 16), "person")
+        self._names = read_classes(self.folder / CLASSES_FILE) or dict.fromkeys(
+            range(1 << 16), "person"
+        )
         self.class_names = tuple(dict.fromkeys(self._names.values()))
 
     def segment(self, frame: Frame) -> Instances:
         """The recorded objects of a frame.
 
         Raises:
-            SegmentationError: No file for the frame, an unreadable file, a wrong size, an object without a class.
+            SegmentationError: No file for the frame, an unreadable file, a wrong size, an object
+                without a class.
         """
         nearest, distance = self._nearest(frame.timestamp if self.by_stamp else frame.index)
         path = self._files[nearest]
@@ -92,7 +107,8 @@ class RecordedSegmenter:
             within = f" within {MAX_DIFFERENCE_S} s" if self.by_stamp else ""
             raise SegmentationError(
                 f"no recorded mask{within} of frame {frame.index} ({frame.timestamp:.6f} s) in {self.folder}",
-                f"the nearest is {path.name}" + (f", {distance:.3f} s away" if self.by_stamp else ""),
+                f"the nearest is {path.name}"
+                + (f", {distance:.3f} s away" if self.by_stamp else ""),
             )
         height, width = frame.rgb.shape[:2]
         labels = _read_labels(path, (width, height))
@@ -109,10 +125,17 @@ class RecordedSegmenter:
         Raises:
             SegmentationError: A file cannot be read, or is a colour image.
         """
-        numbers = [number for number, name in self._names.items() if canonical_name(name) in classes]
-        for index, key in enumerate(timestamps.tolist() if self.by_stamp else range(len(timestamps))):
+        numbers = [
+            number for number, name in self._names.items() if canonical_name(name) in classes
+        ]
+        for index, key in enumerate(
+            timestamps.tolist() if self.by_stamp else range(len(timestamps))
+        ):
             nearest, distance = self._nearest(key)
-            if distance < self._tolerance and np.isin(_read_labels(self._files[nearest]), numbers).any():
+            if (
+                distance < self._tolerance
+                and np.isin(_read_labels(self._files[nearest]), numbers).any()
+            ):
                 return index
         return None
 
@@ -145,7 +168,8 @@ def _read_labels(path: Path, size: tuple[int, int] | None = None) -> NDArray[Any
     labels: NDArray[Any] = np.atleast_3d(image)
     if (labels[:, :, :3] != labels[:, :, :1]).any():
         raise SegmentationError(
-            f"{path} is a colour image", "a mask has one channel: 0 background, else the object's number"
+            f"{path} is a colour image",
+            "a mask has one channel: 0 background, else the object's number",
         )
     return labels[:, :, 0]
 
@@ -159,13 +183,20 @@ def read_classes(path: Path) -> dict[int, str]:
     if not path.is_file():
         return {}
     with raising(
-        SegmentationError, f"cannot read {path}", 'expected {"1": "person", ...}', of=(ValueError, AttributeError)
+        SegmentationError,
+        f"cannot read {path}",
+        'expected {"1": "person", ...}',
+        of=(ValueError, AttributeError),
     ):
-        names = {int(key): str(name) for key, name in read_json(path, kind=SegmentationError).items()}
+        names = {
+            int(key): str(name) for key, name in read_json(path, kind=SegmentationError).items()
+        }
     for name in names.values():
         meant = get_close_matches(canonical_name(name), COCO_NAMES, n=1, cutoff=MISSPELLED)
         if meant and meant[0] != canonical_name(name):
-            warnings.warn(f"{path}: '{name}' is no COCO class; did you mean '{meant[0]}'?", stacklevel=2)
+            warnings.warn(
+                f"{path}: '{name}' is no COCO class; did you mean '{meant[0]}'?", stacklevel=2
+            )
     return names
 
 
@@ -180,9 +211,9 @@ def record_masks(
 ) -> int:
     """Segment every frame of a sequence, one PNG a frame, named by stamp; existing files are kept.
 
-    The files hold the objects of the settings' classes and confidence, before repair and dilation, which are done when
-    the masks are used. Where two objects overlap, the one with the higher score has the pixel. Scores are not stored.
-    It warns where no frame has an object.
+    The files hold the objects of the settings' classes and confidence, before repair and dilation,
+    which are done when the masks are used. Where two objects overlap, the one with the higher score
+    has the pixel. Scores are not stored. It warns where no frame has an object.
 
     Args:
         sequence: The frames.
@@ -198,7 +229,9 @@ def record_masks(
     Raises:
         SegmentationError: The source is ``none`` or not available, or the folder holds other masks.
     """
-    segmenter = build_segmenter(settings, sequence_id=sequence.id, masks=sequence.masks, device=device, threads=threads)
+    segmenter = build_segmenter(
+        settings, sequence_id=sequence.id, masks=sequence.masks, device=device, threads=threads
+    )
     if segmenter is None:
         raise SegmentationError("segmentation.source=none has no masks to record")
     origin = {
@@ -209,7 +242,8 @@ def record_masks(
         "confidence": settings.confidence,
     }
     _begin(folder, origin)
-    classes, segmented = read_classes(folder / CLASSES_FILE), 0
+    classes = read_classes(folder / CLASSES_FILE)
+    segmented = 0
     for index in range(len(sequence)):
         path = folder / f"{sequence.timestamps[index]:.6f}.png"
         if not path.exists():
@@ -249,13 +283,16 @@ def label_image(instances: Instances, classes: dict[int, str]) -> NDArray[np.uin
 
     Args:
         instances: The objects.
-        classes: The class of each number; a number is added where a frame has more objects of a class than before.
+        classes: The class of each number; a number is added where a frame has more objects of a
+            class than before.
     """
     labels = np.zeros(instances.masks.shape[1:], np.uint16)
     free = sorted(classes)
     for index in np.argsort(instances.scores, kind="stable"):
         name = instances.class_names[index]
-        number = next((number for number in free if classes[number] == name), max(classes, default=0) + 1)
+        number = next(
+            (number for number in free if classes[number] == name), max(classes, default=0) + 1
+        )
         classes[number] = name
         free = [other for other in free if other != number]
         labels[instances.masks[index]] = number
@@ -270,16 +307,20 @@ def instances_of(masks: FrameMasks, *, where: str = "masks") -> Instances:
         where: Named in the error.
 
     Returns:
-        One row an id that is visible and has a class name, in order of id. `Instances.moving` is filled.
+        One row an id that is visible and has a class name, in order of id. `Instances.moving` is
+        filled.
 
     Raises:
         SegmentationError: An id in the image has no class name.
     """
-    labels, names = np.asarray(masks.instances), masks.class_names
+    labels = np.asarray(masks.instances)
+    names = masks.class_names
     numbers = [int(number) for number in np.unique(labels) if number != 0]
     if nameless := [number for number in numbers if number not in names]:
         named = ", ".join(map(str, sorted(names))) or "none"
-        raise SegmentationError(f"{where}: object {nameless[0]} has no class name", f"known numbers: {named}")
+        raise SegmentationError(
+            f"{where}: object {nameless[0]} has no class name", f"known numbers: {named}"
+        )
     stack = np.asarray(labels[None] == np.array(numbers, labels.dtype)[:, None, None])
     classes = tuple(names[number] for number in numbers)
     moving = np.array([number in masks.moving for number in numbers], dtype=bool)
@@ -299,7 +340,9 @@ def exact_masks(source: MaskSource, index: int) -> FrameMasks:
     except MemoryError:
         raise
     except Exception as error:  # the masks of a plug-in's data set may raise anything
-        raise SegmentationError(f"the exact masks of frame {index} cannot be read: {error}") from error
+        raise SegmentationError(
+            f"the exact masks of frame {index} cannot be read: {error}"
+        ) from error
 
 
 class OracleSegmenter:
@@ -307,11 +350,13 @@ class OracleSegmenter:
 
     Args:
         source: The sequence's masks.
-        motion: Whether `Instances.moving` is filled; without, objects count by class, as those of a perfect network.
+        motion: Whether `Instances.moving` is filled; without, objects count by class, as those of a
+            perfect network.
     """
 
     def __init__(self, source: MaskSource, *, motion: bool = True) -> None:
-        self.source, self.motion = source, motion
+        self.source = source
+        self.motion = motion
 
     def segment(self, frame: Frame) -> Instances:
         """The objects of frame `frame.index`.

@@ -61,8 +61,11 @@ class _Request:
         """Add the flow from the frame before to a new one."""
         self.age += 1
         rows, columns = np.mgrid[: flow.shape[0], : flow.shape[1]].astype(np.float32)
-        x, y = columns + self.flow[:, :, 0], rows + self.flow[:, :, 1]
-        self.flow = self.flow + np.asarray(cv2.remap(flow, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+        x = columns + self.flow[:, :, 0]
+        y = rows + self.flow[:, :, 1]
+        self.flow = self.flow + np.asarray(
+            cv2.remap(flow, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         """With the answer, which is waited for: a thread can be neither copied nor pickled."""
@@ -80,12 +83,13 @@ class _Request:
 class MaskScheduler:
     """The segmentation stage of a `SlamPipeline`: one call a frame, in order.
 
-    With schedule ``async`` the segmenter runs in a thread of its own, on one frame at a time. The masks of a frame are
-    taken `latency_s` later by the frames' stamps, carried to the frame of that time, and the segmenter begins with that
-    frame; they are at least one frame late. If it is slower than `latency_s`, tracking waits for it: the same settings
-    give the same masks everywhere. With a `latency_s` of 0 masks are taken when they are done, and nothing waits. The
-    segmenter works with the settings of the time when it begins, and without the stage cache, so that the wait is
-    measured.
+    With schedule ``async`` the segmenter runs in a thread of its own, on one frame at a time. The
+    masks of a frame are taken `latency_s` later by the frames' stamps, carried to the frame of that
+    time, and the segmenter begins with that frame; they are at least one frame late. If it is
+    slower than `latency_s`, tracking waits for it: the same settings give the same masks
+    everywhere. With a `latency_s` of 0 masks are taken when they are done, and nothing waits. The
+    segmenter works with the settings of the time when it begins, and without the stage cache, so
+    that the wait is measured.
 
     Args:
         settings: When to segment, how to carry masks, how long to bridge missed detections.
@@ -97,7 +101,8 @@ class MaskScheduler:
     """
 
     def __init__(self, settings: SegmentationSettings, segmenter: Segmenter) -> None:
-        self._request: _Request | None = None  # first: a copy waits for the segmenter before it copies it
+        # first: a copy waits for the segmenter before it copies it
+        self._request: _Request | None = None
         self.segmenter = segmenter
         self._missed = MissedDetections(settings.compensate)
         self.reset()
@@ -124,7 +129,8 @@ class MaskScheduler:
 
     def settle(self) -> None:
         """Wait for the segmenter, which works on one frame at a time, and forget its answer; warn of its error."""
-        request, self._request = self._request, None
+        request = self._request
+        self._request = None
         if request is not None and (error := request.answer.exception()) is not None:
             warnings.warn(f"no frame took masks that failed: {error}", RuntimeWarning, stacklevel=2)
 
@@ -134,9 +140,11 @@ class MaskScheduler:
         Args:
             frame: The frame.
             gray: uint8 ``[H, W]``, its intensities.
-            keyframe: Whether the tracker asks for segmentation: on the first frame, after a keyframe, when lost.
+            keyframe: Whether the tracker asks for segmentation: on the first frame, after a
+                keyframe, when lost.
         """
-        first, self.beside_s = self._gray.shape != gray.shape, 0.0
+        first = self._gray.shape != gray.shape
+        self.beside_s = 0.0
         if self._settings.schedule == "async" and not first:
             self.segmented = self._take(frame, gray)
         elif first or self._due(keyframe):
@@ -154,7 +162,8 @@ class MaskScheduler:
 
     def _take(self, frame: Frame, gray: NDArray[np.uint8]) -> bool:
         """Take the masks that are due, carried to this frame, and begin with it; False if none are due."""
-        flow, request = dense_flow(self._gray, gray), self._request
+        flow = dense_flow(self._gray, gray)
+        request = self._request
         if request is not None:
             request.follow(flow)
         live = self._settings.latency_s == 0  # then nothing waits for the segmenter
@@ -163,7 +172,9 @@ class MaskScheduler:
         if request is not None and taken:
             self._request = None  # an error is raised once
             instances, self.beside_s = request.answer.result()
-            self._instances = carry_dense(self._missed.update(instances, request.since), request.flow)
+            self._instances = carry_dense(
+                self._missed.update(instances, request.since), request.flow
+            )
         else:
             self._instances = carry_dense(self._instances, flow)
         if request is None or taken:
@@ -171,18 +182,27 @@ class MaskScheduler:
             _working.add(answer)
             Thread(target=_segment, args=(self._frozen(), frame, answer), daemon=True).start()
             since = self._age if request is None else request.age
-            self._request = _Request(frame.timestamp + self._settings.latency_s, since, answer, np.zeros_like(flow))
+            self._request = _Request(
+                frame.timestamp + self._settings.latency_s, since, answer, np.zeros_like(flow)
+            )
         return taken
 
     def _frozen(self) -> Segmenter:
         """The segmenter with the settings of now."""
-        return copy(self.segmenter) if isinstance(self.segmenter, ConfiguredSegmenter) else self.segmenter
+        return (
+            copy(self.segmenter)
+            if isinstance(self.segmenter, ConfiguredSegmenter)
+            else self.segmenter
+        )
 
     def _due(self, keyframe: bool) -> bool:
         settings = self._settings
         if settings.schedule == "every":
             return True
-        if settings.crowded_share < 1 and select(self._instances, settings).union().mean() > settings.crowded_share:
+        if (
+            settings.crowded_share < 1
+            and select(self._instances, settings).union().mean() > settings.crowded_share
+        ):
             return True  # the masks of the previous frame cover too much
         if settings.schedule == "every_nth":
             return self._age >= settings.n
@@ -192,7 +212,9 @@ class MaskScheduler:
 def _segment(segmenter: Segmenter, frame: Frame, answer: Future[tuple[Instances, float]]) -> None:
     """Segment a frame in a thread of its own; the answer holds the objects and the seconds, or the error."""
     try:
-        if isinstance(segmenter, ConfiguredSegmenter) and isinstance(segmenter.inner, CachedSegmenter):
+        if isinstance(segmenter, ConfiguredSegmenter) and isinstance(
+            segmenter.inner, CachedSegmenter
+        ):
             segmenter.inner = segmenter.inner.network()
         start = time.perf_counter()
         answer.set_result((segmenter.segment(frame), time.perf_counter() - start))
@@ -214,9 +236,14 @@ class _Track:
         """Take over a detection of the object, `frames` frames after the last update."""
         box = detections.boxes[index]
         velocity = (box - self.box) / np.float32(max(frames, 1))
-        self.velocity = np.asarray(SMOOTHING * velocity + (1 - SMOOTHING) * self.velocity, np.float32)
-        self.box, self.mask, self.score = box, detections.masks[index], float(detections.scores[index])
-        self.hits, self.missed = self.hits + 1, 0
+        self.velocity = np.asarray(
+            SMOOTHING * velocity + (1 - SMOOTHING) * self.velocity, np.float32
+        )
+        self.score = float(detections.scores[index])
+        self.box = box
+        self.mask = detections.masks[index]
+        self.hits = self.hits + 1
+        self.missed = 0
 
     def move(self, box: NDArray[np.float32]) -> bool:
         """Move a missed object to its predicted box; False if it left the image."""
@@ -227,7 +254,8 @@ class _Track:
         if np.count_nonzero(mask) < 0.2 * np.count_nonzero(self.mask):
             return False
         height, width = mask.shape
-        self.mask, self.box = mask, np.clip(box, 0, np.array([width, height] * 2)).astype(np.float32)
+        self.box = np.clip(box, 0, np.array([width, height] * 2)).astype(np.float32)
+        self.mask = mask
         self.missed += 1
         return True
 
@@ -255,25 +283,40 @@ class MissedDetections:
             frames: Frames since the last update.
 
         Returns:
-            The detections, followed by the bridged objects with the scores of their last detections: `limit` alone says
-            how long an object is bridged, not a falling score. Exact masks (with `Instances.moving`) miss nothing and
+            The detections, followed by the bridged objects with the scores of their last
+            detections: `limit` alone says how long an object is bridged, not a falling score. Exact
+                masks (with `Instances.moving`) miss nothing and
             are returned as they are.
         """
         if self.limit <= 0 or detections.moving is not None:
             self.reset()
             return detections
-        predicted = [np.asarray(track.box + track.velocity * frames, np.float32) for track in self._tracks]
+        predicted = [
+            np.asarray(track.box + track.velocity * frames, np.float32) for track in self._tracks
+        ]
         matches = dict(associate(predicted, [track.name for track in self._tracks], detections))
         for index, detection in matches.items():
             self._tracks[index].see(detections, detection, frames)
-        missed = [(track, predicted[index]) for index, track in enumerate(self._tracks) if index not in matches]
-        bridged = [
-            track for track, box in missed if track.hits >= LEAST_HITS and track.missed < self.limit and track.move(box)
+        missed = [
+            (track, predicted[index])
+            for index, track in enumerate(self._tracks)
+            if index not in matches
         ]
-        self._tracks = [track for index, track in enumerate(self._tracks) if index in matches] + bridged
+        bridged = [
+            track
+            for track, box in missed
+            if track.hits >= LEAST_HITS and track.missed < self.limit and track.move(box)
+        ]
+        self._tracks = [
+            track for index, track in enumerate(self._tracks) if index in matches
+        ] + bridged
         for new in sorted(set(range(len(detections.scores))) - set(matches.values())):
-            box, mask, score = detections.boxes[new], detections.masks[new], float(detections.scores[new])
-            self._tracks.append(_Track(box, mask, detections.class_names[new], score, np.zeros(4, np.float32)))
+            box = detections.boxes[new]
+            mask = detections.masks[new]
+            score = float(detections.scores[new])
+            self._tracks.append(
+                _Track(box, mask, detections.class_names[new], score, np.zeros(4, np.float32))
+            )
         if not bridged:
             return detections
         masks = np.stack([track.mask for track in bridged])
@@ -281,19 +324,27 @@ class MissedDetections:
             np.concatenate([detections.masks, masks]),
             np.concatenate([detections.boxes, boxes_of(masks)]),
             (*detections.class_names, *(track.name for track in bridged)),
-            np.concatenate([detections.scores, np.array([track.score for track in bridged], np.float32)]),
+            np.concatenate(
+                [detections.scores, np.array([track.score for track in bridged], np.float32)]
+            ),
         )
 
 
-def associate(predicted: list[NDArray[np.float32]], names: list[str], detections: Instances) -> list[tuple[int, int]]:
+def associate(
+    predicted: list[NDArray[np.float32]], names: list[str], detections: Instances
+) -> list[tuple[int, int]]:
     """Greedy one-to-one pairs (track, detection) of one class by falling box IoU, at least `ASSOCIATION_IOU`."""
     if not predicted or not detections.class_names:
         return []
-    same = np.array([[name == other for other in detections.class_names] for name in names], dtype=bool)
+    same = np.array(
+        [[name == other for other in detections.class_names] for name in names], dtype=bool
+    )
     overlap = np.where(same, box_iou(np.stack(predicted), detections.boxes), 0.0)
     pairs = []
     while overlap.max() >= ASSOCIATION_IOU:
-        track, detection = (int(value) for value in np.unravel_index(int(np.argmax(overlap)), overlap.shape))
+        track, detection = (
+            int(value) for value in np.unravel_index(int(np.argmax(overlap)), overlap.shape)
+        )
         pairs.append((track, detection))
         overlap[track, :] = overlap[:, detection] = 0.0
     return pairs
@@ -337,14 +388,16 @@ def dense_flow(previous: Gray, current: Gray) -> NDArray[np.float32]:
     small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (previous, current)]
     dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
     dis.setFinestScale(1)
-    return np.asarray(dis.calc(small[0], small[1], np.zeros((size[1], size[0], 2), np.float32)), np.float32)
+    return np.asarray(
+        dis.calc(small[0], small[1], np.zeros((size[1], size[0], 2), np.float32)), np.float32
+    )
 
 
 def object_flow(mask: NDArray[np.bool_], flow: NDArray[np.float32]) -> NDArray[np.float32]:
     """The flow of one object, smoothed and continued beyond its edge.
 
-    Dense flow blurs across the edge of a moving object and would leave a trail of its mask. Only the flow inside the
-    object is used; its local means are continued outwards.
+    Dense flow blurs across the edge of a moving object and would leave a trail of its mask. Only
+    the flow inside the object is used; its local means are continued outwards.
 
     Args:
         mask: bool ``[h, w]``.
@@ -358,9 +411,13 @@ def object_flow(mask: NDArray[np.bool_], flow: NDArray[np.float32]) -> NDArray[n
     for window in (31, 7):
         kernel = (window, window)
         weight = cv2.boxFilter(core, -1, kernel, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        total = cv2.boxFilter(flow * core[:, :, None], -1, kernel, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        total = cv2.boxFilter(
+            flow * core[:, :, None], -1, kernel, normalize=False, borderType=cv2.BORDER_CONSTANT
+        )
         near = np.asarray(weight >= 2)
-        field = np.where(near[:, :, None], total / np.maximum(weight, 1)[:, :, None], field).astype(np.float32)
+        field = np.where(near[:, :, None], total / np.maximum(weight, 1)[:, :, None], field).astype(
+            np.float32
+        )
     return field
 
 
@@ -369,7 +426,8 @@ def push_mask(mask: NDArray[np.bool_], field: NDArray[np.float32]) -> NDArray[np
 
     Args:
         mask: bool ``[H, W]``.
-        field: Flow ``[h, w, 2]`` from the mask's image to the next, in its own pixels; a smaller field is interpolated.
+        field: Flow ``[h, w, 2]`` from the mask's image to the next, in its own pixels; a smaller
+            field is interpolated.
 
     Returns:
         Bool ``[H, W]``; an object that the image's edge cuts is continued when it moves in.
@@ -380,16 +438,26 @@ def push_mask(mask: NDArray[np.bool_], field: NDArray[np.float32]) -> NDArray[np
     for _ in range(3):
         back = np.asarray(
             cv2.remap(
-                field, columns - back[:, :, 0], rows - back[:, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+                field,
+                columns - back[:, :, 0],
+                rows - back[:, :, 1],
+                cv2.INTER_LINEAR,
+                borderMode=cv2.BORDER_REPLICATE,
             ),
             np.float32,
         )
     scaled = back * np.array([width / field.shape[1], height / field.shape[0]], np.float32)
-    full = np.asarray(cv2.resize(scaled, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+    full = np.asarray(
+        cv2.resize(scaled, (width, height), interpolation=cv2.INTER_LINEAR), np.float32
+    )
     at_x = np.arange(width, dtype=np.float32)[None] - full[:, :, 0]
     at_y = np.arange(height, dtype=np.float32)[:, None] - full[:, :, 1]
     moved = cv2.remap(
-        mask.view(np.uint8) * np.uint8(255), at_x, at_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        mask.view(np.uint8) * np.uint8(255),
+        at_x,
+        at_y,
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
     )
     return np.asarray(np.asarray(moved) >= 128)
 
@@ -405,13 +473,17 @@ def carry_dense(instances: Instances, flow: NDArray[np.float32]) -> Instances:
 
 def _carry_object(mask: NDArray[np.bool_], flow: NDArray[np.float32]) -> NDArray[np.bool_]:
     """One object's moved mask, computed in a window around the object only."""
-    moved, (height, width) = np.zeros_like(mask), flow.shape[:2]
-    step_y, step_x = mask.shape[0] / height, mask.shape[1] / width
+    moved = np.zeros_like(mask)
+    (height, width) = flow.shape[:2]
+    step_y = mask.shape[0] / height
+    step_x = mask.shape[1] / width
     small = cv2.resize(mask.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
     inside = region(small, 0)
     if inside is None:
         return moved
-    part = region(small, 2 + int(np.ceil(min(float(np.abs(flow[inside]).max()), max(height, width)))))
+    part = region(
+        small, 2 + int(np.ceil(min(float(np.abs(flow[inside]).max()), max(height, width))))
+    )
     assert part is not None
     field = object_flow(np.ascontiguousarray(small[part]), np.ascontiguousarray(flow[part]))
     rows, columns = part
@@ -426,30 +498,40 @@ def _carry_object(mask: NDArray[np.bool_], flow: NDArray[np.float32]) -> NDArray
 def carry_sparse(instances: Instances, previous: Gray, current: Gray) -> Instances:
     """The objects of the previous image in the current one, each moved by the similarity of its tracked corners.
 
-    Corners on each object are tracked there and back by pyramidal Lucas-Kanade; RANSAC fits a similarity. An object
-    with fewer than six consistent corners keeps its place.
+    Corners on each object are tracked there and back by pyramidal Lucas-Kanade; RANSAC fits a
+    similarity. An object with fewer than six consistent corners keeps its place.
     """
     motions = [_similarity(mask, previous, current) for mask in instances.masks]
     pairs = zip(instances.masks, motions, strict=True)
-    return _moved(instances, [mask if motion is None else _warp(mask, motion) for mask, motion in pairs])
+    return _moved(
+        instances, [mask if motion is None else _warp(mask, motion) for mask, motion in pairs]
+    )
 
 
-def shift_mask(mask: NDArray[np.bool_], dx: float, dy: float, scale: float = 1.0) -> NDArray[np.bool_]:
+def shift_mask(
+    mask: NDArray[np.bool_], dx: float, dy: float, scale: float = 1.0
+) -> NDArray[np.bool_]:
     """A mask moved by whole and part pixels and scaled about its box' centre."""
     rows, columns = np.nonzero(mask)
     if not rows.size:
         return mask
     centre = np.array([(columns.min() + columns.max()) / 2, (rows.min() + rows.max()) / 2])
-    move = np.array([[scale, 0, centre[0] * (1 - scale) + dx], [0, scale, centre[1] * (1 - scale) + dy]])
+    move = np.array(
+        [[scale, 0, centre[0] * (1 - scale) + dx], [0, scale, centre[1] * (1 - scale) + dy]]
+    )
     return _warp(mask, move)
 
 
 def _warp(mask: NDArray[np.bool_], motion: NDArray[np.float64]) -> NDArray[np.bool_]:
-    moved = cv2.warpAffine(mask.view(np.uint8) * np.uint8(255), motion, mask.shape[::-1], flags=cv2.INTER_LINEAR)
+    moved = cv2.warpAffine(
+        mask.view(np.uint8) * np.uint8(255), motion, mask.shape[::-1], flags=cv2.INTER_LINEAR
+    )
     return np.asarray(np.asarray(moved) >= 128)
 
 
-def _similarity(mask: NDArray[np.bool_], previous: Gray, current: Gray) -> NDArray[np.float64] | None:
+def _similarity(
+    mask: NDArray[np.bool_], previous: Gray, current: Gray
+) -> NDArray[np.float64] | None:
     corners = cv2.goodFeaturesToTrack(previous, CORNERS, 0.01, 5, mask=mask.view(np.uint8))
     if corners is None or len(corners) < LEAST_CORNERS:
         return None

@@ -1,7 +1,7 @@
 """Settings of the segmentation stage, and the class names of COCO and Pascal VOC.
 
-The settings say where masks come from, which classes are dynamic, how masks are cleaned and on which frames the
-segmenter runs.
+The settings say where masks come from, which classes are dynamic, how masks are cleaned and on
+which frames the segmenter runs.
 """
 
 import shlex
@@ -47,7 +47,11 @@ DYNASLAM_NAMES: tuple[str, ...] = (
 )  # fmt: skip
 """The classes that DynaSLAM (Bescos et al. 2018) holds for movable of their own accord."""
 
-PRESETS: dict[str, tuple[str, ...]] = {"person": ("person",), "dynaslam19": DYNASLAM_NAMES, "all": COCO_NAMES}
+PRESETS: dict[str, tuple[str, ...]] = {
+    "person": ("person",),
+    "dynaslam19": DYNASLAM_NAMES,
+    "all": COCO_NAMES,
+}
 """Named class sets; a preset's name may stand wherever a class name may."""
 
 
@@ -81,15 +85,20 @@ def expand_coco_classes(names: str) -> frozenset[str]:
     """`expand_classes` where all of them must be COCO's.
 
     Raises:
-        SegmentationError: A name is neither a COCO class nor a preset (with a did-you-mean), or there is none.
+        SegmentationError: A name is neither a COCO class nor a preset (with a did-you-mean), or
+            there is none.
     """
     classes = expand_classes(names)
     for name in sorted(classes.difference(COCO_NAMES)):
-        raise SegmentationError(f"unknown class '{name}'", did_you_mean(name, [*PRESETS, *COCO_NAMES]))
+        raise SegmentationError(
+            f"unknown class '{name}'", did_you_mean(name, [*PRESETS, *COCO_NAMES])
+        )
     return classes
 
 
-def check_classes(known: Iterable[str], settings: "SegmentationSettings", where: str, whose: str) -> None:
+def check_classes(
+    known: Iterable[str], settings: "SegmentationSettings", where: str, whose: str
+) -> None:
     """Raise where the dynamic classes select nothing among those that a source of masks knows.
 
     Args:
@@ -99,13 +108,16 @@ def check_classes(known: Iterable[str], settings: "SegmentationSettings", where:
         whose: What the classes are of, e.g. ``the network``.
 
     Raises:
-        SegmentationError: None of the classes is a dynamic one, or a name that is no COCO name is none of them.
+        SegmentationError: None of the classes is a dynamic one, or a name that is no COCO name is
+            none of them.
     """
     names = list(dict.fromkeys(known))
     spelled = {canonical_name(name) for name in names}
     asked = settings.class_names()
     for name in sorted(asked - spelled - set(COCO_NAMES)):
-        raise SegmentationError(f"{where}: {whose} has no class '{name}'", did_you_mean(name, spelled))
+        raise SegmentationError(
+            f"{where}: {whose} has no class '{name}'", did_you_mean(name, spelled)
+        )
     if asked & spelled:
         return
     people = [name for name in names if any(word in canonical_name(name) for word in PEOPLE)]
@@ -121,7 +133,13 @@ def check_classes(known: Iterable[str], settings: "SegmentationSettings", where:
 
 def _joined(value: Any) -> str:
     """A list of names as a comma-separated text; empty for what is neither list nor text."""
-    return ",".join(map(str, value)) if isinstance(value, (list, tuple)) else value if isinstance(value, str) else ""
+    return (
+        ",".join(map(str, value))
+        if isinstance(value, (list, tuple))
+        else value
+        if isinstance(value, str)
+        else ""
+    )
 
 
 def _coco_classes(value: Any) -> str:
@@ -151,23 +169,35 @@ REPAIR_BAND_PX = 8
 class SegmentationSettings(Settings):
     """Which pixels are dynamic because of what they show.
 
-    Pixel quantities are pixels of the input frame. `dilation_px` is the *radius* of the structuring element: 15 grows a
-    mask by 15 pixels on every side (an element of 31 x 31 pixels, as in DynaSLAM).
+    Pixel quantities are pixels of the input frame. `dilation_px` is the *radius* of the structuring
+    element: 15 grows a mask by 15 pixels on every side (an element of 31 x 31 pixels, as in
+    DynaSLAM).
     """
 
     source: str = "auto"
     """Where masks come from: ``auto`` (the embedded network on ``synthetic/*``, else the COCO checkpoint if it was
-    fetched), ``none``, ``oracle`` (exact masks, also of whatever else moves), ``oracle-classes`` (exact masks of the
-    classes alone), ``embedded``, ``coco``, ``onnx:PATH``, ``recorded:DIR``, ``weights:PATH`` (a Mask R-CNN checkpoint:
+    fetched), ``none``, ``oracle`` (exact masks, also of whatever else moves), ``oracle-classes``
+    (exact masks of the classes alone), ``embedded``, ``coco``, ``onnx:PATH``, ``recorded:DIR``,
+    ``weights:PATH`` (a Mask R-CNN checkpoint:
     torchvision's or this project's) or ``plugin:ID``."""
     classes: str = Field(
-        "person", description="dynamic classes: comma-separated names or presets (person, dynaslam19, all)"
+        "person",
+        description="dynamic classes: comma-separated names or presets (person, dynaslam19, all)",
     )
     confidence: float = tunable(
-        0.3, low=0.1, high=0.9, limits=(0.01, 1.0), online=True, meaning="detections with a lower score are ignored"
+        0.3,
+        low=0.1,
+        high=0.9,
+        limits=(0.01, 1.0),
+        online=True,
+        meaning="detections with a lower score are ignored",
     )
     mask_threshold: float = tunable(
-        0.5, low=0.2, high=0.8, limits=(0.01, 0.99), meaning="probability above which a pixel belongs to a mask"
+        0.5,
+        low=0.2,
+        high=0.8,
+        limits=(0.01, 0.99),
+        meaning="probability above which a pixel belongs to a mask",
     )
     dilation_px: int = tunable(
         15, low=0, high=30, limits=(0, 200), unit="px", online=True,
@@ -178,16 +208,22 @@ class SegmentationSettings(Settings):
         online=True,
         meaning="frames on which the segmenter runs; optical flow carries the masks between them",
     )
-    n: int = Field(3, ge=1, description="schedule every_nth: the segmenter runs on every n-th frame")
+    n: int = Field(
+        3, ge=1, description="schedule every_nth: the segmenter runs on every n-th frame"
+    )
     latency_s: float = Field(
         0.1, ge=0, le=10,
         description="schedule async: masks come so many seconds after a frame; 0: when they are done, not repeatable",
     )  # fmt: skip
     crowded_share: float = Field(
-        1.0, ge=0, le=1, description="share of the view under masks above which every frame is segmented; 1 = off"
+        1.0,
+        ge=0,
+        le=1,
+        description="share of the view under masks above which every frame is segmented; 1 = off",
     )
     carry: Literal["dis", "sparse"] = Field(
-        "dis", description="flow that carries masks: dense (DIS) or a similarity of tracked corners a mask"
+        "dis",
+        description="flow that carries masks: dense (DIS) or a similarity of tracked corners a mask",
     )
     compensate: int = tunable(
         3, low=0, high=10, limits=(0, None), unit="frames", online=True,
@@ -197,20 +233,26 @@ class SegmentationSettings(Settings):
         "none", description="mask repair: none, or fill holes and fit the border to depth edges"
     )
     repair_depth_m: float = Field(
-        0.2, ge=0, le=10, description="repair: depth step in metres from a mask to a pixel outside of it"
+        0.2,
+        ge=0,
+        le=10,
+        description="repair: depth step in metres from a mask to a pixel outside of it",
     )
     outside_share: float = tunable(
         0.3, low=0.0, high=1.0, limits=(0.0, 1.0), online=True,
         meaning="least share of n_features outside the masks; with fewer, n_features are extracted there as well",
     )  # fmt: skip
     network_side: int = Field(
-        480, ge=0, le=2000, description="shorter input side in pixels of coco and weights networks; 0 = as trained"
+        480,
+        ge=0,
+        le=2000,
+        description="shorter input side in pixels of coco and weights networks; 0 = as trained",
     )
     onnx_normalisation: Literal["auto", "unit", "symmetric", "imagenet"] = "auto"
     """Input scaling of an ONNX network: [0, 1], [-1, 1], ImageNet's statistics, or what its kind usually takes."""
-    onnx_layout: Literal["auto", "yolo", "yolo-objectness", "yolo-nms", "semantic", "semantic-aligned", "instances"] = (
-        "auto"
-    )
+    onnx_layout: Literal[
+        "auto", "yolo", "yolo-objectness", "yolo-nms", "semantic", "semantic-aligned", "instances"
+    ] = "auto"
     """Layout of an ONNX network's outputs, where the file's metadata and the shapes leave it open."""
 
     @field_validator("source")
@@ -220,7 +262,9 @@ class SegmentationSettings(Settings):
         if value in PLAIN_SOURCES or (prefix in PREFIXED_SOURCES and argument.strip()):
             return value
         if prefix in PREFIXED_SOURCES:
-            raise ValueError(f"'{prefix}:' needs {'an id' if prefix == 'plugin' else 'a path'} after the colon")
+            raise ValueError(
+                f"'{prefix}:' needs {'an id' if prefix == 'plugin' else 'a path'} after the colon"
+            )
         hint = did_you_mean(prefix, [*PLAIN_SOURCES, *(f"{name}:" for name in PREFIXED_SOURCES)])
         raise ValueError(f"not one of {FORMS}" + (f"; {hint}" if hint.startswith("did") else ""))
 
@@ -246,7 +290,9 @@ class SegmentationSettings(Settings):
             "oracle-classes": ("confidence", "mask_threshold"),
             "recorded": ("mask_threshold",),
         }
-        return dict.fromkeys(fields.get(self.source.partition(":")[0], ()), f"segmentation.source is {self.source!r}")
+        return dict.fromkeys(
+            fields.get(self.source.partition(":")[0], ()), f"segmentation.source is {self.source!r}"
+        )
 
     def class_names(self) -> frozenset[str]:
         """The names of the dynamic classes, as `canonical_name` writes them."""

@@ -7,7 +7,8 @@ from dynslam_bench.sequences.synthetic import TUNE_SCENES, parse_synthetic_id
 def seen_in_training(source: str, sequence_id: str) -> bool:
     """Whether masks come from a network that was trained on frames of that scene.
 
-    This is known of the embedded network only: it was trained on every rendered sequence of the scenes 0-99.
+    This is known of the embedded network only: it was trained on every rendered sequence of the
+    scenes 0-99.
 
     Args:
         source: Source of the masks, resolved (``embedded``, never ``auto``).

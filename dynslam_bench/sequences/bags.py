@@ -1,7 +1,8 @@
 """ROS 1 bags, ROS 2 bags and MCAP files unpacked into a folder in TUM layout, which is then a sequence like any other.
 
-Reads with the pure-Python package ``rosbags`` (extra ``[bags]``). Stamps are those of the messages' headers, images and
-depth stay as they are to the last bit, and nothing is guessed where several topics would do.
+Reads with the pure-Python package ``rosbags`` (extra ``[bags]``). Stamps are those of the messages'
+headers, images and depth stay as they are to the last bit, and nothing is guessed where several
+topics would do.
 """
 
 from collections.abc import Iterator, Sequence
@@ -65,24 +66,31 @@ def unpack_bag(
         bag: A ROS 1 ``.bag``, a ROS 2 folder, an ``.mcap`` or ``.db3`` file.
         folder: The folder to make.
         colour: Topic of the colour images; needed where there are several.
-        depth: Topic of depth images that are registered to the colour images; needed where there are several.
-        truth: Topic of camera-to-world poses; ``none`` for no ground truth, needed where there are several.
+        depth: Topic of depth images that are registered to the colour images; needed where there
+            are several.
+        truth: Topic of camera-to-world poses; ``none`` for no ground truth, needed where there are
+            several.
 
     Raises:
-        SequenceError: `rosbags` is not installed, the bag is damaged, a topic is missing or one of several, or the
-            folder exists already.
+        SequenceError: `rosbags` is not installed, the bag is damaged, a topic is missing or one of
+            several, or the folder exists already.
     """
-    source, target = Path(bag).expanduser(), Path(folder).expanduser()
+    source = Path(bag).expanduser()
+    target = Path(folder).expanduser()
     if target.exists():
         raise SequenceError(f"{target} exists already", "name a folder that does not")
     with _opened(source) as reader:
         topics = _Topics(reader, source)
-        chosen_colour, chosen_depth = topics.image("colour", colour), topics.image("depth", depth)
+        chosen_colour = topics.image("colour", colour)
+        chosen_depth = topics.image("depth", depth)
         chosen_truth = topics.pose(truth)
         with atomic_folder(target) as work:
             frames = {
                 kind: _write_images(reader, topics.connections[topic], work, name)
-                for kind, topic, name in (("colour", chosen_colour, "rgb"), ("depth", chosen_depth, "depth"))
+                for kind, topic, name in (
+                    ("colour", chosen_colour, "rgb"),
+                    ("depth", chosen_depth, "depth"),
+                )
             }
             write_camera(work / CAMERA_FILE, topics.camera(chosen_colour))
             if chosen_truth:
@@ -90,13 +98,17 @@ def unpack_bag(
                 write_lines(work / "groundtruth.txt", map(pose_line, poses))
             count = len(open_folder(work))
     apart = f"depth is in the frame '{frames['depth']}', colour in '{frames['colour']}': is {chosen_depth} registered?"
-    notes = {apart: frames["colour"] != frames["depth"],
-             f"the poses of {chosen_truth} are taken for the colour camera's": bool(chosen_truth)}  # fmt: skip
+    notes = {
+        apart: frames["colour"] != frames["depth"],
+        f"the poses of {chosen_truth} are taken for the colour camera's": bool(chosen_truth),
+    }
     said = tuple(note for note, holds in notes.items() if holds)
     return Unpacked(target, chosen_colour, chosen_depth, chosen_truth, count, said)
 
 
-def read_bag_poses(bag: str | Path, topic: str | None = None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def read_bag_poses(
+    bag: str | Path, topic: str | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Stamps in nanoseconds ``[N]`` and rows ``tx ty tz qx qy qz qw`` ``[N, 7]`` of a bag's topic of poses.
 
     Args:
@@ -104,7 +116,8 @@ def read_bag_poses(bag: str | Path, topic: str | None = None) -> tuple[NDArray[n
         topic: Which one; needed where there are several.
 
     Raises:
-        SequenceError: `rosbags` is not installed, the bag is damaged, or the topic is missing or one of several.
+        SequenceError: `rosbags` is not installed, the bag is damaged, or the topic is missing or
+            one of several.
     """
     source = Path(bag).expanduser()
     with _opened(source) as reader:
@@ -121,11 +134,18 @@ class _Topics:
     """The topics of a bag, and which of them to take."""
 
     def __init__(self, reader: Any, source: Path) -> None:
-        self.reader, self.source = reader, source
-        self.connections: dict[str, list[Any]] = {name: topic.connections for name, topic in reader.topics.items()}
+        self.reader = reader
+        self.source = source
+        self.connections: dict[str, list[Any]] = {
+            name: topic.connections for name, topic in reader.topics.items()
+        }
 
     def of_types(self, types: Sequence[str]) -> list[str]:
-        return sorted(topic for topic, connections in self.connections.items() if connections[0].msgtype in types)
+        return sorted(
+            topic
+            for topic, connections in self.connections.items()
+            if connections[0].msgtype in types
+        )
 
     def image(self, kind: str, wanted: str | None) -> str:
         candidates = self.of_types(IMAGES)
@@ -142,9 +162,13 @@ class _Topics:
     def camera(self, colour: str) -> Any:
         namespace = colour.rpartition("/")[0]
         infos = self.of_types((INFO,))
-        beside = [topic for topic in infos if namespace.startswith(topic.rpartition("/")[0])] or infos
+        beside = [
+            topic for topic in infos if namespace.startswith(topic.rpartition("/")[0])
+        ] or infos
         if len(beside) != 1:
-            raise SequenceError(f"{self.source} has {len(beside)} topics of calibration for {colour}, expected 1")
+            raise SequenceError(
+                f"{self.source} has {len(beside)} topics of calibration for {colour}, expected 1"
+            )
         return camera_of(self._first(beside[0]), f"{beside[0]} of {self.source}")
 
     def _first(self, topic: str) -> Any:
@@ -155,17 +179,23 @@ class _Topics:
     def _one(self, what: str, candidates: list[str], wanted: str | None, option: str) -> str:
         listed = ", ".join(candidates)[:300] or "none"
         if wanted is not None and wanted not in candidates:
-            raise SequenceError(f"{self.source} has no topic '{wanted}' of {what}", f"there are: {listed}")
+            raise SequenceError(
+                f"{self.source} has no topic '{wanted}' of {what}", f"there are: {listed}"
+            )
         if wanted is None and len(candidates) != 1:
             hint = f"choose one with {option}" if candidates else "is it the right bag?"
-            raise SequenceError(f"{self.source} has {len(candidates)} topics of {what}: {listed}", hint)
+            raise SequenceError(
+                f"{self.source} has {len(candidates)} topics of {what}: {listed}", hint
+            )
         return wanted or candidates[0]
 
 
 def _write_images(reader: Any, connections: list[Any], work: Path, name: str) -> str:
     """Write the images of a topic and their list; the frame that the first one names."""
     (work / name).mkdir()
-    rows, frame, encode = [], "", colour_file if name == "rgb" else depth_file
+    rows = []
+    frame = ""
+    encode = colour_file if name == "rgb" else depth_file
     for index, message in enumerate(_read(reader, connections)):
         suffix, data = encode(message, f"image {index} of {connections[0].topic}")
         (work / name / f"{index:06d}{suffix}").write_bytes(data)
@@ -186,7 +216,10 @@ def _opened(source: Path) -> Iterator[Any]:
     if not source.exists():
         raise SequenceError(f"there is no bag {source}")
     with raising(
-        SequenceError, "bags are read with rosbags, which is not installed", "pip install rosbags", of=ImportError
+        SequenceError,
+        "bags are read with rosbags, which is not installed",
+        "pip install rosbags",
+        of=ImportError,
     ):
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -228,7 +261,13 @@ def stamp_text(message: Any) -> str:
 def kind_of(message: Any) -> str:
     """``colour``, ``depth`` or empty, of an image message, compressed or not."""
     if hasattr(message, "encoding"):
-        return "depth" if message.encoding in DEPTHS else "colour" if message.encoding in COLOURS else ""
+        return (
+            "depth"
+            if message.encoding in DEPTHS
+            else "colour"
+            if message.encoding in COLOURS
+            else ""
+        )
     return "" if "compressedDepth" in message.format else "colour"
 
 
@@ -242,10 +281,14 @@ def colour_file(message: Any, where: str) -> tuple[str, bytes]:
         data = bytes(message.data)
         return (".png" if data.startswith(b"\x89PNG") else ".jpg"), data
     if message.encoding not in COLOURS:
-        raise SequenceError(f"{where} is of '{message.encoding}', expected one of {', '.join(COLOURS)}")
+        raise SequenceError(
+            f"{where} is of '{message.encoding}', expected one of {', '.join(COLOURS)}"
+        )
     channels, code = COLOURS[message.encoding]
     pixels = _pixels(message, np.dtype(np.uint8), channels, where)
-    return ".png", cv2.imencode(".png", pixels if code is None else cv2.cvtColor(pixels, code))[1].tobytes()
+    return ".png", cv2.imencode(".png", pixels if code is None else cv2.cvtColor(pixels, code))[
+        1
+    ].tobytes()
 
 
 def depth_file(message: Any, where: str) -> tuple[str, bytes]:
@@ -256,8 +299,12 @@ def depth_file(message: Any, where: str) -> tuple[str, bytes]:
     """
     kind = DEPTHS.get(getattr(message, "encoding", ""))
     if kind is None:
-        raise SequenceError(f"{where} holds no depth image of {', '.join(DEPTHS)}", "choose another topic with --depth")
-    depth, buffer = _pixels(message, kind, 1, where), BytesIO()
+        raise SequenceError(
+            f"{where} holds no depth image of {', '.join(DEPTHS)}",
+            "choose another topic with --depth",
+        )
+    depth = _pixels(message, kind, 1, where)
+    buffer = BytesIO()
     if kind == np.uint16:
         return ".png", cv2.imencode(".png", depth)[1].tobytes()
     np.save(buffer, depth)
@@ -265,11 +312,15 @@ def depth_file(message: Any, where: str) -> tuple[str, bytes]:
 
 
 def _pixels(message: Any, kind: np.dtype[Any], channels: int, where: str) -> NDArray[Any]:
-    height, width, step = int(message.height), int(message.width), int(message.step)
+    height = int(message.height)
+    width = int(message.width)
+    step = int(message.step)
     data = np.frombuffer(bytes(message.data), np.uint8)
     used = width * channels * kind.itemsize
     if min(height, width) < 1 or len(data) != height * step or step < used:
-        raise SequenceError(f"{where} is {width}x{height} of {message.encoding} in {len(data)} bytes, {step} a row")
+        raise SequenceError(
+            f"{where} is {width}x{height} of {message.encoding} in {len(data)} bytes, {step} a row"
+        )
     rows = np.ascontiguousarray(data.reshape(height, step)[:, :used])
     values = rows.view(kind.newbyteorder(">" if message.is_bigendian else "<")).astype(kind)
     return values.reshape(height, width, channels) if channels > 1 else values
@@ -279,13 +330,25 @@ def camera_of(message: Any, where: str) -> Camera:
     """The camera of a ``CameraInfo``.
 
     Raises:
-        SequenceError: Its distortion is not the radial-tangential one of five coefficients, or it is none.
+        SequenceError: Its distortion is not the radial-tangential one of five coefficients, or it
+            is none.
     """
-    k, d = (np.asarray(getattr(message, name, getattr(message, name.upper(), ())), float).ravel() for name in "kd")
-    if len(k) != 9 or not np.isfinite(k).all() or min(k[0], k[4], message.width, message.height) <= 0:
-        raise SequenceError(f"{where} holds no calibration (K = {k.tolist()})", "the camera was not calibrated")
+    k, d = (
+        np.asarray(getattr(message, name, getattr(message, name.upper(), ())), float).ravel()
+        for name in "kd"
+    )
+    if (
+        len(k) != 9
+        or not np.isfinite(k).all()
+        or min(k[0], k[4], message.width, message.height) <= 0
+    ):
+        raise SequenceError(
+            f"{where} holds no calibration (K = {k.tolist()})", "the camera was not calibrated"
+        )
     if message.distortion_model not in ("", "plumb_bob", "rational_polynomial") or d[5:].any():
-        raise SequenceError(f"{where} has the distortion '{message.distortion_model}', only plumb_bob is read")
+        raise SequenceError(
+            f"{where} has the distortion '{message.distortion_model}', only plumb_bob is read"
+        )
     coefficients = [*d[:5].tolist(), *[0.0] * 5][:5]
     size = int(message.width), int(message.height)
     return Camera(*size, k[0], k[4], k[2], k[5], tuple(coefficients), MILLIMETRES)

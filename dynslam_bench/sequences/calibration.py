@@ -1,11 +1,12 @@
 """What is often not known of an RGB-D camera, measured in a recording: readout time, delay of depth, depth factor.
 
-Keypoints are tracked through windows of consecutive frames, and each window is adjusted as a bundle whose camera moves
-continuously. Every pixel belongs to the pose at its row's time, every depth to the pose at its image's time. This is
-after Kerl, Stueckler and Cremers (Dense Continuous-Time Tracking and Mapping with Rolling Shutter RGB-D Cameras, ICCV
-2015), with points in place of their dense images. The readout time and the delay of the depth images are unknowns that
-all windows share. They show where the camera's velocity changes: under a constant velocity each row is late in all
-frames alike.
+Keypoints are tracked through windows of consecutive frames, and each window is adjusted as a bundle
+whose camera moves continuously. Every pixel belongs to the pose at its row's time, every depth to
+the pose at its image's time. This is after Kerl, Stueckler and Cremers (Dense Continuous-Time
+Tracking and Mapping with Rolling Shutter RGB-D Cameras, ICCV 2015), with points in place of their
+dense images. The readout time and the delay of the depth images are unknowns that all windows
+share. They show where the camera's velocity changes: under a constant velocity each row is late in
+all frames alike.
 
 The ground truth serves for the depth factor alone.
 """
@@ -37,10 +38,12 @@ CANDIDATES = 64
 """So many windows of a long recording are looked at; the `MOST_WINDOWS` whose velocity changes most are used."""
 JITTER = 0.25
 """Share of the frame interval by which stamps may be off that were given after the exposure (as TUM's are)."""
-SMALLEST_DELAY_S, LARGEST_DELAY_S = 0.005, 0.1
+SMALLEST_DELAY_S = 0.005
+LARGEST_DELAY_S = 0.1
 """A smaller delay changes hardly any pair of images; a larger one is not looked for."""
 ROUNDS = 12
-RESOLVED_S, RESOLVED_SHARE = 0.004, 0.25
+RESOLVED_S = 0.004
+RESOLVED_SHARE = 0.25
 """Half the interval must be at most this, or this share of the value, or the quantity counts as not observable."""
 RESOLVED_FACTOR = 0.05
 SYSTEMATIC_S = 0.001
@@ -98,25 +101,32 @@ class Calibration:
         return any(quantity.written is not None for quantity in self.quantities)
 
 
-def calibrate(sequence: Sequence, *, progress: Callable[[int, int], None] = lambda done, total: None) -> Calibration:
+def calibrate(
+    sequence: Sequence, *, progress: Callable[[int, int], None] = lambda done, total: None
+) -> Calibration:
     """Measure the readout time of the colour camera, the delay of its depth images, and the depth factor.
 
-    The readout time and the delay use images and stamps alone. The depth factor is compared with the ground truth,
-    if there is one. Of a long recording those stretches are used in which the image's velocity changes most.
+    The readout time and the delay use images and stamps alone. The depth factor is compared with
+    the ground truth, if there is one. Of a long recording those stretches are used in which the
+    image's velocity changes most.
 
     Args:
-        sequence: A recording with colour and depth images; its camera's intrinsics have to be right.
+        sequence: A recording with colour and depth images; its camera's intrinsics have to be
+            right.
         progress: Called with (windows done, windows in all).
 
     Returns:
         Estimates with 95 % intervals over windows, and what is to be written of each.
 
     Raises:
-        SequenceError: There is no depth, there are too few frames, or too few windows have points that can be tracked.
+        SequenceError: There is no depth, there are too few frames, or too few windows have points
+            that can be tracked.
     """
     frames = len(sequence)
     if not getattr(sequence, "has_depth", True):
-        raise SequenceError(f"{sequence.id} has no depth images", "calibration needs depth beside colour")
+        raise SequenceError(
+            f"{sequence.id} has no depth images", "calibration needs depth beside colour"
+        )
     length = int(np.clip(2 * frames // 5, LEAST_WINDOW_FRAMES, WINDOW_FRAMES))
     if frames < 2 * length:
         raise SequenceError(
@@ -124,7 +134,8 @@ def calibrate(sequence: Sequence, *, progress: Callable[[int, int], None] = lamb
             "record some seconds of a textured scene with a camera that is turned to and fro",
         )
     starts = _choose(sequence, length)
-    windows, faults = [], []
+    windows = []
+    faults = []
     for done, first in enumerate(starts):
         try:
             windows.append(window_of(sequence, first, length))
@@ -138,12 +149,21 @@ def calibrate(sequence: Sequence, *, progress: Callable[[int, int], None] = lamb
             "record a well-lit, textured, static scene within the depth camera's reach",
         )
     with raising(
-        SequenceError, f"the windows of {sequence.id} cannot be adjusted", "try another part", of=np.linalg.LinAlgError
+        SequenceError,
+        f"the windows of {sequence.id} cannot be adjusted",
+        "try another part",
+        of=np.linalg.LinAlgError,
     ):
         readout, delay = adjust(windows)
     camera = sequence.camera
-    quantities = _readout(readout, windows, camera), _delay(delay, camera), _factor(windows, sequence)
-    written: dict[str, Any] = {one.name: one.written for one in quantities if one.written is not None}
+    quantities = (
+        _readout(readout, windows, camera),
+        _delay(delay, camera),
+        _factor(windows, sequence),
+    )
+    written: dict[str, Any] = {
+        one.name: one.written for one in quantities if one.written is not None
+    }
     noise = float(np.median([window.noise[0] for window in windows]))
     return Calibration(replace(camera, **written), quantities, len(windows), length, noise)
 
@@ -162,10 +182,15 @@ def window_of(sequence: Sequence, first: int, length: int) -> Window:
         raise Unusable("the depth images are empty")
     deep = [cv2.erode((frame.depth > 0).astype(np.uint8), np.ones((9, 9))) for frame in frames]
     grey = [cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY) for frame in frames]
-    pixels = track([np.asarray(image, np.uint8) for image in grey], [np.asarray(mask, np.uint8) for mask in deep])
+    pixels = track(
+        [np.asarray(image, np.uint8) for image in grey],
+        [np.asarray(mask, np.uint8) for mask in deep],
+    )
     if len(pixels) < LEAST_POINTS:
         raise Unusable("too few points can be followed")
-    return Window(sequence.camera, stamps, pixels, np.stack([frame.depth for frame in frames]), offsets)
+    return Window(
+        sequence.camera, stamps, pixels, np.stack([frame.depth for frame in frames]), offsets
+    )
 
 
 def _stamps(sequence: Sequence, first: int, length: int) -> tuple[Array, Array]:
@@ -175,7 +200,9 @@ def _stamps(sequence: Sequence, first: int, length: int) -> tuple[Array, Array]:
     stamps = np.asarray(sequence.timestamps, dtype=np.float64)[part]
     colour = _regular(stamps)[inside]
     depth = getattr(sequence, "depth_timestamps", None)
-    return colour, np.zeros(length) if depth is None else _regular(np.asarray(depth)[part])[inside] - colour
+    return colour, np.zeros(length) if depth is None else _regular(np.asarray(depth)[part])[
+        inside
+    ] - colour
 
 
 def _regular(stamps: Array) -> Array:
@@ -193,7 +220,9 @@ def _choose(sequence: Sequence, length: int) -> list[int]:
     starts = list(range(0, len(sequence) - length + 1, length // 2))
     if len(starts) <= MOST_WINDOWS:
         return starts
-    spread = np.linspace(0, len(starts) - 1, min(len(starts), CANDIDATES)).round().astype(int).tolist()
+    spread = (
+        np.linspace(0, len(starts) - 1, min(len(starts), CANDIDATES)).round().astype(int).tolist()
+    )
     change = [_change(sequence, starts[i], starts[i] + length - 2) for i in spread]
     return sorted(starts[spread[i]] for i in np.argsort(change)[::-1][:MOST_WINDOWS])
 
@@ -203,11 +232,15 @@ def _change(sequence: Sequence, first: int, last: int) -> float:
     flows = []
     for i in (first, last):
         grey = (cv2.cvtColor(sequence[j].rgb, cv2.COLOR_RGB2GRAY) for j in (i, i + 1))
-        now, later = (np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5), np.uint8) for image in grey)
+        now, later = (
+            np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5), np.uint8) for image in grey
+        )
         start = corners(now, np.ones(now.shape, np.uint8), np.zeros((0, 2)), 40)
         if len(start) < LEAST_POINTS:
             return 0.0
-        there, status, _ = cv2.calcOpticalFlowPyrLK(now, later, start, start.copy(), winSize=(21, 21), maxLevel=3)
+        there, status, _ = cv2.calcOpticalFlowPyrLK(
+            now, later, start, start.copy(), winSize=(21, 21), maxLevel=3
+        )
         good = status[:, 0] > 0
         if good.sum() < LEAST_POINTS:
             return 0.0
@@ -252,8 +285,12 @@ def adjust(windows: list[Window]) -> tuple[Estimate, Estimate]:
             if turn < 4:
                 window.measure_noise(shared[0])
             parts.append(window.normal_equations(shared[0]))
-        information, slopes = (np.array([getattr(part, name) for part in parts]) for name in ("information", "slope"))
-        step = np.clip(-np.linalg.lstsq(information.sum(0), slopes.sum(0), rcond=None)[0], -0.02, 0.02)
+        information, slopes = (
+            np.array([getattr(part, name) for part in parts]) for name in ("information", "slope")
+        )
+        step = np.clip(
+            -np.linalg.lstsq(information.sum(0), slopes.sum(0), rcond=None)[0], -0.02, 0.02
+        )
         for window, part in zip(windows, parts, strict=True):
             window.update(*part.steps(step))
         shared = shared + step
@@ -271,8 +308,8 @@ def _over_windows(
 ) -> Estimate:
     """Mean of the windows' values, each with its own and the windows' common variance, and half the 95 % interval.
 
-    A random-effects mean (DerSimonian and Laird, 1986) with the interval of Hartung and Knapp (2001), not less than
-    that of the fixed effects. Windows that share frames count as fewer.
+    A random-effects mean (DerSimonian and Laird, 1986) with the interval of Hartung and Knapp
+    (2001), not less than that of the fixed effects. Windows that share frames count as fewer.
     """
     k = len(values)
     mean = float((values * information).sum() / information.sum())
@@ -284,15 +321,21 @@ def _over_windows(
     scatter = float((weights * (values - mean) ** 2).sum() / ((k - 1) * weights.sum()))
     starts = np.array([window.start for window in windows])
     length = float(np.median([np.ptp(window.stamps) for window in windows]))
-    variance = max(scatter, float(1 / weights.sum())) * (1 + float((np.diff(starts) < length).mean()))
-    return Estimate(mean, float(np.hypot(student.ppf(0.975, k - 1) * np.sqrt(variance), 1.96 * systematic)))
+    variance = max(scatter, float(1 / weights.sum())) * (
+        1 + float((np.diff(starts) < length).mean())
+    )
+    return Estimate(
+        mean, float(np.hypot(student.ppf(0.975, k - 1) * np.sqrt(variance), 1.96 * systematic))
+    )
 
 
 def _readout(estimate: Estimate, windows: list[Window], camera: Camera) -> Quantity:
     """The readout time; what is written is never longer than the time between two frames."""
     interval_s = float(np.median([np.median(np.diff(window.stamps)) for window in windows]))
     longest = np.floor(1e4 * interval_s) / 1e4
-    value, low, high = estimate.value, estimate.value - estimate.half, estimate.value + estimate.half
+    value = estimate.value
+    low = estimate.value - estimate.half
+    high = estimate.value + estimate.half
     quantity = Quantity("readout_s", value, low, high)
     frame = f"{1e3 * interval_s:.0f} ms, a frame's interval"
     impossible = high < 0 or low > interval_s or value > interval_s + RESOLVED_S
@@ -310,14 +353,22 @@ def _readout(estimate: Estimate, windows: list[Window], camera: Camera) -> Quant
         reason = "the interval contains 0: a global shutter, or as good as one"
         return replace(quantity, written=written, observable=True, reason=reason)
     if low <= camera.readout_s <= min(high, interval_s):
-        return replace(quantity, observable=True, reason=f"agrees with the camera's {1e3 * camera.readout_s:g} ms")
+        return replace(
+            quantity,
+            observable=True,
+            reason=f"agrees with the camera's {1e3 * camera.readout_s:g} ms",
+        )
     reason = "a rolling shutter" if value <= interval_s else f"a rolling shutter, at most {frame}"
-    return replace(quantity, written=min(round(value, 4), float(longest)), observable=True, reason=reason)
+    return replace(
+        quantity, written=min(round(value, 4), float(longest)), observable=True, reason=reason
+    )
 
 
 def _delay(estimate: Estimate, camera: Camera) -> Quantity:
     """The stamps that the reader gives have the camera's own delay added already."""
-    value, half, own = estimate.value, estimate.half, camera.depth_delay_s
+    value = estimate.value
+    half = estimate.half
+    own = camera.depth_delay_s
     beyond = f"beyond +- {1e3 * LARGEST_DELAY_S:g} ms: do colour and depth use the same clock?"
     synchronous = value - half <= 0 <= value + half or abs(value) < SMALLEST_DELAY_S
     side = "later" if value > 0 else "earlier"
@@ -334,7 +385,9 @@ def _too_wide(estimate: Estimate, why: str) -> str:
 
 
 def _judged(
-    name: str, interval: tuple[float, float, float], cases: tuple[tuple[bool, bool, float | None, str], ...]
+    name: str,
+    interval: tuple[float, float, float],
+    cases: tuple[tuple[bool, bool, float | None, str], ...],
 ) -> Quantity:
     """A quantity with its value and interval, by the first of the cases (holds, observable, written, reason)."""
     _, observable, written, reason = next(case for case in cases if case[0])
@@ -343,9 +396,13 @@ def _judged(
 
 def _factor(windows: list[Window], sequence: Sequence) -> Quantity:
     """The depth factor by which the windows' paths are as long as the ground truth's."""
-    truth, name = sequence.ground_truth, "depth_factor"
+    truth = sequence.ground_truth
+    name = "depth_factor"
     if truth is None or len(truth) < 2:
-        return Quantity(name, reason="there is no ground truth: images alone do not determine the unit of length")
+        return Quantity(
+            name,
+            reason="there is no ground truth: images alone do not determine the unit of length",
+        )
     used: list[tuple[Window, float, float]] = []
     for window in windows:
         stamps = window.start + window.stamps - window.stamps[0]
@@ -353,8 +410,12 @@ def _factor(windows: list[Window], sequence: Sequence) -> Quantity:
         outside = stamps[0] < truth.timestamps[0] or stamps[-1] > truth.timestamps[-1]
         if outside or (np.diff(truth.timestamps)[after - 1] > 0.1).any():
             continue
-        places = np.stack([np.interp(stamps, truth.timestamps, truth.T_world_cam[:, k, 3]) for k in range(3)], axis=1)
-        own, true = window.centre - window.centre.mean(0), places - places.mean(0)
+        places = np.stack(
+            [np.interp(stamps, truth.timestamps, truth.T_world_cam[:, k, 3]) for k in range(3)],
+            axis=1,
+        )
+        own = window.centre - window.centre.mean(0)
+        true = places - places.mean(0)
         turn = Rotation.align_vectors(true, own)[0].apply(own)
         length = float((own**2).sum())
         scale = float((turn * true).sum()) / length
@@ -362,23 +423,29 @@ def _factor(windows: list[Window], sequence: Sequence) -> Quantity:
         if scale > 0:
             used.append((window, scale, length / max(error, 1e-12)))
     if len(used) < LEAST_WINDOWS:
-        return Quantity(name, reason=f"the ground truth covers {len(used)} of {len(windows)} windows")
+        return Quantity(
+            name, reason=f"the ground truth covers {len(used)} of {len(windows)} windows"
+        )
     covered, scales, information = zip(*used, strict=True)
     systematic = SYSTEMATIC_FACTOR * float(np.median(scales))
     estimate = _over_windows(list(covered), np.array(scales), np.array(information), systematic)
     if estimate.half > RESOLVED_FACTOR * estimate.value:
         share = f"{estimate.half / estimate.value:.0%}"
         return Quantity(
-            name, reason=f"interval of +- {share}, wanted +- {RESOLVED_FACTOR:.0%}: the camera's path is too short"
+            name,
+            reason=f"interval of +- {share}, wanted +- {RESOLVED_FACTOR:.0%}: the camera's path is too short",
         )
     factor = sequence.camera.written_depth_factor
-    low, high = factor / (estimate.value + estimate.half), factor / (estimate.value - estimate.half)
-    agrees, value = low <= factor <= high, factor / estimate.value
+    low = factor / (estimate.value + estimate.half)
+    high = factor / (estimate.value - estimate.half)
+    agrees = low <= factor <= high
+    value = factor / estimate.value
     reason = f"agrees with the camera's {factor:g}" if agrees else f"the camera states {factor:g}"
     return Quantity(name, value, low, high, None if agrees else float(f"{value:.4g}"), True, reason)
 
 
-# Bundle adjustment of a window whose camera moves continuously: every row and every depth image has its own time.
+# Bundle adjustment of a window whose camera moves continuously: every row and every depth image has
+# its own time.
 
 POINTS = 110
 """So many corners are followed at a time."""
@@ -387,10 +454,11 @@ POINTS = 110
 def track(images: list[NDArray[np.uint8]], allowed: list[NDArray[np.uint8]]) -> Array:
     """Corners followed from image to image by Lucas and Kanade, pixels ``[L, n, 2]``; NaN where they are not seen.
 
-    A corner that is tracked back more than half a pixel off is lost. New ones are detected where few are left and
-    `allowed` is not 0.
+    A corner that is tracked back more than half a pixel off is lost. New ones are detected where
+    few are left and `allowed` is not 0.
     """
-    n, (height, width) = len(images), images[0].shape
+    n = len(images)
+    (height, width) = images[0].shape
     tracks = np.full((0, n, 2), np.nan)
     for i in range(n - 1):
         alive = np.isfinite(tracks[:, i, 0])
@@ -405,19 +473,24 @@ def track(images: list[NDArray[np.uint8]], allowed: list[NDArray[np.uint8]]) -> 
         flow = here - tracks[alive, i - 1] if i else np.full(here.shape, np.nan)
         valid = np.isfinite(flow[:, 0])
         flow[~valid] = np.median(flow[valid], axis=0) if valid.any() else 0.0
-        there, good = follow_corners(images[i], images[i + 1], here, (here + flow).astype(np.float32), 0.5)
+        there, good = follow_corners(
+            images[i], images[i + 1], here, (here + flow).astype(np.float32), 0.5
+        )
         good &= (there >= 8).all(axis=1) & (there < (width - 8, height - 8)).all(axis=1)
         tracks[np.flatnonzero(alive)[good], i + 1] = there[good]
     return np.asarray(tracks[np.isfinite(tracks[..., 0]).sum(axis=1) >= 4])
 
 
-def corners(image: NDArray[np.uint8], allowed: NDArray[np.uint8], taken: Array, count: int) -> NDArray[np.float32]:
+def corners(
+    image: NDArray[np.uint8], allowed: NDArray[np.uint8], taken: Array, count: int
+) -> NDArray[np.float32]:
     """Corners ``[N, 2]`` spread over the cells of a grid, away from those that there are."""
     height, width = image.shape
     free = allowed.copy()
     for x, y in taken:
         cv2.circle(free, (int(x), int(y)), 12, 0, -1)
-    rows, columns = np.linspace(0, height, 5).astype(int).tolist(), np.linspace(0, width, 6).astype(int).tolist()
+    rows = np.linspace(0, height, 5).astype(int).tolist()
+    columns = np.linspace(0, width, 6).astype(int).tolist()
     pixels = [np.zeros((0, 2), np.float32)]
     cells = list(product(pairwise(rows), pairwise(columns)))
     per_cell = int(np.ceil(1.5 * count / len(cells)))
@@ -433,16 +506,23 @@ def inverse_depth(depth: NDArray[np.float32], pixels: Array) -> Array:
     """Mean inverse depth ``[N]`` of the 5x5 pixels around `pixels` ``[N, 2]``; NaN at edges, holes and outside."""
     height, width = depth.shape
     place: Array = np.asarray(np.round(pixels))
-    ahead, before = (place >= 2).all(axis=1), (place < (width - 2, height - 2)).all(axis=1)
+    ahead = (place >= 2).all(axis=1)
+    before = (place < (width - 2, height - 2)).all(axis=1)
     inside = np.asarray(np.isfinite(place).all(axis=1) & ahead & before)
     u, v = np.where(inside[:, None], place, 2).astype(np.intp).T
     around = np.arange(-2, 3)
-    patch = depth[v[:, None, None] + around[:, None], u[:, None, None] + around].reshape(len(u), 25).astype(np.float64)
+    patch = (
+        depth[v[:, None, None] + around[:, None], u[:, None, None] + around]
+        .reshape(len(u), 25)
+        .astype(np.float64)
+    )
     measured = patch > 0
     inverse = 1 / np.where(measured, patch, 1.0)
     count = measured.sum(axis=1)
     mean = (inverse * measured).sum(axis=1) / np.maximum(count, 1)
-    spread = np.where(measured, inverse, -np.inf).max(axis=1) - np.where(measured, inverse, np.inf).min(axis=1)
+    spread = np.where(measured, inverse, -np.inf).max(axis=1) - np.where(
+        measured, inverse, np.inf
+    ).min(axis=1)
     return np.where(inside & (count >= 20) & (spread < 0.12 * mean), mean, np.nan)
 
 
@@ -470,19 +550,30 @@ class Window:
         stamps: ``[n]`` seconds, when the middle row of each colour image was exposed.
         pixels: ``[L, n, 2]`` tracked pixels of the colour images, as they are (distorted).
         depth: ``[n, H, W]`` depth images in metres, 0 = missing.
-        offsets: ``[n]`` seconds by which the depth images' stamps are later than the colour images'.
+        offsets: ``[n]`` seconds by which the depth images' stamps are later than the colour
+            images'.
 
     Raises:
         Unusable: Too few points have depth, or do not move as one rigid body.
     """
 
     def __init__(
-        self, camera: Camera, stamps: Array, pixels: Array, depth: NDArray[np.float32], offsets: Array
+        self,
+        camera: Camera,
+        stamps: Array,
+        pixels: Array,
+        depth: NDArray[np.float32],
+        offsets: Array,
     ) -> None:
-        self.camera, self.depth, self.offsets, self.raw = camera, depth, offsets, pixels
+        self.camera = camera
+        self.depth = depth
+        self.offsets = offsets
+        self.raw = pixels
         self.start, self.stamps = float(stamps[0]), stamps - stamps[len(stamps) // 2]
         self.xy = camera.undistort_points(pixels).reshape(pixels.shape)
-        self.inverse_depth = np.stack([inverse_depth(image, pixels[:, i]) for i, image in enumerate(depth)], axis=1)
+        self.inverse_depth = np.stack(
+            [inverse_depth(image, pixels[:, i]) for i, image in enumerate(depth)], axis=1
+        )
         self.R, self.centre = self._chain()
         with np.errstate(divide="ignore", invalid="ignore"):
             points = camera.unproject(self.xy, 1 / self.inverse_depth)
@@ -491,7 +582,9 @@ class Window:
         keep = (np.isfinite(self.xy[..., 0]).sum(1) >= 4) & (deep.sum(1) >= 2)
         if keep.sum() < LEAST_POINTS:
             raise Unusable("too few points with depth can be followed")
-        self.raw, self.xy, self.inverse_depth = self.raw[keep], self.xy[keep], self.inverse_depth[keep]
+        self.raw = self.raw[keep]
+        self.xy = self.xy[keep]
+        self.inverse_depth = self.inverse_depth[keep]
         self.depth_drift = np.zeros(self.raw.shape[:2])
         self.points = np.nanmedian(world[keep], axis=1)
         self.late = np.nan_to_num((self.raw[..., 1] + 0.5) / camera.height - 0.5)
@@ -514,14 +607,28 @@ class Window:
             points = self.camera.unproject(self.xy[usable, i], 1 / self.inverse_depth[usable, i])
             pixels = self.xy[usable, i + 1]
             success, turn, shift, inliers = cv2.solvePnPRansac(
-                points, pixels, matrix, None, iterationsCount=200, reprojectionError=3.0, flags=cv2.SOLVEPNP_EPNP
+                points,
+                pixels,
+                matrix,
+                None,
+                iterationsCount=200,
+                reprojectionError=3.0,
+                flags=cv2.SOLVEPNP_EPNP,
             )
-            if not success or inliers is None or len(inliers) < max(LEAST_POINTS // 2, 0.4 * len(points)):
+            if (
+                not success
+                or inliers is None
+                or len(inliers) < max(LEAST_POINTS // 2, 0.4 * len(points))
+            ):
                 raise Unusable("the points do not move as one rigid scene")
             chosen = inliers[:, 0]
-            turn, shift = cv2.solvePnPRefineLM(points[chosen], pixels[chosen], matrix, None, turn, shift)
+            turn, shift = cv2.solvePnPRefineLM(
+                points[chosen], pixels[chosen], matrix, None, turn, shift
+            )
             step = se3.from_matrix(shift[:, 0], cv2.Rodrigues(turn)[0])
-            error = np.linalg.norm(self.camera.project(points @ step[:3, :3].T + step[:3, 3]) - pixels, axis=1)
+            error = np.linalg.norm(
+                self.camera.project(points @ step[:3, :3].T + step[:3, 3]) - pixels, axis=1
+            )
             moving = np.flatnonzero(usable)[~(error < 6.0)]
             self.xy[moving, i + 1 :] = self.inverse_depth[moving, i + 1 :] = np.nan
             T.append(step @ T[-1])
@@ -530,13 +637,15 @@ class Window:
 
     def _at(self, offset: Array) -> _Moment:
         """The camera at times `offset` ``[L, n]`` seconds after the frames' stamps."""
-        n, times = len(self.stamps), self.stamps + offset
+        n = len(self.stamps)
+        times = self.stamps + offset
         nearest = np.searchsorted((self.stamps[1:] + self.stamps[:-1]) / 2, times)
         nodes = np.clip(np.arange(n) - STENCIL // 2, 0, n - STENCIL)[:, None] + np.arange(STENCIL)
         spread = self.stamps[nodes] - self.stamps[:, None]
         turns = _rotvec(self.R[nodes] @ np.swapaxes(self.R, 1, 2)[:, None])
         weights, slopes = _lagrange(spread[nearest], times - self.stamps[nearest])
-        turn, centres = turns[nearest], self.centre[nodes][nearest]
+        turn = turns[nearest]
+        centres = self.centre[nodes][nearest]
         return _Moment(
             R=_matrix((weights[..., None, :] @ turn)[..., 0, :]) @ self.R[nearest],
             centre=(weights[..., None, :] @ centres)[..., 0, :],
@@ -555,16 +664,24 @@ class Window:
     def _residuals(self, points: Array) -> Array:
         """Pixels and inverse depth ``[L, n, 3]``: predicted less observed."""
         inverse = 1 / np.maximum(points[..., 2:], 1e-3)
-        pixels = points[..., :2] * inverse * (self.camera.fx, self.camera.fy) + (self.camera.cx, self.camera.cy)
+        pixels = points[..., :2] * inverse * (self.camera.fx, self.camera.fy) + (
+            self.camera.cx,
+            self.camera.cy,
+        )
         return np.concatenate([pixels - self.xy, inverse - self.inverse_depth[..., None]], axis=-1)
 
     def measure_noise(self, readout_s: float) -> None:
         """Take the noise of pixels and of inverse depth from the median residuals."""
         residuals = self._residuals(self._in_camera(self._at(self.late * readout_s)))
-        error, depth = np.hypot(residuals[..., 0], residuals[..., 1]), np.abs(residuals[..., 2])
-        valid, deep = np.isfinite(error), np.isfinite(depth)
+        error = np.hypot(residuals[..., 0], residuals[..., 1])
+        depth = np.abs(residuals[..., 2])
+        valid = np.isfinite(error)
+        deep = np.isfinite(depth)
         if valid.any() and deep.any():
-            self.noise = max(np.median(error[valid]) / 1.177, 0.05), max(1.4826 * np.median(depth[deep]), 1e-6)
+            self.noise = (
+                max(np.median(error[valid]) / 1.177, 0.05),
+                max(1.4826 * np.median(depth[deep]), 1e-6),
+            )
 
     def turning_change(self) -> float:
         """Root mean square change of the turning rate within the window, rad/s."""
@@ -575,12 +692,14 @@ class Window:
         """Carry each depth from its image's time to its pixel's, with the motion as estimated so far.
 
         Args:
-            readout_s: Readout time; the depth image's rows are taken to be read as the colour image's are.
+            readout_s: Readout time; the depth image's rows are taken to be read as the colour
+                image's are.
             delay_s: By which the depth images are exposed later than their stamps say.
         """
         now = self._in_camera(self._at(self.late * readout_s))
         self.inverse_depth, before, after = (
-            self._depth_at(now, readout_s, delay_s + step) for step in (0.0, -_DIFFERENCE_S, _DIFFERENCE_S)
+            self._depth_at(now, readout_s, delay_s + step)
+            for step in (0.0, -_DIFFERENCE_S, _DIFFERENCE_S)
         )
         drift = (after - before) / (2 * _DIFFERENCE_S)
         self.inverse_depth[~np.isfinite(drift)] = np.nan
@@ -590,22 +709,31 @@ class Window:
         """Inverse depth ``[L, n]`` at the pixels' time of images exposed `delay_s` after their stamps."""
         moment = self._at(self.late * readout_s + self.offsets + delay_s)
         then = self._in_camera(moment)
-        inverse_now, inverse_then = 1 / np.maximum(now[..., 2:], 1e-3), 1 / np.maximum(then[..., 2:], 1e-3)
-        shift = (then[..., :2] * inverse_then - now[..., :2] * inverse_now) * (self.camera.fx, self.camera.fy)
+        inverse_now = 1 / np.maximum(now[..., 2:], 1e-3)
+        inverse_then = 1 / np.maximum(then[..., 2:], 1e-3)
+        shift = (then[..., :2] * inverse_then - now[..., :2] * inverse_now) * (
+            self.camera.fx,
+            self.camera.fy,
+        )
         place = np.where(moment.within[..., None] & np.isfinite(self.xy), self.raw + shift, np.nan)
-        observed = np.stack([inverse_depth(image, place[:, i]) for i, image in enumerate(self.depth)], axis=1)
+        observed = np.stack(
+            [inverse_depth(image, place[:, i]) for i, image in enumerate(self.depth)], axis=1
+        )
         return np.asarray(observed - (inverse_then - inverse_now)[..., 0])
 
     def depth_cost(self, delay_s: float) -> tuple[float, int]:
         """Robust cost of the depth images under a delay without a rolling shutter, and how many depths it sums."""
         now = self._in_camera(self._at(np.zeros_like(self.late)))
-        error = (1 / np.maximum(now[..., 2], 1e-3) - self._depth_at(now, 0.0, delay_s)) / self.noise[1]
+        error = (
+            1 / np.maximum(now[..., 2], 1e-3) - self._depth_at(now, 0.0, delay_s)
+        ) / self.noise[1]
         valid = np.isfinite(error)
         return float(np.log1p((error[valid] / CAUCHY) ** 2).sum()), int(valid.sum())
 
     def normal_equations(self, readout_s: float) -> _Reduced:
         """Gauss-Newton's normal equations about the state, the points eliminated."""
-        L, n = len(self.xy), len(self.stamps)
+        L = len(self.xy)
+        n = len(self.stamps)
         moment = self._at(self.late * readout_s)
         points = self._in_camera(moment)
         residuals = self._residuals(points)
@@ -614,14 +742,19 @@ class Window:
         by_pixels = 1 / (pixels * np.sqrt(1 + (error / CAUCHY) ** 2))
         by_depth = 1 / (depth * np.sqrt(1 + (residuals[..., 2] / depth / CAUCHY) ** 2))
         weight = np.nan_to_num(np.stack([by_pixels, by_pixels, by_depth], axis=-1))
-        x, y, z = points[..., 0], points[..., 1], np.maximum(points[..., 2], 1e-3)
+        x = points[..., 0]
+        y = points[..., 1]
+        z = np.maximum(points[..., 2], 1e-3)
         by_point = np.zeros((L, n, 3, 3))
-        by_point[..., 0, 0], by_point[..., 0, 2] = self.camera.fx / z, -self.camera.fx * x / z**2
-        by_point[..., 1, 1], by_point[..., 1, 2] = self.camera.fy / z, -self.camera.fy * y / z**2
+        by_point[..., 0, 0] = self.camera.fx / z
+        by_point[..., 0, 2] = -self.camera.fx * x / z**2
+        by_point[..., 1, 1] = self.camera.fy / z
+        by_point[..., 1, 2] = -self.camera.fy * y / z**2
         by_point[..., 2, 2] = -1 / z**2
         by_point *= weight[..., None]
         by_world = by_point @ moment.R
-        by_pose = np.concatenate([-by_point @ se3.hat(points), -by_world], axis=-1)  # rotation, centre
+        # rotation, centre
+        by_pose = np.concatenate([-by_point @ se3.hat(points), -by_world], axis=-1)
         moving = np.cross(moment.turning, points) - (moment.R @ moment.velocity[..., None])[..., 0]
         share = np.zeros((L, n, n))  # of each pose in the interpolated one
         np.put_along_axis(share, moment.nodes, moment.weights, axis=2)
@@ -640,7 +773,8 @@ class Window:
         """Move the state.
 
         Args:
-            poses: ``[n - 1, 6]`` rotation vector (from the left) and centre of all poses but the middle one.
+            poses: ``[n - 1, 6]`` rotation vector (from the left) and centre of all poses but the
+                middle one.
             points: ``[L, 3]``.
         """
         others = np.delete(np.arange(len(self.stamps)), len(self.stamps) // 2)
@@ -690,13 +824,18 @@ class _Reduced:
         turned = np.swapaxes(by_point, 1, 2)
         own = turned @ by_point
         own += (1e-6 * np.trace(own, axis1=1, axis2=2)[:, None, None] + 1e-9) * np.eye(3)
-        self._inverse, self._mixed, self._pull = np.linalg.inv(own), turned @ J, (turned @ r[..., None])[..., 0]
+        self._inverse = np.linalg.inv(own)
+        self._mixed = turned @ J
+        self._pull = (turned @ r[..., None])[..., 0]
         columns = J.shape[-1]
-        flat, carried = J.reshape(-1, columns), (self._inverse @ self._mixed).reshape(-1, columns)
+        flat = J.reshape(-1, columns)
+        carried = (self._inverse @ self._mixed).reshape(-1, columns)
         H = flat.T @ flat - self._mixed.reshape(-1, columns).T @ carried
-        b, m = flat.T @ r.ravel() - carried.T @ self._pull.ravel(), columns - 2
+        b = flat.T @ r.ravel() - carried.T @ self._pull.ravel()
+        m = columns - 2
         damped = H[:m, :m] + 1e-9 * np.trace(H[:m, :m]) / m * np.eye(m)
-        self._response = np.linalg.solve(damped, np.column_stack([H[:m, m:], b[:m]]))  # of the poses
+        # of the poses
+        self._response = np.linalg.solve(damped, np.column_stack([H[:m, m:], b[:m]]))
         self.information = H[m:, m:] - H[m:, :m] @ self._response[:, :2]
         self.slope = b[m:] - H[m:, :m] @ self._response[:, 2]
 
@@ -717,7 +856,8 @@ def _rotvec(R: Array) -> Array:
 
 def _lagrange(nodes: Array, at: Array) -> tuple[Array, Array]:
     """Weights ``[..., k]`` of the nodes ``[..., k]`` of the interpolating polynomial at ``[...]``, and their slopes."""
-    weights, slopes = np.ones_like(nodes), np.zeros_like(nodes)
+    weights = np.ones_like(nodes)
+    slopes = np.zeros_like(nodes)
     for j, m in permutations(range(nodes.shape[-1]), 2):
         span = nodes[..., j] - nodes[..., m]
         slopes[..., j] = (slopes[..., j] * (at - nodes[..., m]) + weights[..., j]) / span

@@ -31,7 +31,8 @@ _WILD_SLAM_DISTORTION = (
 PRIMESENSE_READOUT_S = 0.026
 """Of the Kinect and the Xtion, whose colour cameras have rolling shutters; measured, not published with the sequences.
 
-Of 0, 13, 20, 26 and 33 ms it has the least error, or within 2 % of it, on excerpts of fr1_xyz, fr1_rpy and Bonn crowd
+Of 0, 13, 20, 26 and 33 ms it has the least error, or within 2 % of it, on excerpts of fr1_xyz,
+fr1_rpy and Bonn crowd
 (``docs/results/recordings.md``)."""
 
 CAMERAS: dict[str, Camera] = {
@@ -59,11 +60,18 @@ CAMERAS: dict[str, Camera] = {
         readout_s=PRIMESENSE_READOUT_S,
     ),
     "tum-fr3": Camera(
-        640, 480, 535.4, 539.2, 320.1, 247.6, depth_factor=TUM_DEPTH_FACTOR, readout_s=PRIMESENSE_READOUT_S
+        640,
+        480,
+        535.4,
+        539.2,
+        320.1,
+        247.6,
+        depth_factor=TUM_DEPTH_FACTOR,
+        readout_s=PRIMESENSE_READOUT_S,
     ),  # images are undistorted already
-    # Calibration published with the Bonn RGB-D Dynamic Dataset. Its ground truth is that of the markers on the camera.
-    # The lever arm of 2 cm is left out: positions stay those of the file, to which published errors refer; the protocol
-    # bonn-camera/v1 takes it into account.
+    # Calibration published with the Bonn RGB-D Dynamic Dataset. Its ground truth is that of the
+    # markers on the camera. The lever arm of 2 cm is left out: positions stay those of the file, to
+    # which published errors refer; the protocol bonn-camera/v1 takes it into account.
     "bonn": Camera(
         640,
         480,
@@ -123,9 +131,15 @@ _Row = tuple[float, float, float]
 class CameraFile(Settings):
     """The contents of a ``camera.toml``: the intrinsics, or a known camera by `name`, which other keys change."""
 
-    name: str | None = Field(default=None, description="a known camera; what else the file states replaces its values")
-    width: Annotated[int, Field(ge=1)] | None = Field(default=None, description="image width in pixels")
-    height: Annotated[int, Field(ge=1)] | None = Field(default=None, description="image height in pixels")
+    name: str | None = Field(
+        default=None, description="a known camera; what else the file states replaces its values"
+    )
+    width: Annotated[int, Field(ge=1)] | None = Field(
+        default=None, description="image width in pixels"
+    )
+    height: Annotated[int, Field(ge=1)] | None = Field(
+        default=None, description="image height in pixels"
+    )
     fx: Positive | None = Field(default=None, description="focal length along x in pixels")
     fy: Positive | None = Field(default=None, description="focal length along y in pixels")
     cx: float | None = Field(default=None, description="principal point x in pixels")
@@ -133,13 +147,19 @@ class CameraFile(Settings):
     distortion: tuple[float, float, float, float, float] = Field(
         default=(0.0, 0.0, 0.0, 0.0, 0.0), description="radial-tangential k1, k2, p1, p2, k3"
     )
-    depth_factor: Positive | None = Field(default=None, description="raw depth units a metre; needed by depth images")
-    baseline_m: Positive = Field(default=0.075, description="baseline of the (virtual) stereo pair in metres")
+    depth_factor: Positive | None = Field(
+        default=None, description="raw depth units a metre; needed by depth images"
+    )
+    baseline_m: Positive = Field(
+        default=0.075, description="baseline of the (virtual) stereo pair in metres"
+    )
     readout_s: Annotated[float, Field(ge=0, le=1)] = Field(
-        default=0.0, description="seconds between the first row's exposure and the last one's; 0 = global shutter"
+        default=0.0,
+        description="seconds between the first row's exposure and the last one's; 0 = global shutter",
     )
     depth_delay_s: Annotated[float, Field(ge=-1, le=1)] = Field(
-        default=0.0, description="seconds by which depth images are exposed later than their stamps say"
+        default=0.0,
+        description="seconds by which depth images are exposed later than their stamps say",
     )
     R_body_cam: tuple[_Row, _Row, _Row] | None = Field(
         default=None,
@@ -165,7 +185,9 @@ class CameraFile(Settings):
         if not missing:
             return Camera(**stated)
         if base is None or len(missing) < len(INTRINSICS):
-            raise CameraError(f"the camera lacks {', '.join(missing)}", f"or name = one of {', '.join(CAMERAS)}")
+            raise CameraError(
+                f"the camera lacks {', '.join(missing)}", f"or name = one of {', '.join(CAMERAS)}"
+            )
         return replace(base, **stated)
 
 
@@ -176,7 +198,9 @@ def known_camera(name: str) -> Camera:
         SequenceError: Unknown name; lists the known ones.
     """
     if name not in CAMERAS:
-        raise SequenceError(f"unknown camera '{name}'", f"one of {', '.join(CAMERAS)}, or a camera.toml file")
+        raise SequenceError(
+            f"unknown camera '{name}'", f"one of {', '.join(CAMERAS)}, or a camera.toml file"
+        )
     return CAMERAS[name]
 
 
@@ -252,7 +276,8 @@ def chosen_camera(folder: Path, choice: str | Path | Camera | None = None) -> Ch
 
     Args:
         folder: A sequence's folder.
-        choice: A camera, a known camera's name or a ``camera.toml``; it wins over a ``camera.toml`` inside the folder.
+        choice: A camera, a known camera's name or a ``camera.toml``; it wins over a ``camera.toml``
+            inside the folder.
 
     Raises:
         SequenceError: The choice is not understood.
@@ -271,14 +296,19 @@ def chosen_camera(folder: Path, choice: str | Path | Camera | None = None) -> Ch
 def camera_by_name(folder: Path) -> str | None:
     """Name of the camera of the public data set after which a folder is named; None for any other name."""
     name = folder.resolve().name
-    return next((camera for prefix, camera in PUBLISHED_PREFIXES.items() if name.startswith(prefix)), None)
+    return next(
+        (camera for prefix, camera in PUBLISHED_PREFIXES.items() if name.startswith(prefix)), None
+    )
 
 
-def camera_of(folder: Path, contents: Contents, chosen: ChosenCamera | None, catalogued: str = "") -> Camera:
+def camera_of(
+    folder: Path, contents: Contents, chosen: ChosenCamera | None, catalogued: str = ""
+) -> Camera:
     """The camera of a folder, complete and plausible: what was chosen, else what files say, else what the name implies.
 
-    What belongs to the recording and not to the lens comes from the recording where the chosen camera does not state
-    it: the depth factor from the folder's own calibration, `R_body_cam` from the data set of the folder's name.
+    What belongs to the recording and not to the lens comes from the recording where the chosen
+    camera does not state it: the depth factor from the folder's own calibration, `R_body_cam` from
+    the data set of the folder's name.
 
     Args:
         folder: A sequence's folder.
@@ -287,11 +317,12 @@ def camera_of(folder: Path, contents: Contents, chosen: ChosenCamera | None, cat
         catalogued: Name of the camera that the catalogue states; empty where it does not.
 
     Returns:
-        The camera. Its `R_body_cam` is the rotation that the ground truth needs, None where it needs none.
+        The camera. Its `R_body_cam` is the rotation that the ground truth needs, None where it
+        needs none.
 
     Raises:
-        CameraError: Nothing states the camera, or the depth factor that its depth images need. The error brings a
-            ``camera.toml`` to copy.
+        CameraError: Nothing states the camera, or the depth factor that its depth images need. The
+            error brings a ``camera.toml`` to copy.
         SequenceError: It has values that nobody could mean.
     """
     named = catalogued or camera_by_name(folder)
@@ -300,7 +331,9 @@ def camera_of(folder: Path, contents: Contents, chosen: ChosenCamera | None, cat
     try:
         camera = base if chosen is None else chosen.camera(base)
     except CameraError as error:
-        raise CameraError(str(error.args[0]), error.hint, template=_template(folder, contents, chosen)) from None
+        raise CameraError(
+            str(error.args[0]), error.hint, template=_template(folder, contents, chosen)
+        ) from None
     if camera is None:
         raise CameraError(
             f"the camera of {folder} is not known: there is no {CAMERA_FILE} inside, and '{folder.resolve().name}' is "
@@ -318,7 +351,9 @@ def camera_of(folder: Path, contents: Contents, chosen: ChosenCamera | None, cat
     if not contents.truth_of_body:
         camera = replace(camera, R_body_cam=None)
     check_camera(camera, f"the camera of {folder}" if chosen is None else chosen.source)
-    if camera.depth_factor is None and any(not file.endswith(".npy") for file in contents.depth.files):
+    if camera.depth_factor is None and any(
+        not file.endswith(".npy") for file in contents.depth.files
+    ):
         where = f"{CAMERA_FILE} in the folder" if chosen is None else chosen.source
         raise CameraError(
             f"the depth images of {folder} hold raw numbers, and nothing says how many make a metre: {where} has no "
@@ -355,7 +390,9 @@ def _median_raw_depth(folder: Path, contents: Contents) -> float | None:
     return None
 
 
-def _template(folder: Path, contents: Contents, chosen: ChosenCamera | None, camera: Camera | None = None) -> str:
+def _template(
+    folder: Path, contents: Contents, chosen: ChosenCamera | None, camera: Camera | None = None
+) -> str:
     """A ``camera.toml`` that is complete but for what nobody knows: left empty, with a remark what belongs there."""
     stated: dict[str, Any] = {}
     with suppress(SequenceError):
@@ -374,12 +411,21 @@ def _template(folder: Path, contents: Contents, chosen: ChosenCamera | None, cam
         "cx": "principal point in pixels; the centre of the top-left pixel is 0",
         "cy": "",
     }
-    lines = [_template_line(f"{key} = {stated.get(key, '')}", remark) for key, remark in remarks.items()]
+    lines = [
+        _template_line(f"{key} = {stated.get(key, '')}", remark) for key, remark in remarks.items()
+    ]
     lines.append(_template_line(f"distortion = {distortion}", "k1, k2, p1, p2, k3"))
     median = _median_raw_depth(folder, contents)
-    lines.append("# raw depth units a metre: keep the line whose distance is that of the scene, without its first #")
-    for factor, whose in ((MILLIMETRES, "millimetres, as most cameras write them"), (TUM_DEPTH_FACTOR, "TUM's files")):
-        distance = "" if median is None else f": the first image's median is {median / factor:.3g} m"
+    lines.append(
+        "# raw depth units a metre: keep the line whose distance is that of the scene, without its first #"
+    )
+    for factor, whose in (
+        (MILLIMETRES, "millimetres, as most cameras write them"),
+        (TUM_DEPTH_FACTOR, "TUM's files"),
+    ):
+        distance = (
+            "" if median is None else f": the first image's median is {median / factor:.3g} m"
+        )
         lines.append(_template_line(f"# depth_factor = {factor}", whose + distance))
     rate = chosen.fps if chosen is not None else contents.fps
     lines += [] if rate is None else [f"fps = {rate}"]
@@ -416,7 +462,9 @@ def check_camera(camera: Camera, where: str) -> None:
         SequenceError: Names the first such value, with the number and what is expected.
     """
     for fault in _faults(camera):
-        raise SequenceError(f"{where}: {fault}", "write the camera's calibration, see docs/how-to/recording.md")
+        raise SequenceError(
+            f"{where}: {fault}", "write the camera's calibration, see docs/how-to/recording.md"
+        )
 
 
 def _faults(camera: Camera) -> Iterator[str]:

@@ -12,12 +12,25 @@ from typing import Any, Literal, cast
 from pydantic import Field
 
 from dynslam_bench.contracts import DatasetSpec, Sequence
-from dynslam_bench.core import SequenceError, did_you_mean, find_data_root, is_writable, read_toml, user_cache
+from dynslam_bench.core import (
+    SequenceError,
+    did_you_mean,
+    find_data_root,
+    is_writable,
+    read_toml,
+    user_cache,
+)
 from dynslam_bench.core.plugins import Registry, described, load_object
 from dynslam_bench.core.settings import Settings, build
 from dynslam_bench.geometry import Camera
 from dynslam_bench.sequences.cameras import CAMERA_FILE, CAMERAS, camera_of, chosen_camera
-from dynslam_bench.sequences.readers.layouts import find_layout, is_bag, is_plain, layout_notes, layouts_of
+from dynslam_bench.sequences.readers.layouts import (
+    find_layout,
+    is_bag,
+    is_plain,
+    layout_notes,
+    layouts_of,
+)
 from dynslam_bench.sequences.settings import PreprocessingSettings
 from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS, open_synthetic, parse_synthetic_id
 from dynslam_bench.sequences.tags import Tag
@@ -44,18 +57,32 @@ class CatalogueEntry(Settings):
 
     id: str = Field(description="for example tum/fr3/walking_xyz")
     folder: str = Field(description="published folder name, an alias of the id")
-    camera: str = Field(default="", description="name of the camera; empty where the folder or the layout states it")
-    layout: str = Field(default="tum", description="name of the layout, see dynslam_bench.sequences.readers.layouts")
+    camera: str = Field(
+        default="", description="name of the camera; empty where the folder or the layout states it"
+    )
+    layout: str = Field(
+        default="tum", description="name of the layout, see dynslam_bench.sequences.readers.layouts"
+    )
     url: str = Field(description="archive")
-    verified: bool = Field(default=False, description="whether the publisher's own files were read with it")
-    more_urls: tuple[str, ...] = Field(default=(), description="further archives that belong to the same folder")
-    by_hand: str = Field(default="", description="why this program cannot fetch it; empty where it can")
-    distinctive: bool = Field(default=True, description="whether the folder's name alone identifies the sequence")
+    verified: bool = Field(
+        default=False, description="whether the publisher's own files were read with it"
+    )
+    more_urls: tuple[str, ...] = Field(
+        default=(), description="further archives that belong to the same folder"
+    )
+    by_hand: str = Field(
+        default="", description="why this program cannot fetch it; empty where it can"
+    )
+    distinctive: bool = Field(
+        default=True, description="whether the folder's name alone identifies the sequence"
+    )
     title: str = Field(description="name of the data set")
     page: str = Field(default="", description="web page of the data set")
     size_bytes: int | None = Field(default=None, description="exact size of the archive")
     size_stated: str = Field(default="", description="size as the data set's page states it")
-    sha256: str | None = Field(default=None, pattern=r"^[0-9a-f]{64}$", description="checksum of the archive")
+    sha256: str | None = Field(
+        default=None, pattern=r"^[0-9a-f]{64}$", description="checksum of the archive"
+    )
     license: str = Field(description="licence of the data")
     citation: str = Field(description="what to cite")
     ground_truth: bool = Field(default=True, description="whether the ground truth is public")
@@ -75,12 +102,19 @@ class CatalogueEntry(Settings):
         if not self.distinctive:
             return inside / self.folder, data_root / self.id
         places = (inside / self.folder, data_root / self.folder, data_root / self.id)
-        return (*places, data_root / self.folder.removeprefix("rgbd_")) if data_root.name == self.dataset else places
+        return (
+            (*places, data_root / self.folder.removeprefix("rgbd_"))
+            if data_root.name == self.dataset
+            else places
+        )
 
     def find(self, data_root: Path) -> Path | None:
         """The folder in which the sequence lies, None if it does not."""
         places = self.folders(data_root)
-        return next((folder for folder in places if layouts_of(folder, self.layout) or is_plain(folder)), None)
+        return next(
+            (folder for folder in places if layouts_of(folder, self.layout) or is_plain(folder)),
+            None,
+        )
 
     def how_to_get(self) -> str:
         """What a user does to have it, for the end of a message."""
@@ -134,11 +168,14 @@ def open_sequence(
     """Open a sequence.
 
     Args:
-        name: An id (``tum/fr3/walking_xyz``, ``bonn/crowd``, ``synthetic/walking_xyz?scene=0&frames=150``), a published
-            folder name (``rgbd_dataset_freiburg3_walking_xyz``) or the path of a folder of a layout that is read.
-        data_root: Folder of the sequences; default ``DYNSLAM_BENCH_DATA``, else the user's cache folder.
-        camera: In place of what the catalogue or the folder says: ``tum-fr1``, ``tum-fr2``, ``tum-fr3``, ``bonn`` or a
-            ``camera.toml``.
+        name: An id (``tum/fr3/walking_xyz``, ``bonn/crowd``,
+            ``synthetic/walking_xyz?scene=0&frames=150``), a published folder name
+            (``rgbd_dataset_freiburg3_walking_xyz``) or the path of a folder of a layout that is
+            read.
+        data_root: Folder of the sequences; default ``DYNSLAM_BENCH_DATA``, else the user's cache
+            folder.
+        camera: In place of what the catalogue or the folder says: ``tum-fr1``, ``tum-fr2``,
+            ``tum-fr3``, ``bonn`` or a ``camera.toml``.
         frames: Part of the sequence, ``(first, one past the last or None)`` or ``"A:B"``.
         stride: Take every `stride`-th frame of that part.
         preprocessing: What to do with the frames; nothing by default.
@@ -147,8 +184,8 @@ def open_sequence(
         The sequence; nothing but its first frame was decoded.
 
     Raises:
-        SequenceError: Unknown id (with a did-you-mean), not on this machine (with URL, size, path and the command that
-            fetches it), damaged, or no frame in the part asked for.
+        SequenceError: Unknown id (with a did-you-mean), not on this machine (with URL, size, path
+            and the command that fetches it), damaged, or no frame in the part asked for.
     """
     settings = preprocessing or PreprocessingSettings()
     root = find_data_root(data_root)
@@ -176,7 +213,9 @@ def open_public(sequence_id: str, *, data_root: Path, **how: Any) -> Sequence:
     """
     entry = entry_of(sequence_id)
     if entry is None:
-        raise SequenceError(f"unknown sequence '{sequence_id}'", did_you_mean(sequence_id, sequence_ids()))
+        raise SequenceError(
+            f"unknown sequence '{sequence_id}'", did_you_mean(sequence_id, sequence_ids())
+        )
     folder = entry.find(data_root)
     if folder is None:
         raise SequenceError(
@@ -196,7 +235,9 @@ def open_rendered(sequence_id: str, *, data_root: Path) -> Sequence:
     Raises:
         SequenceError: Unknown id.
     """
-    return open_synthetic(sequence_id, data_root if is_writable(data_root) else user_cache() / "data")
+    return open_synthetic(
+        sequence_id, data_root if is_writable(data_root) else user_cache() / "data"
+    )
 
 
 def open_folder(
@@ -248,7 +289,8 @@ def open_folder(
 def _open_whole(
     name: str, data_root: Path, camera: str | Path | Camera | None, settings: PreprocessingSettings
 ) -> Sequence:
-    path, is_path = Path(name).expanduser(), name.startswith((".", "/", "~", "\\"))
+    path = Path(name).expanduser()
+    is_path = name.startswith((".", "/", "~", "\\"))
     entry = None if is_path else entry_of(name)
     if entry is not None and path.is_dir() and entry.find(data_root) is None:
         raise SequenceError(
@@ -266,12 +308,15 @@ def _open_whole(
         if dataset is not None:
             return cast("Sequence", load_object(dataset.entry_point)(name, data_root=data_root))
     if is_bag(path):
-        raise SequenceError(f"{path} is a bag", f"unpack it first: dynslam-bench sequences unpack {path} FOLDER")
+        raise SequenceError(
+            f"{path} is a bag", f"unpack it first: dynslam-bench sequences unpack {path} FOLDER"
+        )
     if path.is_dir():
         return open_folder(path, camera=camera, settings=settings)
     if is_path:
         raise SequenceError(
-            f"there is no sequence folder {path.absolute()}", "a path names a folder, see docs/reference/sequences.md"
+            f"there is no sequence folder {path.absolute()}",
+            "a path names a folder, see docs/reference/sequences.md",
         )
     near = did_you_mean(name, [*sequence_ids(), *by_folder()])
     raise SequenceError(f"unknown sequence '{name}', and there is no such folder", near)
@@ -291,7 +336,8 @@ def parse_frames(frames: Iterable[int | None] | str | None) -> tuple[int, int | 
     match = re.fullmatch(r"\s*([0-9]{0,12})\s*:\s*([0-9]{0,12})\s*", frames, re.ASCII)
     if match is None:
         raise SequenceError(f"'{frames}' is no range of frames", "write it as A:B, A: or :B")
-    start, stop = int(match[1] or 0), int(match[2]) if match[2] else None
+    start = int(match[1] or 0)
+    stop = int(match[2]) if match[2] else None
     if stop is not None and stop <= start:
         raise SequenceError(f"frames {frames} is no range of frames", "0 <= A < B")
     return start, stop
@@ -305,9 +351,13 @@ def _builtin() -> Iterator[DatasetSpec]:
     for name, group in groupby(catalogue().values(), key=attrgetter("dataset")):
         first, *others = group
         ids = tuple(entry.id for entry in (first, *others))
-        yield DatasetSpec(name, f"{__name__}:open_public", ids, first.title, first.license, first.citation)
+        yield DatasetSpec(
+            name, f"{__name__}:open_public", ids, first.title, first.license, first.citation
+        )
     summary = "rendered scenes with exact poses, masks and flow"
-    yield DatasetSpec("synthetic", f"{__name__}:open_rendered", SYNTHETIC_IDS, summary, "CC0-1.0", "dynslam-bench")
+    yield DatasetSpec(
+        "synthetic", f"{__name__}:open_rendered", SYNTHETIC_IDS, summary, "CC0-1.0", "dynslam-bench"
+    )
 
 
 DATASETS: Registry[DatasetSpec] = Registry("sequences", DatasetSpec, _builtin)
@@ -323,13 +373,15 @@ def summaries(*, data_root: str | Path | None = None) -> list[dict[str, Any]]:
         data_root: Folder of the sequences.
 
     Returns:
-        Of each sequence its ``id``, whether it is ``here`` on this machine (rendered ones always are), the ``size`` of
-        its archive for people, ``tags``, ``split``, whether its ``ground_truth`` is public, ``license``, ``url`` and
-        the ``dataset``'s name. ``layout`` says whether the reader was ``verified`` on the publisher's files or ``not
-        verified``; ``by_hand`` why this program cannot fetch it; ``checksum`` whether that is known before it is
-        fetched, None for what is rendered.
+        Of each sequence its ``id``, whether it is ``here`` on this machine (rendered ones always
+        are), the ``size`` of its archive for people, ``tags``, ``split``, whether its
+        ``ground_truth`` is public, ``license``, ``url`` and the ``dataset``'s name. ``layout`` says
+        whether the reader was ``verified`` on the publisher's files or ``not verified``;
+        ``by_hand`` why this program cannot fetch it; ``checksum`` whether that is known before it
+        is fetched, None for what is rendered.
     """
-    root, rows = find_data_root(data_root), []
+    root = find_data_root(data_root)
+    rows = []
     for spec in (dataset.spec for dataset in DATASETS.all()):
         for name in spec.sequences:
             entry = catalogue().get(name)
@@ -339,7 +391,9 @@ def summaries(*, data_root: str | Path | None = None) -> list[dict[str, Any]]:
                 "checksum": None,
             }  # fmt: skip
             if entry is not None:
-                row |= entry.model_dump(include={"tags", "split", "ground_truth", "license", "url", "by_hand"})
+                row |= entry.model_dump(
+                    include={"tags", "split", "ground_truth", "license", "url", "by_hand"}
+                )
                 layout = "verified" if entry.verified else "not verified"
                 row |= {"here": entry.find(root) is not None, "size": entry.size_text(), "dataset": entry.title,
                         "layout": layout, "checksum": entry.sha256 is not None}  # fmt: skip
@@ -350,7 +404,9 @@ def summaries(*, data_root: str | Path | None = None) -> list[dict[str, Any]]:
     return rows
 
 
-def describe(name: str, *, data_root: str | Path | None = None, camera: str | Path | None = None) -> dict[str, Any]:
+def describe(
+    name: str, *, data_root: str | Path | None = None, camera: str | Path | None = None
+) -> dict[str, Any]:
     """Everything known of a sequence: the catalogue's entry, and what it holds if it is here.
 
     Args:
@@ -361,7 +417,8 @@ def describe(name: str, *, data_root: str | Path | None = None, camera: str | Pa
     Raises:
         SequenceError: Unknown name, or it is here but damaged.
     """
-    root, entry = find_data_root(data_root), entry_of(name)
+    root = find_data_root(data_root)
+    entry = entry_of(name)
     facts: dict[str, Any] = {}
     if entry is not None:
         facts = {
@@ -379,7 +436,8 @@ def describe(name: str, *, data_root: str | Path | None = None, camera: str | Pa
             return facts | {"here": False, "fetch": entry.how_to_get()}
     sequence = open_sequence(name, data_root=data_root, camera=camera)
     truth = sequence.ground_truth
-    folder, stamps = getattr(sequence, "folder", None), sequence.timestamps
+    folder = getattr(sequence, "folder", None)
+    stamps = sequence.timestamps
     return facts | {
         "id": sequence.id,
         "here": True,
@@ -409,6 +467,8 @@ def expand(names: Iterable[str]) -> list[str]:
         pattern = any(character in name for character in "*[") and not Path(name).exists()
         matching = fnmatch.filter(catalogue(), name) if pattern else [name]
         if not matching:
-            raise SequenceError(f"no public sequence matches '{name}'", "see: dynslam-bench sequences list")
+            raise SequenceError(
+                f"no public sequence matches '{name}'", "see: dynslam-bench sequences list"
+            )
         expanded |= dict.fromkeys(matching)
     return list(expanded)

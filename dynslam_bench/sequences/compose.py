@@ -1,8 +1,9 @@
 """Composites: people of a recording by a fixed camera, pasted in depth order into a recording that has a truth.
 
-The person is cut out where depth is nearer than the background, which the fixed camera sees uncovered in other frames,
-and moved as a whole to a place before the host's camera. It is drawn from the host's true poses, so that it stands in
-the host's world, hides what is behind it, is hidden by what is before it, and casts the depth camera's shadow.
+The person is cut out where depth is nearer than the background, which the fixed camera sees
+uncovered in other frames, and moved as a whole to a place before the host's camera. It is drawn
+from the host's true poses, so that it stands in the host's world, hides what is behind it, is
+hidden by what is before it, and casts the depth camera's shadow.
 """
 
 from collections.abc import Callable
@@ -21,19 +22,24 @@ from dynslam_bench.geometry import Array, Camera, Trajectory, se3, write_tum
 from dynslam_bench.sequences.cameras import camera_by_name, write_camera
 from dynslam_bench.sequences.readers.layouts import PEOPLE_LIST
 
-_NEARER_M, _NEARER_SHARE = 0.08, 0.04
+_NEARER_M = 0.08
+_NEARER_SHARE = 0.04
 """A pixel shows a person if its depth is less than the background's by this and by this share of it."""
-_BACKGROUND_FRAMES, _BLOCKS = 150, 16
+_BACKGROUND_FRAMES = 150
+_BLOCKS = 16
 """Frames at most that tell the background's depth, and the parts of the image that are computed one by one."""
 _LEAST_PX = 0.01
 """Smallest share of the image that a person fills; less is noise, or a person who has just begun to enter."""
 _BORDER_PX = 2
 """A person who reaches the left, right or upper border so closely is partly outside."""
 _UPSAMPLED = 4
-_SQUARE, _DISC = np.ones((3, 3), np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
+_SQUARE = np.ones((3, 3), np.uint8)
+_DISC = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
 _LEAST_DISC = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))
 """What is seen of a person and is smaller is left out: points that were drawn without neighbours."""
-_PLACES, _SAMPLED, _REDUCED = 12, 6, 4
+_PLACES = 12
+_SAMPLED = 6
+_REDUCED = 4
 """Places that are tried, frames on which each is tried, and by how much their images are reduced."""
 _MOST_PEOPLE = 3
 _DISTANCES_M = 0.8, 1.5
@@ -92,32 +98,46 @@ def compose(
         host: A recording with depth and ground truth; its colour, depth and poses are kept.
         people: A recording by a camera that does not move.
         folder: The folder to make.
-        instance: Which placement: one to three people, each with a distance, side, turn, mirroring and first frame that
-            are drawn from it.
+        instance: Which placement: one to three people, each with a distance, side, turn, mirroring
+            and first frame that are drawn from it.
         progress: Called with frames done and frames in all.
 
     Raises:
-        SequenceError: The folder exists, the host has people or no ground truth of all frames, the people's camera
-            moves, or nobody is seen.
+        SequenceError: The folder exists, the host has people or no ground truth of all frames, the
+            people's camera moves, or nobody is seen.
         DynslamError: A frame cannot be read, or the folder not be written.
     """
     if host.ground_truth is None:
-        raise SequenceError(f"'{host.id}' has no ground truth, so nobody can be placed in its world")
+        raise SequenceError(
+            f"'{host.id}' has no ground truth, so nobody can be placed in its world"
+        )
     target = Path(folder).expanduser().absolute()
     if target.exists():
         raise SequenceError(f"{target} exists already", "name a folder that does not")
     if host.masks is not None:
-        raise SequenceError(f"'{host.id}' has people already", "compose the recording that was its host")
+        raise SequenceError(
+            f"'{host.id}' has people already", "compose the recording that was its host"
+        )
     truth = host.ground_truth.timestamps
-    outside = int(np.count_nonzero((host.timestamps < truth[0] - _GAP_S) | (host.timestamps > truth[-1] + _GAP_S)))
+    outside = int(
+        np.count_nonzero(
+            (host.timestamps < truth[0] - _GAP_S) | (host.timestamps > truth[-1] + _GAP_S)
+        )
+    )
     if outside or len(truth) < 2:
-        raise SequenceError(f"{outside} of {len(host)} frames of '{host.id}' lie outside its ground truth's time")
+        raise SequenceError(
+            f"{outside} of {len(host)} frames of '{host.id}' lie outside its ground truth's time"
+        )
     _check_fixed(people)
     cutouts = Cutouts(people)
     rng = np.random.default_rng(instance)
     T_world_cam = _poses(host.ground_truth, host.timestamps)
-    actors = [_Actor(cutouts, people.fps, host, T_world_cam, rng) for _ in range(1 + instance % _MOST_PEOPLE)]
-    shares, lists = [], {"rgb": "rgb.txt", "depth": "depth.txt", "people": PEOPLE_LIST}
+    actors = [
+        _Actor(cutouts, people.fps, host, T_world_cam, rng)
+        for _ in range(1 + instance % _MOST_PEOPLE)
+    ]
+    shares = []
+    lists = {"rgb": "rgb.txt", "depth": "depth.txt", "people": PEOPLE_LIST}
     with atomic_folder(target) as work:
         for kind, listed in lists.items():
             (work / kind).mkdir()
@@ -127,7 +147,9 @@ def compose(
             frame = host[i]
             gain = np.clip(frame.rgb.reshape(-1, 3).mean(axis=0) / cutouts.tone, 0.4, 1.6)
             colour, z, ids = _nearest([actor.draw(i, host.camera) for actor in actors])
-            rgb, depth, shown = paste(frame.rgb, frame.depth, colour * gain.astype(np.float32), z, host.camera)
+            rgb, depth, shown = paste(
+                frame.rgb, frame.depth, colour * gain.astype(np.float32), z, host.camera
+            )
             raw = np.rint(depth * host.camera.written_depth_factor).clip(0, 65535).astype(np.uint16)
             images = (rgb[..., ::-1], raw, np.where(shown, ids, 0).astype(np.uint8))
             for kind, image in zip(lists, images, strict=True):
@@ -141,7 +163,9 @@ def compose(
             camera = replace(camera, R_body_cam=_IDENTITY)
         write_camera(work / "camera.toml", camera, fps=host.fps)
         if not max(shares):
-            raise SequenceError(f"nobody can be seen in '{host.id}': all of its depth is missing or nearer than people")
+            raise SequenceError(
+                f"nobody can be seen in '{host.id}': all of its depth is missing or nearer than people"
+            )
     return Composed(target, len(host), float(np.mean(shares)), float(np.max(shares)))
 
 
@@ -152,11 +176,16 @@ def _check_fixed(people: Sequence) -> None:
     if truth is not None and len(truth) > 1 and not se3.stands_still(truth.T_world_cam):
         raise SequenceError(f"the camera of '{people.id}' moves", cure)
     sampled = np.linspace(0, len(people) - 1, _SAMPLED).astype(int).tolist()
-    first, *others = (cv2.cvtColor(people[i].rgb, cv2.COLOR_RGB2GRAY).astype(np.float32) for i in sampled)
+    first, *others = (
+        cv2.cvtColor(people[i].rgb, cv2.COLOR_RGB2GRAY).astype(np.float32) for i in sampled
+    )
     window = cv2.createHanningWindow(first.shape[::-1], cv2.CV_32F)
     shifts = [np.linalg.norm(cv2.phaseCorrelate(first, other, window)[0]) for other in others]
     if np.median(shifts) > _SHIFT_PX:
-        raise SequenceError(f"the camera of '{people.id}' moves: its images shift by {np.median(shifts):.1f} px", cure)
+        raise SequenceError(
+            f"the camera of '{people.id}' moves: its images shift by {np.median(shifts):.1f} px",
+            cure,
+        )
 
 
 class Cutouts:
@@ -175,22 +204,30 @@ class Cutouts:
     """
 
     def __init__(self, people: Sequence) -> None:
-        self._people, self.camera = people, people.camera
+        self._people = people
+        self.camera = people.camera
         self._background = _background(people)
         self._masks: list[tuple[int, NDArray[np.uint8]]] = []
-        colours, centres = [], []
+        colours = []
+        centres = []
         for i in range(len(people)):
             frame = people[i]
             colours.append(frame.rgb.reshape(-1, 3).mean(axis=0))
             mask = _person(self._nearer(frame), frame.rgb)
-            border = mask[:, :_BORDER_PX].any() or mask[:, -_BORDER_PX:].any() or mask[:_BORDER_PX].any()
+            border = (
+                mask[:, :_BORDER_PX].any() or mask[:, -_BORDER_PX:].any() or mask[:_BORDER_PX].any()
+            )
             if mask.mean() < _LEAST_PX or border:
                 continue
             self._masks.append((i, np.packbits(mask)))
             pixels = self.camera.undistort_points(np.stack(np.nonzero(mask)[::-1], axis=1))
-            centres.append(np.median(self.camera.unproject(pixels, self._depth(frame, mask)[mask]), axis=0))
+            centres.append(
+                np.median(self.camera.unproject(pixels, self._depth(frame, mask)[mask]), axis=0)
+            )
         if not centres:
-            raise SequenceError(f"nobody walks through '{people.id}'", "nothing comes nearer than its background")
+            raise SequenceError(
+                f"nobody walks through '{people.id}'", "nothing comes nearer than its background"
+            )
         self.tone, self.centres = np.mean(colours, axis=0), np.array(centres)
         self.cutout = lru_cache(maxsize=_SAMPLED)(self._cutout)
 
@@ -205,16 +242,21 @@ class Cutouts:
         return np.asarray((frame.depth > 0) & (frame.depth < self._background - least))
 
     def _depth(self, frame: Frame, mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-        return _smoothed(_filled(np.where(self._nearer(frame) & mask, frame.depth, 0).astype(np.float32)))
+        return _smoothed(
+            _filled(np.where(self._nearer(frame) & mask, frame.depth, 0).astype(np.float32))
+        )
 
 
 def _background(people: Sequence) -> Array:
     """Depth ``[H, W]``: the median of what is as far as the farthest tenth of a pixel's measurements; 0 without any."""
-    sampled = np.linspace(0, len(people) - 1, min(len(people), _BACKGROUND_FRAMES)).astype(int).tolist()
+    sampled = (
+        np.linspace(0, len(people) - 1, min(len(people), _BACKGROUND_FRAMES)).astype(int).tolist()
+    )
     blocks = []
     for depths in np.array_split(np.stack([people[i].depth for i in sampled]), _BLOCKS, axis=1):
         measured = np.where(depths > 0, depths, np.nan)
-        measured[:, ~(depths > 0).any(axis=0)] = 0  # never measured: nobody is told from what is behind
+        # never measured: nobody is told from what is behind
+        measured[:, ~(depths > 0).any(axis=0)] = 0
         farthest = np.nanquantile(measured, 0.9, axis=0)
         blocks.append(np.nanmedian(np.where(measured >= 0.97 * farthest, measured, np.nan), axis=0))
     return np.concatenate(blocks)
@@ -233,14 +275,16 @@ def _person(nearer: NDArray[np.bool_], rgb: NDArray[np.uint8]) -> NDArray[np.boo
     trimap[region > 0] = cv2.GC_PR_FGD
     trimap[cv2.erode(region, _DISC, iterations=2) > 0] = cv2.GC_FGD
     cv2.setRNGSeed(0)
-    models, image = (np.zeros((1, 65)), np.zeros((1, 65))), np.ascontiguousarray(rgb[..., ::-1])
+    models = (np.zeros((1, 65)), np.zeros((1, 65)))
+    image = np.ascontiguousarray(rgb[..., ::-1])
     cv2.grabCut(image, trimap, (0, 0, 1, 1), *models, 2, cv2.GC_INIT_WITH_MASK)
     return np.isin(trimap, (cv2.GC_FGD, cv2.GC_PR_FGD))
 
 
 def _filled(depth: NDArray[np.float32]) -> NDArray[np.float32]:
     """Depth everywhere: where it is 0, that of the nearest pixel that has one; 0 where none has."""
-    empty, by_pixel = (depth == 0).astype(np.uint8), cv2.DIST_LABEL_PIXEL
+    empty = (depth == 0).astype(np.uint8)
+    by_pixel = cv2.DIST_LABEL_PIXEL
     _, labels = cv2.distanceTransformWithLabels(empty, cv2.DIST_L2, 5, labelType=by_pixel)
     values = np.zeros(labels.max() + 1, np.float32)
     values[labels[depth > 0]] = depth[depth > 0]
@@ -273,12 +317,20 @@ class _Actor:
     """
 
     def __init__(
-        self, cutouts: Cutouts, fps: float, host: Sequence, T_world_cam: Array, rng: np.random.Generator
+        self,
+        cutouts: Cutouts,
+        fps: float,
+        host: Sequence,
+        T_world_cam: Array,
+        rng: np.random.Generator,
     ) -> None:
-        self.cutouts, self.T_world_cam = cutouts, T_world_cam
-        seconds, last = host.timestamps - host.timestamps[0], len(cutouts.centres) - 1
+        self.cutouts = cutouts
+        self.T_world_cam = T_world_cam
+        seconds = host.timestamps - host.timestamps[0]
+        last = len(cutouts.centres) - 1
         place = np.mod(rng.uniform(0, last) + fps * seconds, 2 * max(last, 1))
-        self.played = np.minimum(place, np.maximum(2 * last - place, 0))  # forth and back; between two cutouts, too
+        # forth and back; between two cutouts, too
+        self.played = np.minimum(place, np.maximum(2 * last - place, 0))
         turn = Rotation.from_rotvec([0, np.deg2rad(rng.uniform(-15, 15)), 0]).as_matrix()
         self.turned = turn @ np.diag([rng.choice([-1.0, 1.0]), 1.0, 1.0])
         self.T_world_people = np.eye(4)
@@ -287,14 +339,19 @@ class _Actor:
     def _place(self, host: Sequence, rng: np.random.Generator) -> None:
         """Choose the best of some drawn places.
 
-        A person is upright in the host's first image and has the size there of one at the drawn distance. Where this
-        place lies behind or in the host's surfaces, the person is brought nearer and made smaller in proportion.
+        A person is upright in the host's first image and has the size there of one at the drawn
+        distance. Where this place lies behind or in the host's surfaces, the person is brought
+        nearer and made smaller in proportion.
         """
         small = host.camera.resized(host.camera.width // _REDUCED, host.camera.height // _REDUCED)
         sampled = np.linspace(0, len(host) - 1, _SAMPLED).astype(int).tolist()
-        behind = [_filled(host[i].depth[::_REDUCED, ::_REDUCED][: small.height, : small.width]) for i in sampled]
+        behind = [
+            _filled(host[i].depth[::_REDUCED, ::_REDUCED][: small.height, : small.width])
+            for i in sampled
+        ]
         centres = self.cutouts.centres[self.played.astype(int)]
-        best, least = self.T_world_people, np.inf
+        best = self.T_world_people
+        least = np.inf
         for _ in range(_PLACES):
             distance_m = rng.uniform(*_DISTANCES_M)
             target = distance_m * np.array([rng.uniform(-0.3, 0.3), rng.uniform(-0.1, 0.2), 1.0])
@@ -302,13 +359,19 @@ class _Actor:
                 shift = scale * (target - self.turned @ np.median(centres, axis=0))
                 T_start_people = se3.from_matrix(shift, scale * self.turned)
                 self.T_world_people = self.T_world_cam[0] @ T_start_people
-                shares, hidden = [], []
+                shares = []
+                hidden = []
                 for i, depth in zip(sampled, behind, strict=True):
                     _, z = self.draw(i, small, upsampled=1)
                     shares.append(((z > 0) & (z < depth)).mean())
                     hidden.append(((z > 0) & ((z > depth - _GAP_M) | (z < _NEAREST_M))).mean())
-                share, lost = float(np.mean(shares)), float(np.mean(hidden))
-                cost = 10 * max(_SHARES[0] - share, share - _SHARES[1], 0.0) + lost / max(share, 1e-3) - 0.05 * scale
+                share = float(np.mean(shares))
+                lost = float(np.mean(hidden))
+                cost = (
+                    10 * max(_SHARES[0] - share, share - _SHARES[1], 0.0)
+                    + lost / max(share, 1e-3)
+                    - 0.05 * scale
+                )
                 best, least = (self.T_world_people, cost) if cost < least else (best, least)
         self.T_world_people = best
 
@@ -324,7 +387,8 @@ class _Actor:
             camera: Of the image.
             upsampled: By how much the cutout's resolution is increased.
         """
-        at, cutouts = self.played[index], self.cutouts
+        at = self.played[index]
+        cutouts = self.cutouts
         now, after = (min(int(at) + step, len(cutouts.centres) - 1) for step in (0, 1))
         rgb, pixels, depth = _upsampled(cutouts.cutout(now), upsampled)
         step_m = (at - now) * (cutouts.centres[after] - cutouts.centres[now])
@@ -337,7 +401,8 @@ class _Actor:
             & (at_pixels >= 0).all(axis=1)
             & (at_pixels < (camera.width, camera.height)).all(axis=1)
         )
-        order = np.flatnonzero(visible)[np.argsort(-points[visible, 2])]  # the nearest is written last
+        # the nearest is written last
+        order = np.flatnonzero(visible)[np.argsort(-points[visible, 2])]
         columns, rows = at_pixels[order].T
         z = np.zeros((camera.height, camera.width), np.float32)
         colour = np.zeros((*z.shape, 3), np.float32)
@@ -352,20 +417,28 @@ def _nearest(
     depths = np.stack([np.where(z > 0, z, np.inf) for _, z in drawn])
     who = depths.argmin(axis=0)[None]
     z = np.take_along_axis(depths, who, axis=0)[0]
-    colour = np.take_along_axis(np.stack([colours for colours, _ in drawn]), who[..., None], axis=0)[0]
+    colour = np.take_along_axis(
+        np.stack([colours for colours, _ in drawn]), who[..., None], axis=0
+    )[0]
     return colour, np.where(np.isfinite(z), z, 0).astype(np.float32), who[0] + 1
 
 
-def _upsampled(cutout: Cutout, times: int) -> tuple[NDArray[np.float32], Array, NDArray[np.float32]]:
+def _upsampled(
+    cutout: Cutout, times: int
+) -> tuple[NDArray[np.float32], Array, NDArray[np.float32]]:
     """Colours ``[N, 3]``, pixels ``[N, 2]`` and depths ``[N]`` of a cutout at several times its resolution."""
     rgb, depth, person = cutout
     rows, columns = np.nonzero(person)
-    top, left = max(rows.min() - 1, 0), max(columns.min() - 1, 0)
+    top = max(rows.min() - 1, 0)
+    left = max(columns.min() - 1, 0)
     part = np.s_[top : rows.max() + 2, left : columns.max() + 2]
-    mask, depth = person[part].astype(np.float32), depth[part]
+    mask = person[part].astype(np.float32)
+    depth = depth[part]
     size = (times * mask.shape[1], times * mask.shape[0])
     weight = cv2.resize(mask, size, interpolation=cv2.INTER_LINEAR)
-    smooth, nearest = (cv2.resize(depth, size, interpolation=way) for way in (cv2.INTER_LINEAR, cv2.INTER_NEAREST))
+    smooth, nearest = (
+        cv2.resize(depth, size, interpolation=way) for way in (cv2.INTER_LINEAR, cv2.INTER_NEAREST)
+    )
     edge = (cv2.dilate(depth, _SQUARE) - cv2.erode(depth, _SQUARE) > _EDGE_M).astype(np.uint8)
     stepped = cv2.resize(edge, size, interpolation=cv2.INTER_NEAREST) > 0
     colours = cv2.resize(rgb[part].astype(np.float32), size, interpolation=cv2.INTER_CUBIC)
@@ -374,7 +447,9 @@ def _upsampled(cutout: Cutout, times: int) -> tuple[NDArray[np.float32], Array, 
     return colours[inside].clip(0, 255), pixels, np.where(stepped, nearest, smooth)[inside]
 
 
-def _closed(colour: NDArray[np.float32], z: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _closed(
+    colour: NDArray[np.float32], z: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The same without the small holes between drawn points, which get the mean of their neighbours."""
     drawn = (z > 0).astype(np.float32)
     whole = cv2.morphologyEx(drawn, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
@@ -396,7 +471,8 @@ def paste(
 
     Args:
         rgb: The host's colours, uint8 ``[H, W, 3]``.
-        depth: Its depth in metres ``[H, W]``, 0 where there is none: it is taken for that of the nearest measurement.
+        depth: Its depth in metres ``[H, W]``, 0 where there is none: it is taken for that of the
+            nearest measurement.
         colour: The people's colours ``[H, W, 3]``.
         z: Their depth in metres ``[H, W]``, 0 where nobody is.
         camera: The host's.
@@ -422,7 +498,8 @@ def _shadow(
 ) -> NDArray[np.bool_]:
     """What a projector to the right of the depth camera does not light, because the person stands in its way."""
     scale = camera.fx * _SHADOW_BASELINE_M
-    ahead, back = np.where(shown, scale / np.maximum(z, 0.1), 0), scale / np.maximum(behind, 0.1)
+    ahead = np.where(shown, scale / np.maximum(z, 0.1), 0)
+    back = scale / np.maximum(behind, 0.1)
     dark = np.zeros_like(shown)
     for shift in range(1, _FURTHEST_SHADOW_PX):
         dark[:, :-shift] |= ahead[:, shift:] - back[:, :-shift] > shift

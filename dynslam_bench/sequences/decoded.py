@@ -9,7 +9,14 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, Sequence
-from dynslam_bench.core import STAGES_VARIABLE, DynslamError, SequenceError, raising, replacing, turn
+from dynslam_bench.core import (
+    STAGES_VARIABLE,
+    DynslamError,
+    SequenceError,
+    raising,
+    replacing,
+    turn,
+)
 from dynslam_bench.core.fingerprint import opencv_version
 from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, module_graph
 from dynslam_bench.core.records import digest
@@ -20,14 +27,17 @@ from dynslam_bench.sequences.view import Wrapped, part_of, reader_of
 class Decoded(Wrapped):
     """A sequence whose frames are read from memory; their arrays cannot be written.
 
-    The file is found by the digest of the frames' content. Of several processes one decodes, the others wait.
+    The file is found by the digest of the frames' content. Of several processes one decodes, the
+    others wait.
 
     Args:
         base: The sequence, preprocessed and cut to the frames that are needed.
 
     Raises:
-        SequenceError: A frame cannot be decoded, or the frames take more than half of the stage cache.
-        DynslamError: The stage cache cannot be written, e.g. because the disk is full; nothing is left behind.
+        SequenceError: A frame cannot be decoded, or the frames take more than half of the stage
+            cache.
+        DynslamError: The stage cache cannot be written, e.g. because the disk is full; nothing is
+            left behind.
     """
 
     def __init__(self, base: Sequence) -> None:
@@ -45,14 +55,21 @@ class Decoded(Wrapped):
 
 def _mapped(sequence: Sequence) -> NDArray[np.void]:
     """The frames as a mapped array of records ``rgb`` and ``depth``, which is written if it is not there or damaged."""
-    cache, part = StageCache(), part_of(sequence)
+    cache = StageCache()
+    part = part_of(sequence)
     code = [
-        module_graph().digest([reader_of(sequence), f"{PACKAGE}.sequences.preprocessing"], PLUMBING),
+        module_graph().digest(
+            [reader_of(sequence), f"{PACKAGE}.sequences.preprocessing"], PLUMBING
+        ),
         opencv_version(),
     ]
-    path = cache.path("frames", digest([sequence.digest(), part.start, part.stop, part.stride, code]), ".npy")
+    path = cache.path(
+        "frames", digest([sequence.digest(), part.start, part.stop, part.stride, code]), ".npy"
+    )
     if (frames := _read(path)) is None:
-        with raising(DynslamError, f"cannot write the stage cache {cache.folder}", f"set {STAGES_VARIABLE}"):
+        with raising(
+            DynslamError, f"cannot write the stage cache {cache.folder}", f"set {STAGES_VARIABLE}"
+        ):
             path.parent.mkdir(parents=True, exist_ok=True)
         with turn(path.with_suffix(".lock")):
             if (frames := _read(path)) is None:
@@ -84,11 +101,20 @@ def _write(sequence: Sequence, path: Path, max_bytes: int) -> None:
         )
     fault = f"cannot write the {count / 1e6:.0f} MB of decoded frames of '{sequence.id}' to {path.parent}"
     hint = f"free some space, or name another folder by {STAGES_VARIABLE}"
-    with raising(DynslamError, fault, hint), replacing(path) as temporary, temporary.open("wb") as file:
-        header = {"descr": npy.dtype_to_descr(kind), "fortran_order": False, "shape": (len(sequence),)}
+    with (
+        raising(DynslamError, fault, hint),
+        replacing(path) as temporary,
+        temporary.open("wb") as file,
+    ):
+        header = {
+            "descr": npy.dtype_to_descr(kind),
+            "fortran_order": False,
+            "shape": (len(sequence),),
+        }
         npy.write_array_header_2_0(file, header)
         record = np.zeros((), kind)
         for index in range(len(sequence)):
             frame = sequence[index]
-            record["rgb"], record["depth"] = frame.rgb, frame.depth
+            record["rgb"] = frame.rgb
+            record["depth"] = frame.depth
             file.write(record.tobytes())

@@ -1,8 +1,9 @@
 """How many raw units of a recording's depth make a metre of its ground truth, with a 95 % interval.
 
-Between two frames the truth gives the rotation, the corners and their depth give the translation. Its length is
-compared with the true one. What else can lie between the two is estimated along: a lever arm, the turn of axes, a shift
-in time, and the readout of a rolling shutter, each within what published recordings show.
+Between two frames the truth gives the rotation, the corners and their depth give the translation.
+Its length is compared with the true one. What else can lie between the two is estimated along: a
+lever arm, the turn of axes, a shift in time, and the readout of a rolling shutter, each within what
+published recordings show.
 """
 
 from dataclasses import dataclass
@@ -16,12 +17,14 @@ from dynslam_bench.sequences.rgbd_motion import RgbdPair, TruthMotion
 ROTATION_SIGMA = np.radians(0.1)
 """Standard deviation of the truth's rotation between two frames.
 
-Of 0.05, 0.1, 0.2 degrees and no bound, 0.1 gives translations with the least errors on Bonn, fr1_xyz and fr1_rpy."""
+Of 0.05, 0.1, 0.2 degrees and no bound, 0.1 gives translations with the least errors on Bonn,
+fr1_xyz and fr1_rpy."""
 LEVER_SIGMA_M = 0.02
 """Bonn's camera is 0.019 m from its markers."""
 TURN_SIGMA = np.radians(2.0)
 SHIFT_SIGMA_S = 0.01
-READOUT_S, READOUT_SIGMA_S = 0.013, 0.013
+READOUT_S = 0.013
+READOUT_SIGMA_S = 0.013
 """Mean and standard deviation of a readout that the camera does not state: from a global shutter to most of a frame."""
 STATED_READOUT_SIGMA_S = 0.005
 SYSTEMATIC = 0.03
@@ -61,7 +64,12 @@ class DepthScale:
 
 
 def depth_scale(
-    pairs: list[RgbdPair], truth: TruthMotion, start: Array, end: Array, camera: Camera, first_guess: float
+    pairs: list[RgbdPair],
+    truth: TruthMotion,
+    start: Array,
+    end: Array,
+    camera: Camera,
+    first_guess: float,
 ) -> DepthScale | None:
     """Estimate the scale of the depth images.
 
@@ -119,12 +127,18 @@ def depth_scale(
 
 
 def translation_of(
-    pair: RgbdPair, T_true: Array, rates: tuple[Array, Array], camera: Camera, readout_s: float, first_guess: float
+    pair: RgbdPair,
+    T_true: Array,
+    rates: tuple[Array, Array],
+    camera: Camera,
+    readout_s: float,
+    first_guess: float,
 ) -> Array:
     """Translation ``[3]`` from the first camera to the second, in metres of the depth images.
 
-    A robust least-squares fit of the reprojection errors of all corners that were followed, not only of those on which
-    most agree: these may lie on people. It begins at the true motion, and the rotation stays near the true one.
+    A robust least-squares fit of the reprojection errors of all corners that were followed, not
+    only of those on which most agree: these may lie on people. It begins at the true motion, and
+    the rotation stays near the true one.
 
     Args:
         pair: The pair of frames.
@@ -176,7 +190,9 @@ def _turning_rates(truth: TruthMotion, stamps: Array) -> Array:
     return truth.between(stamps - _RATE_S, stamps + _RATE_S)[2] / (2 * _RATE_S)
 
 
-def _at_middle_row(points: Array, pixels: Array, rate: Array, camera: Camera, readout_s: float) -> Array:
+def _at_middle_row(
+    points: Array, pixels: Array, rate: Array, camera: Camera, readout_s: float
+) -> Array:
     """Points ``[N, 3]`` in the camera at the time of its middle row, which it saw at the times of their rows."""
     late = ((pixels[:, 1] + 0.5) / camera.height - 0.5) * readout_s
     return np.asarray(np.einsum("nij,nj->ni", _rotation(late[:, None] * rate), points))
@@ -195,7 +211,8 @@ def _regression(columns: Array, measured: Array, scaled: Array, fixed: Array) ->
     Args:
         columns: What the translations consist of.
         measured: The translations.
-        scaled: Standard deviations ``[K]`` about 0 of the other columns' factors, as multiples of the scale.
+        scaled: Standard deviations ``[K]`` about 0 of the other columns' factors, as multiples of
+            the scale.
         fixed: Standard deviations that do not depend on the scale; 0 in both: no bound.
     """
     lengths = np.linalg.norm(measured, axis=1)
@@ -212,10 +229,12 @@ def _regression(columns: Array, measured: Array, scaled: Array, fixed: Array) ->
         factors = np.linalg.solve(normals.sum(axis=0) + prior, pulls.sum(axis=0))
         scale = max(float(factors[0]), 1e-3)
         off = np.linalg.norm(measured - columns @ factors, axis=1)
-        sigma = max(float(np.median(off)) / 1.54, 1e-4)  # 1.54: median length of a normal vector in space
+        # 1.54: median length of a normal vector in space
+        sigma = max(float(np.median(off)) / 1.54, 1e-4)
         weight = 1 / (1 + (off / sigma / CAUCHY) ** 2)
 
-    # The variance: of the scale without one block after the other, and of what the bounds leave open.
+    # The variance: of the scale without one block after the other, and of what the bounds leave
+    # open.
     blocks = np.arange(len(measured)) // BLOCK
     count = int(blocks[-1]) + 1
     parts = []
@@ -228,5 +247,9 @@ def _regression(columns: Array, measured: Array, scaled: Array, fixed: Array) ->
     jackknife = (count - 1) / count * float(((without - without.mean()) ** 2).sum())
     left_open = float((inverse @ prior @ inverse)[0, 0])
     variance = max(jackknife + left_open, float(inverse[0, 0]))
-    half = float(np.hypot(student.ppf(0.975, count - 1) * np.sqrt(variance), 1.96 * SYSTEMATIC * factors[0]))
-    return DepthScale(float(factors[0]), max(float(factors[0]) - half, 0.0), max(float(factors[0]) + half, 0.0))
+    half = float(
+        np.hypot(student.ppf(0.975, count - 1) * np.sqrt(variance), 1.96 * SYSTEMATIC * factors[0])
+    )
+    return DepthScale(
+        float(factors[0]), max(float(factors[0]) - half, 0.0), max(float(factors[0]) + half, 0.0)
+    )

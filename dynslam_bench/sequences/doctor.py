@@ -110,7 +110,10 @@ def diagnose(
 
 
 def examine(
-    sequence: Sequence, *, most_frames: int = MOST_FRAMES, progress: Progress = lambda done, total: None
+    sequence: Sequence,
+    *,
+    most_frames: int = MOST_FRAMES,
+    progress: Progress = lambda done, total: None,
 ) -> Diagnosis:
     """The same of an opened sequence.
 
@@ -120,10 +123,12 @@ def examine(
         progress: Called with the frames done and the frames to do.
     """
     indices = [range(*stretch) for stretch in stretches(len(sequence), most_frames)]
-    done, todo = 0, sum(map(len, indices))
+    done = 0
+    todo = sum(map(len, indices))
     interval_s = np.median(np.diff(sequence.timestamps)) if len(sequence) > 1 else 1 / 30
     streams = Streams(sequence.camera.written_depth_factor, float(interval_s))
-    pairs, unreadable = list[RgbdPair](), list[str]()
+    pairs = list[RgbdPair]()
+    unreadable = list[str]()
     with_depth = bool(getattr(sequence, "has_depth", True))
     for stretch in indices:
         frames = []
@@ -137,14 +142,22 @@ def examine(
         if frames:
             streams.add(frames)
             pairs += rgbd_pairs(frames, sequence.camera) if with_depth else ()
-    findings = [finding_of("unreadable", len(unreadable), todo=todo, first=unreadable[0])] if unreadable else []
+    findings = (
+        [finding_of("unreadable", len(unreadable), todo=todo, first=unreadable[0])]
+        if unreadable
+        else []
+    )
     if streams.frames:
         findings += [finding_of("too-short", streams.frames)] if streams.frames < FEWEST else []
         in_streams = stream_findings(streams, with_depth)
         findings += in_streams
         if streams.frames >= FEWEST and not any(map(is_fault, in_streams)):
-            findings += truth_findings(sequence.timestamps, sequence.ground_truth, sequence.camera, pairs)
-    return Diagnosis(sequence.id, streams.frames, tuple(sorted(findings, key=is_fault, reverse=True)))
+            findings += truth_findings(
+                sequence.timestamps, sequence.ground_truth, sequence.camera, pairs
+            )
+    return Diagnosis(
+        sequence.id, streams.frames, tuple(sorted(findings, key=is_fault, reverse=True))
+    )
 
 
 def stretches(frames: int, most: int) -> list[tuple[int, int]]:
@@ -158,14 +171,23 @@ def stretches(frames: int, most: int) -> list[tuple[int, int]]:
 
 def _unopened(error: Exception) -> Finding:
     """Why a recording cannot be opened: no depth, or depth of another size or form; the rest is said as it is."""
-    text, cure = _message(error), getattr(error, "hint", "")
+    text = _message(error)
+    cure = getattr(error, "hint", "")
     other_size = re.search(r"is (\d+)x(\d+), but its colour image is (\d+)x(\d+)", text)
     if other_size:
         columns, rows, width, height = map(int, other_size.groups())
-        return finding_of("depth-size", columns / width, columns=columns, rows=rows, width=width, height=height)
+        return finding_of(
+            "depth-size", columns / width, columns=columns, rows=rows, width=width, height=height
+        )
     cases = {"nor a folder depth$": "no-depth/opening", "^depth image ": "depth-format"}
-    case = next((case for pattern, case in cases.items() if re.search(pattern, text)), "unreadable/opening")
-    usual = RESAVE if isinstance(error, TrajectoryError) else "docs/reference/sequences.md says what a folder holds"
+    case = next(
+        (case for pattern, case in cases.items() if re.search(pattern, text)), "unreadable/opening"
+    )
+    usual = (
+        RESAVE
+        if isinstance(error, TrajectoryError)
+        else "docs/reference/sequences.md says what a folder holds"
+    )
     return finding_of(case, None, text=text, cure=cure or usual)
 
 
@@ -174,11 +196,12 @@ def _message(error: Exception) -> str:
     return " ".join(str(error.args[0] if error.args else error).split())
 
 
-# Do the colour and depth images of a recording fit together? Statistics of single frames and of short stretches.
+# Do the colour and depth images of a recording fit together? Statistics of single frames and of
+# short stretches.
 #
-# Contours of depth are contours in the colour image, too, at the same place and time. Their correlation over shifts,
-# mirrorings and delays says whether the depth is registered, which way up the images are, and whether the two streams
-# are synchronous.
+# Contours of depth are contours in the colour image, too, at the same place and time. Their
+# correlation over shifts, mirrorings and delays says whether the depth is registered, which way up
+# the images are, and whether the two streams are synchronous.
 
 
 Severity = Literal["fault", "note"]
@@ -190,7 +213,8 @@ class Finding:
 
     Attributes:
         id: Stable name, for example ``truth-time-shift``.
-        severity: ``fault``: results on the recording are wrong until it is mended; ``note``: good to know.
+        severity: ``fault``: results on the recording are wrong until it is mended; ``note``: good
+            to know.
         value: The measured number; None where nothing is measured.
         unit: Its unit, for example ``s``; empty for a ratio or where nothing is measured.
         text: One line that says what was measured.
@@ -205,7 +229,9 @@ class Finding:
     cure: str
 
 
-RESAVE = "write each line of groundtruth.txt as: timestamp tx ty tz qx qy qz qw, camera to world, metres"
+RESAVE = (
+    "write each line of groundtruth.txt as: timestamp tx ty tz qx qy qz qw, camera to world, metres"
+)
 _SO = "so they explain {then:.0f} % of the images' motion, as stored {now:.0f} %"
 _FINDINGS: dict[str, tuple[str, str, str]] = {
     "unreadable": (
@@ -224,7 +250,11 @@ _FINDINGS: dict[str, tuple[str, str, str]] = {
         "the sequence has no depth images: only the colour images were checked",
         "add depth images to check more",
     ),
-    "no-depth/opening": ("", "{text}", "record or export depth images: a folder is read only with depth"),
+    "no-depth/opening": (
+        "",
+        "{text}",
+        "record or export depth images: a folder is read only with depth",
+    ),
     "depth-format": ("", "{text}", "{cure}"),
     "depth-size": (
         "",
@@ -322,7 +352,11 @@ _FINDINGS: dict[str, tuple[str, str, str]] = {
         "the camera rests (the image moves by {value:.1f} pixels): truth and intrinsics cannot be compared",
         "check a part in which the camera moves",
     ),
-    "truth-inverted": ("", f"the poses are world-to-camera: {_SO}", "invert them: p -> -R^T p, R -> R^T"),
+    "truth-inverted": (
+        "",
+        f"the poses are world-to-camera: {_SO}",
+        "invert them: p -> -R^T p, R -> R^T",
+    ),
     "truth-inverted/rotations": (
         "",
         f"the rotations are world-to-camera while the positions are the camera's: {_SO}",
@@ -442,7 +476,14 @@ _FINDINGS: dict[str, tuple[str, str, str]] = {
 """Unit, text and cure of every finding, by its id and, where an id has several texts, what it was found by."""
 
 
-_NOT_COMPARED = {"too-short", "no-depth", "no-truth", "motion-unmeasured", "no-motion", "truth-unclear"}
+_NOT_COMPARED = {
+    "too-short",
+    "no-depth",
+    "no-truth",
+    "motion-unmeasured",
+    "no-motion",
+    "truth-unclear",
+}
 """Notes on a truth that was not compared."""
 _NOTES = {
     *_NOT_COMPARED,
@@ -464,7 +505,9 @@ def finding_of(case: str, value: float | None, **facts: Any) -> Finding:
     facts = {"value": value, **facts}
     severity: Severity = "note" if case in _NOTES else "fault"
     number = None if value is None else float(value)
-    return Finding(case.partition("/")[0], severity, number, unit, text.format(**facts), cure.format(**facts))
+    return Finding(
+        case.partition("/")[0], severity, number, unit, text.format(**facts), cure.format(**facts)
+    )
 
 
 def is_fault(finding: Finding) -> bool:
@@ -493,8 +536,10 @@ class Streams:
         medians: Median depth of each frame that has any, metres.
         colour_run: Most equal colour images in a row.
         depth_run: Most equal depth images in a row.
-        rough: Median step between neighbouring raw depths relative to the depth, and the same with swapped bytes.
-        contours: Of each stretch the maps of contours of its colour and of its depth images, both ``[N, H, W]``.
+        rough: Median step between neighbouring raw depths relative to the depth, and the same with
+            swapped bytes.
+        contours: Of each stretch the maps of contours of its colour and of its depth images, both
+            ``[N, H, W]``.
         cell_px: Pixels a cell of the maps.
     """
 
@@ -516,25 +561,39 @@ class Streams:
 
     def add(self, stretch: list[Frame]) -> None:
         """Add consecutive frames of one size."""
-        grays = [np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8) for frame in stretch]
+        grays = [
+            np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8) for frame in stretch
+        ]
         depths = [frame.depth for frame in stretch]
         measured = [depth[::4, ::4][depth[::4, ::4] > 0] for depth in depths]
         deep = [len(values) >= 100 for values in measured]
         self.dark += sum(bool(gray.std() < 1.0) for gray in grays)
         self.empty += deep.count(False)
-        self.medians += [float(np.median(values)) for values, enough in zip(measured, deep, strict=True) if enough]
-        self.rough += [_roughness(depths[i], self.depth_factor) for i in range(0, len(stretch), 5) if deep[i]]
+        self.medians += [
+            float(np.median(values))
+            for values, enough in zip(measured, deep, strict=True)
+            if enough
+        ]
+        self.rough += [
+            _roughness(depths[i], self.depth_factor) for i in range(0, len(stretch), 5) if deep[i]
+        ]
         self.colour_run = max(self.colour_run, _longest_run([frame.rgb for frame in stretch]))
         self.depth_run = max(self.depth_run, _longest_run(depths))
         self.cell_px = max(1, round(stretch[0].rgb.shape[1] / MAP_WIDTH))
-        colour_maps = np.stack([_standardised(_colour_contours(gray, self.cell_px)) for gray in grays])
-        depth_maps = np.stack([_standardised(_depth_contours(depth, self.cell_px)) for depth in depths])
+        colour_maps = np.stack(
+            [_standardised(_colour_contours(gray, self.cell_px)) for gray in grays]
+        )
+        depth_maps = np.stack(
+            [_standardised(_depth_contours(depth, self.cell_px)) for depth in depths]
+        )
         self.contours.append((colour_maps, depth_maps))
 
 
 def _longest_run(images: list[NDArray[Any]]) -> int:
     """Most equal images in a row."""
-    repeated = itertools.groupby(np.array_equal(before, after) for before, after in itertools.pairwise(images))
+    repeated = itertools.groupby(
+        np.array_equal(before, after) for before, after in itertools.pairwise(images)
+    )
     return 1 + max((len([*run]) for equal, run in repeated if equal), default=0)
 
 
@@ -551,9 +610,11 @@ def _by_delay(streams: Streams, delays: range) -> tuple[Map, NDArray[np.intp]]:
         Sums over all pairs ``[D, H, W]``, and how many pairs each sums ``[D]``.
     """
     shape = streams.contours[0][0].shape[1:]
-    surfaces, pairs = np.zeros((len(delays), *shape), np.float32), np.zeros(len(delays), np.intp)
+    surfaces = np.zeros((len(delays), *shape), np.float32)
+    pairs = np.zeros(len(delays), np.intp)
     for colour, depth in streams.contours:
-        colours, depths = np.fft.rfft2(colour), np.conj(np.fft.rfft2(depth))
+        colours = np.fft.rfft2(colour)
+        depths = np.conj(np.fft.rfft2(depth))
         for row, delay in enumerate(delays):
             index = np.arange(0, len(colour), 2)
             index = index[(index + delay >= 0) & (index + delay < len(depth))]
@@ -569,22 +630,31 @@ def _roughness(depth: Map, factor: float) -> tuple[float, float]:
     if both.sum() < 100:
         return np.nan, np.nan
     wide = np.stack([raw, raw.byteswap()]).astype(np.float64)
-    steps = np.minimum(np.abs(np.diff(wide, axis=2)) / np.maximum(wide[:, :, 1:], 1), 1)[:, both].mean(axis=1)
+    steps = np.minimum(np.abs(np.diff(wide, axis=2)) / np.maximum(wide[:, :, 1:], 1), 1)[
+        :, both
+    ].mean(axis=1)
     return float(steps[0]), float(steps[1])
 
 
 def _colour_contours(gray: NDArray[np.uint8], cell: int) -> Map:
-    small = cv2.resize(gray, (gray.shape[1] // cell, gray.shape[0] // cell), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(
+        gray, (gray.shape[1] // cell, gray.shape[0] // cell), interpolation=cv2.INTER_AREA
+    )
     wide = small.astype(np.float32)
-    return np.asarray(np.sqrt(np.hypot(cv2.Sobel(wide, -1, 1, 0), cv2.Sobel(wide, -1, 0, 1))), np.float32)
+    return np.asarray(
+        np.sqrt(np.hypot(cv2.Sobel(wide, -1, 1, 0), cv2.Sobel(wide, -1, 0, 1))), np.float32
+    )
 
 
 def _depth_contours(depth: Map, cell: int) -> Map:
     """The step in depth around each cell, as a logarithm; missing depth is no contour."""
-    rows, columns = depth.shape[0] // cell, depth.shape[1] // cell
+    rows = depth.shape[0] // cell
+    columns = depth.shape[1] // cell
     blocks = depth[: rows * cell, : columns * cell].reshape(rows, cell, columns, cell)
-    around, least = np.ones((3, 3), np.uint8), np.where(blocks > 0, blocks, np.inf).min(axis=(1, 3))
-    far, near = cv2.dilate(blocks.max(axis=(1, 3)), around), cv2.erode(least.astype(np.float32), around)
+    around = np.ones((3, 3), np.uint8)
+    least = np.where(blocks > 0, blocks, np.inf).min(axis=(1, 3))
+    far = cv2.dilate(blocks.max(axis=(1, 3)), around)
+    near = cv2.erode(least.astype(np.float32), around)
     valid = (far > 0) & np.isfinite(near)
     steps = np.log(np.where(valid, far / np.where(valid, near, 1), 1))
     return np.where(valid, np.minimum(steps, 0.3), 0).astype(np.float32)
@@ -616,7 +686,11 @@ def stream_findings(streams: Streams, with_depth: bool = True) -> list[Finding]:
         streams: Statistics of the frames that were read.
         with_depth: Whether the sequence announces depth images.
     """
-    for check in (_empty, _frozen, _swapped, _units, _flipped, _asynchronous, _shifted) if with_depth else (_empty,):
+    for check in (
+        (_empty, _frozen, _swapped, _units, _flipped, _asynchronous, _shifted)
+        if with_depth
+        else (_empty,)
+    ):
         finding = check(streams)
         if finding is not None and (with_depth or finding.id == "colour-blank"):
             return [finding]
@@ -631,10 +705,15 @@ def _empty(streams: Streams) -> Finding | None:
 
 
 def _frozen(streams: Streams) -> Finding | None:
-    colour, depth = streams.colour_run >= FROZEN_FRAMES, streams.depth_run >= FROZEN_FRAMES
+    colour = streams.colour_run >= FROZEN_FRAMES
+    depth = streams.depth_run >= FROZEN_FRAMES
     if colour == depth:  # a rendered camera at rest repeats both; the truth says whether it rests
         return None
-    return finding_of("colour-frozen", streams.colour_run) if colour else finding_of("depth-frozen", streams.depth_run)
+    return (
+        finding_of("colour-frozen", streams.colour_run)
+        if colour
+        else finding_of("depth-frozen", streams.depth_run)
+    )
 
 
 def _swapped(streams: Streams) -> Finding | None:
@@ -645,7 +724,8 @@ def _swapped(streams: Streams) -> Finding | None:
 
 
 def _units(streams: Streams) -> Finding | None:
-    median, factor = float(np.median(streams.medians)), streams.depth_factor
+    median = float(np.median(streams.medians))
+    factor = streams.depth_factor
     if DEPTH_RANGE_M[0] <= median <= DEPTH_RANGE_M[1]:
         return None
     likely = next((usual for usual in USUAL_FACTORS if 0.4 < median * factor / usual < 8), factor)
@@ -655,7 +735,10 @@ def _units(streams: Streams) -> Finding | None:
 def _flipped(streams: Streams) -> Finding | None:
     peaks = {}
     for name, (rows, columns) in FLIPS.items():
-        parts = [_correlation(colour[::4], depth[::4, ::rows, ::columns]) for colour, depth in streams.contours]
+        parts = [
+            _correlation(colour[::4], depth[::4, ::rows, ::columns])
+            for colour, depth in streams.contours
+        ]
         peaks[name] = _peak(np.sum(parts, axis=0), 8)[0]
     best = max(peaks, key=lambda name: peaks[name])
     if best == "" or peaks[best] < CLEAR_PEAK or peaks[best] < 1.4 * peaks[""]:
@@ -668,7 +751,12 @@ def _asynchronous(streams: Streams) -> Finding | None:
     pairs = np.isfinite(rows).sum(axis=0)
     usable = pairs >= max(10, 0.3 * len(rows))
     surfaces, _ = _by_delay(streams, range(-MOST_DELAY, MOST_DELAY + 1))
-    peaks = np.array([_peak(surface, 30)[0] if good else 0.0 for surface, good in zip(surfaces, usable, strict=True)])
+    peaks = np.array(
+        [
+            _peak(surface, 30)[0] if good else 0.0
+            for surface, good in zip(surfaces, usable, strict=True)
+        ]
+    )
     mean = np.where(usable, np.nansum(rows, axis=0) / np.maximum(pairs, 1), -np.inf)
     column = int(np.argmax(mean))
     delay = float(column - MOST_DELAY)
@@ -679,14 +767,28 @@ def _asynchronous(streams: Streams) -> Finding | None:
     better = rows[:, column] - rows[:, reference]
     better = better[np.isfinite(better)]
     sure = float(better.mean() / max(better.std() / np.sqrt(len(better) / 5), 1e-9))
-    if sure < 4 or mean[column] < 1.25 * max(mean[reference], 0) or peaks[column] < 1.1 * peaks[near].max():
+    if (
+        sure < 4
+        or mean[column] < 1.25 * max(mean[reference], 0)
+        or peaks[column] < 1.1 * peaks[near].max()
+    ):
         return None
     around = mean[max(column - 1, 0) : column + 2]
-    if len(around) == 3 and np.isfinite(around).all():  # the vertex of the parabola through the peak
+    # the vertex of the parabola through the peak
+    if len(around) == 3 and np.isfinite(around).all():
         delay += float((around[0] - around[2]) / (2 * (around[0] - 2 * around[1] + around[2])))
-    seconds, better = delay * streams.seconds_a_frame, mean[column] / max(mean[MOST_DELAY], 0.01)
+    seconds = delay * streams.seconds_a_frame
+    better = mean[column] / max(mean[MOST_DELAY], 0.01)
     side, change = ("before", "earlier") if delay > 0 else ("after", "later")
-    return finding_of("depth-delay", seconds, delay=abs(delay), s=abs(seconds), side=side, change=change, better=better)
+    return finding_of(
+        "depth-delay",
+        seconds,
+        delay=abs(delay),
+        s=abs(seconds),
+        side=side,
+        change=change,
+        better=better,
+    )
 
 
 def _agreements(colour_maps: Map, depth_maps: Map) -> NDArray[np.float64]:
@@ -698,9 +800,11 @@ def _agreements(colour_maps: Map, depth_maps: Map) -> NDArray[np.float64]:
         np.stack([cv2.GaussianBlur(contours, (0, 0), 1.0).ravel() for contours in maps])
         for maps in (colour_maps, depth_maps)
     )
-    products, scores = colour @ depth.T, np.full((len(colour), 2 * MOST_DELAY + 1), np.nan)
+    products = colour @ depth.T
+    scores = np.full((len(colour), 2 * MOST_DELAY + 1), np.nan)
     for column, delay in enumerate(range(-MOST_DELAY, MOST_DELAY + 1)):
-        diagonal, first = np.diagonal(products, delay), max(0, -delay)
+        diagonal = np.diagonal(products, delay)
+        first = max(0, -delay)
         scores[first : first + len(diagonal), column] = diagonal
     return scores
 
@@ -711,18 +815,22 @@ def _shifted(streams: Streams) -> Finding | None:
     peaks = [(*_peak(surface, 30), surface) for surface in middle]
     clear, (row, column), surface = max(peaks, key=lambda peak: float(peak[2][peak[1]]))
     shape = middle.shape[1:]
-    down, right = (row + shape[0] // 2) % shape[0] - shape[0] // 2, (column + shape[1] // 2) % shape[1] - shape[1] // 2
+    down = (row + shape[0] // 2) % shape[0] - shape[0] // 2
+    right = (column + shape[1] // 2) % shape[1] - shape[1] // 2
     size = float(np.hypot(down, right)) * streams.cell_px
     rolled = np.roll(middle, (2, 2), (1, 2))[:, :5, :5]
     if size < LEAST_SHIFT_PX or clear < CLEAR_PEAK or surface[row, column] < 1.4 * rolled.max():
         return None
-    return finding_of("depth-not-registered", size, right=-right * streams.cell_px, down=-down * streams.cell_px)
+    return finding_of(
+        "depth-not-registered", size, right=-right * streams.cell_px, down=-down * streams.cell_px
+    )
 
 
 def _peak(surface: Map, reach: int) -> tuple[float, tuple[int, int]]:
     """Height in standard deviations and place of the peak within `reach` cells of no shift."""
     height, width = surface.shape
-    reach_y, reach_x = min(reach, height // 2 - 1), min(reach, width // 2 - 1)
+    reach_y = min(reach, height // 2 - 1)
+    reach_x = min(reach, width // 2 - 1)
     near = np.roll(surface, (reach_y, reach_x), (0, 1))[: 2 * reach_y + 1, : 2 * reach_x + 1]
     y, x = np.unravel_index(int(near.argmax()), near.shape)
     deviation = (float(near[y, x]) - float(surface.mean())) / max(float(surface.std()), 1e-12)
@@ -731,9 +839,9 @@ def _peak(surface: Map, reach: int) -> tuple[float, tuple[int, int]]:
 
 # Does the ground truth of a recording agree with the motion that its images show?
 #
-# The motion between frames (`rgbd_motion`) is compared with that of the truth: as stored, shifted in time, inverted,
-# with its quaternions read in the other order, in other axes. Where the two agree, camera and depth are measured by
-# them.
+# The motion between frames (`rgbd_motion`) is compared with that of the truth: as stored, shifted
+# in time, inverted, with its quaternions read in the other order, in other axes. Where the two
+# agree, camera and depth are measured by them.
 
 total = attrgetter("total")
 
@@ -753,7 +861,8 @@ LEAST_TIME_S = 0.05
 UNRELATED = 0.48
 """The best agreement of a truth of another recording stays below; where moving things fill the view it is 0.55."""
 LEAST_UNLIKE = 12
-LEAST_SHARE, BEYOND_CHANCE = 0.1, 1.3
+LEAST_SHARE = 0.1
+BEYOND_CHANCE = 1.3
 """Share of the corners that a truth of this recording explains at least, also where people fill the view, and its ratio
 to the largest share with the truth's motions in another order: 1.4 and more on 55 recordings."""
 LEAST_UNIT = 30.0
@@ -769,7 +878,9 @@ _MISREAD = {
 }
 
 
-def truth_findings(stamps: Array, truth: Trajectory | None, camera: Camera, pairs: list[RgbdPair]) -> list[Finding]:
+def truth_findings(
+    stamps: Array, truth: Trajectory | None, camera: Camera, pairs: list[RgbdPair]
+) -> list[Finding]:
     """What the truth of a recording does not share with its images, then what camera and depth do not.
 
     Args:
@@ -783,23 +894,42 @@ def truth_findings(stamps: Array, truth: Trajectory | None, camera: Camera, pair
     begin, end = truth.timestamps[[0, -1]]
     apart = max(begin - stamps[-1], stamps[0] - end)
     if apart > 0:
-        return [finding_of("truth-other-sequence/time", apart, begin=begin, end=end, first=stamps[0], last=stamps[-1])]
+        return [
+            finding_of(
+                "truth-other-sequence/time",
+                apart,
+                begin=begin,
+                end=end,
+                first=stamps[0],
+                last=stamps[-1],
+            )
+        ]
     covered = int((nearest_gap(stamps, truth.timestamps) < SAME_FRAME_S).sum())
     if covered < max(LEAST_COVERAGE * len(stamps), 3):
         return [finding_of("truth-sparse", covered, frames=len(stamps), within=SAME_FRAME_S)]
-    usable = [pair for pair in pairs if pair.T_first_second is not None and pair.inliers.mean() >= 0.5]
+    usable = [
+        pair for pair in pairs if pair.T_first_second is not None and pair.inliers.mean() >= 0.5
+    ]
     displacement = float(np.median([pair.displacement_px for pair in usable])) if usable else np.inf
     if displacement < REST_PX and len(usable) >= 3:
         return [_at_rest(TruthMotion(truth), camera, motions_of(usable, stamps), displacement)]
     if len(usable) < LEAST_PAIRS:
         return [finding_of("motion-unmeasured", len(usable), pairs=len(pairs), least=LEAST_PAIRS)]
-    return _compared(stamps, truth, camera, [pair for pair in usable if pair.displacement_px >= REST_PX], len(pairs))
+    return _compared(
+        stamps,
+        truth,
+        camera,
+        [pair for pair in usable if pair.displacement_px >= REST_PX],
+        len(pairs),
+    )
 
 
 def _at_rest(truth: TruthMotion, camera: Camera, motions: Motions, displacement: float) -> Finding:
     """Images that do not move beside a truth that does, or does not either."""
     _, relative, turns, valid = truth.between(motions.start, motions.end)
-    moves = np.linalg.norm(turns, axis=1) + np.linalg.norm(relative[:, :3, 3], axis=1) / motions.depth_m
+    moves = (
+        np.linalg.norm(turns, axis=1) + np.linalg.norm(relative[:, :3, 3], axis=1) / motions.depth_m
+    )
     expected = camera.fx * float(np.median(moves[valid])) if valid.any() else 0.0
     if expected > 10 * REST_PX:
         return finding_of("truth-other-sequence/rest", expected, displacement=displacement)
@@ -818,13 +948,19 @@ def _compared(
     motions = motions_of(pairs, stamps)
     readings = {reading: TruthMotion(truth, reading) for reading in READINGS}
     steps = round(LARGEST_SHIFT_S / _STEP_S)
-    shifts = _STEP_S * np.arange(-steps, steps + 1)  # exact multiples: the same limits early and late
-    every = [match(motions, readings[name], name, float(shift)) for name in READINGS for shift in shifts]
+    # exact multiples: the same limits early and late
+    shifts = _STEP_S * np.arange(-steps, steps + 1)
+    every = [
+        match(motions, readings[name], name, float(shift)) for name in READINGS for shift in shifts
+    ]
     matches = [candidate for candidate in every if candidate.share >= 0.5]
-    near = [one for one in matches if one.reading == READINGS[0] and abs(one.shift_s) < LEAST_TIME_S]
+    near = [
+        one for one in matches if one.reading == READINGS[0] and abs(one.shift_s) < LEAST_TIME_S
+    ]
     if not near or sum(near[0].weights) < 0.4:
         return [finding_of("motion-unmeasured/small", len(pairs))]
-    stated, best = max(near, key=total), max(matches, key=total)
+    stated = max(near, key=total)
+    best = max(matches, key=total)
     unshifted = min(near, key=lambda one: abs(one.shift_s))
     if unshifted.total > stated.total - 0.02:
         stated = unshifted
@@ -835,21 +971,36 @@ def _compared(
             note = finding_of("truth-markers", angle, rig=rig, name=rig.capitalize())
             return [note, *_compared(stamps, in_axes, camera, pairs, tried, {})]
     differs = best.reading != READINGS[0] or abs(best.shift_s) >= LEAST_TIME_S
-    long = len(pairs) >= MANY_PAIRS and float((motions.end - motions.start).sum()) >= 2 * LARGEST_SHIFT_S
+    long = (
+        len(pairs) >= MANY_PAIRS
+        and float((motions.end - motions.start).sum()) >= 2 * LARGEST_SHIFT_S
+    )
     needed = GOOD if long or abs(best.shift_s) < LEAST_TIME_S else SURE
-    now, then = stated.clearest, best.clearest
+    now = stated.clearest
+    then = best.clearest
     if differs and then >= needed and 1 - then < 0.65 * (1 - now) and now < then - 0.05:
-        as_stated = readings[stated.reading].between(motions.start + stated.shift_s, motions.end + stated.shift_s)[1]
-        as_best = readings[best.reading].between(motions.start + best.shift_s, motions.end + best.shift_s)[1]
-        # where people fill the view, another reading may fit their motion, but not that of the background
+        as_stated = readings[stated.reading].between(
+            motions.start + stated.shift_s, motions.end + stated.shift_s
+        )[1]
+        as_best = readings[best.reading].between(
+            motions.start + best.shift_s, motions.end + best.shift_s
+        )[1]
+        # where people fill the view, another reading may fit their motion, but not that of the
+        # background
         if explained_share(pairs, as_best, camera) > explained_share(pairs, as_stated, camera):
-            turned = None if best.reading == READINGS[0] else _turned(motions, readings[READINGS[0]], stated, best)
+            turned = (
+                None
+                if best.reading == READINGS[0]
+                else _turned(motions, readings[READINGS[0]], stated, best)
+            )
             return _misread(motions, readings, stated, best) if turned is None else [turned]
     if stated.rotation >= UNLIKE and stated.weights[0] >= 0.3:
         return _measured(motions, readings[READINGS[0]], stated, camera, pairs)
     share, by_chance = _in_other_orders(motions, readings[READINGS[0]], stated, camera, pairs)
     if share > max(LEAST_SHARE, BEYOND_CHANCE * by_chance):
-        return [finding_of("truth-unclear/moving", share, share=100 * share, by_chance=100 * by_chance)]
+        return [
+            finding_of("truth-unclear/moving", share, share=100 * share, by_chance=100 * by_chance)
+        ]
     return _otherwise(motions, readings, stated, best, tried)
 
 
@@ -861,7 +1012,9 @@ def _in_other_orders(
     Of a truth of another recording all orders explain as much.
     """
     relative = truth.between(motions.start + stated.shift_s, motions.end + stated.shift_s)[1]
-    others = [explained_share(pairs, np.roll(relative, by, axis=0), camera) for by in range(1, len(pairs))]
+    others = [
+        explained_share(pairs, np.roll(relative, by, axis=0), camera) for by in range(1, len(pairs))
+    ]
     return explained_share(pairs, relative, camera), max(others, default=1.0)
 
 
@@ -873,9 +1026,14 @@ def _is_turned(motions: Motions, turned: Trajectory, stated: Match) -> bool:
     return alike >= UNLIKE and 1 - alike < 0.65 * (1 - stated.rotation)
 
 
-def _misread(motions: Motions, readings: dict[str, TruthMotion], stated: Match, best: Match) -> list[Finding]:
+def _misread(
+    motions: Motions, readings: dict[str, TruthMotion], stated: Match, best: Match
+) -> list[Finding]:
     findings = []
-    fine = [match(motions, readings[best.reading], best.reading, best.shift_s + d) for d in np.arange(-5, 6) * 0.005]
+    fine = [
+        match(motions, readings[best.reading], best.reading, best.shift_s + d)
+        for d in np.arange(-5, 6) * 0.005
+    ]
     shift = max(fine, key=total).shift_s
     shares = {"then": 100 * best.clearest, "now": 100 * stated.clearest}
     if best.reading != READINGS[0]:
@@ -894,10 +1052,13 @@ def _otherwise(
     turned = 0.0, np.eye(3)  # the best agreement in other axes of the file as it is, and these axes
     for reading in READINGS[:3]:
         for shift in np.arange(-4, 5) * 0.025 if reading == READINGS[0] else (0.0,):
-            _, _, turns, valid = readings[reading].between(motions.start + shift, motions.end + shift)
+            _, _, turns, valid = readings[reading].between(
+                motions.start + shift, motions.end + shift
+            )
             if valid.mean() < 0.5:
                 continue
-            measured, true = motions.rotation[valid], turns[valid]
+            measured = motions.rotation[valid]
+            true = turns[valid]
             X = rotation_between(measured, true)
             alike = agreement(measured @ X.T, true, ROTATION_GAIN)
             closest = max(closest, alike)
@@ -905,7 +1066,11 @@ def _otherwise(
                 turned = alike, X
     if turned[0] >= GOOD:
         return [_axes(turned[1], turned[0], stated)]
-    enough = stated.weights[0] >= 0.5 and len(motions.start) >= LEAST_UNLIKE and len(motions.start) >= 0.5 * tried
+    enough = (
+        stated.weights[0] >= 0.5
+        and len(motions.start) >= LEAST_UNLIKE
+        and len(motions.start) >= 0.5 * tried
+    )
     if enough and closest < UNRELATED:
         facts = {"share": 100 * closest, "pairs": len(motions.start), "limit": LARGEST_SHIFT_S}
         return [finding_of("truth-other-sequence", closest, **facts)]
@@ -928,15 +1093,22 @@ def _degrees(X: Array) -> float:
 
 
 def _axes(X: Array, alike: float, stated: Match) -> Finding:
-    return finding_of("truth-axes", _degrees(X), then=100 * alike, now=100 * stated.rotation, matrix=_turn(X))
+    return finding_of(
+        "truth-axes", _degrees(X), then=100 * alike, now=100 * stated.rotation, matrix=_turn(X)
+    )
 
 
 def _turn(R_body_cam: Array) -> str:
     """The rotation that gives a truth the camera's axes; one within 20 degrees of swapped axes is written as such."""
     swapped = np.round(R_body_cam)
-    is_rotation = np.array_equal(swapped @ swapped.T, np.eye(3)) and not np.array_equal(swapped, np.eye(3))
+    is_rotation = np.array_equal(swapped @ swapped.T, np.eye(3)) and not np.array_equal(
+        swapped, np.eye(3)
+    )
     near = is_rotation and np.trace(swapped.T @ R_body_cam) > 1 + 2 * np.cos(np.radians(20))
-    rows = [", ".join(f"{value:g}" for value in row) for row in (swapped if near else R_body_cam.round(3)) + 0.0]
+    rows = [
+        ", ".join(f"{value:g}" for value in row)
+        for row in (swapped if near else R_body_cam.round(3)) + 0.0
+    ]
     return "; ".join(rows)
 
 
@@ -947,13 +1119,25 @@ def _measured(
     start = motions.start + stated.shift_s
     end = motions.end + stated.shift_s
     first, relative, turns, valid = truth.between(start, end)
-    size = np.linalg.norm(motions.rotation, axis=1) + np.linalg.norm(turns, axis=1) + 2 * ROTATION_NOISE
+    size = (
+        np.linalg.norm(motions.rotation, axis=1)
+        + np.linalg.norm(turns, axis=1)
+        + 2 * ROTATION_NOISE
+    )
     agreeing = valid & (np.linalg.norm(motions.rotation - turns, axis=1) < 0.5 * size)
     if agreeing.sum() < LEAST_PAIRS:
-        return [finding_of("depth-factor-unmeasured/pairs", agreeing.sum(), pairs=len(pairs), least=LEAST_PAIRS)]
+        return [
+            finding_of(
+                "depth-factor-unmeasured/pairs", agreeing.sum(), pairs=len(pairs), least=LEAST_PAIRS
+            )
+        ]
     if 1 / stated.gain > LEAST_UNIT and 0.15 < motions.depth_m < 20:
         unit, divisor = ("millimetres", 1000) if 1 / stated.gain > 300 else ("centimetres", 100)
-        return [finding_of("truth-scale", 1 / stated.gain, depth_m=motions.depth_m, unit=unit, divisor=divisor)]
+        return [
+            finding_of(
+                "truth-scale", 1 / stated.gain, depth_m=motions.depth_m, unit=unit, divisor=divisor
+            )
+        ]
     used = [pair for pair, use in zip(pairs, agreeing, strict=True) if use]
     relative = relative[agreeing]
     before = fit_camera(used, relative, camera, ())
@@ -963,7 +1147,9 @@ def _measured(
     if explained and best != "scale":
         return [_fitted(best, fits[best], before, camera)]
     if not explained and stated.weights[1] >= 0.4 and stated.translation < UNLIKE:
-        in_other_axes = _positions(motions.translation[agreeing], first[agreeing, :3, :3], relative, stated)
+        in_other_axes = _positions(
+            motions.translation[agreeing], first[agreeing, :3, :3], relative, stated
+        )
         if in_other_axes is not None:
             finding, turned = in_other_axes
             if explained_share(used, turned, camera) > explained_share(used, relative, camera):
@@ -971,7 +1157,11 @@ def _measured(
     first_guess = float(np.exp(-fits["scale"].value["scale"][0]))
     share = float(np.median([pair.depth_share for pair in used]))
     if share < _LEAST_DEPTH:
-        facts = {"percent": 100 * share, "new": first_guess * camera.written_depth_factor, "old": camera.depth_factor}
+        facts = {
+            "percent": 100 * share,
+            "new": first_guess * camera.written_depth_factor,
+            "old": camera.depth_factor,
+        }
         case = "depth-factor/depth" if explained else "depth-factor-unmeasured/depth"
         return [finding_of(case, 1 / first_guess, **facts)]
     scale = depth_scale(used, truth, start[agreeing], end[agreeing], camera, first_guess)
@@ -995,7 +1185,17 @@ def _scale(scale: DepthScale, camera: Camera, *, sure: bool) -> list[Finding]:
         usual = [factor for factor in USUAL_FACTORS if scale.low <= factor / old <= scale.high]
         likely = min(usual, key=lambda factor: abs(np.log(factor / new)), default=new)
         why = ", the usual value within the interval" if usual else ""
-        return [finding_of("depth-factor", 1 / scale.value, new=new, old=old, likely=likely, why=why, **interval)]
+        return [
+            finding_of(
+                "depth-factor",
+                1 / scale.value,
+                new=new,
+                old=old,
+                likely=likely,
+                why=why,
+                **interval,
+            )
+        ]
     if scale.excludes(_LIMITS["scale"]):
         return [finding_of("depth-factor-unmeasured/apart", None, **interval)]
     if scale.high > _WIDEST * scale.low:
@@ -1008,7 +1208,9 @@ def _three_digits(value: float) -> str:
     return f"{float(f'{value:.3g}'):g}"
 
 
-def _positions(steps: Array, R_world_first: Array, relative: Array, stated: Match) -> tuple[Finding, Array] | None:
+def _positions(
+    steps: Array, R_world_first: Array, relative: Array, stated: Match
+) -> tuple[Finding, Array] | None:
     """Positions in other axes than the orientations, or mirrored.
 
     Args:
@@ -1018,7 +1220,8 @@ def _positions(steps: Array, R_world_first: Array, relative: Array, stated: Matc
         stated: How well the truth agrees as it is.
 
     Returns:
-        The finding, and the motions with positions in the orientations' axes; None where these explain little.
+        The finding, and the motions with positions in the orientations' axes; None where these
+        explain little.
     """
     to_world = R_world_first, np.swapaxes(R_world_first, 1, 2)
     stays = np.broadcast_to(np.eye(3), R_world_first.shape)
@@ -1028,7 +1231,11 @@ def _positions(steps: Array, R_world_first: Array, relative: Array, stated: Matc
         W = rotation_between(measured, true, proper=False)
         alike = agreement(measured @ W.T, true)
         angle = _degrees(W)
-        if alike >= GOOD and alike > stated.translation + 0.2 and (np.linalg.det(W) < 0 or angle > 15):
+        if (
+            alike >= GOOD
+            and alike > stated.translation + 0.2
+            and (np.linalg.det(W) < 0 or angle > 15)
+        ):
             how = "mirrored" if np.linalg.det(W) < 0 else f"turned by {angle:.0f} degrees"
             shares = {"then": 100 * alike, "now": 100 * stated.translation}
             turned = relative.copy()
@@ -1045,7 +1252,9 @@ def _explains(name: str, fit: Fit, before: Fit, pairs: list[RgbdPair]) -> bool:
     rules = _EXPLAINED if name != "lever" else _EXPLAINED_BY_LEVER
     if name == "lever" and float(np.median([pair.depth_share for pair in pairs])) < _LEAST_DEPTH:
         return False
-    return size >= _LIMITS[name] and any(size >= sigmas * sigma and left <= share for sigmas, share in rules)
+    return size >= _LIMITS[name] and any(
+        size >= sigmas * sigma and left <= share for sigmas, share in rules
+    )
 
 
 def _fitted(name: str, fit: Fit, before: Fit, camera: Camera) -> Finding:
@@ -1069,7 +1278,13 @@ def _fitted(name: str, fit: Fit, before: Fit, camera: Camera) -> Finding:
     return finding_of("truth-lever-arm", size, errors=errors, sigma=sigma, lever=lever)
 
 
-_GROUPS = {"focal": ("focal",), "centre": ("cx", "cy"), "scale": ("scale",), "turn": ("turn",), "lever": ("lever",)}
+_GROUPS = {
+    "focal": ("focal",),
+    "centre": ("cx", "cy"),
+    "scale": ("scale",),
+    "turn": ("turn",),
+    "lever": ("lever",),
+}
 _LIMITS = {"focal": 0.08, "centre": 25.0, "scale": 0.1, "turn": np.radians(6), "lever": 0.04}
 """Published recordings differ from their cameras and truths by less: Bonn's lever arm is 0.019 m."""
 _EXPLAINED = ((5, 0.75), (8, 0.88))
@@ -1079,12 +1294,14 @@ _EXPLAINED_BY_LEVER = ((5, 0.62),)
 """People who walk past can feign one: 0.68 remained then."""
 _LEAST_DEPTH = 0.5
 """Part of the image that has depth, for a lever arm or a depth factor. With less, the corners may lie on moving people
-alone: of the errors that a lever arm explains 0.61 remained then, and lengths came out at 0.43 of the true ones."""
+alone: of the errors that a lever arm explains 0.61 remained then, and lengths came out at 0.43 of
+the true ones."""
 _WIDEST = 2.0
 """Ratio of the ends of the depth factor's interval above which it counts as not compared."""
 
 
-# Focal length, principal point, depth scale, axes and lever arm at which a truth fits the images best.
+# Focal length, principal point, depth scale, axes and lever arm at which a truth fits the images
+# best.
 
 
 @dataclass(frozen=True)
@@ -1092,9 +1309,10 @@ class Fit:
     """Camera and mounting that make the truth's motion carry the corners from image to image.
 
     Attributes:
-        value: ``focal`` and ``scale`` (of the depth) as natural logarithms of the factor, ``cx`` and ``cy`` as pixels
-            to be added, ``turn`` the rotation vector ``[3]`` in rad and ``lever`` the position ``[3]`` in metres of the
-            camera in the frame of the body that the truth tracks.
+        value: ``focal`` and ``scale`` (of the depth) as natural logarithms of the factor, ``cx``
+            and ``cy`` as pixels to be added, ``turn`` the rotation vector ``[3]`` in rad and
+            ``lever`` the position ``[3]`` in metres of the camera in the frame of the body that the
+            truth tracks.
         sigma: Their standard deviations, each pair of frames being one observation.
         residual_px: Median reprojection error.
         cost: Mean robust cost of a corner.
@@ -1116,7 +1334,13 @@ _OUTLIER_PX = 2.0
 
 
 def _reprojection_errors(
-    x: Array, camera: Camera, pair: NDArray[np.intp], first: Array, depth: Array, second: Array, back: Array
+    x: Array,
+    camera: Camera,
+    pair: NDArray[np.intp],
+    first: Array,
+    depth: Array,
+    second: Array,
+    back: Array,
 ) -> Array:
     """Reprojection errors ``[N, 2]`` in pixels under the values ``[10]``.
 
@@ -1129,20 +1353,27 @@ def _reprojection_errors(
         second: Its pixels in the second frame ``[N, 2]``.
         back: The truth's motions back to the second frames, of all pairs ``[M, 4, 4]``.
     """
-    focal, centre = np.exp(x[0]) * np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy]) + x[1:3]
+    focal = np.exp(x[0]) * np.array([camera.fx, camera.fy])
+    centre = np.array([camera.cx, camera.cy]) + x[1:3]
     rays = np.concatenate([(first - centre) / focal, np.ones((len(first), 1))], axis=1)
     mount = se3.exp(np.concatenate([np.zeros(3), x[4:7]]))
     mount[:3, 3] = x[7:10]
     moves = (se3.inverse(mount) @ back @ mount)[pair]
-    moved = np.einsum("nij,nj->ni", moves[:, :3, :3], np.exp(x[3]) * depth[:, None] * rays) + moves[:, :3, 3]
+    moved = (
+        np.einsum("nij,nj->ni", moves[:, :3, :3], np.exp(x[3]) * depth[:, None] * rays)
+        + moves[:, :3, 3]
+    )
     return np.asarray(moved[:, :2] / np.maximum(moved[:, 2:], 0.05) * focal + centre - second)
 
 
-def fit_camera(pairs: list[RgbdPair], relative: Array, camera: Camera, free: tuple[str, ...]) -> Fit:
+def fit_camera(
+    pairs: list[RgbdPair], relative: Array, camera: Camera, free: tuple[str, ...]
+) -> Fit:
     """Focal length, principal point, depth scale, axes and lever arm at which the truth fits the images best.
 
-    Robust least squares of the reprojection errors of the corners of all pairs, with the truth's relative motions held.
-    A weak prior keeps values that the motion does not determine near the stated ones.
+    Robust least squares of the reprojection errors of the corners of all pairs, with the truth's
+    relative motions held. A weak prior keeps values that the motion does not determine near the
+    stated ones.
 
     Args:
         pairs: Pairs of frames with a motion.
@@ -1153,12 +1384,21 @@ def fit_camera(pairs: list[RgbdPair], relative: Array, camera: Camera, free: tup
     chosen = [np.flatnonzero(pair.inliers) for pair in pairs]
     chosen = [index[:: max(1, len(index) // _CORNERS_A_PAIR)][:_CORNERS_A_PAIR] for index in chosen]
     first, depth, second = (
-        np.concatenate([getattr(pair, name)[index] for pair, index in zip(pairs, chosen, strict=True)])
+        np.concatenate(
+            [getattr(pair, name)[index] for pair, index in zip(pairs, chosen, strict=True)]
+        )
         for name in ("pixels_first", "depth_first", "pixels_second")
     )
-    number, back = np.repeat(np.arange(len(pairs)), [len(index) for index in chosen]), se3.inverse(relative)
+    number = np.repeat(np.arange(len(pairs)), [len(index) for index in chosen])
+    back = se3.inverse(relative)
     errors = partial(
-        _reprojection_errors, camera=camera, pair=number, first=first, depth=depth, second=second, back=back
+        _reprojection_errors,
+        camera=camera,
+        pair=number,
+        first=first,
+        depth=depth,
+        second=second,
+        back=back,
     )
     index = [number for name in free for number in np.arange(10)[_PARAMETERS[name]].tolist()]
 
@@ -1174,17 +1414,27 @@ def fit_camera(pairs: list[RgbdPair], relative: Array, camera: Camera, free: tup
         return np.concatenate([shrunk.ravel(), filled(part) / _PRIOR])
 
     start = np.zeros(len(index))
-    part = np.asarray(least_squares(robust, start, x_scale=_SCALES[index]).x, np.float64) if index else start
-    x, left = filled(part), errors(filled(part))
+    part = (
+        np.asarray(least_squares(robust, start, x_scale=_SCALES[index]).x, np.float64)
+        if index
+        else start
+    )
+    left = errors(filled(part))
+    x = filled(part)
     # Standard deviations by a sandwich estimate, each pair of frames being one observation.
     weight = 1 / np.sqrt(1 + ((left / _OUTLIER_PX) ** 2).sum(axis=1))
-    slopes = np.stack([(errors(x + s) - errors(x - s)) / (2 * s.sum()) for s in np.diag(_STEPS)], axis=-1)
-    prior, pulls = np.diag(1 / _PRIOR**2) * _OUTLIER_PX**2, np.zeros((len(pairs), 10))
+    slopes = np.stack(
+        [(errors(x + s) - errors(x - s)) / (2 * s.sum()) for s in np.diag(_STEPS)], axis=-1
+    )
+    prior = np.diag(1 / _PRIOR**2) * _OUTLIER_PX**2
+    pulls = np.zeros((len(pairs), 10))
     np.add.at(pulls, number, np.einsum("npi,n,np->ni", slopes, weight, left))
     free_part = np.ix_(index, index)
     inverse = np.linalg.inv((np.einsum("npi,n,npj->ij", slopes, weight, slopes) + prior)[free_part])
     spread = inverse @ (pulls.T @ pulls + prior)[free_part] @ inverse
-    deviation = np.sqrt(np.maximum(np.diag(spread), 0)) * np.sqrt(len(pairs) / max(len(pairs) - len(index), 1))
+    deviation = np.sqrt(np.maximum(np.diag(spread), 0)) * np.sqrt(
+        len(pairs) / max(len(pairs) - len(index), 1)
+    )
     return Fit(
         {name: x[where] for name, where in _PARAMETERS.items()},
         {name: filled(deviation)[where] for name, where in _PARAMETERS.items()},

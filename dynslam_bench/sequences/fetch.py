@@ -33,7 +33,13 @@ from dynslam_bench.core import (
 from dynslam_bench.core.download import CHUNK, MOST_BYTES, Progress, Report, download
 from dynslam_bench.core.records import Record, schema
 from dynslam_bench.sequences.cameras import CameraError
-from dynslam_bench.sequences.catalogue import CatalogueEntry, catalogue, entry_of, open_folder, open_sequence
+from dynslam_bench.sequences.catalogue import (
+    CatalogueEntry,
+    catalogue,
+    entry_of,
+    open_folder,
+    open_sequence,
+)
 from dynslam_bench.sequences.readers.layouts import layout_of
 
 RECEIPT = "fetched.json"
@@ -125,8 +131,8 @@ def fetch(
         name: Id or published folder name.
         data_root: Folder of the sequences.
         progress: Called with the stage and the bytes done.
-        checksum: False to accept an archive whose checksum differs from the catalogue's or, where that knows none, from
-            that of the archive which this address gave before.
+        checksum: False to accept an archive whose checksum differs from the catalogue's or, where
+            that knows none, from that of the archive which this address gave before.
         keep_archive: True to keep the archive beside the sequence.
         url: A mirror, in place of the catalogue's address.
         attempts: Connections in a row that may fail without bringing a byte.
@@ -140,15 +146,19 @@ def fetch(
         SequenceError: Unknown id, one that has to be got by hand, or a faulty archive.
         DownloadError: The archive cannot be downloaded.
     """
-    entry, root = _known(name), find_data_root(data_root)
+    entry = _known(name)
+    root = find_data_root(data_root)
     folder = entry.find(root)
     if folder is not None:
         return folder
     if entry.by_hand:
-        raise SequenceError(f"'{entry.id}' cannot be fetched by this program: {entry.by_hand}", entry.how_to_get())
+        raise SequenceError(
+            f"'{entry.id}' cannot be fetched by this program: {entry.by_hand}", entry.how_to_get()
+        )
     parts: list[Download] = []
     for address in (url or entry.url, *entry.more_urls):
-        expected = entry.sha256 if checksum and not parts else None  # the catalogue knows the first archive's only
+        # the catalogue knows the first archive's only
+        expected = entry.sha256 if checksum and not parts else None
         own = address.partition("?")[0].rpartition("/")[2]
         named = is_inside(own) and not own.startswith(".") and len(own) < 200
         archive = root / ".downloads" / (own if named else f"{entry.folder}.archive")
@@ -158,20 +168,26 @@ def fetch(
             timeout_s=timeout_s, progress=progress,
         )  # fmt: skip
         parts.append(Download(address, archive, sha256))
-    place, unstated = entry.folders(root)[0], parts if entry.sha256 is None else parts[1:]
+    place = entry.folders(root)[0]
+    unstated = parts if entry.sha256 is None else parts[1:]
     for part in unstated if checksum else ():
         _compare_checksum(root, part)
     _install(entry, place, parts, checksum and entry.sha256 is not None, progress)
     for part in unstated:  # only of archives whose sequence could be opened
-        write_atomic(_checksum_file(root, part), f"{part.sha256}  {without_passwords(part.address)}\n")
+        write_atomic(
+            _checksum_file(root, part), f"{part.sha256}  {without_passwords(part.address)}\n"
+        )
     for part in () if keep_archive else parts:
         part.archive.unlink(missing_ok=True)
     return place
 
 
-def _install(entry: CatalogueEntry, place: Path, parts: list[Download], checked: bool, progress: Report) -> None:
+def _install(
+    entry: CatalogueEntry, place: Path, parts: list[Download], checked: bool, progress: Report
+) -> None:
     """Let the sequence appear if it can be opened; a faulty archive is deleted, so that the next call fetches it."""
-    first, size = parts[0].archive, parts[0].archive.stat().st_size
+    first = parts[0].archive
+    size = parts[0].archive.stat().st_size
     fault = f"cannot extract {first.name} ({size / 1e9:.2f} GB) into {place.parent}"
     hint = "make room or check the permissions and run the same command again, the archive is kept"
     with raising(SequenceError, fault, hint):
@@ -181,7 +197,11 @@ def _install(entry: CatalogueEntry, place: Path, parts: list[Download], checked:
                 sums = _unpack(parts, unpacked, progress)
                 top = _top(unpacked, entry, first)
                 inner = "" if top == unpacked else f"{top.relative_to(unpacked).as_posix()}/"
-                files = {name.removeprefix(inner): value for name, value in sums.items() if name.startswith(inner)}
+                files = {
+                    name.removeprefix(inner): value
+                    for name, value in sums.items()
+                    if name.startswith(inner)
+                }
                 shutil.copytree(top, work, copy_function=os.replace, dirs_exist_ok=True)
                 shutil.rmtree(unpacked)
                 receipt = Receipt(
@@ -189,7 +209,10 @@ def _install(entry: CatalogueEntry, place: Path, parts: list[Download], checked:
                     files=len(files),
                 )  # fmt: skip
                 write_atomic(work / RECEIPT, receipt.to_json())
-                write_atomic(work / MANIFEST, "".join(f"{value}  {name}\n" for name, value in sorted(files.items())))
+                write_atomic(
+                    work / MANIFEST,
+                    "".join(f"{value}  {name}\n" for name, value in sorted(files.items())),
+                )
                 open_folder(work, entry=entry)
         except SequenceError:
             for part in parts:
@@ -204,7 +227,9 @@ def _unpack(parts: list[Download], target: Path, progress: Report) -> dict[str, 
         with temporary_folder(target) as beside:
             for name, value in extract(part.archive, beside, progress).items():
                 if sums.setdefault(name, value) != value:
-                    raise SequenceError(f"{part.archive.name} holds another {name} than the first archive, refused")
+                    raise SequenceError(
+                        f"{part.archive.name} holds another {name} than the first archive, refused"
+                    )
             shutil.copytree(beside, target, copy_function=os.replace, dirs_exist_ok=True)
     return sums
 
@@ -231,7 +256,9 @@ def verify(
     folder = Path(name).expanduser() if entry is None else status(name, data_root=data_root)
     if folder is None or not folder.is_dir():
         open_sequence(name, data_root=data_root)  # says what is missing
-        raise SequenceError(f"'{name}' is not a recorded sequence", "rendered sequences need no verification")
+        raise SequenceError(
+            f"'{name}' is not a recorded sequence", "rendered sequences need no verification"
+        )
     try:
         sequence = open_folder(folder, entry=entry, camera=camera)
     except CameraError:
@@ -251,13 +278,19 @@ def verify(
     except SequenceError as error:
         faults.append(str(error))
     dropped = getattr(sequence, "dropped", "")
-    return Verification(sequence.id, folder, len(sequence), tuple(faults), manifest.is_file(), dropped)
+    return Verification(
+        sequence.id, folder, len(sequence), tuple(faults), manifest.is_file(), dropped
+    )
 
 
 def _top(work: Path, entry: CatalogueEntry, archive: Path) -> Path:
     """The folder inside the extracted archive that is the sequence."""
     layout = layout_of(entry.layout)
-    for candidate in (work / entry.folder, work, *sorted(path for path in work.iterdir() if path.is_dir())):
+    for candidate in (
+        work / entry.folder,
+        work,
+        *sorted(path for path in work.iterdir() if path.is_dir()),
+    ):
         if layout.fits(candidate):
             return candidate
     hint = f"it is not a sequence in the layout {layout.name}"
@@ -268,7 +301,9 @@ def _known(name: str) -> CatalogueEntry:
     entry = entry_of(name)
     if entry is None:
         if name.startswith("synthetic/"):
-            raise SequenceError(f"'{name}' needs no fetching", "rendered sequences appear when they are first read")
+            raise SequenceError(
+                f"'{name}' needs no fetching", "rendered sequences appear when they are first read"
+            )
         raise SequenceError(f"unknown sequence '{name}'", did_you_mean(name, catalogue()))
     return entry
 
@@ -289,7 +324,11 @@ def _compare_checksum(root: Path, part: Download) -> None:
 
 def _checksum_file(root: Path, part: Download) -> Path:
     """One file an address, so that several processes may fetch at a time."""
-    return root / ".downloads" / f"{hashlib.sha256(without_passwords(part.address).encode()).hexdigest()[:16]}.sha256"
+    return (
+        root
+        / ".downloads"
+        / f"{hashlib.sha256(without_passwords(part.address).encode()).hexdigest()[:16]}.sha256"
+    )
 
 
 # Extraction of archives: nothing outside the target, no links, no devices, no bombs.
@@ -304,8 +343,20 @@ MAX_HEADER = 1 << 20
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 # What Python's readers of archives raise over damaged ones; OSError is gzip's, too.
-_DAMAGE = (tarfile.TarError, zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError,
-           ValueError, TypeError, LookupError, NotImplementedError, RuntimeError, OverflowError)  # fmt: skip
+_DAMAGE = (
+    tarfile.TarError,
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+    OSError,
+    EOFError,
+    ValueError,
+    TypeError,
+    LookupError,
+    NotImplementedError,
+    RuntimeError,
+    OverflowError,
+)
 
 
 def extract(archive: Path, target: Path, progress: Report = lambda state: None) -> dict[str, str]:
@@ -320,13 +371,16 @@ def extract(archive: Path, target: Path, progress: Report = lambda state: None) 
         SHA-256 of each file by its path inside the target.
 
     Raises:
-        SequenceError: No archive, damaged, or it holds what it must not: names outside the target, links, devices,
-            too many files, far more data than its size allows.
+        SequenceError: No archive, damaged, or it holds what it must not: names outside the target,
+            links, devices, too many files, far more data than its size allows.
         OSError: The disk is full, or the target cannot be written.
     """
-    sums, done = dict[str, str](), 0
+    sums = dict[str, str]()
+    done = 0
     try:
-        for name, stream in (_zip_members if zipfile.is_zipfile(archive) else _tar_members)(archive):
+        for name, stream in (_zip_members if zipfile.is_zipfile(archive) else _tar_members)(
+            archive
+        ):
             path = target / safe_name(archive, name)
             path.parent.mkdir(parents=True, exist_ok=True)
             checksum = hashlib.sha256()
@@ -338,12 +392,16 @@ def extract(archive: Path, target: Path, progress: Report = lambda state: None) 
             sums[path.relative_to(target).as_posix()] = checksum.hexdigest()
             progress(Progress("extract", done, None))
     except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
-        raise SequenceError(f"{archive.name} holds one name twice: {error.filename}, refused") from error
+        raise SequenceError(
+            f"{archive.name} holds one name twice: {error.filename}, refused"
+        ) from error
     except _DAMAGE as error:
         if isinstance(error, OSError) and (error.filename is not None or error.errno in DISK_FULL):
             raise  # of the target, not of the archive
         size = archive.stat().st_size
-        raise SequenceError(f"{archive.name} is damaged ({size} bytes): {error}", "fetch it again") from error
+        raise SequenceError(
+            f"{archive.name} is damaged ({size} bytes): {error}", "fetch it again"
+        ) from error
     return sums
 
 
@@ -375,9 +433,13 @@ def _zip_members(archive: Path) -> Iterator[tuple[str, IO[bytes]]]:
         _check(archive, sum(entry.file_size for entry in entries), len(entries))
         for entry in entries:
             if (entry.external_attr >> 16) & 0o170000 not in (0, 0o100000, 0o040000):
-                raise SequenceError(f"{archive.name} holds {entry.filename!r}, no regular file, refused")
+                raise SequenceError(
+                    f"{archive.name} holds {entry.filename!r}, no regular file, refused"
+                )
             if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise SequenceError(f"{archive.name} is compressed in a way that is not unpacked here, refused")
+                raise SequenceError(
+                    f"{archive.name} is compressed in a way that is not unpacked here, refused"
+                )
             if entry.is_dir():
                 safe_name(archive, entry.filename)
             else:
@@ -405,7 +467,8 @@ def _tar_members(archive: Path) -> Iterator[tuple[str, IO[bytes]]]:
                         "of results, pack the folders runs and sequences alone",
                     )
                 yield entry.name, stream
-        while counted.read(CHUNK):  # tarfile stops before the end of the stream, where gzip keeps its checksum
+        # tarfile stops before the end of the stream, where gzip keeps its checksum
+        while counted.read(CHUNK):
             pass
 
 
@@ -413,7 +476,9 @@ class _Counted:
     """A stream that refuses to give more bytes than the archive may unpack to."""
 
     def __init__(self, archive: Path, stream: IO[bytes]) -> None:
-        self.archive, self.stream, self.total = archive, stream, 0
+        self.archive = archive
+        self.stream = stream
+        self.total = 0
 
     def read(self, size: int = -1) -> bytes:
         block = self.stream.read(size)

@@ -20,12 +20,13 @@ class Preprocessed(Wrapped):
     """A sequence whose images are undistorted, resized and normalised when they are read; the camera follows.
 
     Args:
-        base: The sequence as recorded. Its depth images may differ in size from its colour images if a common
-            resolution is asked for.
+        base: The sequence as recorded. Its depth images may differ in size from its colour images
+            if a common resolution is asked for.
         settings: What to do.
 
     Attributes:
-        camera: Intrinsics after preprocessing: without distortion if it is removed, scaled along with the images.
+        camera: Intrinsics after preprocessing: without distortion if it is removed, scaled along
+            with the images.
     """
 
     def __init__(self, base: Sequence, settings: PreprocessingSettings) -> None:
@@ -43,7 +44,8 @@ class Preprocessed(Wrapped):
 
     def _masks_of(self, masks: FrameMasks) -> FrameMasks:
         kind = masks.instances.dtype
-        narrow = kind if kind in (np.uint8, np.int16, np.uint16) else np.int16  # what OpenCV can remap
+        # what OpenCV can remap
+        narrow = kind if kind in (np.uint8, np.int16, np.uint16) else np.int16
         instances = self._geometry(masks.instances.astype(narrow), colour=False).astype(kind)
         return FrameMasks(instances, masks.class_names, masks.moving)
 
@@ -63,7 +65,9 @@ class Preprocessed(Wrapped):
         if self.settings.undistort and self.base.camera.is_distorted:
             maps = _undistortion(self.base.camera.resized(image.shape[1], image.shape[0]))
             interpolation = cv2.INTER_LINEAR if colour else cv2.INTER_NEAREST
-            image = cv2.remap(image, *maps, interpolation, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+            image = cv2.remap(
+                image, *maps, interpolation, borderMode=cv2.BORDER_CONSTANT, borderValue=0
+            )
         return resize(image, self.camera.width, self.camera.height, colour=colour)
 
 
@@ -78,16 +82,19 @@ def resize(image: Image, width: int, height: int, *, colour: bool) -> Any:
     if image.shape[:2] == (height, width):
         return image
     smaller = width * height < image.shape[0] * image.shape[1]
-    interpolation = (cv2.INTER_AREA if smaller else cv2.INTER_LINEAR) if colour else cv2.INTER_NEAREST_EXACT
+    interpolation = (
+        (cv2.INTER_AREA if smaller else cv2.INTER_LINEAR) if colour else cv2.INTER_NEAREST_EXACT
+    )
     return cv2.resize(image, (width, height), interpolation=interpolation)
 
 
 def normalise(rgb: NDArray[np.uint8], settings: PreprocessingSettings) -> NDArray[np.uint8]:
     """Normalise the brightness and contrast of a uint8 ``[H, W, 3]`` image; the hue stays.
 
-    The luminance (Y of YCrCb) is changed: ``equalise`` spreads its histogram, ``clahe`` does so by tiles with limited
-    contrast, ``mean-std`` moves it to a given mean and standard deviation. An image of one brightness only has no
-    contrast to spread and keeps it under ``mean-std`` (it moves to the mean).
+    The luminance (Y of YCrCb) is changed: ``equalise`` spreads its histogram, ``clahe`` does so by
+    tiles with limited contrast, ``mean-std`` moves it to a given mean and standard deviation. An
+    image of one brightness only has no contrast to spread and keeps it under ``mean-std`` (it moves
+    to the mean).
     """
     if settings.normalisation == "none":
         return rgb
@@ -100,6 +107,8 @@ def normalise(rgb: NDArray[np.uint8], settings: PreprocessingSettings) -> NDArra
     else:
         mean, std = cv2.meanStdDev(luminance)
         gain = 255 * settings.target_std / std.item() if std.item() > 0 else 1.0
-        luminance = cv2.convertScaleAbs(np.clip((luminance - mean.item()) * gain + 255 * settings.target_mean, 0, 255))
+        luminance = cv2.convertScaleAbs(
+            np.clip((luminance - mean.item()) * gain + 255 * settings.target_mean, 0, 255)
+        )
     merged = cv2.merge([luminance, *chroma])
     return np.asarray(cv2.cvtColor(merged, cv2.COLOR_YCrCb2RGB), dtype=np.uint8)

@@ -1,6 +1,7 @@
 """The camera's motion between frames of an RGB-D sequence, and the agreement of a ground truth with it.
 
-The motion is measured by tracked corners and their depth. A truth is read in several conventions and shifted in time.
+The motion is measured by tracked corners and their depth. A truth is read in several conventions
+and shifted in time.
 """
 
 from collections.abc import Iterator, Sequence
@@ -39,8 +40,8 @@ class RgbdPair:
         depth_first: Their z-depth in metres ``[N]``.
         pixels_second: Undistorted pixels of the same corners in the second frame ``[N, 2]``.
         inliers: Which corners agree with the motion ``[N]``.
-        T_first_second: Pose of the second camera in the first one's frame ``[4, 4]``, metres; None if too few corners
-            agree on any motion.
+        T_first_second: Pose of the second camera in the first one's frame ``[4, 4]``, metres; None
+            if too few corners agree on any motion.
         displacement_px: Median displacement of the corners.
         depth_share: Part of the first depth image that holds depth.
     """
@@ -59,50 +60,72 @@ class RgbdPair:
 def rgbd_pairs(frames: Sequence[Frame], camera: Camera) -> Iterator[RgbdPair]:
     """Pairs of frames of one stretch, each as far apart as the corners need to move by `FAR_ENOUGH_PX`.
 
-    Corners of Shi and Tomasi (CVPR 1994) are tracked by pyramidal Lucas-Kanade, there and back; the motion is found by
-    PnP with RANSAC on the first frame's depth. A pair ends where the corners have moved far enough, after
-    `MOST_FRAMES_APART` frames, or with the stretch; the next one begins there.
+    Corners of Shi and Tomasi (CVPR 1994) are tracked by pyramidal Lucas-Kanade, there and back; the
+    motion is found by PnP with RANSAC on the first frame's depth. A pair ends where the corners
+    have moved far enough, after `MOST_FRAMES_APART` frames, or with the stretch; the next one
+    begins there.
 
     Args:
         frames: Consecutive frames, at least one, all of the camera's size.
         camera: Its intrinsics; the motion holds in their units.
     """
     start: Pixels = np.zeros((0, 2), np.float32)
-    key, last, points = frames[0], np.zeros((0, 0), np.uint8), start
+    key = frames[0]
+    last = np.zeros((0, 0), np.uint8)
+    points = start
     for frame in frames:
-        gray, due = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8), True
+        gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
+        due = True
         if len(points):
             tracked, good = follow_corners(last, gray, points, points, _BACK_AND_FORTH_PX)
-            start, points = start[good], tracked[good]
+            start = start[good]
+            points = tracked[good]
             moved = float(np.median(np.linalg.norm(points - start, axis=1))) if len(points) else 0.0
             due = frame.index - key.index >= MOST_FRAMES_APART or moved >= FAR_ENOUGH_PX
             if len(points) >= LEAST_INLIERS and due:
                 yield measure_pair(key, frame, start, points, camera)
         if len(points) < LEAST_INLIERS or due:
-            key, start = frame, _corners(gray, frame.depth)
+            key = frame
+            start = _corners(gray, frame.depth)
             points = start
         last = gray
     if frames[-1].index - key.index > 1 and len(points) >= LEAST_INLIERS:
         yield measure_pair(key, frames[-1], start, points, camera)
 
 
-def measure_pair(first: Frame, second: Frame, start: Pixels, end: Pixels, camera: Camera) -> RgbdPair:
+def measure_pair(
+    first: Frame, second: Frame, start: Pixels, end: Pixels, camera: Camera
+) -> RgbdPair:
     """The pair of two frames whose corners `start` ``[N, 2]`` were found again at `end` ``[N, 2]``, raw pixels."""
     x, y = np.round(start).astype(int).T
     depth = np.asarray(first.depth[y, x], dtype=np.float64)
-    a, b = camera.undistort_points(start), camera.undistort_points(end)
-    points, inliers, pose = camera.unproject(a, depth), np.zeros(len(a), bool), None
+    a = camera.undistort_points(start)
+    b = camera.undistort_points(end)
+    points = camera.unproject(a, depth)
+    inliers = np.zeros(len(a), bool)
+    pose = None
     cv2.setRNGSeed(0)
     success, rotation, translation, index = cv2.solvePnPRansac(
-        points, b, camera.matrix, None, iterationsCount=200, reprojectionError=INLIER_PX, confidence=0.999
+        points,
+        b,
+        camera.matrix,
+        None,
+        iterationsCount=200,
+        reprojectionError=INLIER_PX,
+        confidence=0.999,
     )
-    if success and index is not None and len(index) >= max(LEAST_INLIERS, LEAST_INLIER_SHARE * len(points)):
+    if (
+        success
+        and index is not None
+        and len(index) >= max(LEAST_INLIERS, LEAST_INLIER_SHARE * len(points))
+    ):
         inliers[np.asarray(index).reshape(-1)] = True
         rotation, translation = cv2.solvePnPRefineLM(
             points[inliers], b[inliers], camera.matrix, None, rotation, translation
         )
         pose = se3.inverse(se3.from_matrix(translation[:, 0], cv2.Rodrigues(rotation)[0]))
-    displacement, share = float(np.median(np.linalg.norm(b - a, axis=1))), float(np.mean(first.depth[::4, ::4] > 0))
+    displacement = float(np.median(np.linalg.norm(b - a, axis=1)))
+    share = float(np.mean(first.depth[::4, ::4] > 0))
     pose = pose if pose is not None and np.isfinite(pose).all() else None
     return RgbdPair(first.index, second.index, a, depth, b, inliers, pose, displacement, share)
 
@@ -110,26 +133,37 @@ def measure_pair(first: Frame, second: Frame, start: Pixels, end: Pixels, camera
 def _corners(gray: NDArray[np.uint8], depth: NDArray[np.float32]) -> Pixels:
     """Corners ``[N, 2]`` that lie on a surface, not at its edge."""
     window = np.ones((5, 5), np.uint8)
-    near, far = cv2.erode(depth, window), cv2.dilate(depth, window)
+    near = cv2.erode(depth, window)
+    far = cv2.dilate(depth, window)
     mask = ((near > 0) & (far - near < _DEPTH_EDGE * near)).astype(np.uint8)
     corners = cv2.goodFeaturesToTrack(gray, CORNERS, 0.01, max(6, gray.shape[1] // 60), mask=mask)
-    return np.zeros((0, 2), np.float32) if corners is None else np.asarray(corners, np.float32).reshape(-1, 2)
+    return (
+        np.zeros((0, 2), np.float32)
+        if corners is None
+        else np.asarray(corners, np.float32).reshape(-1, 2)
+    )
 
 
 def follow_corners(
-    before: NDArray[np.uint8], after: NDArray[np.uint8], points: Pixels, guess: Pixels, tolerance_px: float
+    before: NDArray[np.uint8],
+    after: NDArray[np.uint8],
+    points: Pixels,
+    guess: Pixels,
+    tolerance_px: float,
 ) -> tuple[Pixels, NDArray[np.bool_]]:
     """Where corners ``[N, 2]`` of one image lie in the next one, and which were found, by pyramidal Lucas-Kanade.
 
-    A corner is found if it lies inside the image and, tracked back, ends within `tolerance_px` of where it began.
-    `guess` ``[N, 2]`` is where the search begins.
+    A corner is found if it lies inside the image and, tracked back, ends within `tolerance_px` of
+    where it began. `guess` ``[N, 2]`` is where the search begins.
     """
     options: Any = {"maxLevel": 4, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
     there, status, _ = cv2.calcOpticalFlowPyrLK(before, after, points, guess.copy(), **options)
     back, status_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, points.copy(), **options)
     good = (status.reshape(-1) == 1) & (status_back.reshape(-1) == 1)
     good &= np.linalg.norm(back - points, axis=1) < tolerance_px
-    good &= (there >= 0).all(axis=1) & (there <= (after.shape[1] - 1, after.shape[0] - 1)).all(axis=1)
+    good &= (there >= 0).all(axis=1) & (there <= (after.shape[1] - 1, after.shape[0] - 1)).all(
+        axis=1
+    )
     return np.asarray(there, np.float32), np.asarray(good, np.bool_)
 
 
@@ -141,11 +175,13 @@ _LENGTHS = (0.2, 1.0, 5.0)
 def explained_share(pairs: Sequence[RgbdPair], relative: Array, camera: Camera) -> float:
     """Mean share of the corners that motions carry to within 3 pixels of where they are seen.
 
-    Unlike the motion on which most corners agree, a true one explains the background also where people fill the view.
+    Unlike the motion on which most corners agree, a true one explains the background also where
+    people fill the view.
 
     Args:
         pairs: Pairs of frames.
-        relative: A motion for each ``[N, 4, 4]``: the second camera's pose in the first one's frame.
+        relative: A motion for each ``[N, 4, 4]``: the second camera's pose in the first one's
+            frame.
         camera: The stated camera.
 
     Returns:
@@ -194,7 +230,8 @@ class Motions:
 def motions_of(pairs: Sequence[RgbdPair], stamps: Array) -> Motions:
     """The motions of pairs that have one."""
     poses = np.array([pair.T_first_second for pair in pairs]).reshape(-1, 4, 4)
-    first, second = [pair.first for pair in pairs], [pair.second for pair in pairs]
+    first = [pair.first for pair in pairs]
+    second = [pair.second for pair in pairs]
     depths = [float(np.median(pair.depth_first[pair.inliers])) for pair in pairs]
     median = float(np.median(depths)) if depths else 1.0
     return Motions(stamps[first], stamps[second], se3.log(poses)[:, 3:], poses[:, :3, 3], median)
@@ -209,8 +246,10 @@ class TruthMotion:
     """
 
     def __init__(self, truth: Trajectory, reading: str = READINGS[0]) -> None:
-        self.stamps, self.poses = truth.timestamps, read_as(truth.T_world_cam, reading)
-        steps, gaps = se3.inverse(self.poses[:-1]) @ self.poses[1:], np.diff(self.stamps)
+        self.poses = read_as(truth.T_world_cam, reading)
+        self.stamps = truth.timestamps
+        steps = se3.inverse(self.poses[:-1]) @ self.poses[1:]
+        gaps = np.diff(self.stamps)
         self._turns = se3.log(steps)[:, 3:] if len(steps) else np.zeros((0, 3))
         self._widest = max(0.12, 2.5 * float(np.median(gaps))) if len(gaps) else 0.0
 
@@ -218,18 +257,25 @@ class TruthMotion:
         """Poses ``[N, 4, 4]`` and whether the truth has them: not beyond its ends nor in its holes."""
         if len(self.stamps) < 2:
             return np.tile(np.eye(4), (len(stamps), 1, 1)), np.zeros(len(stamps), bool)
-        index = np.clip(np.searchsorted(self.stamps, stamps, side="right") - 1, 0, len(self.stamps) - 2)
-        low, high = self.stamps[index], self.stamps[index + 1]
+        index = np.clip(
+            np.searchsorted(self.stamps, stamps, side="right") - 1, 0, len(self.stamps) - 2
+        )
+        low = self.stamps[index]
+        high = self.stamps[index + 1]
         share = np.clip((stamps - low) / (high - low), 0, 1)[:, None]
-        turn, slack = np.pad(share * self._turns[index], ((0, 0), (3, 0))), 0.005
-        poses = se3.with_rotation(self.poses[index], self.poses[index, :3, :3] @ se3.exp(turn)[:, :3, :3])
+        turn = np.pad(share * self._turns[index], ((0, 0), (3, 0)))
+        slack = 0.005
+        poses = se3.with_rotation(
+            self.poses[index], self.poses[index, :3, :3] @ se3.exp(turn)[:, :3, :3]
+        )
         poses[:, :3, 3] += share * (self.poses[index + 1, :3, 3] - self.poses[index, :3, 3])
         inside = (stamps >= self.stamps[0] - slack) & (stamps <= self.stamps[-1] + slack)
         return poses, inside & (high - low <= self._widest)
 
     def between(self, start: Array, end: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
         """Poses at `start`, relative poses from there to `end`, their rotation vectors, and which of them there are."""
-        (first, valid), (second, valid_too) = self.at(start), self.at(end)
+        (first, valid) = self.at(start)
+        (second, valid_too) = self.at(end)
         relative = se3.inverse(first) @ second
         return first, relative, se3.log(relative)[:, 3:], valid & valid_too
 
@@ -264,13 +310,16 @@ ROTATION_GAIN = (0.4, 2.5)
 
 def best_gain(measured: Array, true: Array, low: float = 1e-6, high: float = 1e6) -> float:
     """The ratio of the lengths of vectors, by their weighted sums, within bounds."""
-    a, b = np.linalg.norm(measured, axis=1).sum(), np.linalg.norm(true, axis=1).sum()
+    a = np.linalg.norm(measured, axis=1).sum()
+    b = np.linalg.norm(true, axis=1).sum()
     return float(np.clip(a / max(b, 1e-12), low, high))
 
 
 def rotation_between(measured: Array, true: Array, *, proper: bool = True) -> Array:
     """The orthogonal matrix ``[3, 3]`` that turns `measured` ``[N, 3]`` into `true` best, by three robust rounds."""
-    weight, X, gain = np.ones(len(measured)), np.eye(3), 1.0 / best_gain(measured, true)
+    weight = np.ones(len(measured))
+    X = np.eye(3)
+    gain = 1.0 / best_gain(measured, true)
     for _ in range(4):
         left, _, right = np.linalg.svd((true * weight[:, None]).T @ measured)
         sign = np.linalg.det(left @ right) if proper else 1.0
@@ -324,9 +373,13 @@ def match(motions: Motions, truth: TruthMotion, reading: str, shift_s: float) ->
     share = float(valid.mean()) if len(valid) else 0.0
     if valid.sum() < 5:
         return Match(reading, shift_s, share)
-    rotation, translation, true = motions.rotation[valid], motions.translation[valid], relative[valid, :3, 3]
+    rotation = motions.rotation[valid]
+    translation = motions.translation[valid]
+    true = relative[valid, :3, 3]
     noise = ((rotation, ROTATION_NOISE), (translation, TRANSLATION_NOISE * motions.depth_m))
-    snr, snr_t = (float(np.median(np.linalg.norm(vectors, axis=1))) / sigma for vectors, sigma in noise)
+    snr, snr_t = (
+        float(np.median(np.linalg.norm(vectors, axis=1))) / sigma for vectors, sigma in noise
+    )
     weights = snr**2 / (4 + snr**2), snr_t**2 / (4 + snr_t**2)
     alike = agreement(rotation, turns[valid], ROTATION_GAIN), agreement(translation, true)
     return Match(reading, shift_s, share, *alike, weights, best_gain(translation, true))

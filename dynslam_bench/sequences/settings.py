@@ -23,21 +23,38 @@ class PreprocessingSettings(Settings):
     )
     """Decides which frames there are, and so is nothing to tune."""
     width: int | None = Field(
-        default=None, ge=16, le=16384, description="width of the common resolution; none: as recorded"
+        default=None,
+        ge=16,
+        le=16384,
+        description="width of the common resolution; none: as recorded",
     )
     height: int | None = Field(
-        default=None, ge=16, le=16384, description="height of the common resolution; none: as recorded"
+        default=None,
+        ge=16,
+        le=16384,
+        description="height of the common resolution; none: as recorded",
     )
     undistort: bool = Field(
-        default=False, description="remove the lens distortion (colour bilinear, depth nearest neighbour)"
+        default=False,
+        description="remove the lens distortion (colour bilinear, depth nearest neighbour)",
     )
-    normalisation: Normalisation = tunable("none", meaning="brightness and contrast normalisation of the colour image")
+    normalisation: Normalisation = tunable(
+        "none", meaning="brightness and contrast normalisation of the colour image"
+    )
     clahe_clip: float = Field(
-        2.0, ge=0.01, le=100.0, description="contrast limit of the adaptive histogram equalisation (`clahe`)"
+        2.0,
+        ge=0.01,
+        le=100.0,
+        description="contrast limit of the adaptive histogram equalisation (`clahe`)",
     )
-    clahe_tiles: int = Field(8, ge=1, le=64, description="tiles along each side of the image (`clahe`)")
+    clahe_tiles: int = Field(
+        8, ge=1, le=64, description="tiles along each side of the image (`clahe`)"
+    )
     target_mean: float = Field(
-        0.45, ge=0.0, le=1.0, description="mean luminance after normalisation, of [0, 1] (`mean-std`)"
+        0.45,
+        ge=0.0,
+        le=1.0,
+        description="mean luminance after normalisation, of [0, 1] (`mean-std`)",
     )
     target_std: float = Field(
         0.22, ge=0.001, le=1.0,

@@ -36,14 +36,18 @@ class SequenceView(Wrapped):
         SequenceError: The stride is none, or no frame is left.
     """
 
-    def __init__(self, base: Sequence, start: int = 0, stop: int | None = None, stride: int = 1) -> None:
+    def __init__(
+        self, base: Sequence, start: int = 0, stop: int | None = None, stride: int = 1
+    ) -> None:
         if stride < 1:
             raise SequenceError(f"stride is {stride}, expected at least 1")
         self.base = base
         self.range = range(len(base))[start:stop:stride]
         if not self.range:
             end = "" if stop is None else stop
-            raise SequenceError(f"frames {start}:{end} hold none of the {len(base)} frames of '{base.id}'")
+            raise SequenceError(
+                f"frames {start}:{end} hold none of the {len(base)} frames of '{base.id}'"
+            )
 
     @property
     def fps(self) -> float:
@@ -106,11 +110,13 @@ class Part:
     """Which frames of which content are seen.
 
     Attributes:
-        id: Id without a length: ``synthetic/walking_xyz?scene=0`` for all its lengths; a noise seed stays in it.
+        id: Id without a length: ``synthetic/walking_xyz?scene=0`` for all its lengths; a noise seed
+            stays in it.
         content: Digest of the whole content, however much of it is seen.
         scene: The same without the draw of the sensors' noise.
         camera: The camera before any preprocessing, without what its ground truth tracks.
-        start: First frame of the named part in the numbering of the whole sequence, before any offset.
+        start: First frame of the named part in the numbering of the whole sequence, before any
+            offset.
         stop: One past its last frame, never past the end.
         stride: Every so many frames.
         noise: Seed of the sensors' noise, None for the sequence's own.
@@ -134,8 +140,8 @@ class Part:
 def part_of(sequence: Sequence, offset: int = 0) -> Part:
     """What part a sequence is.
 
-    A sequence whose frames are cut from a longer one may offer ``whole_id``, ``scene_digest()`` and ``noise``, as the
-    rendered ones do; any other is its own whole.
+    A sequence whose frames are cut from a longer one may offer ``whole_id``, ``scene_digest()`` and
+    ``noise``, as the rendered ones do; any other is its own whole.
 
     Args:
         sequence: The opened sequence, cut and preprocessed or not.

@@ -1,9 +1,9 @@
 """The atlas: the root map and the submaps that begin after the camera was lost; saved maps.
 
-As in ORB-SLAM3 (Campos et al., 2021) a camera that is not relocalised begins a new submap, which is merged when a place
-of another map is recognised. Keyframes and points of all maps lie in one `Map` (`Map.kf_map` says which is whose; 0 is
-the root map). The atlas knows where an unmerged submap may lie, `loop_closing` merges it. Poses count in the world of
-the root map alone.
+As in ORB-SLAM3 (Campos et al., 2021) a camera that is not relocalised begins a new submap, which is
+merged when a place of another map is recognised. Keyframes and points of all maps lie in one `Map`
+(`Map.kf_map` says which is whose; 0 is the root map). The atlas knows where an unmerged submap may
+lie, `loop_closing` merges it. Poses count in the world of the root map alone.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ class Submap:
         start: Camera centre of its first frame in its own world ``[3]``, metres.
         anchor: Camera centre where the root map was left ``[3]``, in that map's world, metres.
         bound_m: How far from there it began, at most.
-        slack: How far its world may be rotated against the root map's, radians; any angle if it comes from a file.
+        slack: How far its world may be rotated against the root map's, radians; any angle if it
+            comes from a file.
     """
 
     start: Array
@@ -69,17 +70,23 @@ class Atlas:
         submaps: The submaps by number, merged ones included.
     """
 
-    def __init__(self, world: Map, submaps: Iterable[Submap] = (), *, unit_ratio: float = 1.0) -> None:
-        self.world, self.active, self._unit_ratio = world, 0, unit_ratio
+    def __init__(
+        self, world: Map, submaps: Iterable[Submap] = (), *, unit_ratio: float = 1.0
+    ) -> None:
+        self.world = world
+        self.active = 0
+        self._unit_ratio = unit_ratio
         self.submaps = dict(enumerate(submaps, 1))
 
     def begin_submap(self, start: Array, bound_m: float, slack: float = np.pi) -> None:
         """A submap begins where the camera was lost, as far as is known, and becomes the active one.
 
         Args:
-            start: Camera centre in the map that was active ``[3]``; the submap takes it for that of its first frame.
+            start: Camera centre in the map that was active ``[3]``; the submap takes it for that of
+                its first frame.
             bound_m: How far the camera may have moved since it was lost.
-            slack: How far the submap's directions may be rotated against those of the map that was active, radians.
+            slack: How far the submap's directions may be rotated against those of the map that was
+                active, radians.
         """
         slack = min(slack + self.slack(self.active, 0), np.pi)
         submap = Submap(start.copy(), *self._from_root(self.active, start, bound_m), slack)
@@ -101,19 +108,24 @@ class Atlas:
                 continue
             place = submap.start if number else submap.anchor
             nearest = int(np.linalg.norm(centres - place, axis=1).argmin())
-            scale, back = float(scales[nearest]), se3.inverse(after[nearest])
+            scale = float(scales[nearest])
+            back = se3.inverse(after[nearest])
             moved = se3.transform(back, scale * se3.transform(before[nearest], place))
             slack = min(submap.slack + float(se3.rotation_angle(back @ before[nearest])), np.pi)
             if number:
                 self.submaps[other] = replace(submap, start=moved, slack=slack)
             else:
-                self.submaps[other] = replace(submap, anchor=moved, bound_m=scale * submap.bound_m, slack=slack)
+                self.submaps[other] = replace(
+                    submap, anchor=moved, bound_m=scale * submap.bound_m, slack=slack
+                )
 
     def slack(self, one: int, other: int) -> float:
         """How far the worlds of two maps may be rotated against each other, radians."""
         if one == other:
             return 0.0
-        return float(sum(self.submaps[number].slack for number in (one, other) if number in self.submaps))
+        return float(
+            sum(self.submaps[number].slack for number in (one, other) if number in self.submaps)
+        )
 
     def reachable(self, left: int, there: int, last: Array, now: Array, bound_m: float) -> bool:
         """Whether a camera can have moved from one place to another.
@@ -128,12 +140,15 @@ class Atlas:
         anchor, bound = (last, bound_m) if there == left else self._from_root(left, last, bound_m)
         return there in (left, 0) and bool(np.linalg.norm(now - anchor) <= bound)
 
-    def admits_start(self, number: int, moved: Callable[[Array], Array], drift_m: float = 0.0) -> bool:
+    def admits_start(
+        self, number: int, moved: Callable[[Array], Array], drift_m: float = 0.0
+    ) -> bool:
         """Whether a submap can have begun where a merge would put its start.
 
         Args:
             number: The submap.
-            moved: Where in the root map's world the merge puts a place ``[3]`` of the submap, ``[3]``.
+            moved: Where in the root map's world the merge puts a place ``[3]`` of the submap,
+                ``[3]``.
             drift_m: By how much drift may have put it too far away.
         """
         submap = self.submaps[number]
@@ -144,7 +159,9 @@ class Atlas:
         submap = self.submaps.get(left)
         if submap is None:
             return last.copy(), bound_m
-        return submap.anchor, submap.bound_m + self._unit_ratio * float(np.linalg.norm(last - submap.start)) + bound_m
+        return submap.anchor, submap.bound_m + self._unit_ratio * float(
+            np.linalg.norm(last - submap.start)
+        ) + bound_m
 
 
 # ---------------------------------------------------------------------- from and to a file
@@ -160,7 +177,8 @@ def open_atlas(file: str, camera: Camera, features: MapFeatures, *, depth: bool)
         depth: Whether they have depth.
 
     Raises:
-        SettingsError: The file cannot be read, is no map, or one of another camera, features or sensor.
+        SettingsError: The file cannot be read, is no map, or one of another camera, features or
+            sensor.
     """
     if not file:
         return Atlas(Map(camera, features.scales), unit_ratio=1.0 if depth else MAX_UNIT_RATIO)
@@ -170,7 +188,9 @@ def open_atlas(file: str, camera: Camera, features: MapFeatures, *, depth: bool)
     return unpacked(saved, camera, features.scales)
 
 
-def save_atlas(path: Path, atlas: Atlas, world: Map, features: MapFeatures, *, depth: bool, made_by: str = "") -> None:
+def save_atlas(
+    path: Path, atlas: Atlas, world: Map, features: MapFeatures, *, depth: bool, made_by: str = ""
+) -> None:
     """Write the atlas to a file; `open_atlas` restores every bit.
 
     Args:
@@ -200,7 +220,8 @@ def save_atlas(path: Path, atlas: Atlas, world: Map, features: MapFeatures, *, d
 
 def packed(world: Map, submaps: Collection[Submap]) -> dict[str, NDArray[Any]]:
     """The arrays of a map and its submaps, as `map_files` describes them."""
-    slots, points = world.keyframes, world.points
+    slots = world.keyframes
+    points = world.points
     points = points[np.argsort(world.id[points], kind="stable")]
     features = np.arange(world.kf_point.shape[1]) < world.kf_count[slots][:, None]
     keyframe, feature = world.observations(points)
@@ -209,7 +230,8 @@ def packed(world: Map, submaps: Collection[Submap]) -> dict[str, NDArray[Any]]:
     arrays |= {name: getattr(world, name)[points] for name in POINT_ARRAYS}
     row_of_keyframe = np.zeros(world.kf_alive.size, np.int32)
     row_of_keyframe[slots] = np.arange(len(slots))
-    arrays["obs_kf"], arrays["obs_ft"] = row_of_keyframe[keyframe], feature
+    arrays["obs_kf"] = row_of_keyframe[keyframe]
+    arrays["obs_ft"] = feature
     places = np.array([(submap.start, submap.anchor) for submap in submaps]).reshape(-1, 2, 3)
     arrays["submap_start"], arrays["submap_anchor"] = places[:, 0], places[:, 1]
     arrays["submap_bound"] = np.array([submap.bound_m for submap in submaps], np.float64)
@@ -224,8 +246,10 @@ def unpacked(saved: SavedMap, camera: Camera, scales: Array) -> Atlas:
         camera: Undistorted intrinsics.
         scales: Scale of each octave.
     """
-    arrays, header = saved.arrays, saved.header
-    count, n_obs = arrays["kf_count"], arrays["n_obs"]
+    arrays = saved.arrays
+    header = saved.header
+    count = arrays["kf_count"]
+    n_obs = arrays["n_obs"]
     tables = {name: arrays[name].copy() for name in (*KEYFRAME_ARRAYS, *POINT_ARRAYS)}
     tables |= {name: _padded(arrays[name], count) for name in FEATURE_ARRAYS}
     tables |= {name: _padded(arrays[name], n_obs) for name in OBSERVATION_ARRAYS}
@@ -237,7 +261,9 @@ def unpacked(saved: SavedMap, camera: Camera, scales: Array) -> Atlas:
     tables["kf_centre"] = np.zeros((len(count), 3))
     world = Map(camera, scales)
     world.take_over(tables, header.next_keyframe, header.next_point)
-    priors = zip(arrays["submap_start"], arrays["submap_anchor"], arrays["submap_bound"], strict=True)
+    priors = zip(
+        arrays["submap_start"], arrays["submap_anchor"], arrays["submap_bound"], strict=True
+    )
     submaps = [Submap(start.copy(), anchor.copy(), float(bound)) for start, anchor, bound in priors]
     return Atlas(world, submaps, unit_ratio=1.0 if header.sensors == "rgbd" else MAX_UNIT_RATIO)
 

@@ -1,7 +1,7 @@
 """Local mapping: when a frame becomes a keyframe, and the work on the map at each new one.
 
-New points from depth and by triangulation, fusion of duplicates, local bundle adjustment, culling of points and
-keyframes (ORB-SLAM2, Section III).
+New points from depth and by triangulation, fusion of duplicates, local bundle adjustment, culling
+of points and keyframes (ORB-SLAM2, Section III).
 """
 
 from __future__ import annotations
@@ -13,7 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import kernel
-from dynslam_bench.features.matching import FAR, CellGrid, Features, Words, distance, search_in_radius
+from dynslam_bench.features.matching import (
+    FAR,
+    CellGrid,
+    Features,
+    Words,
+    distance,
+    search_in_radius,
+)
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.bundle_adjustment import Bundle, adjust_bundle, full_bundle, local_bundle
 from dynslam_bench.slam.map import Array, Map, Slots
@@ -41,7 +48,8 @@ MIN_KEYFRAME_INLIERS = 15
 """Inliers that a keyframe needs more than (ORB-SLAM2's number)."""
 ESTABLISHED = 3
 """Keyframes that observe an established point at least."""
-MIN_CLOSE, NEW_CLOSE = 100, 70
+MIN_CLOSE = 100
+NEW_CLOSE = 70
 """A keyframe is made when fewer close points are tracked and more close features are not in the map (ORB-SLAM2)."""
 VIEW_SHARE = 0.9
 """A keyframe is made when less than this share of the last keyframe's points lies in the image."""
@@ -57,19 +65,26 @@ class LocalMapper:
         settings: Of the back end.
 
     Attributes:
-        culled: Keyframes that the last `insert` removed: slot, slot of the replacement, and the pose
-            ``T_culled_replacement``.
+        culled: Keyframes that the last `insert` removed: slot, slot of the replacement, and the
+            pose ``T_culled_replacement``.
     """
 
     def __init__(self, world: Map, settings: BackendSettings) -> None:
-        self.world, self.settings = world, settings
+        self.world = world
+        self.settings = settings
         self.close_m = CLOSE_BASELINES * world.camera.baseline_m
         self.culled: list[tuple[int, int, Array]] = []
         points = world.points
         self._young: Slots = points[world.next_keyframe - 1 - world.born[points] < YOUNG]
 
     def insert(
-        self, observations: Observations, point: Slots, T_cam_world: Array, frame: int, stamp: float, submap: int = 0
+        self,
+        observations: Observations,
+        point: Slots,
+        T_cam_world: Array,
+        frame: int,
+        stamp: float,
+        submap: int = 0,
     ) -> tuple[int, dict[str, float]]:
         """Make a frame a keyframe: new points, fusion, bundle adjustment, culling.
 
@@ -85,7 +100,8 @@ class LocalMapper:
             The keyframe's slot, and the seconds spent on ``mapping`` and ``bundle_adjustment``.
         """
         begin = perf_counter()
-        world, s = self.world, self.settings.mapping
+        world = self.world
+        s = self.settings.mapping
         self.culled.clear()
         first = not world.submap(submap).size
         slot = world.add_keyframe(observations, T_cam_world, frame, stamp, submap)
@@ -97,7 +113,9 @@ class LocalMapper:
         if first:
             return slot, {"mapping": perf_counter() - begin, "bundle_adjustment": 0.0}
         neighbours = world.covisible(slot)[0][: s.neighbours]
-        close = np.count_nonzero((observations.z > 0) & (observations.z < self.close_m)) / max(len(observations), 1)
+        close = np.count_nonzero((observations.z > 0) & (observations.z < self.close_m)) / max(
+            len(observations), 1
+        )
         if close < s.triangulate_below:
             for other in neighbours.tolist():
                 features, others, position = triangulate(world, slot, other, s.min_parallax_sigmas)
@@ -111,15 +129,22 @@ class LocalMapper:
 
     # ------------------------------------------------------------------ points
 
-    def _points_from_depth(self, slot: int, observations: Observations, *, everything: bool) -> None:
+    def _points_from_depth(
+        self, slot: int, observations: Observations, *, everything: bool
+    ) -> None:
         """Points for features without one: all close ones, and the nearest hundred in any case."""
         world = self.world
-        free = np.flatnonzero((world.kf_point[slot, : len(observations)] < 0) & (observations.z > 0))
+        free = np.flatnonzero(
+            (world.kf_point[slot, : len(observations)] < 0) & (observations.z > 0)
+        )
         free = free[np.argsort(observations.z[free], kind="stable")]
         if not everything:
-            free = free[: max(np.count_nonzero(observations.z[free] < self.close_m), MIN_DEPTH_POINTS)]
+            free = free[
+                : max(np.count_nonzero(observations.z[free] < self.close_m), MIN_DEPTH_POINTS)
+            ]
         position = se3.transform(
-            se3.inverse(world.kf_pose[slot]), world.camera.unproject(observations.xy[free], observations.z[free])
+            se3.inverse(world.kf_pose[slot]),
+            world.camera.unproject(observations.xy[free], observations.z[free]),
         )
         self._add_points(slot, free, position, observations)
 
@@ -143,7 +168,9 @@ class LocalMapper:
         world = self.world
         young = self._young[world.alive[self._young]]
         age = world.next_keyframe - 1 - world.born[young]
-        seldom_found = world.found[young] < self.settings.mapping.min_found_ratio * world.visible[young]
+        seldom_found = (
+            world.found[young] < self.settings.mapping.min_found_ratio * world.visible[young]
+        )
         bad = seldom_found | ((age >= 2) & (world.n_obs[young] < MIN_OBSERVATIONS))
         world.remove_points(young[bad])
         self._young = young[~bad & (age < YOUNG)]
@@ -159,7 +186,8 @@ class LocalMapper:
 
     def fuse_into(self, keyframe: int, candidates: Slots) -> None:
         """Match points in a keyframe: new observations of them, and duplicates among its own points."""
-        world, n = self.world, int(self.world.kf_count[keyframe])
+        world = self.world
+        n = int(self.world.kf_count[keyframe])
         own = world.kf_point[keyframe, :n]
         observed = np.zeros(world.alive.size, bool)
         observed[own[own >= 0]] = True
@@ -168,27 +196,36 @@ class LocalMapper:
         xy = world.kf_xy[keyframe, :n]
         grid = CellGrid.of(xy, world.camera.width, world.camera.height)
         levels = world.kf_octave[keyframe, :n].astype(np.int64)
-        features = Features(xy, world.kf_right[keyframe, :n], levels, world.kf_words[keyframe, :n], grid)
-        windows, words = (uv, right, 3.0 * world.scales[octave]), world.words[points]
-        feature = search_in_radius(features, np.ones(n, bool), windows, octave, words, max_distance=MAX_DISTANCE)
+        features = Features(
+            xy, world.kf_right[keyframe, :n], levels, world.kf_words[keyframe, :n], grid
+        )
+        windows = (uv, right, 3.0 * world.scales[octave])
+        words = world.words[points]
+        feature = search_in_radius(
+            features, np.ones(n, bool), windows, octave, words, max_distance=MAX_DISTANCE
+        )
         good = feature >= 0
         good &= ((xy[feature] - uv) ** 2).sum(axis=1) / world.scales[levels[feature]] ** 2 < 5.991
-        points, feature = points[good], feature[good]
+        points = points[good]
+        feature = feature[good]
         empty = own[feature] < 0
         world.observe(keyframe, feature[empty], points[empty])
         for row, point in zip(feature[~empty].tolist(), points[~empty].tolist(), strict=True):
             duplicate = int(own[row])
             if duplicate >= 0 and duplicate != point and world.alive[point]:
-                world.replace_point(*sorted((duplicate, point), key=world.n_obs.__getitem__))  # the less observed one
+                # the less observed one
+                world.replace_point(*sorted((duplicate, point), key=world.n_obs.__getitem__))
 
     # ------------------------------------------------------------------ bundle adjustment
 
     def adjust(self, slot: int) -> None:
         """Local bundle adjustment around a keyframe; observations that do not fit afterwards are removed."""
-        world, settings = self.world, self.settings.bundle_adjustment
+        world = self.world
+        settings = self.settings.bundle_adjustment
         bundle = local_bundle(world, slot, settings.window)
         if bundle is not None:
-            points, out = bundle.points, ~adjust(world, bundle, settings.iterations)
+            points = bundle.points
+            out = ~adjust(world, bundle, settings.iterations)
             world.unobserve(bundle.poses[bundle.problem.obs_pose[out]], bundle.features[out])
             world.refresh(points[world.alive[points]])
 
@@ -196,7 +233,8 @@ class LocalMapper:
 
     def _cull_keyframes(self, slot: int) -> None:
         """Remove redundant keyframes, and the most redundant ones where there are too many."""
-        world, s = self.world, self.settings.keyframes
+        world = self.world
+        s = self.settings.keyframes
         neighbours, _ = world.covisible(slot)
         newest = world.keyframes[-2:]
         for other in neighbours.tolist():
@@ -211,34 +249,44 @@ class LocalMapper:
                 break
             counts = [world.redundancy(other, self.close_m) for other in others.tolist()]
             shares = [redundant / max(total, 1) for total, redundant in counts]
-            self.cull_keyframe(int(others[np.lexsort((world.kf_id[others], np.negative(shares)))[0]]))
+            self.cull_keyframe(
+                int(others[np.lexsort((world.kf_id[others], np.negative(shares)))[0]])
+            )
 
     def _dispensable(self, slot: int) -> Slots:
         """Keyframes that may be culled where there are too many; at least one of each submap stays for its frames.
 
-        Tracking depends on the newest and on those around the camera, which overlap most: they stay if others can be
-        culled.
+        Tracking depends on the newest and on those around the camera, which overlap most: they stay
+        if others can be culled.
         """
-        world, kept = self.world, self.world.keyframes[1:-2]
+        world = self.world
+        kept = self.world.keyframes[1:-2]
         kept = kept[np.bincount(world.kf_map[world.keyframes])[world.kf_map[kept]] > 1]
         near, _ = world.covisible(slot)
-        older = kept[world.kf_id[kept] < world.kf_id[slot] - self.settings.keyframes.maximum // RECENT_SHARE]
+        older = kept[
+            world.kf_id[kept] < world.kf_id[slot] - self.settings.keyframes.maximum // RECENT_SHARE
+        ]
         distant = older[~np.isin(older, near)]
         chosen = next((slots for slots in (distant, older, kept) if len(slots)), kept)
         return np.asarray(np.roll(chosen, -COMPARED * world.next_keyframe)[:COMPARED])
 
     def cull_keyframe(self, slot: int) -> None:
         """Remove a keyframe; `culled` names its replacement, the most covisible keyframe or the newest of its map."""
-        world, same_map = self.world, self.world.submap(int(self.world.kf_map[slot]))
+        world = self.world
+        same_map = self.world.submap(int(self.world.kf_map[slot]))
         replacement = int(np.r_[world.covisible(slot)[0], same_map[same_map != slot][::-1]][0])
-        self.culled.append((slot, replacement, world.kf_pose[slot] @ se3.inverse(world.kf_pose[replacement])))
+        self.culled.append(
+            (slot, replacement, world.kf_pose[slot] @ se3.inverse(world.kf_pose[replacement]))
+        )
         world.remove_keyframe(slot)
 
 
 def adjust(world: Map, bundle: Bundle, iterations: int) -> NDArray[np.bool_]:
     """Put refined poses and points into the map; returns which observations of the bundle fit them."""
     result = adjust_bundle(bundle.problem, iterations)
-    for slot, pose in zip(bundle.poses[: bundle.problem.variable].tolist(), result.poses, strict=False):
+    for slot, pose in zip(
+        bundle.poses[: bundle.problem.variable].tolist(), result.poses, strict=False
+    ):
         world.set_pose(slot, pose)
     world.position[bundle.points] = result.points
     return result.inliers
@@ -246,22 +294,24 @@ def adjust(world: Map, bundle: Bundle, iterations: int) -> NDArray[np.bool_]:
 
 def refined(world: Map) -> Map:
     """A copy of the map after full bundle adjustment, as at the end of a run."""
-    copy, bundle = deepcopy(world), full_bundle(world)
+    copy = deepcopy(world)
+    bundle = full_bundle(world)
     if bundle is not None:
         adjust(copy, bundle, FULL_ITERATIONS)
         copy.refresh(copy.points)
     return copy
 
 
-# ---------------------------------------------------------------------- when a frame becomes a keyframe
+# ---------------------------------------------------------------------- when a frame becomes a
+# keyframe
 
 
 class KeyframePolicy:
     """Decides whether a tracked frame becomes a keyframe: too little of the map is in view, and the frame adds to it.
 
-    Points that many keyframes observe count (ORB-SLAM2's rule). On moving people young points come and go, and a
-    keyframe for each of them would carry the map along with the people. Where the view itself moves on, young points
-    count as well.
+    Points that many keyframes observe count (ORB-SLAM2's rule). On moving people young points come
+    and go, and a keyframe for each of them would carry the map along with the people. Where the
+    view itself moves on, young points count as well.
 
     Args:
         settings: The thresholds.
@@ -287,7 +337,9 @@ class KeyframePolicy:
             frame: Its index.
             reference: Slot of the keyframe that shares most points with it.
         """
-        s, gap, matched = self.settings, frame - self._last, tracked.point >= 0
+        s = self.settings
+        gap = frame - self._last
+        matched = tracked.point >= 0
         close = (tracked.observations.z > 0) & (tracked.observations.z < self._close_m)
         inliers = int(np.count_nonzero(matched))
         self._most_inliers = max(self._most_inliers, inliers)
@@ -298,8 +350,12 @@ class KeyframePolicy:
             return True
         if inliers < s.tracked_share * established_points(world, reference):
             return True
-        view = share_in_view(world, int(np.where(world.kf_alive, world.kf_id, -1).argmax()), tracked.T_cam_world)
-        return view < VIEW_SHARE or (view < MOVED_SHARE and inliers < s.tracked_share * self._most_inliers)
+        view = share_in_view(
+            world, int(np.where(world.kf_alive, world.kf_id, -1).argmax()), tracked.T_cam_world
+        )
+        return view < VIEW_SHARE or (
+            view < MOVED_SHARE and inliers < s.tracked_share * self._most_inliers
+        )
 
 
 def established_points(world: Map, keyframe: int) -> int:
@@ -328,7 +384,8 @@ def _triangulate(
 ) -> tuple[Slots, Slots, Array]:  # fmt: skip
     """Pairs of rows that fit one point, and its depth along the ray of camera `a`."""
     # x_b = r x_a + t
-    r, t = np.zeros((3, 3)), np.zeros(3)
+    r = np.zeros((3, 3))
+    t = np.zeros(3)
     for i in range(3):
         for j in range(3):
             for k in range(3):
@@ -337,19 +394,27 @@ def _triangulate(
         t[i] = pose_b[i, 3]
         for k in range(3):
             t[i] -= r[i, k] * pose_a[k, 3]
-    n, m = rows_a.shape[0], rows_b.shape[0]
-    match, matched_by = np.full(n, -1, np.int64), np.full(m, -1, np.int64)
-    depth, best_distance = np.zeros(n), np.full(n, FAR, np.int64)
-    bx, by = (xy_b[rows_b, 0] - cx) / fx, (xy_b[rows_b, 1] - cy) / fy
-    cosine_limit, focal = np.cos(MIN_PARALLAX), 0.5 * (fx + fy)
+    n = rows_a.shape[0]
+    m = rows_b.shape[0]
+    match = np.full(n, -1, np.int64)
+    matched_by = np.full(m, -1, np.int64)
+    depth = np.zeros(n)
+    best_distance = np.full(n, FAR, np.int64)
+    bx = (xy_b[rows_b, 0] - cx) / fx
+    by = (xy_b[rows_b, 1] - cy) / fy
+    cosine_limit = np.cos(MIN_PARALLAX)
+    focal = 0.5 * (fx + fy)
     for i in range(n):
         a = rows_a[i]
-        x, y = (xy_a[a, 0] - cx) / fx, (xy_a[a, 1] - cy) / fy
+        x = (xy_a[a, 0] - cx) / fx
+        y = (xy_a[a, 1] - cy) / fy
         d0 = r[0, 0] * x + r[0, 1] * y + r[0, 2]
         d1 = r[1, 0] * x + r[1, 1] * y + r[1, 2]
         d2 = r[2, 0] * x + r[2, 1] * y + r[2, 2]
         # epipolar line of a's ray in b: t x d
-        l0, l1, l2 = t[1] * d2 - t[2] * d1, t[2] * d0 - t[0] * d2, t[0] * d1 - t[1] * d0
+        l0 = t[1] * d2 - t[2] * d1
+        l1 = t[2] * d0 - t[0] * d2
+        l2 = t[0] * d1 - t[1] * d0
         norm = np.sqrt(l0 * l0 + l1 * l1)
         if norm < 1e-9:
             continue
@@ -363,9 +428,13 @@ def _triangulate(
             d = distance(words_a[a], words_b[b])
             if d > MAX_DISTANCE or d >= best_distance[i]:
                 continue
-            p0, p1 = d0 - bx[j] * d2, d1 - by[j] * d2
-            q0, q1 = bx[j] * t[2] - t[0], by[j] * t[2] - t[1]
-            cosine = (d0 * bx[j] + d1 * by[j] + d2) / (length * np.sqrt(bx[j] * bx[j] + by[j] * by[j] + 1.0))
+            p0 = d0 - bx[j] * d2
+            p1 = d1 - by[j] * d2
+            q0 = bx[j] * t[2] - t[0]
+            q1 = by[j] * t[2] - t[1]
+            cosine = (d0 * bx[j] + d1 * by[j] + d2) / (
+                length * np.sqrt(bx[j] * bx[j] + by[j] * by[j] + 1.0)
+            )
             least = sigmas * max(scales[octave_a[a]], scales[octave_b[b]]) / focal
             if cosine < cosine_limit and cosine < 1.0 - 0.5 * least * least:
                 s = (p0 * q0 + p1 * q1) / (p0 * p0 + p1 * p1)
@@ -376,16 +445,22 @@ def _triangulate(
             w = d2 * s + t[2]
             if s < 0.1 or w < 0.1 or s > 40.0 or (z_b[b] > 0.0 and abs(w - z_b[b]) > 0.05 * z_b[b]):
                 continue
-            e0, e1 = (d0 * s + t[0]) / w - bx[j], (d1 * s + t[1]) / w - by[j]
+            e0 = (d0 * s + t[0]) / w - bx[j]
+            e1 = (d1 * s + t[1]) / w - by[j]
             if e0 * e0 + e1 * e1 > 5.991 * sigma * sigma:
                 continue
-            ratio = (s * np.sqrt(x * x + y * y + 1.0)) / (w * np.sqrt(bx[j] * bx[j] + by[j] * by[j] + 1.0))
+            ratio = (s * np.sqrt(x * x + y * y + 1.0)) / (
+                w * np.sqrt(bx[j] * bx[j] + by[j] * by[j] + 1.0)
+            )
             expected = scales[octave_b[b]] / scales[octave_a[a]]
             # the nearer view shows the patch larger, hence at a coarser octave
             if ratio > 1.8 * expected or ratio * 1.8 < expected:
                 continue
-            best_distance[i], match[i], depth[i] = d, j, s
-    for i in range(n):  # one feature of b for one of a: the smaller distance wins, then the lower index
+            best_distance[i] = d
+            match[i] = j
+            depth[i] = s
+    # one feature of b for one of a: the smaller distance wins, then the lower index
+    for i in range(n):
         j = match[i]
         if j >= 0 and (matched_by[j] < 0 or best_distance[i] < best_distance[matched_by[j]]):
             matched_by[j] = i
@@ -393,11 +468,13 @@ def _triangulate(
     return rows_a[chosen], rows_b[match[chosen]], depth[chosen]
 
 
-def triangulate(world: Map, slot: int, other: int, min_parallax_sigmas: float) -> tuple[Slots, Slots, Array]:
+def triangulate(
+    world: Map, slot: int, other: int, min_parallax_sigmas: float
+) -> tuple[Slots, Slots, Array]:
     """Features of two keyframes that observe no point yet and show one point along an epipolar line.
 
-    Where the parallax is too small to triangulate, the other keyframe's measured depth is taken; where it is large
-    enough, a measured depth must agree.
+    Where the parallax is too small to triangulate, the other keyframe's measured depth is taken;
+    where it is large enough, a measured depth must agree.
 
     Args:
         world: The map.
@@ -408,7 +485,9 @@ def triangulate(world: Map, slot: int, other: int, min_parallax_sigmas: float) -
     Returns:
         Features of `slot`, features of `other`, world points ``[M, 3]``.
     """
-    n, m, camera = int(world.kf_count[slot]), int(world.kf_count[other]), world.camera
+    n = int(world.kf_count[slot])
+    m = int(world.kf_count[other])
+    camera = world.camera
     features, others, depth = _triangulate(
         world.kf_pose[slot], world.kf_pose[other],
         np.flatnonzero(world.kf_point[slot, :n] < 0), np.flatnonzero(world.kf_point[other, :m] < 0),

@@ -3,11 +3,12 @@
 1. *Detect*: old keyframes that are weakly connected with the newest one are ranked by place recognition. The best few
    of those that score no less than its neighbours are matched feature by feature.
 2. *Verify*: a pose by RANSAC, then by all points around the candidate, and without depth the scale. It must explain
-   most of what should be in view, agree with the keyframes before, and ask for no more correction than the path since
-   the candidate may have drifted. The last condition is this project's: buildings that repeat pass all others.
+   most of what should be in view, agree with the keyframes before, and ask for no more correction
+   than the path since the candidate may have drifted. The last condition is this project's:
+   buildings that repeat pass all others.
 3. *Correct*: a pose graph over all keyframes: neighbours, those that share many points, all loop edges. Without depth
-   the scale drifts as well: each keyframe's scale is solved first, then the poses. A submap is merged instead: it is
-   moved as a whole.
+   the scale drifts as well: each keyframe's scale is solved first, then the poses. A submap is
+   merged instead: it is moved as a whole.
 4. *Fuse*: duplicate points of both visits are merged, and the local map is adjusted.
 
 Lengths are metres; without depth they are in units of the root map's median depth.
@@ -44,17 +45,20 @@ MIN_MATCHES = 20
 """Descriptor matches that a candidate needs; half of them must be RANSAC inliers."""
 MIN_SHARE = 0.3
 """Share of the candidate's own points in view that must be seen."""
-MERGE_INLIERS, MERGE_SHARE = 100, 0.5
+MERGE_INLIERS = 100
+MERGE_SHARE = 0.5
 """The same, and the number of inliers, where two maps are merged, which no drift bounds."""
 MERGE_UNCERTAINTY = 0.4
 """Largest `relocalisation.pose_uncertainty` of a pose by which maps are merged."""
 STRONG_COVISIBILITY = 100
 """Keyframes that share so many points have an edge in the pose graph (ORB-SLAM2's number)."""
-SLACK_M, SLACK_DEG = 0.1, 3.0
+SLACK_M = 0.1
+SLACK_DEG = 3.0
 """Correction that is accepted however short the path is."""
 DRIFT_DEG = 0.5
 """Largest rotation that is accepted, degrees a metre (or unit of length) of path."""
-ROTATION_M, ROTATION_DEPTHS = 3.0, 1.0
+ROTATION_M = 3.0
+ROTATION_DEPTHS = 1.0
 """Path length that a rotation by one radian counts as, with depth and without: it renews the view as much as passing a
 wall so far away."""
 DRIFT_SECTION = 100.0
@@ -69,11 +73,14 @@ LOOP_WEIGHT = 100.0
 """Information weight of a loop edge, where other edges have 1: an error left between two visits bends both."""
 PATIENCE = 5
 """Frames after which a camera leaves a submap for the root map if the two were not merged by then."""
-AGREE_M, AGREE_DEG, AGREE_SCALE = 0.1, 2.0, 0.1
+AGREE_M = 0.1
+AGREE_DEG = 2.0
+AGREE_SCALE = 0.1
 """Largest difference of the corrections of consecutive keyframes; of a scale, its logarithm."""
 SIGMAS = (0.02, 0.02, 0.02, 0.01, 0.01, 0.01)
 """Of an edge of weight 1: metres, or units of length without depth, then radians; only their ratio matters."""
-GRAPH_ITERATIONS, MIN_GAIN = 20, 1e-9
+GRAPH_ITERATIONS = 20
+MIN_GAIN = 1e-9
 """The search ends after so many steps, or when one lowers the cost by a smaller share."""
 
 
@@ -100,7 +107,9 @@ class Correction:
     @property
     def rotated_deg(self) -> float:
         """Angle that the camera rotates by, degrees."""
-        return float(np.degrees(se3.rotation_angle(self.T_cam_now @ se3.inverse(self.T_cam_before))))
+        return float(
+            np.degrees(se3.rotation_angle(self.T_cam_now @ se3.inverse(self.T_cam_before)))
+        )
 
     @property
     def T_now_before(self) -> Array:
@@ -135,7 +144,8 @@ class Loop:
         place: Pose of the newest keyframe by the points around the one that was recognised.
         correction: What follows for the newest keyframe; its scale is 1 with depth.
         merges: Whether the place lies in another submap.
-        fits: Whether the submap can have begun where the merge puts its start; not so after much drift.
+        fits: Whether the submap can have begun where the merge puts its start; not so after much
+            drift.
     """
 
     place: InitialPose
@@ -156,19 +166,30 @@ class LoopCloser:
 
     Attributes:
         closed: All loops that were closed.
-        rescaled: Scales of the keyframes, by slot, that the last `close` rescaled (or with depth moved to another map).
+        rescaled: Scales of the keyframes, by slot, that the last `close` rescaled (or with depth
+            moved to another map).
         in_root_map: Whether the last `close` found a submap's camera in the root map.
         leaves_submap: Whether the camera is to continue in the root map.
     """
 
     def __init__(
-        self, atlas: Atlas, mapper: LocalMapper, settings: BackendSettings, seed: int, *, scale_is_known: bool = True
+        self,
+        atlas: Atlas,
+        mapper: LocalMapper,
+        settings: BackendSettings,
+        seed: int,
+        *,
+        scale_is_known: bool = True,
     ) -> None:
-        self.atlas, self.world, self.mapper, self.settings = atlas, atlas.world, mapper, settings
+        self.atlas = atlas
+        self.world = atlas.world
+        self.mapper = mapper
+        self.settings = settings
         self.closed: list[Loop] = []
         self.rescaled: dict[int, float] = {}
         self.in_root_map = self.leaves_submap = False
-        self._seed, self._scale_is_known = seed, scale_is_known
+        self._seed = seed
+        self._scale_is_known = scale_is_known
         self._path: dict[int, float] = {}
         self._path_length = 0.0
         self._shortcuts: list[tuple[float, float]] = []
@@ -185,14 +206,22 @@ class LoopCloser:
             observations: Its features.
             root: Its pose in the root map, if the camera is in a submap and was found there.
         """
-        self.rescaled, self.in_root_map, self.leaves_submap = {}, False, False
+        self.rescaled = {}
+        self.in_root_map = False
+        self.leaves_submap = False
         self._extend_path(slot)
         for culled, replacement, relative in self.mapper.culled if self._loop_edges else ():
             ids = int(self.world.kf_id[culled]), int(self.world.kf_id[replacement])
             self._loop_edges = transferred_edges(self._loop_edges, *ids, relative)
-        loop = self._verified(slot, observations) if root is None else self._loop_to_root(slot, observations, root)
+        loop = (
+            self._verified(slot, observations)
+            if root is None
+            else self._loop_to_root(slot, observations, root)
+        )
         self._met_at = self._met_at if self.in_root_map else None
-        if loop is None or (self._row and not loop.correction.agrees(self._row[-1], self.world.kf_centre[slot])):
+        if loop is None or (
+            self._row and not loop.correction.agrees(self._row[-1], self.world.kf_centre[slot])
+        ):
             self._row.clear()
         if loop is None:
             return
@@ -219,13 +248,17 @@ class LoopCloser:
     # ------------------------------------------------------------------ detect and verify
 
     def _extend_path(self, slot: int) -> None:
-        pose, number = self.world.kf_pose[slot].copy(), int(self.world.kf_id[slot])
-        for begun in range(next(reversed(self._path), number - 1) + 1, number):  # the first two views of a submap
+        pose = self.world.kf_pose[slot].copy()
+        number = int(self.world.kf_id[slot])
+        # the first two views of a submap
+        for begun in range(next(reversed(self._path), number - 1) + 1, number):
             self._path[begun] = self._path_length
         if self._last_pose is not None:
             step = pose @ se3.inverse(self._last_pose)
             rotation = ROTATION_M if self._scale_is_known else ROTATION_DEPTHS
-            self._path_length += float(np.linalg.norm(step[:3, 3]) + rotation * se3.rotation_angle(step))
+            self._path_length += float(
+                np.linalg.norm(step[:3, 3]) + rotation * se3.rotation_angle(step)
+            )
         self._last_pose = pose
         self._path[number] = self._path_length
 
@@ -233,40 +266,56 @@ class LoopCloser:
         """The first of the best-ranked candidates that is verified."""
         world = self.world
         old = weakly_connected(world, slot)
-        there, here = world.kf_map[old], world.kf_map[slot]
+        there = world.kf_map[old]
+        here = world.kf_map[slot]
         old = old[(there == here) | (there == 0) | (here == 0)]
         if not len(old):
             return None
         near = np.setdiff1d(around(world, slot)[1:], old)
         score = recognition_scores(world, np.concatenate([near, old]), observations)
-        least, score = score[: len(near)].min(initial=np.inf), score[len(near) :]
+        least = score[: len(near)].min(initial=np.inf)
+        score = score[len(near) :]
         rng = stream(self._seed, "loop", int(world.kf_id[slot]))
         best = np.argsort(-score, kind="stable")[:CANDIDATES]
-        loops = (self._verified_candidate(slot, int(old[k]), observations, rng) for k in best if score[k] >= least)
+        loops = (
+            self._verified_candidate(slot, int(old[k]), observations, rng)
+            for k in best
+            if score[k] >= least
+        )
         return next((loop for loop in loops if loop is not None), None)
 
     def _verified_candidate(
         self, slot: int, candidate: int, observations: Observations, rng: np.random.Generator
     ) -> Loop | None:
         """The loop to a candidate, if the points around it explain enough and drift explains the correction."""
-        s, tracking = self.settings.loop_closing, self.settings.tracking
+        s = self.settings.loop_closing
+        tracking = self.settings.tracking
         least = MIN_MATCHES, MIN_MATCHES // 2
         place = recognise_place(self.world, candidate, observations, tracking, rng, *least)
         if place is None or len(place.matches) < s.min_inliers or place.share < MIN_SHARE:
             return None
         loop = self._loop(slot, place)
-        if loop is None or (loop.merges and pose_uncertainty(self.world, observations, place, rng) > MERGE_UNCERTAINTY):
+        if loop is None or (
+            loop.merges
+            and pose_uncertainty(self.world, observations, place, rng) > MERGE_UNCERTAINTY
+        ):
             return None
         return loop if self._within_drift(slot, loop) else None
 
-    def _loop_to_root(self, slot: int, observations: Observations, root: InitialPose) -> Loop | None:
+    def _loop_to_root(
+        self, slot: int, observations: Observations, root: InitialPose
+    ) -> Loop | None:
         """The loop to the place in the root map where a submap's camera is, if it determines the merge well enough."""
-        frame, loop = int(self.world.kf_frame[slot]), self._loop(slot, root)
+        frame = int(self.world.kf_frame[slot])
+        loop = self._loop(slot, root)
         if loop is None or not self.world.kf_alive[root.keyframe]:
             return None
         if (loop.fits or self._scale_is_known) and self._aliased(slot, observations, loop):
             return None
-        enough = len(root.matches) >= self.settings.loop_closing.min_inliers and root.share >= MERGE_SHARE
+        enough = (
+            len(root.matches) >= self.settings.loop_closing.min_inliers
+            and root.share >= MERGE_SHARE
+        )
         well = enough and root.uncertainty <= MERGE_UNCERTAINTY
         self.in_root_map = loop.fits
         self._met_at = frame if self._met_at is None else self._met_at
@@ -279,22 +328,30 @@ class LoopCloser:
         if scale is None:
             return None
         correction = Correction(self.world.kf_pose[slot].copy(), place.T_cam_world, scale)
-        loop = Loop(place, correction, bool(self.world.kf_map[place.keyframe] != self.world.kf_map[slot]))
+        loop = Loop(
+            place, correction, bool(self.world.kf_map[place.keyframe] != self.world.kf_map[slot])
+        )
         return replace(loop, fits=self._fits(slot, loop)) if loop.merges else loop
 
     def _scale(self, slot: int, place: InitialPose) -> float | None:
         """Median ratio of the depths of common points by the first visit and by this one; None where too few."""
-        world, first = self.world, place.matches
+        world = self.world
+        first = place.matches
         own = world.kf_point[slot, first.feature].astype(np.int64)
         both = (own >= 0) & (own != first.point)
         then = se3.transform(place.T_cam_world, world.position[first.point[both]])[:, 2]
         now = se3.transform(world.kf_pose[slot], world.position[own[both]])[:, 2]
         ahead = (then > 0) & (now > 0)
-        return float(np.exp(np.median(np.log(then[ahead] / now[ahead])))) if ahead.sum() >= MIN_SCALE_POINTS else None
+        return (
+            float(np.exp(np.median(np.log(then[ahead] / now[ahead]))))
+            if ahead.sum() >= MIN_SCALE_POINTS
+            else None
+        )
 
     def _within_drift(self, slot: int, loop: Loop) -> bool:
         """Whether drift explains the correction; between submaps, whether the camera can have moved from one there."""
-        place, correction = loop.place, loop.correction
+        place = loop.place
+        correction = loop.correction
         if loop.merges:
             if len(place.matches) < MERGE_INLIERS or place.share < MERGE_SHARE:
                 return False
@@ -302,8 +359,12 @@ class LoopCloser:
             return loop.fits and bool(np.radians(correction.rotated_deg) <= slack)
         if not 1 / MAX_SCALE < correction.scale < MAX_SCALE:
             return False
-        path, share = self._path_since(place.keyframe), self.settings.loop_closing.drift_share
-        return correction.moved_m <= SLACK_M + share * path and correction.rotated_deg <= SLACK_DEG + DRIFT_DEG * path
+        path = self._path_since(place.keyframe)
+        share = self.settings.loop_closing.drift_share
+        return (
+            correction.moved_m <= SLACK_M + share * path
+            and correction.rotated_deg <= SLACK_DEG + DRIFT_DEG * path
+        )
 
     def _fits(self, slot: int, loop: Loop) -> bool:
         """Whether the younger of two submaps can have begun where the merge puts its start."""
@@ -313,12 +374,14 @@ class LoopCloser:
         place = loop.place.keyframe
         ends = (slot, place) if self.world.kf_map[slot] == younger else (place, slot)
         on_younger, on_older = (abs(self._path_at(keyframe) - left) for keyframe in ends)
-        path = correction.scale * on_younger + on_older  # from the meeting place back to where the older was left
+        # from the meeting place back to where the older was left
+        path = correction.scale * on_younger + on_older
         return self.atlas.admits_start(younger, correction.moved, share * path)
 
     def _aliased(self, slot: int, observations: Observations, loop: Loop) -> bool:
         """Whether the keyframe fits two places: nothing but what is seen tells how two maps lie to each other."""
-        world, place = self.world, loop.place
+        world = self.world
+        place = loop.place
         own, other = world.kf_map[[slot, place.keyframe]].tolist()
         points = world.kf_point[slot, world.kf_point[slot] >= 0]
         depth = float(np.median(se3.transform(world.kf_pose[slot], world.position[points])[:, 2]))
@@ -327,7 +390,9 @@ class LoopCloser:
             other: replace(place, depth=depth * loop.correction.scale),
         }
         tracking = self.settings.tracking
-        return is_aliased(world, observations, hypotheses, weakly_connected(world, slot), tracking, self._seed)
+        return is_aliased(
+            world, observations, hypotheses, weakly_connected(world, slot), tracking, self._seed
+        )
 
     def _path_since(self, slot: int) -> float:
         """The path whose drift adds up since a keyframe: the length since then, or over a closed loop."""
@@ -344,18 +409,26 @@ class LoopCloser:
 
     def _correct(self, slot: int, loop: Loop) -> None:
         """Spread the correction over all keyframes; each point moves with the first keyframe that observes it."""
-        world, correction = self.world, loop.correction
+        world = self.world
+        correction = loop.correction
         loop_edge = self._edge(loop.place.keyframe, slot, correction.T_cam_now, LOOP_WEIGHT)
         older = edges_within(world.kf_id[world.keyframes], self._loop_edges)
         self._loop_edges = [*older, loop_edge]
-        if (np.array([correction.moved_m, correction.rotated_deg, abs(np.log(correction.scale))]) < NEGLIGIBLE).all():
+        if (
+            np.array([correction.moved_m, correction.rotated_deg, abs(np.log(correction.scale))])
+            < NEGLIGIBLE
+        ).all():
             return
         submap = int(world.kf_map[slot])
         slots = world.submap(submap)
-        before, ids = world.kf_pose.copy(), world.kf_id[slots]
-        edges, scales = self._covisibility_edges(slots), np.ones(world.kf_alive.size)
+        before = world.kf_pose.copy()
+        ids = world.kf_id[slots]
+        edges = self._covisibility_edges(slots)
+        scales = np.ones(world.kf_alive.size)
         if not self._scale_is_known:
-            scales[slots] = spread_scale(ids, [*edges, *edges_within(ids, older)], loop_edge, correction.scale)
+            scales[slots] = spread_scale(
+                ids, [*edges, *edges_within(ids, older)], loop_edge, correction.scale
+            )
             edges = rescaled_edges(edges, ids, scales[slots])
             self._note_scales(slots, scales[slots])
         after = optimise_poses(ids, before[slots], [*edges, *edges_within(ids, self._loop_edges)])
@@ -364,7 +437,10 @@ class LoopCloser:
         self.atlas.move_nearby(submap, before[slots], after, scales[slots])
         points = world.points_of(slots)
         reference = world.obs_kf[points, 0]
-        local = np.einsum("nij,nj->ni", before[reference, :3, :3], world.position[points]) + before[reference, :3, 3]
+        local = (
+            np.einsum("nij,nj->ni", before[reference, :3, :3], world.position[points])
+            + before[reference, :3, 3]
+        )
         local *= scales[reference, None]
         now = se3.inverse(world.kf_pose[reference])
         world.position[points] = np.einsum("nij,nj->ni", now[:, :3, :3], local) + now[:, :3, 3]
@@ -373,7 +449,9 @@ class LoopCloser:
     def _merge_of(self, slot: int, loop: Loop) -> tuple[int, int, Correction]:
         """The younger of the two submaps, the older one, and the correction of the younger."""
         own, other = self.world.kf_map[[slot, loop.place.keyframe]].tolist()
-        return (own, other, loop.correction) if own > other else (other, own, loop.correction.inverse)
+        return (
+            (own, other, loop.correction) if own > other else (other, own, loop.correction.inverse)
+        )
 
     def _merge(self, slot: int, loop: Loop) -> None:
         """Merge two submaps (ORB-SLAM3's ``MergeLocal``): the younger moves onto the older or the root map."""
@@ -381,7 +459,9 @@ class LoopCloser:
         younger, older, correction = self._merge_of(slot, loop)
         slots = world.move_submap(younger, correction.T_now_before, older, correction.scale)
         self._note_scales(slots, np.full(len(slots), correction.scale))
-        self._loop_edges.append(self._edge(loop.place.keyframe, slot, world.kf_pose[slot], LOOP_WEIGHT))
+        self._loop_edges.append(
+            self._edge(loop.place.keyframe, slot, world.kf_pose[slot], LOOP_WEIGHT)
+        )
 
     def _note_scales(self, slots: Slots, scales: Array) -> None:
         """Lengths around keyframes were multiplied."""
@@ -441,21 +521,30 @@ def rescaled_edges(edges: Sequence[Edge], ids: Slots, factors: Array) -> list[Ed
     return [replace(edge, T_other_one=pose) for edge, pose in zip(edges, poses, strict=True)]
 
 
-def transferred_edges(edges: Sequence[Edge], culled: int, replacement: int, T_culled_replacement: Array) -> list[Edge]:
+def transferred_edges(
+    edges: Sequence[Edge], culled: int, replacement: int, T_culled_replacement: Array
+) -> list[Edge]:
     """The edges after a keyframe was culled, moved to its replacement; an edge from that to itself is left out.
 
     Args:
         edges: The edges.
         culled: Id of the culled keyframe.
         replacement: Id of its replacement.
-        T_culled_replacement: Pose ``[4, 4]`` from the replacement's camera frame to that of the culled one.
+        T_culled_replacement: Pose ``[4, 4]`` from the replacement's camera frame to that of the
+            culled one.
     """
     transferred = []
     for edge in edges:
         if edge.one == culled:
-            edge = replace(edge, one=replacement, T_other_one=edge.T_other_one @ T_culled_replacement)
+            edge = replace(
+                edge, one=replacement, T_other_one=edge.T_other_one @ T_culled_replacement
+            )
         if edge.other == culled:
-            edge = replace(edge, other=replacement, T_other_one=se3.inverse(T_culled_replacement) @ edge.T_other_one)
+            edge = replace(
+                edge,
+                other=replacement,
+                T_other_one=se3.inverse(T_culled_replacement) @ edge.T_other_one,
+            )
         transferred.append(edge)
     return [edge for edge in transferred if edge.one != edge.other]
 
@@ -468,13 +557,14 @@ def edges_within(ids: Slots, edges: Sequence[Edge]) -> list[Edge]:
 def spread_scale(ids: Slots, edges: Sequence[Edge], loop_edge: Edge, scale: float) -> Array:
     """What lengths at each keyframe are to be multiplied by, so that a loop edge's scale is met.
 
-    Logarithms of scales are to be equal at both ends of an edge, and to differ by that of `scale` at the loop edge's.
-    The sum of squared errors is least. Strasdat, Montiel and Davison (Scale Drift-Aware Large Scale Monocular SLAM, RSS
-    2010) solve for scales and poses together.
+    Logarithms of scales are to be equal at both ends of an edge, and to differ by that of `scale`
+    at the loop edge's. The sum of squared errors is least. Strasdat, Montiel and Davison (Scale
+    Drift-Aware Large Scale Monocular SLAM, RSS 2010) solve for scales and poses together.
 
     Args:
         ids: Of the keyframes, ``[N]``, ascending.
-        edges: Edges along which scale was kept. The oldest keyframe of each connected component stays.
+        edges: Edges along which scale was kept. The oldest keyframe of each connected component
+            stays.
         loop_edge: From the keyframe that was recognised to the one that recognises it.
         scale: What lengths at the second are to be multiplied by beside those at the first.
 
@@ -483,17 +573,22 @@ def spread_scale(ids: Slots, edges: Sequence[Edge], loop_edge: Edge, scale: floa
     """
     all_edges = [*edges, loop_edge]
     one, other = np.searchsorted(ids, [[edge.one, edge.other] for edge in all_edges]).T
-    row, wanted = np.arange(len(all_edges)), np.zeros(len(all_edges))
+    row = np.arange(len(all_edges))
+    wanted = np.zeros(len(all_edges))
     wanted[-1] = np.log(scale)
     ends = np.r_[row, row], np.r_[one, other]
     values = np.r_[-np.ones(len(row)), np.ones(len(row))]
-    _, part = connected_components(coo_array((np.ones(len(row)), (one, other)), shape=(len(ids), len(ids))), False)
+    _, part = connected_components(
+        coo_array((np.ones(len(row)), (one, other)), shape=(len(ids), len(ids))), False
+    )
     _, oldest = np.unique(part, return_index=True)
     free = np.setdiff1d(np.arange(len(ids)), oldest)
     jacobian = coo_array((values, ends), shape=(len(row), len(ids))).tocsc()[:, free]
     weight = diags_array(np.array([edge.weight for edge in all_edges]))
     logarithms = np.zeros(len(ids))
-    logarithms[free] = spsolve((jacobian.T @ weight @ jacobian).tocsc(), jacobian.T @ (weight @ wanted))
+    logarithms[free] = spsolve(
+        (jacobian.T @ weight @ jacobian).tocsc(), jacobian.T @ (weight @ wanted)
+    )
     return np.asarray(np.exp(logarithms))
 
 
@@ -512,7 +607,8 @@ def optimise_poses(ids: Slots, poses: Array, edges: Sequence[Edge]) -> Array:
     back = se3.inverse(np.array([edge.T_other_one for edge in edges]))
     sigmas = SIGMAS / np.sqrt([[edge.weight] for edge in edges])
     error = _edge_errors(poses, one, other, back, sigmas)
-    cost, damping = float(np.square(error).sum()), 1e-6
+    cost = float(np.square(error).sum())
+    damping = 1e-6
     for _ in range(GRAPH_ITERATIONS):
         trial = se3.exp(_graph_step(poses, one, other, error, sigmas, damping)) @ poses
         trial_error = _edge_errors(trial, one, other, back, sigmas)
@@ -521,7 +617,10 @@ def optimise_poses(ids: Slots, poses: Array, edges: Sequence[Edge]) -> Array:
             damping *= 30.0
             continue
         done = cost - lower <= MIN_GAIN * cost
-        poses, error, cost, damping = trial, trial_error, lower, max(damping * 0.2, 1e-12)
+        poses = trial
+        error = trial_error
+        cost = lower
+        damping = max(damping * 0.2, 1e-12)
         if done:
             break
     return poses
@@ -532,13 +631,16 @@ def _edge_errors(poses: Array, one: Slots, other: Slots, back: Array, sigmas: Ar
     return se3.log(poses[other] @ se3.inverse(poses[one]) @ back) / sigmas
 
 
-def _graph_step(poses: Array, one: Slots, other: Slots, error: Array, sigmas: Array, damping: float) -> Array:
+def _graph_step(
+    poses: Array, one: Slots, other: Slots, error: Array, sigmas: Array, damping: float
+) -> Array:
     """Twists ``[N, 6]`` on the left of the poses that lower the cost; that of the first one is zero."""
     jacobian_log = _inverse_left_jacobian(error * sigmas)
     weight = 1.0 / sigmas[:, :, None]
     by_other = weight * jacobian_log
     by_one = -by_other @ _adjoint(poses[other] @ se3.inverse(poses[one]))
-    blocks, columns = np.stack([by_one, by_other], axis=1).reshape(-1, 6, 6), np.stack([one, other], axis=1).ravel()
+    blocks = np.stack([by_one, by_other], axis=1).reshape(-1, 6, 6)
+    columns = np.stack([one, other], axis=1).ravel()
     block_rows = blocks, columns, 2 * np.arange(len(error) + 1)
     jacobian = bsr_array(block_rows, shape=(error.size, 6 * len(poses))).tocsc()[:, 6:]
     normal = (jacobian.T @ jacobian).tocsc()
@@ -550,11 +652,14 @@ def _graph_step(poses: Array, one: Slots, other: Slots, error: Array, sigmas: Ar
 def _adjoint(pose: Array) -> Array:
     """Matrices ``[..., 6, 6]`` that turn twists (translation, rotation) into the frame a pose leads to."""
     rotation = pose[..., :3, :3]
-    return np.block([[rotation, se3.hat(pose[..., :3, 3]) @ rotation], [np.zeros_like(rotation), rotation]])
+    return np.block(
+        [[rotation, se3.hat(pose[..., :3, 3]) @ rotation], [np.zeros_like(rotation), rotation]]
+    )
 
 
 def _inverse_left_jacobian(twist: Array) -> Array:
     """``[..., 6, 6]``, to second order: how the logarithm of a pose follows a twist on its left."""
-    by_translation, by_rotation = se3.hat(twist[..., :3]), se3.hat(twist[..., 3:])
+    by_translation = se3.hat(twist[..., :3])
+    by_rotation = se3.hat(twist[..., 3:])
     ad = np.block([[by_rotation, by_translation], [np.zeros_like(by_rotation), by_rotation]])
     return np.asarray(np.eye(6) - ad / 2 + ad @ ad / 12)

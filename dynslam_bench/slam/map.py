@@ -1,6 +1,7 @@
 """The map: keyframes and points in flat tables, so that compiled loops and numpy run over them without objects.
 
-Keyframes and points live in numbered slots; a freed slot is used again, after the mapping step that freed it.
+Keyframes and points live in numbered slots; a freed slot is used again, after the mapping step that
+freed it.
 """
 
 from __future__ import annotations
@@ -59,23 +60,27 @@ class Map:
 
     Attributes (keyframes, by slot; F is the largest number of features so far):
         kf_alive, kf_id, kf_map (number of the submap, 0 for the root map),
-        kf_frame, kf_stamp, kf_pose (world to camera ``[S, 4, 4]``), kf_centre ``[S, 3]``, kf_count, kf_raw
-        ``[S, F, 2]`` raw pixels, kf_response, kf_xy ``[S, F, 2]`` undistorted pixels, kf_right, kf_z, kf_octave,
-        kf_angle, kf_info, kf_info_right, kf_words ``[S, F, W]``, kf_point ``[S, F]`` (slot of the observed point, -1).
+        kf_frame, kf_stamp, kf_pose (world to camera ``[S, 4, 4]``), kf_centre ``[S, 3]``, kf_count,
+        kf_raw ``[S, F, 2]`` raw pixels, kf_response, kf_xy ``[S, F, 2]`` undistorted pixels,
+        kf_right, kf_z, kf_octave, kf_angle, kf_info, kf_info_right, kf_words ``[S, F, W]``,
+        kf_point ``[S, F]`` (slot of the observed point, -1).
 
     Attributes (points, by slot):
-        alive, id, position ``[M, 3]``, normal ``[M, 3]`` mean viewing direction, far ``[M]`` largest distance at which
-        the point's reference scale is still in the pyramid, words ``[M, W]``, rgb, visible and found (frames that
-        should have and did observe it), born (id of the keyframe that made it), n_obs (how many observations it has),
-        obs_kf and obs_ft ``[M, O]`` (observing keyframe slots and feature numbers, oldest first; O is the largest
+        alive, id, position ``[M, 3]``, normal ``[M, 3]`` mean viewing direction, far ``[M]``
+        largest distance at which the point's reference scale is still in the pyramid, words
+        ``[M, W]``, rgb, visible and found (frames that should have and did observe it), born (id of
+        the keyframe that made it), n_obs (how many observations it has), obs_kf and obs_ft
+        ``[M, O]`` (observing keyframe slots and feature numbers, oldest first; O is the largest
         number of observations so far, rounded up).
 
     Attributes (others):
-        substrings: By keyframe slot the keyframe's id, and sorted substrings of its descriptors (`relocalisation`).
+        substrings: By keyframe slot the keyframe's id, and sorted substrings of its descriptors
+        (`relocalisation`).
     """
 
     def __init__(self, camera: Camera, scales: Array) -> None:
-        self.camera, self.scales = camera, np.ascontiguousarray(scales, np.float64)
+        self.scales = np.ascontiguousarray(scales, np.float64)
+        self.camera = camera
         self.next_keyframe = self.next_point = self._top = 0
         self._free_points: list[int] = []
         self._freed_points: list[int] = []
@@ -109,7 +114,8 @@ class Map:
 
     def points_of(self, keyframes: Slots | int) -> Slots:
         """Slots of the points that keyframes observe, ascending."""
-        observed, points = np.zeros(self.alive.size, bool), self.kf_point[keyframes]
+        observed = np.zeros(self.alive.size, bool)
+        points = self.kf_point[keyframes]
         observed[points[points >= 0]] = True
         return np.flatnonzero(observed)
 
@@ -119,21 +125,36 @@ class Map:
         return int(np.count_nonzero(self.kf_alive))
 
     def add_keyframe(
-        self, observations: Observations, T_cam_world: Array, frame: int, stamp: float, submap: int = 0
+        self,
+        observations: Observations,
+        T_cam_world: Array,
+        frame: int,
+        stamp: float,
+        submap: int = 0,
     ) -> int:
         """Store a frame's features as a keyframe that observes no points yet; returns its slot."""
         n, words = observations.words.shape
         if not self.next_keyframe:
-            self.kf_words, self.words = np.zeros((0, 0, words), np.uint64), np.zeros((0, words), np.uint64)
+            self.kf_words, self.words = (
+                np.zeros((0, 0, words), np.uint64),
+                np.zeros((0, words), np.uint64),
+            )
         features = self.kf_point.shape[1]
         if n > features:
             self._grow(FEATURE_TABLES, n, axis=1)
             self.kf_point[:, features:] = -1
         if self.kf_alive.all():
-            self._grow(KEYFRAME_TABLES | FEATURE_TABLES, max(16, self.kf_alive.size + self.kf_alive.size // 2))
+            self._grow(
+                KEYFRAME_TABLES | FEATURE_TABLES,
+                max(16, self.kf_alive.size + self.kf_alive.size // 2),
+            )
         slot = int(self.kf_alive.argmin())
-        self.kf_alive[slot], self.kf_id[slot], self.kf_map[slot] = True, self.next_keyframe, submap
-        self.kf_frame[slot], self.kf_stamp[slot], self.kf_count[slot] = frame, stamp, n
+        self.kf_id[slot] = self.next_keyframe
+        self.kf_alive[slot] = True
+        self.kf_map[slot] = submap
+        self.kf_frame[slot] = frame
+        self.kf_stamp[slot] = stamp
+        self.kf_count[slot] = n
         self.next_keyframe += 1
         self.set_pose(slot, T_cam_world)
         raw = observations.keypoints
@@ -151,12 +172,15 @@ class Map:
         self.kf_pose[slot] = T_cam_world
         self.kf_centre[slot] = -T_cam_world[:3, :3].T @ T_cam_world[:3, 3]
 
-    def take_over(self, tables: Mapping[str, NDArray[Any]], next_keyframe: int, next_point: int) -> None:
+    def take_over(
+        self, tables: Mapping[str, NDArray[Any]], next_keyframe: int, next_point: int
+    ) -> None:
         """Become the map of complete tables, in which every slot is in use; see `atlas`."""
         for name in KEYFRAME_TABLES | FEATURE_TABLES | POINT_TABLES:
             setattr(self, name, tables[name])
         self._top = self.alive.size
-        self.next_keyframe, self.next_point = next_keyframe, next_point
+        self.next_keyframe = next_keyframe
+        self.next_point = next_point
         for slot, pose in enumerate(self.kf_pose):
             self.set_pose(slot, pose)
 
@@ -172,7 +196,9 @@ class Map:
         order = np.lexsort((-self.kf_id[slots], -counts[slots]))
         return slots[order], counts[slots[order]]
 
-    def move_submap(self, number: int, T_new_old: Array, merged_into: int, scale: float = 1.0) -> Slots:
+    def move_submap(
+        self, number: int, T_new_old: Array, merged_into: int, scale: float = 1.0
+    ) -> Slots:
         """Merge a submap into another: all its keyframes and points move, and become part of that; returns their slots.
 
         Args:
@@ -204,18 +230,30 @@ class Map:
         """Slots of all points, ascending."""
         return np.flatnonzero(self.alive[: self._top])
 
-    def add_points(self, position: Array, rgb: NDArray[np.uint8], keyframe: int, features: Slots) -> Slots:
+    def add_points(
+        self, position: Array, rgb: NDArray[np.uint8], keyframe: int, features: Slots
+    ) -> Slots:
         """New points ``[N, 3]`` that features of a keyframe observe; returns their slots."""
         n = len(position)
         reused = [self._free_points.pop() for _ in range(min(n, len(self._free_points)))]
         fresh = n - len(reused)
         if self._top + fresh > self.alive.size:
-            self._grow(POINT_TABLES, max(2048, self._top + fresh, self.alive.size + self.alive.size // 2))
-        slots = np.concatenate([np.array(reused, np.int64), np.arange(self._top, self._top + fresh, dtype=np.int64)])
-        self.alive[slots], self.id[slots] = True, np.arange(self.next_point, self.next_point + n)
-        self._top, self.next_point = self._top + fresh, self.next_point + n
-        self.position[slots], self.rgb[slots], self.born[slots] = position, rgb, self.kf_id[keyframe]
-        self.visible[slots], self.found[slots], self.n_obs[slots] = 1, 1, 0
+            self._grow(
+                POINT_TABLES, max(2048, self._top + fresh, self.alive.size + self.alive.size // 2)
+            )
+        slots = np.concatenate(
+            [np.array(reused, np.int64), np.arange(self._top, self._top + fresh, dtype=np.int64)]
+        )
+        self.id[slots] = np.arange(self.next_point, self.next_point + n)
+        self.alive[slots] = True
+        self._top = self._top + fresh
+        self.next_point = self.next_point + n
+        self.born[slots] = self.kf_id[keyframe]
+        self.position[slots] = position
+        self.rgb[slots] = rgb
+        self.visible[slots] = 1
+        self.found[slots] = 1
+        self.n_obs[slots] = 0
         self.observe(keyframe, features, slots)
         return slots
 
@@ -235,7 +273,8 @@ class Map:
         """Remove points and their observations."""
         points = np.unique(points[self.alive[points]])
         self.kf_point[self.observations(points)] = -1
-        self.n_obs[points], self.alive[points] = 0, False
+        self.n_obs[points] = 0
+        self.alive[points] = False
         self._freed_points.extend(points.tolist())
 
     def replace_point(self, old: int, new: int) -> None:
@@ -249,7 +288,8 @@ class Map:
 
     def refresh(self, points: Slots) -> None:
         """Renew descriptor, viewing direction and scale range of points from their observations."""
-        of_points, of_keyframes = (self.position, self.normal, self.far, self.words), (self.kf_words, self.kf_octave)
+        of_points = (self.position, self.normal, self.far, self.words)
+        of_keyframes = (self.kf_words, self.kf_octave)
         _refresh(points, *of_points, *self._observed, *of_keyframes, self.kf_centre, self.scales)
 
     def release(self) -> None:
@@ -264,7 +304,8 @@ class Map:
     def observations(self, points: NDArray[np.integer]) -> tuple[Ints, Ints]:
         """Keyframe slots and feature numbers of the observations of points, one point after the other."""
         count = self.n_obs[points].astype(np.int64)
-        row, column = np.repeat(points, count), np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        row = np.repeat(points, count)
+        column = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
         return self.obs_kf[row, column], self.obs_ft[row, column]
 
     def _reserve(self, observations: int) -> None:
@@ -275,7 +316,9 @@ class Map:
 
     # ------------------------------------------------------------------ views
 
-    def project(self, T_cam_world: Array, candidates: Slots) -> tuple[Slots, Array, Array, Slots, Array]:
+    def project(
+        self, T_cam_world: Array, candidates: Slots
+    ) -> tuple[Slots, Array, Array, Slots, Array]:
         """The points that a camera should see, with pixels, right coordinates, octaves and viewing cosines."""
         c = self.camera
         return _project(
@@ -324,7 +367,9 @@ def map_outputs(world: Map) -> MapOutputs:
         for slot in world.keyframes.tolist()
     )
     observations = world.n_obs[points].astype(np.int64)
-    return MapOutputs(records, world.id[points], world.position[points], world.rgb[points], observations)
+    return MapOutputs(
+        records, world.id[points], world.position[points], world.rgb[points], observations
+    )
 
 
 class MapViews:
@@ -352,12 +397,17 @@ class MapViews:
         world = self._world
         if self._made_for != (world.next_keyframe, submap):
             self._made_for = world.next_keyframe, submap
-            newest, points = world.submap(submap)[::-1][:VIEWS].tolist(), points_in(world, submap)
-            self._view: MapView = tuple(map(self._keyframe, newest)), (world.id[points], world.position[points])
+            newest = world.submap(submap)[::-1][:VIEWS].tolist()
+            points = points_in(world, submap)
+            self._view: MapView = (
+                tuple(map(self._keyframe, newest)),
+                (world.id[points], world.position[points]),
+            )
         return self._view
 
     def _keyframe(self, slot: int) -> KeyframeView:
-        world, n = self._world, int(self._world.kf_count[slot])
+        world = self._world
+        n = int(self._world.kf_count[slot])
         keypoints = Keypoints(
             world.kf_raw[slot, :n],
             world.kf_octave[slot, :n].astype(np.int32),
@@ -375,22 +425,32 @@ class MapViews:
         )
 
 
-# ---------------------------------------------------------------------- compiled loops over the tables
+# ---------------------------------------------------------------------- compiled loops over the
+# tables
 
 
 @kernel
-def _link_one(obs_kf: Ints, obs_ft: Ints, n_obs: Ints, kf_point: Ints, keyframe: int, feature: int, point: int) -> None:
+def _link_one(
+    obs_kf: Ints, obs_ft: Ints, n_obs: Ints, kf_point: Ints, keyframe: int, feature: int, point: int
+) -> None:
     end = n_obs[point]
     if (obs_kf[point, :end] == keyframe).any():
         return
-    obs_kf[point, end], obs_ft[point, end] = keyframe, feature
+    obs_kf[point, end] = keyframe
+    obs_ft[point, end] = feature
     n_obs[point] += 1
     kf_point[keyframe, feature] = point
 
 
 @kernel
 def _link(
-    obs_kf: Ints, obs_ft: Ints, n_obs: Ints, kf_point: Ints, keyframe: int, features: Slots, points: Slots
+    obs_kf: Ints,
+    obs_ft: Ints,
+    n_obs: Ints,
+    kf_point: Ints,
+    keyframe: int,
+    features: Slots,
+    points: Slots,
 ) -> None:
     """Add observations of the points by the keyframe's features; a second one by the same keyframe is skipped."""
     for i in range(points.shape[0]):
@@ -399,7 +459,9 @@ def _link(
 
 
 @kernel
-def _unlink(obs_kf: Ints, obs_ft: Ints, n_obs: Ints, kf_point: Ints, keyframes: Slots, features: Slots) -> None:
+def _unlink(
+    obs_kf: Ints, obs_ft: Ints, n_obs: Ints, kf_point: Ints, keyframes: Slots, features: Slots
+) -> None:
     """Remove observations; the order of the others is kept."""
     for i in range(keyframes.shape[0]):
         p = kf_point[keyframes[i], features[i]]
@@ -430,29 +492,45 @@ def _refresh(
 ) -> None:  # fmt: skip
     """Renew descriptor (the medoid of the observed ones), viewing direction and scale range of the points."""
     for i in range(points.shape[0]):
-        p, n = points[i], n_obs[points[i]]
+        p = points[i]
+        n = n_obs[points[i]]
         if n == 0:
             continue
-        first, best, best_score = max(n - 12, 0), n - 1, 1 << 40  # only the newest observations count
+        # only the newest observations count
+        first = max(n - 12, 0)
+        best = n - 1
+        best_score = 1 << 40
         if n > 2:
             for a in range(first, n):
                 score = 0
                 for b in range(first, n):
-                    score += distance(kf_words[obs_kf[p, a], obs_ft[p, a]], kf_words[obs_kf[p, b], obs_ft[p, b]])
+                    score += distance(
+                        kf_words[obs_kf[p, a], obs_ft[p, a]], kf_words[obs_kf[p, b], obs_ft[p, b]]
+                    )
                 if score < best_score:
-                    best, best_score = a, score
-        for w in range(words.shape[1]):  # whole rows would compile a message for shapes that differ, seconds of it
+                    best = a
+                    best_score = score
+        # whole rows would compile a message for shapes that differ, seconds of it
+        for w in range(words.shape[1]):
             words[p, w] = kf_words[obs_kf[p, best], obs_ft[p, best], w]
-        sx, sy, sz = 0.0, 0.0, 0.0
+        sx = 0.0
+        sy = 0.0
+        sz = 0.0
         for o in range(n):
             c = kf_centre[obs_kf[p, o]]
-            x, y, z = position[p, 0] - c[0], position[p, 1] - c[1], position[p, 2] - c[2]
+            x = position[p, 0] - c[0]
+            y = position[p, 1] - c[1]
+            z = position[p, 2] - c[2]
             d = np.sqrt(x * x + y * y + z * z) + 1e-12
-            sx, sy, sz = sx + x / d, sy + y / d, sz + z / d
+            sx = sx + x / d
+            sy = sy + y / d
+            sz = sz + z / d
             if o == 0:
                 far[p] = d * scales[kf_octave[obs_kf[p, o], obs_ft[p, o]]]
         length = np.sqrt(sx * sx + sy * sy + sz * sz) + 1e-12
-        normal[p, 0], normal[p, 1], normal[p, 2] = sx / length, sy / length, sz / length
+        normal[p, 0] = sx / length
+        normal[p, 1] = sy / length
+        normal[p, 2] = sz / length
 
 
 @kernel
@@ -467,9 +545,13 @@ def _project(
         Points, pixels, right coordinates, predicted octaves and cosines of the viewing angle.
     """
     n = candidates.shape[0]
-    index, octave = np.empty(n, np.int64), np.empty(n, np.int64)
-    uv, right, cosine = np.empty((n, 2)), np.empty(n), np.empty(n)
-    r, t = pose[:3, :3], pose[:3, 3]
+    index = np.empty(n, np.int64)
+    octave = np.empty(n, np.int64)
+    uv = np.empty((n, 2))
+    right = np.empty(n)
+    cosine = np.empty(n)
+    r = pose[:3, :3]
+    t = pose[:3, 3]
     ox = -(r[0, 0] * t[0] + r[1, 0] * t[1] + r[2, 0] * t[2])
     oy = -(r[0, 1] * t[0] + r[1, 1] * t[1] + r[2, 1] * t[2])
     oz = -(r[0, 2] * t[0] + r[1, 2] * t[1] + r[2, 2] * t[2])
@@ -481,10 +563,13 @@ def _project(
         xc, yc, zc = moved_point(pose, position[p])
         if zc < 0.05:
             continue
-        u, v = fx * xc / zc + cx, fy * yc / zc + cy
+        u = fx * xc / zc + cx
+        v = fy * yc / zc + cy
         if u < 0.0 or u >= width or v < 0.0 or v >= height:
             continue
-        dx, dy, dz = position[p, 0] - ox, position[p, 1] - oy, position[p, 2] - oz
+        dx = position[p, 0] - ox
+        dy = position[p, 1] - oy
+        dz = position[p, 2] - oz
         d = np.sqrt(dx * dx + dy * dy + dz * dz)
         if d > WIDEN_RANGE * far[p] or d * WIDEN_RANGE < far[p] / nearest:
             continue
@@ -492,25 +577,46 @@ def _project(
         if c < MIN_COSINE:
             continue
         level = int(np.ceil(np.log(far[p] / d) * inverse_log - 1e-9))
-        index[count], octave[count] = p, min(max(level, 0), levels - 1)
-        uv[count, 0], uv[count, 1], right[count], cosine[count] = u, v, u - bf / zc, c
+        octave[count] = min(max(level, 0), levels - 1)
+        index[count] = p
+        uv[count, 0] = u
+        uv[count, 1] = v
+        right[count] = u - bf / zc
+        cosine[count] = c
         count += 1
-    return index[:count].copy(), uv[:count].copy(), right[:count].copy(), octave[:count].copy(), cosine[:count].copy()
+    return (
+        index[:count].copy(),
+        uv[:count].copy(),
+        right[:count].copy(),
+        octave[:count].copy(),
+        cosine[:count].copy(),
+    )
 
 
 @kernel
 def _redundancy(
-    keyframe: int, close: NDArray[np.bool_], kf_point: Ints, kf_octave: Any, obs_kf: Ints, obs_ft: Ints, n_obs: Ints
+    keyframe: int,
+    close: NDArray[np.bool_],
+    kf_point: Ints,
+    kf_octave: Any,
+    obs_kf: Ints,
+    obs_ft: Ints,
+    n_obs: Ints,
 ) -> tuple[int, int]:
     """Close points that the keyframe observes, and those that `REDUNDANT_VIEWS` see, at most one octave coarser."""
-    total, redundant = 0, 0
+    total = 0
+    redundant = 0
     for f in range(close.shape[0]):
         p = kf_point[keyframe, f]
         if p < 0 or not close[f]:
             continue
-        total, fine = total + 1, 0
+        total = total + 1
+        fine = 0
         for o in range(n_obs[p]):
-            if obs_kf[p, o] != keyframe and kf_octave[obs_kf[p, o], obs_ft[p, o]] <= kf_octave[keyframe, f] + 1:
+            if (
+                obs_kf[p, o] != keyframe
+                and kf_octave[obs_kf[p, o], obs_ft[p, o]] <= kf_octave[keyframe, f] + 1
+            ):
                 fine += 1
         redundant += fine >= REDUNDANT_VIEWS
     return total, redundant

@@ -1,8 +1,9 @@
 """Files of a map: ``map.npz``, from which a later run starts, ``keyframes.csv`` and ``map.ply``.
 
-``map.npz`` holds arrays and nothing else, which are checked before they are used. Keyframes and points are stored
-without gaps, oldest first, and refer to each other by row. Which frames of which recording the keyframes were is left
-out: in another one it means nothing. `docs/reference/files.md` says how maps are used.
+``map.npz`` holds arrays and nothing else, which are checked before they are used. Keyframes and
+points are stored without gaps, oldest first, and refer to each other by row. Which frames of which
+recording the keyframes were is left out: in another one it means nothing. `docs/reference/files.md`
+says how maps are used.
 """
 
 from __future__ import annotations
@@ -50,7 +51,11 @@ POINT_ARRAYS = {
 """Of each point; P points."""
 OBSERVATION_ARRAYS = {"obs_kf": ("i4", "O"), "obs_ft": ("i4", "O")}
 """Of each observation, one point after the other: row of the keyframe, and which of its features; O observations."""
-SUBMAP_ARRAYS = {"submap_start": ("f8", "I3"), "submap_anchor": ("f8", "I3"), "submap_bound": ("f8", "I")}
+SUBMAP_ARRAYS = {
+    "submap_start": ("f8", "I3"),
+    "submap_anchor": ("f8", "I3"),
+    "submap_bound": ("f8", "I"),
+}
 """Of each submap that was not merged (`Atlas`); I of them."""
 _LAYOUT = KEYFRAME_ARRAYS | FEATURE_ARRAYS | POINT_ARRAYS | OBSERVATION_ARRAYS | SUBMAP_ARRAYS
 
@@ -133,9 +138,17 @@ class SavedMap:
             SettingsError: Names what differs.
         """
         header = self.header
-        saved: dict[str, Any] = {"sensors": header.sensors, **header.features.model_dump(), **header.camera}
+        saved: dict[str, Any] = {
+            "sensors": header.sensors,
+            **header.features.model_dump(),
+            **header.camera,
+        }
         own = {"sensors": sensors, **features.model_dump(), **described(camera)}
-        differing = [f"{name} {saved.get(name)} instead of {own[name]}" for name in own if saved.get(name) != own[name]]
+        differing = [
+            f"{name} {saved.get(name)} instead of {own[name]}"
+            for name in own
+            if saved.get(name) != own[name]
+        ]
         if differing:
             cure = "localise with the camera, sensors and features that the map was made with"
             raise SettingsError(f"{file} is a map of {', '.join(differing)}", cure)
@@ -170,7 +183,8 @@ def read_map(path: Path) -> SavedMap:
     """Read a map that `write_map` wrote; every index is checked.
 
     Raises:
-        SettingsError: The file cannot be read, is no map, of a newer version, or damaged; names the first fault.
+        SettingsError: The file cannot be read, is no map, of a newer version, or damaged; names the
+            first fault.
     """
     arrays = read_npz(path, kind=SettingsError)
     if HEADER not in arrays:
@@ -192,17 +206,26 @@ def read_map(path: Path) -> SavedMap:
 def _faults(arrays: Arrays, header: MapHeader) -> Iterator[str]:
     """Faults of the arrays of a file that anyone may have written: compiled loops check no index.
 
-    Arrays that are missing, unknown, or of another type or shape; indices out of bounds; references that contradict
-    each other. Later checks rely on earlier ones. Damage is found by the check sums of the zip file.
+    Arrays that are missing, unknown, or of another type or shape; indices out of bounds; references
+    that contradict each other. Later checks rely on earlier ones. Damage is found by the check sums
+    of the zip file.
     """
     for name in sorted(_LAYOUT.keys() ^ arrays.keys()):
-        yield f"it holds no array '{name}'" if name in _LAYOUT else f"it holds an unknown array '{name[:40]}'"
+        yield (
+            f"it holds no array '{name}'"
+            if name in _LAYOUT
+            else f"it holds an unknown array '{name[:40]}'"
+        )
     sizes: dict[str, int] = {}
     for name, (kind, axes) in _LAYOUT.items():
         array = arrays[name]
         expected = [int(axis) if axis.isdigit() else sizes.setdefault(axis, size)
                     for axis, size in zip(axes, array.shape, strict=False)]  # fmt: skip
-        if array.dtype != np.dtype(kind) or array.ndim != len(axes) or list(array.shape) != expected:
+        if (
+            array.dtype != np.dtype(kind)
+            or array.ndim != len(axes)
+            or list(array.shape) != expected
+        ):
             shape = ", ".join(map(str, expected)) + ", ?" * max(len(axes) - array.ndim, 0)
             yield f"'{name}' is {array.dtype} of shape {str(array.shape)[:60]}, expected {np.dtype(kind)} of ({shape})"
     last = {
@@ -221,18 +244,31 @@ def _checks(arrays: Arrays) -> Iterator[tuple[Any, str]]:
     for name in ("kf_pose", "kf_xy", "kf_z", "position", "normal", "far"):
         yield np.isfinite(arrays[name]).all(), f"'{name}' holds values that are not finite"
     words = max(arrays["kf_words"].shape[1], arrays["words"].shape[1])
-    yield words <= MAX_WORDS, f"a descriptor has {words} words of 64 bits, at most {MAX_WORDS} are read"
-    count, n_obs = arrays["kf_count"], arrays["n_obs"].astype(np.int64)
+    yield (
+        words <= MAX_WORDS,
+        f"a descriptor has {words} words of 64 bits, at most {MAX_WORDS} are read",
+    )
+    count = arrays["kf_count"]
+    n_obs = arrays["n_obs"].astype(np.int64)
     yield len(count) and n_obs.all(), "it holds no keyframe, or a point that none observes"
     for name, counts, size, held in (
         ("kf_count", count, 64 + 8 * words, len(arrays["kf_xy"])), ("n_obs", n_obs, 8, len(arrays["obs_kf"]))
     ):  # fmt: skip
-        claimed = len(counts) * int(counts.max(initial=0)) * size  # as tables, as wide as the longest row
-        yield claimed <= MAX_TABLE_BYTES, f"'{name}' claims tables of {claimed} bytes, more than {MAX_TABLE_BYTES}"
+        # as tables, as wide as the longest row
+        claimed = len(counts) * int(counts.max(initial=0)) * size
+        yield (
+            claimed <= MAX_TABLE_BYTES,
+            f"'{name}' claims tables of {claimed} bytes, more than {MAX_TABLE_BYTES}",
+        )
         yield int(counts.sum()) == held, f"'{name}' does not add up to {held}"
-    keyframe, feature = arrays["obs_kf"], arrays["obs_ft"]
-    yield (feature < count[keyframe]).all(), "'obs_ft' names features that the keyframe does not have"
-    row, point = (np.cumsum(count) - count)[keyframe] + feature, np.repeat(np.arange(len(n_obs)), n_obs)
+    keyframe = arrays["obs_kf"]
+    feature = arrays["obs_ft"]
+    yield (
+        (feature < count[keyframe]).all(),
+        "'obs_ft' names features that the keyframe does not have",
+    )
+    row = (np.cumsum(count) - count)[keyframe] + feature
+    point = np.repeat(np.arange(len(n_obs)), n_obs)
     yield len(np.unique(row)) == len(row), "a feature observes two points"
     once = len(np.unique(point * len(count) + keyframe)) == len(row)
     yield once, "a keyframe observes a point with two features"
@@ -243,11 +279,14 @@ def _checks(arrays: Arrays) -> Iterator[tuple[Any, str]]:
 _PLY_LAYOUT = np.dtype([("position", "<f4", 3), ("colour", "u1", 3), ("observations", "<i4")])
 
 
-def write_keyframes_csv(path: Path, outputs: MapOutputs, exact: Mapping[float, int] | None = None) -> None:
+def write_keyframes_csv(
+    path: Path, outputs: MapOutputs, exact: Mapping[float, int] | None = None
+) -> None:
     """Write ``keyframes.csv``: the fields of `KeyframeRecord`, the pose as tx ty tz and qx qy qz qw.
 
-    The timestamp has nine decimals; `exact` gives the nanoseconds of stamps by their seconds, where a float does not
-    hold them. It and the frame are empty for keyframes of an earlier run, in whose map this one began.
+    The timestamp has nine decimals; `exact` gives the nanoseconds of stamps by their seconds, where
+    a float does not hold them. It and the frame are empty for keyframes of an earlier run, in whose
+    map this one began.
 
     Raises:
         DynslamError: The folder cannot be written.
@@ -257,7 +296,10 @@ def write_keyframes_csv(path: Path, outputs: MapOutputs, exact: Mapping[float, i
         pose = (f"{value:.9f}" for value in np.concatenate(se3.to_quaternion(record.T_world_cam)))
         when: tuple[object, object] = "", ""
         if record.frame >= 0:
-            when = record.frame, format_ns((exact or {}).get(record.timestamp) or ns_of(record.timestamp))
+            when = (
+                record.frame,
+                format_ns((exact or {}).get(record.timestamp) or ns_of(record.timestamp)),
+            )
         cells = (record.id, *when, *pose, record.features, record.observations, record.map)
         lines.append(",".join(map(str, cells)))
     write_atomic(path, "\n".join([*lines, ""]))
@@ -299,7 +341,13 @@ def read_ply(path: Path) -> Cloud:
 def _ply_header(rows: int) -> bytes:
     kinds = {"float": ("x", "y", "z"), "uchar": ("red", "green", "blue"), "int": ("observations",)}
     properties = [f"property {kind} {name}" for kind, names in kinds.items() for name in names]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {rows}", *properties, "end_header"]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {rows}",
+        *properties,
+        "end_header",
+    ]
     return ("\n".join(lines) + "\n").encode()
 
 
@@ -314,5 +362,7 @@ def write_ply(path: Path, outputs: MapOutputs) -> None:
         DynslamError: The folder cannot be written.
     """
     rows = np.zeros(len(outputs.positions), _PLY_LAYOUT)
-    rows["position"], rows["colour"], rows["observations"] = outputs.positions, outputs.colours, outputs.observations
+    rows["position"] = outputs.positions
+    rows["colour"] = outputs.colours
+    rows["observations"] = outputs.observations
     write_atomic(path, _ply_header(len(rows)) + rows.tobytes())

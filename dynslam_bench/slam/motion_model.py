@@ -1,14 +1,16 @@
 """How a hand-held camera moves: white-noise acceleration, as a filter while tracking and a smoother afterwards.
 
-State of the filter: position p and velocity v in the world, orientation R_cam_world and angular velocity w in the
-camera frame; accelerations are white noise. The measurement is the pose that the image gives, with the Gauss-Newton
-matrix of its optimisation as information. With many well-spread inliers the image decides; with few the motion does.
-The smoother is the fixed-interval one of Rauch, Tung and Striebel (1965); it makes the final trajectory.
+State of the filter: position p and velocity v in the world, orientation R_cam_world and angular
+velocity w in the camera frame; accelerations are white noise. The measurement is the pose that the
+image gives, with the Gauss-Newton matrix of its optimisation as information. With many well-spread
+inliers the image decides; with few the motion does. The smoother is the fixed-interval one of
+Rauch, Tung and Striebel (1965); it makes the final trajectory.
 
-Each row of a rolling shutter's image is exposed a little later than the one above it: a moving camera has another pose
-in every row. Features are therefore moved to where the camera of the middle row, whose pose is the frame's, would
-have seen them. The motion is taken as constant within a frame (the model of Hedborg et al., Rolling Shutter Bundle
-Adjustment, CVPR 2012, applied before the pose is fitted instead of in it).
+Each row of a rolling shutter's image is exposed a little later than the one above it: a moving
+camera has another pose in every row. Features are therefore moved to where the camera of the middle
+row, whose pose is the frame's, would have seen them. The motion is taken as constant within a frame
+(the model of Hedborg et al., Rolling Shutter Bundle Adjustment, CVPR 2012, applied before the pose
+is fitted instead of in it).
 """
 
 from __future__ import annotations
@@ -26,7 +28,13 @@ from dynslam_bench.geometry import Camera, Trajectory, se3
 from dynslam_bench.geometry.gauss_newton import apply_twist
 from dynslam_bench.slam.map import Array, Map
 from dynslam_bench.slam.settings import MotionModelSettings
-from dynslam_bench.slam.tracking import MapFit, Observations, TrackedFrame, fit_pose, right_coordinates
+from dynslam_bench.slam.tracking import (
+    MapFit,
+    Observations,
+    TrackedFrame,
+    fit_pose,
+    right_coordinates,
+)
 
 CHI2_POSE = 12.592
 """95 % quantile of chi-square with six degrees of freedom."""
@@ -65,8 +73,11 @@ def pose_covariance(T_cam_world: Array, information: Array, inflation: float = I
 
 def _process_noise(dt: float, settings: MotionModelSettings) -> Array:
     variance = np.repeat([settings.acceleration**2, settings.angular_acceleration**2], 3)
-    noise, pose, speed = np.zeros((12, 12)), np.arange(6), np.arange(6, 12)
-    noise[pose, pose], noise[speed, speed] = variance * dt**4 / 4, variance * dt**2
+    noise = np.zeros((12, 12))
+    pose = np.arange(6)
+    speed = np.arange(6, 12)
+    noise[pose, pose] = variance * dt**4 / 4
+    noise[speed, speed] = variance * dt**2
     noise[pose, speed] = noise[speed, pose] = variance * dt**3 / 2
     return noise
 
@@ -74,8 +85,10 @@ def _process_noise(dt: float, settings: MotionModelSettings) -> Array:
 @kernel
 def _rotated(rotation: Array, vector: Array) -> Array:
     """A rotation matrix ``[3, 3]`` rotated further by a rotation vector ``[3]``, and kept orthonormal."""
-    pose, twist = np.eye(4), np.zeros(6)
-    pose[:3, :3], twist[3:] = rotation, vector
+    pose = np.eye(4)
+    twist = np.zeros(6)
+    pose[:3, :3] = rotation
+    twist[3:] = vector
     return apply_twist(pose, twist)[:3, :3]
 
 
@@ -98,7 +111,8 @@ class MotionState:
     @classmethod
     def at(cls, T_cam_world: Array, covariance: Array) -> MotionState:
         """A state with known pose and unknown velocity."""
-        r, unknown = T_cam_world[:3, :3], np.zeros((6, 6))
+        r = T_cam_world[:3, :3]
+        unknown = np.zeros((6, 6))
         full = np.block([[covariance, unknown], [unknown, np.diag(_START_SPEED**2)]])
         return cls(-r.T @ T_cam_world[:3, 3], r.copy(), np.zeros(6), full)
 
@@ -106,25 +120,32 @@ class MotionState:
     def T_cam_world(self) -> Array:
         """World-to-camera pose ``[4, 4]``."""
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = self.rotation, -self.rotation @ self.position
+        pose[:3, :3] = self.rotation
+        pose[:3, 3] = -self.rotation @ self.position
         return pose
 
     def difference(self, T_cam_world: Array) -> Array:
         """(position, rotation) ``[6]`` that leads from this state's pose to another."""
-        r, t = T_cam_world[:3, :3], T_cam_world[:3, 3]
+        r = T_cam_world[:3, :3]
+        t = T_cam_world[:3, 3]
         return np.concatenate([-r.T @ t - self.position, se3.rotation_vectors(r @ self.rotation.T)])
 
     def moved(self, correction: Array, covariance: Array) -> MotionState:
         """The state after a correction ``[12]``."""
         rotation = _rotated(self.rotation, correction[3:6])
-        return MotionState(self.position + correction[:3], rotation, self.speed + correction[6:], covariance)
+        return MotionState(
+            self.position + correction[:3], rotation, self.speed + correction[6:], covariance
+        )
 
     def transformed(self, rotation: Array, scale: float) -> MotionState:
         """The same motion after the world was rotated by ``[3, 3]`` and its lengths were multiplied."""
         by = np.eye(12)
         by[:3, :3] = by[6:9, 6:9] = scale * rotation
         return MotionState(
-            by[:3, :3] @ self.position, self.rotation @ rotation.T, by[6:, 6:] @ self.speed, by @ self.covariance @ by.T
+            by[:3, :3] @ self.position,
+            self.rotation @ rotation.T,
+            by[6:, 6:] @ self.speed,
+            by @ self.covariance @ by.T,
         )
 
     def predicted(self, dt: float, settings: MotionModelSettings) -> MotionState:
@@ -136,14 +157,18 @@ class MotionState:
     def motion_covariance(self, dt: float, settings: MotionModelSettings) -> Array:
         """Covariance ``[6, 6]`` of the motion in the next `dt` seconds.
 
-        Of (position in the world, rotation in the camera frame); where the camera is now plays no part.
+        Of (position in the world, rotation in the camera frame); where the camera is now plays no
+        part.
         """
         return np.asarray(dt**2 * self.covariance[6:, 6:] + _process_noise(dt, settings)[:6, :6])
 
     def updated(self, T_cam_world: Array, covariance: Array) -> MotionState:
         """The state after a measured pose; one beyond the chi-square limit inflates the predicted covariance."""
-        p, innovation = self.covariance, self.difference(T_cam_world)
-        surprise = float(innovation @ np.linalg.solve(p[:6, :6] + covariance, innovation)) / CHI2_POSE
+        p = self.covariance
+        innovation = self.difference(T_cam_world)
+        surprise = (
+            float(innovation @ np.linalg.solve(p[:6, :6] + covariance, innovation)) / CHI2_POSE
+        )
         if surprise > 1.0:
             p = p * surprise
         gain = np.linalg.solve(p[:6, :6] + covariance, p[:6]).T
@@ -151,7 +176,9 @@ class MotionState:
         return self.moved(gain @ innovation, 0.5 * (reduced + reduced.T))
 
 
-def smooth(stamps: Array, T_cam_world: Array, covariances: Array, settings: MotionModelSettings) -> Array:
+def smooth(
+    stamps: Array, T_cam_world: Array, covariances: Array, settings: MotionModelSettings
+) -> Array:
     """Fixed-interval smoothing of measured poses; gaps longer than `MAX_GAP_S` are not bridged.
 
     Args:
@@ -171,9 +198,13 @@ def smooth(stamps: Array, T_cam_world: Array, covariances: Array, settings: Moti
     return out
 
 
-def _smooth_part(stamps: Array, poses: Array, covariances: Array, settings: MotionModelSettings) -> Array:
+def _smooth_part(
+    stamps: Array, poses: Array, covariances: Array, settings: MotionModelSettings
+) -> Array:
     later = MotionState.at(poses[0], covariances[0])
-    filtered, predicted, steps = [later], [later], np.diff(stamps)
+    filtered = [later]
+    predicted = [later]
+    steps = np.diff(stamps)
     for k in range(1, len(stamps)):
         predicted.append(later.predicted(float(steps[k - 1]), settings))
         later = predicted[k].updated(poses[k], covariances[k])
@@ -203,7 +234,8 @@ class CameraMotion:
     """
 
     def __init__(self, settings: MotionModelSettings) -> None:
-        self._settings, self._interval = settings, FIRST_INTERVAL_S
+        self._settings = settings
+        self._interval = FIRST_INTERVAL_S
         self.state: MotionState | None = None
         self.intervals: deque[float] = deque(maxlen=INTERVALS)
 
@@ -224,10 +256,13 @@ class CameraMotion:
         if self.state is not None:
             self.state = self.state.transformed(T_cam_now[:3, :3].T @ T_cam_before[:3, :3], scale)
 
-    def expected(self, last: TrackedFrame, timestamp: float, *, jitter: float = 0.0) -> tuple[Array, Array | None]:
+    def expected(
+        self, last: TrackedFrame, timestamp: float, *, jitter: float = 0.0
+    ) -> tuple[Array, Array | None]:
         """World-to-camera pose at a time, and the covariance of the motion since the last frame.
 
-        Where nothing is known of the gap it is the pose of the last tracked frame, and no covariance.
+        Where nothing is known of the gap it is the pose of the last tracked frame, and no
+        covariance.
 
         Args:
             last: The last tracked frame.
@@ -242,7 +277,9 @@ class CameraMotion:
         covariance = self.state.motion_covariance(dt, self._settings)
         return self.state.predicted(dt, self._settings).T_cam_world, covariance
 
-    def filtered(self, last: TrackedFrame, timestamp: float, measured: Array, information: Array) -> Array:
+    def filtered(
+        self, last: TrackedFrame, timestamp: float, measured: Array, information: Array
+    ) -> Array:
         """Weigh the image's pose against the motion model, and remember the motion.
 
         Args:
@@ -265,7 +302,8 @@ class CameraMotion:
         return self.state.T_cam_world
 
 
-# ---------------------------------------------------------------------- rolling-shutter compensation
+# ---------------------------------------------------------------------- rolling-shutter
+# compensation
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,10 +322,14 @@ class CameraVelocity:
     def between(cls, before: Array, now: Array, seconds: float) -> CameraVelocity:
         """From two world-to-camera poses ``[4, 4]`` so many seconds apart; in the camera frame of the later one."""
         angular = se3.rotation_vectors(now[:3, :3] @ before[:3, :3].T) / seconds
-        return cls(now[:3, :3] @ (se3.inverse(before)[:3, 3] - se3.inverse(now)[:3, 3]) / seconds, angular)
+        return cls(
+            now[:3, :3] @ (se3.inverse(before)[:3, 3] - se3.inverse(now)[:3, 3]) / seconds, angular
+        )
 
 
-def compensate_rolling_shutter(observations: Observations, camera: Camera, velocity: CameraVelocity) -> Observations:
+def compensate_rolling_shutter(
+    observations: Observations, camera: Camera, velocity: CameraVelocity
+) -> Observations:
     """The features as a global shutter would have seen them at the frame's stamp, the time of the middle row.
 
     Where a feature has no depth, only the rotation is undone.
@@ -298,30 +340,45 @@ def compensate_rolling_shutter(observations: Observations, camera: Camera, veloc
         velocity: The motion during the frame.
 
     Returns:
-        New observations; a feature that such a motion would put behind the camera stays where it is.
+        New observations; a feature that such a motion would put behind the camera stays where it
+        is.
     """
     lens = camera.fx, camera.fy, camera.cx, camera.cy
     late = ((observations.keypoints.xy[:, 1] + 0.5) / camera.height - 0.5) * camera.readout_s
-    xy, z = _compensated(observations.xy, observations.z, late, velocity.linear, velocity.angular, *lens)
+    xy, z = _compensated(
+        observations.xy, observations.z, late, velocity.linear, velocity.angular, *lens
+    )
     grid = CellGrid.of(xy, camera.width, camera.height)
     return replace(observations, xy=xy, z=z, right=right_coordinates(xy, z, camera), grid=grid)
 
 
 @kernel
 def _compensated(
-    xy: Array, z: Array, late: Array, linear: Array, angular: Array, fx: float, fy: float, cx: float, cy: float
+    xy: Array,
+    z: Array,
+    late: Array,
+    linear: Array,
+    angular: Array,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
 ) -> tuple[Array, Array]:
     """Pixels and depths of features that were exposed so many seconds after the middle row, as of that row's time."""
-    xy, z, speed = xy.copy(), z.copy(), np.sqrt((angular**2).sum())
+    xy = xy.copy()
+    z = z.copy()
+    speed = np.sqrt((angular**2).sum())
     ax, ay, az = angular / max(speed, 1e-12)
     for i in range(len(xy)):
         has_depth = z[i] > 0
-        depth, travelled = z[i] if has_depth else 1.0, late[i] if has_depth else 0.0
+        depth = z[i] if has_depth else 1.0
+        travelled = late[i] if has_depth else 0.0
         x = (xy[i, 0] - cx) / fx * depth - travelled * linear[0]
         y = (xy[i, 1] - cy) / fy * depth - travelled * linear[1]
         depth -= travelled * linear[2]
         # Rodrigues' rotation by -late * angular
-        cosine, sine = np.cos(late[i] * speed), -np.sin(late[i] * speed)
+        cosine = np.cos(late[i] * speed)
+        sine = -np.sin(late[i] * speed)
         along = (1 - cosine) * (ax * x + ay * y + az * depth)
         ahead = cosine * depth + sine * (ax * y - ay * x) + along * az
         if ahead > 0:
@@ -335,8 +392,8 @@ def _compensated(
 class RollingShutter:
     """Compensates the frames that follow a tracked one: by the motion before, then by the frame's own pose.
 
-    The velocity is not the motion filter's: that takes the acceleration as constant between frames, and oscillates
-    about the true velocity of a hand-held camera from one frame to the next.
+    The velocity is not the motion filter's: that takes the acceleration as constant between frames,
+    and oscillates about the true velocity of a hand-held camera from one frame to the next.
 
     Args:
         camera: Intrinsics without distortion, and `readout_s`.
@@ -347,7 +404,8 @@ class RollingShutter:
     """
 
     def __init__(self, camera: Camera, intervals: deque[float]) -> None:
-        self._camera, self._intervals = camera, intervals
+        self._camera = camera
+        self._intervals = intervals
         self.velocity: CameraVelocity | None = None
 
     def predicted(self, raw: Observations, last: TrackedFrame, timestamp: float) -> Observations:
@@ -368,7 +426,8 @@ class RollingShutter:
     ) -> tuple[Observations, MapFit, CameraVelocity | None]:
         """The features compensated by the motion to the frame's pose, the pose fitted to them, and that motion.
 
-        A pose that jumps, as at a cut, tells no motion: where fewer points agree then, nothing changes.
+        A pose that jumps, as at a cut, tells no motion: where fewer points agree then, nothing
+        changes.
 
         Args:
             raw: The measured features.
@@ -378,14 +437,17 @@ class RollingShutter:
             timestamp: The frame's stamp, seconds.
             force: Whether fewer points may agree, as before the first frame is compensated.
         """
-        pose, dt = fit.estimate.T_cam_world, timestamp - last.timestamp
+        pose = fit.estimate.T_cam_world
+        dt = timestamp - last.timestamp
         if not 0 < dt <= MAX_GAP_S:
             return observations, fit, None
         # a camera exposes at a regular rate, however its frames were stamped
         usual = float(np.median(self._intervals)) if self._intervals else dt
         regular = round(dt / usual) * usual
         exposed = regular if abs(dt - regular) <= STAMP_NOISE * usual else dt
-        velocity = CameraVelocity.between(last.T_cam_world, pose, max(exposed, self._camera.readout_s))
+        velocity = CameraVelocity.between(
+            last.T_cam_world, pose, max(exposed, self._camera.readout_s)
+        )
         compensated = compensate_rolling_shutter(raw, self._camera, velocity)
         refit = fit_pose(self._camera, compensated, fit.matches, pose, fit.in_view)
         if refit.count < MIN_AGREEING * fit.count and not force:
@@ -422,17 +484,26 @@ def rescale(history: Sequence[FramePose], scales: Mapping[int, float]) -> None:
         frame.information[:, :3] /= scale
 
 
-def trajectory(history: Sequence[FramePose], world: Map, settings: MotionModelSettings) -> Trajectory:
+def trajectory(
+    history: Sequence[FramePose], world: Map, settings: MotionModelSettings
+) -> Trajectory:
     """Camera-to-world poses in the order of their stamps, smoothed where the settings say so.
 
-    Frames of unmerged submaps are left out: where they were taken in the root map's world is unknown.
+    Frames of unmerged submaps are left out: where they were taken in the root map's world is
+    unknown.
     """
-    frames = {frame.timestamp: frame for frame in reversed(history) if world.kf_map[frame.reference] == 0}
-    stamps, ordered = np.array(sorted(frames), np.float64), [frames[stamp] for stamp in sorted(frames)]
-    poses = np.array([frame.T_cam_ref @ world.kf_pose[frame.reference] for frame in ordered]).reshape(-1, 4, 4)
+    frames = {
+        frame.timestamp: frame for frame in reversed(history) if world.kf_map[frame.reference] == 0
+    }
+    stamps = np.array(sorted(frames), np.float64)
+    ordered = [frames[stamp] for stamp in sorted(frames)]
+    poses = np.array(
+        [frame.T_cam_ref @ world.kf_pose[frame.reference] for frame in ordered]
+    ).reshape(-1, 4, 4)
     if settings.smooth and len(poses) > 2:
         covariances = [
-            pose_covariance(pose, f.information.astype(float)) for pose, f in zip(poses, ordered, strict=True)
+            pose_covariance(pose, f.information.astype(float))
+            for pose, f in zip(poses, ordered, strict=True)
         ]
         poses = smooth(stamps, poses, np.array(covariances), settings)
     return Trajectory(stamps, se3.inverse(poses))

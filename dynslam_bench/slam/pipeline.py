@@ -1,6 +1,7 @@
 """The frame pipeline of a visual SLAM system for dynamic scenes (paper, Figure 2), from top to bottom.
 
-Every published system runs this file; it differs only in its list of filters, its flow and its settings.
+Every published system runs this file; it differs only in its list of filters, its flow and its
+settings.
 """
 
 from __future__ import annotations
@@ -75,7 +76,8 @@ class StageClock:
         """Time the body as part of a stage."""
         cached = self._cached.get(stage)
         if cached is not None:
-            cached.hit, cached.saved_s = False, 0.0
+            cached.hit = False
+            cached.saved_s = 0.0
         start = time.perf_counter()
         yield
         elapsed = time.perf_counter() - start + (0.0 if cached is None else cached.saved_s)
@@ -103,16 +105,20 @@ class SlamPipeline:
     """A tracker: segmentation, features, culling, flow, tracking and mapping, one frame at a time.
 
     Args:
-        extractor: Extracts the keypoints; a `MaskedExtractor` extracts enough of them outside the dynamic mask.
+        extractor: Extracts the keypoints; a `MaskedExtractor` extracts enough of them outside the
+            dynamic mask.
         masks: Segmentation stage; None for systems without semantics.
         filters: Dynamic feature filters in the order of application.
-        flow: Flow of the keypoints that are left to the previous image; run before the first filter that needs it.
-        refine_prediction: Gives the predicted pose ``T_world_cam`` that follows from the flow and the motion model,
-            None where neither tells; needed with a flow.
+        flow: Flow of the keypoints that are left to the previous image; run before the first filter
+            that needs it.
+        refine_prediction: Gives the predicted pose ``T_world_cam`` that follows from the flow and
+            the motion model, None where neither tells; needed with a flow.
         backend: Tracking and mapping.
-        settings: The system's complete settings; their group ``guard`` says what the filters must leave.
-        cached: Stages that answer from the stage cache, by name (``features``, ``segmentation``); their times are
-            reported as they are without it, and ``cached_stages`` in `stats` says how many answered from it.
+        settings: The system's complete settings; their group ``guard`` says what the filters must
+            leave.
+        cached: Stages that answer from the stage cache, by name (``features``, ``segmentation``);
+            their times are reported as they are without it, and ``cached_stages`` in `stats` says
+            how many answered from it.
 
     Raises:
         TrackerError: A filter needs a flow and there is none.
@@ -138,7 +144,9 @@ class SlamPipeline:
         self._masks = masks
         self._filters = tuple(filters)
         if flow is not None and refine_prediction is None:
-            raise TrackerError("a system with an optical flow needs a function that refines the predicted pose with it")
+            raise TrackerError(
+                "a system with an optical flow needs a function that refines the predicted pose with it"
+            )
         self._flow = flow
         self._refine_prediction = refine_prediction
         self._backend = backend
@@ -168,7 +176,8 @@ class SlamPipeline:
             TrackerError: `reset` was not called.
             SequenceError: The frame does not fit the camera (see `check_frame`).
         """
-        backend, camera = self._started(), self._camera
+        backend = self._started()
+        camera = self._camera
         check_frame(frame, camera)
         if not backend.uses_depth:
             frame = replace(frame, depth=np.zeros((camera.height, camera.width), np.float32))
@@ -183,16 +192,25 @@ class SlamPipeline:
                 if self._segmentation is not None and instances.class_names:
                     mask = dynamic_mask(instances, self._segmentation, depth)
         with clock("features"):
-            if mask is None or self._segmentation is None or not isinstance(self._extractor, MaskedExtractor):
+            if (
+                mask is None
+                or self._segmentation is None
+                or not isinstance(self._extractor, MaskedExtractor)
+            ):
                 keypoints = self._extractor.extract(gray)
             else:
-                keypoints = self._extractor.extract_masked(gray, mask, self._segmentation.outside_share)
+                keypoints = self._extractor.extract_masked(
+                    gray, mask, self._segmentation.outside_share
+                )
             xy = camera.undistort_points(keypoints.xy)
         column, row = np.rint(keypoints.xy).astype(np.intp).T
         z = depth[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)].clip(min=0)
-        bundle = FrameBundle(frame.index, frame.timestamp, frame.rgb, gray, depth, keypoints, xy, z, instances, mask)
+        bundle = FrameBundle(
+            frame.index, frame.timestamp, frame.rgb, gray, depth, keypoints, xy, z, instances, mask
+        )
         state = self._filter_state(bundle, camera)
-        static, image = self._cull(bundle, state, clock)  # flow runs on demand, on what the masks leave
+        # flow runs on demand, on what the masks leave
+        static, image = self._cull(bundle, state, clock)
         result = backend.track(bundle, static.keep, static.weight)  # with mapping and loop closing
         # the pose of a frame that is not tracked in the root map's world is unknown
         pose = result.T_world_cam if result.state == backend.state == "ok" else None
@@ -200,9 +218,12 @@ class SlamPipeline:
         self._keyframe_due = result.state != "ok" or bool(result.stats["keyframe"])
         timings = clock.seconds | dict(result.timings)
         if self._masks is not None and self._masks.beside_s:
-            timings["detector"] = self._masks.beside_s  # in a thread of its own: not a part of the frame's time
+            # in a thread of its own: not a part of the frame's time
+            timings["detector"] = self._masks.beside_s
         stats = self._stats(bundle, state, static, result)
-        return TrackResult(result.T_world_cam, result.state, stats, timings, static.mask, keypoints.xy, static.keep)
+        return TrackResult(
+            result.T_world_cam, result.state, stats, timings, static.mask, keypoints.xy, static.keep
+        )
 
     def _filter_state(self, frame: FrameBundle, camera: Camera) -> FilterState:
         """What filters may read beside the frame: the previous frame, the prediction and the map."""
@@ -222,15 +243,19 @@ class SlamPipeline:
             seed=int(stream(self._seed, "frame", frame.index).integers(2**63)),
         )
 
-    def _cull(self, frame: FrameBundle, state: FilterState, clock: StageClock) -> tuple[FilterResult, Any]:
+    def _cull(
+        self, frame: FrameBundle, state: FilterState, clock: StageClock
+    ) -> tuple[FilterResult, Any]:
         """Which keypoints are static, by all filters in order; the first that needs the flow starts it.
 
         Returns:
-            The filters' common verdict. Its stats are every filter's, each name with the filter's before it, and how
-            many of the last filters the guard set aside because too few keypoints would be left. Beside it this
-            frame's image as the flow prepared it, None if no flow ran.
+            The filters' common verdict. Its stats are every filter's, each name with the filter's
+            before it, and how many of the last filters the guard set aside because too few
+            keypoints would be left. Beside it this frame's image as the flow prepared it, None if
+            no flow ran.
         """
-        image, verdicts = None, []
+        image = None
+        verdicts = []
         stats: dict[str, float] = {}
         for dynamic_filter in self._filters:
             if "flow" in dynamic_filter.needs and image is None:
@@ -240,7 +265,9 @@ class SlamPipeline:
             state.keep = state.keep & verdict.keep
             verdicts.append(verdict)
             stats |= {f"{dynamic_filter.name}_{key}": value for key, value in verdict.stats.items()}
-        keep, undone = restore_starved([verdict.keep for verdict in verdicts], self._guard, len(frame.xy))
+        keep, undone = restore_starved(
+            [verdict.keep for verdict in verdicts], self._guard, len(frame.xy)
+        )
         used = verdicts[: len(verdicts) - undone]
         weight = np.ones(len(frame.xy), np.float32)
         for verdict in used:
@@ -255,7 +282,11 @@ class SlamPipeline:
         with clock("flow"):
             image = self._flow.prepare(frame.gray)
             if (previous := self._previous) is not None:
-                other = self._flow.prepare(previous.frame.gray) if previous.image is None else previous.image
+                other = (
+                    self._flow.prepare(previous.frame.gray)
+                    if previous.image is None
+                    else previous.image
+                )
                 state.flow = flow_to_previous(self._flow, image, other, frame, state)
         assert self._refine_prediction is not None  # checked in the constructor
         with clock("ego_motion"):
@@ -274,7 +305,10 @@ class SlamPipeline:
             **static.stats,
         }
         flow_stats = {} if state.flow is None else state.flow.stats
-        stats |= {f"flow_{name}": flow_stats.get(name, 0.0) for name in getattr(self._flow, "stats_names", ())}
+        stats |= {
+            f"flow_{name}": flow_stats.get(name, 0.0)
+            for name in getattr(self._flow, "stats_names", ())
+        }
         if self._masks is not None:
             stats["segmented"] = float(self._masks.segmented)
         if self._cached:
@@ -307,7 +341,8 @@ class SlamPipeline:
             made_by: Which run made it, in words.
 
         Raises:
-            TrackerError: `reset` was never called, there is no map yet, or it is too large for a file.
+            TrackerError: `reset` was never called, there is no map yet, or it is too large for a
+                file.
             DynslamError: The file cannot be written.
         """
         self._started().save_map(path, made_by)
@@ -321,14 +356,19 @@ class SlamPipeline:
         """Put other values of online settings into force from the next frame on; `reset` undoes it.
 
         Args:
-            settings: The complete settings, of which only online fields differ from those it was built with.
+            settings: The complete settings, of which only online fields differ from those it was
+                built with.
         """
         self._online.configure(settings)
 
-    def _configurable_parts(self, settings: Settings) -> Iterator[tuple[str, Callable[[Any], None]]]:
+    def _configurable_parts(
+        self, settings: Settings
+    ) -> Iterator[tuple[str, Callable[[Any], None]]]:
         """Each group of the settings with every part that takes it."""
         parts: list[tuple[str, Any]] = [
-            (group, part) for part in self._filters for group in getattr(part, "groups", (part.name,))
+            (group, part)
+            for part in self._filters
+            for group in getattr(part, "groups", (part.name,))
         ]
         parts += zip(
             ("features", "segmentation", "flow", "backend"),
@@ -339,7 +379,8 @@ class SlamPipeline:
             if isinstance(part, Reconfigurable) and hasattr(settings, group):
                 yield group, part.configure
         if hasattr(settings, "guard"):
-            yield "guard", partial(setattr, self, "_guard")  # a deep copy of it configures the copy, unlike a closure
+            # a deep copy of it configures the copy, unlike a closure
+            yield "guard", partial(setattr, self, "_guard")
         if self._segmentation is not None:
             yield "segmentation", partial(setattr, self, "_segmentation")
 
@@ -362,7 +403,8 @@ def restore_starved(
         total: N.
 
     Returns:
-        The combined keep mask ``[N]`` and how many verdicts were set aside; with all set aside every feature is kept.
+        The combined keep mask ``[N]`` and how many verdicts were set aside; with all set aside
+        every feature is kept.
     """
     needed = min(total, max(settings.min_features, int(np.ceil(settings.min_fraction * total))))
     for undone in range(len(verdicts)):
@@ -384,12 +426,16 @@ def flow_to_previous(
         frame: This frame.
         state: With the keypoints that are left and both poses.
     """
-    kept, count = np.flatnonzero(state.keep), len(frame.xy)
+    kept = np.flatnonzero(state.keep)
+    count = len(frame.xy)
     guess = predicted_flow(frame, state)[kept]
     result = flow.track(image, previous, frame.keypoints.xy[kept], guess=guess, seed=state.seed)
-    xy, cost = np.full((count, 2), np.nan, np.float32), np.full(count, np.inf, np.float32)
+    xy = np.full((count, 2), np.nan, np.float32)
+    cost = np.full(count, np.inf, np.float32)
     valid = np.zeros(count, bool)
-    xy[kept], valid[kept], cost[kept] = result.xy, result.valid, result.cost
+    xy[kept] = result.xy
+    valid[kept] = result.valid
+    cost[kept] = result.cost
     return FlowResult(xy, valid, cost, result.stats)
 
 
@@ -403,11 +449,16 @@ def predicted_flow(frame: FrameBundle, state: FilterState) -> NDArray[np.float32
     Returns:
         Raw pixels float32 ``[N, 2]``; NaN where depth or a prediction is missing.
     """
-    guess, has_depth = np.full((len(frame.xy), 2), np.nan, np.float32), frame.z > 0
+    guess = np.full((len(frame.xy), 2), np.nan, np.float32)
+    has_depth = frame.z > 0
     if state.T_world_prev is None or state.T_world_pred is None or not has_depth.any():
         return guess
-    camera, T_prev_cur = state.camera, se3.inverse(state.T_world_prev) @ state.T_world_pred
-    points = camera.unproject(frame.xy[has_depth], frame.z[has_depth]) @ T_prev_cur[:3, :3].T + T_prev_cur[:3, 3]
+    camera = state.camera
+    T_prev_cur = se3.inverse(state.T_world_prev) @ state.T_world_pred
+    points = (
+        camera.unproject(frame.xy[has_depth], frame.z[has_depth]) @ T_prev_cur[:3, :3].T
+        + T_prev_cur[:3, 3]
+    )
     ahead = points[:, 2] > 0.05
     guess[np.flatnonzero(has_depth)[ahead]] = camera.distort_points(camera.project(points[ahead]))
     return guess

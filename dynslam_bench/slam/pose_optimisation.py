@@ -1,10 +1,11 @@
 """Robust pose optimisation against known points: Gauss-Newton on SE(3) with the right coordinate of depth.
 
-The residual of a point is ``(u - u', v - v', ur - (u' - b f / z'))``; features without depth have the first two rows
-only. Rounds of a Huber-weighted Gauss-Newton alternate with a chi-square test that sets outliers aside, as in
-motion-only bundle adjustment of ORB-SLAM2 (Mur-Artal and Tardos, 2017, Section III-C). The last round weighs the
-inliers by Cauchy's kernel, as wide as their own residuals are: most features are located far more exactly than
-the assumed pixel, and those that are not would move the pose by centimetres.
+The residual of a point is ``(u - u', v - v', ur - (u' - b f / z'))``; features without depth have
+the first two rows only. Rounds of a Huber-weighted Gauss-Newton alternate with a chi-square test
+that sets outliers aside, as in motion-only bundle adjustment of ORB-SLAM2 (Mur-Artal and Tardos,
+2017, Section III-C). The last round weighs the inliers by Cauchy's kernel, as wide as their own
+residuals are: most features are located far more exactly than the assumed pixel, and those that are
+not would move the pose by centimetres.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ CHI2_DEPTH = 7.815
 """95 % quantile of chi-square with three degrees of freedom."""
 CAUCHY = 5.0
 """Squared width of Cauchy's kernel over the variance of the residuals: their weights are those of Student's t with five
-degrees of freedom (Kerl, Sturm and Cremers, Robust Odometry Estimation for RGB-D Cameras, ICRA 2013)."""
+degrees of freedom (Kerl, Sturm and Cremers, Robust Odometry Estimation for RGB-D Cameras, ICRA
+2013)."""
 MEDIAN_CHI2 = 1.386
 """Median of chi-square with two degrees of freedom."""
 LEAST_VARIANCE = 0.01
@@ -44,7 +46,8 @@ class PoseEstimate:
         T_cam_world: World-to-camera pose ``[4, 4]``.
         inliers: bool ``[N]``.
         count: Number of inliers.
-        residual_px: Median reprojection error of the inliers in pixels of octave 0; NaN without any.
+        residual_px: Median reprojection error of the inliers in pixels of octave 0; NaN without
+            any.
         information: Gauss-Newton matrix ``[6, 6]`` of (translation, rotation) in the camera frame.
     """
 
@@ -71,7 +74,8 @@ def _linearise(
 
     The cost is that of Cauchy's kernel of a squared width, or of Huber's where that is 0.
     """
-    sums, cost = normal_equations(), 0.0
+    sums = normal_equations()
+    cost = 0.0
     for i in range(points.shape[0]):
         if not active[i]:
             continue
@@ -83,7 +87,8 @@ def _linearise(
             continue
         iz = 1.0 / z
         u = fx * x * iz + cx
-        du, dv = uv[i, 0] - u, uv[i, 1] - (fy * y * iz + cy)
+        du = uv[i, 0] - u
+        dv = uv[i, 1] - (fy * y * iz + cy)
         dr = right[i] - (u - bf * iz) if depth else 0.0
         chi2 = info[i] * (du * du + dv * dv) + (info_right[i] * dr * dr if depth else 0.0)
         w = 1.0
@@ -95,13 +100,22 @@ def _linearise(
             cost += 2.0 * np.sqrt(limit * chi2) - limit
         else:
             cost += chi2
-        a, b, c = fx * iz, fy * iz, bf * iz * iz
-        j2, j3, j4, j5 = -a * x * iz, -fx * x * y * iz * iz, fx * (1.0 + x * x * iz * iz), -a * y
+        a = fx * iz
+        b = fy * iz
+        c = bf * iz * iz
+        j2 = -a * x * iz
+        j3 = -fx * x * y * iz * iz
+        j4 = fx * (1.0 + x * x * iz * iz)
+        j5 = -a * y
         sums = add_normal_equation(sums, w * info[i], a, 0.0, j2, j3, j4, j5, du)
         turned = -fy * (1.0 + y * y * iz * iz)
-        sums = add_normal_equation(sums, w * info[i], 0.0, b, -b * y * iz, turned, fy * x * y * iz * iz, b * x, dv)
+        sums = add_normal_equation(
+            sums, w * info[i], 0.0, b, -b * y * iz, turned, fy * x * y * iz * iz, b * x, dv
+        )
         if depth:
-            sums = add_normal_equation(sums, w * info_right[i], a, 0.0, j2 + c, j3 + c * y, j4 - c * x, j5, dr)
+            sums = add_normal_equation(
+                sums, w * info_right[i], a, 0.0, j2 + c, j3 + c * y, j4 - c * x, j5, dr
+            )
     store_normal_equations(sums, h, g)
     return cost
 
@@ -116,7 +130,8 @@ def observation_chi2(
     if z < NEAR_M:
         return np.inf, np.inf
     u = fx * x / z + cx
-    du, dv = uv[0] - u, uv[1] - (fy * y / z + cy)
+    du = uv[0] - u
+    dv = uv[1] - (fy * y / z + cy)
     pixel = info * (du * du + dv * dv)
     if info_right <= 0.0:
         return pixel, pixel
@@ -130,7 +145,9 @@ def _classify(
     fx: float, fy: float, cx: float, cy: float, bf: float, inlier: NDArray[np.bool_], error: Array,
 ) -> None:  # fmt: skip
     for i in range(points.shape[0]):
-        pixel, whole = observation_chi2(pose, points[i], uv[i], right[i], info[i], info_right[i], fx, fy, cx, cy, bf)
+        pixel, whole = observation_chi2(
+            pose, points[i], uv[i], right[i], info[i], info_right[i], fx, fy, cx, cy, bf
+        )
         error[i] = np.sqrt(pixel)
         inlier[i] = whole <= (CHI2_DEPTH if info_right[i] > 0.0 else CHI2_MONO)
 
@@ -140,12 +157,16 @@ def _optimise(
     pose: Array, points: Array, uv: Array, right: Array, info: Array, info_right: Array,
     fx: float, fy: float, cx: float, cy: float, bf: float, rounds: int, iterations: int,
 ) -> tuple[Array, NDArray[np.bool_], Array, Array]:  # fmt: skip
-    inlier, error = np.ones(len(points), np.bool_), np.zeros(len(points))
-    h, g = np.zeros((6, 6)), np.zeros(6)
+    inlier = np.ones(len(points), np.bool_)
+    error = np.zeros(len(points))
+    h = np.zeros((6, 6))
+    g = np.zeros(6)
     for turn in range(rounds):
         width = cauchy_width(error[inlier] ** 2) if turn == rounds - 1 else 0.0
         damping = 1e-6
-        cost = _linearise(pose, points, uv, right, info, info_right, inlier, width, fx, fy, cx, cy, bf, h, g)
+        cost = _linearise(
+            pose, points, uv, right, info, info_right, inlier, width, fx, fy, cx, cy, bf, h, g
+        )
         for _ in range(iterations):
             work = h.copy()
             for m in range(6):
@@ -154,11 +175,32 @@ def _optimise(
             if not cholesky_solve(work, step):
                 break
             candidate = apply_twist(pose, step)
-            h2, g2 = np.zeros((6, 6)), np.zeros(6)
-            new = _linearise(candidate, points, uv, right, info, info_right, inlier, width, fx, fy, cx, cy, bf, h2, g2)
+            h2 = np.zeros((6, 6))
+            g2 = np.zeros(6)
+            new = _linearise(
+                candidate,
+                points,
+                uv,
+                right,
+                info,
+                info_right,
+                inlier,
+                width,
+                fx,
+                fy,
+                cx,
+                cy,
+                bf,
+                h2,
+                g2,
+            )
             if new <= cost:
-                gain, damping = cost - new, max(damping * 0.1, 1e-9)
-                pose, cost, h, g = candidate, new, h2, g2
+                gain = cost - new
+                damping = max(damping * 0.1, 1e-9)
+                pose = candidate
+                cost = new
+                h = h2
+                g = g2
                 if gain < 1e-4 * (cost + 1e-12):
                     break
             else:
@@ -202,8 +244,14 @@ def optimise_pose(
     if len(points) < 6:
         return PoseEstimate(T_cam_world, np.zeros(len(points), bool), 0, np.nan, np.zeros((6, 6)))
     start = np.ascontiguousarray(T_cam_world, np.float64)
-    points, uv, right, info, info_right = map(np.ascontiguousarray, (points, uv, right, info, info_right))
+    points, uv, right, info, info_right = map(
+        np.ascontiguousarray, (points, uv, right, info, info_right)
+    )
     lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.fx * camera.baseline_m
-    pose, inliers, error, h = _optimise(start, points, uv, right, info, info_right, *lens, rounds, iterations)
+    pose, inliers, error, h = _optimise(
+        start, points, uv, right, info, info_right, *lens, rounds, iterations
+    )
     residual_px = float(np.median(error[inliers])) if inliers.any() else np.nan
-    return PoseEstimate(pose, inliers, int(np.count_nonzero(inliers)), residual_px, np.tril(h) + np.tril(h, -1).T)
+    return PoseEstimate(
+        pose, inliers, int(np.count_nonzero(inliers)), residual_px, np.tril(h) + np.tril(h, -1).T
+    )

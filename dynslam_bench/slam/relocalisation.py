@@ -1,16 +1,18 @@
 """Relocalisation: which keyframes show the place of a frame, its pose there, and whether the place is verified.
 
 1. *Rank*: keyframes are scored by the 16-bit substrings of binary descriptors that they share with the frame. Two
-   descriptors of one point differ in few bits, so that some substrings are equal; those of different points seldom
-   share one (multi-index hashing: Norouzi, Punjani and Fleet, 2012). Nothing is trained or downloaded.
+   descriptors of one point differ in few bits, so that some substrings are equal; those of
+   different points seldom share one (multi-index hashing: Norouzi, Punjani and Fleet, 2012).
+   Nothing is trained or downloaded.
 2. *Pose*: descriptors are matched with a candidate's map points; a pose follows by RANSAC over three-point poses.
 3. *Verify*: all points around the candidate are matched. What was mapped there and should be in view has to be seen,
-   unless a mask hides it; a few dozen matches alone fit between places that share a shelf or a poster.
+   unless a mask hides it; a few dozen matches alone fit between places that share a shelf or a
+   poster.
 4. *Uncertainty*: the matches have to determine the pose well; those on one distant poster do not.
 5. *Perceptual aliasing*: the features must not fit a second place, as in buildings with repeated corridors.
 6. *Relocalisation gate*: the pose has to be within what the camera can have moved. Buildings repeat themselves: the
-   next door looks like the last one, and the local map there agrees. A camera covers a limited distance in the time,
-   and the images since the last tracked frame tell how far it has rotated.
+   next door looks like the last one, and the local map there agrees. A camera covers a limited
+   distance in the time, and the images since the last tracked frame tell how far it has rotated.
 
 The map is read and never changed (but for the index, which is brought up to date).
 """
@@ -50,9 +52,11 @@ STRIDE = 4
 CHANGED = 0.25
 """A keyframe is indexed again when it has gained or lost this share of its points."""
 
-MAX_DISTANCE, RATIO = 60, 0.85
+MAX_DISTANCE = 60
+RATIO = 0.85
 """Largest Hamming distance of a match by descriptor alone, and over that of the second nearest."""
-RANSAC_ITERATIONS, RANSAC_BATCH = 150, 25
+RANSAC_ITERATIONS = 150
+RANSAC_BATCH = 25
 """RANSAC samples at most, and how many of them are evaluated together."""
 PNP_CANDIDATES = 5
 """Keyframes with the most descriptor matches that RANSAC is tried on."""
@@ -71,7 +75,8 @@ MAX_DILUTION = 0.1
 """Largest dilution of precision: uncertainty of the position in median depths, with the information of one match."""
 MIN_SPREAD_MATCHES = 12
 """Matches at least: a half of fewer determines no pose."""
-SPLITS, MAX_SPLIT_SPREAD = 12, 0.01
+SPLITS = 12
+MAX_SPLIT_SPREAD = 0.01
 """Random halves of the matches that the pose is fitted to, and the largest spread of these positions, median depths."""
 
 ALIASING_CANDIDATES = 12
@@ -79,14 +84,16 @@ ALIASING_CANDIDATES = 12
 ALIASING_SHARE = 0.33
 """What a second place has to show, as a share of what the first one does. Without repetition it is 0.15 at most, with
 repeated walls 0.4 to 1 (rendered buildings)."""
-SAME_PLACE_DEPTHS, SAME_PLACE_ANGLE = 0.3, np.radians(15.0)
+SAME_PLACE_DEPTHS = 0.3
+SAME_PLACE_ANGLE = np.radians(15.0)
 """Poses farther apart, in median depths of what is seen, or rotated by more, are two places."""
 MIN_ALIASING_MATCHES = 30
 """Matches that make a second place."""
 
 CANDIDATES = 10
 """Best-ranked keyframes that are matched feature by feature; bounds the time of a frame."""
-MANY_POINTS, MANY_POINTS_SHARE = 60, 0.75
+MANY_POINTS = 60
+MANY_POINTS_SHARE = 0.75
 """With so many matches at a place this factor of the required share suffices."""
 
 SLACK_M = 0.5
@@ -94,19 +101,24 @@ SLACK_M = 0.5
 KIDNAP_POINTS = 60
 """A frame that shows so many map points, as many as a map begins with, followed by one that shows none of them and is
 not connected with it: the camera was kidnapped."""
-CONNECTED, CONNECTED_SHARE = 20, 0.4
+CONNECTED = 20
+CONNECTED_SHARE = 0.4
 """Matches that fit one homography, and their share of all, that connect two images."""
 HOMOGRAPHY_PX = 4.0
 """Largest error of these matches, pixels."""
-ROTATION_SLACK, ROTATION_SLACK_SHARE = np.radians(20.0), 0.75
+ROTATION_SLACK = np.radians(20.0)
+ROTATION_SLACK_SHARE = 0.75
 """Largest error of the rotation: an angle, and a share of all rotations between images. A camera that moves sideways
-seems to rotate. On four rendered laps none of 4,000 sections of 3 to 30 steps exceeded the share and half the angle."""
+seems to rotate. On four rendered laps none of 4,000 sections of 3 to 30 steps exceeded the share
+and half the angle."""
 
 
 # ---------------------------------------------------------------------- rank
 
 
-def top_candidates(world: Map, keyframes: Slots, observations: Observations, count: int) -> list[int]:
+def top_candidates(
+    world: Map, keyframes: Slots, observations: Observations, count: int
+) -> list[int]:
     """The keyframes with the highest place-recognition scores.
 
     Args:
@@ -116,20 +128,23 @@ def top_candidates(world: Map, keyframes: Slots, observations: Observations, cou
         count: How many to choose at most.
 
     Returns:
-        Slots, best first; of equal scores the newer keyframe. All, in the order given, if there are at most `count`.
+        Slots, best first; of equal scores the newer keyframe. All, in the order given, if there are
+        at most `count`.
     """
     if len(keyframes) <= count or not len(observations):
         return list(map(int, keyframes[:count]))
-    order = np.lexsort((-world.kf_id[keyframes], -recognition_scores(world, keyframes, observations)))
+    order = np.lexsort(
+        (-world.kf_id[keyframes], -recognition_scores(world, keyframes, observations))
+    )
     return list(map(int, keyframes[order[:count]]))
 
 
 def recognition_scores(world: Map, keyframes: Slots, observations: Observations) -> Array:
     """Place-recognition scores ``[S]`` of keyframes; comparable within one call alone.
 
-    The sum of the weights of the substrings that a keyframe shares with the frame, over the root of its number of
-    points: many points share more by chance. The weight is the logarithm of how much rarer a substring is than all of
-    the frame's together.
+    The sum of the weights of the substrings that a keyframe shares with the frame, over the root of
+    its number of points: many points share more by chance. The weight is the logarithm of how much
+    rarer a substring is than all of the frame's together.
     """
     _index_substrings(world)
     query = np.ascontiguousarray(observations.words).view(np.uint16)[:, ::STRIDE].T
@@ -149,7 +164,8 @@ def _index_substrings(world: Map) -> None:
     observed = np.count_nonzero(world.kf_point >= 0, axis=1)
     for slot in np.flatnonzero(world.kf_alive).tolist():
         keyframe, substrings = world.substrings.get(slot, (-1, np.zeros((0, 0), np.uint16)))
-        new, count = keyframe != world.kf_id[slot], substrings.shape[1]
+        new = keyframe != world.kf_id[slot]
+        count = substrings.shape[1]
         if new or abs(observed[slot] - count) > CHANGED * count:
             columns = world.kf_words[slot, world.kf_point[slot] >= 0].view(np.uint16)[:, ::STRIDE].T
             world.substrings[slot] = int(world.kf_id[slot]), np.sort(np.ascontiguousarray(columns))
@@ -200,11 +216,14 @@ def ransac_pose(
         rng: Draws the samples.
 
     Returns:
-        The world-to-camera pose with the most inliers and its inliers; None if no sample gave one with four.
+        The world-to-camera pose with the most inliers and its inliers; None if no sample gave one
+        with four.
     """
     n = len(position)
     best: tuple[Array, NDArray[np.bool_]] | None = None
-    best_count, needed, drawn = 3, RANSAC_ITERATIONS, 0
+    best_count = 3
+    needed = RANSAC_ITERATIONS
+    drawn = 0
     while drawn < min(needed, RANSAC_ITERATIONS):
         samples = _triples(n, min(RANSAC_BATCH, RANSAC_ITERATIONS - drawn), rng)
         drawn += len(samples)
@@ -217,7 +236,8 @@ def ransac_pose(
         count = np.count_nonzero(inliers, axis=1)
         most = int(count.argmax())
         if count[most] > best_count:
-            best, best_count = (poses[most], inliers[most]), int(count[most])
+            best = (poses[most], inliers[most])
+            best_count = int(count[most])
             needed = int(np.ceil(np.log(0.001) / np.log1p(-(min(best_count / n, 0.999) ** 3)))) + 1
     return best
 
@@ -236,10 +256,14 @@ def _three_point_poses(position: Array, xy: Array, camera: Camera) -> Array:
     solutions = [np.zeros((0, 6))]
     for points, pixels in zip(position, xy, strict=True):
         try:
-            _, rotations, translations = cv2.solveP3P(points, pixels, camera.matrix, None, flags=cv2.SOLVEPNP_AP3P)
+            _, rotations, translations = cv2.solveP3P(
+                points, pixels, camera.matrix, None, flags=cv2.SOLVEPNP_AP3P
+            )
         except cv2.error:  # a degenerate sample, e.g. collinear points
             continue
-        solutions.append(np.hstack([np.reshape(rotations, (-1, 3)), np.reshape(translations, (-1, 3))]))
+        solutions.append(
+            np.hstack([np.reshape(rotations, (-1, 3)), np.reshape(translations, (-1, 3))])
+        )
     flat = np.concatenate(solutions)
     flat = flat[np.isfinite(flat).all(axis=1)]
     poses = np.tile(np.eye(4), (len(flat), 1, 1))
@@ -258,14 +282,20 @@ def _ransac_place(
 ) -> InitialPose | None:
     """The RANSAC pose of matches with a keyframe; None where fewer than `min_inliers` fit it."""
     f = matches.feature
-    ransac = ransac_pose(matches.position, observations.xy[f], observations.info[f], world.camera, rng)
+    ransac = ransac_pose(
+        matches.position, observations.xy[f], observations.info[f], world.camera, rng
+    )
     if ransac is None or np.count_nonzero(ransac[1]) < min_inliers:
         return None
     return InitialPose(ransac[0], matches.select(ransac[1]), keyframe)
 
 
 def pnp_poses(
-    world: Map, keyframes: list[int], observations: Observations, rng: np.random.Generator, min_inliers: int
+    world: Map,
+    keyframes: list[int],
+    observations: Observations,
+    rng: np.random.Generator,
+    min_inliers: int,
 ) -> Iterator[InitialPose]:
     """Poses by descriptor matches: a good one at once, the others after all candidates, the best first.
 
@@ -288,7 +318,9 @@ def pnp_poses(
         if place is None:
             continue
         estimate = solve(world.camera, observations, place.matches, place.T_cam_world)
-        candidate = InitialPose(estimate.T_cam_world, place.matches.select(estimate.inliers), keyframe)
+        candidate = InitialPose(
+            estimate.T_cam_world, place.matches.select(estimate.inliers), keyframe
+        )
         if estimate.count >= 2 * min_inliers:
             yield candidate
         else:
@@ -310,12 +342,15 @@ def verify_place(
         observations: The frame's features.
         settings: Radius and descriptor distances.
     """
-    keyframe, matches = candidate.keyframe, candidate.matches
+    keyframe = candidate.keyframe
+    matches = candidate.matches
     points = world.points_of(around(world, keyframe))
     estimate = solve(world.camera, observations, matches, candidate.T_cam_world)
     for _ in range(ROUNDS):
         before = len(matches)
-        more, _ = match_map(world, observations, estimate.T_cam_world, matches, points, settings, WIDEN)
+        more, _ = match_map(
+            world, observations, estimate.T_cam_world, matches, points, settings, WIDEN
+        )
         joined = matches.joined(more)
         estimate = solve(world.camera, observations, joined, estimate.T_cam_world)
         matches = joined.select(estimate.inliers)
@@ -326,7 +361,11 @@ def verify_place(
     if observations.mask is not None:  # the distortion is less than what masks are dilated by
         in_view = in_view[~observations.mask[pixel_index(uv, observations.mask.shape)[0]]]
     share = float(np.isin(in_view, matches.point).mean()) if len(in_view) else 0.0
-    depth = float(np.median(se3.transform(estimate.T_cam_world, matches.position)[:, 2])) if len(matches) else np.nan
+    depth = (
+        float(np.median(se3.transform(estimate.T_cam_world, matches.position)[:, 2]))
+        if len(matches)
+        else np.nan
+    )
     return InitialPose(estimate.T_cam_world, matches, keyframe, share, depth)
 
 
@@ -347,11 +386,14 @@ def recognise_place(
     return None if candidate is None else verify_place(world, candidate, observations, settings)
 
 
-def pose_uncertainty(world: Map, observations: Observations, place: InitialPose, rng: np.random.Generator) -> float:
+def pose_uncertainty(
+    world: Map, observations: Observations, place: InitialPose, rng: np.random.Generator
+) -> float:
     """How badly the matches determine the pose, e.g. those on one distant poster; up to 1 is precise enough.
 
-    The number of matches says nothing of that: errors of the map are common to all of them. So they have to be well
-    spread, and any half has to give the pose, so that a few far off the others do not settle it.
+    The number of matches says nothing of that: errors of the map are common to all of them. So they
+    have to be well spread, and any half has to give the pose, so that a few far off the others do
+    not settle it.
 
     Args:
         world: The map.
@@ -359,18 +401,27 @@ def pose_uncertainty(world: Map, observations: Observations, place: InitialPose,
         place: The place, with matches and pose.
         rng: Draws the halves.
     """
-    matches, T_cam_world = place.matches, place.T_cam_world
-    xy, count = observations.xy[matches.feature], len(matches)
+    matches = place.matches
+    T_cam_world = place.T_cam_world
+    xy = observations.xy[matches.feature]
+    count = len(matches)
     if count < MIN_SPREAD_MATCHES:
         return np.inf
     off = np.abs(xy - np.median(xy, axis=0)).max(axis=1)
-    inner = solve(world.camera, observations, matches.select(off <= np.quantile(off, INNER_SHARE)), T_cam_world)
+    inner = solve(
+        world.camera,
+        observations,
+        matches.select(off <= np.quantile(off, INNER_SHARE)),
+        T_cam_world,
+    )
     if inner.count < MIN_SPREAD_MATCHES // 2:
         return np.inf
     covariance = pose_covariance(inner.T_cam_world, inner.information, inner.count)
     dilution = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
     halves = [matches.select(rng.permutation(count) < count // 2) for _ in range(SPLITS)]
-    poses = np.array([solve(world.camera, observations, half, T_cam_world).T_cam_world for half in halves])
+    poses = np.array(
+        [solve(world.camera, observations, half, T_cam_world).T_cam_world for half in halves]
+    )
     centres = se3.inverse(poses)[:, :3, 3]
     spread = np.sqrt(np.square(centres - np.median(centres, axis=0)).sum(axis=1).mean())
     worst = float(max(dilution / MAX_DILUTION, spread / MAX_SPLIT_SPREAD) / place.depth)
@@ -463,14 +514,19 @@ class RotationEstimate:
         )
         if len(before) < CONNECTED:
             return None
-        xy_before, xy_now = self.observations.xy[before], observations.xy[now]
+        xy_before = self.observations.xy[before]
+        xy_now = observations.xy[now]
         homography, mask = cv2.findHomography(xy_before, xy_now, cv2.RANSAC, HOMOGRAPHY_PX)
         fits = np.zeros(len(before), bool) if homography is None else mask.ravel() > 0
         if np.count_nonzero(fits) < max(CONNECTED, CONNECTED_SHARE * len(before)):
             return None
-        step, _ = Rotation.align_vectors(_bearings(xy_now[fits], camera), _bearings(xy_before[fits], camera))
+        step, _ = Rotation.align_vectors(
+            _bearings(xy_now[fits], camera), _bearings(xy_before[fits], camera)
+        )
         return RotationEstimate(
-            observations, step.as_matrix() @ self.R_now_last, self.apparent + float(step.magnitude())
+            observations,
+            step.as_matrix() @ self.R_now_last,
+            self.apparent + float(step.magnitude()),
         )
 
     @property
@@ -492,7 +548,10 @@ class RotationEstimate:
             T_now_world: That of now.
             more: How far the two worlds may be rotated against each other, radians.
         """
-        return bool(se3.rotation_angle(T_now_world @ se3.inverse(self.applied(T_last_world))) <= self.slack + more)
+        return bool(
+            se3.rotation_angle(T_now_world @ se3.inverse(self.applied(T_last_world)))
+            <= self.slack + more
+        )
 
 
 def _bearings(xy: Array, camera: Camera) -> Array:
@@ -519,7 +578,9 @@ class MotionBound:
     def admits(self, submap: int, T_cam_world: Array) -> bool:
         """Whether the camera can be at a world-to-camera pose in a submap."""
         slack = self.atlas.slack(self.atlas.active, submap)
-        if self.rotation is not None and not self.rotation.allows(self.T_last_world, T_cam_world, slack):
+        if self.rotation is not None and not self.rotation.allows(
+            self.T_last_world, T_cam_world, slack
+        ):
             return False
         last, now = (se3.inverse(pose)[:3, 3] for pose in (self.T_last_world, T_cam_world))
         return self.atlas.reachable(self.atlas.active, submap, last, now, self.distance_m)
@@ -553,28 +614,40 @@ class RelocalisationGate:
         """
         self.start(last)
         self._advance(observations)
-        self._kidnapped = self.rotation is None and textured and int((last.point >= 0).sum()) >= KIDNAP_POINTS
+        self._kidnapped = (
+            self.rotation is None and textured and int((last.point >= 0).sum()) >= KIDNAP_POINTS
+        )
 
     def start(self, last: TrackedFrame) -> None:
         """The camera counts as lost from the next frame on; `last` is the last tracked one."""
-        self.rotation, self._kidnapped = RotationEstimate(last.observations, np.eye(3)), False
+        self.rotation = RotationEstimate(last.observations, np.eye(3))
+        self._kidnapped = False
 
-    def while_lost(self, last: TrackedFrame, observations: Observations, timestamp: float) -> MotionBound:
+    def while_lost(
+        self, last: TrackedFrame, observations: Observations, timestamp: float
+    ) -> MotionBound:
         """The bound for the next frame of a lost camera; has to be called for every one of them."""
         self._advance(observations)
-        return MotionBound(self._atlas, last.T_cam_world, self.distance_m(last, timestamp), self.rotation)
+        return MotionBound(
+            self._atlas, last.T_cam_world, self.distance_m(last, timestamp), self.rotation
+        )
 
     def while_tracked(
         self, last: TrackedFrame, observations: Observations, timestamp: float, prediction: Array
     ) -> MotionBound:
         """The bound for the frame after a tracked one.
 
-        A camera that moves fast, as on a car, may go on as the motion model has it: world-to-camera `prediction`.
+        A camera that moves fast, as on a car, may go on as the motion model has it: world-to-camera
+        `prediction`.
         """
-        rotation = RotationEstimate(last.observations, np.eye(3)).advanced(observations, self._atlas.world.camera)
+        rotation = RotationEstimate(last.observations, np.eye(3)).advanced(
+            observations, self._atlas.world.camera
+        )
         centres = se3.inverse(np.stack([last.T_cam_world, prediction]))[:, :3, 3]
         step = float(np.linalg.norm(centres[1] - centres[0]))
-        return MotionBound(self._atlas, last.T_cam_world, step + self._distance(last, timestamp), rotation)
+        return MotionBound(
+            self._atlas, last.T_cam_world, step + self._distance(last, timestamp), rotation
+        )
 
     def _advance(self, observations: Observations) -> None:
         if self.rotation is not None:
@@ -587,7 +660,9 @@ class RelocalisationGate:
 
     def rotated(self, last: TrackedFrame) -> Array:
         """World-to-camera pose ``[4, 4]`` of a camera that has rotated but has not moved."""
-        return last.T_cam_world if self.rotation is None else self.rotation.applied(last.T_cam_world)
+        return (
+            last.T_cam_world if self.rotation is None else self.rotation.applied(last.T_cam_world)
+        )
 
     def distance_m(self, last: TrackedFrame, timestamp: float) -> float:
         """Largest distance until a time, metres; infinite for a kidnapped camera."""
@@ -627,9 +702,9 @@ class PoseSearch:
     def relocalised(self, weak: InitialPose | None) -> InitialPose | None:
         """The pose from keyframes.
 
-        A pose from the last frame that few matches agree on, as by chance after a gap or a sudden rotation, competes
-        with those of keyframes, and has to be within the motion bound. After a loss it counts only if the place is
-        verified.
+        A pose from the last frame that few matches agree on, as by chance after a gap or a sudden
+        rotation, competes with those of keyframes, and has to be within the motion bound. After a
+        loss it counts only if the place is verified.
 
         Args:
             weak: The pose from the last frame, if there is one.
@@ -643,12 +718,17 @@ class PoseSearch:
 
     def in_root_map(self) -> InitialPose | None:
         """The pose in the root map of a camera that is tracked in a submap, as strict as for a lost one."""
-        pose = replace(self, keyframes=self.bound.atlas.world.submap(0), lost=True)._relocalise(MIN_MATCHES)
-        return pose if pose and len(pose.matches) >= self.settings.relocalisation.min_inliers else None
+        pose = replace(self, keyframes=self.bound.atlas.world.submap(0), lost=True)._relocalise(
+            MIN_MATCHES
+        )
+        return (
+            pose if pose and len(pose.matches) >= self.settings.relocalisation.min_inliers else None
+        )
 
     def _relocalise(self, min_inliers: int) -> InitialPose | None:
         """A pose by descriptors: from the reference keyframe, else from the best-ranked candidates."""
-        world, rng = self.bound.atlas.world, stream(self.seed, "relocalisation", self.frame)
+        rng = stream(self.seed, "relocalisation", self.frame)
+        world = self.bound.atlas.world
         least = self.settings.tracking.min_inliers
         if not self.lost:
             for candidate in pnp_poses(world, [self.reference], self.observations, rng, least):
@@ -661,8 +741,11 @@ class PoseSearch:
 
     def _verified(self, candidate: InitialPose) -> InitialPose | None:
         """The pose at a candidate's place, if it is within the motion bound and the place is verified."""
-        world, observations, s = self.bound.atlas.world, self.observations, self.settings
-        submap, admits = int(world.kf_map[candidate.keyframe]), self.bound.admits
+        world = self.bound.atlas.world
+        observations = self.observations
+        s = self.settings
+        submap = int(world.kf_map[candidate.keyframe])
+        admits = self.bound.admits
         if not admits(submap, candidate.T_cam_world):
             return None
         place = verify_place(world, candidate, observations, s.tracking)
@@ -671,9 +754,13 @@ class PoseSearch:
             return None
         if not self.lost:
             return replace(place, uncertainty=0.0)
-        uncertainty = pose_uncertainty(world, observations, place, stream(self.seed, "halves", self.frame))
+        uncertainty = pose_uncertainty(
+            world, observations, place, stream(self.seed, "halves", self.frame)
+        )
         candidates = {submap: place}, self.keyframes
-        aliased = uncertainty > 1 or is_aliased(world, observations, *candidates, s.tracking, self.seed, admits)
+        aliased = uncertainty > 1 or is_aliased(
+            world, observations, *candidates, s.tracking, self.seed, admits
+        )
         return None if aliased else replace(place, uncertainty=uncertainty)
 
     def _within_bound(self, candidate: InitialPose) -> bool:

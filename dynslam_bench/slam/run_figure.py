@@ -20,10 +20,18 @@ Colour = tuple[int, int, int]
 
 PANEL = (480, 360)
 """Width and height of a panel, pixels."""
-TITLE, HEAD, GAP = 28, 44, 12
+TITLE = 28
+HEAD = 44
+GAP = 12
 """Heights of a panel's title and of the figure's, and the space between panels, pixels."""
-INK, GREY, BLUE, RED, GREEN = (40, 40, 40), (150, 150, 150), (30, 110, 200), (210, 40, 40), (30, 150, 30)
-CAMERA = np.array([[0, 0, 0], [-0.8, -0.6, 1], [0.8, -0.6, 1], [0.8, 0.6, 1], [-0.8, 0.6, 1], [0, 0, 0]])
+INK = (40, 40, 40)
+GREY = (150, 150, 150)
+BLUE = (30, 110, 200)
+RED = (210, 40, 40)
+GREEN = (30, 150, 30)
+CAMERA = np.array(
+    [[0, 0, 0], [-0.8, -0.6, 1], [0.8, -0.6, 1], [0.8, 0.6, 1], [-0.8, 0.6, 1], [0, 0, 0]]
+)
 """Outline of a camera, its depth is 1."""
 
 
@@ -45,7 +53,8 @@ def write_run_figure(
         path: The file.
         title: Heading, e.g. the sequence's id.
         first_image: The input: the first colour image, uint8 ``[H, W, 3]``, red first.
-        frames: A selection of frames with their features drawn, as `SlamEnv.render` gives them or plain.
+        frames: A selection of frames with their features drawn, as `SlamEnv.render` gives them or
+            plain.
         keyframes: Images of keyframes.
         outputs: Keyframes and map points.
         track: The final trajectory.
@@ -66,11 +75,17 @@ def write_run_figure(
         ("1  input sequence", (), _mosaic([first_image])),
         (f"2  frames ({len(track)} tracked)", features, _mosaic(frames)),
         (f"3  keyframes ({len(outputs.keyframes)})", (), _mosaic(keyframes)),
-        (f"4  map points ({len(outputs.positions)})", [("cameras", BLUE)], _draw_map(outputs, plane)),
+        (
+            f"4  map points ({len(outputs.positions)})",
+            [("cameras", BLUE)],
+            _draw_map(outputs, plane),
+        ),
         (f"5  final track ({length}{error})", lines, _draw_track(track, ground_truth, plane)),
     ]
     width, height = PANEL
-    figure = Image.new("RGB", (3 * (width + GAP) + GAP, HEAD + 2 * (height + TITLE + GAP) + GAP), "white")
+    figure = Image.new(
+        "RGB", (3 * (width + GAP) + GAP, HEAD + 2 * (height + TITLE + GAP) + GAP), "white"
+    )
     draw = ImageDraw.Draw(figure)
     draw.text((GAP, 10), title, INK, font_size=22)
     for i, (label, legend, picture) in enumerate(panels):
@@ -123,13 +138,15 @@ class _Axes:
 
     def __init__(self, shown: Array) -> None:
         corners = shown if len(shown) else np.zeros((1, 2))
-        low, high = corners.min(axis=0), corners.max(axis=0)
+        low = corners.min(axis=0)
+        high = corners.max(axis=0)
         self._centre = (low + high) / 2
         self._scale = 0.88 * float((PANEL / np.maximum(high - low, 1e-3)).min())
         self.image = Image.new("RGB", PANEL, "white")
         self.draw = ImageDraw.Draw(self.image)
         bar = 10.0 ** np.floor(np.log10(0.4 * PANEL[0] / self._scale))
-        end, y = 12 + int(bar * self._scale), PANEL[1] - 14
+        end = 12 + int(bar * self._scale)
+        y = PANEL[1] - 14
         self.draw.line((12, y, end, y), INK, 2)
         self.draw.text((end + 6, y - 6), f"{bar:g} m", INK, font_size=11)
 
@@ -168,6 +185,8 @@ def _draw_track(track: Trajectory, ground_truth: Trajectory | None, plane: Array
     axes = _Axes(np.concatenate([flat, truth]))
     axes.line(truth, GREY, 2)
     axes.line(flat, BLUE, 2)
-    for (x, y), colour in zip(axes.pixels(flat[[0, -1]] if len(flat) else flat).tolist(), (GREEN, RED), strict=False):
+    for (x, y), colour in zip(
+        axes.pixels(flat[[0, -1]] if len(flat) else flat).tolist(), (GREEN, RED), strict=False
+    ):
         axes.draw.ellipse((x - 5, y - 5, x + 5, y + 5), colour)
     return axes.image

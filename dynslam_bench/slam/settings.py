@@ -47,7 +47,11 @@ class TrackingSettings(Settings):
         meaning="largest Hamming distance of a match by projection",
     )
     min_inliers: int = tunable(
-        25, low=10, high=60, limits=(6, 1000), meaning="fewer inliers after the last optimisation mean lost"
+        25,
+        low=10,
+        high=60,
+        limits=(6, 1000),
+        meaning="fewer inliers after the last optimisation mean lost",
     )
     rolling_shutter: bool = Field(
         True,
@@ -85,7 +89,9 @@ class KeyframeSettings(Settings):
         limits=(0.1, 1.0),
         meaning="a keyframe is culled when three others see this share of its points, at most one octave coarser",
     )
-    maximum: int = Field(600, ge=10, le=100000, description="keyframes kept at most; bounds memory and searches")
+    maximum: int = Field(
+        600, ge=10, le=100000, description="keyframes kept at most; bounds memory and searches"
+    )
 
 
 class MappingSettings(Settings):
@@ -99,7 +105,10 @@ class MappingSettings(Settings):
         meaning="a point is culled when it is found in fewer than this share of the frames that should see it",
     )
     neighbours: int = Field(
-        8, ge=1, le=100, description="covisible keyframes that new points are triangulated with and fused with"
+        8,
+        ge=1,
+        le=100,
+        description="covisible keyframes that new points are triangulated with and fused with",
     )
     triangulate_below: float = Field(
         0.5,
@@ -121,9 +130,15 @@ class BundleAdjustmentSettings(Settings):
     """Local bundle adjustment at each keyframe; its work is bounded by counts, never by the clock."""
 
     window: int = tunable(
-        8, low=2, high=20, limits=(1, 100), meaning="keyframes that are refined: the newest and its covisible ones"
+        8,
+        low=2,
+        high=20,
+        limits=(1, 100),
+        meaning="keyframes that are refined: the newest and its covisible ones",
     )
-    iterations: int = tunable(3, low=1, high=10, limits=(1, 100), meaning="Levenberg-Marquardt iterations")
+    iterations: int = tunable(
+        3, low=1, high=10, limits=(1, 100), meaning="Levenberg-Marquardt iterations"
+    )
     full: bool = Field(
         False,
         description="whether to refine all keyframes and points together after the last frame; changes the final "
@@ -135,10 +150,17 @@ class RelocalisationSettings(Settings):
     """Finding the pose again after tracking was lost."""
 
     min_inliers: int = tunable(
-        40, low=15, high=80, limits=(6, 1000), meaning="inliers that a recovered pose needs at least"
+        40,
+        low=15,
+        high=80,
+        limits=(6, 1000),
+        meaning="inliers that a recovered pose needs at least",
     )
     min_share: float = Field(
-        0.4, ge=0, le=1, description="share of a keyframe's points in view that a relocalised frame must show"
+        0.4,
+        ge=0,
+        le=1,
+        description="share of a keyframe's points in view that a relocalised frame must show",
     )
     max_speed: float = Field(
         2.0,
@@ -161,9 +183,14 @@ class LoopClosingSettings(Settings):
 
     enabled: bool = Field(False, description="whether to close loops and to merge submaps")
     min_inliers: int = Field(
-        50, ge=10, le=1000, description="points around the candidate that must fit the newest keyframe's pose there"
+        50,
+        ge=10,
+        le=1000,
+        description="points around the candidate that must fit the newest keyframe's pose there",
     )
-    confirmations: int = Field(3, ge=1, le=20, description="keyframes in a row that must agree on the correction")
+    confirmations: int = Field(
+        3, ge=1, le=20, description="keyframes in a row that must agree on the correction"
+    )
     drift_share: float = Field(
         0.03,
         gt=0,
@@ -195,26 +222,35 @@ class MotionModelSettings(Settings):
         meaning="standard deviation of the camera's angular acceleration",
     )
     smooth: bool = Field(
-        True, description="smooth the final trajectory; the online one (that of studies) is never changed afterwards"
+        True,
+        description="smooth the final trajectory; the online one (that of studies) is never changed afterwards",
     )
 
 
 class StartMapSettings(Settings):
     """A map from which the run starts, made by an earlier run; the camera has to be relocalised in it first."""
 
-    file: str = names("", "file", meaning="map.npz of an earlier run (run --save-map); empty to begin without a map")
+    file: str = names(
+        "",
+        "file",
+        meaning="map.npz of an earlier run (run --save-map); empty to begin without a map",
+    )
     localisation_only: bool = Field(
-        False, description="whether that map stays as it is: no keyframes, no bundle adjustment, poses alone"
+        False,
+        description="whether that map stays as it is: no keyframes, no bundle adjustment, poses alone",
     )
 
     def verify(self) -> None:
         """The file exists, and there is one if the run only localises."""
         if self.localisation_only and not self.file:
             raise SettingsError(
-                "localisation only needs a map, but backend.map.file is empty", "make one with: run --save-map"
+                "localisation only needs a map, but backend.map.file is empty",
+                "make one with: run --save-map",
             )
         if self.file and not Path(self.file).expanduser().is_file():
-            raise SettingsError(f"backend.map.file names {self.file}, which is no file", "make one: run --save-map")
+            raise SettingsError(
+                f"backend.map.file names {self.file}, which is no file", "make one: run --save-map"
+            )
 
 
 class BackendSettings(Settings):
@@ -237,10 +273,16 @@ class TwoViewSettings(Settings):
     """The initial map, from two views."""
 
     radius_px: float = Field(
-        100.0, ge=1, le=1000, description="search window around the last position of a feature, pixels"
+        100.0,
+        ge=1,
+        le=1000,
+        description="search window around the last position of a feature, pixels",
     )
     min_matches: int = Field(
-        100, ge=20, le=10000, description="with fewer matches the newest frame becomes the first of the two views"
+        100,
+        ge=20,
+        le=10000,
+        description="with fewer matches the newest frame becomes the first of the two views",
     )
     min_points: int = Field(50, ge=10, le=10000, description="points that the two views must give")
     min_parallax_deg: float = Field(
@@ -267,9 +309,14 @@ class MonocularMappingSettings(MappingSettings):
     """Growing and cleaning the map at each keyframe: all points are triangulated."""
 
     neighbours: int = Field(
-        20, ge=1, le=100, description="covisible keyframes that new points are triangulated with and fused with"
+        20,
+        ge=1,
+        le=100,
+        description="covisible keyframes that new points are triangulated with and fused with",
     )
-    triangulate_below: float = Field(1.0, ge=1, le=1, description="every feature without a point is triangulated")
+    triangulate_below: float = Field(
+        1.0, ge=1, le=1, description="every feature without a point is triangulated"
+    )
     min_parallax_sigmas: float = Field(
         6.0,
         ge=0,

@@ -11,7 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import FrameBundle, Keypoints
-from dynslam_bench.features.matching import CellGrid, Words, as_words, rotation_consistent, search_in_radius
+from dynslam_bench.features.matching import (
+    CellGrid,
+    Words,
+    as_words,
+    rotation_consistent,
+    search_in_radius,
+)
 from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.pose_optimisation import PoseEstimate, optimise_pose
@@ -27,7 +33,8 @@ CLOSE_BASELINES = 40.0
 """Points nearer than this many stereo baselines are close: their depth is trusted at once (ORB-SLAM2's number)."""
 MARGIN_PX = 8.0
 """Points of the last frame are matched up to this distance outside the image."""
-LAST_FRAME_RATIO, MAP_RATIO = 0.9, 0.85
+LAST_FRAME_RATIO = 0.9
+MAP_RATIO = 0.85
 """Nearest over second nearest descriptor distance allowed in the two searches."""
 MIN_KEYFRAME_GAP = 20
 """Keyframes at least between one and another that a loop is closed to."""
@@ -41,7 +48,8 @@ MIN_MATCHES = 10
 """Inliers that a pose needs at least to be a candidate."""
 WIDEN = 2.5
 """Factor on the search window where the narrow one gave no trusted pose."""
-TRUSTED_INLIERS, TRUSTED_SHARE = 50, 0.5
+TRUSTED_INLIERS = 50
+TRUSTED_SHARE = 0.5
 """Inliers, and their share of the matches, that make a pose from the last frame trusted by itself."""
 
 
@@ -57,11 +65,14 @@ class Observations:
         octave: int64 ``[N]``.
         angle: float64 ``[N]`` degrees.
         words: uint64 ``[N, W]`` descriptors.
-        info: float64 ``[N]`` inverse variance of the pixel coordinates, 1/px^2, times the filters' weight.
-        info_right: float64 ``[N]`` inverse variance of the right coordinate, times the weight; 0 without depth.
+        info: float64 ``[N]`` inverse variance of the pixel coordinates, 1/px^2, times the filters'
+            weight.
+        info_right: float64 ``[N]`` inverse variance of the right coordinate, times the weight; 0
+            without depth.
         grid: Cells of the features.
         rgb: uint8 ``[N, 3]`` colour at the feature.
-        mask: bool ``[H, W]``, dynamic pixels, behind which no map point is visible; None without masks.
+        mask: bool ``[H, W]``, dynamic pixels, behind which no map point is visible; None without
+            masks.
     """
 
     keypoints: Keypoints
@@ -90,8 +101,9 @@ def observe(
 ) -> Observations:
     """Select and prepare the features of a frame.
 
-    The right coordinate ``u - b f / z`` carries the depth (ORB-SLAM2, Eq. for RGB-D). Its variance is the pixel's plus
-    that of the depth sensor, ``(b f / z^2 * c z^2)^2 = (b f c)^2``, constant in disparity.
+    The right coordinate ``u - b f / z`` carries the depth (ORB-SLAM2, Eq. for RGB-D). Its variance
+    is the pixel's plus that of the depth sensor, ``(b f / z^2 * c z^2)^2 = (b f c)^2``, constant in
+    disparity.
 
     Args:
         frame: The frame with its keypoints.
@@ -101,8 +113,11 @@ def observe(
         scales: Scale of each octave.
     """
     weight = np.clip(np.nan_to_num(np.asarray(weight, np.float64), nan=0.0), 0.0, 1.0)
-    index = np.flatnonzero(np.asarray(keep, bool) & np.isfinite(frame.xy).all(axis=1) & (weight > 0))
-    xy, z = np.ascontiguousarray(frame.xy[index], dtype=np.float64), frame.z[index].astype(np.float64)
+    index = np.flatnonzero(
+        np.asarray(keep, bool) & np.isfinite(frame.xy).all(axis=1) & (weight > 0)
+    )
+    xy = np.ascontiguousarray(frame.xy[index], dtype=np.float64)
+    z = frame.z[index].astype(np.float64)
     z = np.where((z > 0) & (z < MAX_DEPTH_M), z, 0.0)
     keypoints = frame.keypoints.select(index)
     octave = np.clip(keypoints.octave.astype(np.int64), 0, len(scales) - 1)
@@ -129,7 +144,9 @@ def observe(
 def right_coordinates(xy: Array, z: Array, camera: Camera) -> Array:
     """Right coordinates ``[N]`` of pixels ``[N, 2]`` with depths ``[N]`` in metres; NaN where the depth is 0."""
     has_depth = z > 0
-    return np.where(has_depth, xy[:, 0] - camera.fx * camera.baseline_m / np.where(has_depth, z, 1.0), np.nan)
+    return np.where(
+        has_depth, xy[:, 0] - camera.fx * camera.baseline_m / np.where(has_depth, z, 1.0), np.nan
+    )
 
 
 @dataclass(eq=False)
@@ -138,7 +155,8 @@ class TrackedFrame:
 
     Attributes:
         observations: Its features.
-        point: int64 ``[N]``, slot of the map point that each feature observes (inliers only), or -1.
+        point: int64 ``[N]``, slot of the map point that each feature observes (inliers only), or
+            -1.
         T_cam_world: World-to-camera pose.
         timestamp: Seconds.
     """
@@ -172,7 +190,9 @@ class Matches:
 
     def joined(self, other: Matches) -> Matches:
         """These matches, then the others."""
-        return Matches(*map(np.concatenate, zip(vars(self).values(), vars(other).values(), strict=True)))
+        return Matches(
+            *map(np.concatenate, zip(vars(self).values(), vars(other).values(), strict=True))
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,8 +202,10 @@ class InitialPose:
     Attributes:
         T_cam_world: World-to-camera pose.
         matches: The matches that agree.
-        keyframe: Slot of a keyframe nearby: the one that is matched, or else the last frame's reference.
-        share: Which share of the keyframe's own points, in view and behind no mask, is matched; NaN if not verified.
+        keyframe: Slot of a keyframe nearby: the one that is matched, or else the last frame's
+            reference.
+        share: Which share of the keyframe's own points, in view and behind no mask, is matched; NaN
+            if not verified.
         depth: Median depth of the matches' points; NaN if not verified.
         uncertainty: `relocalisation.pose_uncertainty`; NaN if not verified.
         relocalised: Whether it comes from a keyframe, or the camera was lost before.
@@ -224,13 +246,19 @@ def pose_from_last_frame(
         (WIDEN, close_m, ENOUGH_MATCHES),
     ):
         radius = widen * settings.radius_px
-        matches = match_last_frame(world, last, observations, prediction, radius, depth_m, settings.max_distance)
+        matches = match_last_frame(
+            world, last, observations, prediction, radius, depth_m, settings.max_distance
+        )
         if len(matches) < enough:
             continue
         estimate = solve(world.camera, observations, matches, prediction, rounds=3)
         if estimate.count >= MIN_MATCHES and (best is None or estimate.count > len(best.matches)):
-            best = InitialPose(estimate.T_cam_world, matches.select(estimate.inliers), reference, relocalised=False)
-        if best is not None and estimate.count >= max(TRUSTED_INLIERS, TRUSTED_SHARE * len(matches)):
+            best = InitialPose(
+                estimate.T_cam_world, matches.select(estimate.inliers), reference, relocalised=False
+            )
+        if best is not None and estimate.count >= max(
+            TRUSTED_INLIERS, TRUSTED_SHARE * len(matches)
+        ):
             return best, True
     return best, False
 
@@ -246,7 +274,8 @@ def match_last_frame(
 ) -> Matches:
     """Match the last frame's points around their projections into the new frame.
 
-    Beside map points these are points that only the last frame's depth gives, nearer than `close_m`.
+    Beside map points these are points that only the last frame's depth gives, nearer than
+    `close_m`.
 
     Args:
         world: The map.
@@ -254,17 +283,25 @@ def match_last_frame(
         observations: The new frame's features.
         T_cam_world: Predicted pose of the new frame.
         radius_px: Half side of the window at octave 0; it grows with the feature's scale.
-        close_m: Depth below which the last frame's own depth is used, metres; 0 to use map points alone.
+        close_m: Depth below which the last frame's own depth is used, metres; 0 to use map points
+            alone.
         max_distance: Largest Hamming distance.
     """
-    camera, from_map = world.camera, last.point >= 0
+    camera = world.camera
+    from_map = last.point >= 0
     rows = np.flatnonzero(from_map | (last.observations.z > 0) & (last.observations.z < close_m))
-    position, unmapped = world.position[last.point[rows]], ~from_map[rows]
-    local = camera.unproject(last.observations.xy[rows[unmapped]], last.observations.z[rows[unmapped]])
+    position = world.position[last.point[rows]]
+    unmapped = ~from_map[rows]
+    local = camera.unproject(
+        last.observations.xy[rows[unmapped]], last.observations.z[rows[unmapped]]
+    )
     position[unmapped] = se3.transform(se3.inverse(last.T_cam_world), local)
     local = position @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
     uv, inside = camera.view(local, MARGIN_PX)
-    rows, position, uv, depth = rows[inside], position[inside], uv[inside], local[inside, 2]
+    rows = rows[inside]
+    position = position[inside]
+    uv = uv[inside]
+    depth = local[inside, 2]
     octave = last.observations.octave[rows]
     right = uv[:, 0] - camera.fx * camera.baseline_m / depth
     feature = search_in_radius(
@@ -278,7 +315,9 @@ def match_last_frame(
     )
     hit = feature >= 0
     matches = Matches(feature[hit], last.point[rows[hit]], position[hit])
-    return matches.select(rotation_consistent(last.observations.angle[rows[hit]], observations.angle[matches.feature]))
+    return matches.select(
+        rotation_consistent(last.observations.angle[rows[hit]], observations.angle[matches.feature])
+    )
 
 
 def match_map(
@@ -308,7 +347,9 @@ def match_map(
     free = np.ones(len(observations.xy), bool)
     free[matches.feature] = False
     rest = ~np.isin(points, matches.point)
-    radius = settings.map_radius_px * widen * np.where(cosine > 0.998, 1.0, 1.6) * world.scales[octave]
+    radius = (
+        settings.map_radius_px * widen * np.where(cosine > 0.998, 1.0, 1.6) * world.scales[octave]
+    )
     wanted = points[rest]
     feature = search_in_radius(
         observations,
@@ -324,11 +365,21 @@ def match_map(
 
 
 def solve(
-    camera: Camera, observations: Observations, matches: Matches, T_cam_world: Array, *, rounds: int = 4
+    camera: Camera,
+    observations: Observations,
+    matches: Matches,
+    T_cam_world: Array,
+    *,
+    rounds: int = 4,
 ) -> PoseEstimate:
     """The pose that fits the matches, starting from a given one."""
     f = matches.feature
-    measured = observations.xy[f], observations.right[f], observations.info[f], observations.info_right[f]
+    measured = (
+        observations.xy[f],
+        observations.right[f],
+        observations.info[f],
+        observations.info_right[f],
+    )
     return optimise_pose(T_cam_world, matches.position, *measured, camera, rounds=rounds)
 
 
@@ -394,9 +445,9 @@ def track_local_map(
 class LocalMap:
     """The keyframes and points that a frame is matched with; computed again after a keyframe or at another place.
 
-    Without loop closing that is the whole map. With loop closing it ends where the covisibility graph does: what was
-    left long ago is left to the loop closer. If its points were matched by projection, the pose would jump there, and
-    the path since would keep its drift.
+    Without loop closing that is the whole map. With loop closing it ends where the covisibility
+    graph does: what was left long ago is left to the loop closer. If its points were matched by
+    projection, the pose would jump there, and the path since would keep its drift.
 
     Args:
         world: The map.
@@ -404,7 +455,8 @@ class LocalMap:
     """
 
     def __init__(self, world: Map, *, connected_only: bool) -> None:
-        self._world, self._connected_only = world, connected_only
+        self._world = world
+        self._connected_only = connected_only
         self._computed_for: tuple[int, int] | None = None
 
     def around(self, reference: int) -> tuple[Slots, Slots]:
@@ -412,7 +464,8 @@ class LocalMap:
         world = self._world
         if self._computed_for != (reference, world.next_keyframe):
             self._computed_for = reference, world.next_keyframe
-            self._keyframes, self._points = world.keyframes, world.points
+            self._keyframes = world.keyframes
+            self._points = world.points
             distant = unconnected(world, reference) if self._connected_only else ()
             if len(distant):
                 self._keyframes = self._keyframes[~np.isin(self._keyframes, distant)]
@@ -433,13 +486,15 @@ def unconnected(world: Map, keyframe: int, gap: int = MIN_KEYFRAME_GAP) -> Slots
 def weakly_connected(world: Map, keyframe: int, gap: int = MIN_KEYFRAME_GAP) -> Slots:
     """Slots of the keyframes made `gap` before or after one, or longer, that are not strongly covisible with it.
 
-    Strong covisibility counts directly or over one third keyframe. After a loop that was closed inaccurately, a second
-    visit is connected with the first by fewer points and drifts beside it: such a place may be recognised again.
-    Keyframes of other submaps always may.
+    Strong covisibility counts directly or over one third keyframe. After a loop that was closed
+    inaccurately, a second visit is connected with the first by fewer points and drifts beside it:
+    such a place may be recognised again. Keyframes of other submaps always may.
     """
     near, shared = world.covisible(keyframe)
     near = near[shared >= STRONG_COVISIBILITY]
-    further = [other[count >= STRONG_COVISIBILITY] for other, count in map(world.covisible, near.tolist())]
+    further = [
+        other[count >= STRONG_COVISIBILITY] for other, count in map(world.covisible, near.tolist())
+    ]
     return _long_ago(world, keyframe, gap, np.concatenate([near, *further]))
 
 

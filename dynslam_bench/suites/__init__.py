@@ -61,11 +61,13 @@ class Suite(Record):
         optional: Trackers that take part only where the packages they need are installed.
         sequences: Ids or folders.
         seeds: Seeds.
-        offsets: Start offsets: so many leading frames are left out; repeats, like seeds (see `RunSpec.offset`).
+        offsets: Start offsets: so many leading frames are left out; repeats, like seeds (see
+            `RunSpec.offset`).
         frames: Part of every sequence, ``[start, stop]``; without it all.
         stride: Take every so many frames.
         threads: Threads of a run.
-        cache: Whether features and masks that trackers share are computed once (see `RunSpec.cache`).
+        cache: Whether features and masks that trackers share are computed once (see
+            `RunSpec.cache`).
         settings: Overrides for every tracker that has the setting.
         tracker_settings: Overrides by tracker.
         rows: Further rows: trackers of the suite once more, with other settings.
@@ -153,9 +155,14 @@ class Suite(Record):
 
     def _entries(self, trackers: tuple[str, ...]) -> list[tuple[str, dict[str, Any]]]:
         """The trackers with their settings, row by row; `trackers` in place of the suite's if there are any."""
-        chosen = trackers or (*self.trackers, *(name for name in self.optional if not TRACKERS.get(name).missing()))
+        chosen = trackers or (
+            *self.trackers,
+            *(name for name in self.optional if not TRACKERS.get(name).missing()),
+        )
         own = {*self.trackers, *self.optional}
-        field_sets = {name: set(field_names(TRACKERS.get(name).settings)) for name in {*chosen, *own}}
+        field_sets = {
+            name: set(field_names(TRACKERS.get(name).settings)) for name in {*chosen, *own}
+        }
         if strangers := sorted({*self.tracker_settings, *(row.tracker for row in self.rows)} - own):
             raise RunError(
                 f"suite '{self.name}' has settings for '{strangers[0]}', which is none of its trackers",
@@ -170,7 +177,9 @@ class Suite(Record):
         rows: list[tuple[str, dict[str, Any]]] = [(tracker, {}) for tracker in chosen]
         rows += [(row.tracker, row.settings) for row in self.rows if row.tracker in chosen]
         common = {
-            tracker: {name: value for name, value in self.settings.items() if name in field_sets[tracker]}
+            tracker: {
+                name: value for name, value in self.settings.items() if name in field_sets[tracker]
+            }
             | self.tracker_settings.get(tracker, {})
             for tracker in chosen
         }
@@ -187,17 +196,22 @@ def load_suite(name: str | Path) -> Suite:
     """A suite by its name, or from a TOML file.
 
     Raises:
-        RunError: There is no such suite, the file cannot be read or is no TOML, or it does not describe a suite
-            (with the first fault).
+        RunError: There is no such suite, the file cannot be read or is no TOML, or it does not
+            describe a suite (with the first fault).
         PluginError: One of its trackers is not known.
     """
     path = Path(name).expanduser()
     if str(name) in suite_names():
-        text, where = files(__package__).joinpath(f"{name}.toml").read_text(encoding="utf-8"), f"{name}.toml"
+        text = files(__package__).joinpath(f"{name}.toml").read_text(encoding="utf-8")
+        where = f"{name}.toml"
     elif path.suffix.lower() == ".toml":
-        text, where = read_text(path, kind=RunError), str(path)
+        text = read_text(path, kind=RunError)
+        where = str(path)
     else:
-        raise RunError(f"unknown suite '{name}'", f"{did_you_mean(str(name), suite_names())} Or name a .toml file")
+        raise RunError(
+            f"unknown suite '{name}'",
+            f"{did_you_mean(str(name), suite_names())} Or name a .toml file",
+        )
     document = parse_toml(text, where, kind=RunError)
     document.setdefault("name", Path(where).stem)
     suite = validated(Suite, document, where, RunError)

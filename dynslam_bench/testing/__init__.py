@@ -1,7 +1,8 @@
 """Conformance checks for the authors of plug-ins.
 
-Each ``check_*`` raises a `ConformanceError` that names the fault and its likely cause; each ``*_report`` runs the
-same checks and returns the outcome of every one. `pytest_plugin` makes tests of them.
+Each ``check_*`` raises a `ConformanceError` that names the fault and its likely cause; each
+``*_report`` runs the same checks and returns the outcome of every one. `pytest_plugin` makes tests
+of them.
 """
 
 from typing import TYPE_CHECKING, Any

@@ -49,12 +49,18 @@ def filter_report(construct: Callable[[], DynamicFilter]) -> ConformanceReport:
     """Run all checks of `check_filter` and report each."""
     steps = filter_scene()
     return ConformanceReport.of("filter", construct).run_all(
-        {"declaration": lambda: _declaration(construct()), "results": lambda: _run(construct(), steps)},
+        {
+            "declaration": lambda: _declaration(construct()),
+            "results": lambda: _run(construct(), steps),
+        },
         {
             "declared stats": lambda: _declared_stats(construct(), steps),
             "frames are left alone": lambda: _left_alone(construct(), steps),
             "determinism": lambda: _repeated(
-                (construct(), construct()), steps, "two runs differ", "all randomness has to come from state.seed"
+                (construct(), construct()),
+                steps,
+                "two runs differ",
+                "all randomness has to come from state.seed",
             ),
             "two resets": lambda: _repeated(
                 (construct(),) * 2,
@@ -62,7 +68,10 @@ def filter_report(construct: Callable[[], DynamicFilter]) -> ConformanceReport:
                 "the verdict changes after a second reset()",
                 "reset() keeps something of the sequence before",
             ),
-            **{name: partial(_run_changed, construct, steps, change) for name, change in _DEGENERATE.items()},
+            **{
+                name: partial(_run_changed, construct, steps, change)
+                for name, change in _DEGENERATE.items()
+            },
         },
     )
 
@@ -79,8 +88,11 @@ def filter_scene(frames: int = 4, *, points: int = 400) -> Steps:
         Frame and state, in order; the first has no past. One object for equal arguments.
     """
     sequence = CornerSequence(frames)
-    camera, truth, masks = sequence.camera, sequence.ground_truth, sequence.masks
-    assert truth is not None and masks is not None
+    camera = sequence.camera
+    truth = sequence.ground_truth
+    masks = sequence.masks
+    assert truth is not None
+    assert masks is not None
     rng = np.random.default_rng(0)
     steps: Steps = []
     for index, pose in enumerate(truth.T_world_cam):
@@ -88,7 +100,9 @@ def filter_scene(frames: int = 4, *, points: int = 400) -> Steps:
         xy = rng.uniform((20, 20), (camera.width - 20, camera.height - 20), (points, 2))
         column, row = np.rint(xy).astype(int).T
         mask = masks[index].instances == 1
-        box = np.array([[*np.argwhere(mask).min(0)[::-1], *(np.argwhere(mask).max(0)[::-1] + 1)]], np.float32)
+        box = np.array(
+            [[*np.argwhere(mask).min(0)[::-1], *(np.argwhere(mask).max(0)[::-1] + 1)]], np.float32
+        )
         keypoints = Keypoints(
             xy.astype(np.float32),
             np.zeros(points, np.int32),
@@ -106,12 +120,20 @@ def filter_scene(frames: int = 4, *, points: int = 400) -> Steps:
             world = se3.transform(pose, camera.unproject(xy, z))
             world[mask[row, column], 0] -= 0.03  # the panel's own motion
             flow = camera.project(se3.transform(se3.inverse(truth.T_world_cam[index - 1]), world))
-            inside = np.asarray(((flow > 2) & (flow < (camera.width - 3, camera.height - 3))).all(axis=1))
-            state.flow = FlowResult(flow.astype(np.float32), inside, np.zeros(points, np.float32), {})
-            state.previous, state.previous_keep = steps[-1][0], np.ones(points, dtype=bool)
-            state.T_world_prev, state.T_world_pred = truth.T_world_cam[index - 1], pose
+            inside = np.asarray(
+                ((flow > 2) & (flow < (camera.width - 3, camera.height - 3))).all(axis=1)
+            )
+            state.flow = FlowResult(
+                flow.astype(np.float32), inside, np.zeros(points, np.float32), {}
+            )
+            state.previous_keep = np.ones(points, dtype=bool)
+            state.previous = steps[-1][0]
+            state.T_world_prev = truth.T_world_cam[index - 1]
+            state.T_world_pred = pose
             state.keyframes = tuple(
-                KeyframeView(truth.T_world_cam[past.index], past.keypoints, past.xy, past.z, past.depth)
+                KeyframeView(
+                    truth.T_world_cam[past.index], past.keypoints, past.xy, past.z, past.depth
+                )
                 for past, _ in reversed(steps)
             )
             first = steps[0][0]
@@ -129,17 +151,25 @@ def check_result(result: FilterResult, frame: FrameBundle) -> FilterResult:
     Raises:
         ConformanceError: Something in it breaks the contract.
     """
-    where, count = f"frame {frame.index}: ", (len(frame),)
-    require(isinstance(result, FilterResult), f"{where}apply() gave a {type(result).__name__}, not a FilterResult")
+    where = f"frame {frame.index}: "
+    count = (len(frame),)
+    require(
+        isinstance(result, FilterResult),
+        f"{where}apply() gave a {type(result).__name__}, not a FilterResult",
+    )
     require_arrays(
         result,
         {"keep": (np.bool_, count), "weight": (np.float32, count)},
         where,
         "the verdict is on all keypoints, not only on those that earlier filters kept",
     )
-    weight, bad = result.weight, {key: value for key, value in result.stats.items() if not np.isfinite(value)}
+    weight = result.weight
+    bad = {key: value for key, value in result.stats.items() if not np.isfinite(value)}
     require_all(
-        (((weight >= 0) & (weight <= 1)).all(), f"{where}a weight lies outside [0, 1] or is no number"),
+        (
+            ((weight >= 0) & (weight <= 1)).all(),
+            f"{where}a weight lies outside [0, 1] or is no number",
+        ),
         (not bad, f"{where}stats hold values that are not finite: {bad}"),
     )
     if result.mask is not None:
@@ -170,7 +200,11 @@ def _declared_stats(candidate: DynamicFilter, steps: Steps) -> None:
     for index, result in enumerate(_run(candidate, steps)):
         given = set(result.stats)
         for fault, names in (("not declared", given - declared), ("missing", declared - given)):
-            require(not names, f"frame {index}: stats {fault}: {sorted(names)}", "list them all in stats_names")
+            require(
+                not names,
+                f"frame {index}: stats {fault}: {sorted(names)}",
+                "list them all in stats_names",
+            )
 
 
 def _left_alone(candidate: DynamicFilter, steps: Steps) -> None:
@@ -187,9 +221,13 @@ def _left_alone(candidate: DynamicFilter, steps: Steps) -> None:
         )
 
 
-def _repeated(pair: tuple[DynamicFilter, DynamicFilter], steps: Steps, fault: str, cause: str) -> None:
+def _repeated(
+    pair: tuple[DynamicFilter, DynamicFilter], steps: Steps, fault: str, cause: str
+) -> None:
     """Run two filters, or one twice, which have to give the same."""
-    for index, (a, b) in enumerate(zip(*(_run(candidate, steps) for candidate in pair), strict=True)):
+    for index, (a, b) in enumerate(
+        zip(*(_run(candidate, steps) for candidate in pair), strict=True)
+    ):
         require_equal(a, b, ("keep", "weight"), f"{fault} at frame {index}", cause)
 
 
@@ -197,7 +235,9 @@ def _without_flow(frame: FrameBundle, state: FilterState) -> tuple[FrameBundle, 
     if state.flow is None:
         return frame, state
     lost = np.full_like(state.flow.xy, np.nan)
-    return frame, replace(state, flow=FlowResult(lost, np.zeros(len(lost), bool), state.flow.cost, {}))
+    return frame, replace(
+        state, flow=FlowResult(lost, np.zeros(len(lost), bool), state.flow.cost, {})
+    )
 
 
 def _all_masked(frame: FrameBundle, state: FilterState) -> tuple[FrameBundle, FilterState]:
@@ -212,14 +252,22 @@ def _few(count: int) -> Change:
 
     def select(frame: FrameBundle) -> FrameBundle:
         return replace(
-            frame, keypoints=frame.keypoints.select(np.arange(count)), xy=frame.xy[:count], z=frame.z[:count]
+            frame,
+            keypoints=frame.keypoints.select(np.arange(count)),
+            xy=frame.xy[:count],
+            z=frame.z[:count],
         )
 
     def change(frame: FrameBundle, state: FilterState) -> tuple[FrameBundle, FilterState]:
         keep = np.ones(count, dtype=bool)
         if state.flow is None or state.previous is None:
             return select(frame), replace(state, keep=keep)
-        flow = FlowResult(state.flow.xy[:count], state.flow.valid[:count], state.flow.cost[:count], state.flow.stats)
+        flow = FlowResult(
+            state.flow.xy[:count],
+            state.flow.valid[:count],
+            state.flow.cost[:count],
+            state.flow.stats,
+        )
         return select(frame), replace(
             state, keep=keep, flow=flow, previous=select(state.previous), previous_keep=keep.copy()
         )
@@ -228,17 +276,26 @@ def _few(count: int) -> Change:
 
 
 _DEGENERATE: dict[str, Change] = {
-    "nothing known of the past": lambda frame, state: (frame, FilterState(state.camera, state.keep, seed=state.seed)),
+    "nothing known of the past": lambda frame, state: (
+        frame,
+        FilterState(state.camera, state.keep, seed=state.seed),
+    ),
     "no valid flow": _without_flow,
     "no depth": lambda frame, state: (
         replace(frame, depth=np.zeros_like(frame.depth), z=np.zeros_like(frame.z)),
         state,
     ),
     "no segmenter": lambda frame, state: (replace(frame, instances=None), state),
-    "no objects": lambda frame, state: (replace(frame, instances=Instances.empty(*frame.depth.shape)), state),
+    "no objects": lambda frame, state: (
+        replace(frame, instances=Instances.empty(*frame.depth.shape)),
+        state,
+    ),
     "the whole image masked": _all_masked,
     "no keypoints": _few(0),
     "one keypoint": _few(1),
     "seven keypoints": _few(7),
-    "nothing kept by earlier filters": lambda frame, state: (frame, replace(state, keep=np.zeros_like(state.keep))),
+    "nothing kept by earlier filters": lambda frame, state: (
+        frame,
+        replace(state, keep=np.zeros_like(state.keep)),
+    ),
 }

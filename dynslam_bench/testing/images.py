@@ -37,7 +37,9 @@ SHIFT_PX = (3, -2)
 """The shift of the flow's accuracy check: small, so that any flow finds it, and not zero."""
 
 
-def check_features(construct: Callable[[], FeatureExtractor], *, descriptor_bytes: int | None = None) -> None:
+def check_features(
+    construct: Callable[[], FeatureExtractor], *, descriptor_bytes: int | None = None
+) -> None:
     """Check that a feature extractor keeps its contract.
 
     Args:
@@ -78,12 +80,16 @@ def features_report(
     )
 
 
-def _on_hard_images(frame: Frame, results: Callable[[Frame], object]) -> dict[str, Callable[[], object]]:
+def _on_hard_images(
+    frame: Frame, results: Callable[[Frame], object]
+) -> dict[str, Callable[[], object]]:
     """The checks of results on images that have nothing to find."""
     return {f"{name} image": partial(results, hard) for name, hard in hard_frames(frame).items()}
 
 
-def check_keypoints(keypoints: Keypoints, shape: tuple[int, ...], descriptor_bytes: int | None = None) -> None:
+def check_keypoints(
+    keypoints: Keypoints, shape: tuple[int, ...], descriptor_bytes: int | None = None
+) -> None:
     """Check the keypoints of one image.
 
     Args:
@@ -94,10 +100,19 @@ def check_keypoints(keypoints: Keypoints, shape: tuple[int, ...], descriptor_byt
     Raises:
         ConformanceError: Something in it breaks the contract.
     """
-    require(isinstance(keypoints, Keypoints), f"extract() gave a {type(keypoints).__name__}, not Keypoints")
-    xy, angle, descriptors, count = keypoints.xy, keypoints.angle, keypoints.descriptors, len(keypoints.xy)
+    require(
+        isinstance(keypoints, Keypoints),
+        f"extract() gave a {type(keypoints).__name__}, not Keypoints",
+    )
+    xy = keypoints.xy
+    angle = keypoints.angle
+    descriptors = keypoints.descriptors
+    count = len(keypoints.xy)
     types = {"octave": np.int32, "angle": np.float32, "response": np.float32}
-    require_arrays(keypoints, {"xy": (np.float32, (count, 2)), **{name: (types[name], (count,)) for name in types}})
+    require_arrays(
+        keypoints,
+        {"xy": (np.float32, (count, 2)), **{name: (types[name], (count,)) for name in types}},
+    )
     outside = ((xy < -0.5) | (xy > np.array(shape[::-1]) - 0.5)).any(axis=1)
     require_all(
         (
@@ -116,24 +131,39 @@ def check_keypoints(keypoints: Keypoints, shape: tuple[int, ...], descriptor_byt
             "pixels of the full resolution, x first",
         ),
         ((keypoints.octave >= 0).all(), "a pyramid level is negative"),
-        (((angle >= 0) & (angle < 360)).all(), "an angle lies outside [0, 360)", "degrees, not radians"),
+        (
+            ((angle >= 0) & (angle < 360)).all(),
+            "an angle lies outside [0, 360)",
+            "degrees, not radians",
+        ),
     )
 
 
-def _extractor_determinism(construct: Callable[[], FeatureExtractor], image: Image, other: Image) -> None:
+def _extractor_determinism(
+    construct: Callable[[], FeatureExtractor], image: Image, other: Image
+) -> None:
     first = construct()
     first.extract(other)  # an earlier image has no influence
     cause = "unseeded randomness, or state that outlives an image"
     again = construct().extract(image)
-    require_equal(first.extract(image), again, ("xy", "descriptors"), "the same image gives other keypoints", cause)
+    require_equal(
+        first.extract(image),
+        again,
+        ("xy", "descriptors"),
+        "the same image gives other keypoints",
+        cause,
+    )
 
 
 def _masked_extraction(extractor: FeatureExtractor, image: Image) -> None:
     if not isinstance(extractor, MaskedExtractor):
-        raise NotApplicable("it has no extract_masked(): features on people take the place of others")
+        raise NotApplicable(
+            "it has no extract_masked(): features on people take the place of others"
+        )
     mask = np.zeros(image.shape, bool)
     mask[:, : image.shape[1] * 3 // 4] = True
-    masked, plain = extractor.extract_masked(image, mask, 1.0), extractor.extract(image)
+    masked = extractor.extract_masked(image, mask, 1.0)
+    plain = extractor.extract(image)
     check_keypoints(masked, image.shape)
     more, fewer = (int((~inside(mask, keypoints.xy)).sum()) for keypoints in (masked, plain))
     require(more >= fewer, f"{more} keypoints beside the mask, {fewer} without asking for any")
@@ -159,9 +189,13 @@ def flow_report(construct: Callable[[], FlowEstimator], *, points: int = 200) ->
     grid, guess = _grid(first.shape, points), _grid(first.shape, points)
     guess[::2] = np.nan
 
-    def results(target: Image, points: NDArray[np.float32], guess: NDArray[np.float32] | None = None) -> FlowResult:
+    def results(
+        target: Image, points: NDArray[np.float32], guess: NDArray[np.float32] | None = None
+    ) -> FlowResult:
         flow = construct()
-        result = flow.track(flow.prepare(first.copy()), flow.prepare(target.copy()), points.copy(), guess=guess)
+        result = flow.track(
+            flow.prepare(first.copy()), flow.prepare(target.copy()), points.copy(), guess=guess
+        )
         check_flow_result(result, points, stats_names_of(flow))
         return result
 
@@ -195,7 +229,9 @@ def flow_report(construct: Callable[[], FlowEstimator], *, points: int = 200) ->
     )
 
 
-def check_flow_result(result: FlowResult, points: NDArray[np.float32], names: tuple[str, ...] = ()) -> None:
+def check_flow_result(
+    result: FlowResult, points: NDArray[np.float32], names: tuple[str, ...] = ()
+) -> None:
     """Check the result of a flow.
 
     Args:
@@ -207,15 +243,25 @@ def check_flow_result(result: FlowResult, points: NDArray[np.float32], names: tu
         ConformanceError: Something in it breaks the contract.
     """
     count = len(points)
-    require(isinstance(result, FlowResult), f"track() gave a {type(result).__name__}, not a FlowResult")
+    require(
+        isinstance(result, FlowResult), f"track() gave a {type(result).__name__}, not a FlowResult"
+    )
     require_arrays(
         result,
-        {"xy": (np.float32, (count, 2)), "valid": (np.bool_, (count,)), "cost": (np.float32, (count,))},
+        {
+            "xy": (np.float32, (count, 2)),
+            "valid": (np.bool_, (count,)),
+            "cost": (np.float32, (count,)),
+        },
         cause="one row a point, in the order of the points",
     )
     missing = [name for name in names if name not in result.stats]
     require_all(
-        (np.isfinite(result.xy[result.valid]).all(), "a valid row is not finite", "mark it as not valid"),
+        (
+            np.isfinite(result.xy[result.valid]).all(),
+            "a valid row is not finite",
+            "mark it as not valid",
+        ),
         (not np.isnan(result.cost[result.valid]).any(), "a valid row has no cost"),
         (not missing, f"stats lack {missing}", "stats_names declares them"),
     )
@@ -223,7 +269,10 @@ def check_flow_result(result: FlowResult, points: NDArray[np.float32], names: tu
 
 def _grid(shape: tuple[int, ...], points: int) -> NDArray[np.float32]:
     across = max(2, int(np.sqrt(points * shape[1] / shape[0])))
-    x, y = np.meshgrid(np.linspace(40, shape[1] - 41, across), np.linspace(40, shape[0] - 41, max(2, points // across)))
+    x, y = np.meshgrid(
+        np.linspace(40, shape[1] - 41, across),
+        np.linspace(40, shape[0] - 41, max(2, points // across)),
+    )
     return np.stack([x, y], -1).reshape(-1, 2).astype(np.float32)
 
 
@@ -233,15 +282,24 @@ def _flow_determinism(
     flows = construct(), construct()
     a, b = (flow.track(flow.prepare(first), flow.prepare(second), points, seed=7) for flow in flows)
     same = np.array_equal(a.valid, b.valid) and np.array_equal(a.xy[a.valid], b.xy[b.valid])
-    require(same, "the same images and seed give another flow", "unseeded randomness, or state that outlives an image")
+    require(
+        same,
+        "the same images and seed give another flow",
+        "unseeded randomness, or state that outlives an image",
+    )
 
 
-def _flow_finds_shift(results: Callable[..., FlowResult], image: Image, points: NDArray[np.float32]) -> None:
+def _flow_finds_shift(
+    results: Callable[..., FlowResult], image: Image, points: NDArray[np.float32]
+) -> None:
     matrix = np.array([[1, 0, SHIFT_PX[0]], [0, 1, SHIFT_PX[1]]], np.float64)
     target = cv2.warpAffine(image, matrix, image.shape[::-1], borderMode=cv2.BORDER_REFLECT)
     result = results(np.asarray(target, np.uint8), points)
     share = float(result.valid.mean())
-    require(share > 0.2, f"only {100 * share:.0f} % of the points are found after a shift of {SHIFT_PX} pixels")
+    require(
+        share > 0.2,
+        f"only {100 * share:.0f} % of the points are found after a shift of {SHIFT_PX} pixels",
+    )
     errors = np.linalg.norm(result.xy - points - np.array(SHIFT_PX, np.float32), axis=1)
     error = float(np.median(errors[result.valid]))
     require(
@@ -251,7 +309,9 @@ def _flow_finds_shift(results: Callable[..., FlowResult], image: Image, points: 
     )
 
 
-def check_segmenter(construct: Callable[[], Segmenter], *, sequence: Sequence | None = None, frames: int = 2) -> None:
+def check_segmenter(
+    construct: Callable[[], Segmenter], *, sequence: Sequence | None = None, frames: int = 2
+) -> None:
     """Check that a segmenter keeps its contract.
 
     Args:
@@ -304,29 +364,49 @@ def check_instances(instances: Instances, frame: Frame) -> None:
         f"frame {frame.index}: segment() gave a {type(instances).__name__}, not Instances",
         "a frame without objects is Instances.empty(height, width)",
     )
-    where, boxes, scores = f"frame {frame.index}: ", instances.boxes, instances.scores
-    count, shape = len(instances.class_names), frame.depth.shape
+    where = f"frame {frame.index}: "
+    boxes = instances.boxes
+    scores = instances.scores
+    count = len(instances.class_names)
+    shape = frame.depth.shape
     require_arrays(
         instances,
         {"masks": (np.bool_, (count, *shape))},
         where,
         "masks have to be at the frame's resolution and thresholded",
     )
-    require_arrays(instances, {"boxes": (np.float32, (count, 4)), "scores": (np.float32, (count,))}, where)
+    require_arrays(
+        instances, {"boxes": (np.float32, (count, 4)), "scores": (np.float32, (count,))}, where
+    )
     require_all(
-        (((scores >= 0) & (scores <= 1)).all(), f"{where}a score lies outside [0, 1]", "logits, not scores"),
-        (all(isinstance(name, str) and name for name in instances.class_names), f"{where}a class has no name"),
+        (
+            ((scores >= 0) & (scores <= 1)).all(),
+            f"{where}a score lies outside [0, 1]",
+            "logits, not scores",
+        ),
+        (
+            all(isinstance(name, str) and name for name in instances.class_names),
+            f"{where}a class has no name",
+        ),
         (np.isfinite(boxes).all(), f"{where}a box is not finite"),
         (
             (boxes[:, :2] <= boxes[:, 2:]).all(),
             f"{where}a box ends before it begins",
             "boxes are x0, y0, x1, y1, not x, y, w, h",
         ),
-        (instances.moving is None or instances.moving.shape == (count,), f"{where}moving does not fit the objects"),
+        (
+            instances.moving is None or instances.moving.shape == (count,),
+            f"{where}moving does not fit the objects",
+        ),
     )
     for mask, box, name in zip(instances.masks, boxes, instances.class_names, strict=True):
         rows, columns = np.nonzero(mask)
-        within = (columns >= box[0] - 1) & (columns <= box[2] + 1) & (rows >= box[1] - 1) & (rows <= box[3] + 1)
+        within = (
+            (columns >= box[0] - 1)
+            & (columns <= box[2] + 1)
+            & (rows >= box[1] - 1)
+            & (rows <= box[3] + 1)
+        )
         outside = 100 * (1 - float(within.mean())) if len(rows) else 0.0
         require(
             outside < 10,

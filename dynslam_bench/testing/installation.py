@@ -7,7 +7,11 @@ from importlib import metadata
 
 from dynslam_bench.core import find_data_root, is_writable, stage_cache_folder, weights_folder
 from dynslam_bench.core.version import install_hint, version
-from dynslam_bench.segmentation.networks.checkpoints import COCO, cached_checkpoint, embedded_weights
+from dynslam_bench.segmentation.networks.checkpoints import (
+    COCO,
+    cached_checkpoint,
+    embedded_weights,
+)
 from dynslam_bench.sequences.catalogue import summaries
 
 DISTRIBUTION = "dynslam-bench"
@@ -20,7 +24,8 @@ class Finding:
     """One thing that was examined.
 
     Attributes:
-        part: ``program``, ``package``, ``extra``, ``weights``, ``sequences``, ``folder``, ``plug-in`` or ``device``.
+        part: ``program``, ``package``, ``extra``, ``weights``, ``sequences``, ``folder``,
+            ``plug-in`` or ``device``.
         name: Which.
         state: Its version, place or fault.
         missing: Whether it is not there; what works without it is no fault.
@@ -37,11 +42,23 @@ class Finding:
 def examine() -> list[Finding]:
     """Everything that decides what can be run on this machine; nothing is downloaded for it."""
     system = f"{platform.system()} {platform.machine()}"
-    findings = [Finding("program", DISTRIBUTION, f"{version()}, Python {platform.python_version()}, {system}")]
+    findings = [
+        Finding(
+            "program", DISTRIBUTION, f"{version()}, Python {platform.python_version()}, {system}"
+        )
+    ]
     findings += [*_packages(), *_weights()]
-    recorded = sum(summary["here"] and not summary["id"].startswith("synthetic/") for summary in summaries())
-    hint = "" if recorded else "rendered ones need no download; dynslam-bench sequences list, sequences fetch ID"
-    findings.append(Finding("sequences", "recorded", f"{recorded} in {find_data_root()}", not recorded, hint))
+    recorded = sum(
+        summary["here"] and not summary["id"].startswith("synthetic/") for summary in summaries()
+    )
+    hint = (
+        ""
+        if recorded
+        else "rendered ones need no download; dynslam-bench sequences list, sequences fetch ID"
+    )
+    findings.append(
+        Finding("sequences", "recorded", f"{recorded} in {find_data_root()}", not recorded, hint)
+    )
     for name, folder in (("stage cache", stage_cache_folder()), ("weights", weights_folder())):
         good = is_writable(folder)
         findings.append(
@@ -61,13 +78,18 @@ def _packages() -> list[Finding]:
     try:
         required = metadata.requires(DISTRIBUTION) or []
     except metadata.PackageNotFoundError:
-        return [Finding("package", DISTRIBUTION, "not installed", True, "pip install . in the checkout")]
+        return [
+            Finding("package", DISTRIBUTION, "not installed", True, "pip install . in the checkout")
+        ]
     extras: dict[str, list[str]] = {}
     for requirement in required:
         match = re.match(r"([\w.-]+)[^;]*(?:$|;.*extra\s*==\s*['\"]([\w-]+)['\"])", requirement)
         if match:
             extras.setdefault(match[2] or "", []).append(match[1])
-    packages = [_package("package", name, [name], "pip install --force-reinstall .") for name in extras.pop("")]
+    packages = [
+        _package("package", name, [name], "pip install --force-reinstall .")
+        for name in extras.pop("")
+    ]
     return packages + [
         _package("extra", extra, names, install_hint(extra))
         for extra, names in sorted(extras.items())
@@ -79,7 +101,9 @@ def _package(part: str, title: str, names: list[str], hint: str) -> Finding:
     parts = []
     for name in names:
         try:
-            parts.append(metadata.version(name) if name == title else f"{name} {metadata.version(name)}")
+            parts.append(
+                metadata.version(name) if name == title else f"{name} {metadata.version(name)}"
+            )
         except metadata.PackageNotFoundError:
             return Finding(part, title, f"{name} is not installed", True, hint)
     return Finding(part, title, ", ".join(parts))
@@ -87,8 +111,14 @@ def _package(part: str, title: str, names: list[str], hint: str) -> Finding:
 
 def _weights() -> list[Finding]:
     coco = cached_checkpoint(COCO)
-    where = f"{COCO.megabytes} MB, fetched when first used, or put {COCO.url} into {weights_folder()}"
-    fetched = Finding("weights", "coco", str(coco)) if coco else Finding("weights", "coco", "not here", True, where)
+    where = (
+        f"{COCO.megabytes} MB, fetched when first used, or put {COCO.url} into {weights_folder()}"
+    )
+    fetched = (
+        Finding("weights", "coco", str(coco))
+        if coco
+        else Finding("weights", "coco", "not here", True, where)
+    )
     if embedded_weights().is_file():
         return [Finding("weights", "embedded", "in the package, for rendered people"), fetched]
     return [Finding("weights", "embedded", "missing", True, "reinstall"), fetched]
@@ -100,7 +130,9 @@ def _torch_device() -> Finding:
 
     cuda = torch.cuda.is_available()
     name = torch.cuda.get_device_name(0) if cuda else f"{torch.get_num_threads()} processor threads"
-    return Finding("device", "auto", f"{'cuda:0' if cuda else 'cpu'}, {name}, torch {torch.__version__}")
+    return Finding(
+        "device", "auto", f"{'cuda:0' if cuda else 'cpu'}, {name}, torch {torch.__version__}"
+    )
 
 
 def unavailable_plugins() -> list[Finding]:
@@ -117,5 +149,7 @@ def unavailable_plugins() -> list[Finding]:
         for failure in registry.failures()
     ]
     specs = [tracker.spec for tracker in TRACKERS.all()]
-    failed += [(f"trackers: {spec.id}", f"needs {hint}") for spec in specs for hint in spec.missing()]
+    failed += [
+        (f"trackers: {spec.id}", f"needs {hint}") for spec in specs for hint in spec.missing()
+    ]
     return [Finding("plug-in", name, "missing", True, reason) for name, reason in failed]

@@ -1,7 +1,8 @@
 """The conformance checks of a tracker in child processes: a tracker that exits, hangs or crashes fails a check.
 
-The checks run one after the other in a child of the kind that makes runs. If the child dies, or makes no progress for
-too long, the running check has failed, and another child continues with the next one.
+The checks run one after the other in a child of the kind that makes runs. If the child dies, or
+makes no progress for too long, the running check has failed, and another child continues with the
+next one.
 """
 
 import contextlib
@@ -46,7 +47,8 @@ def isolated_tracker_report(
         seed: Seed of the randomness.
         frame_s: Seconds for one frame, or for any other step of a check.
         start_s: Seconds until the first frame is tracked: loading, compiling.
-        memory_mb: Memory that it may take; None for the default share of the machine's, 0 for no limit.
+        memory_mb: Memory that it may take; None for the default share of the machine's, 0 for no
+            limit.
         on_check: Called with every outcome at once.
         on_wait: Called many times a second with the name of the running check.
 
@@ -60,7 +62,12 @@ def isolated_tracker_report(
     """
     checks: list[Check] = []
     limits = Limits(start_s=start_s, frame_s=frame_s, memory_mb=memory_mb)
-    job_options = {"tracker": tracker, "settings": dict(settings or {}), "frames": frames, "seed": seed}
+    job_options = {
+        "tracker": tracker,
+        "settings": dict(settings or {}),
+        "frames": frames,
+        "seed": seed,
+    }
     running = ""
 
     def add(check: Check) -> None:
@@ -84,12 +91,17 @@ def isolated_tracker_report(
                     on_wait(running)  # noqa: B023
 
             job = make_job(
-                _WORK, folder.path, spec={"threads": 1}, known=[asdict(check) for check in checks], **job_options
+                _WORK,
+                folder.path,
+                spec={"threads": 1},
+                known=[asdict(check) for check in checks],
+                **job_options,
             )
             verdict = supervise(Child(), job, limits, receive, tick=tick, located=False)
         if verdict.status != "ok":
             add(_failure(verdict, running, checks))
-        if verdict.status == "ok" or not running:  # between two checks, another child would fail alike
+        # between two checks, another child would fail alike
+        if verdict.status == "ok" or not running:
             return ConformanceReport(verdict.final.get("subject", f"tracker {tracker!r}"), checks)
 
 
@@ -104,7 +116,9 @@ def _failure(verdict: Verdict, running: str, checks: list[Check]) -> Check:
         raise getattr(errors, kind, DynslamError)(verdict.reason)
     name = running or (f"after {checks[-1].name}" if checks else "loading")
     cause = "" if kind else _CAUSES.get(verdict.status, "")
-    return Check(name, "failed", f"{verdict.reason} (likely cause: {cause})" if cause else verdict.reason)
+    return Check(
+        name, "failed", f"{verdict.reason} (likely cause: {cause})" if cause else verdict.reason
+    )
 
 
 class _SentReport(ConformanceReport):
@@ -130,13 +144,26 @@ class _SentReport(ConformanceReport):
         self._send({"type": "frame", "index": self._tracked})
 
 
-def work(job: dict[str, Any], send: Callable[[dict[str, Any]], None], stopping: Callable[[], bool]) -> dict[str, Any]:
+def work(
+    job: dict[str, Any], send: Callable[[dict[str, Any]], None], stopping: Callable[[], bool]
+) -> dict[str, Any]:
     """The child's work: the checks whose outcome is not known yet."""
     from dynslam_bench.testing.tracker import tracker_report
 
     report = _SentReport([Check(**check) for check in job["known"]], send)
     try:
-        tracker_report(job["tracker"], settings=job["settings"], frames=job["frames"], seed=job["seed"], report=report)
+        tracker_report(
+            job["tracker"],
+            settings=job["settings"],
+            frames=job["frames"],
+            seed=job["seed"],
+            report=report,
+        )
     except DynslamError as error:
-        return {"type": "failed", "status": "crashed", "reason": str(error), "error": type(error).__name__}
+        return {
+            "type": "failed",
+            "status": "crashed",
+            "reason": str(error),
+            "error": type(error).__name__,
+        }
     return {"type": "done", "subject": report.subject}

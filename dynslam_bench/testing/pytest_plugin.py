@@ -1,8 +1,9 @@
 """The conformance checks as tests of pytest: ``pytest --dynslam-tracker my_slam.py:SPEC``.
 
-Every check of a subject becomes a test item of its name. The checks run while pytest collects, because their names are
-known only then; those of a tracker run in a child process. The entry point ``pytest11`` makes pytest load this module,
-so it imports nothing heavy before one of its options is used.
+Every check of a subject becomes a test item of its name. The checks run while pytest collects,
+because their names are known only then; those of a tracker run in a child process. The entry point
+``pytest11`` makes pytest load this module, so it imports nothing heavy before one of its options is
+used.
 """
 
 from __future__ import annotations
@@ -32,10 +33,18 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     """Add an option for each kind of plug-in."""
     group = parser.getgroup("dynslam-bench", "conformance checks of dynslam-bench")
     for kind, meaning in OPTIONS.items():
-        group.addoption(f"--dynslam-{kind}", action="append", default=[], metavar="NAME", help=f"check {meaning}")
+        group.addoption(
+            f"--dynslam-{kind}",
+            action="append",
+            default=[],
+            metavar="NAME",
+            help=f"check {meaning}",
+        )
 
 
-def pytest_collection_modifyitems(session: pytest.Session, config: pytest.Config, items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(
+    session: pytest.Session, config: pytest.Config, items: list[pytest.Item]
+) -> None:
     """Run the checks of every subject that was asked for, and add an item for each."""
     for kind in OPTIONS:
         for subject in config.getoption(f"--dynslam-{kind}"):
@@ -44,7 +53,11 @@ def pytest_collection_modifyitems(session: pytest.Session, config: pytest.Config
             except DynslamError as error:
                 raise pytest.UsageError(f"--dynslam-{kind}: {error}") from error
             for check in checks:
-                items.append(ConformanceItem.from_parent(session, name=f"{kind} {subject}::{check.name}", check=check))
+                items.append(
+                    ConformanceItem.from_parent(
+                        session, name=f"{kind} {subject}::{check.name}", check=check
+                    )
+                )
 
 
 class ConformanceItem(pytest.Item):
@@ -90,7 +103,8 @@ def report_on(kind: str, subject: str) -> ConformanceReport:
         from dynslam_bench.segmentation.settings import SegmentationSettings
 
         SEGMENTERS.get(subject)  # an unknown name is an error, not a failed check
-        scene, masks = testing.CornerSequence(2), SegmentationSettings(source=f"plugin:{subject}")
+        scene = testing.CornerSequence(2)
+        masks = SegmentationSettings(source=f"plugin:{subject}")
         build: Any = partial(build_segmenter, masks, sequence_id=scene.id, masks=scene.masks)
         return testing.segmenter_report(build, sequence=scene)
     if kind == "flow":
@@ -104,7 +118,8 @@ def report_on(kind: str, subject: str) -> ConformanceReport:
 
     spec = FEATURES.get(subject)
     return testing.features_report(
-        partial(build_extractor, FeatureSettings(extractor=subject)), descriptor_bytes=spec.descriptor_bytes
+        partial(build_extractor, FeatureSettings(extractor=subject)),
+        descriptor_bytes=spec.descriptor_bytes,
     )
 
 
@@ -114,9 +129,13 @@ def _open(subject: str) -> Any:
     from dynslam_bench.sequences import DATASETS
 
     head, _, attribute = subject.rpartition(":")
-    if not attribute.isidentifier() or not (head.endswith(".py") or head.replace(".", "").isidentifier()):
+    if not attribute.isidentifier() or not (
+        head.endswith(".py") or head.replace(".", "").isidentifier()
+    ):
         return subject
     spec = DATASETS.get(subject)
     if not spec.sequences:
-        raise PluginError(f"the data set '{spec.id}' lists no sequence", "name one in DatasetSpec.sequences")
+        raise PluginError(
+            f"the data set '{spec.id}' lists no sequence", "name one in DatasetSpec.sequences"
+        )
     return load_object(spec.entry_point)(spec.sequences[0], data_root=find_data_root())

@@ -69,10 +69,15 @@ class ConformanceReport:
             outcome = Check(name, "skipped", str(reason))
         except ConformanceError as error:
             outcome = Check(name, "failed", str(error))
-        except Exception as error:  # the subject's own code may raise anything: that is what is tested
+        # the subject's own code may raise anything: that is what is tested
+        except Exception as error:
             outcome = Check(name, "failed", f"raised {type(error).__name__}: {error}")
         except SystemExit as error:
-            outcome = Check(name, "failed", f"called sys.exit({error.code!r}) (a tracker raises, it never exits)")
+            outcome = Check(
+                name,
+                "failed",
+                f"called sys.exit({error.code!r}) (a tracker raises, it never exits)",
+            )
         self.checks.append(outcome)
         return outcome.status != "failed"
 
@@ -100,7 +105,9 @@ class ConformanceReport:
         """
         if self.failed:
             lines = "".join(f"\n  {check.name}: {check.message}" for check in self.failed)
-            raise ConformanceError(f"{self.subject} fails {len(self.failed)} of {len(self.checks)} checks:{lines}")
+            raise ConformanceError(
+                f"{self.subject} fails {len(self.failed)} of {len(self.checks)} checks:{lines}"
+            )
 
 
 def require(condition: object, fault: str, cause: str = "") -> None:
@@ -128,13 +135,19 @@ def require_all(*rules: tuple[object, str] | tuple[object, str, str]) -> None:
         require(*rule)
 
 
-def require_equal(first: object, second: object, names: Sequence[str], fault: str, cause: str) -> None:
+def require_equal(
+    first: object, second: object, names: Sequence[str], fault: str, cause: str
+) -> None:
     """Raise unless two results have the same arrays, or other values, under these names.
 
     Raises:
         ConformanceError: They have not.
     """
-    require(all(np.array_equal(getattr(first, name), getattr(second, name)) for name in names), fault, cause)
+    require(
+        all(np.array_equal(getattr(first, name), getattr(second, name)) for name in names),
+        fault,
+        cause,
+    )
 
 
 def require_methods(candidate: object, *names: str) -> None:
@@ -148,7 +161,10 @@ def require_methods(candidate: object, *names: str) -> None:
 
 
 def require_arrays(
-    holder: object, expected: Mapping[str, tuple[DTypeLike, tuple[int, ...]]], where: str = "", cause: str = ""
+    holder: object,
+    expected: Mapping[str, tuple[DTypeLike, tuple[int, ...]]],
+    where: str = "",
+    cause: str = "",
 ) -> None:
     """Raise unless the named attributes are arrays of the expected types and shapes.
 

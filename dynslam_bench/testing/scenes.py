@@ -14,7 +14,8 @@ from dynslam_bench.geometry import se3
 class CornerSequence:
     """Two textured walls that meet in a corner, and a textured panel that slides along; everything is exact.
 
-    It is drawn by intersecting each pixel's ray with three planes, so that it needs no renderer and no data.
+    It is drawn by intersecting each pixel's ray with three planes, so that it needs no renderer and
+    no data.
 
     Args:
         frames: Number of frames at 30 Hz.
@@ -94,7 +95,9 @@ class _Masks:
 
     def __getitem__(self, index: int) -> FrameMasks:
         panel = draw(type(self._sequence), range(len(self._sequence))[index])[2]  # type: ignore[arg-type]
-        return FrameMasks(panel.astype(np.uint8), {1: "person"}, frozenset({1} if index and panel.any() else ()))
+        return FrameMasks(
+            panel.astype(np.uint8), {1: "person"}, frozenset({1} if index and panel.any() else ())
+        )
 
 
 def grey(frame: Frame) -> NDArray[np.uint8]:
@@ -108,33 +111,52 @@ def hard_frames(like: Frame) -> dict[str, Frame]:
     Args:
         like: A frame whose index, stamp and size they take.
     """
-    black, zero = np.zeros_like(like.rgb), np.zeros_like(like.depth)
+    black = np.zeros_like(like.rgb)
+    zero = np.zeros_like(like.depth)
     return {
         "all-black": replace(like, rgb=black, depth=zero),
         "saturated": replace(like, rgb=np.full_like(like.rgb, 255)),
         "zero depth": replace(like, depth=zero),
-        "textureless": replace(like, rgb=np.full_like(like.rgb, 128), depth=np.full_like(like.depth, 2.0)),
-        "noise": replace(like, rgb=np.random.default_rng(3).integers(0, 256, like.rgb.shape, dtype=np.uint8)),
+        "textureless": replace(
+            like, rgb=np.full_like(like.rgb, 128), depth=np.full_like(like.depth, 2.0)
+        ),
+        "noise": replace(
+            like, rgb=np.random.default_rng(3).integers(0, 256, like.rgb.shape, dtype=np.uint8)
+        ),
     }
 
 
 @lru_cache(maxsize=32)  # the 4 frames and the 24 turning ones of `tracker_report`; 25 MB
-def draw(scene: type[CornerSequence], index: int) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
+def draw(
+    scene: type[CornerSequence], index: int
+) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
     """Colour, depth and the panel's mask of a frame."""
-    camera, pose = scene.camera, scene.pose(index)
+    camera = scene.camera
+    pose = scene.pose(index)
     centre = pose[:3, 3]
     v, u = np.mgrid[: camera.height, : camera.width]
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    rays = np.stack(
+        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1
+    )
     ray_x, ray_y, ray_z = np.moveaxis(rays @ pose[:3, :3].T, -1, 0)
-    # walls z = 2.6 + 0.5 x and z = 2.6 - 0.7 x, the nearer one is seen; depth along a ray with z-component 1
-    walls = [(2.6 + slope * centre[0] - centre[2]) / (ray_z - slope * ray_x) for slope in (0.5, -0.7)]
+    # walls z = 2.6 + 0.5 x and z = 2.6 - 0.7 x, the nearer one is seen; depth along a ray with
+    # z-component 1
+    walls = [
+        (2.6 + slope * centre[0] - centre[2]) / (ray_z - slope * ray_x) for slope in (0.5, -0.7)
+    ]
     depth = np.minimum(*[np.where(wall > 0, wall, np.inf) for wall in walls])
-    x, y = centre[0] + depth * ray_x, centre[1] + depth * ray_y
-    left, panel_depth = -0.35 + 0.03 * index, (1.5 - centre[2]) / ray_z
-    panel_x, panel_y = centre[0] + panel_depth * ray_x, centre[1] + panel_depth * ray_y
-    panel = np.asarray(scene.has_panel & (panel_x > left) & (panel_x < left + 0.25) & (np.abs(panel_y) < 0.4))
+    x = centre[0] + depth * ray_x
+    y = centre[1] + depth * ray_y
+    left = -0.35 + 0.03 * index
+    panel_depth = (1.5 - centre[2]) / ray_z
+    panel_x = centre[0] + panel_depth * ray_x
+    panel_y = centre[1] + panel_depth * ray_y
+    panel = np.asarray(
+        scene.has_panel & (panel_x > left) & (panel_x < left + 0.25) & (np.abs(panel_y) < 0.4)
+    )
     depth = np.where(panel, panel_depth, depth)
-    x, y = np.where(panel, panel_x - left + 7.3, x), np.where(panel, panel_y + 3.1, y)
+    x = np.where(panel, panel_x - left + 7.3, x)
+    y = np.where(panel, panel_y + 3.1, y)
     return _sample(_texture(), scene.detail * x, scene.detail * y), depth.astype(np.float32), panel
 
 
@@ -149,14 +171,21 @@ def _texture(size: int = 512) -> NDArray[np.float64]:
     return texture
 
 
-def _sample(texture: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.uint8]:
+def _sample(
+    texture: NDArray[np.float64], x: NDArray[np.float64], y: NDArray[np.float64]
+) -> NDArray[np.uint8]:
     """Colours at metres (x, y), bilinear, 250 texels a metre."""
     size = len(texture)
-    x, y = x * 250, y * 250
-    x0, y0 = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-    fx, fy = (x - x0)[..., None], (y - y0)[..., None]
-    x0, y0 = x0 % size, y0 % size
-    x1, y1 = (x0 + 1) % size, (y0 + 1) % size
+    x = x * 250
+    y = y * 250
+    x0 = np.floor(x).astype(np.int64)
+    y0 = np.floor(y).astype(np.int64)
+    fx = (x - x0)[..., None]
+    fy = (y - y0)[..., None]
+    x0 = x0 % size
+    y0 = y0 % size
+    x1 = (x0 + 1) % size
+    y1 = (y0 + 1) % size
     top = texture[y0, x0] * (1 - fx) + texture[y0, x1] * fx
     bottom = texture[y1, x0] * (1 - fx) + texture[y1, x1] * fx
     return np.round(top * (1 - fy) + bottom * fy).astype(np.uint8)

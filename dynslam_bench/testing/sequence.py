@@ -53,25 +53,42 @@ def sequence_report(sequence: Sequence | str | Path, *, frames: int = 3) -> Conf
     )
 
 
-_MEMBERS = ("id", "camera", "timestamps", "ground_truth", "masks", "fps", "license", "citation", "digest", "__len__")
+_MEMBERS = (
+    "id",
+    "camera",
+    "timestamps",
+    "ground_truth",
+    "masks",
+    "fps",
+    "license",
+    "citation",
+    "digest",
+    "__len__",
+)
 
 
 def _protocol(sequence: Sequence) -> None:
     missing = [name for name in (*_MEMBERS, "__getitem__") if not hasattr(sequence, name)]
     require(
-        not missing, f"a {type(sequence).__name__} lacks {', '.join(missing)}", "see dynslam_bench.sequences.Sequence"
+        not missing,
+        f"a {type(sequence).__name__} lacks {', '.join(missing)}",
+        "see dynslam_bench.sequences.Sequence",
     )
     texts = (sequence.license, sequence.citation)
     require_all(
         (isinstance(sequence.id, str) and sequence.id, f"the id is {sequence.id!r}, not a text"),
-        (isinstance(sequence.camera, Camera), f"the camera is a {type(sequence.camera).__name__}, not a Camera"),
+        (
+            isinstance(sequence.camera, Camera),
+            f"the camera is a {type(sequence.camera).__name__}, not a Camera",
+        ),
         (len(sequence) >= 1, "the sequence has no frame"),
         (all(isinstance(text, str) for text in texts), "license or citation is no text"),
     )
 
 
 def _timestamps(sequence: Sequence) -> None:
-    stamps, fps = sequence.timestamps, sequence.fps
+    stamps = sequence.timestamps
+    fps = sequence.fps
     require(
         isinstance(stamps, np.ndarray) and stamps.dtype == np.float64,
         "timestamps are no float64 array",
@@ -81,7 +98,11 @@ def _timestamps(sequence: Sequence) -> None:
     require_all(
         (stamps.shape == (len(sequence),), f"{stamps.shape} timestamps for {len(sequence)} frames"),
         (np.isfinite(stamps).all(), "a timestamp is not finite"),
-        ((intervals > 0).all(), "timestamps are not strictly increasing", "the list is unsorted or has duplicates"),
+        (
+            (intervals > 0).all(),
+            "timestamps are not strictly increasing",
+            "the list is unsorted or has duplicates",
+        ),
         (fps > 0, f"fps is {fps}"),
     )
     rate = 1 / float(np.median(intervals)) if len(intervals) else fps
@@ -95,7 +116,9 @@ def _timestamps(sequence: Sequence) -> None:
 def _frames(sequence: Sequence, chosen: list[int]) -> None:
     size = sequence.camera.height, sequence.camera.width
     for index in chosen:
-        frame, stamp, where = sequence[index], float(sequence.timestamps[index]), f"frame {index}: "
+        frame = sequence[index]
+        stamp = float(sequence.timestamps[index])
+        where = f"frame {index}: "
         require(isinstance(frame, Frame), f"frame {index} is a {type(frame).__name__}, not a Frame")
         require_arrays(
             frame,
@@ -103,11 +126,15 @@ def _frames(sequence: Sequence, chosen: list[int]) -> None:
             where,
             "the camera's size is not the image's, or the image is grey",
         )
-        depth, measured = frame.depth, frame.depth[frame.depth > 0]
+        depth = frame.depth
+        measured = frame.depth[frame.depth > 0]
         median = float(np.median(measured)) if len(measured) else 1.0
         require_all(
             (frame.index == index, f"frame {index} says that its index is {frame.index}"),
-            (frame.timestamp == stamp, f"{where}stamped {frame.timestamp!r}, but timestamps[{index}] is {stamp}"),
+            (
+                frame.timestamp == stamp,
+                f"{where}stamped {frame.timestamp!r}, but timestamps[{index}] is {stamp}",
+            ),
             (
                 (np.isfinite(depth) & (depth >= 0)).all(),
                 f"{where}depth has values below 0 or not finite",
@@ -122,13 +149,21 @@ def _end(sequence: Sequence) -> None:
         sequence[len(sequence)]
     except IndexError:
         return
-    require(False, f"sequence[{len(sequence)}] gives a frame beyond the end", "without an IndexError, loops never end")
+    require(
+        False,
+        f"sequence[{len(sequence)}] gives a frame beyond the end",
+        "without an IndexError, loops never end",
+    )
 
 
 def _twice(sequence: Sequence, index: int) -> None:
     cause = "randomness, or a buffer that is written again"
     require_equal(
-        sequence[index], sequence[index], ("rgb", "depth"), f"frame {index} differs when it is read again", cause
+        sequence[index],
+        sequence[index],
+        ("rgb", "depth"),
+        f"frame {index} differs when it is read again",
+        cause,
     )
 
 
@@ -136,7 +171,10 @@ def _ground_truth(sequence: Sequence) -> None:
     truth = sequence.ground_truth
     if truth is None:
         raise NotApplicable("the sequence has none")
-    require(isinstance(truth, Trajectory), f"the ground truth is a {type(truth).__name__}, not a Trajectory")
+    require(
+        isinstance(truth, Trajectory),
+        f"the ground truth is a {type(truth).__name__}, not a Trajectory",
+    )
     stamps = sequence.timestamps
     require(
         ((truth.timestamps >= stamps[0] - 0.1) & (truth.timestamps <= stamps[-1] + 0.1)).any(),
@@ -153,14 +191,19 @@ def _masks(sequence: Sequence, chosen: list[int]) -> None:
     shape = (sequence.camera.height, sequence.camera.width)
     for index in chosen:
         masks = source[index]
-        kind, names = masks.instances.dtype, set(masks.class_names)
+        kind = masks.instances.dtype
+        names = set(masks.class_names)
         unnamed = sorted(set(np.unique(masks.instances).tolist()) - {0} - names)
         require_all(
             (
                 masks.instances.shape == shape and np.issubdtype(kind, np.integer),
                 f"the mask of frame {index} is {kind} {masks.instances.shape}, expected integers {shape}",
             ),
-            (not unnamed, f"instances {unnamed} of frame {index} have no class name", "0 is the background"),
+            (
+                not unnamed,
+                f"instances {unnamed} of frame {index} have no class name",
+                "0 is the background",
+            ),
             (set(masks.moving) <= names, f"moving instances of frame {index} have no class name"),
         )
 
@@ -168,10 +211,17 @@ def _masks(sequence: Sequence, chosen: list[int]) -> None:
 def _digest(sequence: Sequence) -> None:
     first = sequence.digest()
     require(isinstance(first, str) and first, f"the digest is {first!r}, not a text")
-    require(sequence.digest() == first, "two digests of one sequence differ", "it must depend on the content only")
+    require(
+        sequence.digest() == first,
+        "two digests of one sequence differ",
+        "it must depend on the content only",
+    )
 
 
 def _pickling(sequence: Sequence) -> None:
     copy = pickle.loads(pickle.dumps(sequence))
-    require(len(copy) == len(sequence) and copy.digest() == sequence.digest(), "a pickled copy is another sequence")
+    require(
+        len(copy) == len(sequence) and copy.digest() == sequence.digest(),
+        "a pickled copy is another sequence",
+    )
     require(np.array_equal(copy[0].rgb, sequence[0].rgb), "frame 0 of a pickled copy differs")

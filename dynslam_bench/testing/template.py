@@ -119,9 +119,16 @@ def write_tracker_template(name: str, folder: Path | str = ".") -> Path:
         DynslamError: The folder cannot be written.
     """
     words = re.findall(r"[A-Za-z0-9]+", name)
-    if not words or not words[0][0].isalpha() or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9 _.-]*", name):
-        raise PluginError(f"'{name}' is no name for a tracker", "letters, digits and hyphens, e.g. my-slam")
-    identifier, module = "-".join(words).lower(), "_".join(words).lower()
+    if (
+        not words
+        or not words[0][0].isalpha()
+        or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9 _.-]*", name)
+    ):
+        raise PluginError(
+            f"'{name}' is no name for a tracker", "letters, digits and hyphens, e.g. my-slam"
+        )
+    identifier = "-".join(words).lower()
+    module = "_".join(words).lower()
     path = Path(folder).expanduser() / f"{module}.py"
     if path.exists():
         raise PluginError(f"{path} exists already", "choose another name or folder")

@@ -8,7 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from dynslam_bench.contracts import Frame, Sequence, Tracker, TrackerContext, TrackerSpec, TrackResult, Trajectory
+from dynslam_bench.contracts import (
+    Frame,
+    Sequence,
+    Tracker,
+    TrackerContext,
+    TrackerSpec,
+    TrackResult,
+    Trajectory,
+)
 from dynslam_bench.contracts.checks import Fault, blemishes, faults, trajectory_faults
 from dynslam_bench.core import DynslamError
 from dynslam_bench.core.settings import Settings, apply_overrides, build, online_parameters
@@ -38,7 +46,8 @@ def check_tracker(
     """Check that a tracker keeps its contract, on a small exact scene and on degenerate frames.
 
     Args:
-        subject: A spec, an id, ``module:Attr``, ``file.py:Attr``, or a function that constructs a tracker.
+        subject: A spec, an id, ``module:Attr``, ``file.py:Attr``, or a function that constructs a
+            tracker.
         settings: Its settings, or overrides of the defaults by dotted name.
         sequence: What to track; the built-in scene by default.
         frames: How many frames to track in each check.
@@ -47,7 +56,9 @@ def check_tracker(
     Raises:
         ConformanceError: Names every failed check, the fault and the likely cause.
     """
-    tracker_report(subject, settings=settings, sequence=sequence, frames=frames, seed=seed).raise_for_failures()
+    tracker_report(
+        subject, settings=settings, sequence=sequence, frames=frames, seed=seed
+    ).raise_for_failures()
 
 
 def tracker_report(
@@ -65,8 +76,16 @@ def tracker_report(
         PluginError: There is no such tracker.
     """
     report = ConformanceReport("") if report is None else report
-    spec = TRACKERS.get(subject) if isinstance(subject, str) else subject if isinstance(subject, TrackerSpec) else None
-    report.subject = f"tracker {spec.id!r}" if spec else ConformanceReport.of("tracker", subject).subject
+    spec = (
+        TRACKERS.get(subject)
+        if isinstance(subject, str)
+        else subject
+        if isinstance(subject, TrackerSpec)
+        else None
+    )
+    report.subject = (
+        f"tracker {spec.id!r}" if spec else ConformanceReport.of("tracker", subject).subject
+    )
     scene = CornerSequence(frames) if sequence is None else sequence
     turning = TurningSequence()
     if spec is not None:
@@ -97,9 +116,19 @@ class _Runner:
     """Tracks a scene, or variants of it, with fresh or given trackers."""
 
     def __init__(
-        self, report: ConformanceReport, subject: Any, settings: Any, scene: Sequence, frames: int, seed: int
+        self,
+        report: ConformanceReport,
+        subject: Any,
+        settings: Any,
+        scene: Sequence,
+        frames: int,
+        seed: int,
     ) -> None:
-        self.report, self.subject, self.settings, self.scene, self.seed = report, subject, settings, scene, seed
+        self.report = report
+        self.subject = subject
+        self.settings = settings
+        self.scene = scene
+        self.seed = seed
         self.frames = [scene[index] for index in range(min(frames, len(scene)))]
 
     def construct(self, settings: Settings | None = None) -> Any:
@@ -125,7 +154,8 @@ class _Runner:
         """
         used = self.construct() if tracker is None else tracker
         used.reset(self.scene.camera, rng=np.random.default_rng(self.seed))
-        results, poses = [], []
+        results = []
+        poses = []
         for number, frame in enumerate(frames):
             if changed is not None and number == at:
                 used.configure(changed)
@@ -151,7 +181,9 @@ def _results_of(final: Trajectory, frames: list[Frame]) -> list[TrackResult]:
     """The final trajectory of a tracker that has no other one, frame by frame."""
     poses = dict(zip(final.timestamps.tolist(), final.T_world_cam, strict=True))
     return [
-        TrackResult(poses[frame.timestamp], "ok") if frame.timestamp in poses else TrackResult(None, "lost")
+        TrackResult(poses[frame.timestamp], "ok")
+        if frame.timestamp in poses
+        else TrackResult(None, "lost")
         for frame in frames
     ]
 
@@ -218,22 +250,36 @@ def _same_keys(run: _Runner) -> None:
 
 def _conventions(run: _Runner, monocular: bool) -> None:
     """Recognise world-to-camera poses, other axes and other units by the path of a camera that turns."""
-    results, count = run.track(run.frames), len(run.frames)
-    tracked = [(f.timestamp, r.T_world_cam) for f, r in zip(run.frames, results, strict=True) if r.state == "ok"]
+    results = run.track(run.frames)
+    count = len(run.frames)
+    tracked = [
+        (f.timestamp, r.T_world_cam)
+        for f, r in zip(run.frames, results, strict=True)
+        if r.state == "ok"
+    ]
     if len(tracked) < count // 2:
-        raise NotApplicable(f"only {len(tracked)} of the {count} frames of a camera that turns were tracked")
-    estimate = Trajectory(np.array([stamp for stamp, _ in tracked]), np.array([pose for _, pose in tracked]))
+        raise NotApplicable(
+            f"only {len(tracked)} of the {count} frames of a camera that turns were tracked"
+        )
+    estimate = Trajectory(
+        np.array([stamp for stamp, _ in tracked]), np.array([pose for _, pose in tracked])
+    )
     truth = run.scene.ground_truth
     assert truth is not None
     likely = hints(estimate, truth, "tum-rgbd/v1-sim3" if monocular else "tum-rgbd/v1")
-    conventions = [hint.text for hint in likely if hint.id not in ("time-shift", "below-truth-noise")]
+    conventions = [
+        hint.text for hint in likely if hint.id not in ("time-shift", "below-truth-noise")
+    ]
     require(not conventions, "; ".join(conventions))
 
 
 def _frames_left_alone(run: _Runner) -> None:
-    frames = [run.scene[frame.index] for frame in run.frames]  # earlier checks may have changed the others
+    # earlier checks may have changed the others
+    frames = [run.scene[frame.index] for frame in run.frames]
     require_unchanged(
-        lambda: run.track(frames), *[image for frame in frames for image in (frame.rgb, frame.depth)], what="a frame"
+        lambda: run.track(frames),
+        *[image for frame in frames for image in (frame.rgb, frame.depth)],
+        what="a frame",
     )
 
 
@@ -256,7 +302,10 @@ def _determinism(run: _Runner, deterministic: bool) -> None:
 def _two_resets(run: _Runner, deterministic: bool) -> None:
     tracker = run.construct()
     first = run.track(run.frames, tracker)
-    mirrored = [Frame(f.index, f.timestamp, f.rgb[:, ::-1].copy(), f.depth[:, ::-1].copy()) for f in run.frames[:3]]
+    mirrored = [
+        Frame(f.index, f.timestamp, f.rgb[:, ::-1].copy(), f.depth[:, ::-1].copy())
+        for f in run.frames[:3]
+    ]
     run.track(mirrored, tracker)
     at = first_difference(first, run.track(run.frames, tracker))
     _close(tracker)
@@ -268,7 +317,10 @@ def _two_resets(run: _Runner, deterministic: bool) -> None:
 
 
 def _hard_frame(run: _Runner, name: str) -> None:
-    for position, where in ((0, "the first frame"), (len(run.frames) // 2, "a frame in the middle")):
+    for position, where in (
+        (0, "the first frame"),
+        (len(run.frames) // 2, "a frame in the middle"),
+    ):
         frames = list(run.frames)
         frames[position] = hard_frames(frames[position])[name]
         try:
@@ -285,7 +337,8 @@ def _hard_frame(run: _Runner, name: str) -> None:
 def _final(run: _Runner, count: int | None = None) -> None:
     if count == 1 and isinstance(run.subject, TrackerSpec) and not run.subject.online:
         raise NotApplicable("a program for whole sequences may need more than one frame")
-    tracker, frames = run.construct(), run.frames[:count]
+    tracker = run.construct()
+    frames = run.frames[:count]
     run.track(frames, tracker)
     finalises = callable(getattr(tracker, "finalize", None))
     final = tracker.finalize() if finalises else None
@@ -323,29 +376,38 @@ def _close(tracker: Tracker) -> None:
         ) from error
 
 
-def _online_settings(run: _Runner, spec: TrackerSpec | None, settings: Settings | Mapping[str, Any] | None) -> None:
+def _online_settings(
+    run: _Runner, spec: TrackerSpec | None, settings: Settings | Mapping[str, Any] | None
+) -> None:
     """Check the contract of `core.settings.Reconfigurable` on a tracker.
 
-    An episode that is reconfigured before its first frame has to equal that of a tracker built with the same settings;
-    the next episode, without reconfiguration, that of a fresh tracker. Where settings have an effect in the second half
-    of an episode, changing them in its middle has to have one there. All online settings are moved to alternate ends.
+    An episode that is reconfigured before its first frame has to equal that of a tracker built with
+    the same settings; the next episode, without reconfiguration, that of a fresh tracker. Where
+    settings have an effect in the second half of an episode, changing them in its middle has to
+    have one there. All online settings are moved to alternate ends.
     """
     if spec is None or not spec.deterministic:
-        raise NotApplicable("no spec names online settings" if spec is None else "it is not deterministic")
+        raise NotApplicable(
+            "no spec names online settings" if spec is None else "it is not deterministic"
+        )
     start = settings if isinstance(settings, Settings) else resolve_settings(spec, settings)
     online = online_parameters(start)
     if not online:
         raise NotApplicable("the tracker has no online settings")
     tracker = run.construct(start)
-    names = ", ".join(parameter.name for parameter in online[:4]) + (", ..." if len(online) > 4 else "")
+    names = ", ".join(parameter.name for parameter in online[:4]) + (
+        ", ..." if len(online) > 4 else ""
+    )
     fault = f"the tracker class {type(tracker).__name__} has no method configure(settings), but {names} is online"
     require(
         callable(getattr(tracker, "configure", None)),
         fault,
         "implement configure (see core.settings.Reconfigurable), or declare the setting without online=True",
     )
-    fresh, half = run.track(run.frames, tracker), len(run.frames) // 2
-    has_effect, late_effects = False, []
+    fresh = run.track(run.frames, tracker)
+    half = len(run.frames) // 2
+    has_effect = False
+    late_effects = []
     for first in (0, 1):
         ends = {}
         for number, parameter in enumerate(online, first):
@@ -359,15 +421,31 @@ def _online_settings(run: _Runner, spec: TrackerSpec | None, settings: Settings 
         what = ", ".join(f"{name}={value}" for name, value in list(ends.items())[:4])
         at = first_difference(built, run.track(run.frames, tracker, changed))
         fault = f"configure() with {what} gives another result than building with it: {at}"
-        require(not at, fault, "configure() does not reach the part that uses the setting, or only later")
+        require(
+            not at,
+            fault,
+            "configure() does not reach the part that uses the setting, or only later",
+        )
         at = first_difference(fresh, run.track(run.frames, tracker))
-        fault = f"after an episode configured to {what}, reset() does not bring back the settings: {at}"
-        require(not at, fault, "remember the settings that it was built with, and put them into force in reset()")
+        fault = (
+            f"after an episode configured to {what}, reset() does not bring back the settings: {at}"
+        )
+        require(
+            not at,
+            fault,
+            "remember the settings that it was built with, and put them into force in reset()",
+        )
         has_effect |= bool(first_difference(fresh, built))
         if first_difference(fresh[half:], built[half:]):
-            late_effects.append(first_difference(fresh, run.track(run.frames, tracker, changed, half)))
+            late_effects.append(
+                first_difference(fresh, run.track(run.frames, tracker, changed, half))
+            )
     fault = f"configure() in mid-episode changes nothing, although building with {names} does"
-    require(any(late_effects) or not late_effects, fault, "the settings are read once; read them on every frame")
+    require(
+        any(late_effects) or not late_effects,
+        fault,
+        "the settings are read once; read them on every frame",
+    )
     if not has_effect:
         raise NotApplicable(f"{names} change nothing on this scene, at either end of their ranges")
 
@@ -378,7 +456,9 @@ def first_difference(first: list[TrackResult], second: list[TrackResult]) -> str
         if a.state != b.state:
             return f"frame {index}, states {a.state} and {b.state}"
         arrays = ("T_world_cam", "dynamic_mask", "keypoints_xy", "keypoints_keep")
-        different = [name for name in arrays if not np.array_equal(getattr(a, name), getattr(b, name))]
+        different = [
+            name for name in arrays if not np.array_equal(getattr(a, name), getattr(b, name))
+        ]
         different += [key for key in {**a.stats, **b.stats} if a.stats.get(key) != b.stats.get(key)]
         if different:
             return f"frame {index}, {', '.join(different[:3])}"

@@ -32,7 +32,9 @@ def tracker_groups() -> dict[str, list[list[TrackerSpec]]]:
     Returns:
         Kind to its trackers by id; each is a list of the tracker and its variants (``ID?...``).
     """
-    groups: dict[str, list[list[TrackerSpec]]] = {kind: [] for kind in (*dict.fromkeys(KINDS.values()), "plug-in")}
+    groups: dict[str, list[list[TrackerSpec]]] = {
+        kind: [] for kind in (*dict.fromkeys(KINDS.values()), "plug-in")
+    }
     registered = TRACKERS.all()
     for tracker in registered:
         name = tracker.spec.id
@@ -46,15 +48,17 @@ def tracker_groups() -> dict[str, list[list[TrackerSpec]]]:
 class TrackerRegistry(Registry[TrackerSpec]):
     """All trackers; an id may carry a parameter, as in ``replay:trajectory.txt``.
 
-    An exact id wins over ``id:value``, and that over ``module:Attr`` and ``file.py:Attr``. A name is read as
-    ``id:value`` only if the part before its first colon is the id of a tracker that takes a parameter.
+    An exact id wins over ``id:value``, and that over ``module:Attr`` and ``file.py:Attr``. A name
+    is read as ``id:value`` only if the part before its first colon is the id of a tracker that
+    takes a parameter.
     """
 
     def get(self, name: str) -> TrackerSpec:
         """The spec of an id, of ``id:value``, or of ``module:Attr`` / ``file.py:Attr``; imports no other plug-in.
 
         Raises:
-            PluginError: Unknown id (with a did-you-mean), an empty value, or the named object is no spec.
+            PluginError: Unknown id (with a did-you-mean), an empty value, or the named object is no
+                spec.
         """
         prefix, separator, value = name.partition(":")
         if separator and self.find(name) is None:
@@ -67,11 +71,16 @@ class TrackerRegistry(Registry[TrackerSpec]):
 def _bind(spec: TrackerSpec, value: str) -> TrackerSpec:
     """The spec of ``id:value``; a named file's content becomes part of the version, and so of a run's identity."""
     if not value.strip():
-        raise PluginError(f"'{spec.id}:' lacks its {spec.parameter}", f"write {spec.id}:{spec.parameter.upper()}")
+        raise PluginError(
+            f"'{spec.id}:' lacks its {spec.parameter}", f"write {spec.id}:{spec.parameter.upper()}"
+        )
     path = Path(value).expanduser()
     content = f"+{sha256(path.read_bytes()).hexdigest()[:12]}" if path.is_file() else ""
     described = load_object(spec.describe)(path) if spec.describe else {}
-    named = {"label": f"{spec.label}: {path.name if content else value}", "version": spec.version} | described
+    named = {
+        "label": f"{spec.label}: {path.name if content else value}",
+        "version": spec.version,
+    } | described
     named |= {"id": f"{spec.id}:{value}", "version": named["version"] + content, "parameter": ""}
     return replace(spec, **named, bound={**spec.bound, spec.parameter: value})
 
@@ -91,7 +100,9 @@ def resolve_settings(spec: TrackerSpec, overrides: Mapping[str, Any] | None = No
 
 
 def build_tracker(
-    spec: TrackerSpec | str, settings: Settings | Mapping[str, Any] | None = None, context: TrackerContext | None = None
+    spec: TrackerSpec | str,
+    settings: Settings | Mapping[str, Any] | None = None,
+    context: TrackerContext | None = None,
 ) -> Tracker:
     """Load and construct a tracker.
 
@@ -111,10 +122,16 @@ def build_tracker(
         settings = resolve_settings(spec, settings)
     missing = spec.missing()
     if missing:
-        raise TrackerError(f"tracker '{spec.id}' needs a package that is not installed", "; ".join(missing))
+        raise TrackerError(
+            f"tracker '{spec.id}' needs a package that is not installed", "; ".join(missing)
+        )
 
     def construct(build: Callable[..., object]) -> object:
         takes_context = "context" in inspect.signature(build).parameters
-        return build(settings, context=context or TrackerContext()) if takes_context else build(settings)
+        return (
+            build(settings, context=context or TrackerContext())
+            if takes_context
+            else build(settings)
+        )
 
     return build_plugin("tracker", spec, Tracker, TrackerError, construct)  # type: ignore[type-abstract]

@@ -13,7 +13,9 @@ def main(checkout: str, camera: str, sequence: str, output: str) -> None:
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
     np.savetxt("calibration.txt", [[settings.getNode(f"Camera1.{name}").real() for name in names]])
     cfg.merge_from_file(f"{checkout}/config/default.yaml")
-    poses, indices = run(cfg, f"{checkout}/dpvo.pth", f"{sequence}/rgb", "calibration.txt", stride=1)[:2]
+    poses, indices = run(
+        cfg, f"{checkout}/dpvo.pth", f"{sequence}/rgb", "calibration.txt", stride=1
+    )[:2]
     np.savetxt(output, np.column_stack([indices, poses]))
 
 

@@ -1,7 +1,8 @@
 """A system of VSLAM-LAB on a whole sequence: CHECKOUT SYSTEM MODE CAMERA SEQUENCE OUTPUT.
 
-Writes the sequence's tables as VSLAM-LAB does, runs `pixi run -e SYSTEM execute-MODE`, and reads its table of poses.
-Systems whose task takes `key:value` in place of `--key value`, such as orbslam2, need that change below.
+Writes the sequence's tables as VSLAM-LAB does, runs `pixi run -e SYSTEM execute-MODE`, and reads
+its table of poses. Systems whose task takes `key:value` in place of `--key value`, such as
+orbslam2, need that change below.
 """
 
 import subprocess
@@ -15,13 +16,16 @@ from dynslam_bench.runs import read_trajectory
 
 
 def main(checkout: str, system: str, mode: str, camera: str, sequence: str, output: str) -> None:
-    settings, work = cv2.FileStorage(camera, cv2.FILE_STORAGE_READ), Path(output).parent
+    settings = cv2.FileStorage(camera, cv2.FILE_STORAGE_READ)
+    work = Path(output).parent
     number = {
         name: settings.getNode(f"Camera1.{name}").real()
         for name in ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
     }
     fx, fy, cx, cy, *distortion = number.values()
-    width, height, fps = (int(settings.getNode(f"Camera.{name}").real()) for name in ("width", "height", "fps"))
+    width, height, fps = (
+        int(settings.getNode(f"Camera.{name}").real()) for name in ("width", "height", "fps")
+    )
     (work / "calibration.yaml").write_text(
         "%YAML:1.2\n---\ncameras:\n"
         f"  - {{cam_name: rgb_0, cam_type: rgb+depth, depth_name: depth_0, cam_model: radtan5,"
@@ -41,7 +45,11 @@ def main(checkout: str, system: str, mode: str, camera: str, sequence: str, outp
         "exp_folder": work, "exp_it": 0, "verbose": 0, "mode": mode,
     }  # fmt: skip
     words = [str(word) for key, value in stated.items() for word in (f"--{key}", value)]
-    subprocess.run(["pixi", "run", "--frozen", "-e", system, f"execute-{mode}", *words], cwd=checkout, check=True)
+    subprocess.run(
+        ["pixi", "run", "--frozen", "-e", system, f"execute-{mode}", *words],
+        cwd=checkout,
+        check=True,
+    )
     poses = next(work.glob("*_KeyFrameTrajectory.csv"))
     write_tum(output, read_trajectory(poses).trajectory)
 

@@ -10,7 +10,9 @@ from dynslam_bench.envs import STATS_LAYOUT, ControlBenchmark
 
 Policy = Callable[[np.ndarray, int], object]
 """From the observation and the number of the step to the action."""
-FIELDS = {name: index for index, name in enumerate([*(name for name, _ in STATS_LAYOUT), "since_network"])}
+FIELDS = {
+    name: index for index, name in enumerate([*(name for name, _ in STATS_LAYOUT), "since_network"])
+}
 """Where each entry of the observation stands."""
 
 
@@ -26,7 +28,9 @@ class Memory(gym.ObservationWrapper):
 
     def observation(self, observation: np.ndarray) -> np.ndarray:
         frames = self.unwrapped.episode.outcomes[::-1]
-        since = next((n for n, frame in enumerate(frames) if frame.stats.get("segmented")), len(frames))
+        since = next(
+            (n for n, frame in enumerate(frames) if frame.stats.get("segmented")), len(frames)
+        )
         return np.append(observation, np.float32(since / (since + 10)))
 
 
@@ -41,7 +45,8 @@ class Score:
 
 def score(benchmark: ControlBenchmark, env: gym.Env) -> Score:
     """Of the frames so far but the first, which no action has changed."""
-    frames, reward = env.unwrapped.episode.outcomes[1:], benchmark.reward
+    frames = env.unwrapped.episode.outcomes[1:]
+    reward = benchmark.reward
     earned = sum(frame.reward for frame in frames)
     charge = sum(reward.charge(frame) for frame in frames)
     return Score(earned, -earned - charge, sum(reward.cost_of(frame) for frame in frames))
@@ -50,8 +55,10 @@ def score(benchmark: ControlBenchmark, env: gym.Env) -> Score:
 def play(benchmark: ControlBenchmark, env: gym.Env, policy: Policy, seed: int = 0) -> Score:
     """One episode."""
     observation, _ = env.reset(seed=seed)
-    step, over = 0, False
+    step = 0
+    over = False
     while not over:
         observation, _, terminated, truncated, _ = env.step(policy(observation, step))
-        step, over = step + 1, terminated or truncated
+        step = step + 1
+        over = terminated or truncated
     return score(benchmark, env)

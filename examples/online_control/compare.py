@@ -1,10 +1,12 @@
 """All agents on the held-out scenes of a benchmark: what can be learnt, what each agent earns, how the learners learn.
 
     pip install stable-baselines3
-    python examples/online_control/compare.py masks-v0 [--steps 5000] [--seeds 5] [--scenes 6] [--data-root FOLDER]
+    python examples/online_control/compare.py masks-v0 [--steps 5000] [--seeds 5] [--scenes 6]
+    [--data-root FOLDER]
 
-Differences are paired by scene; their intervals are of 95 %, from a bootstrap over the scenes. Recordings are played if
-they lie in the folder; a network for them is named as a setting: ``--masks onnx:yolov8n-seg.onnx``.
+Differences are paired by scene; their intervals are of 95 %, from a bootstrap over the scenes.
+Recordings are played if they lie in the folder; a network for them is named as a setting:
+``--masks onnx:yolov8n-seg.onnx``.
 """
 
 import argparse
@@ -50,13 +52,21 @@ def main(
         **arguments: Of `ControlBenchmark.make`.
     """
     bench = control_benchmark(id)
-    tests = [Memory(bench.make("test", n, **arguments)) for n in range(len(bench.test) if test is None else test)]
+    tests = [
+        Memory(bench.make("test", n, **arguments))
+        for n in range(len(bench.test) if test is None else test)
+    ]
     trains = [Memory(bench.make("train", n, **arguments)) for n in range(scenes)]
     train = Memory(bench.make("train", range(scenes), **arguments))
 
     statics: dict[str, Agent] = {name: partial(sweep_agent, name) for name in static.sweep(train)}
-    sweep = {name: [play(bench, env, agent(env)) for env in tests] for name, agent in statics.items()}
-    tuned = {name: np.mean([play(bench, env, agent(env)).earned for env in trains]) for name, agent in statics.items()}
+    sweep = {
+        name: [play(bench, env, agent(env)) for env in tests] for name, agent in statics.items()
+    }
+    tuned = {
+        name: np.mean([play(bench, env, agent(env)).earned for env in trains])
+        for name, agent in statics.items()
+    }
     best = max(statics, key=tuned.__getitem__)
     agents: dict[str, list[Agent]] = {
         "default": [static.default],
@@ -65,28 +75,37 @@ def main(
         "rule by hand": [rule],
     }
     rows = {
-        name: average([[play(bench, env, agent(env)) for env in tests] for agent in agents[name]]) for name in agents
+        name: average([[play(bench, env, agent(env)) for env in tests] for agent in agents[name]])
+        for name in agents
     }
     each = [max(scores, key=lambda s: s.earned) for scores in zip(*sweep.values(), strict=True)]
     ways = [spliced(bench, env, static.sweep(env).values()) for env in tests]
     rows["best static of each scene"] = each
-    rows["hindsight splice"] = [max(scores, key=lambda s: s.earned) for scores in zip(each, ways, strict=True)]
+    rows["hindsight splice"] = [
+        max(scores, key=lambda s: s.earned) for scores in zip(each, ways, strict=True)
+    ]
     print(f"{len(tests)} held-out scenes, {scenes} training scenes, {steps} steps a learner.\n")
     print_table(rows, sweep, list(rows))
 
-    curves, began = {}, time.perf_counter()
+    curves = {}
+    began = time.perf_counter()
     for name, learn in {"evolution strategy": learn_evolution, "PPO": learn_ppo}.items():
         learnt = [learn(bench, train, steps, seed) for seed in range(seeds)]
         agents[name] = [agent for agent, _ in learnt]
         curves |= {(name, seed): curve for seed, (_, curve) in enumerate(learnt)}
     learnt_s = time.perf_counter() - began
     learners = list(dict.fromkeys(name for name, _ in curves))
-    scores = {name: [[play(bench, env, agent(env)) for env in tests] for agent in agents[name]] for name in learners}
+    scores = {
+        name: [[play(bench, env, agent(env)) for env in tests] for agent in agents[name]]
+        for name in learners
+    }
     print(f"\nLearners, means of {seeds} seeds.\n")
     print_table(rows | {name: average(runs) for name, runs in scores.items()}, sweep, learners)
     print_curves(curves, scores)
     if data_root is not None:
-        print_recordings(bench, agents, data_root, {} if masks is None else {"segmentation.source": masks})
+        print_recordings(
+            bench, agents, data_root, {} if masks is None else {"segmentation.source": masks}
+        )
     print(f"\n{2 * seeds * steps / learnt_s:.0f} steps a second while learning.")
 
 
@@ -94,7 +113,9 @@ def sweep_agent(name: str, env: gym.Env) -> Policy:
     return static.sweep(env)[name]
 
 
-def learn_evolution(bench: ControlBenchmark, env: gym.Env, steps: int, seed: int) -> tuple[Agent, list]:
+def learn_evolution(
+    bench: ControlBenchmark, env: gym.Env, steps: int, seed: int
+) -> tuple[Agent, list]:
     weights, curve = evolution.evolve(bench, env, steps, seed)
     return lambda env: evolution.linear(env, weights), curve
 
@@ -135,16 +156,26 @@ def front(statics: np.ndarray, scenes: np.ndarray) -> np.ndarray:
     return means[np.r_[True, means[1:, 1] < np.minimum.accumulate(means[:, 1])[:-1]]]
 
 
-def print_table(rows: dict[str, list[Score]], sweep: dict[str, list[Score]], shown: list[str]) -> None:
+def print_table(
+    rows: dict[str, list[Score]], sweep: dict[str, list[Score]], shown: list[str]
+) -> None:
     """A row an agent: mean loss (minus the return), error and cost, and what static settings have instead.
 
-    The error is compared with that of static settings at the agent's cost, the cost with theirs at the agent's error:
-    between the static settings that no other one beats in both, linearly.
+    The error is compared with that of static settings at the agent's cost, the cost with theirs at
+    the agent's error: between the static settings that no other one beats in both, linearly.
     """
-    tables = {name: np.array([(-s.earned, s.error, s.cost) for s in scores]) for name, scores in rows.items()}
-    statics = np.array([[(-s.earned, s.error, s.cost) for s in scores] for scores in sweep.values()])
+    tables = {
+        name: np.array([(-s.earned, s.error, s.cost) for s in scores])
+        for name, scores in rows.items()
+    }
+    statics = np.array(
+        [[(-s.earned, s.error, s.cost) for s in scores] for scores in sweep.values()]
+    )
     best = next(table for name, table in tables.items() if name.startswith("best static:"))
-    print("| agent | loss, mm | error, mm | cost | loss against default, % | loss against best static, % ", end="")
+    print(
+        "| agent | loss, mm | error, mm | cost | loss against default, % | loss against best static, % ",
+        end="",
+    )
     print("| error at equal cost, % | cost at equal error, % |\n| --- |" + " ---: |" * 7)
     for name in shown:
         table = tables[name]
@@ -162,30 +193,47 @@ def print_table(rows: dict[str, list[Score]], sweep: dict[str, list[Score]], sho
             percent(table, 1, error_there),
             percent(table, 2, cost_there),
         ]
-        print(f"| {name} | {1e3 * loss:.0f} | {1e3 * error:.0f} | {cost:.1f} | {' | '.join(changes)} |", flush=True)
+        print(
+            f"| {name} | {1e3 * loss:.0f} | {1e3 * error:.0f} | {cost:.1f} | {' | '.join(changes)} |",
+            flush=True,
+        )
 
 
 def print_recordings(
     bench: ControlBenchmark, agents: dict[str, list[Agent]], folder: str, settings: dict[str, Any]
 ) -> None:
     """A row an agent and recording; a recording that is not there is left out with the reason."""
-    print("\n| recording | agent | loss, mm | error, mm | cost |\n| --- | --- | ---: | ---: | ---: |")
+    print(
+        "\n| recording | agent | loss, mm | error, mm | cost |\n| --- | --- | ---: | ---: | ---: |"
+    )
     for number, name in enumerate(bench.recordings):
         try:
-            env = Memory(bench.make("recordings", number, data_root=folder, settings={**bench.settings, **settings}))
+            env = Memory(
+                bench.make(
+                    "recordings", number, data_root=folder, settings={**bench.settings, **settings}
+                )
+            )
             for agent, seeds in agents.items():
                 (s,) = average([[play(bench, env, each(env))] for each in seeds])
-                print(f"| {name} | {agent} | {-1e3 * s.earned:.0f} | {1e3 * s.error:.0f} | {s.cost:.1f} |")
+                print(
+                    f"| {name} | {agent} | {-1e3 * s.earned:.0f} | {1e3 * s.error:.0f} | {s.cost:.1f} |"
+                )
         except DynslamError as error:
             print(f"| {name} | left out: {error} | | | |")
 
 
-def print_curves(curves: dict[tuple[str, int], list[tuple[int, float]]], scores: dict[str, list[list[Score]]]) -> None:
+def print_curves(
+    curves: dict[tuple[str, int], list[tuple[int, float]]], scores: dict[str, list[list[Score]]]
+) -> None:
     """A row a learner: mean loss of its training episodes from the first steps to the last, then on held-out scenes."""
-    print("\n| learner | seed | loss of training episodes, mm, by steps | held out |\n| --- | ---: | --- | ---: |")
+    print(
+        "\n| learner | seed | loss of training episodes, mm, by steps | held out |\n| --- | ---: | --- | ---: |"
+    )
     for (name, seed), curve in curves.items():
         parts = ", ".join(f"{steps}: {-1e3 * earned:.0f}" for steps, earned in curve)
-        print(f"| {name} | {seed} | {parts} | {-1e3 * np.mean([s.earned for s in scores[name][seed]]):.0f} |")
+        print(
+            f"| {name} | {seed} | {parts} | {-1e3 * np.mean([s.earned for s in scores[name][seed]]):.0f} |"
+        )
 
 
 if __name__ == "__main__":

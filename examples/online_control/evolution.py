@@ -1,6 +1,7 @@
 """An evolution strategy (weighted recombination, one step size) tunes a linear policy; numpy alone.
 
-The policy sees five numbers: 1, the mask's share, the frames since the network ran, the camera's speed, the brightness.
+The policy sees five numbers: 1, the mask's share, the frames since the network ran, the camera's
+speed, the brightness.
 """
 
 import gymnasium as gym
@@ -15,7 +16,9 @@ MOTION = slice(FIELDS["motion_x"], FIELDS["motion_x"] + 6)
 
 def seen(observation: np.ndarray) -> np.ndarray:
     speed = np.abs(observation[MOTION]).max()
-    values = [observation[FIELDS[name]] for name in ("mask_fraction", "since_network", "brightness")]
+    values = [
+        observation[FIELDS[name]] for name in ("mask_fraction", "since_network", "brightness")
+    ]
     return np.array([1.0, *values, speed])
 
 
@@ -23,8 +26,11 @@ def linear(env: gym.Env, weights: np.ndarray) -> Policy:
     """Segment if the weighted sum is positive; or the neutral action changed by a sum for each setting."""
     if isinstance(env.action_space, gym.spaces.Discrete):
         return lambda observation, step: 0 if weights @ seen(observation) > 0 else 3
-    neutral, rows = env.unwrapped.neutral_action, weights.reshape(-1, SEEN)
-    return lambda observation, step: np.clip(neutral + rows @ seen(observation), -1, 1).astype(np.float32)
+    rows = weights.reshape(-1, SEEN)
+    neutral = env.unwrapped.neutral_action
+    return lambda observation, step: np.clip(neutral + rows @ seen(observation), -1, 1).astype(
+        np.float32
+    )
 
 
 def evolve(
@@ -36,16 +42,23 @@ def evolve(
     """
     rng = np.random.default_rng(seed)
     rows = 1 if isinstance(env.action_space, gym.spaces.Discrete) else env.action_space.shape[0]
-    centre, sigma = np.zeros(rows * SEEN), 0.5
+    centre = np.zeros(rows * SEEN)
+    sigma = 0.5
     share = np.log(population / 2 + 0.5) - np.log(np.arange(1, population // 2 + 1))
     share /= share.sum()
-    used, generation, curve = 0, 0, []
+    used = 0
+    generation = 0
+    curve = []
     while used < steps:
         candidates = centre + sigma * rng.normal(size=(population, len(centre)))
-        played = [play(benchmark, env, linear(env, weights), 1000 * seed + generation) for weights in candidates]
+        played = [
+            play(benchmark, env, linear(env, weights), 1000 * seed + generation)
+            for weights in candidates
+        ]
         returns = [score.earned for score in played]
         used += population * (env.unwrapped.episode.next_index - 1)
         centre = share @ candidates[np.argsort(returns)[::-1][: len(share)]]
-        sigma, generation = 0.9 * sigma, generation + 1
+        sigma = 0.9 * sigma
+        generation = generation + 1
         curve.append((used, float(np.mean(returns))))
     return centre, curve

@@ -18,10 +18,17 @@ def train(env: gym.Env, steps: int, seed: int) -> tuple[Policy, list[tuple[int, 
     torch.set_num_threads(1)
     size = min(256, steps)
     sizes = {"n_steps": size, "batch_size": min(64, size)}
-    agent = PPO("MlpPolicy", scaled, **sizes, gamma=0.9, learning_rate=1e-3, seed=seed, device="cpu")
+    agent = PPO(
+        "MlpPolicy", scaled, **sizes, gamma=0.9, learning_rate=1e-3, seed=seed, device="cpu"
+    )
     agent.learn(steps)
-    returns, lengths = monitor.get_episode_rewards(), np.cumsum(monitor.get_episode_lengths())
+    returns = monitor.get_episode_rewards()
+    lengths = np.cumsum(monitor.get_episode_lengths())
     parts = np.array_split(np.arange(len(returns)), min(8, len(returns)))
-    curve = [(int(lengths[part[-1]]), float(np.mean([returns[n] for n in part]))) for part in parts if len(part)]
+    curve = [
+        (int(lengths[part[-1]]), float(np.mean([returns[n] for n in part])))
+        for part in parts
+        if len(part)
+    ]
     means = isinstance(env.action_space, gym.spaces.Box)
     return lambda observation, step: agent.predict(observation, deterministic=means)[0], curve

@@ -1,7 +1,8 @@
 """What hindsight reaches: of a few static settings, the best one for every stretch of the episode.
 
-At every stretch a copy of the episode tries each of the settings, and the one that earns most is taken. This is no
-agent, because it knows the rewards before it acts, and no upper bound, because it looks one stretch ahead alone.
+At every stretch a copy of the episode tries each of the settings, and the one that earns most is
+taken. This is no agent, because it knows the rewards before it acts, and no upper bound, because it
+looks one stretch ahead alone.
 """
 
 from collections.abc import Iterable
@@ -12,12 +13,16 @@ from common import Policy, Score, score
 from dynslam_bench.envs import ControlBenchmark
 
 
-def spliced(benchmark: ControlBenchmark, env: gym.Env, policies: Iterable[Policy], stretch: int = 30) -> Score:
+def spliced(
+    benchmark: ControlBenchmark, env: gym.Env, policies: Iterable[Policy], stretch: int = 30
+) -> Score:
     """The episode that is spliced from the policies' best stretches."""
-    inner, policies = env.unwrapped, list(policies)
+    inner = env.unwrapped
+    policies = list(policies)
     env.reset(seed=0)
     while not inner.episode.over:
-        start, ends = inner.clone_state(), []
+        start = inner.clone_state()
+        ends = []
         for policy in policies:
             ends.append(run(env, policy, stretch))
             inner.restore_state(start)
@@ -27,7 +32,8 @@ def spliced(benchmark: ControlBenchmark, env: gym.Env, policies: Iterable[Policy
 
 def run(env: gym.Env, policy: Policy, frames: int) -> float:
     """Play some frames with a policy that does not look; returns what they earn."""
-    inner, earned = env.unwrapped, 0.0
+    inner = env.unwrapped
+    earned = 0.0
     for _ in range(frames):
         if inner.episode.over:
             break

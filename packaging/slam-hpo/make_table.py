@@ -1,8 +1,8 @@
 """Make the tables of `slam_hpo`: runs of dynslam-bench at Sobol's points, one Parquet file for each system.
 
-    python make_table.py suite mask-rcnn 0 32 > suite.toml     # a suite of the first 32 configurations
-    dynslam-bench bench suite.toml --shard 1/4 --results part1  # on as many machines as you like
-    python make_table.py table mask-rcnn part1 part2 part3 part4
+    python make_table.py suite mask-rcnn 0 32 > suite.toml     # a suite of the first 32
+    configurations dynslam-bench bench suite.toml --shard 1/4 --results part1  # on as many machines
+    as you like python make_table.py table mask-rcnn part1 part2 part3 part4
 
 A table may grow: later points of the sequence are added, and what is stored is not run again.
 """
@@ -28,7 +28,11 @@ def suite(system: str, first: str, count: str) -> str:
     space = SPACES[system]
     points = qmc.Sobol(len(space), seed=0).random(POINTS)[int(first) : int(first) + int(count)]
     lines = ['name = "slam-hpo"', f"trackers = {json.dumps([system])}", "cache = true"]
-    lines += [f"sequences = {json.dumps(SEQUENCES)}", f"offsets = {json.dumps(STARTS)}", f"stride = {STRIDE}"]
+    lines += [
+        f"sequences = {json.dumps(SEQUENCES)}",
+        f"offsets = {json.dumps(STARTS)}",
+        f"stride = {STRIDE}",
+    ]
     lines += [f"frames = [0, {max(STARTS) + STRIDE * max(FRAMES)}]"]
     for point in points:
         values = ((name, space[name].at(unit)) for name, unit in zip(space, point, strict=True))
@@ -50,10 +54,18 @@ def table(system: str, *folders: str) -> str:
                 sequence = next(name for name in SEQUENCES if record.sequence.id.startswith(name))
                 same = {name: record.settings[name] for name in SPACES[system]}
                 same |= {"sequence": sequence, "start": record.offset}
-                found += [same | {"frames": length} | evaluated(store, record, length)._asdict() for length in FRAMES]
-    data = pd.DataFrame(found).drop(columns="log_ate_std").astype({"sequence": "category", "status": "category"})
+                found += [
+                    same | {"frames": length} | evaluated(store, record, length)._asdict()
+                    for length in FRAMES
+                ]
+    data = (
+        pd.DataFrame(found)
+        .drop(columns="log_ate_std")
+        .astype({"sequence": "category", "status": "category"})
+    )
     key = [*SPACES[system], "sequence", "start", "frames"]
-    data = data.drop_duplicates(key).sort_values(key, ignore_index=True)  # the default may be there several times
+    # the default may be there several times
+    data = data.drop_duplicates(key).sort_values(key, ignore_index=True)
     data = data.astype({name: "float32" for name in ("ate_m", "coverage", "processor_s")})
     data.to_parquet(DATA / f"{system.partition('?')[0]}.parquet", compression="zstd", index=False)
     return f"{len(data)} rows\n"

@@ -20,17 +20,26 @@ for system in SPACES:
     units = np.stack([bench.units(bench.configuration(i)) for i in range(len(bench.values))])
     truth = transformed(bench.values)[..., FRAMES.index(60), 0]
     fold = np.random.default_rng(0).permutation(len(units)) % 5
-    mean, std = np.empty_like(truth), np.empty_like(truth)
+    mean = np.empty_like(truth)
+    std = np.empty_like(truth)
     for k in range(5):
         predicted = Surrogate(units[fold != k], bench.values[fold != k]).predict(units[fold == k])
         mean[fold == k], std[fold == k] = (part[..., FRAMES.index(60), 0] for part in predicted)
     for split, names in SPLITS.items():
         at = [SEQUENCES.index(name) for name in names]
-        a, b = mean[:, at], truth[:, at]
+        a = mean[:, at]
+        b = truth[:, at]
         whole = spearmanr(a.mean(axis=(1, 2)), b.mean(axis=(1, 2)))[0]
         starts = spearmanr(b[:, :, 0].mean(axis=1), b[:, :, 1].mean(axis=1))[0]
-        single = np.median([spearmanr(a[:, s, k], b[:, s, k])[0] for s in range(a.shape[1]) for k in range(a.shape[2])])
-        residual, expected = np.sqrt(np.mean((a - b) ** 2)), np.sqrt(np.mean(std[:, at] ** 2))
+        single = np.median(
+            [
+                spearmanr(a[:, s, k], b[:, s, k])[0]
+                for s in range(a.shape[1])
+                for k in range(a.shape[2])
+            ]
+        )
+        residual = np.sqrt(np.mean((a - b) ** 2))
+        expected = np.sqrt(np.mean(std[:, at] ** 2))
         lines.append(
             f"| `{system}` | {len(units)} | {split} | {whole:.2f} | {starts:.2f} | {single:.2f} | {residual:.3f} | "
             f"{expected:.3f} | {bench.noise():.3f} |"

@@ -23,7 +23,11 @@ from dynslam_bench.reports.tables.leaderboard import (
 )
 from dynslam_bench.reports.tables.table import TableCell
 
-_OPPOSITE: dict[Verdict, Verdict] = {"better": "worse", "worse": "better", "cannot tell": "cannot tell"}
+_OPPOSITE: dict[Verdict, Verdict] = {
+    "better": "worse",
+    "worse": "better",
+    "cannot tell": "cannot tell",
+}
 MOST_LISTED = 5000
 """Runs that are listed one by one; of more, those that have a page, and the first of every cell."""
 
@@ -43,9 +47,9 @@ def entries_of(
 ) -> list[dict[str, Any]]:
     """The rows of one category, cells by the names that `board.html.j2` calls them by.
 
-    ``at`` numbers the tracker on all pages; ``group`` is 0 for ranked trackers, 1 for others, 2 for controls (bounds).
-    The name leads to the tracker's run with the median error on the first sequence where that has a page, and the
-    successes lead to its first failure.
+    ``at`` numbers the tracker on all pages; ``group`` is 0 for ranked trackers, 1 for others, 2 for
+    controls (bounds). The name leads to the tracker's run with the median error on the first
+    sequence where that has a page, and the successes lead to its first failure.
 
     Args:
         board: Of the category.
@@ -57,7 +61,9 @@ def entries_of(
     limits = _limits([s.ratio for s in board.standings])
     entries = []
     for key in board.trackers:
-        standing, cells, runs = board.placed.get(key), leaderboard_cells(board, key), board.cells[key]
+        standing = board.placed.get(key)
+        cells = leaderboard_cells(board, key)
+        runs = board.cells[key]
         first = board.first(key)
         typical = [runs[name].typical for name in board.sequences if name in runs] or [first]
         start = next((run for run in typical if run.run_id in paged), typical[0])
@@ -70,14 +76,22 @@ def entries_of(
         entries.append(
             {
                 "at": keys.index(key),
-                "group": 2 if first.tracker.provenance == "control" else int(key not in board.ranked),
-                "name": replace(cells["tracker"], text=board.names[key] + marks, link=run_link(start)),
+                "group": 2
+                if first.tracker.provenance == "control"
+                else int(key not in board.ranked),
+                "name": replace(
+                    cells["tracker"], text=board.names[key] + marks, link=run_link(start)
+                ),
                 "kind": TableCell("imported") if first.imported else cells["provenance"],
                 "remark": first.program_remark,
                 "rank": TableCell("–") if standing is None else rank_cell(standing),
-                "ratio": cells["ATE ratio"] if standing is None else _ratio_cell(board, standing, cells["ATE ratio"]),
+                "ratio": cells["ATE ratio"]
+                if standing is None
+                else _ratio_cell(board, standing, cells["ATE ratio"]),
                 "bar": {} if standing is None else _bar(standing.ratio, limits),
-                "verdict": TableCell("not ranked", why) if (why := board.unranked_why(key)) else cells["better?"],
+                "verdict": TableCell("not ranked", why)
+                if (why := board.unranked_why(key))
+                else cells["better?"],
                 "success": cells["success"],
                 "coverage": cells["coverage"],
                 "time": frame_time_cell(board, ended),
@@ -92,7 +106,9 @@ def _ratio_cell(board: Board, standing: Standing, cell: TableCell) -> TableCell:
     """The leaderboard's cell with the interval, which is drawn beside it, as a tip."""
     if cell.emphasis == "failed":
         return cell
-    low, high, some = standing.ratio.low, standing.ratio.high, standing.sequences < len(board.common)
+    low = standing.ratio.low
+    high = standing.ratio.high
+    some = standing.sequences < len(board.common)
     tip = f"95 % interval {low:.2f} to {high:.2f}" if math.isfinite(low) else ""
     small = f"{standing.sequences} of {len(board.common)} sequences" if some else ""
     return replace(cell, small=small, emphasis="", tip=tip)
@@ -100,7 +116,12 @@ def _ratio_cell(board: Board, standing: Standing, cell: TableCell) -> TableCell:
 
 def _limits(ratios: Sequence[Interval]) -> tuple[float, float]:
     """Ends of the axis of interval bars, in logarithms; 1 lies between them."""
-    ends = [end for ratio in ratios for end in (ratio.value, ratio.low, ratio.high) if math.isfinite(end) and end > 0]
+    ends = [
+        end
+        for ratio in ratios
+        for end in (ratio.value, ratio.low, ratio.high)
+        if math.isfinite(end) and end > 0
+    ]
     return math.log(max(min([0.8, *ends]), 0.02)), math.log(min(max([1.25, *ends]), 20.0))
 
 
@@ -117,7 +138,9 @@ def _bar(ratio: Interval, limits: tuple[float, float]) -> dict[str, float]:
 
 def _by_category(key: str, boards: Mapping[str, Board]) -> list[tuple[str, float, float]]:
     """A dot a category: its name, the ratio there, and the height of a ratio from 1/8 to 8 in pixels from above."""
-    ratios = {name: board.placed[key].ratio.value for name, board in boards.items() if key in board.placed}
+    ratios = {
+        name: board.placed[key].ratio.value for name, board in boards.items() if key in board.placed
+    }
     return [
         (name, ratio, 12 - 8 * min(max(math.log(max(ratio, FLOOR_M)) / math.log(8), -1.0), 1.0))
         for name, ratio in ratios.items()
@@ -129,7 +152,12 @@ def _by_category(key: str, boards: Mapping[str, Board]) -> list[tuple[str, float
 
 
 def side_content(
-    board: Board, boards: Mapping[str, Board], protocol: Protocol, paged: set[str], pictured: set[str], pageless: str
+    board: Board,
+    boards: Mapping[str, Board],
+    protocol: Protocol,
+    paged: set[str],
+    pictured: set[str],
+    pageless: str,
 ) -> dict[str, Any]:
     """What ``data/board.js`` holds: trackers, sequences, cells and runs.
 
@@ -141,18 +169,25 @@ def side_content(
         pictured: Ids of those whose pictures lie beside it.
         pageless: Which runs have no page, in words.
     """
-    keys, names = [*board.trackers, *board.final_only], [*board.sequences, *board.unscored]
+    keys = [*board.trackers, *board.final_only]
+    names = [*board.sequences, *board.unscored]
     place, column = ({name: at for at, name in enumerate(items)} for items in (keys, names))
     metrics = _metrics(protocol)
     first = {cell.rows[0].run_id for cells in board.cells.values() for cell in cells.values()}
     all_listed = len(board.rows) <= MOST_LISTED  # a page of a hundred thousand would open slowly
     listed = [row for row in board.rows if all_listed or row.run_id in paged or row.run_id in first]
-    ordered = sorted(listed, key=lambda row: (place[row.variant_key], column[board.sequence(row)], row.repeat_key))
+    ordered = sorted(
+        listed,
+        key=lambda row: (place[row.variant_key], column[board.sequence(row)], row.repeat_key),
+    )
     tags = {
         name: {tag for row in rows for tag in row.sequence.tags}
         for name, rows in grouped(board.rows, board.sequence).items()
     }
-    categories = {category: {column[name] for name in some.sequences} for category, some in list(boards.items())[1:]}
+    categories = {
+        category: {column[name] for name in some.sequences}
+        for category, some in list(boards.items())[1:]
+    }
     return {
         "protocol": protocol.describe(),
         "seen": SEEN,
@@ -196,7 +231,15 @@ def ratios_content(board: Board) -> list[list[Any]]:
             verdict = verdicts.get(pair.one, "")
         elif pair.one == board.reference:
             verdict = _OPPOSITE.get(verdicts.get(pair.other, ""), verdict)
-        ratios.append([place[pair.other], place[pair.one], *ratio_numbers(pair.ratio), pair.sequences, verdict])
+        ratios.append(
+            [
+                place[pair.other],
+                place[pair.one],
+                *ratio_numbers(pair.ratio),
+                pair.sequences,
+                verdict,
+            ]
+        )
     return ratios
 
 
@@ -206,10 +249,17 @@ def ratio_numbers(ratio: Interval) -> list[float | None]:
 
 
 def cell_content(
-    cell: Cell, tracker: int, sequence: int, metrics: Sequence[Mapping[str, str]], *, rank_seen: bool
+    cell: Cell,
+    tracker: int,
+    sequence: int,
+    metrics: Sequence[Mapping[str, str]],
+    *,
+    rank_seen: bool,
 ) -> list[Any]:
     """Place, runs, failures, what speaks against it, the median of every number, typical run, the error's quartiles."""
-    doubt = any(not row.rotation_reliable for row in cell.rows) + 2 * (cell.in_training and not rank_seen)
+    doubt = any(not row.rotation_reliable for row in cell.rows) + 2 * (
+        cell.in_training and not rank_seen
+    )
     medians = [significant(middle(_value(row, metric) for row in cell.kept)) for metric in metrics]
     quartiles = np.percentile(cell.scores, [25, 75]).tolist() if len(cell.scores) > 1 else []
     place = [tracker, sequence, len(cell.rows), cell.failed, doubt]
@@ -243,7 +293,11 @@ def _metrics(protocol: Protocol) -> list[dict[str, str]]:
 def _value(row: RunRow, metric: Mapping[str, str]) -> float | None:
     """A run's number; only the ATE that ranks counts failures."""
     if metric["which"] != row.trajectory:
-        return None if row.failed or metric["which"] == "online" else row.final_metrics.get(metric["key"])
+        return (
+            None
+            if row.failed or metric["which"] == "online"
+            else row.final_metrics.get(metric["key"])
+        )
     if metric["key"] == "ate_rmse_m":
         return row.score_m
     return None if row.failed else row.metrics.get(metric["key"])

@@ -18,7 +18,8 @@ from dynslam_bench.core import write_atomic
 from dynslam_bench.reports.figures import THEMES
 from dynslam_bench.reports.tables.table import Table
 
-ASSETS, FOLDER = "assets", "data"
+ASSETS = "assets"
+FOLDER = "data"
 _SCRIPTS = ("page.js", "board.js", "errors.js", "run.js", "compare.js")
 
 
@@ -79,7 +80,9 @@ def render(template: str, **values: Any) -> str:
         template: Name of the template.
         **values: What it shows; all pages need ``title``.
     """
-    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True, loader=FunctionLoader(resource))
+    environment = Environment(
+        autoescape=True, trim_blocks=True, lstrip_blocks=True, loader=FunctionLoader(resource)
+    )
     environment.filters |= {"breakable": _breakable, "script": to_script, "figure": figure_json}
     return environment.get_template(template).render(**values)
 
@@ -140,7 +143,10 @@ def figure_json(figure: go.Figure) -> Markup:
 
 def read_remark(output: Path, name: str) -> Any:
     """What stands in the first line of ``data/<name>.js``, see `write_side`; None without that file."""
-    with suppress(OSError, ValueError), (output / FOLDER / f"{name}.js").open(encoding="utf-8") as file:
+    with (
+        suppress(OSError, ValueError),
+        (output / FOLDER / f"{name}.js").open(encoding="utf-8") as file,
+    ):
         return json.loads(file.readline().removeprefix("//"))
     return None
 
@@ -158,7 +164,9 @@ def write_side(output: Path, name: str, value: Any, remark: Any = None) -> None:
         DynslamError: It cannot be written.
     """
     path = output / FOLDER / f"{name}.js"
-    write_changed(path, f"//{to_script(remark)}\nkeep({json.dumps(name)},{to_script(value)});\n".encode())
+    write_changed(
+        path, f"//{to_script(remark)}\nkeep({json.dumps(name)},{to_script(value)});\n".encode()
+    )
 
 
 def write_changed(path: Path, content: bytes) -> None:

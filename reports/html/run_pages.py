@@ -59,8 +59,8 @@ class RunPage:
 
     Attributes:
         variant_key: Its tracker and settings.
-        squares: Sum of the squared frame-to-frame errors (translation, m²) of its frames in every bin of `SHARE_EDGES`,
-            of a successful run where exact masks tell the share.
+        squares: Sum of the squared frame-to-frame errors (translation, m²) of its frames in every
+            bin of `SHARE_EDGES`, of a successful run where exact masks tell the share.
         frames: Number of these frames.
     """
 
@@ -90,8 +90,13 @@ def write_run_pages(
     Raises:
         DynslamError: The folder cannot be written, or a run's files are damaged.
     """
-    newest = sorted(sorted(rows, key=lambda row: row.started, reverse=True), key=lambda row: row.offset)
-    shares = {column: exact_shares(runs) for column, runs in grouped(newest, lambda row: row.column_id).items()}
+    newest = sorted(
+        sorted(rows, key=lambda row: row.started, reverse=True), key=lambda row: row.offset
+    )
+    shares = {
+        column: exact_shares(runs)
+        for column, runs in grouped(newest, lambda row: row.column_id).items()
+    }
     jobs = [
         (row, row.run_id in pictured, shares[column], protocol, output)
         for column, runs in grouped(rows, lambda row: row.column_id).items()
@@ -104,12 +109,15 @@ def write_run_pages(
     return pages
 
 
-def _write_page(row: RunRow, pictured: bool, share: Mapping[int, float], protocol: Protocol, output: Path) -> RunPage:
+def _write_page(
+    row: RunRow, pictured: bool, share: Mapping[int, float], protocol: Protocol, output: Path
+) -> RunPage:
     """Write the page of a run whose frames have these exact shares of dynamic pixels.
 
     A page whose inputs are as they were stays as it is.
     """
-    name, files = f"run-{row.run_id}", _files(row, output)
+    name = f"run-{row.run_id}"
+    files = _files(row, output)
     stamps = [file_stamp(row.folder / file) for file in (CSV_FILE, "log.txt")]
     state = row.store.index.state(row.run_id, row.sequence.part)
     code = [module_graph().digest([__name__], PLUMBING), protocol.digest(), *share.items()]
@@ -117,8 +125,11 @@ def _write_page(row: RunRow, pictured: bool, share: Mapping[int, float], protoco
     earlier = read_remark(output, name)
     if earlier and earlier[0] == made_of:
         return RunPage(row.variant_key, *earlier[1:])
-    record, frames = row.store.read_whole(row.run_id), read_frames(row, share)
-    content = run_content(row, record, frames, protocol, _copy_pictures(row, output) if pictured else [])
+    record = row.store.read_whole(row.run_id)
+    frames = read_frames(row, share)
+    content = run_content(
+        row, record, frames, protocol, _copy_pictures(row, output) if pictured else []
+    )
     has_exact = (frames.share_source == EXACT) & (not row.failed)
     exact = np.isfinite(frames.errors_m) & np.isfinite(frames.share) & has_exact
     sums = share_sums(frames.share[exact], frames.errors_m[exact])
@@ -128,7 +139,8 @@ def _write_page(row: RunRow, pictured: bool, share: Mapping[int, float], protoco
 
 def _copy_pictures(row: RunRow, output: Path) -> list[int]:
     """Copy the pictures of a run beside its page; returns their frames."""
-    sources, target = sorted(row.folder.glob("frame_*.webp")), output / "frames" / row.run_id
+    sources = sorted(row.folder.glob("frame_*.webp"))
+    target = output / "frames" / row.run_id
     for source in sources:
         write_changed(target / source.name, read_bytes(source, kind=RunError))
     return [int(source.stem.removeprefix("frame_")) for source in sources]
@@ -145,21 +157,28 @@ def _files(row: RunRow, output: Path) -> list[tuple[str, str]]:
         "frames.csv": CSV_FILE,
     }
     folder = Path(os.path.relpath(row.folder.resolve(), output.resolve())).as_posix()
-    return [(name, f"{folder}/{file}") for name, file in names.items() if (row.folder / file).is_file()]
+    return [
+        (name, f"{folder}/{file}") for name, file in names.items() if (row.folder / file).is_file()
+    ]
 
 
 def share_sums(share: Array, errors_m: Array) -> tuple[list[float], list[int]]:
     """Sums of the squared errors ``[N]``, and numbers of frames, in every bin of `SHARE_EDGES`."""
-    squares, counts = (np.histogram(share, SHARE_EDGES, weights=weights)[0] for weights in (errors_m**2, None))
+    squares, counts = (
+        np.histogram(share, SHARE_EDGES, weights=weights)[0] for weights in (errors_m**2, None)
+    )
     return squares.tolist(), counts.tolist()
 
 
 def error_by_share(pages: Sequence[RunPage]) -> list[list[float | None]]:
     """RMSE in mm and number of frames of each bin between `SHARE_EDGES`, over some runs; empty for no frame.
 
-    Not the median: a tracker that follows people errs grossly on few frames, and best of all on most.
+    Not the median: a tracker that follows people errs grossly on few frames, and best of all on
+    most.
     """
-    squares, counts = (np.sum(sums, axis=0) for sums in ([p.squares for p in pages], [p.frames for p in pages]))
+    squares, counts = (
+        np.sum(sums, axis=0) for sums in ([p.squares for p in pages], [p.frames for p in pages])
+    )
     if not counts.any():
         return []
     rmse_mm = 1000 * np.sqrt(squares / np.maximum(counts, 1))
@@ -173,7 +192,11 @@ def error_by_share(pages: Sequence[RunPage]) -> list[list[float | None]]:
 
 
 def run_content(
-    row: RunRow, record: RunRecord, frames: RunFrames, protocol: Protocol, pictures: Sequence[int] = ()
+    row: RunRow,
+    record: RunRecord,
+    frames: RunFrames,
+    protocol: Protocol,
+    pictures: Sequence[int] = (),
 ) -> dict[str, Any]:
     """Everything that the page of a run shows, as the page's script reads it.
 
@@ -187,7 +210,9 @@ def run_content(
         pictures: Frames that have a picture.
     """
     series, lost = _series(frames, pictures)
-    track, fault = _track(row, protocol, float(frames.columns["timestamp"][0]) if frames.columns else None)
+    track, fault = _track(
+        row, protocol, float(frames.columns["timestamp"][0]) if frames.columns else None
+    )
     level, verdict = verdict_of(row, frames)
     settings = {name: value if isinstance(value, str | int | bool) else str(value)
                 for name, value in record.settings.items()}  # fmt: skip
@@ -205,9 +230,14 @@ def run_content(
         "numbers": _numbers(row, protocol.rpe),
         "quote": _quote(row, protocol),
         "more": _more_numbers(row, record),
-        "settings": [[name, settings[name], name in changed] for name in dict.fromkeys([*changed, *settings])],
+        "settings": [
+            [name, settings[name], name in changed] for name in dict.fromkeys([*changed, *settings])
+        ],
         "stages": [
-            [name, *(significant(1000 * value) for value in (time.median_s, time.p95_s, time.mean_s))]
+            [
+                name,
+                *(significant(1000 * value) for value in (time.median_s, time.p95_s, time.mean_s)),
+            ]
             for name, time in record.timings.items()
         ],
         "protocol": protocol.describe(),
@@ -220,7 +250,8 @@ def run_content(
         "pictures": list(pictures),
         "worst": _worst(frames),
         "series": {
-            name: packed(values, "i4" if name == "index" else "f4") for name, values in (series | track).items()
+            name: packed(values, "i4" if name == "index" else "f4")
+            for name, values in (series | track).items()
         },
         "figures": {name: figure for name, figure in figures.items() if figure},
     }
@@ -239,8 +270,14 @@ def verdict_of(row: RunRow, frames: RunFrames) -> tuple[Level, str]:
         if row.status == "lost":
             why = row.reason or row.ending
             return "red", f"{_loss(frames, length) or 'Lost'}. {why[0].upper()}{why[1:]}"
-        return "red", f"{row.ending.capitalize()} frames{reason}" if row.status != "ok" else f"Not evaluated{reason}"
-    score, static = row.score_m, row.static_camera_ate_rmse_m
+        return (
+            "red",
+            f"{row.ending.capitalize()} frames{reason}"
+            if row.status != "ok"
+            else f"Not evaluated{reason}",
+        )
+    score = row.score_m
+    static = row.static_camera_ate_rmse_m
     error = "No ground truth" if score is None else f"ATE {mm(score)} mm"
     if score is not None and static:
         error += f", {significant_text(100 * score / static, 2)} % of a static camera's"
@@ -248,7 +285,10 @@ def verdict_of(row: RunRow, frames: RunFrames) -> tuple[Level, str]:
         return "amber", f"No better than a static camera: {error}"
     if row.incomplete:
         loss = _loss(frames, length)
-        return "amber", f"Tracked {row.n_tracked} of {row.n_frames} frames: {error}" + f". {loss}" * bool(loss)
+        return (
+            "amber",
+            f"Tracked {row.n_tracked} of {row.n_frames} frames: {error}" + f". {loss}" * bool(loss),
+        )
     if row.hints:
         return "amber", f"{error}, but the trajectory is probably faulty: {row.hints[0]}"
     tracked = "Tracked" if row.n_tracked < row.n_frames else f"All {row.n_frames} frames tracked"
@@ -264,20 +304,33 @@ def _loss(frames: RunFrames, length: str) -> str:
     seconds = frames.columns["timestamp"][at] - frames.columns["timestamp"][0]
     inliers = frames.columns.get("stat_inliers", np.full(at + 1, np.nan))[at]
     who = "people fill" if frames.share_source == EXACT else "its masks cover"
-    values = {f"{inliers:.0f} inliers": inliers, f"{who} {100 * frames.share[at]:.0f} %": frames.share[at]}
+    values = {
+        f"{inliers:.0f} inliers": inliers,
+        f"{who} {100 * frames.share[at]:.0f} %": frames.share[at],
+    }
     facts = " while ".join(words for words, value in values.items() if np.isfinite(value))
     return f"Lost after {seconds:.1f} s of {length}" + f": {facts}" * bool(facts)
 
 
 def _numbers(row: RunRow, rpe: Sequence[RPESpec]) -> list[list[str]]:
     """The six numbers of a run: name and text."""
-    score, static = row.score_m, row.static_camera_ate_rmse_m
+    score = row.score_m
+    static = row.static_camera_ate_rmse_m
     relative = next(
-        ((spec, row.metrics[spec.metric("trans")]) for spec in rpe if spec.metric("trans") in row.metrics), None
+        (
+            (spec, row.metrics[spec.metric("trans")])
+            for spec in rpe
+            if spec.metric("trans") in row.metrics
+        ),
+        None,
     )
     numbers = {
-        "ATE, as it counts" if row.failed else "ATE, lost frames held": "" if score is None else f"{mm(score)} mm",
-        "of a static camera's": "" if score is None or not static else f"{significant_text(100 * score / static)} %",
+        "ATE, as it counts" if row.failed else "ATE, lost frames held": ""
+        if score is None
+        else f"{mm(score)} mm",
+        "of a static camera's": ""
+        if score is None or not static
+        else f"{significant_text(100 * score / static)} %",
         f"RPE over {relative[0].describe()}" if relative else "RPE": (
             "" if relative is None else f"{mm(relative[1])} mm{'/s' * relative[0].rate}"
         ),
@@ -293,8 +346,14 @@ def _quote(row: RunRow, protocol: Protocol) -> list[str]:
     if row.score_m is None:
         return []
     part = part_words(row)
-    words = [f"{row.label} on {row.sequence.id}{part and f' [{part}]'}, {row.repeat}: ATE (RMSE) {mm(row.score_m)} mm"]
-    words += ["lost frames held at the last pose", f"coverage {coverage_text(row.coverage)}", protocol.describe()]
+    words = [
+        f"{row.label} on {row.sequence.id}{part and f' [{part}]'}, {row.repeat}: ATE (RMSE) {mm(row.score_m)} mm"
+    ]
+    words += [
+        "lost frames held at the last pose",
+        f"coverage {coverage_text(row.coverage)}",
+        protocol.describe(),
+    ]
     words += [f"revision {row.git.revision[:10]}"] if row.git else []
     return [f"{', '.join(words)}.", *reservations([row])]
 
@@ -311,7 +370,9 @@ def _more_numbers(row: RunRow, record: RunRecord) -> list[list[str]]:
         ("map points", record.map_points, 1, ""),
         ("overlap (IoU) of the masks, dilated", row.mask_iou, 1, ""),
     ]
-    return [[name, f"{value * by:.4g}{unit}"] for name, value, by, unit in numbers if value is not None]
+    return [
+        [name, f"{value * by:.4g}{unit}"] for name, value, by, unit in numbers if value is not None
+    ]
 
 
 def _log(row: RunRow) -> str:
@@ -358,7 +419,8 @@ def _series(frames: RunFrames, pictures: Sequence[int]) -> tuple[Series, list[tu
     columns = frames.columns
     if not columns:
         return {}, []
-    index, stamps = columns["index"], columns["timestamp"] - columns["timestamp"][0]
+    index = columns["index"]
+    stamps = columns["timestamp"] - columns["timestamp"][0]
     tracked = columns["state"] == "ok"
     keep = (np.arange(len(index)) % -(-len(index) // MOST_FRAMES) == 0) | np.isin(index, pictures)
     series = {
@@ -369,20 +431,25 @@ def _series(frames: RunFrames, pictures: Sequence[int]) -> tuple[Series, list[tu
     }
     series |= {name: columns[f"stat_{name}"] for name in COUNTS if f"stat_{name}" in columns}
     stages = [name for name in columns if name.endswith("_s") and name not in _WHOLE]
-    series |= {name: 1000 * columns[name] for name in stages if np.nanmax(columns[name], initial=0.0) > 0}
+    series |= {
+        name: 1000 * columns[name] for name in stages if np.nanmax(columns[name], initial=0.0) > 0
+    }
     lost = np.flatnonzero(np.diff(np.concatenate([[0], columns["state"] != "ok", [0]])))
     ends = np.append(stamps, stamps[-1])
-    spans = [(float(stamps[first]), float(ends[last])) for first, last in lost.reshape(-1, 2).tolist()]
+    spans = [
+        (float(stamps[first]), float(ends[last])) for first, last in lost.reshape(-1, 2).tolist()
+    ]
     return {name: values[keep] for name, values in series.items()}, spans
 
 
 def _track(row: RunRow, protocol: Protocol, start: float | None) -> tuple[Series, str]:
     """The aligned track and the true path of the run's frames over the time since `start`, and why there is none.
 
-    Without ground truth the track is as the tracker gave it. Where the time between two poses exceeds twice the median
-    interval, all series have a gap.
+    Without ground truth the track is as the tracker gave it. Where the time between two poses
+    exceeds twice the median interval, all series have a gap.
     """
-    truth, estimate = row.ground_truth(), row.estimate(row.trajectory)
+    truth = row.ground_truth()
+    estimate = row.estimate(row.trajectory)
     longest = truth or estimate
     first = start if start is not None else 0.0 if longest is None else float(longest.timestamps[0])
     series: Series = {}
@@ -408,7 +475,9 @@ def _of_part(row: RunRow, truth: Trajectory) -> Trajectory:
         stamps = row.store.timestamps(row.sequence.part)
         if len(stamps) > 1:
             margin = float(np.median(np.diff(stamps)))
-            inside = (truth.timestamps >= stamps[0] - margin) & (truth.timestamps <= stamps[-1] + margin)
+            inside = (truth.timestamps >= stamps[0] - margin) & (
+                truth.timestamps <= stamps[-1] + margin
+            )
             return truth.select(inside) if np.count_nonzero(inside) > 1 else truth
     return truth
 
@@ -417,17 +486,27 @@ def _along(name: str, stamps: Array, columns: Sequence[Array]) -> Series:
     """Time, position, angles and error along a track, thinned and broken at gaps."""
     stamps, values = broken(stamps, np.column_stack(columns), MOST_FRAMES)
     names = ("x", "y", "z", "yaw", "pitch", "roll", "error")[: values.shape[1]]
-    return {f"{name}_t": stamps} | {f"{name}_{part}": values[:, at] for at, part in enumerate(names)}
+    return {f"{name}_t": stamps} | {
+        f"{name}_{part}": values[:, at] for at, part in enumerate(names)
+    }
 
 
 def _line(name: str, x: str, y: str, colour: str, axis: int, **more: Any) -> dict[str, Any]:
     line = {"color": colour, "width": 1.8} | more.pop("line", {})
     place = {"xaxis": "x", "yaxis": f"y{axis if axis > 1 else ''}"}
-    return {"type": "scatter", "mode": "lines", "name": name, "x": f"@{x}", "y": f"@{y}", "line": line} | place | more
+    return (
+        {"type": "scatter", "mode": "lines", "name": name, "x": f"@{x}", "y": f"@{y}", "line": line}
+        | place
+        | more
+    )
 
 
 def _time_figure(
-    row: RunRow, frames: RunFrames, series: Series, track: Series, lost: Sequence[tuple[float, float]]
+    row: RunRow,
+    frames: RunFrames,
+    series: Series,
+    track: Series,
+    lost: Sequence[tuple[float, float]],
 ) -> dict[str, Any]:
     """Error, inliers and people's share on one time axis, lost spans shaded."""
     unit = {"hovertemplate": "%{y:.3g} at %{x:.2f} s<extra>%{fullData.name}</extra>"}
@@ -440,7 +519,9 @@ def _time_figure(
     ]  # fmt: skip
     columns = series | track
     measured = {
-        title: [line for line in lines if line[2] in columns and np.isfinite(columns[line[2]]).any()]
+        title: [
+            line for line in lines if line[2] in columns and np.isfinite(columns[line[2]]).any()
+        ]
         for title, lines in panels
     }
     shown = {title: lines for title, lines in measured.items() if lines}
@@ -451,8 +532,10 @@ def _time_figure(
         for axis, lines in enumerate(shown.values(), 1)
         for name, x, y, colour, more in lines
     ]
-    spans, times = list(lost), columns.get("t", columns.get("track_t"))
-    if row.failed and times is not None and row.n_processed < row.n_frames:  # the rest was never seen
+    spans = list(lost)
+    times = columns.get("t", columns.get("track_t"))
+    # the rest was never seen
+    if row.failed and times is not None and row.n_processed < row.n_frames:
         spans.append((float(times[-1]), row.sequence.duration_s))
     layout = {
         "height": 60 + 150 * len(shown),
@@ -465,7 +548,8 @@ def _time_figure(
 
 def _axes(titles: Sequence[str], gap: float, **more: Any) -> dict[str, Any]:
     """Axes of panels below each other, with these titles, over one time axis."""
-    last, count = len(titles) if len(titles) > 1 else "", len(titles)
+    last = len(titles) if len(titles) > 1 else ""
+    count = len(titles)
     axes: dict[str, Any] = {"xaxis": {"title": {"text": "time (s)"}, "anchor": f"y{last}"}}
     for at, title in enumerate(titles):
         domain = [1 - (at + 1) / count + gap, 1 - at / count - gap]
@@ -476,7 +560,13 @@ def _axes(titles: Sequence[str], gap: float, **more: Any) -> dict[str, Any]:
 def _shade(start: float, end: float) -> dict[str, Any]:
     """A span of time that is shaded over all panels."""
     span = {"x0": round(start, 4), "x1": round(end, 4), "y0": 0, "y1": 1, "yref": "paper"}
-    return {"type": "rect", "fillcolor": COLOURS[1], "opacity": 0.18, "line": {"width": 0}, "layer": "below"} | span
+    return {
+        "type": "rect",
+        "fillcolor": COLOURS[1],
+        "opacity": 0.18,
+        "line": {"width": 0},
+        "layer": "below",
+    } | span
 
 
 HEAT = {
@@ -495,14 +585,23 @@ def _track_figure(track: Series) -> dict[str, Any]:
     if "track_t" in track:
         track["track_heat"] = np.log10(np.maximum(track["track_error"], 1e-3))
         measured = bool(np.isfinite(track["track_error"]).any())
-        line: dict[str, Any] = HEAT | {"color": "@track_heat"} if measured else {"color": COLOURS[0]}
-        path = _path("estimate", "track", line | {"width": 6}, "%{customdata:.3g} mm<extra></extra>")
+        line: dict[str, Any] = (
+            HEAT | {"color": "@track_heat"} if measured else {"color": COLOURS[0]}
+        )
+        path = _path(
+            "estimate", "track", line | {"width": 6}, "%{customdata:.3g} mm<extra></extra>"
+        )
         data.append(path | {"customdata": "@track_error", "showlegend": not measured})
     axes = {f"{name}axis": {"title": {"text": f"{name} (m)"}} for name in "xyz"}
     view = {"up": {"x": 0, "y": -1, "z": 0}, "eye": {"x": 0.7, "y": -1.4, "z": -1.8}}
     scene = axes | {"aspectmode": "data", "camera": view}
     legend = {"orientation": "h", "y": 0, "x": 0}
-    layout = {"height": 430, "margin": {"l": 0, "r": 0, "t": 0, "b": 0}, "scene": scene, "legend": legend}
+    layout = {
+        "height": 430,
+        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+        "scene": scene,
+        "legend": legend,
+    }
     return {"data": data, "layout": layout} if data else {}
 
 
@@ -517,8 +616,15 @@ def _poses_figure(row: RunRow, track: Series) -> dict[str, Any]:
     if "track_t" not in track:
         return {}
     parts = {"x": "x (m)", "y": "y (m)", "z": "z (m)"}
-    parts |= {"yaw": "yaw (°)", "pitch": "pitch (°)", "roll": "roll (°)"} if row.rotation_reliable else {}
-    kinds = [("truth", "true", NEUTRAL, {"line": {"dash": "dash"}}), ("estimate", "track", COLOURS[0], {})]
+    parts |= (
+        {"yaw": "yaw (°)", "pitch": "pitch (°)", "roll": "roll (°)"}
+        if row.rotation_reliable
+        else {}
+    )
+    kinds = [
+        ("truth", "true", NEUTRAL, {"line": {"dash": "dash"}}),
+        ("estimate", "track", COLOURS[0], {}),
+    ]
     data = [
         _line(name, f"{of}_t", f"{of}_{part}", colour, at, **more)
         for at, part in enumerate(parts, 1)
@@ -536,13 +642,22 @@ def _stages_figure(series: Series) -> dict[str, Any]:
         return {}
     data = [
         _line(
-            name.removesuffix("_s"), "t", name, COLOURS[at % len(COLOURS)], 1, stackgroup="stages", line={"width": 0.5}
+            name.removesuffix("_s"),
+            "t",
+            name,
+            COLOURS[at % len(COLOURS)],
+            1,
+            stackgroup="stages",
+            line={"width": 0.5},
         )
         for at, name in enumerate(stages)
     ]
     total = np.nansum([series[name] for name in stages], axis=0)
     top = min(float(total.max()), 2.5 * float(np.quantile(total, 0.8))) or 1.0
-    axes = {"xaxis": {"title": {"text": "time (s)"}}, "yaxis": {"title": {"text": "ms"}, "range": [0, 1.05 * top]}}
+    axes = {
+        "xaxis": {"title": {"text": "time (s)"}},
+        "yaxis": {"title": {"text": "ms"}, "range": [0, 1.05 * top]},
+    }
     return {"data": data, "layout": {"height": 360} | axes}
 
 
@@ -596,7 +711,8 @@ class RunFrames:
     """The frames of a run.
 
     Attributes:
-        columns: What the page shows of ``frames.csv``, a name to values ``[N]``; empty for an imported trajectory.
+        columns: What the page shows of ``frames.csv``, a name to values ``[N]``; empty for an
+            imported trajectory.
         errors_m: Frame-to-frame translational errors ``[N]`` in metres, nan where there is none.
         share: Share of the pixels that show people ``[N]``, nan where it is not known.
         share_source: Where that comes from, in words; empty where nothing is known.
@@ -623,11 +739,14 @@ def read_frames(row: RunRow, exact: Mapping[int, float]) -> RunFrames:
         return RunFrames({}, np.zeros(0), np.zeros(0), fault=str(error))
     if columns is None:
         return RunFrames({}, np.zeros(0), np.zeros(0))
-    share, source = columns.get("stat_mask_fraction", np.zeros(0)), "the tracker's own masks"
+    share = columns.get("stat_mask_fraction", np.zeros(0))
+    source = "the tracker's own masks"
     if exact:
-        share, source = np.array([exact.get(at + row.offset, np.nan) for at in columns["index"].tolist()]), EXACT
+        share = np.array([exact.get(at + row.offset, np.nan) for at in columns["index"].tolist()])
+        source = EXACT
     elif not share.any():  # it may have no masks
-        share, source = np.full(len(columns["index"]), np.nan), ""
+        share = np.full(len(columns["index"]), np.nan)
+        source = ""
     return RunFrames(columns, columns["frame_error_trans_m"], share, source)
 
 
@@ -657,7 +776,10 @@ def read_table(path: Path, wanted: Callable[[str], bool]) -> Columns | None:
         if not path.is_file() or not path.stat().st_size:
             return None
         table = pd.read_csv(
-            io.BytesIO(read_bytes(path, limit=TABLE_BYTES)), usecols=wanted, dtype=kinds, low_memory=False
+            io.BytesIO(read_bytes(path, limit=TABLE_BYTES)),
+            usecols=wanted,
+            dtype=kinds,
+            low_memory=False,
         )
     except (DynslamError, ValueError, OverflowError, OSError) as error:
         raise RunError(f"{CSV_FILE} is damaged: {error}") from error
@@ -672,4 +794,6 @@ def read_table(path: Path, wanted: Callable[[str], bool]) -> Columns | None:
 
 def _is_shown(name: str) -> bool:
     """Whether the page shows a column of ``frames.csv``."""
-    return name in _NEEDED or name in _STATS or (name.endswith("_s") and not name.startswith("stat_"))
+    return (
+        name in _NEEDED or name in _STATS or (name.endswith("_s") and not name.startswith("stat_"))
+    )

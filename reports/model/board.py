@@ -19,7 +19,13 @@ from numpy.typing import NDArray
 from dynslam_bench.core import ReportError, assignments, did_you_mean
 from dynslam_bench.evaluation import Protocol, get_protocol
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores
-from dynslam_bench.reports.model.names import OUR_BACK_END, OUR_OWN, make_labels, name_columns, shortened
+from dynslam_bench.reports.model.names import (
+    OUR_BACK_END,
+    OUR_OWN,
+    make_labels,
+    name_columns,
+    shortened,
+)
 from dynslam_bench.reports.model.row import RunRow, command_with, grouped, part_options
 from dynslam_bench.reports.model.statistics import (
     FLOOR_M,
@@ -66,15 +72,18 @@ class Board:
         on: What trackers are ranked on.
         rank_seen: Whether cells rank whose masks come from a network that was trained on the scene.
         columns: Column id of a row to the name of its sequence.
-        trackers: Variant keys in order of standing; those of which only final trajectories are known stand apart.
-        final_only: Variant keys of imports and batch programs of which only the final trajectory is known.
+        trackers: Variant keys in order of standing; those of which only final trajectories are
+            known stand apart.
+        final_only: Variant keys of imports and batch programs of which only the final trajectory is
+            known.
         labels: Variant key to the name in tables.
         sequences: Names of the sequences with ground truth, grouped and sorted.
         common: Those of them that the standings are taken over.
         short: Sequence to what is left of its name without the parts that all share.
         tags: Sequence to its tags, with ``recorded`` or ``rendered``.
         groups: Sequence to the name of its group: what moves in its scene.
-        category: Which category the board is of, `OVERALL` for all sequences: then groups have equal weights.
+        category: Which category the board is of, `OVERALL` for all sequences: then groups have
+            equal weights.
         unscored: Names of the sequences without ground truth.
         cells: Variant key to sequence to its runs.
         static_camera: Sequence to the error of a static camera.
@@ -84,8 +93,9 @@ class Board:
         standings: Standing of every variant with a score on the common sequences, in order.
         ranked: Variant keys that take part in the ranking, from the best to the worst.
         incomplete: Variant keys of rankable trackers that are not ranked since they lack sequences.
-        no_better: Variant keys of trackers that are not ranked since they are no better than a static camera: the
-            geometric mean of their errors over its on the common sequences is 1 or more.
+        no_better: Variant keys of trackers that are not ranked since they are no better than a
+            static camera: the geometric mean of their errors over its on the common sequences is 1
+            or more.
         hopeless: Variant keys that never succeeded on the common sequences.
     """
 
@@ -121,9 +131,15 @@ class Board:
     @cached_property
     def names(self) -> dict[str, str]:
         """Labels as sentences, headings and figures say them: without whose they are, unless two would be alike."""
-        short = {key: label.replace(OUR_BACK_END, "").replace(OUR_OWN, "") for key, label in self.labels.items()}
+        short = {
+            key: label.replace(OUR_BACK_END, "").replace(OUR_OWN, "")
+            for key, label in self.labels.items()
+        }
         counts = Counter(short.values())
-        return {key: label if counts[short[key]] > 1 else short[key] for key, label in self.labels.items()}
+        return {
+            key: label if counts[short[key]] > 1 else short[key]
+            for key, label in self.labels.items()
+        }
 
     @property
     def categories(self) -> dict[str, list[str]]:
@@ -131,12 +147,20 @@ class Board:
         categories = grouped(self.sequences, self.groups.__getitem__)
         for tag, category in _FURTHER.items():
             categories[category] = [name for name in self.sequences if tag in self.tags[name]]
-        return {category: names for category, names in categories.items() if 0 < len(names) < len(self.sequences)}
+        return {
+            category: names
+            for category, names in categories.items()
+            if 0 < len(names) < len(self.sequences)
+        }
 
     @property
     def weights(self) -> dict[str, float]:
         """Weights of the common sequences: on an overall board all groups weigh the same, elsewhere all sequences."""
-        groups = [self.groups[name] for name in self.common] if self.category == OVERALL else [""] * len(self.common)
+        groups = (
+            [self.groups[name] for name in self.common]
+            if self.category == OVERALL
+            else [""] * len(self.common)
+        )
         return dict(zip(self.common, group_weights(groups).tolist(), strict=True))
 
     @property
@@ -147,7 +171,9 @@ class Board:
     @cached_property
     def timing_computer(self) -> str:
         """The computer whose times are shown where runs were made on several: the one with most timed runs."""
-        counts = Counter(row.computer for row in timed([row for row in self.rows if not row.failed]))
+        counts = Counter(
+            row.computer for row in timed([row for row in self.rows if not row.failed])
+        )
         return min(counts, key=lambda computer: (-counts[computer], computer), default="")
 
     @property
@@ -183,9 +209,15 @@ class Board:
             "in real time": row.realtime,
             "exact masks: a bound": row.segmentation == EXACT_MASKS,
             "by another program": not row.is_current,
-            "ablation" if row.tracker.provenance == "own" else row.tracker.provenance: not self.is_rankable(key),
+            "ablation"
+            if row.tracker.provenance == "own"
+            else row.tracker.provenance: not self.is_rankable(key),
         }
-        return "" if key in self.ranked else next((words for words, holds in reasons.items() if holds), "")
+        return (
+            ""
+            if key in self.ranked
+            else next((words for words, holds in reasons.items() if holds), "")
+        )
 
     def no_better_than_static(self, key: str, sequence: str) -> bool:
         """Whether a tracker's runs that ended well have, by their median, a static camera's error or more.
@@ -194,7 +226,12 @@ class Board:
         """
         cell = self.cells[key].get(sequence)
         static_m = None if self.groups[sequence] == _FIXED else self.static_camera.get(sequence)
-        if cell is None or static_m is None or not cell.succeeded or self.first(key).tracker.provenance == "control":
+        if (
+            cell is None
+            or static_m is None
+            or not cell.succeeded
+            or self.first(key).tracker.provenance == "control"
+        ):
             return False
         return median(row.score_m or 0.0 for row in cell.succeeded) >= (1 - 1e-9) * static_m
 
@@ -210,7 +247,11 @@ class Board:
 
     def scored(self, key: str) -> list[str]:
         """The sequences on which a tracker has a score."""
-        return [name for name in self.sequences if name in self.cells[key] and self.cells[key][name].scores]
+        return [
+            name
+            for name in self.sequences
+            if name in self.cells[key] and self.cells[key][name].scores
+        ]
 
     @property
     def typical(self) -> set[str]:
@@ -222,27 +263,38 @@ class Board:
         """All rows as a pandas frame.
 
         Returns:
-            One line a run, ordered by label, sequence and repeat; whatever is missing is ``pd.NA``. ``string`` columns:
-            run_id, kind (``run here``, ``imported``), tracker, label, settings (what sets the variant apart,
-            ``name=value; ...``), provenance, sequence (name of the column in tables), column_id, frames, split, repeat,
-            status, ending (of a failed run), study (of which the run is a trial), protocol_id, protocol_digest,
-            trajectory (``online``, ``final``: whose errors they are), segmentation, computer (on which the times were
-            taken), program_remark (how many programs share the row, or how the results differ from those of the
-            program that ranks).
-            ``Int64``: seed, offset, noise (missing for the sequence's own), n_frames, n_processed, n_tracked.
-            ``boolean``: ranked, failed, cached (whether stage times come from the stage cache), seen_in_training
-            (whether the masks come from a network that was trained on the scene). ``Float64``: coverage and
-            epipolar_skipped (shares, 0 to 1), score_m (the ATE in metres that ranks: lost frames held, failures as a
-            static camera or worse), hold_last_pose_ate_m, final_ate_m and static_camera_ate_rmse_m (metres), frame_ms
-            (median, milliseconds), real_time_factor, peak_memory_mb (MB), mask_iou (0 to 1), rotation_uncertainty_deg
-            (standard error in degrees of the alignment's rotation; above 10 the metrics ``ape_rot_*`` say nothing of
-            the tracker), and every metric of the protocol under its own name, the unit at its end (``ate_rmse_m``,
-            ``rpe_1s_rot_rmse_deg``; see `Evaluation`).
+            One line a run, ordered by label, sequence and repeat; whatever is missing is ``pd.NA``.
+            ``string`` columns: run_id, kind (``run here``, ``imported``), tracker, label, settings
+            (what sets the variant apart, ``name=value; ...``), provenance, sequence (name of the
+            column in tables), column_id, frames, split, repeat, status, ending (of a failed run),
+            study (of which the run is a trial), protocol_id, protocol_digest, trajectory
+            (``online``, ``final``: whose errors they are), segmentation, computer (on which the
+            times were taken), program_remark (how many programs share the row, or how the results
+            differ from those of the program that ranks).
+            ``Int64``: seed, offset, noise (missing for the sequence's own), n_frames, n_processed,
+                n_tracked.
+            ``boolean``: ranked, failed, cached (whether stage times come from the stage cache),
+                seen_in_training
+            (whether the masks come from a network that was trained on the scene). ``Float64``:
+            coverage and epipolar_skipped (shares, 0 to 1), score_m (the ATE in metres that ranks:
+            lost frames held, failures as a static camera or worse), hold_last_pose_ate_m,
+            final_ate_m and static_camera_ate_rmse_m (metres), frame_ms (median, milliseconds),
+            real_time_factor, peak_memory_mb (MB), mask_iou (0 to 1), rotation_uncertainty_deg
+            (standard error in degrees of the alignment's rotation; above 10 the metrics
+            ``ape_rot_*`` say nothing of the tracker), and every metric of the protocol under its
+            own name, the unit at its end (``ate_rmse_m``, ``rpe_1s_rot_rmse_deg``; see
+            `Evaluation`).
         """
-        metrics = sorted({name for row in self.rows for name in row.metrics} - set(_COLUMNS["Float64"]))
-        kinds = {name: kind for kind, names in _COLUMNS.items() for name in names} | dict.fromkeys(metrics, "Float64")
+        metrics = sorted(
+            {name for row in self.rows for name in row.metrics} - set(_COLUMNS["Float64"])
+        )
+        kinds = {name: kind for kind, names in _COLUMNS.items() for name in names} | dict.fromkeys(
+            metrics, "Float64"
+        )
         lines = []
-        for row in sorted(self.rows, key=lambda r: (self.labels[r.variant_key], self.sequence(r), r.repeat_key)):
+        for row in sorted(
+            self.rows, key=lambda r: (self.labels[r.variant_key], self.sequence(r), r.repeat_key)
+        ):
             values: dict[str, Any] = {
                 "kind": row.origin,
                 "tracker": row.tracker.id,
@@ -283,17 +335,23 @@ class Board:
 
 
 def make_board(
-    rows: Sequence[RunRow], reference: str | None = None, on: On = "common", *, rank_seen: bool = False
+    rows: Sequence[RunRow],
+    reference: str | None = None,
+    on: On = "common",
+    *,
+    rank_seen: bool = False,
 ) -> Board:
     """Order rows into a board.
 
     Args:
         rows: One a run.
-        reference: Tracker id that errors are divided by; `DEFAULT_REFERENCE` where none is named. Real-time runs,
-            imports and runs by another program than the one that ranks are never it. Where it was not run on every
-            ranked sequence, a static camera takes its place.
-        on: ``common`` ranks on the sequences that all ranked trackers have, ``all`` only trackers that have all.
-        rank_seen: Whether trackers are also ranked on scenes that the network behind their masks was trained on.
+        reference: Tracker id that errors are divided by; `DEFAULT_REFERENCE` where none is named.
+            Real-time runs, imports and runs by another program than the one that ranks are never
+            it. Where it was not run on every ranked sequence, a static camera takes its place.
+        on: ``common`` ranks on the sequences that all ranked trackers have, ``all`` only trackers
+            that have all.
+        rank_seen: Whether trackers are also ranked on scenes that the network behind their masks
+            was trained on.
 
     Raises:
         ReportError: There are no rows, they mix protocols, or no run is of the reference.
@@ -303,9 +361,16 @@ def make_board(
     check_one_protocol(rows)
     trackers = sorted({row.tracker.id for row in rows})
     if reference is not None and reference not in trackers:
-        raise ReportError(f"there is no run of the reference '{reference}'", did_you_mean(reference, trackers))
+        raise ReportError(
+            f"there is no run of the reference '{reference}'", did_you_mean(reference, trackers)
+        )
     board = Board(
-        list(rows), on, rank_seen, name_columns(rows), labels=make_labels(rows), asked_reference=reference or ""
+        list(rows),
+        on,
+        rank_seen,
+        name_columns(rows),
+        labels=make_labels(rows),
+        asked_reference=reference or "",
     )
     return _completed(board)
 
@@ -336,13 +401,17 @@ def _completed(board: Board) -> Board:
     _order_sequences(board)
     by_tracker = {key: grouped(board.runs(key), board.sequence) for key in board.labels}
     board.cells = {
-        key: {name: make_cell(runs) for name, runs in by_name.items()} for key, by_name in by_tracker.items()
+        key: {name: make_cell(runs) for name, runs in by_name.items()}
+        for key, by_name in by_tracker.items()
     }
     board.final_only = [
         key
-        for key in board.labels  # imports and batch programs without the trajectory that the protocol asks for
+        # imports and batch programs without the trajectory that the protocol asks for
+        for key in board.labels
         if all(
-            (row.imported or not row.tracker.online) and not row.metrics and row.final_ate_m is not None
+            (row.imported or not row.tracker.online)
+            and not row.metrics
+            and row.final_ate_m is not None
             for row in board.runs(key)
         )
     ]
@@ -360,7 +429,11 @@ def _completed(board: Board) -> Board:
 def _choose_reference(board: Board, scored: Sequence[str], tracker: str) -> None:
     """The plainest variant of a tracker that was run on all common sequences, if there is one."""
     everywhere = [board.first(key) for key in scored if set(board.common) <= set(board.scored(key))]
-    rows = [row for row in everywhere if row.tracker.id == tracker and row.is_current and not row.imported]
+    rows = [
+        row
+        for row in everywhere
+        if row.tracker.id == tracker and row.is_current and not row.imported
+    ]
     candidates = [row.variant_key for row in rows if not row.realtime and "map" not in row.variant]
     if candidates and board.common:
         board.reference = min(candidates, key=lambda key: len(board.first(key).variant))
@@ -383,9 +456,16 @@ def rank(
     """
     cells: dict[str, dict[str, list[float]]] = {}
     for key in {*scored} if board.reference is None else {*scored, board.reference}:
-        rows = {name: board.cells[key][name].kept for name in board.common if name in board.cells[key]}
-        cells[key] = {name: [error for error in map(score, kept) if error is not None] for name, kept in rows.items()}
-    static = {name: [board.static_camera[name]] for name in board.common if board.groups[name] != _FIXED}
+        rows = {
+            name: board.cells[key][name].kept for name in board.common if name in board.cells[key]
+        }
+        cells[key] = {
+            name: [error for error in map(score, kept) if error is not None]
+            for name, kept in rows.items()
+        }
+    static = {
+        name: [board.static_camera[name]] for name in board.common if board.groups[name] != _FIXED
+    }
     reference = static if board.reference is None else cells[board.reference]
     shared = {name: errors for name, errors in reference.items() if errors}
     if not shared:
@@ -394,7 +474,9 @@ def rank(
     full = [key for key in ranked if key in placed and all(cells[key].get(name) for name in shared)]
     placed_cells = {key: cells[key] for key in placed}
     return [
-        replace(standing, verdict="reference") if standing.key == board.reference and standing.verdict else standing
+        replace(standing, verdict="reference")
+        if standing.key == board.reference and standing.verdict
+        else standing
         for standing in standings(placed_cells, shared, full, board.weights)
     ]
 
@@ -410,10 +492,15 @@ def group_weights(groups: Sequence[str]) -> NDArray[np.float64]:
     return np.array([1.0 / sizes[group] for group in groups])
 
 
-def common_logs(board: Board, keys: Sequence[str]) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64]]:
+def common_logs(
+    board: Board, keys: Sequence[str]
+) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64]]:
     """Logarithms of some trackers' median errors on the common sequences, nan for none, and the weights of these."""
     logs = {
-        key: log_medians({name: cell.scores for name, cell in board.cells[key].items()}, board.common) for key in keys
+        key: log_medians(
+            {name: cell.scores for name, cell in board.cells[key].items()}, board.common
+        )
+        for key in keys
     }
     return logs, np.array([*board.weights.values()])
 
@@ -441,13 +528,18 @@ class Pair(NamedTuple):
 def compare_pairs(board: Board, keys: Sequence[str]) -> list[Pair]:
     """Compare every two of some trackers that have a common sequence in common, in their order."""
     logs, weights = common_logs(board, keys)
-    tests = separable({key: logs[key] for key in keys if key in board.ranked}, weights) if board.common else {}
+    tests = (
+        separable({key: logs[key] for key in keys if key in board.ranked}, weights)
+        if board.common
+        else {}
+    )
     pairs = []
     for a, b in combinations(keys, 2):
         differences = logs[a] - logs[b]
         if not np.isfinite(differences).any():
             continue
-        ratio, (apart, p_value) = ratio_interval(differences, weights), tests.get((a, b), (False, None))
+        ratio = ratio_interval(differences, weights)
+        (apart, p_value) = tests.get((a, b), (False, None))
         verdict: Verdict = "" if p_value is None else "cannot tell"
         if apart:
             verdict = "better" if ratio.value < 1 else "worse"
@@ -459,7 +551,9 @@ def _order_sequences(board: Board) -> None:
     """Name the sequences and their groups, static ones first; note what a static camera scores on each."""
     by_name = grouped(board.rows, board.sequence)
     errors = {
-        name: [row.static_camera_ate_rmse_m for row in rows if row.static_camera_ate_rmse_m is not None]
+        name: [
+            row.static_camera_ate_rmse_m for row in rows if row.static_camera_ate_rmse_m is not None
+        ]
         for name, rows in by_name.items()
     }
     board.static_camera = {name: median(values) for name, values in errors.items() if values}
@@ -471,30 +565,45 @@ def _order_sequences(board: Board) -> None:
     if set(board.groups.values()) == {_OTHER}:
         board.groups = dict.fromkeys(board.groups, "")
     order = ["static", "low dynamic", "high dynamic", "unknown objects", _FIXED, _OTHER, ""]
-    board.sequences = sorted(board.static_camera, key=lambda name: (order.index(board.groups[name]), name))
+    board.sequences = sorted(
+        board.static_camera, key=lambda name: (order.index(board.groups[name]), name)
+    )
     board.short = shortened(board.sequences)
 
 
 def _choose_ranked(board: Board, scored: Sequence[str]) -> None:
     """Who is ranked on which sequences: on those that all ranked trackers have.
 
-    Trackers with few sequences are left out where that leaves more cells to rank (trackers times sequences), so that
-    neither one more sequence of one tracker nor one run of another takes the ranking away from the rest. A tracker
-    without any success is not ranked, nor is one that is no better than a static camera, nor one where its network was
-    trained (`Board.competes`).
+    Trackers with few sequences are left out where that leaves more cells to rank (trackers times
+    sequences), so that neither one more sequence of one tracker nor one run of another takes the
+    ranking away from the rest. A tracker without any success is not ranked, nor is one that is no
+    better than a static camera, nor one where its network was trained (`Board.competes`).
     """
     rankable = [key for key in scored if board.is_rankable(key)]
-    rankable = [key for key in rankable if not board.first(key).realtime] or rankable  # never beside real-time runs
-    rankable = [key for key in rankable if board.first(key).segmentation != EXACT_MASKS] or rankable  # a bound
-    has = {key: {name for name in board.scored(key) if board.competes(key, name)} for key in rankable}
-    rankable = [key for key in rankable if has[key] and any(cell.success for cell in board.cells[key].values())]
+    # never beside real-time runs
+    rankable = [key for key in rankable if not board.first(key).realtime] or rankable
+    # a bound
+    rankable = [key for key in rankable if board.first(key).segmentation != EXACT_MASKS] or rankable
+    has = {
+        key: {name for name in board.scored(key) if board.competes(key, name)} for key in rankable
+    }
+    rankable = [
+        key
+        for key in rankable
+        if has[key] and any(cell.success for cell in board.cells[key].values())
+    ]
     competing = sorted(rankable, key=lambda key: (-len(has[key]), key))
     if board.on == "all":
         competing = [key for key in competing if has[key] == set(board.sequences)]
-    sizes = {n: n * len(set.intersection(*(has[key] for key in competing[:n]))) for n in range(1, len(competing) + 1)}
+    sizes = {
+        n: n * len(set.intersection(*(has[key] for key in competing[:n])))
+        for n in range(1, len(competing) + 1)
+    }
     several = {n: cells for n, cells in sizes.items() if n > 1 and cells} or sizes
     competing = competing[: max(several, key=lambda n: (several[n], n), default=0)]
-    shared = set.intersection(*(has[key] for key in competing)) if competing else set(board.sequences)
+    shared = (
+        set.intersection(*(has[key] for key in competing)) if competing else set(board.sequences)
+    )
     board.common = [name for name in board.sequences if name in shared]
     board.incomplete = [key for key in rankable if key not in competing]
     for key in scored:
@@ -565,16 +674,31 @@ class Cell:
     def ending(self) -> str:
         """How the runs failed, e.g. ``crashed at 20/60``; several that ended differently are counted."""
         endings = list(dict.fromkeys(row.ending for row in self.rows if row.failed))
-        return endings[0] if len(endings) == 1 else f"{self.failed} failed: {'; '.join(endings)}" if endings else ""
+        return (
+            endings[0]
+            if len(endings) == 1
+            else f"{self.failed} failed: {'; '.join(endings)}"
+            if endings
+            else ""
+        )
 
 
 def make_cell(rows: Sequence[RunRow]) -> Cell:
     """Order the runs of a cell and find the copies among them."""
     ordered = sorted(rows, key=lambda row: row.repeat_key)
     kept: list[RunRow] = []
-    for group in grouped(ordered, lambda row: (row.offset, row.sequence.noise, row.imported)).values():
+    for group in grouped(
+        ordered, lambda row: (row.offset, row.sequence.noise, row.imported)
+    ).values():
         results = {
-            (row.status, row.n_processed, row.coverage, row.score_m, row.final_ate_m, *sorted(row.metrics.items()))
+            (
+                row.status,
+                row.n_processed,
+                row.coverage,
+                row.score_m,
+                row.final_ate_m,
+                *sorted(row.metrics.items()),
+            )
             for row in group
         }
         kept += group[:1] if len(results) == 1 else group
@@ -612,7 +736,9 @@ def mean_of(values: Iterable[float | None]) -> float | None:
 def missing_cells(board: Board) -> dict[str, list[str]]:
     """The sequences on which each tracker that could be ranked was not run."""
     rankable = [key for key in board.trackers if board.is_rankable(key)]
-    missing = {key: [name for name in board.sequences if name not in board.cells[key]] for key in rankable}
+    missing = {
+        key: [name for name in board.sequences if name not in board.cells[key]] for key in rankable
+    }
     return {key: names for key, names in missing.items() if names}
 
 
@@ -621,7 +747,8 @@ def missing_note(board: Board) -> str:
     missing = missing_cells(board)
     if not missing:
         return ""
-    common, total = len(board.common), len(board.sequences)
+    common = len(board.common)
+    total = len(board.sequences)
     left = ", ".join(board.labels[key] for key in board.incomplete)
     why = "lack sequences" if board.on == "all" else "lack too many of the others' sequences"
     cells = []
@@ -652,9 +779,13 @@ def missing_commands(board: Board) -> list[str]:
         for name in ("seed", "offset"):
             values = sorted({getattr(run, name) for run in board.runs(key)})
             repeats += [f"--{name}", *map(str, values)] if values != [0] else []
-        others = grouped((by_sequence[name][0] for name in names), lambda row: tuple(part_options(row)))
+        others = grouped(
+            (by_sequence[name][0] for name in names), lambda row: tuple(part_options(row))
+        )
         commands += [
-            command_with(board.first(key), [*[row.place or row.sequence.id for row in rows], *part, *repeats])
+            command_with(
+                board.first(key), [*[row.place or row.sequence.id for row in rows], *part, *repeats]
+            )
             for part, rows in others.items()
         ]
     return commands
@@ -664,15 +795,48 @@ def missing_commands(board: Board) -> list[str]:
 
 _COLUMNS = {
     "string": (
-        *("run_id", "kind", "tracker", "label", "settings", "provenance", "sequence", "column_id", "frames", "split"),
-        *("repeat", "status", "ending", "study", "protocol_id", "protocol_digest", "trajectory", "segmentation"),
+        *(
+            "run_id",
+            "kind",
+            "tracker",
+            "label",
+            "settings",
+            "provenance",
+            "sequence",
+            "column_id",
+            "frames",
+            "split",
+        ),
+        *(
+            "repeat",
+            "status",
+            "ending",
+            "study",
+            "protocol_id",
+            "protocol_digest",
+            "trajectory",
+            "segmentation",
+        ),
         *("computer", "program_remark"),
     ),
     "Int64": ("seed", "offset", "n_frames", "n_processed", "n_tracked", "noise"),
     "boolean": ("ranked", "failed", "cached", "seen_in_training"),
     "Float64": (
-        *("coverage", "score_m", "hold_last_pose_ate_m", "final_ate_m", "static_camera_ate_rmse_m", "frame_ms"),
-        *("real_time_factor", "peak_memory_mb", "mask_iou", "epipolar_skipped", "rotation_uncertainty_deg"),
+        *(
+            "coverage",
+            "score_m",
+            "hold_last_pose_ate_m",
+            "final_ate_m",
+            "static_camera_ate_rmse_m",
+            "frame_ms",
+        ),
+        *(
+            "real_time_factor",
+            "peak_memory_mb",
+            "mask_iou",
+            "epipolar_skipped",
+            "rotation_uncertainty_deg",
+        ),
     ),
 }
 """Type of a column of `Board.frame` to the names."""

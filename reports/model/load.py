@@ -1,6 +1,7 @@
 """From results folders to rows: which runs count, scored under one protocol.
 
-Rows of unchanged runs are taken from the store's SQLite index. Many runs are scored by several processes.
+Rows of unchanged runs are taken from the store's SQLite index. Many runs are scored by several
+processes.
 """
 
 import os
@@ -50,7 +51,9 @@ def no_progress(done: float, total: float | None, what: str) -> None:
 @contextmanager
 def worker_pool(runs: int) -> Iterator[Executor | None]:
     """As many worker processes as so many runs are worth on this machine; None where they are worth none."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
     if runs < MANY or cores == 1:
         yield None
         return
@@ -72,7 +75,9 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-def run_jobs(pool: Executor | None, function: Callable[..., T], jobs: Sequence[tuple[Any, ...]]) -> Iterator[T]:
+def run_jobs(
+    pool: Executor | None, function: Callable[..., T], jobs: Sequence[tuple[Any, ...]]
+) -> Iterator[T]:
     """Call a function once a job, in worker processes or here.
 
     Args:
@@ -92,7 +97,9 @@ def run_jobs(pool: Executor | None, function: Callable[..., T], jobs: Sequence[t
         return
     with _without_main():
         answers = pool.map(function, *zip(*jobs, strict=True), chunksize=_AT_ONCE)
-    with raising(InfrastructureError, "a worker process of the report ended early", of=BrokenProcessPool):
+    with raising(
+        InfrastructureError, "a worker process of the report ended early", of=BrokenProcessPool
+    ):
         yield from answers
 
 
@@ -115,7 +122,9 @@ def _place(protocol: Protocol) -> tuple[str, str]:
     return f"report {protocol.digest()}", module_graph().digest(_ROW_CODE, PLUMBING)
 
 
-def _unchanged_rows(store: RunStore, protocol: Protocol, run_ids: Sequence[str]) -> dict[str, RunRow]:
+def _unchanged_rows(
+    store: RunStore, protocol: Protocol, run_ids: Sequence[str]
+) -> dict[str, RunRow]:
     """The rows of those runs that are unchanged, by run id; damaged rows, and rows of other runs, count as missing."""
     rows = {}
     for run_id, text in store.index.read(*_place(protocol), run_ids, check_links=True).items():
@@ -140,7 +149,8 @@ def _keep_rows(store: RunStore, protocol: Protocol, rows: Iterable[tuple[RunRow,
     """Keep rows for later reports, as far as the store can be written."""
     entries = []
     for row, state in rows:
-        with suppress(ValueError):  # half characters, of the name of a folder: the run is read every time
+        # half characters, of the name of a folder: the run is read every time
+        with suppress(ValueError):
             entries.append((row.run_id, state, row.model_dump_json(exclude_defaults=True)))
     if entries:
         store.index.write(*_place(protocol), entries)
@@ -157,10 +167,11 @@ class Loaded:
         rows: One run of every variant, column and repeat, see `model.programs.choose_runs`.
         superseded: How many others of them there were.
         in_future: Runs that started in the future by their records.
-        not_installed: What of a ranked program is another one here, by its variant key, where several programs made
-            runs and none of them is installed.
+        not_installed: What of a ranked program is another one here, by its variant key, where
+            several programs made runs and none of them is installed.
         stopped: How many runs were left out since they were ended on request.
-        without_scale: How many were left out since their scale is unknown and the protocol's alignment finds none.
+        without_scale: How many were left out since their scale is unknown and the protocol's
+            alignment finds none.
         trials: How many were left out since they are trials of studies.
         unreadable: Folders without a valid record, with reasons.
         conflicts: Runs that should be equal and are not, in words.
@@ -205,13 +216,17 @@ def load_runs(
         unchanged = _unchanged_rows(store, protocol, run_ids)
         unread = [run_id for run_id in run_ids if run_id not in unchanged]
         scored: list[tuple[RunRow, str]] = []
-        for done, answer in enumerate(run_jobs(pool, _score_run, [(store, protocol, run_id) for run_id in unread]), 1):
+        for done, answer in enumerate(
+            run_jobs(pool, _score_run, [(store, protocol, run_id) for run_id in unread]), 1
+        ):
             if isinstance(answer, str):
                 loaded.unreadable.append(answer)
                 on_progress(done, len(unread), "")
             else:
                 scored.append(answer)
-                on_progress(done, len(unread), f"scoring {answer[0].tracker.id} on {answer[0].sequence.id}")
+                on_progress(
+                    done, len(unread), f"scoring {answer[0].tracker.id} on {answer[0].sequence.id}"
+                )
         _keep_rows(store, protocol, scored)
         everything += [*unchanged.values(), *(row for row, _ in scored)]
     warn_of_unreadable(loaded.unreadable)
@@ -233,7 +248,9 @@ def load_runs(
     if loaded.trials:
         raise ReportError(f"all {trial_words(loaded.trials)}")
     places = ", ".join(str(store.source) for store in stores)
-    raise ReportError(f"there are no runs in {places}", next(iter(loaded.unreadable), "make some with 'run'"))
+    raise ReportError(
+        f"there are no runs in {places}", next(iter(loaded.unreadable), "make some with 'run'")
+    )
 
 
 def without_scale_words(count: int, protocol: Protocol) -> str:
@@ -256,10 +273,14 @@ def _two_results(rows: Iterable[RunRow]) -> list[str]:
     """Which runs of one id from several stores have different results although they should be equal, in words."""
     conflicts = []
     for first, *others in grouped(rows, lambda row: row.run_id).values():
-        errors = sorted({row.metrics["ate_rmse_m"] for row in (first, *others) if "ate_rmse_m" in row.metrics})
+        errors = sorted(
+            {row.metrics["ate_rmse_m"] for row in (first, *others) if "ate_rmse_m" in row.metrics}
+        )
         if len(errors) > 1 and first.tracker.deterministic and not first.realtime:
             results = ", ".join(f"{1000 * error:.3f}" for error in errors)
-            conflicts.append(f"{first.label} on {first.sequence.id} (run {first.run_id}): ATE {results} mm")
+            conflicts.append(
+                f"{first.label} on {first.sequence.id} (run {first.run_id}): ATE {results} mm"
+            )
     return conflicts
 
 
@@ -271,9 +292,12 @@ def check_one_protocol(rows: Sequence[RunRow]) -> None:
     """
     counts = Counter((row.protocol_id, row.protocol_digest) for row in rows)
     if len(counts) > 1:
-        named = " and ".join(f"{name} [{digest}] ({count} rows)" for (name, digest), count in sorted(counts.items()))
+        named = " and ".join(
+            f"{name} [{digest}] ({count} rows)" for (name, digest), count in sorted(counts.items())
+        )
         raise ReportError(
-            f"one table cannot mix {len(counts)} protocols: {named}", "score all runs under one protocol first"
+            f"one table cannot mix {len(counts)} protocols: {named}",
+            "score all runs under one protocol first",
         )
 
 
@@ -286,4 +310,7 @@ def open_stores(runs: Sequence[Path] | Sequence[str] | RunStore | Path | str) ->
     if isinstance(runs, RunStore):
         return [runs]
     roots = [Path(runs)] if isinstance(runs, str | Path) else map(Path, runs)
-    return [open_store(root.parent if root.name == "runs" and not (root / "runs").is_dir() else root) for root in roots]
+    return [
+        open_store(root.parent if root.name == "runs" and not (root / "runs").is_dir() else root)
+        for root in roots
+    ]

@@ -14,13 +14,15 @@ from dynslam_bench.runs.store import part_words
 def name_columns(rows: Sequence[RunRow]) -> dict[str, str]:
     """A name for every column, no two alike.
 
-    Recordings that share a name are distinguished by the last parts of their folders' paths, then by camera, content
-    and frames: ``chess/seq-01`` and ``fire/seq-01``.
+    Recordings that share a name are distinguished by the last parts of their folders' paths, then
+    by camera, content and frames: ``chess/seq-01`` and ``fire/seq-01``.
 
     Returns:
         Column id (see `RunRow.column_id`) to its name.
     """
-    plainest = sorted(rows, key=lambda r: (r.sequence.noise is not None, r.offset, len(_name(r)), _name(r)))
+    plainest = sorted(
+        rows, key=lambda r: (r.sequence.noise is not None, r.offset, len(_name(r)), _name(r))
+    )
     columns = [of_column[0] for of_column in grouped(plainest, lambda row: row.column_id).values()]
     names: dict[str, str] = {}
     for name, group in grouped(columns, _name).items():
@@ -81,19 +83,27 @@ def _distinct(name: str, group: Mapping[str, RunRow]) -> dict[str, str]:
         {column: column for column in group},
     ):
         if len(set(names.values())) < len(names) and len(set(words.values())) > 1:
-            names = {column: f"{name} ({words[column]})" if words[column] else name for column, name in names.items()}
+            names = {
+                column: f"{name} ({words[column]})" if words[column] else name
+                for column, name in names.items()
+            }
     return names
 
 
 def _camera_words(row: RunRow) -> str:
     """The camera in a few words, empty if the record does not name it."""
     camera = row.identity.get("camera")
-    values = [camera.get(name) for name in ("width", "height", "fx", "fy")] if isinstance(camera, dict) else [None]
+    values = (
+        [camera.get(name) for name in ("width", "height", "fx", "fy")]
+        if isinstance(camera, dict)
+        else [None]
+    )
     stated = all(isinstance(value, int | float) for value in values)
     return "camera {:g}x{:g}, f {:g} {:g}".format(*values) if stated else ""
 
 
-OUR_BACK_END, OUR_OWN = " (our back end)", ", our own"
+OUR_BACK_END = " (our back end)"
+OUR_OWN = ", our own"
 """Behind the labels of re-implementations, and of compositions of this project."""
 ALWAYS = ("map", "backend.map.localisation_only")
 """Named in any table: a run that begins in a map knows more than one that begins without."""
@@ -104,19 +114,28 @@ OF_ALL = {"device", "threads"}
 def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:
     """A name for every variant: the tracker's label and what sets it apart from the tracker's other variants.
 
-    What one tracker alone was asked for is named though it has no other variant; what several were, as all that a suite
-    runs, is not.
+    What one tracker alone was asked for is named though it has no other variant; what several were,
+    as all that a suite runs, is not.
     Behind it stands `SEEN` if any of its runs had masks of a network that was trained on the scene.
     """
     in_training = {row.variant_key for row in rows if row.seen_in_training}
-    variants = {key: of_key[0] for key, of_key in grouped(rows, lambda row: row.variant_key).items()}
+    variants = {
+        key: of_key[0] for key, of_key in grouped(rows, lambda row: row.variant_key).items()
+    }
     by_tracker = grouped(variants.values(), lambda row: row.tracker.id)
     by_label = grouped(variants.values(), lambda row: row.label)
-    named = {tracker: {name for row in others for name in row.variant} for tracker, others in by_tracker.items()}
+    named = {
+        tracker: {name for row in others for name in row.variant}
+        for tracker, others in by_tracker.items()
+    }
     shown = {}
     for tracker, others in by_tracker.items():
         elsewhere = set().union(*(names for other, names in named.items() if other != tracker))
-        differing = {name for name in named[tracker] if len({str(row.variant.get(name)) for row in others}) > 1}
+        differing = {
+            name
+            for name in named[tracker]
+            if len({str(row.variant.get(name)) for row in others}) > 1
+        }
         shown[tracker] = {*ALWAYS, *differing, *(named[tracker] - OF_ALL - elsewhere)}
     texts = {setting_text(value) for row in variants.values() for value in row.variant.values()}
     counts = Counter(map(label_text, texts))
@@ -129,9 +148,21 @@ def make_labels(rows: Sequence[RunRow]) -> dict[str, str]:
     labels = {}
     for key, row in variants.items():
         tracker = row.tracker.id
-        parts = [f"{name}={spelled(value)}" for name, value in sorted(row.variant.items()) if name in shown[tracker]]
+        parts = [
+            f"{name}={spelled(value)}"
+            for name, value in sorted(row.variant.items())
+            if name in shown[tracker]
+        ]
         parts += [f"{name} {value}" for name, value in sorted(row.split_by.items())]
-        parts += ["imported"] * (row.imported and not all(other.imported for other in by_tracker[tracker]))
-        name = f"{row.label} <{tracker}>" if len({other.tracker.id for other in by_label[row.label]}) > 1 else row.label
-        labels[key] = name + (f" · {', '.join(parts)}" if parts else "") + f" {SEEN}" * (key in in_training)
+        parts += ["imported"] * (
+            row.imported and not all(other.imported for other in by_tracker[tracker])
+        )
+        name = (
+            f"{row.label} <{tracker}>"
+            if len({other.tracker.id for other in by_label[row.label]}) > 1
+            else row.label
+        )
+        labels[key] = (
+            name + (f" · {', '.join(parts)}" if parts else "") + f" {SEEN}" * (key in in_training)
+        )
     return labels

@@ -1,7 +1,7 @@
 """Which programs made the runs of a tracker: which of them ranks, and which have equal results and share a row.
 
-A program is code, libraries and weights. The runs of one tracker with the same settings have a row for each program
-that made some of them. The row of the program that is installed here ranks.
+A program is code, libraries and weights. The runs of one tracker with the same settings have a row
+for each program that made some of them. The row of the program that is installed here ranks.
 """
 
 import json
@@ -99,7 +99,8 @@ class ProgramRow:
     def outcomes(self, other: "ProgramRow") -> Iterator["Outcome"]:
         """How each run compares with that of another row, of all runs that both have; copies are left out.
 
-        Copies are runs that differ in their seed only and have one result: they count once, as in a cell of a table.
+        Copies are runs that differ in their seed only and have one result: they count once, as in a
+        cell of a table.
         """
         compared = set()
         for repeat, results in self._results.items():
@@ -117,11 +118,18 @@ class ProgramRow:
         outcomes = list(self.outcomes(other))
         equal = sum(outcome.verdict == "equal" for outcome in outcomes)
         different = sum(outcome.verdict == "different" for outcome in outcomes)
-        return Agreement(equal, different, [outcome.ratio for outcome in outcomes if outcome.ratio is not None])
+        return Agreement(
+            equal, different, [outcome.ratio for outcome in outcomes if outcome.ratio is not None]
+        )
 
     def is_equal_to(self, other: "ProgramRow") -> bool:
         """Whether both have equal results on all runs that both have, and enough of these."""
-        if not (self.is_verified and other.is_verified and self.is_deterministic and other.is_deterministic):
+        if not (
+            self.is_verified
+            and other.is_verified
+            and self.is_deterministic
+            and other.is_deterministic
+        ):
             return False
         equal = 0
         for outcome in self.outcomes(other):
@@ -149,8 +157,8 @@ class Outcome(NamedTuple):
     """One run of two programs.
 
     Attributes:
-        verdict: ``equal``: both ended well with equal trajectories; ``different``: other trajectories, or one of them
-            failed; empty: both failed alike, which says little.
+        verdict: ``equal``: both ended well with equal trajectories; ``different``: other
+            trajectories, or one of them failed; empty: both failed alike, which says little.
         ratio: Error of the first program's run over that of the second's; None where one has none.
     """
 
@@ -171,7 +179,8 @@ def _compare_results(first: Mapping[Result, RunRow], second: Mapping[Result, Run
         return Outcome("different", ratio)
     if status != "ok":
         return Outcome("", ratio)
-    return Outcome("equal" if checksums else "different", ratio)  # without checksums nothing shows that they are equal
+    # without checksums nothing shows that they are equal
+    return Outcome("equal" if checksums else "different", ratio)
 
 
 class Agreement(NamedTuple):
@@ -202,8 +211,8 @@ class Chosen:
     Attributes:
         rows: One run of every program row, column and repeat.
         in_future: Runs that started in the future by their records.
-        not_installed: What of the ranked program is another one here, by its variant key, where several programs made
-            runs and none of them is the one that is installed.
+        not_installed: What of the ranked program is another one here, by its variant key, where
+            several programs made runs and none of them is the one that is installed.
     """
 
     rows: list[RunRow] = field(default_factory=list)
@@ -214,11 +223,13 @@ class Chosen:
 def choose_runs(rows: Iterable[RunRow]) -> Chosen:
     """Choose one run of every column and repeat, and say which program's runs stand in which row.
 
-    Of several programs the one that is installed here ranks; where none is, the one of the newest run. In a cell the
-    ranked program's run is taken where it has one, then the newest. Starts in the future count as the oldest.
+    Of several programs the one that is installed here ranks; where none is, the one of the newest
+    run. In a cell the ranked program's run is taken where it has one, then the newest. Starts in
+    the future count as the oldest.
 
     Args:
-        rows: All runs. `split_by`, `is_current` and `program_remark` of those that are chosen are set.
+        rows: All runs. `split_by`, `is_current` and `program_remark` of those that are chosen are
+            set.
     """
     installation = Installation()
     now = datetime.now(timezone.utc)
@@ -237,22 +248,27 @@ def choose_runs(rows: Iterable[RunRow]) -> Chosen:
     return chosen
 
 
-# -- programs ----------------------------------------------------------------------------------------------------------
+# -- programs --------------------------------------------------------------------------------------
 
 
-def _find_programs(rows: Sequence[RunRow], installation: Installation, now: datetime) -> list[Program]:
+def _find_programs(
+    rows: Sequence[RunRow], installation: Installation, now: datetime
+) -> list[Program]:
     """The programs that made runs of one tracker with the same settings, the preferred one first.
 
-    Runs on sequences of two kinds name different readers, and may be by one program: those that no part tells apart
-    are. Each program joins the first that it fits.
+    Runs on sequences of two kinds name different readers, and may be by one program: those that no
+    part tells apart are. Each program joins the first that it fits.
     """
     by_identity = grouped(rows, _program_text)
     described = []
     for some in by_identity.values():
         by_change = grouped(some, installation.what_changed) if len(by_identity) > 1 else {"": some}
-        described += [Program(runs, _parts_of(runs[0]), changed) for changed, runs in by_change.items()]
+        described += [
+            Program(runs, _parts_of(runs[0]), changed) for changed, runs in by_change.items()
+        ]
     described.sort(
-        key=lambda program: max(_preference(row, program.changed, now) for row in program.rows), reverse=True
+        key=lambda program: max(_preference(row, program.changed, now) for row in program.rows),
+        reverse=True,
     )
 
     programs: list[Program] = []
@@ -321,7 +337,7 @@ def _leaves(name: str, value: Any) -> Iterator[tuple[str, str]]:
         yield name, str(value)
 
 
-# -- which run of each repeat ------------------------------------------------------------------------------------------
+# -- which run of each repeat ----------------------------------------------------------------------
 
 
 def starts_in_future(row: RunRow, now: datetime) -> bool:
@@ -361,7 +377,7 @@ def _choose_of_each_repeat(program_rows: Sequence[ProgramRow], now: datetime) ->
     return kept
 
 
-# -- what the rows say -------------------------------------------------------------------------------------------------
+# -- what the rows say -----------------------------------------------------------------------------
 
 
 def _mark(program_rows: Sequence[ProgramRow], kept: Sequence[Sequence[RunRow]]) -> None:
@@ -384,7 +400,9 @@ def _mark(program_rows: Sequence[ProgramRow], kept: Sequence[Sequence[RunRow]]) 
         if at == 0:
             remarks += _superseded_words(ranked, superseded)
         elif ranked.is_verified:
-            remarks.append(f"other {_what_differs(program_row, ranked)}: {_comparison_words(program_row, ranked)}")
+            remarks.append(
+                f"other {_what_differs(program_row, ranked)}: {_comparison_words(program_row, ranked)}"
+            )
         for row in kept[at]:
             row.split_by = name
             row.is_current = at == 0 and ranked.is_verified
@@ -411,7 +429,9 @@ def _names_of(program_rows: Sequence[ProgramRow]) -> list[dict[str, str]]:
 def _short_texts(program_row: ProgramRow) -> dict[str, str]:
     """Code, libraries and weights of a row's programs, by name as short texts."""
     values = program_row.values()
-    texts = {"code": digest([[*part, *some] for part, some in values.items() if part[0] == CODE], 8)}
+    texts = {
+        "code": digest([[*part, *some] for part, some in values.items() if part[0] == CODE], 8)
+    }
     for (kind, name), some in values.items():
         short_name = name.removeprefix(f"{kind} ")
         if kind == LIBRARIES:
@@ -423,8 +443,13 @@ def _short_texts(program_row: ProgramRow) -> dict[str, str]:
 
 def _what_differs(one: ProgramRow, other: ProgramRow) -> str:
     """In which kinds of parts two rows differ, in words."""
-    values, other_values = one.values(), other.values()
-    differing = {kind for (kind, name), some in values.items() if other_values.get((kind, name), some) != some}
+    values = one.values()
+    other_values = other.values()
+    differing = {
+        kind
+        for (kind, name), some in values.items()
+        if other_values.get((kind, name), some) != some
+    }
     kinds = [kind for kind in (CODE, LIBRARIES, WEIGHTS) if kind in differing]
     if len(kinds) > 1:
         return f"{', '.join(kinds[:-1])} and {kinds[-1]}"
@@ -440,7 +465,9 @@ def _comparison_words(program_row: ProgramRow, ranked: ProgramRow) -> str:
     if not (program_row.is_deterministic and ranked.is_deterministic):
         words = [f"not deterministic, {_runs(total)} in common"]
     elif agreement.different:
-        words = [f"{agreement.different} of {_runs(total)} differ{'s' * (agreement.different == 1)}"]
+        words = [
+            f"{agreement.different} of {_runs(total)} differ{'s' * (agreement.different == 1)}"
+        ]
     else:
         return f"equal on {_runs(total)}, fewer than {FEWEST_EQUAL}"
     return ", ".join(filter(None, [*words, agreement.ratio_words]))
@@ -453,7 +480,9 @@ def _superseded_words(ranked: ProgramRow, superseded: Sequence[ProgramRow]) -> l
     for program_row in superseded:
         is_comparable = program_row.is_verified and program_row.is_deterministic
         if is_comparable and program_row.compare(ranked).different:
-            return [f"superseded {_what_differs(program_row, ranked)}: {_comparison_words(program_row, ranked)}"]
+            return [
+                f"superseded {_what_differs(program_row, ranked)}: {_comparison_words(program_row, ranked)}"
+            ]
     return []
 
 

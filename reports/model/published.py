@@ -26,7 +26,8 @@ _LEAST_FRAMES = {
     "bonn/crowd": 425,
 }
 """Least number of frames of a recording, at 30 Hz. TUM: the pairs of colour and depth in the association files that are
-published with the code of DynaSLAM (walking_xyz: of DANI-SLAM). Bonn: the last frame of an excerpt that is numbered as
+published with the code of DynaSLAM (walking_xyz: of DANI-SLAM). Bonn: the last frame of an excerpt
+that is numbered as
 in the whole, counted from 0. Of others no source was read."""
 METRICS = (
     "ate_rmse_m", "ate_mean_m", "ate_median_m", "ate_sd_m", "rpe_1s_trans_rmse_m", "rpe_1s_rot_rmse_deg",
@@ -40,7 +41,11 @@ KINDS = {
     "cpu": "lowest error found in print, real time on a CPU",
     "masks": "ORB-SLAM2 with person masks, in print",
 }
-HOW = {"R": "read in its source", "S": "second-hand: another paper's table or notes", "I": "inferred"}
+HOW = {
+    "R": "read in its source",
+    "S": "second-hand: another paper's table or notes",
+    "I": "inferred",
+}
 
 
 @dataclass(frozen=True)
@@ -66,14 +71,17 @@ class ReportedCell:
 def published() -> pd.DataFrame:
     """All published numbers, one a line.
 
-    Columns: system (name collisions are told apart, e.g. ``DGS-SLAM (Kong 2024)``), sequence (its id), metric (as in
-    `Evaluation.metrics`), value, unit, alignment (as far as stated), source (where it was read), by (``authors`` where
-    that is the system's own publication, ``third party`` where it is another one, which may have run the system or
-    quote its authors; empty where both print the number), year (of the source), hardware (of the runs), remarks.
-    Unknown hardware is empty.
+    Columns: system (name collisions are told apart, e.g. ``DGS-SLAM (Kong 2024)``), sequence (its
+    id), metric (as in `Evaluation.metrics`), value, unit, alignment (as far as stated), source
+    (where it was read), by (``authors`` where that is the system's own publication, ``third party``
+    where it is another one, which may have run the system or quote its authors; empty where both
+    print the number), year (of the source), hardware (of the runs), remarks. Unknown hardware is
+    empty.
     """
     frame = _read("published.csv")
-    return frame.assign(year=frame["year"].replace("", pd.NA)).astype({"value": float, "year": "Int64"})
+    return frame.assign(year=frame["year"].replace("", pd.NA)).astype(
+        {"value": float, "year": "Int64"}
+    )
 
 
 def published_for(sequences: Sequence[str], protocol: Protocol | None = None) -> pd.DataFrame:
@@ -84,16 +92,23 @@ def published_for(sequences: Sequence[str], protocol: Protocol | None = None) ->
         protocol: Only what is known to be scored alike (`scored_as`); None for everything.
 
     Returns:
-        Columns: sequence, system, source, by, year, alignment, hardware and remarks as in `published`, then one for
+        Columns: sequence, system, source, by, year, alignment, hardware and remarks as in
+            `published`, then one for
         every metric (``Float64``).
     """
     frame = published()
     frame = frame[frame["sequence"].isin(sequences)]
     key = ["sequence", "system", "source"]
-    facts = frame.sort_values("metric").drop_duplicates(key)[[*key, "by", "year", "alignment", "hardware", "remarks"]]
+    facts = frame.sort_values("metric").drop_duplicates(key)[
+        [*key, "by", "year", "alignment", "hardware", "remarks"]
+    ]
     values = frame.pivot(index=key, columns="metric", values="value").astype("Float64")
-    lines = facts.join(values.reindex(columns=METRICS), on=key).sort_values(["sequence", METRICS[0], "system"])
-    return lines.loc[[protocol is None or scored_as(p.alignment, p.sequence, protocol) for p in lines_of(lines)]]
+    lines = facts.join(values.reindex(columns=METRICS), on=key).sort_values(
+        ["sequence", METRICS[0], "system"]
+    )
+    return lines.loc[
+        [protocol is None or scored_as(p.alignment, p.sequence, protocol) for p in lines_of(lines)]
+    ]
 
 
 def spans(lines: pd.DataFrame) -> pd.DataFrame:
@@ -103,10 +118,11 @@ def spans(lines: pd.DataFrame) -> pd.DataFrame:
         lines: Lines of `published_for`.
 
     Returns:
-        One line where there are several. Columns: sequence, system, alignment, numbers, ratio, lowest_m, highest_m,
-        authors_m (the lowest by its authors, missing where none was read).
+        One line where there are several. Columns: sequence, system, alignment, numbers, ratio,
+        lowest_m, highest_m, authors_m (the lowest by its authors, missing where none was read).
     """
-    whole = lines["system"].replace("DynaSLAM N+G", "DynaSLAM")  # what others call by its short name
+    # what others call by its short name
+    whole = lines["system"].replace("DynaSLAM N+G", "DynaSLAM")
     own = lines[METRICS[0]].where(lines["by"] == "authors")
     errors = lines.assign(system=whole, own=own).dropna(subset=METRICS[0])
     groups = errors.groupby(["sequence", "system", "alignment"])
@@ -124,21 +140,25 @@ def spans(lines: pd.DataFrame) -> pd.DataFrame:
 def claimed() -> pd.DataFrame:
     """Tables 1 to 3 of the paper that this project implements, as printed: claimed, not reproduced.
 
-    Columns: table, system (as named there), sequence (its id), quantity (``ape_rmse``, ``rpe_mean``,
-    ``accuracy_percent``, ``time_ms``, ...), kind (``value``, or ``improvement_percent``: the gain of the paper's method
-    over the system), value, digits (decimals as printed).
+    Columns: table, system (as named there), sequence (its id), quantity (``ape_rmse``,
+    ``rpe_mean``, ``accuracy_percent``, ``time_ms``, ...), kind (``value``, or
+    ``improvement_percent``: the gain of the paper's method over the system), value, digits
+    (decimals as printed).
     """
     frame = _read("claimed.csv")
-    return frame.astype({"table": int, "value": float}).assign(digits=frame["value"].str.partition(".")[2].str.len())
+    return frame.astype({"table": int, "value": float}).assign(
+        digits=frame["value"].str.partition(".")[2].str.len()
+    )
 
 
 @cache
 def records() -> pd.DataFrame:
     """The lowest published errors that were found, by sequence and kind (see `KINDS`).
 
-    Columns: sequence, kind, system, value (ATE, RMSE in metres), input (``RGB``, ``RGB-D`` or ``not stated``),
-    alignment (as far as stated), protocol (id of the protocol here that scores alike, empty where that is not known; a
-    table that states no alignment and takes depth is taken for TUM's), hardware, source, how (see `HOW`).
+    Columns: sequence, kind, system, value (ATE, RMSE in metres), input (``RGB``, ``RGB-D`` or
+    ``not stated``), alignment (as far as stated), protocol (id of the protocol here that scores
+    alike, empty where that is not known; a table that states no alignment and takes depth is taken
+    for TUM's), hardware, source, how (see `HOW`).
     """
     return _read("records.csv").astype({"value": float})
 
@@ -147,7 +167,9 @@ def records() -> pd.DataFrame:
 def static_camera_errors() -> dict[tuple[str, str], float]:
     """Errors of a static camera by sequence and metric, from the published ground truth."""
     frame = _read("never_move.csv").astype({"value": float})
-    return dict(zip(zip(frame["sequence"], frame["metric"], strict=True), frame["value"], strict=True))
+    return dict(
+        zip(zip(frame["sequence"], frame["metric"], strict=True), frame["value"], strict=True)
+    )
 
 
 def least_length_s(sequence: str) -> float | None:
@@ -169,32 +191,43 @@ def reported_for(sequences: Sequence[str], protocol: Protocol) -> list[ReportedC
 
     Args:
         sequences: Names of a report's whole sequences.
-        protocol: The report's protocol; numbers known to be aligned or scored otherwise are left out.
+        protocol: The report's protocol; numbers known to be aligned or scored otherwise are left
+            out.
 
     Returns:
-        One cell for every system, source and sequence, and those that the implemented paper claims, tagged so.
+        One cell for every system, source and sequence, and those that the implemented paper claims,
+        tagged so.
     """
     cells = [
         ReportedCell(
             f"{p.system} ({p.by or NOT_STATED}: {p.source})",
             p.sequence,
             p.ate_rmse_m,
-            "; ".join(filter(None, (p.alignment, p.hardware, "" if pd.isna(p.year) else str(p.year), p.remarks))),
+            "; ".join(
+                filter(
+                    None,
+                    (p.alignment, p.hardware, "" if pd.isna(p.year) else str(p.year), p.remarks),
+                )
+            ),
         )
         for p in lines_of(published_for(sequences, protocol).dropna(subset=METRICS[0]))
     ]
     if scored_as("SE(3) or not stated", "", protocol):
         remark = "contradicts itself and what the systems' authors published; see the audit"
-        frame = claimed().query("kind == 'value' and quantity == 'ape_rmse' and sequence in @sequences")
-        cells += [ReportedCell(c.system, c.sequence, c.value, remark, CLAIMED) for c in lines_of(frame)]
+        frame = claimed().query(
+            "kind == 'value' and quantity == 'ape_rmse' and sequence in @sequences"
+        )
+        cells += [
+            ReportedCell(c.system, c.sequence, c.value, remark, CLAIMED) for c in lines_of(frame)
+        ]
     return cells
 
 
 def scored_as(alignment: str, sequence: str, protocol: Protocol) -> bool:
     """Whether a published number was scored as a protocol scores, as far as is known.
 
-    A table of a system with depth that states no alignment is taken for TUM's. What is aligned by Sim(3) is from tables
-    of WildGS-SLAM's evaluation, which corrects Bonn's truth.
+    A table of a system with depth that states no alignment is taken for TUM's. What is aligned by
+    Sim(3) is from tables of WildGS-SLAM's evaluation, which corrects Bonn's truth.
     """
     truth = "bonn-droid-w" if alignment == "Sim(3)" and sequence.startswith("bonn/") else "as-is"
     return (

@@ -41,24 +41,27 @@ class RunRow(RunRecord):
         protocol_id: Id of the protocol of `metrics`.
         protocol_digest: Its digest.
         trajectory: Which trajectory the metrics are of; an import may hold the final one only.
-        metrics: Errors of the trajectory that the protocol asks for; empty for a failure without any.
+        metrics: Errors of the trajectory that the protocol asks for; empty for a failure without
+            any.
         final_metrics: All errors of the final trajectory; empty if there is none.
         final_coverage: Share of the input frames with a pose in it; None where it is not known.
         rotation_uncertainty_deg: Standard error of the rotation of the trajectory's alignment, see
-            `AlignmentRecord.uncertainty_deg`; None where it is not known or does not come from the positions.
-        hold_last_pose_ate_m: The ATE with lost frames held at the last tracked pose, which ranks; None without
-            evaluation.
+            `AlignmentRecord.uncertainty_deg`; None where it is not known or does not come from the
+            positions.
+        hold_last_pose_ate_m: The ATE with lost frames held at the last tracked pose, which ranks;
+            None without evaluation.
         static_camera_ate_rmse_m: What a static camera scores there; None without ground truth.
         not_evaluated: Whether the run ended and cannot be evaluated although there is ground truth.
-        seen_in_training: Whether the masks come from a network that was trained on this very scene: a best case, which
-            does not rank unless that is asked for.
+        seen_in_training: Whether the masks come from a network that was trained on this very scene:
+            a best case, which does not rank unless that is asked for.
         hints: What is probably wrong with the trajectory, see `evaluation.hints`.
-        split_by: Parts of their programs in which the rows of this tracker and variant differ, by name, see
-            `model.programs`.
-        is_current: Whether its row ranks: its identity is verified, and of the programs that made runs of this tracker
-            and variant its own is the one that is installed or, where none is, that of the newest run.
-        program_remark: How many programs share its row since their results are equal, or how the results differ from
-            those of the row that ranks; empty where there is one program.
+        split_by: Parts of their programs in which the rows of this tracker and variant differ, by
+            name, see `model.programs`.
+        is_current: Whether its row ranks: its identity is verified, and of the programs that made
+            runs of this tracker and variant its own is the one that is installed or, where none is,
+            that of the newest run.
+        program_remark: How many programs share its row since their results are equal, or how the
+            results differ from those of the row that ranks; empty where there is one program.
         store: Where its files lie; not written.
     """
 
@@ -149,7 +152,9 @@ class RunRow(RunRecord):
     @cached_property
     def settings_key(self) -> str:
         """Tracker and settings, whatever program made the run."""
-        return f"{self.tracker.id}|{self.kind}|{json.dumps(self.variant, sort_keys=True, default=str)}"
+        return (
+            f"{self.tracker.id}|{self.kind}|{json.dumps(self.variant, sort_keys=True, default=str)}"
+        )
 
     @property
     def variant_key(self) -> str:
@@ -176,13 +181,17 @@ class RunRow(RunRecord):
     def score_m(self) -> float | None:
         """The ATE that ranks: lost frames held, failures as a static camera or worse; None without ground truth.
 
-        A failure whose held trajectory is even further off than a static camera keeps that error. Before a fixed camera
-        a failure has no error: a static camera has none there.
+        A failure whose held trajectory is even further off than a static camera keeps that error.
+        Before a fixed camera a failure has no error: a static camera has none there.
         """
         if self.failed:
             static_m = None if self.fixed_camera else self.static_camera_ate_rmse_m
             return None if static_m is None else max(static_m, self.hold_last_pose_ate_m or 0.0)
-        return self.hold_last_pose_ate_m if self.hold_last_pose_ate_m is not None else self.metrics.get("ate_rmse_m")
+        return (
+            self.hold_last_pose_ate_m
+            if self.hold_last_pose_ate_m is not None
+            else self.metrics.get("ate_rmse_m")
+        )
 
     @property
     def frame_ms(self) -> float | None:
@@ -193,12 +202,17 @@ class RunRow(RunRecord):
     def cached(self) -> bool:
         """Whether stage times come from the stage cache and were not taken in this run."""
         # controls and external systems have no such stage
-        return bool(self.identity.get("cache")) and self.tracker.provenance not in ("control", "external")
+        return bool(self.identity.get("cache")) and self.tracker.provenance not in (
+            "control",
+            "external",
+        )
 
     @property
     def rotation_reliable(self) -> bool:
         """Whether the metrics ``ape_rot_*`` are errors of the estimate rather than of its alignment."""
-        return self.rotation_uncertainty_deg is None or self.rotation_uncertainty_deg <= RELIABLE_DEG
+        return (
+            self.rotation_uncertainty_deg is None or self.rotation_uncertainty_deg <= RELIABLE_DEG
+        )
 
     @property
     def ending(self) -> str:
@@ -207,7 +221,11 @@ class RunRow(RunRecord):
             return ""
         if self.status == "lost":
             return f"lost, {self.n_tracked}/{self.n_frames} tracked"
-        return "not evaluated" if self.status == "ok" else f"{self.status} at {self.n_processed}/{self.n_frames}"
+        return (
+            "not evaluated"
+            if self.status == "ok"
+            else f"{self.status} at {self.n_processed}/{self.n_frames}"
+        )
 
     @property
     def computer(self) -> str:
@@ -215,14 +233,22 @@ class RunRow(RunRecord):
         if self.machine is None:
             return ""
         machine = self.machine
-        words = [machine.cpu, f"{machine.cores} cores", f"{machine.memory_gb:g} GB", machine.system, machine.gpu]
+        words = [
+            machine.cpu,
+            f"{machine.cores} cores",
+            f"{machine.memory_gb:g} GB",
+            machine.system,
+            machine.gpu,
+        ]
         return ", ".join(filter(None, words))
 
     @property
     def machine_words(self) -> str:
         """Computer and versions in words."""
-        git, versions = self.git, dict(self.versions)
-        if git is not None and "dynslam-bench" in versions:  # a checkout is older than its code: git's revision holds
+        git = self.git
+        versions = dict(self.versions)
+        # a checkout is older than its code: git's revision holds
+        if git is not None and "dynslam-bench" in versions:
             versions["dynslam-bench"] = versions["dynslam-bench"].partition("+")[0]
         parts = [
             self.computer,
@@ -270,7 +296,9 @@ class ReportData(Record):
             DynslamError: The folder cannot be written.
         """
         head = self.model_copy(update={"rows": []}).to_line().removesuffix("]}")
-        rows = (_without_reads(row).to_line() + "," * (row is not self.rows[-1]) for row in self.rows)
+        rows = (
+            _without_reads(row).to_line() + "," * (row is not self.rows[-1]) for row in self.rows
+        )
         write_lines(path, chain([head], rows, ["]}"]))
 
 
@@ -292,7 +320,9 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
     warnings = [] if evaluation is None else [f"warning: {line}" for line in evaluation.warnings]
     alignment = None if evaluation is None else evaluation.alignment
     scores: dict[str, Any] = dict(
-        settings={name: record.settings[name] for name in record.overrides if name in record.settings},
+        settings={
+            name: record.settings[name] for name in record.overrides if name in record.settings
+        },
         identity={name: value for name, value in record.identity.items() if name != "settings"},
         timings={name: time for name, time in record.timings.items() if name == "total"},
         protocol_id=scored.protocol_id,
@@ -305,7 +335,13 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         hold_last_pose_ate_m=_hold_last_pose_error(store, record, protocol, evaluation, static_m),
         static_camera_ate_rmse_m=static_m,
         seen_in_training=seen_in_training(record.segmentation, record.sequence.id),
-        notes=[*(f"hint: {hint}" for hint in scored.hints), *warnings, *trial, *record.notes, *diagnostics],
+        notes=[
+            *(f"hint: {hint}" for hint in scored.hints),
+            *warnings,
+            *trial,
+            *record.notes,
+            *diagnostics,
+        ],
         hints=scored.hints,
         store=store,
     )
@@ -324,7 +360,8 @@ def _outcome(
             return {}
         reason = record.reason or scored.reasons.get(protocol.trajectory, "it cannot be evaluated")
         return {"not_evaluated": True, "reason": reason}
-    n_tracked, frames_due = evaluation.n_tracked, record.n_frames - record.n_dropped
+    n_tracked = evaluation.n_tracked
+    frames_due = record.n_frames - record.n_dropped
     if record.kind == "imported" or protocol.trajectory == "online" or n_tracked is None:
         return {}
     outcome: dict[str, Any] = {"n_tracked": n_tracked, "coverage": evaluation.coverage}
@@ -352,11 +389,16 @@ def _static_camera_error(
 
 
 def _hold_last_pose_error(
-    store: RunStore, record: RunRecord, protocol: Protocol, evaluation: Evaluation | None, static_m: float | None
+    store: RunStore,
+    record: RunRecord,
+    protocol: Protocol,
+    evaluation: Evaluation | None,
+    static_m: float | None,
 ) -> float | None:
     """The ATE with every lost frame held at the last tracked pose; None without evaluation.
 
-    Poses that belong to no input frames cannot be held: with lost frames, the error is at least a static camera's.
+    Poses that belong to no input frames cannot be held: with lost frames, the error is at least a
+    static camera's.
     """
     if evaluation is None:
         return None
@@ -367,15 +409,24 @@ def _hold_last_pose_error(
         trajectory = store.trajectory(record.run_id, protocol.trajectory)
         truth = store.ground_truth(record.sequence.part)
         if trajectory is not None and truth is not None:
-            return ate_rmse_m(trajectory, truth, protocol, held_at=store.timestamps(record.sequence.part))
+            return ate_rmse_m(
+                trajectory, truth, protocol, held_at=store.timestamps(record.sequence.part)
+            )
     return error if record.coverage >= 1.0 else max(error, static_m or 0.0)
 
 
 def command_line(command: list[str]) -> str:
     """The command line as one would type it; a results folder named by its absolute path is ``RESULTS``."""
     place = _option(command, "--results")
-    words = [word.replace(place, "RESULTS") for word in command] if place and Path(place).is_absolute() else command
-    heads = ["dynslam-bench" if Path(head).name in ("__main__.py", "dynslam-bench") else head for head in command[:1]]
+    words = (
+        [word.replace(place, "RESULTS") for word in command]
+        if place and Path(place).is_absolute()
+        else command
+    )
+    heads = [
+        "dynslam-bench" if Path(head).name in ("__main__.py", "dynslam-bench") else head
+        for head in command[:1]
+    ]
     return shlex.join([*heads, *words[1:]])
 
 
@@ -403,14 +454,24 @@ def command_with(row: RunRow, words: Iterable[str]) -> str:
             settings += ["--degrade", f"{name.removeprefix('degrade.')}={value}"]
         else:
             settings += options.get(name, ["--set", f"{name}={setting_text(value)}"])
-    return shlex.join(["dynslam-bench", "run", row.tracker.given or row.tracker.id, *words, *settings])
+    return shlex.join(
+        ["dynslam-bench", "run", row.tracker.given or row.tracker.id, *words, *settings]
+    )
 
 
 def part_options(row: RunRow) -> list[str]:
     """Its part of the sequence, and the camera that its command named, as options of the command line."""
-    frames = "" if row.frames is None else ":".join("" if end is None else str(end) for end in row.frames)
+    frames = (
+        ""
+        if row.frames is None
+        else ":".join("" if end is None else str(end) for end in row.frames)
+    )
     camera = _option(row.command, "--camera") if row.place else None
-    options = {"--frames": frames, "--camera": camera, "--stride": "" if row.stride == 1 else str(row.stride)}
+    options = {
+        "--frames": frames,
+        "--camera": camera,
+        "--stride": "" if row.stride == 1 else str(row.stride),
+    }
     return [word for name, value in options.items() if value for word in (name, value)]
 
 

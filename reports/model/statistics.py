@@ -1,9 +1,10 @@
 """Statistics of a leaderboard: ratios to a reference, who is better than it, and which trackers can be told apart.
 
-Errors of different sequences are never averaged as they are (a hard sequence would drown the rest); they are compared
-as ratios on the same sequence and averaged geometrically. Sequences are the sample: the repeats of a cell give its
-median, and are no further evidence about other sequences. Sequences may have weights, so that a mean over categories
-does not depend on how many sequences each category has; with equal weights all formulas are Student's.
+Errors of different sequences are never averaged as they are (a hard sequence would drown the rest);
+they are compared as ratios on the same sequence and averaged geometrically. Sequences are the
+sample: the repeats of a cell give its median, and are no further evidence about other sequences.
+Sequences may have weights, so that a mean over categories does not depend on how many sequences
+each category has; with equal weights all formulas are Student's.
 """
 
 import math
@@ -45,15 +46,15 @@ class Standing:
 
     Attributes:
         key: The tracker.
-        ratio: Geometric mean over sequences of its median error over the reference's; with a 95 % interval from
-            `FEWEST` sequences on.
+        ratio: Geometric mean over sequences of its median error over the reference's; with a 95 %
+            interval from `FEWEST` sequences on.
         rank: Rank by that ratio among the ranked trackers, 1 is best; None for an unranked one.
         group: First and last rank that the data leave open; None for an unranked tracker.
         mean_rank: Mean over sequences of its rank there; None for an unranked one.
         wins: Sequences on which its median error is smaller than the reference's.
         verdict: Whether it is better than the reference.
-        p_value: Two-sided paired t test of the log errors against the reference's, Holm-corrected over the ranked
-            trackers; None where there is no verdict.
+        p_value: Two-sided paired t test of the log errors against the reference's, Holm-corrected
+            over the ranked trackers; None where there is no verdict.
         sequences: Sequences it was run on.
     """
 
@@ -92,8 +93,12 @@ def standings(
     ranked_logs = {key: logs[key] for key in ranked}
     verdicts = verdicts_against(ranked_logs, base, share)
     means = [round(float(np.average(log, weights=share)), 12) for log in ranked_logs.values()]
-    ranks = dict(zip(ranked, scipy.stats.rankdata(means, method="min").astype(int).tolist(), strict=True))
-    by_sequence = scipy.stats.rankdata(np.reshape([*ranked_logs.values()], (len(ranked), len(names))), axis=0)
+    ranks = dict(
+        zip(ranked, scipy.stats.rankdata(means, method="min").astype(int).tolist(), strict=True)
+    )
+    by_sequence = scipy.stats.rankdata(
+        np.reshape([*ranked_logs.values()], (len(ranked), len(names))), axis=0
+    )
     mean_ranks = dict(zip(ranked, by_sequence.mean(axis=1).tolist(), strict=True))
     groups = rank_groups(ranked_logs, share)
     unordered = [
@@ -121,7 +126,8 @@ def ratio_interval(log_ratios: Array, weights: Array | None = None) -> Interval:
         weights: Their weights ``[S]``; all the same where there are none.
     """
     finite = np.isfinite(log_ratios)
-    values, share = log_ratios[finite], np.ones(finite.sum()) if weights is None else weights[finite]
+    values = log_ratios[finite]
+    share = np.ones(finite.sum()) if weights is None else weights[finite]
     if len(values) < FEWEST:
         few = float(np.exp(np.average(values, weights=share))) if len(values) else math.nan
         return Interval(few, math.nan, math.nan)
@@ -150,10 +156,13 @@ def p_values(differences: Array, weights: Array) -> Array:
     return np.where(constant, np.where(differences[:, 0] == 0, 1.0, 0.0), p)
 
 
-def verdicts_against(logs: Mapping[str, Array], base: Array, weights: Array) -> dict[str, tuple[Verdict, float | None]]:
+def verdicts_against(
+    logs: Mapping[str, Array], base: Array, weights: Array
+) -> dict[str, tuple[Verdict, float | None]]:
     """Whether each tracker is better than the reference, Holm-corrected over the trackers.
 
-    All claims of a board are right together with a chance of at least 95 % (a family-wise error of `FAMILY_ERROR`).
+    All claims of a board are right together with a chance of at least 95 % (a family-wise error of
+    `FAMILY_ERROR`).
 
     Args:
         logs: Tracker to the logarithms of its median errors ``[S]``.
@@ -164,25 +173,33 @@ def verdicts_against(logs: Mapping[str, Array], base: Array, weights: Array) -> 
         Verdict and corrected p value of every tracker.
     """
     verdicts: dict[str, tuple[Verdict, float | None]] = dict.fromkeys(logs, ("cannot tell", None))
-    others = [key for key, log in logs.items() if not np.array_equal(log, base)]  # not the reference itself
-    corrected = holm(p_values(np.reshape([logs[key] - base for key in others], (-1, len(base))), weights))
+    # not the reference itself
+    others = [key for key, log in logs.items() if not np.array_equal(log, base)]
+    corrected = holm(
+        p_values(np.reshape([logs[key] - base for key in others], (-1, len(base))), weights)
+    )
     for key, p in zip(others, corrected.tolist(), strict=True):
         smaller = np.average(logs[key] - base, weights=weights) < 0
         verdicts[key] = ("cannot tell" if p > FAMILY_ERROR else "better" if smaller else "worse"), p
     return verdicts
 
 
-def separable(logs: Mapping[str, Array], weights: Array) -> dict[tuple[str, str], tuple[bool, float]]:
+def separable(
+    logs: Mapping[str, Array], weights: Array
+) -> dict[tuple[str, str], tuple[bool, float]]:
     """Which trackers the sequences tell apart: paired t tests of the log errors, Holm-corrected over all pairs.
 
-    The order of all pairs that are called separable is right together with a chance of at least 95 %.
+    The order of all pairs that are called separable is right together with a chance of at least 95
+    %.
 
     Args:
-        logs: Tracker to the logarithms of its median errors ``[S]``, in the same order of sequences, none missing.
+        logs: Tracker to the logarithms of its median errors ``[S]``, in the same order of
+            sequences, none missing.
         weights: Weights ``[S]`` of the sequences.
 
     Returns:
-        For every pair ``(a, b)``, a before b in `logs`, whether they differ, and the corrected p value.
+        For every pair ``(a, b)``, a before b in `logs`, whether they differ, and the corrected p
+        value.
     """
     pairs = list(combinations(logs, 2))
     differences = np.reshape([logs[a] - logs[b] for a, b in pairs], (-1, len(weights)))
@@ -192,7 +209,8 @@ def separable(logs: Mapping[str, Array], weights: Array) -> dict[tuple[str, str]
 
 def rank_groups(logs: Mapping[str, Array], weights: Array) -> dict[str, tuple[int, int]]:
     """First and last rank that the data leave open to every tracker; arguments as in `separable`."""
-    better, worse = dict.fromkeys(logs, 0), dict.fromkeys(logs, 0)
+    better = dict.fromkeys(logs, 0)
+    worse = dict.fromkeys(logs, 0)
     means = {key: np.average(log, weights=weights) for key, log in logs.items()}
     for (a, b), (apart, _) in separable(logs, weights).items():
         if apart:
@@ -209,10 +227,11 @@ def mean_rank_test(logs: Mapping[str, Array]) -> tuple[float, float] | None:
         logs: As in `separable`.
 
     Returns:
-        The p value of all trackers being alike, and the difference above which two mean ranks are different at 5 %;
-        None for fewer than three trackers or `FEWEST` sequences.
+        The p value of all trackers being alike, and the difference above which two mean ranks are
+        different at 5 %; None for fewer than three trackers or `FEWEST` sequences.
     """
-    trackers, sequences = len(logs), len(next(iter(logs.values()), ()))
+    trackers = len(logs)
+    sequences = len(next(iter(logs.values()), ()))
     if trackers < 3 or sequences < FEWEST:
         return None
     quantile = scipy.stats.studentized_range.ppf(0.95, trackers, np.inf) / math.sqrt(2.0)

@@ -23,7 +23,9 @@ def headline(board: Board) -> str:
     where = f"On {_sequences(board)} "
     best = ranked[0]
     reference = "a static camera" if board.reference_name == STATIC_CAMERA else board.reference_name
-    ratio = f", with {best.ratio.value:.2f} times the error of {reference}" * (best.key != board.reference)
+    ratio = f", with {best.ratio.value:.2f} times the error of {reference}" * (
+        best.key != board.reference
+    )
     if len(ranked) == 1:
         return f"{where}{board.names[best.key]} alone is ranked{ratio}."
     if len(board.common) < FEWEST:
@@ -31,7 +33,9 @@ def headline(board: Board) -> str:
             f"{where}{board.names[best.key]} has the smallest error{ratio}; below {FEWEST} sequences "
             "no tracker is called better than another."
         )
-    first = [standing for standing in ranked if standing.group is not None and standing.group[0] == 1]
+    first = [
+        standing for standing in ranked if standing.group is not None and standing.group[0] == 1
+    ]
     better = [standing for standing in first if standing.verdict == "better"]
     if not better:
         count = Counter(standing.verdict for standing in ranked)
@@ -52,7 +56,9 @@ def explanation(board: Board) -> str:
             f"{FEWEST}, chance alone could produce it."
         )
     count = Counter(standing.verdict for standing in board.standings)
-    ratios = [s.ratio for s in board.standings if s.rank is not None and s.ratio.high > s.ratio.value > 0]
+    ratios = [
+        s.ratio for s in board.standings if s.rank is not None and s.ratio.high > s.ratio.value > 0
+    ]
     # the factor between an interval's end and its middle, of a typical tracker
     width = median_high([ratio.high / ratio.value for ratio in ratios] or [1.0])
     more = math.ceil(len(board.common) * (math.log(max(width, 1.0 + 1e-9)) / math.log(1.1)) ** 2)
@@ -76,14 +82,25 @@ def reservations(rows: Sequence[RunRow]) -> list[str]:
     rendered = any(row.sequence.id.startswith("synthetic/") for row in rows)
     computers = {row.computer for row in rows if row.frame_ms is not None}
     sentences = {
-        "One run of a tracker on a sequence: how far repeats lie apart is not known.": len(cells) == len(rows),
-        "Parts of sequences: errors on the whole ones differ.": any(part_words(row) for row in rows),
+        "One run of a tracker on a sequence: how far repeats lie apart is not known.": len(cells)
+        == len(rows),
+        "Parts of sequences: errors on the whole ones differ.": any(
+            part_words(row) for row in rows
+        ),
         "Rendered scenes: not comparable with recordings.": rendered,
-        "Frame times come from the stage cache, not from the runs.": any(row.cached for row in rows),
+        "Frame times come from the stage cache, not from the runs.": any(
+            row.cached for row in rows
+        ),
         f"Frame times of {len(computers)} computers are not comparable.": len(computers) > 1,
-        "Made by code with changes that no revision holds.": any(row.git and row.git.dirty for row in rows),
-        f"{SEEN} Masks of a network that was trained on the very scene.": any(row.seen_in_training for row in rows),
-        f"{HINTED} Trajectories that are probably faulty, see Reproduce.": any(row.hints for row in rows),
+        "Made by code with changes that no revision holds.": any(
+            row.git and row.git.dirty for row in rows
+        ),
+        f"{SEEN} Masks of a network that was trained on the very scene.": any(
+            row.seen_in_training for row in rows
+        ),
+        f"{HINTED} Trajectories that are probably faulty, see Reproduce.": any(
+            row.hints for row in rows
+        ),
         "Failures, which count as a static camera or worse.": any(row.failed for row in rows),
     }
     return [sentence for sentence, holds in sentences.items() if holds]
@@ -105,11 +122,19 @@ def _sequences(board: Board) -> str:
     number = len(board.common)
     plural = f"sequence{'s' * (number != 1)}"
     if board.category != OVERALL:
-        return f"{number} {board.category} {plural}" if board.category != "loops" else f"{number} {plural} with loops"
+        return (
+            f"{number} {board.category} {plural}"
+            if board.category != "loops"
+            else f"{number} {plural} with loops"
+        )
     groups = {board.groups[name] for name in board.common}
     if len(groups) == 1 and groups != {""}:
         return f"{number} {groups.pop()} {plural}"
-    return f"{number} {plural} of {len(groups)} categories" if len(groups) > 1 else f"{number} {plural}"
+    return (
+        f"{number} {plural} of {len(groups)} categories"
+        if len(groups) > 1
+        else f"{number} {plural}"
+    )
 
 
 def _are(number: int) -> str:

@@ -56,7 +56,9 @@ _NAMES = {"own": "our composition"}
 CACHED_MARK = "†"
 COMPUTER_MARK = "‖"
 """Behind times of trackers with runs on other computers than most."""
-CACHED_NOTE = f"{CACHED_MARK} Times of features and masks come from the stage cache, not from the run itself."
+CACHED_NOTE = (
+    f"{CACHED_MARK} Times of features and masks come from the stage cache, not from the run itself."
+)
 SEEN_NOTE = (
     f"{SEEN} The masks come from a network that was trained on this very scene (the embedded one, on rendered "
     "scenes 0-99): its best case, no judgement."
@@ -74,7 +76,9 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
     lines = [leaderboard_cells(board, key) for key in board.trackers]
     rows = [[cells[column.name] for column in columns] for cells in lines]
     brief = f"Geometric mean of the ATE over that of {board.reference_name}"
-    brief += ", with 95 % intervals" * any(math.isfinite(standing.ratio.low) for standing in board.standings)
+    brief += ", with 95 % intervals" * any(
+        math.isfinite(standing.ratio.low) for standing in board.standings
+    )
     return Table(
         "leaderboard",
         "Leaderboard",
@@ -88,10 +92,15 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
 
 
 COLUMNS = (
-    Column("#", meaning="ranks that the data leave open; several: these trackers cannot be told apart"),
+    Column(
+        "#", meaning="ranks that the data leave open; several: these trackers cannot be told apart"
+    ),
     Column("success", meaning="runs that ended and could be evaluated, of all"),
     Column("tracker", numeric=False),
-    Column("ATE ratio", meaning="geometric mean over sequences of the median ATE over that of {reference}"),
+    Column(
+        "ATE ratio",
+        meaning="geometric mean over sequences of the median ATE over that of {reference}",
+    ),
     Column(
         "better?",
         meaning="better than {reference}, worse, or cannot tell: paired t test of the log errors over sequences, "
@@ -118,7 +127,8 @@ COLUMNS = (
 
 
 def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
-    failed, groups = sum(row.failed for row in board.rows), dict.fromkeys(board.groups[name] for name in board.common)
+    failed = sum(row.failed for row in board.rows)
+    groups = dict.fromkeys(board.groups[name] for name in board.common)
     several = len(groups) > 1 and board.category == OVERALL
     mean = f"It is a mean over {len(groups)} categories ({', '.join(groups)}), which all weigh the same. "
     intervals = (
@@ -136,14 +146,19 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
         "in the map of an earlier one or by another program, real-time runs and exact masks beside others, "
         "trackers that lack sequences, never succeeded, or are no better than a static camera.",
     ]
-    counts = {key: sum(board.no_better_than_static(key, name) for name in board.sequences) for key in board.trackers}
+    counts = {
+        key: sum(board.no_better_than_static(key, name) for name in board.sequences)
+        for key in board.trackers
+    }
     worse = "; ".join(
         f"{board.labels[key]} on {count} of {_count(len(board.cells[key]), 'sequence')}"
         for key, count in counts.items()
         if count
     )
     hinted = _hinted(board.rows)
-    rule = "Such runs rank, since that was asked for." if board.rank_seen else "Such runs do not rank."
+    rule = (
+        "Such runs rank, since that was asked for." if board.rank_seen else "Such runs do not rank."
+    )
     remarks = {
         f"No better than a static camera, although their runs ended: {worse}.": worse,
         f"{board.asked_reference} was asked for as the reference, but has not every ranked sequence: a static "
@@ -151,7 +166,9 @@ def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
         "F skipped: frames on which an epipolar system did not use its fundamental matrix.": epipolar,
         CACHED_NOTE: any(row.cached for row in board.rows),
         computer_note(board): True,
-        f"{SEEN_NOTE} {rule} Instances 100-199 are held out.": any(row.seen_in_training for row in board.rows),
+        f"{SEEN_NOTE} {rule} Instances 100-199 are held out.": any(
+            row.seen_in_training for row in board.rows
+        ),
         f"{HINTED} The trajectories of {_count(sum(bool(row.hints) for row in board.rows), 'run')} are probably faulty "
         f"({hinted}), as the diagnostics say; no number is changed for that.": hinted,
     }
@@ -166,22 +183,32 @@ def _hinted(rows: Iterable[RunRow]) -> str:
 
 def leaderboard_cells(board: Board, key: str) -> dict[str, TableCell]:
     """The cells of a tracker by the names of their columns; what is not known is empty."""
-    runs, standing = board.runs(key), board.placed.get(key)
+    runs = board.runs(key)
+    standing = board.placed.get(key)
     ended = [row for row in runs if not row.failed]
     coverage = mean_of(row.coverage for row in runs)
     hinted = _hinted(runs)
-    masks = " + ".join(sorted({label_text(row.segmentation) for row in runs if row.segmentation not in ("", "none")}))
-    tracker, skipped = runs[0].tracker, mean_of(row.epipolar_skipped for row in runs)
+    masks = " + ".join(
+        sorted(
+            {label_text(row.segmentation) for row in runs if row.segmentation not in ("", "none")}
+        )
+    )
+    tracker = runs[0].tracker
+    skipped = mean_of(row.epipolar_skipped for row in runs)
     cells = dict.fromkeys((column.name for column in COLUMNS), TableCell()) | {
         "#": TableCell("–"),
         "success": TableCell(f"{len(ended)}/{len(runs)}", value=len(ended) / len(runs)),
-        "tracker": TableCell(board.labels[key] + f" {HINTED}" * bool(hinted), hinted, tip=tracker.id),
+        "tracker": TableCell(
+            board.labels[key] + f" {HINTED}" * bool(hinted), hinted, tip=tracker.id
+        ),
         "coverage": TableCell(coverage_text(coverage), value=coverage),
         "× real time": speed_cell(board, ended),
         "MB": number(middle(row.peak_memory_mb for row in ended), ".0f"),
         "rows": TableCell(
             small=runs[0].program_remark,
-            tag=" + ".join(f"{n} {origin}" for origin, n in Counter(row.origin for row in runs).items()),
+            tag=" + ".join(
+                f"{n} {origin}" for origin, n in Counter(row.origin for row in runs).items()
+            ),
         ),
         "F skipped": TableCell() if skipped is None else TableCell(percent(skipped), value=skipped),
         "provenance": TableCell(
@@ -212,8 +239,16 @@ def verdict_cell(board: Board, standing: Standing) -> TableCell:
     """Better than the reference, worse, or cannot tell, with the corrected p value; coloured where it is shown."""
     if not standing.verdict or (len(board.common) < FEWEST and standing.verdict != "reference"):
         return TableCell()
-    p = "" if standing.p_value is None else "p < 0.001" if standing.p_value < 0.001 else f"p {standing.p_value:.3f}"
-    return TableCell(standing.verdict, p, shade={"better": shade(0.5), "worse": shade(2.0)}.get(standing.verdict))
+    p = (
+        ""
+        if standing.p_value is None
+        else "p < 0.001"
+        if standing.p_value < 0.001
+        else f"p {standing.p_value:.3f}"
+    )
+    return TableCell(
+        standing.verdict, p, shade={"better": shade(0.5), "worse": shade(2.0)}.get(standing.verdict)
+    )
 
 
 def category_table(boards: Mapping[str, Board]) -> Table | None:
@@ -238,7 +273,9 @@ def category_table(boards: Mapping[str, Board]) -> Table | None:
         for key in overall.trackers
     ]
     columns = [
-        Column(name, meaning=f"{_count(len(board.common), 'sequence')}, against {board.reference_name}")
+        Column(
+            name, meaning=f"{_count(len(board.common), 'sequence')}, against {board.reference_name}"
+        )
         for name, board in boards.items()
     ]
     caption = (
@@ -246,8 +283,11 @@ def category_table(boards: Mapping[str, Board]) -> Table | None:
         f"{FEWEST} sequences on. Blue: better than the reference; orange: worse; no colour: cannot tell or not ranked. "
         "A sequence may be in several categories: what moves there, how the camera moves, recorded or rendered."
     )
-    muted, separators = overall.unranked_rows(overall.trackers), overall.separators()
-    return Table("categories", "By category", caption, [*texts("tracker"), *columns], rows, muted, separators)
+    muted = overall.unranked_rows(overall.trackers)
+    separators = overall.separators()
+    return Table(
+        "categories", "By category", caption, [*texts("tracker"), *columns], rows, muted, separators
+    )
 
 
 def pair_table(board: Board) -> Table | None:
@@ -263,9 +303,14 @@ def pair_table(board: Board) -> Table | None:
         ratio = pair.ratio.value if pair.one == key else 1.0 / pair.ratio.value
         apart = pair.verdict != "cannot tell"
         colour = shade(0.5 if ratio < 1 else 2.0) if apart else None
-        return TableCell(f"{ratio:.2f}", "" if apart else "?", ratio, shade=colour, tip=f"p {pair.p_value:.3f}")
+        return TableCell(
+            f"{ratio:.2f}", "" if apart else "?", ratio, shade=colour, tip=f"p {pair.p_value:.3f}"
+        )
 
-    rows = [[TableCell(board.labels[key]), *(shown(key, other) for other in board.ranked)] for key in board.ranked]
+    rows = [
+        [TableCell(board.labels[key]), *(shown(key, other) for other in board.ranked)]
+        for key in board.ranked
+    ]
     caption = (
         "Geometric mean of the errors of the row over those of the column. Coloured: the two can be told apart (paired "
         "t tests of the log errors over sequences, Holm-corrected over all pairs); '?': they cannot."
@@ -277,12 +322,15 @@ def pair_table(board: Board) -> Table | None:
 def speed_cell(board: Board, ended: Sequence[RunRow]) -> TableCell:
     """Real-time factor and frame time on one computer, with their marks (`time_marks`)."""
     rows = timed_on_one(ended, board.timing_computer)
-    factor, frame_ms = middle(row.real_time_factor for row in rows), middle(row.frame_ms for row in rows)
+    factor = middle(row.real_time_factor for row in rows)
+    frame_ms = middle(row.frame_ms for row in rows)
     if factor is None:
         return TableCell()
     mark, tip = time_marks(board, ended)
     small = "" if frame_ms is None else f"{frame_ms:.1f} ms{mark}"
-    return TableCell((f"{factor:.2f}" if factor < 100 else f"{factor:.0f}") + mark, small, factor, tip=tip)
+    return TableCell(
+        (f"{factor:.2f}" if factor < 100 else f"{factor:.0f}") + mark, small, factor, tip=tip
+    )
 
 
 def frame_time_cell(board: Board, ended: Sequence[RunRow]) -> TableCell:
@@ -296,7 +344,8 @@ def frame_time_cell(board: Board, ended: Sequence[RunRow]) -> TableCell:
 
 def time_marks(board: Board, ended: Sequence[RunRow]) -> tuple[str, str]:
     """What stands behind the times of some runs, and why: the stage cache, and other computers than most runs had."""
-    marks, tips = [], []
+    marks = []
+    tips = []
     if any(row.cached for row in timed_on_one(ended, board.timing_computer)):
         marks.append(CACHED_MARK)
         tips.append(CACHED_NOTE)
@@ -306,7 +355,9 @@ def time_marks(board: Board, ended: Sequence[RunRow]) -> tuple[str, str]:
         by_number = sorted(by_computer.items(), key=lambda entry: (-len(entry[1]), entry[0]))
         for computer, rows in by_number:
             frame_ms = middle(row.frame_ms for row in rows) or 0.0
-            tips.append(f"{frame_ms:.1f} ms on {computer_words(computer)} ({_count(len(rows), 'run')})")
+            tips.append(
+                f"{frame_ms:.1f} ms on {computer_words(computer)} ({_count(len(rows), 'run')})"
+            )
     return "".join(marks), "; ".join(tips)
 
 
@@ -317,7 +368,9 @@ def computer_words(computer: str) -> str:
 
 def computer_note(board: Board) -> str:
     """On which computer times were taken, and that some are of others; empty where all are of one."""
-    others = {row.computer for row in timed([row for row in board.rows if not row.failed])} - {board.timing_computer}
+    others = {row.computer for row in timed([row for row in board.rows if not row.failed])} - {
+        board.timing_computer
+    }
     if not others:
         return ""
     return (
@@ -338,7 +391,11 @@ def ratio_cell(board: Board, standing: Standing) -> TableCell:
 
 def interval_cell(interval: Interval, digits: str, emphasis: Emphasis = "") -> TableCell:
     """A value with its interval, if it has one."""
-    small = f"[{interval.low:{digits}}, {interval.high:{digits}}]" if math.isfinite(interval.low) else ""
+    small = (
+        f"[{interval.low:{digits}}, {interval.high:{digits}}]"
+        if math.isfinite(interval.low)
+        else ""
+    )
     return TableCell(f"{interval.value:{digits}}", small, interval.value, emphasis)
 
 
@@ -385,12 +442,15 @@ def metric_table(
         unit: What the numbers are, in a word or two.
         text: How the number is written; metres become millimetres by default.
         larger_is_better: Which end is bold.
-        doubt: Why the number of a cell says nothing, empty if it does; such a cell carries `DOUBT` and is never bold.
+        doubt: Why the number of a cell says nothing, empty if it does; such a cell carries `DOUBT`
+            and is never bold.
     """
     values = medians(board, value)
     if not values:
         return None
-    doubtful: dict[tuple[str, str], Emphasis] = {(k, s): "muted" for k, s in values if doubt(board.cells[k][s])}
+    doubtful: dict[tuple[str, str], Emphasis] = {
+        (k, s): "muted" for k, s in values if doubt(board.cells[k][s])
+    }
     sign = -1.0 if larger_is_better else 1.0
     compared = {place: sign * number for place, number in values.items() if place not in doubtful}
     return _sequence_table(
@@ -436,9 +496,14 @@ def _sequence_table(
         text: How a number is written.
         behind: What stands behind the numbers of a cell.
         tip: The tip of a cell.
-        marks: Emphasis of the numbers of each kind; None for the best and second best of every column.
+        marks: Emphasis of the numbers of each kind; None for the best and second best of every
+            column.
     """
-    marks = {kind: column_marks(board, values) for kind, values in measures.items()} if marks is None else marks
+    marks = (
+        {kind: column_marks(board, values) for kind, values in measures.items()}
+        if marks is None
+        else marks
+    )
     measured = {key for values in measures.values() for key, _ in values}
     keys = [key for key in (*board.trackers, *board.final_only) if key in measured]
 
@@ -452,7 +517,10 @@ def _sequence_table(
         return TableCell(text(value) + behind(cell), value=value, emphasis=mark, tip=tip(cell))
 
     rows = [
-        [TableCell(board.labels[key]), *(shown((key, name), kind) for name in board.sequences for kind in measures)]
+        [
+            TableCell(board.labels[key]),
+            *(shown((key, name), kind) for name in board.sequences for kind in measures),
+        ]
         for key in keys
     ]
     muted = board.unranked_rows(keys)
@@ -484,8 +552,16 @@ def column_marks(board: Board, values: Values) -> dict[tuple[str, str], Emphasis
     """
     marks: dict[tuple[str, str], Emphasis] = {}
     for name in board.sequences:
-        keys = [key for key in board.ranked if name in board.cells[key] and not board.cells[key][name].failed]
-        places = [(k, name) for k in keys if board.competes(k, name) and not board.no_better_than_static(k, name)]
+        keys = [
+            key
+            for key in board.ranked
+            if name in board.cells[key] and not board.cells[key][name].failed
+        ]
+        places = [
+            (k, name)
+            for k in keys
+            if board.competes(k, name) and not board.no_better_than_static(k, name)
+        ]
         marks |= zip(places, emphasise([values.get(place) for place in places]), strict=True)
     return marks
 
@@ -495,23 +571,40 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
     sizes = Counter(len(cell.rows) for key in board.trackers for cell in board.cells[key].values())
     usual = sizes.most_common(1)[0][0] if sizes else 1
     marks = column_marks(
-        board, {(key, name): board.cells[key][name].median or 0.0 for key in board.ranked for name in board.scored(key)}
+        board,
+        {
+            (key, name): board.cells[key][name].median or 0.0
+            for key in board.ranked
+            for name in board.scored(key)
+        },
     )
     rows = []
     for key in board.trackers:
         name_cell = TableCell(board.labels[key], tag="imported" * board.first(key).imported)
-        errors = (_error_cell(board, key, name, marks.get((key, name), ""), usual) for name in board.sequences)
+        errors = (
+            _error_cell(board, key, name, marks.get((key, name), ""), usual)
+            for name in board.sequences
+        )
         rows.append([name_cell, *errors])
-    rows.append([TableCell(STATIC_CAMERA), *(_static_camera_cell(board, name) for name in board.sequences)])
+    rows.append(
+        [TableCell(STATIC_CAMERA), *(_static_camera_cell(board, name) for name in board.sequences)]
+    )
     separators = board.separators() | {len(board.trackers)} | ({len(rows)} if reported else set())
     for (name, tag), published in grouped(reported, lambda cell: (cell.system, cell.tag)).items():
         line = {cell.sequence: cell for cell in reversed(published)}
         printed = [line.get(sequence) for sequence in board.sequences]
-        cells = [TableCell(mm(p.value), value=p.value, tip=p.source) if p else TableCell() for p in printed]
+        cells = [
+            TableCell(mm(p.value), value=p.value, tip=p.source) if p else TableCell()
+            for p in printed
+        ]
         rows.append([TableCell(name, tag=tag), *cells])
     muted = board.unranked_rows(board.trackers) | set(range(len(board.trackers), len(rows)))
     first = board.sequences[0]
-    names = "" if board.short[first] == first else f"'{board.short[first]}' stands for {first}, and so on. "
+    names = (
+        ""
+        if board.short[first] == first
+        else f"'{board.short[first]}' stands for {first}, and so on. "
+    )
     caption = (
         f"Median ATE (RMSE, millimetres; metres in the CSV) over the runs of a cell ({usual} unless n says otherwise), "
         "lost frames held at the last tracked pose. Behind it half the interquartile range of the runs that differ, or "
@@ -532,7 +625,9 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
         columns.append(Column(f"{SEEN} trained on", numeric=False, meaning=SEEN_NOTE))
         for key, row in zip_longest(board.trackers, rows):
             cells_of = board.cells.get(key, {})
-            trained = [name for name in board.sequences if name in cells_of and cells_of[name].in_training]
+            trained = [
+                name for name in board.sequences if name in cells_of and cells_of[name].in_training
+            ]
             row.append(TableCell(", ".join(board.short[name] for name in trained)))
         caption += f" {SEEN_NOTE}"
     return Table(
@@ -563,9 +658,17 @@ def final_errors(board: Board, protocol: Protocol) -> Table | None:
 
 def _final_doubt(cell: Cell) -> str:
     """Why the error of a final trajectory says little: it lacks poses of frames that were tracked."""
-    shares = [row.final_coverage / row.coverage for row in cell.rows if row.final_coverage and row.coverage]
+    shares = [
+        row.final_coverage / row.coverage
+        for row in cell.rows
+        if row.final_coverage and row.coverage
+    ]
     least = min(shares, default=1.0)
-    return f"it has poses of only {100 * least:.0f} % of the tracked frames" if least < FINAL_SHARE else ""
+    return (
+        f"it has poses of only {100 * least:.0f} % of the tracked frames"
+        if least < FINAL_SHARE
+        else ""
+    )
 
 
 def tracked_errors(board: Board, protocol: Protocol) -> Table | None:
@@ -584,7 +687,11 @@ def relative_errors(board: Board, protocol: Protocol) -> list[Table]:
     """One table for each relative error of the protocol and each of its parts."""
 
     def table(spec: RPESpec, part: str, unit: str, name: str) -> Table | None:
-        per = {"s": "/s", "f": " per frame"}.get(spec.unit, "") if spec.delta == 1 or spec.rate else ""
+        per = (
+            {"s": "/s", "f": " per frame"}.get(spec.unit, "")
+            if spec.delta == 1 or spec.rate
+            else ""
+        )
         return metric_table(
             board,
             lambda row: row.metrics.get(spec.metric(part)),
@@ -597,7 +704,12 @@ def relative_errors(board: Board, protocol: Protocol) -> list[Table]:
         )
 
     parts = (("trans", "mm", "translation"), ("rot", "°", "rotation"))
-    return [shown for spec in protocol.rpe for part in parts if (shown := table(spec, *part)) is not None]
+    return [
+        shown
+        for spec in protocol.rpe
+        for part in parts
+        if (shown := table(spec, *part)) is not None
+    ]
 
 
 def rotation_errors(board: Board, protocol: Protocol) -> Table | None:
@@ -629,7 +741,10 @@ def false_motion(board: Board, protocol: Protocol) -> Table | None:
     farthest = medians(board, lambda row: row.metrics.get("false_motion_max_m"))
     if not farthest:
         return None
-    values = {"farthest": farthest, "path": medians(board, lambda row: row.metrics.get("false_motion_path_m"))}
+    values = {
+        "farthest": farthest,
+        "path": medians(board, lambda row: row.metrics.get("false_motion_path_m")),
+    }
     still = {name for _, name in farthest}
     return _sequence_table(
         replace(board, sequences=[name for name in board.sequences if name in still]),
@@ -662,7 +777,11 @@ def _rotation_doubt(cell: Cell) -> str:
     """Why the absolute rotational error of a cell says nothing, with the largest uncertainty; empty if it does."""
     uncertain = [row for row in cell.kept if not row.failed and not row.rotation_reliable]
     largest = max((row.rotation_uncertainty_deg or 0.0 for row in uncertain), default=0.0)
-    return f"unreliable: the alignment's rotation is known to ±{largest:.0f}° only" if uncertain else ""
+    return (
+        f"unreliable: the alignment's rotation is known to ±{largest:.0f}° only"
+        if uncertain
+        else ""
+    )
 
 
 def _error_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual: int) -> TableCell:
@@ -677,7 +796,8 @@ def _error_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual: in
         return TableCell(cell.ending, count, emphasis="failed", tip=tip, link=link)
     if cell.median is None:
         return TableCell("", emphasis="muted")
-    skipped, base = mean_of(row.epipolar_skipped for row in cell.rows), board.reference_median(sequence)
+    skipped = mean_of(row.epipolar_skipped for row in cell.rows)
+    base = board.reference_median(sequence)
     no_better = board.no_better_than_static(key, sequence)
     ratio = None if base is None else cell.median / max(base, FLOOR_M)
     notes = [
@@ -688,7 +808,11 @@ def _error_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual: in
         f"{cell.success}/{len(cell.rows)} succeeded" if cell.failed else "",
     ]
     shown = TableCell(
-        mm(cell.median) + SEEN * cell.in_training, ", ".join(filter(None, notes)), cell.median, mark, link=link
+        mm(cell.median) + SEEN * cell.in_training,
+        ", ".join(filter(None, notes)),
+        cell.median,
+        mark,
+        link=link,
     )
     if ratio is None or cell.in_training:
         return replace(shown, tip=coverage if ratio is None else SEEN_NOTE)
@@ -706,7 +830,8 @@ def _spread(cell: Cell) -> str:
 
 
 def _static_camera_cell(board: Board, sequence: str) -> TableCell:
-    value, base = board.static_camera[sequence], board.reference_median(sequence)
+    base = board.reference_median(sequence)
+    value = board.static_camera[sequence]
     if base is None:
         return TableCell(mm(value), value=value)
     ratio = value / max(base, FLOOR_M)
@@ -730,9 +855,15 @@ def failure_rule_table(board: Board) -> Table | None:
         "lost frames left out": _tracked_error,
         "failures left out too": lambda row: None if row.failed else _tracked_error(row),
     }
-    columns = [*texts("tracker"), *(column for name in rules for column in numbers("#", "ATE ratio", group=name))]
+    columns = [
+        *texts("tracker"),
+        *(column for name in rules for column in numbers("#", "ATE ratio", group=name)),
+    ]
     cells = [
-        {s.key: [rank_cell(s), interval_cell(s.ratio, ".2f")] for s in rank(board, board.ranked, board.ranked, rule)}
+        {
+            s.key: [rank_cell(s), interval_cell(s.ratio, ".2f")]
+            for s in rank(board, board.ranked, board.ranked, rule)
+        }
         for rule in rules.values()
     ]
     empty = [TableCell(), TableCell()]
@@ -768,7 +899,11 @@ def failures(board: Board) -> Table | None:
     failed = [row for row in board.rows if row.failed]
     if not failed:
         return None
-    columns = [*texts("tracker", "sequence", "repeat", "ended"), Column("coverage"), *texts("reason", "run")]
+    columns = [
+        *texts("tracker", "sequence", "repeat", "ended"),
+        Column("coverage"),
+        *texts("reason", "run"),
+    ]
     rows = [
         [
             TableCell(board.labels[row.variant_key]),
@@ -779,7 +914,9 @@ def failures(board: Board) -> Table | None:
             TableCell(row.reason),
             TableCell(row.run_id, link=run_link(row)),
         ]
-        for row in sorted(failed, key=lambda r: (board.labels[r.variant_key], board.sequence(r), r.repeat_key))
+        for row in sorted(
+            failed, key=lambda r: (board.labels[r.variant_key], board.sequence(r), r.repeat_key)
+        )
     ]
     return Table(
         "failures",
@@ -795,7 +932,10 @@ def repeatability(board: Board) -> Table | None:
     columns = [
         Column("tracker", numeric=False),
         Column("cells", meaning="sequences with several runs that differ"),
-        Column("deterministic", meaning="sequences on which several seeds gave one result to the last digit"),
+        Column(
+            "deterministic",
+            meaning="sequences on which several seeds gave one result to the last digit",
+        ),
         Column("runs a cell"),
         Column("worst / best", meaning="median over cells of the largest over the smallest ATE"),
         Column("largest worst / best"),
@@ -823,7 +963,9 @@ def _spread_cells(board: Board, key: str) -> list[TableCell]:
     counts = [TableCell(board.labels[key]), number(len(several)), number(copies)]
     if not several:
         return [*counts, *[TableCell()] * 4] if copies else []
-    errors = {name: [row.score_m or 0.0 for row in cell.succeeded] for name, cell in several.items()}
+    errors = {
+        name: [row.score_m or 0.0 for row in cell.succeeded] for name, cell in several.items()
+    }
     spreads = {name: max(values) / max(min(values), FLOOR_M) for name, values in errors.items()}
     widest = max(spreads, key=lambda name: (spreads[name], name))
     size = f"{median(len(cell.succeeded) for cell in several.values()):g}"
@@ -836,7 +978,13 @@ def machines(board: Board) -> Table:
     counts = Counter(row.machine_words or "not recorded" for row in board.rows)
     columns = [Column("runs"), Column("machine and versions", numeric=False)]
     rows = [[number(count), TableCell(name)] for name, count in counts.most_common()]
-    return Table("machines", "Machines and versions", "Times of different machines are not comparable.", columns, rows)
+    return Table(
+        "machines",
+        "Machines and versions",
+        "Times of different machines are not comparable.",
+        columns,
+        rows,
+    )
 
 
 # -- the implemented paper's Tables 1 to 3, made of our own runs
@@ -845,12 +993,18 @@ SUBJECT = "emfoa-oft"
 """Tracker whose improvement over the others is shown, where it was run."""
 STATISTICS = {"rmse": "RMSE", "mean": "mean", "median": "median", "std": "SD"}
 LOST_MARK = "¶"
-LOST_NOTE = f"{LOST_MARK} Frames were lost in a run of the cell: the error is of the tracked ones only."
+LOST_NOTE = (
+    f"{LOST_MARK} Frames were lost in a run of the cell: the error is of the tracked ones only."
+)
 
 
 def subject_of(board: Board) -> str | None:
     """The tracker that is compared with the others: `SUBJECT` as it is by default, else the best ranked one."""
-    own = [key for key in board.trackers if board.first(key).tracker.id == SUBJECT and key not in board.hopeless]
+    own = [
+        key
+        for key in board.trackers
+        if board.first(key).tracker.id == SUBJECT and key not in board.hopeless
+    ]
     best = board.ranked[0] if board.ranked else None
     return min(own, key=lambda key: len(board.first(key).variant), default=best)
 
@@ -881,7 +1035,9 @@ def relative_table(board: Board, protocol: Protocol) -> Table | None:
 def time_table(board: Board) -> Table | None:
     """Table 3: accuracy, error and time of a frame; None if nothing was scored."""
     measures = {
-        "accuracy (%)": medians(board, lambda row: None if (share := _share(row)) is None else 100 - share),
+        "accuracy (%)": medians(
+            board, lambda row: None if (share := _share(row)) is None else 100 - share
+        ),
         "error (%)": medians(board, _share),
         "time (ms)": _frame_times(board),
     }
@@ -921,7 +1077,11 @@ def _frame_times(board: Board) -> dict[tuple[str, str], float]:
 def _share(row: RunRow) -> float | None:
     """A run's error in percent of that of a static camera."""
     static_m = row.static_camera_ate_rmse_m
-    return None if not static_m or row.hold_last_pose_ate_m is None else 100 * row.hold_last_pose_ate_m / static_m
+    return (
+        None
+        if not static_m or row.hold_last_pose_ate_m is None
+        else 100 * row.hold_last_pose_ate_m / static_m
+    )
 
 
 def _statistics_table(
@@ -942,7 +1102,9 @@ def _statistics_table(
         brief,
         behind=lambda cell: SEEN * cell.in_training + LOST_MARK * has_lost(cell),
     )
-    table.caption += f" {LOST_NOTE}" * any(cell.text.endswith(LOST_MARK) for row in table.rows for cell in row)
+    table.caption += f" {LOST_NOTE}" * any(
+        cell.text.endswith(LOST_MARK) for row in table.rows for cell in row
+    )
     keys = {key for key, _ in errors["rmse"]}
     subject = subject_of(board)
     others = [key for key in board.ranked if key in keys and key != subject]
@@ -959,7 +1121,11 @@ def _statistics_table(
         return None if ours is None or not theirs else 100 * (theirs - ours) / theirs
 
     for other in others:
-        gains = (gain(other, sequence, values) for sequence in board.sequences for values in errors.values())
+        gains = (
+            gain(other, sequence, values)
+            for sequence in board.sequences
+            for values in errors.values()
+        )
         name_cell = TableCell(f"improvement on {board.labels[other]}")
         table.rows.append([name_cell, *(number(percents, ".1f", " %") for percents in gains)])
     return table
@@ -969,10 +1135,15 @@ def sequence_columns(board: Board, kinds: Sequence[str] = ("",)) -> list[Column]
     """One column for every sequence, grouped; of several kinds of numbers one for each of them."""
     if len(kinds) == 1:
         return [
-            Column(board.short[name], group=board.groups[name], meaning=name, full=name) for name in board.sequences
+            Column(board.short[name], group=board.groups[name], meaning=name, full=name)
+            for name in board.sequences
         ]
     return [
-        Column(STATISTICS.get(kind, kind), board.short[name], full=f"{name}: {STATISTICS.get(kind, kind)}")
+        Column(
+            STATISTICS.get(kind, kind),
+            board.short[name],
+            full=f"{name}: {STATISTICS.get(kind, kind)}",
+        )
         for name in board.sequences
         for kind in kinds
     ]

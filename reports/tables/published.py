@@ -49,7 +49,14 @@ def published_table(lines: pd.DataFrame) -> Table | None:
         "authors of the system, or a third party, which may have run it or quote them. Year: of the source. Most leave "
         "lost frames out. 'SE(3) or not stated': a table of a system with depth that states no alignment."
     )
-    return Table("published", "Published errors", caption, columns, rows, brief="Published errors, as printed")
+    return Table(
+        "published",
+        "Published errors",
+        caption,
+        columns,
+        rows,
+        brief="Published errors, as printed",
+    )
 
 
 def span_table(spans: pd.DataFrame) -> Table | None:
@@ -80,7 +87,9 @@ def span_table(spans: pd.DataFrame) -> Table | None:
         "The lowest and the highest published ATE of one system under one alignment. By its authors: the lowest that "
         "they print."
     )
-    return Table("published_spans", "What is published of one system differs", caption, columns, rows)
+    return Table(
+        "published_spans", "What is published of one system differs", caption, columns, rows
+    )
 
 
 def _printed(value: Any, name: str) -> TableCell:

@@ -101,7 +101,8 @@ class Table:
         rows: A cell for every column, by row.
         muted_rows: Rows that are shown but do not compete.
         separators: Rows above which a line is drawn.
-        brief: Caption where there is little room, without the full stop: what is shown, and its unit.
+        brief: Caption where there is little room, without the full stop: what is shown, and its
+            unit.
     """
 
     id: str
@@ -116,18 +117,26 @@ class Table:
     def frame(self) -> pd.DataFrame:
         """What CSV holds, in columns named by `Column.key`.
 
-        Numbers have all their digits, in the units that the caption and the headings name (errors in metres, times in
-        milliseconds, shares from 0 to 1); other cells have their words.
+        Numbers have all their digits, in the units that the caption and the headings name (errors
+        in metres, times in milliseconds, shares from 0 to 1); other cells have their words.
         """
-        lines = [[_words(cell) if cell.value is None else cell.value for cell in row] for row in self.rows]
+        lines = [
+            [_words(cell) if cell.value is None else cell.value for cell in row]
+            for row in self.rows
+        ]
         return pd.DataFrame(lines, columns=[column.key for column in self.columns], dtype=object)
 
     def displayed(self) -> Table:
         """The table as pages, Markdown and LaTeX show it; CSV has all.
 
-        Columns in which nothing is written are left out, and rows behind `MOST_ROWS`, which the caption says.
+        Columns in which nothing is written are left out, and rows behind `MOST_ROWS`, which the
+        caption says.
         """
-        kept = [at for at in range(len(self.columns)) if not self.rows or any(_words(row[at]) for row in self.rows)]
+        kept = [
+            at
+            for at in range(len(self.columns))
+            if not self.rows or any(_words(row[at]) for row in self.rows)
+        ]
         caption = self.caption
         if len(self.rows) > MOST_ROWS:
             caption += f" These are the first {MOST_ROWS} of {len(self.rows)} rows; all stand in csv/{self.id}.csv."
@@ -135,7 +144,9 @@ class Table:
 
     def without(self, *names: str) -> Table:
         """The table without the columns of these names."""
-        return self._with_columns([at for at, column in enumerate(self.columns) if column.name not in names])
+        return self._with_columns(
+            [at for at, column in enumerate(self.columns) if column.name not in names]
+        )
 
     def _with_columns(self, kept: Sequence[int]) -> Table:
         rows = [[row[at] for at in kept] for row in self.rows]
@@ -143,13 +154,19 @@ class Table:
 
     def groups(self) -> list[tuple[str, int]]:
         """Neighbouring columns of one group: name and how many."""
-        return [(name, len(list(group))) for name, group in groupby(self.columns, key=lambda column: column.group)]
+        return [
+            (name, len(list(group)))
+            for name, group in groupby(self.columns, key=lambda column: column.group)
+        ]
 
 
 def to_markdown(table: Table) -> str:
     """The table as GitHub Markdown with its caption."""
     table = table.displayed()
-    names = [f"{column.group}: {column.name}" if column.group else column.name for column in table.columns]
+    names = [
+        f"{column.group}: {column.name}" if column.group else column.name
+        for column in table.columns
+    ]
     lines = [
         f"## {prose(table.title)}",
         "",
@@ -190,7 +207,11 @@ def _escape_markdown(text: str) -> str:
 
 def _markdown_cell(cell: TableCell) -> str:
     mark = {"best": "**", "second": "*"}.get(cell.emphasis, "") if cell.text else ""
-    parts = [mark + _escape_markdown(cell.text) + mark, _escape_markdown(cell.small), f"({cell.tag})" * bool(cell.tag)]
+    parts = [
+        mark + _escape_markdown(cell.text) + mark,
+        _escape_markdown(cell.small),
+        f"({cell.tag})" * bool(cell.tag),
+    ]
     return " ".join(filter(None, parts))
 
 
@@ -224,7 +245,11 @@ def percent(share: float) -> str:
     """A share as whole percents, but nothing short of all is 100 % and nothing above none 0 %."""
     rounded = round(100 * share)
     if (rounded == 100 and share < 1) or (rounded == 0 and share > 0):
-        return f"{100 * share:.1f} %" if 0.0005 <= share < 0.9995 else ("< 0.1 %" if share < 0.5 else "> 99.9 %")
+        return (
+            f"{100 * share:.1f} %"
+            if 0.0005 <= share < 0.9995
+            else ("< 0.1 %" if share < 0.5 else "> 99.9 %")
+        )
     return f"{rounded} %"
 
 
@@ -240,9 +265,28 @@ _HEADING = 11
 _STAR = r"\rlap{$^*$}"
 _LATEX = {
     **{character: f"\\{character}" for character in "&%$#_{}"},
-    **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "|": r"\textbar{}"},
-    **{"<": r"\textless{}", ">": r"\textgreater{}", "·": r"\textperiodcentered{}", "—": "---", "–": "--"},
-    **{"†": r"$^\dagger$", "‡": r"$^\ddagger$", "…": r"\ldots{}", "’": "'", "“": "``", "”": "''", '"': "''"},
+    **{
+        "\\": r"\textbackslash{}",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        "|": r"\textbar{}",
+    },
+    **{
+        "<": r"\textless{}",
+        ">": r"\textgreater{}",
+        "·": r"\textperiodcentered{}",
+        "—": "---",
+        "–": "--",
+    },
+    **{
+        "†": r"$^\dagger$",
+        "‡": r"$^\ddagger$",
+        "…": r"\ldots{}",
+        "’": "'",
+        "“": "``",
+        "”": "''",
+        '"': "''",
+    },
     "×": r"$\times$",
     "±": r"$\pm$",
     "≤": r"$\leq$",
@@ -257,8 +301,9 @@ _LATEX = {
 def to_latex(table: Table, protocol: str = "") -> str:
     """The table as one or several LaTeX tables that fit a column; needs the package ``booktabs`` and nothing else.
 
-    Columns that do not fit stand in further blocks below, and rows that do not fit in further tables. Captions are
-    short: what is shown, its unit and the protocol's name; everything else is in the other formats.
+    Columns that do not fit stand in further blocks below, and rows that do not fit in further
+    tables. Captions are short: what is shown, its unit and the protocol's name; everything else is
+    in the other formats.
 
     Args:
         table: The table.
@@ -267,20 +312,24 @@ def to_latex(table: Table, protocol: str = "") -> str:
     table = table.displayed()
     floats: list[list[str]] = []
     used = MOST_LINES
-    for text, lines in (tabular for columns in _blocks(table) for tabular in _tabulars(table, columns)):
+    for text, lines in (
+        tabular for columns in _blocks(table) for tabular in _tabulars(table, columns)
+    ):
         if used + lines > MOST_LINES:
             floats.append([])
             used = 0
         floats[-1].append(text)
         used += lines
-    return "\n".join(_float(table, tabulars, number, protocol) for number, tabulars in enumerate(floats))
+    return "\n".join(
+        _float(table, tabulars, number, protocol) for number, tabulars in enumerate(floats)
+    )
 
 
 def escape_latex(text: str) -> str:
     """Text with LaTeX's special characters escaped, on one line.
 
-    Letters of other alphabets than the Latin one and pictures, which ``pdflatex`` has no glyphs for, are named by their
-    code point: ``[U+1F600]``.
+    Letters of other alphabets than the Latin one and pictures, which ``pdflatex`` has no glyphs
+    for, are named by their code point: ``[U+1F600]``.
     """
     return "".join(_character(character) for character in " ".join(text.split()))
 
@@ -291,11 +340,19 @@ def _character(character: str) -> str:
     if character.isascii():
         return character if character.isprintable() else " "
     plain = unicodedata.normalize("NFKD", character).encode("ascii", "ignore").decode()
-    return "".join(_LATEX.get(letter, letter) for letter in plain) if plain else f"[U+{ord(character):04X}]"
+    return (
+        "".join(_LATEX.get(letter, letter) for letter in plain)
+        if plain
+        else f"[U+{ord(character):04X}]"
+    )
 
 
 def _float(table: Table, blocks: Sequence[str], number: int, protocol: str) -> str:
-    words = [table.brief or table.title] + [f"protocol {protocol}"] * bool(protocol) + ["continued"] * bool(number)
+    words = (
+        [table.brief or table.title]
+        + [f"protocol {protocol}"] * bool(protocol)
+        + ["continued"] * bool(number)
+    )
     note = " $^*$\\,our back end." if any(_STAR in block for block in blocks) else ""
     return "\n".join(
         [
@@ -318,8 +375,13 @@ def _blocks(table: Table) -> list[list[int]]:
     blocks: list[list[int]] = [[]]
     for at in (at for at in shown if at != names):
         by_group = groupby([*blocks[-1], at], key=lambda other: table.columns[other].group)
-        groups = [(name, sum(widths[other] + _GAP_PT for other in group)) for name, group in by_group]
-        if blocks[-1] and sum(max(width, _text_pt(name) + _GAP_PT) for name, width in groups) > available:
+        groups = [
+            (name, sum(widths[other] + _GAP_PT for other in group)) for name, group in by_group
+        ]
+        if (
+            blocks[-1]
+            and sum(max(width, _text_pt(name) + _GAP_PT) for name, width in groups) > available
+        ):
             blocks.append([])
         blocks[-1].append(at)
     return [[names, *columns] for columns in blocks]
@@ -327,7 +389,9 @@ def _blocks(table: Table) -> list[list[int]]:
 
 def _width_pt(table: Table, at: int) -> float:
     """About how wide a column is, in points."""
-    return max(map(_text_pt, [*(_plain(row[at]) for row in table.rows), *_heading(table.columns[at].name)]))
+    return max(
+        map(_text_pt, [*(_plain(row[at]) for row in table.rows), *_heading(table.columns[at].name)])
+    )
 
 
 def _text_pt(text: str) -> float:
@@ -356,7 +420,9 @@ def _tabulars(table: Table, columns: Sequence[int]) -> list[tuple[str, int]]:
     """Columns as one tabular, or as several where they have too many rows; each with its height in lines."""
     chosen = [table.columns[at] for at in columns]
     wide = _width_pt(table, columns[0]) > _NAMES_PT
-    kinds = (f"p{{{_NAMES_PT:.0f}pt}}" if wide else "l") + "".join("r" if c.numeric else "l" for c in chosen[1:])
+    kinds = (f"p{{{_NAMES_PT:.0f}pt}}" if wide else "l") + "".join(
+        "r" if c.numeric else "l" for c in chosen[1:]
+    )
     groups = replace(table, columns=chosen).groups()
     head = [_groups(groups)] if any(name for name, _ in groups) else []
     head.append(" & ".join(_stacked(column.name) for column in chosen) + " \\\\")
@@ -386,16 +452,29 @@ def _stacked(name: str) -> str:
 def _cell(cell: TableCell) -> str:
     if cell.emphasis == "failed":
         return "failed"
-    text, font = escape_latex(cell.text.replace(OUR_BACK_END, "")), {"best": "bf", "second": "it"}.get(cell.emphasis)
-    text = (f"\\text{font}{{{text}}}" if text and font else text) + _STAR * (OUR_BACK_END in cell.text)
-    return f"{text}~{{\\scriptsize {escape_latex(cell.small)}}}" if cell.small.startswith("[") else text
+    text = escape_latex(cell.text.replace(OUR_BACK_END, ""))
+    font = {"best": "bf", "second": "it"}.get(cell.emphasis)
+    text = (f"\\text{font}{{{text}}}" if text and font else text) + _STAR * (
+        OUR_BACK_END in cell.text
+    )
+    return (
+        f"{text}~{{\\scriptsize {escape_latex(cell.small)}}}"
+        if cell.small.startswith("[")
+        else text
+    )
 
 
 def _groups(groups: Sequence[tuple[str, int]]) -> str:
     """The line of headings above the columns' own, with a rule below each."""
-    cells, rules, at = [], [], 1
+    cells = []
+    rules = []
+    at = 1
     for name, width in groups:
-        cells.append(f"\\multicolumn{{{width}}}{{c}}{{{escape_latex(name)}}}" if name else " & ".join([""] * width))
+        cells.append(
+            f"\\multicolumn{{{width}}}{{c}}{{{escape_latex(name)}}}"
+            if name
+            else " & ".join([""] * width)
+        )
         rules += [f"\\cmidrule(lr){{{at}-{at + width - 1}}}"] if name else []
         at += width
     return " & ".join(cells) + " \\\\ " + " ".join(rules)

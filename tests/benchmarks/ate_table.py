@@ -1,13 +1,15 @@
 """Run trackers on sequences and print a Markdown table of their errors.
 
-    python tests/benchmarks/ate_table.py --trackers orb-slam2 'emfoa-oft segmentation.source=oracle' \\
+    python tests/benchmarks/ate_table.py --trackers orb-slam2 'emfoa-oft segmentation.source=oracle'
+    \\
         --sequences ./excerpts/rgbd_bonn_crowd 'synthetic/walking_xyz?scene=100' --offsets 0 3 --cell mean
 
-A tracker may be followed by settings; with ``--scenes`` the runs of all those scenes of a sequence are one cell. With
-one ``--show`` a row is a tracker and a column a sequence; with several a row is a tracker on a sequence. A cell holds
-the values of all runs (one for each start offset and seed), or their mean with the standard deviation, or their
-median with the range. Errors are those of tracked frames unless ``hold`` is shown; the least coverage follows in
-brackets where it is below 95 %. Runs are kept in ``--results`` and made once.
+A tracker may be followed by settings; with ``--scenes`` the runs of all those scenes of a sequence
+are one cell. With one ``--show`` a row is a tracker and a column a sequence; with several a row is
+a tracker on a sequence. A cell holds the values of all runs (one for each start offset and seed),
+or their mean with the standard deviation, or their median with the range. Errors are those of
+tracked frames unless ``hold`` is shown; the least coverage follows in brackets where it is below 95
+%. Runs are kept in ``--results`` and made once.
 """
 
 import itertools
@@ -41,13 +43,21 @@ COLUMNS = {
 
 def digits(value: float) -> str:
     """A count, or a figure with a tenth below a hundred; a dash where there is none."""
-    return "-" if np.isnan(value) else f"{value:.0f}" if value >= 99.95 or value.dtype.kind == "i" else f"{value:.1f}"
+    return (
+        "-"
+        if np.isnan(value)
+        else f"{value:.0f}"
+        if value >= 99.95 or value.dtype.kind == "i"
+        else f"{value:.1f}"
+    )
 
 
 CELLS: dict[str, Callable[[Sequence[float]], str]] = {
     "values": lambda values: ", ".join(map(digits, values)),
     "mean": lambda values: f"{digits(np.mean(values))} ± {digits(np.std(values, ddof=1))}",
-    "median": lambda values: f"{digits(np.median(values))} [{digits(np.min(values))} - {digits(np.max(values))}]",
+    "median": lambda values: (
+        f"{digits(np.median(values))} [{digits(np.min(values))} - {digits(np.max(values))}]"
+    ),
 }
 
 
@@ -67,7 +77,9 @@ def measured(run: RunResult) -> dict[str, float]:
 def cell(runs: pd.DataFrame, show: str, style: str) -> str:
     """The runs of one tracker on one sequence."""
     _, column, scale = COLUMNS[show]
-    values = scale * runs[column].to_numpy(int if pd.api.types.is_integer_dtype(runs[column]) else float)
+    values = scale * runs[column].to_numpy(
+        int if pd.api.types.is_integer_dtype(runs[column]) else float
+    )
     text = digits(values[0]) if len(set(values)) == 1 else CELLS[style](values)
     least = runs["coverage"].min()
     note = f" ({least:.0%} tracked)" if show in ("ate", "final") and least < 0.95 else ""
@@ -82,13 +94,16 @@ def main() -> None:
         realtime=False,
     )  # fmt: skip
     parser.add_argument("--scenes", nargs="+", type=int, default=[])
-    parser.add_argument("--trackers", nargs="+", required=True, metavar="'TRACKER [NAME=VALUE ...]'")
+    parser.add_argument(
+        "--trackers", nargs="+", required=True, metavar="'TRACKER [NAME=VALUE ...]'"
+    )
     parser.add_argument("--sequences", nargs="+", required=True)
     parser.add_argument("--show", nargs="+", default=["ate"], choices=COLUMNS)
     parser.add_argument("--cell", default="values", choices=CELLS)
     parser.add_argument("--frames", help="part of each sequence, A:B")
     chosen = parser.parse_args()
-    specs, keys = [], []
+    specs = []
+    keys = []
     for text, sequence in itertools.product(chosen.trackers, chosen.sequences):
         tracker, *assignments = text.split()
         new = make_specs(
@@ -100,27 +115,43 @@ def main() -> None:
         specs += new
         keys += [(text, sequence)] * len(new)
     runs = run_specs(specs, results=chosen.results, protocol=chosen.protocol, jobs=chosen.jobs)
-    table = db.load(chosen.results, chosen.protocol).set_index("run_id").loc[[run.record.run_id for run in runs]]
-    table = table.drop(columns="keyframes", errors="ignore").join(pd.DataFrame(map(measured, runs), table.index))
+    table = (
+        db.load(chosen.results, chosen.protocol)
+        .set_index("run_id")
+        .loc[[run.record.run_id for run in runs]]
+    )
+    table = table.drop(columns="keyframes", errors="ignore").join(
+        pd.DataFrame(map(measured, runs), table.index)
+    )
     cells = {key: part for key, part in table.groupby(pd.MultiIndex.from_tuples(keys), sort=False)}
     names = {sequence: sequence.rstrip("/").rpartition("/")[2] for sequence in chosen.sequences}
     labels = {
-        text: f"`{text.split()[0]}`" + "".join(f", {part.rpartition('/')[2]}" for part in text.split()[1:])
+        text: f"`{text.split()[0]}`"
+        + "".join(f", {part.rpartition('/')[2]}" for part in text.split()[1:])
         for text in chosen.trackers
     }
     if len(chosen.show) == 1:
         head = ["tracker", *names.values()]
         lines = [
-            [labels[text], *(cell(cells[text, sequence], chosen.show[0], chosen.cell) for sequence in names)]
+            [
+                labels[text],
+                *(cell(cells[text, sequence], chosen.show[0], chosen.cell) for sequence in names),
+            ]
             for text in labels
         ]
     else:
         head = ["sequence", "tracker", *(COLUMNS[show][0] for show in chosen.show)]
         lines = [
-            [names[sequence], labels[text], *(cell(cells[text, sequence], show, chosen.cell) for show in chosen.show)]
+            [
+                names[sequence],
+                labels[text],
+                *(cell(cells[text, sequence], show, chosen.cell) for show in chosen.show),
+            ]
             for sequence, text in itertools.product(names, labels)
         ]
-    rule = ["---"] * (1 + (len(chosen.show) > 1)) + ["---:"] * (len(head) - 1 - (len(chosen.show) > 1))
+    rule = ["---"] * (1 + (len(chosen.show) > 1)) + ["---:"] * (
+        len(head) - 1 - (len(chosen.show) > 1)
+    )
     print("\n".join(f"| {' | '.join(line)} |" for line in [head, rule, *lines]), end="\n\n")
 
 

@@ -16,17 +16,26 @@ import numpy as np
 import pandas as pd
 
 from dynslam_bench.geometry import Camera, se3
-from dynslam_bench.slam.bundle_adjustment import DEPTH_SHARE, BundleProblem, BundleResult, adjust_bundle
+from dynslam_bench.slam.bundle_adjustment import (
+    DEPTH_SHARE,
+    BundleProblem,
+    BundleResult,
+    adjust_bundle,
+)
 from dynslam_bench.slam.pose_optimisation import cauchy_width
 
 FIXED_SIGMA = 1e-5
 """Standard deviation (rad, m) of the prior of a fixed pose; an equality constraint is seven times slower."""
 
 
-REPEATS, OBSERVATIONS, ITERATIONS = 5, 6000, 3
+REPEATS = 5
+OBSERVATIONS = 6000
+ITERATIONS = 3
 
 
-def problem(observations: int, seed: int, poses: int = 14, variable: int = 8) -> tuple[BundleProblem, np.ndarray]:
+def problem(
+    observations: int, seed: int, poses: int = 14, variable: int = 8
+) -> tuple[BundleProblem, np.ndarray]:
     """A room seen from `poses` cameras, disturbed; and the true poses."""
     rng = np.random.default_rng(seed)
     camera = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
@@ -34,8 +43,11 @@ def problem(observations: int, seed: int, poses: int = 14, variable: int = 8) ->
     each = 5
     points = rng.uniform([-1.5, -1, 1.5], [1.5, 1, 4], (observations // each, 3))
     at = np.sort(np.argsort(rng.random((len(points), poses)), axis=1)[:, :each], axis=1)
-    obs_pose, obs_point = at.ravel(), np.repeat(np.arange(len(points)), each)
-    local = np.einsum("nij,nj->ni", truth[obs_pose, :3, :3], points[obs_point]) + truth[obs_pose, :3, 3]
+    obs_pose = at.ravel()
+    obs_point = np.repeat(np.arange(len(points)), each)
+    local = (
+        np.einsum("nij,nj->ni", truth[obs_pose, :3, :3], points[obs_point]) + truth[obs_pose, :3, 3]
+    )
     uv = camera.project(local)
     right = uv[:, 0] - camera.fx * camera.baseline_m / local[:, 2]
     uv = uv + rng.normal(0, 0.7, uv.shape)
@@ -44,14 +56,17 @@ def problem(observations: int, seed: int, poses: int = 14, variable: int = 8) ->
     start[:variable] = se3.exp(rng.normal(0, 0.01, (variable, 6))) @ truth[:variable]
     info = np.ones(len(uv))
     noisy = points + rng.normal(0, 0.02, points.shape)
-    return BundleProblem(start, variable, noisy, obs_pose, obs_point, uv, right, info, info, camera), truth
+    return BundleProblem(
+        start, variable, noisy, obs_pose, obs_point, uv, right, info, info, camera
+    ), truth
 
 
 def adjust_bundle_gtsam(problem: BundleProblem, iterations: int) -> BundleResult:
     """The same minimisation by gtsam's Levenberg-Marquardt; all observations have depth."""
     camera = problem.camera
     lens = gtsam.Cal3_S2Stereo(camera.fx, camera.fy, 0.0, camera.cx, camera.cy, camera.baseline_m)
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph = gtsam.NonlinearFactorGraph()
+    values = gtsam.Values()
     pose_keys = [gtsam.symbol("x", i) for i in range(len(problem.poses))]
     point_keys = [gtsam.symbol("l", i) for i in range(len(problem.points))]
     prior = gtsam.noiseModel.Isotropic.Sigma(6, FIXED_SIGMA)
@@ -66,7 +81,11 @@ def adjust_bundle_gtsam(problem: BundleProblem, iterations: int) -> BundleResult
     noise = gtsam.noiseModel.Robust.Create(cauchy, gtsam.noiseModel.Isotropic.Sigma(3, 1.0))
     for k, (u, v) in enumerate(problem.uv):
         keys = pose_keys[problem.obs_pose[k]], point_keys[problem.obs_point[k]]
-        graph.add(gtsam.GenericStereoFactor3D(gtsam.StereoPoint2(u, problem.right[k], v), noise, *keys, lens))
+        graph.add(
+            gtsam.GenericStereoFactor3D(
+                gtsam.StereoPoint2(u, problem.right[k], v), noise, *keys, lens
+            )
+        )
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(iterations)
     result = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()

@@ -1,24 +1,26 @@
 """Do the re-implemented systems fail and survive where the published ones do?
 
-Reads the results folder of ``dynslam-bench bench dynamic`` and prints, in Markdown, each system's class on each
-rendered replica beside the class that published figures put it in.
+Reads the results folder of ``dynslam-bench bench dynamic`` and prints, in Markdown, each system's
+class on each rendered replica beside the class that published figures put it in.
 
     dynslam-bench bench dynamic --results results
     python tests/benchmarks/baseline_signatures.py results
 
-Each instance of a replica is a row of its own. Its repeats (start offsets, sensor-noise seeds, seeds) are one cell: the
-median counts, the range stands beside it.
+Each instance of a replica is a row of its own. Its repeats (start offsets, sensor-noise seeds,
+seeds) are one cell: the median counts, the range stands beside it.
 
 Measured class (medians over the repeats):
-  fails     ATE >= 0.5 x that of a camera that never moves, or coverage < 80 %, or the run did not end;
-  survives  ATE <= 3 x that of `mask-rcnn` with exact masks on the same replica;
+  fails     ATE >= 0.5 x that of a camera that never moves, or coverage < 80 %, or the run did not
+  end; survives  ATE <= 3 x that of `mask-rcnn` with exact masks on the same replica;
   between   neither.
-Where a replica moves so little that both hold (half of never-move is below three times the reference system's error:
-the rotating and the standing camera), the cell survives: what is as good as exact masks has not failed.
+Where a replica moves so little that both hold (half of never-move is below three times the
+reference system's error: the rotating and the standing camera), the cell survives: what is as good
+as exact masks has not failed.
 
 Published class, from the product's own table of reported numbers, by the same rule: a cell is
-  fails     if all published ATEs of the system on the recorded sequence are >= 0.5 x never-move there;
-  survives  if all are <= 3 x the reference system's, which is DynaSLAM N (Mask R-CNN's masks alone), or where that is
+  fails     if all published ATEs of the system on the recorded sequence are >= 0.5 x never-move
+  there; survives  if all are <= 3 x the reference system's, which is DynaSLAM N (Mask R-CNN's masks
+  alone), or where that is
             not published the best published ATE of DynaSLAM;
 and clear if exactly one of the two holds. Sim(3)-aligned numbers and ablations do not count.
 """
@@ -37,7 +39,9 @@ from dynslam_bench.reports.model.published import published, static_camera_error
 from dynslam_bench.runs import DEFAULT_PROTOCOL, FAILED
 from dynslam_bench.trackers.registry import TRACKERS
 
-FAILS, SURVIVES, BETWEEN = "fails", "survives", "between"
+FAILS = "fails"
+SURVIVES = "survives"
+BETWEEN = "between"
 REFERENCES = (("DynaSLAM N",), ("DynaSLAM N+G", "DynaSLAM"))
 FAITHFUL = ("faithful-code", "faithful-paper")
 EXACT = "mask-rcnn with exact masks"
@@ -65,7 +69,9 @@ def recorded(replica: str) -> str:
 
 def published_values(names: Sequence[str], sequence: str) -> list[float]:
     """Published ATEs in metres of systems of these names on a recorded sequence, SE(3) or not stated."""
-    rows = published().query("system in @names and sequence == @sequence and metric == 'ate_rmse_m'")
+    rows = published().query(
+        "system in @names and sequence == @sequence and metric == 'ate_rmse_m'"
+    )
     return rows.loc[rows["alignment"] != "Sim(3)", "value"].tolist()
 
 
@@ -75,7 +81,9 @@ def published_class(tracker: str, sequence: str) -> str | None:
     if not values:
         return None
     standstill = static_camera_errors().get((sequence, "ape_rmse"))
-    reference = next((min(found) for names in REFERENCES if (found := published_values(names, sequence))), None)
+    reference = next(
+        (min(found) for names in REFERENCES if (found := published_values(names, sequence))), None
+    )
     fails = standstill is not None and min(values) >= 0.5 * standstill
     survives = reference is not None and max(values) <= 3 * reference
     if fails == survives:
@@ -87,8 +95,9 @@ def read_cells(folder: Path) -> pd.DataFrame:
     """Everything that the table needs of a suite's results: a row by (tracker, sequence), over its repeats.
 
     Returns:
-        Medians of the ATE in metres (with its `low` and `high`), of the coverage, and of the ATE of a camera that never
-        moves; whether any run is `broken`; provenance. The reference system is `EXACT`, others have default settings.
+        Medians of the ATE in metres (with its `low` and `high`), of the coverage, and of the ATE of
+        a camera that never moves; whether any run is `broken`; provenance. The reference system is
+        `EXACT`, others have default settings.
     """
     rows = []
     for run in load_runs(open_stores(folder), get_protocol(DEFAULT_PROTOCOL)).rows:
@@ -139,26 +148,44 @@ def report(folder: Path) -> str:
         "| --- | --- | --- | --- | --- |",
     ]
     for replica in replicas:
-        still, exact = standstill[replica], reference[replica]
-        lines.append(f"| {short(replica)} | {still:.3f} | {exact:.4f} | {0.5 * still:.4f} | {3 * exact:.4f} |")
+        still = standstill[replica]
+        exact = reference[replica]
+        lines.append(
+            f"| {short(replica)} | {still:.3f} | {exact:.4f} | {0.5 * still:.4f} | {3 * exact:.4f} |"
+        )
     lines += [
         "",
         "| system | provenance | replica | ATE m | coverage | measured | published | verdict |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
-    clear, misses = 0, []
-    by_name = {(key, place): cell for (key, place), cell in cells.iterrows() if key != EXACT and place in replicas}
-    order = sorted(by_name, key=lambda key: (by_name[key].provenance not in FAITHFUL, key[0], replicas.index(key[1])))
+    clear = 0
+    misses = []
+    by_name = {
+        (key, place): cell
+        for (key, place), cell in cells.iterrows()
+        if key != EXACT and place in replicas
+    }
+    order = sorted(
+        by_name,
+        key=lambda key: (by_name[key].provenance not in FAITHFUL, key[0], replicas.index(key[1])),
+    )
     for tracker, replica in order:
-        cell, expected = by_name[tracker, replica], published_class(tracker, recorded(replica))
+        cell = by_name[tracker, replica]
+        expected = published_class(tracker, recorded(replica))
         if expected is None:
             continue
-        measured = classify(cell.ate, cell.coverage, standstill[replica], reference[replica], cell.broken)
-        verdict = "not clear" if expected == BETWEEN else "match" if measured == expected else "**miss**"
+        measured = classify(
+            cell.ate, cell.coverage, standstill[replica], reference[replica], cell.broken
+        )
+        verdict = (
+            "not clear" if expected == BETWEEN else "match" if measured == expected else "**miss**"
+        )
         if cell.provenance in FAITHFUL and expected != BETWEEN:
             clear += 1
             if measured != expected:
-                misses.append(f"- {tracker} on {short(replica)}: {measured} ({cell.ate:.4f} m), published {expected}")
+                misses.append(
+                    f"- {tracker} on {short(replica)}: {measured} ({cell.ate:.4f} m), published {expected}"
+                )
         elif verdict != "not clear":
             verdict += " (not counted)"
         spread = f" ({cell.low:.4f}-{cell.high:.4f})" if cell.high - cell.low >= 5e-5 else ""
@@ -168,7 +195,10 @@ def report(folder: Path) -> str:
         )
     matched = clear - len(misses)
     share = f"{100 * matched / clear:.0f} %" if clear else "-"
-    lines += ["", f"Clear cells of faithful systems that match: {matched} of {clear} ({share}; the bar is 75 %)."]
+    lines += [
+        "",
+        f"Clear cells of faithful systems that match: {matched} of {clear} ({share}; the bar is 75 %).",
+    ]
     return "\n".join([*lines, "", "Misses:", "", *misses] if misses else lines)
 
 
@@ -179,7 +209,9 @@ def short(replica: str) -> str:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("results", type=Path, help="folder that 'dynslam-bench bench dynamic' wrote")
+    parser.add_argument(
+        "results", type=Path, help="folder that 'dynslam-bench bench dynamic' wrote"
+    )
     try:
         print(report(parser.parse_args().results))
     except DynslamError as error:

@@ -1,11 +1,12 @@
 """Real people pasted into real recordings: errors of trackers on many instances, beside those on the hosts alone.
 
-    python tests/benchmarks/composites.py ./excerpts/rgbd_dataset_freiburg1_xyz --with ./excerpts/man_130 --instances 10
+    python tests/benchmarks/composites.py ./excerpts/rgbd_dataset_freiburg1_xyz --with
+    ./excerpts/man_130 --instances 10
 
-The first table has a row a tracker: the median hold-last-pose ATE over instances with a 95 % interval (bootstrap), the
-ratio to the tracker's error on the host of each instance (geometric mean; that of orb-slam2 where a tracker needs
-masks), and the worst instance. The second one has the error of the last tracker by the share of the pixels that people
-fill.
+The first table has a row a tracker: the median hold-last-pose ATE over instances with a 95 %
+interval (bootstrap), the ratio to the tracker's error on the host of each instance (geometric mean;
+that of orb-slam2 where a tracker needs masks), and the worst instance. The second one has the error
+of the last tracker by the share of the pixels that people fill.
 """
 
 from pathlib import Path
@@ -44,7 +45,8 @@ def main() -> None:
             compose(open_sequence(host), people, folder, instance)
         hosts[str(folder)] = host
     shares = {name: share_of(name) for name in hosts}
-    lines, errors = [], pd.Series(dtype=float)
+    lines = []
+    errors = pd.Series(dtype=float)
     for text in TRACKERS:
         tracker, *assignments = text.split()
         masked = any(part.startswith("segmentation.source") for part in assignments)
@@ -61,7 +63,9 @@ def main() -> None:
     print(f"| people fill | instances | `{TRACKERS[-1]}`, median mm |\n| --- | ---: | ---: |")
     thirds = pd.qcut(pd.Series(shares), 3)
     for span, names in thirds.groupby(thirds, observed=True).groups.items():
-        print(f"| {span.left:.0%} to {span.right:.0%} | {len(names)} | {1e3 * errors[names].median():.1f} |")
+        print(
+            f"| {span.left:.0%} to {span.right:.0%} | {len(names)} | {1e3 * errors[names].median():.1f} |"
+        )
 
 
 def errors_of(tracker: str, assignments: list[str], sequences: list[str]) -> pd.Series:
@@ -72,7 +76,10 @@ def errors_of(tracker: str, assignments: list[str], sequences: list[str]) -> pd.
     )
     table = db.load(FOLDER / "runs").set_index("run_id").loc[[run.record.run_id for run in runs]]
     return pd.Series(
-        table["hold_last_pose_ate_m"].fillna(table["static_camera_ate_rmse_m"]).astype(float).to_numpy(),
+        table["hold_last_pose_ate_m"]
+        .fillna(table["static_camera_ate_rmse_m"])
+        .astype(float)
+        .to_numpy(),
         index=sequences,
     )
 
@@ -80,13 +87,16 @@ def errors_of(tracker: str, assignments: list[str], sequences: list[str]) -> pd.
 def share_of(name: str) -> float:
     """Mean share of the pixels that people fill in a composite."""
     sequence = open_sequence(name)
-    return float(np.mean([np.mean(sequence.masks[i].instances > 0) for i in range(0, len(sequence), 5)]))
+    return float(
+        np.mean([np.mean(sequence.masks[i].instances > 0) for i in range(0, len(sequence), 5)])
+    )
 
 
 def interval(values: np.ndarray) -> tuple[float, float]:
     """95 % interval of the median over instances, by resampling them."""
     low, high = np.quantile(
-        np.median(np.random.default_rng(0).choice(values, (2000, len(values))), axis=1), [0.025, 0.975]
+        np.median(np.random.default_rng(0).choice(values, (2000, len(values))), axis=1),
+        [0.025, 0.975],
     )
     return float(low), float(high)
 

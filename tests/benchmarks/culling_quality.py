@@ -9,11 +9,11 @@ Every feature of every frame lies on one of three things, by the renderer's exac
   is better off without them; so they count neither for nor against and are shown apart;
 - *background*: everything else.
 
-Recall is the share of the moving features that were culled; precision the share of moving ones among the culled moving
-and background features; the next columns are the share of the background and of the still people that was culled, and
-the share of the frames in which nothing was. Counts are pooled over all frames and sequences. What is culled is what
-the back end did not get, after the starvation guard. ATE is the online one in mm under tum-rgbd/v1, the mean over the
-sequences.
+Recall is the share of the moving features that were culled; precision the share of moving ones
+among the culled moving and background features; the next columns are the share of the background
+and of the still people that was culled, and the share of the frames in which nothing was. Counts
+are pooled over all frames and sequences. What is culled is what the back end did not get, after the
+starvation guard. ATE is the online one in mm under tum-rgbd/v1, the mean over the sequences.
 """
 
 import one_thread  # noqa: F401  # before all others
@@ -51,37 +51,52 @@ def kinds(masks: FrameMasks, xy: np.ndarray) -> np.ndarray:
     column, row = np.rint(xy).astype(int).T
     instance = masks.instances[row.clip(0, height - 1), column.clip(0, width - 1)]
     people = [number for number, name in masks.class_names.items() if name == "person"]
-    return np.where(np.isin(instance, list(masks.moving)), 2, np.where(np.isin(instance, people), 1, 0))
+    return np.where(
+        np.isin(instance, list(masks.moving)), 2, np.where(np.isin(instance, people), 1, 0)
+    )
 
 
 def measure(
-    tracker_id: str, settings: dict[str, object], name: str, part: tuple[int, int | None], cache: Path
+    tracker_id: str,
+    settings: dict[str, object],
+    name: str,
+    part: tuple[int, int | None],
+    cache: Path,
 ) -> tuple[float, float, np.ndarray]:
     """Run one tracker on one sequence.
 
     Returns:
-        ATE in metres, coverage, and of each frame ``[F, 2, 3]`` the number of features and of culled ones by kind.
+        ATE in metres, coverage, and of each frame ``[F, 2, 3]`` the number of features and of
+        culled ones by kind.
     """
     sequence = open_sequence(name, frames=part)
-    assert sequence.masks is not None and sequence.ground_truth is not None, f"{name} has no exact masks"
+    assert sequence.masks is not None, f"{name} has no exact masks"
+    assert sequence.ground_truth is not None, f"{name} has no exact masks"
     tracker = build_tracker(
-        tracker_id, settings, TrackerContext(sequence_id=sequence.id, masks=sequence.masks, cache=str(cache))
+        tracker_id,
+        settings,
+        TrackerContext(sequence_id=sequence.id, masks=sequence.masks, cache=str(cache)),
     )
     tracker.reset(sequence.camera, rng=np.random.default_rng(0))
-    poses, counts = {}, []
+    poses = {}
+    counts = []
     for i in range(len(sequence)):
         frame = sequence[i]
         result = tracker.track(frame)
         if result.state == "ok":
             poses[frame.timestamp] = result.T_world_cam
         kind = kinds(sequence.masks[i], result.keypoints_xy)
-        counts.append([np.bincount(which, minlength=3) for which in (kind, kind[~result.keypoints_keep])])
-    coverage, ate = len(poses) / len(sequence), np.nan
+        counts.append(
+            [np.bincount(which, minlength=3) for which in (kind, kind[~result.keypoints_keep])]
+        )
+    coverage = len(poses) / len(sequence)
+    ate = np.nan
     if len(poses) >= 3:
-        online, due = Trajectory(np.array([*poses]), np.array([*poses.values()])), sequence.timestamps
-        ate = evaluate(online, sequence.ground_truth, get_protocol("tum-rgbd/v1"), input_timestamps=due).metrics[
-            "ate_rmse_m"
-        ]
+        online = Trajectory(np.array([*poses]), np.array([*poses.values()]))
+        due = sequence.timestamps
+        ate = evaluate(
+            online, sequence.ground_truth, get_protocol("tum-rgbd/v1"), input_timestamps=due
+        ).metrics["ate_rmse_m"]
     return ate, coverage, np.array(counts)
 
 

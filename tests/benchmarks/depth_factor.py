@@ -2,9 +2,9 @@
 
     python tests/benchmarks/depth_factor.py [--scenes 100]
 
-A Markdown table, one row a part of a recording: pairs of frames, what is found as it is, and what is found where depth
-in millimetres is read as TUM's (factor 5000; 1000 is right). Excerpts are looked for in ``../shared``; what is not
-there is named.
+A Markdown table, one row a part of a recording: pairs of frames, what is found as it is, and what
+is found where depth in millimetres is read as TUM's (factor 5000; 1000 is right). Excerpts are
+looked for in ``../shared``; what is not there is named.
 """
 
 import re
@@ -26,7 +26,16 @@ from dynslam_bench.sequences.synthetic import open_synthetic
 
 SHARED = Path(__file__).resolve().parents[3] / "shared/data"
 REAL = {
-    "bonn/rgbd_bonn_crowd": [(0, 200), (0, 100), (100, 200), (0, 60), (25, 145), (75, 195), (120, 180), (140, 200)],
+    "bonn/rgbd_bonn_crowd": [
+        (0, 200),
+        (0, 100),
+        (100, 200),
+        (0, 60),
+        (25, 145),
+        (75, 195),
+        (120, 180),
+        (140, 200),
+    ],
     "tum/rgbd_dataset_freiburg1_xyz": [(0, 100), (0, 50), (50, 100), (25, 75), (60, 100)],
     "tum/rgbd_dataset_freiburg1_rpy": [(0, 40), (0, 20), (20, 40)],
 }
@@ -69,7 +78,9 @@ def smaller(pair: RgbdPair) -> RgbdPair:
     return replace(pair, depth_first=pair.depth_first / 5, T_first_second=pose)
 
 
-def found_in(stamps: Array, truth: Trajectory | None, camera: Camera, pairs: list[RgbdPair]) -> list[Finding]:
+def found_in(
+    stamps: Array, truth: Trajectory | None, camera: Camera, pairs: list[RgbdPair]
+) -> list[Finding]:
     """The doctor's findings by the truth."""
     return truth_findings(stamps, truth, camera, pairs)
 
@@ -77,8 +88,11 @@ def found_in(stamps: Array, truth: Trajectory | None, camera: Camera, pairs: lis
 def main() -> None:
     """One line a part, then the counts."""
     options = parser_of(__doc__, scenes=[100]).parse_args()
-    held, falsely = [], []
-    print("| part | pairs | as it is | depth in millimetres | 1000 within |\n| --- | ---: | --- | --- | --- |")
+    held = []
+    falsely = []
+    print(
+        "| part | pairs | as it is | depth in millimetres | 1000 within |\n| --- | ---: | --- | --- | --- |"
+    )
     for name, sequence in parts(options.scenes):
         pairs = pairs_of(sequence)
         known = sequence.timestamps, sequence.ground_truth, sequence.camera

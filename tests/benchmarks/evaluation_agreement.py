@@ -1,10 +1,12 @@
 """Compare our ATE and RPE with the TUM benchmark's own scripts on given trajectories.
 
-    python tests/benchmarks/evaluation_agreement.py --scripts DIR ESTIMATE GROUNDTRUTH [ESTIMATE GROUNDTRUTH ...]
+    python tests/benchmarks/evaluation_agreement.py --scripts DIR ESTIMATE GROUNDTRUTH [ESTIMATE
+    GROUNDTRUTH ...]
 
-DIR holds `associate.py`, `evaluate_ate.py` and `evaluate_rpe.py` of the benchmark (a Python 3 port comes with evo's
-source distribution, `test/tum_benchmark_tools`, trajectories in `test/data`). What keeps them from running on Python 3
-and NumPy 2 (`numpy.linalg.linalg`, `keys.sort()` of a dictionary's keys) is mended in a temporary copy.
+DIR holds `associate.py`, `evaluate_ate.py` and `evaluate_rpe.py` of the benchmark (a Python 3 port
+comes with evo's source distribution, `test/tum_benchmark_tools`, trajectories in `test/data`). What
+keeps them from running on Python 3 and NumPy 2 (`numpy.linalg.linalg`, `keys.sort()` of a
+dictionary's keys) is mended in a temporary copy.
 """
 
 import argparse
@@ -37,7 +39,11 @@ def mended(scripts: Path, folder: Path) -> Path:
 
 def official(folder: Path, script: str, *arguments: str) -> dict[str, float]:
     done = subprocess.run(
-        [sys.executable, script, *arguments, "--verbose"], cwd=folder, capture_output=True, text=True, timeout=600
+        [sys.executable, script, *arguments, "--verbose"],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=600,
     )
     found = re.findall(r"(compared_pose_pairs|[\w.]*rmse) ([\d.]+)", done.stdout)
     if not found:
@@ -46,17 +52,22 @@ def official(folder: Path, script: str, *arguments: str) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--scripts", type=Path, required=True)
     parser.add_argument("files", type=Path, nargs="+")
     options = parser.parse_args()
-    print("| trajectory | metric | pairs (TUM) | pairs (ours) | m (TUM) | m (ours) | deg (TUM) | deg (ours) |")
+    print(
+        "| trajectory | metric | pairs (TUM) | pairs (ours) | m (TUM) | m (ours) | deg (TUM) | deg (ours) |"
+    )
     print("| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: |")
     with tempfile.TemporaryDirectory() as temporary:
         folder = mended(options.scripts, Path(temporary))
         for est, gt in zip(options.files[::2], options.files[1::2], strict=True):
             pair = (str(gt.resolve()), str(est.resolve()))
-            estimate, truth = read_tum(est), read_tum(gt)
+            estimate = read_tum(est)
+            truth = read_tum(gt)
             theirs = official(folder, "evaluate_ate.py", *pair)
             ours = evaluate(estimate, truth)
             rmse = next(value for name, value in theirs.items() if name.endswith("rmse"))
@@ -66,7 +77,10 @@ def main() -> None:
             )
             for delta, unit in DELTAS:
                 theirs = official(
-                    folder, "evaluate_rpe.py", *pair, *(("--fixed_delta", "--delta", str(delta), "--delta_unit", unit))
+                    folder,
+                    "evaluate_rpe.py",
+                    *pair,
+                    *(("--fixed_delta", "--delta", str(delta), "--delta_unit", unit)),
                 )
                 spec = RPESpec(delta=delta, unit=unit)
                 ours = evaluate(estimate, truth, Protocol(id="agreement", rpe=(spec,)))

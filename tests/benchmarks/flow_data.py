@@ -32,7 +32,8 @@ DENSE_SEARCHES = {
 class Pair:
     """Two images and where points of the first lie in the second.
 
-    `guess` is where the motion over the gap before the first image, kept up, takes the points; NaN without depth.
+    `guess` is where the motion over the gap before the first image, kept up, takes the points; NaN
+    without depth.
     """
 
     name: str
@@ -50,7 +51,9 @@ def lengths(pairs: Sequence[Pair]) -> np.ndarray:
 
 def corners(gray: np.ndarray, count: int = 1000) -> np.ndarray:
     """ORB keypoints over all octaves, spread over a grid, float32 ``[N, 2]``."""
-    keypoints = sorted(cv2.ORB.create(4 * count, fastThreshold=7).detect(gray), key=lambda k: -k.response)
+    keypoints = sorted(
+        cv2.ORB.create(4 * count, fastThreshold=7).detect(gray), key=lambda k: -k.response
+    )
     xy = np.array([k.pt for k in keypoints], np.float32).reshape(-1, 2)
     column, row = (xy * (16, 12) // gray.shape[::-1]).astype(int).T
     cells = pd.Series(16 * row + column)
@@ -72,11 +75,16 @@ def _warp(image: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> np.nd
     scale = np.sqrt(abs(np.linalg.det(matrix[:2, :2])))
     if scale < 1:  # what the camera would have averaged
         image = cv2.GaussianBlur(image, (0, 0), 0.5 * np.sqrt(1 / scale**2 - 1) + 1e-3)
-    return cv2.warpPerspective(image, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    return cv2.warpPerspective(
+        image, matrix, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+    )
 
 
-def _similarity(scale: float, degrees: float, tx: float, ty: float, centre: tuple[float, float]) -> np.ndarray:
-    c, s = scale * np.cos(np.deg2rad(degrees)), scale * np.sin(np.deg2rad(degrees))
+def _similarity(
+    scale: float, degrees: float, tx: float, ty: float, centre: tuple[float, float]
+) -> np.ndarray:
+    c = scale * np.cos(np.deg2rad(degrees))
+    s = scale * np.sin(np.deg2rad(degrees))
     x, y = centre
     return np.array([[c, -s, x - c * x + s * y + tx], [s, c, y - s * x - c * y + ty], [0, 0, 1.0]])
 
@@ -95,7 +103,8 @@ def synthetic(kinds: tuple[str, ...], images: int) -> list[Pair]:
     pictures = textures(images + 1)
     for index, image in enumerate(pictures[:-1]):
         height, width = image.shape
-        size, centre = (width, height), (width / 2, height / 2)
+        size = (width, height)
+        centre = (width / 2, height / 2)
         points = corners(image)
         for kind in kinds:
             t = rng.uniform(-1, 1, 2) * (100, 75)
@@ -106,16 +115,33 @@ def synthetic(kinds: tuple[str, ...], images: int) -> list[Pair]:
             else:
                 octaves, degrees, share = SIMILARITIES[kind]
                 scale = 2 ** rng.uniform(-octaves, octaves) if octaves else 1
-                matrix = _similarity(scale, rng.uniform(-degrees, degrees) if degrees else 0, *(t * share), centre)
+                matrix = _similarity(
+                    scale, rng.uniform(-degrees, degrees) if degrees else 0, *(t * share), centre
+                )
             target = _warp(image, matrix, size)
-            reference, here = image, points
+            reference = image
+            here = points
             truth = cv2.perspectiveTransform(points[:, None].astype(np.float64), matrix)[:, 0]
             if kind == "foreground":  # an ellipse with another picture's texture moves its own way
                 other = pictures[index + 1]
                 spot = (float(rng.uniform(200, 440)), float(rng.uniform(160, 320)))
                 mask = np.zeros_like(image)
-                cv2.ellipse(mask, (int(spot[0]), int(spot[1])), (110, 80), float(rng.uniform(0, 180)), 0, 360, 255, -1)
-                own = _similarity(2 ** rng.uniform(-0.2, 0.2), rng.uniform(-10, 10), *rng.uniform(-45, 45, 2), spot)
+                cv2.ellipse(
+                    mask,
+                    (int(spot[0]), int(spot[1])),
+                    (110, 80),
+                    float(rng.uniform(0, 180)),
+                    0,
+                    360,
+                    255,
+                    -1,
+                )
+                own = _similarity(
+                    2 ** rng.uniform(-0.2, 0.2),
+                    rng.uniform(-10, 10),
+                    *rng.uniform(-45, 45, 2),
+                    spot,
+                )
                 reference = np.where(mask > 0, other, image)
                 moved_mask = _warp(mask, own, size) > 127
                 target = np.where(moved_mask, _warp(other, own, size), target)
@@ -126,10 +152,12 @@ def synthetic(kinds: tuple[str, ...], images: int) -> list[Pair]:
                 truth = np.where(inside[:, None], front, behind)
                 column, row = np.clip(np.rint(truth).astype(int), 0, (width - 1, height - 1)).T
                 hidden = ~inside & moved_mask[row, column]
-                here, truth = here[~hidden], truth[~hidden]
+                here = here[~hidden]
+                truth = truth[~hidden]
             seen = ((truth >= 4) & (truth < (width - 4, height - 4))).all(axis=1)
             noisy = [
-                np.clip(x + rng.normal(0, 1.5, x.shape), 0, 255).round().astype(np.uint8) for x in (reference, target)
+                np.clip(x + rng.normal(0, 1.5, x.shape), 0, 255).round().astype(np.uint8)
+                for x in (reference, target)
             ]
             if seen.sum() >= 30:
                 pairs.append(Pair(f"{kind}", *noisy, here[seen], truth[seen]))
@@ -140,7 +168,9 @@ def _lift(xy: np.ndarray, z: np.ndarray, camera: Camera) -> tuple[np.ndarray, np
     """Points in space (metres, camera frame), and whether the depth around them is known and smooth."""
     column, row = np.rint(xy).astype(int).T
     offsets = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
-    patch = np.stack([z[np.clip(row + dy, 0, 479), np.clip(column + dx, 0, 639)] for dy, dx in offsets])
+    patch = np.stack(
+        [z[np.clip(row + dy, 0, 479), np.clip(column + dx, 0, 639)] for dy, dx in offsets]
+    )
     smooth = (patch.min(0) > 0.2) & (patch.max(0) - patch.min(0) < 0.03 * patch.max(0))
     return camera.unproject(camera.undistort_points(xy), z[row, column]), smooth
 
@@ -155,7 +185,9 @@ def _motion(first: Frame, second: Frame, motion: np.ndarray, camera: Camera) -> 
     xy1 = np.array([k1[m.queryIdx].pt for m in matches], np.float32).reshape(-1, 2)
     xy2 = np.array([k2[m.trainIdx].pt for m in matches], np.float32).reshape(-1, 2)
     space, smooth = _lift(xy1, first.depth, camera)
-    uv, one, none = camera.undistort_points(xy2)[smooth], np.ones(smooth.sum()), np.zeros(smooth.sum())
+    uv = camera.undistort_points(xy2)[smooth]
+    one = np.ones(smooth.sum())
+    none = np.zeros(smooth.sum())
     estimate = optimise_pose(motion, space[smooth], uv, none, one, none, camera)
     return estimate.T_cam_world if len(xy1) >= 50 and estimate.residual_px < 1.0 else None
 
@@ -168,7 +200,8 @@ def grey(frame: Frame) -> np.ndarray:
 def real(name: str, gaps: tuple[int, ...], every: int = 4) -> list[Pair]:
     """Pairs of real frames; truth is depth and the relative pose, refined on ORB matches near the raw ground truth.
 
-    Points whose depth in the second image contradicts the prediction (occluded, moved) are left out.
+    Points whose depth in the second image contradicts the prediction (occluded, moved) are left
+    out.
 
     Args:
         name: Of `RECORDINGS`.
@@ -176,15 +209,18 @@ def real(name: str, gaps: tuple[int, ...], every: int = 4) -> list[Pair]:
         every: First images are this far apart, further for wide gaps.
     """
     sequence = open_sequence(str(RECORDINGS[name]))
-    camera, truth = sequence.camera, sequence.ground_truth
+    camera = sequence.camera
+    truth = sequence.ground_truth
     away = np.abs(truth.timestamps[:, None] - sequence.timestamps)
     known = np.flatnonzero(away.min(axis=0) < 0.02)
     poses = truth.T_world_cam[away.argmin(axis=0)]
     pairs = []
     for gap in gaps:
         for start in range(0, len(known) - gap, every * max(1, gap // 2)):
-            at, then = known[start], known[start + gap]
-            first, second = sequence[int(at)], sequence[int(then)]
+            at = known[start]
+            then = known[start + gap]
+            first = sequence[int(at)]
+            second = sequence[int(then)]
             motion = _motion(first, second, se3.inverse(poses[then]) @ poses[at], camera)
             if motion is None:
                 continue
@@ -197,13 +233,21 @@ def real(name: str, gaps: tuple[int, ...], every: int = 4) -> list[Pair]:
             depth = second.depth[row, column]
             seen &= (depth > 0) & (abs(depth - moved[:, 2]) < 0.04 * moved[:, 2])
             if seen.sum() >= 50:
-                pairs.append(Pair(f"{name} +{gap}", grey(first), grey(second), points[seen], ends[seen]))
+                pairs.append(
+                    Pair(f"{name} +{gap}", grey(first), grey(second), points[seen], ends[seen])
+                )
     return pairs
 
 
 def kitti() -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
     """The KITTI pair: both images in grey, flow float32 ``[H, W, 2]``, validity."""
     folder = DATA / "flow/kitti"
-    raw = cv2.imread(str(folder / "flow_gt.png"), cv2.IMREAD_UNCHANGED)[..., ::-1].astype(np.float32)
+    raw = cv2.imread(str(folder / "flow_gt.png"), cv2.IMREAD_UNCHANGED)[..., ::-1].astype(
+        np.float32
+    )
     images = [cv2.imread(str(folder / name)) for name in ("frame1.png", "frame2.png")]
-    return [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in images], (raw[..., :2] - 2**15) / 64, raw[..., 2] > 0
+    return (
+        [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in images],
+        (raw[..., :2] - 2**15) / 64,
+        raw[..., 2] > 0,
+    )

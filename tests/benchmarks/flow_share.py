@@ -4,10 +4,10 @@
 
 With ``--dense``, the dense flow is compared with a larger search of its own.
 
-Every row uses the default settings but for the search. A cell is the share of all points, valid or not, within
-`WITHIN_PX` pixels of the truth: mean +- standard deviation over the units; then the mean paired difference
-to `emfoa+propagation` with Student's 95 % interval over the units. A unit is a scene of a rendered sequence, its start
-offsets averaged.
+Every row uses the default settings but for the search. A cell is the share of all points, valid or
+not, within `WITHIN_PX` pixels of the truth: mean +- standard deviation over the units; then the
+mean paired difference to `emfoa+propagation` with Student's 95 % interval over the units. A unit is
+a scene of a rendered sequence, its start offsets averaged.
 """
 
 import itertools
@@ -45,7 +45,8 @@ Units = dict[str, list[Pair]]
 def share(settings: DaisySettings, pair: Pair, guess: bool) -> tuple[float, float]:
     """Percent of the points near the truth, and evaluations a point."""
     flow = build_flow(settings)
-    reference, target = flow.prepare(pair.reference), flow.prepare(pair.target)
+    reference = flow.prepare(pair.reference)
+    target = flow.prepare(pair.target)
     result = flow.track(reference, target, pair.points, guess=pair.guess if guess else None, seed=0)
     good = np.hypot(*(result.xy - pair.truth).T) < WITHIN_PX
     return 100 * good.mean(), result.stats["evaluations"] / len(good)
@@ -57,7 +58,9 @@ def paired(values: np.ndarray, base: np.ndarray) -> str:
     difference = values - base
     if not difference.any():
         return text
-    half = stats.t.ppf(0.975, len(difference) - 1) * difference.std(ddof=1) / np.sqrt(len(difference))
+    half = (
+        stats.t.ppf(0.975, len(difference) - 1) * difference.std(ddof=1) / np.sqrt(len(difference))
+    )
     return f"{text} ({difference.mean():+.1f} [{difference.mean() - half:+.1f}, {difference.mean() + half:+.1f}])"
 
 
@@ -65,16 +68,22 @@ def measure(
     rows: Mapping[str, DaisySettings], units: Units, guess: bool
 ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
     """Share of each unit, and mean evaluations a point, by row."""
-    shares, spent = {}, {}
+    shares = {}
+    spent = {}
     for name, settings in rows.items():
         by_unit = np.array(
-            [np.mean([share(settings, pair, guess) for pair in unit], axis=0) for unit in units.values()]
+            [
+                np.mean([share(settings, pair, guess) for pair in unit], axis=0)
+                for unit in units.values()
+            ]
         )
         shares[name], spent[name] = by_unit[:, 0], by_unit[:, 1].mean()
     return shares, spent
 
 
-def table(title: str, rows: Mapping[str, DaisySettings], columns: dict[str, Units], guess: bool) -> None:
+def table(
+    title: str, rows: Mapping[str, DaisySettings], columns: dict[str, Units], guess: bool
+) -> None:
     """One Markdown table: a row a search, a column a stride (or whatever the columns are)."""
     measured = {name: measure(rows, units, guess) for name, units in columns.items()}
     heads = []
@@ -85,7 +94,9 @@ def table(title: str, rows: Mapping[str, DaisySettings], columns: dict[str, Unit
             off = np.concatenate([np.hypot(*(p.truth - p.guess).T) for p in pairs])
             head += f", guess off by {np.nanmedian(off):.0f}"
         heads.append(head)
-    print(f"\n### {title}\n\n| search | evaluations a point | {' | '.join(heads)} |\n|{' --- |' * (2 + len(heads))}")
+    print(
+        f"\n### {title}\n\n| search | evaluations a point | {' | '.join(heads)} |\n|{' --- |' * (2 + len(heads))}"
+    )
     base = next(iter(rows))
     for name in rows:
         spent = np.mean([evaluations[name] for _, evaluations in measured.values()])
@@ -96,9 +107,10 @@ def table(title: str, rows: Mapping[str, DaisySettings], columns: dict[str, Unit
 def rendered(scene: int, start: int) -> list[Pair]:
     """Pairs ``(start, start + stride)`` of a rendered sequence; truth is the exact flow, also of what moves by itself.
 
-    Points lie on whole pixels. Those that leave the second image or are hidden there (exact flow there and back does
-    not return) are left out. The guess is the constant-velocity prediction from the exact poses at ``start - stride``
-    and ``start`` with the noisy depth, what a motion model at this frame rate would say; NaN where depth is missing.
+    Points lie on whole pixels. Those that leave the second image or are hidden there (exact flow
+    there and back does not return) are left out. The guess is the constant-velocity prediction from
+    the exact poses at ``start - stride`` and ``start`` with the noisy depth, what a motion model at
+    this frame rate would say; NaN where depth is missing.
 
     Args:
         scene: 100-199 are held out.
@@ -106,24 +118,42 @@ def rendered(scene: int, start: int) -> list[Pair]:
     """
     motion = MOTIONS[scene % len(MOTIONS)]
     sequence = open_sequence(f"synthetic/{motion}?scene={scene}&frames={start + max(STRIDES) + 1}")
-    frame, camera, poses = sequence[start], sequence.camera, sequence.ground_truth.T_world_cam
+    frame = sequence[start]
+    camera = sequence.camera
+    poses = sequence.ground_truth.T_world_cam
     gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
     points = np.unique(np.rint(corners(gray, POINTS)), axis=0).astype(np.float32)
     column, row = points.astype(int).T
     pairs = []
     for stride in STRIDES:
         truth = points + sequence.flow(start, start + stride)[row, column]
-        inside = ((truth >= MARGIN_PX) & (truth < (camera.width - MARGIN_PX, camera.height - MARGIN_PX))).all(axis=1)
+        inside = (
+            (truth >= MARGIN_PX) & (truth < (camera.width - MARGIN_PX, camera.height - MARGIN_PX))
+        ).all(axis=1)
         there = np.where(inside[:, None], truth, 0).astype(np.float32)
-        way_back = cv2.remap(sequence.flow(start + stride, start), *there.T[:, None], cv2.INTER_LINEAR)[0]
+        way_back = cv2.remap(
+            sequence.flow(start + stride, start), *there.T[:, None], cv2.INTER_LINEAR
+        )[0]
         with np.errstate(invalid="ignore"):
             seen = inside & (np.hypot(*(truth + way_back - points).T) < HIDDEN_PX)
-        kept_up = se3.inverse(poses[start]) @ poses[start - stride]  # T_next_now, as T_now_before was
+        # T_next_now, as T_now_before was
+        kept_up = se3.inverse(poses[start]) @ poses[start - stride]
         z = frame.depth[row, column]
         moved = se3.transform(kept_up, camera.unproject(points, np.maximum(z, 0.1)))
-        guess = np.where((z > 0)[:, None] & (moved[:, 2:] > 0.1), camera.project(moved), np.nan).astype(np.float32)
+        guess = np.where(
+            (z > 0)[:, None] & (moved[:, 2:] > 0.1), camera.project(moved), np.nan
+        ).astype(np.float32)
         target = cv2.cvtColor(sequence[start + stride].rgb, cv2.COLOR_RGB2GRAY)
-        pairs.append(Pair(f"{motion}?scene={scene} +{stride}", gray, target, points[seen], truth[seen], guess[seen]))
+        pairs.append(
+            Pair(
+                f"{motion}?scene={scene} +{stride}",
+                gray,
+                target,
+                points[seen],
+                truth[seen],
+                guess[seen],
+            )
+        )
     return pairs
 
 

@@ -2,8 +2,8 @@
 
     python tests/benchmarks/identity_commits.py --last 300 --upto 62446da7
 
-Of each commit the sources are read from git; nothing is run. Edges that were cut later (`CUT`) are left out in older
-commits, too, so that the figure says what today's structure would have cost.
+Of each commit the sources are read from git; nothing is run. Edges that were cut later (`CUT`) are
+left out in older commits, too, so that the figure says what today's structure would have cost.
 """
 
 import argparse
@@ -43,7 +43,9 @@ def git(*words: str) -> bytes:
 
 def sources(commit: str) -> dict[str, str]:
     """The git object of each module's source at a commit, by the module's name."""
-    listed = git("ls-tree", "-r", commit, "--", "dynslam_bench", "envs", "tuning", "reports").decode()
+    listed = git(
+        "ls-tree", "-r", commit, "--", "dynslam_bench", "envs", "tuning", "reports"
+    ).decode()
     objects = {}
     for line in listed.splitlines():
         about, _, path = line.partition("\t")
@@ -77,14 +79,19 @@ def is_cut(module: str, reference: tuple[str, str]) -> bool:
     """Whether an import was taken out later."""
     imported = ".".join(filter(None, reference))
     return any(
-        module == f"{PACKAGE}.{source}" and f"{imported}.".startswith(f"{PACKAGE}.{target}.") for source, target in CUT
+        module == f"{PACKAGE}.{source}" and f"{imported}.".startswith(f"{PACKAGE}.{target}.")
+        for source, target in CUT
     )
 
 
 def digest_of_packages(graph: ModuleGraph, packages: Iterable[str]) -> str:
     """What ids depended on before."""
     starts = tuple(f"{PACKAGE}.{package}" for package in packages)
-    return str(sorted((name, code.digest) for name, code in graph.modules.items() if name.startswith(starts)))
+    return str(
+        sorted(
+            (name, code.digest) for name, code in graph.modules.items() if name.startswith(starts)
+        )
+    )
 
 
 def main() -> None:
@@ -93,7 +100,11 @@ def main() -> None:
     parser.add_argument("--last", type=int, default=300)
     parser.add_argument("--upto", default="HEAD")
     arguments = parser.parse_args()
-    commits = git("rev-list", "--first-parent", f"--max-count={arguments.last + 1}", arguments.upto).decode().split()
+    commits = (
+        git("rev-list", "--first-parent", f"--max-count={arguments.last + 1}", arguments.upto)
+        .decode()
+        .split()
+    )
     history = History()
     changes = dict.fromkeys(["whole packages", *SYSTEMS], 0)
     counted: dict[str, int] = {}
@@ -109,7 +120,10 @@ def main() -> None:
             changes[name] += before.get(name, digest) != digest
         before = now
     for name, count in changes.items():
-        print(f"{name}: {count} of {len(commits) - 1} commits", f"({counted[name]} modules)" if name in counted else "")
+        print(
+            f"{name}: {count} of {len(commits) - 1} commits",
+            f"({counted[name]} modules)" if name in counted else "",
+        )
 
 
 if __name__ == "__main__":

@@ -1,14 +1,17 @@
 """Kills commands at random moments, repeats them, and compares what they give with what they give undisturbed.
 
-    python tests/benchmarks/kills.py [--kills 10] [--seed 0] [--commands bench tune report merge bank]
+    python tests/benchmarks/kills.py [--kills 10] [--seed 0] [--commands bench tune report merge
+    bank]
 
-Each command does a small job: runs of a toy tracker on recordings of 12 images of 16 x 12 pixels. It is done once
-undisturbed. Then, so many times, it begins again in an empty folder; its process group gets SIGKILL when its result has
-come as far as a random number says, and a random moment later; and the same command is given again. A command that
-ends before its kill is drawn again. The table gives the kills in the middle (some of the result was there, and not
-all), how many commands went on, with exit code 0, and how many gave an equal result: statuses, checksums of
-trajectories and errors of runs; trials, candidates and preset of a study; the files of a report, of merged results and
-of a bank. Times of the machine are not compared. The exit code is 1 unless all results are equal.
+Each command does a small job: runs of a toy tracker on recordings of 12 images of 16 x 12 pixels.
+It is done once undisturbed. Then, so many times, it begins again in an empty folder; its process
+group gets SIGKILL when its result has come as far as a random number says, and a random moment
+later; and the same command is given again. A command that ends before its kill is drawn again. The
+table gives the kills in the middle (some of the result was there, and not all), how many commands
+went on, with exit code 0, and how many gave an equal result: statuses, checksums of trajectories
+and errors of runs; trials, candidates and preset of a study; the files of a report, of merged
+results and of a bank. Times of the machine are not compared. The exit code is 1 unless all results
+are equal.
 """
 
 from __future__ import annotations
@@ -129,7 +132,9 @@ def runs_of(results: Path) -> list[Any]:
     records, unreadable = store.all()
     rows: list[Any] = [str(entry) for entry in unreadable]
     for record in sorted(records, key=lambda record: record.run_id):
-        rows.append([record.run_id, record.status, record.reason, record.notes, record.files, record.study])
+        rows.append(
+            [record.run_id, record.status, record.reason, record.notes, record.files, record.study]
+        )
         rows.append(store.score(record).model_dump(mode="json"))
     return rows
 
@@ -186,7 +191,12 @@ class Command:
         log = target.with_suffix(".log").open("wb")
         with log:
             return subprocess.Popen(
-                command, cwd=target.parent, stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True
+                command,
+                cwd=target.parent,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
             )
 
     def finish(self, target: Path) -> int:
@@ -199,7 +209,8 @@ def make_commands(folder: Path) -> dict[str, Command]:
     sequences = [str(make_sequence(folder / f"s{number}", 0.5 * number)) for number in range(4)]
     (folder / "drifting.py").write_text(TRACKER)
     tracker = json.dumps(f"{folder / 'drifting.py'}:SPEC")
-    suite, study = folder / "suite.toml", folder / "study.toml"
+    suite = folder / "suite.toml"
+    study = folder / "study.toml"
     suite.write_text(SUITE.format(tracker=tracker, sequences=json.dumps(sequences[:2])))
     study.write_text(
         STUDY.format(
@@ -258,9 +269,8 @@ class Tally:
 
     def row(self) -> str:
         """A row of the table."""
-        return (
-            f"| {self.name} | {self.undisturbed_s:.1f} | {self.kills} | {self.middle} | {self.went_on} | {self.equal} |"
-        )
+        outcome = f"{self.kills} | {self.middle} | {self.went_on} | {self.equal}"
+        return f"| {self.name} | {self.undisturbed_s:.1f} | {outcome} |"
 
 
 def progress(target: Path) -> int:
@@ -293,7 +303,8 @@ def kill_and_repeat(name: str, command: Command, folder: Path, kills: int, rando
     began = time.time()
     assert command.finish(target) == 0, target.with_suffix(".log").read_text()
     tally.undisturbed_s = time.time() - began
-    times = [path.lstat().st_ctime for path in target.rglob("*")]  # a copy has the time of content of its original
+    # a copy has the time of content of its original
+    times = [path.lstat().st_ctime for path in target.rglob("*")]
     end = progress(target)
     step_s = (max(times) - min(times)) / end
     count = len(files_of(target))
@@ -329,12 +340,17 @@ def kill_and_repeat(name: str, command: Command, folder: Path, kills: int, rando
 def difference(expected: Any, result: Any) -> str:
     """The first place where two results differ, in words."""
     if isinstance(expected, dict) and isinstance(result, dict):
-        names = [name for name in sorted({*expected, *result}) if expected.get(name) != result.get(name)]
+        names = [
+            name for name in sorted({*expected, *result}) if expected.get(name) != result.get(name)
+        ]
         return f"{names[0]}: {difference(expected.get(names[0]), result.get(names[0]))}"
     if isinstance(expected, list) and isinstance(result, list) and len(expected) == len(result):
-        at = next(at for at, pair in enumerate(zip(expected, result, strict=True)) if pair[0] != pair[1])
+        at = next(
+            at for at, pair in enumerate(zip(expected, result, strict=True)) if pair[0] != pair[1]
+        )
         return f"[{at}] {difference(expected[at], result[at])}"
-    one, other = str(expected), str(result)
+    one = str(expected)
+    other = str(result)
     differing = (at for at, pair in enumerate(zip(one, other, strict=False)) if pair[0] != pair[1])
     at = next(differing, min(len(one), len(other)))
     part = slice(max(0, at - 50), at + 100)
@@ -345,16 +361,25 @@ def main() -> int:
     """Print the table."""
     names = ["bench", "tune", "report", "merge", "bank"]
     options = parser_of(__doc__, kills=10, seed=0, commands=names).parse_args()
-    print("| command | undisturbed, s | kills | in the middle | went on | equal results |\n" + "| --- " * 6 + "|")
+    print(
+        "| command | undisturbed, s | kills | in the middle | went on | equal results |\n"
+        + "| --- " * 6
+        + "|"
+    )
     with tempfile.TemporaryDirectory() as folder:
         commands = make_commands(Path(folder))
         tallies = []
         for name in options.commands:
             random = Random(f"{options.seed} {name}")
-            tallies.append(kill_and_repeat(name, commands[name], Path(folder), options.kills, random))
+            tallies.append(
+                kill_and_repeat(name, commands[name], Path(folder), options.kills, random)
+            )
             print(tallies[-1].row(), flush=True)
-    kills, equal = sum(tally.kills for tally in tallies), sum(tally.equal for tally in tallies)
-    print(f"\n{equal} of {kills} commands that were killed gave, when repeated, the result of an undisturbed one.")
+    kills = sum(tally.kills for tally in tallies)
+    equal = sum(tally.equal for tally in tallies)
+    print(
+        f"\n{equal} of {kills} commands that were killed gave, when repeated, the result of an undisturbed one."
+    )
     return 0 if equal == kills else 1
 
 

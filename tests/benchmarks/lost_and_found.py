@@ -2,16 +2,18 @@
 
     python tests/benchmarks/lost_and_found.py
 
-Frames are rendered and their ORB features kept, those on people left out by the exact masks; the back end of
-`orb-slam2` is driven over them again and again, each time from another start. A case is one of:
+Frames are rendered and their ORB features kept, those on people left out by the exact masks; the
+back end of `orb-slam2` is driven over them again and again, each time from another start. A case is
+one of:
 
 * black: 100 frames, 20 frames without any feature while the camera moves on, 30 frames;
 * kidnapped: 200 frames, then 30 frames of what was seen 150 frames ago, from one frame to the next;
 * carried: the same with 20 frames in between.
 
-The view afterwards is known if an earlier frame that was tracked was taken within 0.3 m and 20 degrees of it. Bar: of
-the known ones all are `ok` within ten frames. A frame that is `ok` is wrong if its camera centre is farther than 0.1 m
-from the true one in the world of the first frame, beyond what it was before the loss; a black one always is.
+The view afterwards is known if an earlier frame that was tracked was taken within 0.3 m and 20
+degrees of it. Bar: of the known ones all are `ok` within ten frames. A frame that is `ok` is wrong
+if its camera centre is farther than 0.1 m from the true one in the world of the first frame, beyond
+what it was before the loss; a black one always is.
 """
 
 import one_thread  # noqa: F401  # before all others
@@ -38,10 +40,16 @@ SCENES = [
     "synthetic/loop_room?scene=103&frames=1800",
 ]
 BEFORE = {"black": 100, "kidnapped": 200, "carried": 200}
-BACK, AFTER, SOON = 150, 30, 10
-FRAMES, BLACK, CASES = 300, 20, 6
+BACK = 150
+AFTER = 30
+SOON = 10
+FRAMES = 300
+BLACK = 20
+CASES = 6
 """Frames of a scene, black ones of a case, cases of a kind in a scene."""
-NEAR_M, NEAR_DEG, WRONG_M = 0.3, 20.0, 0.1
+NEAR_M = 0.3
+NEAR_DEG = 20.0
+WRONG_M = 0.1
 DILATION = 15
 """Pixels around people that count as theirs."""
 
@@ -52,7 +60,8 @@ class Scene:
 
     Attributes:
         camera: The camera.
-        frames: Of each frame its static keypoints, their depth, and the mask of people as packed bits.
+        frames: Of each frame its static keypoints, their depth, and the mask of people as packed
+            bits.
         poses: True camera-to-world poses ``[N, 4, 4]``.
         fps: Frames a second.
     """
@@ -68,10 +77,14 @@ def rendered(source: str) -> Scene:
     stride = 2 if "loop" in source else 1
     sequence = open_sequence(source, frames=(0, FRAMES * stride), stride=stride)
     extractor = build_extractor(FeatureSettings())
-    kernel, frames = np.ones((2 * DILATION + 1, 2 * DILATION + 1), np.uint8), []
+    kernel = np.ones((2 * DILATION + 1, 2 * DILATION + 1), np.uint8)
+    frames = []
     for index in range(len(sequence)):
-        frame, masks = sequence[index], sequence.masks[index]
-        people = np.isin(masks.instances, [n for n, name in masks.class_names.items() if name == "person"])
+        frame = sequence[index]
+        masks = sequence.masks[index]
+        people = np.isin(
+            masks.instances, [n for n, name in masks.class_names.items() if name == "person"]
+        )
         mask = cv2.dilate(people.astype(np.uint8), kernel) > 0
         keypoints = extractor.extract_masked(
             cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), mask, SegmentationSettings().outside_share
@@ -79,8 +92,11 @@ def rendered(source: str) -> Scene:
         column, row = np.rint(keypoints.xy).astype(int).T
         at = row.clip(0, mask.shape[0] - 1), column.clip(0, mask.shape[1] - 1)
         static = np.flatnonzero(~mask[at])
-        frames.append((keypoints.select(static), frame.depth[at][static].clip(min=0), np.packbits(mask)))
-    stamps, truth = sequence.timestamps, sequence.ground_truth
+        frames.append(
+            (keypoints.select(static), frame.depth[at][static].clip(min=0), np.packbits(mask))
+        )
+    stamps = sequence.timestamps
+    truth = sequence.ground_truth
     nearest = np.abs(truth.timestamps[:, None] - stamps[None]).argmin(axis=0)
     return Scene(sequence.camera, frames, truth.T_world_cam[nearest], sequence.fps / stride)
 
@@ -91,33 +107,51 @@ def frame_of(scene: Scene, index: int | None, number: int) -> FrameBundle:
     keypoints, z, packed = scene.frames[index or 0]
     mask = np.unpackbits(packed).reshape(size).astype(bool)
     if index is None:
-        keypoints, z, mask = keypoints.select(np.zeros(0, np.int64)), z[:0], np.zeros(size, bool)
+        keypoints = keypoints.select(np.zeros(0, np.int64))
+        z = z[:0]
+        mask = np.zeros(size, bool)
     blank = np.zeros((*size, 3), np.uint8)
     pictures = blank, blank[..., 0], np.zeros(size, np.float32)
-    return FrameBundle(number, number / scene.fps, *pictures, keypoints, keypoints.xy.astype(np.float64), z, mask=mask)
+    return FrameBundle(
+        number,
+        number / scene.fps,
+        *pictures,
+        keypoints,
+        keypoints.xy.astype(np.float64),
+        z,
+        mask=mask,
+    )
 
 
 def path_of(kind: str, start: int) -> list[int | None]:
     """Which frames a case shows, in order."""
     left = start + BEFORE[kind]
     back = left + BLACK if kind == "black" else left - BACK
-    return [*range(start, left), *[None] * (0 if kind == "kidnapped" else BLACK), *range(back, back + AFTER)]
+    return [
+        *range(start, left),
+        *[None] * (0 if kind == "kidnapped" else BLACK),
+        *range(back, back + AFTER),
+    ]
 
 
 def is_known(scene: Scene, view: int, mapped: list[int]) -> bool:
     """Whether the camera was near a view before."""
     relative = se3.inverse(scene.poses[view]) @ scene.poses[mapped]
     near = np.linalg.norm(relative[:, :3, 3], axis=1) <= NEAR_M
-    rotated = np.degrees(np.arccos(np.clip((np.trace(relative[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)))
+    rotated = np.degrees(
+        np.arccos(np.clip((np.trace(relative[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1))
+    )
     return bool((near & (rotated <= NEAR_DEG)).any())
 
 
 def case(scene: Scene, kind: str, start: int) -> dict[str, object]:
     """Drive one case; a row of the table of cases."""
-    path, before = path_of(kind, start), BEFORE[kind]
+    path = path_of(kind, start)
+    before = BEFORE[kind]
     backend = RgbdBackend(BackendSettings())
     backend.reset(scene.camera, 0)
-    ok, error = np.zeros(len(path), bool), np.zeros(len(path))
+    ok = np.zeros(len(path), bool)
+    error = np.zeros(len(path))
     for number, index in enumerate(path):
         frame = frame_of(scene, index, number)
         result = backend.track(frame, np.ones(len(frame), bool), np.ones(len(frame), np.float32))

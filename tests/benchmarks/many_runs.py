@@ -2,10 +2,11 @@
 
     python tests/benchmarks/many_runs.py FOLDER
 
-FOLDER is a recording in TUM layout. First table: looking runs up, resuming when all are stored, listing them, and all
-runs as one frame. Each number of runs is shared by two trackers, ten start offsets and as many seeds as are needed. No
-frame is tracked: the stored runs are copies of one. Times are of the processor, in seconds, but the one to the first
-run, which is the clock's. The other tables: runs of `never-move`, which tracks nothing. Times are of the processor, in
+FOLDER is a recording in TUM layout. First table: looking runs up, resuming when all are stored,
+listing them, and all runs as one frame. Each number of runs is shared by two trackers, ten start
+offsets and as many seeds as are needed. No frame is tracked: the stored runs are copies of one.
+Times are of the processor, in seconds, but the one to the first run, which is the clock's. The
+other tables: runs of `never-move`, which tracks nothing. Times are of the processor, in
 milliseconds a run: of the process that asks for the runs, and of those that make them.
 """
 
@@ -74,8 +75,13 @@ def look_up(folder: str, count: int, results: str) -> list[float]:
 def fill(folder: str, count: int, results: str) -> list[float]:
     """Store copies of one run, with its metrics, under the ids of all."""
     store = RunStore(results)
-    (record,) = run_many([RunSpec(tracker="orb-slam2", sequence=folder, frames=(0, 30), device="cpu")], results=store)
-    model, text, look, entries = store.folder(record.run_id), record.to_json(), Resolver(), []
+    (record,) = run_many(
+        [RunSpec(tracker="orb-slam2", sequence=folder, frames=(0, 30), device="cpu")], results=store
+    )
+    model = store.folder(record.run_id)
+    text = record.to_json()
+    look = Resolver()
+    entries = []
     metrics = store.score(record)
     for spec in specs(folder, count):
         run_id = look(spec).run_id
@@ -85,7 +91,11 @@ def fill(folder: str, count: int, results: str) -> list[float]:
                 shutil.copy(model / name, store.runs / run_id)
         (store.runs / run_id / "run.json").write_text(text.replace(record.run_id, run_id))
         entries.append(
-            (run_id, store.index.state(run_id, record.sequence.part), metrics.to_line().replace(record.run_id, run_id))
+            (
+                run_id,
+                store.index.state(run_id, record.sequence.part),
+                metrics.to_line().replace(record.run_id, run_id),
+            )
         )
     store.index.write(f"metrics {metrics.protocol_digest}", metrics.code, entries)
     return []
@@ -121,12 +131,17 @@ cluster.close()
 def on_workers(folder: str, workers: int, results: str) -> list[float]:
     """Runs of five frames on Dask's workers."""
     command = [sys.executable, "-c", _CLUSTER.format(workers=workers)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as cluster:
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as cluster:
         with DaskWorkers(cluster.stdout.readline().strip()) as executor:
-            run_many(still(folder, 5, range(-5 * workers, 0)), results=results, executor=executor)  # all are ready then
-            began, spent = time.monotonic(), time.process_time()
+            # all are ready then
+            run_many(still(folder, 5, range(-5 * workers, 0)), results=results, executor=executor)
+            spent = time.process_time()
+            began = time.monotonic()
             run_many(still(folder, 5, range(RUNS)), results=results, executor=executor)
-        head_ms, minutes = 1000 * (time.process_time() - spent) / RUNS, (time.monotonic() - began) / 60
+        head_ms = 1000 * (time.process_time() - spent) / RUNS
+        minutes = (time.monotonic() - began) / 60
         cluster.communicate("\n")
     return [head_ms, RUNS / minutes]
 
@@ -135,11 +150,18 @@ def of_frames(folder: str, frames: int, results: str) -> list[float]:
     """Runs of so many frames."""
     run_many(still(folder, frames, [-1]), results=results)  # the fork server has started then
     (server,) = psutil.Process().children()
-    before, spent = sum(server.cpu_times()), time.process_time()
+    before = sum(server.cpu_times())
+    spent = time.process_time()
     records = run_many(still(folder, frames, range(RUNS)), results=results)
-    head, other = time.process_time() - spent, sum(server.cpu_times()) - before
+    head = time.process_time() - spent
+    other = sum(server.cpu_times()) - before
     files = list(RunStore(results).folder(records[0].run_id).iterdir())
-    return [1000 * head / RUNS, 1000 * other / RUNS, sum(file.stat().st_size for file in files) / 1000, len(files)]
+    return [
+        1000 * head / RUNS,
+        1000 * other / RUNS,
+        sum(file.stat().st_size for file in files) / 1000,
+        len(files),
+    ]
 
 
 RUNS = 50
@@ -148,7 +170,13 @@ RUNS = 50
 
 def still(folder: str, frames: int, seeds: Iterable[int]) -> list[RunSpec]:
     return [
-        RunSpec(tracker="never-move", sequence=folder, frames=(0, frames), seed=seed % 10**6, device="cpu")
+        RunSpec(
+            tracker="never-move",
+            sequence=folder,
+            frames=(0, frames),
+            seed=seed % 10**6,
+            device="cpu",
+        )
         for seed in seeds
     ]
 
@@ -177,15 +205,24 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as results:
             before = measured(look_up, folder, count, results)
             measured(fill, folder, count, results)
-            after = [measured(part, folder, count, results) for part in (resume, listing, listing, frame)]
+            after = [
+                measured(part, folder, count, results) for part in (resume, listing, listing, frame)
+            ]
         cells, peaks = zip(before, *after, strict=True)
-        print(f"| {count} | {' | '.join(f'{cell:.1f}' for cell in chain(*cells))} | {max(peaks):.0f} |", flush=True)
+        print(
+            f"| {count} | {' | '.join(f'{cell:.1f}' for cell in chain(*cells))} | {max(peaks):.0f} |",
+            flush=True,
+        )
     print("\n| Dask's workers | head, ms a run | runs a minute |\n| --- | --- | --- |")
     for count in (1, 2, 4, 8):
         with tempfile.TemporaryDirectory() as results:
             (head_ms, a_minute), _ = measured(on_workers, folder, count, results)
         print(f"| {count} | {head_ms:.1f} | {a_minute:.0f} |", flush=True)
-    print("\n| frames | head, ms a run | other processes, ms a run | kB a run | files a run |\n" + "| --- " * 5 + "|")
+    print(
+        "\n| frames | head, ms a run | other processes, ms a run | kB a run | files a run |\n"
+        + "| --- " * 5
+        + "|"
+    )
     for count in (5, 50, 200):
         with tempfile.TemporaryDirectory() as results:
             cells, _ = measured(of_frames, folder, count, results)

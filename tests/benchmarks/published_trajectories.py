@@ -2,8 +2,9 @@
 
     python tests/benchmarks/published_trajectories.py ./trajectories --table agreement
 
-The folder holds ``rgbd-vo/SEQUENCE/`` (EdwardjkFeng/rgbd-vo, commit 49ff0b8): trajectories, the publisher's truth, and
-the author's tables of ``evo_ape -as`` as ``published.csv``. It holds ``authors/NAME/`` too: single trajectories.
+The folder holds ``rgbd-vo/SEQUENCE/`` (EdwardjkFeng/rgbd-vo, commit 49ff0b8): trajectories, the
+publisher's truth, and the author's tables of ``evo_ape -as`` as ``published.csv``. It holds
+``authors/NAME/`` too: single trajectories.
 """
 
 import argparse
@@ -31,26 +32,36 @@ SINGLE = {
 
 def agreement(folder: Path) -> None:
     """How many of the author's numbers come out, with and without the rows outside of the truth's time."""
-    print("| sequence | numbers | agree to 1e-9 m | largest difference (m) | agree without rows of other recordings |")
+    print(
+        "| sequence | numbers | agree to 1e-9 m | largest difference (m) | agree without rows of other recordings |"
+    )
     print("| --- | ---: | ---: | ---: | ---: |")
     for table in sorted(folder.glob("rgbd-vo/*/published.csv")):
         truth = load_tum(table.parent / "groundtruth.txt")
         poses = truth.every_line or truth.trajectory
-        differences, cut = [], []
+        differences = []
+        cut = []
         for line in csv.DictReader(table.open()):
             files = table.parent / line["trajectory"], table.parent / "groundtruth.txt"
             metrics = evaluate_files(*files, "evo-as/v1").metrics
-            differences.append(max(abs(metrics[f"ate_{name}_m"] - float(line[f"{name}_m"])) for name in STATISTICS))
+            differences.append(
+                max(abs(metrics[f"ate_{name}_m"] - float(line[f"{name}_m"])) for name in STATISTICS)
+            )
             estimate = read_tum(files[0])
             inside = (estimate.timestamps >= poses.timestamps[0] - 0.01) & (
                 estimate.timestamps <= poses.timestamps[-1] + 0.01
             )
             cut.append(
-                abs(evaluate(estimate.select(inside), poses, "evo-as/v1").metrics["ate_rmse_m"] - float(line["rmse_m"]))
+                abs(
+                    evaluate(estimate.select(inside), poses, "evo-as/v1").metrics["ate_rmse_m"]
+                    - float(line["rmse_m"])
+                )
                 < 1e-6
             )
         good = sum(difference < 1e-9 for difference in differences)
-        print(f"| {table.parent.name} | {len(cut)} | {good} | {max(differences):.0e} | {sum(cut)} |")
+        print(
+            f"| {table.parent.name} | {len(cut)} | {good} | {max(differences):.0e} | {sum(cut)} |"
+        )
 
 
 def conventions(folder: Path) -> None:
@@ -73,7 +84,8 @@ def single(folder: Path) -> None:
     for name, of_truth in SINGLE.items():
         estimate = folder / "authors" / f"{name}.txt"
         result = evaluate_files(
-            estimate, (folder / "rgbd-vo" / of_truth if of_truth else estimate.parent) / "groundtruth.txt"
+            estimate,
+            (folder / "rgbd-vo" / of_truth if of_truth else estimate.parent) / "groundtruth.txt",
         )
         print(f"| {name} | {result.metrics['ate_rmse_m']:.4f} | {result.n_pairs} |")
 
@@ -81,7 +93,9 @@ def single(folder: Path) -> None:
 def main() -> None:
     """Print one of the tables."""
     tables = {"agreement": agreement, "conventions": conventions, "single": single}
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--table", choices=tables, required=True)
     options = parser.parse_args()

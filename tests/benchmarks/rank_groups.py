@@ -1,10 +1,11 @@
 """How often a leaderboard is right, and how many true differences it finds, on boards whose truth is known.
 
-Errors are simulated: a hardness for every sequence, a quality for every tracker, and a scatter of several shapes. Two
-questions are asked of every board: is a tracker better than the reference (Holm over the trackers), and what is the
-order of all pairs (Holm over the pairs). A board counts as right if none of its claims is wrong; of trackers that are
-exactly equal, any claim counts as wrong. In the shape "failures" every tracker fails as often as every other. "Unlike
-failures" is outside of what a test on few sequences can hold: the more a tracker fails there, the better it is where it
+Errors are simulated: a hardness for every sequence, a quality for every tracker, and a scatter of
+several shapes. Two questions are asked of every board: is a tracker better than the reference (Holm
+over the trackers), and what is the order of all pairs (Holm over the pairs). A board counts as
+right if none of its claims is wrong; of trackers that are exactly equal, any claim counts as wrong.
+In the shape "failures" every tracker fails as often as every other. "Unlike failures" is outside of
+what a test on few sequences can hold: the more a tracker fails there, the better it is where it
 does not, so that all have the same mean.
 
 Run: python tests/benchmarks/rank_groups.py [boards]
@@ -29,7 +30,9 @@ def failures(rng, size, least=0.1, most=0.1):
 SHAPES = {
     "normal": lambda rng, size: rng.normal(0, 0.4, size),
     "heavy tails": lambda rng, size: 0.3 * rng.standard_t(3, size),
-    "unequal spread": lambda rng, size: rng.normal(0, 1, size) * np.geomspace(0.05, 1, size[0])[:, None],
+    "unequal spread": lambda rng, size: (
+        rng.normal(0, 1, size) * np.geomspace(0.05, 1, size[0])[:, None]
+    ),
     "skewed": lambda rng, size: 0.4 * (rng.exponential(1, size) - 1),
     "failures": failures,
     "unlike failures": lambda rng, size: failures(rng, size, least=0.02, most=0.2),
@@ -48,15 +51,21 @@ def simulate(shape, quality, sequences, boards, seed=0, weights=None):
         weights: Of the sequences; all the same where there are none.
 
     Returns:
-        For the pairs and for the comparisons with the reference, the middle tracker: share of boards without a wrong
-        claim, and mean share of the true differences that are claimed.
+        For the pairs and for the comparisons with the reference, the middle tracker: share of
+        boards without a wrong claim, and mean share of the true differences that are claimed.
     """
     rng = np.random.default_rng(seed)
-    trackers, middle = len(quality), len(quality) // 2
+    trackers = len(quality)
+    middle = len(quality) // 2
     weights = np.ones(sequences) if weights is None else weights
-    right, claimed = np.zeros(2), np.zeros(2)
+    right = np.zeros(2)
+    claimed = np.zeros(2)
     for _ in range(boards):
-        log = quality[:, None] + rng.normal(-3, 1, sequences) + SHAPES[shape](rng, (trackers, sequences))
+        log = (
+            quality[:, None]
+            + rng.normal(-3, 1, sequences)
+            + SHAPES[shape](rng, (trackers, sequences))
+        )
         logs = {str(k): log[k] for k in range(trackers)}
         means = log @ weights
         pairs = [
@@ -90,7 +99,9 @@ def main():
                     outcomes.append(simulate(shape, quality, sequences, boards, seed=trackers))
                 cells.append(np.mean(outcomes, axis=0))
             for at, question in enumerate(("all pairs", "reference")):
-                words = " | ".join(f"{right[at]:.3f}, {claimed[at]:.3f}" for right, claimed in cells)
+                words = " | ".join(
+                    f"{right[at]:.3f}, {claimed[at]:.3f}" for right, claimed in cells
+                )
                 print(f"| {shape} | {name} | {question} | {words} |", flush=True)
     print("\n| scatter | sequences | all pairs | reference |\n| --- | ---: | ---: | ---: |")
     quality = np.sort(np.random.default_rng(1).normal(0, 1, 20)) * SPREAD

@@ -2,8 +2,10 @@
 
     python tests/benchmarks/readme_pictures.py SITE RESULTS
 
-`SITE` is a published site (`dynslam-bench report publish`); `RESULTS` holds one run of a tracker that culls, e.g. with
-`dynslam-bench run emfoa-oft 'synthetic/walking_xyz?scene=100' --frames 0:60 --snapshots`. Headless Chromium draws both.
+`SITE` is a published site (`dynslam-bench report publish`); `RESULTS` holds one run of a tracker
+that culls, e.g. with
+`dynslam-bench run emfoa-oft 'synthetic/walking_xyz?scene=100' --frames 0:60 --snapshots`. Headless
+Chromium draws both.
 """
 
 import argparse
@@ -33,12 +35,18 @@ def framed(browser: Browser, selector: str, target: Path, most: int = 0) -> None
     image = cv2.imread(str(target.with_suffix(".png")))
     target.with_suffix(".png").unlink()
     x, y, width, height = box
-    cv2.imwrite(str(target), image[y : y + min(height, most or height), x : x + width], [cv2.IMWRITE_WEBP_QUALITY, 82])
+    cv2.imwrite(
+        str(target),
+        image[y : y + min(height, most or height), x : x + width],
+        [cv2.IMWRITE_WEBP_QUALITY, 82],
+    )
 
 
 def main() -> None:
     """Draw both."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("site", type=Path)
     parser.add_argument("results", type=Path)
     options = parser.parse_args()
@@ -48,7 +56,9 @@ def main() -> None:
         browser.until("one('.dt-search input')", tries=200)
         framed(browser, "main", PICTURES / "leaderboard.webp", most=760)
         store = RunStore(options.results)
-        browser.open(build_report(store, Path(folder) / "report").run, 1100, anchor=f"#{store.ids()[0]}")
+        browser.open(
+            build_report(store, Path(folder) / "report").run, 1100, anchor=f"#{store.ids()[0]}"
+        )
         browser.until("one('#time .main-svg') && one('#picture img').complete", tries=200)
         browser.settle()
         framed(browser, ".panes", PICTURES / "culling.webp")

@@ -1,14 +1,16 @@
 """Does a change of the code's shape leave every result as it was, to the last bit?
 
-    python tests/benchmarks/refactoring.py --record      # before: write refactoring.json beside this script
-    python tests/benchmarks/refactoring.py               # after: compare, exit code 1 where anything differs
-    python tests/benchmarks/refactoring.py --only orb-slam2      # after, of some trackers
-    python tests/benchmarks/refactoring.py --times 5     # frame times only, to be paired with another checkout's
+    python tests/benchmarks/refactoring.py --record      # before: write refactoring.json beside
+    this script python tests/benchmarks/refactoring.py               # after: compare, exit code 1
+    where anything differs python tests/benchmarks/refactoring.py --only orb-slam2      # after, of
+    some trackers python tests/benchmarks/refactoring.py --times 5     # frame times only, to be
+    paired with another checkout's
 
-Twelve trackers on three sequences (two rendered instances that nobody tunes on, and the Bonn excerpt where it is
-present), one thread, seed 0. A digest covers the state and the 16 numbers of every online pose, the final trajectory,
-the culled features of every frame, and the names of the stats. Bits depend on processor and versions, which are
-recorded too: on another machine, record at the revision to compare with first.
+Twelve trackers on three sequences (two rendered instances that nobody tunes on, and the Bonn
+excerpt where it is present), one thread, seed 0. A digest covers the state and the 16 numbers of
+every online pose, the final trajectory, the culled features of every frame, and the names of the
+stats. Bits depend on processor and versions, which are recorded too: on another machine, record at
+the revision to compare with first.
 """
 
 from one_thread import ROOT  # before all others
@@ -41,7 +43,10 @@ MASKS = f"onnx:{ROOT.parent / 'shared/weights/yolov8n-seg_480x640_fp32.onnx'}"
 
 def machine() -> dict[str, str]:
     """What the bits depend on besides the code."""
-    model = next((line for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line), "")
+    model = next(
+        (line for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line),
+        "",
+    )
     return {
         "processor": model.partition(":")[2].strip() or platform.processor(),
         "numpy": np.__version__,
@@ -56,7 +61,9 @@ def run(tracker_id: str, name: str, frames: int) -> tuple[str, list[float]]:
     rendered = name.startswith("synthetic/")
     masked = tracker_id not in ("orb-slam2", "emfoa-oft?masks=none", "dynaslam-g", "dai-slam")
     overrides = {"segmentation.source": "embedded" if rendered else MASKS} if masked else {}
-    tracker = build_tracker(tracker_id, overrides, TrackerContext(sequence_id=sequence.id, masks=sequence.masks))
+    tracker = build_tracker(
+        tracker_id, overrides, TrackerContext(sequence_id=sequence.id, masks=sequence.masks)
+    )
     tracker.reset(sequence.camera, rng=np.random.default_rng(0))
     whole = hashlib.sha256()
     times = []
@@ -76,8 +83,12 @@ def run(tracker_id: str, name: str, frames: int) -> tuple[str, list[float]]:
 def main() -> int:
     """Record, compare, or time."""
     parser = parser_of(__doc__, record=False, frames=16)
-    parser.add_argument("--only", nargs="+", choices=TRACKERS, default=TRACKERS, help="compare these trackers alone")
-    parser.add_argument("--times", type=int, default=0, help="rounds over orb-slam2 and emfoa-oft; prints medians")
+    parser.add_argument(
+        "--only", nargs="+", choices=TRACKERS, default=TRACKERS, help="compare these trackers alone"
+    )
+    parser.add_argument(
+        "--times", type=int, default=0, help="rounds over orb-slam2 and emfoa-oft; prints medians"
+    )
     arguments = parser.parse_args()
     if arguments.record and arguments.only != TRACKERS:
         parser.error("--record takes all trackers")
@@ -86,14 +97,19 @@ def main() -> int:
     sequences = [name for name in SEQUENCES if name.startswith("synthetic/") or Path(name).is_dir()]
     if arguments.times:
         for tracker in ("orb-slam2", "emfoa-oft"):
-            rounds = [statistics.median(run(tracker, SEQUENCES[0], 60)[1]) for _ in range(arguments.times)]
+            rounds = [
+                statistics.median(run(tracker, SEQUENCES[0], 60)[1]) for _ in range(arguments.times)
+            ]
             print(
-                f"{tracker:12s} {1000 * statistics.median(rounds):.2f} ms", " ".join(f"{1e3 * t:.2f}" for t in rounds)
+                f"{tracker:12s} {1000 * statistics.median(rounds):.2f} ms",
+                " ".join(f"{1e3 * t:.2f}" for t in rounds),
             )
         return 0
     before = {} if arguments.record else json.loads(RECORDED.read_text())
     if before and (before["machine"] != machine() or before["frames"] != arguments.frames):
-        print(f"recorded on {before['machine']}, {before['frames']} frames; here {machine()}: record here first")
+        print(
+            f"recorded on {before['machine']}, {before['frames']} frames; here {machine()}: record here first"
+        )
         return 2
     digests = {}
     differing = []
@@ -101,13 +117,21 @@ def main() -> int:
         for tracker in arguments.only:
             key = f"{tracker} | {'bonn/crowd' if name == str(EXCERPT) else name}"
             digests[key] = run(tracker, name, arguments.frames)[0]
-            verdict = "" if arguments.record else ("same" if before["digests"].get(key) == digests[key] else "DIFFERS")
+            verdict = (
+                ""
+                if arguments.record
+                else ("same" if before["digests"].get(key) == digests[key] else "DIFFERS")
+            )
             differing += [key] if verdict == "DIFFERS" else []
             print(f"{key:48s} {digests[key]} {verdict}", flush=True)
     if arguments.record:
         document = {"machine": machine(), "frames": arguments.frames, "digests": digests}
         RECORDED.write_text(json.dumps(document, indent=1) + "\n")
-    print(f"{len(digests)} runs, {len(differing)} differ" if not arguments.record else f"wrote {RECORDED.name}")
+    print(
+        f"{len(digests)} runs, {len(differing)} differ"
+        if not arguments.record
+        else f"wrote {RECORDED.name}"
+    )
     return 1 if differing else 0
 
 

@@ -2,12 +2,14 @@
 
     python tests/benchmarks/report_speed.py
 
-Makes a results folder with files as large as those of real runs: trajectories, 39 columns of ``frames.csv``, snapshots
-of 1500 features and a mask on 30 frames, logs. Then seconds, processor seconds and memory of `build_report`: without
-stored metrics, again with nothing changed, and anew of scored runs (runs are scored as they end). In Chromium,
-the time from opening to the first contentful paint and to the load event, with the bytes that were loaded until then.
+Makes a results folder with files as large as those of real runs: trajectories, 39 columns of
+``frames.csv``, snapshots of 1500 features and a mask on 30 frames, logs. Then seconds, processor
+seconds and memory of `build_report`: without stored metrics, again with nothing changed, and anew
+of scored runs (runs are scored as they end). In Chromium, the time from opening to the first
+contentful paint and to the load event, with the bytes that were loaded until then.
 
-Bars for 2000 runs on two idle cores: made in 30 s, first paint after 0.5 s, 1 MB loaded before the script of plotly.
+Bars for 2000 runs on two idle cores: made in 30 s, first paint after 0.5 s, 1 MB loaded before the
+script of plotly.
 """
 
 import resource
@@ -31,14 +33,20 @@ from dynslam_bench.runs.record import IDENTITY_SCHEME  # noqa: E402
 from dynslam_bench.runs.store import RunStore  # noqa: E402
 
 STAGES = "segmentation features culling_box_depth culling_reseeding tracking mapping bundle_adjustment".split()
-STATS = [*"keypoints culled matches inliers mask_fraction".split(), *(f"figure_{k}" for k in range(16))]
+STATS = [
+    *"keypoints culled matches inliers mask_fraction".split(),
+    *(f"figure_{k}" for k in range(16)),
+]
 SETTINGS = {f"group_{k % 12}.setting_{k}": 0.5 * k for k in range(150)}
 """As many as trackers have; a run's record holds them twice."""
 PAINT = "(performance.getEntriesByName('first-contentful-paint')[0] ?? {}).startTime"
 LOAD = "performance.getEntriesByType('navigation')[0].loadEventEnd"
 
 
-FRAMES, TRACKERS, SEQUENCES, REPEATS = 200, 20, 20, 5
+FRAMES = 200
+TRACKERS = 20
+SEQUENCES = 20
+REPEATS = 5
 
 
 def fill(root: Path) -> RunStore:
@@ -47,7 +55,9 @@ def fill(root: Path) -> RunStore:
     for number in range(SEQUENCES):
         pattern = root / "patterns" / str(number)
         pattern.mkdir(parents=True)
-        add_frames(pattern, FRAMES, features=1500, size=(480, 640), stages=STAGES, stats=STATS, seed=number)
+        add_frames(
+            pattern, FRAMES, features=1500, size=(480, 640), stages=STAGES, stats=STATS, seed=number
+        )
         for at, seed in product(range(TRACKERS), range(REPEATS)):
             quality = float(np.geomspace(0.005, 0.2, TRACKERS)[at])
             broken = (at + number + seed) % 37 == 0
@@ -67,11 +77,16 @@ def timed_report(store: RunStore, output: Path) -> str:
     """One report: the cells of a row."""
 
     def spent() -> float:
-        return sum(sum(resource.getrusage(who)[:2]) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+        return sum(
+            sum(resource.getrusage(who)[:2])
+            for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+        )
 
-    began, before = time.perf_counter(), spent()
+    began = time.perf_counter()
+    before = spent()
     build_report(store, output)
-    wall, processor = time.perf_counter() - began, spent() - before
+    wall = time.perf_counter() - began
+    processor = spent() - before
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     size = sum(path.stat().st_size for path in output.rglob("*") if path.is_file()) / 1e6
     return f"{wall:.0f} | {processor:.0f} | {peak:.0f} | {size:.0f}"

@@ -1,10 +1,11 @@
 """Make the tables of a page of `docs/results/`: run each section's command and put its output below it.
 
-    python tests/benchmarks/results.py docs/results/flow.md                   # list the sections of a page
-    python tests/benchmarks/results.py docs/results/flow.md "Speed"           # run one section's command
-    python tests/benchmarks/results.py docs/results/flow.md --all
+    python tests/benchmarks/results.py docs/results/flow.md                   # list the sections of
+    a page python tests/benchmarks/results.py docs/results/flow.md "Speed"           # run one
+    section's command python tests/benchmarks/results.py docs/results/flow.md --all
 
-A section is a heading, what the table shows, a block of commands, a line that begins with ``*Made at``, and the table:
+A section is a heading, what the table shows, a block of commands, a line that begins with
+``*Made at``, and the table:
 
     ## Speed
 
@@ -16,8 +17,9 @@ A section is a heading, what the table shows, a block of commands, a line that b
 
     *Made at 1a2b3c4d on 2026-11-25; two cores of an AMD EPYC; data: fr1_xyz, fr1_rpy.*
 
-What follows that line, up to the next heading, is replaced by what the commands print. Commit, date and machine are
-written again, `data` stays as it is. A new table is a section without the line: ``--data`` says what it is made of.
+What follows that line, up to the next heading, is replaced by what the commands print. Commit, date
+and machine are written again, `data` stays as it is. A new table is a section without the line:
+``--data`` says what it is made of.
 """
 
 import datetime
@@ -40,15 +42,22 @@ COMMANDS = re.compile(r"^```bash\n(.*?)^```\n", re.DOTALL | re.MULTILINE)
 
 def sections(page: str) -> dict[str, str]:
     """A page's sections by their headings, each with its heading."""
-    return {part.partition("\n")[0][3:]: part for part in re.split(r"^(?=## )", page, flags=re.MULTILINE)[1:]}
+    return {
+        part.partition("\n")[0][3:]: part
+        for part in re.split(r"^(?=## )", page, flags=re.MULTILINE)[1:]
+    }
 
 
 def made_at() -> str:
     """Revision of the checkout (with ``+`` where files differ from it), date and machine."""
-    commit = _run("git rev-parse --short=8 HEAD").strip() + ("+" if _run("git status --porcelain -uno") else "")
+    commit = _run("git rev-parse --short=8 HEAD").strip() + (
+        "+" if _run("git status --porcelain -uno") else ""
+    )
     model = re.search(r"model name\s*: (.+)", _run("cat /proc/cpuinfo 2>/dev/null || true"))
     machine = model[1] if model else platform.processor() or platform.machine()
-    return f"*Made at {commit} on {datetime.date.today()}; {os.cpu_count()} cores of {machine}; data: "
+    return (
+        f"*Made at {commit} on {datetime.date.today()}; {os.cpu_count()} cores of {machine}; data: "
+    )
 
 
 def remade(section: str, data: str = "") -> str:
@@ -72,7 +81,10 @@ def _run(command: str) -> str:
         ["bash", "-euc", command],
         cwd=ROOT,
         env=os.environ
-        | {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": str(ROOT)},
+        | {
+            "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+            "PYTHONPATH": str(ROOT),
+        },
         check=True,
         capture_output=True,
         text=True,

@@ -1,6 +1,7 @@
 """Time of every segmenter on one 640x480 frame, and of carrying masks; prints a Markdown table.
 
-Run from the checkout: ``python tests/benchmarks/segmentation_speed.py [--threads 2] [--device cuda:0]``. Wall times are
+Run from the checkout:
+``python tests/benchmarks/segmentation_speed.py [--threads 2] [--device cuda:0]``. Wall times are
 medians; user CPU time stands beside them, because wall times of a busy machine mean little.
 """
 
@@ -32,7 +33,9 @@ def untrained(config: NetworkConfig, side: int, threads: int, device: str) -> Ma
     network = MaskRCNN(config.model_copy(update={"max_detections": 3, "classes": ("person",) * 90}))
     network.roi_heads.config = network.config
     network.set_input(side)
-    return MaskRCNNSegmenter(network, SegmentationSettings(), device=device, threads=threads, floor=0.0)
+    return MaskRCNNSegmenter(
+        network, SegmentationSettings(), device=device, threads=threads, floor=0.0
+    )
 
 
 def main() -> None:
@@ -48,7 +51,11 @@ def main() -> None:
         frame: Frame = frames[0]
         rows.append((label, lambda: segmenter.segment(frame)))  # type: ignore[attr-defined]
 
-    for name, config, side in (("50", NetworkConfig(), 480), ("50", NetworkConfig(), 800), ("18", RESNET18, 480)):
+    for name, config, side in (
+        ("50", NetworkConfig(), 480),
+        ("50", NetworkConfig(), 800),
+        ("18", RESNET18, 480),
+    ):
         network = untrained(config, side, arguments.threads, arguments.device)
         add(f"Mask R-CNN, ResNet-{name}, CFPN, shorter side {side}", network)
     settings = SegmentationSettings(source="embedded")
@@ -65,7 +72,12 @@ def main() -> None:
     rows.append((f"carry {len(found)} masks, dis", lambda: carry_dense(found, dense_flow(*grays))))
     rows.append((f"carry {len(found)} masks, sparse", lambda: carry_sparse(found, *grays)))
     rows.append(("dilation by 15 px", lambda: dynamic_mask(found, SegmentationSettings())))
-    rows.append(("depth repair and dilation", lambda: dynamic_mask(found, SegmentationSettings(repair="depth"), depth)))
+    rows.append(
+        (
+            "depth repair and dilation",
+            lambda: dynamic_mask(found, SegmentationSettings(repair="depth"), depth),
+        )
+    )
     print("| stage | wall ms | CPU ms |\n| --- | --- | --- |")
     for label, work in rows:
         wall, cpu = map(statistics.median, timed(work, arguments.repeats))

@@ -2,15 +2,17 @@
 
     python tests/benchmarks/study_null.py [--studies 100] [--table null choice planted regret]
 
-Whole studies (trials, choice, held-out check) over runs from a noise model: `sd` is the spread of the log ratio of two
-runs in one scene (measured 0.24 to 0.31), and beside it each setting differs from the baseline by 0.15 in log from
-scene to scene. `null`: no setting is better than another. `choice`: the same without a search, which takes no part in
-the choice: two such settings on the scenes of the choice. `planted`: the best setting has 30 % less error than the
-baseline, and a study has at most 40 trial runs. Beside it stands how often the best setting itself is proven, known
-without any trial: by the study's rule, and by the best possible rule with as few false claims (a z-test of known
-variance over all scenes that no trial saw). Studies that are not proven are extended once by six scenes. `regret`: the
-true log ratio of the best trial to the optimum, beside that of fifteen lines of plain Optuna with the same runs and the
-same bound at the end. A run is one of a configuration on one instance, counted once as the run store makes it.
+Whole studies (trials, choice, held-out check) over runs from a noise model: `sd` is the spread of
+the log ratio of two runs in one scene (measured 0.24 to 0.31), and beside it each setting differs
+from the baseline by 0.15 in log from scene to scene. `null`: no setting is better than another.
+`choice`: the same without a search, which takes no part in the choice: two such settings on the
+scenes of the choice. `planted`: the best setting has 30 % less error than the baseline, and a study
+has at most 40 trial runs. Beside it stands how often the best setting itself is proven, known
+without any trial: by the study's rule, and by the best possible rule with as few false claims (a
+z-test of known variance over all scenes that no trial saw). Studies that are not proven are
+extended once by six scenes. `regret`: the true log ratio of the best trial to the optimum, beside
+that of fifteen lines of plain Optuna with the same runs and the same bound at the end. A run is one
+of a configuration on one instance, counted once as the run store makes it.
 """
 
 import math
@@ -36,7 +38,8 @@ from dynslam_bench.tuning import Verdict, distributions, finish
 from dynslam_bench.tuning.judgement import compared
 from dynslam_bench.tuning.study_file import scenes
 
-SCENES, SPREADS = (6, 11, 12, 24), (0.15, 0.5)
+SCENES = (6, 11, 12, 24)
+SPREADS = (0.15, 0.5)
 PLANTED = 0.3
 MOST_RUNS = 40
 
@@ -49,18 +52,32 @@ def study_on(scenes: int, offsets: str = "0-1", **changes: object) -> Any:
 
 
 def line(*cells: object) -> str:
-    return "| " + " | ".join(f"{100 * cell:.0f} %" if isinstance(cell, float) else str(cell) for cell in cells) + " |"
+    return (
+        "| "
+        + " | ".join(
+            f"{100 * cell:.0f} %" if isinstance(cell, float) else str(cell) for cell in cells
+        )
+        + " |"
+    )
 
 
 def null(studies: int, folder: Path) -> Iterable[str]:
     """Of so many studies in which nothing is better, the shares that say what."""
 
     verdicts = [verdict.value for verdict in Verdict if verdict != Verdict.NOT_JUDGED]
-    yield line("scenes", "sd", "the best trial promises 5 %", "chosen", *(f"*{verdict}*" for verdict in verdicts))
+    yield line(
+        "scenes",
+        "sd",
+        "the best trial promises 5 %",
+        "chosen",
+        *(f"*{verdict}*" for verdict in verdicts),
+    )
     for count in SCENES:
         for simulated.STARTS_SD in SPREADS:
             counts = Counter[str]()
-            for seed in range(count * 1000 + int(100 * simulated.STARTS_SD) * 100000, 10**9)[:studies]:
+            for seed in range(count * 1000 + int(100 * simulated.STARTS_SD) * 100000, 10**9)[
+                :studies
+            ]:
                 tuner = simulated.SimulatedTuner(
                     study_on(count, sampler_seed=seed, sampler="tpe"),
                     folder / f"{count}-{simulated.STARTS_SD}-{seed}",
@@ -86,7 +103,9 @@ def choice(studies: int, folder: Path) -> Iterable[str]:
     for simulated.STARTS_SD in SPREADS:
         chosen = 0
         for tuner.noise_seed in range(studies):
-            baseline, *candidates = (tuner.outcomes({"gain": gain}, confirm) for gain in (1.5, 1.0, 2.0))
+            baseline, *candidates = (
+                tuner.outcomes({"gain": gain}, confirm) for gain in (1.5, 1.0, 2.0)
+            )
             chosen += any(compared(one, baseline, candidates=2).bound < 1 for one in candidates)
         yield line(len(confirm) // 2, str(simulated.STARTS_SD), f"{100 * chosen / studies:.1f} %")
 
@@ -107,7 +126,8 @@ def recovered(studies: int, folder: Path) -> Iterable[str]:
         "*does not matter here*", "known setting, this rule", "known setting, best test",
     )  # fmt: skip
     for simulated.STARTS_SD in (0.15, 0.28, 0.5):
-        counts, gains = Counter[str](), []
+        counts = Counter[str]()
+        gains = []
         for seed in range(studies):
             spec = study_on(6, "0", sampler_seed=seed, sampler="tpe", trials=14)
             name = f"planted-{simulated.STARTS_SD}-{seed}"
@@ -117,7 +137,8 @@ def recovered(studies: int, folder: Path) -> Iterable[str]:
             while tuner.runs - first + len(tuner.design.tune) <= MOST_RUNS:
                 trial = tuner.ask()
                 tuner.tell(trial, tuner.evaluate(trial))
-            summary, design = finish(tuner), tuner.design
+            summary = finish(tuner)
+            design = tuner.design
             gains.append(1 - planted(summary.best.params) / loss)
             counts[summary.verdict] += 1
             counts["chosen"] += summary.best.chosen
@@ -130,7 +151,14 @@ def recovered(studies: int, folder: Path) -> Iterable[str]:
                 tuner.extend(scenes=6)
                 summary = finish(tuner)
             counts["extended"] += summary.verdict == Verdict.PROVEN
-        names = ("chosen", Verdict.PROVEN, Verdict.PROMISING, "extended", Verdict.NO_MATTER, "known")
+        names = (
+            "chosen",
+            Verdict.PROVEN,
+            Verdict.PROMISING,
+            "extended",
+            Verdict.NO_MATTER,
+            "known",
+        )
         yield line(
             str(simulated.STARTS_SD),
             float(np.mean(gains)),
@@ -163,7 +191,9 @@ def regret(studies: int, folder: Path) -> Iterable[str]:
         *(("plain Optuna, `WilcoxonPruner`", "trials", "plain Optuna, no pruner", "trials")),
     )
     for pruner in ("none", "halving", "wilcoxon"):
-        runs, ours, others = [], [], {optuna.pruners.WilcoxonPruner: [], optuna.pruners.NopPruner: []}
+        runs = []
+        ours = []
+        others = {optuna.pruners.WilcoxonPruner: [], optuna.pruners.NopPruner: []}
         for seed in range(studies):
             tuner = simulated.SimulatedTuner(
                 study_on(8, pruner=pruner, trials=24, sampler="tpe", sampler_seed=seed),
@@ -179,14 +209,19 @@ def regret(studies: int, folder: Path) -> Iterable[str]:
             for kind, found in others.items():
                 found.append(plain(tuner, seed, runs[-1], kind()))
         yield line(
-            f"`{pruner}`", round(np.mean(runs)), *[cell for found in (ours, *others.values()) for cell in summed(found)]
+            f"`{pruner}`",
+            round(np.mean(runs)),
+            *[cell for found in (ours, *others.values()) for cell in summed(found)],
         )
 
 
 def summed(found: Sequence[tuple[float, int]]) -> tuple[str, int]:
     """Mean regret with its standard error, and mean number of trials."""
     regrets, trials = zip(*found, strict=True)
-    return f"{np.mean(regrets):.3f} ± {np.std(regrets, ddof=1) / math.sqrt(len(regrets)):.3f}", round(np.mean(trials))
+    return (
+        f"{np.mean(regrets):.3f} ± {np.std(regrets, ddof=1) / math.sqrt(len(regrets)):.3f}",
+        round(np.mean(trials)),
+    )
 
 
 def plain(tuner: Any, seed: int, most: int, pruner: optuna.pruners.BasePruner) -> tuple[float, int]:
@@ -194,9 +229,12 @@ def plain(tuner: Any, seed: int, most: int, pruner: optuna.pruners.BasePruner) -
 
     study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed), pruner=pruner)
     study.enqueue_trial({parameter.name: tuner.base[parameter.name] for parameter in tuner.space})
-    order, runs = np.random.default_rng(seed), 0
+    order = np.random.default_rng(seed)
+    runs = 0
     while runs + len(tuner.design.tune) <= most:
-        trial, logs, state = study.ask(distributions(tuner.space)), [], TrialState.COMPLETE
+        trial = study.ask(distributions(tuner.space))
+        logs = []
+        state = TrialState.COMPLETE
         for index in order.permutation(len(tuner.design.tune)):
             (run,) = tuner.outcomes(trial.params, [tuner.design.tune[index]]).values()
             logs.append(math.log(run.ate_m))
@@ -204,14 +242,18 @@ def plain(tuner: Any, seed: int, most: int, pruner: optuna.pruners.BasePruner) -
             if trial.should_prune():
                 state = TrialState.PRUNED
                 break
-        study.tell(trial, float(np.mean(logs)) if state == TrialState.COMPLETE else None, state=state)
+        study.tell(
+            trial, float(np.mean(logs)) if state == TrialState.COMPLETE else None, state=state
+        )
         runs += len(logs)
     complete = study.get_trials(states=(TrialState.COMPLETE,))
     best = sorted((trial for trial in complete if trial.number), key=lambda trial: trial.value)[:2]
     baseline = tuner.outcomes({}, tuner.design.confirm)
 
     def bound(trial: optuna.trial.FrozenTrial) -> float:
-        return compared(tuner.outcomes(trial.params, tuner.design.confirm), baseline, candidates=2).bound
+        return compared(
+            tuner.outcomes(trial.params, tuner.design.confirm), baseline, candidates=2
+        ).bound
 
     return simulated.valley(min(best, key=bound).params), len(study.trials)
 

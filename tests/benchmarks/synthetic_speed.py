@@ -2,7 +2,8 @@
 
 Usage: python tests/benchmarks/synthetic_speed.py [--frames 120] [--threads 2]
 
-A Markdown table of wall and CPU time a frame: on a machine shared with others only the CPU time says something.
+A Markdown table of wall and CPU time a frame: on a machine shared with others only the CPU time
+says something.
 """
 
 import tempfile
@@ -17,9 +18,11 @@ from dynslam_bench.sequences.synthetic import open_synthetic
 
 def timed(what: str, frames: int, work: Callable[[], object]) -> None:
     """Print a row: how long some work on so many frames takes."""
-    wall, cpu = time.perf_counter(), time.process_time()
+    wall = time.perf_counter()
+    cpu = time.process_time()
     work()
-    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    wall = time.perf_counter() - wall
+    cpu = time.process_time() - cpu
     print(f"| {what} | {1e3 * wall / frames:.1f} | {1e3 * cpu / frames:.1f} |", flush=True)
 
 
@@ -27,12 +30,18 @@ if __name__ == "__main__":
     arguments = parser_of(__doc__, frames=120, threads=2).parse_args()
     with tempfile.TemporaryDirectory() as folder:
         sequence = open_synthetic(
-            f"synthetic/walking_xyz?frames={arguments.frames}", Path(folder), threads=arguments.threads
+            f"synthetic/walking_xyz?frames={arguments.frames}",
+            Path(folder),
+            threads=arguments.threads,
         )
         print("| work | wall ms a frame | CPU ms a frame |\n| --- | ---: | ---: |")
         timed("first frame (textures, compilation if not cached)", 1, lambda: sequence[0])
         timed("render and write", arguments.frames - 1, sequence.render)
-        timed("read back", arguments.frames, lambda: list(map(sequence.__getitem__, range(len(sequence)))))
+        timed(
+            "read back",
+            arguments.frames,
+            lambda: list(map(sequence.__getitem__, range(len(sequence)))),
+        )
         timed("check a complete cache", arguments.frames, sequence.render)
         size = sum(path.stat().st_size for path in Path(folder).rglob("*.png")) / len(sequence)
         print(f"\nA frame takes {size / 1e6:.2f} MB on disk.")

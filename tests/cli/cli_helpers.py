@@ -9,5 +9,7 @@ PROGRAM = typer.main.get_command(app)
 
 
 def one_line(err):
-    assert err.startswith("error: ") and err.count("\n") == 1 and "Traceback" not in err
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    assert "Traceback" not in err
     return err

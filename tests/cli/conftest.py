@@ -24,7 +24,8 @@ def cli(capsys, monkeypatch, tmp_path):
         (user_cache() / folder.name).symlink_to(folder)
     monkeypatch.delenv("DYNSLAM_BENCH_DATA", raising=False)
     monkeypatch.setattr(app, "app", PROGRAM)
-    monkeypatch.setattr(output, "HEARTBEAT_S", 1000.0)  # no lines of progress where the machine is slow
+    # no lines of progress where the machine is slow
+    monkeypatch.setattr(output, "HEARTBEAT_S", 1000.0)
 
     def call(*arguments):
         with pytest.raises(SystemExit) as ended:
@@ -47,7 +48,8 @@ def facts(cli):
 
     def call(*arguments, code=0):
         ended, out, err = cli(*arguments, "--json")
-        assert ended == code and (code or not err), err
+        assert ended == code, err
+        assert code or not err, err
         return json.loads(out)
 
     return call

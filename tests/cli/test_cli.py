@@ -40,7 +40,9 @@ def commands(command=PROGRAM, words=()):
 def test_the_help_of_every_command_fits_one_screen(cli, monkeypatch, words):
     monkeypatch.setenv("COLUMNS", "100")
     code, out, _ = cli(*words, "--help")
-    assert code == 0 and "Usage: dynslam-bench" in out and len(out.strip().splitlines()) <= 45
+    assert code == 0
+    assert "Usage: dynslam-bench" in out
+    assert len(out.strip().splitlines()) <= 45
 
 
 def test_version(cli):
@@ -49,9 +51,16 @@ def test_version(cli):
 
 def test_usage_errors_exit_with_2(cli):
     limits = [["run", "never-move", "x", "--memory-limit", argument] for argument in ("abc", "-1")]
-    for arguments in (["nonsense"], ["run"], ["run", "orb-slam2", "x", "--jobs", "0"], ["sequences", "info"], *limits):
+    for arguments in (
+        ["nonsense"],
+        ["run"],
+        ["run", "orb-slam2", "x", "--jobs", "0"],
+        ["sequences", "info"],
+        *limits,
+    ):
         code, _, err = cli(*arguments)
-        assert code == 2 and "Traceback" not in err
+        assert code == 2
+        assert "Traceback" not in err
 
 
 RENDERED = "synthetic/sitting_xyz?frames=3"
@@ -60,7 +69,11 @@ BAD_OPTIONS = {
     "--degrade blurr=1": "blurr", "--camera tum-fr9": "camera", "--device gpu": "gpu", "--time-limit -1": "time",
     "--retry craashed": "craashed", "--map none.npz": "backend.map.file", "--frames 0:1": "1 frames",
 }  # fmt: skip
-BAD_FILES = {"nested.toml": "features.count", "table.toml": "features.nothing", "broken.toml": "not valid TOML"}
+BAD_FILES = {
+    "nested.toml": "features.count",
+    "table.toml": "features.nothing",
+    "broken.toml": "not valid TOML",
+}
 
 
 @pytest.mark.parametrize(
@@ -69,9 +82,18 @@ BAD_FILES = {"nested.toml": "features.count", "table.toml": "features.nothing", 
         (["run", "orb-slam", "synthetic/walking_xyz"], "unknown tracker 'orb-slam' (did you mean"),
         (["run", "never-move", "tum/fr3/walkin_xyz"], "did you mean 'tum/fr3/walking_xyz'"),
         (["run", "never-move", "tum/fr3/walking_xyz"], "sequences fetch tum/fr3/walking_xyz"),
-        (["run", "orb-slam2", "synthetic/walking_xyz", "--set", "features.nonsense=3"], "unknown setting"),
-        (["run", "orb-slam2", "synthetic/walking_xyz", "--set", "features"], "is not an assignment"),
-        (["run", "orb-slam2", "synthetic/walking_xyz", "--settings", "none.toml"], "cannot read none.toml"),
+        (
+            ["run", "orb-slam2", "synthetic/walking_xyz", "--set", "features.nonsense=3"],
+            "unknown setting",
+        ),
+        (
+            ["run", "orb-slam2", "synthetic/walking_xyz", "--set", "features"],
+            "is not an assignment",
+        ),
+        (
+            ["run", "orb-slam2", "synthetic/walking_xyz", "--settings", "none.toml"],
+            "cannot read none.toml",
+        ),
         (["run", "orb-slam2", RENDERED, "--localisation-only"], "needs a map"),
         (["run", "replay:none.txt", RENDERED], "none.txt"),
         (["run", "orb-slam2", "synthetic/walking_xyz", "--preset", "fast"], "has no preset 'fast'"),
@@ -97,36 +119,52 @@ BAD_FILES = {"nested.toml": "features.count", "table.toml": "features.nothing", 
         (["runs", "list", "--status", "crashd", "--results", "nowhere"], "did you mean 'crashed'"),
         (["report", "compare", "nowhere", "nowhere"], "nowhere"),
         (["bench", "smoke", "--tracker", "orb-slm2"], "did you mean 'orb-slam2'"),
-        *[(["run", "never-move", RENDERED, *options.split()], word) for options, word in BAD_OPTIONS.items()],
-        *[(["run", "orb-slam2", RENDERED, "--settings", name], word) for name, word in BAD_FILES.items()],
+        *[
+            (["run", "never-move", RENDERED, *options.split()], word)
+            for options, word in BAD_OPTIONS.items()
+        ],
+        *[
+            (["run", "orb-slam2", RENDERED, "--settings", name], word)
+            for name, word in BAD_FILES.items()
+        ],
     ],
 )
 def test_user_errors_are_one_line_and_exit_with_1(cli, tmp_path, arguments, words):
     (tmp_path / "nested.toml").write_text("[features]\ncount = 1\n")
-    (tmp_path / "table.toml").write_text("tracker = 'orb-slam2'\n[settings]\n'features.nothing' = 1\n")
+    (tmp_path / "table.toml").write_text(
+        "tracker = 'orb-slam2'\n[settings]\n'features.nothing' = 1\n"
+    )
     (tmp_path / "broken.toml").write_text("a = \n")
     code, out, err = cli(*arguments)
-    assert code == 1 and out == "" and words in one_line(err)
+    assert code == 1
+    assert out == ""
+    assert words in one_line(err)
     assert not list(tmp_path.glob("results/runs/*"))
 
 
 def test_sequences_list(cli, facts):
     listed = [row["id"] for row in facts("sequences", "list", "tum/fr3/walking*")]
-    assert "tum/fr3/walking_xyz" in listed and all(name.startswith("tum/fr3/walking") for name in listed)
+    assert "tum/fr3/walking_xyz" in listed
+    assert all(name.startswith("tum/fr3/walking") for name in listed)
     whole, starred = (cli("sequences", "list", pattern) for pattern in ("tum/fr3", "tum/fr3/*"))
-    assert whole == starred and whole[0] == 0, "a folder's name stands for its sequences"
-    assert sorted(row["id"] for row in facts("sequences", "list", "--here")) == sorted(SYNTHETIC_IDS)
+    assert whole == starred, "a folder's name stands for its sequences"
+    assert whole[0] == 0, "a folder's name stands for its sequences"
+    assert sorted(row["id"] for row in facts("sequences", "list", "--here")) == sorted(
+        SYNTHETIC_IDS
+    )
     code, out, _ = cli("sequences", "list", "bonn/*", "--tag", "low-dynamic", "--here")
-    assert code == 0 and len(out.splitlines()) == 1, "no table without a match"
+    assert code == 0, "no table without a match"
+    assert len(out.splitlines()) == 1, "no table without a match"
 
 
 def test_sequences_info(facts, walk):
     found = facts("sequences", "info", "tum/fr1/360_validation")
-    assert (
-        found["ground_truth"] == "not public" and found["here"] is False and found["url"].endswith("360_validation.tgz")
-    )
+    assert found["ground_truth"] == "not public"
+    assert found["here"] is False
+    assert found["url"].endswith("360_validation.tgz")
     found = facts("sequences", "info", walk)
-    assert found["frames"] == 4 and found["ground_truth_poses"] == 4
+    assert found["frames"] == 4
+    assert found["ground_truth_poses"] == 4
 
 
 def test_sequences_verify(cli, facts, walk, tmp_path):
@@ -136,7 +174,8 @@ def test_sequences_verify(cli, facts, walk, tmp_path):
     last.write_bytes(last.read_bytes()[:-30])
     assert cli("sequences", "verify", copy)[0] == 4
     (report,) = facts("sequences", "verify", copy, code=4)
-    assert report["ok"] is False and last.name in report["faults"][0]
+    assert report["ok"] is False
+    assert last.name in report["faults"][0]
 
 
 def test_a_faulty_recording_is_found_by_the_doctor_and_named_after_a_bad_run(cli, facts, tmp_path):
@@ -154,14 +193,16 @@ def test_a_faulty_recording_is_found_by_the_doctor_and_named_after_a_bad_run(cli
     assert code == 0
     assert out.endswith(": ready\n")
     _, _, err = cli("run", "constant-velocity", faulty)
-    assert f"sequences doctor {faulty}" in err and findings[0]["text"] in err
+    assert f"sequences doctor {faulty}" in err
+    assert findings[0]["text"] in err
     assert "sequences doctor" not in cli("run", "constant-velocity", sound)[2]
 
 
 def test_sequences_render(cli, tmp_path):
     name = "synthetic/sitting_static?scene=1&frames=2"
     code, out, _ = cli("sequences", "render", name, "--data-root", tmp_path / "data")
-    assert code == 0 and Path(out.strip()).is_relative_to(tmp_path / "data")
+    assert code == 0
+    assert Path(out.strip()).is_relative_to(tmp_path / "data")
     assert len(open_sequence(name, data_root=tmp_path / "data")) == 2
 
 
@@ -169,7 +210,10 @@ def test_run_show_report_compare_and_remove(cli, facts, walk, tmp_path):
     """One store through its life."""
     code, out, _ = cli("run", "never-move", walk, "--seed", "0", "1", "--frames", "0:3")
     shown = [re.split(r"\s{2,}", line) for line in out.splitlines()]
-    assert [(row[3], row[6], row[7]) for row in shown[1:3]] == [("ok", "0:3", "seed 0"), ("ok", "0:3", "seed 1")]
+    assert [(row[3], row[6], row[7]) for row in shown[1:3]] == [
+        ("ok", "0:3", "seed 0"),
+        ("ok", "0:3", "seed 1"),
+    ]
     remark = "warning: never-move on .* and 1 more run: little-truth: only 3 poses have ground truth: the alignment .*"
     assert re.fullmatch(remark, "".join(shown[3]))
     assert len(shown) == 4
@@ -179,38 +223,52 @@ def test_run_show_report_compare_and_remove(cli, facts, walk, tmp_path):
         ("never-move", 1, 1.0),
     ]
     stored = sorted(path.stat().st_mtime_ns for path in tmp_path.glob("results/runs/*/run.json"))
-    assert cli("run", "never-move", walk, "--seed", "0", "1", "--frames", ":3")[0] == 0  # nothing is made again
-    assert stored == sorted(path.stat().st_mtime_ns for path in tmp_path.glob("results/runs/*/run.json"))
+    # nothing is made again
+    assert cli("run", "never-move", walk, "--seed", "0", "1", "--frames", ":3")[0] == 0
+    assert stored == sorted(
+        path.stat().st_mtime_ns for path in tmp_path.glob("results/runs/*/run.json")
+    )
     assert cli("runs", "show", runs[0]["run_id"][:8])[0] == 0
     shown = facts("runs", "show", "latest")
-    assert shown["record"]["status"] == "ok" and shown["metrics"]["online"]["metrics"]["ate_rmse_m"] > 0
+    assert shown["record"]["status"] == "ok"
+    assert shown["metrics"]["online"]["metrics"]["ate_rmse_m"] > 0
     code, out, _ = cli("report", "results", "-o", "page")
-    assert code == 0 and out.strip().endswith("page/index.html") and Path("page/index.html").is_file()
+    assert code == 0
+    assert out.strip().endswith("page/index.html")
+    assert Path("page/index.html").is_file()
     assert facts("report")["html"].endswith("results/report/index.html")
     assert cli("report", "compare", "results", "page")[0] == 0
     code, out, _ = cli("runs", "rm", *[run["run_id"] for run in runs])
-    assert code == 0 and out.split() == [run["run_id"] for run in runs]
+    assert code == 0
+    assert out.split() == [run["run_id"] for run in runs]
     assert facts("runs", "list") == []
 
 
 def test_eval_and_protocols(cli, facts, walk, tmp_path):
     truth = walk / "groundtruth.txt"
     code, out, _ = cli("eval", truth, truth)
-    assert code == 0 and out.startswith("ATE (rmse) 0.0000 m over 4 poses [tum-rgbd/v1")
+    assert code == 0
+    assert out.startswith("ATE (rmse) 0.0000 m over 4 poses [tum-rgbd/v1")
     found = facts("eval", truth, truth, "--protocol", "evo-default")
-    assert found["protocol_id"] == "evo-default" and found["metrics"]["ate_rmse_m"] < 1e-9
+    assert found["protocol_id"] == "evo-default"
+    assert found["metrics"]["ate_rmse_m"] < 1e-9
     code, out, _ = cli("protocols", "list")
-    assert code == 0 and "kitti" in out
+    assert code == 0
+    assert "kitti" in out
 
 
 def test_kitti_trajectories_with_their_stamps(cli, facts, walk, tmp_path):
     truth = walk / "groundtruth.txt"
     write_kitti(tmp_path / "kitti.txt", read_tum(truth))
-    assert facts("eval", tmp_path / "kitti.txt", truth, "--timestamps", truth)["metrics"]["ate_rmse_m"] < 1e-6
+    assert (
+        facts("eval", tmp_path / "kitti.txt", truth, "--timestamps", truth)["metrics"]["ate_rmse_m"]
+        < 1e-6
+    )
     options = ("--tracker", "theirs", "--sequence", walk, "--timestamps", truth)
     assert facts("import", tmp_path / "kitti.txt", *options)[0]["ate_rmse_m"] < 1e-6
     code, _, err = cli("eval", tmp_path / "kitti.txt", truth)
-    assert code == 1 and "--timestamps FILE" in one_line(err)
+    assert code == 1
+    assert "--timestamps FILE" in one_line(err)
 
 
 def test_doctor(facts):
@@ -226,27 +284,35 @@ def test_cache(cli, facts, monkeypatch, tmp_path):
     StageCache().put("masks", "ab" * 16, {"a": np.zeros(10)}, 0.5)
     for entries in ({"masks": 1}, {}):
         usage = facts("cache", "info")
-        assert usage["entries_by_stage"] == entries and (usage["bytes"] > 0) == bool(entries)
+        assert usage["entries_by_stage"] == entries
+        assert (usage["bytes"] > 0) == bool(entries)
         assert cli("cache", "clear", "--yes")[0] == 0
 
 
 def test_a_scheduler_that_is_not_there_is_one_line(cli, walk, tmp_path):
-    (tmp_path / "mine.toml").write_text(f"trackers = ['never-move', 'constant-velocity']\nsequences = ['{walk}']\n")
+    (tmp_path / "mine.toml").write_text(
+        f"trackers = ['never-move', 'constant-velocity']\nsequences = ['{walk}']\n"
+    )
     code, _, err = cli("bench", "mine.toml", "--scheduler", "tcp://127.0.0.1:9")
-    assert code == 1 and ("distributed" in err or "no Dask scheduler answers" in err)
+    assert code == 1
+    assert "distributed" in err or "no Dask scheduler answers" in err
 
 
 def test_audit_of_the_paper(cli, facts, tmp_path):
     findings = facts("report", "audit-paper")
-    assert findings and {"check", "printed", "expected", "holds"} <= set(findings[0])
-    assert cli("report", "audit-paper", "-o", "audit.md")[0] == 0 and (tmp_path / "audit.md").is_file()
+    assert findings
+    assert {"check", "printed", "expected", "holds"} <= set(findings[0])
+    assert cli("report", "audit-paper", "-o", "audit.md")[0] == 0
+    assert (tmp_path / "audit.md").is_file()
 
 
 def test_help_all_shows_every_option(cli):
-    short, whole = cli("run", "--help")[1], cli("run", "--help-all")[1]
+    short = cli("run", "--help")[1]
+    whole = cli("run", "--help-all")[1]
     (run,) = [command for words, command in commands() if words == ("run",)]
     options = {name for parameter in run.params for name in parameter.opts if name.startswith("--")}
-    assert [name for name in options if name not in whole] == [] and "--realtime" not in short
+    assert [name for name in options if name not in whole] == []
+    assert "--realtime" not in short
 
 
 STUDY = f"""
@@ -270,17 +336,26 @@ def test_a_study(cli, facts, tmp_path):
     Path("study.toml").write_text(STUDY)
     plan = facts("tune", "space", "study.toml")
     (parameter,) = plan["settings"]
-    assert parameter["name"] == "gain" and plan["preview"]["needed"] > 2
+    assert parameter["name"] == "gain"
+    assert plan["preview"]["needed"] > 2
     assert "there is no study 'tiny'" in one_line(cli("tune", "best", "study.toml")[2])
     found = facts("tune", "run", "study.toml")
-    assert Path(found["page"]).is_file() and found["summary"]["trials"]["complete"] == 2
+    assert Path(found["page"]).is_file()
+    assert found["summary"]["trials"]["complete"] == 2
     assert facts("tune", "status", "study.toml")["complete"] == 2
     assert "has its 2 trials" in cli("tune", "worker", "study.toml")[1]
     more = facts("tune", "extend", "study.toml", "--trials", "1")
-    assert more["summary"]["trials"]["complete"] == 3 == facts("tune", "status", "study.toml")["complete"]
+    assert (
+        more["summary"]["trials"]["complete"]
+        == 3
+        == facts("tune", "status", "study.toml")["complete"]
+    )
     assert "not judged" in cli("tune", "best", "study.toml", "--trial", "0")[1]
     assert cli("tune", "best", "study.toml", "-o", "preset.toml")[0] == 0
-    assert facts("run", f"{toy_tracker.__file__}:SPEC", "1", "--settings", "preset.toml")[0]["status"] == "ok"
+    assert (
+        facts("run", f"{toy_tracker.__file__}:SPEC", "1", "--settings", "preset.toml")[0]["status"]
+        == "ok"
+    )
     assert facts("tune", "status", "study.toml")["conclusion"] == more["summary"]["conclusion"]
     Path("study.toml").write_text(STUDY.replace("gain", "gian"))
     assert "did you mean 'gain'" in one_line(cli("tune", "space", "study.toml")[2])
@@ -308,8 +383,11 @@ def test_help_loads_nothing_heavy():
         "for words in ([], ['run'], ['report']):\n    try: start([*words, '--help'])\n    except SystemExit: pass\n"
         f"sys.stderr.write(' '.join(m for m in {HEAVY!r} if m in sys.modules))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
-    assert done.stderr == "" and done.stdout.count("Usage: dynslam-bench") == 3
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    assert done.stderr == ""
+    assert done.stdout.count("Usage: dynslam-bench") == 3
 
 
 def test_output_to_a_closed_pipe_is_no_error():
@@ -320,15 +398,19 @@ def test_output_to_a_closed_pipe_is_no_error():
         cwd=ROOT,
         check=True,
     )
-    assert done.stderr == "" and done.stdout.startswith("7-Scenes"), "the first data set"
+    assert done.stderr == "", "the first data set"
+    assert done.stdout.startswith("7-Scenes"), "the first data set"
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device without space")
 def test_output_to_a_full_device_is_one_line():
     command = [sys.executable, "-m", "dynslam_bench", "sequences", "list"]
     with Path("/dev/full").open("w") as full:
-        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT, check=False)
-    assert done.returncode == 1 and done.stderr.count("\n") == 1
+        done = subprocess.run(
+            command, stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT, check=False
+        )
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
 
 
 # `eval` takes every format that it names.
@@ -347,10 +429,14 @@ def test_hints_are_shown_of_files_runs_and_boards(cli, tmp_path):
     truth = open_sequence(sequence).ground_truth
     noise = se3.exp(np.random.default_rng(0).normal(0, 1e-3, (60, 6)))
     write_tum(tmp_path / "truth.txt", truth)
-    write_tum(tmp_path / "inverted.txt", Trajectory(truth.timestamps, se3.inverse(truth.T_world_cam @ noise)))
+    write_tum(
+        tmp_path / "inverted.txt",
+        Trajectory(truth.timestamps, se3.inverse(truth.T_world_cam @ noise)),
+    )
     files = tmp_path / "inverted.txt", tmp_path / "truth.txt"
     code, out, err = cli("eval", *files)
-    assert code == 0 and "hint: inverted-poses: " in out, err
+    assert code == 0, err
+    assert "hint: inverted-poses: " in out, err
     code, out, err = cli("eval", *files, "--json")
     assert [hint["id"] for hint in json.loads(out)["hints"]] == ["inverted-poses"]
     assert json.loads(out)["metrics"] == pytest.approx(evaluate_files(*files).metrics)
@@ -361,12 +447,14 @@ def test_hints_are_shown_of_files_runs_and_boards(cli, tmp_path):
     code, _, err = cli("report", tmp_path / "results", "-o", tmp_path / "report")
     assert code == 0, err
     text = (tmp_path / "report" / "report.md").read_text()
-    assert "‡" in text and "inverted-poses 1" in text
+    assert "‡" in text
+    assert "inverted-poses 1" in text
 
 
 def test_a_protocol_for_some_sequences_says_so(cli, pair):
     code, out, _ = cli("eval", "estimate.txt", "truth.txt", "--protocol", "droid-w/v1-bonn")
-    assert code == 0 and "droid-w/v1-bonn means something for bonn/* only" in out
+    assert code == 0
+    assert "droid-w/v1-bonn means something for bonn/* only" in out
 
 
 def test_the_protocol_of_a_published_number_is_marked(cli, facts, pair):
@@ -375,12 +463,18 @@ def test_the_protocol_of_a_published_number_is_marked(cli, facts, pair):
     printed = f"{rows['evo_ape -as']:.9f}"
     code, out, _ = cli(*command, "--published", printed)
     marked = [line for line in out.splitlines() if " agrees " in line]
-    assert code == 0 and any(line.startswith("ATE     evo_ape -as") for line in marked)
-    assert all(row["agrees"] == (f"{row['rmse_m']:.9f}" == printed) for row in facts(*command, "--published", printed))
+    assert code == 0
+    assert any(line.startswith("ATE     evo_ape -as") for line in marked)
+    assert all(
+        row["agrees"] == (f"{row['rmse_m']:.9f}" == printed)
+        for row in facts(*command, "--published", printed)
+    )
     code, out, _ = cli(*command, "--published", "77")
-    assert code == 0 and "No row agrees with 77; the nearest is" in out.splitlines()[-1]
+    assert code == 0
+    assert "No row agrees with 77; the nearest is" in out.splitlines()[-1]
     code, _, err = cli(*command, "--published", "7cm")
-    assert code == 1 and "as it was printed" in one_line(err)
+    assert code == 1
+    assert "as it was printed" in one_line(err)
 
 
 # The public interface for Python: lazy, typed names, each with the result of its command.
@@ -391,9 +485,13 @@ def test_a_suite_its_report_and_its_frame(walk: Path, tmp_path: Path) -> None:
     suite.write_text(f"trackers = ['never-move', 'constant-velocity']\nsequences = ['{walk}']\n")
     results = tmp_path / "results"
     runs = db.bench(suite, results=results)
-    assert [run.status for run in runs] == ["ok", "ok"] and all(run.metrics["ate_rmse_m"] > 0 for run in runs)
-    assert len(runs[0].trajectory) == len(runs[0].frames()) == 4 and (runs[0].folder / "run.json").is_file()
-    assert db.run("never-move", walk, results=results).record.run_id == runs[0].record.run_id, "it is stored already"
+    assert [run.status for run in runs] == ["ok", "ok"]
+    assert all(run.metrics["ate_rmse_m"] > 0 for run in runs)
+    assert len(runs[0].trajectory) == len(runs[0].frames()) == 4
+    assert (runs[0].folder / "run.json").is_file()
+    assert db.run("never-move", walk, results=results).record.run_id == runs[0].record.run_id, (
+        "it is stored already"
+    )
     assert sorted(db.load(results)["tracker"]) == ["constant-velocity", "never-move"]
     assert db.report(results).html == results / "report" / "index.html"
 
@@ -407,6 +505,15 @@ def test_unfit_options_are_errors_of_the_user(walk: Path, tmp_path: Path) -> Non
 
 
 def test_names_are_listed_and_loaded_on_first_use() -> None:
-    assert set(dir(db)) == {"bench", "load", "report", "run", "sequence", "trackers", "tune", "__version__"}
+    assert set(dir(db)) == {
+        "bench",
+        "load",
+        "report",
+        "run",
+        "sequence",
+        "trackers",
+        "tune",
+        "__version__",
+    }
     with pytest.raises(AttributeError, match="nothing"):
         _ = db.nothing

@@ -37,20 +37,37 @@ from dynslam_bench.trackers import TRACKERS
 
 
 def test_a_row_names_the_part_the_settings_and_its_origin(cli, facts, walk):
-    command = ("run", "constant-velocity", walk, "--frames", "0:3", "--stride", "2", "--set", "frames=4")
+    command = (
+        "run",
+        "constant-velocity",
+        walk,
+        "--frames",
+        "0:3",
+        "--stride",
+        "2",
+        "--set",
+        "frames=4",
+    )
     assert "from the store" not in cli(*command, "--label", "my control")[1]
     assert "from the store" in cli(*command)[1]
     (row,) = facts(*command)
-    assert row["from_store"] is True and row["settings"] == "frames=4" and row["frames"] == "0:3, every 2nd"
-    assert "0:3, every 2nd" in cli("runs", "list")[1] and "my control" in cli("runs", "show")[1]
+    assert row["from_store"] is True
+    assert row["settings"] == "frames=4"
+    assert row["frames"] == "0:3, every 2nd"
+    assert "0:3, every 2nd" in cli("runs", "list")[1]
+    assert "my control" in cli("runs", "show")[1]
 
 
 def test_the_number_of_frames_and_the_expected_time_are_written_before_the_run(cli, walk):
     command = ("run", "constant-velocity", walk, "--set")
-    unknown = "1 run, 4 frames; a system's first run on a machine compiles its code for up to a minute"
+    unknown = (
+        "1 run, 4 frames; a system's first run on a machine compiles its code for up to a minute"
+    )
     assert cli(*command, "frames=3")[2].splitlines()[0] == unknown
     first = cli(*command, "frames=4", "--offset", "0", "1")[2].splitlines()[0]
-    assert re.fullmatch(r"2 runs, 7 frames, about 0:00:0\d by the frame times of stored runs", first)
+    assert re.fullmatch(
+        r"2 runs, 7 frames, about 0:00:0\d by the frame times of stored runs", first
+    )
     assert "frames" not in cli(*command, "frames=4")[2], "it is stored: nothing will be tracked"
     assert cli(*command, "frames=5", "--json")[2] == ""
 
@@ -58,18 +75,21 @@ def test_the_number_of_frames_and_the_expected_time_are_written_before_the_run(c
 def test_a_row_names_files_without_their_folders(cli, facts, walk):
     command = ("run", f"replay:{walk / 'groundtruth.txt'}", walk, "--set", "tolerance_s=0.02")
     code, out, _ = cli(*command)
-    assert code == 0 and "replay:groundtruth.txt" in out and str(walk) not in out
+    assert code == 0
+    assert "replay:groundtruth.txt" in out
+    assert str(walk) not in out
     (row,) = facts(*command)
     assert row["tracker"] == f"replay:{walk / 'groundtruth.txt'}", "scripts get the whole name"
-    assert runs.shown_cell("settings", "a=1, s.source=onnx:/x/y z/net.onnx, v=/w/ORBvoc.txt, r=recorded:./m/n") == (
-        "a=1, s.source=onnx:net.onnx, v=ORBvoc.txt, r=recorded:n"
-    )
+    assert runs.shown_cell(
+        "settings", "a=1, s.source=onnx:/x/y z/net.onnx, v=/w/ORBvoc.txt, r=recorded:./m/n"
+    ) == ("a=1, s.source=onnx:net.onnx, v=ORBvoc.txt, r=recorded:n")
 
 
 def test_a_recording_without_ground_truth_says_where_its_trajectory_is(cli, tmp_path):
     write_folder(tmp_path / "mine", 4, has_truth=False)
     code, _, err = cli("run", "never-move", "mine")
-    assert code == 0 and len(read_tum(Path(err.splitlines()[-1].rpartition(": ")[2]))) == 4
+    assert code == 0
+    assert len(read_tum(Path(err.splitlines()[-1].rpartition(": ")[2]))) == 4
 
 
 def test_a_folder_whose_camera_is_not_known_names_the_choices(cli, walk, tmp_path):
@@ -90,7 +110,9 @@ def fetched(tmp_path, monkeypatch):
     """Where the COCO checkpoint lies once it is fetched; a copy of the embedded network takes its place."""
     file = tmp_path / "weights" / checkpoints.COCO.file
     file.parent.mkdir()
-    monkeypatch.setattr(checkpoints, "fetch_checkpoint", lambda _: shutil.copy(checkpoints.embedded_weights(), file))
+    monkeypatch.setattr(
+        checkpoints, "fetch_checkpoint", lambda _: shutil.copy(checkpoints.embedded_weights(), file)
+    )
     monkeypatch.setenv(WEIGHTS_VARIABLE, str(file.parent))
     return file
 
@@ -98,18 +120,27 @@ def fetched(tmp_path, monkeypatch):
 def test_masks_of_a_recording_are_downloaded_only_by_agreement(cli, walk, fetched, monkeypatch):
     command = ("run", "mask-rcnn", walk, "--frames", "0:2")
     code, out, err = cli(*command)
-    assert code == 1 and not out and not fetched.exists() and len(err.splitlines()) == 5, "an error and four cures"
+    assert code == 1, "an error and four cures"
+    assert not out, "an error and four cures"
+    assert not fetched.exists(), "an error and four cures"
+    assert len(err.splitlines()) == 5, "an error and four cures"
     monkeypatch.setattr(running, "is_interactive", lambda: True)
     monkeypatch.setattr(running.typer, "confirm", lambda *_, **__: False)
     code, _, err = cli(*command)
-    assert code == 1 and "170 MB" in err and not fetched.exists()
+    assert code == 1
+    assert "170 MB" in err
+    assert not fetched.exists()
     monkeypatch.setattr(running.typer, "confirm", lambda *_, **__: True)
-    assert cli(*command)[0] == 0 and fetched.is_file()
+    assert cli(*command)[0] == 0
+    assert fetched.is_file()
     monkeypatch.setattr(running.typer, "confirm", pytest.fail)
     assert cli(*command)[0] == 0, "nobody is asked again, and the run is stored"
     fetched.unlink()
-    monkeypatch.setattr(checkpoints, "fetch_checkpoint", lambda _: fetched.with_suffix(".asked").touch())
-    assert cli(*command, "--yes", "--seed", "1")[0] == 1 and fetched.with_suffix(".asked").exists()
+    monkeypatch.setattr(
+        checkpoints, "fetch_checkpoint", lambda _: fetched.with_suffix(".asked").touch()
+    )
+    assert cli(*command, "--yes", "--seed", "1")[0] == 1
+    assert fetched.with_suffix(".asked").exists()
 
 
 def test_bench_has_limits(cli, walk, tmp_path):
@@ -122,12 +153,17 @@ def test_bench_has_limits(cli, walk, tmp_path):
         (("--retry", "ok", "--time-limit", "0.0001"), 3, ("timeout", "out-of-memory")),
     ):
         ended, out, _ = cli("bench", "small.toml", *options, "--json")
-        assert ended == code and json.loads(out)[0]["status"] in statuses
+        assert ended == code
+        assert json.loads(out)[0]["status"] in statuses
 
 
 def test_a_part_without_runs_is_no_error(cli, walk, tmp_path):
     (tmp_path / "small.toml").write_text(f'trackers = ["never-move"]\nsequences = ["{walk}"]\n')
-    assert cli("bench", "small.toml", "--shard", "7/64") == (0, "this part of the suite holds no runs\n", "")
+    assert cli("bench", "small.toml", "--shard", "7/64") == (
+        0,
+        "this part of the suite holds no runs\n",
+        "",
+    )
     assert cli("bench", "small.toml", "--shard", "7/64", "--json") == (0, "[]\n", "")
 
 
@@ -137,21 +173,26 @@ def test_pictures_of_a_stored_run_are_made(facts, walk):
     assert not names & {path.name for path in folder.iterdir()}
     for from_store in (False, True):
         (row,) = facts("run", "orb-slam2", walk, "--snapshots", "--sheet", "--video")
-        assert row["from_store"] is from_store and Path(row["folder"]) == folder
+        assert row["from_store"] is from_store
+        assert Path(row["folder"]) == folder
         assert names <= {path.name for path in folder.iterdir()}
 
 
 def test_a_map_that_cannot_be_had_is_no_success(cli, walk):
     code, _, err = cli("run", "never-move", walk, "--save-map", "--json")
-    assert code == 3 and err.startswith("no map.npz: ") and err.count("\n") == 1
+    assert code == 3
+    assert err.startswith("no map.npz: ")
+    assert err.count("\n") == 1
     code, out, _ = cli("run", "orb-slam2", walk, "--save-map")
-    assert code == 0 and "map.npz" in out
+    assert code == 0
+    assert "map.npz" in out
 
 
 def test_a_run_that_was_lost_is_no_success(cli, walk):
     toys = Path(__file__).parents[1] / "envs" / "envs_toys.py"
     code, out, _ = cli("run", f"{toys}:SPEC", walk, "--set", "mode=lost", "--set", "at=1", "--json")
-    assert json.loads(out)[0]["status"] == "lost" and code == 3
+    assert json.loads(out)[0]["status"] == "lost"
+    assert code == 3
 
 
 def test_progress_off_a_terminal_is_a_line_now_and_then(capsys, monkeypatch):
@@ -160,7 +201,8 @@ def test_progress_off_a_terminal_is_a_line_now_and_then(capsys, monkeypatch):
         advance(1.5, 3, "orb-slam2 on walk, frame 5 of 10")
         time.sleep(0.4)
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) >= 2 and lines[0].startswith("3 runs: 1.5 of 3, about ")
+    assert len(lines) >= 2
+    assert lines[0].startswith("3 runs: 1.5 of 3, about ")
     assert "(orb-slam2 on walk, frame 5 of 10)" in lines[0]
     with output.progress("report") as advance:
         advance(1280, 1500)
@@ -188,22 +230,28 @@ def test_runs_are_filtered_sorted_and_coloured(cli, facts, walk, monkeypatch):
     assert cli("run", hostile.TARGET, walk, "--set", "mode=raise")[0] == 3
     listed = facts("runs", "list")
     (crashed,) = (row for row in listed if row["status"] == "crashed")
-    assert crashed["coverage"] == 0.5 and crashed["ate_rmse_m"] is None, "two poses have an error, the run has none"
+    assert crashed["coverage"] == 0.5, "two poses have an error, the run has none"
+    assert crashed["ate_rmse_m"] is None, "two poses have an error, the run has none"
     assert [row["tracker"] for row in facts("runs", "list", "--tracker", "never")] == ["never-move"]
     assert facts("runs", "list", "--sequence", "elsewhere") == []
     errors = [row["ate_rmse_m"] for row in facts("runs", "list", "--sort", "-ate")]
-    assert errors[0] >= errors[1] and errors[2] is None
+    assert errors[0] >= errors[1]
+    assert errors[2] is None
     assert [row["tracker"] for row in facts("runs", "list", "--sort", "tracker")] == sorted(
         r["tracker"] for r in listed
     )
     code, out, _ = cli("runs", "list")
-    assert code == 0 and "1 of 3 runs are not ok: 1 crashed." in out and "\033" not in out
+    assert code == 0
+    assert "1 of 3 runs are not ok: 1 crashed." in out
+    assert "\033" not in out
     assert "did you mean 'coverage'" in one_line(cli("runs", "list", "--sort", "coverge")[2])
     assert "1 run failed: Hostile · mode=raise crashed (1)." in cli("report")[1]
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
     out = cli("runs", "list")[1]
-    assert "\033[31mcrashed\033[0m" in out and "\033[32mok\033[0m" in out
-    assert crashed["run_id"] not in out and crashed["run_id"][:8] in out
+    assert "\033[31mcrashed\033[0m" in out
+    assert "\033[32mok\033[0m" in out
+    assert crashed["run_id"] not in out
+    assert crashed["run_id"][:8] in out
     monkeypatch.setenv("NO_COLOR", "1")
     assert "\033" not in cli("runs", "list")[1]
     assert cli("runs", "rm", "--failed") == (0, f"{crashed['run_id']}\n", "")
@@ -211,24 +259,30 @@ def test_runs_are_filtered_sorted_and_coloured(cli, facts, walk, monkeypatch):
 
 def test_a_monocular_tracker_is_scored_with_its_scale_unless_told_otherwise(cli, facts, walk):
     code, _, err = cli("run", "orb-slam2-mono", walk)
-    assert code in (0, 3) and "scored under tum-rgbd/v1-sim3" in err.splitlines()[0]
+    assert code in (0, 3)
+    assert "scored under tum-rgbd/v1-sim3" in err.splitlines()[0]
     (row,) = facts("run", "orb-slam2-mono", walk, code=code)
     assert row["protocol"] == "tum-rgbd/v1-sim3"
     (row,) = facts("run", "orb-slam2-mono", walk, "--protocol", "tum-rgbd/v1", code=code)
-    assert row["protocol"] == "tum-rgbd/v1" and row["ate_rmse_m"] is None
+    assert row["protocol"] == "tum-rgbd/v1"
+    assert row["ate_rmse_m"] is None
     assert running.default_protocol("never-move") == "tum-rgbd/v1"
 
 
 def test_progress_names_what_is_written_behind_the_last_frame():
     spec = RunSpec(tracker="never-move", sequence="walk", video=True, sheet=True)
     texts = [
-        running.event_text(RunEvent("progress", "id", spec, 1, partial={"frames_done": done, "frames": 9}))
+        running.event_text(
+            RunEvent("progress", "id", spec, 1, partial={"frames_done": done, "frames": 9})
+        )
         for done in (8, 9)
     ]
-    assert texts[0].endswith(", frame 8 of 9") and texts[1].endswith(", writing trajectories, video.webm, sheet.png")
+    assert texts[0].endswith(", frame 8 of 9")
+    assert texts[1].endswith(", writing trajectories, video.webm, sheet.png")
 
 
-# Ctrl-C, SIGTERM and SIGHUP in long commands: they stop at once, say how to go on, and exit with the shell's code.
+# Ctrl-C, SIGTERM and SIGHUP in long commands: they stop at once, say how to go on, and exit with
+# the shell's code.
 
 
 HERE = Path(__file__).resolve().parents[1]
@@ -281,7 +335,12 @@ def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number, s
         preexec_fn=attentive,
     )
     try:
-        hostile.until(lambda: program.poll() is not None or (pids.is_file() and pids.read_text().endswith("\n")), 300)
+        hostile.until(
+            lambda: (
+                program.poll() is not None or (pids.is_file() and pids.read_text().endswith("\n"))
+            ),
+            300,
+        )
         assert program.poll() is None, program.stderr.read()
         program.send_signal(number)
         began = time.monotonic()
@@ -289,7 +348,8 @@ def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number, s
         took = time.monotonic() - began
     finally:
         program.kill()
-    assert program.returncode == 128 + number and "the same command goes on from there" in err, err
+    assert program.returncode == 128 + number, err
+    assert "the same command goes on from there" in err, err
     assert took < 2 + 10 * _crowded(), f"{took:.1f} s"
     assert not Path(f"/proc/{pids.read_text().split()[0]}").exists()
     assert not list(tmp_path.glob("results/runs/*")), "what was interrupted is no outcome"
@@ -301,7 +361,8 @@ def test_sigterm_ends_with_the_shells_code():
         f"app.start = lambda: kill(getpid(), {signal.SIGTERM:d}); cli.main()"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 128 + signal.SIGTERM and done.stderr == "interrupted\n"
+    assert done.returncode == 128 + signal.SIGTERM
+    assert done.stderr == "interrupted\n"
 
 
 def _crowded():
@@ -309,7 +370,9 @@ def _crowded():
     return float(Path("/proc/loadavg").read_text().split()[0]) > 1.5 * (os.cpu_count() or 1)
 
 
-@pytest.mark.parametrize("error", [ValueError("schema: KeyboardInterrupt"), RunError("cannot load")])
+@pytest.mark.parametrize(
+    "error", [ValueError("schema: KeyboardInterrupt"), RunError("cannot load")]
+)
 def test_an_error_that_a_library_makes_of_an_interrupt_is_an_interrupt(monkeypatch, capsys, error):
     monkeypatch.setattr(app, "app", Mock(side_effect=error))
     monkeypatch.setattr(app, "interrupted", lambda: True)
@@ -321,7 +384,9 @@ def test_an_error_that_a_library_makes_of_an_interrupt_is_an_interrupt(monkeypat
 # The demonstration: its closing sentences, and kernels compiled ahead.
 
 
-def row(tracker: str, ate_m: float, sequence: str = "synthetic/walking_xyz?scene=100&frames=100") -> RunRow:
+def row(
+    tracker: str, ate_m: float, sequence: str = "synthetic/walking_xyz?scene=100&frames=100"
+) -> RunRow:
     return RunRow.model_validate({
         "run_id": digest([tracker, sequence], 16), "status": "ok", "n_frames": 100, "n_tracked": 100, "coverage": 1.0,
         "tracker": {"id": tracker, "label": tracker},
@@ -337,8 +402,11 @@ def row(tracker: str, ate_m: float, sequence: str = "synthetic/walking_xyz?scene
 def test_the_verdict_is_that_of_the_numbers(culled_m: float, verdict: str) -> None:
     rows = [row("orb-slam2", 0.02), row("mask-rcnn", culled_m), row("never-move", 0.1)]
     first, *rest = tell([*rows, row("orb-slam2", 0.003, "synthetic/sitting_xyz?scene=104")])
-    assert "20.0 mm" in first and f"{1e3 * culled_m:.1f} mm" in first and verdict in first
-    assert ("times" in first) == bool(verdict) and len(rest) == 1, "no sentence where nothing was culled"
+    assert "20.0 mm" in first
+    assert f"{1e3 * culled_m:.1f} mm" in first
+    assert verdict in first
+    assert ("times" in first) == bool(verdict), "no sentence where nothing was culled"
+    assert len(rest) == 1, "no sentence where nothing was culled"
 
 
 NOTHING_IS_LEFT = """
@@ -369,7 +437,9 @@ def test_nothing_is_left_for_the_first_run_to_compile() -> None:
 
 
 def test_the_compiling_process_ends_when_rendering_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(demo.subprocess, "Popen", lambda *_, popen=subprocess.Popen, **__: popen(["sleep", "60"]))
+    monkeypatch.setattr(
+        demo.subprocess, "Popen", lambda *_, popen=subprocess.Popen, **__: popen(["sleep", "60"])
+    )
     began = time.monotonic()
     with pytest.raises(KeyError), compiled_ahead():
         raise KeyError
@@ -383,25 +453,34 @@ def test_the_list_fits_one_screen_and_holds_every_tracker(cli, facts):
     assert len(lines) < 50
     shown = "\n".join(lines)
     assert [name for name in rows if "?" not in name and f"  {name} " not in shown] == []
-    assert [name for name in rows if name.partition("?")[2] and name[name.index("?") :] not in shown] == []
+    assert [
+        name for name in rows if name.partition("?")[2] and name[name.index("?") :] not in shown
+    ] == []
 
 
 def test_info_describes_settings_and_presets_on_one_screen(cli, facts):
     lines = cli("trackers", "info", "emfoa-oft")[1].splitlines()
-    assert 24 < len(lines) <= 50 and any(line.startswith("flow.budget ") for line in lines)
+    assert 24 < len(lines) <= 50
+    assert any(line.startswith("flow.budget ") for line in lines)
     described = facts("trackers", "info", "emfoa-oft")
     by_name = {setting["name"]: setting for setting in described["parameters"]}
     threshold = by_name["segmentation.confidence"]
     assert (threshold["low"], threshold["high"], threshold["scale"]) == (0.1, 0.9, "linear")
-    assert by_name["segmentation.source"]["tunable"] is False and described["presets"]["fast"]["flow.budget"] == 24
+    assert by_name["segmentation.source"]["tunable"] is False
+    assert described["presets"]["fast"]["flow.budget"] == 24
 
 
 def test_trackers_info_tells_what_others_report_and_where(facts):
     reported = facts("trackers", "info", "dynaslam")["reported"]
-    row = next(r for r in reported if r["sequence"] == "tum/fr3/walking_xyz" and r["source"] == "DynaSLAM paper")
+    row = next(
+        r
+        for r in reported
+        if r["sequence"] == "tum/fr3/walking_xyz" and r["source"] == "DynaSLAM paper"
+    )
     assert (row["metric"], row["value"]) == ("ate_rmse_m", 0.015)
     claims = facts("trackers", "info", "di-slam")["reported"]
-    assert claims and all("claimed by the paper" in r["remarks"] for r in claims)
+    assert claims
+    assert all("claimed by the paper" in r["remarks"] for r in claims)
     assert facts("trackers", "info", "never-move")["reported"] == []
 
 
@@ -427,25 +506,35 @@ def plugin(cli, monkeypatch, tmp_path):
         ("ends.py", "import os; os._exit(0)", "that ends the process (exit code 0)"),
     ],
 )
-def test_a_broken_plugin_is_explained_and_ends_neither_run_nor_list(cli, facts, walk, plugin, name, text, reason):
+def test_a_broken_plugin_is_explained_and_ends_neither_run_nor_list(
+    cli, facts, walk, plugin, name, text, reason
+):
     plugin(name, text)
     code, out, _ = cli("trackers", "doctor")
-    assert code == 0 and f"{name}:SPEC" in out and reason in out
+    assert code == 0
+    assert f"{name}:SPEC" in out
+    assert reason in out
     assert "never-move" in {row["id"] for row in facts("trackers", "list")}
     code, out, err = cli("run", f"./{name}:SPEC", walk)
-    assert code == 1 and out == "" and reason in one_line(err)
+    assert code == 1
+    assert out == ""
+    assert reason in one_line(err)
 
 
 def test_a_new_tracker_passes_its_checks_and_runs(cli, facts, walk):
     code, out, _ = cli("trackers", "new", "My SLAM-2")
-    assert code == 0 and Path("my_slam_2.py").is_file() and "trackers test ./my_slam_2.py:SPEC" in out
+    assert code == 0
+    assert Path("my_slam_2.py").is_file()
+    assert "trackers test ./my_slam_2.py:SPEC" in out
     code, out, _ = cli("trackers", "test", "./my_slam_2.py:SPEC", "--frames", "2")
     assert code == 0, out
     *checks, total = [line for line in out.splitlines() if line]
     assert {line.split()[0] for line in checks} == {"passed", "skipped"}
-    assert total == f"tracker 'my-slam-2': 0 of {len(checks)} checks failed" and len(checks) > 10
+    assert total == f"tracker 'my-slam-2': 0 of {len(checks)} checks failed"
+    assert len(checks) > 10
     (row,) = facts("run", "./my_slam_2.py:SPEC", walk, "--set", "features=300")
-    assert row["status"] == "ok" and row["ate_rmse_m"] < 0.01
+    assert row["status"] == "ok"
+    assert row["ate_rmse_m"] < 0.01
     assert "exists already" in one_line(cli("trackers", "new", "my-slam-2")[2])
     assert "is no name" in one_line(cli("trackers", "new", "../evil")[2])
 
@@ -461,12 +550,19 @@ def test_a_faulty_tracker_fails_with_4(facts, tmp_path):
     )
     report = facts("trackers", "test", "faulty.py:SPEC", code=4)
     (fault,) = [check["message"] for check in report["checks"] if check["status"] == "failed"]
-    assert report["ok"] is False and "gave a NoneType, not a TrackResult" in fault
+    assert report["ok"] is False
+    assert "gave a NoneType, not a TrackResult" in fault
 
 
 ROWS = [
     ["run", "tracker", "sequence", "ATE (m)", "masks"],
-    ["0123456789abcdef", "emfoa-oft", "synthetic/walking_halfsphere?scene=0&frames=600", "0.01234", "embedded"],
+    [
+        "0123456789abcdef",
+        "emfoa-oft",
+        "synthetic/walking_halfsphere?scene=0&frames=600",
+        "0.01234",
+        "embedded",
+    ],
 ]
 
 
@@ -475,12 +571,14 @@ def test_a_table_is_no_wider_than_the_terminal(monkeypatch, width):
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
     monkeypatch.setattr(output, "_terminal_width", lambda: width)
     head, row, *left_out = table(ROWS[0], ROWS[1:]).splitlines()
-    assert max(len(head), len(row)) <= width and row.startswith("012345")
+    assert max(len(head), len(row)) <= width
+    assert row.startswith("012345")
     assert bool(left_out) == ("masks" not in head)
     if width == 400:
         assert [head.split("  ")[0], *row.split()] == ["run", *ROWS[1]]
     if width == 80:
-        assert row.split()[2:] == ["synthetic/walkin…ne=0&frames=600", "0.01234", "embedded"] and not left_out
+        assert row.split()[2:] == ["synthetic/walkin…ne=0&frames=600", "0.01234", "embedded"]
+        assert not left_out
     if width == 40:
         assert left_out == ["(no room for: ATE (m), masks)"]
 
@@ -489,10 +587,13 @@ def test_numbers_are_never_shortened(monkeypatch):
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
     monkeypatch.setattr(output, "_terminal_width", lambda: 30)
     spread = "12.34 ±0.56, F skipped 98 %"
-    assert table(["tracker", "ATE (mm)"], [["x" * 80, 1.5], ["y", 23.0]]).splitlines()[-1].split() == ["y", "23"]
+    assert table(["tracker", "ATE (mm)"], [["x" * 80, 1.5], ["y", 23.0]]).splitlines()[
+        -1
+    ].split() == ["y", "23"]
     assert table(["ATE (mm)"], [[spread]]).splitlines()[1] == spread
     lines = table(["tracker", "ATE (mm)"], [["x" * 80, spread]]).splitlines()
-    assert lines[1] == "x" * 15 + "…" + "x" * 14 and lines[2] == "(no room for: ATE (mm))"
+    assert lines[1] == "x" * 15 + "…" + "x" * 14
+    assert lines[2] == "(no room for: ATE (mm))"
 
 
 def test_what_names_a_column_or_fills_a_cell_reaches_no_terminal_as_an_escape():
@@ -504,13 +605,22 @@ def test_what_names_a_column_or_fills_a_cell_reaches_no_terminal_as_an_escape():
 
 
 def test_a_reports_table_has_no_markup():
-    source = Table("t", "title", "caption", [Column("a_b"), Column("empty")], [[TableCell("x|y_*"), TableCell()]])
+    source = Table(
+        "t",
+        "title",
+        "caption",
+        [Column("a_b"), Column("empty")],
+        [[TableCell("x|y_*"), TableCell()]],
+    )
     assert report_table(source) == "a_b\nx|y_*"
 
 
 def test_a_terminal_shows_as_many_digits_of_an_id_as_name_the_run():
     """Runs of one request share twelve digits; older ids have sixteen, and none may begin like another."""
-    one, other, alone, old = "0123456789ab" + "c" * 8, "0123456789ab" + "cd" * 4, "f" * 20, "0123456a00000000"
+    one = "0123456789ab" + "c" * 8
+    other = "0123456789ab" + "cd" * 4
+    alone = "f" * 20
+    old = "0123456a00000000"
     assert runs.short_ids([one, other, alone, old, one]) == {
         one: "0123456789abcc",
         other: "0123456789abcd",
@@ -523,32 +633,54 @@ def test_a_terminal_shows_as_many_digits_of_an_id_as_name_the_run():
 def test_an_error_of_the_tracked_frames_alone_is_marked(capsys):
     for coverage in (0.5, 1.0):
         row = dict.fromkeys(runs.COLUMNS.values(), "x") | {"ate_rmse_m": 0.1, "coverage": coverage}
-        runs.show_rows([row | {"static_camera_ate_rmse_m": 0.2, "false_motion_max_m": None}], None, "p")
+        runs.show_rows(
+            [row | {"static_camera_ate_rmse_m": 0.2, "false_motion_max_m": None}], None, "p"
+        )
         assert ("of the tracked frames alone" in capsys.readouterr().out) == (coverage < 1)
 
 
 def test_no_motion_of_a_fixed_camera_is_shown_and_nothing_is_worse_than_it(capsys):
-    numbers = {"static_camera_ate_rmse_m": 0.0, "coverage": 1.0, "from_store": False, "status": "ok"}
+    numbers = {
+        "static_camera_ate_rmse_m": 0.0,
+        "coverage": 1.0,
+        "from_store": False,
+        "status": "ok",
+    }
     for error in (0.0, 0.002):
-        row = dict.fromkeys(runs.COLUMNS.values(), "") | numbers | {"ate_rmse_m": error, "false_motion_max_m": error}
+        row = (
+            dict.fromkeys(runs.COLUMNS.values(), "")
+            | numbers
+            | {"ate_rmse_m": error, "false_motion_max_m": error}
+        )
         runs.show_rows([row], None, "p")
         out = capsys.readouterr().out.splitlines()
-        assert len(out) == 2 and "ATE (m)" in out[0] and "false motion (m)" in out[0] and "from the store" not in out[0]
+        assert len(out) == 2
+        assert "ATE (m)" in out[0]
+        assert "false motion (m)" in out[0]
+        assert "from the store" not in out[0]
 
 
 def test_report_prints_its_message_the_leaderboard_and_its_place(cli, walk, tmp_path):
-    (tmp_path / "mine.toml").write_text(f"trackers = ['never-move', 'constant-velocity']\nsequences = ['{walk}']\n")
+    (tmp_path / "mine.toml").write_text(
+        f"trackers = ['never-move', 'constant-velocity']\nsequences = ['{walk}']\n"
+    )
     assert cli("bench", "mine.toml")[0] == 0
     code, out, _ = cli("report")
     lines = out.splitlines()
-    assert code == 0 and lines[0] == "No tracker can be ranked." and len(lines) == 6
+    assert code == 0
+    assert lines[0] == "No tracker can be ranked."
+    assert len(lines) == 6
     assert lines[1].split()[:2] == ["#", "tracker"]
     assert lines[-2].startswith("Geometric mean of the ATE over that of")
     assert lines[-1].endswith("results/report/index.html")
     code, out, err = cli("report", "--reference", "orb-slam2")
-    assert code == 1 and "there is no run of the reference 'orb-slam2'" in one_line(err)
+    assert code == 1
+    assert "there is no run of the reference 'orb-slam2'" in one_line(err)
     code, out, _ = cli("report", "compare", "results", "results")
-    assert code == 0 and "\\_" not in out and "| tracker" not in out and "all 1 sequences" in out
+    assert code == 0
+    assert "\\_" not in out
+    assert "| tracker" not in out
+    assert "all 1 sequences" in out
 
 
 def test_the_sequences_to_rank_on_are_a_switch(cli, tmp_path):
@@ -574,7 +706,8 @@ def test_compare_as_json_has_no_nan_and_says_what_differs(cli, tmp_path):
         add_run(RunStore(tmp_path / place), "ours", "s/a", overrides={"x": value})
     code, out, _ = cli("report", "compare", "a", "b", "--json")
     found = json.loads(out, parse_constant=pytest.fail)  # NaN is no JSON
-    assert code == 0 and list(found["differences"].values()) == [["x: 1 in A, 2 in B"]]
+    assert code == 0
+    assert list(found["differences"].values()) == [["x: 1 in A, 2 in B"]]
     assert [interval["low"] for interval in found["overall"].values()] == [None]
     assert "B better on" in cli("report", "compare", "a", "b")[1]
 
@@ -598,27 +731,36 @@ def test_the_shell_completes(cli, monkeypatch, words, expected):
     monkeypatch.setenv("COMP_CWORD", str(len(words.split())))
     code, out, _ = cli()
     found = set(out.split())
-    assert code == 0 and (expected <= found if expected else not found), out
+    assert code == 0, out
+    assert expected <= found if expected else not found, out
 
 
 def test_published_numbers_are_listed_with_whose_they_are(cli, facts):
     code, out, _ = cli("published", "rgbd_dataset_freiburg3_walking_xyz")
     lines = [" ".join(line.split()) for line in out.splitlines()]
-    spans, errors = lines[: lines.index("")], lines[lines.index("") :]
-    assert code == 0 and "NGD-SLAM SE(3) or not stated 3 15 34.6 2.31 15" in spans
+    spans = lines[: lines.index("")]
+    errors = lines[lines.index("") :]
+    assert code == 0
+    assert "NGD-SLAM SE(3) or not stated 3 15 34.6 2.31 15" in spans
     rows = [line for line in errors if line.startswith("NGD-SLAM")]
-    assert "15 authors leaderboard page of arXiv 2405.07392 SE(3) or not stated 2024 Ryzen 7 4800H, no GPU" in rows[0]
-    assert "34.6 third party re-run on a Jetson" in rows[2] and "not stated Jetson" in rows[2]
+    assert (
+        "15 authors leaderboard page of arXiv 2405.07392 SE(3) or not stated 2024 Ryzen 7 4800H, no GPU"
+        in rows[0]
+    )
+    assert "34.6 third party re-run on a Jetson" in rows[2]
+    assert "not stated Jetson" in rows[2]
     shown = facts("published", "tum/fr3/walking_xyz", "--protocol", "droid-w/v1")
     values = [line["ate_rmse_m"] for line in shown["numbers"]]
-    assert values == sorted(values) and {line["alignment"] for line in shown["numbers"]} == {"Sim(3)"}
+    assert values == sorted(values)
+    assert {line["alignment"] for line in shown["numbers"]} == {"Sim(3)"}
     for arguments, text in (
         (["bonn/crowdd"], "did you mean 'bonn/crowd'"),
         (["bonn/crowd", "--protocol", "kitti"], "leave --protocol out"),
         (["bonn/crowd", "--protocol", "kiti"], "did you mean 'kitti'"),
     ):
         code, _, err = cli("published", *arguments)
-        assert code == 1 and text in one_line(err)
+        assert code == 1
+        assert text in one_line(err)
 
 
 # Terminals that cannot show every character: output with question marks, and no traceback.
@@ -627,7 +769,9 @@ def test_published_numbers_are_listed_with_whose_they_are(cli, facts):
 LABEL = "caf\xe9 \u2013 \U0001f600"
 
 
-def test_a_report_is_shown_on_a_terminal_that_lacks_characters(cli, walk: Path, tmp_path: Path, monkeypatch) -> None:
+def test_a_report_is_shown_on_a_terminal_that_lacks_characters(
+    cli, walk: Path, tmp_path: Path, monkeypatch
+) -> None:
     options = "--tracker", "theirs", "--label", LABEL, "--sequence", walk, "--online"
     assert cli("import", walk / "groundtruth.txt", *options)[0] == 0
     terminal = io.TextIOWrapper(io.BytesIO(), encoding="latin-1")
@@ -637,11 +781,13 @@ def test_a_report_is_shown_on_a_terminal_that_lacks_characters(cli, walk: Path, 
     with pytest.raises(SystemExit, match="0"):
         program.main()
     shown = terminal.buffer.getvalue()
-    assert "caf" in shown.decode("latin-1") and b"?" in shown
+    assert "caf" in shown.decode("latin-1")
+    assert b"?" in shown
     assert LABEL in (tmp_path / "report.md").read_text(encoding="utf-8")
 
 
-# Records that somebody else made, on a terminal: no escape sequence, no traceback, and the others are shown.
+# Records that somebody else made, on a terminal: no escape sequence, no traceback, and the others
+# are shown.
 
 
 HOSTILE = "\x1b[2J\x1b]0;owned\x07\u202egnp\n"
@@ -652,11 +798,17 @@ def stored(walk: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two runs, the latest of which holds escape sequences in all of its texts."""
     folder = tmp_path_factory.mktemp("results")
     _, last = run_many(
-        [RunSpec(tracker="never-move", sequence=str(walk), seed=seed) for seed in (0, 1)], results=folder
+        [RunSpec(tracker="never-move", sequence=str(walk), seed=seed) for seed in (0, 1)],
+        results=folder,
     )
     path = folder / "runs" / last.run_id / "run.json"
     record = json.loads(path.read_text())
-    record |= {"reason": HOSTILE, "notes": [HOSTILE], "command": [HOSTILE], "overrides": {HOSTILE: HOSTILE}}
+    record |= {
+        "reason": HOSTILE,
+        "notes": [HOSTILE],
+        "command": [HOSTILE],
+        "overrides": {HOSTILE: HOSTILE},
+    }
     record["tracker"] |= {"id": HOSTILE, "label": HOSTILE}
     record["sequence"] |= {"id": HOSTILE}
     path.write_text(json.dumps(record))
@@ -669,34 +821,50 @@ def results(stored: Path, tmp_path: Path) -> Path:
 
 
 def hostile_run(results: Path) -> str:
-    return next(path.parent.name for path in results.glob("runs/*/run.json") if "owned" in path.read_text())
+    return next(
+        path.parent.name for path in results.glob("runs/*/run.json") if "owned" in path.read_text()
+    )
 
 
 def harmless(text: str) -> bool:
     return not set(text) & {"\x1b", "\x07", "\u202e"}
 
 
-@pytest.mark.parametrize("arguments", [("list",), ("show", "RUN"), ("list", "--json"), ("show", "RUN", "--json")])
+@pytest.mark.parametrize(
+    "arguments", [("list",), ("show", "RUN"), ("list", "--json"), ("show", "RUN", "--json")]
+)
 def test_names_are_shown_as_text(cli, results: Path, arguments: tuple[str, ...]) -> None:
     run = hostile_run(results)
-    code, out, err = cli("runs", *[run if word == "RUN" else word for word in arguments], "--results", results)
-    assert code == 0 and harmless(out + err) and "owned" in out
+    code, out, err = cli(
+        "runs", *[run if word == "RUN" else word for word in arguments], "--results", results
+    )
+    assert code == 0
+    assert harmless(out + err)
+    assert "owned" in out
 
 
 def test_errors_are_shown_as_text(cli, results: Path) -> None:
     code, out, err = cli("runs", "show", HOSTILE, "--results", results)
-    assert code == 1 and harmless(out + err) and err.startswith("error: there is no run") and err.count("\n") == 1
+    assert code == 1
+    assert harmless(out + err)
+    assert err.startswith("error: there is no run")
+    assert err.count("\n") == 1
 
 
 def test_one_unreadable_record_is_named_and_the_others_are_listed(cli, results: Path) -> None:
     (results / "runs" / hostile_run(results) / "run.json").write_bytes(b"\xff\xfe")
     code, out, err = cli("runs", "list", "--results", results)
-    assert code == 0 and "never-move" in out
-    assert err.startswith("unreadable: ") and err.count("\n") == 1 and "is not a text file" in err
+    assert code == 0
+    assert "never-move" in out
+    assert err.startswith("unreadable: ")
+    assert err.count("\n") == 1
+    assert "is not a text file" in err
 
 
 @pytest.mark.parametrize("command", ["export", "report", "compare"])
-def test_a_table_says_that_it_leaves_out_an_unreadable_run(cli, results: Path, tmp_path: Path, command: str) -> None:
+def test_a_table_says_that_it_leaves_out_an_unreadable_run(
+    cli, results: Path, tmp_path: Path, command: str
+) -> None:
     (results / "runs" / hostile_run(results) / "run.json").write_bytes(b"")
     arguments = {
         "export": ("runs", "export", tmp_path / "all.csv", "--results", results),
@@ -704,27 +872,36 @@ def test_a_table_says_that_it_leaves_out_an_unreadable_run(cli, results: Path, t
         "compare": ("report", "compare", results, results, "-o", tmp_path),
     }
     code, _, err = cli(*arguments[command])
-    assert code == 0 and "warning: 1 runs cannot be read and are left out" in err
+    assert code == 0
+    assert "warning: 1 runs cannot be read and are left out" in err
 
 
 def test_half_characters_of_the_command_line_end_in_one_line(cli, results: Path) -> None:
     code, _, err = cli("run", "caf\udce9", "synthetic/walking_xyz", "--results", results)
-    assert code == 1 and "caf\\udce9" in err and err.count("\n") == 1
+    assert code == 1
+    assert "caf\\udce9" in err
+    assert err.count("\n") == 1
 
 
 @pytest.mark.parametrize("suffix", ["csv", "CSV", "parquet"])
 def test_all_runs_are_written_as_one_table(cli, stored: Path, tmp_path: Path, suffix: str) -> None:
-    target, frame = tmp_path / f"runs.{suffix}", RunStore(stored).frame()
+    target = tmp_path / f"runs.{suffix}"
+    frame = RunStore(stored).frame()
     if suffix == "parquet":
         pytest.importorskip("pyarrow")
     assert cli("runs", "export", target, "--results", stored) == (0, f"{target}\n", "")
     read = pd.read_csv(target) if suffix != "parquet" else pd.read_parquet(target)
-    assert list(read.columns) == list(frame.columns) and read["ate_rmse_m"].tolist() == frame["ate_rmse_m"].tolist()
+    assert list(read.columns) == list(frame.columns)
+    assert read["ate_rmse_m"].tolist() == frame["ate_rmse_m"].tolist()
     assert suffix != "parquet" or read.dtypes.equals(frame.dtypes)
 
 
-@pytest.mark.parametrize("word", ["=1+1", "+1", "-1", "@SUM(A1)", "\t=1", "\r=1", "=HYPERLINK('http://x')"])
-def test_no_cell_of_an_exported_table_is_a_formula(cli, results: Path, tmp_path: Path, word: str) -> None:
+@pytest.mark.parametrize(
+    "word", ["=1+1", "+1", "-1", "@SUM(A1)", "\t=1", "\r=1", "=HYPERLINK('http://x')"]
+)
+def test_no_cell_of_an_exported_table_is_a_formula(
+    cli, results: Path, tmp_path: Path, word: str
+) -> None:
     """Words of anybody's program and folder stand in the table that is opened in a spreadsheet."""
     path = results / "runs" / hostile_run(results) / "run.json"
     record = json.loads(path.read_text())
@@ -741,8 +918,13 @@ def test_no_cell_of_an_exported_table_is_a_formula(cli, results: Path, tmp_path:
     assert all(re.fullmatch(r"-[\d.e+-]+", cell) for cell in numbers)
 
 
-def test_a_table_without_pyarrow_or_of_another_kind_is_one_line(cli, stored: Path, tmp_path: Path, monkeypatch) -> None:
+def test_a_table_without_pyarrow_or_of_another_kind_is_one_line(
+    cli, stored: Path, tmp_path: Path, monkeypatch
+) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     for name, words in (("runs.parquet", "[parquet]"), ("runs.xlsx", ".csv or .parquet")):
         code, _, err = cli("runs", "export", tmp_path / name, "--results", stored)
-        assert code == 1 and words in err and err.count("\n") == 1 and not (tmp_path / name).exists()
+        assert code == 1
+        assert words in err
+        assert err.count("\n") == 1
+        assert not (tmp_path / name).exists()

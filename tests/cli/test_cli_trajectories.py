@@ -31,7 +31,9 @@ def files(tmp_path):
     def write(unit, start=0.0, heading="", true_unit=None, true_start=None):
         true_stamps = stamps(true_unit or unit, start if true_start is None else true_start)
         (tmp_path / "estimate.txt").write_text(heading + rows_of(ESTIMATE, stamps(unit, start)))
-        (tmp_path / "truth.txt").write_text((heading if true_unit is None else "") + rows_of(TRUTH, true_stamps))
+        (tmp_path / "truth.txt").write_text(
+            (heading if true_unit is None else "") + rows_of(TRUTH, true_stamps)
+        )
         return tmp_path / "estimate.txt", tmp_path / "truth.txt"
 
     return write
@@ -43,7 +45,9 @@ def right(files, facts):
     return facts("eval", *files("s"))["metrics"]
 
 
-@pytest.mark.parametrize(("unit", "start"), [("us", 0.0), ("ns", 0.0), ("ms", UNIX), ("us", UNIX), ("ns", UNIX)])
+@pytest.mark.parametrize(
+    ("unit", "start"), [("us", 0.0), ("ns", 0.0), ("ms", UNIX), ("us", UNIX), ("ns", UNIX)]
+)
 def test_units_are_named_and_every_error_is_that_of_seconds(cli, facts, files, right, unit, start):
     pair = files(unit, start)
     found = facts("eval", *pair)["metrics"]
@@ -51,17 +55,23 @@ def test_units_are_named_and_every_error_is_that_of_seconds(cli, facts, files, r
     code, out, _ = cli("eval", *pair)
     assert code == 0
     for whose in ("estimate", "ground truth"):
-        assert re.search(rf"{whose}: stamps are [0-9.]+ apart by the median: taken as \w+seconds \(30 Hz\)", out)
+        assert re.search(
+            rf"{whose}: stamps are [0-9.]+ apart by the median: taken as \w+seconds \(30 Hz\)", out
+        )
 
 
 @pytest.mark.parametrize(("unit", "true_unit"), [("ns", "s"), ("ms", "ns"), ("s", "us")])
 def test_each_file_has_a_unit_of_its_own(facts, files, right, unit, true_unit):
     pair = files(unit, UNIX, true_unit=true_unit)
-    assert facts("eval", *pair)["metrics"]["ate_rmse_m"] == pytest.approx(right["ate_rmse_m"], rel=1e-3)
+    assert facts("eval", *pair)["metrics"]["ate_rmse_m"] == pytest.approx(
+        right["ate_rmse_m"], rel=1e-3
+    )
 
 
 @pytest.mark.parametrize("command", ["eval", "protocols compare", "import"])
-def test_where_the_unit_is_not_told_both_readings_are_and_the_cure_works(cli, facts, files, right, command):
+def test_where_the_unit_is_not_told_both_readings_are_and_the_cure_works(
+    cli, facts, files, right, command
+):
     def words(pair):
         if command == "import":
             return ["import", pair[0], "--tracker", "x", "--sequence", "mine", "--truth", pair[1]]
@@ -69,7 +79,10 @@ def test_where_the_unit_is_not_told_both_readings_are_and_the_cure_works(cli, fa
 
     code, out, err = cli(*words(files("ms")))
     assert (code, out) == (1, "")
-    assert "33.3333 apart by the median: milliseconds (30 Hz) or seconds (one pose in 33.3 s)?" in one_line(err)
+    assert (
+        "33.3333 apart by the median: milliseconds (30 Hz) or seconds (one pose in 33.3 s)?"
+        in one_line(err)
+    )
     heading = re.search("'(# timestamp .*)'", err)[1] + "\n"
     found = facts(*words(files("ms", heading=heading)))
     ate = found["metrics"]["ate_rmse_m"] if command == "eval" else found[0].get("ate_rmse_m")
@@ -89,13 +102,17 @@ def test_import_takes_a_truth_in_the_formats_of_eval(cli, facts, files, right, t
     estimate, _ = files("s", UNIX)
     write_pose_table(tmp_path, "euroc", Trajectory(UNIX + TRUTH.timestamps, TRUTH.T_world_cam))
     words = "--tracker", "x", "--sequence", "mine", "--truth", tmp_path / "data.csv"
-    assert facts("import", estimate, *words)[0]["ate_rmse_m"] == pytest.approx(right["ate_rmse_m"], rel=1e-3)
+    assert facts("import", estimate, *words)[0]["ate_rmse_m"] == pytest.approx(
+        right["ate_rmse_m"], rel=1e-3
+    )
 
 
 @pytest.mark.parametrize("form", ["{:g}", "{:.6e}"])
 def test_lost_digits_are_told_wherever_the_file_is_read(cli, files, tmp_path, form):
     pair = files("s", UNIX)
-    pair[0].write_text(rows_of(ESTIMATE, [form.format(UNIX + stamp) for stamp in TRUTH.timestamps.tolist()]))
+    pair[0].write_text(
+        rows_of(ESTIMATE, [form.format(UNIX + stamp) for stamp in TRUTH.timestamps.tolist()])
+    )
     folder = write_folder(tmp_path / "toy", 6)
     for words in (
         ["eval", *pair],
@@ -116,9 +133,18 @@ def test_lost_digits_are_told_wherever_the_file_is_read(cli, files, tmp_path, fo
 @pytest.mark.parametrize(
     ("change", "remark"),
     [
-        (lambda truth: truth.select(np.array([0, 7, 29])), "warning: .*little-truth: only 3 of 30 poses"),
-        (lambda truth: _far(truth), "warning: .*far-positions: 2 of 29 steps of the ground truth are faster"),
-        (lambda truth: Trajectory(np.arange(30) + 0.25, truth.T_world_cam), "ground truth within 0.02 s"),
+        (
+            lambda truth: truth.select(np.array([0, 7, 29])),
+            "warning: .*little-truth: only 3 of 30 poses",
+        ),
+        (
+            lambda truth: _far(truth),
+            "warning: .*far-positions: 2 of 29 steps of the ground truth are faster",
+        ),
+        (
+            lambda truth: Trajectory(np.arange(30) + 0.25, truth.T_world_cam),
+            "ground truth within 0.02 s",
+        ),
     ],
     ids=["3 of 30 frames", "1e9 m away", "another clock"],
 )
@@ -143,8 +169,14 @@ def _far(truth):
     [
         (lambda estimate: scaled(estimate, 1000), "hint: .*scale: .*millimetres"),
         (lambda estimate: scaled(estimate, 1.4), "hint: .*scale: .*with the factor 0.7"),
-        (lambda estimate: scaled(estimate, 0.01), "warning: .*static-camera: the error of .* % of a static camera's"),
-        (lambda estimate: estimate.select(slice(0, 40, 20)), "warning: .*little-truth: only 2 poses"),
+        (
+            lambda estimate: scaled(estimate, 0.01),
+            "warning: .*static-camera: the error of .* % of a static camera's",
+        ),
+        (
+            lambda estimate: estimate.select(slice(0, 40, 20)),
+            "warning: .*little-truth: only 2 poses",
+        ),
     ],
     ids=["millimetres", "a scale factor", "nearly static", "two poses"],
 )
@@ -153,7 +185,13 @@ def test_files_are_scored_with_the_same_lines_at_every_entrance(cli, tmp_path, c
     write_tum(tmp_path / "truth.txt", TRUTH)
     pair = Path("estimate.txt"), Path("truth.txt")
     imported = ["import", pair[0], "--tracker", "x", "--sequence", "mine", "--truth", pair[1]]
-    for words in (["eval", *pair], ["protocols", "compare", *pair], imported, ["runs", "list"], ["runs", "show"]):
+    for words in (
+        ["eval", *pair],
+        ["protocols", "compare", *pair],
+        imported,
+        ["runs", "list"],
+        ["runs", "show"],
+    ):
         code, out, _ = cli(*words)
         assert code == 0
         assert re.search(remark, out), (words, out)
@@ -173,13 +211,19 @@ def test_many_remarks_are_cut_and_equal_ones_are_said_once(cli, facts, tmp_path)
     assert all(row["remarks"] for row in facts("runs", "list"))
 
 
-@pytest.mark.parametrize("topics", [["/estimate/pose", "/ground_truth/pose"], ["/ground_truth/pose"]])
+@pytest.mark.parametrize(
+    "topics", [["/estimate/pose", "/ground_truth/pose"], ["/ground_truth/pose"]]
+)
 def test_topics_of_bags_are_chosen_as_the_hint_says(cli, facts, tmp_path, topics):
     pytest.importorskip("rosbags")
     (tmp_path / "bag").mkdir()
     write_bag(tmp_path / "bag", {"estimate": ESTIMATE, "ground_truth": TRUTH})
     write_tum(tmp_path / "estimate.txt", ESTIMATE)
-    pair = (tmp_path / "bag", tmp_path / "bag") if len(topics) > 1 else (tmp_path / "estimate.txt", tmp_path / "bag")
+    pair = (
+        (tmp_path / "bag", tmp_path / "bag")
+        if len(topics) > 1
+        else (tmp_path / "estimate.txt", tmp_path / "bag")
+    )
     code, _, err = cli("eval", *pair)
     assert code == 1
     assert "choose one with --topic" in one_line(err)

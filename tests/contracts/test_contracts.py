@@ -23,7 +23,12 @@ LIGHT = {
     "import dynslam_bench": (*ALL, "numpy", "typer", "pydantic"),
     "import dynslam_bench.contracts": ALL,
     "import dynslam_bench.sequences.synthetic": ("numba", "cv2", "torch"),
-    "from dynslam_bench.trackers import TRACKERS; assert len(TRACKERS.all()) > 30": ("torch", "cv2", "gtsam", "numba"),
+    "from dynslam_bench.trackers import TRACKERS; assert len(TRACKERS.all()) > 30": (
+        "torch",
+        "cv2",
+        "gtsam",
+        "numba",
+    ),
     "import dynslam_bench.testing.pytest_plugin": ("cv2", "torch"),
     "import dynslam_bench.segmentation.build_segmenter": ("cv2", "torch"),
     "import dynslam_bench.segmentation.training.settings, dynslam_bench.segmentation.networks.checkpoints": (
@@ -41,7 +46,9 @@ def test_what_is_run_often_loads_nothing_heavy() -> None:
         f"import sys\nfor code, names in {LIGHT}.items():\n"
         "    exec(code)\n    print(*[f'{code} loads {name}' for name in names if name in sys.modules], sep='\\n')"
     )
-    assert subprocess.check_output([sys.executable, "-c", command], text=True, cwd=ROOT) == "\n" * len(LIGHT)
+    assert subprocess.check_output(
+        [sys.executable, "-c", command], text=True, cwd=ROOT
+    ) == "\n" * len(LIGHT)
 
 
 def given(**changes: object) -> TrackResult:
@@ -56,9 +63,18 @@ def given(**changes: object) -> TrackResult:
         (given(T_world_cam=None), "state 'ok' without a pose"),
         (given(T_world_cam=np.eye(3)), "an array of shape (3, 3) as pose"),
         (given(T_world_cam=np.full((4, 4), np.nan)), "a pose with 16 values that are not finite"),
-        (given(T_world_cam=np.diag([2.0, 2.0, 2.0, 1.0])), "a pose that is no rigid transformation"),
-        (given(T_world_cam=np.diag([-1.0, 1.0, 1.0, 1.0])), "a pose that is no rigid transformation"),
-        (given(T_world_cam=se3.from_matrix(np.array([0, 0, 1e200]), np.eye(3))), "a pose 1e+200 m away"),
+        (
+            given(T_world_cam=np.diag([2.0, 2.0, 2.0, 1.0])),
+            "a pose that is no rigid transformation",
+        ),
+        (
+            given(T_world_cam=np.diag([-1.0, 1.0, 1.0, 1.0])),
+            "a pose that is no rigid transformation",
+        ),
+        (
+            given(T_world_cam=se3.from_matrix(np.array([0, 0, 1e200]), np.eye(3))),
+            "a pose 1e+200 m away",
+        ),
         ("nonsense", "a str, not a TrackResult"),
         (given(T_world_cam=np.eye(4, dtype=complex)), "a pose of the type complex128"),
         (given(T_world_cam=np.eye(4).astype(object)), "a pose of the type object"),
@@ -88,7 +104,9 @@ TURNED = se3.exp(np.array([3.0, -2.0, 1.0, 0.3, -0.7, 1.1]))
 def test_a_pose_of_any_real_type_is_taken_as_float64(dtype: object) -> None:
     expected = np.eye(4) if dtype is np.int64 else TURNED
     pose = check_result(given(T_world_cam=expected.astype(dtype)), FRAME, "mine").T_world_cam
-    assert pose is not None and pose.dtype == np.float64 and np.abs(pose - expected).max() < 3e-7
+    assert pose is not None
+    assert pose.dtype == np.float64
+    assert np.abs(pose - expected).max() < 3e-7
 
 
 @pytest.mark.parametrize(
@@ -108,10 +126,13 @@ def test_blemishes_are_no_faults(result: TrackResult, words: str) -> None:
 @pytest.mark.parametrize("state", STATES)
 def test_a_good_result_has_neither(state: str) -> None:
     result = given(state=state, stats={"matches": 3}, timings={"all": 0.01})
-    assert not list(faults(result, FRAME)) and not list(blemishes(result))
+    assert not list(faults(result, FRAME))
+    assert not list(blemishes(result))
     assert check_result(result, FRAME, "mine").stats == {"matches": 3.0}
 
 
 def test_a_final_trajectory_is_one() -> None:
-    assert [fault.found for fault in trajectory_faults(np.eye(4))] == ["a ndarray, not a Trajectory"]
+    assert [fault.found for fault in trajectory_faults(np.eye(4))] == [
+        "a ndarray, not a Trajectory"
+    ]
     assert not list(trajectory_faults(Trajectory(np.array([0.0, 1.0]), np.stack([np.eye(4)] * 2))))

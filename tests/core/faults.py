@@ -1,8 +1,9 @@
 """Faults at every file operation below a folder: a kill, a full disk, a read-only one, a folder that is removed.
 
-`survey` runs a piece of work once undisturbed; then, for every operation and every fault, once with the fault at that
-operation and once more to go on from there. What is disturbed is a fork of this process, so `in_a_small_process` runs
-the tests: late in a session a fork of pytest's own process takes fifty times as long.
+`survey` runs a piece of work once undisturbed; then, for every operation and every fault, once with
+the fault at that operation and once more to go on from there. What is disturbed is a fork of this
+process, so `in_a_small_process` runs the tests: late in a session a fork of pytest's own process
+takes fifty times as long.
 """
 
 import builtins
@@ -24,9 +25,19 @@ from typing import Any
 from dynslam_bench.core.errors import DynslamError
 
 FAULTS = ("kill", "full", "read-only", "gone")
-DONE, TOLD, RAW = 0, 3, 9
+DONE = 0
+TOLD = 3
+RAW = 9
 """Exit codes of a piece of work: it came to its end, it gave one clear error, it let a raw one out."""
-_CHANGES = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.link", "os.symlink", "os.truncate")
+_CHANGES = (
+    "os.rename",
+    "os.remove",
+    "os.mkdir",
+    "os.rmdir",
+    "os.link",
+    "os.symlink",
+    "os.truncate",
+)
 _TAKES_SPACE = ("open", "os.mkdir", "os.symlink", "write")
 _open = io.open
 
@@ -61,7 +72,9 @@ class Injector:
     """
 
     def __init__(self, root: Path, at: int = 0, fault: str = "kill") -> None:
-        self.root, self.at, self.fault = str(root), at, fault
+        self.root = str(root)
+        self.at = at
+        self.fault = fault
         self.count = 0
 
     def install(self) -> None:
@@ -72,15 +85,24 @@ class Injector:
     def _audit(self, event: str, arguments: tuple[Any, ...]) -> None:
         if event == "open":
             path, _, flags = arguments
-            if isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT) and self._is_below(path):
+            if (
+                isinstance(flags, int)
+                and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
+                and self._is_below(path)
+            ):
                 self._operation(event)
         elif event == "ctypes.dlsym" and arguments[1] == "renameat2":
             self._operation("os.rename")
-        elif event in _CHANGES and (self._is_below(*arguments[:2]) or any(a not in (-1, None) for a in arguments[2:3])):
+        elif event in _CHANGES and (
+            self._is_below(*arguments[:2]) or any(a not in (-1, None) for a in arguments[2:3])
+        ):
             self._operation(event)
 
     def _is_below(self, *paths: object) -> bool:
-        return any(isinstance(path, (str, os.PathLike)) and os.fspath(path).startswith(self.root) for path in paths)
+        return any(
+            isinstance(path, (str, os.PathLike)) and os.fspath(path).startswith(self.root)
+            for path in paths
+        )
 
     def _operation(self, event: str, before: Callable[[], object] = lambda: None) -> None:
         self.count += 1
@@ -162,7 +184,9 @@ def survey(
             code, _ = in_fork(work, Injector(root, at, fault))
             found.ends[fault, code] += 1
             where = f"{fault} at operation {at} of {found.operations}"
-            assert code in ((-signal.SIGKILL, DONE) if fault == "kill" else (DONE, TOLD)), f"{where}: {code}"
+            assert code in ((-signal.SIGKILL, DONE) if fault == "kill" else (DONE, TOLD)), (
+                f"{where}: {code}"
+            )
             if fault == "gone":
                 _fresh(root, begin)
             halfway()
@@ -201,7 +225,9 @@ def tree(root: Path) -> dict[str, bytes | str]:
     """Everything below a folder: files by their content, links by their target."""
     paths = [path for path in sorted(root.rglob("*")) if path.is_symlink() or path.is_file()]
     contents = [str(path.readlink()) if path.is_symlink() else path.read_bytes() for path in paths]
-    return {str(path.relative_to(root)): content for path, content in zip(paths, contents, strict=True)}
+    return {
+        str(path.relative_to(root)): content for path, content in zip(paths, contents, strict=True)
+    }
 
 
 def _fresh(root: Path, begin: Callable[[], None]) -> None:

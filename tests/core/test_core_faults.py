@@ -79,8 +79,11 @@ def test_a_file_is_the_old_one_or_the_new_one(tmp_path: Path) -> None:
         halfway=lambda: one_of(path.read_text(), "old", "new " * 1000),
         result=lambda: swept(root),
     )
-    assert found.operations >= 4 and found.ends.total() == 4 * found.operations
-    assert found.ends["kill", -9] == found.operations and found.ends["full", 3] > 0 and found.ends["read-only", 3] > 0
+    assert found.operations >= 4
+    assert found.ends.total() == 4 * found.operations
+    assert found.ends["kill", -9] == found.operations
+    assert found.ends["full", 3] > 0
+    assert found.ends["read-only", 3] > 0
 
 
 @in_a_small_process
@@ -99,10 +102,13 @@ def test_a_folder_is_the_old_one_or_the_new_one(tmp_path: Path) -> None:
         lambda: write("new"),
         root,
         begin=lambda: write("old"),
-        halfway=lambda: one_of(tree(root / "folder"), *({n: (t + n).encode() for n in "ab"} for t in ("old", "new"))),
+        halfway=lambda: one_of(
+            tree(root / "folder"), *({n: (t + n).encode() for n in "ab"} for t in ("old", "new"))
+        ),
         result=lambda: swept(root),
     )
-    assert found.operations >= 8 and found.ends["kill", -9] == found.operations
+    assert found.operations >= 8
+    assert found.ends["kill", -9] == found.operations
 
 
 RECORD = RunRecord.read(Path(__file__).parents[1] / "runs" / "data" / "run.json")
@@ -131,21 +137,24 @@ FAILED = RECORD.model_copy(update={"status": "crashed", "reason": "an earlier tr
 def test_a_run_is_there_whole_or_not_at_all_and_one_that_is_made_again_is_never_lost(
     before: str, tmp_path: Path
 ) -> None:
-    root, earlier = tmp_path / "results", [] if before == "nothing" else [FAILED]
+    root = tmp_path / "results"
+    earlier = [] if before == "nothing" else [FAILED]
 
     def old_or_new() -> None:
         records, unreadable = RunStore(root).all()
         assert [record.model_copy(update={"files": {}}) for record in records] in (
             earlier,
             [RECORD],
-        ) and unreadable == []
+        )
+        assert unreadable == []
 
     found = survey(
         lambda: make(root), root, begin=lambda: [make(root, record) for record in earlier], halfway=old_or_new,
         result=lambda: swept(root, prepared), faults=("kill",) if earlier else ("kill", "full", "read-only"),
     )  # fmt: skip
     assert {name.split("/")[0] for name in tree(root)} == {"runs", "sequences", "latest"}
-    assert found.operations > 15 and found.ends["kill", -9] == found.operations
+    assert found.operations > 15
+    assert found.ends["kill", -9] == found.operations
     assert earlier or (found.ends["full", 3] > 5 and found.ends["read-only", 3] > 5)
 
 
@@ -159,19 +168,29 @@ def test_a_run_is_removed_or_still_there(tmp_path: Path) -> None:
             store.remove(RECORD.run_id)
 
     found = survey(
-        remove, root, begin=lambda: make(root), result=lambda: swept(root, prepared).keys(), faults=("kill", "full")
+        remove,
+        root,
+        begin=lambda: make(root),
+        result=lambda: swept(root, prepared).keys(),
+        faults=("kill", "full"),
     )
-    assert not RunStore(root).ids() and found.operations > 5 and found.ends["kill", -9] == found.operations
+    assert not RunStore(root).ids()
+    assert found.operations > 5
+    assert found.ends["kill", -9] == found.operations
 
 
 @in_a_small_process
 def test_a_download_goes_on_after_any_fault(here: str, tmp_path: Path) -> None:
     root = tmp_path / "data"
     found = survey(
-        lambda: download(f"{here}/file", root / "file", attempts=1) and None, root, result=lambda: tree(root)
+        lambda: download(f"{here}/file", root / "file", attempts=1) and None,
+        root,
+        result=lambda: tree(root),
     )
     assert tree(root) == {"file": BODY}
-    assert found.ends["kill", -9] >= 5 and found.ends["full", 3] > 0  # how many writes it takes depends on the line
+    # how many writes it takes depends on the line
+    assert found.ends["kill", -9] >= 5
+    assert found.ends["full", 3] > 0
 
 
 @pytest.mark.parametrize("can_exchange", [True, False])
@@ -192,23 +211,29 @@ def test_many_replace_a_folder_at_the_same_time(
     with ThreadPoolExecutor(4) as pool:
         writers = [pool.submit(replace, number) for number in range(4)]
         while not all(writer.done() for writer in writers):
-            assert not can_exchange or not target.is_dir() or (target / "file").read_text() == "whole"
+            assert (
+                not can_exchange or not target.is_dir() or (target / "file").read_text() == "whole"
+            )
     assert [writer.result() for writer in writers] == [None] * 4
     assert [path.name for path in tmp_path.iterdir()] == ["folder"]
 
 
 def test_a_name_is_claimed_once(tmp_path: Path) -> None:
     with claimed(tmp_path / "x") as first, claimed(tmp_path / "x") as second:
-        assert first and not second
+        assert first
+        assert not second
     assert not list(tmp_path.iterdir())
     with claimed(tmp_path / "x") as again:
         assert again
 
 
-def test_temporary_folders_go_with_their_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_temporary_folders_go_with_their_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     mine = TemporaryFolder()
-    assert mine.path.stat().st_mode & 0o777 == 0o700 and not is_abandoned(mine.path)
+    assert mine.path.stat().st_mode & 0o777 == 0o700
+    assert not is_abandoned(mine.path)
     pid = os.fork()
     if pid == 0:
         other = TemporaryFolder()
@@ -227,10 +252,12 @@ def test_arrays_and_cost_come_back_bit_for_bit(tmp_path: Path) -> None:
     arrays = {"a": np.random.default_rng(0).normal(size=(3, 4)), "b": np.array(["person", "chair"])}
     cache.put("masks", "ab12", arrays, 0.25)
     entry = cache.get("masks", "ab12")
-    assert entry is not None and entry.cost_s == 0.25
+    assert entry is not None
+    assert entry.cost_s == 0.25
     for name, value in arrays.items():
         np.testing.assert_array_equal(entry.arrays[name], value)
-    assert cache.get("masks", "ab13") is None and cache.get("features", "ab12") is None
+    assert cache.get("masks", "ab13") is None
+    assert cache.get("features", "ab12") is None
 
 
 @pytest.mark.parametrize("damage", [b"", b"PK\x03\x04 cut short", b"not an archive"])
@@ -239,7 +266,8 @@ def test_a_damaged_entry_counts_as_missing_and_goes(tmp_path: Path, damage: byte
     cache.put("masks", "ab12", {"a": np.arange(9)}, 0.1)
     (path,) = tmp_path.rglob("*.npz")
     path.write_bytes(damage)
-    assert cache.get("masks", "ab12") is None and not path.exists()
+    assert cache.get("masks", "ab12") is None
+    assert not path.exists()
 
 
 def test_the_least_recently_used_entries_go_first(tmp_path: Path) -> None:
@@ -250,7 +278,8 @@ def test_the_least_recently_used_entries_go_first(tmp_path: Path) -> None:
         os.utime(path, (number, number))
     assert cache.get("features", "00") is not None  # now the latest used
     assert cache.prune() > 0
-    assert cache.get("features", "00") is not None and cache.get("features", "01") is None
+    assert cache.get("features", "00") is not None
+    assert cache.get("features", "01") is None
     assert sum(cache.info()["bytes_by_stage"].values()) <= 50_000
 
 
@@ -272,7 +301,8 @@ def test_the_least_recently_used_entries_go_first(tmp_path: Path) -> None:
 def test_odd_addresses_are_one_clear_line(url: str, words: str, tmp_path: Path) -> None:
     with pytest.raises(DownloadError, match=words) as caught:
         download(url, tmp_path / "x", attempts=1)
-    assert "s3cret" not in str(caught.value) and not list(tmp_path.iterdir())
+    assert "s3cret" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
     check_address("http://host/x.tgz", checked=True)
     check_address("http://127.0.0.1:80/x", checked=False)
 
@@ -289,7 +319,9 @@ class Handler(http.server.BaseHTTPRequestHandler):
         headers, body = {
             "/file": (
                 {"Content-Length": len(BODY) - start, "ETag": '"one"'}
-                | ({"Content-Range": f"bytes {start}-{len(BODY) - 1}/{len(BODY)}"} if start else {}),
+                | (
+                    {"Content-Range": f"bytes {start}-{len(BODY) - 1}/{len(BODY)}"} if start else {}
+                ),
                 [BODY[start:]],
             ),
             "/to": ({"Location": target}, []),
@@ -321,8 +353,14 @@ ADDRESSES = r"stopped at 0 bytes|refused"
 @pytest.mark.parametrize(
     ("target", "words"),
     [
-        *((target, SCHEMES) for target in ("ftp://127.0.0.1/x", "file:///etc/passwd", "gopher://h/x", "data:,x")),
-        *((target, ADDRESSES) for target in ("https://[::1", "https://host:x/", "http://" + "a" * 70 + "/")),
+        *(
+            (target, SCHEMES)
+            for target in ("ftp://127.0.0.1/x", "file:///etc/passwd", "gopher://h/x", "data:,x")
+        ),
+        *(
+            (target, ADDRESSES)
+            for target in ("https://[::1", "https://host:x/", "http://" + "a" * 70 + "/")
+        ),
     ],
 )
 def test_redirects_to_other_schemes_and_odd_addresses_are_refused(
@@ -368,7 +406,8 @@ def test_what_is_no_file_is_one_line(tmp_path: Path) -> None:
 def test_the_byte_order_mark_is_left_out_and_long_lines_are_bounded(tmp_path: Path) -> None:
     path = tmp_path / "text"
     path.write_bytes(b"\xef\xbb\xbfa\nb")
-    assert read_text(path) == "a\nb" and list(read_lines(path)) == ["a\n", "b"]
+    assert read_text(path) == "a\nb"
+    assert list(read_lines(path)) == ["a\n", "b"]
     path.write_bytes(b"x" * 5000)
     with pytest.raises(DynslamError, match="has more than"):
         list(read_lines(path, limit=1000))
@@ -376,7 +415,9 @@ def test_the_byte_order_mark_is_left_out_and_long_lines_are_bounded(tmp_path: Pa
 
 def test_messages_are_one_line_of_bounded_length() -> None:
     error = DynslamError("first\nsecond" + "x" * 100_000, "hint\r\nmore", options=["one\ntwo"])
-    assert "\n" not in str(error) and len(str(error)) < 2100 and str(error).startswith("first second")
+    assert "\n" not in str(error)
+    assert len(str(error)) < 2100
+    assert str(error).startswith("first second")
     with pytest.raises(DynslamError, match="where is no valid JSON"):
         parse_json("\n{\n", "where")
 
@@ -389,10 +430,16 @@ class Sample(Record):
 
 
 def test_half_characters_do_not_keep_a_record_from_being_stored(tmp_path: Path) -> None:
-    write_atomic(tmp_path / "record.json", Sample(text="caf\udce9", more={"\ud800": ["\udfff"]}).to_json())
-    assert Sample.read(tmp_path / "record.json") == Sample(text="caf\\udce9", more={"\\ud800": ["\\udfff"]})
+    write_atomic(
+        tmp_path / "record.json", Sample(text="caf\udce9", more={"\ud800": ["\udfff"]}).to_json()
+    )
+    assert Sample.read(tmp_path / "record.json") == Sample(
+        text="caf\\udce9", more={"\\ud800": ["\\udfff"]}
+    )
     for value in (0.1 + 0.2, 1e-300, np.inf, -np.inf, np.nan):
-        assert np.array_equal(Sample.parse(Sample(text="p", x=value).to_json(), "p").x, value, equal_nan=True)
+        assert np.array_equal(
+            Sample.parse(Sample(text="p", x=value).to_json(), "p").x, value, equal_nan=True
+        )
     write_atomic(tmp_path / "text", "comment \ud800")
     assert (tmp_path / "text").read_bytes() == b"comment \\ud800"
     assert storable(("a\udc80", 1, None)) == ("a\\udc80", 1, None)
@@ -404,7 +451,8 @@ def test_half_characters_do_not_keep_a_record_from_being_stored(tmp_path: Path) 
      "grpc://:s3cret@host:1", "https://h/x;token=s3cret", "postgresql://me:s3cret@/x@y@db/x"],
 )  # fmt: skip
 def test_passwords_are_in_no_message(address: str) -> None:
-    assert "s3cret" in address and "s3cret" not in str(DynslamError(f"cannot reach {address!r} now", f"try {address}"))
+    assert "s3cret" in address
+    assert "s3cret" not in str(DynslamError(f"cannot reach {address!r} now", f"try {address}"))
 
 
 SECRETS = [
@@ -419,12 +467,17 @@ def test_a_programs_secrets_are_in_no_record(secret: str) -> None:
     command = f"slam {secret} --threads 2"
     words = ["dynslam-bench", "run", f"subprocess:{command}", "--set", f"command={command}"]
     shell = shlex.split(command)
-    stored = Sample(text=command, words=shell, more={"api_key": "s3cret", "command": command, "words": words})
+    stored = Sample(
+        text=command, words=shell, more={"api_key": "s3cret", "command": command, "words": words}
+    )
     for text in (stored.to_json(), stored.to_line()):
         assert "s3cret" not in text
         again = Sample.model_validate_json(text)
-        assert again.words[0] == "slam" and again.words[-2:] == ["--threads", "2"] and len(again.words) == len(shell)
-        assert again.text.startswith("slam ") and again.text.endswith(" --threads 2")
+        assert again.words[0] == "slam"
+        assert again.words[-2:] == ["--threads", "2"]
+        assert len(again.words) == len(shell)
+        assert again.text.startswith("slam ")
+        assert again.text.endswith(" --threads 2")
     assert "s3cret" not in str(DynslamError(f"cannot start {command}"))
     assert "s3cret" not in " ".join(words_without_passwords(words + shlex.split(command)))
 
@@ -435,22 +488,44 @@ def test_a_programs_secrets_are_in_no_record(secret: str) -> None:
 )  # fmt: skip
 def test_words_that_are_no_secrets_stay(words: list[str]) -> None:
     kept = words_without_passwords(words)
-    assert len(kept) == len(words) and (kept == words or words[-1] == "x")
+    assert len(kept) == len(words)
+    assert kept == words or words[-1] == "x"
 
 
 def test_what_holds_no_password_stays_as_it_is() -> None:
-    for text in ("sqlite:///studies.db", "https://host:8080/a", "grpc://host:13000", "a:b@c", "mail me@host"):
+    for text in (
+        "sqlite:///studies.db",
+        "https://host:8080/a",
+        "grpc://host:13000",
+        "a:b@c",
+        "mail me@host",
+    ):
         assert without_passwords(text) == text
 
 
 @pytest.mark.parametrize(
     "name",
-    ["../x", "a/../../x", "/etc/passwd", "", "a\0b", "a\\..\\b", "x" * 256, "a\nb", "\x1b[2J", "..", "caf\udce9"],
+    [
+        "../x",
+        "a/../../x",
+        "/etc/passwd",
+        "",
+        "a\0b",
+        "a\\..\\b",
+        "x" * 256,
+        "a\nb",
+        "\x1b[2J",
+        "..",
+        "caf\udce9",
+    ],
 )
 def test_no_name_leads_out_of_its_folder(tmp_path: Path, name: str) -> None:
     with pytest.raises(RunError, match="does not lie in"):
         inside(tmp_path, name, where="a list", kind=RunError)
-    assert inside(tmp_path, "rgb/1.000.png", where="a list", kind=RunError) == tmp_path / "rgb" / "1.000.png"
+    assert (
+        inside(tmp_path, "rgb/1.000.png", where="a list", kind=RunError)
+        == tmp_path / "rgb" / "1.000.png"
+    )
 
 
 @pytest.mark.parametrize(
@@ -475,7 +550,10 @@ def test_files_and_folders_have_the_permissions_that_the_umask_gives(tmp_path: P
             (work / "inside").touch()
     finally:
         os.umask(before)
-    assert [stat.S_IMODE((tmp_path / name).stat().st_mode) for name in ("file", "folder")] == [0o640, 0o750]
+    assert [stat.S_IMODE((tmp_path / name).stat().st_mode) for name in ("file", "folder")] == [
+        0o640,
+        0o750,
+    ]
 
 
 @pytest.mark.parametrize("size", [0, 1, 1 << 16, (1 << 16) + 1, 1 << 17])
@@ -491,7 +569,10 @@ def test_files_of_any_size_are_read_whole_up_to_the_limit(tmp_path, size):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ('{"text": "", "x": "wide"}', r"p\.json is not a valid Sample: x: Input should be a valid number"),
+        (
+            '{"text": "", "x": "wide"}',
+            r"p\.json is not a valid Sample: x: Input should be a valid number",
+        ),
         ('{"text": "", "y": 2}', "y: Extra inputs are not permitted"),
         ("{", "file: Invalid JSON"),
         ("{}", "text: Field required"),
@@ -505,7 +586,9 @@ def test_bad_records_name_file_and_field(tmp_path, text, expected):
 
 def test_digest_is_stable_and_blind_to_order():
     assert digest({"a": 1, "b": [1, 2]}) == digest({"b": [1, 2], "a": 1}) == "8baa73198470"
-    assert digest(Sample(text="p", x=1.0)) == digest({"x": 1.0, "text": "p", "words": [], "more": {}})
+    assert digest(Sample(text="p", x=1.0)) == digest(
+        {"x": 1.0, "text": "p", "words": [], "more": {}}
+    )
     assert digest({"a": 1}) != digest({"a": 2})
     assert len(digest({}, length=40)) == 40
 
@@ -515,7 +598,10 @@ def test_digest_is_stable_and_blind_to_order():
 
 def test_streams_are_fixed_for_good():
     # raw words: guaranteed by NumPy across versions and platforms
-    assert stream(0, "flow", 3).bit_generator.random_raw(2).tolist() == [7831125740418745553, 14977623595910913313]
+    assert stream(0, "flow", 3).bit_generator.random_raw(2).tolist() == [
+        7831125740418745553,
+        14977623595910913313,
+    ]
     assert stream(2**40 + 7).bit_generator.random_raw(1).tolist() == [12832584331059455313]
 
 

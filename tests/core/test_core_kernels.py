@@ -64,7 +64,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """The folder of compiled kernels, empty; the toys are forgotten afterwards."""
     kernels = tmp_path / "kernels"
     monkeypatch.setattr(kernel_cache, "kernels_folder", lambda: kernels)
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # two edits within a second look the same to Python
+    # two edits within a second look the same to Python
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
     path = list(sys.path)
     yield kernels
     sys.path[:] = path
@@ -74,7 +75,9 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def forget_toys() -> None:
     for name in [name for name in sys.modules if name.partition(".")[0] == "toys"]:
         del sys.modules[name]
-    for function in [function for function in KERNELS if function.__module__.partition(".")[0] == "toys"]:
+    for function in [
+        function for function in KERNELS if function.__module__.partition(".")[0] == "toys"
+    ]:
         del KERNELS[function]
 
 
@@ -112,7 +115,7 @@ def names(folder: Path) -> set[str]:
     return {file.name for file in folder.iterdir()}
 
 
-# -- edits -------------------------------------------------------------------------------------------------------------
+# -- edits -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -276,11 +279,13 @@ def test_the_processor_counts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
     kernel = outer_kernel(write_toys(tmp_path / "toys"))
     before = kernel_digest(kernel)
     system, _, _ = kernel.targetctx.codegen().magic_tuple()
-    monkeypatch.setattr(type(kernel.targetctx.codegen()), "magic_tuple", lambda _: (system, "x86-64-v3", ""))
+    monkeypatch.setattr(
+        type(kernel.targetctx.codegen()), "magic_tuple", lambda _: (system, "x86-64-v3", "")
+    )
     assert kernel_digest(kernel) != before
 
 
-# -- files -------------------------------------------------------------------------------------------------------------
+# -- files -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -311,14 +316,18 @@ def test_damaged_and_foreign_files_are_compiled_again(
         assert kernel_cache._read(file) is not None
 
 
-def test_kernels_compile_where_nothing_can_be_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_kernels_compile_where_nothing_can_be_written(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setattr(kernel_cache, "kernels_folder", lambda: tmp_path / "file" / "kernels")
     assert outer_kernel(write_toys(tmp_path / "toys"))(3.0) == 116.0
     load_kernels()
 
 
-def test_kernels_compile_for_a_user_without_a_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_kernels_compile_for_a_user_without_a_home(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     def no_folder() -> Path:
         raise RuntimeError("Could not determine home directory.")
 
@@ -326,7 +335,9 @@ def test_kernels_compile_for_a_user_without_a_home(monkeypatch: pytest.MonkeyPat
     assert outer_kernel(write_toys(tmp_path / "toys"))(3.0) == 116.0
 
 
-def test_kernels_compile_on_a_full_disk_and_leave_nothing_behind(folder: Path, tmp_path: Path) -> None:
+def test_kernels_compile_on_a_full_disk_and_leave_nothing_behind(
+    folder: Path, tmp_path: Path
+) -> None:
     kernel = outer_kernel(write_toys(tmp_path / "toys"))
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
@@ -357,7 +368,9 @@ def test_loading_is_a_use(folder: Path, tmp_path: Path) -> None:
     for file in folder.iterdir():
         os.utime(file, (0, 0))
     outer_kernel(tmp_path / "toys")(3.0)
-    assert {file.name.partition("-")[0] for file in folder.iterdir() if file.stat().st_mtime} == {"toys.outer.outer"}
+    assert {file.name.partition("-")[0] for file in folder.iterdir() if file.stat().st_mtime} == {
+        "toys.outer.outer"
+    }
 
 
 def test_kernels_on_disk_are_loaded_before_they_are_called(
@@ -373,20 +386,26 @@ def test_kernels_on_disk_are_loaded_before_they_are_called(
     assert sys.modules["toys.inner"].called.signatures == []  # type: ignore[attr-defined]
 
 
-# -- the kernels of this package ---------------------------------------------------------------------------------------
+# -- the kernels of this package -------------------------------------------------------------------
 
 
 def test_every_kernel_of_this_package_can_be_stored() -> None:
     for name, file in module_files().items():
         if "core.compiled import" in file.read_text(encoding="utf-8"):
             importlib.import_module(name)
-    own = [kernel for function, kernel in KERNELS.items() if function.__module__.startswith("dynslam_bench.")]
+    own = [
+        kernel
+        for function, kernel in KERNELS.items()
+        if function.__module__.startswith("dynslam_bench.")
+    ]
     assert len(own) > 60
     for kernel in own:
         assert len(kernel_digest(kernel)) == 64
 
 
-def test_code_of_a_module_that_has_changed_since_its_import_is_not_stored(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_code_of_a_module_that_has_changed_since_its_import_is_not_stored(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     from dynslam_bench.features.orb import orientations  # uses instructions of `core.simd`
 
     instructions = "dynslam_bench.core.simd"
@@ -405,7 +424,9 @@ def test_two_instructions_of_one_function_are_told_apart() -> None:
     from dynslam_bench.core import simd
 
     assert simd.load.__qualname__ == simd.load_bytes.__qualname__
-    digests = {tuple(kernel_code._value_words(value, (), {})) for value in (simd.load, simd.load_bytes)}
+    digests = {
+        tuple(kernel_code._value_words(value, (), {})) for value in (simd.load, simd.load_bytes)
+    }
     assert len(digests) == 2
 
 
@@ -422,7 +443,9 @@ print(json.dumps({f"{kernel.__module__}.{kernel.__name__}": kernel_digest(kernel
 def copied_checkout(folder: Path) -> Path:
     """The package in a folder of its own, from where it can be imported."""
     package = Path(dynslam_bench.__file__).parent
-    shutil.copytree(package, folder / package.name, ignore=shutil.ignore_patterns("__pycache__", "weights"))
+    shutil.copytree(
+        package, folder / package.name, ignore=shutil.ignore_patterns("__pycache__", "weights")
+    )
     return folder
 
 
@@ -430,7 +453,9 @@ def printed(code: str, checkout: Path) -> Any:
     """What code writes as JSON in a process that imports a checkout."""
     # edits of equal length within a second would leave byte code that looks up to date
     environment = {**os.environ, "PYTHONPATH": str(checkout), "PYTHONDONTWRITEBYTECODE": "1"}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
     return json.loads(done.stdout)
 
 
@@ -444,7 +469,9 @@ def test_an_edit_counts_for_the_kernels_that_it_is_compiled_into(tmp_path: Path)
         file.write_text(source.replace(old, new))
         digests = printed(DIGESTS, tmp_path)
         file.write_text(source)
-        return {name.removeprefix("dynslam_bench.") for name in before if digests[name] != before[name]}
+        return {
+            name.removeprefix("dynslam_bench.") for name in before if digests[name] != before[name]
+        }
 
     # a constant, where it is used
     layout = package / "flow" / "layout.py"
@@ -464,7 +491,9 @@ def test_an_edit_counts_for_the_kernels_that_it_is_compiled_into(tmp_path: Path)
     by_instruction = changed_by(instructions, "DERIVATIVE_SHIFT = 11", "DERIVATIVE_SHIFT = 10")
     assert {*maps, "slam.pose_optimisation._optimise"} <= by_instruction
     assert "geometry.gauss_newton.apply_twist" not in by_instruction
-    assert not changed_by(instructions, "DERIVATIVE_SHIFT = 11", "DERIVATIVE_SHIFT = 11  # a comment")
+    assert not changed_by(
+        instructions, "DERIVATIVE_SHIFT = 11", "DERIVATIVE_SHIFT = 11  # a comment"
+    )
 
 
 OPTIMISE = """
@@ -493,10 +522,13 @@ def test_an_edited_checkout_optimises_poses_anew_and_a_copy_shares(tmp_path: Pat
     solver.write_text(source.replace("pose[0, 0] * x", "0.999 * pose[0, 0] * x"))
     edited, compiled_edited = printed(OPTIMISE, checkout)
     assert edited != first
-    assert set(compiled_edited) >= set(compiled_first)  # an earlier run of this test may have compiled both
+    # an earlier run of this test may have compiled both
+    assert set(compiled_edited) >= set(compiled_first)
 
     # a comment, a docstring, an edit of another module, another folder: nothing is compiled
-    solver.write_text("# A comment.\n" + source.replace("Coordinates of a point", "The coordinates of a point"))
+    solver.write_text(
+        "# A comment.\n" + source.replace("Coordinates of a point", "The coordinates of a point")
+    )
     unrelated = checkout / "dynslam_bench" / "geometry" / "camera.py"
     unrelated.write_text(unrelated.read_text() + "\nUNUSED = 1\n")
     copy = checkout.rename(tmp_path / "copy")

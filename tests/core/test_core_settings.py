@@ -13,7 +13,14 @@ import numpy as np
 import pytest
 
 import dynslam_bench
-from dynslam_bench.core import DynslamError, PluginError, SettingsError, did_you_mean, fingerprint, folders
+from dynslam_bench.core import (
+    DynslamError,
+    PluginError,
+    SettingsError,
+    did_you_mean,
+    fingerprint,
+    folders,
+)
 from dynslam_bench.core import plugins as plugin_probe
 from dynslam_bench.core import version as versions
 from dynslam_bench.core.code_files import files_below
@@ -39,8 +46,12 @@ from dynslam_bench.core.settings import (
 
 class Epipolar(Settings):
     enabled: bool = tunable(True, meaning="whether to test")
-    threshold_px: float = tunable(1.0, low=0.1, high=5.0, scale="log", unit="px", online=True, meaning="distance")
-    wide: float = tunable(1.0, low=0.5, high=2.0, limits=(0.0, None), meaning="validated more widely than searched")
+    threshold_px: float = tunable(
+        1.0, low=0.1, high=5.0, scale="log", unit="px", online=True, meaning="distance"
+    )
+    wide: float = tunable(
+        1.0, low=0.5, high=2.0, limits=(0.0, None), meaning="validated more widely than searched"
+    )
 
 
 class Root(Settings):
@@ -54,14 +65,32 @@ class Root(Settings):
 
 def test_parameters_describe_the_search_space():
     by_name = {p.name: p for p in parameters(Root)}
-    assert list(by_name) == ["epipolar.enabled", "epipolar.threshold_px", "epipolar.wide", "features", "method"]
+    assert list(by_name) == [
+        "epipolar.enabled",
+        "epipolar.threshold_px",
+        "epipolar.wide",
+        "features",
+        "method",
+    ]
     threshold = by_name["epipolar.threshold_px"]
-    assert (threshold.kind, threshold.low, threshold.high, threshold.scale) == ("float", 0.1, 5.0, "log")
+    assert (threshold.kind, threshold.low, threshold.high, threshold.scale) == (
+        "float",
+        0.1,
+        5.0,
+        "log",
+    )
     assert by_name["features"].kind == "int"
-    assert (by_name["epipolar.enabled"].choices, by_name["method"].choices) == ((False, True), ("orb", "fast"))
+    assert (by_name["epipolar.enabled"].choices, by_name["method"].choices) == (
+        (False, True),
+        ("orb", "fast"),
+    )
     online = parameters(Root, online_only=True)
-    assert [(p.name, p.tunable) for p in online] == [("epipolar.threshold_px", True), ("when", False)]
-    assert online[1].choices == ("rule", "now") and "`rule`, `now` |  | yes |" in settings_table(Root)
+    assert [(p.name, p.tunable) for p in online] == [
+        ("epipolar.threshold_px", True),
+        ("when", False),
+    ]
+    assert online[1].choices == ("rule", "now")
+    assert "`rule`, `now` |  | yes |" in settings_table(Root)
 
 
 @pytest.mark.parametrize(
@@ -78,16 +107,24 @@ def test_parameters_describe_the_search_space():
     ],
 )
 def test_assignments_of_the_command_line(assignment, name, value):
-    assert flatten(apply_overrides(Root(), parse_assignments([assignment]))) == flatten(Root()) | {name: value}
+    assert flatten(apply_overrides(Root(), parse_assignments([assignment]))) == flatten(Root()) | {
+        name: value
+    }
 
 
 @pytest.mark.parametrize(
     ("assignment", "expected"),
     [
-        ("epipolar.treshold_px=1", r"unknown setting 'epipolar.treshold_px' \(did you mean 'epipolar.threshold_px'"),
+        (
+            "epipolar.treshold_px=1",
+            r"unknown setting 'epipolar.treshold_px' \(did you mean 'epipolar.threshold_px'",
+        ),
         ("epipolar=1", r"setting 'epipolar' is a group \(set one of epipolar\.\*\)"),
         ("features.more=1", "unknown setting 'features.more'"),
-        ("epipolar.threshold_px=9", r"setting 'epipolar.threshold_px' is 9: input should be less than or equal to 5"),
+        (
+            "epipolar.threshold_px=9",
+            r"setting 'epipolar.threshold_px' is 9: input should be less than or equal to 5",
+        ),
         ("epipolar.threshold_px=nan", "setting 'epipolar.threshold_px' is"),
         ("epipolar.threshold_px=wide", r"is 'wide': input should be a valid number"),
         ("features=2.5", "setting 'features' is 2.5"),
@@ -151,7 +188,12 @@ def test_a_group_with_other_defaults_is_described_with_them():
     class Other(Root):
         epipolar: Epipolar = Epipolar(threshold_px=2.5)
 
-    defaults = [p.default for kind in (Other, Root) for p in parameters(kind) if p.name == "epipolar.threshold_px"]
+    defaults = [
+        p.default
+        for kind in (Other, Root)
+        for p in parameters(kind)
+        if p.name == "epipolar.threshold_px"
+    ]
     assert defaults == [2.5, 1.0]
     assert "| `epipolar.threshold_px` | `2.5` |" in settings_table(Other)
 
@@ -172,7 +214,9 @@ def test_did_you_mean(name, names, answer):
 
 def test_errors_survive_a_process_border():
     again = pickle.loads(pickle.dumps(SettingsError("what", "how")))
-    assert type(again) is SettingsError and str(again) == "what (how)" and str(DynslamError("only")) == "only"
+    assert type(again) is SettingsError
+    assert str(again) == "what (how)"
+    assert str(DynslamError("only")) == "only"
 
 
 def write(path: Path, text: str) -> Path:
@@ -183,7 +227,9 @@ def write(path: Path, text: str) -> Path:
 
 def test_content_digest_sees_type_shape_and_value() -> None:
     base = np.zeros((2, 3), np.uint8)
-    assert len({*map(content_digest, (base, base.reshape(3, 2), base.astype(np.int8), base + 1))}) == 4
+    assert (
+        len({*map(content_digest, (base, base.reshape(3, 2), base.astype(np.int8), base + 1))}) == 4
+    )
     assert content_digest(base) == content_digest(np.zeros((2, 6), np.uint8)[:, ::2])
 
 
@@ -201,7 +247,9 @@ class Whole(Settings):
     inner: Inner = Inner()
 
 
-def test_only_what_names_a_file_counts_as_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_what_names_a_file_counts_as_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "orb").mkdir()
     write(tmp_path / "auto", "a file called like a setting")
@@ -220,11 +268,21 @@ def test_only_what_names_a_file_counts_as_one(tmp_path: Path, monkeypatch: pytes
         inner=Inner(source="onnx:net.onnx", options=options),
     )
     found = named_digests(settings)
-    named = {"vocabulary", "word", "weights", "inner.source", "inner.options.network.file", "inner.options.masks"}
-    assert set(found) == named and len(set(found.values())) == 3
+    named = {
+        "vocabulary",
+        "word",
+        "weights",
+        "inner.source",
+        "inner.options.network.file",
+        "inner.options.masks",
+    }
+    assert set(found) == named
+    assert len(set(found.values())) == 3
     net.write_text("three")
     masks.write_text("2222")
-    assert {name for name, digest in named_digests(settings).items() if digest != found[name]} == named - {"vocabulary"}
+    assert {
+        name for name, digest in named_digests(settings).items() if digest != found[name]
+    } == named - {"vocabulary"}
     monkeypatch.setenv("FP_TEST_VOCABULARY", str(tmp_path / "voc.txt"))
     assert named_digests(Whole())["vocabulary"] == found["vocabulary"], "named by the environment"
 
@@ -250,7 +308,9 @@ class Listed(Settings):
         Listed(text="nets/"),
     ],
 )
-def test_paths_count_in_every_form(settings: Listed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_paths_count_in_every_form(
+    settings: Listed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("FP_TEST_FOLDER", str(tmp_path))
     files = [write(tmp_path / name, "1111") for name in ("net.bin", "nets/net.bin", "first.bin")]
@@ -263,16 +323,23 @@ def test_paths_count_in_every_form(settings: Listed, tmp_path: Path, monkeypatch
 
 
 @pytest.mark.parametrize("name", fingerprint.OPENCV)
-def test_every_distribution_of_opencv_is_versioned(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_distribution_of_opencv_is_versioned(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def only(version: str):
-        monkeypatch.setattr(fingerprint, "distribution_version", lambda asked: version if asked == name else "")
+        monkeypatch.setattr(
+            fingerprint, "distribution_version", lambda asked: version if asked == name else ""
+        )
         for cached in (opencv_version, machine_digest):
             cached.cache_clear()
         return opencv_version(), machine_digest()
 
     try:
-        (first, machine), (second, other) = only("4.10.0"), only("4.11.0")
-        assert first == f"{name} 4.10.0" and second == f"{name} 4.11.0" and machine != other
+        (first, machine) = only("4.10.0")
+        (second, other) = only("4.11.0")
+        assert first == f"{name} 4.10.0"
+        assert second == f"{name} 4.11.0"
+        assert machine != other
         monkeypatch.setattr(fingerprint, "distribution_version", lambda asked: "")
         opencv_version.cache_clear()
         assert opencv_version().startswith("cv2 "), "a build of one's own tells its version itself"
@@ -300,7 +367,11 @@ FOLDERS = {
 }
 CACHES = ("stages", "digests", "kernels")
 """What ``DYNSLAM_BENCH_CACHE`` moves."""
-VARIABLES = {"data": folders.DATA_VARIABLE, "stages": folders.STAGES_VARIABLE, "weights": folders.WEIGHTS_VARIABLE}
+VARIABLES = {
+    "data": folders.DATA_VARIABLE,
+    "stages": folders.STAGES_VARIABLE,
+    "weights": folders.WEIGHTS_VARIABLE,
+}
 
 
 @pytest.fixture
@@ -313,7 +384,9 @@ def home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize(("platform", "cache"), [("linux", ".cache"), ("darwin", "Library/Caches")])
 @pytest.mark.parametrize("name", FOLDERS)
-def test_everything_lies_in_one_cache_folder(name: str, platform: str, cache: str, home: Path, monkeypatch) -> None:
+def test_everything_lies_in_one_cache_folder(
+    name: str, platform: str, cache: str, home: Path, monkeypatch
+) -> None:
     monkeypatch.setattr(sys, "platform", platform)
     assert FOLDERS[name]() == home / cache / "dynslam-bench" / name
     monkeypatch.setenv("XDG_CACHE_HOME", str(home / "elsewhere"))
@@ -323,7 +396,11 @@ def test_everything_lies_in_one_cache_folder(name: str, platform: str, cache: st
 @pytest.mark.parametrize("name", VARIABLES)
 def test_a_variable_moves_one_of_them(name: str, home: Path, monkeypatch) -> None:
     monkeypatch.setenv(VARIABLES[name], str(home / "mine"))
-    moved = {folder: home / "mine" / folder for folder in CACHES} if name == "stages" else {name: home / "mine"}
+    moved = (
+        {folder: home / "mine" / folder for folder in CACHES}
+        if name == "stages"
+        else {name: home / "mine"}
+    )
     for folder, find in FOLDERS.items():
         assert find() == moved.get(folder, folders.user_cache() / folder)
 
@@ -347,7 +424,9 @@ def fresh_version(monkeypatch: pytest.MonkeyPatch):
     ],
 )
 @pytest.mark.usefixtures("fresh_version")
-def test_the_release_of_a_version(installed: str, release: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_release_of_a_version(
+    installed: str, release: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(metadata, "version", lambda name: installed)
     assert (dynslam_bench.__version__, versions.release()) == (installed, release)
 
@@ -431,19 +510,24 @@ ENDINGS = {
 
 
 @pytest.mark.parametrize("statement", ENDINGS)
-def test_an_import_that_ends_the_process_is_an_error_like_any_other(tmp_path, monkeypatch, statement):
+def test_an_import_that_ends_the_process_is_an_error_like_any_other(
+    tmp_path, monkeypatch, statement
+):
     """As a file, as a module that the environment names, and as an entry point: the rest goes on."""
     (tmp_path / "ends_env.py").write_text(statement)
     (tmp_path / "ends_dist.py").write_text(statement)
     fake_distribution(tmp_path, "dynslam_bench.trackers", {"ends": "ends_dist:SPEC"}, "ends-dist")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv(ENVIRONMENT_VARIABLE, "ends_env:SPEC")
-    with pytest.raises(PluginError, match=rf"that ends the process \({ENDINGS[statement]}\) .*sys.exit"):
+    with pytest.raises(
+        PluginError, match=rf"that ends the process \({ENDINGS[statement]}\) .*sys.exit"
+    ):
         load_object(f"{tmp_path / 'ends_env.py'}:SPEC")
     trackers = registry()
     assert len(trackers.all()) == 2
     reasons = [failure.reason for failure in trackers.failures()]
-    assert len(reasons) == 2 and all(f"ends the process ({ENDINGS[statement]})" in reason for reason in reasons)
+    assert len(reasons) == 2
+    assert all(f"ends the process ({ENDINGS[statement]})" in reason for reason in reasons)
 
 
 def test_an_import_without_an_end_is_an_error_too(tmp_path, monkeypatch):
@@ -456,28 +540,39 @@ def test_an_import_without_an_end_is_an_error_too(tmp_path, monkeypatch):
 def test_environment_variable(tmp_path, monkeypatch):
     good = write(tmp_path / "good.py", SPEC_SOURCE.format(id="from-env"))
     broken = write(tmp_path / "broken.py", "import nothing_of_that_name\n")
-    monkeypatch.setenv(ENVIRONMENT_VARIABLE, f"{good}:SPEC, flow={good}:SPEC,trackers={broken}:SPEC")
+    monkeypatch.setenv(
+        ENVIRONMENT_VARIABLE, f"{good}:SPEC, flow={good}:SPEC,trackers={broken}:SPEC"
+    )
     trackers = registry()
     assert [found.spec.id for found in trackers.all()] == ["built-in", "from-env", "never-move"]
     (failure,) = trackers.failures()
     assert str(broken) in failure.source
     assert "ModuleNotFoundError: No module named 'nothing_of_that_name'" in failure.reason
     assert [len(registry(kind).all()) for kind in ("flow", "filters")] == [3, 2]
-    with pytest.raises(PluginError, match=r"unknown tracker 'brokn'.*broken\.py:SPEC failed to load: cannot import"):
+    with pytest.raises(
+        PluginError, match=r"unknown tracker 'brokn'.*broken\.py:SPEC failed to load: cannot import"
+    ):
         trackers.get("brokn")
     monkeypatch.delenv(ENVIRONMENT_VARIABLE)
     assert len(trackers.all()) == 3  # discovered once
     trackers.refresh()
-    assert len(trackers.all()) == 2 and trackers.failures() == []
+    assert len(trackers.all()) == 2
+    assert trackers.failures() == []
 
 
-def test_entry_points_of_installed_distributions_come_after_the_environment_and_what_is_built_in(tmp_path, monkeypatch):
+def test_entry_points_of_installed_distributions_come_after_the_environment_and_what_is_built_in(
+    tmp_path, monkeypatch
+):
     source = "from tests_plugin_contract import Spec\nGOOD, SAME, OTHER = Spec('from-dist'), Spec('same'), 5\n"
     (tmp_path / "dist_plugin.py").write_text(source + "BUILT_IN = Spec('never-move', 'a:b')\n")
-    (tmp_path / "dist_broken.py").write_text("raise OSError('libGL.so.1: cannot open shared object file')\n")
+    (tmp_path / "dist_broken.py").write_text(
+        "raise OSError('libGL.so.1: cannot open shared object file')\n"
+    )
     (tmp_path / "order_env.py").write_text(SPEC_SOURCE.format(id="same"))
     names = {"good": "GOOD", "number": "OTHER", "same": "SAME", "never": "BUILT_IN"}
-    targets = {name: f"dist_plugin:{attribute}" for name, attribute in names.items()} | {"bad": "dist_broken:SPEC"}
+    targets = {name: f"dist_plugin:{attribute}" for name, attribute in names.items()} | {
+        "bad": "dist_broken:SPEC"
+    }
     fake_distribution(tmp_path, "dynslam_bench.trackers", targets)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv(ENVIRONMENT_VARIABLE, "order_env:SPEC")
@@ -496,5 +591,7 @@ def test_entry_points_of_installed_distributions_come_after_the_environment_and_
         "never": "id 'never-move' is already taken by built in",
     }.items():
         assert words in reasons[f"entry point '{name}' of fake-dist"]
-    with pytest.raises(PluginError, match="failed to load: cannot import dist_broken: OSError: libGL"):
+    with pytest.raises(
+        PluginError, match="failed to load: cannot import dist_broken: OSError: libGL"
+    ):
         trackers.get("bad")

@@ -20,6 +20,7 @@ RULES = {
         get_args(kind.__orig_bases__[0])[0](),
         *FURTHER.get(kind, [SegmentationSettings()] * issubclass(kind, culling.ObjectRule)),
     )
-    for kind in {*culling.Rule.__subclasses__(), *culling.ObjectRule.__subclasses__()} - {culling.ObjectRule}
+    for kind in {*culling.Rule.__subclasses__(), *culling.ObjectRule.__subclasses__()}
+    - {culling.ObjectRule}
 }
 """What makes each of them, by the name of its class."""

@@ -5,7 +5,14 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from dynslam_bench.contracts import FilterState, FlowResult, FrameBundle, Instances, KeyframeView, Keypoints
+from dynslam_bench.contracts import (
+    FilterState,
+    FlowResult,
+    FrameBundle,
+    Instances,
+    KeyframeView,
+    Keypoints,
+)
 from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
@@ -38,7 +45,14 @@ def keypoints(xy: np.ndarray) -> Keypoints:
 def bundle(xy: np.ndarray, z: np.ndarray, depth: np.ndarray, timestamp: float) -> FrameBundle:
     gray = np.zeros(depth.shape, np.uint8)
     return FrameBundle(
-        0, timestamp, np.zeros((*depth.shape, 3), np.uint8), gray, depth, keypoints(xy), xy, z.astype(np.float32)
+        0,
+        timestamp,
+        np.zeros((*depth.shape, 3), np.uint8),
+        gray,
+        depth,
+        keypoints(xy),
+        xy,
+        z.astype(np.float32),
     )
 
 
@@ -70,12 +84,16 @@ def scene(
 ) -> Scene:
     """Static points all over the image, moving ones inside x 200..330, y 100..380 at 1.5 m.
 
-    `motion` [3] is the moving points' displacement between the frames, metres, in the previous camera frame. `camera`
-    is `CAMERA` with any distortion, which moves where the keypoints and the ends of their flow lie in the image.
+    `motion` [3] is the moving points' displacement between the frames, metres, in the previous
+    camera frame. `camera` is `CAMERA` with any distortion, which moves where the keypoints and the
+    ends of their flow lie in the image.
     """
     rng = np.random.default_rng(seed)
     xy = np.concatenate(
-        [rng.uniform((20, 20), (620, 460), (n_static, 2)), rng.uniform((200, 100), (330, 380), (n_moving, 2))]
+        [
+            rng.uniform((20, 20), (620, 460), (n_static, 2)),
+            rng.uniform((200, 100), (330, 380), (n_moving, 2)),
+        ]
     )
     z = np.concatenate([rng.uniform(*depths, n_static), rng.uniform(1.45, 1.55, n_moving)])
     moving = np.arange(len(xy)) >= n_static
@@ -85,11 +103,17 @@ def scene(
     before = CAMERA.project(previous_points) + rng.normal(0, noise_px, xy.shape)
     visible = (before > 5).all(axis=1) & (before < (634, 474)).all(axis=1)
     visible &= on_top(xy, z) & on_top(before, previous_points[:, 2])
-    xy, z, moving, before, previous_points = (array[visible] for array in (xy, z, moving, before, previous_points))
-    frame = replace(
-        bundle(xy, z, splat(xy, z), 1.0), keypoints=keypoints(camera.distort_points(xy)), instances=instances
+    xy, z, moving, before, previous_points = (
+        array[visible] for array in (xy, z, moving, before, previous_points)
     )
-    previous = bundle(before, previous_points[:, 2], splat(before, previous_points[:, 2]), 1.0 - 1 / 30)
+    frame = replace(
+        bundle(xy, z, splat(xy, z), 1.0),
+        keypoints=keypoints(camera.distort_points(xy)),
+        instances=instances,
+    )
+    previous = bundle(
+        before, previous_points[:, 2], splat(before, previous_points[:, 2]), 1.0 - 1 / 30
+    )
     state = FilterState(
         camera=camera,
         keep=np.ones(len(xy), bool),
@@ -98,7 +122,9 @@ def scene(
         T_world_prev=np.eye(4),
         T_world_pred=T_prev_cur,
         flow=FlowResult(
-            camera.distort_points(before).astype(np.float32), np.ones(len(xy), bool), np.zeros(len(xy), np.float32)
+            camera.distort_points(before).astype(np.float32),
+            np.ones(len(xy), bool),
+            np.zeros(len(xy), np.float32),
         ),
     )
     return Scene(frame, state, moving)
@@ -107,7 +133,9 @@ def scene(
 def box_instance(x0: int, y0: int, x1: int, y1: int, name: str = "person") -> Instances:
     mask = np.zeros((1, CAMERA.height, CAMERA.width), bool)
     mask[0, y0:y1, x0:x1] = True
-    return Instances(mask, np.array([[x0, y0, x1, y1]], np.float32), (name,), np.ones(1, np.float32))
+    return Instances(
+        mask, np.array([[x0, y0, x1, y1]], np.float32), (name,), np.ones(1, np.float32)
+    )
 
 
 def on_rectangle(made: Scene | FrameBundle, x0: int, y0: int, x1: int, y1: int) -> np.ndarray:
@@ -118,14 +146,23 @@ def on_rectangle(made: Scene | FrameBundle, x0: int, y0: int, x1: int, y1: int) 
 
 def keyframe(T_world_cam: np.ndarray, depth: np.ndarray, timestamp: float) -> KeyframeView:
     empty = np.zeros((0, 2))
-    return KeyframeView(T_world_cam, keypoints(empty), empty, np.zeros(0, np.float32), depth, timestamp)
+    return KeyframeView(
+        T_world_cam, keypoints(empty), empty, np.zeros(0, np.float32), depth, timestamp
+    )
 
 
-def at_rest(frame: FrameBundle, previous: FrameBundle | None = None, keyframes: tuple = ()) -> FilterState:  # type: ignore[type-arg]
+def at_rest(
+    frame: FrameBundle, previous: FrameBundle | None = None, keyframes: tuple = ()
+) -> FilterState:  # type: ignore[type-arg]
     """The state of a camera at rest at the origin."""
     pose = np.eye(4)
     return FilterState(
-        CAMERA, np.ones(len(frame), bool), previous=previous, T_world_prev=pose, T_world_pred=pose, keyframes=keyframes
+        CAMERA,
+        np.ones(len(frame), bool),
+        previous=previous,
+        T_world_prev=pose,
+        T_world_pred=pose,
+        keyframes=keyframes,
     )
 
 
@@ -136,9 +173,11 @@ def texture(seed: int) -> np.ndarray:
 
 def moved_patch(shift: int) -> tuple[np.ndarray, np.ndarray]:
     """Two images of a textured wall; the box's texture has moved by `shift` pixels downwards in the second."""
-    wall, person = texture(0), texture(1)
+    wall = texture(0)
+    person = texture(1)
     x0, y0, x1, y1 = BOX
-    before, after = wall.copy(), wall.copy()
+    before = wall.copy()
+    after = wall.copy()
     before[y0:y1, x0:x1] = person[y0:y1, x0:x1]
     after[y0:y1, x0:x1] = person[y0 - shift : y1 - shift, x0:x1]
     return before, after

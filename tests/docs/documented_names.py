@@ -43,7 +43,11 @@ def read(file: Path) -> tuple[list[tuple[int, str]], set[str]]:
     docstrings = {id(node): (node.lineno, str(node.value)) for node in _docstrings(nodes)}
     names = {name for node in nodes for name in _names_of(node)}
     for node in nodes:
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
+        if (
+            isinstance(node, ast.Constant)
+            and isinstance(node.value, str)
+            and id(node) not in docstrings
+        ):
             names |= {node.value, *re.findall(r"[A-Za-z0-9_][A-Za-z0-9_-]*", node.value)}
     return list(docstrings.values()), names
 
@@ -54,7 +58,12 @@ def words() -> frozenset[str]:
     names: set[str] = set()
     for file in [*sources(), *sorted((ROOT / "tests").rglob("*.py"))]:
         names |= {*read(file)[1], file.stem, *file.parent.relative_to(ROOT).parts}
-    data = [file for package in PACKAGES for kind in ("toml", "csv") for file in (ROOT / package).rglob(f"*.{kind}")]
+    data = [
+        file
+        for package in PACKAGES
+        for kind in ("toml", "csv")
+        for file in (ROOT / package).rglob(f"*.{kind}")
+    ]
     for file in [*data, ROOT / "pyproject.toml"]:
         names.update(re.findall(r"[A-Za-z_][A-Za-z0-9_-]*", file.read_text(encoding="utf-8")))
     return frozenset(names)
@@ -75,7 +84,9 @@ def _names_of(node: ast.AST) -> Iterator[str]:
 def _docstrings(nodes: list[ast.AST]) -> Iterator[ast.Constant]:
     """The docstrings of a module: of itself, its classes and functions, and those below assignments."""
     for node in nodes:
-        for statement in getattr(node, "body", []) if not isinstance(node, ast.Lambda | ast.IfExp) else []:
+        for statement in (
+            getattr(node, "body", []) if not isinstance(node, ast.Lambda | ast.IfExp) else []
+        ):
             match statement:
                 case ast.Expr(value=ast.Constant(value=str()) as docstring):
                     yield docstring
@@ -84,7 +95,12 @@ def _docstrings(nodes: list[ast.AST]) -> Iterator[ast.Constant]:
 def in_pages() -> Iterator[Mention]:
     """Inline code of all pages (fenced blocks are commands, which are tested elsewhere, or made-up files)."""
     for page in PAGES:
-        text = re.sub(r"^```.*?^```", lambda m: "\n" * m.group().count("\n"), page.read_text(), flags=re.S | re.M)
+        text = re.sub(
+            r"^```.*?^```",
+            lambda m: "\n" * m.group().count("\n"),
+            page.read_text(),
+            flags=re.S | re.M,
+        )
         for found in re.finditer(r"`([^`\n]+)`", text):
             line = text.count("\n", 0, found.start()) + 1
             yield Mention(f"{page.relative_to(ROOT)}:{line}", found.group(1).replace("\\|", "|"))
@@ -100,4 +116,7 @@ def in_docstrings() -> Iterator[Mention]:
 
 def exists(path: str) -> bool:
     """Whether a path is there, from the root, from the package, or from a package (``culling/epipolar.py``)."""
-    return any((base / path).exists() for base in (ROOT, ROOT / "dynslam_bench", ROOT / "docs", ROOT.parent))
+    return any(
+        (base / path).exists()
+        for base in (ROOT, ROOT / "dynslam_bench", ROOT / "docs", ROOT.parent)
+    )

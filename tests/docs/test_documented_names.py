@@ -79,21 +79,31 @@ def options() -> frozenset[str]:
     waiting = [program()]
     while waiting:
         command = waiting.pop()
-        found.update(name for taken in command.params for name in (*taken.opts, *taken.secondary_opts))
+        found.update(
+            name for taken in command.params for name in (*taken.opts, *taken.secondary_opts)
+        )
         waiting += getattr(command, "commands", {}).values()
     scripts = Path(__file__).resolve().parents[1] / "benchmarks"
-    return frozenset(found.union(*(re.findall(r'"(--[a-z-]+)"', file.read_text()) for file in scripts.glob("*.py"))))
+    return frozenset(
+        found.union(
+            *(re.findall(r'"(--[a-z-]+)"', file.read_text()) for file in scripts.glob("*.py"))
+        )
+    )
 
 
 def missing(named: list[Mention], known: object) -> list[str]:
     assert named, "nothing was looked at"
-    return sorted({f"{mention.where}: {mention.text}" for mention in named if not known(mention.text)})  # type: ignore[operator]
+    return sorted(
+        {f"{mention.where}: {mention.text}" for mention in named if not known(mention.text)}
+    )  # type: ignore[operator]
 
 
 def test_files_and_folders_exist() -> None:
     path = re.compile(r"(?:[\w.-]+/)+(?:[\w.-]+\.(?:py|toml|md|jsonl))?")
     named = [m for m in mentions() if path.fullmatch(m.text) and not m.text.startswith(OF_USERS)]
-    assert not missing(named, lambda text: exists(text) or (text.endswith("/") and text.strip("/") in words()))
+    assert not missing(
+        named, lambda text: exists(text) or (text.endswith("/") and text.strip("/") in words())
+    )
 
 
 def test_settings_exist() -> None:
@@ -110,13 +120,21 @@ def test_settings_exist() -> None:
 
 
 def _is_symbol(text: str) -> bool:
-    return exists(text.replace(".", "/") + ".py") or exists(text.rpartition(".")[0].replace(".", "/") + ".py")
+    return exists(text.replace(".", "/") + ".py") or exists(
+        text.rpartition(".")[0].replace(".", "/") + ".py"
+    )
 
 
 def test_identifiers_exist() -> None:
     identifier = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)(?:\(\))?")
-    named = [Mention(m.where, found.group(1)) for m in mentions() if (found := identifier.fullmatch(m.text))]
-    assert not missing(named, lambda text: text in words() | FOREIGN or POSE.fullmatch(text) is not None)
+    named = [
+        Mention(m.where, found.group(1))
+        for m in mentions()
+        if (found := identifier.fullmatch(m.text))
+    ]
+    assert not missing(
+        named, lambda text: text in words() | FOREIGN or POSE.fullmatch(text) is not None
+    )
 
 
 def test_options_exist() -> None:
@@ -149,28 +167,39 @@ def test_the_documented_command_parses(line: str) -> None:
     words = expand_lists(shlex.split(line, comments=True)[1:])
     command = program()
     assert command.commands, "the command line has no verbs"
-    while commands := getattr(command, "commands", None):  # a group, of whichever click typer brings
-        name = words.pop(0) if words and words[0] in commands else "make"  # the default verb of `DefaultGroup`
+    # a group, of whichever click typer brings
+    while commands := getattr(command, "commands", None):
+        # the default verb of `DefaultGroup`
+        name = words.pop(0) if words and words[0] in commands else "make"
         assert name in commands, f"there is no '{words[:1]}' below '{command.name}'"
         command = commands[name]
     context = command.make_context(command.name, words, resilient_parsing=False)
     if command.name == "run" and "tracker" in context.params:
         tracker = context.params["tracker"]
-        assert ":" in tracker or tracker in {entry.spec.id for entry in TRACKERS.all()}, f"no tracker '{tracker}'"
+        assert ":" in tracker or tracker in {entry.spec.id for entry in TRACKERS.all()}, (
+            f"no tracker '{tracker}'"
+        )
         for sequence in context.params["sequences"]:
-            assert sequence.startswith(("synthetic/", *MADE_UP)) or entry_of(sequence) is not None, sequence
+            assert (
+                sequence.startswith(("synthetic/", *MADE_UP)) or entry_of(sequence) is not None
+            ), sequence
 
 
-# The reference pages that are made of the code are those that the code makes now, and all links between pages hold.
+# The reference pages that are made of the code are those that the code makes now, and all links
+# between pages hold.
 
 
 @pytest.mark.parametrize(("page", "text"), reference_pages().items(), ids=lambda value: value[:30])
 def test_reference_pages_are_those_of_the_code(page: str, text: str) -> None:
-    assert (ROOT / "docs" / page).read_text(encoding="utf-8") == text, "write it again: python .ci/site/generated.py"
+    assert (ROOT / "docs" / page).read_text(encoding="utf-8") == text, (
+        "write it again: python .ci/site/generated.py"
+    )
 
 
 @pytest.mark.parametrize(
-    "page", [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")], ids=lambda page: page.relative_to(ROOT).as_posix()
+    "page",
+    [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")],
+    ids=lambda page: page.relative_to(ROOT).as_posix(),
 )
 def test_links_between_files_hold_without_the_site(page: Path) -> None:
     text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.S | re.M)

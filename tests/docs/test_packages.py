@@ -25,7 +25,9 @@ def test_every_package_is_listed(project: dict) -> None:
     """A package that is forgotten is missing from the wheel, and nothing says so."""
     homes = {"": "dynslam_bench", ".envs": "envs", ".tuning": "tuning", ".reports": "reports"}
     found = {
-        "dynslam_bench" + prefix + "".join(f".{part}" for part in init.parent.relative_to(ROOT / home).parts)
+        "dynslam_bench"
+        + prefix
+        + "".join(f".{part}" for part in init.parent.relative_to(ROOT / home).parts)
         for prefix, home in homes.items()
         for init in (ROOT / home).rglob("__init__.py")
     }
@@ -35,7 +37,10 @@ def test_every_package_is_listed(project: dict) -> None:
 def test_the_recipe_names_what_the_package_needs(project: dict) -> None:
     recipe = (ROOT / "packaging" / "conda" / "recipe.yaml").read_text()
     other = {"opencv-python-headless": "py-opencv", "torch": "pytorch"}
-    needed = [line.partition(";")[0].replace(" ", "").partition(">=") for line in project["project"]["dependencies"]]
+    needed = [
+        line.partition(";")[0].replace(" ", "").partition(">=")
+        for line in project["project"]["dependencies"]
+    ]
     assert len(needed) > 10
     wanted = [f"- {other.get(name, name)} >={number}" for name, _, number in needed]
     assert [line for line in wanted if f"    {line}\n" not in recipe] == []

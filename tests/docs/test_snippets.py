@@ -50,7 +50,11 @@ A_RUN = (
 )
 BEFORE = {"docs/how-to/export.md": A_RUN, "docs/how-to/pandas.md": A_RUN}
 """What a reader has done already: a run is stored."""
-WITH_OUTPUT = {"docs/how-to/trajectory.md": "", "docs/tutorials/study.md": "mine.toml", "docs/tutorials/tracker.md": ""}
+WITH_OUTPUT = {
+    "docs/how-to/trajectory.md": "",
+    "docs/tutorials/study.md": "mine.toml",
+    "docs/tutorials/tracker.md": "",
+}
 """Pages that show what commands print, and the file that their block of TOML is."""
 ELSEWHERE = {
     "docs/how-to/dataset.md": (1, "tests/trackers/adapters/test_adapter_controls.py"),
@@ -65,12 +69,16 @@ ELSEWHERE = {
 
 
 def blocks(page: Path | str, language: str = "python") -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), flags=re.S | re.M)
+    return re.findall(
+        rf"^```{language}\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), flags=re.S | re.M
+    )
 
 
 def test_every_block_of_python_is_run_by_some_test() -> None:
     held = {str(page.relative_to(ROOT)): len(blocks(page)) for page in PAGES if blocks(page)}
-    assert held == {page: RUN.get(page, 0) + ELSEWHERE.get(page, (0, ""))[0] for page in {*RUN, *ELSEWHERE}}
+    assert held == {
+        page: RUN.get(page, 0) + ELSEWHERE.get(page, (0, ""))[0] for page in {*RUN, *ELSEWHERE}
+    }
     for page, (_, test) in ELSEWHERE.items():
         assert Path(page).name in (ROOT / test).read_text(), f"{test} does not read {page}"
 
@@ -97,7 +105,9 @@ def outputs(page: str, language: str) -> list[tuple[str, str]]:
 
 def test_pages_that_show_outputs_are_compared() -> None:
     shown = {
-        str(page.relative_to(ROOT)) for page in PAGES if outputs(str(page), "bash") or outputs(str(page), "python")
+        str(page.relative_to(ROOT))
+        for page in PAGES
+        if outputs(str(page), "bash") or outputs(str(page), "python")
     }
     assert shown == set(WITH_OUTPUT)
 
@@ -140,7 +150,9 @@ def test_the_suite_on_the_page_is_one(tmp_path: Path) -> None:
     suite = load_suite(only_toml("docs/how-to/suite.md", tmp_path))
     trackers = {"orb-slam2", "emfoa-oft", "never-move"}
     specs = list(suite.specs(trackers=tuple(sorted(trackers))))
-    assert len(specs) == 4 * 2 * 2 * 3, "three trackers and a row, two sequences, two variants, three offsets"
+    assert len(specs) == 4 * 2 * 2 * 3, (
+        "three trackers and a row, two sequences, two variants, three offsets"
+    )
     assert {spec.tracker for spec in specs} == trackers
 
 
@@ -148,7 +160,9 @@ def test_the_suite_on_the_page_is_one(tmp_path: Path) -> None:
 def test_the_studies_on_the_pages_are_some(page: str, tmp_path: Path) -> None:
     spec = read_study(only_toml(page, tmp_path))
     settings = flatten(TRACKERS.get(spec.tracker).settings())
-    assert spec.instances(*spec.tune) and spec.instances(*spec.held_out) and spec.space.include
+    assert spec.instances(*spec.tune)
+    assert spec.instances(*spec.held_out)
+    assert spec.space.include
     for pattern in (*spec.space.include, *spec.space.fixed):
         assert any(name.startswith(pattern.rstrip("*")) for name in settings), pattern
 
@@ -168,22 +182,33 @@ def test_the_entry_point_on_the_page_is_of_a_group_that_is_read() -> None:
 
 def module_of(file: Path) -> str:
     parts = file.relative_to(ROOT).with_suffix("").parts
-    return ".".join(parts if parts[0] == "dynslam_bench" else ("dynslam_bench", *parts)).removesuffix(".__init__")
+    return ".".join(
+        parts if parts[0] == "dynslam_bench" else ("dynslam_bench", *parts)
+    ).removesuffix(".__init__")
 
 
-WITH_EXAMPLES = [module_of(file) for file in sources() if ">>> " in file.read_text(encoding="utf-8")]
+WITH_EXAMPLES = [
+    module_of(file) for file in sources() if ">>> " in file.read_text(encoding="utf-8")
+]
 
 
 @pytest.mark.parametrize("name", WITH_EXAMPLES)
 def test_examples_give_what_they_say(name: str) -> None:
     outcome = doctest.testmod(importlib.import_module(name), optionflags=doctest.ELLIPSIS)
-    assert outcome.attempted > 0 and outcome.failed == 0
+    assert outcome.attempted > 0
+    assert outcome.failed == 0
 
 
-# What the pages and the template of a new tracker import from this package: contracts, settings and errors.
+# What the pages and the template of a new tracker import from this package: contracts, settings and
+# errors.
 
 
-PLUGIN_PAGES = ("reference/plugins.md", "how-to/dataset.md", "how-to/filter.md", "how-to/segmenter.md")
+PLUGIN_PAGES = (
+    "reference/plugins.md",
+    "how-to/dataset.md",
+    "how-to/filter.md",
+    "how-to/segmenter.md",
+)
 OPEN = {"dynslam_bench.contracts", "dynslam_bench.core.settings", "dynslam_bench.core.errors"}
 COMPOSING = "dynslam_bench.trackers.systems.composition"
 """Puts filters on our back end: the one thing that a plug-in may take from us that is no contract."""
@@ -204,7 +229,13 @@ def imports(code: str) -> list[tuple[str, str]]:
 
 def test_plug_ins_import_from_the_contracts_only(tmp_path: Path) -> None:
     page = "\n".join((ROOT / "docs" / page).read_text(encoding="utf-8") for page in PLUGIN_PAGES)
-    taken = [pair for text in re.findall(r"^```python\n(.*?)^```", page, flags=re.S | re.M) for pair in imports(text)]
-    assert len(taken) > 10 and {module for module, _ in taken} <= OPEN | {COMPOSING, RULES}
+    taken = [
+        pair
+        for text in re.findall(r"^```python\n(.*?)^```", page, flags=re.S | re.M)
+        for pair in imports(text)
+    ]
+    assert len(taken) > 10
+    assert {module for module, _ in taken} <= OPEN | {COMPOSING, RULES}
     template = imports(write_tracker_template("my-slam", tmp_path).read_text())
-    assert ("dynslam_bench.contracts", "TrackerSpec") in template and {module for module, _ in template} <= OPEN
+    assert ("dynslam_bench.contracts", "TrackerSpec") in template
+    assert {module for module, _ in template} <= OPEN

@@ -10,9 +10,12 @@ import results
 from documented_names import PAGES as WRITTEN
 from documented_names import ROOT, sources
 
-LONGEST, MEDIAN = 35, 18
+LONGEST = 35
+MEDIAN = 18
 """Words of a sentence."""
-ALL_PAGES, README, CHANGELOG_LINES = 26_000, 700, 40
+ALL_PAGES = 26_000
+README = 700
+CHANGELOG_LINES = 40
 """Words of all pages for users (of results the prose alone) and of the README; lines of a version's changes."""
 WORDS = {
     r"\bheir\b": "replacement",
@@ -45,7 +48,11 @@ def paragraphs(text: str) -> list[str]:
         (r"`[^`]*`", "Name"),
     ):
         text = re.sub(pattern, plain, text, flags=re.MULTILINE)
-    return [" ".join(part.replace("*", "").split()) for part in re.split(r"\n\s*\n", text) if part.strip()]
+    return [
+        " ".join(part.replace("*", "").split())
+        for part in re.split(r"\n\s*\n", text)
+        if part.strip()
+    ]
 
 
 def sentences(text: str) -> list[str]:
@@ -67,7 +74,11 @@ def tables(text: str) -> list[list[list[str]]]:
     """A page's tables as rows of cells, each with its header first and without the rule below it."""
     text = BLOCKS.sub("\n", text)
     return [
-        [[cell.strip() for cell in CELLS.split(row.strip())[1:-1]] for row in block.splitlines() if "| --" not in row]
+        [
+            [cell.strip() for cell in CELLS.split(row.strip())[1:-1]]
+            for row in block.splitlines()
+            if "| --" not in row
+        ]
         for block in re.findall(r"(?:^ *\|.*\n?)+", text, flags=re.MULTILINE)
     ]
 
@@ -86,7 +97,9 @@ def test_sentences_are_short(text: str) -> None:
 
 def test_words_are_the_field_s(text: str) -> None:
     assert [
-        (word, better) for word, better in WORDS.items() if re.search(word, "\n".join(paragraphs(text)), re.I)
+        (word, better)
+        for word, better in WORDS.items()
+        if re.search(word, "\n".join(paragraphs(text)), re.I)
     ] == []
 
 
@@ -97,14 +110,18 @@ def test_a_page_begins_with_one_sentence_that_says_what_it_is_for(text: str) -> 
 
 def test_all_pages_are_short() -> None:
     texts = {page: page.read_text(encoding="utf-8") for page in PAGES}
-    counted = [paragraphs(text) if page.parent.name == "results" else [text] for page, text in texts.items()]
+    counted = [
+        paragraphs(text) if page.parent.name == "results" else [text]
+        for page, text in texts.items()
+    ]
     assert sum(len(part.split()) for parts in counted for part in parts) <= ALL_PAGES
     assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= README
     changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     assert max(len(part.splitlines()) for part in changes.split("\n## ")[1:]) <= CHANGELOG_LINES
 
 
-# The product is written in the field's terms: these words of our own dialect appear in no identifier or text of it.
+# The product is written in the field's terms: these words of our own dialect appear in no
+# identifier or text of it.
 
 
 OUR_WORDS = (
@@ -124,7 +141,10 @@ def test_our_words_are_not_used() -> None:
     words = "|".join("[ _]?".join(word.split()) for word in OUR_WORDS)
     text = re.compile(rf"(?<![A-Za-z])(?:{words})(?![a-z])", re.IGNORECASE)
     assert text.search("of_piece_index") is not None
-    used = [(str(file.relative_to(ROOT)), text.findall(file.read_text(encoding="utf-8"))) for file in sources()]
+    used = [
+        (str(file.relative_to(ROOT)), text.findall(file.read_text(encoding="utf-8")))
+        for file in sources()
+    ]
     assert [(file, found) for file, found in used if found] == []
 
 
@@ -143,7 +163,9 @@ def test_variables_are_named_by_what_they_hold() -> None:
 # Measured tables lie in `docs/results/`, each with its command, commit, date, machine and data.
 
 
-RESULTS = sorted({*(ROOT / "docs" / "results").glob("*.md")} - {ROOT / "docs" / "results" / "README.md"})
+RESULTS = sorted(
+    {*(ROOT / "docs" / "results").glob("*.md")} - {ROOT / "docs" / "results" / "README.md"}
+)
 
 SIGN = r"[\d.,±+~<>/()\[\];:\s-]"
 UNIT = r"(?<![A-Za-z])(?:mm|cm|m|ms|s|%|MB|px|fps)(?![A-Za-z])"
@@ -160,7 +182,9 @@ def is_figure(cell: str) -> bool:
 def measured(text: str) -> list[str]:
     """The headers of a page's tables in which two cells or more are figures."""
     return [
-        " | ".join(table[0]) for table in tables(text) if sum(is_figure(cell) for row in table[1:] for cell in row) >= 2
+        " | ".join(table[0])
+        for table in tables(text)
+        if sum(is_figure(cell) for row in table[1:] for cell in row) >= 2
     ]
 
 
@@ -174,21 +198,30 @@ def test_a_page_outside_of_results_holds_no_measured_table(page: Path) -> None:
 def test_every_table_says_how_it_was_made(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     sections = results.sections(text)
-    assert sections and measured(text.partition("\n## ")[0]) == [], "a table above the first section"
+    assert sections, "a table above the first section"
+    assert measured(text.partition("\n## ")[0]) == [], "a table above the first section"
     for title, section in sections.items():
-        block, made = results.COMMANDS.search(section), results.MADE.search(section)
-        assert block is not None and made is not None, title
+        block = results.COMMANDS.search(section)
+        made = results.MADE.search(section)
+        assert block is not None, title
+        assert made is not None, title
         assert section.index(block[0]) < section.index(made[0]), title
         assert re.search(r"^(?:\||```text)", section[section.index(made[0]) :], re.MULTILINE), title
         scripts = re.findall(r"tests/benchmarks/\w+\.py", block[1])
         assert [script for script in scripts if not (ROOT / script).exists()] == [], title
 
 
-def test_a_section_is_made_of_what_its_command_prints(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    section = "## Sums\n\nA sum.\n\n```bash\nprintf '| a |\\n| --- |\\n| %s |\\n' $((2 + 3))\n```\n\n"
+def test_a_section_is_made_of_what_its_command_prints(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    section = (
+        "## Sums\n\nA sum.\n\n```bash\nprintf '| a |\\n| --- |\\n| %s |\\n' $((2 + 3))\n```\n\n"
+    )
     made = results.remade(section, "none")
-    assert made.startswith(section) and made.endswith("data: none.*\n\n| a |\n| --- |\n| 5 |\n\n")
+    assert made.startswith(section)
+    assert made.endswith("data: none.*\n\n| a |\n| --- |\n| 5 |\n\n")
     again = results.remade(made.replace("| 5 |", "| 7 |\n\nRemarks on 7."))
-    assert again == made and results.sections("# T\n\nx\n\n" + made) == {"Sums": made}
+    assert again == made
+    assert results.sections("# T\n\nx\n\n" + made) == {"Sums": made}
     with pytest.raises(SystemExit, match="--data"):
         results.remade(section)

@@ -43,12 +43,16 @@ class ToySequence:
     license = "MIT"
     citation = "tests"
 
-    def __init__(self, frames: int = 12, *, has_truth: bool = True, hole: tuple[int, int] | None = None) -> None:
+    def __init__(
+        self, frames: int = 12, *, has_truth: bool = True, hole: tuple[int, int] | None = None
+    ) -> None:
         self.timestamps = 100.0 + np.arange(frames) / 30.0
         keep = np.ones(frames, bool)
         if hole is not None:
             keep[hole[0] : hole[1]] = False
-        self.ground_truth = Trajectory(self.timestamps[keep], truth(frames)[keep]) if has_truth else None
+        self.ground_truth = (
+            Trajectory(self.timestamps[keep], truth(frames)[keep]) if has_truth else None
+        )
         self.masks = ToyMasks()
 
     def __len__(self) -> int:
@@ -65,7 +69,9 @@ class ToySequence:
 
 def images(index: int) -> tuple[np.ndarray, np.ndarray]:
     """Colour and depth of frame `index`: a texture that slides along."""
-    texture = np.random.default_rng(7).integers(0, 255, (CAMERA.height, CAMERA.width + 400, 3), dtype=np.uint8)
+    texture = np.random.default_rng(7).integers(
+        0, 255, (CAMERA.height, CAMERA.width + 400, 3), dtype=np.uint8
+    )
     rgb = np.ascontiguousarray(texture[:, index : index + CAMERA.width])
     return rgb, np.full((CAMERA.height, CAMERA.width), 1.3, np.float32)
 
@@ -95,8 +101,12 @@ def write_sequence(folder: Path, sequence: Sequence) -> Path:
 
 
 class Noise(Settings):
-    level_m: float = tunable(0.001, low=1e-4, high=1e-1, scale="log", unit="m", online=True, meaning="noise of a pose")
-    clip: float = tunable(2.0, low=0.0, high=4.0, online=True, meaning="largest deviation in standard deviations")
+    level_m: float = tunable(
+        0.001, low=1e-4, high=1e-1, scale="log", unit="m", online=True, meaning="noise of a pose"
+    )
+    clip: float = tunable(
+        2.0, low=0.0, high=4.0, online=True, meaning="largest deviation in standard deviations"
+    )
     passes: int = tunable(1, low=1, high=5, online=True, meaning="how often noise is added")
     enabled: bool = tunable(True, online=True, meaning="whether there is noise")
     seedless: int = tunable(0, low=0, high=3, meaning="may not change in mid-episode")
@@ -130,9 +140,15 @@ class ToyTracker:
         noise = self.settings.noise
         pose = truth(frame.index + 1)[-1]
         for _ in range(noise.passes):
-            wobble = np.clip(self._rng.normal(size=6), -noise.clip, noise.clip) * noise.level_m * noise.enabled
+            wobble = (
+                np.clip(self._rng.normal(size=6), -noise.clip, noise.clip)
+                * noise.level_m
+                * noise.enabled
+            )
             pose = pose @ se3.exp(wobble)
-        points = self._rng.uniform((0, 0), (frame.rgb.shape[1], frame.rgb.shape[0]), (100, 2)).astype(np.float32)
+        points = self._rng.uniform(
+            (0, 0), (frame.rgb.shape[1], frame.rgb.shape[0]), (100, 2)
+        ).astype(np.float32)
         mask = np.zeros(frame.depth.shape, bool)
         mask[40:80, 10 + frame.index : 40 + frame.index] = True
         result = TrackResult(
@@ -142,12 +158,18 @@ class ToyTracker:
         )  # fmt: skip
         if self.settings.mode != "ok" and self.settings.at <= frame.index < self.settings.until:
             result = misbehave(self.settings.mode, result)
-        if isinstance(result, TrackResult) and result.state == "ok" and result.T_world_cam is not None:
+        if (
+            isinstance(result, TrackResult)
+            and result.state == "ok"
+            and result.T_world_cam is not None
+        ):
             self._poses[frame.timestamp] = result.T_world_cam
         return result
 
     def finalize(self) -> Trajectory:
-        return Trajectory(np.array(list(self._poses)), np.array(list(self._poses.values())).reshape(-1, 4, 4))
+        return Trajectory(
+            np.array(list(self._poses)), np.array(list(self._poses.values())).reshape(-1, 4, 4)
+        )
 
 
 def misbehave(mode: str, result: TrackResult) -> TrackResult:
@@ -179,7 +201,9 @@ class FixedTracker:
         return TrackResult(truth(frame.index + 1)[-1], "ok")
 
 
-def _spec(name: str, factory: str, presets: Mapping[str, Mapping[str, object]] | None = None) -> TrackerSpec:
+def _spec(
+    name: str, factory: str, presets: Mapping[str, Mapping[str, object]] | None = None
+) -> TrackerSpec:
     return TrackerSpec(
         id=name, entry_point=f"{__file__}:{factory}", label=f"{name} (tests)", settings=ToySettings,
         summary="for tests", presets=presets or {},

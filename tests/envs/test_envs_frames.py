@@ -45,11 +45,19 @@ def in_hertz(folder: Path, rate: float) -> str:
         (10.0, {"stride": 3, "window": 3}, 10 / 3),
     ],
 )
-def test_pictures_play_at_the_rate_of_the_frames_that_are_seen(tmp_path, rate, cut, expected) -> None:
+def test_pictures_play_at_the_rate_of_the_frames_that_are_seen(
+    tmp_path, rate, cut, expected
+) -> None:
     folder = in_hertz(tmp_path / "rec", rate)
     env = gym.make(GENERIC_ID, sequence=folder, tracker=FIXED, render_mode="rgb_array", **cut)
     wrapped = RecordTimings(DropFrames(env, share=0.1))
-    for layer in (env, env.unwrapped, wrapped, deepcopy(env.unwrapped), pickle.loads(pickle.dumps(env.unwrapped))):
+    for layer in (
+        env,
+        env.unwrapped,
+        wrapped,
+        deepcopy(env.unwrapped),
+        pickle.loads(pickle.dumps(env.unwrapped)),
+    ):
         assert layer.metadata["render_fps"] == pytest.approx(expected)
         assert layer.metadata["render_modes"] == ["rgb_array"]
     assert env.unwrapped.sequence.fps == pytest.approx(expected)
@@ -68,11 +76,14 @@ def test_pictures_play_at_the_rate_of_the_frames_that_are_seen(tmp_path, rate, c
 def test_registered_environments_do_so_too(id, arguments, expected) -> None:
     env = gym.make(id, render_mode="rgb_array", **arguments)
     assert env.metadata["render_fps"] == expected
-    assert isinstance(env.metadata["render_fps"], int), "some of Gymnasium's tools want a whole number"
+    assert isinstance(env.metadata["render_fps"], int), (
+        "some of Gymnasium's tools want a whole number"
+    )
 
 
 def test_another_sequence_brings_its_rate_and_one_that_cannot_be_opened_does_not(tmp_path) -> None:
-    slow, fast = in_hertz(tmp_path / "slow", 10.0), in_hertz(tmp_path / "fast", 30.0)
+    slow = in_hertz(tmp_path / "slow", 10.0)
+    fast = in_hertz(tmp_path / "fast", 30.0)
     env = gym.make(GENERIC_ID, sequence=fast, tracker=FIXED, render_mode="rgb_array", stride=2)
     env.reset(options={"sequence": slow})
     assert env.metadata["render_fps"] == 5
@@ -110,7 +121,8 @@ class Vandal:
     """Writes into something that it was given, at frame 1."""
 
     def __init__(self, settings: Settings, context: TrackerContext) -> None:
-        self.what, self.context = settings.what, context
+        self.what = settings.what
+        self.context = context
 
     def reset(self, camera, *, rng) -> None:
         self.camera = camera
@@ -144,7 +156,8 @@ VANDAL = TrackerSpec("vandal", f"{__file__}:Vandal", label="Vandal", settings=Va
 
 @pytest.mark.parametrize("what", ["rgb", "depth", "whole rgb", "a view", "masks", "camera"])
 def test_a_tracker_that_writes_fails_by_its_own_fault_and_changes_nothing(what) -> None:
-    sequence, untouched = InMemory(), InMemory()
+    sequence = InMemory()
+    untouched = InMemory()
     env = SlamEnv(sequence, VANDAL, settings={"what": what})
     env.reset(seed=0)
     with pytest.raises(ValueError, match="read-only") as caught:
@@ -168,7 +181,8 @@ def unchanged(sequence: InMemory, untouched: InMemory) -> None:
 
 
 def test_names_of_classes_are_the_tracker_s_own_copy() -> None:
-    sequence, untouched = InMemory(), InMemory()
+    sequence = InMemory()
+    untouched = InMemory()
     env = SlamEnv(sequence, VANDAL, settings={"what": "classes"})
     env.reset(seed=0)
     env.step(0)
@@ -202,7 +216,9 @@ def test_no_pixel_is_copied_and_no_frame_can_be_written(tmp_path, kind) -> None:
     }[kind]()
     env = SlamEnv(sequence, KEEPER, data_root=tmp_path)
     if kind == "preprocessed":
-        env.frame_transforms.append(lambda frame: Frame(frame.index, frame.timestamp, frame.rgb + 1, frame.depth + 1))
+        env.frame_transforms.append(
+            lambda frame: Frame(frame.index, frame.timestamp, frame.rgb + 1, frame.depth + 1)
+        )
     observation, _ = env.reset(seed=0)
     env.step(0)
     for frame in env._tracker.frames:
@@ -215,7 +231,8 @@ def test_no_pixel_is_copied_and_no_frame_can_be_written(tmp_path, kind) -> None:
 
 
 def test_observations_can_be_written_and_reach_neither_tracker_nor_sequence() -> None:
-    sequence, untouched = InMemory(), InMemory()
+    sequence = InMemory()
+    untouched = InMemory()
     env = SlamEnv(sequence, KEEPER, observation="rgbd")
     observation, _ = env.reset(seed=0)
     for key in ("rgb", "depth"):

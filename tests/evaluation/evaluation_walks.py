@@ -19,16 +19,22 @@ def chained(steps):
 
 
 def noisy(truth, seed=1, size=0.01):
-    return truth.with_poses(truth.T_world_cam @ se3.exp(np.random.default_rng(seed).normal(0, size, (len(truth), 6))))
+    return truth.with_poses(
+        truth.T_world_cam @ se3.exp(np.random.default_rng(seed).normal(0, size, (len(truth), 6)))
+    )
 
 
 def turned(trajectory, seed):
     """The trajectory in another world frame."""
-    return trajectory.with_poses(se3.exp(np.random.default_rng(seed).normal(0, 2, 6)) @ trajectory.T_world_cam)
+    return trajectory.with_poses(
+        se3.exp(np.random.default_rng(seed).normal(0, 2, 6)) @ trajectory.T_world_cam
+    )
 
 
 def scaled(trajectory, factor):
-    return trajectory.with_poses(se3.from_matrix(factor * trajectory.positions, trajectory.T_world_cam[:, :3, :3]))
+    return trajectory.with_poses(
+        se3.from_matrix(factor * trajectory.positions, trajectory.T_world_cam[:, :3, :3])
+    )
 
 
 def written_w_first(trajectory):
@@ -50,13 +56,18 @@ def followed(truth, seed=3):
     rng = np.random.default_rng(seed)
     size = 0.01 * np.array([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
     waves = np.sin(np.outer(np.arange(len(truth)) / 9, np.ones(6)) + rng.uniform(0, 6, 6))
-    return truth.with_poses(truth.T_world_cam @ se3.exp(size * (waves + 0.2 * rng.normal(size=waves.shape))))
+    return truth.with_poses(
+        truth.T_world_cam @ se3.exp(size * (waves + 0.2 * rng.normal(size=waves.shape)))
+    )
 
 
 def rows_of(trajectory, stamps, separator=" ", order=(0, 1, 2, 3, 4, 5, 6)):
     """Lines of a trajectory file: stamps as they are to be written, then ``tx ty tz qx qy qz qw`` in an order."""
-    numbers = np.concatenate(se3.to_quaternion(trajectory.T_world_cam), axis=1)[:, list(order)].tolist()
+    numbers = np.concatenate(se3.to_quaternion(trajectory.T_world_cam), axis=1)[
+        :, list(order)
+    ].tolist()
     lines = [
-        separator.join([stamp, *(f"{value:.9f}" for value in row)]) for stamp, row in zip(stamps, numbers, strict=True)
+        separator.join([stamp, *(f"{value:.9f}" for value in row)])
+        for stamp, row in zip(stamps, numbers, strict=True)
     ]
     return "\n".join(lines) + "\n"

@@ -36,7 +36,10 @@ def perturbed(truth, seed):
     picked = truth.select(slice(0, None, 3))
     poses = picked.T_world_cam @ se3.exp(rng.normal(0, 0.01, (len(picked), 6)))
     poses[:, :3, 3] *= 1.07
-    return Trajectory(picked.timestamps + rng.uniform(-0.006, 0.006, len(picked)), se3.exp(rng.normal(size=6)) @ poses)
+    return Trajectory(
+        picked.timestamps + rng.uniform(-0.006, 0.006, len(picked)),
+        se3.exp(rng.normal(size=6)) @ poses,
+    )
 
 
 TRUTHS = {f"random-{seed}": smooth(seed) for seed in range(4)} | {
@@ -44,10 +47,16 @@ TRUTHS = {f"random-{seed}": smooth(seed) for seed in range(4)} | {
     for path in sorted(SHARED.glob("*/*/groundtruth.txt"))
     if path.parts[-3] != "fixed_camera"  # evo needs motion
 }
-CASES = [pytest.param(perturbed(truth, at), truth, id=name) for at, (name, truth) in enumerate(TRUTHS.items())]
-# evo starts from the ground truth where the estimate has more poses, and from the estimate where both have 80
+CASES = [
+    pytest.param(perturbed(truth, at), truth, id=name)
+    for at, (name, truth) in enumerate(TRUTHS.items())
+]
+# evo starts from the ground truth where the estimate has more poses, and from the estimate where
+# both have 80
 CASES += [
-    pytest.param(perturbed(smooth(9), 9), smooth(9).select(slice(0, None, 7)), id="longer-estimate"),
+    pytest.param(
+        perturbed(smooth(9), 9), smooth(9).select(slice(0, None, 7)), id="longer-estimate"
+    ),
     pytest.param(perturbed(smooth(9), 9), smooth(9).select(slice(80)), id="equally-long"),
 ]
 
@@ -55,7 +64,10 @@ CASES += [
 @lru_cache(maxsize=128)
 def evo_pair(estimate, truth, alignment, max_dt):
     """What evo compares, associated and aligned; its metrics only read it."""
-    pair = (PoseTrajectory3D(poses_se3=list(t.T_world_cam), timestamps=t.timestamps.copy()) for t in (truth, estimate))
+    pair = (
+        PoseTrajectory3D(poses_se3=list(t.T_world_cam), timestamps=t.timestamps.copy())
+        for t in (truth, estimate)
+    )
     return aligned(*pair, alignment, max_dt)
 
 
@@ -70,7 +82,9 @@ def aligned(reference, estimated, alignment, max_dt):
 
 def statistics_of(evaluation, prefix, unit):
     """The statistics of one error, by evo's names."""
-    names = {"sse": f"{prefix}_sse_{unit}2"} | {name: f"{prefix}_{name}_{unit}" for name in STATISTICS}
+    names = {"sse": f"{prefix}_sse_{unit}2"} | {
+        name: f"{prefix}_{name}_{unit}" for name in STATISTICS
+    }
     return {name: evaluation.metrics[key] for name, key in names.items()}
 
 
@@ -88,7 +102,9 @@ def test_absolute_errors(estimate, truth, alignment, max_dt):
     ):
         ape = metrics.APE(relation)
         ape.process_data(pair)
-        assert statistics_of(ours, prefix, unit) == pytest.approx(ape.get_all_statistics(), abs=1e-9, rel=1e-9)
+        assert statistics_of(ours, prefix, unit) == pytest.approx(
+            ape.get_all_statistics(), abs=1e-9, rel=1e-9
+        )
 
 
 @pytest.mark.parametrize(("estimate", "truth"), CASES)
@@ -97,7 +113,9 @@ def test_absolute_errors(estimate, truth, alignment, max_dt):
 @pytest.mark.parametrize("delta", [1, 7])
 def test_relative_errors(estimate, truth, alignment, mode, delta):
     spec = RPESpec(delta=delta, unit="f", pairs=mode)
-    protocol = Protocol(id="x", max_dt=0.01, strict=False, one_to_one=False, alignment=alignment, rpe=(spec,))
+    protocol = Protocol(
+        id="x", max_dt=0.01, strict=False, one_to_one=False, alignment=alignment, rpe=(spec,)
+    )
     ours = evaluate(estimate, truth, protocol)
     pair = evo_pair(estimate, truth, alignment, 0.01)
     for relation, part, ending in (
@@ -107,16 +125,20 @@ def test_relative_errors(estimate, truth, alignment, mode, delta):
         rpe = metrics.RPE(relation, delta, metrics.Unit.frames, all_pairs=mode == "all")
         try:
             rpe.process_data(pair)
-        except Exception as error:  # evo refuses where there is no such pair; we leave the metric out and say so
-            assert "produced an empty index list" in str(error) and "no pair of poses" in str(ours.diagnostics)
-            assert ours.n_pairs_rpe[spec.key] == 0 and f"rpe_{spec.key}_{part}_rmse_{ending}" not in ours.metrics
+        # evo refuses where there is no such pair; we leave the metric out and say so
+        except Exception as error:
+            assert "produced an empty index list" in str(error)
+            assert "no pair of poses" in str(ours.diagnostics)
+            assert ours.n_pairs_rpe[spec.key] == 0
+            assert f"rpe_{spec.key}_{part}_rmse_{ending}" not in ours.metrics
             continue
         assert ours.n_pairs_rpe[spec.key] == len(rpe.error)
         found = statistics_of(ours, f"rpe_{spec.key}_{part}", ending)
         assert found == pytest.approx(rpe.get_all_statistics(), abs=1e-9, rel=1e-9)
 
 
-# Units and coordinates that are far from a metre: centred, in double precision, without absolute limits.
+# Units and coordinates that are far from a metre: centred, in double precision, without absolute
+# limits.
 
 
 UTM_M = np.array([4.1e5, 5.54e6, 210.0])
@@ -133,8 +155,11 @@ def elsewhere(trajectory, unit, offset):
 @pytest.mark.parametrize("unit", [1.0, 1e-9, 1e6])
 @pytest.mark.parametrize("true_unit", [1.0, 0.1, 1e4])
 @pytest.mark.parametrize("offset", [0.0, UTM_M])
-def test_alignment_in_other_units_and_with_map_coordinates_is_evos(alignment, unit, true_unit, offset):
-    truth, estimate = elsewhere(lap(), true_unit, offset), elsewhere(followed(lap()), unit, 0.0)
+def test_alignment_in_other_units_and_with_map_coordinates_is_evos(
+    alignment, unit, true_unit, offset
+):
+    truth = elsewhere(lap(), true_unit, offset)
+    estimate = elsewhere(followed(lap()), unit, 0.0)
     protocol = Protocol(id="x", max_dt=0.01, strict=False, one_to_one=False, alignment=alignment)
     ours = evaluate(estimate, truth, protocol)
     error = metrics.APE(metrics.PoseRelation.translation_part)
@@ -151,8 +176,12 @@ def test_the_unit_of_either_side_makes_no_difference_where_the_scale_is_fitted(u
     """Also where evo finds no rotation, for the product of the two is too small."""
     protocol = Protocol(id="x", alignment="sim3")
     plain = evaluate(followed(lap()), lap(), protocol)
-    ours = evaluate(elsewhere(followed(lap()), unit, 0.0), elsewhere(lap(), true_unit, 0.0), protocol)
-    assert ours.metrics["ate_rmse_m"] == pytest.approx(true_unit * plain.metrics["ate_rmse_m"], rel=1e-9)
+    ours = evaluate(
+        elsewhere(followed(lap()), unit, 0.0), elsewhere(lap(), true_unit, 0.0), protocol
+    )
+    assert ours.metrics["ate_rmse_m"] == pytest.approx(
+        true_unit * plain.metrics["ate_rmse_m"], rel=1e-9
+    )
     assert ours.alignment.scale == pytest.approx(true_unit / unit * plain.alignment.scale, rel=1e-9)
     assert not ours.alignment.degenerate
 
@@ -165,10 +194,13 @@ def test_a_camera_that_stands_still_anywhere_does_not_move(offset, alignment):
     still = elsewhere(truth, 0.0, 0.3 + offset)
     found = evaluate(still, truth, Protocol(id="x", alignment=alignment))
     assert found.alignment.scale == 1.0
-    assert found.metrics["ate_rmse_m"] == pytest.approx(found.metrics["static_camera_ate_rmse_m"], abs=1e-8)
+    assert found.metrics["ate_rmse_m"] == pytest.approx(
+        found.metrics["static_camera_ate_rmse_m"], abs=1e-8
+    )
 
 
-# Published numbers from published trajectories, repeated stamps beside evo, rows that agree with a printed number.
+# Published numbers from published trajectories, repeated stamps beside evo, rows that agree with a
+# printed number.
 
 
 AUTHOR = SHARED / "trajectories" / "rgbd-vo"
@@ -183,7 +215,9 @@ def published():
             yield table.parent / line["trajectory"], table.parent / "groundtruth.txt", numbers
 
 
-needs_author = pytest.mark.skipif(not AUTHOR.is_dir(), reason="the author's trajectories are not beside the checkout")
+needs_author = pytest.mark.skipif(
+    not AUTHOR.is_dir(), reason="the author's trajectories are not beside the checkout"
+)
 
 
 @needs_author
@@ -192,18 +226,23 @@ def test_an_authors_evo_tables_are_given_back():
     assert len(lines) == 44
     for estimate, truth, numbers in lines:
         metrics = evaluate_files(estimate, truth, "evo-as/v1").metrics
-        assert {name: metrics[f"ate_{name}_m"] for name in STATISTICS} == pytest.approx(numbers, abs=1e-9), estimate
+        assert {name: metrics[f"ate_{name}_m"] for name in STATISTICS} == pytest.approx(
+            numbers, abs=1e-9
+        ), estimate
 
 
 @needs_author
 def test_tolerance_and_scale_move_one_published_number():
-    estimate, truth = AUTHOR / "rgbd_bonn_crowd" / "rgbdvo.txt", AUTHOR / "rgbd_bonn_crowd" / "groundtruth.txt"
+    estimate = AUTHOR / "rgbd_bonn_crowd" / "rgbdvo.txt"
+    truth = AUTHOR / "rgbd_bonn_crowd" / "groundtruth.txt"
     rows = compare_protocols(load_tum(estimate), load_tum(truth))
     expected = {
         "evo_ape -as": (0.0733, 554), "Sim(3)-aligned": (0.1099, 904),
         "evo_ape -a": (54.8671, 554), "SE(3)-aligned (TUM's ATE)": (53.3026, 904),
     }  # fmt: skip
-    assert {row.label: (round(row.rmse_m, 4), row.pairs) for row in rows if row.label in expected} == expected
+    assert {
+        row.label: (round(row.rmse_m, 4), row.pairs) for row in rows if row.label in expected
+    } == expected
     assert [row.label for row in rows if agrees(row, "0.0733")] == ["evo_ape -as"]
 
 
@@ -212,20 +251,30 @@ def test_tolerance_and_scale_move_one_published_number():
 def test_repeated_stamps_are_taken_as_evo_takes_them(tmp_path, longer, scaled):
     truth = walk(n=300)
     estimate = noisy(truth).select(slice(0, None, 3))
-    pair = {"truth": truth, "estimate": estimate} if longer == "truth" else {"truth": estimate, "estimate": truth}
+    pair = (
+        {"truth": truth, "estimate": estimate}
+        if longer == "truth"
+        else {"truth": estimate, "estimate": truth}
+    )
     for name, trajectory in pair.items():
         write_tum(tmp_path / f"{name}.txt", trajectory)
         *lines, last = (tmp_path / f"{name}.txt").read_text().splitlines()
         stamp, x, *rest = lines[20].split()
         moved = " ".join([stamp, f"{float(x) + 0.5:.9f}", *rest])
-        (tmp_path / f"{name}.txt").write_text("\n".join([*lines[:20], moved, moved, *lines[20:], last]) + "\n")
-    reference, estimated = (file_interface.read_tum_trajectory_file(str(tmp_path / f"{name}.txt")) for name in pair)
+        (tmp_path / f"{name}.txt").write_text(
+            "\n".join([*lines[:20], moved, moved, *lines[20:], last]) + "\n"
+        )
+    reference, estimated = (
+        file_interface.read_tum_trajectory_file(str(tmp_path / f"{name}.txt")) for name in pair
+    )
     error = metrics.APE(metrics.PoseRelation.translation_part)
     error.process_data(aligned(reference, estimated, "sim3" if scaled else "se3", 0.01))
     files = tmp_path / "estimate.txt", tmp_path / "truth.txt"
     ours = evaluate_files(*files, "evo-as/v1" if scaled else "evo-as/v1-se3")
     assert ours.n_pairs == len(error.error)
-    assert ours.metrics["ate_rmse_m"] == pytest.approx(error.get_statistic(metrics.StatisticsType.rmse), abs=1e-9)
+    assert ours.metrics["ate_rmse_m"] == pytest.approx(
+        error.get_statistic(metrics.StatisticsType.rmse), abs=1e-9
+    )
     assert any("repeat the next line's stamp, all are taken" in line for line in ours.diagnostics)
     under_tum = evaluate_files(*files, "tum-rgbd/v1")
     assert any("replaced by a later line" in line for line in under_tum.diagnostics)
@@ -235,7 +284,8 @@ def test_repeated_stamps_are_taken_as_evo_takes_them(tmp_path, longer, scaled):
 def test_repeated_stamps_stay_in_order_and_are_kept():
     poses = np.tile(np.eye(4), (3, 1, 1))
     twice = RepeatedStamps(np.array([1.0, 1.0, 2.0]), poses)
-    assert isinstance(twice.select(slice(0, 2)), RepeatedStamps) and isinstance(twice.with_poses(poses), RepeatedStamps)
+    assert isinstance(twice.select(slice(0, 2)), RepeatedStamps)
+    assert isinstance(twice.with_poses(poses), RepeatedStamps)
     with pytest.raises(Exception, match="not strictly increasing"):
         RepeatedStamps(np.array([1.0, 2.0, 1.0]), poses)
 
@@ -261,11 +311,15 @@ def test_what_is_no_printed_number_is_refused(printed):
 
 
 def bisect_closest(values, target):
-    low, high, best, difference = 0, len(values), 0, abs(values[0] - target)
+    low = 0
+    high = len(values)
+    best = 0
+    difference = abs(values[0] - target)
     while low < high:
         middle = (low + high) // 2
         if abs(values[middle] - target) < difference:
-            difference, best = abs(values[middle] - target), middle
+            difference = abs(values[middle] - target)
+            best = middle
         if values[middle] == target:
             return middle
         if values[middle] > target:
@@ -289,20 +343,27 @@ LENGTHS = {"m": lambda step: np.linalg.norm(step[:3, 3]), "deg": lambda step: an
 
 
 def slow_rpe(truth, estimate, delta, unit):
-    t_gt, t_est = truth.timestamps.tolist(), estimate.timestamps.tolist()
+    t_gt = truth.timestamps.tolist()
+    t_est = estimate.timestamps.tolist()
     poses = estimate.T_world_cam
     steps = [ominus(after, before) for before, after in itertools.pairwise(poses)]
-    index = t_est if unit == "s" else list(itertools.accumulate(map(LENGTHS[unit], steps), initial=0.0))
+    index = (
+        t_est if unit == "s" else list(itertools.accumulate(map(LENGTHS[unit], steps), initial=0.0))
+    )
     tolerance = 2 * np.median(np.diff(t_gt))
-    translation, rotation = [], []
+    translation = []
+    rotation = []
     for i, start in enumerate(index):
         j = bisect_closest(index, start + delta)
         if j == len(t_est) - 1:
             continue
-        gi, gj = bisect_closest(t_gt, t_est[i]), bisect_closest(t_gt, t_est[j])
+        gi = bisect_closest(t_gt, t_est[i])
+        gj = bisect_closest(t_gt, t_est[j])
         if abs(t_gt[gi] - t_est[i]) > tolerance or abs(t_gt[gj] - t_est[j]) > tolerance:
             continue
-        error = ominus(ominus(poses[j], poses[i]), ominus(truth.T_world_cam[gj], truth.T_world_cam[gi]))
+        error = ominus(
+            ominus(poses[j], poses[i]), ominus(truth.T_world_cam[gj], truth.T_world_cam[gi])
+        )
         translation.append(np.linalg.norm(error[:3, 3]))
         rotation.append(np.rad2deg(angle_of(error)))
     return np.array(translation), np.array(rotation)
@@ -340,7 +401,8 @@ def pairs_of_trajectories():
 
 @pytest.mark.parametrize(("truth", "estimate"), list(pairs_of_trajectories()))
 @pytest.mark.parametrize(
-    ("delta", "unit"), [(1, "f"), (10, "f"), (1, "s"), (0.5, "s"), (0.1, "m"), (5, "deg"), (0.2, "rad")]
+    ("delta", "unit"),
+    [(1, "f"), (10, "f"), (1, "s"), (0.5, "s"), (0.1, "m"), (5, "deg"), (0.2, "rad")],
 )
 def test_rpe_with_fixed_delta(truth, estimate, delta, unit):
     spec = RPESpec(delta=delta, unit=unit)
@@ -348,10 +410,14 @@ def test_rpe_with_fixed_delta(truth, estimate, delta, unit):
     translation, rotation = slow_rpe(truth, estimate, delta, unit)
     assert ours.n_pairs_rpe[spec.key] == len(translation) > 10
     expected = {"rmse": np.sqrt((translation**2).mean()), "sse": (translation**2).sum()}
-    expected |= {name: getattr(np, name)(translation) for name in ("mean", "median", "std", "min", "max")}
+    expected |= {
+        name: getattr(np, name)(translation) for name in ("mean", "median", "std", "min", "max")
+    }
     assert statistics_of(ours, f"rpe_{spec.key}_trans", "m") == pytest.approx(expected, abs=1e-12)
     # the reference's arccos loses half the digits near zero, ours does not
-    assert ours.metrics[f"rpe_{spec.key}_rot_rmse_deg"] == pytest.approx(np.sqrt((rotation**2).mean()), abs=1e-5)
+    assert ours.metrics[f"rpe_{spec.key}_rot_rmse_deg"] == pytest.approx(
+        np.sqrt((rotation**2).mean()), abs=1e-5
+    )
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -359,20 +425,29 @@ def test_the_vectorised_bisection_meets_the_same_value(seed):
     rng = np.random.default_rng(seed)
     values = np.sort(rng.integers(0, 12, 40) / 4.0)
     targets = np.concatenate([values, values + 0.125, rng.uniform(-1, 5, 50)])
-    assert closest(values, targets).tolist() == [bisect_closest(values.tolist(), t) for t in targets.tolist()]
+    assert closest(values, targets).tolist() == [
+        bisect_closest(values.tolist(), t) for t in targets.tolist()
+    ]
 
 
 def test_random_pairs_are_fixed_for_good():
     pairs = random_pairs(2893, 10000)
     # raw generator words: no version of Python or NumPy may change them
     assert pairs[:3].tolist() == [[1107, 2782], [1047, 2715], [384, 2384]]
-    assert pairs.shape == (10000, 2) and (pairs.min(), pairs.max()) == (0, 2892)
+    assert pairs.shape == (10000, 2)
+    assert (pairs.min(), pairs.max()) == (0, 2892)
     assert abs(pairs.mean() - 1446) < 20
 
 
 def test_random_pairs_of_a_short_trajectory_are_all_pairs_with_themselves_too():
-    assert [len(random_pairs(*args)) for args in ((99, 10000), (100, 10000), (300, 0))] == [99**2, 10000, 300**2]
-    assert len(np.unique(random_pairs(100, 10000), axis=0)) < 10000, "as many as there are, and yet drawn"
+    assert [len(random_pairs(*args)) for args in ((99, 10000), (100, 10000), (300, 0))] == [
+        99**2,
+        10000,
+        300**2,
+    ]
+    assert len(np.unique(random_pairs(100, 10000), axis=0)) < 10000, (
+        "as many as there are, and yet drawn"
+    )
     assert random_pairs(2, 10000).tolist() == [[0, 0], [0, 1], [1, 0], [1, 1]]
 
 
@@ -381,4 +456,5 @@ def test_more_than_the_most_fixed_pairs_are_a_seeded_sample():
     for most, pairs in ((50, 50), (0, 148)):
         protocol = Protocol(id="x", rpe=(RPESpec(delta=1, unit="f", max_pairs=most),))
         result = evaluate(estimate, estimate, protocol)
-        assert result.n_pairs_rpe["1f"] == pairs and result.metrics == evaluate(estimate, estimate, protocol).metrics
+        assert result.n_pairs_rpe["1f"] == pairs
+        assert result.metrics == evaluate(estimate, estimate, protocol).metrics

@@ -50,7 +50,10 @@ def test_the_work_does_not_grow_with_the_time_that_the_stamps_span(stretch):
     assert motion_tags(truth) == set()
     assert "slow-stamps" in kinds(result)
     assert "rpe_1s_trans_rmse_m" not in result.metrics
-    assert any("0 s apart by the median: the relative error over 1s is left out" in line for line in result.diagnostics)
+    assert any(
+        "0 s apart by the median: the relative error over 1s is left out" in line
+        for line in result.diagnostics
+    )
 
 
 @pytest.mark.parametrize("later", [1.3e9, 1e7])
@@ -65,7 +68,10 @@ def test_rows_of_another_time_cost_nothing_and_are_named(later, rows):
     ]
     result = evaluate(*both)
     assert kinds(result) == ["far-stamp", "far-stamp"]
-    assert f"{rows} of {150 + rows} poses of the estimate lie {later:.3g} s apart" in result.warnings[0]
+    assert (
+        f"{rows} of {150 + rows} poses of the estimate lie {later:.3g} s apart"
+        in result.warnings[0]
+    )
     assert hints(*both) == ()
     motion_tags(both[1])
     # the cure: remove those lines
@@ -99,14 +105,18 @@ def test_pairs_that_are_no_second_apart_make_no_error_over_one_second(interval_s
     assert any("1s is left out" in line for line in result.diagnostics)
     spec = RPESpec(delta=2 * interval_s, unit="s")
     assert (
-        spec.metric("trans") in evaluate(at(ESTIMATE, stamps), at(TRUTH, stamps), Protocol(id="x", rpe=(spec,))).metrics
+        spec.metric("trans")
+        in evaluate(at(ESTIMATE, stamps), at(TRUTH, stamps), Protocol(id="x", rpe=(spec,))).metrics
     )
 
 
 def test_pairs_of_a_pose_with_itself_are_counted():
     kept = np.r_[0:60, 120:150]
     result = evaluate(ESTIMATE.select(kept), TRUTH)
-    assert any(re.match(r"\d+ of \d+ pairs over 1s join a pose with itself", line) for line in result.diagnostics)
+    assert any(
+        re.match(r"\d+ of \d+ pairs over 1s join a pose with itself", line)
+        for line in result.diagnostics
+    )
 
 
 @pytest.mark.parametrize("unix_is_truth", [True, False])
@@ -120,11 +130,16 @@ def test_clocks_that_differ_are_told_with_a_cure_that_works(unix_is_truth):
     later = re.search(rf"add ([0-9.]+) s to each stamp of the {whose}", caught.value.hint)
     moved = at(since_start, since_start.timestamps + float(later[1]))
     pair = (moved, unix) if unix_is_truth else (unix, moved)
-    assert evaluate(*pair).metrics["ate_rmse_m"] == pytest.approx(RIGHT.metrics["ate_rmse_m"], rel=1e-6)
+    assert evaluate(*pair).metrics["ate_rmse_m"] == pytest.approx(
+        RIGHT.metrics["ate_rmse_m"], rel=1e-6
+    )
 
 
 def test_frame_numbers_beside_unix_time_are_told():
-    with pytest.raises(EvaluationError, match="the estimate are whole numbers, 1 apart by the median: frame numbers"):
+    with pytest.raises(
+        EvaluationError,
+        match="the estimate are whole numbers, 1 apart by the median: frame numbers",
+    ):
         evaluate(at(ESTIMATE, np.arange(150)), at(TRUTH, 1305031102.175304 + TRUTH.timestamps))
 
 
@@ -157,7 +172,10 @@ def test_positions_in_millimetres_on_both_sides_are_named():
 
 @pytest.mark.parametrize("far_m", [1e13, 1e200])
 def test_positions_whose_squares_are_no_numbers_end_in_no_traceback(far_m):
-    for pair in ((ESTIMATE, placed(TRUTH, 5, [far_m, 0, 0])), (placed(ESTIMATE, 5, [far_m, 0, 0]), TRUTH)):
+    for pair in (
+        (ESTIMATE, placed(TRUTH, 5, [far_m, 0, 0])),
+        (placed(ESTIMATE, 5, [far_m, 0, 0]), TRUTH),
+    ):
         assert hints(*pair) == ()
         if far_m < 1e150:
             assert np.isfinite(list(evaluate(*pair).metrics.values())).all()
@@ -184,7 +202,9 @@ def test_a_truth_of_few_frames_is_named(rows, named):
 
 @pytest.mark.parametrize("frames", [2, 7])
 def test_few_poses_that_an_alignment_fits_are_named(frames):
-    result = evaluate(*(one.select(np.linspace(0, 149, frames).astype(int)) for one in (ESTIMATE, TRUTH)))
+    result = evaluate(
+        *(one.select(np.linspace(0, 149, frames).astype(int)) for one in (ESTIMATE, TRUTH))
+    )
     assert any("the alignment fits most of their error" in line for line in result.warnings)
 
 
@@ -206,4 +226,7 @@ def test_a_camera_that_truly_stands_still_is_no_fault():
 
 def test_the_scale_that_an_alignment_finds_is_told():
     result = evaluate(scaled(ESTIMATE, 0.5), TRUTH, "tum-rgbd/v1-sim3")
-    assert any(re.match(r"the alignment scales the estimate by (1\.99|2\.0)", line) for line in result.diagnostics)
+    assert any(
+        re.match(r"the alignment scales the estimate by (1\.99|2\.0)", line)
+        for line in result.diagnostics
+    )

@@ -23,27 +23,49 @@ def main_of(script: str):
 
 
 def test_own_data_set_then_its_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder, results = str(tmp_path / "mine"), str(tmp_path / "results")
+    folder = str(tmp_path / "mine")
+    results = str(tmp_path / "results")
     main_of("own_dataset.py")(folder, results, 8)
     still, slam = capsys.readouterr().out.splitlines()
-    assert still.startswith("never-move   ok") and slam.startswith("orb-slam2    ok")
-    assert float(slam.split()[-2]) < 0.5 * float(still.split()[-2]), "mm: the recording can be tracked"
+    assert still.startswith("never-move   ok")
+    assert slam.startswith("orb-slam2    ok")
+    assert float(slam.split()[-2]) < 0.5 * float(still.split()[-2]), (
+        "mm: the recording can be tracked"
+    )
 
     main_of("read_results.py")(results, str(tmp_path / "figures"))
     told = capsys.readouterr().out
-    assert "folder/mine" in told and "slowest frames" in told
+    assert "folder/mine" in told
+    assert "slowest frames" in told
     assert {path.name for path in (tmp_path / "figures").iterdir()} == {"ate.html", "frames.html"}
 
 
-def test_own_tracker_is_found_where_it_is_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_own_tracker_is_found_where_it_is_installed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     source = shutil.copytree(EXAMPLES / "own_tracker", tmp_path / "source")
-    command = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "--no-index"]
-    subprocess.run([*command, "--target", tmp_path / "there", source], check=True, capture_output=True, timeout=120)
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "-q",
+        "--no-deps",
+        "--no-build-isolation",
+        "--no-index",
+    ]
+    subprocess.run(
+        [*command, "--target", tmp_path / "there", source],
+        check=True,
+        capture_output=True,
+        timeout=120,
+    )
     monkeypatch.syspath_prepend(tmp_path / "there")
     try:
         TRACKERS.refresh()
         found = {found.spec.id: found for found in TRACKERS.all()}["shift-odometry"]
-        assert found.spec.entry_point == "own_tracker.slam:ShiftOdometry" and "own-tracker" in found.source
+        assert found.spec.entry_point == "own_tracker.slam:ShiftOdometry"
+        assert "own-tracker" in found.source
     finally:
         monkeypatch.undo()
         TRACKERS.refresh()
@@ -56,7 +78,10 @@ def test_own_tracker_keeps_the_contract(monkeypatch: pytest.MonkeyPatch) -> None
 
 @pytest.mark.parametrize("benchmark", ["masks-v0", "features-v0"])
 def test_agents_are_compared(
-    benchmark: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    benchmark: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     pytest.importorskip("stable_baselines3", reason="the extra [rl] is not installed")
     monkeypatch.syspath_prepend(EXAMPLES / "online_control")
@@ -69,10 +94,13 @@ def test_agents_are_compared(
     assert losses["best static of each scene"] <= losses["best static"]
     assert {"default", "random", "hindsight splice", "rule by hand", "PPO"} < set(losses)
     assert losses["hindsight splice"] <= losses["best static of each scene"]
-    assert "left out" in text and "is not at" in text, "no recordings there"
+    assert "left out" in text, "no recordings there"
+    assert "is not at" in text, "no recordings there"
 
 
-def test_static_settings_become_a_minari_data_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_static_settings_become_a_minari_data_set(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for module in ("minari", "jax", "h5py"):
         pytest.importorskip(module, reason="Minari is not installed")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
@@ -86,7 +114,11 @@ def test_static_settings_become_a_minari_data_set(tmp_path: Path, monkeypatch: p
 
 NOTEBOOKS = sorted((EXAMPLES / "notebooks").glob("*.ipynb"))
 SHORTER = {
-    "leaderboard": {"FRAMES = 60": "FRAMES = 4", "range(100, 106)": "range(100, 102)", ', "mask-rcnn"': ""},
+    "leaderboard": {
+        "FRAMES = 60": "FRAMES = 4",
+        "range(100, 106)": "range(100, 102)",
+        ', "mask-rcnn"': "",
+    },
     "culling": {},
 }
 SHOWN = {
@@ -109,7 +141,9 @@ def test_they_run(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     shown = play(EXAMPLES / "notebooks" / f"{name}.ipynb", SHORTER[name])
-    output = capsys.readouterr().out + "".join(v.to_json() if hasattr(v, "to_json") else repr(v) for v in shown)
+    output = capsys.readouterr().out + "".join(
+        v.to_json() if hasattr(v, "to_json") else repr(v) for v in shown
+    )
     output = output.replace("\\/", "/")  # as JSON writes it
     assert [text for text in SHOWN[name] if text not in output] == []
 

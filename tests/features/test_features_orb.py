@@ -31,7 +31,8 @@ def texture(height=480, width=640, seed=0):
 
 def test_extracts_the_number_of_features_from_all_levels():
     features = build_extractor(FeatureSettings(n_features=700)).extract(texture())
-    assert len(features) == 700 and set(np.unique(features.octave)) == set(range(8))
+    assert len(features) == 700
+    assert set(np.unique(features.octave)) == set(range(8))
 
 
 def test_same_image_gives_same_bits_whatever_the_threads():
@@ -50,11 +51,15 @@ def test_same_image_gives_same_bits_whatever_the_threads():
 
 def test_features_cover_the_image_better_than_plain_orb():
     image = texture(seed=1)
-    image[:, :320] = cv2.addWeighted(image[:, :320], 0.35, np.full((480, 320), 80, np.uint8), 0.65, 0)  # weak half
+    # weak half
+    image[:, :320] = cv2.addWeighted(
+        image[:, :320], 0.35, np.full((480, 320), 80, np.uint8), 0.65, 0
+    )
     ours = OrbExtractor(FeatureSettings(n_features=500)).extract(image).xy
     plain = np.array([k.pt for k in cv2.ORB_create(500).detect(image)])
     weak = [np.count_nonzero(xy[:, 0] < 320) for xy in (ours, plain)]
-    assert weak[0] > 30 and weak[0] > 5 * weak[1]
+    assert weak[0] > 30
+    assert weak[0] > 5 * weak[1]
 
 
 def test_weak_corners_count_only_in_cells_without_strong_ones():
@@ -65,13 +70,16 @@ def test_weak_corners_count_only_in_cells_without_strong_ones():
     image = cv2.GaussianBlur(image, (3, 3), 0.8)
     settings = FeatureSettings(levels=1, fast_threshold=30, fast_threshold_min=5, cell_px=40)
     features = OrbExtractor(settings).extract(image)
-    strong, weak = (features.response[np.abs(features.xy - centre).max(axis=1) < 9] for centre in (105, 305))
+    strong, weak = (
+        features.response[np.abs(features.xy - centre).max(axis=1) < 9] for centre in (105, 305)
+    )
     assert strong.min() >= 30 > weak.max()  # neither is empty
 
 
 def test_orientation_turns_with_the_image():
     image = texture(481, 481, seed=5)
-    turned = np.ascontiguousarray(np.rot90(image))  # counter-clockwise on screen: angles fall by 90 degrees
+    # counter-clockwise on screen: angles fall by 90 degrees
+    turned = np.ascontiguousarray(np.rot90(image))
     a = OrbExtractor(FeatureSettings(levels=1, n_features=800)).extract(image)
     b = OrbExtractor(FeatureSettings(levels=1, n_features=800)).extract(turned)
     where = {tuple(p): i for i, p in enumerate(np.rint(b.xy).astype(int).tolist())}
@@ -88,23 +96,33 @@ def test_the_corners_are_those_of_opencv(shape, threshold):
     noise = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
     for image in (noise, cv2.GaussianBlur(noise, (7, 7), 2)):
         at, score = fast_corners(image, threshold)
-        theirs = cv2.FastFeatureDetector.create(threshold, True).detect(image[EDGE - 3 : 3 - EDGE, EDGE - 3 : 3 - EDGE])
+        theirs = cv2.FastFeatureDetector.create(threshold, True).detect(
+            image[EDGE - 3 : 3 - EDGE, EDGE - 3 : 3 - EDGE]
+        )
         ours = np.c_[at % shape[1] - EDGE + 3, at // shape[1] - EDGE + 3, score]
         assert ours.tolist() == [[*keypoint.pt, keypoint.response] for keypoint in theirs]
 
 
 def test_the_descriptors_are_those_of_opencv():
     ours = OrbExtractor(FeatureSettings(levels=1)).extract(image := texture(seed=2))
-    points = [cv2.KeyPoint(*map(float, (*xy, 31, angle))) for xy, angle in zip(ours.xy, ours.angle, strict=True)]
-    assert (cv2.ORB.create(nlevels=1, edgeThreshold=EDGE).compute(image, points)[1] == ours.descriptors).all()
+    points = [
+        cv2.KeyPoint(*map(float, (*xy, 31, angle)))
+        for xy, angle in zip(ours.xy, ours.angle, strict=True)
+    ]
+    assert (
+        cv2.ORB.create(nlevels=1, edgeThreshold=EDGE).compute(image, points)[1] == ours.descriptors
+    ).all()
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (20, 30), (39, 640), (45, 45), (480, 640)])
 def test_small_and_flat_images_are_no_error(shape):
-    features = OrbExtractor().extract(np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8))
+    features = OrbExtractor().extract(
+        np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
+    )
     assert ((features.xy >= 0) & (features.xy < shape[::-1])).all()
     flat = OrbExtractor().extract(np.full(shape, 128, np.uint8))
-    assert len(flat) == 0 and flat.descriptors.shape == (0, 32)
+    assert len(flat) == 0
+    assert flat.descriptors.shape == (0, 32)
 
 
 def test_what_lies_on_a_mask_takes_no_place_of_what_lies_outside():
@@ -112,21 +130,32 @@ def test_what_lies_on_a_mask_takes_no_place_of_what_lies_outside():
     mask = np.zeros(image.shape, bool)
     mask[:, :576] = True  # nine tenths
     extractor = OrbExtractor(FeatureSettings(n_features=500))
-    plain, beside = extractor.extract(image), extractor.extract_masked(image, mask, share=0.3)
+    plain = extractor.extract(image)
+    beside = extractor.extract_masked(image, mask, share=0.3)
     assert isinstance(extractor, MaskedExtractor)
-    assert np.count_nonzero(~inside(mask, plain.xy)) < 100 < 400 < np.count_nonzero(~inside(mask, beside.xy)) <= 500
+    assert (
+        np.count_nonzero(~inside(mask, plain.xy))
+        < 100
+        < 400
+        < np.count_nonzero(~inside(mask, beside.xy))
+        <= 500
+    )
     assert np.array_equal(plain.xy[inside(mask, plain.xy)], beside.xy[inside(mask, beside.xy)])
     assert np.all(np.diff(beside.octave) >= 0)
     assert len(np.unique(np.c_[beside.xy, beside.octave], axis=0)) == len(beside)
     enough = extractor.extract_masked(image, mask, share=0.02)
-    assert np.array_equal(enough.xy, plain.xy) and np.array_equal(enough.descriptors, plain.descriptors)
+    assert np.array_equal(enough.xy, plain.xy)
+    assert np.array_equal(enough.descriptors, plain.descriptors)
 
 
 def test_spread_takes_every_cells_best_first():
     cells = np.array([0, 0, 0, 1, 2, 2])
     response = np.array([9, 8, 7, 1, 5, 6], np.int16)
     allowed = np.ones(6, bool)
-    assert [spread(cells, response, allowed, count).tolist() for count in (3, 4)] == [[0, 5, 3], [0, 5, 3, 1]]
+    assert [spread(cells, response, allowed, count).tolist() for count in (3, 4)] == [
+        [0, 5, 3],
+        [0, 5, 3, 1],
+    ]
     allowed[0] = False
     assert spread(cells, response, allowed, 2).tolist() == [1, 5]
 
@@ -178,14 +207,18 @@ def test_words_keep_every_bit_and_pad_with_zeros():
     raw = descriptors(5, 33)
     words = as_words(raw)
     assert words.shape == (5, 5)
-    assert np.array_equal(words.view(np.uint8)[:, :33], raw) and not words.view(np.uint8)[:, 33:].any()
+    assert np.array_equal(words.view(np.uint8)[:, :33], raw)
+    assert not words.view(np.uint8)[:, 33:].any()
 
 
 def test_mutual_brute_force_agrees_with_opencv():
-    a, b = descriptors(60), descriptors(80, seed=1)
+    a = descriptors(60)
+    b = descriptors(80, seed=1)
     b[:40] = a[10:50]
     b[:40, 0] ^= 1
-    ours = np.stack(match_brute_force(as_words(a), as_words(b), max_distance=256, ratio=2.0), axis=1)
+    ours = np.stack(
+        match_brute_force(as_words(a), as_words(b), max_distance=256, ratio=2.0), axis=1
+    )
     theirs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(a, b)
     assert {(i, i - 10) for i in range(10, 50)} <= set(map(tuple, ours.tolist()))
     near = hamming(as_words(a)[ours[:, 0]], as_words(b)[ours[:, 1]]) < 50
@@ -206,11 +239,20 @@ def test_nothing_to_match_is_no_error(n, m):
     assert len(match_brute_force(as_words(descriptors(n)), as_words(descriptors(m)))[0]) == 0
 
 
-def reference_search(xy, right, octave, words, free, target, target_right, radius, low, high, target_words, limit):
+def reference_search(
+    xy, right, octave, words, free, target, target_right, radius, low, high, target_words, limit
+):
     """One target at a time, in order; a nearer later target takes a keypoint over."""
-    owner, match, gap = {}, [-1] * len(target), [None] * len(target)
+    owner = {}
+    match = [-1] * len(target)
+    gap = [None] * len(target)
     for i in range(len(target)):
-        ok = free & (np.abs(xy - target[i]).max(axis=1) <= radius[i]) & (octave >= low[i]) & (octave <= high[i])
+        ok = (
+            free
+            & (np.abs(xy - target[i]).max(axis=1) <= radius[i])
+            & (octave >= low[i])
+            & (octave <= high[i])
+        )
         ok &= ~(np.abs(right - target_right[i]) > radius[i])
         if not ok.any():
             continue
@@ -220,13 +262,16 @@ def reference_search(xy, right, octave, words, free, target, target_right, radiu
             continue
         if j in owner:
             match[owner[j]] = -1
-        owner[j], match[i], gap[i] = i, j, d[j]
+        gap[i] = d[j]
+        owner[j] = i
+        match[i] = j
     return match
 
 
 def test_search_in_radius_against_plain_search():
     rng = np.random.default_rng(4)
-    n, m = 300, 200
+    n = 300
+    m = 200
     xy = rng.uniform(-5, [645, 485], (n, 2))
     right = np.where(rng.random(n) < 0.3, np.nan, xy[:, 0] - rng.uniform(0, 40, n))
     octave = rng.integers(0, 8, n)
@@ -246,7 +291,9 @@ def test_search_in_radius_against_plain_search():
     expected = reference_search(
         xy, right, octave, words, free, target, target_right, radius, low, low + 2, target_words, 30
     )
-    ties = hamming(words[np.maximum(match, 0)], target_words) == hamming(words[np.maximum(expected, 0)], target_words)
+    ties = hamming(words[np.maximum(match, 0)], target_words) == hamming(
+        words[np.maximum(expected, 0)], target_words
+    )
     assert ((match == expected) | ties).all()
 
 

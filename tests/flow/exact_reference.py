@@ -14,17 +14,27 @@ def quantised_maps(gray: Array) -> Array:
     """Histograms uint8 ``[total, 8]`` of a uint8 ``[H, W]`` image, equal to those of `orientation_maps`."""
     geometry = layout.map_geometry(*gray.shape)
     histograms = np.zeros((geometry.total, layout.BINS), np.uint8)
-    maps, step = half_derivatives(gray), layout.LEVEL_STEPS[0]
-    for level, (level_step, (taps, distance)) in enumerate(zip(layout.LEVEL_STEPS, layout.LEVEL_BLURS, strict=True)):
+    maps = half_derivatives(gray)
+    step = layout.LEVEL_STEPS[0]
+    for level, (level_step, (taps, distance)) in enumerate(
+        zip(layout.LEVEL_STEPS, layout.LEVEL_BLURS, strict=True)
+    ):
         if level_step != step:
-            maps, step = halved(maps), level_step
+            maps = halved(maps)
+            step = level_step
         maps = binomial(binomial(maps, 1, taps, distance), 2, taps, distance)
         norm = np.sqrt((maps**2).sum(axis=0).astype(np.float32))
         gain = np.float32(255) / (norm + np.float32(NORM_FLOOR * FIXED_POINT))
-        cells = np.moveaxis((maps.astype(np.float32) * gain + np.float32(0.5)).astype(np.uint8), 0, -1)
-        margin, base, stride = layout.MARGIN // step, geometry.base[level], geometry.stride[level]
+        cells = np.moveaxis(
+            (maps.astype(np.float32) * gain + np.float32(0.5)).astype(np.uint8), 0, -1
+        )
+        margin = layout.MARGIN // step
+        base = geometry.base[level]
+        stride = geometry.stride[level]
         rows, columns = cells.shape[:2]
-        area = histograms[base : base + (rows + 2 * margin) * stride].reshape(-1, stride, layout.BINS)
+        area = histograms[base : base + (rows + 2 * margin) * stride].reshape(
+            -1, stride, layout.BINS
+        )
         area[margin : margin + rows, margin : margin + columns] = cells
     return histograms
 

@@ -8,7 +8,11 @@ def picture(seed: int = 0, shape: tuple[int, int] = (240, 320)) -> np.ndarray:
     """A uint8 texture with structure at three scales."""
     rng = np.random.default_rng(seed)
     layers = [
-        cv2.resize(rng.uniform(0, 1, (shape[0] // k, shape[1] // k)), shape[::-1], interpolation=cv2.INTER_CUBIC)
+        cv2.resize(
+            rng.uniform(0, 1, (shape[0] // k, shape[1] // k)),
+            shape[::-1],
+            interpolation=cv2.INTER_CUBIC,
+        )
         for k in (3, 8, 24)
     ]
     return np.clip(sum(layers) * 85, 0, 255).astype(np.uint8)
@@ -30,5 +34,6 @@ def moved_points(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 def grid(shape: tuple[int, int] = (240, 320), margin: int = 60, step: int = 10) -> np.ndarray:
     """float32 points of a regular grid."""
-    x, y = np.arange(margin, shape[1] - margin, step), np.arange(margin, shape[0] - margin, step)
+    x = np.arange(margin, shape[1] - margin, step)
+    y = np.arange(margin, shape[0] - margin, step)
     return np.stack(np.meshgrid(x, y), -1).reshape(-1, 2).astype(np.float32)

@@ -15,13 +15,17 @@ PARTIAL_FLOOR = 0.01
 def describe(image, points):
     """DAISY descriptors ``[N, 17, 8]`` of points ``[N, 2]`` by their definition (Tola, Lepetit, Fua 2010).
 
-    With DAISY Filter Flow's layout: rectified directional derivatives, blurred at full resolution with the Gaussian of
-    each ring, sampled bilinearly, each histogram normalised on its own. Samples outside the image are zero.
+    With DAISY Filter Flow's layout: rectified directional derivatives, blurred at full resolution
+    with the Gaussian of each ring, sampled bilinearly, each histogram normalised on its own.
+    Samples outside the image are zero.
     """
     gray = np.pad(image / 255.0, 1, mode="edge")
-    gx, gy = (gray[1:-1, 2:] - gray[1:-1, :-2]) / 2, (gray[2:, 1:-1] - gray[:-2, 1:-1]) / 2
+    gx = (gray[1:-1, 2:] - gray[1:-1, :-2]) / 2
+    gy = (gray[2:, 1:-1] - gray[:-2, 1:-1]) / 2
     angle = np.arange(layout.BINS) * (2 * np.pi / layout.BINS)
-    derivatives = np.maximum(gx * np.cos(angle)[:, None, None] + gy * np.sin(angle)[:, None, None], 0)
+    derivatives = np.maximum(
+        gx * np.cos(angle)[:, None, None] + gy * np.sin(angle)[:, None, None], 0
+    )
     x, y = np.moveaxis(np.asarray(points)[:, None] + layout.unit_pattern(), -1, 0)
     out = np.zeros((len(points), layout.HISTOGRAMS, layout.BINS))
     for sigma, ring in zip(layout.RING_SIGMAS, (slice(0, 9), slice(9, 17)), strict=True):
@@ -58,14 +62,17 @@ def test_resembles_scikit_image():
         return np.median((descriptors * other).sum(axis=2) / norm)
 
     # they weigh directions by a von Mises function, not by a rectified cosine
-    assert similarity(expected) > 0.97 and similarity(expected[::-1]) < similarity(expected) - 0.03
+    assert similarity(expected) > 0.97
+    assert similarity(expected[::-1]) < similarity(expected) - 0.03
 
 
 @kernel
 def label_costs(labels, reference, target, tables, out):
     for i in range(len(labels)):
         u, v, s, theta = labels[i]
-        out[i] = matching_cost.label_cost(i, u, v, s, theta, reference, target, tables, matching_cost.OUTSIDE)
+        out[i] = matching_cost.label_cost(
+            i, u, v, s, theta, reference, target, tables, matching_cost.OUTSIDE
+        )
 
 
 def compiled_cost(first, second, points, labels, terms=1, support=1):
@@ -76,25 +83,32 @@ def compiled_cost(first, second, points, labels, terms=1, support=1):
     appearance = np.zeros((len(points), support, 2), np.int32)
     matching_cost.describe(0, len(points), points, here, tables, descriptors, appearance)
     out = np.empty(len(points), np.int64)
-    label_costs(labels, matching_cost.Reference(points, descriptors, appearance), there, tables, out)
+    label_costs(
+        labels, matching_cost.Reference(points, descriptors, appearance), there, tables, out
+    )
     return out, tables, descriptors
 
 
 def test_compiled_cost_follows_the_reference_descriptor():
-    image, rng = picture(4), np.random.default_rng(1)
+    image = picture(4)
+    rng = np.random.default_rng(1)
     points = rng.uniform((60, 60), (260, 180), (200, 2)).astype(np.float32)
     labels = np.zeros((200, 4), np.float32)
     labels[:, :2] = rng.uniform(-15, 15, (200, 2))
     cost, tables, _ = compiled_cost(image, image, points, labels)
-    here, there = describe(image, points), describe(image, points + labels[:, :2])
+    here = describe(image, points)
+    there = describe(image, points + labels[:, :2])
     expected = np.minimum(np.abs(here - there).sum(2), 0.882).sum(1) * 255
-    assert np.corrcoef(cost, expected)[0, 1] > 0.93 and (cost <= tables.ceiling).all()
+    assert np.corrcoef(cost, expected)[0, 1] > 0.93
+    assert (cost <= tables.ceiling).all()
     assert (compiled_cost(image, image, points, np.zeros_like(labels))[0] == 0).all()
 
 
 def test_the_cost_over_a_support_is_the_sum_over_its_points():
-    shape, rng = (120, 160), np.random.default_rng(0)
-    first, second = picture(2, shape), picture(3, shape)
+    shape = (120, 160)
+    rng = np.random.default_rng(0)
+    first = picture(2, shape)
+    second = picture(3, shape)
     points = rng.uniform((40, 40), (120, 80), (400, 2)).astype(np.float32)
     labels = (rng.uniform(-1, 1, (400, 4)) * (20, 20, 1.0, 0.7)).astype(np.float32)
     cost, tables, _ = compiled_cost(first, second, points, labels, support=5)
@@ -102,7 +116,9 @@ def test_the_cost_over_a_support_is_the_sum_over_its_points():
     total = np.zeros_like(cost)
     for dx, dy in tables.support:
         shift = np.column_stack([a * dx - b * dy - dx, b * dx + a * dy - dy, *np.zeros((2, 400))])
-        total += compiled_cost(first, second, points + np.float32((dx, dy)), labels + shift.astype(np.float32))[0]
+        total += compiled_cost(
+            first, second, points + np.float32((dx, dy)), labels + shift.astype(np.float32)
+        )[0]
     assert (total == cost).mean() > 0.97  # rounded cosines may fall into neighbouring cells
 
 
@@ -122,13 +138,15 @@ def test_right_scale_and_rotation_cost_least():
 
 def test_appearance_terms_add_truncated_differences():
     flat = np.full((100, 120), 100, np.uint8)
-    points, labels = np.array([[50, 50]], np.float32), np.zeros((1, 4), np.float32)
+    points = np.array([[50, 50]], np.float32)
+    labels = np.zeros((1, 4), np.float32)
     for step, expected in ((0, 0), (3, 55 * 3 / 255), (7, 55 * 7 / 255), (60, 55 * 7 / 255)):
         cost, _, _ = compiled_cost(flat, flat + np.uint8(step), points, labels, terms=3)
         assert cost[0] == pytest.approx(255 * expected, abs=1)
     ramp = np.tile(np.arange(0, 240, 2, dtype=np.uint8), (100, 1))
     without, having = (compiled_cost(flat, ramp, points, labels, terms)[0] for terms in (1, 3))
-    assert having[0] - without[0] == pytest.approx(190 * 2, abs=1)  # the ramp has the level of the flat image there
+    # the ramp has the level of the flat image there
+    assert having[0] - without[0] == pytest.approx(190 * 2, abs=1)
 
 
 def test_labels_outside_cost_more_than_any_inside():
@@ -136,4 +154,5 @@ def test_labels_outside_cost_more_than_any_inside():
     points = np.array([[5, 5], [195, 155], [100, 80], [100, 80]], np.float32)
     labels = np.array([[-6, 0, 0, 0], [0, 9, 0, 0], [np.nan, 0, 0, 0], [1e30, 0, 0, 0]], np.float32)
     cost, tables, _ = compiled_cost(image, image, points, labels)
-    assert (cost == matching_cost.OUTSIDE).all() and tables.ceiling < matching_cost.OUTSIDE
+    assert (cost == matching_cost.OUTSIDE).all()
+    assert tables.ceiling < matching_cost.OUTSIDE

@@ -6,7 +6,13 @@ from exact_reference import binomial, quantised_maps
 from pictures import moved, moved_points, picture
 
 from dynslam_bench.flow import layout
-from dynslam_bench.flow.dense_flow import DenseDaisyFlow, consistent, filter_patch, frame_patch, superpixels
+from dynslam_bench.flow.dense_flow import (
+    DenseDaisyFlow,
+    consistent,
+    filter_patch,
+    frame_patch,
+    superpixels,
+)
 from dynslam_bench.flow.orientation_maps import orientation_maps
 from dynslam_bench.flow.registry import build_flow
 from dynslam_bench.flow.settings import DenseFlowSettings
@@ -16,7 +22,8 @@ from dynslam_bench.flow.workers import Workers
 def guided_filter(guide, values, radius, epsilon):
     """`filter_patch` of a whole image."""
     framed = np.pad(np.asarray(values, np.float32), radius)
-    patch, work = np.empty(framed.size, np.float32), np.empty((8, framed.size), np.float32)
+    patch = np.empty(framed.size, np.float32)
+    work = np.empty((8, framed.size), np.float32)
     frame_patch(np.ascontiguousarray(guide, np.float32), 0, 0, *guide.shape, radius, patch, work)
     filter_patch(patch, framed.reshape(-1), framed.shape[1], radius, np.float32(epsilon), work)
     return framed[radius:-radius, radius:-radius]
@@ -25,11 +32,16 @@ def guided_filter(guide, values, radius, epsilon):
 def direct_guided_filter(guide, values, radius, epsilon):
     """He, Sun and Tang's definition, window by window."""
     height, width = guide.shape
-    a, b = np.empty_like(values), np.empty_like(values)
-    window = lambda z, y, x: z[max(y - radius, 0) : y + radius + 1, max(x - radius, 0) : x + radius + 1]  # noqa: E731
+    a = np.empty_like(values)
+    b = np.empty_like(values)
+
+    def window(z, y, x):
+        return z[max(y - radius, 0) : y + radius + 1, max(x - radius, 0) : x + radius + 1]
+
     for y in range(height):
         for x in range(width):
-            i, p = window(guide, y, x), window(values, y, x)
+            i = window(guide, y, x)
+            p = window(values, y, x)
             a[y, x] = ((i * p).mean() - i.mean() * p.mean()) / (i.var() + epsilon)
             b[y, x] = p.mean() - a[y, x] * i.mean()
     out = np.empty_like(values)
@@ -39,18 +51,25 @@ def direct_guided_filter(guide, values, radius, epsilon):
     return out
 
 
-@pytest.mark.parametrize(("shape", "radius", "epsilon"), [((20, 27), 3, 0.01), ((9, 8), 4, 1e-3), ((3, 30), 5, 0.1)])
+@pytest.mark.parametrize(
+    ("shape", "radius", "epsilon"), [((20, 27), 3, 0.01), ((9, 8), 4, 1e-3), ((3, 30), 5, 0.1)]
+)
 def test_guided_filter_equals_the_direct_reference(shape, radius, epsilon):
     rng = np.random.default_rng(0)
-    guide, values = rng.uniform(0, 1, shape), rng.uniform(0, 4000, shape)
+    guide = rng.uniform(0, 1, shape)
+    values = rng.uniform(0, 4000, shape)
     expected = direct_guided_filter(guide, values, radius, epsilon)
-    np.testing.assert_allclose(guided_filter(guide, values, radius, epsilon), expected, rtol=1e-3, atol=1.0)
+    np.testing.assert_allclose(
+        guided_filter(guide, values, radius, epsilon), expected, rtol=1e-3, atol=1.0
+    )
 
 
 def test_guided_filter_without_regularisation():
     values = np.random.default_rng(0).random((8, 9)).astype(np.float32)
     flat = guided_filter(np.full((8, 9), 0.5, np.float32), values, 3, 0.0)
-    assert np.isfinite(flat).all() and flat.min() >= values.min() and flat.max() <= values.max()
+    assert np.isfinite(flat).all()
+    assert flat.min() >= values.min()
+    assert flat.max() <= values.max()
 
 
 def test_superpixels_cover_the_image_and_follow_edges():
@@ -58,8 +77,11 @@ def test_superpixels_cover_the_image_and_follow_edges():
     image[:, 43:] = 200
     regions = superpixels(image, 10)
     count = len(regions.centres)
-    assert count == 48 and regions.labels.min() >= 0 and regions.labels.max() < count
-    assert sorted(regions.members.tolist()) == list(range(60 * 80)) and regions.starts[-1] == 60 * 80
+    assert count == 48
+    assert regions.labels.min() >= 0
+    assert regions.labels.max() < count
+    assert sorted(regions.members.tolist()) == list(range(60 * 80))
+    assert regions.starts[-1] == 60 * 80
     for k in range(count):
         members = regions.members[regions.starts[k] : regions.starts[k + 1]]
         assert (regions.labels.ravel()[members] == k).all()
@@ -78,7 +100,8 @@ def test_consistency_check():
     forward[..., 0] = 3
     backward = -forward
     valid = check(forward, backward, 1.0)
-    assert valid[:, :9].all() and not valid[:, 9:].any()
+    assert valid[:, :9].all()
+    assert not valid[:, 9:].any()
     backward[5, 6] = 2
     assert not check(forward, backward, 1.0)[5, 3]
 
@@ -95,9 +118,11 @@ def test_dense_flow_of_a_similarity_and_its_thread_independence():
     truth = moved_points(np.stack([x, y], -1), matrix) - np.stack([x, y], -1)
     inner = np.s_[20:-20, 20:-20]
     error = np.linalg.norm(results[0].flow - truth, axis=2)[inner]
-    assert np.median(error) < 0.3 and (error > 3).mean() < 0.05
+    assert np.median(error) < 0.3
+    assert (error > 3).mean() < 0.05
     assert results[0].valid[inner].mean() > 0.9
-    assert np.isfinite(results[0].flow).all() and (results[0].cost <= 1).all()
+    assert np.isfinite(results[0].flow).all()
+    assert (results[0].cost <= 1).all()
 
 
 # Orientation maps: exact against plain numpy code, their blurs, their threads, and reused memory.
@@ -107,7 +132,9 @@ def noise(shape, seed=0):
     return np.random.default_rng(seed).integers(0, 256, shape, dtype=np.uint8)
 
 
-@pytest.mark.parametrize("shape", [(120, 160), (97, 131), (33, 47), (9, 17), (7, 2), (2, 3), (1, 5), (1, 1)])
+@pytest.mark.parametrize(
+    "shape", [(120, 160), (97, 131), (33, 47), (9, 17), (7, 2), (2, 3), (1, 5), (1, 1)]
+)
 @pytest.mark.parametrize("kind", ["smooth", "noise", "extremes"])
 def test_maps_equal_the_reference_exactly_with_any_number_of_threads(shape, kind):
     gray = noise(shape, 1)
@@ -128,14 +155,16 @@ def test_maps_equal_the_reference_exactly_with_any_number_of_threads(shape, kind
 
 def test_blurs_have_the_variances_of_their_gaussians():
     """An impulse through the cascade: each level's variance in full-image pixels, the mean of 2 x 2 included."""
-    step, variance = 2, 0.0
+    step = 2
+    variance = 0.0
     x = np.arange(257) - 128
     line = (x == 0).astype(np.int64)[None, None] << 24
     for sigma, level_step, (taps, distance) in zip(
         layout.LEVEL_SIGMAS, layout.LEVEL_STEPS, layout.LEVEL_BLURS, strict=True
     ):
         if level_step != step:  # a mean of two, read at every second place
-            variance, step = variance + 0.25 * step**2, level_step
+            variance = variance + 0.25 * step**2
+            step = level_step
         weight = binomial(line, 2, taps, distance)[0, 0]
         variance += (weight * x**2).sum() / weight.sum() * step**2
         assert variance**0.5 == pytest.approx(sigma, rel=0.04)
@@ -148,13 +177,16 @@ def test_memory_is_reused_only_when_nothing_refers_to_it():
     held = [flow.prepare(image) for image in images[:6]]
     for _ in range(6):
         flow.prepare(images[7])
-    for maps, fresh in zip([*held, flow.prepare(images[3])], [*expected[:6], expected[3]], strict=True):
+    for maps, fresh in zip(
+        [*held, flow.prepare(images[3])], [*expected[:6], expected[3]], strict=True
+    ):
         for name in ("histograms", "framed", "framed_half"):
             np.testing.assert_array_equal(getattr(maps, name), getattr(fresh, name))
 
 
 def test_the_memory_of_deleted_maps_is_used_again():
-    buffers, image = [], noise((60, 80))
+    buffers = []
+    image = noise((60, 80))
     maps = orientation_maps(image, buffers=buffers)
     address = maps.histograms.ctypes.data
     assert orientation_maps(image, buffers=buffers).histograms.ctypes.data != address

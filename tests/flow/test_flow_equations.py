@@ -11,21 +11,24 @@ from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.flow.sparse import SparseDaisyFlow, side_of
 
 FAMILY = {"emfoa": rules.EMFOA, "mfo": rules.MFO, "printed": rules.EMFOA_LITERAL}
-POPULATION, ITERATIONS = 6, 10
+POPULATION = 6
+ITERATIONS = 10
 
 
 def picture(seed=0, shape=(144, 192)):
     """Blocks of three sizes; whole numbers only, so that every machine sees the same."""
     rng = np.random.default_rng(seed)
     layers = [
-        np.kron(rng.integers(0, 256, (shape[0] // k, shape[1] // k)), np.ones((k, k), np.int64)) for k in (3, 8, 24)
+        np.kron(rng.integers(0, 256, (shape[0] // k, shape[1] // k)), np.ones((k, k), np.int64))
+        for k in (3, 8, 24)
     ]
     return (sum(layers) // 3).astype(np.uint8)
 
 
 def by_hand(moths, flames, iteration, family, uniform, jumps, scale):
     """Eq. 8-18 for one population, a number at a time; flames best first."""
-    position, progress = np.empty_like(moths), iteration / ITERATIONS
+    position = np.empty_like(moths)
+    progress = iteration / ITERATIONS
     left = rules.flame_counts(POPULATION, ITERATIONS, family)[iteration - 1]
     for i in range(POPULATION):
         for j in range(4):
@@ -35,7 +38,9 @@ def by_hand(moths, flames, iteration, family, uniform, jumps, scale):
             if family.best_flame and iteration > ITERATIONS / 2:
                 a = 0.6 - 0.4 * progress
                 goal = (a * goal + (1 - a) * flames[0, j]) / (2 if family.half else 1)
-            position[i, j] = abs(flames[i, j] - moths[i, j]) * np.exp(t) * np.cos(2 * np.pi * t) + goal
+            position[i, j] = (
+                abs(flames[i, j] - moths[i, j]) * np.exp(t) * np.cos(2 * np.pi * t) + goal
+            )
             if family.cauchy and iteration <= ITERATIONS / 2:
                 position[i, j] += np.tan(np.pi * (jumps[i, j] - 0.5)) * scale[j]
     return position
@@ -43,8 +48,12 @@ def by_hand(moths, flames, iteration, family, uniform, jumps, scale):
 
 def drawn(seed, stepping):
     """A population, its flames, and the numbers that the compiled search would draw for them."""
-    moths, flames = np.random.default_rng(seed).uniform(-40, 40, (2, POPULATION, 4)).astype(np.float32)
-    state, uniform, jumps = np.uint64(seed + 77), np.empty((POPULATION, 4)), np.full((POPULATION, 4), 0.5)
+    moths, flames = (
+        np.random.default_rng(seed).uniform(-40, 40, (2, POPULATION, 4)).astype(np.float32)
+    )
+    state = np.uint64(seed + 77)
+    uniform = np.empty((POPULATION, 4))
+    jumps = np.full((POPULATION, 4), 0.5)
     for i in range(POPULATION):
         for numbers, levels in ((uniform, 65536), (jumps, 4096))[: 1 + stepping]:
             state = np.uint64(advance(state))
@@ -60,45 +69,81 @@ def test_numpy_and_the_kernel_follow_the_equations(family, iteration):
     now = rules.flight(iteration / ITERATIONS, family)
     moths, flames, uniform, jumps = drawn(iteration, now.stepping)
     scale = np.array([2.0, 2.0, 0.1, 0.087])
-    expected = by_hand(moths.astype(np.float64), flames.astype(np.float64), iteration, family, uniform, jumps, scale)
+    expected = by_hand(
+        moths.astype(np.float64),
+        flames.astype(np.float64),
+        iteration,
+        family,
+        uniform,
+        jumps,
+        scale,
+    )
     left = rules.flame_counts(POPULATION, ITERATIONS, family)[iteration - 1]
     around = flames[np.minimum(np.arange(POPULATION), left - 1)]
     numbers = iter((uniform, jumps))
-    positions = rules.moth_positions(moths, flames, around, flames[:1], now, scale, lambda _: next(numbers))
+    positions = rules.moth_positions(
+        moths, flames, around, flames[:1], now, scale, lambda _: next(numbers)
+    )
     np.testing.assert_allclose(positions, expected, rtol=1e-5, atol=1e-4)
     table = rules.flight_table(POPULATION, ITERATIONS, family)
     box = np.full(4, 1e9, np.float32)
-    flying, tried, steps = moths.copy(), np.empty_like(moths), scale.astype(np.float32)
+    flying = moths.copy()
+    tried = np.empty_like(moths)
+    steps = scale.astype(np.float32)
     tables = table, rules.spiral_table(), rules.cauchy_table()
-    move_moths(flying, flames, -box, box, iteration - 1, *tables, steps, tried, np.uint64(iteration + 77))
-    # the spiral is looked up in steps of 1/1024: its slope is at most 2 pi e^2 outside, 2 pi e inside t <= 1
-    looked_up = abs(flames - moths) * 2 * np.pi * np.exp(2 if family.as_printed else 1) / 1024 + 1e-3
-    assert (abs(flying - expected) <= looked_up + 1e-4 * abs(expected)).all() and np.array_equal(tried, flying)
+    move_moths(
+        flying, flames, -box, box, iteration - 1, *tables, steps, tried, np.uint64(iteration + 77)
+    )
+    # the spiral is looked up in steps of 1/1024: its slope is at most 2 pi e^2 outside, 2 pi e
+    # inside t <= 1
+    looked_up = (
+        abs(flames - moths) * 2 * np.pi * np.exp(2 if family.as_printed else 1) / 1024 + 1e-3
+    )
+    assert (abs(flying - expected) <= looked_up + 1e-4 * abs(expected)).all()
+    assert np.array_equal(tried, flying)
 
 
 def test_opposites_keep_to_their_bounds():
     members = np.random.default_rng(0).uniform(-3, 3, (5, 7, 4))
-    least, greatest = members.min(1, keepdims=True), members.max(1, keepdims=True)
-    numbers = [np.random.default_rng(1).random((5, 7, 1)), np.random.default_rng(2).random((5, 7, 4))]
+    least = members.min(1, keepdims=True)
+    greatest = members.max(1, keepdims=True)
+    numbers = [
+        np.random.default_rng(1).random((5, 7, 1)),
+        np.random.default_rng(2).random((5, 7, 4)),
+    ]
     draws = iter(numbers)
-    opposite = rules.opposites(members, least, greatest, np.full(4, -2.0), np.full(4, 2.5), lambda _: next(draws))
+    opposite = rules.opposites(
+        members, least, greatest, np.full(4, -2.0), np.full(4, 2.5), lambda _: next(draws)
+    )
     mirrored = numbers[0] * (least + greatest) - members
     kept = (mirrored >= -2) & (mirrored <= 2.5)
     np.testing.assert_allclose(opposite[kept], mirrored[kept])
-    assert 0.3 < kept.mean() < 1 and (opposite >= -2).all() and (opposite <= 2.5).all()
+    assert 0.3 < kept.mean() < 1
+    assert (opposite >= -2).all()
+    assert (opposite <= 2.5).all()
 
 
 def searched(search):
     """The state of a label search with a guess for every second point."""
     image = picture()
     target = np.roll(image, (4, -7), axis=(0, 1))
-    points = np.stack(np.meshgrid(np.arange(40, 150, 10), np.arange(40, 100, 10)), -1).reshape(-1, 2).astype(np.float32)
+    points = (
+        np.stack(np.meshgrid(np.arange(40, 150, 10), np.arange(40, 100, 10)), -1)
+        .reshape(-1, 2)
+        .astype(np.float32)
+    )
     guess = points + np.float32(3)
     guess[::2] = np.nan
     flow = SparseDaisyFlow(FlowSettings(search=search))
     pair = flow.pair(flow.prepare(image), flow.prepare(target))
-    costs = flow.describe(pair.reference, points, pair.tables), side_of(pair.target, pair.tables), pair.tables
-    return search_labels(flow.settings, flow.workers.run, costs, nearest(points, flow.workers.run), guess, 9)
+    costs = (
+        flow.describe(pair.reference, points, pair.tables),
+        side_of(pair.target, pair.tables),
+        pair.tables,
+    )
+    return search_labels(
+        flow.settings, flow.workers.run, costs, nearest(points, flow.workers.run), guess, 9
+    )
 
 
 STORED = {
@@ -119,12 +164,16 @@ STORED = {
 @pytest.mark.parametrize("search", sorted(STORED))
 def test_label_searches_are_as_before_to_the_bit(search):
     state = searched(search)
-    content = b"".join(np.ascontiguousarray(array).tobytes() for array in (state.flames, state.costs, state.used))
+    content = b"".join(
+        np.ascontiguousarray(array).tobytes() for array in (state.flames, state.costs, state.used)
+    )
     assert hashlib.sha256(content).hexdigest()[:16] == STORED[search]
 
 
 def test_flame_counts_follow_equation_11():
     assert rules.flame_counts(30, 100, rules.MFO)[[0, 49, 99]].tolist() == [30, 16, 1]
     printed = rules.flame_counts(30, 100, rules.EMFOA_LITERAL)
-    assert printed[19] <= 6 and printed[-1] == 1  # collapses: taken from the last count instead of N
+    # collapses: taken from the last count instead of N
+    assert printed[19] <= 6
+    assert printed[-1] == 1
     assert (np.diff(rules.flame_counts(12, 30, rules.EMFOA)) <= 0).all()

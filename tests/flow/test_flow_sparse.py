@@ -39,7 +39,14 @@ def track(settings, first, second, points, *, threads=1, **arguments):
 
 @pytest.mark.parametrize(
     ("scale", "degrees", "tx", "ty"),
-    [(1, 0, 3.4, -2.3), (1, 0, 45, -30), (1.5, 0, 5, 5), (0.7, 0, 0, 9), (1, 40, 4, 2), (1.25, -20, 12, 8)],
+    [
+        (1, 0, 3.4, -2.3),
+        (1, 0, 45, -30),
+        (1.5, 0, 5, 5),
+        (0.7, 0, 0, 9),
+        (1, 40, 4, 2),
+        (1.25, -20, 12, 8),
+    ],
 )
 def test_finds_similarities_to_a_fraction_of_a_pixel(scale, degrees, tx, ty):
     image = picture(1)
@@ -48,8 +55,10 @@ def test_finds_similarities_to_a_fraction_of_a_pixel(scale, degrees, tx, ty):
     truth = moved_points(points, matrix)
     result = track(FlowSettings(), image, target, points, seed=3)
     error = np.hypot(*(result.xy - truth).T)
-    assert (error < 1.5).mean() > 0.9 and np.median(error) < 0.2
-    assert (error[result.valid] < 1.5).mean() > 0.97 and result.valid.mean() > 0.85
+    assert (error < 1.5).mean() > 0.9
+    assert np.median(error) < 0.2
+    assert (error[result.valid] < 1.5).mean() > 0.97
+    assert result.valid.mean() > 0.85
 
 
 @pytest.mark.parametrize("window", [5, 9, 17, 31, 41])
@@ -63,7 +72,8 @@ def test_refinement_windows_of_every_size_align_to_a_fraction_of_a_pixel(window)
     labels[:, :2] = truth - points + np.random.default_rng(0).uniform(-1.5, 1.5, points.shape)
     correlation = flow.refine(points, labels, pair_of(flow, image, target))
     error = np.hypot(*(points + labels[:, :2] - truth).T)
-    assert np.median(error) < (0.25 if window == 5 else 0.1) and (correlation > 0.9).mean() > 0.9
+    assert np.median(error) < (0.25 if window == 5 else 0.1)
+    assert (correlation > 0.9).mean() > 0.9
     assert correlation.max() <= 1 + 1e-5
     if window >= 17:
         assert np.median(abs(labels[:, 2] - np.log2(1.03))) < 0.02
@@ -77,12 +87,16 @@ def test_points_at_the_border_are_refined_without_reading_beyond_the_image():
     edge = (x < 20) | (y < 20) | (x > 140) | (y > 100)
     points = np.stack([x[edge], y[edge]], 1).astype(np.float32)
     flow = SparseDaisyFlow(FlowSettings(refinement_window_px=41))
-    labels = (np.random.default_rng(0).uniform(-1, 1, (len(points), 4)) * (200, 200, 1.2, 0.8)).astype(np.float32)
+    labels = (
+        np.random.default_rng(0).uniform(-1, 1, (len(points), 4)) * (200, 200, 1.2, 0.8)
+    ).astype(np.float32)
     before = labels.copy()
     correlation = flow.refine(points, labels, pair_of(flow, image, target))
-    assert np.isfinite(labels).all() and (np.abs(correlation) <= 1 + 1e-5).all()
+    assert np.isfinite(labels).all()
+    assert (np.abs(correlation) <= 1 + 1e-5).all()
     outside = ((points + before[:, :2] < 0) | (points + before[:, :2] > (159, 119))).any(axis=1)
-    assert outside.sum() > 50 and (correlation[outside] == -1).all()
+    assert outside.sum() > 50
+    assert (correlation[outside] == -1).all()
     np.testing.assert_array_equal(labels[outside], before[outside])
 
 
@@ -112,7 +126,12 @@ def test_all_searches_that_draw_spend_exactly_the_budget(search, budget):
 def test_propagation_carries_what_one_point_finds(search):
     image, points = picture(14), grid()
     target, matrix = moved(image, 1.1, 8, 30, -20)
-    assert share_found(track(FlowSettings(search=search), image, target, points, seed=2), points, matrix) > 0.9
+    assert (
+        share_found(
+            track(FlowSettings(search=search), image, target, points, seed=2), points, matrix
+        )
+        > 0.9
+    )
     alone = FlowSettings(search=search, neighbours=0, similarity_seeds=False)
     assert share_found(track(alone, image, target, points, seed=2), points, matrix) < 0.6
 
@@ -125,10 +144,13 @@ def test_more_budget_lowers_the_cost_and_the_order_of_searches():
         settings = FlowSettings(search=search, budget=budget, refinement="none")
         return track(settings, image, target, points, seed=1).cost.mean()
 
-    costs = {search: np.array([cost(search, budget) for budget in (48, 192)]) for search in SEARCHES}
+    costs = {
+        search: np.array([cost(search, budget) for budget in (48, 192)]) for search in SEARCHES
+    }
     assert all(few >= many for few, many in costs.values())
     # as printed is worse than random; neighbours matter more than the metaheuristic
-    assert (costs["emfoa-literal"] > costs["random"] - 0.01).all() and costs["emfoa"][1] < costs["random"][1]
+    assert (costs["emfoa-literal"] > costs["random"] - 0.01).all()
+    assert costs["emfoa"][1] < costs["random"][1]
     for search in ("random", "emfoa-literal", "emfoa"):
         assert (costs[f"{search}+propagation"] < costs[search]).all()
     assert (costs["patchmatch"] < costs["emfoa"]).all()
@@ -155,7 +177,8 @@ def test_without_propagation_points_are_independent():
     target, _ = moved(image, tx=9)
     points = grid()
     settings = FlowSettings(search="emfoa")
-    everything, first = track(settings, image, target, points), track(settings, image, target, points[:10])
+    everything = track(settings, image, target, points)
+    first = track(settings, image, target, points[:10])
     np.testing.assert_array_equal(everything.xy[:10], first.xy)
 
 
@@ -169,14 +192,17 @@ def test_common_motions_finds_two_similarities_among_noise():
         moved_to = points[part] @ np.array([[a, b], [-b, a]]) + (tx, ty)
         labels[part, :2] = moved_to - points[part] + rng.normal(0, 0.5, moved_to.shape)
     costs = np.where(np.arange(400) < 260, rng.integers(0, 1000, 400), rng.integers(800, 3000, 400))
-    np.testing.assert_allclose(common_motions(points, labels, costs, 1)[:, :2], motions[:, :2], atol=0.03)
+    np.testing.assert_allclose(
+        common_motions(points, labels, costs, 1)[:, :2], motions[:, :2], atol=0.03
+    )
     assert np.isnan(common_motions(points[:3], labels[:3], costs[:3], 1)).all()
 
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("kind", ["identical", "black", "textureless", "black target", "gradient"])
 def test_degenerate_images_give_no_valid_points(method, kind):
-    image, flat = picture(8), np.full((240, 320), 100, np.uint8)
+    flat = np.full((240, 320), 100, np.uint8)
+    image = picture(8)
     first, second = {
         "identical": (image, image.copy()),
         "black": (0 * flat, 0 * flat),
@@ -185,45 +211,62 @@ def test_degenerate_images_give_no_valid_points(method, kind):
         "gradient": (np.tile(np.linspace(0, 60, 320), (240, 1)).astype(np.uint8), flat),
     }[kind]
     result = track(FlowSettings(method=method), first, second, grid())
-    assert result.xy.shape == grid().shape and np.isfinite(result.xy).all()
-    assert not result.valid.any() and result.stats["degenerate"] == 1 and result.stats["valid"] == 0
+    assert result.xy.shape == grid().shape
+    assert np.isfinite(result.xy).all()
+    assert not result.valid.any()
+    assert result.stats["degenerate"] == 1
+    assert result.stats["valid"] == 0
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_unusable_points_and_guesses_are_not_valid_and_do_not_influence_others(method):
-    image, good = picture(9), grid(margin=40)
+    good = grid(margin=40)
+    image = picture(9)
     target, matrix = moved(image, tx=3, ty=2)
-    bad = np.array([[np.nan, 3], [-5, 10], [1e9, 1e9], [319.9, 50], [np.inf, 0], [100, 240]], np.float32)
+    bad = np.array(
+        [[np.nan, 3], [-5, 10], [1e9, 1e9], [319.9, 50], [np.inf, 0], [100, 240]], np.float32
+    )
     points = np.concatenate([bad, good])
     guess = np.full_like(points, np.nan)
-    guess[-5:], guess[-10:-5] = 1e20, np.inf
+    guess[-5:] = 1e20
+    guess[-10:-5] = np.inf
     result = track(FlowSettings(method=method), image, target, points, guess=guess)
-    assert not result.valid[: len(bad)].any() and np.isfinite(result.xy[result.valid]).all()
-    assert (np.hypot(*(result.xy[len(bad) :] - moved_points(good, matrix)).T) < 1.5)[:-10].mean() > 0.95
+    assert not result.valid[: len(bad)].any()
+    assert np.isfinite(result.xy[result.valid]).all()
+    assert (np.hypot(*(result.xy[len(bad) :] - moved_points(good, matrix)).T) < 1.5)[
+        :-10
+    ].mean() > 0.95
     nothing = track(FlowSettings(method=method), image, target, bad[:2])
-    assert not nothing.valid.any() and nothing.stats["degenerate"] == 0
+    assert not nothing.valid.any()
+    assert nothing.stats["degenerate"] == 0
 
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(
-    ("shape", "count"), [((2, 3), 7), ((9, 17), 7), ((33, 47), 7), *(((240, 320), n) for n in (0, 1, 2, 5))]
+    ("shape", "count"),
+    [((2, 3), 7), ((9, 17), 7), ((33, 47), 7), *(((240, 320), n) for n in (0, 1, 2, 5))],
 )
 def test_tiny_images_and_few_points(method, shape, count):
-    first, points = picture(10)[: shape[0], : shape[1]].copy(), grid()[:count] * (np.array(shape[::-1]) / (320, 240))
+    first = picture(10)[: shape[0], : shape[1]].copy()
+    points = grid()[:count] * (np.array(shape[::-1]) / (320, 240))
     result = track(FlowSettings(method=method), first, np.roll(first, 2, axis=1), points)
-    assert result.xy.shape == (count, 2) and result.valid.shape == result.cost.shape == (count,)
-    assert np.isfinite(result.xy[result.valid]).all() and result.stats["points"] == count
+    assert result.xy.shape == (count, 2)
+    assert result.valid.shape == result.cost.shape == (count,)
+    assert np.isfinite(result.xy[result.valid]).all()
+    assert result.stats["points"] == count
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_images_of_two_sizes_are_refused(method):
-    flow, image = build_flow(FlowMethodSettings(method=method)), picture(11)
+    flow = build_flow(FlowMethodSettings(method=method))
+    image = picture(11)
     with pytest.raises(ValueError, match="size"):
         flow.track(flow.prepare(image), flow.prepare(image[:120]), grid())
 
 
 def test_the_forward_backward_check_rejects_what_is_covered():
-    image, cover = picture(12), picture(13)
+    cover = picture(13)
+    image = picture(12)
     target, _ = moved(image, tx=5)
     target[80:160, 100:220] = cover[80:160, 100:220]
     points = grid(margin=20)
@@ -280,16 +323,24 @@ FIXED = {
 """Settings that studies do not tune, with a value other than the default."""
 MATRIX = cv2.getRotationMatrix2D((64, 48), 14, 0.85)
 MATRIX[:, 2] += 9, -6
-POINTS = np.stack(np.meshgrid(np.arange(12, 120, 9), np.arange(12, 88, 9)), -1).reshape(-1, 2).astype(np.float32)
+POINTS = (
+    np.stack(np.meshgrid(np.arange(12, 120, 9), np.arange(12, 88, 9)), -1)
+    .reshape(-1, 2)
+    .astype(np.float32)
+)
 
 
 @lru_cache(maxsize=1)
 def pair() -> tuple[np.ndarray, np.ndarray]:
     """A rotated, shrunk and darkened image with an object in it that moves by itself, and noise in both."""
-    rng, image = np.random.default_rng(3), picture(3, (96, 128)).astype(float)
+    rng = np.random.default_rng(3)
+    image = picture(3, (96, 128)).astype(float)
     target = cv2.warpAffine(image, MATRIX, (128, 96), borderMode=cv2.BORDER_REFLECT)
     target[32:64, 48:80] = image[28:60, 64:96]
-    first, second = (np.clip(i + rng.normal(0, 5, i.shape), 0, 255).astype(np.uint8) for i in (image, target - 12))
+    first, second = (
+        np.clip(i + rng.normal(0, 5, i.shape), 0, 255).astype(np.uint8)
+        for i in (image, target - 12)
+    )
     return first, second
 
 
@@ -301,8 +352,14 @@ def output(settings: FlowMethodSettings) -> bytes:
 
 
 def cases() -> list[tuple[str, str, tuple[object, ...]]]:
-    tuned = [(kind, p.name, p.choices or (p.low, p.high)) for kind in BASES for p in parameters(type(BASES[kind]))]
-    return tuned + [(kind, name, (value,)) for kind, values in FIXED.items() for name, value in values.items()]
+    tuned = [
+        (kind, p.name, p.choices or (p.low, p.high))
+        for kind in BASES
+        for p in parameters(type(BASES[kind]))
+    ]
+    return tuned + [
+        (kind, name, (value,)) for kind, values in FIXED.items() for name, value in values.items()
+    ]
 
 
 @pytest.mark.parametrize(("kind", "name", "values"), cases())
@@ -316,7 +373,8 @@ def test_copied_and_pickled_flows_find_the_same(settings) -> None:
     flow = build_flow(settings, threads=2)
     images = [flow.prepare(image) for image in pair()]
     found = [
-        each.track(*images, POINTS, seed=5).xy for each in (flow, deepcopy(flow), pickle.loads(pickle.dumps(flow)))
+        each.track(*images, POINTS, seed=5).xy
+        for each in (flow, deepcopy(flow), pickle.loads(pickle.dumps(flow)))
     ]
     np.testing.assert_array_equal(found[1:], [found[0]] * 2)
 
@@ -327,13 +385,20 @@ def test_the_dense_flow_reads_its_field_at_the_points() -> None:
     first, second = (flow.prepare(image) for image in pair())
     unusable = np.array([[np.nan, 5], [-3, 5], [500, 5]], np.float32)
     result = flow.track(first, second, np.concatenate([POINTS, unusable]), seed=5)
-    assert result.xy.dtype == result.cost.dtype == np.float32 and not result.valid[-3:].any()
-    assert 0.3 < result.valid.mean() < 1 and result.stats["valid"] == result.valid.sum()
-    xy, valid = result.xy[:-3], result.valid[:-3]
+    assert result.xy.dtype == result.cost.dtype == np.float32
+    assert not result.valid[-3:].any()
+    assert 0.3 < result.valid.mean() < 1
+    assert result.stats["valid"] == result.valid.sum()
+    xy = result.xy[:-3]
+    valid = result.valid[:-3]
     elsewhere = (np.abs(xy - (64, 48)) > 20).any(axis=1)  # not on the other object
-    assert np.median(np.linalg.norm(xy - moved_points(POINTS, MATRIX), axis=1)[valid & elsewhere]) < 0.7
+    assert (
+        np.median(np.linalg.norm(xy - moved_points(POINTS, MATRIX), axis=1)[valid & elsewhere])
+        < 0.7
+    )
     degenerate = flow.track(first, first, POINTS)
-    assert set(degenerate.stats) == set(result.stats) and not degenerate.valid.any()
+    assert set(degenerate.stats) == set(result.stats)
+    assert not degenerate.valid.any()
     assert len(flow.track(first, second, POINTS[:0]).xy) == 0
 
 

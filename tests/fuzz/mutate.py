@@ -88,7 +88,9 @@ _TOKEN = re.compile(rb"[-+]?[0-9][0-9.eE+-]*|[A-Za-z_]+")
 def mutate(data: bytes, others: list[bytes], random: Random) -> bytes:
     """One to four damages to some bytes; `others` are spliced in."""
     for _ in range(random.choice((1, 1, 1, 2, 3, 4))):
-        data = random.choice((*[_replace_part] * 3, _replace_token, _move_line))(data, others, random)
+        data = random.choice((*[_replace_part] * 3, _replace_token, _move_line))(
+            data, others, random
+        )
     return data[: 1 << 22]
 
 
@@ -125,11 +127,15 @@ def mutate_zip(data: bytes, random: Random) -> bytes:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as old:
             sizes = {entry.filename: entry.file_size for entry in old.infolist()}
-            files = {name: old.read(name) if size < 1 << 16 else b"" for name, size in sizes.items()}
+            files = {
+                name: old.read(name) if size < 1 << 16 else b"" for name, size in sizes.items()
+            }
         name = random.choice(list(files))
         content = files.pop(name)
         content = random.choice((mutate_json(content, random), mutate(content, [content], random)))
-        name = random.choice((name, name, name, "../x.txt", "/etc/passwd", f"runs/{'0' * 16}/run.json"))
+        name = random.choice(
+            (name, name, name, "../x.txt", "/etc/passwd", f"runs/{'0' * 16}/run.json")
+        )
         return zipped(files | {name: content})
     except Exception:  # a seed that is no archive any more is damaged as bytes
         return mutate(data, [data], random)
@@ -139,7 +145,8 @@ def mutate_png(data: bytes, random: Random) -> bytes:
     """One chunk of a PNG damaged under a right checksum, so that the decoder goes on to read it."""
     if not data.startswith(b"\x89PNG"):
         return data
-    position, chunks = 8, []
+    position = 8
+    chunks = []
     while position + 12 <= len(data):
         end = position + 8 + struct.unpack_from(">I", data, position)[0]
         chunks.append(data[position + 4 : end])
@@ -147,7 +154,8 @@ def mutate_png(data: bytes, random: Random) -> bytes:
     if not chunks:
         return data
     at = random.randrange(len(chunks))
-    kind, body = chunks[at][:4], chunks[at][4:]
+    kind = chunks[at][:4]
+    body = chunks[at][4:]
     damaged = mutate(body, [], random)
     if random.random() < 0.3:  # the compressed pixels themselves
         with suppress(zlib.error):
@@ -168,8 +176,15 @@ def _changed(value: Any, random: Random) -> Any:
         key = random.choice(list(value))
         if random.random() < 0.12:
             return {name: each for name, each in value.items() if name != key}
-        renamed = random.choice(["", "x", key * 2, "\ud800", "__class__"]) if random.random() < 0.05 else key
-        return {**{k: v for k, v in value.items() if k != key}, renamed: _changed(value[key], random)}
+        renamed = (
+            random.choice(["", "x", key * 2, "\ud800", "__class__"])
+            if random.random() < 0.05
+            else key
+        )
+        return {
+            **{k: v for k, v in value.items() if k != key},
+            renamed: _changed(value[key], random),
+        }
     if isinstance(value, list) and value and random.random() < 0.85:
         at = random.randrange(len(value))
         if random.random() < 0.15:
@@ -184,10 +199,20 @@ def _replace_part(data: bytes, others: list[bytes], random: Random) -> bytes:
     """Bytes removed, doubled, overwritten by numbers that are often too much, or replaced by a word or another file."""
     start = random.randrange(len(data) + 1)
     length = random.choice((0, 0, 1, 1, 2, 4, 8, 64, 512, len(data)))
-    part, other = data[start : start + length], random.choice(others or [data])
+    part = data[start : start + length]
+    other = random.choice(others or [data])
     flipped = bytes(byte ^ (1 << random.randrange(8)) for byte in part[:1]) + part[1:]
-    replacements = (b"", flipped, random.randbytes(len(part)), b"\xff" * len(part), bytes(len(part)), part * 2,
-                    part * 50, random.choice(WORDS), other[random.randrange(len(other) + 1) :])  # fmt: skip
+    replacements = (
+        b"",
+        flipped,
+        random.randbytes(len(part)),
+        b"\xff" * len(part),
+        bytes(len(part)),
+        part * 2,
+        part * 50,
+        random.choice(WORDS),
+        other[random.randrange(len(other) + 1) :],
+    )
     return data[:start] + random.choice(replacements) + data[start + length :]
 
 

@@ -70,10 +70,11 @@ class Target:
 
     Attributes:
         name: Its name.
-        read: Reads what the bytes are in an empty folder of its own; None stands for a file that is missing. It ends,
-            or raises an error of `allowed`; anything else is a finding.
+        read: Reads what the bytes are in an empty folder of its own; None stands for a file that is
+            missing. It ends, or raises an error of `allowed`; anything else is a finding.
         seeds: Makes sound and unsound files, once.
-        mutation: Damage that keeps checksums or syntax right, used every other time beside damage to plain bytes.
+        mutation: Damage that keeps checksums or syntax right, used every other time beside damage
+            to plain bytes.
         allowed: The errors that its documentation names.
     """
 
@@ -103,7 +104,8 @@ def at(folder: Path, name: str, data: bytes | None) -> Path:
 
 
 FIXTURE = Path(__file__).resolve().parents[1] / "fixtures" / "results"
-RUN, OTHER = "a7abe04996a79cc4", b"e7f8d4df9db4bb16"
+RUN = "a7abe04996a79cc4"
+OTHER = b"e7f8d4df9db4bb16"
 
 
 @cache
@@ -141,10 +143,12 @@ def _read_index(data: bytes | None, folder: Path) -> None:
         os.utime(file, (1, 1))  # values that were computed from another copy hold
     at(store.root, INDEX_FILE, data)
     rows, unreadable = list_runs(store)
-    assert [row["run_id"] for row in rows] == [RUN] and len(unreadable) == 1
+    assert [row["run_id"] for row in rows] == [RUN]
+    assert len(unreadable) == 1
     assert store.score(store.read(RUN)).run_id == RUN
     loaded = load_runs([store], get_protocol("tum-rgbd/v1"))
-    assert [row.run_id for row in loaded.rows] == [RUN] and len(loaded.unreadable) == 1
+    assert [row.run_id for row in loaded.rows] == [RUN]
+    assert len(loaded.unreadable) == 1
 
 
 @cache
@@ -176,10 +180,22 @@ def _log_seeds() -> list[bytes]:
     made = frames.read_csv(FIXTURE / "runs" / RUN / "frames.csv")
     pose = [0.0, 0.1, 0.2, 0.0, 0.0, 0.0, 1.0]
     lines = [json.dumps({**vars(row), "pose": pose}) + "\n" for row in made]
-    odd = ({"pose": pose[:6]}, {"stats": {"a": "x"}}, {"state": "asleep"}, {"timestamp": "nan"}, {"x": 1})
+    odd = (
+        {"pose": pose[:6]},
+        {"stats": {"a": "x"}},
+        {"state": "asleep"},
+        {"timestamp": "nan"},
+        {"x": 1},
+    )
     one = json.loads(lines[0])
     return [
-        *("".join(lines).encode(), lines[0].encode(), "".join(lines).encode()[:-30], lines[0].encode() * 2, b"[]\n"),
+        *(
+            "".join(lines).encode(),
+            lines[0].encode(),
+            "".join(lines).encode()[:-30],
+            lines[0].encode() * 2,
+            b"[]\n",
+        ),
         *(json.dumps(one | each).encode() + b"\n" for each in odd),
     ]
 
@@ -192,8 +208,16 @@ def _packed_seeds() -> list[bytes]:
     lying[start : start + 4] = b"\xfe\xff\xff\xff"
     with zipfile.ZipFile(io.BytesIO(packed)) as archive:
         files = {name: archive.read(name) for name in archive.namelist()}
-    renamed = [{name.replace(RUN, run): content for name, content in files.items()} for run in ("0" * 16, "zz")]
-    return [packed, bytes(lying), zipped({f"runs/{RUN}/run.json": b"{}"}, zipfile.ZIP_LZMA), *map(zipped, renamed)]
+    renamed = [
+        {name.replace(RUN, run): content for name, content in files.items()}
+        for run in ("0" * 16, "zz")
+    ]
+    return [
+        packed,
+        bytes(lying),
+        zipped({f"runs/{RUN}/run.json": b"{}"}, zipfile.ZIP_LZMA),
+        *map(zipped, renamed),
+    ]
 
 
 def _read_study(data: bytes | None, folder: Path) -> None:
@@ -210,9 +234,14 @@ def _read_study(data: bytes | None, folder: Path) -> None:
 
 
 def _study_seeds() -> list[bytes]:
-    stored, text = _stored("studies/small/study.json"), (FIXTURE.parent / "small.toml").read_bytes()
+    stored = _stored("studies/small/study.json")
+    text = (FIXTURE.parent / "small.toml").read_bytes()
     return [
-        *(stored, stored.replace(b'"small"', b'"other"'), stored.replace(b'"storage": ""', b'"storage": "redis://h"')),
+        *(
+            stored,
+            stored.replace(b'"small"', b'"other"'),
+            stored.replace(b'"storage": ""', b'"storage": "redis://h"'),
+        ),
         *(text, text + b'\nname = "gone"\n', b'name = "gone"\n' + text),
     ]
 
@@ -227,7 +256,9 @@ def _read_journal(data: bytes | None, folder: Path) -> None:
 @cache
 def _entry() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
-        StageCache(Path(folder)).put("masks", "ab12", {"a": np.eye(3), "b": np.array(["person"])}, 0.1)
+        StageCache(Path(folder)).put(
+            "masks", "ab12", {"a": np.eye(3), "b": np.array(["person"])}, 0.1
+        )
         (path,) = Path(folder).rglob("*.npz")
         return path.read_bytes()
 
@@ -238,7 +269,9 @@ def _read_entry(data: bytes | None, folder: Path) -> None:
     assert found is None or found.cost_s == 0.1
 
 
-RECEIPT = fetch.Receipt(id="tum/x", url="https://host/x.tgz", sha256="0" * 64, size_bytes=1, checked=True, files=3)
+RECEIPT = fetch.Receipt(
+    id="tum/x", url="https://host/x.tgz", sha256="0" * 64, size_bytes=1, checked=True, files=3
+)
 
 
 def _snapshot_seeds() -> list[bytes]:
@@ -246,23 +279,40 @@ def _snapshot_seeds() -> list[bytes]:
     sound = {"index": np.array([0, 5]), "count": np.array([3, 1]), "size": np.array([4, 10]),
              "points": np.zeros((4, 2), np.int16), "kept": np.ones(4, bool), "masked": np.array([True, False]),
              "masks": np.zeros((2, 4, 2), np.uint8)}  # fmt: skip
-    odd: list[dict[str, Any]] = [{}, {"count": np.array([3, 2])}, {"masks": np.zeros((2, 4, 3), np.uint8)}]
-    odd += [{"kept": np.array([None] * 4)}, {"points": np.zeros(0)}, {"size": np.zeros(300 << 20, np.uint8)}]
-    return [written(lambda file, arrays=sound | each: np.savez_compressed(file, **arrays)) for each in odd]
+    odd: list[dict[str, Any]] = [
+        {},
+        {"count": np.array([3, 2])},
+        {"masks": np.zeros((2, 4, 3), np.uint8)},
+    ]
+    odd += [
+        {"kept": np.array([None] * 4)},
+        {"points": np.zeros(0)},
+        {"size": np.zeros(300 << 20, np.uint8)},
+    ]
+    return [
+        written(lambda file, arrays=sound | each: np.savez_compressed(file, **arrays))
+        for each in odd
+    ]
 
 
 RECORDS = [
     Target(
         "run record",
         _read_run,
-        lambda: [_stored(f"runs/{RUN}/run.json").replace(RUN.encode(), run) for run in (RUN.encode(), OTHER)],
+        lambda: [
+            _stored(f"runs/{RUN}/run.json").replace(RUN.encode(), run)
+            for run in (RUN.encode(), OTHER)
+        ],
         mutate_json,
     ),
     Target("index of runs", _read_index, lambda: [_index()]),
     Target(
         "stamps and trajectories of a run",
         _read_part,
-        lambda: [_stored("sequences/*/timestamps.txt"), _stored(f"runs/{RUN}/trajectory_online.txt")],
+        lambda: [
+            _stored("sequences/*/timestamps.txt"),
+            _stored(f"runs/{RUN}/trajectory_online.txt"),
+        ],
     ),
     Target("frame log", _read_log, _log_seeds, mutate_lines),
     Target(
@@ -270,7 +320,12 @@ RECORDS = [
         lambda data, folder: frames.load_frames(at(folder, frames.CSV_FILE, data)),
         lambda: [_stored(f"runs/{RUN}/frames.csv")],
     ),
-    Target("packed run", lambda data, folder: running.unpack(data or b"", RunStore(folder)), _packed_seeds, mutate_zip),
+    Target(
+        "packed run",
+        lambda data, folder: running.unpack(data or b"", RunStore(folder)),
+        _packed_seeds,
+        mutate_zip,
+    ),
     Target(
         "study's summary",
         lambda data, folder: StudySummary.read(at(folder, "record.json", data)),
@@ -278,7 +333,12 @@ RECORDS = [
         mutate_json,
     ),
     Target("stored study", _read_study, _study_seeds, mutate_json),
-    Target("journal of a study", _read_journal, lambda: [_stored("studies/small/journal.log")], mutate_lines),
+    Target(
+        "journal of a study",
+        _read_journal,
+        lambda: [_stored("studies/small/journal.log")],
+        mutate_lines,
+    ),
     Target(
         "receipt of a fetch",
         lambda data, folder: fetch.Receipt.read(at(folder, "fetched.json", data)),
@@ -287,7 +347,9 @@ RECORDS = [
     ),
     Target(
         "snapshots of a run",
-        lambda data, folder: artifacts.read_snapshots(at(folder, artifacts.SNAPSHOTS_FILE, data).parent),
+        lambda data, folder: artifacts.read_snapshots(
+            at(folder, artifacts.SNAPSHOTS_FILE, data).parent
+        ),
         _snapshot_seeds,
         mutate_zip,
     ),
@@ -297,10 +359,12 @@ RECORDS = [
 
 ROOT = Path(__file__).resolve().parents[2]
 POSES = (
-    b"# a comment\n1.0 0 0 0 0 0 0 1\n3.0,1,2,3,0,0,0,2\n2.0\t1 2 3 0 0 0.6 0.8\n4.0 nan 0 0 0 0 0 1\n5 0 0 0 0 0 0 0\n"
+    b"# a comment\n1.0 0 0 0 0 0 0 1\n3.0,1,2,3,0,0,0,2\n2.0\t1 2 3 0 0 0.6 0.8\n"
+    b"4.0 nan 0 0 0 0 0 1\n5 0 0 0 0 0 0 0\n"
 )
 LIST = (
-    b"# timestamp filename\n1.000000 rgb/1.png\n2.000000 rgb/2.png\n1.5 rgb/3.png\n2.0 rgb/4.png\nnan rgb/5.png\n3.0\n"
+    b"# timestamp filename\n1.000000 rgb/1.png\n2.000000 rgb/2.png\n1.5 rgb/3.png\n"
+    b"2.0 rgb/4.png\nnan rgb/5.png\n3.0\n"
 )
 PAIRS = b"1.0 rgb/1.png 1.01 depth/1.png\n2.0 rgb/2.png 2.01 depth/2.png\n1.0 rgb/3.png 1.0 depth/3.png\n"
 CAMERA_FILE = (
@@ -352,10 +416,14 @@ def _read_folder(data: bytes | None, folder: Path) -> None:
         at(folder, f"rgb/{name}", _PNG)
         at(folder, f"depth/{name}", _DEPTH)
     sequence = reader.RecordedSequence(
-        folder, layouts.read_tum(folder, 30.0), Camera(8, 8, 8.0, 8.0, 4.0, 4.0, depth_factor=5000.0), id="fuzz"
+        folder,
+        layouts.read_tum(folder, 30.0),
+        Camera(8, 8, 8.0, 8.0, 4.0, 4.0, depth_factor=5000.0),
+        id="fuzz",
     )
     files = (*sequence._colour, *sequence._depth)
-    assert files and all((folder / file).resolve().is_relative_to(folder.resolve()) for file in files)
+    assert files
+    assert all((folder / file).resolve().is_relative_to(folder.resolve()) for file in files)
 
 
 def _read_manifest(data: bytes | None, folder: Path) -> None:
@@ -367,7 +435,8 @@ def _read_coco(data: bytes | None, folder: Path) -> None:
     at(folder, "a.png", _PNG)
     at(folder, "b/c.png", _PNG)
     labelled = labelled_images.coco_images(str(at(folder, "annotations.json", data)))
-    assert labelled.name and labelled.version
+    assert labelled.name
+    assert labelled.version
     for index in range(min(len(labelled), 4)):
         labelled[index]
 
@@ -376,7 +445,9 @@ def _read_yolo(data: bytes | None, folder: Path) -> None:
     at(folder, "images/a.png", _PNG)
     at(folder, "labels/a.txt", data)
     labelled = labelled_images.yolo_images(str(folder))
-    assert labelled.name and labelled.version and len(labelled) == 1
+    assert labelled.name
+    assert labelled.version
+    assert len(labelled) == 1
     labelled[0]
 
 
@@ -389,7 +460,9 @@ def _read_answer(text: str) -> None:
 
 def _harmless(text: str) -> None:
     """Whatever a record says, the terminal gets no escape, the file no half character, the path no way out."""
-    assert not set(sanitise.printable(text)) & {chr(code) for code in (*range(9), *range(14, 32), 0x9B, 0x202E)}
+    assert not set(sanitise.printable(text)) & {
+        chr(code) for code in (*range(9), *range(14, 32), 0x9B, 0x202E)
+    }
     str(sanitise.storable({text: [text]})).encode()
     assert "\n" not in cell_text(text)
     if sanitise.is_inside(text):
@@ -426,20 +499,48 @@ TEXTS = [
     ),
     Target(
         "KITTI trajectory",
-        lambda data, folder: read_kitti(at(folder, "poses.txt", data), at(folder, "times.txt", b"0\n0.1\n")),
+        lambda data, folder: read_kitti(
+            at(folder, "poses.txt", data), at(folder, "times.txt", b"0\n0.1\n")
+        ),
         lambda: [
-            *(b"1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 2 0 0 1 3" + b"\n" * ends for ends in (1, 2)),
-            *(b"# none\n\n", b"1 0 0 0 0 1 0 0 0 0 1 x\n", b"1 2 3\n", b"2 0 0 0 0 2 0 0 0 0 2 0\n"),
+            *(
+                b"1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 2 0 0 1 3" + b"\n" * ends
+                for ends in (1, 2)
+            ),
+            *(
+                b"# none\n\n",
+                b"1 0 0 0 0 1 0 0 0 0 1 x\n",
+                b"1 2 3\n",
+                b"2 0 0 0 0 2 0 0 0 0 2 0\n",
+            ),
         ],
     ),
-    Target("list of images", lambda data, folder: files.read_image_list(at(folder, "rgb.txt", data)), lambda: [LIST]),
-    Target("associations", lambda data, folder: files.read_associations(at(folder, "a.txt", data)), lambda: [PAIRS]),
+    Target(
+        "list of images",
+        lambda data, folder: files.read_image_list(at(folder, "rgb.txt", data)),
+        lambda: [LIST],
+    ),
+    Target(
+        "associations",
+        lambda data, folder: files.read_associations(at(folder, "a.txt", data)),
+        lambda: [PAIRS],
+    ),
     Target(
         "folder in TUM layout",
         _read_folder,
-        lambda: [LIST, LIST.replace(b"rgb/2", b"../2"), PAIRS, POSES, PAIRS.replace(b"rgb/2", b"../2")],
+        lambda: [
+            LIST,
+            LIST.replace(b"rgb/2", b"../2"),
+            PAIRS,
+            POSES,
+            PAIRS.replace(b"rgb/2", b"../2"),
+        ],
     ),
-    Target("manifest of a fetch", _read_manifest, lambda: [b"0" * 64 + b"  rgb/1.png\n" + b"1" * 64 + b"  gone.png\n"]),
+    Target(
+        "manifest of a fetch",
+        _read_manifest,
+        lambda: [b"0" * 64 + b"  rgb/1.png\n" + b"1" * 64 + b"  gone.png\n"],
+    ),
     Target(
         "checksums of a bank",
         lambda data, folder: bank.verify(at(folder, bank.SUMS, data).parent),
@@ -448,16 +549,28 @@ TEXTS = [
     Target(
         "manifest of a bank",
         lambda data, folder: bank.read_manifest(at(folder, "m.toml", data)),
-        lambda: [(ROOT / "docs/how-to/authors.toml").read_bytes()[:3000], b"trajectory = [1]\n", b"[[trajectory]]\n"],
+        lambda: [
+            (ROOT / "docs/how-to/authors.toml").read_bytes()[:3000],
+            b"trajectory = [1]\n",
+            b"[[trajectory]]\n",
+        ],
     ),
     Target(
         "camera",
         lambda data, folder: cameras.read_camera(at(folder, "camera.toml", data)).camera(),
-        lambda: [CAMERA_FILE, b'name = "tum-fr1"\n', b'name = "x"\n', b"width = 640\n", b"fps = " + b"[" * 5000],
+        lambda: [
+            CAMERA_FILE,
+            b'name = "tum-fr1"\n',
+            b'name = "x"\n',
+            b"width = 640\n",
+            b"fps = " + b"[" * 5000,
+        ],
     ),
     Target(
         "settings file",
-        lambda data, folder: settings.apply_overrides(FewSettings(), toml.read_settings(at(folder, "s.toml", data))),
+        lambda data, folder: settings.apply_overrides(
+            FewSettings(), toml.read_settings(at(folder, "s.toml", data))
+        ),
         lambda: [
             b"[settings]\n[settings.tracking]\nradius_px = 15\n",
             *(b"a.b = 1\n", b"settings = 3\n", b'tracking.radius_px = "' + b"a" * 300 + b'"\n'),
@@ -466,11 +579,19 @@ TEXTS = [
     ),
     Target(
         "--set",
-        _of_text(lambda text: settings.apply_overrides(FewSettings(), settings.parse_assignments(text.split("\n")))),
+        _of_text(
+            lambda text: settings.apply_overrides(
+                FewSettings(), settings.parse_assignments(text.split("\n"))
+            )
+        ),
         lambda: [
             b"tracking.radius_px=15\ntracking.local_map=all",
             *(b"x=1", b"tracking=1", b"tracking.radius_px.x=1", b"a.b.c=1", b"tracking.x=1"),
-            *(b"tracking.radius_px=[1]", b"tracking.radius_px=" + b"9" * 4999, b"tracking.radius_px"),
+            *(
+                b"tracking.radius_px=[1]",
+                b"tracking.radius_px=" + b"9" * 4999,
+                b"tracking.radius_px",
+            ),
         ],
     ),
     Target(
@@ -482,7 +603,11 @@ TEXTS = [
             b"trackers = 3\n",
         ],
     ),
-    Target("study", lambda data, folder: study_file.read_study(at(folder, "s.toml", data)), _study_texts),
+    Target(
+        "study",
+        lambda data, folder: study_file.read_study(at(folder, "s.toml", data)),
+        _study_texts,
+    ),
     Target(
         "COCO annotations",
         _read_coco,
@@ -490,7 +615,9 @@ TEXTS = [
             json.dumps(COCO).encode(),
             b'{"images": [], "annotations": [], "categories": []}',
             *(
-                json.dumps(COCO | {"annotations": [{**COCO["annotations"][0], "segmentation": odd}]}).encode()
+                json.dumps(
+                    COCO | {"annotations": [{**COCO["annotations"][0], "segmentation": odd}]}
+                ).encode()
                 for odd in (
                     [[1, 2, 1000000000.0, 3, 4, 5]],
                     {"counts": "a", "size": [8, 8]},
@@ -507,7 +634,12 @@ TEXTS = [
     Target(
         "YOLO labels",
         _read_yolo,
-        lambda: [b"0 0.1 0.1 0.9 0.1 0.9 0.9\n56 0 0 1 0 1 1\n\n", b"-1 0 0\n", b"0 nan 0\n", b"0 0 0\n"],
+        lambda: [
+            b"0 0.1 0.1 0.9 0.1 0.9 0.9\n56 0 0 1 0 1 1\n\n",
+            b"-1 0 0\n",
+            b"0 nan 0\n",
+            b"0 0 0\n",
+        ],
     ),
     Target(
         "classes of recorded masks",
@@ -527,7 +659,13 @@ TEXTS = [
                 {"T_world_cam": [2] * 16},
                 {"trajectory": [[1, 0, 0, 0, 0, 0, 0, 9]]},
                 {"trajectory": [[1, 0, 0, 0, 0, 0, 0, 1]] * 2},
-                *({"trajectory": "x"}, {"T_world_cam": "x"}, {"stats": []}, {"state": 3}, {"dynamic_mask": "x"}),
+                *(
+                    {"trajectory": "x"},
+                    {"T_world_cam": "x"},
+                    {"stats": []},
+                    {"state": 3},
+                    {"dynamic_mask": "x"},
+                ),
             )
         ],
         mutate_json,
@@ -546,7 +684,9 @@ TEXTS = [
             b"https://[x/y",
         ],
     ),
-    Target("names and texts", _of_text(_harmless), lambda: [b"rgb/1.png", "Zoë \x1b[2J\u202e".encode()]),
+    Target(
+        "names and texts", _of_text(_harmless), lambda: [b"rgb/1.png", "Zoë \x1b[2J\u202e".encode()]
+    ),
     Target(
         "ids of sequences",
         _of_text(_ids),
@@ -576,7 +716,8 @@ def _encoded(*suffixes: str, image: np.ndarray | None = None) -> list[bytes]:
 
 
 def _colours() -> list[bytes]:
-    grey, deep = np.full((12, 16), 80, np.uint8), np.full((12, 16, 3), 999, np.uint16)
+    grey = np.full((12, 16), 80, np.uint8)
+    deep = np.full((12, 16, 3), 999, np.uint16)
     return [*_encoded(".png", ".jpg", ".bmp", ".tiff", ".ppm"), *_encoded(".png", image=grey),
             *_encoded(".png", image=np.full((12, 16, 4), 80, np.uint8)), *_encoded(".png", image=deep),
             *_odd_headers()]  # fmt: skip
@@ -588,14 +729,30 @@ def _odd_headers() -> list[bytes]:
     bitmap = b"BM" + bytes(12) + struct.pack("<IHH", 12, 16, 12) + bytes(99)
     jpeg = b"\xff\xd8\xff\xff\xd0\x00\xff\xc0\x00\x11\x08\xff\xff\xff\xff" + bytes(20)
     huge = start + struct.pack(">IIBB", 65535, 60000, 8, 2) + bytes(60) + b"IEND\xaeB`\x82"
-    tiff, pnm = b"II*\0\x08\0\0\0\0\0", b"P5 99999 99999 255\n"
-    return [huge, start[:20], bitmap, b"BM", jpeg, tiff, pnm, b"no image", _encoded(".png")[0][:-20]]
+    tiff = b"II*\0\x08\0\0\0\0\0"
+    pnm = b"P5 99999 99999 255\n"
+    return [
+        huge,
+        start[:20],
+        bitmap,
+        b"BM",
+        jpeg,
+        tiff,
+        pnm,
+        b"no image",
+        _encoded(".png")[0][:-20],
+    ]
 
 
 def _depths() -> list[bytes]:
     deep = np.arange(192, dtype=np.uint16).reshape(12, 16) * 90
     metres = _npy(np.full((12, 16), 1.5, np.float32))
-    return [metres, *_encoded(".png", ".tiff", ".pgm", image=deep), *_encoded(".png", image=deep[:4]), *_colours()]
+    return [
+        metres,
+        *_encoded(".png", ".tiff", ".pgm", image=deep),
+        *_encoded(".png", image=deep[:4]),
+        *_colours(),
+    ]
 
 
 def _npy(array: np.ndarray) -> bytes:
@@ -611,14 +768,16 @@ def _read_colour(data: bytes | None, folder: Path) -> None:
     path = at(folder, "1.png", data)
     images.read_image(path)  # any size
     image = reader.read_colour(path, size=(16, 12), mismatch="but the camera is 16x12")
-    assert image.shape == (12, 16, 3) and image.dtype == np.uint8
+    assert image.shape == (12, 16, 3)
+    assert image.dtype == np.uint8
 
 
 def _read_depth(data: bytes | None, folder: Path) -> None:
     path = at(folder, "1.npy" if data and data.startswith(b"\x93") else "1.png", data)
     reader.read_depth(path, 5000.0, furthest_m=2.0)  # any size
     image = reader.read_depth(path, 5000.0, size=(16, 12), mismatch="but the camera is 16x12")
-    assert image.shape == (12, 16) and image.dtype == np.float32
+    assert image.shape == (12, 16)
+    assert image.dtype == np.float32
 
 
 def _read_mask(data: bytes | None, folder: Path) -> None:
@@ -646,21 +805,32 @@ def _tar(*members: tuple[str, bytes, bytes], form: int = tarfile.GNU_FORMAT) -> 
     with tarfile.open(fileobj=buffer, mode="w", format=form) as tar:
         for name, content, kind in members:
             info = tarfile.TarInfo(name)
-            info.size, info.type = len(content), kind
+            info.size = len(content)
+            info.type = kind
             tar.addfile(info, io.BytesIO(content))
     return buffer.getvalue()
 
 
 def _archives() -> list[bytes]:
-    lines, link = b"1 a\n" * 50, zipfile.ZipInfo("seq/link")
+    lines = b"1 a\n" * 50
+    link = zipfile.ZipInfo("seq/link")
     link.external_attr = 0o120777 << 16
     plain = ("seq/", b"", tarfile.DIRTYPE), ("seq/rgb.txt", lines, tarfile.REGTYPE)
     long = ("seq/" + "n" * 150 + "/" + "m" * 99, b"x", tarfile.REGTYPE)
     packed = zipped({"seq/": b"", "seq/rgb.txt": lines})
     return [
         *(gzip.compress(_tar(*plain), 1), gzip.compress(_tar(*plain), 1)[:-20], _tar(*plain, long)),
-        *(_tar(*plain, long, form=tarfile.PAX_FORMAT), _tar(*plain, *plain), _tar(("seq/link", b"", tarfile.SYMTYPE))),
-        *(_tar(*plain, *plain[1:]), packed, packed.replace(b"1 a", b"1 b", 1), zipped({"../rgb.txt": lines})),
+        *(
+            _tar(*plain, long, form=tarfile.PAX_FORMAT),
+            _tar(*plain, *plain),
+            _tar(("seq/link", b"", tarfile.SYMTYPE)),
+        ),
+        *(
+            _tar(*plain, *plain[1:]),
+            packed,
+            packed.replace(b"1 a", b"1 b", 1),
+            zipped({"../rgb.txt": lines}),
+        ),
         *(zipped({"seq/rgb.txt": lines}, zipfile.ZIP_BZIP2), zipped({link: lines})),
     ]
 
@@ -671,7 +841,9 @@ def _tar_checked(data: bytes, random: Random) -> bytes:
         plain = bytearray(gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data)
     except Exception:  # a seed whose compression is damaged already
         return mutate(data, [data], random)
-    blocks = [at_ for at_ in range(0, len(plain) - 511, 512) if plain[at_ + 257 : at_ + 262] == b"ustar"]
+    blocks = [
+        at_ for at_ in range(0, len(plain) - 511, 512) if plain[at_ + 257 : at_ + 262] == b"ustar"
+    ]
     if not blocks:
         return mutate(data, [data], random)
     start = random.choice(blocks)
@@ -701,16 +873,34 @@ def _checkpoints() -> list[bytes]:
     ours = {"format": loading.FORMAT, "config": SMALL.model_dump_json(), "model": state}
     odd = next(iter(state))
     contents: list[Any] = [
-        *(ours, {"model": state}, state, {}, [1], {"a": 1}, ours | {"config": "{}"}, ours | {"format": "x"}),
-        *(ours | {"model": state | {odd: value}} for value in (torch.zeros(2), torch.zeros(1).expand(10**6, 10**6))),
+        *(
+            ours,
+            {"model": state},
+            state,
+            {},
+            [1],
+            {"a": 1},
+            ours | {"config": "{}"},
+            ours | {"format": "x"},
+        ),
+        *(
+            ours | {"model": state | {odd: value}}
+            for value in (torch.zeros(2), torch.zeros(1).expand(10**6, 10**6))
+        ),
         *(
             ours | {"model": state | {odd: value}}
             for value in (torch.full_like(state[odd], torch.nan), torch.zeros(2).to_sparse())
         ),
-        ours | {"config": SMALL.model_copy(update={"stem": 4096, "channels": 4096}).model_dump_json()},
-        *({"model": {**state, "roi_heads.box_predictor.cls_score.weight": torch.zeros(size, 4)}} for size in (91, 7)),
+        ours
+        | {"config": SMALL.model_copy(update={"stem": 4096, "channels": 4096}).model_dump_json()},
+        *(
+            {"model": {**state, "roi_heads.box_predictor.cls_score.weight": torch.zeros(size, 4)}}
+            for size in (91, 7)
+        ),
     ]
-    stored = [written(lambda file, content=content: torch.save(content, file)) for content in contents]
+    stored = [
+        written(lambda file, content=content: torch.save(content, file)) for content in contents
+    ]
     return [
         *stored,
         written(lambda file: torch.save(ours, file, _use_new_zipfile_serialization=False)),
@@ -786,7 +976,10 @@ BINARIES = [
     Target("rendered frame", _read_rendered, _rendered, mutate_png),
     Target("archive", _extract, _archives, _tar_checked),
     Target(
-        "checkpoint", lambda data, folder: loading.load_network(at(folder, "net.pt", data)), _checkpoints, mutate_zip
+        "checkpoint",
+        lambda data, folder: loading.load_network(at(folder, "net.pt", data)),
+        _checkpoints,
+        mutate_zip,
     ),
     Target(
         "ONNX header",
@@ -814,7 +1007,11 @@ def _files(name: str) -> dict[str, bytes]:
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made) / "s"
         WRITERS[name](folder, random_poses(0), size=SIZE)
-        return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+        return {
+            path.relative_to(folder).as_posix(): path.read_bytes()
+            for path in folder.rglob("*")
+            if path.is_file()
+        }
 
 
 GONE = 128
@@ -828,21 +1025,34 @@ def _attacked(name: str, damaged: tuple[str, ...]) -> Target:
         first = data[0] if data else 0
         for file, content in _files(name).items():
             at(folder, file, content)
-        at(folder, damaged[first % GONE % len(damaged)], None if data is None or first >= GONE else data[1:])
+        at(
+            folder,
+            damaged[first % GONE % len(damaged)],
+            None if data is None or first >= GONE else data[1:],
+        )
         contents = layouts.layout_of(name).read(folder, None)
         sequence = reader.RecordedSequence(
-            folder, contents, Camera(*SIZE, 10.0, 10.0, 8.0, 6.0, depth_factor=1000.0), id="fuzz", any_depth_size=True
+            folder,
+            contents,
+            Camera(*SIZE, 10.0, 10.0, 8.0, 6.0, depth_factor=1000.0),
+            id="fuzz",
+            any_depth_size=True,
         )
         for index in range(min(len(sequence), 3)):
             depth = sequence[index].depth
-            assert np.isfinite(depth).all() and (depth >= 0).all()
+            assert np.isfinite(depth).all()
+            assert (depth >= 0).all()
 
     def seeds() -> list[bytes]:
         found = []
         for which, file in enumerate(damaged):
             content = _files(name).get(file, b"")
             found += [bytes([which]) + content, bytes([which + GONE])]
-            found += [bytes([which]) + re.sub(old, new, content) for place, old, new in ODD[name] if place == file]
+            found += [
+                bytes([which]) + re.sub(old, new, content)
+                for place, old, new in ODD[name]
+                if place == file
+            ]
         return found
 
     return Target(f"layout {name}", read, seeds)
@@ -868,7 +1078,10 @@ SKEWED = (rb"0\.269463", b"5")
 ODD: dict[str, list[tuple[str, bytes, bytes]]] = {
     "eth3d": [],
     "icl-nuim": [],
-    "7-scenes": [("frame-000001.pose.txt", rb"5\.43\S*", b"nan"), ("frame-000001.pose.txt", rb"5\.43\S*", b"7.0")],
+    "7-scenes": [
+        ("frame-000001.pose.txt", rb"5\.43\S*", b"nan"),
+        ("frame-000001.pose.txt", rb"5\.43\S*", b"7.0"),
+    ],
     "tartanair-shibuya": [
         ("depth_0/000001.npy", rb"'<f4'", b"'<U1'"),
         ("depth_0/000001.npy", rb"12, 16", b"16, 12"),
@@ -908,8 +1121,13 @@ ODD: dict[str, list[tuple[str, bytes, bytes]]] = {
 LAYOUTS = [_attacked(name, files) for name, files in DAMAGED.items()]
 
 
-EUROC = (formats.POSE_TABLES["euroc"][1] + "\n1000000000,0,0,0,1,0,0,0\n2000000000,1,2,3,0.5,0.5,0.5,0.5\n").encode()
-VSLAM_LAB = b"ts (ns),tx (m),ty (m),tz (m),qx,qy,qz,qw\n1000000000,0,0,0,0,0,0,1\n2e9,1,2,3,0.6,0,0,0.8\n"
+EUROC = (
+    formats.POSE_TABLES["euroc"][1]
+    + "\n1000000000,0,0,0,1,0,0,0\n2000000000,1,2,3,0.5,0.5,0.5,0.5\n"
+).encode()
+VSLAM_LAB = (
+    b"ts (ns),tx (m),ty (m),tz (m),qx,qy,qz,qw\n1000000000,0,0,0,0,0,0,1\n2e9,1,2,3,0.6,0,0,0.8\n"
+)
 COLMAP = (
     b"# a comment\n1 1 0 0 0 0 0 0 1 rgb/1.5.png\n\n2 0.8 0 0 0.6 1 2 3 1 rgb/2.5.png\n3.0 4.0 -1 5 6 7\n"
     b"3 1 0 0 0 4 5 6 1 c.png\n\n"
@@ -920,14 +1138,18 @@ RGB = b"1.5 rgb/1.5.png\n2.5 rgb/2.5.png\n3.5 c.png\n"
 def _read_colmap(data: bytes | None, folder: Path) -> None:
     """With the stamps in the names, or in a list: a part of the inputs each."""
     at(folder, formats.IMAGES, data)
-    formats.read_trajectory(folder, at(folder, "rgb.txt", RGB) if len(data or b"") % 2 == 0 else None)
+    formats.read_trajectory(
+        folder, at(folder, "rgb.txt", RGB) if len(data or b"") % 2 == 0 else None
+    )
 
 
 def _read_provenance(data: bytes | None, folder: Path) -> None:
     """Asked of the file and of its folder; whatever it says, no other file is looked at, and nothing is raised."""
     at(folder, transfer.PROVENANCE_FILE, data)
     file = at(folder, "trajectory.txt", b"# none\n")
-    assert [asked for asked in (file, folder) if not isinstance(transfer.stated_provenance(asked), str)] == []
+    assert [
+        asked for asked in (file, folder) if not isinstance(transfer.stated_provenance(asked), str)
+    ] == []
 
 
 def _provenances() -> list[bytes]:
@@ -945,7 +1167,9 @@ def _maps() -> list[bytes]:
     with tempfile.TemporaryDirectory() as made:
         path = Path(made) / "map.ply"
         positions = np.random.default_rng(0).normal(size=(4, 3))
-        map_files.write_ply(path, MapOutputs((), np.arange(4), positions, np.zeros((4, 3), np.uint8), np.arange(4)))
+        map_files.write_ply(
+            path, MapOutputs((), np.arange(4), positions, np.zeros((4, 3), np.uint8), np.arange(4))
+        )
         return [path.read_bytes()]
 
 
@@ -991,7 +1215,12 @@ def _map_seeds() -> list[bytes]:
         (map_files.HEADER, np.frombuffer(b"{}", np.uint8)),
     ]  # fmt: skip
     nothing = {name: value[:0] for name, value in sound.items() if name != map_files.HEADER}
-    faulty = [sound, *(sound | {name: value} for name, value in odd), sound | nothing, {"header ": np.zeros(1)}]
+    faulty = [
+        sound,
+        *(sound | {name: value} for name, value in odd),
+        sound | nothing,
+        {"header ": np.zeros(1)},
+    ]
     return [written(lambda file, arrays=arrays: np.savez(file, **arrays)) for arrays in faulty]
 
 
@@ -1014,7 +1243,9 @@ EXCHANGE = [
         lambda: [EUROC, VSLAM_LAB],
     ),
     Target("COLMAP images", _read_colmap, lambda: [COLMAP, COLMAP + b"\n"]),
-    Target("map of points", lambda data, folder: map_files.read_ply(at(folder, "map.ply", data)), _maps),
+    Target(
+        "map of points", lambda data, folder: map_files.read_ply(at(folder, "map.ply", data)), _maps
+    ),
     Target("provenance of an export", _read_provenance, _provenances),
     Target("map of a run", _read_map, _map_seeds, mutate_zip),
 ]

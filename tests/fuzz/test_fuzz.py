@@ -15,7 +15,8 @@ import pytest
 from .mutate import mutate
 from .targets import TARGETS, Target
 
-INPUTS, SEED = int(os.environ.get("FUZZ_INPUTS", "60")), int(os.environ.get("FUZZ_SEED", "0"))
+INPUTS = int(os.environ.get("FUZZ_INPUTS", "60"))
+SEED = int(os.environ.get("FUZZ_SEED", "0"))
 MOST_MB = 512
 """One input may not take more memory than this, whatever it claims to be."""
 MOST_S = 5.0
@@ -38,14 +39,16 @@ def attack(target: Target, inputs: int, seed: int = 0) -> dict[str, bytes | None
     Returns:
         What escaped, with the input, one of a kind.
     """
-    random, corpus = Random(f"{target.name} {seed}"), target.seeds()
+    random = Random(f"{target.name} {seed}")
+    corpus = target.seeds()
     first: list[bytes | None] = [*corpus, None, b"", b"\xff\xfe\x00", b"{}", b"[" * 100_000]
     findings: dict[str, bytes | None] = {}
     peak = _peak_mb()
     for number in range(inputs):
         data = first[number] if number < len(first) else _damaged(target, corpus, random)
         fault = _one(target, data)
-        before, peak = peak, _peak_mb()
+        before = peak
+        peak = _peak_mb()
         if peak - before > MOST_MB:
             fault = f"takes more than {MOST_MB} MB"
         if fault:
@@ -62,11 +65,14 @@ def _damaged(target: Target, corpus: list[bytes], random: Random) -> bytes:
 
 def _one(target: Target, data: bytes | None) -> str:
     """What escaped; empty for nothing."""
-    began, fault = time.process_time(), ""
+    began = time.process_time()
+    fault = ""
     signal.signal(signal.SIGPROF, _hangs)
     signal.setitimer(signal.ITIMER_PROF, HANGS_S)
     try:
-        with tempfile.TemporaryDirectory(prefix="dynslam-fuzz-", dir=_MEMORY, ignore_cleanup_errors=True) as folder:
+        with tempfile.TemporaryDirectory(
+            prefix="dynslam-fuzz-", dir=_MEMORY, ignore_cleanup_errors=True
+        ) as folder:
             target.read(data, Path(folder))
     except target.allowed as error:
         if "\n" in str(error) or len(str(error)) > LONGEST_MESSAGE:

@@ -29,7 +29,15 @@ from dynslam_bench.geometry import (
 from dynslam_bench.geometry.gauss_newton import apply_twist, twist_of
 
 FR1 = Camera(640, 480, 517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
-BONN = Camera(640, 480, 542.822841, 542.57687, 315.59352, 237.756098, (0.039903, -0.099343, -0.00073, -0.000144, 0.0))
+BONN = Camera(
+    640,
+    480,
+    542.822841,
+    542.57687,
+    315.59352,
+    237.756098,
+    (0.039903, -0.099343, -0.00073, -0.000144, 0.0),
+)
 PINHOLE = Camera(640, 480, 535.4, 539.2, 320.1, 247.6)
 
 
@@ -40,7 +48,9 @@ def twists(angle, n=50, seed=0):
     return np.concatenate([rng.normal(0, 2, (n, 3)), phi], axis=1)
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-8, 9e-6, 1.1e-5, 1e-3, 0.5, 2.0, 3.1, np.pi - 1e-6])
+@pytest.mark.parametrize(
+    "angle", [0.0, 1e-12, 1e-8, 9e-6, 1.1e-5, 1e-3, 0.5, 2.0, 3.1, np.pi - 1e-6]
+)
 def test_exp_and_log_are_inverse(angle):
     xi = twists(angle)
     poses = se3.exp(xi)
@@ -68,8 +78,11 @@ def test_inverse_transform_and_hat():
     poses = se3.exp(twists(1.0))
     assert np.allclose(se3.inverse(poses) @ poses, np.eye(4), atol=1e-12)
     points = np.random.default_rng(1).normal(size=(7, 3))
-    assert np.allclose(se3.transform(poses[0], points), [(poses[0] @ np.append(p, 1))[:3] for p in points])
-    a, b = points[:3], points[3:6]
+    assert np.allclose(
+        se3.transform(poses[0], points), [(poses[0] @ np.append(p, 1))[:3] for p in points]
+    )
+    a = points[:3]
+    b = points[3:6]
     assert np.allclose((se3.hat(a) @ b[..., None])[..., 0], np.cross(a, b))
 
 
@@ -87,7 +100,8 @@ def test_quaternions_are_normalised_and_canonical():
     poses = se3.from_quaternion(np.zeros((5, 3)), lengths * [0.1, -0.2, 0.3, -0.4])
     assert np.allclose(poses, poses[0])
     _, again = se3.to_quaternion(poses)
-    assert np.allclose(np.linalg.norm(again, axis=1), 1) and (again[:, 3] > 0).all()
+    assert np.allclose(np.linalg.norm(again, axis=1), 1)
+    assert (again[:, 3] > 0).all()
 
 
 @pytest.mark.parametrize(
@@ -113,7 +127,10 @@ def test_what_is_no_pose(pose):
 
 
 def pixel_grid(camera, border=0.0):
-    u, v = np.meshgrid(np.linspace(border, camera.width - border, 25), np.linspace(border, camera.height - border, 19))
+    u, v = np.meshgrid(
+        np.linspace(border, camera.width - border, 25),
+        np.linspace(border, camera.height - border, 19),
+    )
     return np.stack([u.ravel(), v.ravel()], axis=1)
 
 
@@ -128,7 +145,9 @@ def test_undistort_and_distort_are_inverse(camera):
 @pytest.mark.parametrize("camera", [FR1, BONN], ids=["fr1", "bonn"])
 def test_distortion_is_opencvs(camera):
     points = np.random.default_rng(0).uniform([-0.5, -0.4, 1], [0.5, 0.4, 1], (100, 3))
-    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.distortion))
+    expected, _ = cv2.projectPoints(
+        points, np.zeros(3), np.zeros(3), camera.matrix, np.array(camera.distortion)
+    )
     assert np.allclose(camera.distort_points(camera.project(points)), expected[:, 0], atol=1e-9)
 
 
@@ -140,22 +159,31 @@ def test_project_and_unproject_are_inverse():
     assert np.allclose(PINHOLE.project(points), pixels)
 
 
-@pytest.mark.parametrize(("width", "height"), list(itertools.product((320, 640, 1280), (240, 480, 300))))
+@pytest.mark.parametrize(
+    ("width", "height"), list(itertools.product((320, 640, 1280), (240, 480, 300)))
+)
 def test_resizing_scales_the_intrinsics_with_the_pixels(width, height):
     small = PINHOLE.resized(width, height)
     points = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 5], (20, 3))
-    assert np.allclose(small.project(points), (PINHOLE.project(points) + 0.5) * (width / 640, height / 480) - 0.5)
+    assert np.allclose(
+        small.project(points), (PINHOLE.project(points) + 0.5) * (width / 640, height / 480) - 0.5
+    )
     assert (small.width, small.height) == (width, height)
     back = small.resized(640, 480)
-    assert np.allclose([back.fx, back.fy, back.cx, back.cy], [PINHOLE.fx, PINHOLE.fy, PINHOLE.cx, PINHOLE.cy])
+    assert np.allclose(
+        [back.fx, back.fy, back.cx, back.cy], [PINHOLE.fx, PINHOLE.fy, PINHOLE.cx, PINHOLE.cy]
+    )
 
 
 def test_distortion_does_not_depend_on_the_resolution():
     small = FR1.resized(320, 240)
     pixels = pixel_grid(FR1, border=20)
     half = (pixels + 0.5) / 2 - 0.5
-    assert np.allclose(small.distort_points(half), (FR1.distort_points(pixels) + 0.5) / 2 - 0.5, atol=1e-9)
-    assert not FR1.undistorted().is_distorted and np.array_equal(FR1.undistorted().matrix, FR1.matrix)
+    assert np.allclose(
+        small.distort_points(half), (FR1.distort_points(pixels) + 0.5) / 2 - 0.5, atol=1e-9
+    )
+    assert not FR1.undistorted().is_distorted
+    assert np.array_equal(FR1.undistorted().matrix, FR1.matrix)
 
 
 # -- trajectory
@@ -166,7 +194,12 @@ def test_distortion_does_not_depend_on_the_resolution():
     [
         ([0.0, 1.0], None, 0.0, "2 stamps but 3 poses"),
         ([0.0, 1.0, 1.0], None, 0.0, r"not strictly increasing: 1\.0+ then 1\.0+"),
-        ([0.0, 1.0, 1.0 + 4e-10], None, 0.0, r"increasing in nanoseconds: 1\.000000000 then 1\.000000000"),
+        (
+            [0.0, 1.0, 1.0 + 4e-10],
+            None,
+            0.0,
+            r"increasing in nanoseconds: 1\.000000000 then 1\.000000000",
+        ),
         ([0.0, 1.0, np.nan], None, 0.0, "not finite"),
         ([0.0, 1.0, 2.0], None, np.inf, "not finite"),
         ([0.0, 1.0, 2.0], [10**9], 0.0, "3 stamps but 1 in ns"),
@@ -184,7 +217,8 @@ def test_trajectory_views():
     assert trajectory.select(trajectory.timestamps > 2).timestamps.tolist() == [3.0, 4.0]
     way = sum(np.linalg.norm(b - a) for a, b in itertools.pairwise(trajectory.positions))
     assert trajectory.path_length_m == pytest.approx(way)
-    assert len(trajectory.select(slice(1, 4))) == 3 and trajectory.select(slice(0, 0)).path_length_m == 0
+    assert len(trajectory.select(slice(1, 4))) == 3
+    assert trajectory.select(slice(0, 0)).path_length_m == 0
 
 
 # Stamps: decimal text, nanoseconds and floats are one another's, exactly.
@@ -206,7 +240,14 @@ def poses_at(rows):
 
 
 def test_text_and_nanoseconds_are_one_anothers() -> None:
-    for ns in [0, 1, -1, EUROC, 2**63 - 1, *np.random.default_rng(0).integers(-(2**62), 2**62, 2000).tolist()]:
+    for ns in [
+        0,
+        1,
+        -1,
+        EUROC,
+        2**63 - 1,
+        *np.random.default_rng(0).integers(-(2**62), 2**62, 2000).tolist(),
+    ]:
         text = stamps.format_ns(ns)
         assert stamps.parse_ns(text) == ns == int(Decimal(text).scaleb(9))
 
@@ -228,7 +269,9 @@ def test_further_ways_to_write_a_stamp(text: str, ns: int) -> None:
     assert stamps.parse_ns(text) == ns
 
 
-@pytest.mark.parametrize("text", ["nan", "inf", "", "1.2.3", "1e300", "9300000000.0", "-1e999999", "x"])
+@pytest.mark.parametrize(
+    "text", ["nan", "inf", "", "1.2.3", "1e300", "9300000000.0", "-1e999999", "x"]
+)
 def test_what_is_no_stamp(text: str) -> None:
     with pytest.raises(ValueError, match="is not a number of seconds"):
         stamps.parse_ns(text)
@@ -237,10 +280,16 @@ def test_what_is_no_stamp(text: str) -> None:
 def test_floats_are_those_of_the_text() -> None:
     """So that differences are TUM's and evo's to the last bit."""
     ns = np.random.default_rng(1).integers(0, 2 * 10**18, 20_000)
-    ns = np.concatenate([ns, ns // 10**9, ns // 10**3, np.arange(20_000) * 50_000 + 1_305_031_102_000_000_000])
-    assert stamps.to_seconds(ns).tolist() == [float(stamps.format_ns(stamp)) for stamp in ns.tolist()]
+    ns = np.concatenate(
+        [ns, ns // 10**9, ns // 10**3, np.arange(20_000) * 50_000 + 1_305_031_102_000_000_000]
+    )
+    assert stamps.to_seconds(ns).tolist() == [
+        float(stamps.format_ns(stamp)) for stamp in ns.tolist()
+    ]
     six = [f"{1305031102 + i / 7:.6f}" for i in range(2000)]
-    assert [stamps.format_ns(stamps.ns_of(float(text))) for text in six] == [f"{text}000" for text in six]
+    assert [stamps.format_ns(stamps.ns_of(float(text))) for text in six] == [
+        f"{text}000" for text in six
+    ]
 
 
 def test_files_keep_nanoseconds(tmp_path: Path) -> None:
@@ -248,12 +297,18 @@ def test_files_keep_nanoseconds(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text("".join(f"{text} {POSE}\n" for text in texts))
     read = read_tum(tmp_path / "a.txt")
     write_tum(tmp_path / "b.txt", read.select(slice(3, None)))
-    assert [line.split()[0] for line in (tmp_path / "b.txt").read_text().splitlines()[1:]] == texts[3:]
+    assert [line.split()[0] for line in (tmp_path / "b.txt").read_text().splitlines()[1:]] == texts[
+        3:
+    ]
     write_kitti(tmp_path / "k.txt", read, tmp_path / "times.txt")
     assert (tmp_path / "times.txt").read_text().split() == texts
-    assert read_kitti(tmp_path / "k.txt", tmp_path / "times.txt").timestamps_ns.tolist() == read.timestamps_ns.tolist()
     assert (
-        file_interface.read_tum_trajectory_file(tmp_path / "b.txt").timestamps.tolist() == read.timestamps[3:].tolist()
+        read_kitti(tmp_path / "k.txt", tmp_path / "times.txt").timestamps_ns.tolist()
+        == read.timestamps_ns.tolist()
+    )
+    assert (
+        file_interface.read_tum_trajectory_file(tmp_path / "b.txt").timestamps.tolist()
+        == read.timestamps[3:].tolist()
     )
 
 
@@ -263,14 +318,17 @@ def test_true_poses_that_cannot_be_told_apart_are_refused_with_gap_and_lines(
     tmp_path: Path, start: int, gap: int
 ) -> None:
     rows = [start, start + 2_000_000, start + 1_000_000, start + 1_000_000 + gap]
-    with pytest.raises(TrajectoryError, match=rf"groundtruth\.txt lines 4 and 5: .* {gap} ns apart .*remove"):
+    with pytest.raises(
+        TrajectoryError, match=rf"groundtruth\.txt lines 4 and 5: .* {gap} ns apart .*remove"
+    ):
         load_tum(write(tmp_path, "# a comment\n" + poses_at(rows), "groundtruth.txt"))
 
 
 def test_equal_stamps_and_stamps_a_microsecond_apart_are_read(tmp_path: Path) -> None:
     rows = [EUROC, EUROC, EUROC + 1000, EUROC + 2000]
     file = load_tum(write(tmp_path, poses_at(rows)))
-    assert file.trajectory.timestamps_ns.tolist() == rows[1:] and file.notes.duplicates == 1
+    assert file.trajectory.timestamps_ns.tolist() == rows[1:]
+    assert file.notes.duplicates == 1
 
 
 def test_a_tolerance_is_met_or_missed_as_in_tums_script() -> None:
@@ -279,8 +337,11 @@ def test_a_tolerance_is_met_or_missed_as_in_tums_script() -> None:
     second = [ns + 20_000_000 for ns in first]
     texts = [[stamps.format_ns(ns) for ns in list_] for list_ in (first, second)]
     found, _ = associate(*(stamps.to_seconds(np.array(list_)) for list_ in (first, second)), 0.02)
-    expected = [i for i, (a, b) in enumerate(zip(*texts, strict=True)) if abs(float(a) - float(b)) < 0.02]
-    assert 0 < len(expected) < 300 and found.tolist() == expected
+    expected = [
+        i for i, (a, b) in enumerate(zip(*texts, strict=True)) if abs(float(a) - float(b)) < 0.02
+    ]
+    assert 0 < len(expected) < 300
+    assert found.tolist() == expected
 
 
 # The greedy associator against a slow transcription of the published rule.
@@ -291,7 +352,11 @@ def slow_associate(first, second, max_dt, strict=True):
     pairs = [(abs(a - b), a, b) for a in first for b in second]
     matches = {}
     for dt, a, b in sorted(pairs):
-        if (dt < max_dt or (not strict and dt == max_dt)) and a not in matches and b not in matches.values():
+        if (
+            (dt < max_dt or (not strict and dt == max_dt))
+            and a not in matches
+            and b not in matches.values()
+        ):
             matches[a] = b
     return [(list(first).index(a), list(second).index(b)) for a, b in sorted(matches.items())]
 
@@ -304,19 +369,26 @@ def test_equals_the_slow_rule(seed, strict):
     grid = 0.005 if seed % 2 else 1e-6
     first = np.unique(np.round(1305031102.0 + rng.uniform(0, 2, 60) / 1.0, 6) // grid * grid)
     second = np.unique(np.round(1305031102.0 + rng.uniform(0, 2, 80), 6) // grid * grid)
-    first, second = rng.permutation(first), rng.permutation(second)
+    first = rng.permutation(first)
+    second = rng.permutation(second)
     indices = associate(first, second, 0.02, strict=strict)
-    assert list(zip(*(index.tolist() for index in indices), strict=True)) == slow_associate(first, second, 0.02, strict)
+    assert list(zip(*(index.tolist() for index in indices), strict=True)) == slow_associate(
+        first, second, 0.02, strict
+    )
 
 
 @pytest.mark.parametrize(
     ("first", "second", "max_dt", "strict", "pairs"),
     [
-        *((first, second, 0.02, True, []) for first, second in (([], []), ([1.0], []), ([], [1.0]))),
+        *(
+            (first, second, 0.02, True, [])
+            for first, second in (([], []), ([1.0], []), ([], [1.0]))
+        ),
         ([0.0], [0.5], 0.5, True, []),
         ([0.0], [0.5], 0.5, False, [(0, 0)]),
         ([1.0], [1.0], 0.0, False, [(0, 0)]),
-        ([0.0, 0.010], [0.008], 0.02, True, [(1, 0)]),  # the closer pair wins and the other stamp goes without
+        # the closer pair wins and the other stamp goes without
+        ([0.0, 0.010], [0.008], 0.02, True, [(1, 0)]),
         ([0.008], [0.0, 0.010], 0.02, True, [(0, 1)]),
     ],
 )
@@ -354,7 +426,10 @@ SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 def random_trajectory(n=50, seed=0, start=1305031102.175304):
     rng = np.random.default_rng(seed)
-    return Trajectory(np.round(start + np.cumsum(rng.uniform(0.01, 0.05, n)), 6), se3.exp(rng.normal(0, 1, (n, 6))))
+    return Trajectory(
+        np.round(start + np.cumsum(rng.uniform(0.01, 0.05, n)), 6),
+        se3.exp(rng.normal(0, 1, (n, 6))),
+    )
 
 
 def test_tum_round_trip(tmp_path):
@@ -370,7 +445,9 @@ def test_tum_round_trip(tmp_path):
 
 
 def test_tum_quaternion_order_is_xyzw(tmp_path):
-    pose = read_tum(write(tmp_path, "1.0 0.1 0.2 0.3 0 0 0.7071067811865476 0.7071067811865476\n")).T_world_cam[0]
+    pose = read_tum(
+        write(tmp_path, "1.0 0.1 0.2 0.3 0 0 0.7071067811865476 0.7071067811865476\n")
+    ).T_world_cam[0]
     assert np.allclose(pose[:3], [[0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3]])
 
 
@@ -390,8 +467,16 @@ def test_tum_skips_and_counts_like_the_official_tools(tmp_path):
     assert file.trajectory.timestamps.tolist() == [1.0, 2.0, 3.0]
     assert file.trajectory.positions[:, 0].tolist() == [1.0, 2.0, 9.0]
     assert np.allclose(file.trajectory.T_world_cam[1, :3, :3], np.eye(3))
-    counts = {"lines": 8, "not_finite": 3, "zero_quaternions": 1, "duplicates": 1, "out_of_order": 1, "renormalised": 1}
-    assert file.notes == FileNotes(**counts, back_s=2.0) and len(file.notes.describe()) == 5
+    counts = {
+        "lines": 8,
+        "not_finite": 3,
+        "zero_quaternions": 1,
+        "duplicates": 1,
+        "out_of_order": 1,
+        "renormalised": 1,
+    }
+    assert file.notes == FileNotes(**counts, back_s=2.0)
+    assert len(file.notes.describe()) == 5
 
 
 @pytest.mark.parametrize(
@@ -403,7 +488,10 @@ def test_tum_skips_and_counts_like_the_official_tools(tmp_path):
         ("# c\n1 0 0 x 0 0 0 1\n", "line 2: 'x' is not a number"),
         ("1 0 0 0 0 0 0 0 0 0 0 1\n", "KITTI"),
         ("1305031102.175304 rgb/1305031102.175304.png\n", "list of images"),
-        ("1 nan 0 0 0 0 0 1\n2 0 0 0 0 0 0 0\n", "no valid pose .1 of 2 lines skipped: not finite; 1 of 2"),
+        (
+            "1 nan 0 0 0 0 0 1\n2 0 0 0 0 0 0 0\n",
+            "no valid pose .1 of 2 lines skipped: not finite; 1 of 2",
+        ),
     ],
 )
 def test_tum_bad_files_are_one_clear_line(tmp_path, text, expected):
@@ -415,7 +503,11 @@ def test_tum_bad_files_are_one_clear_line(tmp_path, text, expected):
 
 def test_tum_missing_folder_and_binary_files(tmp_path):
     (tmp_path / "image.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(range(256)))
-    for name, named in (("missing.txt", "No such file"), ("", "directory"), ("image.png", "not a text file")):
+    for name, named in (
+        ("missing.txt", "No such file"),
+        ("", "directory"),
+        ("image.png", "not a text file"),
+    ):
         with pytest.raises(TrajectoryError, match=named):
             read_tum(tmp_path / name)
 
@@ -447,7 +539,9 @@ def test_kitti_bad_files(tmp_path, poses, named):
         read_kitti(write(tmp_path, poses), write(tmp_path, "0.0\n", "times.txt"))
 
 
-@pytest.mark.parametrize("path", sorted(SHARED.glob("*/*/groundtruth.txt")), ids=lambda path: path.parent.name)
+@pytest.mark.parametrize(
+    "path", sorted(SHARED.glob("*/*/groundtruth.txt")), ids=lambda path: path.parent.name
+)
 def test_real_ground_truth_reads_whole(path):
     file = load_tum(path)
     lines = [line for line in path.read_text().splitlines() if line and not line.startswith("#")]

@@ -8,7 +8,14 @@ import pytest
 from evaluation_walks import followed, lap, rows_of
 
 from dynslam_bench.core.errors import TrajectoryError
-from dynslam_bench.geometry import Trajectory, load_tum, read_kitti, read_tum, write_kitti, write_tum
+from dynslam_bench.geometry import (
+    Trajectory,
+    load_tum,
+    read_kitti,
+    read_tum,
+    write_kitti,
+    write_tum,
+)
 from dynslam_bench.geometry.headings import Heading, parse_heading
 from dynslam_bench.geometry.stamp_units import SECONDS, UNITS, are_frame_numbers, unit_of
 
@@ -18,7 +25,10 @@ MS, US, NS = UNITS[1:]
 
 def written(stamps, unit, start=0.0):
     """Stamps in seconds as a file has them in a unit, with all digits."""
-    return [f"{round((start + stamp) * 1e9) / 10 ** (9 - unit.digits):.6f}" for stamp in np.asarray(stamps).tolist()]
+    return [
+        f"{round((start + stamp) * 1e9) / 10 ** (9 - unit.digits):.6f}"
+        for stamp in np.asarray(stamps).tolist()
+    ]
 
 
 # -- the unit of the stamps
@@ -52,7 +62,8 @@ def test_a_single_stamp_of_unix_time_tells_its_unit(unit):
         UNIX + np.arange(20) * 0.5,
         np.array([0.0]),
         np.arange(50.0),  # one pose a second, or frame numbers
-        UNIX + np.cumsum(np.random.default_rng(0).uniform(6, 9, 12)),  # keyframes of a camera that hardly moves
+        # keyframes of a camera that hardly moves
+        UNIX + np.cumsum(np.random.default_rng(0).uniform(6, 9, 12)),
         np.cumsum(np.random.default_rng(1).uniform(6, 9, 5)),
         np.append(0.0, UNIX + np.arange(30) / 30),  # one row without a stamp
     ],
@@ -64,10 +75,19 @@ def test_seconds_are_taken_without_a_word(stamps):
 @pytest.mark.parametrize(
     ("step", "named"),
     [
-        (100 / 3, "33.3333 apart by the median: milliseconds (30 Hz) or seconds (one pose in 33.3 s)?"),
+        (
+            100 / 3,
+            "33.3333 apart by the median: milliseconds (30 Hz) or seconds (one pose in 33.3 s)?",
+        ),
         (50.0, "50 apart by the median: milliseconds (20 Hz) or seconds (one pose in 50 s)?"),
-        (1000.0, "1000 apart by the median: milliseconds (one pose in 1 s) or microseconds (1e+03 Hz)?"),
-        (2e6, "2000000 apart by the median: microseconds (one pose in 2 s) or nanoseconds (500 Hz)?"),
+        (
+            1000.0,
+            "1000 apart by the median: milliseconds (one pose in 1 s) or microseconds (1e+03 Hz)?",
+        ),
+        (
+            2e6,
+            "2000000 apart by the median: microseconds (one pose in 2 s) or nanoseconds (500 Hz)?",
+        ),
     ],
 )
 def test_where_two_units_are_possible_both_are_named_and_what_decides(step, named):
@@ -94,7 +114,8 @@ def test_stamps_of_no_unit_are_refused(stamps, hint):
 @pytest.mark.parametrize(("unit", "scale"), [(NS, 1.0), (SECONDS, 1e9), (MS, 1e12)])
 def test_a_heading_that_contradicts_the_stamps_is_refused_with_both(unit, scale):
     with pytest.raises(
-        TrajectoryError, match=f"the heading of x says {unit.name}, but its stamps .* apart by the median"
+        TrajectoryError,
+        match=f"the heading of x says {unit.name}, but its stamps .* apart by the median",
     ):
         unit_of(scale * np.arange(30) / 30, "x", unit)
 
@@ -111,16 +132,23 @@ def test_frame_numbers_are_whole_and_no_unix_time():
 @pytest.mark.parametrize("start", [0.0, UNIX])
 def test_files_in_other_units_are_read_to_the_last_digit(tmp_path, unit, start):
     truth = lap()
-    texts = [f"{round((start + stamp) * 1e9) // 10 ** (9 - unit.digits)}" for stamp in truth.timestamps.tolist()]
+    texts = [
+        f"{round((start + stamp) * 1e9) // 10 ** (9 - unit.digits)}"
+        for stamp in truth.timestamps.tolist()
+    ]
     text = rows_of(truth, texts)
     (tmp_path / "a.txt").write_text(text)
     if unit is MS and not start:
-        with pytest.raises(TrajectoryError, match=r"milliseconds \(30\.3 Hz\) or seconds") as caught:
+        with pytest.raises(
+            TrajectoryError, match=r"milliseconds \(30\.3 Hz\) or seconds"
+        ) as caught:
             load_tum(tmp_path / "a.txt")
         # the cure: the heading that the hint shows
         (tmp_path / "a.txt").write_text(re.search("'(#.*)'", caught.value.hint)[1] + "\n" + text)
     file = load_tum(tmp_path / "a.txt")
-    assert file.trajectory.timestamps_ns.tolist() == [int(stamp) * 10 ** (9 - unit.digits) for stamp in texts]
+    assert file.trajectory.timestamps_ns.tolist() == [
+        int(stamp) * 10 ** (9 - unit.digits) for stamp in texts
+    ]
     assert np.allclose(file.trajectory.positions, truth.positions, atol=1e-8)
 
 
@@ -134,7 +162,9 @@ def test_the_other_cures_of_a_unit_work_as_well(tmp_path):
     ):
         (tmp_path / "a.txt").write_text(f"{heading}\n# timestamp tx ty tz qx qy qz qw\n{text}")
         step = 33.333333 if "[s]" in heading else 0.033333
-        assert np.median(np.diff(read_tum(tmp_path / "a.txt").timestamps)) == pytest.approx(step, rel=1e-4)
+        assert np.median(np.diff(read_tum(tmp_path / "a.txt").timestamps)) == pytest.approx(
+            step, rel=1e-4
+        )
     (tmp_path / "a.txt").write_text(rows_of(truth, written(truth.timestamps, SECONDS)))
     assert load_tum(tmp_path / "a.txt").notes.describe() == []
 
@@ -175,7 +205,8 @@ def test_stamps_that_lost_their_digits_are_told_and_the_cure_works(tmp_path, for
     stamps = (UNIX + truth.timestamps).tolist()
     (tmp_path / "a.txt").write_text(rows_of(truth, map(form, stamps)))
     with pytest.raises(
-        TrajectoryError, match=f"{repeats} of 150 lines of .*a.txt repeat the stamp .*digits were lost"
+        TrajectoryError,
+        match=f"{repeats} of 150 lines of .*a.txt repeat the stamp .*digits were lost",
     ) as caught:
         read_tum(tmp_path / "a.txt")
     assert "%.9f" in caught.value.hint
@@ -214,7 +245,10 @@ def test_lines_that_are_written_twice_lost_nothing(tmp_path):
     [
         ("# timestamp tx ty tz qx qy qz qw", Heading(8, (0, 1, 2, 3, 4, 5, 6, 7), None)),
         ("timestamp,tx,ty,tz,qx,qy,qz,qw", Heading(8, (0, 1, 2, 3, 4, 5, 6, 7), None)),
-        ("#timestamp [s],p_x,p_y,p_z,q_w,q_x,q_y,q_z", Heading(8, (0, 1, 2, 3, 5, 6, 7, 4), SECONDS)),
+        (
+            "#timestamp [s],p_x,p_y,p_z,q_w,q_x,q_y,q_z",
+            Heading(8, (0, 1, 2, 3, 5, 6, 7, 4), SECONDS),
+        ),
         ("ts (ns),tx (m),ty (m),tz (m),qx,qy,qz,qw", Heading(8, (0, 1, 2, 3, 4, 5, 6, 7), NS)),
         ("Time_us, qw, qx, qy, qz, X, Y, Z", Heading(8, (0, 5, 6, 7, 2, 3, 4, 1), US)),
         (
@@ -228,7 +262,10 @@ def test_lines_that_are_written_twice_lost_nothing(tmp_path):
         ("# timestamp, position, orientation", None),
         ("timestamp,tx,ty,tz,q0,q1,q2,q3", None),
         (",timestamp,x,y,z,qx,qy,qz,qw", Heading(9, (1, 2, 3, 4, 5, 6, 7, 8), None)),
-        ('frame,"t [s]","x","y","z","qx","qy","qz","qw",', Heading(9, (1, 2, 3, 4, 5, 6, 7, 8), SECONDS)),
+        (
+            'frame,"t [s]","x","y","z","qx","qy","qz","qw",',
+            Heading(9, (1, 2, 3, 4, 5, 6, 7, 8), SECONDS),
+        ),
         ("", None),
     ],
 )
@@ -248,7 +285,9 @@ def test_headings_are_names_of_columns_and_prose_is_none(line, heading):
 )
 def test_a_comment_makes_no_table_of_a_tum_file(tmp_path, comment):
     truth = lap()
-    (tmp_path / "a.txt").write_text(f"{comment}\n{rows_of(truth, written(truth.timestamps, SECONDS, UNIX))}")
+    (tmp_path / "a.txt").write_text(
+        f"{comment}\n{rows_of(truth, written(truth.timestamps, SECONDS, UNIX))}"
+    )
     assert np.allclose(read_tum(tmp_path / "a.txt").T_world_cam, truth.T_world_cam, atol=1e-8)
 
 
@@ -257,7 +296,11 @@ def test_a_comment_makes_no_table_of_a_tum_file(tmp_path, comment):
     [
         ("timestamp,tx,ty,tz,qx,qy,qz,qw", (0, 1, 2, 3, 4, 5, 6), SECONDS),
         ("#timestamp [s],p_x,p_y,p_z,q_w,q_x,q_y,q_z", (0, 1, 2, 6, 3, 4, 5), SECONDS),
-        ("#timestamp,p_RS_R_x,p_RS_R_y,p_RS_R_z,q_RS_w,q_RS_x,q_RS_y,q_RS_z", (0, 1, 2, 6, 3, 4, 5), NS),
+        (
+            "#timestamp,p_RS_R_x,p_RS_R_y,p_RS_R_z,q_RS_w,q_RS_x,q_RS_y,q_RS_z",
+            (0, 1, 2, 6, 3, 4, 5),
+            NS,
+        ),
         ("t,qw,qx,qy,qz,x,y,z", (6, 3, 4, 5, 0, 1, 2), US),
         ("#time [ms],x,y,z,qx,qy,qz,qw", (0, 1, 2, 3, 4, 5, 6), MS),
     ],
@@ -272,11 +315,15 @@ def test_tables_are_read_by_their_headings(tmp_path, heading, order, unit, separ
     assert np.allclose(read.timestamps, UNIX + truth.timestamps, atol=2e-6)
 
 
-@pytest.mark.parametrize("heading", [",timestamp,x,y,z,qx,qy,qz,qw", "frame,time [s],x,y,z,qx,qy,qz,qw"])
+@pytest.mark.parametrize(
+    "heading", [",timestamp,x,y,z,qx,qy,qz,qw", "frame,time [s],x,y,z,qx,qy,qz,qw"]
+)
 def test_a_column_that_numbers_the_rows_is_passed_over(tmp_path, heading):
     truth = lap()
     rows = rows_of(truth, written(truth.timestamps, SECONDS, UNIX), ",").splitlines()
-    (tmp_path / "a.csv").write_text("\n".join([heading, *(f"{number},{row}" for number, row in enumerate(rows))]))
+    (tmp_path / "a.csv").write_text(
+        "\n".join([heading, *(f"{number},{row}" for number, row in enumerate(rows))])
+    )
     read = read_tum(tmp_path / "a.csv")
     assert np.allclose(read.T_world_cam, truth.T_world_cam, atol=1e-8)
     assert np.allclose(read.timestamps, UNIX + truth.timestamps, atol=1e-6)
@@ -295,12 +342,18 @@ def test_a_first_line_that_is_neither_a_pose_nor_a_heading_is_named_and_the_cure
 
 def test_17_columns_need_their_heading(tmp_path):
     truth = lap()
-    rows = rows_of(truth, written(truth.timestamps, NS, UNIX), ",", (0, 1, 2, 6, 3, 4, 5)).splitlines()
+    rows = rows_of(
+        truth, written(truth.timestamps, NS, UNIX), ",", (0, 1, 2, 6, 3, 4, 5)
+    ).splitlines()
     (tmp_path / "a.csv").write_text("".join(f"{row}{',0' * 9}\n" for row in rows))
     with pytest.raises(TrajectoryError, match=r"17 values, not the 8 .*leave its heading in"):
         read_tum(tmp_path / "a.csv")
-    names = "#timestamp,p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
-    others = ",".join(f"{name}_{axis}" for name in ("v_RS_R", "b_w_RS_S", "b_a_RS_S") for axis in "xyz")
+    names = (
+        "#timestamp,p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []"
+    )
+    others = ",".join(
+        f"{name}_{axis}" for name in ("v_RS_R", "b_w_RS_S", "b_a_RS_S") for axis in "xyz"
+    )
     (tmp_path / "a.csv").write_text(f"{names},{others}\n" + (tmp_path / "a.csv").read_text())
     assert np.allclose(read_tum(tmp_path / "a.csv").T_world_cam, truth.T_world_cam, atol=1e-8)
 

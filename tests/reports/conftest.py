@@ -12,7 +12,15 @@ def made(tmp_path_factory):
     """One filled store and its report, made once."""
     root = tmp_path_factory.mktemp("results")
     store = fill(root / "results", seeds=(0, 1))
-    add_run(store, "orb-slam3", "synthetic/walking_xyz", kind="imported", label="ORB-SLAM3", error=0.08, frame_s=None)
+    add_run(
+        store,
+        "orb-slam3",
+        "synthetic/walking_xyz",
+        kind="imported",
+        label="ORB-SLAM3",
+        error=0.08,
+        frame_s=None,
+    )
     return store, build_report(store, root / "report")
 
 

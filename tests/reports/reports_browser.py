@@ -20,7 +20,9 @@ globalThis.choose = (select) => {
 globalThis.slide = (input, value) => { input.value = value; input.dispatchEvent(new Event("input")); };
 """
 AXE = Path(axe_playwright_python.__file__).with_name("axe.min.js")
-needs_browser = pytest.mark.skipif(EXECUTABLE is None, reason=f"no browser is installed: {', '.join(NAMES)}")
+needs_browser = pytest.mark.skipif(
+    EXECUTABLE is None, reason=f"no browser is installed: {', '.join(NAMES)}"
+)
 
 
 OF_THE_DRIVER = ("GL Driver Message", "willReadFrequently", "WebGL")
@@ -36,7 +38,8 @@ class Browser:
     """
 
     def __init__(self, folder):
-        self.faults, self.fetched = [], []
+        self.faults = []
+        self.fetched = []
         self._playwright = sync_playwright().start()
         self._context = self._playwright.chromium.launch_persistent_context(
             folder,
@@ -47,11 +50,15 @@ class Browser:
         self._session = self._context.new_cdp_session(self._page)
         self._page.on("console", self._hear)
         self._page.on("pageerror", lambda error: self.faults.append(str(error)))
-        self._page.on("requestfailed", lambda request: self.faults.append(f"{request.failure} {request.url}"))
+        self._page.on(
+            "requestfailed", lambda request: self.faults.append(f"{request.failure} {request.url}")
+        )
         self._page.on("request", lambda request: self.fetched.append(request.url))
 
     def _hear(self, message):
-        if message.type in ("error", "warning") and not any(word in message.text for word in OF_THE_DRIVER):
+        if message.type in ("error", "warning") and not any(
+            word in message.text for word in OF_THE_DRIVER
+        ):
             self.faults.append(message.text)
 
     def close(self):
@@ -70,7 +77,9 @@ class Browser:
 
     def settle(self):
         """Wait until what was started has been drawn."""
-        self.run("new Promise(done => setTimeout(() => requestAnimationFrame(() => requestAnimationFrame(done)), 150))")
+        self.run(
+            "new Promise(done => setTimeout(() => requestAnimationFrame(() => requestAnimationFrame(done)), 150))"
+        )
 
     def run(self, expression):
         """The value of a JavaScript expression; a promise is waited for."""
@@ -92,8 +101,11 @@ class Browser:
         """What axe-core finds against accessibility: rule, first element, and why."""
         self.run(AXE.read_text(encoding="utf-8") + ";0")
         first = "[rule.id, rule.nodes.length, rule.nodes[0].html.slice(0, 200), rule.nodes[0].failureSummary]"
-        options = "{preload: false, resultTypes: ['violations']}"  # what passes is not described: that takes longest
-        return self.run(f"axe.run({options}).then(({{violations}}) => violations.map((rule) => {first}))")
+        # what passes is not described: that takes longest
+        options = "{preload: false, resultTypes: ['violations']}"
+        return self.run(
+            f"axe.run({options}).then(({{violations}}) => violations.map((rule) => {first}))"
+        )
 
     def prefer(self, scheme):
         """Colour scheme of the system: ``light`` or ``dark``."""

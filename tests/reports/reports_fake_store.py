@@ -15,7 +15,13 @@ from dynslam_bench.geometry import Trajectory, format_tum, from_seconds, se3
 from dynslam_bench.reports import RunRow
 from dynslam_bench.runs.artifacts import SnapshotWriter
 from dynslam_bench.runs.frames import FrameRow, write_csv
-from dynslam_bench.runs.record import IDENTITY_SCHEME, RunRecord, SequenceInfo, StageTime, TrackerInfo
+from dynslam_bench.runs.record import (
+    IDENTITY_SCHEME,
+    RunRecord,
+    SequenceInfo,
+    StageTime,
+    TrackerInfo,
+)
 from dynslam_bench.runs.store import RunStore
 
 LABELS = {
@@ -31,7 +37,8 @@ def truth_of(sequence, n=120):
     """A smooth path at 100 Hz with a hole, different for every sequence."""
     rng = np.random.default_rng(int(hashlib.sha256(sequence.encode()).hexdigest()[:8], 16))
     t = np.arange(3 * n + 6) / 90
-    phase, speed = rng.uniform(0, 6, 6), rng.uniform(0.6, 1.8, 6)
+    phase = rng.uniform(0, 6, 6)
+    speed = rng.uniform(0.6, 1.8, 6)
     twist = np.sin(t[:, None] * speed + phase) * [0.5, 0.4, 0.3, 0.15, 0.15, 0.2]
     stamps = np.round(1000.0 + t, 6)
     keep = (t < 2.0) | (t > 2.3)
@@ -91,9 +98,12 @@ def add_run(
 
     Runs with the same `copy_of` have the same noise: what a deterministic tracker leaves.
     """
-    stamps, truth = stamps_of(n)[offset:], truth_of(sequence, n)
+    stamps = stamps_of(n)[offset:]
+    truth = truth_of(sequence, n)
     n = len(stamps)
-    part = hashlib.sha256(f"{sequence} {content or ''} {frames} {offset or ''}".encode()).hexdigest()[:16]
+    part = hashlib.sha256(
+        f"{sequence} {content or ''} {frames} {offset or ''}".encode()
+    ).hexdigest()[:16]
     store.prepare()
     store.add_sequence(part, from_seconds(stamps.tolist()), truth if ground_truth else None)
     made_of = {"t": tracker, "s": sequence, "seed": seed, "o": overrides or {}, "started": started, "kind": kind,
@@ -105,7 +115,11 @@ def add_run(
     nearest = np.abs(truth.timestamps[:, None] - stamps).argmin(0)
     drift = np.cumsum(rng.normal(0, 1, (n, 6)), axis=0)
     drift = (drift - drift.mean(0)) / drift.std() * error
-    poses = se3.exp(rng.normal(size=6)) @ truth.T_world_cam[nearest] @ se3.exp(drift * [1, 1, 1, 0.3, 0.3, 0.3])
+    poses = (
+        se3.exp(rng.normal(size=6))
+        @ truth.T_world_cam[nearest]
+        @ se3.exp(drift * [1, 1, 1, 0.3, 0.3, 0.3])
+    )
     ended = status in ("ok", "stopped")
     ok = ~np.isin(np.arange(n), lost) & (ended | (np.arange(n) < n // 4))
     record = RunRecord(
@@ -128,12 +142,16 @@ def add_run(
     )  # fmt: skip
     with store.work_folder(run_id) as work:
         if ok.any() and online:
-            (work / "trajectory_online.txt").write_text(format_tum(Trajectory(stamps[ok], poses[ok])))
+            (work / "trajectory_online.txt").write_text(
+                format_tum(Trajectory(stamps[ok], poses[ok]))
+            )
         if final_error is not None:
             kept = ok | final_whole
             better = truth.T_world_cam[nearest] @ se3.exp(drift * final_error / error)
             (work / "trajectory_final.txt").write_text(
-                format_tum(Trajectory(stamps[kept], better[kept]).select(final_frames or slice(None)))
+                format_tum(
+                    Trajectory(stamps[kept], better[kept]).select(final_frames or slice(None))
+                )
             )
         (work / "log.txt").write_text("a log\n")
         store.publish(work, record)
@@ -153,20 +171,32 @@ def add_frames(
     seed=0,
 ):
     """Frames and snapshots as a run would leave them: the error grows with the share of dynamic pixels."""
-    rows, writer, rng = [], SnapshotWriter(folder, count), np.random.default_rng(seed)
+    rows = []
+    writer = SnapshotWriter(folder, count)
+    rng = np.random.default_rng(seed)
     for at in range(count):
         share = at / count
-        error = OnlineSample(trans_m=0.01, rot_deg=0.1, frame_trans_m=0.001 * (1 + 9 * share), frame_rot_deg=0.1)
+        error = OnlineSample(
+            trans_m=0.01, rot_deg=0.1, frame_trans_m=0.001 * (1 + 9 * share), frame_rot_deg=0.1
+        )
         numbers = dict(zip(stats, rng.uniform(0, 1500, len(stats)).tolist(), strict=True))
-        numbers |= {"keypoints": float(features), "culled": 0.4 * features, "mask_fraction": masks * share}
+        numbers |= {
+            "keypoints": float(features),
+            "culled": 0.4 * features,
+            "mask_fraction": masks * share,
+        }
         times = {"read": 0.001, "total": 0.02, "processor": 0.03} | dict.fromkeys(stages, 0.01)
-        outcome = FrameOutcome(at, 1000.01 + at / 30, "ok", np.eye(4), numbers, times, error, -0.001)
+        outcome = FrameOutcome(
+            at, 1000.01 + at / 30, "ok", np.eye(4), numbers, times, error, -0.001
+        )
         rows.append(FrameRow.of(outcome, 0.5, share if exact else None))
         points = rng.uniform(0, size, (features, 2)).astype(np.float32)[:, ::-1]
         mask = np.broadcast_to(np.arange(size[1]) < int(size[1] * share), size)
         kept = np.arange(features) >= 0.4 * features
         writer.add(
-            outcome, np.full((*size, 3), 90, np.uint8), TrackResult(np.eye(4), "ok", numbers, times, mask, points, kept)
+            outcome,
+            np.full((*size, 3), 90, np.uint8),
+            TrackResult(np.eye(4), "ok", numbers, times, mask, points, kept),
         )
     writer.write()
     write_csv(folder / "frames.csv", rows)
@@ -223,7 +253,9 @@ TRACKER = {"label", "provenance", "ranked", "deterministic"}
 
 def row(tracker="a", sequence="s", error=0.1, variant=None, **changes):
     """A row of one run that ended; `variant` holds settings, device and threads."""
-    info, spec = ({name: changes.pop(name) for name in names & set(changes)} for names in (SEQUENCE, TRACKER))
+    info, spec = (
+        {name: changes.pop(name) for name in names & set(changes)} for names in (SEQUENCE, TRACKER)
+    )
     info["block"] = digest([info.get("block") or sequence, changes.get("frames")], 16)
     settings = dict(variant or {})
     changes |= {name: settings.pop(name) for name in ("device", "threads") if name in settings}

@@ -30,7 +30,14 @@ def report(tmp_path_factory):
             final_error=0.004, settings=settings,
         )  # fmt: skip
         add_frames(store.folder(run_id), 40, stats=("keypoints", "inliers"))
-    add_run(store, "elsewhere", "synthetic/walking_xyz", kind="imported", label="Elsewhere", frame_s=None)
+    add_run(
+        store,
+        "elsewhere",
+        "synthetic/walking_xyz",
+        kind="imported",
+        label="Elsewhere",
+        frame_s=None,
+    )
     return build_report(store, root / "report")
 
 
@@ -44,15 +51,23 @@ def browser(tmp_path_factory):
 def numbers_of(report, label, sequence):
     """Numbers of a tracker and of a sequence on the pages."""
     board = page_data(report.html.parent, "board")
-    lists = [each["label"] for each in board["trackers"]], [each["name"] for each in board["sequences"]]
+    lists = (
+        [each["label"] for each in board["trackers"]],
+        [each["name"] for each in board["sequences"]],
+    )
     starts = zip(lists, (label, sequence), strict=True)
-    return tuple(next(at for at, name in enumerate(names) if name.startswith(start)) for names, start in starts)
+    return tuple(
+        next(at for at, name in enumerate(names) if name.startswith(start))
+        for names, start in starts
+    )
 
 
 def run_of(report, label, sequence):
     """Id of the first run of a tracker on a sequence."""
     place = list(numbers_of(report, label, sequence))
-    return next(run[0] for run in page_data(report.html.parent, "board")["runs"] if run[1:3] == place)
+    return next(
+        run[0] for run in page_data(report.html.parent, "board")["runs"] if run[1:3] == place
+    )
 
 
 READY = {
@@ -70,7 +85,8 @@ def open_page(browser, report, page, width=1440, anchor=""):
     if page == "run" and not anchor:
         anchor = f"#{run_of(report, 'Ours', 'toy')}"
     if page == "compare" and not anchor:
-        (a, toy), (b, _) = numbers_of(report, "ORB-SLAM2", "toy"), numbers_of(report, "Ours", "toy")
+        (a, toy) = numbers_of(report, "ORB-SLAM2", "toy")
+        (b, _) = numbers_of(report, "Ours", "toy")
         anchor = f"#a={a}&b={b}&sequence={toy}"
     browser.open(report.html.parent / f"{page}.html", width, anchor=anchor)
     browser.run("all('details').forEach((fold) => { fold.open = true; })")
@@ -81,27 +97,43 @@ def open_page(browser, report, page, width=1440, anchor=""):
 
 @pytest.mark.parametrize("page", READY)
 @pytest.mark.parametrize(("width", "scheme"), [(1440, "light"), (390, "dark")])
-def test_nothing_faults_nothing_is_fetched_all_fits_and_is_accessible(browser, report, page, width, scheme):
+def test_nothing_faults_nothing_is_fetched_all_fits_and_is_accessible(
+    browser, report, page, width, scheme
+):
     browser.prefer(scheme)
     open_page(browser, report, page, width)
     assert browser.faults == []
     folder = report.html.parent.absolute().as_uri()
-    assert browser.fetched and all(url.startswith((folder, "data:", "blob:")) for url in browser.fetched)
+    assert browser.fetched
+    assert all(url.startswith((folder, "data:", "blob:")) for url in browser.fetched)
     assert browser.run("document.documentElement.scrollWidth") == width
-    cut = browser.run("all('.dt-layout-table > div').filter((each) => each.scrollWidth > each.clientWidth + 1).length")
-    assert cut == browser.run("all('.dt-layout-table > .wide').length"), "tables that are cut say so"
+    cut = browser.run(
+        "all('.dt-layout-table > div').filter((each) => each.scrollWidth > each.clientWidth + 1).length"
+    )
+    assert cut == browser.run("all('.dt-layout-table > .wide').length"), (
+        "tables that are cut say so"
+    )
     assert width > 500 or page != "index" or cut
     if page == "run":  # a straight path
         sides = browser.run("Object.values(byId('track')._fullLayout.scene.aspectratio)")
         assert min(sides) > 0.3 * max(sides), "the box of the track fits the view"
-    assert max(browser.run("all('.figure').map((figure) => figure.getBoundingClientRect().right)"), default=0) <= width
+    assert (
+        max(
+            browser.run("all('.figure').map((figure) => figure.getBoundingClientRect().right)"),
+            default=0,
+        )
+        <= width
+    )
     assert browser.violations() == []
     browser.prefer("light")
 
 
 def test_a_page_follows_the_theme_of_the_system(browser, report):
     open_page(browser, report, "run")
-    colours = ["getComputedStyle(document.body).backgroundColor", "byId('time')._fullLayout.font.color"]
+    colours = [
+        "getComputedStyle(document.body).backgroundColor",
+        "byId('time')._fullLayout.font.color",
+    ]
     light = {colour: browser.run(colour) for colour in colours}
     browser.prefer("dark")
     for colour, before in light.items():
@@ -123,7 +155,8 @@ def sort(browser, column):
 def test_the_board_sorts_within_its_groups_and_back(browser, report):
     browser.open(report.html)
     at_first = browser.run(ROWS)
-    assert at_first[-1] == "constant velocity" and len(at_first) == 7
+    assert at_first[-1] == "constant velocity"
+    assert len(at_first) == 7
     assert browser.run("document.documentElement.scrollHeight") <= 4 * 900, "four screens"
     ratio = "select('[data-panel]:not([hidden]) tbody tr.group-0 td.n[data-order]').map((cell) => +cell.dataset.order)"
     orders = []
@@ -132,22 +165,29 @@ def test_the_board_sorts_within_its_groups_and_back(browser, report):
         orders.append((browser.run(ROWS), browser.run("location.hash")))
     assert [address for _, address in orders] == ["#sort=4.asc", "#sort=4.desc", ""]
     ranked = len(browser.run("select('[data-panel]:not([hidden]) tbody tr.group-0')"))
-    assert orders[1][0][:ranked] == orders[0][0][:ranked][::-1] and orders[1][0][-1] == "constant velocity"
-    assert orders[2][0] == at_first and browser.run(ratio)
+    assert orders[1][0][:ranked] == orders[0][0][:ranked][::-1]
+    assert orders[1][0][-1] == "constant velocity"
+    assert orders[2][0] == at_first
+    assert browser.run(ratio)
 
 
 def test_the_view_of_the_board_is_in_the_address(browser, report):
     browser.open(report.html)
     browser.run("all('[data-tab]').find((tab) => tab.dataset.tab === 'high dynamic').click()")
-    browser.run("all('[data-panel]:not([hidden]) input[type=checkbox]').slice(0, 2).forEach((box) => box.click())")
+    browser.run(
+        "all('[data-panel]:not([hidden]) input[type=checkbox]').slice(0, 2).forEach((box) => box.click())"
+    )
     browser.run("""(() => { const search = one('[data-panel]:not([hidden]) .dt-search input');
         search.value = 'slam'; search.dispatchEvent(new Event('input', {bubbles: true})); })()""")
     sort(browser, "tracker")
-    address, rows = browser.run("location.hash"), browser.run(ROWS)
+    address = browser.run("location.hash")
+    rows = browser.run(ROWS)
     assert all(part in address for part in ("tab=high+dynamic", "select=", "q=slam", "sort=3.asc"))
-    assert rows == sorted(rows) and all("slam" in name.lower() for name in rows)
+    assert rows == sorted(rows)
+    assert all("slam" in name.lower() for name in rows)
     browser.open(report.html, anchor=address)
-    assert browser.run(ROWS) == rows and browser.run("all('.headline')[0].textContent").count("high dynamic") == 1
+    assert browser.run(ROWS) == rows
+    assert browser.run("all('.headline')[0].textContent").count("high dynamic") == 1
     assert browser.run("byId('compare').disabled") is False
     browser.run("byId('compare').click()")
     ready = "typeof byId === 'function' && byId('sentence') && byId('sentence').textContent.includes('against')"
@@ -167,8 +207,14 @@ def choose(browser, place, text):
 def test_every_number_can_be_chosen_and_is_that_of_the_runs(browser, report):
     """ATE, relative and rotational errors, absolute and as ratios: each against the CSV of the runs."""
     runs = pd.read_csv(report.csv["runs"])
-    mine = runs[(runs["label"] == "Mask R-CNN (our back end)") & (runs["sequence"] == "synthetic/walking_xyz")]
-    base = runs[(runs["label"] == "ORB-SLAM2 (our back end)") & (runs["sequence"] == "synthetic/walking_xyz")]
+    mine = runs[
+        (runs["label"] == "Mask R-CNN (our back end)")
+        & (runs["sequence"] == "synthetic/walking_xyz")
+    ]
+    base = runs[
+        (runs["label"] == "ORB-SLAM2 (our back end)")
+        & (runs["sequence"] == "synthetic/walking_xyz")
+    ]
     open_page(browser, report, "errors")
     cell = """(() => { const heads = select('#explore-table thead th');
         const at = heads.findIndex((head) => head.textContent.trim().endsWith('walking_xyz'));
@@ -185,13 +231,17 @@ def test_every_number_can_be_chosen_and_is_that_of_the_runs(browser, report):
         choose(browser, "scale", "absolute")
         assert browser.run(cell) == pytest.approx(factor * mine[column].median(), rel=1e-3)
         choose(browser, "scale", "ratio")
-        assert browser.run(cell) == pytest.approx(mine[column].median() / base[column].median(), rel=1e-3)
+        assert browser.run(cell) == pytest.approx(
+            mine[column].median() / base[column].median(), rel=1e-3
+        )
     assert "scale=ratio" in browser.run("location.hash")
     choose(browser, "kind", "static")
     assert browser.run("select('#explore-table thead th').length") == 2
     choose(browser, "kind", "all")
     assert browser.run("select('#explore-table tbody tr').length") == 7
-    assert browser.run("select('#explore-table small').map((each) => each.textContent.trim())") == ["✕1"]
+    assert browser.run("select('#explore-table small').map((each) => each.textContent.trim())") == [
+        "✕1"
+    ]
 
 
 # -- the page of a run
@@ -199,7 +249,8 @@ def test_every_number_can_be_chosen_and_is_that_of_the_runs(browser, report):
 
 def test_picture_track_and_time_move_together(browser, report):
     open_page(browser, report, "run")
-    assert NAME in browser.run("one('h1').textContent") and "amber" in browser.run("byId('verdict').className")
+    assert NAME in browser.run("one('h1').textContent")
+    assert "amber" in browser.run("byId('verdict').className")
     assert "Lost" not in browser.run("byId('verdict').textContent")
     assert "39 of 40" in browser.run("one('main').innerText")
     state = """[one('#picture img').src.split('/').at(-1), +byId('frame').value,
@@ -208,22 +259,34 @@ def test_picture_track_and_time_move_together(browser, report):
     browser.run("(byId('frame').value = 3, byId('frame').oninput())")
     browser.settle()
     moved = browser.run(state)
-    assert moved[1] == 3 and all(a != b for a, b in zip(at_first, moved, strict=True))
-    assert moved[2] == pytest.approx(3 / 30, abs=1e-3) and "frame=3" in browser.run("location.hash")
+    assert moved[1] == 3
+    assert all(a != b for a, b in zip(at_first, moved, strict=True))
+    assert moved[2] == pytest.approx(3 / 30, abs=1e-3)
+    assert "frame=3" in browser.run("location.hash")
     for key, expected in (("ArrowRight", 4), ("ArrowLeft", 3)):
-        browser.run(f"document.body.dispatchEvent(new KeyboardEvent('keydown', {{key: '{key}', bubbles: true}}))")
+        browser.run(
+            f"document.body.dispatchEvent(new KeyboardEvent('keydown', {{key: '{key}', bubbles: true}}))"
+        )
         assert browser.run("+byId('frame').value") == expected
     browser.run("byId('time').emit('plotly_click', {points: [{x: 1.0}]})")
     assert browser.run("+byId('frame').value") == 30
-    browser.run("void Plotly.relayout(byId('time'), {[`shapes[${byId('time').layout.shapes.length - 1}].x0`]: 0.5})")
+    browser.run(
+        "void Plotly.relayout(byId('time'), {[`shapes[${byId('time').layout.shapes.length - 1}].x0`]: 0.5})"
+    )
     browser.settle()
     assert browser.run("+byId('frame').value") == 15, "as by dragging the cursor"
     browser.run("one('#worst button').click()")
     assert browser.run("+byId('frame').value") == 39
-    browser.run("(byId('second').selectedIndex = 1, byId('second').onchange({target: byId('second')}))")
+    browser.run(
+        "(byId('second').selectedIndex = 1, byId('second').onchange({target: byId('second')}))"
+    )
     browser.until("byId('track').data.length === 5")
-    text = browser.run("(all('details').forEach((fold) => { fold.open = true; }), one('main').innerText)")
-    assert "dynslam-bench run ours" in text and "a log" in text and "features.levels" in text
+    text = browser.run(
+        "(all('details').forEach((fold) => { fold.open = true; }), one('main').innerText)"
+    )
+    assert "dynslam-bench run ours" in text
+    assert "a log" in text
+    assert "features.levels" in text
     browser.until("one('#poses .main-svg') && one('#stages .main-svg')")
     assert browser.faults == []
 
@@ -234,10 +297,14 @@ def test_a_failed_run_explains_itself(browser, report):
     browser.run("(byId('run-choice').children[2].selectedIndex = 1)")
     browser.run("byId('run-choice').children[2].dispatchEvent(new Event('change'))")
     browser.until("byId('verdict').classList.contains('red')", tries=100)
-    assert browser.run("byId('verdict').textContent") == "Crashed at 30/120 frames: RuntimeError: the map is empty"
+    assert (
+        browser.run("byId('verdict').textContent")
+        == "Crashed at 30/120 frames: RuntimeError: the map is empty"
+    )
     browser.until("byId('time').layout", tries=100)
     shaded = browser.run("byId('time').layout.shapes[0]")
-    assert shaded["x0"] == pytest.approx(29 / 30, abs=0.05) and shaded["x1"] == pytest.approx(4.0)
+    assert shaded["x0"] == pytest.approx(29 / 30, abs=0.05)
+    assert shaded["x1"] == pytest.approx(4.0)
     failed = browser.run("location.hash")
     browser.open(report.html)
     linked = browser.run("select('#panel-0 td a').find((link) => link.textContent === '7/8').href")
@@ -247,7 +314,11 @@ def test_a_failed_run_explains_itself(browser, report):
 
 
 def test_an_unknown_run_and_a_missing_file_are_said(browser, report):
-    victim = report.html.parent / "data" / f"run-{run_of(report, 'constant', 'synthetic/sitting_xyz')}.js"
+    victim = (
+        report.html.parent
+        / "data"
+        / f"run-{run_of(report, 'constant', 'synthetic/sitting_xyz')}.js"
+    )
     victim.rename(victim.with_suffix(".away"))
     for run_id, said in (
         ("0" * 16, f"There is no run {'0' * 16} in this report."),
@@ -271,18 +342,25 @@ def test_angles_that_only_the_alignment_made_are_not_drawn(store, tmp_path, monk
 def test_of_too_many_runs_some_have_no_page_and_that_is_said(browser, tmp_path):
     store = fill(tmp_path / "results", sequences=["synthetic/walking_xyz"], seeds=(0, 1))
     paths = build_report(store, tmp_path / "report", most_pages=6)
-    pages = {path.stem.removeprefix("run-") for path in (tmp_path / "report" / "data").glob("run-*.js")}
+    pages = {
+        path.stem.removeprefix("run-") for path in (tmp_path / "report" / "data").glob("run-*.js")
+    }
     text = paths.markdown.read_text()
     runs = len(store.ids())
-    assert len(pages) == 6 < runs and f"{runs - 6} of {runs} runs have no pictures" in text
+    assert len(pages) == 6 < runs
+    assert f"{runs - 6} of {runs} runs have no pictures" in text
     assert "--most-pages 6" in (tmp_path / "report" / "reproduce.html").read_text()
     linked = {cell[6] for cell in page_data(tmp_path / "report", "board")["cells"]}
-    assert linked and linked <= pages  # the typical run of every cell comes first
+    # the typical run of every cell comes first
+    assert linked
+    assert linked <= pages
     (pageless, *_) = sorted(set(store.ids()) - pages)
     browser.open(paths.run, anchor=f"#{pageless}")
     browser.until("one('#verdict.amber')")  # what the tables know of it, and where the rest is
     said, title = browser.run("[byId('verdict').textContent, byId('run-title').textContent]")
-    assert pageless in said and "--most-pages" in said and "walking_xyz" in title
+    assert pageless in said
+    assert "--most-pages" in said
+    assert "walking_xyz" in title
 
 
 # -- two trackers, and two results folders
@@ -293,15 +371,19 @@ def test_two_trackers_are_compared_as_in_the_tables(browser, report):
     browser.open(report.html.parent / "compare.html", anchor=f"#a={a}&b={b}")
     browser.until("byId('sentence').textContent.includes('against')", tries=200)
     errors = pd.read_csv(report.csv["per_sequence"], index_col="tracker").filter(like="synthetic")
-    one, other = (errors.loc[f"{name} (our back end)"].astype(float) for name in ("Mask R-CNN", "ORB-SLAM2"))
+    one, other = (
+        errors.loc[f"{name} (our back end)"].astype(float) for name in ("Mask R-CNN", "ORB-SLAM2")
+    )
     gain = 100 * (1 - (one / other).prod() ** (1 / len(one)))
     said = f"{gain:.2g} % less error on 4 sequences, too few scenes to tell."
     assert said in browser.run("byId('sentence').textContent")
     open_page(browser, report, "compare")
-    assert browser.run("byId('pair-title').textContent") == "toy" and browser.run("all('#divided img').length") == 2
+    assert browser.run("byId('pair-title').textContent") == "toy"
+    assert browser.run("all('#divided img').length") == 2
     browser.run("byId('divider').oninput({target: {value: 80}})")
     assert "80%" in browser.run("all('#divided img')[1].style.clipPath")
-    assert browser.run("byId('difference').data.length") == 3 and browser.faults == []
+    assert browser.run("byId('difference').data.length") == 3
+    assert browser.faults == []
 
 
 def test_two_results_folders_are_a_page(browser, tmp_path):
@@ -312,6 +394,8 @@ def test_two_results_folders_are_a_page(browser, tmp_path):
     browser.open(found.page)
     browser.until("one('#dumbbells .main-svg')", tries=200)
     assert browser.run("all('#choice option').length") == 3, "two trackers and the control"
-    browser.run("byId('dumbbells').emit('plotly_click', {points: [{y: byId('dumbbells').data[1].y[0]}]})")
+    browser.run(
+        "byId('dumbbells').emit('plotly_click', {points: [{y: byId('dumbbells').data[1].y[0]}]})"
+    )
     browser.until("one('#difference .main-svg')", tries=200)
     assert browser.faults == []

@@ -63,9 +63,18 @@ def made_elsewhere(code: str = "0", reader: str = RENDERED, **changes: Any) -> d
     return identity | {"source": identity["source"] | {TRACKER: code * 16}}
 
 
-def add(store: RunStore, scene: str, identity: dict[str, Any], result: int = 1, **options: Any) -> str:
+def add(
+    store: RunStore, scene: str, identity: dict[str, Any], result: int = 1, **options: Any
+) -> str:
     """A run of the tracker ``mine``; runs of equal `result` on one scene have equal trajectories."""
-    return add_run(store, "mine", scene, copy_of=result, identity=identity, **({"started": LAST_YEAR} | options))
+    return add_run(
+        store,
+        "mine",
+        scene,
+        copy_of=result,
+        identity=identity,
+        **({"started": LAST_YEAR} | options),
+    )
 
 
 def rows_by_label(board: Board) -> dict[str, list[str]]:
@@ -78,12 +87,15 @@ def ratio_words(store: RunStore, pairs: list[tuple[str, str]]) -> str:
     """What a row says of the errors of some runs over those of others."""
     ratios = []
     for run_id, other_id in pairs:
-        errors = [store.score(store.read(name), PROTOCOL).metrics["ate_rmse_m"] for name in (run_id, other_id)]
+        errors = [
+            store.score(store.read(name), PROTOCOL).metrics["ate_rmse_m"]
+            for name in (run_id, other_id)
+        ]
         ratios.append(errors[0] / errors[1])
     return f"ATE × {geometric_mean(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
 
 
-# -- programs with equal results ---------------------------------------------------------------------------------------
+# -- programs with equal results -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("common", [5, 6])
@@ -102,7 +114,9 @@ def test_programs_with_five_equal_results_share_a_row(store: RunStore, common: i
 
 
 @pytest.mark.parametrize(("common", "words"), [(1, "1 run"), (4, "4 runs")])
-def test_programs_with_four_equal_results_have_a_row_each(store: RunStore, common: int, words: str) -> None:
+def test_programs_with_four_equal_results_have_a_row_each(
+    store: RunStore, common: int, words: str
+) -> None:
     for scene in SCENES[:7]:
         add(store, scene, made_elsewhere())
     for scene in SCENES[:common]:
@@ -119,19 +133,29 @@ def test_programs_with_four_equal_results_have_a_row_each(store: RunStore, commo
 def test_programs_without_a_run_in_common_say_so(store: RunStore) -> None:
     add(store, SCENES[0], made_elsewhere())
     add(store, SCENES[1], made_here())
-    assert rows_by_label(load_board(store)) == {"": [SCENES[1]], "other code: no run in common": [SCENES[0]]}
+    assert rows_by_label(load_board(store)) == {
+        "": [SCENES[1]],
+        "other code: no run in common": [SCENES[0]],
+    }
 
 
 @pytest.mark.parametrize("differing", [1, 3])
-def test_programs_that_differ_have_a_row_each_that_says_by_how_much(store: RunStore, differing: int) -> None:
+def test_programs_that_differ_have_a_row_each_that_says_by_how_much(
+    store: RunStore, differing: int
+) -> None:
     pairs = []
     for at, scene in enumerate(SCENES[:7]):
         changed = {"error": 0.02} if at < differing else {}
-        pairs.append((add(store, scene, made_elsewhere(), **changed), add(store, scene, made_here())))
+        pairs.append(
+            (add(store, scene, made_elsewhere(), **changed), add(store, scene, made_here()))
+        )
     left = add(store, SCENES[7], made_elsewhere())
     verb = "differs" if differing == 1 else "differ"
     words = f"code: {differing} of 7 runs {verb}, {ratio_words(store, pairs)}"
-    assert rows_by_label(load_board(store)) == {"": sorted(SCENES[:7]), f"other {words}": [SCENES[7]]}
+    assert rows_by_label(load_board(store)) == {
+        "": sorted(SCENES[:7]),
+        f"other {words}": [SCENES[7]],
+    }
     store.remove(left)
     assert rows_by_label(load_board(store)) == {f"superseded {words}": sorted(SCENES[:7])}
 
@@ -146,7 +170,9 @@ def test_programs_that_differ_have_a_row_each_that_says_by_how_much(store: RunSt
          "code, libraries and weights"),
     ],
 )  # fmt: skip
-def test_a_row_says_in_what_its_program_differs(store: RunStore, changes: dict[str, Any], words: str) -> None:
+def test_a_row_says_in_what_its_program_differs(
+    store: RunStore, changes: dict[str, Any], words: str
+) -> None:
     add(store, SCENES[0], made_here(weights={"coco": "bbbb"}), started=YESTERDAY)
     add(store, SCENES[1], made_here(weights={"coco": "bbbb"}, **{}) | changes)
     assert f"other {words}: no run in common" in rows_by_label(load_board(store))
@@ -181,7 +207,9 @@ def test_equal_failures_are_no_evidence(store: RunStore) -> None:
         ([1, 2, 3, 4, 5, 1], "2 programs, equal on 5 runs"),
     ],
 )
-def test_copies_of_one_result_under_several_seeds_count_once(store: RunStore, results: list[int], remark: str) -> None:
+def test_copies_of_one_result_under_several_seeds_count_once(
+    store: RunStore, results: list[int], remark: str
+) -> None:
     for seed, result in enumerate(results):
         add(store, SCENES[0], made_elsewhere(), result, seed=seed)
         add(store, SCENES[0], made_here(), result, seed=seed)
@@ -193,11 +221,18 @@ def test_trackers_that_are_not_deterministic_never_share_a_row(store: RunStore) 
     pairs = []
     for scene in SCENES[:7]:
         options: dict[str, Any] = {"deterministic": False}
-        pairs.append((add(store, scene, made_elsewhere(), **options), add(store, scene, made_here(), **options)))
+        pairs.append(
+            (
+                add(store, scene, made_elsewhere(), **options),
+                add(store, scene, made_here(), **options),
+            )
+        )
     add(store, SCENES[7], made_elsewhere(), deterministic=False)
     assert rows_by_label(load_board(store)) == {
         "": sorted(SCENES[:7]),
-        f"other code: not deterministic, 7 runs in common, {ratio_words(store, pairs)}": [SCENES[7]],
+        f"other code: not deterministic, 7 runs in common, {ratio_words(store, pairs)}": [
+            SCENES[7]
+        ],
     }
 
 
@@ -207,7 +242,9 @@ def test_runs_whose_ids_are_not_verified_never_share_a_row(store: RunStore) -> N
         add(store, scene, made_here())
     add(store, SCENES[7], made_here() | {"scheme": IDENTITY_SCHEME - 1}, started=YESTERDAY)
     board = load_board(store)
-    assert {board.labels[run.variant_key] for run in board.rows if not run.is_current} == {"mine · identity unverified"}
+    assert {board.labels[run.variant_key] for run in board.rows if not run.is_current} == {
+        "mine · identity unverified"
+    }
     assert sum(run.is_current for run in board.rows) == 7
 
 
@@ -222,11 +259,15 @@ def test_programs_share_a_row_only_where_all_pairs_agree(store: RunStore) -> Non
         add(store, scene, made_elsewhere("3"), result=2)
     remarks = rows_by_label(load_board(store))
     assert remarks["2 programs, equal on 5 runs"] == sorted(SCENES[:6])
-    (other,) = [remark for remark in remarks if remark.startswith("other code: 1 of 6 runs differs, ATE × ")]
+    (other,) = [
+        remark for remark in remarks if remark.startswith("other code: 1 of 6 runs differs, ATE × ")
+    ]
     assert remarks[other] == [SCENES[6]]
 
 
-def test_programs_that_agree_with_one_another_by_way_of_a_third_share_a_row(store: RunStore) -> None:
+def test_programs_that_agree_with_one_another_by_way_of_a_third_share_a_row(
+    store: RunStore,
+) -> None:
     for scene in SCENES[:5]:
         add(store, scene, made_here())
     for scene in SCENES[:8]:
@@ -239,7 +280,9 @@ def test_programs_that_agree_with_one_another_by_way_of_a_third_share_a_row(stor
     }
 
 
-def test_the_remark_stands_on_the_first_page_and_in_the_tables(store: RunStore, tmp_path: Path) -> None:
+def test_the_remark_stands_on_the_first_page_and_in_the_tables(
+    store: RunStore, tmp_path: Path
+) -> None:
     for scene in SCENES[:6]:
         add(store, scene, made_elsewhere())
     for scene in SCENES[:5]:
@@ -251,18 +294,25 @@ def test_the_remark_stands_on_the_first_page_and_in_the_tables(store: RunStore, 
     assert {line["program_remark"] for line in rows_of(paths.csv["runs"])} == {remark}
 
 
-# -- which program ranks -----------------------------------------------------------------------------------------------
+# -- which program ranks ---------------------------------------------------------------------------
 
 
-def test_the_program_that_is_installed_ranks_though_another_is_newer_by_the_clock(store: RunStore) -> None:
+def test_the_program_that_is_installed_ranks_though_another_is_newer_by_the_clock(
+    store: RunStore,
+) -> None:
     add(store, SCENES[0], made_here(), started=LAST_YEAR)
     add(store, SCENES[1], made_elsewhere(), started=YESTERDAY)
     loaded = load_runs([store], PROTOCOL)
-    assert {run.sequence.id: run.is_current for run in loaded.rows} == {SCENES[0]: True, SCENES[1]: False}
+    assert {run.sequence.id: run.is_current for run in loaded.rows} == {
+        SCENES[0]: True,
+        SCENES[1]: False,
+    }
     assert loaded.not_installed == {}
 
 
-def test_in_a_cell_the_run_of_the_installed_program_counts_though_another_is_newer(store: RunStore) -> None:
+def test_in_a_cell_the_run_of_the_installed_program_counts_though_another_is_newer(
+    store: RunStore,
+) -> None:
     installed = add(store, SCENES[0], made_here(), started=LAST_YEAR)
     add(store, SCENES[0], made_elsewhere(), result=2, started=YESTERDAY)
     loaded = load_runs([store], PROTOCOL)
@@ -286,13 +336,19 @@ def test_a_result_that_came_back_counts_in_place_of_one_between(store: RunStore)
     board = load_board(store)
     assert {run.started for run in board.rows} == {LAST_YEAR}
     (remark,) = rows_by_label(board)
-    assert remark.startswith("2 programs, equal on 5 runs; superseded code: 6 of 6 runs differ, ATE × ")
+    assert remark.startswith(
+        "2 programs, equal on 5 runs; superseded code: 6 of 6 runs differ, ATE × "
+    )
 
 
 @pytest.mark.parametrize(
-    "started", ["2031-01-01T00:00:00+00:00", NEXT_YEAR, "2999-12-31T00:00:00Z"], ids=["2031", "next year", "2999"]
+    "started",
+    ["2031-01-01T00:00:00+00:00", NEXT_YEAR, "2999-12-31T00:00:00Z"],
+    ids=["2031", "next year", "2999"],
 )
-def test_a_start_in_the_future_is_never_preferred_and_is_named(store: RunStore, tmp_path: Path, started: str) -> None:
+def test_a_start_in_the_future_is_never_preferred_and_is_named(
+    store: RunStore, tmp_path: Path, started: str
+) -> None:
     if datetime.now(timezone.utc) >= datetime.fromisoformat(started.replace("Z", "+00:00")):
         pytest.skip("it is no date in the future any more")
     add(store, SCENES[0], made_elsewhere("1"), started=YESTERDAY)
@@ -302,7 +358,10 @@ def test_a_start_in_the_future_is_never_preferred_and_is_named(store: RunStore, 
     assert {run.started: run.is_current for run in loaded.rows} == {YESTERDAY: True, started: False}
     assert {run.run_id for run in loaded.in_future} >= {ahead}
     text = build_report(store, tmp_path / "report").html.read_text()
-    assert "Dated in the future, and so counted as the oldest: mine on synthetic/walking_xyz?scene=" in text
+    assert (
+        "Dated in the future, and so counted as the oldest: mine on synthetic/walking_xyz?scene="
+        in text
+    )
     assert ahead in text
 
 
@@ -329,8 +388,13 @@ def test_where_none_of_several_programs_is_installed_the_newest_ranks_and_the_re
     add(store, SCENES[0], made_elsewhere("1"), started=LAST_YEAR)
     add(store, SCENES[1], made_elsewhere("2"), started=YESTERDAY)
     loaded = load_runs([store], PROTOCOL)
-    assert {run.started: run.is_current for run in loaded.rows} == {LAST_YEAR: False, YESTERDAY: True}
-    assert list(loaded.not_installed.values()) == ["the code of dynslam_bench.trackers.adapters.controls"]
+    assert {run.started: run.is_current for run in loaded.rows} == {
+        LAST_YEAR: False,
+        YESTERDAY: True,
+    }
+    assert list(loaded.not_installed.values()) == [
+        "the code of dynslam_bench.trackers.adapters.controls"
+    ]
     text = build_report(store, tmp_path / "report").markdown.read_text()
     assert "none of several is the one installed here: mine · code " in text
 
@@ -347,7 +411,9 @@ def test_one_program_on_two_kinds_of_sequences_has_one_row(store: RunStore) -> N
     ]
 
 
-def test_programs_elsewhere_are_told_apart_by_the_parts_that_their_sequences_share(store: RunStore) -> None:
+def test_programs_elsewhere_are_told_apart_by_the_parts_that_their_sequences_share(
+    store: RunStore,
+) -> None:
     """A bank: an early program on both kinds of sequences, a late one on one kind only."""
     add(store, SCENES[0], made_elsewhere("1", RENDERED))
     add(store, "tum/a", made_elsewhere("1", RECORDED))
@@ -358,14 +424,22 @@ def test_programs_elsewhere_are_told_apart_by_the_parts_that_their_sequences_sha
 def test_an_import_is_no_program(store: RunStore) -> None:
     for seed in (0, 1):
         add_run(
-            store, "mine", SCENES[0], seed, kind="imported", identity={"scheme": IDENTITY_SCHEME, "file": str(seed)}
+            store,
+            "mine",
+            SCENES[0],
+            seed,
+            kind="imported",
+            identity={"scheme": IDENTITY_SCHEME, "file": str(seed)},
         )
     loaded = load_runs([store], PROTOCOL)
-    assert [(run.is_current, run.program_remark, run.split_by) for run in loaded.rows] == [(True, "", {})] * 2
+    assert [(run.is_current, run.program_remark, run.split_by) for run in loaded.rows] == [
+        (True, "", {})
+    ] * 2
 
 
 def test_results_are_compared_by_the_row_that_ranks(tmp_path: Path) -> None:
-    before, after = RunStore(tmp_path / "before"), RunStore(tmp_path / "after")
+    before = RunStore(tmp_path / "before")
+    after = RunStore(tmp_path / "after")
     add(before, SCENES[0], made_elsewhere(), error=0.08)
     add(after, SCENES[0], made_elsewhere(), error=0.08, seed=1)
     add(after, SCENES[0], made_here(), error=0.01)
@@ -374,7 +448,7 @@ def test_results_are_compared_by_the_row_that_ranks(tmp_path: Path) -> None:
     assert ratio.value < 0.2
 
 
-# -- what is installed -------------------------------------------------------------------------------------------------
+# -- what is installed -----------------------------------------------------------------------------
 
 
 def record_of(identity: dict[str, Any], **changes: Any) -> RunRecord:
@@ -434,13 +508,17 @@ def test_no_plug_in_is_imported_to_tell_whether_it_has_changed(
     monkeypatch.syspath_prepend(tmp_path)
     parts = [part.format(folder=tmp_path)]
     for at, version in enumerate("12"):
-        identity = made_here(parts=parts, source=source_digests(parts), reads={"files": {}}, tracker_version=version)
+        identity = made_here(
+            parts=parts, source=source_digests(parts), reads={"files": {}}, tracker_version=version
+        )
         add(store, SCENES[at], identity)
     build_report(store, tmp_path / "report")
     assert "boards_plugin" not in sys.modules
 
 
-def test_runs_on_rendered_and_recorded_sequences_name_the_same_parts_of_a_tracker(toy_folder: str) -> None:
+def test_runs_on_rendered_and_recorded_sequences_name_the_same_parts_of_a_tracker(
+    toy_folder: str,
+) -> None:
     runs = [
         resolve(RunSpec(tracker="orb-slam2", sequence=sequence))
         for sequence in ("synthetic/walking_xyz?frames=4", toy_folder)
@@ -455,14 +533,18 @@ def test_runs_on_rendered_and_recorded_sequences_name_the_same_parts_of_a_tracke
     assert {*rendered} - shared == {RENDERED}
 
 
-def test_a_report_does_not_say_file_by_file_what_plug_ins_read(store: RunStore, tmp_path: Path) -> None:
+def test_a_report_does_not_say_file_by_file_what_plug_ins_read(
+    store: RunStore, tmp_path: Path
+) -> None:
     add(store, SCENES[0], made_here(reads={"files": {"/home/me/secret.txt": "0" * 64}}))
     paths = build_report(store, tmp_path / "report")
     assert "secret" not in paths.data.read_text()
     assert "reads" not in ReportData.read(paths.data).rows[0].identity
 
 
-def test_choosing_among_many_runs_looks_at_each_program_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_choosing_among_many_runs_looks_at_each_program_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     looked_at = []
     compare_program = Installation._compare
 
@@ -480,11 +562,13 @@ def test_choosing_among_many_runs_looks_at_each_program_once(monkeypatch: pytest
     assert len(looked_at) == 2
 
 
-# -- ids of 20 digits, and of 16 ---------------------------------------------------------------------------------------
+# -- ids of 20 digits, and of 16 -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("run_id", ["0123456789abcdef", "0123456789abcdef0123"])
-def test_pages_lead_to_runs_whose_ids_have_20_digits_or_16(store: RunStore, tmp_path: Path, run_id: str) -> None:
+def test_pages_lead_to_runs_whose_ids_have_20_digits_or_16(
+    store: RunStore, tmp_path: Path, run_id: str
+) -> None:
     add_run(store, "mine", "s/a", run_id=run_id)
     paths = build_report(store, tmp_path / "report")
     folder = paths.html.parent
@@ -504,7 +588,7 @@ def test_imports_of_several_files_have_names_of_their_own(store: RunStore) -> No
     assert sorted(repeats) == ["import 000001", "import 000002"]
 
 
-# -- times of several computers ----------------------------------------------------------------------------------------
+# -- times of several computers --------------------------------------------------------------------
 
 FAST = MACHINE.model_copy(update={"cpu": "Fast CPU"})
 SLOW = MACHINE.model_copy(update={"cpu": "Slow CPU"})
@@ -601,7 +685,11 @@ def test_the_pareto_front_joins_trackers_that_were_timed_on_one_computer() -> No
     front = next(trace for trace in figure.data if trace.name == "Pareto front")
     assert len(front.x) == 2
     assert max(front.x) == pytest.approx(1 / (30 * 0.02), rel=1e-4)
-    assert sorted(trace.name for trace in figure.data if trace.mode == "markers") == ["ONE", "THREE ‖", "TWO"]
+    assert sorted(trace.name for trace in figure.data if trace.mode == "markers") == [
+        "ONE",
+        "THREE ‖",
+        "TWO",
+    ]
 
 
 def test_the_first_page_has_the_time_on_one_computer(store: RunStore, tmp_path: Path) -> None:
@@ -609,7 +697,9 @@ def test_the_first_page_has_the_time_on_one_computer(store: RunStore, tmp_path: 
         add_run(store, "mine", f"s/{at}", machine=FAST, frame_s=0.02)
     add_run(store, "mine", "s/3", machine=SLOW, frame_s=0.9)
     text = build_report(store, tmp_path / "report").html.read_text()
-    assert f'title="20.0 ms on {ON_FAST} (3 runs); 900.0 ms on {ON_SLOW} (1 run)">20.0‖</td>' in text
+    assert (
+        f'title="20.0 ms on {ON_FAST} (3 runs); 900.0 ms on {ON_SLOW} (1 run)">20.0‖</td>' in text
+    )
     assert f"Times are those of {ON_FAST}; ‖ of rows with runs on other computers" in text
 
 

@@ -25,7 +25,12 @@ from dynslam_bench.reports.model.statistics import (
 )
 from dynslam_bench.reports.model.summary import explanation, headline, mean_rank_note
 from dynslam_bench.reports.tables import leaderboard as tables
-from dynslam_bench.reports.tables.leaderboard import false_motion, leaderboard, per_sequence, time_table
+from dynslam_bench.reports.tables.leaderboard import (
+    false_motion,
+    leaderboard,
+    per_sequence,
+    time_table,
+)
 from dynslam_bench.runs import RunStore
 
 LIVE = {"realtime": True, "machine": MACHINE}
@@ -37,23 +42,35 @@ def names(board, keys):
 
 def test_what_is_worse_than_a_static_camera_is_never_first():
     """On the page and on the terminal, though it alone came to its end everywhere, or it alone is there."""
-    rows = [row("bad", s, 2.16) for s in "st"] + [row("still", s, 0.3, provenance="control") for s in "st"]
+    rows = [row("bad", s, 2.16) for s in "st"] + [
+        row("still", s, 0.3, provenance="control") for s in "st"
+    ]
     alone = make_board(rows)
-    assert alone.ranked == [] and names(alone, alone.no_better) == ["bad"]
+    assert alone.ranked == []
+    assert names(alone, alone.no_better) == ["bad"]
     assert names(alone, alone.trackers) == ["still", "bad"]
     board = make_board([*rows, row("good", "s", 0.1), crashed("good", "t")])
     assert names(board, board.trackers) == ["good", "still", "bad"]
     table = leaderboard(board, PROTOCOL)
-    assert {cells[2].text: cells[0].text for cells in table.rows} == {"GOOD": "1", "STILL": "\u2013", "BAD": "\u2013"}
+    assert {cells[2].text: cells[0].text for cells in table.rows} == {
+        "GOOD": "1",
+        "STILL": "\u2013",
+        "BAD": "\u2013",
+    }
     lines = report_table(table, ["#", "tracker"]).splitlines()[1:4]
-    assert [name in line for name, line in zip(("GOOD", "STILL", "BAD"), lines, strict=True)] == [True] * 3
+    assert [name in line for name, line in zip(("GOOD", "STILL", "BAD"), lines, strict=True)] == [
+        True
+    ] * 3
 
 
 @pytest.mark.parametrize(
-    ("s", "t", "ranked"), [(0.1, 0.8, True), (0.2, 0.5, False), (0.3, 0.3, False), (0.29, 0.3, True)]
+    ("s", "t", "ranked"),
+    [(0.1, 0.8, True), (0.2, 0.5, False), (0.3, 0.3, False), (0.29, 0.3, True)],
 )
 def test_worse_than_a_static_camera_is_a_geometric_mean(s, t, ranked):
-    board = make_board([row("one", "s", s), row("one", "t", t), row("best", "s", 0.01), row("best", "t", 0.01)])
+    board = make_board(
+        [row("one", "s", s), row("one", "t", t), row("best", "s", 0.01), row("best", "t", 0.01)]
+    )
     key = next(key for key in board.labels if board.first(key).tracker.id == "one")
     assert board.static_ratio(key) == pytest.approx(np.sqrt(s * t) / 0.3)
     assert (key in board.ranked) == ranked != (key in board.no_better)
@@ -61,55 +78,93 @@ def test_worse_than_a_static_camera_is_a_geometric_mean(s, t, ranked):
 
 def fixed(tracker, error, **changes):
     """A run before a fixed camera, where a static camera has no error."""
-    moved = {"ate_rmse_m": error, "false_motion_max_m": 3 * error, "false_motion_path_m": 90 * error}
-    return row(tracker, "f", error, tags=["fixed-camera"], static_camera_ate_rmse_m=0.0, metrics=moved, **changes)
+    moved = {
+        "ate_rmse_m": error,
+        "false_motion_max_m": 3 * error,
+        "false_motion_path_m": 90 * error,
+    }
+    return row(
+        tracker,
+        "f",
+        error,
+        tags=["fixed-camera"],
+        static_camera_ate_rmse_m=0.0,
+        metrics=moved,
+        **changes,
+    )
 
 
 def test_before_a_fixed_camera_trackers_rank_though_none_is_better_than_not_moving():
     systems = fixed("orb-slam2", 0.05), fixed("good", 0.002), fixed("bad", 0.24)
     board = make_board([*systems, fixed("never", 0.0, provenance="control")])
-    assert names(board, board.ranked) == ["good", "orb-slam2", "bad"] and not board.no_better
-    assert board.groups == {"f": "fixed camera"} and board.static_camera == {"f": 0.0}
+    assert names(board, board.ranked) == ["good", "orb-slam2", "bad"]
+    assert not board.no_better
+    assert board.groups == {"f": "fixed camera"}
+    assert board.static_camera == {"f": 0.0}
     assert "no better" not in per_sequence(board, PROTOCOL).caption.replace("or are no better", "")
-    cells = {line[0].text: [cell.text for cell in line[1:]] for line in false_motion(board, PROTOCOL).rows}
-    assert cells["GOOD"] == ["6.00", "180"] and cells["NEVER"] == ["0", "0"]
+    cells = {
+        line[0].text: [cell.text for cell in line[1:]]
+        for line in false_motion(board, PROTOCOL).rows
+    }
+    assert cells["GOOD"] == ["6.00", "180"]
+    assert cells["NEVER"] == ["0", "0"]
     assert time_table(board) is None, "no percentage of zero"
-    assert make_board([fixed("good", 0.002), fixed("bad", 0.24)]).standings == [], "no ratio to zero either"
+    assert make_board([fixed("good", 0.002), fixed("bad", 0.24)]).standings == [], (
+        "no ratio to zero either"
+    )
 
 
 def test_beside_other_sequences_the_fixed_camera_is_a_category_and_no_yardstick_of_not_moving():
-    rows = [row(name, s, error) for name, error in (("orb-slam2", 0.1), ("good", 0.05)) for s in "st"]
+    rows = [
+        row(name, s, error) for name, error in (("orb-slam2", 0.1), ("good", 0.05)) for s in "st"
+    ]
     board = make_board([*rows, fixed("orb-slam2", 0.05), fixed("good", 0.002)])
     assert names(board, board.ranked) == ["good", "orb-slam2"]
     assert set(category_boards(board)) == {"overall", "fixed camera", "other"}
-    assert [column.name for column in false_motion(board, PROTOCOL).columns] == ["tracker", "farthest", "path"]
+    assert [column.name for column in false_motion(board, PROTOCOL).columns] == [
+        "tracker",
+        "farthest",
+        "path",
+    ]
     assert false_motion(make_board(rows), PROTOCOL) is None
 
 
 def test_who_fails_before_a_fixed_camera_does_not_win_with_an_error_of_zero():
-    gone = fixed("gone", 0.001, status="crashed", n_processed=20, n_tracked=20, coverage=1 / 3, reason="boom")
+    gone = fixed(
+        "gone", 0.001, status="crashed", n_processed=20, n_tracked=20, coverage=1 / 3, reason="boom"
+    )
     board = make_board([fixed("good", 0.002), fixed("orb-slam2", 0.05), gone])
-    assert names(board, board.ranked) == ["good", "orb-slam2"] and gone.score_m is None
+    assert names(board, board.ranked) == ["good", "orb-slam2"]
+    assert gone.score_m is None
     assert cell_of(per_sequence(board, PROTOCOL), "GONE").text == "crashed at 20/60"
 
 
 def test_a_reference_worse_than_a_static_camera_stays_the_reference():
-    board = make_board([row("orb-slam2", s, 0.6) for s in "st"] + [row("good", s, 0.1) for s in "st"])
-    assert names(board, [board.reference]) == ["orb-slam2"] and names(board, board.ranked) == ["good"]
+    board = make_board(
+        [row("orb-slam2", s, 0.6) for s in "st"] + [row("good", s, 0.1) for s in "st"]
+    )
+    assert names(board, [board.reference]) == ["orb-slam2"]
+    assert names(board, board.ranked) == ["good"]
 
 
 def test_real_time_runs_are_shown_apart_and_are_never_the_reference():
     """What they dropped is the machine's doing."""
     slow = [row("orb-slam2", name, 0.01, **LIVE) for name in "stu"]
-    others = [row(tracker, name, error) for tracker, error in (("a", 0.1), ("b", 0.2)) for name in "stu"]
+    others = [
+        row(tracker, name, error) for tracker, error in (("a", 0.1), ("b", 0.2)) for name in "stu"
+    ]
     board = make_board([*others, *slow])
-    assert names(board, board.ranked) == ["a", "b"] and len(board.trackers) == 3 and board.reference is None
+    assert names(board, board.ranked) == ["a", "b"]
+    assert len(board.trackers) == 3
+    assert board.reference is None
     board = make_board([*others, *slow, *(row("orb-slam2", name, 0.05) for name in "stu")])
     (live,) = (key for key in board.labels if board.first(key).realtime)
-    assert names(board, [board.reference]) == ["orb-slam2"] and board.reference != live not in board.ranked
+    assert names(board, [board.reference]) == ["orb-slam2"]
+    assert board.reference != live not in board.ranked
     assert board.labels[board.reference] != board.labels[live]
     alone = make_board([row(name, s, 0.1, **LIVE) for name in ("orb-slam2", "b") for s in "st"])
-    assert len(alone.ranked) == 2 and alone.reference is None
+    assert len(alone.ranked) == 2
+    assert alone.reference is None
 
 
 def mixed(root, trackers):
@@ -126,8 +181,10 @@ def mixed(root, trackers):
 def test_a_protocol_without_scale_leaves_monocular_runs_out_and_counts_them(tmp_path):
     store = mixed(tmp_path / "both", ("orb-slam2", "orb-slam2-mono"))
     metric, scaled = (load_runs([store], get_protocol(name)) for name in ("tum-rgbd/v1", MONOCULAR))
-    assert [row.tracker.id for row in metric.rows] == ["orb-slam2"] and metric.without_scale == 1
-    assert len(scaled.rows) == 2 and not scaled.without_scale
+    assert [row.tracker.id for row in metric.rows] == ["orb-slam2"]
+    assert metric.without_scale == 1
+    assert len(scaled.rows) == 2
+    assert not scaled.without_scale
     assert all(row.metrics["ate_rmse_m"] > 0 for row in scaled.rows)
     with pytest.raises(ReportError, match=f"--protocol {MONOCULAR}"):
         load_runs([mixed(tmp_path / "alone", ("orb-slam2-mono",))], get_protocol("tum-rgbd/v1"))
@@ -140,11 +197,19 @@ def rows_of_truth(sizes, sequences, spread=0.05, seed=0):
     for category, number in sequences.items():
         for i in range(number):
             hardness = rng.uniform(0.02, 0.06)
-            for tracker, by_category in ({"orb-slam2": dict.fromkeys(sequences, 1.0)} | sizes).items():
+            for tracker, by_category in (
+                {"orb-slam2": dict.fromkeys(sequences, 1.0)} | sizes
+            ).items():
                 error = hardness * by_category[category] * np.exp(rng.normal(0, spread))
                 tags = [category, *(["fast"] if i == 0 else [])]
                 rows.append(
-                    row(tracker, f"synthetic/{category}?scene={i}", error, tags=tags, static_camera_ate_rmse_m=1.0)
+                    row(
+                        tracker,
+                        f"synthetic/{category}?scene={i}",
+                        error,
+                        tags=tags,
+                        static_camera_ate_rmse_m=1.0,
+                    )
                 )
     return rows
 
@@ -166,25 +231,38 @@ def test_every_category_has_a_board_and_the_overall_one_is_a_mean_over_what_move
     assert {name: len(part.common) for name, part in boards.items()} == {
         OVERALL: 18, "low dynamic": 6, "high dynamic": 12, "fast": 2,
     }  # fmt: skip
-    ratio = {name: {s.key.split("|")[0]: s.ratio.value for s in part.standings} for name, part in boards.items()}
+    ratio = {
+        name: {s.key.split("|")[0]: s.ratio.value for s in part.standings}
+        for name, part in boards.items()
+    }
     assert ratio["high dynamic"]["masks"] == pytest.approx(0.2, rel=0.05)
     assert ratio["low dynamic"]["masks"] == pytest.approx(1.0, rel=0.05)
     both = ratio["high dynamic"]["masks"] * ratio["low dynamic"]["masks"]
     assert ratio[OVERALL]["masks"] == pytest.approx(np.sqrt(both)), "not the mean over 18 sequences"
-    verdicts = {name: {s.key.split("|")[0]: s.verdict for s in part.standings} for name, part in boards.items()}
+    verdicts = {
+        name: {s.key.split("|")[0]: s.verdict for s in part.standings}
+        for name, part in boards.items()
+    }
     judged = {"masks": "better", "flow": "better", "orb-slam2": "reference", "bad": "worse"}
-    assert verdicts["high dynamic"] == judged and verdicts["low dynamic"]["masks"] == "cannot tell"
+    assert verdicts["high dynamic"] == judged
+    assert verdicts["low dynamic"]["masks"] == "cannot tell"
     assert set(verdicts["fast"].values()) == {"cannot tell", "reference"}, "two sequences"
     assert [column.name for column in tables.category_table(boards).columns] == ["tracker", *boards]
 
 
 def test_the_headline_names_the_best_and_whether_they_can_be_told_apart(boards):
     said = headline(boards["high dynamic"])
-    assert said.startswith("On 12 high dynamic sequences ") and "ORB-SLAM2's error by" in said
-    assert "MASKS" in said and "FLOW" in said and said.endswith("these cannot be told apart.")
+    assert said.startswith("On 12 high dynamic sequences ")
+    assert "ORB-SLAM2's error by" in said
+    assert "MASKS" in said
+    assert "FLOW" in said
+    assert said.endswith("these cannot be told apart.")
     assert "below 5 sequences" in headline(boards["fast"])
     alone = headline(make_board(rows_of_truth({"bad": SIZES["bad"]}, {"high-dynamic": 12})))
-    assert alone == "On 12 high dynamic sequences no tracker is shown to be better than ORB-SLAM2; 1 is worse."
+    assert (
+        alone
+        == "On 12 high dynamic sequences no tracker is shown to be better than ORB-SLAM2; 1 is worse."
+    )
     assert "not as evidence" in explanation(boards["fast"])
     assert "2 are better, 1 is worse" in explanation(boards["high dynamic"])
 
@@ -192,35 +270,46 @@ def test_the_headline_names_the_best_and_whether_they_can_be_told_apart(boards):
 def test_all_pairs_stand_in_a_matrix():
     board = make_board(rows_of_truth(SIZES, {"high-dynamic": 12}))
     pairs = compare_pairs(board, board.ranked)
-    alike = [{board.labels[p.one], board.labels[p.other]} for p in pairs if p.verdict == "cannot tell"]
-    assert len(pairs) == 6 and alike == [{"MASKS", "FLOW"}]
+    alike = [
+        {board.labels[p.one], board.labels[p.other]} for p in pairs if p.verdict == "cannot tell"
+    ]
+    assert len(pairs) == 6
+    assert alike == [{"MASKS", "FLOW"}]
     assert [len(cells) for cells in tables.pair_table(board).rows] == [5] * 4
-    assert "critical" not in mean_rank_note(board) and "Nemenyi" in mean_rank_note(board)
+    assert "critical" not in mean_rank_note(board)
+    assert "Nemenyi" in mean_rank_note(board)
     assert tables.pair_table(make_board(rows_of_truth(SIZES, {"high-dynamic": 4}))) is None
 
 
 def test_two_trackers_side_by_side_have_the_numbers_of_the_board(boards):
     board = boards[OVERALL]
     assert len(set(board.weights.values())) == 2, "the categories have unequal sizes"
-    reference, shown = board.trackers.index(board.reference), ratios_content(board)
+    reference = board.trackers.index(board.reference)
+    shown = ratios_content(board)
     assert len(shown) == len(board.trackers) * (len(board.trackers) - 1) // 2
     for a, b, *ratio, sequences, verdict in (line for line in shown if reference in line[:2]):
         standing = board.placed[board.trackers[b if a == reference else a]]
         value, low, high = ratio if a == reference else (1 / ratio[0], 1 / ratio[2], 1 / ratio[1])
         expected = standing.ratio
-        assert (value, low, high) == pytest.approx((expected.value, expected.low, expected.high), rel=1e-3)
+        assert (value, low, high) == pytest.approx(
+            (expected.value, expected.low, expected.high), rel=1e-3
+        )
         turned = {"better": "worse", "worse": "better"}.get(verdict, verdict)
-        assert standing.verdict == (verdict if a == reference else turned) and sequences == 18
+        assert standing.verdict == (verdict if a == reference else turned)
+        assert sequences == 18
 
 
 def test_exact_masks_are_a_bound_and_never_rank_beside_others():
     rows = rows_of_truth(SIZES, {"high-dynamic": 12})
-    bound_info = dict(variant={"segmentation.source": "oracle"}, tags=["high-dynamic"], segmentation="oracle")
+    bound_info = dict(
+        variant={"segmentation.source": "oracle"}, tags=["high-dynamic"], segmentation="oracle"
+    )
     plain = [other for other in rows if other.tracker.id == "orb-slam2"]
     exact = [row("masks", other.sequence.id, 0.1 * other.score_m, **bound_info) for other in plain]
     board = make_board([*rows, *exact])
     bound = next(key for key in board.labels if "oracle" in key)
-    assert bound not in board.ranked and len(board.ranked) == 4
+    assert bound not in board.ranked
+    assert len(board.ranked) == 4
     assert board.placed[bound].ratio.value == pytest.approx(0.1)
     assert make_board(exact).ranked == [bound], "alone they rank"
 
@@ -228,14 +317,20 @@ def test_exact_masks_are_a_bound_and_never_rank_beside_others():
 def cells(rng, trackers, sequences=6, runs=4, spread=0.1):
     hardness = rng.uniform(0.01, 0.5, sequences)
     return {
-        name: {f"s{i}": list(hardness[i] * size * np.exp(rng.normal(0, spread, runs))) for i in range(sequences)}
+        name: {
+            f"s{i}": list(hardness[i] * size * np.exp(rng.normal(0, spread, runs)))
+            for i in range(sequences)
+        }
         for name, size in trackers.items()
     }
 
 
 def test_ranks_groups_and_mean_ranks():
     data = cells(np.random.default_rng(2), {"best": 0.1, "middle": 0.5, "worst": 5.0}, spread=0.01)
-    places = [(s.key, s.group, s.mean_rank) for s in standings(data, data["middle"], ["worst", "middle", "best"])]
+    places = [
+        (s.key, s.group, s.mean_rank)
+        for s in standings(data, data["middle"], ["worst", "middle", "best"])
+    ]
     assert places == [("best", (1, 1), 1.0), ("middle", (2, 2), 2.0), ("worst", (3, 3), 3.0)]
 
 
@@ -245,7 +340,8 @@ def test_pairs_are_tested_as_scipy_does_and_corrected_together():
     found = separable(logs, np.ones(7))
     p = holm([stats.ttest_rel(logs[a], logs[b]).pvalue for a, b in found])
     assert [p_value for _, p_value in found.values()] == pytest.approx(p)
-    assert [apart for apart, _ in found.values()] == [*(p <= 0.04)] and found["a", "c"][0]
+    assert [apart for apart, _ in found.values()] == [*(p <= 0.04)]
+    assert found["a", "c"][0]
 
 
 def test_equal_trackers_share_their_rank():
@@ -263,7 +359,9 @@ def test_an_error_of_zero_has_a_ratio():
 def test_who_is_better_than_the_reference_is_tested_as_scipy_does_and_corrected_over_the_trackers():
     rng = np.random.default_rng(7)
     base = rng.normal(0, 1, 9)
-    logs = {f"t{i}": base + rng.normal(shift, 0.2, 9) for i, shift in enumerate((-1.0, 0.02, 0.0, 1.0))}
+    logs = {
+        f"t{i}": base + rng.normal(shift, 0.2, 9) for i, shift in enumerate((-1.0, 0.02, 0.0, 1.0))
+    }
     found = verdicts_against(logs | {"ref": base}, base, np.ones(9))
     expected = holm([stats.ttest_rel(log, base).pvalue for log in logs.values()])
     assert [found[key][1] for key in logs] == pytest.approx(expected)
@@ -272,10 +370,13 @@ def test_who_is_better_than_the_reference_is_tested_as_scipy_does_and_corrected_
 
 
 def test_weights_make_categories_count_alike_and_one_sequence_of_many_weights_is_no_evidence():
-    logs = np.concatenate([np.full(2, -1.0), np.full(20, 1.0)]) + np.random.default_rng(8).normal(0, 0.01, 22)
+    logs = np.concatenate([np.full(2, -1.0), np.full(20, 1.0)]) + np.random.default_rng(8).normal(
+        0, 0.01, 22
+    )
     interval = ratio_interval(logs, np.repeat([1 / 2, 1 / 20], [2, 20]))
     assert interval.value == pytest.approx(np.exp((logs[:2].mean() + logs[2:].mean()) / 2))
-    assert interval.low < 0.4 and interval.high > 2.5, "two sequences carry half of the weight"
+    assert interval.low < 0.4, "two sequences carry half of the weight"
+    assert interval.high > 2.5, "two sequences carry half of the weight"
 
 
 def test_nemenyis_differences_are_those_of_scikit_posthocs():
@@ -286,9 +387,12 @@ def test_nemenyis_differences_are_those_of_scikit_posthocs():
     ranks = stats.rankdata(list(logs.values()), axis=0).mean(axis=1)
     apart = np.abs(ranks[:, None] - ranks) > difference
     assert p_value == pytest.approx(stats.friedmanchisquare(*logs.values()).pvalue)
-    assert difference == pytest.approx(2.850 * np.sqrt(6 * 7 / (6 * 10)), rel=1e-3)  # Demsar's table 5
+    # Demsar's table 5
+    assert difference == pytest.approx(2.850 * np.sqrt(6 * 7 / (6 * 10)), rel=1e-3)
     assert mean_rank_test({"0": logs["0"], "1": logs["1"]}) is None
-    assert (apart == (p < 0.05)).all() and apart.any() and not apart.all()
+    assert (apart == (p < 0.05)).all()
+    assert apart.any()
+    assert not apart.all()
 
 
 @pytest.mark.parametrize(
@@ -314,7 +418,8 @@ def test_ratio_is_the_geometric_mean_of_medians():
     data = cells(np.random.default_rng(0), {"a": 0.5, "ref": 1.0})
     (a, ref) = standings(data, data["ref"], ["a", "ref"])
     expected = stats.gmean([np.median(data["a"][s]) / np.median(data["ref"][s]) for s in data["a"]])
-    assert a.ratio.value == pytest.approx(expected) and a.ratio.low < a.ratio.value < a.ratio.high
+    assert a.ratio.value == pytest.approx(expected)
+    assert a.ratio.low < a.ratio.value < a.ratio.high
     assert (ref.ratio.value, ref.ratio.low, ref.ratio.high) == (1, 1, 1)
     places = [(s.key, s.rank, s.wins, s.verdict) for s in (a, ref)]
     assert places == [("a", 1, 6, "better"), ("ref", 2, 0, "cannot tell")]
@@ -324,9 +429,12 @@ def test_ratio_is_the_geometric_mean_of_medians():
 def test_the_interval_of_a_ratio_is_students(weights):
     values = np.random.default_rng(1).normal(-0.3, 0.5, 12)
     found = ratio_interval(np.append(values, np.nan), weights)
-    assert (found.low, found.high) == pytest.approx(np.exp(stats.ttest_1samp(values, 0).confidence_interval(0.95)))
+    assert (found.low, found.high) == pytest.approx(
+        np.exp(stats.ttest_1samp(values, 0).confidence_interval(0.95))
+    )
     few = ratio_interval(values[:4])
-    assert few.value == pytest.approx(np.exp(values[:4].mean())) and np.isnan([few.low, few.high]).all()
+    assert few.value == pytest.approx(np.exp(values[:4].mean()))
+    assert np.isnan([few.low, few.high]).all()
 
 
 def test_below_five_sequences_there_is_one_group_and_from_five_on_clear_differences_show():
@@ -337,7 +445,10 @@ def test_below_five_sequences_there_is_one_group_and_from_five_on_clear_differen
 
 
 def test_a_difference_that_one_sequence_decides_is_none():
-    data = {"a": {f"s{i}": [0.1] for i in range(6)}, "b": {f"s{i}": [0.1] for i in range(5)} | {"s5": [3.0]}}
+    data = {
+        "a": {f"s{i}": [0.1] for i in range(6)},
+        "b": {f"s{i}": [0.1] for i in range(5)} | {"s5": [3.0]},
+    }
     assert [s.group for s in standings(data, data["b"], ["a", "b"])] == [(1, 2), (1, 2)]
 
 
@@ -347,6 +458,7 @@ def test_unranked_and_incomplete_trackers_come_last_and_take_no_rank():
     found = standings(data, data["ref"], ["a", "ref"])
     assert [s.key for s in found] == ["a", "ref", "oracle", "partial"]
     assert [s.rank is None for s in found] == [False, False, True, True]
-    assert found[3].sequences == 1 and found[3].ratio.value == pytest.approx(
+    assert found[3].sequences == 1
+    assert found[3].ratio.value == pytest.approx(
         np.median(data["a"]["s0"]) / np.median(data["ref"]["s0"])
     )

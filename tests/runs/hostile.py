@@ -114,7 +114,9 @@ class Hostile:
 
     def leave_children(self) -> None:
         """One in its own process group, one in a session of its own, one whose parent is gone (a daemon)."""
-        self.note(subprocess.Popen(SLEEPER).pid, subprocess.Popen(SLEEPER, start_new_session=True).pid)
+        self.note(
+            subprocess.Popen(SLEEPER).pid, subprocess.Popen(SLEEPER, start_new_session=True).pid
+        )
         middle = os.fork()
         if middle == 0:
             os.setsid()
@@ -164,7 +166,9 @@ class BlackHater(Hostile):
 
 
 def _spec(name: str) -> TrackerSpec:
-    return TrackerSpec(id=name.lower(), entry_point=f"{__file__}:{name}", label=name, settings=HostileSettings)
+    return TrackerSpec(
+        id=name.lower(), entry_point=f"{__file__}:{name}", label=name, settings=HostileSettings
+    )
 
 
 SPEC = _spec("Hostile")

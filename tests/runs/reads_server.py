@@ -1,6 +1,7 @@
 """Runs functions of plug-ins in forked processes while their reads are recorded, as the fork server does.
 
-Each line of standard input is a job (`Job` in test_runs_reads.py), each line of standard output its outcome.
+Each line of standard input is a job (`Job` in test_runs_reads.py), each line of standard output its
+outcome.
 """
 
 import json
@@ -22,7 +23,9 @@ def record(job, answer):
     sys.path[:0] = job["path"]
     plugin = Path(job["plugin"])
     folder = plugin.parent if plugin.suffix == ".py" else None
-    recorder = ReadRecorder(Anchors(folder, Path(job["work"])), private=[Path(job["private"])], plugins=job["plugins"])
+    recorder = ReadRecorder(
+        Anchors(folder, Path(job["work"])), private=[Path(job["private"])], plugins=job["plugins"]
+    )
     recorder.start()
     module = load_object(f"{plugin}:run").__globals__
     module["run"](**job["arguments"])
@@ -35,7 +38,9 @@ def record(job, answer):
     snapshot = recorder.snapshot()
     reads = recorder.finish()
     forks = list(Path(job["private"]).glob("reads-*"))
-    assert forks or reads.programs or snapshot == digest_of(reads), "the snapshot at the end is another than the result"
+    assert forks or reads.programs or snapshot == digest_of(reads), (
+        "the snapshot at the end is another than the result"
+    )
     answer({"reads": reads.model_dump()})
 
 

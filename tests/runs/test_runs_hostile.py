@@ -21,7 +21,13 @@ from hostile import alive, until
 from dynslam_bench.core import SHARED_MEMORY, InfrastructureError
 from dynslam_bench.runs import Limits, RunRecord, RunSpec, RunStore, run_many, run_one
 from dynslam_bench.runs.process import supervisor as memory_module
-from dynslam_bench.runs.process.fork_server import SERVERS, START_VARIABLE, Child, ForkServer, process_tree
+from dynslam_bench.runs.process.fork_server import (
+    SERVERS,
+    START_VARIABLE,
+    Child,
+    ForkServer,
+    process_tree,
+)
 from dynslam_bench.runs.process.supervisor import ServerDiedError, supervise
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux' subreapers and /proc")
@@ -51,7 +57,11 @@ def attack(store: RunStore, toy_folder: str, tmp_path: Path):
     [
         ("sys.exit", "crashed", "frame 2 of 6: sys.exit(0) was called (hostile.py:"),
         ("os._exit", "crashed", "the process left with exit code 0, after frame 1 of 6"),
-        ("build-os._exit", "crashed", "the process left with exit code 0, before frame 0 was tracked of 6"),
+        (
+            "build-os._exit",
+            "crashed",
+            "the process left with exit code 0, before frame 0 was tracked of 6",
+        ),
         ("hang", "timeout", "no sign of life for 1 s, after frame 1 of 6"),
         ("deaf", "timeout", "no sign of life for 1 s, after frame 1 of 6"),
         ("raise", "crashed", "frame 2 of 6: ValueError: too few points (hostile.py:"),
@@ -60,7 +70,8 @@ def attack(store: RunStore, toy_folder: str, tmp_path: Path):
 )
 def test_every_bad_end_is_one_line(attack, mode: str, status: str, reason: str) -> None:
     record, _ = attack(mode, frame_s=1.0)
-    assert record.status == status and record.reason.startswith(reason), record.reason
+    assert record.status == status, record.reason
+    assert record.reason.startswith(reason), record.reason
     assert "\n" not in record.reason
 
 
@@ -73,7 +84,9 @@ def test_every_bad_end_is_one_line(attack, mode: str, status: str, reason: str) 
         ("fork", "hog-child", {"memory_mb": 1000, "frame_s": 60}, "out-of-memory", 1),
     ],
 )
-def test_nothing_survives_a_run_that_ends_or_is_killed(attack, monkeypatch, start, mode, limits, status, count) -> None:
+def test_nothing_survives_a_run_that_ends_or_is_killed(
+    attack, monkeypatch, start, mode, limits, status, count
+) -> None:
     monkeypatch.setenv(START_VARIABLE, start)
     record, pids = attack(mode, **limits)
     assert (record.status, len(pids), alive(pids)) == (status, count, []), record.reason
@@ -105,8 +118,10 @@ def test_memory_that_forks_share_counts_once(attack) -> None:
     assert plain.peak_memory_mb is not None
     record, pids = attack("shared", memory_mb=plain.peak_memory_mb + 700, frame_s=60)
     assert record.status == "ok", record.reason
-    assert 300 < record.peak_memory_mb - plain.peak_memory_mb < 700  # a fork that ends while it is counted counts twice
-    assert len(pids) == 3 and alive(pids) == []
+    # a fork that ends while it is counted counts twice
+    assert 300 < record.peak_memory_mb - plain.peak_memory_mb < 700
+    assert len(pids) == 3
+    assert alive(pids) == []
 
 
 def test_the_default_memory_limit_is_a_share_of_the_machine(attack, monkeypatch) -> None:
@@ -115,22 +130,30 @@ def test_the_default_memory_limit_is_a_share_of_the_machine(attack, monkeypatch)
         400.0,
         " (by default 80 % of this machine's 1000 MB, shared by 2 runs at a time)",
     )
-    assert memory_module.memory_limit(0) == (None, "") and memory_module.memory_limit(70.0, 4) == (70.0, "")
+    assert memory_module.memory_limit(0) == (None, "")
+    assert memory_module.memory_limit(70.0, 4) == (70.0, "")
     record, _ = attack("hog-child", frame_s=60)
     assert record.status == "out-of-memory"
-    assert "the limit is 800 MB (by default 80 % of this machine's 1000 MB), after frame 1 of 6" in record.reason
+    assert (
+        "the limit is 800 MB (by default 80 % of this machine's 1000 MB), after frame 1 of 6"
+        in record.reason
+    )
 
 
 def test_a_flooded_log_keeps_its_ends(attack, store: RunStore) -> None:
     record, _ = attack("flood")
     log = (store.folder(record.run_id) / "log.txt").read_bytes()
-    assert record.status == "ok" and len(log) < 600_000
-    assert log.startswith(b"the first line") and log.endswith(b"the last line\n")
+    assert record.status == "ok"
+    assert len(log) < 600_000
+    assert log.startswith(b"the first line")
+    assert log.endswith(b"the last line\n")
     assert log.count(b"was cut here") == 1
 
 
 @linux
-def test_the_parent_ends_and_all_end_with_it(store: RunStore, toy_folder: str, tmp_path: Path) -> None:
+def test_the_parent_ends_and_all_end_with_it(
+    store: RunStore, toy_folder: str, tmp_path: Path
+) -> None:
     """The program is killed in mid-run, without a chance to clean up."""
     here = Path(hostile.__file__).parent
     settings = {"mode": "hog-child", "pids": str(tmp_path / "pids")}
@@ -142,7 +165,9 @@ def test_the_parent_ends_and_all_end_with_it(store: RunStore, toy_folder: str, t
         "run_one(spec, store)\n"
     )
     parent = subprocess.Popen([sys.executable, "-c", script], cwd=tmp_path)
-    until(lambda: (tmp_path / "pids").is_file() and (tmp_path / "pids").read_text().endswith("\n"), 60)
+    until(
+        lambda: (tmp_path / "pids").is_file() and (tmp_path / "pids").read_text().endswith("\n"), 60
+    )
     pids = [int(line) for line in (tmp_path / "pids").read_text().split()]
     assert alive(pids) == pids
     parent.kill()
@@ -183,7 +208,12 @@ def strays(tmp_path: Path, toy_folder: str):
     """A run of a foreign program that hangs on frame 2, with children that hide; and the file with their numbers."""
     (tmp_path / "strays.py").write_text(STRAYS)
     command = shlex.join([sys.executable, str(tmp_path / "strays.py"), str(tmp_path / "pids")])
-    spec = RunSpec(tracker=f"subprocess:{command}", sequence=toy_folder, frames=(0, 6), limits=Limits(frame_s=60))
+    spec = RunSpec(
+        tracker=f"subprocess:{command}",
+        sequence=toy_folder,
+        frames=(0, 6),
+        limits=Limits(frame_s=60),
+    )
     return spec, tmp_path / "pids"
 
 
@@ -194,7 +224,9 @@ def started(pids: Path, count: int) -> list[int]:
 
 
 @linux
-def test_a_killed_server_takes_everything_along_and_its_run_is_repeated(strays, store: RunStore, monkeypatch) -> None:
+def test_a_killed_server_takes_everything_along_and_its_run_is_repeated(
+    strays, store: RunStore, monkeypatch
+) -> None:
     """Nothing is left of either try; the second server dies with this run alone, which is taken for the cause."""
     spec, pids = strays
     trees: list[set[int]] = []
@@ -205,7 +237,8 @@ def test_a_killed_server_takes_everything_along_and_its_run_is_repeated(strays, 
         return tree
 
     monkeypatch.setattr(memory_module, "process_tree", look)
-    monkeypatch.setenv(START_VARIABLE, "fresh")  # a server that loads nothing is there again at once
+    # a server that loads nothing is there again at once
+    monkeypatch.setenv(START_VARIABLE, "fresh")
     with ThreadPoolExecutor(1) as pool:
         run = pool.submit(run_one, spec, store)
         for turn in (1, 2):
@@ -217,7 +250,9 @@ def test_a_killed_server_takes_everything_along_and_its_run_is_repeated(strays, 
         record = run.result()
     assert len(seen) == 8
     assert record.status == "crashed"
-    assert record.reason.startswith("the fork server was killed twice, the second time with this run alone, ")
+    assert record.reason.startswith(
+        "the fork server was killed twice, the second time with this run alone, "
+    )
     assert [path.name for path in store.runs.iterdir()] == [record.run_id]
 
 
@@ -239,7 +274,9 @@ def test_a_server_that_dies_before_the_run_begins_is_no_outcome(
 
     monkeypatch.setenv(START_VARIABLE, "fresh")
     monkeypatch.setattr("dynslam_bench.runs.running.supervise", dies)
-    with pytest.raises(InfrastructureError, match="the fork server was ended from outside") as raised:
+    with pytest.raises(
+        InfrastructureError, match="the fork server was ended from outside"
+    ) as raised:
         run_one(hostile_spec(toy_folder, "ok"), store)
     assert len(tries) == 2
     assert raised.value.hint == "the run is not stored; the same command goes on from there"
@@ -285,7 +322,8 @@ def test_the_number_of_a_process_that_has_ended_is_not_killed(is_told: bool) -> 
 def test_a_foreign_program_ends_with_its_limit_however_it_hides(strays, store: RunStore) -> None:
     spec, pids = strays
     record = run_one(spec.model_copy(update={"limits": Limits(frame_s=1.0)}), store)
-    assert record.status == "timeout" and len(started(pids, 4)) == 4
+    assert record.status == "timeout"
+    assert len(started(pids, 4)) == 4
     assert alive(started(pids, 4)) == []
 
 
@@ -302,8 +340,10 @@ def test_shared_memory_goes_with_a_run_that_is_killed(strays, store: RunStore) -
 
     record = run_many([spec], results=store, cancelled=look)[0]
     frame = Path(frames.read_text())
-    assert record.status == "stopped" and seen == [True]
-    assert frame.is_relative_to(SHARED_MEMORY) and not frame.parent.exists()
+    assert record.status == "stopped"
+    assert seen == [True]
+    assert frame.is_relative_to(SHARED_MEMORY)
+    assert not frame.parent.exists()
 
 
 @pytest.mark.parametrize(
@@ -317,7 +357,9 @@ def test_shared_memory_goes_with_a_run_that_is_killed(strays, store: RunStore) -
         ("log-gone", "was removed"),
     ],
 )
-def test_a_full_disk_or_a_removed_folder_is_no_outcome(mode: str, words: str, store: RunStore, toy_folder: str) -> None:
+def test_a_full_disk_or_a_removed_folder_is_no_outcome(
+    mode: str, words: str, store: RunStore, toy_folder: str
+) -> None:
     settings = {"mode": mode, "pids": str(store.root)}
     spec = RunSpec(tracker=hostile.TARGET, sequence=toy_folder, frames=(0, 6), settings=settings)
     with pytest.raises(InfrastructureError, match=words):
@@ -326,7 +368,13 @@ def test_a_full_disk_or_a_removed_folder_is_no_outcome(mode: str, words: str, st
 
 
 def hostile_spec(toy_folder: str, mode: str, **changes: object) -> RunSpec:
-    return RunSpec(tracker=hostile.TARGET, sequence=toy_folder, frames=(0, 6), settings={"mode": mode}, **changes)
+    return RunSpec(
+        tracker=hostile.TARGET,
+        sequence=toy_folder,
+        frames=(0, 6),
+        settings={"mode": mode},
+        **changes,
+    )
 
 
 @pytest.mark.parametrize("mode", ["kill-parent", "end-parents-group"])
@@ -336,16 +384,21 @@ def test_a_tracker_may_not_end_the_processes_above_it(attack, mode: str) -> None
     before = server._running
     record, _ = attack(mode)
     assert record.status == "crashed"
-    assert record.reason.startswith("frame 2 of 6: PermissionError: [Errno 1] a run may not signal process")
+    assert record.reason.startswith(
+        "frame 2 of 6: PermissionError: [Errno 1] a run may not signal process"
+    )
     assert "(hostile.py:" in record.reason
-    assert server._running == before and before[1].poll() is None
+    assert server._running == before
+    assert before[1].poll() is None
 
 
 def test_a_tracker_may_ask_whether_the_processes_above_it_are_there(attack) -> None:
     assert attack("ask-parent")[0].status == "ok"
 
 
-def test_a_tracker_may_not_end_the_program(store: RunStore, toy_folder: str, tmp_path: Path) -> None:
+def test_a_tracker_may_not_end_the_program(
+    store: RunStore, toy_folder: str, tmp_path: Path
+) -> None:
     """The program is a process of its own here: it would be this one that is killed."""
     here = Path(hostile.__file__).parent
     spec = hostile_spec(toy_folder, "kill-program").model_dump_json()
@@ -354,7 +407,9 @@ def test_a_tracker_may_not_end_the_program(store: RunStore, toy_folder: str, tmp
         "from dynslam_bench.runs import RunSpec, RunStore, run_one\n"
         f"print(run_one(RunSpec.model_validate_json({spec!r}), RunStore({str(store.root)!r})).reason)\n"
     )
-    program = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True)
+    program = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True
+    )
     assert program.returncode == 0, program.stderr
     assert program.stdout.startswith("frame 2 of 6: AccessDenied")
 
@@ -398,7 +453,8 @@ def test_a_run_that_kills_the_fork_server_costs_itself_alone(
     store: RunStore, toy_folder: str, monkeypatch: pytest.MonkeyPatch, mode: str
 ) -> None:
     """Runs beside it are repeated; it is repeated once, with nothing beside it, and has crashed."""
-    monkeypatch.setenv(START_VARIABLE, "fresh")  # a server that loads nothing is there again at once
+    # a server that loads nothing is there again at once
+    monkeypatch.setenv(START_VARIABLE, "fresh")
     others = [hostile_spec(toy_folder, "ok", seed=seed) for seed in range(4)]
     specs = [others[0], hostile_spec(toy_folder, mode), *others[1:]]
     records = list(run_many(specs, results=store, jobs=3))
@@ -416,7 +472,8 @@ def test_a_run_that_kills_the_fork_server_costs_itself_alone(
 class _Slow:
     """A child that is ready late, as when the fork server still loads; then it does nothing."""
 
-    pid, lost = 0, ""
+    pid = 0
+    lost = ""
 
     def __init__(self, ready_after_s: float) -> None:
         self.connection, self.theirs = Pipe()
@@ -441,7 +498,8 @@ class _Slow:
 
 def test_the_time_limit_begins_when_the_run_does(tmp_path: Path) -> None:
     began = time.monotonic()
-    assert supervise(_Slow(1.0), {}, Limits(time_s=0.5)).status == "timeout" and time.monotonic() - began > 1.5
+    assert supervise(_Slow(1.0), {}, Limits(time_s=0.5)).status == "timeout"
+    assert time.monotonic() - began > 1.5
     with pytest.raises(InfrastructureError, match=r"no process for the run within 0\.3 s"):
         supervise(_Slow(60), {}, Limits(time_s=0.1, start_s=0.3))
 
@@ -455,15 +513,24 @@ def test_several_on_one_folder_share_the_work_and_without_locks_lose_nothing(
 
     if not has_locks:
         monkeypatch.setattr("fcntl.flock", flock)  # as on some network file systems
-    specs = [RunSpec(tracker="never-move", sequence=toy_folder, frames=(0, 4), stride=s) for s in (1, 2, 3)]
+    specs = [
+        RunSpec(tracker="never-move", sequence=toy_folder, frames=(0, 4), stride=s)
+        for s in (1, 2, 3)
+    ]
     made: list[str] = []
 
     def bench(_: int) -> list[RunRecord]:
-        events = {"on_event": lambda event: made.append(event.run_id) if event.kind == "finished" else None}
+        events = {
+            "on_event": lambda event: (
+                made.append(event.run_id) if event.kind == "finished" else None
+            )
+        }
         return list(run_many(specs, results=RunStore(store.root), **events))
 
     with ThreadPoolExecutor(3) as pool:
         first, second, third = pool.map(bench, range(3))
-    assert {record.status for record in first} == {"ok"} and len(set(made)) == len(store.ids()) == 3
+    assert {record.status for record in first} == {"ok"}
+    assert len(set(made)) == len(store.ids()) == 3
     assert not has_locks or (len(made) == 3 and first == second == third)
-    assert store.all()[1] == [] and not list(store.runs.glob(".*"))
+    assert store.all()[1] == []
+    assert not list(store.runs.glob(".*"))

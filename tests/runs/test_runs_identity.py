@@ -59,7 +59,8 @@ def edit(path: Path, old: str, new: str) -> Callable[[], None]:
     def change() -> None:
         stat = path.stat()
         text = path.read_text()
-        assert old in text and len(old) == len(new)
+        assert old in text
+        assert len(old) == len(new)
         path.write_text(text.replace(old, new))
         os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
 
@@ -107,7 +108,9 @@ def a_plug_in(tmp_path: Path, source: str = PLUGIN) -> tuple[RunSpec, Path]:
     }
     for name, text in files.items():
         write(folder / name, text)
-    return RunSpec(tracker=f"{folder / 'mine.py'}:SPEC", sequence=str(write_folder(tmp_path / "toy", 4))), folder
+    return RunSpec(
+        tracker=f"{folder / 'mine.py'}:SPEC", sequence=str(write_folder(tmp_path / "toy", 4))
+    ), folder
 
 
 def made_again(spec: RunSpec, store: RunStore, change: Callable[[], object]) -> bool:
@@ -219,7 +222,9 @@ def test_a_plug_in_that_is_only_listed_is_imported_by_nobody(
     monkeypatch.setenv("DYNSLAM_BENCH_PLUGINS", f"{other}:SPEC")
     TRACKERS.refresh()
     try:
-        records = run_many([spec, RunSpec(tracker="never-move", sequence=spec.sequence)], results=store)
+        records = run_many(
+            [spec, RunSpec(tracker="never-move", sequence=spec.sequence)], results=store
+        )
         store.frame()
     finally:
         TRACKERS.refresh()
@@ -280,7 +285,9 @@ def a_program(tmp_path: Path) -> Path:
         ("./script", "part.py", "1", "2"),
     ],
 )
-def test_a_changed_program_is_another_run(command: str, file: str, old: str, new: str, tmp_path: Path) -> None:
+def test_a_changed_program_is_another_run(
+    command: str, file: str, old: str, new: str, tmp_path: Path
+) -> None:
     folder = a_program(tmp_path)
     spec = RunSpec(
         tracker=f"subprocess:{command.format(python=sys.executable)}",
@@ -290,21 +297,30 @@ def test_a_changed_program_is_another_run(command: str, file: str, old: str, new
     assert makes_another_run(spec, edit(folder / file, old, new))
 
 
-@pytest.mark.skipif(shutil.which("gcc") is None or shutil.which("ldd") is None, reason="needs gcc and ldd")
+@pytest.mark.skipif(
+    shutil.which("gcc") is None or shutil.which("ldd") is None, reason="needs gcc and ldd"
+)
 def test_a_rebuilt_shared_library_is_another_run(tmp_path: Path) -> None:
     folder = tmp_path / "native"
     write(folder / "part.c", "int part(void) { return 1; }\n")
     write(folder / "main.c", "int part(void); int main(void) { return part(); }\n")
     build = f"cd {folder} && gcc -shared -fPIC -o libpart.so part.c"
     assert os.system(f"{build} && gcc -o slam main.c -L. -lpart -Wl,-rpath,'$ORIGIN'") == 0
-    spec = RunSpec(tracker=f"subprocess:{folder}/slam", sequence=str(write_folder(tmp_path / "toy", 4)))
+    spec = RunSpec(
+        tracker=f"subprocess:{folder}/slam", sequence=str(write_folder(tmp_path / "toy", 4))
+    )
     write(folder / "part.c", "int part(void) { return 2; }\n")
     assert makes_another_run(spec, lambda: os.system(build))
 
 
 def test_data_and_programs_that_change_meanwhile_are_noticed_but_no_output(tmp_path: Path) -> None:
-    program, folder = write(tmp_path / "slam.py", "x = 1"), write_folder(tmp_path / "toy", 4)
-    asked = resolve(RunSpec(tracker=f"subprocess:{sys.executable} {program} {tmp_path}/out", sequence=str(folder)))
+    program = write(tmp_path / "slam.py", "x = 1")
+    folder = write_folder(tmp_path / "toy", 4)
+    asked = resolve(
+        RunSpec(
+            tracker=f"subprocess:{sys.executable} {program} {tmp_path}/out", sequence=str(folder)
+        )
+    )
     write(tmp_path / "out", "poses")
     identity.check_unchanged(asked)
     write(program, "x = 22")
@@ -323,12 +339,18 @@ Path("trajectory.txt").write_text("".join(f"{stamp} {x} 0 0 0 0 0 1\\n" for stam
 """
 
 
-@pytest.mark.parametrize(("variable", "counts"), [("IDENTITY_TOY_GAIN", True), ("IDENTITY_TOY_OTHER", False)])
+@pytest.mark.parametrize(
+    ("variable", "counts"), [("IDENTITY_TOY_GAIN", True), ("IDENTITY_TOY_OTHER", False)]
+)
 def test_a_program_gets_the_variables_that_it_declares_and_their_values_count(
     variable: str, counts: bool, tmp_path: Path, store: RunStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write(tmp_path / "program" / "slam.py", PROGRAM)
-    lines = ['name = "toy"', 'command = ["{python}", "slam.py", "{sequence}"]', 'environment = ["IDENTITY_TOY_GAIN"]']
+    lines = [
+        'name = "toy"',
+        'command = ["{python}", "slam.py", "{sequence}"]',
+        'environment = ["IDENTITY_TOY_GAIN"]',
+    ]
     file = write(tmp_path / "program" / "toy.toml", "\n".join(lines))
     spec = RunSpec(tracker=f"batch:{file}", sequence=str(write_folder(tmp_path / "toy", 4)))
     assert made_again(spec, store, partial(monkeypatch.setenv, variable, "2")) is counts
@@ -354,14 +376,18 @@ def test_where_the_linker_looks_makes_another_run(
     assert makes_another_run(spec, partial(monkeypatch.setenv, variable, str(tmp_path)))
 
 
-def test_own_code_that_changes_meanwhile_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_own_code_that_changes_meanwhile_is_noticed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     asked = resolve(RunSpec(tracker="orb-slam2", sequence=str(write_folder(tmp_path / "toy", 4))))
     identity.check_unchanged(asked)
     graph = identity.read_module_graph()
     code = graph.modules["dynslam_bench.slam.tracking"]
     edited = {**graph.modules, "dynslam_bench.slam.tracking": replace(code, digest="another")}
     monkeypatch.setattr(identity, "read_module_graph", lambda: type(graph)(edited))
-    with pytest.raises(RunError, match="the code of dynslam-bench has changed since this process began"):
+    with pytest.raises(
+        RunError, match="the code of dynslam-bench has changed since this process began"
+    ):
         identity.check_unchanged(asked)
 
 
@@ -377,9 +403,11 @@ def test_one_run_id_with_two_results_is_said_and_another_scheme_is_unverified(
     spec = RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 6))
     record = run_one(spec, store)
     assert run_one(spec, store).notes == record.notes
-    assert record.verified and "identity" not in record.program
+    assert record.verified
+    assert "identity" not in record.program
     old = record.model_copy(update={"identity": record.identity | {"scheme": 0}})
-    assert not old.verified and old.program["identity"] == "unverified"
+    assert not old.verified
+    assert old.program["identity"] == "unverified"
     trajectory = store.folder(record.run_id) / "trajectory_online.txt"
     trajectory.write_text(trajectory.read_text().replace("0.0", "0.1"))
     (again,) = run_many([spec], results=store, retry=["ok"])
@@ -392,7 +420,10 @@ def test_a_plug_in_that_patches_numpy_changes_no_score(
     tmp_path: Path, store: RunStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("dynslam_bench.runs.store.has_imported_plugins", has_imported_plugins)
-    patching = PLUGIN + "\nif 'dynslam_bench.envs' in __import__('sys').modules:\n    np.sqrt = lambda x: 2 * x\n"
+    patching = (
+        PLUGIN
+        + "\nif 'dynslam_bench.envs' in __import__('sys').modules:\n    np.sqrt = lambda x: 2 * x\n"
+    )
     spec, _ = a_plug_in(tmp_path, patching)
     other = RunSpec(tracker="never-move", sequence=spec.sequence)
     (alone,) = run_many([other], results=store)

@@ -12,7 +12,13 @@ import tarfile
 import time
 import zipfile
 from collections.abc import Iterator
-from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import (
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+)
 from dataclasses import astuple
 from itertools import cycle
 from pathlib import Path
@@ -53,7 +59,10 @@ from dynslam_bench.trackers.registry import TRACKERS
 
 
 def specs(folder: str, seeds: range, **change) -> list[RunSpec]:
-    return [RunSpec(tracker=TARGET, sequence=folder, frames=(0, 8), seed=seed, **change) for seed in seeds]
+    return [
+        RunSpec(tracker=TARGET, sequence=folder, frames=(0, 8), seed=seed, **change)
+        for seed in seeds
+    ]
 
 
 def follow(events: list) -> dict:
@@ -72,22 +81,31 @@ def test_resuming_is_a_set_difference(store: RunStore, toy_folder: str) -> None:
     events.clear()
     second = run_many(specs(toy_folder, range(4)), results=store, jobs=2, **follow(events))
     assert kinds(events) == {"finished": 2, "reused": 2, "started": 2}
-    assert second[:2] == first and [record.seed for record in second] == [0, 1, 2, 3]
+    assert second[:2] == first
+    assert [record.seed for record in second] == [0, 1, 2, 3]
     assert all(score(store, record).metrics["ate_rmse_m"] > 0 for record in second)
 
 
-def test_a_run_of_a_study_is_an_ordinary_one_once_it_is_asked_for_without(store: RunStore, toy_folder: str) -> None:
+def test_a_run_of_a_study_is_an_ordinary_one_once_it_is_asked_for_without(
+    store: RunStore, toy_folder: str
+) -> None:
     (made,) = run_many(specs(toy_folder, range(1), study="mine"), results=store)
     assert made.study == "mine"
     assert list(run_many(specs(toy_folder, range(1), study="other"), results=store)) == [made]
     (asked,) = run_many(specs(toy_folder, range(1)), results=store)
-    assert asked.study == "" and asked.run_id == made.run_id
+    assert asked.study == ""
+    assert asked.run_id == made.run_id
     assert list(run_many(specs(toy_folder, range(1), study="mine"), results=store)) == [asked]
     assert store.get(made.run_id) == asked
 
 
-def test_one_failure_stops_nothing_and_is_made_again_only_on_request(store: RunStore, toy_folder: str) -> None:
-    wanted = [*specs(toy_folder, range(1), settings={"mode": "segfault"}), *specs(toy_folder, range(2))]
+def test_one_failure_stops_nothing_and_is_made_again_only_on_request(
+    store: RunStore, toy_folder: str
+) -> None:
+    wanted = [
+        *specs(toy_folder, range(1), settings={"mode": "segfault"}),
+        *specs(toy_folder, range(2)),
+    ]
     assert [record.status for record in run_many(wanted, results=store)] == ["crashed", "ok", "ok"]
     for retry, made in (((), 0), (("failed",), 1), (("timeout",), 0), (("ok",), 2)):
         events: list = []
@@ -106,12 +124,24 @@ def test_a_wrong_name_is_refused_before_anything_runs(store: RunStore, toy_folde
         run_many(specs(toy_folder, range(1)), results=store, jobs=0)
 
 
-def test_what_cannot_be_looked_up_is_set_aside_where_somebody_is_told(store: RunStore, toy_folder: str) -> None:
-    wrong = {"tracker": "orb-slam"}, {"settings": {"speed": 1}}, {"sequence": "nowhere/x"}, {"frames": (5, 6)}
-    asked = [spec.model_copy(update=change) for spec in specs(toy_folder, range(1)) for change in (*wrong, {})]
+def test_what_cannot_be_looked_up_is_set_aside_where_somebody_is_told(
+    store: RunStore, toy_folder: str
+) -> None:
+    wrong = (
+        {"tracker": "orb-slam"},
+        {"settings": {"speed": 1}},
+        {"sequence": "nowhere/x"},
+        {"frames": (5, 6)},
+    )
+    asked = [
+        spec.model_copy(update=change)
+        for spec in specs(toy_folder, range(1))
+        for change in (*wrong, {})
+    ]
     faults: list[str] = []
     records = run_many(asked, results=store, on_fault=lambda spec, error: faults.append(str(error)))
-    assert [record.status for record in records] == ["ok"] and len(faults) == len(wrong)
+    assert [record.status for record in records] == ["ok"]
+    assert len(faults) == len(wrong)
 
 
 def _be_daemonic() -> None:
@@ -123,17 +153,24 @@ def _be_daemonic() -> None:
 def test_any_executor(tmp_path: Path, toy_folder: str, monkeypatch: pytest.MonkeyPatch) -> None:
     run_many(specs(toy_folder, range(1)), results=tmp_path / "here")
     monkeypatch.setenv("DYNSLAM_BENCH_START", "fresh")  # no fork server for one run of the worker
-    executors = [ThreadPoolExecutor(2), ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _be_daemonic)]
+    executors = [
+        ThreadPoolExecutor(2),
+        ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _be_daemonic),
+    ]
     for number, executor in enumerate(executors):
         events: list = []
         with executor:
             there = run_many(
-                specs(toy_folder, range(1)), results=tmp_path / f"there{number}", executor=executor, **follow(events)
+                specs(toy_folder, range(1)),
+                results=tmp_path / f"there{number}",
+                executor=executor,
+                **follow(events),
             )
         assert kinds(events) == {"finished": 1, "started": 1}
         store = RunStore(tmp_path / f"there{number}")
         assert sorted(record.run_id for record in there) == store.ids()
-        # the plug-in's process has loaded other modules here than there: another id, the same result
+        # the plug-in's process has loaded other modules here than there: another id, the same
+        # result
         assert by_request(store) == by_request(RunStore(tmp_path / "here"))
         assert score(store, there[0], "evo-default").metrics["ate_rmse_m"] > 0
 
@@ -142,7 +179,8 @@ class _Dying(Executor):
     """An executor whose other end goes: before anything is handed over, or while it is made."""
 
     def __init__(self, error: Exception, *, at_once: bool) -> None:
-        self.error, self.at_once = error, at_once
+        self.error = error
+        self.at_once = at_once
 
     def submit(self, *_: object, **__: object) -> Future:
         if self.at_once:
@@ -153,10 +191,18 @@ class _Dying(Executor):
 
 
 @pytest.mark.parametrize("at_once", [True, False])
-@pytest.mark.parametrize("error", [CancelledError(), OSError("comm\nclosed"), RuntimeError("shutdown"), KeyError(1)])
-def test_an_executor_that_dies_is_one_clear_line_and_no_outcome(tmp_path, toy_folder, error, at_once) -> None:
-    with pytest.raises(InfrastructureError, match=rf"^the executor gave up: {type(error).__name__}"):
-        run_many(specs(toy_folder, range(2)), results=tmp_path, executor=_Dying(error, at_once=at_once))
+@pytest.mark.parametrize(
+    "error", [CancelledError(), OSError("comm\nclosed"), RuntimeError("shutdown"), KeyError(1)]
+)
+def test_an_executor_that_dies_is_one_clear_line_and_no_outcome(
+    tmp_path, toy_folder, error, at_once
+) -> None:
+    with pytest.raises(
+        InfrastructureError, match=rf"^the executor gave up: {type(error).__name__}"
+    ):
+        run_many(
+            specs(toy_folder, range(2)), results=tmp_path, executor=_Dying(error, at_once=at_once)
+        )
     assert RunStore(tmp_path).ids() == []
 
 
@@ -167,29 +213,41 @@ def test_packed_runs_that_are_none(store: RunStore, toy_folder: str, tmp_path: P
     good = pack(store, record)
     other = RunStore(tmp_path / "other")
     other.prepare()
-    for name in ("../evil.txt", "/etc/evil", f"runs/{record.run_id}/../../evil.txt", "runs/zz/x.txt"):
+    for name in (
+        "../evil.txt",
+        "/etc/evil",
+        f"runs/{record.run_id}/../../evil.txt",
+        "runs/zz/x.txt",
+    ):
         buffer = io.BytesIO(good)
         with zipfile.ZipFile(buffer, "a") as archive:
             archive.writestr(name, "x")
         with pytest.raises(RunError, match="packed run holds"):
             unpack(buffer.getvalue(), other)
-    assert other.ids() == [] and not list(tmp_path.rglob("evil*"))
-    assert unpack(good, other) == record and other.ids() == [record.run_id]
+    assert other.ids() == []
+    assert not list(tmp_path.rglob("evil*"))
+    assert unpack(good, other) == record
+    assert other.ids() == [record.run_id]
 
 
 @pytest.mark.parametrize(
-    "writes", ["dynslam_bench.runs.running.TemporaryFolder", "zipfile.ZipFile.extractall"], ids=["worker", "head"]
+    "writes",
+    ["dynslam_bench.runs.running.TemporaryFolder", "zipfile.ZipFile.extractall"],
+    ids=["worker", "head"],
 )
 def test_a_full_disk_of_a_worker_or_of_the_head_is_one_clear_line(
     tmp_path: Path, toy_folder: str, monkeypatch: pytest.MonkeyPatch, writes: str
 ) -> None:
     monkeypatch.setattr(writes, Mock(side_effect=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))))
-    with ThreadPoolExecutor(1) as executor, pytest.raises(InfrastructureError, match=r"No space left"):
+    with (
+        ThreadPoolExecutor(1) as executor,
+        pytest.raises(InfrastructureError, match=r"No space left"),
+    ):
         run_many(specs(toy_folder, range(1)), results=tmp_path, executor=executor)
     assert RunStore(tmp_path).ids() == []
 
 
-# -- imported trajectories -------------------------------------------------------------------------------------------
+# -- imported trajectories -------------------------------------------------------------------------
 
 
 def write_estimate(path: Path, shift_s: float = 0.0, every: int = 1) -> Path:
@@ -205,8 +263,10 @@ def test_import(store: RunStore, toy_folder: str, tmp_path: Path) -> None:
     record = import_trajectory(path, "their-slam", toy_folder, results=store)
     assert (record.kind, record.tracker.label) == ("imported", "their-slam (imported)")
     metrics = score(store, record)
-    assert metrics.trajectory == "final" and metrics.online is None
-    assert 0.001 < metrics.metrics["ate_rmse_m"] < 0.01 and metrics.primary.coverage == 0.5
+    assert metrics.trajectory == "final"
+    assert metrics.online is None
+    assert 0.001 < metrics.metrics["ate_rmse_m"] < 0.01
+    assert metrics.primary.coverage == 0.5
     assert import_trajectory(path, "their-slam", toy_folder, results=store).run_id == record.run_id
 
 
@@ -215,7 +275,8 @@ def test_import(store: RunStore, toy_folder: str, tmp_path: Path) -> None:
     [
         (slice(0, 8), "lost"),  # 13 %
         (slice(0, 60, 7), "lost"),  # 15 %, to the end
-        (slice(0, 50), "lost"),  # the last ten frames have none, as in a run that is lost at its end
+        # the last ten frames have none, as in a run that is lost at its end
+        (slice(0, 50), "lost"),
         (slice(0, 51), "ok"),
         (slice(0, 60, 2), "ok"),
         (slice(30, 60), "ok"),
@@ -226,22 +287,28 @@ def test_an_import_is_lost_by_the_rule_of_runs(
 ) -> None:
     whole = read_tum(write_estimate(tmp_path / "all.txt"))
     write_tum(tmp_path / "part.txt", whole.select(kept))
-    record = import_trajectory(tmp_path / "part.txt", "their-slam", toy_folder, results=store, which="online")
+    record = import_trajectory(
+        tmp_path / "part.txt", "their-slam", toy_folder, results=store, which="online"
+    )
     assert (record.status, bool(record.reason)) == (status, status != "ok")
-    assert record.n_tracked == len(whole.select(kept)) and record.coverage == pytest.approx(record.n_tracked / 60)
+    assert record.n_tracked == len(whole.select(kept))
+    assert record.coverage == pytest.approx(record.n_tracked / 60)
 
 
 def test_import_with_stamps_of_its_own(store: RunStore, toy_folder: str, tmp_path: Path) -> None:
     path = write_estimate(tmp_path / "theirs.txt", shift_s=0.005)
     record = import_trajectory(path, "their-slam", toy_folder, results=store, which="online")
-    assert not record.stamps_match and record.coverage == 1.0
+    assert not record.stamps_match
+    assert record.coverage == 1.0
     assert record.notes == ["60 of 60 poses carry stamps that are no input frame's"]
     assert score(store, record).online.n_pairs == 60
 
 
 def test_import_of_something_else(store: RunStore, toy_folder: str, tmp_path: Path) -> None:
     far = write_estimate(tmp_path / "far.txt", shift_s=1000.0)
-    with pytest.raises(RunError, match=r"shares 0 stamps with .*, at least 2 are needed: the nearest is 998"):
+    with pytest.raises(
+        RunError, match=r"shares 0 stamps with .*, at least 2 are needed: the nearest is 998"
+    ):
         import_trajectory(far, "x", toy_folder, results=store)
     with pytest.raises(DynslamError, match="cannot read"):
         import_trajectory(tmp_path / "none.txt", "x", toy_folder, results=store)
@@ -253,14 +320,17 @@ def test_import_of_something_else(store: RunStore, toy_folder: str, tmp_path: Pa
 @pytest.fixture
 def jumps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Eleven days forwards, then backwards, at every look at the clock."""
-    now, away = time.time, cycle((1e6, -1e6))
+    away = cycle((1e6, -1e6))
+    now = time.time
     monkeypatch.setattr(time, "time", lambda: now() + next(away))
     assert abs(time.time() - time.time()) > 1e6
 
 
 @pytest.mark.usefixtures("jumps")
 def test_runs_are_made_waited_for_and_kept(store: RunStore, toy_folder: str) -> None:
-    specs = [RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 8), seed=seed) for seed in range(2)]
+    specs = [
+        RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 8), seed=seed) for seed in range(2)
+    ]
     pool = ThreadPoolExecutor(1)
     with store.work_folder("0" * 16) as work, store.claim(resolve(specs[0]).run_id) as mine:
         assert mine
@@ -272,31 +342,44 @@ def test_runs_are_made_waited_for_and_kept(store: RunStore, toy_folder: str) -> 
         assert run_id.startswith(resolve(specs[1]).asked)
     made = call.result(300)
     assert [record.status for record in made] == ["ok", "ok"]
-    assert all(0 < record.wall_s < 900 and 0 < record.timings["total"].mean_s < 900 for record in made)
+    assert all(
+        0 < record.wall_s < 900 and 0 < record.timings["total"].mean_s < 900 for record in made
+    )
 
 
 @pytest.mark.parametrize("name", suite_names())
 def test_every_suite_names_only_what_exists(name: str) -> None:
     suite = load_suite(name)
-    assert suite.title and suite.description and suite.name == name
+    assert suite.title
+    assert suite.description
+    assert suite.name == name
     for sequence in suite.sequences:
         assert sequence.partition("?")[0] in sequence_ids() or entry_of(sequence) is not None
         if sequence.startswith("synthetic/"):
-            assert parse_synthetic_id(sequence).split == "held-out", "the embedded network was trained on the others"
+            assert parse_synthetic_id(sequence).split == "held-out", (
+                "the embedded network was trained on the others"
+            )
     specs = list(suite.specs())
     assert len(specs) == len({spec.model_dump_json() for spec in specs}) > 0
 
 
 def test_dynamic_holds_every_ranked_system_on_three_scenes_of_the_eight_replicas() -> None:
     suite = load_suite("dynamic")
-    assert len({parse_synthetic_id(name).scene for name in suite.sequences}) == len(suite.sequences) == 24
+    assert (
+        len({parse_synthetic_id(name).scene for name in suite.sequences})
+        == len(suite.sequences)
+        == 24
+    )
     specs = [found.spec for found in TRACKERS.all() if "trackers.systems" in found.spec.entry_point]
     composed = {spec.id for spec in specs if spec.sensors == "rgbd"}
-    ablations = {name for name in composed if not TRACKERS.get(name).ranked and name.startswith("emfoa-oft")}
+    ablations = {
+        name for name in composed if not TRACKERS.get(name).ranked and name.startswith("emfoa-oft")
+    }
     assert composed - ablations <= set(suite.trackers)
     assert load_suite("dynamic-full").trackers == suite.trackers
     objects = load_suite("objects")
-    assert set(suite.trackers) - {"emfoa-oft-paper"} < set(objects.trackers)  # that one takes half a second a frame
+    # that one takes half a second a frame
+    assert set(suite.trackers) - {"emfoa-oft-paper"} < set(objects.trackers)
     assert objects.settings == {"segmentation.source": "oracle-classes"}
 
 
@@ -324,9 +407,9 @@ def test_a_suite_of_the_users_own(tmp_path: Path) -> None:
         """,
     )
     specs = list(load_suite(path).specs(data_root="/data", device="cpu", threads=2))
-    assert (
-        len(specs) == 8 and {spec.threads for spec in specs} == {2} and {spec.data_root for spec in specs} == {"/data"}
-    )
+    assert len(specs) == 8
+    assert {spec.threads for spec in specs} == {2}
+    assert {spec.data_root for spec in specs} == {"/data"}
     assert [spec.degrade for spec in specs] == [{}] * 4 + [{"blur": 0.5}] * 4
     orb = next(spec for spec in specs if spec.tracker == "orb-slam2")
     assert (orb.settings["guard.min_features"], orb.settings["features.n_features"]) == (30, 500)
@@ -338,7 +421,9 @@ def test_offsets_of_a_suite_are_repeats_beside_the_seeds(tmp_path: Path) -> None
     suite = load_suite(write(tmp_path / "mine.toml", text))
     assert [(spec.seed, spec.offset) for spec in suite.specs()] == [(0, 0), (0, 3), (1, 0), (1, 3)]
     assert [spec.offset for spec in suite.specs(seeds=(0,), offsets=(5,))] == [5]
-    with pytest.raises(DynslamError, match=r"offsets\.0: input should be greater than or equal to 0"):
+    with pytest.raises(
+        DynslamError, match=r"offsets\.0: input should be greater than or equal to 0"
+    ):
         load_suite(write(tmp_path / "bad.toml", text.replace("[0, 3]", "[-1]")))
 
 
@@ -348,7 +433,10 @@ def test_offsets_of_a_suite_are_repeats_beside_the_seeds(tmp_path: Path) -> None
         ("trackers = [", "not valid TOML"),
         ('trackers = ["never-move"]', "sequences: field required"),
         ('trackers = []\nsequences = ["a/b"]', "trackers"),
-        ('trackers = ["never-mov"]\nsequences = ["a/b"]', "unknown tracker 'never-mov'.*never-move"),
+        (
+            'trackers = ["never-mov"]\nsequences = ["a/b"]',
+            "unknown tracker 'never-mov'.*never-move",
+        ),
         ('trackers = ["never-move"]\nsequences = ["a/b"]\nseed = [1]', "unknown key 'seed'.*seeds"),
     ],
 )
@@ -360,7 +448,10 @@ def test_bad_suites(tmp_path: Path, text: str, message: str) -> None:
 def test_frames_of_a_run_are_read_however_they_are_written() -> None:
     ways = [(0, 30), [0, 30], "0:30", ":30"]
     assert {RunSpec(tracker="x", sequence="y", frames=way).frames for way in ways} == {(0, 30)}
-    assert {RunSpec(tracker="x", sequence="y", frames=way).frames for way in (None, ":", "0:", (0, None))} == {None}
+    assert {
+        RunSpec(tracker="x", sequence="y", frames=way).frames
+        for way in (None, ":", "0:", (0, None))
+    } == {None}
     with pytest.raises(DynslamError, match=r"5:2"):
         RunSpec(tracker="x", sequence="y", frames="5:2")
 
@@ -369,7 +460,9 @@ def test_rows_are_of_trackers_of_the_suite(tmp_path: Path) -> None:
     text = 'trackers = ["never-move"]\nsequences = ["synthetic/walking_xyz"]\n[[rows]]\ntracker = "{}"\nsettings = {}'
     stranger = write(tmp_path / "a.toml", text.format("orb-slam2", '{ "guard.min_features" = 30 }'))
     common = 'trackers = ["orb-slam2"]\nsequences = ["synthetic/sitting_xyz"]\n[settings]\n"features.levls" = 4\n'
-    with pytest.raises(RunError, match=r"'features\.levls', which none of its trackers has.*features\.levels"):
+    with pytest.raises(
+        RunError, match=r"'features\.levls', which none of its trackers has.*features\.levels"
+    ):
         load_suite(write(tmp_path / "c.toml", common)).specs()
     with pytest.raises(RunError, match="'orb-slam2', which is none of its trackers"):
         load_suite(stranger).specs()
@@ -377,23 +470,41 @@ def test_rows_are_of_trackers_of_the_suite(tmp_path: Path) -> None:
         load_suite(write(tmp_path / "b.toml", text.format("never-move", "{}")))
 
 
-# A real Dask cluster: runs come back as bytes, and its end is one clear line. Skipped without `distributed`.
+# A real Dask cluster: runs come back as bytes, and its end is one clear line. Skipped without
+# `distributed`.
 
 
 class Cluster:
     """A Dask scheduler and its workers, each a process of one thread."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.place, self.workers = folder, folder / "scheduler.json", []
+        self.folder = folder
+        self.place = folder / "scheduler.json"
+        self.workers = []
         self.scheduler = self.start("dask_scheduler", "--host", "127.0.0.1", "--port", "0")
-        until(lambda: self.scheduler.poll() is not None or (self.place.is_file() and self.place.read_text()), 300)
+        until(
+            lambda: (
+                self.scheduler.poll() is not None
+                or (self.place.is_file() and self.place.read_text())
+            ),
+            300,
+        )
         assert self.scheduler.poll() is None
         self.address = json.loads(self.place.read_text())["address"]
 
     def start(self, program: str, *arguments: str, **environment: str) -> subprocess.Popen:
-        command = [sys.executable, "-m", f"distributed.cli.{program}", "--scheduler-file", str(self.place), *arguments]
+        command = [
+            sys.executable,
+            "-m",
+            f"distributed.cli.{program}",
+            "--scheduler-file",
+            str(self.place),
+            *arguments,
+        ]
         silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        return subprocess.Popen([*command, "--no-dashboard"], env=os.environ | environment, **silent)
+        return subprocess.Popen(
+            [*command, "--no-dashboard"], env=os.environ | environment, **silent
+        )
 
     def add(self, **environment: str) -> subprocess.Popen:
         """A worker on a host of its own, with these variables of the environment."""
@@ -418,7 +529,8 @@ def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster
 def test_a_scheduler_that_is_killed_in_the_middle_is_one_clear_line(
     tmp_path: Path, toy_folder: str, cluster: Cluster, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    store, executor = RunStore(tmp_path / "results"), DaskWorkers(cluster.address)
+    store = RunStore(tmp_path / "results")
+    executor = DaskWorkers(cluster.address)
     cluster.add()
 
     def told(event: RunEvent) -> None:
@@ -430,7 +542,9 @@ def test_a_scheduler_that_is_killed_in_the_middle_is_one_clear_line(
         run_many(asked, results=store, executor=executor, on_event=told)
     assert "Traceback" not in capfd.readouterr().err
     records, unreadable = store.all()
-    assert 1 <= len(records) < len(asked) and unreadable == []  # what came back stays
+    # what came back stays
+    assert 1 <= len(records) < len(asked)
+    assert unreadable == []
     assert {record.status for record in records} == {"ok"}
 
 
@@ -460,20 +574,34 @@ def test_runs_are_made_by_the_workers_that_can_make_them(
             victim.kill()
 
     asked = [
-        RunSpec(tracker="toy_of_mine:SPEC", sequence="tum/fr1/xyz", camera=str(data / "camera.toml"), seed=seed)
+        RunSpec(
+            tracker="toy_of_mine:SPEC",
+            sequence="tum/fr1/xyz",
+            camera=str(data / "camera.toml"),
+            seed=seed,
+        )
         for seed in range(8)
     ]
-    here, there = RunStore(tmp_path / "here"), RunStore(tmp_path / "there")
+    here = RunStore(tmp_path / "here")
+    there = RunStore(tmp_path / "there")
     with DaskWorkers(cluster.address) as executor:
         executor._client.wait_for_workers(5)
         rows = executor.describe(["tum/fr1/xyz"])
-        assert sorted(str(row["lacks"]) for row in rows) == ["['tum/fr1/xyz']", "[]", "[]", "[]", "[]"]
+        assert sorted(str(row["lacks"]) for row in rows) == [
+            "['tum/fr1/xyz']",
+            "[]",
+            "[]",
+            "[]",
+            "[]",
+        ]
         assert sorted(str(row["code"]) for row in rows) == ["none", *["the same"] * 4]
         records = run_many(asked, results=there, executor=executor, on_event=told)
         (refusals,) = executor._refused.values()
     assert [record.status for record in records] == ["ok"] * len(asked)
     reasons = sorted(str(reason) for reason in refusals.values())
-    assert len(reasons) == 2 and "is not at" in reasons[0] and "source differ" in reasons[1]
+    assert len(reasons) == 2
+    assert "is not at" in reasons[0]
+    assert "source differ" in reasons[1]
     run_many(asked, results=here)
     assert by_request(here) == by_request(there)
 
@@ -481,13 +609,20 @@ def test_runs_are_made_by_the_workers_that_can_make_them(
 def test_a_suite_on_a_scheduler_begins_with_what_its_workers_have(
     tmp_path: Path, toy_folder: str, cluster: Cluster, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    suite = write(tmp_path / "toys.toml", f'trackers = ["{TARGET}"]\nsequences = ["{toy_folder}"]\nframes = [0, 8]\n')
+    suite = write(
+        tmp_path / "toys.toml",
+        f'trackers = ["{TARGET}"]\nsequences = ["{toy_folder}"]\nframes = [0, 8]\n',
+    )
     cluster.add()
     with DaskWorkers(cluster.address) as executor:
         executor._client.wait_for_workers(1)
-    (run,) = bench(suite, results=tmp_path / "results", scheduler=cluster.address, on_workers=show_workers)
+    (run,) = bench(
+        suite, results=tmp_path / "results", scheduler=cluster.address, on_workers=show_workers
+    )
     heading, row = capsys.readouterr().err.splitlines()[:2]
-    assert heading.startswith("worker ") and "the same" in row and run.record.status == "ok"
+    assert heading.startswith("worker ")
+    assert "the same" in row
+    assert run.record.status == "ok"
     with pytest.raises(RunError, match="no Dask scheduler answers at nowhere:1"):
         bench(suite, results=tmp_path / "results", scheduler="nowhere:1")
 
@@ -498,10 +633,15 @@ def shards(tmp_path_factory: pytest.TempPathFactory, toy_folder: str) -> list[Ru
     folder = tmp_path_factory.mktemp("shards")
     toys = f'trackers = ["{TARGET}"]\nsequences = ["{toy_folder}"]\nframes = [0, 8]\nseeds = [0, 1, 2, 3, 4]\n'
     suite = write(folder / "toys.toml", toys)
-    stores = {"1/2": RunStore(folder / "shard1"), "2/2": RunStore(folder / "shard2"), "1/1": RunStore(folder / "whole")}
+    stores = {
+        "1/2": RunStore(folder / "shard1"),
+        "2/2": RunStore(folder / "shard2"),
+        "1/1": RunStore(folder / "whole"),
+    }
     for shard, store in stores.items():
         bench(suite, results=store.root, shard=parse_shard(shard))
-    assert bench(suite, results=folder / "none", shard=(6, 6)) == [] and not (folder / "none").exists()
+    assert bench(suite, results=folder / "none", shard=(6, 6)) == []
+    assert not (folder / "none").exists()
     return list(stores.values())
 
 
@@ -511,7 +651,10 @@ def by_request(store: RunStore) -> dict[str, bytes]:
 
 
 def outcomes(store: RunStore) -> dict[str, bytes]:
-    return {run_id: (store.folder(run_id) / "trajectory_online.txt").read_bytes() for run_id in store.ids()}
+    return {
+        run_id: (store.folder(run_id) / "trajectory_online.txt").read_bytes()
+        for run_id in store.ids()
+    }
 
 
 def test_merged_shards_are_the_suite(shards: list[RunStore], tmp_path: Path) -> None:
@@ -529,9 +672,12 @@ def test_a_shard_is_merged_and_read_as_one_file(shards: list[RunStore], tmp_path
         for name in ("runs", "sequences"):
             archive.add(parts[0].root / name, name)
     shutil.make_archive(str(tmp_path / "shard2"), "zip", parts[1].root.parent, "shard2")
-    files, target = [tmp_path / "shard1.tgz", tmp_path / "shard2.zip"], RunStore(tmp_path / "all")
+    files = [tmp_path / "shard1.tgz", tmp_path / "shard2.zip"]
+    target = RunStore(tmp_path / "all")
     assert len(merge(map(open_store, files), target).added) == 5
-    frame = pd.concat([open_store(file).frame() for file in files]).sort_values("started", ignore_index=True)
+    frame = pd.concat([open_store(file).frame() for file in files]).sort_values(
+        "started", ignore_index=True
+    )
     pd.testing.assert_frame_equal(frame, target.frame())
     assert len(load_frame(files)) == 5
     with pytest.raises(RunError, match=r"shard1.tgz is an archive.*-o"):
@@ -539,7 +685,9 @@ def test_a_shard_is_merged_and_read_as_one_file(shards: list[RunStore], tmp_path
     one = parts[0].ids()[0]
     with pytest.raises(RunError, match=r"shard1.tgz is an archive.*-o"):
         export_run(one, "tum", results=files[0])
-    assert (export_run(one, "tum", tmp_path / "tum", results=files[0]).folder / "provenance.json").is_file()
+    assert (
+        export_run(one, "tum", tmp_path / "tum", results=files[0]).folder / "provenance.json"
+    ).is_file()
     contradicted = files[1].rename(tmp_path / "other.zip")
     trajectory = target.folder(parts[1].ids()[0]) / "trajectory_online.txt"
     trajectory.write_text("")
@@ -554,7 +702,9 @@ def test_a_shard_is_merged_and_read_as_one_file(shards: list[RunStore], tmp_path
         ("shard1/runs/x", "holds 2 results folders"),
     ],
 )  # fmt: skip
-def test_an_archive_that_is_no_results_folder_is_refused(tmp_path: Path, name: str, reason: str) -> None:
+def test_an_archive_that_is_no_results_folder_is_refused(
+    tmp_path: Path, name: str, reason: str
+) -> None:
     with tarfile.open(tmp_path / "shard.tar", "w") as archive:
         entry = tarfile.TarInfo(name)
         entry.type = tarfile.SYMTYPE if name == "latest" else tarfile.REGTYPE
@@ -572,7 +722,9 @@ def test_a_shard_that_is_none_is_refused(text: str) -> None:
 
 
 def test_what_contradicts_the_store_is_named_and_left_out(tmp_path: Path, toy_folder: str) -> None:
-    stores = [RunStore(tmp_path / name) for name in ("one", "other", "damaged", "truth", "lost", "linked")]
+    stores = [
+        RunStore(tmp_path / name) for name in ("one", "other", "damaged", "truth", "lost", "linked")
+    ]
     spec = RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 8))
     for store in stores:
         (record,) = run_many([spec], results=store)
@@ -580,17 +732,23 @@ def test_what_contradicts_the_store_is_named_and_left_out(tmp_path: Path, toy_fo
     trajectory = other / "trajectory_online.txt"
     trajectory.write_text(trajectory.read_text().replace("0.1", "0.2"))
     (damaged / "run.json").write_text("{")
-    (stores[3].root / "sequences" / record.sequence.part / "groundtruth.txt").write_text("0 0 0 0 0 0 0 1\n")
+    (stores[3].root / "sequences" / record.sequence.part / "groundtruth.txt").write_text(
+        "0 0 0 0 0 0 0 1\n"
+    )
     (stores[4].root / "sequences" / record.sequence.part / "timestamps.txt").unlink()
     (stores[5].root / "sequences" / record.sequence.part / "more.txt").symlink_to(__file__)
     before = outcomes(stores[0])
     merged = merge(stores[1:], stores[0])
     assert [entry.path for entry in merged.left_out] == [other, damaged, truth, lost, linked]
-    assert "a link that leads out" in merged.left_out[4].reason and not list(stores[0].root.rglob("more.txt"))
-    assert "another result" in merged.left_out[0].reason and "stamps or truth" in merged.left_out[2].reason
-    assert (merged.added, merged.stored, outcomes(stores[0])) == ([], [], before) and one.is_dir()
+    assert "a link that leads out" in merged.left_out[4].reason
+    assert not list(stores[0].root.rglob("more.txt"))
+    assert "another result" in merged.left_out[0].reason
+    assert "stamps or truth" in merged.left_out[2].reason
+    assert (merged.added, merged.stored, outcomes(stores[0])) == ([], [], before)
+    assert one.is_dir()
     for store in (stores[1], stores[3]):  # made again, and put back
-        assert store.changed(record) and not store.changed(*run_many([spec], results=store))
+        assert store.changed(record)
+        assert not store.changed(*run_many([spec], results=store))
 
 
 class OtherWorkers(ThreadPoolExecutor):
@@ -603,7 +761,10 @@ class OtherWorkers(ThreadPoolExecutor):
     def submit(self, fn, spec: str, protocol: str, identity: str) -> Future:
         texts = [spec, identity]
         if json.loads(spec)["seed"] == 1:
-            texts = [json.dumps(json.loads(text) | new) for text, new in zip(texts, self.changes, strict=True)]
+            texts = [
+                json.dumps(json.loads(text) | new)
+                for text, new in zip(texts, self.changes, strict=True)
+            ]
         return super().submit(fn, texts[0], protocol, texts[1])
 
 
@@ -617,11 +778,16 @@ class OtherWorkers(ThreadPoolExecutor):
 def test_a_worker_that_is_not_like_this_machine_stops_no_other_run(
     tmp_path: Path, toy_folder: str, spec_changes: dict, identity_changes: dict, reason: str
 ) -> None:
-    specs = [RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 8), seed=seed) for seed in range(3)]
+    specs = [
+        RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, 8), seed=seed) for seed in range(3)
+    ]
     faults: list[tuple[int, DynslamError]] = []
     with OtherWorkers(spec_changes, identity_changes) as executor:
         records = run_many(
-            specs, results=tmp_path, executor=executor, on_fault=lambda spec, error: faults.append((spec.seed, error))
+            specs,
+            results=tmp_path,
+            executor=executor,
+            on_fault=lambda spec, error: faults.append((spec.seed, error)),
         )
     assert [record.seed for record in records] == [0, 2]
     ((seed, fault),) = faults
@@ -632,11 +798,19 @@ def test_a_worker_that_is_not_like_this_machine_stops_no_other_run(
 
 def test_what_many_runs_share_is_looked_up_once(toy_folder: str) -> None:
     specs = [
-        RunSpec(tracker=TARGET, sequence=toy_folder, frames=(0, stop), offset=offset, seed=seed, threads=threads)
+        RunSpec(
+            tracker=TARGET,
+            sequence=toy_folder,
+            frames=(0, stop),
+            offset=offset,
+            seed=seed,
+            threads=threads,
+        )
         for stop, offset, seed, threads in [(8, 0, 0, 1), (8, 0, 1, 1), (9, 0, 0, 1), (8, 1, 0, 2)]
     ]
     look_up = Resolver()
     together = [look_up(spec) for spec in specs]
     assert [run.run_id for run in together] == [resolve(spec).run_id for spec in specs]
-    assert together[0].sequence is together[1].sequence and together[0].settings is together[3].settings
+    assert together[0].sequence is together[1].sequence
+    assert together[0].settings is together[3].settings
     assert len({run.run_id for run in together}) == 4

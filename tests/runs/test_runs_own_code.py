@@ -57,7 +57,10 @@ def test_a_closure_follows_imports_wherever_they_stand() -> None:
         e="import dynslam_bench.a\n",
     )
     assert graph.closure([f"{PACKAGE}.a"]) == [f"{PACKAGE}.{name}" for name in "abcd"]
-    assert graph.closure([f"{PACKAGE}.a"], without=[f"{PACKAGE}.c"]) == [f"{PACKAGE}.a", f"{PACKAGE}.b"]
+    assert graph.closure([f"{PACKAGE}.a"], without=[f"{PACKAGE}.c"]) == [
+        f"{PACKAGE}.a",
+        f"{PACKAGE}.b",
+    ]
 
 
 def test_a_name_that_a_package_passes_on_counts_with_the_module_that_defines_it() -> None:
@@ -69,7 +72,12 @@ def test_a_name_that_a_package_passes_on_counts_with_the_module_that_defines_it(
         other="from dynslam_bench.parts import own\n",
     )
     assert graph.closure([f"{PACKAGE}.user"]) == [f"{PACKAGE}.parts.wheels", f"{PACKAGE}.user"]
-    whole_package = {f"{PACKAGE}.parts", f"{PACKAGE}.parts.wheels", f"{PACKAGE}.parts.doors", f"{PACKAGE}.other"}
+    whole_package = {
+        f"{PACKAGE}.parts",
+        f"{PACKAGE}.parts.wheels",
+        f"{PACKAGE}.parts.doors",
+        f"{PACKAGE}.other",
+    }
     assert set(graph.closure([f"{PACKAGE}.other"])) == whole_package
 
 
@@ -114,7 +122,12 @@ def test_code_counts_by_its_syntax(edited: str, changes: bool) -> None:
 
 def test_the_graph_knows_every_module_of_the_package() -> None:
     names = set(module_graph().modules)
-    assert {f"{PACKAGE}.slam.tracking", f"{PACKAGE}.envs.slam_env", f"{PACKAGE}.core", PACKAGE} <= names
+    assert {
+        f"{PACKAGE}.slam.tracking",
+        f"{PACKAGE}.envs.slam_env",
+        f"{PACKAGE}.core",
+        PACKAGE,
+    } <= names
     for name in module_files():
         assert "tests" not in name
 
@@ -122,7 +135,9 @@ def test_the_graph_knows_every_module_of_the_package() -> None:
 def edited(graph: ModuleGraph, module: str) -> ModuleGraph:
     """The graph with an unused constant added to a module."""
     code = graph.modules[module]
-    return ModuleGraph({**graph.modules, module: type(code)(f"{code.digest} and more", code.imports, code.names)})
+    return ModuleGraph(
+        {**graph.modules, module: type(code)(f"{code.digest} and more", code.imports, code.names)}
+    )
 
 
 @pytest.mark.parametrize(
@@ -165,21 +180,27 @@ def test_an_edit_changes_the_runs_that_use_the_module(module: str, changes: bool
         ("dynaslam", {"segmentation.source": "oracle"}),
     ],
 )
-def test_every_module_that_runs_is_one_that_counts(tracker: str, settings: dict[str, str], tmp_path: Path) -> None:
+def test_every_module_that_runs_is_one_that_counts(
+    tracker: str, settings: dict[str, str], tmp_path: Path
+) -> None:
     run = resolve(RunSpec(tracker=tracker, sequence=SCENE, settings=settings))
     command = [sys.executable, "-c", TRACER, run.spec.model_dump_json(), str(tmp_path)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     executed = set(json.loads(done.stdout.splitlines()[-1]))
     beside = {PACKAGE, *PLUMBING, *(f"{PACKAGE}.{name}" for name in (*FINDERS, *BESIDE_THE_LOOP))}
-    # They only name what there is: the tables of trackers and of sequences, and the modules that these read.
+    # They only name what there is: the tables of trackers and of sequences, and the modules that
+    # these read.
     finding = {f"{PACKAGE}.trackers.adapters.specs", f"{PACKAGE}.trackers.systems.emfoa_oft"}
     finding |= {f"{PACKAGE}.trackers.systems.published", f"{PACKAGE}.trackers.systems.composition"}
     counted = set(modules_of_run(module_graph(), run.identity["parts"]))
     assert executed - counted - beside - finding == set()
 
 
-# Three edits of a module within the second in which it was compiled; the first two leave its length.
-@pytest.mark.parametrize(("text", "is_stale"), [("VALUE = 2", True), ("VALUE = 3", True), ("VALUE = 20", False)])
+# Three edits of a module within the second in which it was compiled; the first two leave its
+# length.
+@pytest.mark.parametrize(
+    ("text", "is_stale"), [("VALUE = 2", True), ("VALUE = 3", True), ("VALUE = 20", False)]
+)
 def test_byte_code_that_is_older_than_its_source_is_refused(
     text: str, is_stale: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -189,7 +210,9 @@ def test_byte_code_that_is_older_than_its_source_is_refused(
     os.utime(source, ns=(second_ns, second_ns))
     byte_code = Path(py_compile.compile(str(source), doraise=True))
     os.utime(byte_code, ns=(second_ns, second_ns + 100_000_000))
-    monkeypatch.setattr("dynslam_bench.core.module_graph.module_files", lambda: {"dynslam_bench.constants": source})
+    monkeypatch.setattr(
+        "dynslam_bench.core.module_graph.module_files", lambda: {"dynslam_bench.constants": source}
+    )
     check_byte_code.__wrapped__()
 
     source.write_text(text)

@@ -27,7 +27,9 @@ class Child:
     """
 
     def __init__(self, path: Sequence[str] = (), preloaded: str = "sys") -> None:
-        code = f"import {preloaded}; exec(compile(open({str(SERVER)!r}).read(), '<server>', 'exec'))"
+        code = (
+            f"import {preloaded}; exec(compile(open({str(SERVER)!r}).read(), '<server>', 'exec'))"
+        )
         pipe = subprocess.PIPE
         places = os.pathsep.join([*path, os.environ.get("PYTHONPATH", "")])
         environment = os.environ | {"PYTHONPATH": places}
@@ -132,7 +134,7 @@ def edit(path: Path, text: str) -> None:
     os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
 
 
-# -- files and folders -------------------------------------------------------------------------------------------------
+# -- files and folders -----------------------------------------------------------------------------
 
 READ_ALL = """
 from pathlib import Path
@@ -161,7 +163,8 @@ def test_files_in_settings_of_any_form(files: Any, edited: str, bench: Bench) ->
     assert bench.changed(reads) == f"the file {edited}"
 
 
-NAME = "net" + ".bin"  # the name of a file that no source writes: it would count without being opened
+# the name of a file that no source writes: it would count without being opened
+NAME = "net" + ".bin"
 
 
 @pytest.mark.parametrize(
@@ -198,7 +201,9 @@ def test_a_bare_name_in_the_working_folder_however_it_is_opened(read: str, bench
     source = f"NAME = 'net' + '.bin'\ndef open_it(name):\n    open(name).read()\ndef run():\n    try:\n        {read}\n"
     reads = bench.record(
         source
-        + "    except OSError:\n        assert 'CDLL' in open_it.__doc__\n".replace("open_it.__doc__", repr(read))
+        + "    except OSError:\n        assert 'CDLL' in open_it.__doc__\n".replace(
+            "open_it.__doc__", repr(read)
+        )
     )
     assert f"work:/{NAME}" in (*reads.files, *reads.programs)
     assert set(reads.files) <= {"plugin:/mine.py", f"work:/{NAME}"}
@@ -223,7 +228,11 @@ def test_a_folder_that_a_text_names(read: str, bench: Bench) -> None:
         bench.write(f"work/maps/{name}", "1111")
     source = f"import glob, os, pathlib\ndef run(folder):\n    {read}\n".replace("FOLDER", "folder")
     reads = bench.record(source, folder="maps")
-    assert set(reads.files) == {"plugin:/mine.py", "work:/maps/associations.txt", "work:/maps/b.txt"}
+    assert set(reads.files) == {
+        "plugin:/mine.py",
+        "work:/maps/associations.txt",
+        "work:/maps/b.txt",
+    }
     assert set(reads.folders) == {"work:/maps"}
     edit(bench.work / "maps" / "associations.txt", "2222")
     assert bench.changed(reads) == "the file maps/associations.txt"
@@ -259,7 +268,9 @@ def test_a_configuration_that_names_weights(config: str, is_opened: bool, bench:
 @pytest.mark.parametrize("name", ["0001.png", "net.ONNX"])
 def test_a_listed_folder_whose_images_are_opened_in_machine_code(name: str, bench: Bench) -> None:
     bench.write(f"work/masks/{name}", "1111")
-    reads = bench.record("import os\ndef run(folder):\n    return os.listdir(folder)\n", folder="masks")
+    reads = bench.record(
+        "import os\ndef run(folder):\n    return os.listdir(folder)\n", folder="masks"
+    )
     assert set(reads.files) == {"plugin:/mine.py", f"work:/masks/{name}"}
     edit(bench.work / "masks" / name, "2222")
     assert bench.changed(reads) == f"the file masks/{name}"
@@ -285,7 +296,11 @@ def test_names_that_no_file_can_have(name: str, bench: Bench) -> None:
 
 @pytest.mark.parametrize(
     "look",
-    ["open(name).read()", "from pathlib import Path; Path(name).read_bytes()", "import numpy; numpy.load(name)"],
+    [
+        "open(name).read()",
+        "from pathlib import Path; Path(name).read_bytes()",
+        "import numpy; numpy.load(name)",
+    ],
 )
 def test_a_file_that_is_missing(look: str, bench: Bench) -> None:
     source = f"def run(name):\n    try:\n        {look}\n    except OSError:\n        pass\n"
@@ -295,7 +310,9 @@ def test_a_file_that_is_missing(look: str, bench: Bench) -> None:
     assert bench.changed(reads) == "the file net.bin"
 
 
-@pytest.mark.parametrize("look", ["os.path.exists('tuned.yaml')", "pathlib.Path('tuned.yaml').is_file()"])
+@pytest.mark.parametrize(
+    "look", ["os.path.exists('tuned.yaml')", "pathlib.Path('tuned.yaml').is_file()"]
+)
 def test_a_file_that_is_missing_and_never_opened(look: str, bench: Bench) -> None:
     reads = bench.record(f"import os, pathlib\ndef run():\n    return {look}\n")
     assert set(reads.files.values()) >= {""}
@@ -312,14 +329,18 @@ def test_a_variable_in_a_path(text: str, bench: Bench, monkeypatch: pytest.Monke
     for folder in ("first", "second"):
         bench.write(f"{folder}/net.bin", folder)
     point_to("first")
-    source = "import os\ndef run(text):\n    open(os.path.expanduser(os.path.expandvars(text))).read()\n"
+    source = (
+        "import os\ndef run(text):\n    open(os.path.expanduser(os.path.expandvars(text))).read()\n"
+    )
     reads = bench.record(source, text=text)
     assert "~/net.bin" in reads.files
     point_to("second")
-    assert bench.changed(reads) == ("the file ~/net.bin" if "~" in text else "the environment variable WEIGHTS")
+    assert bench.changed(reads) == (
+        "the file ~/net.bin" if "~" in text else "the environment variable WEIGHTS"
+    )
 
 
-# -- environment variables ---------------------------------------------------------------------------------------------
+# -- environment variables -------------------------------------------------------------------------
 
 
 LOOKS = [
@@ -371,8 +392,14 @@ def test_a_variable_that_a_plug_in_looks_up(look: str, bench: Bench) -> None:
         ("import os, library\ndef run():\n    library.mode()\n", True),
         ("import os\ndef run():\n    os.environ['MODE'] = '1'; os.environ['MODE']\n", False),
         ("import os\ndef run():\n    os.environ.pop('MODE', None)\n", True),
-        ("import os\ndef run():\n    os.environ['HOME'], os.environ['PATH'], os.environ.get('DISPLAY')\n", False),
-        ("from dynslam_bench.core import find_data_root\ndef run():\n    find_data_root()\n", False),
+        (
+            "import os\ndef run():\n    os.environ['HOME'], os.environ['PATH'], os.environ.get('DISPLAY')\n",
+            False,
+        ),
+        (
+            "from dynslam_bench.core import find_data_root\ndef run():\n    find_data_root()\n",
+            False,
+        ),
         ("import tempfile\ndef run():\n    tempfile.mkdtemp()\n", False),
     ],
 )
@@ -393,7 +420,7 @@ def test_a_secret_is_neither_stored_nor_hidden_from_the_comparison(bench: Bench)
     assert bench.changed(reads) == "the environment variable MY_API_KEY"
 
 
-# -- modules -----------------------------------------------------------------------------------------------------------
+# -- modules ---------------------------------------------------------------------------------------
 
 
 def on_path(bench: Bench, folder: str = "path") -> None:
@@ -413,7 +440,9 @@ IMPORTS = "def run():\n    import library\n    return library.VALUE\n"
         ("library/__init__.py", "VALUE = 1\n", "VALUE = 2\n"),
     ],
 )
-def test_a_module_without_a_distribution_counts_by_its_bytes(name: str, text: str, edited: str, bench: Bench) -> None:
+def test_a_module_without_a_distribution_counts_by_its_bytes(
+    name: str, text: str, edited: str, bench: Bench
+) -> None:
     on_path(bench)
     file = bench.write(f"path/{name}", text)
     reads = bench.record(IMPORTS)
@@ -423,11 +452,14 @@ def test_a_module_without_a_distribution_counts_by_its_bytes(name: str, text: st
     assert bench.changed(reads) == f"the file {file}"
 
 
-@pytest.mark.parametrize("where", ["beside the plug-in", "in a package", "in a namespace package", "in an archive"])
+@pytest.mark.parametrize(
+    "where", ["beside the plug-in", "in a package", "in a namespace package", "in an archive"]
+)
 def test_modules_wherever_they_are_loaded_from(where: str, bench: Bench) -> None:
     import zipfile
 
-    name, source = "library.py", "VALUE = 1\n"
+    name = "library.py"
+    source = "VALUE = 1\n"
     match where:
         case "beside the plug-in":
             file = bench.write(f"plugin/{name}", source)
@@ -466,7 +498,9 @@ def test_byte_code_that_is_older_than_its_source_is_not_run(bench: Bench) -> Non
     source = "def run(name):\n    import library\n    open(name + str(library.VALUE))\n"
     for value in (1, 2):
         bench.write(f"work/gain{value}", "")
-    subprocess.run([sys.executable, "-m", "compileall", "-q", str(file)], check=True, env={**os.environ})
+    subprocess.run(
+        [sys.executable, "-m", "compileall", "-q", str(file)], check=True, env={**os.environ}
+    )
     assert list(file.parent.glob("__pycache__/*.pyc"))
     assert "work:/gain1" in bench.record(source, name="gain").files
     edit(file, "VALUE = 2\n")
@@ -480,13 +514,20 @@ def install(folder: Path, version: str, content: str) -> None:
 
     shutil.rmtree(folder, ignore_errors=True)
     metadata = folder / f"library_of_mine-{version}.dist-info"
-    files = {"library/__init__.py": f"VALUE = {content!r}\n", f"{metadata.name}/METADATA": f"Version: {version}\n"}
+    files = {
+        "library/__init__.py": f"VALUE = {content!r}\n",
+        f"{metadata.name}/METADATA": f"Version: {version}\n",
+    }
     lines = []
     for name, text in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)
         lines.append(f"{name},sha256={hashlib.sha256(text.encode()).hexdigest()},{len(text)}")
-    lines += [f"{metadata.name}/RECORD,,", "library/__pycache__/__init__.cpython-311.pyc,,", "../../bin/library,,"]
+    lines += [
+        f"{metadata.name}/RECORD,,",
+        "library/__pycache__/__init__.cpython-311.pyc,,",
+        "../../bin/library,,",
+    ]
     (metadata / "RECORD").write_text("\n".join(lines))
 
 
@@ -499,7 +540,9 @@ def install(folder: Path, version: str, content: str) -> None:
         ("", "", "the place of the module library"),
     ],
 )
-def test_a_dependency_that_is_installed_anew(version: str, content: str, changed: str, bench: Bench) -> None:
+def test_a_dependency_that_is_installed_anew(
+    version: str, content: str, changed: str, bench: Bench
+) -> None:
     on_path(bench, "site")
     install(bench.root / "site", "1.0", "one")
     reads = bench.record(IMPORTS)
@@ -600,11 +643,16 @@ def test_what_opencv_adds_to_the_search_path_of_its_process_does_not_count(tmp_p
     anchors = Anchors(None, tmp_path)
     added = "/env/lib/python3.11/site-packages/cv2/../../lib64:"
     assert search_now("LD_LIBRARY_PATH", {"LD_LIBRARY_PATH": added}, anchors) == ""
-    assert search_now("LD_LIBRARY_PATH", {"LD_LIBRARY_PATH": f"{added}{tmp_path}/lib"}, anchors) == "work:/lib"
-    assert program_environment((), {"LD_LIBRARY_PATH": f"{added}/opt/lib"}) == {"LD_LIBRARY_PATH": "/opt/lib"}
+    assert (
+        search_now("LD_LIBRARY_PATH", {"LD_LIBRARY_PATH": f"{added}{tmp_path}/lib"}, anchors)
+        == "work:/lib"
+    )
+    assert program_environment((), {"LD_LIBRARY_PATH": f"{added}/opt/lib"}) == {
+        "LD_LIBRARY_PATH": "/opt/lib"
+    }
 
 
-# -- what changes while it is read -------------------------------------------------------------------------------------
+# -- what changes while it is read -----------------------------------------------------------------
 
 TWICE = "def run(name):\n    open(name, 'rb').read()\ndef again():\n    pass\n"
 
@@ -656,7 +704,9 @@ def test_a_file_that_appears_while_it_is_looked_for(bench: Bench) -> None:
 
 def test_a_source_that_is_edited_while_the_run_lasts(bench: Bench) -> None:
     bench.write(f"work/{NAME}", "1111")
-    fault = record_while(bench, TWICE, lambda: edit(bench.plugin, TWICE.replace("rb", "br")), name=NAME)
+    fault = record_while(
+        bench, TWICE, lambda: edit(bench.plugin, TWICE.replace("rb", "br")), name=NAME
+    )
     assert "mine.py has changed" in fault
 
 
@@ -670,7 +720,7 @@ def test_the_snapshot_grows_with_what_is_read(bench: Bench) -> None:
         assert "reads" in bench.child.answer()
 
 
-# -- what does not count -----------------------------------------------------------------------------------------------
+# -- what does not count ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -742,7 +792,7 @@ def test_reads_are_equal_in_another_place_of_equal_layout(
     assert digest_of(bench.record(source, name=NAME)) == digest_of(other.record(source, name=NAME))
 
 
-# -- programs ----------------------------------------------------------------------------------------------------------
+# -- programs --------------------------------------------------------------------------------------
 
 START = "import subprocess\ndef run(words, folder=None):\n    subprocess.run(words, cwd=folder)\n"
 
@@ -768,7 +818,12 @@ def a_tool(bench: Bench, name: str = "bin/tool") -> Path:
 )
 def test_what_a_program_is_made_of(words: list[str], edited: str, bench: Bench) -> None:
     a_tool(bench)
-    texts = {"slam.yaml": "weights: net.bin", "net.bin": "1111", "maps/a/associations.txt": "1111", "part.py": "# 1111"}
+    texts = {
+        "slam.yaml": "weights: net.bin",
+        "net.bin": "1111",
+        "maps/a/associations.txt": "1111",
+        "part.py": "# 1111",
+    }
     for name, text in (texts | {"script.py": "import part  # 1111"}).items():
         bench.write(f"work/{name}", text)
     reads = bench.record(START, words=words)
@@ -779,7 +834,9 @@ def test_what_a_program_is_made_of(words: list[str], edited: str, bench: Bench) 
     assert bench.changed(reads).endswith(f"{shown} of a program")
 
 
-@pytest.mark.parametrize("words", [["ls", "/"], ["ls", "."], ["ls", ".."], ["true", "~"], ["true", sys.prefix]])
+@pytest.mark.parametrize(
+    "words", [["ls", "/"], ["ls", "."], ["ls", ".."], ["true", "~"], ["true", sys.prefix]]
+)
 def test_a_folder_that_is_too_wide_is_not_read_whole(words: list[str], bench: Bench) -> None:
     bench.write("work/a", "1111")
     reads = bench.record(START, words=words)
@@ -788,7 +845,9 @@ def test_a_folder_that_is_too_wide_is_not_read_whole(words: list[str], bench: Be
 
 def test_a_program_is_searched_on_the_path(bench: Bench) -> None:
     tool = a_tool(bench, "second/tool")
-    bench.environment["PATH"] = os.pathsep.join([str(bench.root / "first"), str(tool.parent), os.environ["PATH"]])
+    bench.environment["PATH"] = os.pathsep.join(
+        [str(bench.root / "first"), str(tool.parent), os.environ["PATH"]]
+    )
     reads = bench.record(START, words=["tool"])
     assert reads.search["command tool"] == str(tool)
     edit(tool, tool.read_text().replace("1", "2"))
@@ -825,7 +884,9 @@ def run(words):
     ],
 )
 @pytest.mark.parametrize("value", ["slow", None])
-def test_an_environment_variable_that_a_program_looks_up(words: list[str], value: str | None, bench: Bench) -> None:
+def test_an_environment_variable_that_a_program_looks_up(
+    words: list[str], value: str | None, bench: Bench
+) -> None:
     bench.write("work/mode.sh", "echo ${MY_SLAM_MODE}")
     bench.write("work/mode.py", "import os; os.getenv('MY_SLAM_MODE')")
     bench.environment |= {"ANOTHER": "1"} | ({} if value is None else {"MY_SLAM_MODE": value})
@@ -848,12 +909,25 @@ def test_what_a_program_writes_is_no_input(bench: Bench) -> None:
     for name in ("in/a", "out/old"):
         bench.write(f"work/{name}", "1111")
     reads = bench.record(START, words=["cp", "in/a", "out"])
-    assert {name for name in reads.programs if name.startswith("work:")} == {"work:/in/a", "work:/out/old"}
+    assert {name for name in reads.programs if name.startswith("work:")} == {
+        "work:/in/a",
+        "work:/out/old",
+    }
 
 
 def test_the_environment_of_a_program() -> None:
-    variables = {"PATH": "/bin", "LC_ALL": "C", "OMP_NUM_THREADS": "2", "MY_SLAM_MODE": "fast", "SSH_TTY": "x"}
-    assert program_environment((), variables) == {"PATH": "/bin", "LC_ALL": "C", "OMP_NUM_THREADS": "2"}
+    variables = {
+        "PATH": "/bin",
+        "LC_ALL": "C",
+        "OMP_NUM_THREADS": "2",
+        "MY_SLAM_MODE": "fast",
+        "SSH_TTY": "x",
+    }
+    assert program_environment((), variables) == {
+        "PATH": "/bin",
+        "LC_ALL": "C",
+        "OMP_NUM_THREADS": "2",
+    }
     assert program_environment(["MY_SLAM_MODE", "UNSET"], variables)["MY_SLAM_MODE"] == "fast"
     assert [name for name in variables if is_counted(name)] == ["LC_ALL", "MY_SLAM_MODE"]
 
@@ -865,10 +939,12 @@ def test_what_a_process_shows() -> None:
     assert len(shown.commands) == 1
 
 
-# -- comparing many runs -----------------------------------------------------------------------------------------------
+# -- comparing many runs ---------------------------------------------------------------------------
 
 
-def test_a_verifier_looks_at_each_thing_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_verifier_looks_at_each_thing_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from dynslam_bench.core import reads as module
 
     looked: list[str] = []
@@ -879,10 +955,17 @@ def test_a_verifier_looks_at_each_thing_once(tmp_path: Path, monkeypatch: pytest
     for number in range(4):
         for name in ("shared", f"own{number}"):
             (tmp_path / name).write_text(name)
-        digests = {f"work:/{name}": real(str(tmp_path / name)) for name in ("shared", f"own{number}")}
+        digests = {
+            f"work:/{name}": real(str(tmp_path / name)) for name in ("shared", f"own{number}")
+        }
         records.append(Reads(files=digests))
     verifier = Verifier()
     assert [verifier.changed(record, anchors) for record in records] == [""] * 4
     assert len(looked) == 5
     (tmp_path / "own2").write_text("another")
-    assert [Verifier().changed(record, anchors) for record in records] == ["", "", "the file own2", ""]
+    assert [Verifier().changed(record, anchors) for record in records] == [
+        "",
+        "",
+        "the file own2",
+        "",
+    ]

@@ -64,7 +64,9 @@ def test_a_bank_is_added_to_again_after_any_fault(tmp_path: Path) -> None:
         else:
             assert RunStore(target).ids() == []
 
-    found = survey(lambda: add(source, target), target, halfway=halfway, result=lambda: swept(target), every=2)
+    found = survey(
+        lambda: add(source, target), target, halfway=halfway, result=lambda: swept(target), every=2
+    )
     assert bank.verify(target) == []
     assert RunStore(target).ids() == source.ids()
     assert found.ends["kill", -9] >= found.operations // 2 > 15
@@ -138,7 +140,9 @@ def test_what_was_changed_in_an_unfinished_bank_is_a_fault_all_the_same(
 
 
 @pytest.mark.parametrize("folder", ["runs", "runs/.y.0123456789ab.tmp", "sequences/b"])
-def test_what_a_killed_process_left_is_no_part_of_a_bank(three: RunStore, tmp_path: Path, folder: str) -> None:
+def test_what_a_killed_process_left_is_no_part_of_a_bank(
+    three: RunStore, tmp_path: Path, folder: str
+) -> None:
     """Its name ends in ``.new``: it may be that of a process which is about to lock it."""
     target = tmp_path / "bank"
     add(three, target)
@@ -177,7 +181,9 @@ def test_a_full_disk_is_one_line_with_its_cause(
     with monkeypatch.context() as patch:
         patch.setattr("shutil.copyfile", full)
         patch.setattr("shutil.copy2", full)
-        with pytest.raises(InfrastructureError, match=r"cannot write .*No space left on device") as raised:
+        with pytest.raises(
+            InfrastructureError, match=r"cannot write .*No space left on device"
+        ) as raised:
             work()
     assert "[(" not in str(raised.value), "the first file alone is named"
     assert raised.value.hint == "check the free space"
@@ -185,9 +191,12 @@ def test_a_full_disk_is_one_line_with_its_cause(
     assert RunStore(target).ids() == three.ids()
 
 
-def test_a_full_disk_is_no_fault_of_a_manifest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_no_fault_of_a_manifest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its trajectories are not left out for it."""
-    truth, file = walk(tmp_path / "truth.txt", 0.0), walk(tmp_path / "theirs.txt", 0.001)
+    truth = walk(tmp_path / "truth.txt", 0.0)
+    file = walk(tmp_path / "theirs.txt", 0.001)
     checksum = sha256(file.read_bytes()).hexdigest()
     (tmp_path / "manifest.toml").write_text(
         f'[[trajectory]]\nfile = "{file.name}"\nsha256 = "{checksum}"\ntracker = "theirs"\nsequence = "mine"\n'
@@ -270,7 +279,9 @@ def vanishing(three: RunStore, monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 def test_a_run_that_vanishes_is_left_out_of_a_frame(three: RunStore, vanishing: str) -> None:
-    with pytest.warns(RuntimeWarning, match=f"1 runs cannot be read .*{vanishing}: run {vanishing} is not in"):
+    with pytest.warns(
+        RuntimeWarning, match=f"1 runs cannot be read .*{vanishing}: run {vanishing} is not in"
+    ):
         frame = three.frame()
     assert len(frame) == 2
     assert vanishing not in set(frame.run_id)
@@ -284,7 +295,9 @@ def test_a_run_that_vanishes_is_not_merged(three: RunStore, vanishing: str, tmp_
     assert "is not in" in left_out.reason
 
 
-def test_a_run_that_vanishes_is_listed_as_unreadable(three: RunStore, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_that_vanishes_is_listed_as_unreadable(
+    three: RunStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
     ids = three.ids()
     monkeypatch.setattr(RunStore, "ids", lambda store: ids)
     shutil.rmtree(three.folder(ids[1]))
@@ -309,7 +322,9 @@ def test_a_results_folder_that_vanishes_holds_no_runs(three: RunStore) -> None:
     assert list_runs(three) == ([], [])
 
 
-@pytest.mark.parametrize("file", ["trajectory_online.txt", "trajectory_final.txt", "groundtruth.txt"])
+@pytest.mark.parametrize(
+    "file", ["trajectory_online.txt", "trajectory_final.txt", "groundtruth.txt"]
+)
 def test_a_file_that_vanishes_before_it_is_opened_is_one_line(
     three: RunStore, monkeypatch: pytest.MonkeyPatch, file: str
 ) -> None:

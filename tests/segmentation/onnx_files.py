@@ -6,9 +6,15 @@ from collections.abc import Mapping
 
 import numpy as np
 
-FLOAT, UINT8, INT64, FLOAT16 = 1, 2, 7, 10
+FLOAT = 1
+UINT8 = 2
+INT64 = 7
+FLOAT16 = 10
 """Types of numbers."""
-CELLS, SIZE, MASKS, DETECTIONS = 16, 64, 4, 20
+CELLS = 16
+SIZE = 64
+MASKS = 4
+DETECTIONS = 20
 """Of the YOLO networks below: side of the prototypes and of the image, prototypes, rows of detections."""
 BOX = (26, 9, 38, 39)
 """Corners of the only object of these networks; its mask fills the box: 360 px."""
@@ -17,7 +23,8 @@ BOX = (26, 9, 38, 39)
 def varint(value: int) -> bytes:
     out = b""
     while True:
-        value, low = value >> 7, value & 127
+        low = value & 127
+        value = value >> 7
         out += bytes([low | (128 if value else 0)])
         if not value:
             return out
@@ -39,7 +46,9 @@ def tensor(name: str, value: np.ndarray) -> bytes:
 
 
 def value_info(name: str, shape, kind: int = FLOAT) -> bytes:
-    dims = b"".join(text(1, number(1, size) if isinstance(size, int) else text(2, size)) for size in shape)
+    dims = b"".join(
+        text(1, number(1, size) if isinstance(size, int) else text(2, size)) for size in shape
+    )
     return text(1, name) + text(2, text(1, number(1, kind) + text(2, dims)))
 
 
@@ -62,16 +71,25 @@ def constant_network(
     """
     graph = text(1, node("ReduceMean", ["image"], ["mean"], "mean_node"))
     graph += text(1, node("Mul", ["mean", "zero"], ["nothing"], "mul_node"))
-    inits = text(5, tensor("zero", np.zeros(1, np.float32))) + text(5, tensor("one_dim", np.array([1], np.int64)))
+    inits = text(5, tensor("zero", np.zeros(1, np.float32))) + text(
+        5, tensor("one_dim", np.array([1], np.int64))
+    )
     outs = b""
     for name, value in outputs.items():
         inits += text(5, tensor(f"const_{name}", value.astype(np.float32)))
-        graph += text(1, node("Reshape", ["nothing", "one_dim"], [f"flat_{name}"], f"flatten_{name}"))
+        graph += text(
+            1, node("Reshape", ["nothing", "one_dim"], [f"flat_{name}"], f"flatten_{name}")
+        )
         graph += text(1, node("Add", [f"const_{name}", f"flat_{name}"], [name], f"add_{name}"))
         shape = [f"{name}{axis}" for axis in range(value.ndim)] if open_shapes else value.shape
         outs += text(12, value_info(name, shape))
     graph += text(2, "tiny") + inits + text(11, value_info("image", input_shape, input_kind)) + outs
-    return number(1, 8) + text(7, graph) + text(8, text(1, "") + number(2, 13)) + entries(metadata or {})
+    return (
+        number(1, 8)
+        + text(7, graph)
+        + text(8, text(1, "") + number(2, 13))
+        + entries(metadata or {})
+    )
 
 
 def entries(metadata: Mapping[str, str]) -> bytes:

@@ -10,7 +10,11 @@ import torch
 
 from dynslam_bench.contracts.sequence import Frame
 from dynslam_bench.core.errors import SegmentationError
-from dynslam_bench.segmentation.build_segmenter import build_segmenter, resolve_source, weights_digest
+from dynslam_bench.segmentation.build_segmenter import (
+    build_segmenter,
+    resolve_source,
+    weights_digest,
+)
 from dynslam_bench.segmentation.networks import network as box_ops
 from dynslam_bench.segmentation.networks.backbone import RESNET18, NetworkConfig
 from dynslam_bench.segmentation.networks.checkpoints import embedded_weights
@@ -29,7 +33,8 @@ SMALL = NetworkConfig(
 def random_boxes(count, rng, side=100.0):
     corner = rng.uniform(0, side, (count, 2))
     return torch.tensor(
-        np.concatenate([corner, corner + rng.uniform(1, side / 2, (count, 2))], axis=1), dtype=torch.float32
+        np.concatenate([corner, corner + rng.uniform(1, side / 2, (count, 2))], axis=1),
+        dtype=torch.float32,
     )
 
 
@@ -58,7 +63,10 @@ def test_nms_equals_opencv(count, threshold):
     scores = torch.tensor((rng.permutation(count) + 1).astype(np.float32) / max(count, 1))
     as_xywh = torch.cat([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]], dim=1).double().tolist()
     expected = cv2.dnn.NMSBoxes(as_xywh, scores.double().tolist(), 0.0, threshold) if count else []
-    assert box_ops.nms(boxes, scores, threshold).tolist() == np.asarray(expected, int).reshape(-1).tolist()
+    assert (
+        box_ops.nms(boxes, scores, threshold).tolist()
+        == np.asarray(expected, int).reshape(-1).tolist()
+    )
 
 
 def test_suppression_of_a_long_chain_is_greedy_and_by_group():
@@ -71,17 +79,23 @@ def test_suppression_of_a_long_chain_is_greedy_and_by_group():
 
 def test_codes_are_inverse():
     rng = np.random.default_rng(0)
-    boxes, references = random_boxes(50, rng), random_boxes(50, rng)
+    references = random_boxes(50, rng)
+    boxes = random_boxes(50, rng)
     codes = box_ops.encode(boxes, references, box_ops.BOX_WEIGHTS)
-    assert torch.allclose(box_ops.decode(codes, references, box_ops.BOX_WEIGHTS)[:, 0], boxes, atol=1e-3)
-    assert torch.isfinite(box_ops.decode(torch.full((50, 4), 1e4), references, box_ops.RPN_WEIGHTS)).all()
+    assert torch.allclose(
+        box_ops.decode(codes, references, box_ops.BOX_WEIGHTS)[:, 0], boxes, atol=1e-3
+    )
+    assert torch.isfinite(
+        box_ops.decode(torch.full((50, 4), 1e4), references, box_ops.RPN_WEIGHTS)
+    ).all()
 
 
 def slow_roi_align(feature, box, scale, size, samples):
     """RoIAlign by its definition, one sample at a time."""
     channels, height, width = feature.shape
     x0, y0, x1, y1 = (float(value) * scale for value in box)
-    step_y, step_x = max(y1 - y0, 1.0) / size, max(x1 - x0, 1.0) / size
+    step_y = max(y1 - y0, 1.0) / size
+    step_x = max(x1 - x0, 1.0) / size
     out = np.zeros((channels, size, size))
     for i in range(size):
         for j in range(size):
@@ -91,12 +105,17 @@ def slow_roi_align(feature, box, scale, size, samples):
                     x = x0 + (j + (b + 0.5) / samples) * step_x
                     if y < -1 or y > height or x < -1 or x > width:
                         continue
-                    y, x = min(max(y, 0), height - 1), min(max(x, 0), width - 1)
-                    r, c = min(int(y), height - 1), min(int(x), width - 1)
-                    r1, c1, fy, fx = min(r + 1, height - 1), min(c + 1, width - 1), y - r, x - c
-                    out[:, i, j] += (1 - fy) * ((1 - fx) * feature[:, r, c] + fx * feature[:, r, c1]) + fy * (
-                        (1 - fx) * feature[:, r1, c] + fx * feature[:, r1, c1]
-                    )
+                    y = min(max(y, 0), height - 1)
+                    x = min(max(x, 0), width - 1)
+                    r = min(int(y), height - 1)
+                    c = min(int(x), width - 1)
+                    r1 = min(r + 1, height - 1)
+                    c1 = min(c + 1, width - 1)
+                    fy = y - r
+                    fx = x - c
+                    out[:, i, j] += (1 - fy) * (
+                        (1 - fx) * feature[:, r, c] + fx * feature[:, r, c1]
+                    ) + fy * ((1 - fx) * feature[:, r1, c] + fx * feature[:, r1, c1])
     return out / samples**2
 
 
@@ -110,9 +129,16 @@ def test_roi_align_equals_its_definition():
     assert len(set(levels.tolist())) >= 3
     for k, box in enumerate(torch.cat(boxes)):
         level = int(levels[k])
-        expected = slow_roi_align(features[level][0 if k < 12 else 1].numpy(), box, 1 / (4 * 2**level), 7, 2)
+        expected = slow_roi_align(
+            features[level][0 if k < 12 else 1].numpy(), box, 1 / (4 * 2**level), 7, 2
+        )
         assert np.allclose(found[k].numpy(), expected, atol=1e-4)
-    assert roi_align(features, [boxes[0][:0], boxes[1][:0]], 256, 7, canonical=60.0).shape == (0, 5, 7, 7)
+    assert roi_align(features, [boxes[0][:0], boxes[1][:0]], 256, 7, canonical=60.0).shape == (
+        0,
+        5,
+        7,
+        7,
+    )
 
 
 def test_box_levels_follow_the_paper():
@@ -122,22 +148,30 @@ def test_box_levels_follow_the_paper():
 
 
 def test_a_fresh_cfpn_changes_nothing_and_a_trained_one_the_masks_only():
-    plain, fused = network(SMALL.model_copy(update={"cfpn": False})), network()
+    plain = network(SMALL.model_copy(update={"cfpn": False}))
+    fused = network()
     fused.load_state_dict(plain.state_dict(), strict=False)
     image = torch.rand(3, 60, 80)
-    before, after = plain.detect(image), fused.detect(image)
+    before = plain.detect(image)
+    after = fused.detect(image)
     assert len(before.boxes) > 0
     names = ("boxes", "labels", "scores", "masks")
-    assert [name for name in names if not torch.equal(getattr(before, name), getattr(after, name))] == []
+    assert [
+        name for name in names if not torch.equal(getattr(before, name), getattr(after, name))
+    ] == []
     with torch.no_grad():
         for smooth in fused.backbone.cfpn.smooth:
             smooth.weight.normal_(0, 0.1)
     trained = fused.detect(image)
-    assert torch.equal(before.boxes, trained.boxes) and not torch.allclose(before.masks, trained.masks)
+    assert torch.equal(before.boxes, trained.boxes)
+    assert not torch.allclose(before.masks, trained.masks)
 
 
 def test_fusing_batch_norm_changes_no_output():
-    for config in (SMALL, SMALL.model_copy(update={"norm": "frozen", "bottleneck": True, "blocks": (1, 2, 1, 1)})):
+    for config in (
+        SMALL,
+        SMALL.model_copy(update={"norm": "frozen", "bottleneck": True, "blocks": (1, 2, 1, 1)}),
+    ):
         made = network(config)
         x, _ = made.prepare(torch.rand(3, 60, 80))
         before = made.backbone(x)[0]
@@ -152,7 +186,11 @@ def test_fusing_batch_norm_changes_no_output():
 
 def published(config, layout):
     """A state dict with torchvision's names: 'frozen' (no counters), 'counted', or '2019'."""
-    state = {k: v.clone() for k, v in network(config).state_dict().items() if not k.startswith("backbone.cfpn.")}
+    state = {
+        k: v.clone()
+        for k, v in network(config).state_dict().items()
+        if not k.startswith("backbone.cfpn.")
+    }
     if layout != "counted":
         state = {k: v for k, v in state.items() if not k.endswith("num_batches_tracked")}
     if layout == "2019":
@@ -167,12 +205,15 @@ def published(config, layout):
 
 @pytest.mark.parametrize(("layout", "keys"), [("frozen", 307), ("counted", 360), ("2019", 307)])
 def test_the_three_published_layouts_load_strictly(tmp_path, layout, keys):
-    config = NetworkConfig(norm="batch", stem=8, channels=16, box_hidden=16, mask_channels=16)  # narrow: same keys
+    # narrow: same keys
+    config = NetworkConfig(norm="batch", stem=8, channels=16, box_hidden=16, mask_channels=16)
     state = published(config, layout)
     assert len(state) == keys
     torch.save(state, tmp_path / "coco.pth")
     loaded = load_network(tmp_path / "coco.pth")
-    assert loaded.config.blocks == (3, 4, 6, 3) and loaded.config.bottleneck and len(loaded.config.classes) == 90
+    assert loaded.config.blocks == (3, 4, 6, 3)
+    assert loaded.config.bottleneck
+    assert len(loaded.config.classes) == 90
     own = loaded.state_dict()
     assert all(torch.equal(own[key], value) for key, value in published(config, "frozen").items())
     assert all(not key.startswith("backbone.cfpn.smooth") or not own[key].any() for key in own)
@@ -201,7 +242,12 @@ def test_a_resnet18_checkpoint_is_recognised(tmp_path):
     torch.save(published(RESNET18.model_copy(update=NARROW), "counted"), tmp_path / "r18.pth")
     with pytest.warns(UserWarning, match="does not name its only class: it is taken for person"):
         config = load_network(tmp_path / "r18.pth").config
-    assert (config.blocks, config.bottleneck, config.stem, config.classes) == ((2, 2, 2, 2), False, 8, ("person",))
+    assert (config.blocks, config.bottleneck, config.stem, config.classes) == (
+        (2, 2, 2, 2),
+        False,
+        8,
+        ("person",),
+    )
 
 
 def test_foreign_checkpoints_say_what_is_wrong(tmp_path):
@@ -215,7 +261,9 @@ def test_foreign_checkpoints_say_what_is_wrong(tmp_path):
             torch.save(content, path)
         with pytest.raises(SegmentationError) as error:
             load_network(path)
-        assert [text for text in (str(path), *texts) if text not in str(error.value)] == [], error.value
+        assert [text for text in (str(path), *texts) if text not in str(error.value)] == [], (
+            error.value
+        )
 
     refused(
         {k: v for k, v in good.items() if "mask_predictor" not in k},
@@ -227,8 +275,15 @@ def test_foreign_checkpoints_say_what_is_wrong(tmp_path):
         {**good, "rpn.head.bbox_pred.bias": torch.zeros(8)},
         "1 shapes differ (rpn.head.bbox_pred.bias [8] instead of [12])",
     )
-    refused({**good, "rpn.head.bbox_pred.bias": torch.full((12,), float("nan"))}, "rpn.head.bbox_pred.bias holds NaN")
-    refused({"fc.weight": torch.zeros(3, 3)}, "is no Mask R-CNN", "backbone.body.conv1.weight is missing")
+    refused(
+        {**good, "rpn.head.bbox_pred.bias": torch.full((12,), float("nan"))},
+        "rpn.head.bbox_pred.bias holds NaN",
+    )
+    refused(
+        {"fc.weight": torch.zeros(3, 3)},
+        "is no Mask R-CNN",
+        "backbone.body.conv1.weight is missing",
+    )
     refused({"epoch": 3}, "holds no weights")
     refused([1, 2, 3], "holds a list")
     refused(b"", "it is truncated")
@@ -256,18 +311,30 @@ def test_images_of_any_size(shape):
     floor = 1.0 if shape == (48, 64, 3) else 0.01
     settings = SegmentationSettings(classes="person,chair")
     found = MaskRCNNSegmenter(network(), settings, floor=floor).segment(frame(shape))
-    assert found.masks.shape[1:] == shape[:2] and found.masks.dtype == bool
-    assert len(found.masks) == len(found) == len(found.boxes) == len(found.scores) and (not len(found) or floor < 1)
-    assert (found.boxes[:, [0, 1]] >= 0).all() and (found.boxes[:, 2] <= shape[1]).all()
+    assert found.masks.shape[1:] == shape[:2]
+    assert found.masks.dtype == bool
+    assert len(found.masks) == len(found) == len(found.boxes) == len(found.scores)
+    assert not len(found) or floor < 1
+    assert (found.boxes[:, [0, 1]] >= 0).all()
+    assert (found.boxes[:, 2] <= shape[1]).all()
 
 
 def test_a_weights_file_as_source(tmp_path):
     save_network(network(), tmp_path / "own.pt")
-    settings = SegmentationSettings(source=f"weights:{tmp_path / 'own.pt'}", confidence=0.05, network_side=0)
-    first, second = (build_segmenter(settings, threads=1).segment(frame((48, 64, 3))) for _ in range(2))
-    assert len(first) > 0 and set(first.class_names) == {"person"}
-    assert np.array_equal(first.masks, second.masks) and np.array_equal(first.scores, second.scores)
-    with pytest.raises(SegmentationError, match=r"none of the 2 classes of the network is among the dynamic ones: dog"):
+    settings = SegmentationSettings(
+        source=f"weights:{tmp_path / 'own.pt'}", confidence=0.05, network_side=0
+    )
+    first, second = (
+        build_segmenter(settings, threads=1).segment(frame((48, 64, 3))) for _ in range(2)
+    )
+    assert len(first) > 0
+    assert set(first.class_names) == {"person"}
+    assert np.array_equal(first.masks, second.masks)
+    assert np.array_equal(first.scores, second.scores)
+    with pytest.raises(
+        SegmentationError,
+        match=r"none of the 2 classes of the network is among the dynamic ones: dog",
+    ):
         build_segmenter(settings.model_copy(update={"classes": "dog"}))
     with pytest.raises(SegmentationError, match="sees no GPU"):
         build_segmenter(settings, device="cuda:99" if not torch.cuda.is_available() else "cuda")
@@ -278,11 +345,22 @@ def test_pasted_masks_fill_their_box():
     plane = np.ones((28, 28), np.float32)
     box = np.array([10, 20, 50, 80], np.float32)
     exact = paste(plane, box, 100, 100, 0.5, exact=True)
-    assert exact[20:80, 10:50].all() and exact.sum() == 40 * 60
+    assert exact[20:80, 10:50].all()
+    assert exact.sum() == 40 * 60
     rows, columns = np.nonzero(paste(plane, box, 100, 100, 0.5))
-    assert (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1) == pytest.approx((10, 20, 50, 80), abs=1.01)
-    moved = paste(np.tile(np.repeat(np.float32([0, 1]), 14), (28, 1)), box + np.float32(0.4), 100, 100, 0.5, exact=True)
-    assert not moved[:, :30].any() and moved[21:80, 31:50].all()
+    assert (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1) == pytest.approx(
+        (10, 20, 50, 80), abs=1.01
+    )
+    moved = paste(
+        np.tile(np.repeat(np.float32([0, 1]), 14), (28, 1)),
+        box + np.float32(0.4),
+        100,
+        100,
+        0.5,
+        exact=True,
+    )
+    assert not moved[:, :30].any()
+    assert moved[21:80, 31:50].all()
     assert not paste(plane, np.array([-30, -30, -5, -5], np.float32), 100, 100, 0.5).any()
 
 
@@ -296,22 +374,32 @@ def test_auto_means_embedded_on_rendered_sequences():
     assert embedded_weights().stat().st_size < 15e6
     assert resolve_source(AUTO, "synthetic/walking_xyz?scene=0&frames=60") == "embedded"
     assert len(weights_digest(AUTO, "synthetic/walking_xyz")) == 12
-    assert f'"{weights_digest(AUTO, "synthetic/walking_xyz")}"' in embedded_weights().with_suffix(".json").read_text()
+    assert (
+        f'"{weights_digest(AUTO, "synthetic/walking_xyz")}"'
+        in embedded_weights().with_suffix(".json").read_text()
+    )
 
 
 def test_it_finds_people_of_a_held_out_instance(tmp_path):
     segmenter = build_segmenter(AUTO, sequence_id="synthetic/walking_xyz", threads=1)
     sequence = open_sequence("synthetic/sitting_xyz?scene=120&frames=30", data_root=tmp_path)
-    frame, masks = sequence[5], sequence.masks[5]
-    people = np.isin(masks.instances, [k for k, name in masks.class_names.items() if name == "person"])
-    found, again = segmenter.segment(frame), segmenter.segment(frame)
+    frame = sequence[5]
+    masks = sequence.masks[5]
+    people = np.isin(
+        masks.instances, [k for k, name in masks.class_names.items() if name == "person"]
+    )
+    found = segmenter.segment(frame)
+    again = segmenter.segment(frame)
     union = found.union()
-    assert set(found.class_names) == {"person"} and len(found) == 2
+    assert set(found.class_names) == {"person"}
+    assert len(found) == 2
     assert (union & people).sum() / (union | people).sum() > 0.85
-    assert np.array_equal(found.masks, again.masks) and np.array_equal(found.scores, again.scores)
+    assert np.array_equal(found.masks, again.masks)
+    assert np.array_equal(found.scores, again.scores)
 
 
-# Whole models against torchvision's own, on random weights; skipped where torchvision cannot be imported.
+# Whole models against torchvision's own, on random weights; skipped where torchvision cannot be
+# imported.
 
 
 @pytest.fixture(scope="module")
@@ -358,7 +446,9 @@ def make(torchvision, seed, size):
     return model
 
 
-@pytest.mark.parametrize(("seed", "shape", "size"), [(0, (120, 160), (128, 171)), (1, (100, 90), (96, 128))])
+@pytest.mark.parametrize(
+    ("seed", "shape", "size"), [(0, (120, 160), (128, 171)), (1, (100, 90), (96, 128))]
+)
 def test_outputs_equal_torchvisions(torchvision, tmp_path, seed, shape, size):
     model = make(torchvision, seed, size)
     torch.save(model.state_dict(), tmp_path / "theirs.pth")

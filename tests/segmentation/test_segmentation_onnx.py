@@ -50,7 +50,10 @@ def picture(rgb):
 
 def info(**shapes):
     """Outputs by name: a shape, or a shape and the type of the numbers."""
-    return [TensorInfo(name, *(shape if isinstance(shape[-1], str) else (shape,))) for name, shape in shapes.items()]
+    return [
+        TensorInfo(name, *(shape if isinstance(shape[-1], str) else (shape,)))
+        for name, shape in shapes.items()
+    ]
 
 
 def detect(outputs, metadata=None, size=(SIZE, SIZE), asked="auto"):
@@ -65,9 +68,11 @@ def refused(outputs, metadata=None, size=(SIZE, SIZE), asked="auto"):
 
 
 PLANES = (1, MASKS, CELLS, CELLS)
-ONE, TWO = {"names": names_of("person")}, {"names": names_of("person", "car")}
+ONE = {"names": names_of("person")}
+TWO = {"names": names_of("person", "car")}
 COCO_80 = {"names": names_of(*COCO_NAMES)}
-RAW, SUPPRESSED = {"end2end": "False"}, {"end2end": "True", "task": "segment"}
+RAW = {"end2end": "False"}
+SUPPRESSED = {"end2end": "True", "task": "segment"}
 HD = (640, 640)
 AT_HD = (1, 32, 160, 160)
 INSTANCES = {"boxes": (None, 4), "labels": (None,), "scores": (None,), "masks": (None, 1, 480, 640)}
@@ -76,7 +81,8 @@ INSTANCES = {"boxes": (None, 4), "labels": (None,), "scores": (None,), "masks": 
 @pytest.mark.parametrize(
     ("outputs", "metadata", "size", "expected"),
     [
-        # YOLOv8 and newer as they are exported: 80 classes without and with names, one and two classes
+        # YOLOv8 and newer as they are exported: 80 classes without and with names, one and two
+        # classes
         ({"a": (1, 116, 6300), "b": (1, 32, 120, 160)}, {}, (480, 640), ("yolo", True)),
         ({"a": (1, 116, 8400), "b": AT_HD}, COCO_80 | RAW | {"task": "segment"}, HD, ("yolo", True)),
         ({"a": (1, 37, 8400), "b": AT_HD}, {}, HD, ("yolo", True)),
@@ -89,18 +95,21 @@ INSTANCES = {"boxes": (None, 4), "labels": (None,), "scores": (None,), "masks": 
         # more detections than channels, and fewer
         ({"a": (1, 116, 84), "b": (1, 32, 16, 16)}, COCO_80, (64, 64), ("yolo", True)),
         ({"a": (1, 84, 116), "b": (1, 32, 16, 16)}, COCO_80, (64, 64), ("yolo", False)),
-        # YOLOv5: 80 classes and one, which has as many channels as suppressed detections, told by 3 anchors a cell
+        # YOLOv5: 80 classes and one, which has as many channels as suppressed detections, told by 3
+        # anchors a cell
         ({"a": (1, 25200, 117), "b": AT_HD}, {}, HD, ("yolo-objectness", False)),
         ({"a": (1, 25200, 117), "b": AT_HD}, COCO_80 | {"stride": "32"}, HD, ("yolo-objectness", False)),
         ({"a": (1, 25200, 38), "b": AT_HD}, ONE, HD, ("yolo-objectness", False)),
-        # suppression inside: said by end2end or by nms, or by a number of classes that fits nothing else
+        # suppression inside: said by end2end or by nms, or by a number of classes that fits nothing
+        # else
         ({"a": (1, 300, 38), "b": AT_HD}, ONE | SUPPRESSED, HD, ("yolo-nms", False)),
         ({"a": (1, 300, 38), "b": AT_HD}, TWO | {"end2end": "true"}, HD, ("yolo-nms", False)),
         ({"b": AT_HD, "a": (1, 300, 38)}, TWO | RAW | {"args": "{'nms': True}"}, HD, ("yolo-nms", False)),
         ({"a": (1, 300, 38), "b": AT_HD}, COCO_80, HD, ("yolo-nms", False)),
         ({"a": (1, 38, 38), "b": AT_HD}, TWO | SUPPRESSED, HD, ("yolo-nms", False)),
         ({"a": (1, 0, 38), "b": AT_HD}, COCO_80 | SUPPRESSED, HD, ("yolo-nms", False)),
-        # semantic networks: VOC's names, own names with and without the background, a label map beside the logits
+        # semantic networks: VOC's names, own names with and without the background, a label map
+        # beside the logits
         ({"logits": (1, 21, 31, 41)}, {}, (481, 641), ("semantic-aligned", True)),
         ({"out": (1, 21, 480, 640)}, {}, (480, 640), ("semantic", True)),
         ({"out": (1, 3, 60, 80)}, {"names": names_of("background", "person", "car")}, (480, 640), ("semantic", True)),
@@ -158,7 +167,8 @@ def test_without_names_the_number_of_classes_is_open(detections, usable, layouts
     outputs = {"a": detections, "b": AT_HD}
     error = refused(outputs, size=HD)
     assert [text for text in layouts if text not in error.args[0]] == []
-    assert "'names' of the file tells" in error.hint and f"onnx_layout={usable} decides" in error.hint
+    assert "'names' of the file tells" in error.hint
+    assert f"onnx_layout={usable} decides" in error.hint
     assert detect(outputs, size=HD, asked=usable).id == usable
 
 
@@ -222,11 +232,14 @@ def test_the_setting_outweighs_the_metadata_but_not_the_shapes():
     assert detect(outputs, TWO | RAW, HD, "yolo-nms").suppressed
     assert detect({"a": (1, 37, 8400), "b": AT_HD}, ONE | SUPPRESSED, HD, "yolo").id == "yolo"
     error = refused(outputs, TWO, HD, "semantic")
-    assert "onnx_layout is semantic" in error.args[0] and "'yolo-nms'" in error.args[0]
+    assert "onnx_layout is semantic" in error.args[0]
+    assert "'yolo-nms'" in error.args[0]
 
 
 def test_names_come_from_the_metadata():
-    own = detect({"a": (1, 38, 2100), "b": (1, 32, 60, 80)}, {"names": "{0: 'person', 1: 'cat'}"}, (240, 320))
+    own = detect(
+        {"a": (1, 38, 2100), "b": (1, 32, 60, 80)}, {"names": "{0: 'person', 1: 'cat'}"}, (240, 320)
+    )
     assert own.names == {0: "person", 1: "cat"}
 
 
@@ -251,13 +264,17 @@ def yolo_values(boxes, scores, labels, cells=(12, 16), count=50, coefficients=3)
 
 def test_yolo_decoding_cuts_masks_to_boxes_and_suppresses_per_class():
     outputs = yolo_values(
-        [(8, 8, 40, 56), (9, 8, 41, 56), (8, 8, 40, 56), (50, 4, 60, 20)], [0.9, 0.8, 0.7, 0.2], [0, 0, 16, 0]
+        [(8, 8, 40, 56), (9, 8, 41, 56), (8, 8, 40, 56), (50, 4, 60, 20)],
+        [0.9, 0.8, 0.7, 0.2],
+        [0, 0, 16, 0],
     )
     place = Placement((96, 128), (96, 128))
     found = decode(COCO, outputs, place, SETTINGS, 0.1)
-    assert found.class_names == ("person", "person") and found.scores == pytest.approx([0.9, 0.2])
+    assert found.class_names == ("person", "person")
+    assert found.scores == pytest.approx([0.9, 0.2])
     assert found.boxes[0] == pytest.approx([8, 8, 40, 56])
-    assert found.masks[0].sum() == 32 * 48 and found.masks[0][8:56, 8:40].all()
+    assert found.masks[0].sum() == 32 * 48
+    assert found.masks[0][8:56, 8:40].all()
     both = decode(COCO, outputs, place, SegmentationSettings(classes="person,dog"), 0.5)
     assert both.class_names == ("person", "dog")
 
@@ -265,10 +282,13 @@ def test_yolo_decoding_cuts_masks_to_boxes_and_suppresses_per_class():
 def test_yolo_letterbox_is_undone():
     outputs = yolo_values([(16, 32, 48, 64)], [0.9], [0], cells=(32, 32))
     image, place = fit(np.zeros((240, 320, 3), np.uint8), (128, 128), keep_aspect=True)
-    assert image.shape == (128, 128, 3) and (image[:16] == 114).all() and (image[16:112] == 0).all()
+    assert image.shape == (128, 128, 3)
+    assert (image[:16] == 114).all()
+    assert (image[16:112] == 0).all()
     found = decode(COCO, outputs, place, SETTINGS, 0.1)
     assert found.boxes[0] == pytest.approx([40, 40, 120, 120])
-    assert found.masks[0][41:119, 41:119].all() and found.masks[0].sum() == 80 * 80
+    assert found.masks[0][41:119, 41:119].all()
+    assert found.masks[0].sum() == 80 * 80
 
 
 def test_semantic_decoding_is_argmax_split_into_parts():
@@ -280,7 +300,8 @@ def test_semantic_decoding_is_argmax_split_into_parts():
     layout = detect_layout(info(out=logits.shape), {}, (480, 640), "f")
     found = decode(layout, [logits], Placement((480, 640), (480, 640)), SETTINGS, 0.1)
     assert found.class_names == ("person", "person")
-    assert found.masks[0][100:200, 50:150].all() and found.masks.sum() == 100 * 100 + 100 * 200
+    assert found.masks[0][100:200, 50:150].all()
+    assert found.masks.sum() == 100 * 100 + 100 * 200
     assert found.scores == pytest.approx([1 / (1 + np.exp(-3.0))] * 2, abs=1e-5)
 
 
@@ -290,7 +311,8 @@ def test_aligned_logits_are_interpolated_between_corners():
     logits[0, 15] = np.linspace(-1, 3, 41)[None]
     layout = detect_layout(info(out=logits.shape), {}, (481, 641), "f")
     found = decode(layout, [logits], Placement((481, 641), (481, 641)), SETTINGS, 0.1)
-    assert found.masks[0][:, 321:].all() and not found.masks[0][:, :320].any()
+    assert found.masks[0][:, 321:].all()
+    assert not found.masks[0][:, :320].any()
 
 
 def test_torchvision_instances():
@@ -299,15 +321,30 @@ def test_torchvision_instances():
     masks[1, 0, 60:90, 70:100] = 0.8
     masks[2, 0, 0:9, 0:9] = 0.9
     boxes = np.array([[20, 10, 60, 50], [70, 60, 100, 90], [0, 0, 9, 9]], np.float32)
-    values = [boxes, np.array([1, 62, 1], np.float32), np.array([0.9, 0.8, 0.05], np.float32), masks]
-    layout = detect_layout(info(boxes=(3, 4), labels=(3,), scores=(3,), masks=(3, 1, 96, 128)), {}, (96, 128), "f")
+    values = [
+        boxes,
+        np.array([1, 62, 1], np.float32),
+        np.array([0.9, 0.8, 0.05], np.float32),
+        masks,
+    ]
+    layout = detect_layout(
+        info(boxes=(3, 4), labels=(3,), scores=(3,), masks=(3, 1, 96, 128)), {}, (96, 128), "f"
+    )
     place = Placement((96, 128), (96, 128))
     found = decode(layout, values, place, SETTINGS, 0.1)
-    assert found.class_names == ("person",) and (found.masks[0] == (masks[0, 0] > 0.5)).all()
-    assert decode(layout, values, place, SegmentationSettings(classes="chair"), 0.1).class_names == ("chair",)
-    fewer, small = [boxes, values[1][:2], *values[2:]], [*values[:3], np.ones((3, 1, 28, 28), np.float32)]
+    assert found.class_names == ("person",)
+    assert (found.masks[0] == (masks[0, 0] > 0.5)).all()
+    assert decode(
+        layout, values, place, SegmentationSettings(classes="chair"), 0.1
+    ).class_names == ("chair",)
+    fewer = [boxes, values[1][:2], *values[2:]]
+    small = [*values[:3], np.ones((3, 1, 28, 28), np.float32)]
     unknown = [*values[:3], np.full_like(masks, np.nan)]
-    for wrong, words in ((fewer, "disagree: 3 boxes, 2 labels"), (small, "28x28"), (unknown, "'masks' holds NaN")):
+    for wrong, words in (
+        (fewer, "disagree: 3 boxes, 2 labels"),
+        (small, "28x28"),
+        (unknown, "'masks' holds NaN"),
+    ):
         with pytest.raises(SegmentationError, match=words):
             decode(layout, wrong, place, SETTINGS, 0.1)
     assert len(decode(layout, [value[:0] for value in values], place, SETTINGS, 0.1)) == 0
@@ -364,7 +401,9 @@ def objects(settings):
     found = build_segmenter(settings).segment(picture(np.zeros((SIZE, SIZE, 3), np.uint8)))
     return [
         (name, tuple(box), int(mask.sum()))
-        for name, box, mask in zip(found.class_names, found.boxes.tolist(), found.masks, strict=True)
+        for name, box, mask in zip(
+            found.class_names, found.boxes.tolist(), found.masks, strict=True
+        )
     ]
 
 
@@ -396,7 +435,10 @@ def test_suppressed_detections_are_not_suppressed_again(tmp_path):
     detections = suppressed_detections()
     detections[0, 1] = detections[0, 0]
     detections[0, 1, 1:5] += (1, 0, 1, -0.1)  # a row lower: 29 of 31 rows are common
-    assert objects(yolo(tmp_path, detections, ONE | SUPPRESSED)) == [*PERSON, ("person", (26, 10, 38, 40), 360)]
+    assert objects(yolo(tmp_path, detections, ONE | SUPPRESSED)) == [
+        *PERSON,
+        ("person", (26, 10, 38, 40), 360),
+    ]
 
 
 @pytest.mark.parametrize(
@@ -445,7 +487,9 @@ def test_a_layout_that_the_user_took_for_another_is_noticed(tmp_path, detections
 )
 def test_inputs_that_are_no_image_of_real_numbers_are_refused(tmp_path, shape, kind, words):
     path = tmp_path / "net.onnx"
-    path.write_bytes(constant_network(shape, {"a": raw_detections(1), "b": prototypes()}, ONE, input_kind=kind))
+    path.write_bytes(
+        constant_network(shape, {"a": raw_detections(1), "b": prototypes()}, ONE, input_kind=kind)
+    )
     with pytest.raises(SegmentationError, match=words):
         build_segmenter(SegmentationSettings(source=f"onnx:{path}"))
 
@@ -453,7 +497,9 @@ def test_inputs_that_are_no_image_of_real_numbers_are_refused(tmp_path, shape, k
 def test_a_file_that_says_two_things_is_refused(tmp_path):
     settings = yolo(tmp_path, suppressed_detections(), ONE)
     path = Path(settings.source.removeprefix("onnx:"))
-    path.write_bytes(path.read_bytes() + entries({"end2end": "True"}) + entries({"end2end": "False"}))
+    path.write_bytes(
+        path.read_bytes() + entries({"end2end": "True"}) + entries({"end2end": "False"})
+    )
     with pytest.raises(SegmentationError, match="two different entries 'end2end'"):
         read_header(path)
 
@@ -464,7 +510,9 @@ def test_a_file_that_says_two_things_is_refused(tmp_path):
 def test_a_name_that_is_coco_s_but_for_its_case_is_taken_with_a_warning(tmp_path):
     for name in ("Person", " PERSON", "person, individual"):
         settings = yolo(tmp_path, raw_detections(2), {"names": names_of(name, "car")})
-        with pytest.warns(UserWarning, match=f"the class '{name}' of the network is taken for 'person'"):
+        with pytest.warns(
+            UserWarning, match=f"the class '{name}' of the network is taken for 'person'"
+        ):
             assert objects(settings) == PERSON
 
 
@@ -478,14 +526,17 @@ def test_a_name_that_is_coco_s_but_for_its_case_is_taken_with_a_warning(tmp_path
     ],
 )
 @pytest.mark.parametrize("suppressed", [False, True])
-def test_no_class_that_is_dynamic_is_refused_and_the_hint_works(tmp_path, names, example, suppressed):
+def test_no_class_that_is_dynamic_is_refused_and_the_hint_works(
+    tmp_path, names, example, suppressed
+):
     label = 1 if "human" in example else 0
     detections = suppressed_detections(label) if suppressed else raw_detections(len(names), label)
     settings = yolo(tmp_path, detections, {"names": names_of(*names), "end2end": str(suppressed)})
     with pytest.raises(SegmentationError) as error:
         build_segmenter(settings)
     fault = f"none of the {len(names)} classes of the network is among the dynamic ones: person"
-    assert fault in error.value.args[0] and ", ".join(names) in error.value.hint
+    assert fault in error.value.args[0]
+    assert ", ".join(names) in error.value.hint
     assert error.value.hint.endswith(f"--set {example}")
     assignment = parse_assignments([shlex.split(example)[0].removeprefix("segmentation.")])
     cured = apply_overrides(settings, assignment)
@@ -497,7 +548,8 @@ def test_a_class_that_neither_coco_nor_the_network_has_is_misspelled(tmp_path):
     assert objects(apply_overrides(settings, {"classes": "Person,dog"})) == PERSON
     with pytest.raises(SegmentationError) as error:
         build_segmenter(apply_overrides(settings, {"classes": "person,pedestrain"}))
-    assert "the network has no class 'pedestrain'" in error.value.args[0] and "'pedestrian'" in error.value.hint
+    assert "the network has no class 'pedestrain'" in error.value.args[0]
+    assert "'pedestrian'" in error.value.hint
     for source in ("auto", "coco", "embedded", "none"):
         with pytest.raises(SettingsError, match="unknown class 'pedestrian'"):
             build(SegmentationSettings, {"source": source, "classes": "pedestrian"})
@@ -509,7 +561,9 @@ def test_what_is_assumed_of_classes_without_names_is_said(tmp_path):
     logits = np.zeros((1, 2, 60, 80), np.float32)
     logits[0, 1, 10:30, 20:40] = 5
     path = write(tmp_path, (1, 3, 240, 320), {"out": logits})
-    with pytest.warns(UserWarning, match="class 0 is taken for background, class 1 is taken for person"):
+    with pytest.warns(
+        UserWarning, match="class 0 is taken for background, class 1 is taken for person"
+    ):
         assert OnnxSegmenter(path, SETTINGS).layout.names[1] == "person"
 
 
@@ -523,14 +577,23 @@ def test_a_filters_further_classes_are_sought_by_the_network(tmp_path):
     for cache in (None, StageCache(tmp_path / "cache"), StageCache(tmp_path / "cache")):
         alone = build_segmenter(settings, cache=cache).segment(black)
         found = build_segmenter(settings, cache=cache, also=frozenset({"chair"})).segment(black)
-        assert alone.class_names == ("person",) and found.class_names == ("person", "chair")
+        assert alone.class_names == ("person",)
+        assert found.class_names == ("person", "chair")
 
 
-@pytest.mark.skipif(not (WEIGHTS.is_dir() and BONN.is_dir()), reason="needs ../shared/weights and ../shared/data")
+@pytest.mark.skipif(
+    not (WEIGHTS.is_dir() and BONN.is_dir()), reason="needs ../shared/weights and ../shared/data"
+)
 def test_yolo_and_deeplab_agree_on_bonn():
     names = ("yolov8n-seg_480x640_fp32.onnx", "deeplabv3_mnv2_voc_481x641.onnx")
-    segmenters = [build_segmenter(SegmentationSettings(source=f"onnx:{WEIGHTS / name}")) for name in names]
-    lines = [line.split() for line in (BONN / "rgb.txt").read_text().splitlines() if line and line[0] != "#"]
+    segmenters = [
+        build_segmenter(SegmentationSettings(source=f"onnx:{WEIGHTS / name}")) for name in names
+    ]
+    lines = [
+        line.split()
+        for line in (BONN / "rgb.txt").read_text().splitlines()
+        if line and line[0] != "#"
+    ]
     for index, least in ((60, 0.93), (110, 0.93), (150, 0.85)):
         rgb = np.ascontiguousarray(cv2.imread(str(BONN / lines[index][1]))[:, :, ::-1])
         yolo, deeplab = (segmenter.segment(picture(rgb)).union() for segmenter in segmenters)

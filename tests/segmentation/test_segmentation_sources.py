@@ -47,10 +47,28 @@ from dynslam_bench.segmentation.networks.onnx_export import (
     write_onnx,
 )
 from dynslam_bench.segmentation.networks.onnx_segmenter import OnnxSegmenter
-from dynslam_bench.segmentation.postprocess import boxes_of, dilate, dynamic_mask, fill_holes, repair, select
-from dynslam_bench.segmentation.recorded import OracleSegmenter, RecordedSegmenter, label_image, record_masks
+from dynslam_bench.segmentation.postprocess import (
+    boxes_of,
+    dilate,
+    dynamic_mask,
+    fill_holes,
+    repair,
+    select,
+)
+from dynslam_bench.segmentation.recorded import (
+    OracleSegmenter,
+    RecordedSegmenter,
+    label_image,
+    record_masks,
+)
 from dynslam_bench.segmentation.schedule import MaskScheduler, MissedDetections
-from dynslam_bench.segmentation.settings import COCO_IDS, COCO_NAMES, NMS_IOU, VOC_NAMES, SegmentationSettings
+from dynslam_bench.segmentation.settings import (
+    COCO_IDS,
+    COCO_NAMES,
+    NMS_IOU,
+    VOC_NAMES,
+    SegmentationSettings,
+)
 from dynslam_bench.segmentation.training.evaluate_masks import MaskTally, average_precision
 from dynslam_bench.sequences.catalogue import open_sequence
 
@@ -91,8 +109,13 @@ def test_classes_are_names_and_presets():
     assert SegmentationSettings().class_names() == {"person"}
     assert len(SegmentationSettings(classes="dynaslam19").class_names()) == 19
     both = apply_overrides(SegmentationSettings(), {"classes": ["person", "chair"]})
-    assert both.classes == "person,chair" and both.class_names() == {"person", "chair"}
-    assert SegmentationSettings(classes="dynaslam19, chair").class_names() > {"person", "chair", "zebra"}
+    assert both.classes == "person,chair"
+    assert both.class_names() == {"person", "chair"}
+    assert SegmentationSettings(classes="dynaslam19, chair").class_names() > {
+        "person",
+        "chair",
+        "zebra",
+    }
     for wrong, words in (
         ("persson", r"unknown class 'persson' .did you mean 'person'"),
         (" , ", "empty"),
@@ -103,8 +126,13 @@ def test_classes_are_names_and_presets():
 
 
 def test_the_case_of_class_names_does_not_matter():
-    assert SegmentationSettings(classes="Person, Traffic_Light").class_names() == {"person", "traffic light"}
-    assert build(SegmentationSettings, {"source": "onnx:a", "classes": ["Fork Lift", "person"]}).class_names() == {
+    assert SegmentationSettings(classes="Person, Traffic_Light").class_names() == {
+        "person",
+        "traffic light",
+    }
+    assert build(
+        SegmentationSettings, {"source": "onnx:a", "classes": ["Fork Lift", "person"]}
+    ).class_names() == {
         "fork lift",
         "person",
     }
@@ -114,9 +142,16 @@ def test_the_case_of_class_names_does_not_matter():
 
 
 def test_class_tables():
-    assert len(COCO_NAMES) == len(set(COCO_NAMES)) == 80 and len(COCO_IDS) == 80
-    assert (COCO_IDS[1], COCO_IDS[13], COCO_IDS[62], COCO_IDS[90]) == ("person", "stop sign", "chair", "toothbrush")
-    assert VOC_NAMES[15] == "person" and set(VOC_NAMES[1:]) <= set(COCO_NAMES)
+    assert len(COCO_NAMES) == len(set(COCO_NAMES)) == 80
+    assert len(COCO_IDS) == 80
+    assert (COCO_IDS[1], COCO_IDS[13], COCO_IDS[62], COCO_IDS[90]) == (
+        "person",
+        "stop sign",
+        "chair",
+        "toothbrush",
+    )
+    assert VOC_NAMES[15] == "person"
+    assert set(VOC_NAMES[1:]) <= set(COCO_NAMES)
 
 
 # --- oracle ------------------------------------------------------------------------------------------------------
@@ -124,8 +159,10 @@ def test_class_tables():
 
 def test_oracle_gives_everything_and_the_stage_what_is_dynamic():
     found = OracleSegmenter(Masks()).segment(frame(1))
-    assert found.class_names == ("person", "chair") and found.moving.tolist() == [False, True]
-    assert found.boxes.tolist() == [[2, 4, 8, 20], [20, 10, 28, 20]] and found.masks.sum() == 16 * 6 + 10 * 8
+    assert found.class_names == ("person", "chair")
+    assert found.moving.tolist() == [False, True]
+    assert found.boxes.tolist() == [[2, 4, 8, 20], [20, 10, 28, 20]]
+    assert found.masks.sum() == 16 * 6 + 10 * 8
     stage = build_segmenter(SegmentationSettings(source="oracle"), masks=Masks())
     assert stage.segment(frame(0)).class_names == ("person",)
     assert stage.segment(frame(1)).class_names == ("person", "chair")
@@ -160,15 +197,22 @@ def test_recorded_by_stamp_and_by_index(tmp_path):
     for stamp, values in ((100.0, [255]), (100.033333, [1, 2]), (100.066667, [])):
         record(tmp_path, f"{stamp:.6f}.png", values)
     segmenter = RecordedSegmenter(tmp_path)
-    assert [len(segmenter.segment(frame(5, stamp))) for stamp in (100.001, 100.04, 100.07)] == [1, 2, 0]
-    with pytest.raises(SegmentationError, match=r"within 0.02 s of frame 5 .* 100.066667.png, 0.933 s away"):
+    assert [len(segmenter.segment(frame(5, stamp))) for stamp in (100.001, 100.04, 100.07)] == [
+        1,
+        2,
+        0,
+    ]
+    with pytest.raises(
+        SegmentationError, match=r"within 0.02 s of frame 5 .* 100.066667.png, 0.933 s away"
+    ):
         segmenter.segment(frame(5, 101.0))
     indexed = tmp_path / "indexed"
     indexed.mkdir()
     record(indexed, "000000.png", [1])
     record(indexed, "000010.png", [1, 300], dtype=np.uint16)
     segmenter = build_segmenter(SegmentationSettings(source=f"recorded:{indexed}"))
-    assert len(segmenter.segment(frame(10, 55.0))) == 2 and segmenter.source == f"recorded:{indexed}"
+    assert len(segmenter.segment(frame(10, 55.0))) == 2
+    assert segmenter.source == f"recorded:{indexed}"
     with pytest.raises(SegmentationError, match=r"frame 3 .*the nearest is 000000.png"):
         segmenter.segment(frame(3))
 
@@ -225,7 +269,9 @@ class FixedSegmenter:
     def segment(self, frame):
         masks = np.zeros((2, 24, 32), bool)
         masks[:, 3:9, 3:9] = True
-        return Instances(masks, boxes_of(masks), ("person", "person"), np.array([0.9, 0.2], np.float32))
+        return Instances(
+            masks, boxes_of(masks), ("person", "person"), np.array([0.9, 0.2], np.float32)
+        )
 
 
 class SmallMasks(FixedSegmenter):
@@ -256,7 +302,9 @@ def test_plugins():
     assert built.segment(frame()).scores == pytest.approx([0.9])
     built.settings = built.settings.model_copy(update={"confidence": 0.15})
     assert len(built.segment(frame())) == 2
-    with pytest.raises(SegmentationError, match=r"masks of shape \(0, 12, 16\).* the frame is 32x24"):
+    with pytest.raises(
+        SegmentationError, match=r"masks of shape \(0, 12, 16\).* the frame is 32x24"
+    ):
         build_segmenter(source("SMALL")).segment(frame())
     built.inner.segment = lambda frame: None
     with pytest.raises(SegmentationError, match="gave NoneType instead of Instances"):
@@ -284,12 +332,15 @@ def published(server, sha256):
 
 
 def test_a_checkpoint_is_fetched_once_and_verified(server, tmp_path):
-    checkpoint, told = published(server, hashlib.sha256(server.data).hexdigest()[:8]), []
+    checkpoint = published(server, hashlib.sha256(server.data).hexdigest()[:8])
+    told = []
     path = checkpoints.fetch_checkpoint(checkpoint, told.append)
     assert path.read_bytes() == server.data
     whole = [(state.done, state.total) for state in told if state.stage == "download"]
-    assert whole[-1] == (len(server.data), len(server.data)) and len(whole) > 1
-    assert checkpoints.fetch_checkpoint(checkpoint) == path and len(server.requests) == 1
+    assert whole[-1] == (len(server.data), len(server.data))
+    assert len(whole) > 1
+    assert checkpoints.fetch_checkpoint(checkpoint) == path
+    assert len(server.requests) == 1
     assert [entry.name for entry in (tmp_path / "cache").iterdir()] == ["test.pth"]
 
 
@@ -320,7 +371,8 @@ def test_recorded_masks_are_the_segmenters(sequence, tmp_path: Path) -> None:
     recorded = RecordedSegmenter(tmp_path / "masks")
     assert recorded.missing(sequence.timestamps) == []
     for index in range(len(sequence)):
-        found, exact = recorded.segment(sequence[index]).of_classes(["person"]), sequence.masks[index]
+        found = recorded.segment(sequence[index]).of_classes(["person"])
+        exact = sequence.masks[index]
         people = {label for label, name in exact.class_names.items() if name == "person"}
         assert len(found) == len(people & set(np.unique(exact.instances).tolist())) > 0
         np.testing.assert_array_equal(found.union(), np.isin(exact.instances, list(people)))
@@ -347,7 +399,9 @@ class Tracked(Settings):
 
 
 def checked(sequence, source, **changes):
-    return segmentation_source(build(Tracked, {"segmentation": {"source": source, **changes}}), sequence)
+    return segmentation_source(
+        build(Tracked, {"segmentation": {"source": source, **changes}}), sequence
+    )
 
 
 def record_stamps(folder, sequence, values, classes=None):
@@ -367,12 +421,15 @@ def record_stamps(folder, sequence, values, classes=None):
         ({"1": "chair", "2": "pedestrian"}, "dynaslam19", "chair, pedestrian", 2),
     ],
 )
-def test_recorded_classes_none_of_which_is_dynamic_are_refused(sequence, tmp_path, classes, asked, named, count):
+def test_recorded_classes_none_of_which_is_dynamic_are_refused(
+    sequence, tmp_path, classes, asked, named, count
+):
     source = record_stamps(tmp_path, sequence, range(1, count + 1), classes)
     with pytest.raises(SegmentationError) as error:
         checked(sequence, source, classes=asked)
     fault = f"none of the {count} classes of the folder of recorded masks is among the dynamic ones: {asked}"
-    assert fault in error.value.args[0] and f"it has {named};" in error.value.hint
+    assert fault in error.value.args[0]
+    assert f"it has {named};" in error.value.hint
     name = error.value.hint.rpartition("segmentation.classes=")[2]
     assert checked(sequence, source, classes=name) == source
 
@@ -380,16 +437,23 @@ def test_recorded_classes_none_of_which_is_dynamic_are_refused(sequence, tmp_pat
 @pytest.mark.parametrize("values", [[], [7]])
 def test_recorded_masks_that_show_nobody_are_said(sequence, tmp_path, values):
     source = record_stamps(tmp_path, sequence, values, {"1": "Person", "7": "chair"})
-    with pytest.warns(UserWarning, match=f"no object of the classes person in any of {len(sequence)} frames of"):
+    with pytest.warns(
+        UserWarning, match=f"no object of the classes person in any of {len(sequence)} frames of"
+    ):
         assert checked(sequence, source) == source
     last = f"{sequence.timestamps[-1]:.6f}.png"
     record(tmp_path, last, [1], shape=sequence[0].rgb.shape[:2])
-    assert RecordedSegmenter(tmp_path).first_object(sequence.timestamps, frozenset({"person"})) == len(sequence) - 1
+    assert (
+        RecordedSegmenter(tmp_path).first_object(sequence.timestamps, frozenset({"person"}))
+        == len(sequence) - 1
+    )
 
 
 def test_a_misspelled_recorded_class_is_said(sequence, tmp_path):
     record_stamps(tmp_path, sequence, [1], {"1": "person", "2": "chiar", "3": "pedestrian"})
-    with pytest.warns(UserWarning, match="'chiar' is no COCO class; did you mean 'chair'") as warned:
+    with pytest.warns(
+        UserWarning, match="'chiar' is no COCO class; did you mean 'chair'"
+    ) as warned:
         RecordedSegmenter(tmp_path)
     assert len(warned) == 1
 
@@ -402,7 +466,9 @@ def test_masks_of_own_names_are_recorded_and_used(sequence, tmp_path):
     said = [str(warning.message) for warning in warned]
     assert sum("found 'pedestrian', which is no COCO class" in text for text in said) == 1
     assert sum("no object of the classes person in any of 3 frames" in text for text in said) == 1
-    record_masks(sequence, tmp_path / "pedestrian", SegmentationSettings(source=source, classes="Pedestrian"))
+    record_masks(
+        sequence, tmp_path / "pedestrian", SegmentationSettings(source=source, classes="Pedestrian")
+    )
     recorded = f"recorded:{tmp_path / 'pedestrian'}"
     assert checked(sequence, recorded, classes="PEDESTRIAN") == recorded
     stage = build_segmenter(SegmentationSettings(source=recorded, classes="PEDESTRIAN"))
@@ -411,10 +477,14 @@ def test_masks_of_own_names_are_recorded_and_used(sequence, tmp_path):
 
 def test_exact_masks_of_nobody_dynamic_are_said(sequence):
     assert checked(sequence, "oracle-classes") == "oracle-classes"
-    with pytest.warns(UserWarning, match="classes of the sequence is among the dynamic ones: zebra"):
+    with pytest.warns(
+        UserWarning, match="classes of the sequence is among the dynamic ones: zebra"
+    ):
         checked(sequence, "oracle-classes", classes="zebra")
     for source in ("oracle", "oracle-classes"):
-        with pytest.raises(SegmentationError, match=r"the sequence has no class 'persson'.*'person'"):
+        with pytest.raises(
+            SegmentationError, match=r"the sequence has no class 'persson'.*'person'"
+        ):
             checked(sequence, source, classes="persson")
 
 
@@ -429,12 +499,15 @@ def test_numbers_stand_for_classes_in_every_frame() -> None:
     first = label_image(objects("person", "chair", "person"), table)
     again = label_image(objects("chair", "person"), table)
     assert table == {1: "person", 2: "chair", 3: "person"}
-    assert [table[int(v)] for v in first[0, :4]] == ["person", "person", "chair", "person"], "the surest is on top"
+    assert [table[int(v)] for v in first[0, :4]] == ["person", "person", "chair", "person"], (
+        "the surest is on top"
+    )
     assert [table[int(v)] for v in again[0, :3]] == ["chair", "chair", "person"]
     assert len(np.unique(first)) == 4
 
 
-# Our networks for other runtimes: fixed shapes give the same objects, and so does the ONNX file, if it can be made.
+# Our networks for other runtimes: fixed shapes give the same objects, and so does the ONNX file, if
+# it can be made.
 
 
 SETTINGS = SegmentationSettings(network_side=0)
@@ -462,7 +535,9 @@ def noise(height: int, width: int) -> np.ndarray:
     return (smooth[0].permute(1, 2, 0).numpy() * 255).astype(np.uint8)
 
 
-def objects(found: tuple[torch.Tensor, ...], threshold: float) -> list[tuple[str, float, np.ndarray, np.ndarray]]:
+def objects(
+    found: tuple[torch.Tensor, ...], threshold: float
+) -> list[tuple[str, float, np.ndarray, np.ndarray]]:
     rows = [
         (CLASSES[int(label) - 1], float(score), box.numpy(), mask[0].numpy() >= threshold)
         for box, label, score, mask in zip(*found, strict=True)
@@ -476,7 +551,9 @@ def test_fixed_shapes_give_the_same_objects(exact: bool) -> None:
     network = tiny(exact_paste=exact)
     settings = SETTINGS.model_copy(update={"classes": ",".join(CLASSES)})
     image = noise(120, 160)
-    expected = MaskRCNNSegmenter(network, settings).segment(Frame(0, 0.0, image, np.zeros((120, 160), np.float32)))
+    expected = MaskRCNNSegmenter(network, settings).segment(
+        Frame(0, 0.0, image, np.zeros((120, 160), np.float32))
+    )
     with torch.no_grad():
         found = StaticMaskRCNN(network, 120, 160, score=0.1, iou=NMS_IOU)(
             torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
@@ -499,7 +576,10 @@ def test_suppression_in_rounds_is_the_greedy_one() -> None:
     scores = torch.linspace(1, 0.1, 120)
     for first in (0, 1):
         kept = unsuppressed(box_iou(boxes, boxes) > 0.3, (torch.arange(120) >= first).float())
-        assert torch.nonzero(kept)[:, 0].tolist() == (first + nms(boxes[first:], scores[first:], 0.3)).tolist()
+        assert (
+            torch.nonzero(kept)[:, 0].tolist()
+            == (first + nms(boxes[first:], scores[first:], 0.3)).tolist()
+        )
 
 
 def test_other_runtimes_give_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -507,7 +587,8 @@ def test_other_runtimes_give_the_same(tmp_path: Path, monkeypatch: pytest.Monkey
     runtime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed")
     pytest.importorskip("onnxscript", reason="onnxscript (extra [onnx]) is not installed")
     monkeypatch.setattr(static, "ROUNDS", 4)
-    network, path = tiny(exact_paste=True), tmp_path / "tiny.onnx"
+    network = tiny(exact_paste=True)
+    path = tmp_path / "tiny.onnx"
     assert write_onnx(network.fuse(), path, size=(120, 160)) == {1: "person", 2: "chair", 3: "dog"}
     image = noise(120, 160)
     tensor = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
@@ -523,23 +604,32 @@ def test_other_runtimes_give_the_same(tmp_path: Path, monkeypatch: pytest.Monkey
         pytest.skip(f"this OpenCV cannot load it: {error}")
     seen = segmenter.segment(Frame(0, 0.0, image, np.zeros((120, 160), np.float32)))
     rows = objects(expected, SETTINGS.mask_threshold)
-    assert segmenter.layout.kind == "instances" and sorted(seen.class_names) == sorted(row[0] for row in rows)
+    assert segmenter.layout.kind == "instances"
+    assert sorted(seen.class_names) == sorted(row[0] for row in rows)
     assert np.abs(np.sort(seen.scores) - np.sort([row[1] for row in rows])).max() < 1e-3
 
 
 def test_what_cannot_be_exported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    with pytest.raises(SegmentationError, match=r"'yolo' is no network of this project \(export embedded, coco or"):
+    with pytest.raises(
+        SegmentationError, match=r"'yolo' is no network of this project \(export embedded, coco or"
+    ):
         export_network("yolo", tmp_path / "x.onnx")
     for text in ("640", "640x8", "x480"):
-        with pytest.raises(SegmentationError, match=rf"'{text}' is no size of an image \(for example 640x480"):
+        with pytest.raises(
+            SegmentationError, match=rf"'{text}' is no size of an image \(for example 640x480"
+        ):
             parse_size(text)
     assert parse_size("640x480") == (480, 640)
     monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(SegmentationError, match=r"onnx and onnxscript.* \(pip install '\.\[onnx\]' in the checkout of"):
+    with pytest.raises(
+        SegmentationError,
+        match=r"onnx and onnxscript.* \(pip install '\.\[onnx\]' in the checkout of",
+    ):
         write_onnx(tiny(), tmp_path / "x.onnx")
 
 
-H, W = 120, 160
+H = 120
+W = 160
 
 
 def block(y0, y1, x0, x1):
@@ -572,7 +662,9 @@ def iou(a, b):
 
 def test_selection_by_class_score_and_motion():
     masks = [block(0, 20, 0, 20), block(30, 50, 0, 20), block(60, 80, 0, 20), block(90, 92, 0, 2)]
-    found = instances(*masks, names=["person", "chair", "person", "person"], scores=[0.9, 0.9, 0.2, 0.9])
+    found = instances(
+        *masks, names=["person", "chair", "person", "person"], scores=[0.9, 0.9, 0.2, 0.9]
+    )
     changes = ({}, {"confidence": 0.1}, {"classes": "person,chair"})
     assert [len(select(found, SegmentationSettings(**change))) for change in changes] == [2, 3, 3]
     oracle = instances(*masks[:2], names=["person", "chair"], moving=[False, True])
@@ -589,7 +681,9 @@ def test_dilation_is_a_disc_of_that_radius(radius):
     assert not dilate(np.zeros((H, W), bool), radius).any()
 
 
-@pytest.mark.parametrize("nothing", [Instances.empty(H, W), instances(block(10, 50, 10, 50), scores=[0.05])])
+@pytest.mark.parametrize(
+    "nothing", [Instances.empty(H, W), instances(block(10, 50, 10, 50), scores=[0.05])]
+)
 def test_dynamic_mask_of_nothing(nothing):
     assert not dynamic_mask(nothing, SegmentationSettings()).any()
 
@@ -599,7 +693,8 @@ def test_holes_are_filled_and_bays_stay():
     assert np.array_equal(fill_holes(mask & ~block(40, 60, 40, 60)), mask)
     bay = mask & ~block(40, 80, 60, 100)
     assert np.array_equal(fill_holes(bay)[45:75, 65:100], bay[45:75, 65:100])
-    assert fill_holes(np.ones((H, W), bool)).all() and not fill_holes(np.zeros((H, W), bool)).any()
+    assert fill_holes(np.ones((H, W), bool)).all()
+    assert not fill_holes(np.zeros((H, W), bool)).any()
 
 
 def test_depth_repair_fits_the_border_to_the_depth_edge():
@@ -608,7 +703,9 @@ def test_depth_repair_fits_the_border_to_the_depth_edge():
     depth[::7] = 0  # missing rows decide nothing
     settings = SegmentationSettings(repair="depth", dilation_px=0)
     for wrong in (block(25, 95, 55, 105), block(15, 105, 45, 115), block(20, 100, 54, 114)):
-        assert iou(dynamic_mask(instances(wrong), settings, depth), truth) > 0.93 > iou(wrong, truth)
+        assert (
+            iou(dynamic_mask(instances(wrong), settings, depth), truth) > 0.93 > iou(wrong, truth)
+        )
     wrong = block(25, 95, 55, 105)
     assert np.array_equal(dynamic_mask(instances(wrong), settings), wrong)
     assert np.array_equal(repair(wrong, np.zeros((H, W), np.float32), 0.2), wrong)
@@ -622,12 +719,18 @@ def scene(shift_x, shift_y=0, scale=1.0, seed=0):
     rng = np.random.default_rng(seed)
     background = cv2.GaussianBlur(rng.integers(0, 255, (480, 640)).astype(np.uint8), (0, 0), 2.5)
     texture = cv2.GaussianBlur(rng.integers(0, 255, (480, 640)).astype(np.uint8), (0, 0), 2.5)
-    stretch = [cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX) for image in (background, texture)]
+    stretch = [
+        cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX) for image in (background, texture)
+    ]
     square = np.zeros((480, 640), np.uint8)
     square[150:330, 200:360] = 255
-    move = np.array([[scale, 0, 280 * (1 - scale) + shift_x], [0, scale, 240 * (1 - scale) + shift_y]])
+    move = np.array(
+        [[scale, 0, 280 * (1 - scale) + shift_x], [0, scale, 240 * (1 - scale) + shift_y]]
+    )
     mask = cv2.warpAffine(square, move, (640, 480)) >= 128
-    image = np.where(mask, cv2.warpAffine(stretch[1], move, (640, 480)), stretch[0]).astype(np.uint8)
+    image = np.where(mask, cv2.warpAffine(stretch[1], move, (640, 480)), stretch[0]).astype(
+        np.uint8
+    )
     return image, mask
 
 
@@ -643,14 +746,18 @@ def test_masks_follow_the_motion(move, motion):
     carried = move(instances(mask, scores=[0.8]), before, after)
     assert iou(carried.masks[0], moved) > 0.93
     assert carried.boxes[0] == pytest.approx(boxes_of(moved[None])[0], abs=8)
-    assert carried.class_names == ("person",) and carried.scores == pytest.approx([0.8])
+    assert carried.class_names == ("person",)
+    assert carried.scores == pytest.approx([0.8])
 
 
 @pytest.mark.parametrize("move", [carry_dense, schedule.carry_sparse])
 def test_carrying_nothing_and_carrying_over_black_images(move):
     black = np.zeros((H, W), np.uint8)
     assert len(move(Instances.empty(H, W), black, black)) == 0
-    assert iou(move(instances(block(20, 80, 30, 90)), black, black).masks[0], block(20, 80, 30, 90)) > 0.95
+    assert (
+        iou(move(instances(block(20, 80, 30, 90)), black, black).masks[0], block(20, 80, 30, 90))
+        > 0.95
+    )
 
 
 def test_an_exact_flow_moves_masks_exactly():
@@ -674,7 +781,8 @@ def test_a_missed_detection_is_bridged_at_constant_velocity():
         assert len(bridge.update(instances(walker(k)))) == 1
     for k in (4, 5):
         bridged = bridge.update(instances())
-        assert len(bridged) == 1 and bridged.scores[0] == np.float32(0.9)
+        assert len(bridged) == 1
+        assert bridged.scores[0] == np.float32(0.9)
         assert iou(bridged.masks[0], walker(k)) > 0.75
     assert len(bridge.update(instances())) == 0
 
@@ -689,13 +797,16 @@ def test_an_object_that_is_seen_again_keeps_its_speed():
 
 @pytest.mark.parametrize("when", ["every", "every_nth"])
 @pytest.mark.parametrize("promised", [0, 1, 3, 5])
-def test_a_miss_is_bridged_for_as_many_segmented_frames_as_promised_however_weak_the_detection(promised, when):
+def test_a_miss_is_bridged_for_as_many_segmented_frames_as_promised_however_weak_the_detection(
+    promised, when
+):
     class Weak:
         def segment(self, frame):
             return instances(walker(1), scores=[0.31]) if frame.index < 6 else instances()
 
     settings = SegmentationSettings(compensate=promised, schedule=when, n=2, confidence=0.3)
-    stage, seen = MaskScheduler(settings, Weak()), []
+    stage = MaskScheduler(settings, Weak())
+    seen = []
     gray = np.random.default_rng(0).integers(0, 255, (H, W), dtype=np.uint8)
     for index in range(20):
         used = select(stage.masks_for(frame_of(gray, index), gray, keyframe=False), settings)
@@ -724,7 +835,9 @@ class Square:
     """Finds the square of `scene` where it is, after some time, but in a broken frame."""
 
     def __init__(self, takes_s=0.0, broken=None):
-        self.calls, self.takes_s, self.broken = [], takes_s, broken
+        self.calls = []
+        self.takes_s = takes_s
+        self.broken = broken
 
     def segment(self, frame):
         time.sleep(self.takes_s)
@@ -742,7 +855,8 @@ def feed(stage, index, *, keyframe=False):
 
 
 def run(settings, count=10, keyframes=()):
-    stage, quality = MaskScheduler(settings, Square()), []
+    stage = MaskScheduler(settings, Square())
+    quality = []
     for index in range(count):
         quality.append(feed(stage, index, keyframe=index in keyframes)[1])
         assert stage.segmented == (stage.segmenter.calls[-1] == index)
@@ -752,9 +866,11 @@ def run(settings, count=10, keyframes=()):
 def test_every_frame_every_nth_and_keyframes(monkeypatch):
     assert run(SegmentationSettings())[0] == list(range(10))
     calls, quality = run(SegmentationSettings(schedule="every_nth", n=4))
-    assert calls == [0, 4, 8] and min(quality) > 0.9
+    assert calls == [0, 4, 8]
+    assert min(quality) > 0.9
     calls, quality = run(SegmentationSettings(schedule="keyframes"), keyframes=(0, 7))
-    assert calls == [0, 7] and min(quality) > 0.88
+    assert calls == [0, 7]
+    assert min(quality) > 0.88
     monkeypatch.setattr(schedule, "MAX_CARRY", 3)
     assert run(SegmentationSettings(schedule="keyframes"))[0] == [0, 3, 6, 9]
     assert min(run(SegmentationSettings(schedule="every_nth", n=5, carry="sparse"))[1]) > 0.9
@@ -764,10 +880,14 @@ def test_every_frame_every_nth_and_keyframes(monkeypatch):
 def test_where_masks_cover_much_of_the_view_every_frame_is_segmented(when, rests):
     covered = scene(0)[1].mean()  # carried masks may cover a little less or more
     settings = SegmentationSettings(schedule=when, n=4)
-    less, more = (settings.model_copy(update={"crowded_share": factor * covered}) for factor in (0.5, 1.5))
+    less, more = (
+        settings.model_copy(update={"crowded_share": factor * covered}) for factor in (0.5, 1.5)
+    )
     assert run(less, keyframes=(0,))[0] == list(range(10))
     assert run(more, keyframes=(0,))[0] == rests
-    assert run(less.model_copy(update={"confidence": 0.95}), keyframes=(0,))[0] == rests, "masks that do not count"
+    assert run(less.model_copy(update={"confidence": 0.95}), keyframes=(0,))[0] == rests, (
+        "masks that do not count"
+    )
 
 
 ASYNC = SegmentationSettings(schedule="async", latency_s=0.09)
@@ -776,14 +896,16 @@ ASYNC = SegmentationSettings(schedule="async", latency_s=0.09)
 @pytest.mark.parametrize("takes_s", [0.0, 0.05])
 def test_beside_tracking_masks_come_late_by_the_stamps_and_are_carried_to_the_frame(takes_s):
     stage = MaskScheduler(ASYNC, Square(takes_s))
-    taken, quality = [], []
+    taken = []
+    quality = []
     for index in range(14):
         if index == 8:
             stage = deepcopy(stage)
         quality.append(feed(stage, index, keyframe=True)[1])
         taken += [index] * stage.segmented
     stage.reset()
-    assert stage.segmenter.calls == [0, 1, 4, 7, 10, 13] and taken == [0, 4, 7, 10, 13]
+    assert stage.segmenter.calls == [0, 1, 4, 7, 10, 13]
+    assert taken == [0, 4, 7, 10, 13]
     assert min(quality) > 0.85
     feed(stage, 0)
     assert stage.segmented, "a sequence begins with masks"
@@ -803,32 +925,41 @@ def test_without_a_latency_masks_are_taken_when_they_are_done():
         assert stage.segmented == (index == 0)
     Held.released.set()
     wait([stage._request.answer])
-    assert feed(stage, 5)[1] > 0.85 and stage.segmented
+    assert feed(stage, 5)[1] > 0.85
+    assert stage.segmented
 
 
 def test_beside_tracking_missed_detections_count_the_frames_between_those_segmented(monkeypatch):
-    stage, apart = MaskScheduler(ASYNC, Square()), []
+    stage = MaskScheduler(ASYNC, Square())
+    apart = []
     update = stage._missed.update
-    monkeypatch.setattr(stage._missed, "update", lambda found, frames: apart.append(frames) or update(found, frames))
+    monkeypatch.setattr(
+        stage._missed, "update", lambda found, frames: apart.append(frames) or update(found, frames)
+    )
     for index in range(11):
         feed(stage, index)
-    assert stage.segmenter.calls[:4] == [0, 1, 4, 7] and apart == [1, 1, 3, 3]
+    assert stage.segmenter.calls[:4] == [0, 1, 4, 7]
+    assert apart == [1, 1, 3, 3]
 
 
 @pytest.mark.parametrize("epoch", [0.0, 1311868164.3])
 def test_beside_tracking_masks_are_due_at_the_same_frames_from_any_first_stamp(epoch):
     """A latency of three frames is three frames, however the sum of stamp and latency is rounded."""
-    stage, taken = MaskScheduler(SegmentationSettings(schedule="async", latency_s=0.1), Square()), []
+    stage = MaskScheduler(SegmentationSettings(schedule="async", latency_s=0.1), Square())
+    taken = []
     for index in range(20):
         frame = frame_of(scene(3 * index)[0], index)
-        stage.masks_for(replace(frame, timestamp=epoch + index / 30), frame.rgb[:, :, 0], keyframe=False)
+        stage.masks_for(
+            replace(frame, timestamp=epoch + index / 30), frame.rgb[:, :, 0], keyframe=False
+        )
         taken += [index] * stage.segmented
     assert taken == [0, 4, 7, 10, 13, 16, 19]
 
 
 def test_beside_tracking_the_segmenter_keeps_the_settings_that_it_began_with():
     strict = ASYNC.model_copy(update={"confidence": 0.95})  # its objects have less
-    stage, found = MaskScheduler(ASYNC, ConfiguredSegmenter(Square(0.05), ASYNC, "test")), []
+    stage = MaskScheduler(ASYNC, ConfiguredSegmenter(Square(0.05), ASYNC, "test"))
+    found = []
     for index in range(8):
         found.append(len(feed(stage, index)[0]))
         stage.configure(strict if index in (1, 2, 3) else ASYNC)
@@ -843,11 +974,17 @@ def test_beside_tracking_nothing_comes_from_the_stage_cache(tmp_path):
         for index in range(5):
             feed(stage, index)
         stage.reset()
-    assert network.calls == [0, 1, 4, 1, 4], "the first frame is segmented before it is tracked, and stored"
+    assert network.calls == [0, 1, 4, 1, 4], (
+        "the first frame is segmented before it is tracked, and stored"
+    )
 
 
-@pytest.mark.parametrize("end", ["masks are taken", "settle", "reset", "configure", "a copy's settle"])
-def test_an_error_of_the_segmenter_beside_tracking_is_raised_where_its_masks_are_taken_else_warned_of(end):
+@pytest.mark.parametrize(
+    "end", ["masks are taken", "settle", "reset", "configure", "a copy's settle"]
+)
+def test_an_error_of_the_segmenter_beside_tracking_is_raised_where_its_masks_are_taken_else_warned_of(
+    end,
+):
     stage = MaskScheduler(ASYNC, Square(broken=4))
     for index in range(7):
         feed(stage, index)
@@ -869,13 +1006,15 @@ def test_an_error_of_the_segmenter_beside_tracking_is_raised_where_its_masks_are
 
 def test_the_schedule_may_change_while_the_segmenter_runs_beside_tracking():
     """It finishes first, what it was asked before is forgotten, and masks stay those of the frame."""
-    stage, taken = MaskScheduler(ASYNC, Square()), []
+    stage = MaskScheduler(ASYNC, Square())
+    taken = []
     for index in range(12):
         stage.configure(SegmentationSettings() if index in (3, 4) else ASYNC)
         assert feed(stage, index)[1] > 0.85
         taken += [index] * stage.segmented
     stage.reset()
-    assert taken == [0, 3, 4, 8, 11] and stage.segmenter.calls == [0, 1, 3, 4, 5, 8, 11]
+    assert taken == [0, 3, 4, 8, 11]
+    assert stage.segmenter.calls == [0, 1, 3, 4, 5, 8, 11]
 
 
 def test_settings_may_change_while_a_run_lasts_and_reset_forgets():
@@ -917,15 +1056,24 @@ def test_quality_of_perfect_shifted_missed_and_false_detections():
     tally = MaskTally()
     add(tally, [walker(0), walker(10)], [walker(0), walker(10)])
     perfect = tally.quality()
-    assert [perfect[name] for name in ("ap", "iou", "instance_iou", "recall", "truths")] == [1, 1, 1, 1, 2]
+    assert [perfect[name] for name in ("ap", "iou", "instance_iou", "recall", "truths")] == [
+        1,
+        1,
+        1,
+        1,
+        2,
+    ]
     add(tally, [walker(5)])
     add(tally, [], [walker(5)])
     quality = tally.quality()
-    assert (quality["truths"], quality["detections"]) == (3, 3) and 0 < quality["ap50"] < 1
+    assert (quality["truths"], quality["detections"]) == (3, 3)
+    assert 0 < quality["ap50"] < 1
     shares = [quality[name] for name in ("recall", "instance_iou", "iou", "frame_iou")]
     assert shares == pytest.approx([2 / 3, 2 / 3, 2 / 4, 1 / 3])
     nothing = MaskTally().quality()
-    assert nothing["truths"] == 0 and nothing["ap"] is None and nothing["iou"] is None
+    assert nothing["truths"] == 0
+    assert nothing["ap"] is None
+    assert nothing["iou"] is None
 
 
 def test_two_detections_of_one_object_count_once_and_small_objects_are_left_out():

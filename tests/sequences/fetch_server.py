@@ -7,7 +7,8 @@ import re
 import tarfile
 import threading
 
-NAME, FOLDER = "tum/fr3/sitting_static", "rgbd_dataset_freiburg3_sitting_static"
+NAME = "tum/fr3/sitting_static"
+FOLDER = "rgbd_dataset_freiburg3_sitting_static"
 """The archive that is served: its id, and the folder inside."""
 
 
@@ -15,7 +16,11 @@ class Server:
     """Serves one file; `plan` holds what goes wrong with each of the next requests."""
 
     def __init__(self, data):
-        self.data, self.plan, self.requests, self.etag, self.ranges = data, [], [], '"one"', True
+        self.data = data
+        self.plan = []
+        self.requests = []
+        self.etag = '"one"'
+        self.ranges = True
         owner = self
 
         class Handler(http.server.BaseHTTPRequestHandler):
@@ -39,15 +44,20 @@ class Server:
             return
         wanted = re.fullmatch(r"bytes=(\d+)-", handler.headers.get("Range") or "")
         resumed = wanted and self.ranges and handler.headers.get("If-Range", self.etag) == self.etag
-        start, size, headers = int(wanted[1]) if resumed else 0, len(self.data), {"ETag": self.etag}
-        body, status = self.data[start:], 416 if start >= size else 206 if start else 200
+        start = int(wanted[1]) if resumed else 0
+        size = len(self.data)
+        headers = {"ETag": self.etag}
+        body = self.data[start:]
+        status = 416 if start >= size else 206 if start else 200
         if start:
             headers["Content-Range"] = f"bytes {f'{start}-{size - 1}' if body else '*'}/{size}"
         sent = body[: fault.get("cut", size)]
         if fault.get("chunked"):
             headers["Transfer-Encoding"] = "chunked"
             half = len(body) // 2
-            first, rest = (b"%x\r\n" % len(part) + part + b"\r\n" for part in (body[:half], body[half:]))
+            first, rest = (
+                b"%x\r\n" % len(part) + part + b"\r\n" for part in (body[:half], body[half:])
+            )
             sent = first + rest + b"0\r\n\r\n" if fault["chunked"] == "whole" else first
         else:
             headers["Content-Length"] = str(len(body) + fault.get("lie", 0))
@@ -75,4 +85,8 @@ def tgz(folder, name=FOLDER, extra=()):
 def left_behind(root):
     """Every file below the root, hidden ones included, but for the checksums that are kept of archives."""
     kept = {*root.glob(".downloads/*.sha256")}
-    return sorted(path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file() and path not in kept)
+    return sorted(
+        path.relative_to(root).as_posix()
+        for path in root.rglob("*")
+        if path.is_file() and path not in kept
+    )

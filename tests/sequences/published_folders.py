@@ -26,7 +26,9 @@ def tum_line(stamp, pose):
 
 def image(path, value, size, dtype=np.uint8):
     path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), np.full((size[1], size[0], 3) if dtype is np.uint8 else size[::-1], value, dtype))
+    cv2.imwrite(
+        str(path), np.full((size[1], size[0], 3) if dtype is np.uint8 else size[::-1], value, dtype)
+    )
 
 
 def images(folder, names, size, raw):
@@ -46,7 +48,10 @@ def write_tum(folder, poses, size=(640, 480), names=("rgb", "depth"), raw=10000)
     for name in names:
         listed = [f"{5 + i / 30:.6f} {name}/{i}.png" for i in range(len(poses))]
         lines(folder / f"{name}.txt", ["#Time Filename", *listed])
-    lines(folder / "groundtruth.txt", [tum_line(round(5 + i / 30, 6), pose) for i, pose in enumerate(poses)])
+    lines(
+        folder / "groundtruth.txt",
+        [tum_line(round(5 + i / 30, 6), pose) for i, pose in enumerate(poses)],
+    )
 
 
 def write_eth3d(folder, poses, size=(739, 458)):
@@ -54,23 +59,37 @@ def write_eth3d(folder, poses, size=(739, 458)):
     write_tum(folder, poses, size)
     (folder / "depth.txt").unlink()
     stamps = [f"{5 + i / 30:.6f}" for i in range(len(poses))]
-    lines(folder / "associated.txt", [f"{s} rgb/{i}.png {s} depth/{i}.png" for i, s in enumerate(stamps)])
-    lines(folder / "calibration.txt", ["726.28741455078 726.28741455078 354.6496887207 186.46566772461"])
+    lines(
+        folder / "associated.txt",
+        [f"{s} rgb/{i}.png {s} depth/{i}.png" for i, s in enumerate(stamps)],
+    )
+    lines(
+        folder / "calibration.txt",
+        ["726.28741455078 726.28741455078 354.6496887207 186.46566772461"],
+    )
 
 
 def write_icl(folder, poses, size=(640, 480)):
     """Frame 0 has no pose; poses are written with the y axis up, depth comes first in the associations."""
     images(folder, [(f"rgb/{i}.png", f"depth/{i}.png") for i in range(len(poses) + 1)], size, 10000)
-    lines(folder / "associations.txt", [f"{i} depth/{i}.png {i} rgb/{i}.png" for i in range(len(poses) + 1)])
+    lines(
+        folder / "associations.txt",
+        [f"{i} depth/{i}.png {i} rgb/{i}.png" for i in range(len(poses) + 1)],
+    )
     upward = MIRROR @ poses @ MIRROR
-    lines(folder / "livingRoom0.gt.freiburg", [tum_line(i + 1, pose) for i, pose in enumerate(upward)])
+    lines(
+        folder / "livingRoom0.gt.freiburg", [tum_line(i + 1, pose) for i, pose in enumerate(upward)]
+    )
 
 
 def write_seven_scenes(folder, poses, size=(640, 480)):
     for i, pose in enumerate(poses):
         image(folder / f"frame-{i:06d}.color.png", 90, size)
         image(folder / f"frame-{i:06d}.depth.png", 65535 if i == 1 else 2000, size, np.uint16)
-        lines(folder / f"frame-{i:06d}.pose.txt", ["\t ".join(f"{value:.17e}" for value in row) for row in pose])
+        lines(
+            folder / f"frame-{i:06d}.pose.txt",
+            ["\t ".join(f"{value:.17e}" for value in row) for row in pose],
+        )
 
 
 def write_shibuya(folder, poses, size=(640, 360)):
@@ -82,7 +101,10 @@ def write_shibuya(folder, poses, size=(640, 360)):
         (folder / "depth_0").mkdir(exist_ok=True)
         np.save(folder / "depth_0" / f"{i:06d}.npy", depth)
     lines(folder / "times.txt", [f"{0.1 * i!r}" for i in range(len(poses))])
-    lines(folder / "gt_pose.txt", [tum_line(0.1 * i, pose) for i, pose in enumerate(poses @ np.linalg.inv(NED))])
+    lines(
+        folder / "gt_pose.txt",
+        [tum_line(0.1 * i, pose) for i, pose in enumerate(poses @ np.linalg.inv(NED))],
+    )
 
 
 def write_openloris(folder, poses, size=(848, 480)):
@@ -106,7 +128,10 @@ def write_vslam_lab(folder, poses, size=(64, 48)):
     rows = [f"{stamp},rgb_0/{i}.png,{stamp}.0,depth_0/{i}.png" for i, stamp in enumerate(stamps)]
     lines(folder / "rgb.csv", ["ts_rgb_0 (ns),path_rgb_0,ts_depth_0 (ns),path_depth_0", *rows])
     body = poses @ np.linalg.inv(BASE_CAM)
-    truth = [f"{stamp}," + ",".join(tum_line(0, pose).split()[1:]) for stamp, pose in zip(stamps, body, strict=True)]
+    truth = [
+        f"{stamp}," + ",".join(tum_line(0, pose).split()[1:])
+        for stamp, pose in zip(stamps, body, strict=True)
+    ]
     lines(folder / "groundtruth.csv", ["ts (ns),tx (m),ty (m),tz (m),qx,qy,qz,qw", *truth])
     (folder / "calibration.yaml").write_text(
         "%YAML:1.0\n\ncameras:\n  - {cam_name: rgb_0,\n     cam_type: rgb+depth,\n     depth_name: depth_0,\n"
@@ -121,17 +146,28 @@ def write_euroc(folder, poses, size=(64, 48)):
     """Nanoseconds, and a ground truth of the body with the quaternion's w first."""
     base = folder / "mav0"
     stamps = [1403636579763555584 + i * 50_000_000 for i in range(len(poses))]
-    images(base, [(f"cam0/data/{stamp}.png", f"depth0/data/{stamp}.png") for stamp in stamps], size, 2000)
+    images(
+        base,
+        [(f"cam0/data/{stamp}.png", f"depth0/data/{stamp}.png") for stamp in stamps],
+        size,
+        2000,
+    )
     for name in ("cam0", "depth0"):
-        lines(base / name / "data.csv", ["#timestamp [ns],filename", *[f"{s},{s}.png" for s in stamps]])
+        lines(
+            base / name / "data.csv",
+            ["#timestamp [ns],filename", *[f"{s},{s}.png" for s in stamps]],
+        )
     position, q = se3.to_quaternion(poses @ np.linalg.inv(BASE_CAM))
     body = np.column_stack([position, q[:, [3, 0, 1, 2]], np.zeros((len(poses), 3))]).tolist()
-    rows = [",".join([str(stamp), *map(repr, row)]) for stamp, row in zip(stamps, body, strict=True)]
-    heading = (
-        "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v, v, v"
-    )
+    rows = [
+        ",".join([str(stamp), *map(repr, row)]) for stamp, row in zip(stamps, body, strict=True)
+    ]
+    position = "p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m]"
+    heading = f"#timestamp, {position}, q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v, v, v"
     lines(base / "state_groundtruth_estimate0" / "data.csv", [heading, *rows])
-    (base / "depth0" / "sensor.yaml").write_text("sensor_type: depth-camera\ndepth_factor: 1000.0\n")
+    (base / "depth0" / "sensor.yaml").write_text(
+        "sensor_type: depth-camera\ndepth_factor: 1000.0\n"
+    )
     (base / "cam0" / "sensor.yaml").write_text(
         "# General sensor definitions.\nsensor_type: camera\ncomment: VI-Sensor cam0 (MT9M034)\n\n# Extrinsics.\n"
         f"T_BS:\n  cols: 4\n  rows: 4\n  data: [{MATRIX}]\n\nrate_hz: 20\nresolution: [{size[0]}, {size[1]}]\n"

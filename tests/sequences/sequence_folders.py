@@ -13,7 +13,9 @@ from dynslam_bench.sequences.cameras import write_camera
 from dynslam_bench.sequences.synthetic import CAMERA
 
 SHARED = Path(__file__).resolve().parents[3] / "shared"
-needs_shared = pytest.mark.skipif(not (SHARED / "data").is_dir(), reason="needs the excerpts in ../shared/data")
+needs_shared = pytest.mark.skipif(
+    not (SHARED / "data").is_dir(), reason="needs the excerpts in ../shared/data"
+)
 
 
 def make_folder(folder, *, frames=4, width=32, height=24, rate=30, fps=30.0, start=100.0):
@@ -27,7 +29,9 @@ def make_folder(folder, *, frames=4, width=32, height=24, rate=30, fps=30.0, sta
         (folder / kind).mkdir(parents=True)
         for i, image in enumerate(images):
             cv2.imwrite(str(folder / kind / f"{i}.png"), image)
-        (folder / f"{kind}.txt").write_text("".join(f"{stamp!r} {kind}/{i}.png\n" for i, stamp in enumerate(stamps)))
+        (folder / f"{kind}.txt").write_text(
+            "".join(f"{stamp!r} {kind}/{i}.png\n" for i, stamp in enumerate(stamps))
+        )
     poses = (f"{stamp!r} {i * 0.01} 0 0 0 0 0 1\n" for i, stamp in enumerate(stamps))
     (folder / "groundtruth.txt").write_text("".join(poses))
     camera = Camera(width, height, 30.0, 30.5, 15.5, 11.5, depth_factor=5000.0)
@@ -62,7 +66,8 @@ class Altered:
     """A sequence with other frames, truth or camera."""
 
     def __init__(self, base, *, frame=None, truth=None, camera=None):
-        self.base, self.frame = base, frame
+        self.base = base
+        self.frame = frame
         self.frames = getattr(base, "frames", None) or [base[index] for index in range(len(base))]
         self.ground_truth = truth(base.ground_truth) if truth else base.ground_truth
         self.camera = camera(base.camera) if camera else base.camera
@@ -78,7 +83,9 @@ class Altered:
         if self.frame is None:
             return frame
         rgb, depth = self.frame(frame, self.base)
-        return Frame(frame.index, frame.timestamp, np.ascontiguousarray(rgb), np.ascontiguousarray(depth))
+        return Frame(
+            frame.index, frame.timestamp, np.ascontiguousarray(rgb), np.ascontiguousarray(depth)
+        )
 
 
 def frame_hash(frame):

@@ -64,7 +64,9 @@ def written_by_write_camera(folder, name):
 def written_as_calibrate_writes(folder, name):
     """The camera of the opened sequence, with one value measured."""
     opened = open_sequence(folder, camera=name)
-    write_camera(folder / "calibrated.toml", replace(opened.camera, depth_delay_s=0.0), fps=opened.fps)
+    write_camera(
+        folder / "calibrated.toml", replace(opened.camera, depth_delay_s=0.0), fps=opened.fps
+    )
     return open_sequence(folder, camera=folder / "calibrated.toml")
 
 
@@ -79,7 +81,11 @@ def named_in_another_file(folder, name):
 
 
 def named_by_the_folder(folder, name):
-    prefix = {"bonn": "rgbd_bonn_", "tum-fr1": "rgbd_dataset_freiburg1_", "tum-fr3": "rgbd_dataset_freiburg3_"}[name]
+    prefix = {
+        "bonn": "rgbd_bonn_",
+        "tum-fr1": "rgbd_dataset_freiburg1_",
+        "tum-fr3": "rgbd_dataset_freiburg3_",
+    }[name]
     return open_sequence(folder.rename(folder.parent / f"{prefix}my_cut"))
 
 
@@ -100,7 +106,9 @@ def test_every_way_of_naming_a_camera_gives_the_same_sequence(tmp_path, way, nam
     """Truth, depth, rolling shutter, distortion, baseline and frame rate."""
     reference = open_sequence(recording(tmp_path / "reference"), camera=name)
     sequence = WAYS[way](recording(tmp_path / "other"), name)
-    np.testing.assert_array_equal(sequence.ground_truth.T_world_cam, reference.ground_truth.T_world_cam)
+    np.testing.assert_array_equal(
+        sequence.ground_truth.T_world_cam, reference.ground_truth.T_world_cam
+    )
     np.testing.assert_array_equal(sequence[1].depth, reference[1].depth)
     assert sequence.camera == reference.camera == CAMERAS[name]
     assert sequence.fps == reference.fps
@@ -109,7 +117,8 @@ def test_every_way_of_naming_a_camera_gives_the_same_sequence(tmp_path, way, nam
 
 def test_bonn_s_truth_is_turned_once_into_the_camera_s_axes(tmp_path):
     folder = recording(tmp_path / "rec", 'name = "bonn"\n')
-    markers, truth = read_tum(folder / "groundtruth.txt"), open_sequence(folder).ground_truth
+    markers = read_tum(folder / "groundtruth.txt")
+    truth = open_sequence(folder).ground_truth
     np.testing.assert_array_equal(truth.positions, markers.positions)
     turns = se3.inverse(markers.T_world_cam) @ truth.T_world_cam
     for turn in turns:
@@ -126,10 +135,14 @@ def test_a_rig_of_one_s_own_is_stated_in_the_camera_file(tmp_path):
     sequence = open_sequence(folder)
     R_body_cam = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
     np.testing.assert_allclose(
-        sequence.ground_truth.T_world_cam[:, :3, :3], body.T_world_cam[:, :3, :3] @ R_body_cam, atol=1e-12
+        sequence.ground_truth.T_world_cam[:, :3, :3],
+        body.T_world_cam[:, :3, :3] @ R_body_cam,
+        atol=1e-12,
     )
     write_camera(folder / CAMERA_FILE, sequence.camera)
-    np.testing.assert_array_equal(open_sequence(folder).ground_truth.T_world_cam, sequence.ground_truth.T_world_cam)
+    np.testing.assert_array_equal(
+        open_sequence(folder).ground_truth.T_world_cam, sequence.ground_truth.T_world_cam
+    )
 
 
 def test_a_data_set_s_rig_holds_under_intrinsics_of_one_s_own(tmp_path):
@@ -139,15 +152,20 @@ def test_a_data_set_s_rig_holds_under_intrinsics_of_one_s_own(tmp_path):
     uncatalogued = open_sequence(recording(tmp_path / "rgbd_bonn_my_cut", own))
     elsewhere = open_sequence(recording(tmp_path / "mine", own))
     for sequence in (catalogued, uncatalogued):
-        np.testing.assert_array_equal(sequence.ground_truth.T_world_cam, reference.ground_truth.T_world_cam)
+        np.testing.assert_array_equal(
+            sequence.ground_truth.T_world_cam, reference.ground_truth.T_world_cam
+        )
         assert sequence.camera.fx == 540.0
-    assert np.abs(elsewhere.ground_truth.T_world_cam - reference.ground_truth.T_world_cam).max() > 0.1
+    assert (
+        np.abs(elsewhere.ground_truth.T_world_cam - reference.ground_truth.T_world_cam).max() > 0.1
+    )
 
 
 def test_the_identity_says_that_the_poses_are_the_camera_s(tmp_path):
     folder = recording(tmp_path / "rgbd_bonn_my_cut", 'name = "bonn"\n' + IDENTITY)
     np.testing.assert_array_equal(
-        open_sequence(folder).ground_truth.T_world_cam, read_tum(folder / "groundtruth.txt").T_world_cam
+        open_sequence(folder).ground_truth.T_world_cam,
+        read_tum(folder / "groundtruth.txt").T_world_cam,
     )
 
 
@@ -158,10 +176,18 @@ def test_a_composite_of_bonn_is_not_turned_a_second_time(tmp_path, target):
     class Host:
         """A wall, filmed by Bonn's camera."""
 
-        id, license, citation, masks, fps = "host", "", "", None, 30.0
-        camera = replace(CAMERAS["bonn"], width=160, height=120, fx=130.0, fy=130.0, cx=79.5, cy=59.5)
+        id = "host"
+        license = ""
+        citation = ""
+        masks = None
+        fps = 30.0
+        camera = replace(
+            CAMERAS["bonn"], width=160, height=120, fx=130.0, fy=130.0, cx=79.5, cy=59.5
+        )
         timestamps = np.round(100 + np.arange(6) / 30, 6)
-        ground_truth = Trajectory(timestamps, np.tile(se3.exp(np.array([0, 0, 0, 0.3, 0.2, 0.1])), (6, 1, 1)))
+        ground_truth = Trajectory(
+            timestamps, np.tile(se3.exp(np.array([0, 0, 0, 0.3, 0.2, 0.1])), (6, 1, 1))
+        )
         walker = False
 
         def digest(self):
@@ -182,7 +208,9 @@ def test_a_composite_of_bonn_is_not_turned_a_second_time(tmp_path, target):
     people = type("People", (Host,), {"walker": True, "ground_truth": None})()
     compose(Host(), people, tmp_path / target, 0)
     composed = open_sequence(tmp_path / target)
-    np.testing.assert_allclose(composed.ground_truth.T_world_cam, Host.ground_truth.T_world_cam, atol=1e-9)
+    np.testing.assert_allclose(
+        composed.ground_truth.T_world_cam, Host.ground_truth.T_world_cam, atol=1e-9
+    )
 
 
 def test_bodies_of_other_layouts_are_carried_to_the_camera_once(tmp_path):
@@ -192,16 +220,23 @@ def test_bodies_of_other_layouts_are_carried_to_the_camera_once(tmp_path):
         WRITERS[name](tmp_path / name, poses)
         stated = replace(open_sequence(tmp_path / name).camera, R_body_cam=BONN_R_BODY_CAM)
         np.testing.assert_allclose(
-            open_sequence(tmp_path / name, camera=stated).ground_truth.T_world_cam, poses, atol=1e-12
+            open_sequence(tmp_path / name, camera=stated).ground_truth.T_world_cam,
+            poses,
+            atol=1e-12,
         )
     calibration = tmp_path / "vslam-lab" / "calibration.yaml"
     text = calibration.read_text()
-    start, end = text.index("T_BS: ["), text.index("]", text.index("T_BS: ["))
+    start = text.index("T_BS: [")
+    end = text.index("]", text.index("T_BS: ["))
     calibration.write_text(f"{text[:start]}T_BS: [1,0,0,0, 0,1,0,0, 0,0,1,0, 0,0,0,1{text[end:]}")
     body = open_sequence(tmp_path / "vslam-lab").ground_truth.T_world_cam
-    turned = open_sequence(tmp_path / "vslam-lab", camera=stated_by_bonn(tmp_path / "vslam-lab")).ground_truth
+    turned = open_sequence(
+        tmp_path / "vslam-lab", camera=stated_by_bonn(tmp_path / "vslam-lab")
+    ).ground_truth
     np.testing.assert_allclose(
-        turned.T_world_cam[:, :3, :3], body[:, :3, :3] @ nearest_rotation(BONN_R_BODY_CAM), atol=1e-9
+        turned.T_world_cam[:, :3, :3],
+        body[:, :3, :3] @ nearest_rotation(BONN_R_BODY_CAM),
+        atol=1e-9,
     )
 
 
@@ -282,7 +317,10 @@ def beside_associations(folder):
 WITHOUT_FACTOR = {
     "folder": lambda folder: {"name": small(folder, INTRINSICS + "fps = 30\n")},
     "--camera FILE": in_a_file,
-    "Camera": lambda folder: {"name": small(folder, ""), "camera": Camera(32, 24, 30.0, 30.5, 15.5, 11.5)},
+    "Camera": lambda folder: {
+        "name": small(folder, ""),
+        "camera": Camera(32, 24, 30.0, 30.5, 15.5, 11.5),
+    },
     "associations": beside_associations,
     "vslam-lab": vslam_lab_without,
     "euroc": euroc_without,
@@ -298,7 +336,13 @@ def test_depth_without_a_stated_factor_is_refused_at_every_entrance(tmp_path, en
     with pytest.raises(CameraError, match="nothing says how many make a metre") as caught:
         open_sequence(**how)
     assert "\n" not in str(caught.value)
-    for part in ("width = ", "height = ", "fx = ", "depth_factor = 1000.0", "depth_factor = 5000.0"):
+    for part in (
+        "width = ",
+        "height = ",
+        "fx = ",
+        "depth_factor = 1000.0",
+        "depth_factor = 5000.0",
+    ):
         assert part in caught.value.template
         assert part in str(caught.value)
 
@@ -359,7 +403,12 @@ def test_arrays_of_metres_need_no_factor(tmp_path):
 
 def test_layouts_whose_publisher_states_the_unit_keep_it_under_another_camera(tmp_path):
     """7-Scenes' depth is in millimetres, ETH3D's and ICL-NUIM's in TUM's units."""
-    for name, factor in (("7-scenes", 1000.0), ("eth3d", 5000.0), ("icl-nuim", 5000.0), ("openloris", 1000.0)):
+    for name, factor in (
+        ("7-scenes", 1000.0),
+        ("eth3d", 5000.0),
+        ("icl-nuim", 5000.0),
+        ("openloris", 1000.0),
+    ):
         WRITERS[name](tmp_path / name, random_poses(0))
         before = open_sequence(tmp_path / name).camera
         other = Camera(before.width, before.height, 400.0, 400.0, 300.0, 200.0)
@@ -386,7 +435,9 @@ def test_the_command_line_prints_the_file_as_it_stands(tmp_path):
     error, *lines = done.stderr.splitlines()
     assert error.startswith("error: the depth images of ")
     assert lines[0].startswith("width = 32")
-    (folder / CAMERA_FILE).write_text("\n".join(lines).replace("# depth_factor = 5000.0", "depth_factor = 5000.0"))
+    (folder / CAMERA_FILE).write_text(
+        "\n".join(lines).replace("# depth_factor = 5000.0", "depth_factor = 5000.0")
+    )
     done = subprocess.run([*command, "--json"], capture_output=True, text=True, check=True)
     assert json.loads(done.stdout)["frames"] == 4
 
@@ -439,16 +490,25 @@ def test_published_cameras_are_plausible(name):
 
 
 def test_usual_lenses_are_plausible():
-    check_camera(Camera(752, 480, 458.654, 457.296, 367.215, 248.375, (-0.2834, 0.0740, 2e-4, 1.8e-5, 0.0)), "EuRoC")
+    check_camera(
+        Camera(752, 480, 458.654, 457.296, 367.215, 248.375, (-0.2834, 0.0740, 2e-4, 1.8e-5, 0.0)),
+        "EuRoC",
+    )
     check_camera(Camera(640, 480, 3000.0, 3000.0, 320.0, 240.0), "a long lens")
-    check_camera(Camera(640, 480, 160.0, 160.0, 320.0, 240.0, (0.05, 0.0, 0.0, 0.0, 0.0)), "a wide lens")
+    check_camera(
+        Camera(640, 480, 160.0, 160.0, 320.0, 240.0, (0.05, 0.0, 0.0, 0.0, 0.0)), "a wide lens"
+    )
 
 
 @pytest.mark.parametrize("name", ["vslam-lab", "euroc", "openloris"])
 def test_calibrations_of_other_layouts_are_looked_at_as_well(tmp_path, name):
     WRITERS[name](tmp_path / "s", random_poses(0))
     file, old, new = {
-        "vslam-lab": ("calibration.yaml", "principal_point: [31.5, 23.5]", "principal_point: [3150, 23.5]"),
+        "vslam-lab": (
+            "calibration.yaml",
+            "principal_point: [31.5, 23.5]",
+            "principal_point: [3150, 23.5]",
+        ),
         "euroc": ("mav0/cam0/sensor.yaml", "intrinsics: [58.6,", "intrinsics: [1.0e-290,"),
         "openloris": ("sensors.yaml", "6.12e+02", "6.12e+22"),
     }[name]
@@ -474,7 +534,12 @@ def test_cameras_of_code_are_looked_at_as_well(tmp_path):
     class Data:
         """A data set of a plug-in."""
 
-        id, license, citation, masks, ground_truth, fps = "mine/one", "", "", None, None, 30.0
+        id = "mine/one"
+        license = ""
+        citation = ""
+        masks = None
+        ground_truth = None
+        fps = 30.0
         camera = replace(good, cx=-500.0)
         timestamps = np.array([1.0, 1.1, 1.2])
 
@@ -490,16 +555,26 @@ def test_cameras_of_code_are_looked_at_as_well(tmp_path):
 
     with pytest.raises(SequenceError, match=r"camera of 'mine/one'.*cx is -500 px"):
         SlamEnv(Data(), "never-move")
-    Data.camera, Data.fps = good, 0.0
+    Data.camera = good
+    Data.fps = 0.0
     with pytest.raises(SequenceError, match="frame rate of 'mine/one' is 0"):
         SlamEnv(Data(), "never-move")
 
 
 @pytest.mark.parametrize(
     ("rate", "stated", "taken"),
-    [(10, 31.0, 10.0), (30, 300.0, 30.0), (30, 0.5, 30.0), (30, 25.0, 25.0), (30, 30.0, 30.0), (30, 15.0, 15.0)],
+    [
+        (10, 31.0, 10.0),
+        (30, 300.0, 30.0),
+        (30, 0.5, 30.0),
+        (30, 25.0, 25.0),
+        (30, 30.0, 30.0),
+        (30, 15.0, 15.0),
+    ],
 )
-def test_a_frame_rate_that_the_stamps_contradict_is_not_taken_and_said(tmp_path, rate, stated, taken):
+def test_a_frame_rate_that_the_stamps_contradict_is_not_taken_and_said(
+    tmp_path, rate, stated, taken
+):
     folder, *_ = make_folder(tmp_path / "rec", frames=5, rate=rate, fps=stated)
     sequence = open_sequence(folder)
     assert sequence.fps == pytest.approx(taken)
@@ -512,14 +587,18 @@ def test_a_bag_s_camera_states_its_unit():
     message = type("Info", (), {})()
     message.k = np.array([300.0, 0, 8, 0, 301.0, 6, 0, 0, 1])
     message.d = np.zeros(5)
-    message.width, message.height, message.distortion_model = 16, 12, "plumb_bob"
+    message.width = 16
+    message.height = 12
+    message.distortion_model = "plumb_bob"
     assert camera_of_bag(message, "info").depth_factor == 1000.0
 
 
 def test_errors_with_a_file_to_copy_survive_pickling():
     import pickle
 
-    error = DynslamError("what", "how", options=["a"], template="x = 1  # one\n# y = 2  # two\n# words")
+    error = DynslamError(
+        "what", "how", options=["a"], template="x = 1  # one\n# y = 2  # two\n# words"
+    )
     again = pickle.loads(pickle.dumps(error))
     assert again.template == error.template
     assert str(again) == "what (how) (choose: a) (template: x = 1; # y = 2)"

@@ -34,7 +34,8 @@ class Recording:
         lever_m: Of the camera from the body whose poses the truth holds.
         late_s: By which the truth is late.
         noise_px: Standard deviation of the corners.
-        followed: Whether the measured motions are those relative to the people: most corners lie on them.
+        followed: Whether the measured motions are those relative to the people: most corners lie on
+            them.
     """
 
     def __init__(
@@ -58,7 +59,9 @@ class Recording:
         size = np.array([speed] * 3 + [0.6] * 3) / frequency / 5
 
         def pose(stamps):
-            return se3.exp(size * np.sin(2 * np.pi * frequency * np.asarray(stamps)[..., None] + phase))
+            return se3.exp(
+                size * np.sin(2 * np.pi * frequency * np.asarray(stamps)[..., None] + phase)
+            )
 
         self.stamps = np.arange(frames) / 30
         body = np.eye(4)
@@ -74,14 +77,28 @@ class Recording:
             walking = rng.random(200) < people
             walk = se3.exp(np.concatenate([rng.normal(0, 0.1, 3), rng.normal(0, turning, 3)]))
             world[walking] = world[walking] @ walk[:3, :3].T + walk[:3, 3]
-            second = self._shown(pose, self.stamps[first + STEP], world, readout_s) + rng.normal(0, noise_px, (200, 2))
+            second = self._shown(pose, self.stamps[first + STEP], world, readout_s) + rng.normal(
+                0, noise_px, (200, 2)
+            )
             measured = scale * depth * (1 + rng.normal(0, 0.01, 200))
             walked = se3.inverse(walk) if followed else np.eye(4)
-            motion = se3.inverse(pose(self.stamps[first])) @ walked @ pose(self.stamps[first + STEP])
+            motion = (
+                se3.inverse(pose(self.stamps[first])) @ walked @ pose(self.stamps[first + STEP])
+            )
             motion[:3, 3] *= scale
             moved = float(np.median(np.linalg.norm(second - pixels, axis=1)))
             self.pairs.append(
-                RgbdPair(first, first + STEP, pixels, measured, second, walking == followed, motion, moved, 0.9)
+                RgbdPair(
+                    first,
+                    first + STEP,
+                    pixels,
+                    measured,
+                    second,
+                    walking == followed,
+                    motion,
+                    moved,
+                    0.9,
+                )
             )
 
     def _late(self, pixels, readout_s):
@@ -122,10 +139,14 @@ CONDITIONS = {
 @pytest.mark.parametrize("condition", CONDITIONS.values(), ids=CONDITIONS)
 def test_the_interval_holds_the_right_scale(condition):
     scales = [(0.2, seed) for seed in range(3)] + [(1.0, seed) for seed in range(3, 6)]
-    found = [(scale, Recording(seed, scale=scale, **condition).measured()) for scale, seed in scales]
+    found = [
+        (scale, Recording(seed, scale=scale, **condition).measured()) for scale, seed in scales
+    ]
     within = [each.low <= scale <= each.high for scale, each in found]
     assert sum(within) >= 5, "95 % of many"
-    assert all(each.high - each.low >= 0.11 * scale for scale, each in found), "what all pairs share is in it"
+    assert all(each.high - each.low >= 0.11 * scale for scale, each in found), (
+        "what all pairs share is in it"
+    )
 
 
 def test_the_interval_widens_with_what_is_not_known():
@@ -144,7 +165,8 @@ def test_a_camera_at_rest_gives_no_scale():
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "excluded"), [(1.05, 1.4, False), (1.11, 1.4, True), (0.5, 0.92, False), (0.5, 0.9, True)]
+    ("low", "high", "excluded"),
+    [(1.05, 1.4, False), (1.11, 1.4, True), (0.5, 0.92, False), (0.5, 0.9, True)],
 )
 def test_a_scale_is_excluded_beyond_a_tenth(low, high, excluded):
     assert DepthScale(1.0, low, high).excludes(0.1) == excluded
@@ -157,16 +179,21 @@ def found_in(recording, **camera):
     return {finding.id: finding for finding in found}
 
 
-@pytest.mark.parametrize(("scale", "right"), [(0.2, 1000), (5.0, 25000), (1.3, 6500), (0.02, 100), (1 / 3.3, 1515)])
+@pytest.mark.parametrize(
+    ("scale", "right"), [(0.2, 1000), (5.0, 25000), (1.3, 6500), (0.02, 100), (1 / 3.3, 1515)]
+)
 @pytest.mark.parametrize("seed", [0, 1])
 def test_a_wrong_factor_is_named_with_an_interval_that_holds_the_right_one(scale, right, seed):
     found = found_in(Recording(seed, scale=scale))
-    text, cure = found["depth-factor"].text, found["depth-factor"].cure
+    text = found["depth-factor"].text
+    cure = found["depth-factor"].cure
     low, high = map(float, re.search(r"95 % interval ([\d.]+) to ([\d.]+)", text).groups())
     assert low < right < high < 1.2 * low
     assert found["depth-factor"].value == pytest.approx(1 / scale, rel=0.08)
     proposed = float(re.search(r"depth_factor = ([\d.]+)", cure).group(1))
-    assert proposed == (right if right in (100, 1000) else pytest.approx(right, rel=0.08)), "a usual one is taken"
+    assert proposed == (right if right in (100, 1000) else pytest.approx(right, rel=0.08)), (
+        "a usual one is taken"
+    )
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.95, 1.06])
@@ -183,7 +210,8 @@ def test_a_factor_that_the_data_cannot_tell_is_a_note():
 
 
 @pytest.mark.parametrize(
-    ("scale", "id", "severity"), [(1.0, "depth-factor-unmeasured", "note"), (0.2, "depth-factor", "fault")]
+    ("scale", "id", "severity"),
+    [(1.0, "depth-factor-unmeasured", "note"), (0.2, "depth-factor", "fault")],
 )
 def test_with_little_depth_there_is_no_interval(scale, id, severity):
     """All corners may lie on one person then."""
@@ -198,23 +226,31 @@ def test_with_little_depth_there_is_no_interval(scale, id, severity):
 def of_markers(truth):
     """A truth in the camera's axes as the poses of Bonn's markers."""
     R = nearest_rotation(BONN_R_BODY_CAM)
-    markers = truth.with_poses(se3.with_rotation(truth.T_world_cam, truth.T_world_cam[:, :3, :3] @ R.T))
-    np.testing.assert_allclose(in_camera_axes(markers.T_world_cam, BONN_R_BODY_CAM), truth.T_world_cam, atol=1e-9)
+    markers = truth.with_poses(
+        se3.with_rotation(truth.T_world_cam, truth.T_world_cam[:, :3, :3] @ R.T)
+    )
+    np.testing.assert_allclose(
+        in_camera_axes(markers.T_world_cam, BONN_R_BODY_CAM), truth.T_world_cam, atol=1e-9
+    )
     return markers
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_truth_of_published_markers_is_no_fault_and_hides_none(seed):
-    sound, wrong = Recording(seed), Recording(seed, scale=0.2)
+    sound = Recording(seed)
+    wrong = Recording(seed, scale=0.2)
     for each in (sound, wrong):
         each.truth = of_markers(each.truth)
     (finding,) = found_in(sound).values()
     assert (finding.id, finding.severity) == ("truth-markers", "note")
-    assert finding.value == pytest.approx(172.7, abs=0.5) and "bonn" in finding.cure
+    assert finding.value == pytest.approx(172.7, abs=0.5)
+    assert "bonn" in finding.cure
     assert set(found_in(wrong)) == {"truth-markers", "depth-factor"}
 
 
-@pytest.mark.parametrize("turn", [np.array([0, 0, np.pi / 2]), np.array([2.0, 0, 0]), np.array([0.5, -1, 1])])
+@pytest.mark.parametrize(
+    "turn", [np.array([0, 0, np.pi / 2]), np.array([2.0, 0, 0]), np.array([0.5, -1, 1])]
+)
 def test_other_axes_are_a_fault(turn):
     """Those that nobody publishes; the recordings' rotations tell them."""
     recording = Recording(1)
@@ -232,11 +268,18 @@ def test_other_axes_are_a_fault(turn):
         (("note",), ("truth-markers",), "found: ready"),
         (("note",), ("no-truth",), ": ready"),
         (("fault",), ("depth-factor",), "1 fault: not ready"),
-        (("fault", "note", "fault"), ("depth-factor", "no-truth", "unreadable"), "2 faults: not ready"),
+        (
+            ("fault", "note", "fault"),
+            ("depth-factor", "no-truth", "unreadable"),
+            "2 faults: not ready",
+        ),
     ],
 )
 def test_the_verdict_ends_with_whether_the_recording_is_ready(severities, ids, end):
-    found = [Finding(id, severity, None, "", "t", "c") for id, severity in zip(ids, severities, strict=True)]
+    found = [
+        Finding(id, severity, None, "", "t", "c")
+        for id, severity in zip(ids, severities, strict=True)
+    ]
     diagnosis = Diagnosis("x", 40, tuple(found))
     assert diagnosis.verdict.endswith(end)
     assert diagnosis.ok == (not diagnosis.verdict.endswith("not ready"))
@@ -269,7 +312,11 @@ def test_the_truth_of_another_recording_is_not_taken_for_one_with_people(seed, p
     assert all("it is of this recording" not in finding.text for finding in findings.values())
 
 
-PARTS = [("bonn/rgbd_bonn_crowd", 75, 195), ("bonn/rgbd_bonn_crowd", 0, 100), ("tum/rgbd_dataset_freiburg1_xyz", 0, 60)]
+PARTS = [
+    ("bonn/rgbd_bonn_crowd", 75, 195),
+    ("bonn/rgbd_bonn_crowd", 0, 100),
+    ("tum/rgbd_dataset_freiburg1_xyz", 0, 60),
+]
 
 
 @needs_shared
@@ -278,10 +325,12 @@ def test_real_depth_in_millimetres(name, start, stop):
     """Crowd's colour frames 300-419 were said to have 833.53 +- 7.9 %, or a truth turned by 172 degrees."""
     part = SequenceView(open_sequence(SHARED / "data" / name), start, stop)
     right = examine(Altered(part, camera=lambda camera: replace(camera, depth_factor=1000.0)))
-    assert right.ok and right.verdict.endswith(": ready"), right.findings
+    assert right.ok, right.findings
+    assert right.verdict.endswith(": ready"), right.findings
     wrong = examine(Altered(part, frame=lambda frame, _: (frame.rgb, frame.depth / 5)))
     (fault,) = (finding for finding in wrong.findings if finding.severity == "fault")
-    assert fault.id == "depth-factor" and "depth_factor = 1000 " in fault.cure
+    assert fault.id == "depth-factor"
+    assert "depth_factor = 1000 " in fault.cure
     low, high = map(float, re.search(r"95 % interval ([\d.]+) to ([\d.]+)", fault.text).groups())
     assert low < 1000 < high
 
@@ -317,6 +366,7 @@ def windows_at(fps):
 def test_no_readout_is_longer_than_the_time_between_frames(fps, stated_s, value_s, half_s, written):
     camera = replace(CAMERA, readout_s=stated_s)
     found = _readout(Estimate(value_s, half_s), windows_at(fps), camera)
-    assert found.written == written and found.reason
+    assert found.written == written
+    assert found.reason
     kept = camera.readout_s if found.written is None else found.written
     assert kept <= 1 / fps

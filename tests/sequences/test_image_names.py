@@ -8,12 +8,17 @@ from sequence_folders import make_folder, rewrite
 from dynslam_bench.core import SequenceError
 from dynslam_bench.sequences import open_sequence
 
-CAMERA = "width = 32\nheight = 24\nfx = 30.0\nfy = 30.5\ncx = 15.5\ncy = 11.5\ndepth_factor = 5000.0\n"
+CAMERA = (
+    "width = 32\nheight = 24\nfx = 30.0\nfy = 30.5\ncx = 15.5\ncy = 11.5\ndepth_factor = 5000.0\n"
+)
 
 
 def named(folder, names, fps=None, suffix=".png"):
     """A recording without lists whose images have these names."""
-    for kind, image in (("rgb", np.full((24, 32, 3), 90, np.uint8)), ("depth", np.full((24, 32), 10000, np.uint16))):
+    for kind, image in (
+        ("rgb", np.full((24, 32, 3), 90, np.uint8)),
+        ("depth", np.full((24, 32), 10000, np.uint16)),
+    ):
         (folder / kind).mkdir(parents=True)
         for name in names:
             cv2.imwrite(str(folder / kind / f"{name}{suffix}"), image)
@@ -25,7 +30,11 @@ UNIX = {
     "seconds": [1_700_000_000, 1_700_000_001, 1_700_000_002],
     "milliseconds": [1_700_000_000_000, 1_700_000_000_033, 1_700_000_000_067],
     "microseconds": [1_700_000_000_000_000, 1_700_000_000_033_333, 1_700_000_000_066_667],
-    "nanoseconds": [1_700_000_000_000_000_000, 1_700_000_000_033_333_000, 1_700_000_000_066_666_000],
+    "nanoseconds": [
+        1_700_000_000_000_000_000,
+        1_700_000_000_033_333_000,
+        1_700_000_000_066_666_000,
+    ],
 }
 PER_S = {"seconds": 1, "milliseconds": 10**3, "microseconds": 10**6, "nanoseconds": 10**9}
 
@@ -35,7 +44,9 @@ PER_S = {"seconds": 1, "milliseconds": 10**3, "microseconds": 10**6, "nanosecond
 def test_unix_time_is_read_in_its_unit_to_the_last_digit(tmp_path, unit, fps):
     """Names of nanoseconds with fps = 30 crashed; the size of the numbers says the unit."""
     sequence = open_sequence(named(tmp_path / "rec", UNIX[unit], fps))
-    assert sequence.timestamps_ns.tolist() == [number * (10**9 // PER_S[unit]) for number in UNIX[unit]]
+    assert sequence.timestamps_ns.tolist() == [
+        number * (10**9 // PER_S[unit]) for number in UNIX[unit]
+    ]
     assert sequence.fps == pytest.approx(1.0 if unit == "seconds" else 30.0, rel=0.02)
 
 
@@ -52,7 +63,12 @@ SINCE_BOOT = {
     "ms at 15 Hz": ([9000, 9067, 9133], 15.0, "milliseconds", 10**3),
     "ms under a wrong rate": ([5000, 5100, 5200], 30.0, "milliseconds", 10**3),
     "us": ([7_000_000, 7_033_333, 7_066_667], 30.0, "microseconds", 10**6),
-    "ns": ([123_456_789_012_345, 123_456_822_345_678, 123_456_855_679_011], 30.0, "nanoseconds", 10**9),
+    "ns": (
+        [123_456_789_012_345, 123_456_822_345_678, 123_456_855_679_011],
+        30.0,
+        "nanoseconds",
+        10**9,
+    ),
 }
 
 
@@ -70,7 +86,8 @@ def test_time_since_boot_is_refused_with_both_readings_and_the_hint_works(tmp_pa
         assert "\n" not in str(caught.value)
         line = f"{numbers[0] // per_s}.{numbers[0] % per_s * (10**9 // per_s):09d} {kind}/{numbers[0]}.png"
         assert (
-            f"write {kind}.txt with a line an image, in seconds: '{line}' if the names are {unit}" in caught.value.hint
+            f"write {kind}.txt with a line an image, in seconds: '{line}' if the names are {unit}"
+            in caught.value.hint
         )
         listed = [f"{number / per_s:.9f} {kind}/{number}.png\n" for number in numbers]
         (folder / f"{kind}.txt").write_text("".join(listed))
@@ -88,7 +105,9 @@ def test_the_other_reading_of_the_hint_works_too(tmp_path):
         open_sequence(folder)
     assert "'1.100000000 rgb/33.png' if they are frame numbers" in caught.value.hint
     for kind in ("rgb", "depth"):
-        (folder / f"{kind}.txt").write_text("".join(f"{number / 30:.9f} {kind}/{number}.png\n" for number in numbers))
+        (folder / f"{kind}.txt").write_text(
+            "".join(f"{number / 30:.9f} {kind}/{number}.png\n" for number in numbers)
+        )
     sequence = open_sequence(folder)
     np.testing.assert_allclose(sequence.timestamps, [1.1, 2.2, 3.3], atol=1e-8)
     assert sequence.fps == pytest.approx(1 / 1.1)
@@ -105,21 +124,34 @@ def test_frame_numbers_get_their_times_from_the_frame_rate_and_both_hints_work(t
     np.testing.assert_allclose(by_rate.timestamps, [0, 1 / 30, 2 / 30], atol=1e-8)
     (folder / "camera.toml").write_text(CAMERA)
     for kind in ("rgb", "depth"):
-        (folder / f"{kind}.txt").write_text("".join(f"{i / 30:.9f} {kind}/{i:06d}.png\n" for i in range(3)))
+        (folder / f"{kind}.txt").write_text(
+            "".join(f"{i / 30:.9f} {kind}/{i:06d}.png\n" for i in range(3))
+        )
     np.testing.assert_allclose(open_sequence(folder).timestamps, by_rate.timestamps, atol=1e-8)
 
 
 def test_the_frame_rate_in_a_camera_file_of_its_own_counts_too(tmp_path):
     folder = named(tmp_path / "rec", range(3))
     (tmp_path / "mine.toml").write_text(CAMERA + "fps = 25\n")
-    assert open_sequence(folder, camera=tmp_path / "mine.toml").timestamps.tolist() == [0, 0.04, 0.08]
+    assert open_sequence(folder, camera=tmp_path / "mine.toml").timestamps.tolist() == [
+        0,
+        0.04,
+        0.08,
+    ]
 
 
 @pytest.mark.parametrize(
     ("numbers", "missing", "rate"),
-    [([0, 1, 2, 5, 6], 2, 30.0), ([10, 12, 14, 16], 3, 15.0), ([0, 10, 20], 18, 3.0), ([7, 8, 9], 0, 30.0)],
+    [
+        ([0, 1, 2, 5, 6], 2, 30.0),
+        ([10, 12, 14, 16], 3, 15.0),
+        ([0, 10, 20], 18, 3.0),
+        ([7, 8, 9], 0, 30.0),
+    ],
 )
-def test_left_out_frame_numbers_are_counted_and_the_rate_is_that_of_the_stamps(tmp_path, numbers, missing, rate):
+def test_left_out_frame_numbers_are_counted_and_the_rate_is_that_of_the_stamps(
+    tmp_path, numbers, missing, rate
+):
     sequence = open_sequence(named(tmp_path / "rec", numbers, 30.0))
     np.testing.assert_allclose(sequence.timestamps, np.array(numbers) / 30, atol=1e-8)
     assert sequence.fps == pytest.approx(rate)
@@ -142,7 +174,11 @@ def test_names_with_and_without_a_point_are_all_seconds(tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "unit"),
-    [("1700000000000000000", "nanoseconds"), ("1700000000000.5", "milliseconds"), ("1700000000000000", "microseconds")],
+    [
+        ("1700000000000000000", "nanoseconds"),
+        ("1700000000000.5", "milliseconds"),
+        ("1700000000000000", "microseconds"),
+    ],
 )
 def test_a_list_in_another_unit_is_refused_with_the_unit(tmp_path, text, unit):
     folder, *_ = make_folder(tmp_path / "rec")
@@ -181,5 +217,7 @@ def test_names_that_are_no_numbers_say_what_to_write_and_it_works(tmp_path, stem
         with pytest.raises(SequenceError, match="is not a timestamp in seconds") as caught:
             open_sequence(folder)
         assert caught.value.hint == f"write {kind}.txt with lines 'timestamp {kind}/FILE'"
-        (folder / f"{kind}.txt").write_text("".join(f"{i / 30:.9f} {kind}/{stem}{i}.png\n" for i in range(3)))
+        (folder / f"{kind}.txt").write_text(
+            "".join(f"{i / 30:.9f} {kind}/{stem}{i}.png\n" for i in range(3))
+        )
     assert len(open_sequence(folder)) == 3

@@ -19,25 +19,37 @@ POSES = random_poses(0)
 
 
 @pytest.mark.parametrize(
-    "name", ["rgbd_dataset_freiburg1_xyz", "rgbd_bonn_crowd", "living_room_traj0_frei_png", "rgbd_bonn_my_cut", "mine"]
+    "name",
+    [
+        "rgbd_dataset_freiburg1_xyz",
+        "rgbd_bonn_crowd",
+        "living_room_traj0_frei_png",
+        "rgbd_bonn_my_cut",
+        "mine",
+    ],
 )
 @pytest.mark.parametrize("layout", [layout for layout in WRITERS if layout != "tum"])
 def test_a_folder_opens_by_its_files_whatever_its_name(tmp_path, layout, name):
     WRITERS[layout](tmp_path / "reference" / "s", POSES)
     WRITERS[layout](tmp_path / "named" / name, POSES)
-    reference, sequence = open_sequence(tmp_path / "reference" / "s"), open_sequence(tmp_path / "named" / name)
+    reference = open_sequence(tmp_path / "reference" / "s")
+    sequence = open_sequence(tmp_path / "named" / name)
     assert find_layout(tmp_path / "named" / name).name == layout
     assert len(sequence) == len(reference)
     assert sequence.camera == reference.camera
     np.testing.assert_array_equal(sequence[1].depth, reference[1].depth)
-    np.testing.assert_array_equal(sequence.ground_truth.T_world_cam, reference.ground_truth.T_world_cam)
+    np.testing.assert_array_equal(
+        sequence.ground_truth.T_world_cam, reference.ground_truth.T_world_cam
+    )
     entry = entry_of(name)
     stated = layout if entry is None else entry.layout
     said = f"read in the layout {layout}, by its files; the data set is published in {stated}"
     assert (said in sequence.dropped) == (stated != layout)
 
 
-@pytest.mark.parametrize("name", ["living_room_traj0_frei_png", "rgbd_dataset_freiburg1_xyz", "mine"])
+@pytest.mark.parametrize(
+    "name", ["living_room_traj0_frei_png", "rgbd_dataset_freiburg1_xyz", "mine"]
+)
 def test_plain_folders_open_under_any_name(tmp_path, name):
     folder, *_ = make_folder(tmp_path / name)
     for kind in ("rgb", "depth"):
@@ -57,14 +69,20 @@ def test_an_id_finds_its_folder_in_another_layout(tmp_path):
         assert len(sequence) == 3
 
 
-@pytest.mark.parametrize("name", ["rgbd_dataset_freiburg1_xyz", "rgbd_bonn_crowd", "living_room_traj0_frei_png"])
-def test_a_published_name_that_is_a_folder_here_says_how_to_open_that_and_it_works(tmp_path, monkeypatch, name):
+@pytest.mark.parametrize(
+    "name", ["rgbd_dataset_freiburg1_xyz", "rgbd_bonn_crowd", "living_room_traj0_frei_png"]
+)
+def test_a_published_name_that_is_a_folder_here_says_how_to_open_that_and_it_works(
+    tmp_path, monkeypatch, name
+):
     monkeypatch.chdir(tmp_path)
     WRITERS["vslam-lab"](tmp_path / name, POSES)
     with pytest.raises(SequenceError, match="which is not at") as caught:
         open_sequence(name, data_root=tmp_path / "data")
     assert caught.value.hint == f"for the folder of that name here write ./{name}"
-    assert len(open_sequence(caught.value.hint.rpartition(" ")[2], data_root=tmp_path / "data")) == 3
+    assert (
+        len(open_sequence(caught.value.hint.rpartition(" ")[2], data_root=tmp_path / "data")) == 3
+    )
 
 
 def test_half_of_a_published_folder_is_not_another_layout(tmp_path):
@@ -107,8 +125,9 @@ def test_a_published_folder_with_a_second_layout_is_read_as_published(tmp_path):
     WRITERS["vslam-lab"](folder, POSES, size=(640, 480))
     sequence = open_sequence(folder)
     assert (sequence[0].depth == 2.0).all()
-    assert "read in the layout tum (rgb.txt); rgb.csv, calibration.yaml of the layout vslam-lab is not used" in (
-        sequence.dropped
+    assert (
+        "read in the layout tum (rgb.txt); rgb.csv, calibration.yaml of the layout vslam-lab is not used"
+        in (sequence.dropped)
     )
 
 
@@ -133,10 +152,15 @@ def test_a_folder_of_one_layout_says_nothing(tmp_path):
 
 
 def pairs(folder, name, numbers):
-    lines(folder / name, [f"{100 + i / 30:.6f} rgb/{i}.png {100 + i / 30:.6f} depth/{i}.png" for i in numbers])
+    lines(
+        folder / name,
+        [f"{100 + i / 30:.6f} rgb/{i}.png {100 + i / 30:.6f} depth/{i}.png" for i in numbers],
+    )
 
 
-@pytest.mark.parametrize("name", ["associations.txt", "associated.txt", "associate.txt", "association.txt"])
+@pytest.mark.parametrize(
+    "name", ["associations.txt", "associated.txt", "associate.txt", "association.txt"]
+)
 def test_pairs_beside_both_lists_are_said_to_be_unused(tmp_path, name):
     folder, *_ = make_folder(tmp_path / "rec")
     pairs(folder, name, [1, 2])
@@ -163,7 +187,10 @@ def test_a_missing_list_is_said(tmp_path, gone):
         (folder / gone / f"{i}.png").rename(folder / gone / f"{100 + i / 30:.6f}.png")
     sequence = open_sequence(folder)
     assert len(sequence) == 4
-    assert f"there is no {gone}.txt: the images of {gone}/ are stamped by their names" in sequence.dropped
+    assert (
+        f"there is no {gone}.txt: the images of {gone}/ are stamped by their names"
+        in sequence.dropped
+    )
 
 
 def test_a_second_truth_and_a_second_list_of_pairs_are_said(tmp_path):
@@ -194,7 +221,10 @@ def test_masks_are_read_beside_pairs(tmp_path):
 
 
 def test_poses_of_other_layouts_that_are_not_taken_are_counted(tmp_path):
-    for name, table in (("vslam-lab", "groundtruth.csv"), ("euroc", "mav0/state_groundtruth_estimate0/data.csv")):
+    for name, table in (
+        ("vslam-lab", "groundtruth.csv"),
+        ("euroc", "mav0/state_groundtruth_estimate0/data.csv"),
+    ):
         WRITERS[name](tmp_path / name, POSES)
         rows = (tmp_path / name / table).read_text().splitlines()
         zero = [*rows[-1].split(",")[:4], "0", "0", "0", "0", *rows[-1].split(",")[8:]]
@@ -226,7 +256,8 @@ def link_to_itself(path):
 
 @pytest.mark.parametrize("damage", [dangling, folder_of_that_name, link_to_itself])
 @pytest.mark.parametrize(
-    "name", ["rgb.txt", "depth.txt", "groundtruth.txt", "associations.txt", "people.txt", "camera.toml"]
+    "name",
+    ["rgb.txt", "depth.txt", "groundtruth.txt", "associations.txt", "people.txt", "camera.toml"],
 )
 def test_a_file_that_cannot_be_one_is_refused(tmp_path, name, damage):
     """rgb.txt as a link to nowhere gave the images of the folder instead."""

@@ -25,7 +25,14 @@ from dynslam_bench.core.images import read_image
 from dynslam_bench.core.stage_cache import StageCache
 from dynslam_bench.envs import SlamEnv
 from dynslam_bench.geometry import Camera, load_tum, read_tum, se3, trajectory_files
-from dynslam_bench.sequences import PreprocessingSettings, Sequence, SequenceView, decoded, fetch, open_sequence
+from dynslam_bench.sequences import (
+    PreprocessingSettings,
+    Sequence,
+    SequenceView,
+    decoded,
+    fetch,
+    open_sequence,
+)
 from dynslam_bench.sequences.bags import unpack_bag
 from dynslam_bench.sequences.cameras import CAMERAS
 from dynslam_bench.sequences.catalogue import catalogue
@@ -50,14 +57,16 @@ FOCAL = {
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     """A folder of every layout, with three frames and known poses."""
-    root, poses = tmp_path_factory.mktemp("layouts"), random_poses(0)
+    root = tmp_path_factory.mktemp("layouts")
+    poses = random_poses(0)
     for name, write in WRITERS.items():
         write(root / name, poses)
     return root, poses
 
 
 def test_every_layout_has_a_writer():
-    assert set(WRITERS) == {layout.name for layout in LAYOUTS} and layout_of("tum").name == "tum"
+    assert set(WRITERS) == {layout.name for layout in LAYOUTS}
+    assert layout_of("tum").name == "tum"
     with pytest.raises(SequenceError, match="unknown layout 'kitti'"):
         layout_of("kitti")
 
@@ -69,40 +78,55 @@ def test_a_folder_in_the_published_format_is_read(written, name):
     assert find_layout(root / name).name == name
     camera = sequence.camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == FOCAL[name]
-    frame, missing = sequence[len(sequence) - 1], 1 if name == "tartanair-shibuya" else 0  # its first row is sky
-    assert (frame.depth[missing:] == 2.0).all() and not frame.depth[:missing].any() and (frame.rgb == 90).all()
+    # its first row is sky
+    frame = sequence[len(sequence) - 1]
+    missing = 1 if name == "tartanair-shibuya" else 0
+    assert (frame.depth[missing:] == 2.0).all()
+    assert not frame.depth[:missing].any()
+    assert (frame.rgb == 90).all()
     assert len(sequence) == (4 if name == "icl-nuim" else 3)
     truth = sequence.ground_truth
     assert np.abs(truth.T_world_cam - poses).max() < 1e-12
     assert np.abs(truth.timestamps - sequence.timestamps[-3:]).max() < 1e-6
     check_sequence(sequence)
-    chosen = open_sequence(root / name, camera=Camera(camera.width, camera.height, 100.0, 100.0, 10.0, 10.0))
-    assert chosen.camera.fx == 100.0 and chosen.digest() != sequence.digest()
+    chosen = open_sequence(
+        root / name, camera=Camera(camera.width, camera.height, 100.0, 100.0, 10.0, 10.0)
+    )
+    assert chosen.camera.fx == 100.0
+    assert chosen.digest() != sequence.digest()
 
 
-def test_seven_scenes_to_the_last_bit_with_missing_depth_and_frames_that_kinectfusion_lost(tmp_path):
+def test_seven_scenes_to_the_last_bit_with_missing_depth_and_frames_that_kinectfusion_lost(
+    tmp_path,
+):
     poses = random_poses(3, n=40)
     write_seven_scenes(tmp_path / "seq-01", poses)
     lines(tmp_path / "seq-01" / "frame-000002.pose.txt", ["-1.#IND -1.#IND -1.#IND -1.#IND"] * 4)
     sequence = open_sequence(tmp_path / "seq-01")
     assert np.array_equal(sequence.ground_truth.T_world_cam, np.delete(poses, 2, axis=0))
     assert "1 of 40 poses lost" in sequence.dropped
-    assert (sequence[1].depth == 0).all() and (sequence[0].depth == 2.0).all()
+    assert (sequence[1].depth == 0).all()
+    assert (sequence[0].depth == 2.0).all()
 
 
 def test_frame_0_of_icl_has_no_pose_and_its_view_is_mirrored_back(written):
     """A point that the published camera (fy = -480) sees at a pixel is seen there by ours."""
     sequence = open_sequence(written[0] / "icl-nuim")
     assert "1 frames without ground truth" in sequence.dropped
-    pose, mirror = sequence.ground_truth.T_world_cam[1], np.diag([1.0, -1.0, 1.0, 1.0])
-    published, point = mirror @ pose @ mirror, np.array([0.3, 0.4, 2.0, 1.0])
+    pose = sequence.ground_truth.T_world_cam[1]
+    mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+    published = mirror @ pose @ mirror
+    point = np.array([0.3, 0.4, 2.0, 1.0])
     seen = np.linalg.inv(pose) @ mirror @ published @ point
     pixel = 481.2 * 0.3 / 2 + 319.5, -480.0 * 0.4 / 2 + 239.5
     assert np.allclose(sequence.camera.project(seen[:3]), pixel, atol=1e-9)
 
 
 BROKEN = {
-    "eth3d": [("associated.txt", None, "no depth"), ("calibration.txt", "726 726 354", "3 values, not the 4")],
+    "eth3d": [
+        ("associated.txt", None, "no depth"),
+        ("calibration.txt", "726 726 354", "3 values, not the 4"),
+    ],
     "icl-nuim": [
         ("depth/1.png", "x", "cannot be decoded"),
         ("livingRoom0.gt.freiburg", "1 2", "2 values"),
@@ -124,7 +148,11 @@ BROKEN = {
         ("sensors.yaml", "d400_color_optical_frame: 3", "lacks 'intrinsics'"),
         ("trans_matrix.yaml", "trans_matrix: []", "no rigid transformation from base_link"),
         ("aligned_depth.txt", None, "cannot read"),
-        ("groundtruth.txt", "4711.0 0 0 0 0 0 0 1", r"never nearer than 4705\.9.*bias of their own"),
+        (
+            "groundtruth.txt",
+            "4711.0 0 0 0 0 0 0 1",
+            r"never nearer than 4705\.9.*bias of their own",
+        ),
     ],
     "vslam-lab": [
         ("rgb.csv", "ts_rgb_0 (ns),path_rgb_0\n1,a.png", "no column 'ts_depth_0"),
@@ -134,18 +162,27 @@ BROKEN = {
             "does not lie in",
         ),
         ("calibration.yaml", "cameras: []", "describes no camera 'rgb_0'"),
-        ("groundtruth.csv", "ts (ns),tx (m),ty (m),tz (m),qx,qy,qz,qw\n1,2,3,4,5,6,x,8", "'x' is not a number"),
+        (
+            "groundtruth.csv",
+            "ts (ns),tx (m),ty (m),tz (m),qx,qy,qz,qw\n1,2,3,4,5,6,x,8",
+            "'x' is not a number",
+        ),
     ],
     "euroc": [
         ("mav0/depth0/data.csv", None, "that is no depth"),
         ("mav0/cam0/sensor.yaml", "resolution: [1]", "resolution holds no 2 numbers"),
-        ("mav0/cam0/data.csv", "#timestamp [ns],filename\nx,a.png", "'x' is not a stamp in nanoseconds"),
+        (
+            "mav0/cam0/data.csv",
+            "#timestamp [ns],filename\nx,a.png",
+            "'x' is not a stamp in nanoseconds",
+        ),
     ],
 }
 
 
 @pytest.mark.parametrize(
-    ("name", "file", "content", "words"), [(name, *case) for name, cases in BROKEN.items() for case in cases]
+    ("name", "file", "content", "words"),
+    [(name, *case) for name, cases in BROKEN.items() for case in cases],
 )
 def test_wrong_or_partial_folders_give_one_clear_line(tmp_path, name, file, content, words):
     WRITERS[name](tmp_path / "s", random_poses(2))
@@ -157,14 +194,18 @@ def test_wrong_or_partial_folders_give_one_clear_line(tmp_path, name, file, cont
         layout_of(name).read(tmp_path / "s", None)
         sequence = open_sequence(tmp_path / "s")
         [sequence[i] for i in range(len(sequence))]
-    assert "\n" not in str(caught.value) and str(tmp_path / "s") in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert str(tmp_path / "s") in str(caught.value)
 
 
 def test_every_catalogued_sequence_opens_once_it_lies_where_it_belongs(tmp_path):
     """Nothing is listed that cannot be opened: the reader named reads a folder of the published layout."""
-    entries, root, first = catalogue(), tmp_path / "root", {}
+    entries = catalogue()
+    root = tmp_path / "root"
+    first = {}
     for entry in entries.values():
-        made, camera = tmp_path / f"{entry.layout} {entry.camera}", CAMERAS.get(entry.camera)
+        made = tmp_path / f"{entry.layout} {entry.camera}"
+        camera = CAMERAS.get(entry.camera)
         if not made.exists():
             size = {} if camera is None else {"size": (camera.width, camera.height)}
             WRITERS[entry.layout](made, random_poses(5), **size)
@@ -172,13 +213,17 @@ def test_every_catalogued_sequence_opens_once_it_lies_where_it_belongs(tmp_path)
         place.parent.mkdir(parents=True, exist_ok=True)
         place.symlink_to(made)
         first.setdefault((entry.dataset, entry.layout, entry.camera), entry.id)
-    assert len(entries) > 200 and len(first) >= 11
+    assert len(entries) > 200
+    assert len(first) >= 11
     assert {name: entry.find(root) for name, entry in entries.items()} == {
         name: entry.folders(root)[0] for name, entry in entries.items()
     }
     for name in first.values():
         sequence = open_sequence(name, data_root=root)
-        assert sequence.id == name and sequence.license and sequence.tags and len(sequence.ground_truth) == 3
+        assert sequence.id == name
+        assert sequence.license
+        assert sequence.tags
+        assert len(sequence.ground_truth) == 3
 
 
 def test_a_folder_of_ones_own_with_one_image_more(tmp_path):
@@ -194,26 +239,35 @@ def test_a_folder_of_ones_own_with_one_image_more(tmp_path):
 def test_reads_what_was_written(tmp_path):
     folder, rgb, depth = make_folder(tmp_path / "seq")
     sequence = open_sequence(folder)
-    assert isinstance(sequence, Sequence) and sequence.id == "folder/seq"
+    assert isinstance(sequence, Sequence)
+    assert sequence.id == "folder/seq"
     assert (sequence.camera.width, sequence.camera.height) == (32, 24)
     frame = sequence[2]
     assert (frame.index, frame.timestamp) == (2, 100.066666667)  # to the nanosecond
-    assert frame.rgb.dtype == np.uint8 and (frame.rgb == rgb[2]).all()
+    assert frame.rgb.dtype == np.uint8
+    assert (frame.rgb == rgb[2]).all()
     assert frame.depth.dtype == np.float32
-    assert np.allclose(frame.depth, depth[2] / 5000, rtol=1e-6) and (frame.depth[depth[2] == 0] == 0).all()
-    assert len(sequence) == 4 and sequence[-1].index == 3
+    assert np.allclose(frame.depth, depth[2] / 5000, rtol=1e-6)
+    assert (frame.depth[depth[2] == 0] == 0).all()
+    assert len(sequence) == 4
+    assert sequence[-1].index == 3
     with pytest.raises(IndexError):
         sequence[4]
     assert np.array_equal(sequence.ground_truth.timestamps, sequence.timestamps)
-    assert sequence.fps == 30 and sequence.masks is None
-    assert sequence.dropped == "4 frames of 4 colour and 4 depth images (|dt| < 0.02 s); 4 ground-truth poses"
+    assert sequence.fps == 30
+    assert sequence.masks is None
+    assert (
+        sequence.dropped
+        == "4 frames of 4 colour and 4 depth images (|dt| < 0.02 s); 4 ground-truth poses"
+    )
 
 
 @pytest.mark.parametrize(("frames", "fps"), [(5, 10), (1, 30)])
 def test_fps_follows_from_the_stamps_where_nothing_states_it(tmp_path, frames, fps):
     folder, *_ = make_folder(tmp_path / "seq", frames=frames, rate=10, fps=None)
     sequence = open_sequence(folder)
-    assert len(sequence) == frames and sequence.fps == pytest.approx(fps)
+    assert len(sequence) == frames
+    assert sequence.fps == pytest.approx(fps)
 
 
 @pytest.mark.parametrize(("per_s", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds")])
@@ -222,7 +276,8 @@ def test_stamps_in_another_unit_are_refused_with_the_unit(tmp_path, per_s, unit,
     folder, *_ = make_folder(tmp_path / "seq", frames=5, rate=1 / (round(per_s / 30)), fps=fps)
     with pytest.raises(SequenceError, match=f"look like {unit}") as caught:
         open_sequence(folder)
-    assert f"{round(per_s / 30):g} s apart" in str(caught.value) and "\n" not in str(caught.value)
+    assert f"{round(per_s / 30):g} s apart" in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_digest_tells_contents_apart_and_survives_moving_and_links(tmp_path):
@@ -233,7 +288,9 @@ def test_digest_tells_contents_apart_and_survives_moving_and_links(tmp_path):
     (moved / "rgb").symlink_to(tmp_path / "elsewhere")
     (moved / "up").symlink_to(moved)
     assert open_sequence(moved).digest() == digests[0]
-    digests.append(open_sequence(moved, camera=replace(open_sequence(moved).camera, readout_s=0.02)).digest())
+    digests.append(
+        open_sequence(moved, camera=replace(open_sequence(moved).camera, readout_s=0.02)).digest()
+    )
     rewrite(moved / "groundtruth.txt", lambda lines: lines[:-1])
     digests.append(open_sequence(moved).digest())
     (tmp_path / "elsewhere" / "0.png").write_bytes((moved / "rgb" / "1.png").read_bytes() + b"\0")
@@ -244,21 +301,30 @@ def test_digest_tells_contents_apart_and_survives_moving_and_links(tmp_path):
 def test_frames_and_stride(tmp_path):
     folder, rgb, _ = make_folder(tmp_path / "seq", frames=7)
     view = open_sequence(folder, frames="1:6", stride=2)
-    assert isinstance(view, SequenceView) and isinstance(view, Sequence)
-    assert len(view) == 3 and [view[i].index for i in range(3)] == [0, 1, 2]
+    assert isinstance(view, SequenceView)
+    assert isinstance(view, Sequence)
+    assert len(view) == 3
+    assert [view[i].index for i in range(3)] == [0, 1, 2]
     assert view.fps == open_sequence(folder).fps / 2
     assert (view[1].rgb == rgb[3]).all()
     assert view.dropped.startswith("7 frames")
     assert len(open_sequence(folder, frames=(2, None))) == 5
     wrong = [({"frames": frames}, "no range") for frames in ("3", "a:b", "5:5", "-2:")]
-    for part, words in (*wrong, ({"frames": "7:9"}, "hold none of the 7 frames"), ({"stride": 0}, "stride is 0")):
+    for part, words in (
+        *wrong,
+        ({"frames": "7:9"}, "hold none of the 7 frames"),
+        ({"stride": 0}, "stride is 0"),
+    ):
         with pytest.raises(SequenceError, match=words):
             open_sequence(folder, **part)
 
 
 def test_ground_truth_hole_and_bad_lines_are_counted(tmp_path):
     folder, *_ = make_folder(tmp_path / "seq", frames=30)
-    rewrite(folder / "groundtruth.txt", lambda lines: [*lines[:11], "100.4 nan 0 0 0 0 0 1", *lines[21:]])
+    rewrite(
+        folder / "groundtruth.txt",
+        lambda lines: [*lines[:11], "100.4 nan 0 0 0 0 0 1", *lines[21:]],
+    )
     dropped = open_sequence(folder).dropped
     assert "1 of 21 lines skipped: not finite" in dropped
     assert "10 frames without ground truth within 0.02 s (largest hole 0.37 s)" in dropped
@@ -279,14 +345,26 @@ def test_disordered_lists_are_put_in_order_and_counted(tmp_path):
 
     def disorder(lines):
         stamp, comma = lines[3].split()[0], lines[2].replace(" ", ",")
-        return ["# comment", lines[1], lines[0], comma, *lines[3:], "nan rgb/0.png", f"{stamp} rgb/0.png", "101.5", ""]
+        return [
+            "# comment",
+            lines[1],
+            lines[0],
+            comma,
+            *lines[3:],
+            "nan rgb/0.png",
+            f"{stamp} rgb/0.png",
+            "101.5",
+            "",
+        ]
 
     rewrite(folder / "rgb.txt", disorder)
     rewrite(folder / "depth.txt", lambda lines: [line.replace(" ", "\t") + "\r" for line in lines])
     sequence = open_sequence(folder)
-    assert (np.diff(sequence.timestamps) > 0).all() and len(sequence) == 6
+    assert (np.diff(sequence.timestamps) > 0).all()
+    assert len(sequence) == 6
     assert (sequence[0].rgb == rgb[0]).all()
-    assert (sequence[3].rgb == rgb[0]).all()  # the last of two equal stamps wins, as in TUM's associate.py
+    # the last of two equal stamps wins, as in TUM's associate.py
+    assert (sequence[3].rgb == rgb[0]).all()
     counts = "1 stamps not finite; 1 duplicate stamps; 2 stamps out of order; 1 lines without a file name"
     assert counts in sequence.dropped
 
@@ -295,7 +373,10 @@ def test_disordered_lists_are_put_in_order_and_counted(tmp_path):
     ("damage", "words"),
     [
         (lambda f: rewrite(f / "groundtruth.txt", lambda _: ["# nothing"]), "holds no poses"),
-        (lambda f: (f / "rgb.txt").write_bytes((f / "depth.txt").read_bytes()), "has 16 bits a channel, expected 8"),
+        (
+            lambda f: (f / "rgb.txt").write_bytes((f / "depth.txt").read_bytes()),
+            "has 16 bits a channel, expected 8",
+        ),
         (lambda f: (f / "rgb" / "0.png").write_bytes(b"<html>404</html>"), "cannot be decoded"),
         (
             lambda f: (f / "rgb" / "2.png").write_bytes((f / "rgb" / "2.png").read_bytes()[:-20]),
@@ -306,11 +387,23 @@ def test_disordered_lists_are_put_in_order_and_counted(tmp_path):
             r"1 channel\(s\) of 8 bits \(values 77 to 77\), expected 1 of 16 bits",
         ),
         (lambda f: rewrite(f / "rgb.txt", lambda _: []), "lists no image"),
-        (lambda f: rewrite(f / "rgb.txt", lambda _: ["abc rgb/0.png"]), "line 1: 'abc' is not a timestamp"),
+        (
+            lambda f: rewrite(f / "rgb.txt", lambda _: ["abc rgb/0.png"]),
+            "line 1: 'abc' is not a timestamp",
+        ),
         (lambda f: (f / "rgb.txt").write_bytes(b"\xff\xfe\x00"), "not a text file"),
-        (lambda f: rewrite(f / "depth.txt", lambda ls: [f"9{line}" for line in ls]), "none of the 4 colour images"),
-        (lambda f: (f / "rgb" / "1.png").unlink(), "1 of 4 colour images .* are missing, the first is rgb/1.png"),
-        (lambda f: (f / "depth" / "1.png").write_bytes(b""), r"1 of 4 depth images .* are empty \(0 bytes\)"),
+        (
+            lambda f: rewrite(f / "depth.txt", lambda ls: [f"9{line}" for line in ls]),
+            "none of the 4 colour images",
+        ),
+        (
+            lambda f: (f / "rgb" / "1.png").unlink(),
+            "1 of 4 colour images .* are missing, the first is rgb/1.png",
+        ),
+        (
+            lambda f: (f / "depth" / "1.png").write_bytes(b""),
+            r"1 of 4 depth images .* are empty \(0 bytes\)",
+        ),
     ],
 )
 def test_damaged_folders_give_one_clear_line(tmp_path, damage, words):
@@ -336,9 +429,13 @@ def test_associations_file(tmp_path):
     folder, rgb, _ = make_folder(tmp_path / "seq", frames=3)
     for name in ("rgb.txt", "depth.txt"):
         (folder / name).unlink()
-    lines(folder / "associations.txt", [f"{100 + i} rgb/{i}.png {107 + i} depth/{i}.png" for i in (2, 0, 1)])
+    lines(
+        folder / "associations.txt",
+        [f"{100 + i} rgb/{i}.png {107 + i} depth/{i}.png" for i in (2, 0, 1)],
+    )
     sequence = open_sequence(folder)
-    assert sequence.timestamps.tolist() == [100, 101, 102] and "1 stamps out of order" in sequence.dropped
+    assert sequence.timestamps.tolist() == [100, 101, 102]
+    assert "1 stamps out of order" in sequence.dropped
     assert (sequence[0].rgb == rgb[0]).all()
     (folder / "associations.txt").write_text("100 rgb/0.png depth/0.png")
     with pytest.raises(SequenceError, match="has 3 parts, expected 4"):
@@ -353,7 +450,8 @@ def test_folders_without_lists(tmp_path):
         open_sequence(folder)
     rewrite(folder / "camera.toml", lambda lines: [*lines, "fps = 25.0"])
     sequence = open_sequence(folder)
-    assert sequence.timestamps.tolist() == [0, 0.04, 0.08] and (sequence[1].rgb == rgb[1]).all()
+    assert sequence.timestamps.tolist() == [0, 0.04, 0.08]
+    assert (sequence[1].rgb == rgb[1]).all()
     for path in folder.glob("*/?.png"):
         path.rename(path.with_name(f"5{path.stem}.5.png"))
     assert open_sequence(folder).timestamps.tolist() == [50.5, 51.5, 52.5]
@@ -365,9 +463,13 @@ def test_folders_without_lists(tmp_path):
 def test_grey_and_alpha_images_become_rgb(tmp_path):
     folder, *_ = make_folder(tmp_path / "seq", frames=2)
     cv2.imwrite(str(folder / "rgb" / "0.png"), np.full((24, 32), 90, np.uint8))
-    cv2.imwrite(str(folder / "rgb" / "1.png"), np.dstack([np.full((24, 32), v, np.uint8) for v in (1, 2, 3, 200)]))
+    cv2.imwrite(
+        str(folder / "rgb" / "1.png"),
+        np.dstack([np.full((24, 32), v, np.uint8) for v in (1, 2, 3, 200)]),
+    )
     sequence = open_sequence(folder)
-    assert sequence[0].rgb.shape == (24, 32, 3) and (sequence[0].rgb == 90).all()
+    assert sequence[0].rgb.shape == (24, 32, 3)
+    assert (sequence[0].rgb == 90).all()
     assert sequence[1].rgb[0, 0].tolist() == [3, 2, 1]
 
 
@@ -386,10 +488,13 @@ def test_few_missing_files_are_tolerated_and_counted(tmp_path):
 @needs_shared
 def test_bonn_poses_are_the_camera_s_and_positions_stay_those_of_the_file():
     folder = SHARED / "data" / "bonn" / "rgbd_bonn_crowd"
-    raw, truth = read_tum(folder / "groundtruth.txt"), open_sequence(folder).ground_truth
+    raw = read_tum(folder / "groundtruth.txt")
+    truth = open_sequence(folder).ground_truth
     np.testing.assert_array_equal(truth.positions, raw.positions)
     relative = se3.inverse(raw.T_world_cam) @ truth.T_world_cam
-    assert np.ptp(relative[:, :3, :3], axis=0).max() < 1e-9, "one fixed rotation between markers and camera"
+    assert np.ptp(relative[:, :3, :3], axis=0).max() < 1e-9, (
+        "one fixed rotation between markers and camera"
+    )
     assert se3.is_pose(truth.T_world_cam[0], 1e-9)
 
 
@@ -397,7 +502,8 @@ rosbag1 = pytest.importorskip("rosbags.rosbag1", reason="needs the extra [bags]"
 rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="needs the extra [bags]")
 typesys = pytest.importorskip("rosbags.typesys", reason="needs the extra [bags]")
 
-SIZE, START = (16, 12), 1_700_000_000
+SIZE = (16, 12)
+START = 1_700_000_000
 RNG = np.random.default_rng(0)
 COLOUR = RNG.integers(0, 256, (3, 12, 16, 3), dtype=np.uint8)
 MILLIMETRES = RNG.integers(500, 9000, (3, 12, 16), dtype=np.uint16)
@@ -411,9 +517,15 @@ class Bag:
     def __init__(self, path, kind):
         self.one = kind == "ros1"
         self.path = path.with_suffix(".bag") if self.one else path
-        self.types = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if self.one else typesys.Stores.ROS2_HUMBLE)
+        self.types = typesys.get_typestore(
+            typesys.Stores.ROS1_NOETIC if self.one else typesys.Stores.ROS2_HUMBLE
+        )
         plugin = rosbag2.StoragePlugin.MCAP if kind == "mcap" else rosbag2.StoragePlugin.SQLITE3
-        self.writer = rosbag1.Writer(self.path) if self.one else rosbag2.Writer(path, version=9, storage_plugin=plugin)
+        self.writer = (
+            rosbag1.Writer(self.path)
+            if self.one
+            else rosbag2.Writer(path, version=9, storage_plugin=plugin)
+        )
         self.connections = {}
 
     def make(self, name, **fields):
@@ -421,7 +533,9 @@ class Bag:
 
     def add(self, topic, name, i, frame="camera", **fields):
         stamp = self.make("builtin_interfaces/msg/Time", sec=START, nanosec=i * 33_333_333)
-        header = self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame, **({"seq": i} if self.one else {}))
+        header = self.make(
+            "std_msgs/msg/Header", stamp=stamp, frame_id=frame, **({"seq": i} if self.one else {})
+        )
         if topic not in self.connections:
             self.connections[topic] = self.writer.add_connection(topic, name, typestore=self.types)
         serialize = self.types.serialize_ros1 if self.one else self.types.serialize_cdr
@@ -430,13 +544,30 @@ class Bag:
 
     def image(self, topic, i, pixels, encoding, frame="camera", padding=0):
         rows = np.pad(pixels.reshape(len(pixels), -1).view(np.uint8), ((0, 0), (0, padding)))
-        fields = {"encoding": encoding, "is_bigendian": 0, "step": rows.shape[1], "data": rows.ravel()}
+        fields = {
+            "encoding": encoding,
+            "is_bigendian": 0,
+            "step": rows.shape[1],
+            "data": rows.ravel(),
+        }
         self.add(topic, "sensor_msgs/msg/Image", i, frame, height=12, width=16, **fields)
 
     def info(self, topic, model="plumb_bob"):
         k = np.array([300.0, 0, 8, 0, 301.0, 6, 0, 0, 1])
-        fields = {"d": np.array([0.1, -0.2, 1e-3, 2e-3, 0.3]), "k": k, "r": np.eye(3).ravel(), "p": np.zeros(12)}
-        roi = self.make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+        fields = {
+            "d": np.array([0.1, -0.2, 1e-3, 2e-3, 0.3]),
+            "k": k,
+            "r": np.eye(3).ravel(),
+            "p": np.zeros(12),
+        }
+        roi = self.make(
+            "sensor_msgs/msg/RegionOfInterest",
+            x_offset=0,
+            y_offset=0,
+            height=0,
+            width=0,
+            do_rectify=False,
+        )
         self.add(
             topic, "sensor_msgs/msg/CameraInfo", 0, height=12, width=16, distortion_model=model, binning_x=0,
             binning_y=0, roi=roi, **{(key.upper() if self.one else key): v for key, v in fields.items()},
@@ -454,7 +585,14 @@ class Bag:
 
 @pytest.fixture
 def write(tmp_path):
-    def made(kind, *, depths=("/cam/aligned/image",), metres=False, models=("plumb_bob",), depth_frame="camera"):
+    def made(
+        kind,
+        *,
+        depths=("/cam/aligned/image",),
+        metres=False,
+        models=("plumb_bob",),
+        depth_frame="camera",
+    ):
         bag = Bag(tmp_path / f"bag_{kind}", kind)
         images, encoding = (METRES, "32FC1") if metres else (MILLIMETRES, "16UC1")
         with bag.writer:
@@ -474,29 +612,40 @@ def write(tmp_path):
 def test_a_bag_is_unpacked_to_the_last_bit(write, tmp_path, kind):
     bag = write(kind)
     found = unpack_bag(bag, tmp_path / "out")
-    assert (found.colour, found.depth, found.truth) == ("/cam/color/image_raw", "/cam/aligned/image", "/mocap")
+    assert (found.colour, found.depth, found.truth) == (
+        "/cam/color/image_raw",
+        "/cam/aligned/image",
+        "/mocap",
+    )
     sequence = open_sequence(tmp_path / "out")
     assert len(sequence) == found.frames == 3
     for i in range(3):
-        assert (sequence[i].rgb == COLOUR[i]).all() and np.array_equal(sequence[i].depth, METRES[i])
+        assert (sequence[i].rgb == COLOUR[i]).all()
+        assert np.array_equal(sequence[i].depth, METRES[i])
     assert np.allclose(sequence.timestamps, START + np.arange(3) * 0.033333333, atol=1e-6, rtol=0)
     assert np.abs(sequence.ground_truth.T_world_cam - POSES).max() < 1e-12
-    assert sequence.camera == Camera(16, 12, 300.0, 301.0, 8.0, 6.0, (0.1, -0.2, 1e-3, 2e-3, 0.3), depth_factor=1000.0)
-    with pytest.raises(SequenceError, match=r"is a bag \(unpack it first: dynslam-bench sequences unpack"):
+    assert sequence.camera == Camera(
+        16, 12, 300.0, 301.0, 8.0, 6.0, (0.1, -0.2, 1e-3, 2e-3, 0.3), depth_factor=1000.0
+    )
+    with pytest.raises(
+        SequenceError, match=r"is a bag \(unpack it first: dynslam-bench sequences unpack"
+    ):
         open_sequence(bag)
 
 
 def test_a_single_mcap_file_and_depth_in_metres(write, tmp_path):
     (file,) = write("mcap", metres=True, depth_frame="ir").glob("*.mcap")
     found = unpack_bag(file, tmp_path / "out", truth="none")
-    assert found.truth == "" and "depth is in the frame 'ir', colour in 'camera'" in found.notes[0]
+    assert found.truth == ""
+    assert "depth is in the frame 'ir', colour in 'camera'" in found.notes[0]
     sequence = open_sequence(tmp_path / "out")
     assert sequence.ground_truth is None
     assert np.array_equal(sequence[2].depth, METRES[2])
 
 
 def test_several_topics_are_a_question_and_wrong_bags_give_one_clear_line(write, tmp_path):
-    out, damaged = tmp_path / "out", tmp_path / "damaged.bag"
+    out = tmp_path / "out"
+    damaged = tmp_path / "damaged.bag"
     bag = write("ros2", depths=("/cam/aligned/image", "/cam/raw/image"))
     for source, depth, words in (
         (bag, None, r"2 topics of depth images: /cam/aligned/image, /cam/raw/image.*--depth"),
@@ -510,7 +659,8 @@ def test_several_topics_are_a_question_and_wrong_bags_give_one_clear_line(write,
         damaged.write_bytes((tmp_path / "bag_ros1.bag").read_bytes()[:900])
         with pytest.raises(SequenceError, match=words) as caught:
             unpack_bag(source, out, depth=depth)
-        assert "\n" not in str(caught.value) and not out.exists()
+        assert "\n" not in str(caught.value)
+        assert not out.exists()
     assert unpack_bag(bag, out, depth="/cam/raw/image").depth == "/cam/raw/image"
     with pytest.raises(SequenceError, match="exists already"):
         unpack_bag(bag, out, depth="/cam/raw/image")
@@ -532,27 +682,41 @@ def files(cache: StageCache) -> list[Path]:
 
 
 def same(one: Sequence, other: Sequence) -> bool:
-    frames, others = ([sequence[index] for index in range(len(sequence))] for sequence in (one, other))
+    frames, others = (
+        [sequence[index] for index in range(len(sequence))] for sequence in (one, other)
+    )
     return all(
-        a.timestamp == b.timestamp and a.index == b.index and (a.rgb == b.rgb).all() and (a.depth == b.depth).all()
+        a.timestamp == b.timestamp
+        and a.index == b.index
+        and (a.rgb == b.rgb).all()
+        and (a.depth == b.depth).all()
         for a, b in zip(frames, others, strict=True)
     )
 
 
-def test_frames_are_the_same_and_decoded_once(folder: Path, cache: StageCache, monkeypatch: pytest.MonkeyPatch) -> None:
-    plain, reads = open_sequence(folder), Mock(wraps=recorded.read_colour)
+def test_frames_are_the_same_and_decoded_once(
+    folder: Path, cache: StageCache, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain = open_sequence(folder)
+    reads = Mock(wraps=recorded.read_colour)
     mapped = Decoded(plain)
     monkeypatch.setattr(recorded, "read_colour", reads)
-    assert same(mapped, Decoded(open_sequence(folder))) and reads.call_count == 1, "opening decodes the first frame"
-    assert same(mapped, plain) and mapped[-1].index == 5
+    assert same(mapped, Decoded(open_sequence(folder))), "opening decodes the first frame"
+    assert reads.call_count == 1, "opening decodes the first frame"
+    assert same(mapped, plain)
+    assert mapped[-1].index == 5
     assert (mapped.id, mapped.digest(), mapped.camera) == (plain.id, plain.digest(), plain.camera)
-    assert mapped[0].rgb.dtype == np.uint8 and mapped[0].depth.dtype == np.float32
-    assert len(files(cache)) == 1 and cache.info()["entries_by_stage"] == {"frames": 1}
+    assert mapped[0].rgb.dtype == np.uint8
+    assert mapped[0].depth.dtype == np.float32
+    assert len(files(cache)) == 1
+    assert cache.info()["entries_by_stage"] == {"frames": 1}
     with pytest.raises(ValueError, match="read-only"):
         mapped[0].rgb[0] = 0
 
 
-@pytest.mark.parametrize("damage", [lambda data: data[:-9], lambda _: b"", lambda data: b"x" * len(data)])
+@pytest.mark.parametrize(
+    "damage", [lambda data: data[:-9], lambda _: b"", lambda data: b"x" * len(data)]
+)
 def test_a_damaged_file_is_written_again(folder: Path, cache: StageCache, damage) -> None:
     Decoded(open_sequence(folder))
     (file,) = files(cache)
@@ -563,20 +727,27 @@ def test_a_damaged_file_is_written_again(folder: Path, cache: StageCache, damage
 def test_other_frames_are_another_file(folder: Path, cache: StageCache) -> None:
     whole = open_sequence(folder)
     smaller = open_sequence(folder, preprocessing=PreprocessingSettings(width=16, height=16))
-    for count, variant in enumerate([whole, SequenceView(whole, 1), SequenceView(whole, 0, None, 2), smaller], 1):
-        assert same(Decoded(variant), variant) and len(files(cache)) == count
+    for count, variant in enumerate(
+        [whole, SequenceView(whole, 1), SequenceView(whole, 0, None, 2), smaller], 1
+    ):
+        assert same(Decoded(variant), variant)
+        assert len(files(cache)) == count
     cv2.imwrite(str(folder / "rgb" / "3.png"), 255 - whole[3].rgb)
     changed = open_sequence(folder)
-    assert same(Decoded(changed), changed) and len(files(cache)) == 5
+    assert same(Decoded(changed), changed)
+    assert len(files(cache)) == 5
     assert not same(Decoded(changed), Decoded(whole))
 
 
-def test_of_several_at_once_one_decodes(folder: Path, cache: StageCache, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_several_at_once_one_decodes(
+    folder: Path, cache: StageCache, monkeypatch: pytest.MonkeyPatch
+) -> None:
     written = Mock(wraps=decoded._write)
     monkeypatch.setattr(decoded, "_write", written)
     with ThreadPoolExecutor(3) as pool:
         assert {len(made) for made in pool.map(decoded.Decoded, [open_sequence(folder)] * 3)} == {6}
-    assert written.call_count == 1 and len(files(cache)) == 1
+    assert written.call_count == 1
+    assert len(files(cache)) == 1
 
 
 def test_a_full_disk_is_one_line_and_leaves_nothing(folder: Path, cache: StageCache) -> None:
@@ -585,17 +756,24 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(folder: Path, cache: StageCa
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))  # as if the disk were full
     try:
-        with pytest.raises(DynslamError, match=r"cannot write the 0 MB of decoded frames .*free some space") as caught:
+        with pytest.raises(
+            DynslamError, match=r"cannot write the 0 MB of decoded frames .*free some space"
+        ) as caught:
             Decoded(sequence)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert "\n" not in str(caught.value) and files(cache) == []
+    assert "\n" not in str(caught.value)
+    assert files(cache) == []
     assert len(Decoded(sequence)) == 6
 
 
-def test_more_frames_than_the_cache_holds_are_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_frames_than_the_cache_holds_are_refused(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(StageCache.__init__, "__defaults__", (None, 20_000))
-    with pytest.raises(SequenceError, match=r"6 decoded frames of .*choose part of the sequence by frames"):
+    with pytest.raises(
+        SequenceError, match=r"6 decoded frames of .*choose part of the sequence by frames"
+    ):
         Decoded(open_sequence(folder))
 
 
@@ -609,9 +787,12 @@ def test_a_damaged_image_is_named(folder: Path, cache: StageCache) -> None:
 
 @pytest.mark.parametrize("tracker", ["emfoa-oft?masks=none", "opencv-odometry"])
 def test_an_episode_is_the_same_to_the_bit(tracker: str) -> None:
-    sequence, episodes = CornerSequence(6), []
+    sequence = CornerSequence(6)
+    episodes = []
     for memory_map in (False, True):
-        env = SlamEnv(sequence, tracker, observation=["stats", "rgb", "depth", "gray"], memory_map=memory_map)
+        env = SlamEnv(
+            sequence, tracker, observation=["stats", "rgb", "depth", "gray"], memory_map=memory_map
+        )
         steps = [env.reset(seed=0)[0]] + [env.step(0)[0] for _ in range(5)]
         episodes.append([value.tobytes() for step in steps for value in step.values()])
         episodes[-1].append(env.online_trajectory().T_world_cam.tobytes())
@@ -622,10 +803,15 @@ def lying_png(width: int, height: int) -> bytes:
     """A PNG of a few hundred bytes that claims any size, with right checksums."""
 
     def chunk(kind: bytes, body: bytes) -> bytes:
-        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+        return (
+            struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+        )
 
-    header, pixels = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0), zlib.compress(bytes(99))
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    pixels = zlib.compress(bytes(99))
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", pixels) + chunk(b"IEND", b"")
+    )
 
 
 @pytest.mark.parametrize("kind", ["rgb", "depth"])
@@ -648,7 +834,9 @@ def test_a_png_whose_chunk_claims_gigabytes_is_refused(tmp_path: Path) -> None:
         read_image(tmp_path / "1.png", kind=SequenceError)
 
 
-@pytest.mark.parametrize("name", ["../secret.png", "/etc/passwd", "rgb/../../secret.png", "a\\..\\b.png"])
+@pytest.mark.parametrize(
+    "name", ["../secret.png", "/etc/passwd", "rgb/../../secret.png", "a\\..\\b.png"]
+)
 def test_lists_name_nothing_outside_their_folder(tmp_path: Path, name: str) -> None:
     folder, *_ = make_folder(tmp_path / "seq")
     cv2.imwrite(str(tmp_path / "secret.png"), np.zeros((24, 32, 3), np.uint8))
@@ -666,7 +854,9 @@ def test_a_manifest_that_leads_outside_is_a_fault(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("module", [reader_files, trajectory_files])
-def test_millions_of_lines_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: ModuleType) -> None:
+def test_millions_of_lines_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: ModuleType
+) -> None:
     monkeypatch.setattr(module, "MOST_LINES", 1000)
     (tmp_path / "seq.txt").write_bytes(b"#\n" * 1001)
     with pytest.raises(DynslamError, match="has more than 1000 lines"):
@@ -682,10 +872,13 @@ def refuses(archive: Path, words: str) -> None:
     ("method", "size", "words"),
     [
         (zipfile.ZIP_DEFLATED, 2_000_000, "unpacks to more than"),
-        (zipfile.ZIP_LZMA, 1, "compressed in a way that is not unpacked here"),  # it takes the memory the file asks for
+        # it takes the memory the file asks for
+        (zipfile.ZIP_LZMA, 1, "compressed in a way that is not unpacked here"),
     ],
 )
-def test_bombs_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: int, size: int, words: str) -> None:
+def test_bombs_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: int, size: int, words: str
+) -> None:
     monkeypatch.setattr(fetch, "MAX_SLACK", 1_000_000)
     with zipfile.ZipFile(tmp_path / "bomb.zip", "w", method) as file:
         file.writestr("zeros", bytes(size))
@@ -702,7 +895,9 @@ def tar_header(name: bytes, size: int, kind: bytes) -> bytes:
     return bytes(block)
 
 
-@pytest.mark.parametrize("kind", [tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK])
+@pytest.mark.parametrize(
+    "kind", [tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK]
+)
 def test_a_tar_header_that_claims_gigabytes_costs_nothing(tmp_path: Path, kind: bytes) -> None:
     archive = tmp_path / "a.tgz"
     archive.write_bytes(gzip.compress(tar_header(b"x", 3 << 30, kind) + bytes(10 << 20), 1))
@@ -711,7 +906,8 @@ def test_a_tar_header_that_claims_gigabytes_costs_nothing(tmp_path: Path, kind: 
 
 def test_a_million_empty_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fetch, "MAX_MEMBERS", 20)
-    tar, zipped = tmp_path / "a.tar", tmp_path / "a.zip"
+    tar = tmp_path / "a.tar"
+    zipped = tmp_path / "a.zip"
     with tarfile.open(tar, "w") as as_tar, zipfile.ZipFile(zipped, "w") as as_zip:
         for number in range(30):
             as_tar.addfile(tarfile.TarInfo(f"seq/{number}"))
@@ -720,7 +916,9 @@ def test_a_million_empty_files_are_refused(tmp_path: Path, monkeypatch: pytest.M
         refuses(archive, "holds more than 20 files, refused")
 
 
-def test_zeros_after_the_end_of_an_archive_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_zeros_after_the_end_of_an_archive_are_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(fetch, "MAX_SLACK", 1_000_000)
     empty = tarfile.TarInfo("seq/rgb.txt").tobuf() + bytes(1024)
     (tmp_path / "a.tgz").write_bytes(gzip.compress(empty, 1) + gzip.compress(bytes(4_000_000), 9))

@@ -17,12 +17,27 @@ from sequence_folders import SHARED, Altered, frame_hash, make_folder, needs_sha
 
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.geometry import Camera, Trajectory, se3
-from dynslam_bench.sequences import Frame, FrameMasks, PreprocessingSettings, SequenceView, doctor, open_sequence
+from dynslam_bench.sequences import (
+    Frame,
+    FrameMasks,
+    PreprocessingSettings,
+    SequenceView,
+    doctor,
+    open_sequence,
+)
 from dynslam_bench.sequences import compose as composing
 from dynslam_bench.sequences.calibration import calibrate
 from dynslam_bench.sequences.cameras import read_camera, write_camera
 from dynslam_bench.sequences.compose import compose
-from dynslam_bench.sequences.doctor import Diagnosis, Finding, _turn, diagnose, examine, stretches, truth_findings
+from dynslam_bench.sequences.doctor import (
+    Diagnosis,
+    Finding,
+    _turn,
+    diagnose,
+    examine,
+    stretches,
+    truth_findings,
+)
 from dynslam_bench.sequences.preprocessing import Preprocessed, normalise
 from dynslam_bench.sequences.rgbd_motion import rgbd_pairs
 from dynslam_bench.sequences.synthetic import RenderSettings, open_synthetic
@@ -37,7 +52,9 @@ def sound():
     """A rendered office without people, at half the size."""
     id = f"synthetic/walking_halfsphere?scene=1&frames={FRAMES}"
     # halving smooths enough
-    settings = RenderSettings(people="none", antialias=False, color=ColorSensor(noise=False, shutter=0))
+    settings = RenderSettings(
+        people="none", antialias=False, color=ColorSensor(noise=False, shutter=0)
+    )
     small = PreprocessingSettings(width=320, height=240)
     return Altered(Preprocessed(open_synthetic(id, None, settings=settings), small))
 
@@ -71,7 +88,9 @@ def diagnosed(sound, pairs):
         if "truth" not in FAULTS[name]:
             return examine(SequenceView(Altered(sound, **FAULTS[name]), 0, 60))
         truth = FAULTS[name]["truth"](sound.ground_truth)
-        return Diagnosis(sound.id, FRAMES, tuple(truth_findings(sound.timestamps, truth, sound.camera, pairs)))
+        return Diagnosis(
+            sound.id, FRAMES, tuple(truth_findings(sound.timestamps, truth, sound.camera, pairs))
+        )
 
     return found
 
@@ -134,15 +153,21 @@ def test_a_sound_recording_has_no_fault(sound, examined):
 def test_a_fault_is_named_and_measured(diagnosed, name):
     diagnosis = diagnosed(name)
     (fault,) = (finding for finding in diagnosis.findings if finding.severity == "fault")
-    assert fault.id == name.partition(",")[0] and not diagnosis.ok
+    assert fault.id == name.partition(",")[0]
+    assert not diagnosis.ok
     assert all(finding.text and finding.cure for finding in diagnosis.findings)
     if name in VALUES:
-        assert diagnosis.findings == (fault,) and fault.value == pytest.approx(VALUES[name], rel=0.1)
+        assert diagnosis.findings == (fault,)
+        assert fault.value == pytest.approx(VALUES[name], rel=0.1)
 
 
 def test_an_unrelated_truth_is_named_or_said_to_be_unclear(sound, pairs):
     truths = [wander(seed)(sound.ground_truth) for seed in (0, 1)]
-    ids = [finding.id for truth in truths for finding in truth_findings(sound.timestamps, truth, sound.camera, pairs)]
+    ids = [
+        finding.id
+        for truth in truths
+        for finding in truth_findings(sound.timestamps, truth, sound.camera, pairs)
+    ]
     assert ids == ["truth-unclear", "truth-other-sequence"]
 
 
@@ -153,7 +178,11 @@ REST = {"frame": lambda frame, base: (base[0].rgb, base[0].depth)}
     ("severity", "finding", "changes"),
     [
         ("note", "no-truth", {"truth": lambda _: None}),
-        ("note", "no-motion", REST | {"truth": of_poses(lambda poses: np.tile(poses[:1], (len(poses), 1, 1)))}),
+        (
+            "note",
+            "no-motion",
+            REST | {"truth": of_poses(lambda poses: np.tile(poses[:1], (len(poses), 1, 1)))},
+        ),
         ("note", "no-depth", {"frame": lambda frame, _: (frame.rgb, np.zeros_like(frame.depth))}),
         ("fault", "truth-other-sequence", REST | {"truth": lambda truth: scaled(truth, 5.0)}),
         ("fault", "truth-other-sequence", {"truth": apart}),
@@ -162,8 +191,11 @@ REST = {"frame": lambda frame, base: (base[0].rgb, base[0].depth)}
 def test_without_truth_depth_or_motion_it_is_a_note(sound, severity, finding, changes):
     sequence = Altered(sound, **changes)
     sequence.has_depth = finding != "no-depth"
-    findings = [(found.severity, found.id) for found in examine(SequenceView(sequence, 0, 40)).findings]
-    assert findings[0] == (severity, finding) and (finding == "no-depth" or len(findings) == 1)
+    findings = [
+        (found.severity, found.id) for found in examine(SequenceView(sequence, 0, 40)).findings
+    ]
+    assert findings[0] == (severity, finding)
+    assert finding == "no-depth" or len(findings) == 1
     assert {found for found, _ in findings} == {severity}
 
 
@@ -172,7 +204,9 @@ DAMAGES = {
     "unreadable": lambda folder: (folder / "rgb" / "2.png").write_bytes(b"no image"),
     "unreadable, truth": lambda folder: (folder / "groundtruth.txt").write_text("1 2 3\n"),
     "unreadable, missing": shutil.rmtree,
-    "unreadable, other clock": lambda folder: rewrite(folder / "depth.txt", lambda rows: [f"9{row}" for row in rows]),
+    "unreadable, other clock": lambda folder: rewrite(
+        folder / "depth.txt", lambda rows: [f"9{row}" for row in rows]
+    ),
     "depth-size": lambda folder: fill(folder, "depth", np.full((12, 16), 9000, np.uint16)),
     "depth-format": lambda folder: fill(folder, "depth", np.full((24, 32), 90, np.uint8)),
     "no-depth": lambda folder: [(folder / "depth.txt").unlink(), shutil.rmtree(folder / "depth")],
@@ -192,14 +226,17 @@ def test_damaged_folders_never_raise(tmp_path, damage):
     diagnosis = diagnose(folder)
     assert diagnosis.frames == {"too-short": 4, "unreadable": 3}.get(damage, 0)
     ids = [finding.id for finding in diagnosis.findings]
-    assert damage.partition(",")[0] in ids and not diagnosis.ok
+    assert damage.partition(",")[0] in ids
+    assert not diagnosis.ok
     assert len(ids) == 1 or diagnosis.frames, "a folder that cannot be opened has one fault"
 
 
 @pytest.mark.parametrize(("ids", "verdict"), [((), "no fault found"), (("note",), "could not be compared"),
                                               (("fault", "note"), "1 fault")])  # fmt: skip
 def test_the_verdict_says_whether_the_truth_was_compared(ids, verdict):
-    findings = tuple(Finding("truth-unclear", severity, 0.2, "", "unclear", "look") for severity in ids)
+    findings = tuple(
+        Finding("truth-unclear", severity, 0.2, "", "unclear", "look") for severity in ids
+    )
     assert verdict in Diagnosis("x", 40, findings).verdict
 
 
@@ -219,7 +256,9 @@ def test_the_cure_of_turned_axes_is_their_inverse_and_a_rotation(diagnosed):
 def test_stretches_cover_a_short_recording_and_sample_a_long_one():
     assert stretches(95, 240) == [(0, 40), (40, 80), (80, 95)]
     parts = stretches(6000, 240)
-    assert sum(stop - start for start, stop in parts) <= 240 and parts[0][0] == 0 and parts[-1][1] == 6000
+    assert sum(stop - start for start, stop in parts) <= 240
+    assert parts[0][0] == 0
+    assert parts[-1][1] == 6000
 
 
 @needs_shared
@@ -228,7 +267,8 @@ def test_real_recordings_have_no_fault(name):
     assert diagnose(SHARED / "data" / name, most_frames=60).ok
 
 
-# Readout time, delay of depth and depth factor, of a rendered sequence and of what cannot tell them.
+# Readout time, delay of depth and depth factor, of a rendered sequence and of what cannot tell
+# them.
 
 
 PINHOLE = Camera(320, 240, 260.0, 262.0, 160.0, 118.0, depth_factor=5000.0)
@@ -240,8 +280,11 @@ def test_a_rendered_rolling_shutter_is_measured_and_what_differs_is_to_be_writte
     stated = calibrate(sequence)
     readout, delay, factor = stated.quantities
     assert readout.value == pytest.approx(0.026, abs=0.003)
-    assert readout.low < 0.026 < readout.high and delay.low < 0.0 < delay.high and factor.low < 5000 < factor.high
-    assert readout.observable and not stated.measured, "it is what the camera states"
+    assert readout.low < 0.026 < readout.high
+    assert delay.low < 0.0 < delay.high
+    assert factor.low < 5000 < factor.high
+    assert readout.observable, "it is what the camera states"
+    assert not stated.measured, "it is what the camera states"
     truth, camera = scaled(sequence.ground_truth, 2.0), replace(sequence.camera, readout_s=0.0)
 
     def late(frame, base):
@@ -252,7 +295,8 @@ def test_a_rendered_rolling_shutter_is_measured_and_what_differs_is_to_be_writte
     readout, delay, factor = other.quantities
     assert other.camera.readout_s == readout.written == pytest.approx(0.026, abs=0.003)
     assert other.camera.depth_delay_s == delay.written == pytest.approx(1 / FPS, abs=0.003)
-    assert factor.low < 2500 < factor.high and other.measured
+    assert factor.low < 2500 < factor.high
+    assert other.measured
 
 
 def test_a_camera_file_keeps_the_delay_and_pairs_by_it(tmp_path):
@@ -280,7 +324,8 @@ def still(tmp_path):
 
 def test_a_camera_at_rest_tells_nothing(still):
     found = calibrate(open_sequence(still))
-    assert not any(each.observable for each in found.quantities) and all(each.reason for each in found.quantities)
+    assert not any(each.observable for each in found.quantities)
+    assert all(each.reason for each in found.quantities)
     assert found.camera == PINHOLE
 
 
@@ -305,11 +350,17 @@ ROOM_CAMERA = Camera(160, 120, 130.0, 130.0, 79.5, 59.5, depth_factor=5000.0)
 class Room:
     """A wall of noise at some distance; a box of another colour walks before it if `walker` says so."""
 
-    fps, license, citation, masks = 30.0, "", "", None
+    fps = 30.0
+    license = ""
+    citation = ""
+    masks = None
 
     def __init__(self, id, frames=10, *, wall_m=3.0, walker=False, moving=False, seed=0):
         rng = np.random.default_rng(seed)
-        self.id, self.camera, self.walker, self.wall_m = id, ROOM_CAMERA, walker, wall_m
+        self.id = id
+        self.camera = ROOM_CAMERA
+        self.walker = walker
+        self.wall_m = wall_m
         self.wall = rng.integers(60, 200, (120, 160, 3)).astype(np.uint8)
         self.timestamps = 1000 + np.arange(frames) / 30
         poses = np.tile(np.eye(4), (frames, 1, 1))
@@ -320,7 +371,8 @@ class Room:
         return len(self.timestamps)
 
     def __getitem__(self, index):
-        rgb, depth = self.wall.copy(), np.full((120, 160), self.wall_m, np.float32)
+        rgb = self.wall.copy()
+        depth = np.full((120, 160), self.wall_m, np.float32)
         if self.walker and 2 <= index < len(self) - 2:
             left = 20 + 6 * index
             rgb[20:110, left : left + 25] = (200, 40, 40)
@@ -332,7 +384,9 @@ class Watched(Wrapped):
     """The same; `most` counts the largest number of its images that existed at once."""
 
     def __init__(self, base):
-        self.base, self.images, self.most = base, [], 0
+        self.base = base
+        self.images = []
+        self.most = 0
 
     def __len__(self):
         return len(self.base)
@@ -378,10 +432,13 @@ def test_only_people_and_their_shadow_differ_from_the_host(host, folder):
     assert len(composed) == 4
     assert np.array_equal(composed.ground_truth.T_world_cam, host.ground_truth.T_world_cam)
     shares = []
-    for before, after in zip((host[i] for i in range(4)), (composed[i] for i in range(4)), strict=True):
+    for before, after in zip(
+        (host[i] for i in range(4)), (composed[i] for i in range(4)), strict=True
+    ):
         masks = composed.masks[after.index]
         person = masks.instances > 0
-        assert masks.moving == set(np.unique(masks.instances)) - {0} and set(masks.class_names.values()) <= {"person"}
+        assert masks.moving == set(np.unique(masks.instances)) - {0}
+        assert set(masks.class_names.values()) <= {"person"}
         around = cv2.dilate(person.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         assert np.array_equal(after.rgb[~around], before.rgb[~around])
         core = cv2.erode(person.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
@@ -395,10 +452,16 @@ def test_only_people_and_their_shadow_differ_from_the_host(host, folder):
 
 
 def test_an_instance_repeats_and_another_one_differs(host, people, folder, tmp_path):
-    again, other = compose(host, people, tmp_path / "made", 0), compose(host, people, tmp_path / "other" / "made", 1)
-    digests = [open_sequence(str(place)).digest() for place in (folder / "made", again.folder, other.folder)]
+    again = compose(host, people, tmp_path / "made", 0)
+    other = compose(host, people, tmp_path / "other" / "made", 1)
+    digests = [
+        open_sequence(str(place)).digest()
+        for place in (folder / "made", again.folder, other.folder)
+    ]
     assert digests[0] == digests[1] != digests[2]
-    assert again.share == np.mean([np.mean(open_sequence(str(again.folder)).masks[i].instances > 0) for i in range(4)])
+    assert again.share == np.mean(
+        [np.mean(open_sequence(str(again.folder)).masks[i].instances > 0) for i in range(4)]
+    )
 
 
 def test_images_are_not_held(host, tmp_path):
@@ -409,7 +472,8 @@ def test_images_are_not_held(host, tmp_path):
 
 def test_masks_count_as_content_and_have_to_be_there(folder, tmp_path):
     made = shutil.copytree(folder / "made", tmp_path / "made")
-    before, path = open_sequence(str(made)).digest(), min((made / "people").iterdir())
+    before = open_sequence(str(made)).digest()
+    path = min((made / "people").iterdir())
     cv2.imwrite(str(path), np.zeros((120, 160), np.uint8))
     assert open_sequence(str(made)).digest() != before
     path.unlink()
@@ -434,7 +498,10 @@ MOVING = of_poses(lambda poses: se3.exp(0.01 * np.arange(len(poses))[:, None] * 
         (lambda host, people: (Altered(host, truth=lambda _: None), people), "no ground truth"),
         (lambda host, people: (Altered(host, truth=apart), people), "4 of 4 frames .* lie outside"),
         (lambda host, people: (Room("dark", 4, wall_m=0.0), people), "nobody can be seen"),
-        (lambda host, people: (open_sequence(host.folder.parent / "made"), people), "has people already"),
+        (
+            lambda host, people: (open_sequence(host.folder.parent / "made"), people),
+            "has people already",
+        ),
         (lambda host, people: (host, Altered(people, truth=MOVING)), "moves"),
         (
             lambda host, people: (host, Altered(people, truth=lambda _: None, frame=rolled)),
@@ -462,9 +529,12 @@ def test_a_real_person_is_pasted_into_a_real_recording(tmp_path):
     people = open_sequence(str(SHARED / "data/fixed_camera/man_130"), frames="0:60", stride=3)
     made = compose(host, people, tmp_path / "made", 3)
     composed = open_sequence(str(tmp_path / "made"))
-    assert 0.1 < made.share < 0.7 and composed.camera == host.camera
+    assert 0.1 < made.share < 0.7
+    assert composed.camera == host.camera
     person = composed.masks[2].instances > 0
-    assert np.median(composed[2].depth[person]) < np.median(host[2].depth[person & (host[2].depth > 0)])
+    assert np.median(composed[2].depth[person]) < np.median(
+        host[2].depth[person & (host[2].depth > 0)]
+    )
 
 
 LENS = Camera(160, 120, 130.0, 131.0, 80.5, 58.0, (0.26, -0.95, -0.005, 0.003, 1.16))
@@ -473,7 +543,12 @@ LENS = Camera(160, 120, 130.0, 131.0, 80.5, 58.0, (0.26, -0.95, -0.005, 0.003, 1
 class Memory(list):
     """Frames in memory, with masks."""
 
-    id, license, citation, fps, ground_truth, camera = "memory", "", "", 30.0, None, LENS
+    id = "memory"
+    license = ""
+    citation = ""
+    fps = 30.0
+    ground_truth = None
+    camera = LENS
 
     def digest(self):
         return "d"
@@ -506,7 +581,8 @@ def test_undistortion_moves_points_where_the_camera_model_says():
     distorted = LENS.distort_points(ideal)
     assert np.abs(distorted - ideal).max() > 1  # the lens matters here
     sequence = preprocessed(dots(distorted), np.ones((120, 160), np.float32), undistort=True)
-    assert not sequence.camera.is_distorted and sequence.camera.fx == LENS.fx
+    assert not sequence.camera.is_distorted
+    assert sequence.camera.fx == LENS.fx
     for point in ideal:
         assert np.abs(centroid(sequence[0].rgb, point) - point).max() < 0.1
 
@@ -514,38 +590,56 @@ def test_undistortion_moves_points_where_the_camera_model_says():
 @pytest.mark.parametrize(("width", "height"), [(80, 60), (320, 240), (100, 90)])
 def test_resize_scales_the_intrinsics_along(width, height):
     points = np.array([[30.0, 25.0], [121.0, 31.0], [40.0, 95.0]])
-    sequence = preprocessed(dots(points), np.full((120, 160), 2.0, np.float32), width=width, height=height)
-    frame, camera = sequence[0], sequence.camera
-    assert frame.rgb.shape == (height, width, 3) and frame.depth.shape == (height, width)
+    sequence = preprocessed(
+        dots(points), np.full((120, 160), 2.0, np.float32), width=width, height=height
+    )
+    frame = sequence[0]
+    camera = sequence.camera
+    assert frame.rgb.shape == (height, width, 3)
+    assert frame.depth.shape == (height, width)
     for point in points:
         ray = LENS.unproject(point, np.array(2.0))
-        assert np.abs(centroid(frame.rgb, camera.project(ray), 6) - camera.project(ray)).max() < 0.12
+        assert (
+            np.abs(centroid(frame.rgb, camera.project(ray), 6) - camera.project(ray)).max() < 0.12
+        )
 
 
 def test_depth_and_masks_are_never_averaged():
     depth = np.where(np.mgrid[:120, :160][1] < 77, 1.0, 4.0).astype(np.float32)
     depth[10:20, 10:20] = 0
     sequence = preprocessed(dots([]), depth, width=100, height=70, undistort=True)
-    frame, masks = sequence[0], sequence.masks[0]
+    frame = sequence[0]
+    masks = sequence.masks[0]
     assert set(np.unique(frame.depth)) == {0.0, 1.0, 4.0}
-    assert (masks.instances.shape, masks.instances.dtype, masks.moving) == ((70, 100), np.int32, {1})
+    assert (masks.instances.shape, masks.instances.dtype, masks.moving) == (
+        (70, 100),
+        np.int32,
+        {1},
+    )
     assert ((masks.instances == 1) == (frame.depth > 2)).all()
 
 
 def test_mean_std_reaches_its_target():
-    grey = np.repeat(np.random.default_rng(0).normal(60, 12, (120, 160, 1)).clip(0, 255).astype(np.uint8), 3, axis=2)
+    grey = np.repeat(
+        np.random.default_rng(0).normal(60, 12, (120, 160, 1)).clip(0, 255).astype(np.uint8),
+        3,
+        axis=2,
+    )
     settings = PreprocessingSettings(normalisation="mean-std", target_mean=0.5, target_std=0.2)
     result = cv2.cvtColor(normalise(grey, settings), cv2.COLOR_RGB2GRAY) / 255
-    assert result.mean() == pytest.approx(0.5, abs=0.005) and result.std() == pytest.approx(0.2, abs=0.01)
+    assert result.mean() == pytest.approx(0.5, abs=0.005)
+    assert result.std() == pytest.approx(0.2, abs=0.01)
     flat = normalise(np.full((8, 8, 3), 200, np.uint8), settings)
-    assert flat.std() == 0 and flat.mean() == pytest.approx(127, abs=1)
+    assert flat.std() == 0
+    assert flat.mean() == pytest.approx(127, abs=1)
 
 
 def test_equalisation_spreads_a_dark_image_and_keeps_the_hue():
     dark = np.random.default_rng(1).integers(0, 40, (120, 160, 3), dtype=np.uint8)
     for name in ("equalise", "clahe"):
         result = normalise(dark, PreprocessingSettings(normalisation=name))
-        assert result.dtype == np.uint8 and result.shape == dark.shape
+        assert result.dtype == np.uint8
+        assert result.shape == dark.shape
         after, before = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).std() for image in (result, dark))
         assert after > 1.5 * before
     gray = np.repeat(dark[..., :1], 3, axis=2)
@@ -554,7 +648,8 @@ def test_equalisation_spreads_a_dark_image_and_keeps_the_hue():
     assert (balanced[..., 0] == cv2.equalizeHist(gray[..., 0])).mean() > 0.99
 
 
-# What part of which sequence is seen: one identity for every spelling, and for repeats of one problem instance.
+# What part of which sequence is seen: one identity for every spelling, and for repeats of one
+# problem instance.
 
 
 WALK = "synthetic/walking_xyz"
@@ -570,7 +665,8 @@ def test_all_spellings_of_the_same_frames_are_one_part() -> None:
         (WALK, "0:60"), (f"{WALK}?scene=0", (0, 60)), (f"{WALK}?scene=000&frames=60", None),
         (f"{WALK}?frames=100", ":60"), (f"{WALK}?frames=60", "0:90"), (f"{WALK}?frames=60", "0:"),
     ]  # fmt: skip
-    assert all(part(name, frames=frames) == first for name, frames in spellings) and first.id == f"{WALK}?scene=0"
+    assert all(part(name, frames=frames) == first for name, frames in spellings)
+    assert first.id == f"{WALK}?scene=0"
     assert part(WALK) == part(f"{WALK}?frames=600")
 
 
@@ -590,8 +686,12 @@ def test_offset_and_noise_are_repeats_of_one_problem_instance() -> None:
     plain = part(WALK, frames="0:60")
     noisy = part(f"{WALK}?noise=7", frames="0:60")
     assert plain.block == part(WALK, frames="3:60", offset=3).block == noisy.block
-    assert part(WALK, frames="3:60").block != plain.block, "without an offset these are other frames"
-    assert noisy.content != plain.content and noisy.noise == 7 and noisy.id != plain.id
+    assert part(WALK, frames="3:60").block != plain.block, (
+        "without an offset these are other frames"
+    )
+    assert noisy.content != plain.content
+    assert noisy.noise == 7
+    assert noisy.id != plain.id
     assert noisy.content != part(f"{WALK}?noise=8").content
 
 
@@ -613,10 +713,13 @@ def test_a_noise_seed_changes_the_noise_and_nothing_else(tmp_path: Path) -> None
     plain, one, two = (open_synthetic(name, tmp_path) for name in ids)
     assert frame_hash(plain[1])[:16] == "8ed2db9ef4f896d1", "scenes keep their bytes"
     assert len({frame_hash(each[1]) for each in (plain, one, two)}) == 3
-    assert frame_hash(one[1]) == frame_hash(open_synthetic(f"{WALK}?scene=3&frames=2&noise=1", None)[1])
+    assert frame_hash(one[1]) == frame_hash(
+        open_synthetic(f"{WALK}?scene=3&frames=2&noise=1", None)[1]
+    )
     assert frame_hash(one[1]) == frame_hash(one[1]), "read back from a folder of its own"
     assert np.array_equal(plain.exact_depth(1), one.exact_depth(1))
     assert np.array_equal(plain.masks[1].instances, one.masks[1].instances)
     assert np.array_equal(plain.ground_truth.T_world_cam, one.ground_truth.T_world_cam)
     difference = np.abs(plain[1].rgb.astype(int) - one[1].rgb.astype(int))
-    assert 0.3 < difference.mean() < 5 and difference.max() < 40, "grey levels: noise, no other picture"
+    assert 0.3 < difference.mean() < 5, "grey levels: noise, no other picture"
+    assert difference.max() < 40, "grey levels: noise, no other picture"

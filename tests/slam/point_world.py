@@ -28,14 +28,25 @@ class PointWorld:
         self.camera = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 
     def see(
-        self, T_world_cam, index, *, stamp=None, noise_px=0.4, depth_noise=0.002, depthless=0.1, limit=700, wrong=0
+        self,
+        T_world_cam,
+        index,
+        *,
+        stamp=None,
+        noise_px=0.4,
+        depth_noise=0.002,
+        depthless=0.1,
+        limit=700,
+        wrong=0,
     ):
         """The frame at a pose; `wrong` features get positions that fit no point."""
         rng = np.random.default_rng([index, 77])
         local = se3.transform(se3.inverse(T_world_cam), self.points)
         with np.errstate(divide="ignore", invalid="ignore"):
             uv = self.camera.project(local)
-        rows = np.flatnonzero((local[:, 2] > 0.2) & (uv > 4).all(axis=1) & (uv[:, 0] < 636) & (uv[:, 1] < 476))
+        rows = np.flatnonzero(
+            (local[:, 2] > 0.2) & (uv > 4).all(axis=1) & (uv[:, 0] < 636) & (uv[:, 1] < 476)
+        )
         if len(rows) > limit:
             rows = np.sort(rng.permutation(rows)[:limit])
         n = len(rows)
@@ -84,8 +95,16 @@ def observed(frame, camera, levels=8, keep=None):
 
 def make_backend(world, *, monocular=False, seed=0, **overrides):
     """A back end that is ready for a world; settings as ``group__name=value``."""
-    kind, settings = (MonocularBackend, MonocularBackendSettings) if monocular else (RgbdBackend, BackendSettings)
-    backend = kind(apply_overrides(settings(), {name.replace("__", "."): value for name, value in overrides.items()}))
+    kind, settings = (
+        (MonocularBackend, MonocularBackendSettings)
+        if monocular
+        else (RgbdBackend, BackendSettings)
+    )
+    backend = kind(
+        apply_overrides(
+            settings(), {name.replace("__", "."): value for name, value in overrides.items()}
+        )
+    )
     backend.reset(world.camera, seed)
     return backend
 
@@ -108,4 +127,9 @@ def errors(results, truth):
     """Translation errors in metres of the tracked frames, in the frame of the first pose."""
     tracked = [i for i, r in enumerate(results) if r.state == "ok"]
     start = results[tracked[0]].T_world_cam @ se3.inverse(truth[tracked[0]])
-    return np.array([np.linalg.norm((se3.inverse(start @ truth[i]) @ results[i].T_world_cam)[:3, 3]) for i in tracked])
+    return np.array(
+        [
+            np.linalg.norm((se3.inverse(start @ truth[i]) @ results[i].T_world_cam)[:3, 3])
+            for i in tracked
+        ]
+    )

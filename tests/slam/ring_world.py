@@ -11,7 +11,8 @@ VIEW_M = 6.0
 
 
 def rotated(quarters):
-    c, s = np.cos(quarters * np.pi / 2), np.sin(quarters * np.pi / 2)
+    c = np.cos(quarters * np.pi / 2)
+    s = np.sin(quarters * np.pi / 2)
     return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
 
 
@@ -20,15 +21,21 @@ class RingWorld(PointWorld):
 
     def __init__(self, side=6.0, density=24, seed=0, *, alike=0.0):
         rng = np.random.default_rng(seed)
-        walls, descriptors, same = [], [], {}
+        walls = []
+        descriptors = []
+        same = {}
         for r in (side / 2 + WIDTH / 2, side / 2 - WIDTH / 2):
             for quarter in range(4):
                 n = int(density * 5 * r)
-                wall = np.stack([rng.uniform(-r, r, n), rng.uniform(-1.2, 1.3, n), np.full(n, r)], axis=1)
+                wall = np.stack(
+                    [rng.uniform(-r, r, n), rng.uniform(-1.2, 1.3, n), np.full(n, r)], axis=1
+                )
                 words = rng.integers(0, 256, (n, 32), dtype=np.uint8)
                 if alike:
                     common = int(alike * n)
-                    wall[:common], words[:common] = same.setdefault(r, (wall[:common], words[:common]))
+                    wall[:common], words[:common] = same.setdefault(
+                        r, (wall[:common], words[:common])
+                    )
                 walls.append(wall @ rotated(quarter).T)
                 descriptors.append(words)
         self.side = side
@@ -40,13 +47,18 @@ class RingWorld(PointWorld):
 
     def lap(self, count, step_m):
         """Camera-to-world poses along the centre line, looking ahead, y down; corners are quarter circles."""
-        straight, arc = self.side - 2 * CORNER, np.pi / 2 * CORNER
+        straight = self.side - 2 * CORNER
+        arc = np.pi / 2 * CORNER
         poses = np.tile(np.eye(4), (count, 1, 1))
         for pose, path in zip(poses, np.arange(count) * step_m, strict=True):
             quarter, along = divmod(path, straight + arc)
             bend = max(0.0, along - straight) / CORNER
             before = min(along, straight) - straight / 2
-            spot = [before + CORNER * np.sin(bend), 0.0, self.side / 2 - CORNER * (1 - np.cos(bend))]
+            spot = [
+                before + CORNER * np.sin(bend),
+                0.0,
+                self.side / 2 - CORNER * (1 - np.cos(bend)),
+            ]
             ahead = rotated(quarter + bend / (np.pi / 2)) @ [1.0, 0.0, 0.0]
             down = np.array([0.0, 1.0, 0.0])
             pose[:3, :3] = np.column_stack([np.cross(down, ahead), down, ahead])
@@ -58,10 +70,12 @@ class RingWorld(PointWorld):
         centre = T_world_cam[:3, 3]
         near = np.flatnonzero(np.linalg.norm(self.walls - centre, axis=1) < VIEW_M)
         sight = centre + (self.walls[near] - centre) * np.linspace(0.05, 0.95, 12)[:, None, None]
-        inner, outer = (self.side - WIDTH) / 2 - 0.05, (self.side + WIDTH) / 2 + 0.05
+        inner = (self.side - WIDTH) / 2 - 0.05
+        outer = (self.side + WIDTH) / 2 + 0.05
         far = np.abs(sight[..., [0, 2]]).max(axis=-1)
         visible = near[~((far < inner) | (far > outer)).any(axis=0)]
-        self.points, self.descriptors = self.walls[visible], self._descriptors[visible]
+        self.points = self.walls[visible]
+        self.descriptors = self._descriptors[visible]
         return super().see(T_world_cam, index, **noise)
 
 

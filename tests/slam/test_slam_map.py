@@ -17,9 +17,14 @@ from dynslam_bench.slam.tracking import LocalMap, unconnected, weakly_connected
 
 
 def keyframe_of(room, world, pose, index, octave=0):
-    observations = observed(without_depth(room.see(pose, index, noise_px=0.0)), room.camera, levels=len(world.scales))
+    observations = observed(
+        without_depth(room.see(pose, index, noise_px=0.0)), room.camera, levels=len(world.scales)
+    )
     return world.add_keyframe(
-        replace(observations, octave=observations.octave + octave), se3.inverse(pose), index, index / 30
+        replace(observations, octave=observations.octave + octave),
+        se3.inverse(pose),
+        index,
+        index / 30,
     )
 
 
@@ -31,19 +36,27 @@ def observers(world, point):
 def test_points_and_keyframes_agree_on_their_observations(room):
     """Table entries of features that a keyframe does not have, since another one has more, observe nothing either."""
     backend = make_backend(room)
-    track_all(backend, [room.see(pose, i, limit=300 + 2 * i) for i, pose in enumerate(room.path(120))])
+    track_all(
+        backend, [room.see(pose, i, limit=300 + 2 * i) for i, pose in enumerate(room.path(120))]
+    )
     world = backend.world
-    points, (keyframe, feature) = world.points, np.nonzero((world.kf_point >= 0) & world.kf_alive[:, None])
-    by_feature = dict(zip(zip(keyframe, feature, strict=True), world.kf_point[keyframe, feature], strict=True))
+    points = world.points
+    (keyframe, feature) = np.nonzero((world.kf_point >= 0) & world.kf_alive[:, None])
+    by_feature = dict(
+        zip(zip(keyframe, feature, strict=True), world.kf_point[keyframe, feature], strict=True)
+    )
     pairs = zip(*world.observations(points), strict=True)
     by_point = dict(zip(pairs, np.repeat(points, world.n_obs[points]), strict=True))
-    assert by_feature == by_point and len(by_point) > 1000
+    assert by_feature == by_point
+    assert len(by_point) > 1000
 
 
 def test_a_point_has_as_many_observations_as_keyframes_see_it(room):
     world = Map(room.camera, np.ones(1))
     first = keyframe_of(room, world, np.eye(4), 0)
-    points = world.add_points(np.ones((300, 3)), np.zeros((300, 3), np.uint8), first, np.arange(300))
+    points = world.add_points(
+        np.ones((300, 3)), np.zeros((300, 3), np.uint8), first, np.arange(300)
+    )
     for index in range(1, 100):
         world.observe(keyframe_of(room, world, np.eye(4), index), np.array([7]), points[:1])
     assert observers(world, points[0]) == [(0, 0), *((index, 7) for index in range(1, 100))]
@@ -52,9 +65,13 @@ def test_a_point_has_as_many_observations_as_keyframes_see_it(room):
 def test_merged_points_keep_every_observation_once(room):
     world = Map(room.camera, np.ones(1))
     slots = [keyframe_of(room, world, np.eye(4), index) for index in range(40)]
-    one, other, last = world.add_points(np.ones((3, 3)), np.zeros((3, 3), np.uint8), slots[0], np.arange(3))
+    one, other, last = world.add_points(
+        np.ones((3, 3)), np.zeros((3, 3), np.uint8), slots[0], np.arange(3)
+    )
     for slot in slots[1:]:
-        world.observe(slot, np.array([0, 1]) if slot % 2 else np.array([1, 0]), np.array([one, other]))
+        world.observe(
+            slot, np.array([0, 1]) if slot % 2 else np.array([1, 0]), np.array([one, other])
+        )
     for slot in slots[20:]:
         world.unobserve(np.array([slot]), np.array([1 if slot % 2 else 0]))
     world.observe(slots[1], np.array([2]), np.array([last]))
@@ -62,7 +79,8 @@ def test_merged_points_keep_every_observation_once(room):
     assert [len(pairs) for pairs in before] == [2, 40, 20]
     world.replace_point(int(one), int(last))
     merged = observers(world, last)
-    assert set(merged) >= set(before[0]) and len({slot for slot, _ in merged}) == len(merged) == 40
+    assert set(merged) >= set(before[0])
+    assert len({slot for slot, _ in merged}) == len(merged) == 40
     assert observers(world, other) == before[2]
 
 
@@ -71,13 +89,16 @@ def test_the_room_of_removed_points_is_used_again(room):
     slots = [keyframe_of(room, world, np.eye(4), index) for index in range(9)]
     sizes = []
     for _ in range(6):
-        points = world.add_points(np.ones((200, 3)), np.zeros((200, 3), np.uint8), slots[0], np.arange(200))
+        points = world.add_points(
+            np.ones((200, 3)), np.zeros((200, 3), np.uint8), slots[0], np.arange(200)
+        )
         for slot in slots[1:]:
             world.observe(slot, np.arange(200), points)
         world.replace_point(int(points[0]), int(points[1]))
         world.remove_points(points)
         world.release()
-        assert not world.n_obs.any() and (world.kf_point[slots] < 0).all()
+        assert not world.n_obs.any()
+        assert (world.kf_point[slots] < 0).all()
         sizes.append(world.obs_kf.size)
     assert sizes[1:] == sizes[1:2] * 5
 
@@ -85,7 +106,13 @@ def test_the_room_of_removed_points_is_used_again(room):
 @pytest.mark.parametrize(
     ("octaves", "sigmas", "triangulated"),
     [
-        *(((0, 0), 0.0, True), ((0, 0), 6.0, True), ((0, 3), 6.0, True), ((7, 7), 0.0, True), ((7, 5), 0.0, True)),
+        *(
+            ((0, 0), 0.0, True),
+            ((0, 0), 6.0, True),
+            ((0, 3), 6.0, True),
+            ((7, 7), 0.0, True),
+            ((7, 5), 0.0, True),
+        ),
         *(((7, 7), 6.0, False), ((5, 7), 6.0, False), ((7, 5), 6.0, False)),
     ],
 )
@@ -93,11 +120,15 @@ def test_a_coarse_feature_needs_a_larger_parallax(room, octaves, sigmas, triangu
     """1.5 degrees are 14 standard deviations of a feature of the finest octave, and 4 of one of the coarsest."""
     room.points = room.points[:400] * [1.0, 1.0, 0.0] + [0.0, 0.0, 3.0]
     room.descriptors = room.descriptors[:400]
-    world, step = Map(room.camera, 1.2 ** np.arange(8)), np.eye(4)
+    step = np.eye(4)
+    world = Map(room.camera, 1.2 ** np.arange(8))
     step[0, 3] = 3.0 * np.tan(np.deg2rad(1.5))
-    one, other = (keyframe_of(room, world, p, i, octaves[i]) for i, p in enumerate((np.eye(4), step)))
+    one, other = (
+        keyframe_of(room, world, p, i, octaves[i]) for i, p in enumerate((np.eye(4), step))
+    )
     features, _, position = triangulate(world, one, other, sigmas)
-    assert (len(features) > 30) is triangulated and (triangulated or not len(features))
+    assert (len(features) > 30) is triangulated
+    assert triangulated or not len(features)
     assert np.allclose(position[:, 2], 3.0, rtol=0.01)
 
 
@@ -111,7 +142,8 @@ SHARED = 10
 @pytest.fixture
 def chain(room):
     """Six keyframes in a row; each shares ten points with the next, and with no other."""
-    world, observations = Map(room.camera, np.ones(1)), observed(room.see(np.eye(4), 0), room.camera, levels=1)
+    observations = observed(room.see(np.eye(4), 0), room.camera, levels=1)
+    world = Map(room.camera, np.ones(1))
     last = np.zeros(0, np.int64)
     for index in range(6):
         slot = world.add_keyframe(observations, np.eye(4), index, float(index))
@@ -122,9 +154,12 @@ def chain(room):
 
 
 @pytest.mark.parametrize(
-    ("keyframe", "gap", "expected"), [(5, 2, [0, 1, 2]), (5, 4, [0, 1]), (0, 4, [4, 5]), (2, 3, [5])]
+    ("keyframe", "gap", "expected"),
+    [(5, 2, [0, 1, 2]), (5, 4, [0, 1]), (0, 4, [4, 5]), (2, 3, [5])],
 )
-def test_unconnected_keyframes_are_old_and_share_no_covisible_keyframe(chain, keyframe, gap, expected):
+def test_unconnected_keyframes_are_old_and_share_no_covisible_keyframe(
+    chain, keyframe, gap, expected
+):
     assert unconnected(chain, keyframe, gap).tolist() == expected
 
 
@@ -137,12 +172,14 @@ def test_keyframes_that_share_few_points_may_be_recognised_anew(chain, monkeypat
 
 def test_the_local_map_is_the_whole_map_or_the_connected_part(chain, monkeypatch):
     keyframes, points = LocalMap(chain, connected_only=False).around(5)
-    assert keyframes.tolist() == [0, 1, 2, 3, 4, 5] and (points == chain.points).all()
+    assert keyframes.tolist() == [0, 1, 2, 3, 4, 5]
+    assert (points == chain.points).all()
     monkeypatch.setattr(tracking, "unconnected", lambda world, slot: unconnected(world, slot, 2))
     local_map = LocalMap(chain, connected_only=True)
     keyframes, points = local_map.around(5)
     assert keyframes.tolist() == [3, 4, 5]
-    assert sorted(set(chain.born[points].tolist())) == [2, 3, 4, 5] and len(points) == 4 * SHARED
+    assert sorted(set(chain.born[points].tolist())) == [2, 3, 4, 5]
+    assert len(points) == 4 * SHARED
     assert local_map.around(0)[0].tolist() == [0, 1, 2]
     chain.remove_keyframe(1)
     chain.next_keyframe += 1
@@ -153,23 +190,31 @@ def test_the_local_map_is_the_whole_map_or_the_connected_part(chain, monkeypatch
 
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
-POSES, VARIABLE, POINTS = 4, 2, 16
+POSES = 4
+VARIABLE = 2
+POINTS = 16
 
 
 def measured(poses, points):
     """Pixels and right coordinates ``[N, 3]`` of all points in all views, point by point."""
     local = np.einsum("pij,qj->qpi", poses[:, :3, :3], points) + poses[:, :3, 3]
     uv = CAMERA.project(local)
-    return np.concatenate([uv, uv[..., :1] - CAMERA.fx * CAMERA.baseline_m / local[..., 2:]], axis=-1).reshape(-1, 3)
+    return np.concatenate(
+        [uv, uv[..., :1] - CAMERA.fx * CAMERA.baseline_m / local[..., 2:]], axis=-1
+    ).reshape(-1, 3)
 
 
 @pytest.mark.parametrize("with_depth", [0.6, 1.0])
 def test_bundle_adjustment_agrees_with_general_least_squares(with_depth):
     rng = np.random.default_rng(0)
-    true, points = se3.exp(rng.normal(0, 0.06, (POSES, 6))), rng.uniform([-1, -1, 2], [1, 1, 4], (POINTS, 3))
+    true = se3.exp(rng.normal(0, 0.06, (POSES, 6)))
+    points = rng.uniform([-1, -1, 2], [1, 1, 4], (POINTS, 3))
     values = measured(true, points) + rng.normal(0, 0.3, (POSES * POINTS, 3))
-    info, has_depth = np.ones(len(values)), rng.random(len(values)) < with_depth
-    start = np.concatenate([se3.exp(rng.normal(0, 0.01, (VARIABLE, 6))) @ true[:VARIABLE], true[VARIABLE:]])
+    info = np.ones(len(values))
+    has_depth = rng.random(len(values)) < with_depth
+    start = np.concatenate(
+        [se3.exp(rng.normal(0, 0.01, (VARIABLE, 6))) @ true[:VARIABLE], true[VARIABLE:]]
+    )
     problem = BundleProblem(
         start, VARIABLE, points + rng.normal(0, 0.02, points.shape), np.tile(np.arange(POSES), POINTS),
         np.repeat(np.arange(POINTS), POSES), values[:, :2].copy(), values[:, 2].copy(), info, info * has_depth, CAMERA,
@@ -177,11 +222,15 @@ def test_bundle_adjustment_agrees_with_general_least_squares(with_depth):
 
     def moved(x):
         twists, offsets = np.split(x, [6 * VARIABLE])
-        poses = np.concatenate([se3.exp(twists.reshape(-1, 6)) @ start[:VARIABLE], start[VARIABLE:]])
+        poses = np.concatenate(
+            [se3.exp(twists.reshape(-1, 6)) @ start[:VARIABLE], start[VARIABLE:]]
+        )
         return poses, problem.points + offsets.reshape(-1, 3)
 
     def errors(x):
-        return np.where([True, True, False], True, has_depth[:, None]) * (measured(*moved(x)) - values)
+        return np.where([True, True, False], True, has_depth[:, None]) * (
+            measured(*moved(x)) - values
+        )
 
     def residuals(x):
         squared = (errors(x) ** 2).sum(axis=1, keepdims=True)
@@ -193,8 +242,10 @@ def test_bundle_adjustment_agrees_with_general_least_squares(with_depth):
     width = 5.0 * np.median(start_chi2 / chi2.median(np.where(has_depth, 3, 2)))
     solution = least_squares(residuals, np.zeros(6 * VARIABLE + 3 * POINTS), xtol=1e-12, ftol=1e-12)
     result = adjust_bundle(problem, 40)
-    assert result.inliers.all() and result.cost == pytest.approx(2 * solution.cost, rel=1e-4)
+    assert result.inliers.all()
+    assert result.cost == pytest.approx(2 * solution.cost, rel=1e-4)
     np.testing.assert_allclose(result.poses, moved(solution.x)[0], atol=1e-4)
     behind = problem.points * np.where(np.arange(POINTS) % 5 < 3, -1, 1)[:, None]
     rest = adjust_bundle(replace(problem, points=behind), 40)
-    assert np.isfinite(rest.cost) and rest.inliers.mean() > 0.35, "points behind the camera stop no other's adjustment"
+    assert np.isfinite(rest.cost), "points behind the camera stop no other's adjustment"
+    assert rest.inliers.mean() > 0.35, "points behind the camera stop no other's adjustment"

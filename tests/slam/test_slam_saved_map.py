@@ -14,7 +14,13 @@ from dynslam_bench.core.errors import DynslamError, SettingsError, TrackerError
 from dynslam_bench.geometry import Trajectory, se3
 from dynslam_bench.slam.atlas import packed
 from dynslam_bench.slam.backend import RgbdBackend
-from dynslam_bench.slam.map_files import HEADER, MAP_SCHEMA, read_map, write_keyframes_csv, write_ply
+from dynslam_bench.slam.map_files import (
+    HEADER,
+    MAP_SCHEMA,
+    read_map,
+    write_keyframes_csv,
+    write_ply,
+)
 from dynslam_bench.slam.run_figure import write_run_figure
 from dynslam_bench.slam.settings import BackendSettings, StartMapSettings
 
@@ -25,14 +31,18 @@ HALF = 45
 def errors_m(results, poses, first):
     """Position errors of tracked frames in the world of the first pose."""
     true = se3.transform(se3.inverse(first), poses[:, :3, 3])
-    return np.array([np.linalg.norm(r.T_world_cam[:3, 3] - at) for r, at in zip(results, true, strict=True)])
+    return np.array(
+        [np.linalg.norm(r.T_world_cam[:3, 3] - at) for r, at in zip(results, true, strict=True)]
+    )
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A room, the poses of a path in it, the map of the first half, and its back end."""
-    room, file = PointWorld(), tmp_path_factory.mktemp("map") / "map.npz"
-    poses, backend = room.path(2 * HALF), make_backend(room)
+    room = PointWorld()
+    file = tmp_path_factory.mktemp("map") / "map.npz"
+    poses = room.path(2 * HALF)
+    backend = make_backend(room)
     track_all(backend, [room.see(pose, i) for i, pose in enumerate(poses[:HALF])])
     backend.save_map(file, "a run")
     return room, poses, file, backend
@@ -40,16 +50,23 @@ def made(tmp_path_factory):
 
 def test_a_loaded_map_is_the_saved_one_to_the_last_bit(made, tmp_path):
     room, _, file, backend = made
-    saved, loaded = packed(backend.world, []), read_map(file)
-    assert loaded.header.made_by == "a run" and saved.keys() == loaded.arrays.keys() and len(saved["id"]) > 300
+    saved = packed(backend.world, [])
+    loaded = read_map(file)
+    assert loaded.header.made_by == "a run"
+    assert saved.keys() == loaded.arrays.keys()
+    assert len(saved["id"]) > 300
     for name, array in saved.items():
-        assert array.dtype == loaded.arrays[name].dtype and array.tobytes() == loaded.arrays[name].tobytes(), name
+        assert array.dtype == loaded.arrays[name].dtype, name
+        assert array.tobytes() == loaded.arrays[name].tobytes(), name
     again = make_backend(room, map__file=str(file))
     again.save_map(tmp_path / "again.npz", "a run")
     assert (tmp_path / "again.npz").read_bytes() == file.read_bytes()
-    before, after = backend.outputs(), again.outputs()
-    order = np.argsort(before.ids)  # slots are used again in memory, and follow each other in the file
-    assert np.array_equal(before.ids[order], after.ids) and np.array_equal(before.positions[order], after.positions)
+    before = backend.outputs()
+    after = again.outputs()
+    # slots are used again in memory, and follow each other in the file
+    order = np.argsort(before.ids)
+    assert np.array_equal(before.ids[order], after.ids)
+    assert np.array_equal(before.positions[order], after.positions)
 
 
 def test_localisation_only_relocalises_and_leaves_the_map_unchanged(made, tmp_path):
@@ -57,14 +74,17 @@ def test_localisation_only_relocalises_and_leaves_the_map_unchanged(made, tmp_pa
     backend = make_backend(room, map__file=str(file), map__localisation_only=True)
     assert backend.predict(0.0) == (None, None)
     elsewhere = [PointWorld(seed=9).see(pose, i) for i, pose in enumerate(poses[:8])]
-    order = [*range(2 * HALF - 1, HALF // 2, -1)]  # from the end of the path, which the map does not know
+    # from the end of the path, which the map does not know
+    order = [*range(2 * HALF - 1, HALF // 2, -1)]
     here = [room.see(poses[i], 8 + number) for number, i in enumerate(order)]
     blind = [room.blind(8 + len(here) + i) for i in range(4)]
     back = [room.see(pose, 12 + len(here) + i) for i, pose in enumerate(poses[20:25])]
     results = track_all(backend, [*elsewhere, *here, *blind, *back])
     assert states(results) == ["lost"] * 8 + ["ok"] * len(here) + ["lost"] * 4 + ["ok"] * 5
-    assert all(r.T_world_cam is None for r in results[:8]) and not any(r.keyframe for r in results)
-    assert results[8].relocalised and not results[12].relocalised
+    assert all(r.T_world_cam is None for r in results[:8])
+    assert not any(r.keyframe for r in results)
+    assert results[8].relocalised
+    assert not results[12].relocalised
     tracked = [r for r in results if r.state == "ok"]
     assert errors_m(tracked, poses[[*order, *range(20, 25)]], poses[0]).max() < 0.05
     backend.save_map(tmp_path / "after.npz", "a run")
@@ -76,13 +96,18 @@ def test_localisation_only_relocalises_and_leaves_the_map_unchanged(made, tmp_pa
 def test_a_loaded_map_continues_to_grow(made, tmp_path, loops):
     room, poses, file, before = made
     backend = make_backend(room, map__file=str(file), loop_closing__enabled=loops)
-    frames = [*(room.blind(i) for i in range(3)), *(room.see(p, 3 + i) for i, p in enumerate(poses[HALF:]))]
+    frames = [
+        *(room.blind(i) for i in range(3)),
+        *(room.see(p, 3 + i) for i, p in enumerate(poses[HALF:])),
+    ]
     results = track_all(backend, frames)
     assert states(results) == ["lost"] * 3 + ["ok"] * HALF
     assert errors_m(results[3:], poses[HALF:], poses[0]).max() < 0.05
-    assert results[-1].map_points > len(before.world.points) and any(r.keyframe for r in results)
+    assert results[-1].map_points > len(before.world.points)
+    assert any(r.keyframe for r in results)
     new = [record.frame for record in backend.outputs().keyframes if record.frame >= 0]
-    assert 0 < len(new) < backend.world.keyframe_count and min(new) >= 3
+    assert 0 < len(new) < backend.world.keyframe_count
+    assert min(new) >= 3
     backend.save_map(tmp_path / "grown.npz")
     assert len(read_map(tmp_path / "grown.npz").arrays["kf_id"]) == backend.world.keyframe_count
 
@@ -113,7 +138,10 @@ def test_other_descriptors_and_missing_maps_are_refused(made, tmp_path):
     frame.keypoints.descriptors.resize((len(frame), 64), refcheck=False)
     with pytest.raises(TrackerError, match=r"32 bytes.* 64"):
         track_all(make_backend(room, map__file=str(file)), [frame])
-    for settings in (StartMapSettings(localisation_only=True), StartMapSettings(file=str(tmp_path))):
+    for settings in (
+        StartMapSettings(localisation_only=True),
+        StartMapSettings(file=str(tmp_path)),
+    ):
         with pytest.raises(SettingsError):
             settings.verify()
     with pytest.raises(TrackerError):
@@ -141,7 +169,8 @@ def with_two_features(arrays):
     """The keyframe that observes the first point observes it with a further feature, too."""
     keyframe = arrays["obs_kf"][0]
     used = arrays["obs_ft"][arrays["obs_kf"] == keyframe]
-    arrays["obs_kf"][1], arrays["obs_ft"][1] = keyframe, np.setdiff1d(np.arange(arrays["kf_count"][keyframe]), used)[0]
+    arrays["obs_ft"][1] = np.setdiff1d(np.arange(arrays["kf_count"][keyframe]), used)[0]
+    arrays["obs_kf"][1] = keyframe
 
 
 FAULTS = [
@@ -177,7 +206,9 @@ def test_a_file_of_another_version_kind_or_size_is_refused(made, arrays, tmp_pat
     text = json.dumps(json.loads(arrays[HEADER].tobytes()) | header)
     arrays[HEADER] = np.frombuffer(text.encode(), np.uint8)
     if not header:  # a small file that claims large tables
-        arrays |= {name: np.zeros((len(arrays[name]), 8000), np.uint64) for name in ("kf_words", "words")}
+        arrays |= {
+            name: np.zeros((len(arrays[name]), 8000), np.uint64) for name in ("kf_words", "words")
+        }
     np.savez_compressed(tmp_path / "odd.npz", **arrays)
     with pytest.raises(SettingsError, match=words):
         read_map(tmp_path / "odd.npz")
@@ -192,7 +223,9 @@ def test_a_file_of_another_version_kind_or_size_is_refused(made, arrays, tmp_pat
 def outputs(points=50, keyframes=4):
     rng = np.random.default_rng(0)
     poses = se3.exp(rng.normal(0, 0.3, (keyframes, 6)))
-    records = tuple(KeyframeRecord(i, 3 * i, 100.0 + i / 3, pose, 900, 300 + i) for i, pose in enumerate(poses))
+    records = tuple(
+        KeyframeRecord(i, 3 * i, 100.0 + i / 3, pose, 900, 300 + i) for i, pose in enumerate(poses)
+    )
     return MapOutputs(
         records,
         np.arange(points),
@@ -212,7 +245,9 @@ def test_keyframes_csv(tmp_path):
     for row, record in zip(rows, map_outputs.keyframes, strict=True):
         translation = np.array([float(row[k]) for k in ("tx", "ty", "tz")])
         quaternion = np.array([float(row[k]) for k in ("qx", "qy", "qz", "qw")])
-        assert np.allclose(se3.from_quaternion(translation, quaternion), record.T_world_cam, atol=1e-8)
+        assert np.allclose(
+            se3.from_quaternion(translation, quaternion), record.T_world_cam, atol=1e-8
+        )
         assert int(row["observations"]) == record.observations
 
 
@@ -221,20 +256,31 @@ def test_binary_ply_byte_by_byte(tmp_path, points):
     map_outputs = outputs(points)
     write_ply(tmp_path / "map.ply", map_outputs)
     head, body = (tmp_path / "map.ply").read_bytes().split(b"end_header\n")
-    assert head.startswith(b"ply\nformat binary_little_endian 1.0\n") and f"element vertex {points}\n".encode() in head
+    assert head.startswith(b"ply\nformat binary_little_endian 1.0\n")
+    assert f"element vertex {points}\n".encode() in head
     assert len(body) == 19 * points
     for i, (x, y, z, r, g, b, n) in enumerate(struct.iter_unpack("<fffBBBi", body)):
         assert np.allclose((x, y, z), map_outputs.positions[i], atol=1e-6)
-        assert (r, g, b) == tuple(map_outputs.colours[i]) and n == map_outputs.observations[i]
+        assert (r, g, b) == tuple(map_outputs.colours[i])
+        assert n == map_outputs.observations[i]
 
 
 def test_the_figure_of_nothing_is_as_large_as_that_of_a_run(tmp_path):
     rng = np.random.default_rng(1)
     image = rng.integers(0, 256, (480, 640, 3)).astype(np.uint8)
     poses = se3.exp(np.cumsum(rng.normal(0, 0.05, (30, 6)), axis=0))
-    track, file = Trajectory(np.arange(30) / 30.0, poses), tmp_path / "figure.png"
-    write_run_figure(file, "tum/fr1/xyz", image, [image] * 9, [image] * 5, outputs(400), track, track)
+    track = Trajectory(np.arange(30) / 30.0, poses)
+    file = tmp_path / "figure.png"
+    write_run_figure(
+        file, "tum/fr1/xyz", image, [image] * 9, [image] * 5, outputs(400), track, track
+    )
     figure = cv2.imread(str(file))
-    empty = MapOutputs((), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, np.int64))
+    empty = MapOutputs(
+        (),
+        np.zeros(0, np.int64),
+        np.zeros((0, 3)),
+        np.zeros((0, 3), np.uint8),
+        np.zeros(0, np.int64),
+    )
     write_run_figure(file, "x", image, [], [], empty, Trajectory(np.zeros(0), np.zeros((0, 4, 4))))
     assert cv2.imread(str(file)).shape == figure.shape

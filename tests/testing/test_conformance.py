@@ -62,19 +62,28 @@ def test_the_filter_scene_is_exact():
     expected = state.camera.project(se3.transform(se3.inverse(state.T_world_prev), world))
     error = np.linalg.norm(expected - state.flow.xy, axis=1)
     assert error[~moving & state.flow.valid].max() < 1e-3
-    assert error[moving].min() > 5 and moving.sum() > 10
+    assert error[moving].min() > 5
+    assert moving.sum() > 10
     column, row = np.rint(state.flow.xy).astype(int).T
-    patch = frame.gray[np.rint(frame.xy[:, 1]).astype(int), np.rint(frame.xy[:, 0]).astype(int)].astype(int)
-    same = np.abs(before.gray[row.clip(0, 479), column.clip(0, 639)].astype(int) - patch)[state.flow.valid]
+    patch = frame.gray[
+        np.rint(frame.xy[:, 1]).astype(int), np.rint(frame.xy[:, 0]).astype(int)
+    ].astype(int)
+    same = np.abs(before.gray[row.clip(0, 479), column.clip(0, 639)].astype(int) - patch)[
+        state.flow.valid
+    ]
     assert (same < 25).mean() > 0.8  # the images agree with the flow
 
 
 @pytest.mark.parametrize("name", ["never-move", "constant-velocity", "mask-rcnn"])
 def test_trackers(name):
-    check_tracker(name, frames=3, settings={"segmentation.source": "oracle"} if name == "mask-rcnn" else None)
+    check_tracker(
+        name, frames=3, settings={"segmentation.source": "oracle"} if name == "mask-rcnn" else None
+    )
 
 
-@pytest.mark.parametrize("sequence", [CornerSequence(3), CornerSequence(1), "synthetic/sitting_rpy?scene=2&frames=5"])
+@pytest.mark.parametrize(
+    "sequence", [CornerSequence(3), CornerSequence(1), "synthetic/sitting_rpy?scene=2&frames=5"]
+)
 def test_sequences(sequence):
     check_sequence(sequence)
 
@@ -91,7 +100,8 @@ def test_segmenters():
     check_segmenter(lambda: build_segmenter(settings, sequence_id=scene.id, masks=scene.masks))
 
 
-# Conformance checks of trackers that exit, hang, crash or leave processes behind: a verdict on every check.
+# Conformance checks of trackers that exit, hang, crash or leave processes behind: a verdict on
+# every check.
 
 
 def report_of(mode, target=hostile.TARGET, **options):
@@ -113,7 +123,8 @@ def failures(report):
 )
 def test_a_tracker_that_ends_its_process_fails_the_check(mode, check, words):
     report = report_of(mode, frame_s=1.0)
-    assert list(failures(report)) == [check] and words in failures(report)[check]
+    assert list(failures(report)) == [check]
+    assert words in failures(report)[check]
     assert "\n" not in failures(report)[check]
 
 
@@ -122,20 +133,26 @@ def test_the_other_checks_go_on():
     told = []
     report = report_of("ok", target=f"{hostile.__file__}:BLACK", on_check=told.append)
     assert list(failures(report)) == ["all-black frame"]
-    assert told == report.checks and len({check.name for check in told}) == len(told) >= 14
-    assert report.checks[-1].name == "closing" and report.subject == "tracker 'blackhater'"
+    assert told == report.checks
+    assert len({check.name for check in told}) == len(told) >= 14
+    assert report.checks[-1].name == "closing"
+    assert report.subject == "tracker 'blackhater'"
 
 
 def test_a_module_that_exits_when_it_is_loaded(tmp_path):
     (tmp_path / "leaver.py").write_text("import os\nos._exit(0)\n")
     report = report_of("ok", target=f"{tmp_path}/leaver.py:SPEC")
-    assert list(failures(report)) == ["loading"] and "exit code 0" in failures(report)["loading"]
+    assert list(failures(report)) == ["loading"]
+    assert "exit code 0" in failures(report)["loading"]
 
 
 def test_unknown_names_are_errors_and_no_verdicts():
     with pytest.raises(PluginError, match=r"unknown tracker 'orb-slam'.*orb-slam2"):
         isolated_tracker_report("orb-slam")
-    assert "unknown setting 'speed'" in failures(isolated_tracker_report("never-move", settings={"speed": 1}))["spec"]
+    assert (
+        "unknown setting 'speed'"
+        in failures(isolated_tracker_report("never-move", settings={"speed": 1}))["spec"]
+    )
 
 
 # Each check finds the fault that it is for, and names it.
@@ -149,7 +166,8 @@ class Good:
     """Knows the scenes' poses by heart."""
 
     def reset(self, camera, *, rng):
-        self.rng, self.stamps = rng, []
+        self.rng = rng
+        self.stamps = []
         self.poses = TRUTH if camera.width == 640 else TURNING
 
     def track(self, frame):
@@ -180,7 +198,8 @@ def reused_pose(self, frame):
 
 def test_a_good_tracker_passes():
     report = tracker_report(Good, frames=4)
-    assert report.ok and {c.status for c in report.checks if c.name != "online settings"} == {"passed"}
+    assert report.ok
+    assert {c.status for c in report.checks if c.name != "online settings"} == {"passed"}
     assert len(report.checks) == 16
 
 
@@ -205,24 +224,56 @@ def scribble(self, result, frame):
     [
         (gave(lambda s, r, f: r.T_world_cam), "results", "gave a ndarray, not a TrackResult"),
         (gave(lambda s, r, f: replace(r, state="fine")), "results", "gave state 'fine'"),
-        (gave(lambda s, r, f: replace(r, T_world_cam=None)), "results", "state 'ok' without a pose"),
-        (gave(lambda s, r, f: replace(r, T_world_cam=r.T_world_cam * np.nan)), "results", "a solver diverged"),
-        (gave(lambda s, r, f: replace(r, T_world_cam=r.T_world_cam @ SKEW)), "results", "no rigid transformation"),
+        (
+            gave(lambda s, r, f: replace(r, T_world_cam=None)),
+            "results",
+            "state 'ok' without a pose",
+        ),
+        (
+            gave(lambda s, r, f: replace(r, T_world_cam=r.T_world_cam * np.nan)),
+            "results",
+            "a solver diverged",
+        ),
+        (
+            gave(lambda s, r, f: replace(r, T_world_cam=r.T_world_cam @ SKEW)),
+            "results",
+            "no rigid transformation",
+        ),
         (
             gave(lambda s, r, f: replace(r, T_world_cam=r.T_world_cam[:3])),
             "results",
             r"shape \(3, 4\) as pose",
         ),
-        (gave(lambda s, r, f: replace(r, T_world_cam=se3.inverse(r.T_world_cam))), "camera to world", "invert your"),
-        (gave(lambda s, r, f: replace(r, state="lost")), "results", "no frame of an easy scene was tracked"),
+        (
+            gave(lambda s, r, f: replace(r, T_world_cam=se3.inverse(r.T_world_cam))),
+            "camera to world",
+            "invert your",
+        ),
+        (
+            gave(lambda s, r, f: replace(r, state="lost")),
+            "results",
+            "no frame of an easy scene was tracked",
+        ),
         (
             gave(lambda s, r, f: replace(r, stats={f"n{f.index}": 1.0})),
             "same stats on every frame",
             "the same on every frame",
         ),
-        (gave(lambda s, r, f: replace(r, stats={"n": float("nan")})), "results", "no finite numbers"),
-        (gave(lambda s, r, f: replace(r, timings={"t": -1.0})), "results", "a timing that is negative"),
-        (gave(lambda s, r, f: replace(r, dynamic_mask=np.zeros((4, 4), bool))), "results", "a dynamic mask of shape"),
+        (
+            gave(lambda s, r, f: replace(r, stats={"n": float("nan")})),
+            "results",
+            "no finite numbers",
+        ),
+        (
+            gave(lambda s, r, f: replace(r, timings={"t": -1.0})),
+            "results",
+            "a timing that is negative",
+        ),
+        (
+            gave(lambda s, r, f: replace(r, dynamic_mask=np.zeros((4, 4), bool))),
+            "results",
+            "a dynamic mask of shape",
+        ),
         (gave(scribble), "frames are left alone", "draw on a copy"),
         (faulty(track=reused_pose), "results", "the pose of frame 0 changed"),
         (
@@ -239,7 +290,11 @@ def scribble(self, result, frame):
         (faulty(finalize=lambda self: TRUTH), "final trajectory", "not a Trajectory"),
         (faulty(__init__=lambda self: 1 / 0), "construction", "raised ZeroDivisionError"),
         (faulty(track=None), "construction", r"lacks track\(\)"),
-        (faulty(close=lambda self: self.inner.close()), "construction", r"close\(\) of a Faulty raised AttributeError"),
+        (
+            faulty(close=lambda self: self.inner.close()),
+            "construction",
+            r"close\(\) of a Faulty raised AttributeError",
+        ),
     ],
 )
 def test_faulty_trackers(tracker, check, words):
@@ -269,8 +324,11 @@ def test_trackers_that_break_on_hard_frames(condition, name):
 
 
 def test_the_spec_is_checked_too(tmp_path):
-    report = tracker_report(TrackerSpec("mine", f"{__name__}:Good", "Mine", presets={"fast": {"nothing": 1}}), frames=2)
-    assert report.checks[0].status == "failed" and "preset 'fast' does not fit" in report.checks[0].message
+    report = tracker_report(
+        TrackerSpec("mine", f"{__name__}:Good", "Mine", presets={"fast": {"nothing": 1}}), frames=2
+    )
+    assert report.checks[0].status == "failed"
+    assert "preset 'fast' does not fit" in report.checks[0].message
 
 
 def frames(change):
@@ -284,14 +342,29 @@ def frames(change):
         ({"stamps": lambda stamps: stamps[::-1].copy()}, "not strictly increasing"),
         ({"stamps": lambda stamps: stamps * 1000}, "in seconds"),
         ({"truth": Trajectory(CornerSequence(4).timestamps + 1e6, TRUTH)}, "different clocks"),
-        ({"__getitem__": lambda self, index: CornerSequence.__getitem__(self, min(index, 3))}, "beyond the end"),
+        (
+            {"__getitem__": lambda self, index: CornerSequence.__getitem__(self, min(index, 3))},
+            "beyond the end",
+        ),
         (frames(lambda f: replace(f, rgb=f.rgb[..., 0])), "the image is grey"),
         (frames(lambda f: replace(f, depth=f.depth * 5000)), "wrong depth_factor"),
-        (frames(lambda f: replace(f, depth=np.where(f.depth > 2, np.float32("nan"), f.depth))), "missing depth is 0"),
+        (
+            frames(lambda f: replace(f, depth=np.where(f.depth > 2, np.float32("nan"), f.depth))),
+            "missing depth is 0",
+        ),
         (frames(lambda f: replace(f, index=0)), "says that its index is 0"),
-        (frames(lambda f: replace(f, depth=f.depth + np.float32(np.random.rand()))), "differs when it is read"),  # noqa: NPY002
-        ({"masks": [replace(CornerSequence(4).masks[i], class_names={}) for i in range(4)]}, "have no class name"),
-        ({"digest": lambda self: str(np.random.default_rng().random())}, "two digests of one sequence differ"),
+        (
+            frames(lambda f: replace(f, depth=f.depth + np.float32(np.random.rand()))),  # noqa: NPY002
+            "differs when it is read",
+        ),
+        (
+            {"masks": [replace(CornerSequence(4).masks[i], class_names={}) for i in range(4)]},
+            "have no class name",
+        ),
+        (
+            {"digest": lambda self: str(np.random.default_rng().random())},
+            "two digests of one sequence differ",
+        ),
     ],
 )
 def test_faulty_sequences(changes, words):
@@ -305,7 +378,8 @@ def test_faulty_sequences(changes, words):
 class Keep:
     """Keeps everything."""
 
-    name, needs = "keep", frozenset({"depth"})
+    needs = frozenset({"depth"})
+    name = "keep"
 
     def reset(self, camera):
         pass
@@ -318,12 +392,29 @@ class Keep:
     ("change", "words"),
     [
         ({"needs": frozenset({"magic"})}, "unknown needs"),
-        ({"apply": lambda s, f, st: FilterResult.of(np.ones(3, bool))}, "not only on those that earlier filters kept"),
-        ({"apply": lambda s, f, st: FilterResult(np.ones(len(f), bool), np.full(len(f), 2, np.float32))}, "outside"),
-        ({"apply": lambda s, f, st: FilterResult.of(st.flow.valid)}, "raised AttributeError"),
-        ({"apply": lambda s, f, st: FilterResult.of(f.z > f.z.min())}, "no keypoints: raised ValueError"),
         (
-            {"apply": lambda s, f, st: replace(FilterResult.of(np.ones(len(f), bool)), stats={f"n{f.index}": 1.0})},
+            {"apply": lambda s, f, st: FilterResult.of(np.ones(3, bool))},
+            "not only on those that earlier filters kept",
+        ),
+        (
+            {
+                "apply": lambda s, f, st: FilterResult(
+                    np.ones(len(f), bool), np.full(len(f), 2, np.float32)
+                )
+            },
+            "outside",
+        ),
+        ({"apply": lambda s, f, st: FilterResult.of(st.flow.valid)}, "raised AttributeError"),
+        (
+            {"apply": lambda s, f, st: FilterResult.of(f.z > f.z.min())},
+            "no keypoints: raised ValueError",
+        ),
+        (
+            {
+                "apply": lambda s, f, st: replace(
+                    FilterResult.of(np.ones(len(f), bool)), stats={f"n{f.index}": 1.0}
+                )
+            },
             "not declared",
         ),
         ({"stats_names": ("dropped", "tested")}, r"stats missing: \['tested'\]"),
@@ -341,7 +432,10 @@ def instances(frame, **change):
     mask = np.zeros((1, *frame.depth.shape), bool)
     mask[0, 10:20, 30:60] = True
     return replace(
-        Instances(mask, np.array([[30, 10, 60, 20]], np.float32), ("person",), np.ones(1, np.float32)), **change
+        Instances(
+            mask, np.array([[30, 10, 60, 20]], np.float32), ("person",), np.ones(1, np.float32)
+        ),
+        **change,
     )
 
 
@@ -386,7 +480,8 @@ class Late(Configured):
     """Obeys one frame late."""
 
     def track(self, frame):
-        before, self.seen = self.seen if frame.index else self.built_with, self.settings
+        before = self.seen if frame.index else self.built_with
+        self.seen = self.settings
         return replace(Good.track(self, frame), stats={"shift": before.shift})
 
 
@@ -409,10 +504,22 @@ Inert = type("Inert", (Configured,), {"track": Good.track})
     [
         (Configured, "passed", ""),
         (Fixed, "failed", "class Fixed has no method configure.settings., but shift is online"),
-        (Deaf, "failed", "configure.. with shift=1.0 gives another result than building with it: frame 0, shift"),
+        (
+            Deaf,
+            "failed",
+            "configure.. with shift=1.0 gives another result than building with it: frame 0, shift",
+        ),
         (Leaky, "failed", "reset.. does not bring back the settings: frame 0, shift"),
-        (Late, "failed", "configure.. with shift=1.0 gives another result than building with it: frame 0, shift"),
-        (Once, "failed", "configure.. in mid-episode changes nothing, although building with shift does"),
+        (
+            Late,
+            "failed",
+            "configure.. with shift=1.0 gives another result than building with it: frame 0, shift",
+        ),
+        (
+            Once,
+            "failed",
+            "configure.. in mid-episode changes nothing, although building with shift does",
+        ),
         (Inert, "skipped", "shift change nothing on this scene"),
     ],
 )
@@ -420,7 +527,8 @@ def test_online_settings_are_checked(tracker, status, words, monkeypatch):
     monkeypatch.setenv(ISOLATED_VARIABLE, "1")  # this file is no danger to the process
     spec = TrackerSpec("t", f"{__file__}:{tracker.__name__}", "T", settings=Online)
     (check,) = [c for c in tracker_report(spec, frames=4).checks if c.name == "online settings"]
-    assert check.status == status and re.search(words, check.message), check
+    assert check.status == status, check
+    assert re.search(words, check.message), check
 
 
 # The checks as tests of pytest, and what they find in broken flows and feature extractors.
@@ -447,7 +555,11 @@ SPEC = FlowSpec("still", f"{__file__}:build")
 
 PLUGINS = [
     *("-p", "no:cacheprovider", "-p", "no:xdist"),
-    *([] if entry_points(group="pytest11", name="dynslam-bench") else ["-p", "dynslam_bench.testing.pytest_plugin"]),
+    *(
+        []
+        if entry_points(group="pytest11", name="dynslam-bench")
+        else ["-p", "dynslam_bench.testing.pytest_plugin"]
+    ),
 ]
 """Where the distribution is installed, pytest finds the plug-in by itself."""
 
@@ -463,7 +575,8 @@ def test_each_check_of_a_plug_in_is_a_test(tmp_path: Path) -> None:
     assert re.search(r"still\.py:SPEC::determinism PASSED", out), out
     assert re.search(r"still\.py:SPEC::a small shift is found FAILED", out), out
     assert "xy are positions in the target, x first, not displacements" in out
-    assert "1 failed" in out and "INTERNALERROR" not in out
+    assert "1 failed" in out
+    assert "INTERNALERROR" not in out
 
 
 DATASET = """
@@ -482,14 +595,17 @@ EMPTY = DatasetSpec("nothing", f"{__file__}:build")
 def test_a_data_set_is_checked_by_the_sequence_that_it_lists(tmp_path: Path) -> None:
     (tmp_path / "corners.py").write_text(DATASET)
     report = report_on("sequence", f"{tmp_path / 'corners.py'}:SPEC")
-    assert {"protocol", "timestamps", "frames", "reading twice"} <= {check.name for check in report.checks}
+    assert {"protocol", "timestamps", "frames", "reading twice"} <= {
+        check.name for check in report.checks
+    }
     with pytest.raises(PluginError, match="the data set 'nothing' lists no sequence"):
         report_on("sequence", f"{tmp_path / 'corners.py'}:EMPTY")
 
 
 def test_an_unknown_subject_is_one_line(tmp_path: Path) -> None:
     ended = run_pytest(tmp_path, "--dynslam-flow", "dasiy")
-    assert ended.returncode == 4 and "--dynslam-flow: unknown flow 'dasiy'" in ended.stderr + ended.stdout
+    assert ended.returncode == 4
+    assert "--dynslam-flow: unknown flow 'dasiy'" in ended.stderr + ended.stdout
     assert "Traceback" not in ended.stderr + ended.stdout
 
 
@@ -515,7 +631,8 @@ class BadFlow:
         return prepared
 
     def track(self, reference, target, points, *, guess=None, seed=0):
-        xy, valid = points.copy(), np.isfinite(points).all(1) & (points >= 0).all(1) & (points < 600).all(1)
+        xy = points.copy()
+        valid = np.isfinite(points).all(1) & (points >= 0).all(1) & (points < 600).all(1)
         match self.fault:
             case "double":
                 xy = xy.astype(np.float64)
@@ -570,7 +687,9 @@ def test_an_extractor_that_breaks_the_contract_is_found(fault: str, message: str
 # What the program says is installed, and how to get what is not.
 
 
-def test_missing_packages_extras_and_weights_are_named_with_a_way_to_get_them(monkeypatch, tmp_path) -> None:
+def test_missing_packages_extras_and_weights_are_named_with_a_way_to_get_them(
+    monkeypatch, tmp_path
+) -> None:
     def version(name: str) -> str:
         if name in ("gtsam", "pandas"):
             raise metadata.PackageNotFoundError(name)
@@ -585,10 +704,16 @@ def test_missing_packages_extras_and_weights_are_named_with_a_way_to_get_them(mo
                    "tomli>=2; python_version < '3.11'"],
     )  # fmt: skip
     findings = {(finding.part, finding.name): finding for finding in examine()}
-    assert findings["package", "numpy"].state == "1.2.3" and not findings["package", "numpy"].missing
-    assert findings["package", "pandas"].missing and "pip install" in findings["package", "pandas"].hint
-    assert findings["extra", "gtsam"].hint == "pip install '.[gtsam]' in the checkout of dynslam-bench"
+    assert findings["package", "numpy"].state == "1.2.3"
+    assert not findings["package", "numpy"].missing
+    assert findings["package", "pandas"].missing
+    assert "pip install" in findings["package", "pandas"].hint
+    assert (
+        findings["extra", "gtsam"].hint == "pip install '.[gtsam]' in the checkout of dynslam-bench"
+    )
     assert ("extra", "lint") not in findings
     coco = findings["weights", "coco"]
-    assert coco.missing and "https://" in coco.hint and str(tmp_path) in coco.hint
+    assert coco.missing
+    assert "https://" in coco.hint
+    assert str(tmp_path) in coco.hint
     assert not findings["weights", "embedded"].missing

@@ -28,7 +28,11 @@ QUICK_DENSE = {
 
 def quick(settings: type[Settings]) -> dict[str, object]:
     """Overrides with which a system's flow costs little; none where it has no dense flow."""
-    return dict(QUICK_DENSE) if isinstance(getattr(settings(), "flow", None), DenseFlowSettings) else {}
+    return (
+        dict(QUICK_DENSE)
+        if isinstance(getattr(settings(), "flow", None), DenseFlowSettings)
+        else {}
+    )
 
 
 STRIDE = 3
@@ -45,7 +49,10 @@ class SmallScene:
     """
 
     def __init__(
-        self, name: str = "synthetic/walking_xyz?scene=103", frames: int = FRAMES, stride: int = STRIDE
+        self,
+        name: str = "synthetic/walking_xyz?scene=103",
+        frames: int = FRAMES,
+        stride: int = STRIDE,
     ) -> None:
         whole = open_sequence(f"{name}&frames={frames * stride}")
         self.id = whole.id
@@ -53,10 +60,17 @@ class SmallScene:
         self.frames = []
         self._masks = []
         for number in range(frames):
-            frame, masks = whole[number * stride], whole.masks[number * stride]
-            rgb = frame.rgb.reshape(self.camera.height, 2, self.camera.width, 2, 3).mean(axis=(1, 3))
-            self.frames.append(Frame(number, frame.timestamp, rgb.astype(np.uint8), frame.depth[::2, ::2].copy()))
-            self._masks.append(FrameMasks(masks.instances[::2, ::2].copy(), masks.class_names, masks.moving))
+            frame = whole[number * stride]
+            masks = whole.masks[number * stride]
+            rgb = frame.rgb.reshape(self.camera.height, 2, self.camera.width, 2, 3).mean(
+                axis=(1, 3)
+            )
+            self.frames.append(
+                Frame(number, frame.timestamp, rgb.astype(np.uint8), frame.depth[::2, ::2].copy())
+            )
+            self._masks.append(
+                FrameMasks(masks.instances[::2, ::2].copy(), masks.class_names, masks.moving)
+            )
 
     def __getitem__(self, index: int) -> FrameMasks:
         """The masks of a frame: the scene is its own `MaskSource`."""
@@ -87,8 +101,13 @@ SEGMENTER = SegmenterSpec("erring", f"{__file__}:build_erring")
 
 def settings_for(spec: TrackerSpec, **settings: object) -> Settings:
     """All settings of a tracker for the scene, with fewer features as its images are smaller."""
-    given: dict[str, object] = {"features.n_features": 500, "features.levels": 4} | quick(spec.settings)
-    if issubclass(spec.settings, SemanticSystemSettings) and spec.settings().segmentation.source == "auto":
+    given: dict[str, object] = {"features.n_features": 500, "features.levels": 4} | quick(
+        spec.settings
+    )
+    if (
+        issubclass(spec.settings, SemanticSystemSettings)
+        and spec.settings().segmentation.source == "auto"
+    ):
         given["segmentation.source"] = f"plugin:{__file__}:SEGMENTER"
         if "segmentation.dilation_px" in {each.name for each in parameters(spec.settings)}:
             given["segmentation.dilation_px"] = 4
@@ -97,7 +116,9 @@ def settings_for(spec: TrackerSpec, **settings: object) -> Settings:
 
 def construct(spec: TrackerSpec, scene: SmallScene, **settings: object):
     """A tracker for the scene."""
-    return build_tracker(spec, settings_for(spec, **settings), TrackerContext(sequence_id=scene.id, masks=scene))
+    return build_tracker(
+        spec, settings_for(spec, **settings), TrackerContext(sequence_id=scene.id, masks=scene)
+    )
 
 
 def play(

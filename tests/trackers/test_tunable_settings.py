@@ -1,7 +1,7 @@
 """Every tunable setting acts, and an online one acts in mid-episode as it does from the beginning.
 
-An episode that is configured before its first frame equals, bit for bit, that of a tracker built with those settings.
-After `reset` the settings that the tracker was built with are in force again.
+An episode that is configured before its first frame equals, bit for bit, that of a tracker built
+with those settings. After `reset` the settings that the tracker was built with are in force again.
 """
 
 import subprocess
@@ -18,7 +18,13 @@ import pytest
 from steering_scene import FRAMES, SmallScene, construct, difference, play, quick, settings_for
 
 from dynslam_bench.contracts import Frame, TrackResult
-from dynslam_bench.core.errors import DynslamError, SegmentationError, SequenceError, SettingsError, TrackerError
+from dynslam_bench.core.errors import (
+    DynslamError,
+    SegmentationError,
+    SequenceError,
+    SettingsError,
+    TrackerError,
+)
 from dynslam_bench.core.settings import (
     OnlineSettings,
     Parameter,
@@ -37,7 +43,9 @@ from dynslam_bench.trackers.registry import all_specs, resolve_settings
 from dynslam_bench.trackers.systems.composition import UnfilteredSystemSettings
 from dynslam_bench.tuning import SpaceSpec, search_space
 
-SYSTEMS = {spec.id: spec for spec in all_specs() if issubclass(spec.settings, UnfilteredSystemSettings)}
+SYSTEMS = {
+    spec.id: spec for spec in all_specs() if issubclass(spec.settings, UnfilteredSystemSettings)
+}
 SHORT = 3
 """Frames of the episodes in which all settings of a tracker change at once."""
 IDENTITY = {"orb-slam2-mono", "orb-slam2"}
@@ -97,9 +105,16 @@ MANY = {
     "backend.keyframes.view_share": 0.98,
 }
 """A keyframe nearly every frame."""
-JUDGED = ("emfoa-oft?masks=none&depth=none", {"epipolar.min_parallax_px": 0.0, "epipolar.parallax_share": 0.0})
+JUDGED = (
+    "emfoa-oft?masks=none&depth=none",
+    {"epipolar.min_parallax_px": 0.0, "epipolar.parallax_share": 0.0},
+)
 """F judges every frame."""
-BRISK = {"multiview.min_keyframes": 1, "multiview.max_variance": 1.0, "backend.keyframes.tracked_share": 1.0}
+BRISK = {
+    "multiview.min_keyframes": 1,
+    "multiview.max_variance": 1.0,
+    "backend.keyframes.tracked_share": 1.0,
+}
 """Depth is compared with keyframes from the second one on."""
 NETWORK = ("mask-rcnn", {"segmentation.source": "embedded"})
 CASES |= {
@@ -138,7 +153,9 @@ class Scene(SmallScene):
         super().__init__(frames=FRAMES)
         for number in (8, 9):
             frame = self.frames[number]
-            self.frames[number] = Frame(number, frame.timestamp, np.zeros_like(frame.rgb), np.zeros_like(frame.depth))
+            self.frames[number] = Frame(
+                number, frame.timestamp, np.zeros_like(frame.rgb), np.zeros_like(frame.depth)
+            )
 
 
 @pytest.fixture(scope="module")
@@ -167,7 +184,9 @@ def at_first(tracker, settings: Settings):
     return lambda number: tracker.configure(settings) if number == 0 else None
 
 
-def until_it_acts(unsteered: list[TrackResult], episode: Iterator[TrackResult]) -> list[TrackResult]:
+def until_it_acts(
+    unsteered: list[TrackResult], episode: Iterator[TrackResult]
+) -> list[TrackResult]:
     """An episode's results to the first that is not as unsteered; none if none differs."""
     results = []
     for before, result in zip(unsteered, episode, strict=True):
@@ -179,9 +198,12 @@ def until_it_acts(unsteered: list[TrackResult], episode: Iterator[TrackResult]) 
 
 def check_honest(spec, results: list[TrackResult], culling: list[TrackResult]) -> None:
     """What a system says of its frames is so, and in the episode `culling` it culls where it should."""
-    waiting = {"initialising"} if spec.sensors == "rgb" else set()  # until the camera has moved enough
+    # until the camera has moved enough
+    waiting = {"initialising"} if spec.sensors == "rgb" else set()
     assert {result.state for result in results} <= {"ok"} | waiting
-    assert len({frozenset(result.stats) for result in results[1:]}) == 1, "the same stats on every frame"
+    assert len({frozenset(result.stats) for result in results[1:]}) == 1, (
+        "the same stats on every frame"
+    )
     for result in results:
         assert np.isfinite(list(result.stats.values())).all()
         assert np.count_nonzero(~result.keypoints_keep) == result.stats["culled"]
@@ -190,11 +212,15 @@ def check_honest(spec, results: list[TrackResult], culling: list[TrackResult]) -
         assert culled == 0
     elif spec.id not in SLOW_STARTERS:
         degenerate = [result.stats.get("epipolar_degenerate") for result in results[1:]]
-        assert culled > 0 or set(degenerate) == {1.0}, "it culls, or says that the camera shows too little parallax"
+        assert culled > 0 or set(degenerate) == {1.0}, (
+            "it culls, or says that the camera shows too little parallax"
+        )
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
-def test_every_system_is_honest_and_all_its_settings_act_and_are_restored(name: str, scene: Scene, unsteered) -> None:
+def test_every_system_is_honest_and_all_its_settings_act_and_are_restored(
+    name: str, scene: Scene, unsteered
+) -> None:
     spec = SYSTEMS[name]
     tracker = construct(spec, scene)
     settings = settings_for(spec)
@@ -207,16 +233,25 @@ def test_every_system_is_honest_and_all_its_settings_act_and_are_restored(name: 
     static = list(play(construct(spec, scene, **ends), scene, SHORT))
     check_honest(spec, fresh, static if name in LATE else fresh)
     assert difference(fresh[:1], static[:1]), "the extremes do not act from the first frame on"
-    assert not difference(static, steered), "steered is not what building with the same values gives"
-    assert not difference(fresh[:2], play(tracker, scene, 2)), "reset() leaves something of the steered episode"
+    assert not difference(static, steered), (
+        "steered is not what building with the same values gives"
+    )
+    assert not difference(fresh[:2], play(tracker, scene, 2)), (
+        "reset() leaves something of the steered episode"
+    )
 
 
-@pytest.mark.parametrize("name", [name for name in OFFERED if name not in SHOWN_ALONE and "preprocessing" not in name])
+@pytest.mark.parametrize(
+    "name", [name for name in OFFERED if name not in SHOWN_ALONE and "preprocessing" not in name]
+)
 def test_every_setting_that_a_study_may_draw_acts(name: str, scene: Scene, unsteered) -> None:
     system, parameter = OFFERED[name]
     system, others = CASES.get(name, (system, {}))
-    frames = SHORT if quick(SYSTEMS[system].settings) else FRAMES  # dense flow costs ten times as much
-    ends = (parameter.high, parameter.low) if name in FROM_ABOVE else (parameter.low, parameter.high)
+    # dense flow costs ten times as much
+    frames = SHORT if quick(SYSTEMS[system].settings) else FRAMES
+    ends = (
+        (parameter.high, parameter.low) if name in FROM_ABOVE else (parameter.low, parameter.high)
+    )
     for value in parameter.choices or ends:
         if value == parameter.default:
             continue
@@ -252,11 +287,14 @@ def test_only_what_differs_is_handed_on() -> None:
     assert given == [("two", 2.0)]
     steering.restore()
     assert given[1:] == [("one", 1.0), ("two", 1.0)]
-    with pytest.raises(SettingsError, match=r"'two.value' of Whole is taken by no part .*configure\(settings\)"):
+    with pytest.raises(
+        SettingsError, match=r"'two.value' of Whole is taken by no part .*configure\(settings\)"
+    ):
         OnlineSettings(Whole(), takers[:1])
 
 
-# Systems without depth: they never read it, they are refused what takes it, and what they score says so.
+# Systems without depth: they never read it, they are refused what takes it, and what they score
+# says so.
 
 
 @pytest.fixture(scope="module")
@@ -264,16 +302,22 @@ def plain_scene():
     return SmallScene("synthetic/walking_xyz?scene=105")
 
 
-@pytest.mark.parametrize("tracker", [name for name, spec in SYSTEMS.items() if spec.sensors == "rgb"])
+@pytest.mark.parametrize(
+    "tracker", [name for name, spec in SYSTEMS.items() if spec.sensors == "rgb"]
+)
 def test_depth_is_never_read(plain_scene, tracker):
-    rng, wild = np.random.default_rng(0), copy(plain_scene)
+    rng = np.random.default_rng(0)
+    wild = copy(plain_scene)
     wild.frames = [
-        replace(frame, depth=rng.uniform(0.1, 9.0, frame.depth.shape).astype(np.float32)) for frame in wild.frames
+        replace(frame, depth=rng.uniform(0.1, 9.0, frame.depth.shape).astype(np.float32))
+        for frame in wild.frames
     ]
     spec = TRACKERS.get(tracker)
-    few = {"backend.two_views.min_matches": 40, "backend.two_views.min_points": 25}  # the images are small
+    # the images are small
+    few = {"backend.two_views.min_matches": 40, "backend.two_views.min_points": 25}
     true = list(play(construct(spec, plain_scene, **few), plain_scene))
-    if tracker == "orb-slam2-mono":  # masks that err leave the others too little of so small a room for a map
+    # masks that err leave the others too little of so small a room for a map
+    if tracker == "orb-slam2-mono":
         assert sum(result.state == "ok" for result in true) >= len(true) // 2
     else:
         assert sum(result.stats["culled"] for result in true) > 100
@@ -285,7 +329,9 @@ CACHED = 4
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory: pytest.TempPathFactory):
-    return open_synthetic(f"synthetic/walking_xyz?scene=5&frames={CACHED}", tmp_path_factory.mktemp("rendered"))
+    return open_synthetic(
+        f"synthetic/walking_xyz?scene=5&frames={CACHED}", tmp_path_factory.mktemp("rendered")
+    )
 
 
 def run(rendered, cache: Path | None, **settings: object):
@@ -307,15 +353,22 @@ def test_cached_runs_have_the_same_bits_and_load_no_network(
     def refuse(*_: object) -> None:
         raise AssertionError("a network was loaded although all masks are stored")
 
-    monkeypatch.setattr("dynslam_bench.segmentation.networks.mask_rcnn_segmenter.build_embedded", refuse)
-    warm, found = run(rendered, tmp_path, **{"epipolar.threshold_px": 2.0, "segmentation.confidence": 0.35})
+    monkeypatch.setattr(
+        "dynslam_bench.segmentation.networks.mask_rcnn_segmenter.build_embedded", refuse
+    )
+    warm, found = run(
+        rendered, tmp_path, **{"epipolar.threshold_px": 2.0, "segmentation.confidence": 0.35}
+    )
     again, _ = run(rendered, tmp_path)
     assert [result.stats["cached_stages"] for result in found] == [2.0] * CACHED
-    assert np.array_equal(plain, cold) and np.array_equal(plain, again)
+    assert np.array_equal(plain, cold)
+    assert np.array_equal(plain, again)
     assert warm.shape == plain.shape
     for before, after in zip(filled, found, strict=True):
         cost = before.timings["segmentation"]
-        assert after.timings["segmentation"] == pytest.approx(cost, rel=0.5), "told as what it costs, not the look-up"
+        assert after.timings["segmentation"] == pytest.approx(cost, rel=0.5), (
+            "told as what it costs, not the look-up"
+        )
 
 
 EXTRACTOR = """
@@ -355,12 +408,23 @@ for content in sys.argv[4:]:
 
 
 def test_an_edited_extractor_or_other_weights_get_no_old_keypoints(tmp_path: Path) -> None:
-    plugin, weights = tmp_path / "mine.py", tmp_path / "net.bin"
+    plugin = tmp_path / "mine.py"
+    weights = tmp_path / "net.bin"
 
     def ask(count: int, *contents: str) -> list[str]:
         plugin.write_text(EXTRACTOR.replace("COUNT", str(count)))
-        command = [sys.executable, "-c", ASK, f"{plugin}:SPEC", str(tmp_path / "cache"), str(weights), *contents]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+        command = [
+            sys.executable,
+            "-c",
+            ASK,
+            f"{plugin}:SPEC",
+            str(tmp_path / "cache"),
+            str(weights),
+            *contents,
+        ]
+        return subprocess.run(
+            command, capture_output=True, text=True, check=True
+        ).stdout.splitlines()
 
     assert ask(3, "one", "one") == ["3 False", "3 True"]
     assert ask(5, "one", "three") == ["5 False", "5 False"]
@@ -369,7 +433,9 @@ def test_an_edited_extractor_or_other_weights_get_no_old_keypoints(tmp_path: Pat
 def test_a_result_during_which_a_plug_in_reads_something_is_not_stored(tmp_path: Path) -> None:
     settings = FeatureSettings()
     digests = iter(["before", "after the weights were read", "after", "after"])
-    cached = CachedExtractor(build_extractor(settings), settings, StageCache(tmp_path), 1, lambda: next(digests))
+    cached = CachedExtractor(
+        build_extractor(settings), settings, StageCache(tmp_path), 1, lambda: next(digests)
+    )
     image = np.zeros((60, 60), np.uint8)
     cached.extract(image)
     assert not list(tmp_path.rglob("*.npz"))
@@ -385,21 +451,31 @@ def test_a_missing_file_is_an_error_at_once_with_the_cache_too(rendered, tmp_pat
 # The presets that ship: they fit, change something and act in a run.
 
 
-@pytest.mark.parametrize(("tracker", "name"), [(t.spec.id, name) for t in TRACKERS.all() for name in t.spec.presets])
+@pytest.mark.parametrize(
+    ("tracker", "name"), [(t.spec.id, name) for t in TRACKERS.all() for name in t.spec.presets]
+)
 def test_each_sets_something_else_than_the_default(tracker, name):
     spec = TRACKERS.get(tracker)
-    default, chosen = flatten(spec.settings()), flatten(resolve_settings(spec, spec.presets[name]))
+    default = flatten(spec.settings())
+    chosen = flatten(resolve_settings(spec, spec.presets[name]))
     changed = {key for key in chosen if chosen[key] != default[key]}
-    assert changed and changed <= set(spec.presets[name])
+    assert changed
+    assert changed <= set(spec.presets[name])
 
 
-@pytest.mark.parametrize(("more", "asked"), [({}, [1, 0, 1, 0, 1, 0, 1]), ({"crowded_share": 0.1}, [1] * 7)])
-def test_fast_asks_the_network_on_every_second_frame_but_where_people_cover_the_view(sitting, more, asked):
+@pytest.mark.parametrize(
+    ("more", "asked"), [({}, [1, 0, 1, 0, 1, 0, 1]), ({"crowded_share": 0.1}, [1] * 7)]
+)
+def test_fast_asks_the_network_on_every_second_frame_but_where_people_cover_the_view(
+    sitting, more, asked
+):
     settings = {"segmentation.source": "oracle", **TRACKERS.get("mask-rcnn").presets["fast"]}
     settings |= {f"segmentation.{name}": value for name, value in more.items()}
     tracker = build_tracker("mask-rcnn", settings, TrackerContext(sitting.id, masks=sitting.masks))
     tracker.reset(sitting.camera, rng=np.random.default_rng(0))
-    assert [tracker.track(sitting[index]).stats["segmented"] for index in range(len(asked))] == asked
+    assert [
+        tracker.track(sitting[index]).stats["segmented"] for index in range(len(asked))
+    ] == asked
 
 
 BAD = range(4, 9)
@@ -410,7 +486,9 @@ END = 13
 
 @pytest.fixture(scope="module")
 def sitting(tmp_path_factory: pytest.TempPathFactory):
-    return open_synthetic("synthetic/sitting_xyz?scene=2&frames=44", tmp_path_factory.mktemp("rendered"))
+    return open_synthetic(
+        "synthetic/sitting_xyz?scene=2&frames=44", tmp_path_factory.mktemp("rendered")
+    )
 
 
 def started(sitting, name: str = "orb-slam2"):
@@ -422,7 +500,8 @@ def started(sitting, name: str = "orb-slam2"):
 def track(sitting, change: Callable[[Frame], Frame], bad: range = BAD):
     """States, and for the tracked frames the distance in metres from the true camera centre, first pose aligned."""
     tracker = started(sitting)
-    states, error = [], {}
+    states = []
+    error = {}
     truth = sitting.ground_truth.T_world_cam
     for index in range(END):
         frame = sitting[index]
@@ -430,7 +509,9 @@ def track(sitting, change: Callable[[Frame], Frame], bad: range = BAD):
         states.append(result.state)
         assert result.T_world_cam is None or np.isfinite(result.T_world_cam).all()
         if result.state == "ok":
-            error[index] = float(np.linalg.norm((truth[0] @ result.T_world_cam - truth[index])[:3, 3]))
+            error[index] = float(
+                np.linalg.norm((truth[0] @ result.T_world_cam - truth[index])[:3, 3])
+            )
     assert max(error.values()) < 0.05
     return states
 
@@ -461,16 +542,20 @@ def test_without_depth_for_a_while_it_tracks_on_or_says_lost(sitting) -> None:
 def test_a_sudden_turn_is_no_translation(sitting, degrees: int) -> None:
     """From rest, one frame later turned: a chance agreement within the search window must not pass for the pose."""
     tracker = started(sitting)
-    frame, matrix = sitting[5], sitting.camera.matrix
+    frame = sitting[5]
+    matrix = sitting.camera.matrix
     for index in range(3):
         tracker.track(replace(frame, index=index, timestamp=index / 30))
     rotation = cv2.Rodrigues(np.array([0, np.deg2rad(degrees), 0]))[0]
-    warp, size = matrix @ rotation @ np.linalg.inv(matrix), (sitting.camera.width, sitting.camera.height)
+    warp = matrix @ rotation @ np.linalg.inv(matrix)
+    size = (sitting.camera.width, sitting.camera.height)
     turned = Frame(
         3,
         0.1,
         np.asarray(cv2.warpPerspective(frame.rgb, warp, size), np.uint8),
-        np.asarray(cv2.warpPerspective(frame.depth, warp, size, flags=cv2.INTER_NEAREST), np.float32),
+        np.asarray(
+            cv2.warpPerspective(frame.depth, warp, size, flags=cv2.INTER_NEAREST), np.float32
+        ),
     )
     result = tracker.track(turned)
     assert result.state == "lost" or np.linalg.norm(result.T_world_cam[:3, 3]) < 0.02
@@ -497,7 +582,10 @@ def test_frames_of_another_kind_are_refused_in_one_line(sitting) -> None:
     frame = sitting[0]
     for wrong, text in (
         (replace(frame, rgb=frame.rgb / 255.0), r"colour of type float64 .*uint8"),
-        (replace(frame, depth=(1000 * frame.depth).astype(np.uint16)), r"depth of type uint16 .*float32, in metres"),
+        (
+            replace(frame, depth=(1000 * frame.depth).astype(np.uint16)),
+            r"depth of type uint16 .*float32, in metres",
+        ),
         (replace(frame, depth=None), r"depth of type object"),
         (replace(frame, timestamp=float("inf")), r"timestamp inf"),
     ):
@@ -508,12 +596,20 @@ def test_frames_of_another_kind_are_refused_in_one_line(sitting) -> None:
 def test_missing_depth_is_missing_however_it_is_written_and_buffers_may_be_reused(sitting) -> None:
     def poses(missing: float, *, reuse: bool) -> bytes:
         tracker = started(sitting, "emfoa-oft?masks=none")
-        found, buffer = [], np.empty_like(sitting[0].depth)
+        buffer = np.empty_like(sitting[0].depth)
+        found = []
         for index in range(5):
             frame = sitting[index]
             depth = np.where(frame.depth > 0, frame.depth, missing).astype(np.float32)
             buffer[:] = depth
-            found.append(tracker.track(replace(frame, depth=buffer if reuse else depth)).T_world_cam)
+            found.append(
+                tracker.track(replace(frame, depth=buffer if reuse else depth)).T_world_cam
+            )
         return np.array(found).tobytes()
 
-    assert poses(0.0, reuse=False) == poses(np.inf, reuse=False) == poses(np.nan, reuse=False) == poses(0.0, reuse=True)
+    assert (
+        poses(0.0, reuse=False)
+        == poses(np.inf, reuse=False)
+        == poses(np.nan, reuse=False)
+        == poses(0.0, reuse=True)
+    )

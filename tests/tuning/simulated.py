@@ -20,10 +20,8 @@ from dynslam_bench.tuning.plan import Design, design_of
 from dynslam_bench.tuning.storage import open_storage
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
-TUNE, HELD_OUT = (
-    "synthetic/walking_xyz?scene=0-11&frames=20&offsets=0-1",
-    "synthetic/walking_xyz?scene=100-107&frames=20&offsets=0-2",
-)
+TUNE = "synthetic/walking_xyz?scene=0-11&frames=20&offsets=0-1"
+HELD_OUT = "synthetic/walking_xyz?scene=100-107&frames=20&offsets=0-2"
 STARTS_SD = 0.28
 """Standard deviation of the log ratio of two runs in one scene: measured 0.24 to 0.31 for real trackers."""
 SCENES_SD = 0.15
@@ -71,14 +69,24 @@ class SimulatedTuner(Study):
     """
 
     def __init__(
-        self, spec: StudySpec, results: Path, *, effect: Effect = nothing, seed: int = 0, in_memory: bool = True
+        self,
+        spec: StudySpec,
+        results: Path,
+        *,
+        effect: Effect = nothing,
+        seed: int = 0,
+        in_memory: bool = True,
     ) -> None:
-        self.effect, self.noise_seed, self._made = effect, seed, set[tuple[str, ProblemInstance]]()
+        self._made = set[tuple[str, ProblemInstance]]()
+        self.effect = effect
+        self.noise_seed = seed
         with (
             _PATCHING,
             patch.multiple(
                 "dynslam_bench.tuning.study",
-                open_storage=(lambda *_: optuna.storages.InMemoryStorage()) if in_memory else open_storage,
+                open_storage=(lambda *_: optuna.storages.InMemoryStorage())
+                if in_memory
+                else open_storage,
                 design_of=simulated_design,
             ),
             patch("dynslam_bench.tuning.plan.design_of", simulated_design),
@@ -103,14 +111,20 @@ class SimulatedTuner(Study):
         who = digest({**self.base, **settings})
         self._made |= {(who, instance) for instance in instances}
         return {
-            instance: Outcome(instance, "", self._error(who, settings, instance), 1.0, 0.03, 0.03, 1.0)
+            instance: Outcome(
+                instance, "", self._error(who, settings, instance), 1.0, 0.03, 0.03, 1.0
+            )
             for instance in instances
         }
 
     def _error(self, who: str, settings: Mapping[str, Any], instance: ProblemInstance) -> float:
         scene = stream(self.noise_seed, "scene", instance.scene).normal(0, 0.5)
-        own = stream(self.noise_seed, "own", who, instance.scene).normal(0, SCENES_SD / math.sqrt(2))
-        start = stream(self.noise_seed, "start", who, str(instance)).normal(0, STARTS_SD / math.sqrt(2))
+        own = stream(self.noise_seed, "own", who, instance.scene).normal(
+            0, SCENES_SD / math.sqrt(2)
+        )
+        start = stream(self.noise_seed, "start", who, str(instance)).normal(
+            0, STARTS_SD / math.sqrt(2)
+        )
         return math.exp(math.log(0.03) + scene + self.effect(settings) + own + start)
 
 
@@ -119,6 +133,8 @@ def simulated_design(spec: StudySpec, *, further: int = 0) -> Design:
 
 
 @cache
-def _design(tune: tuple[str, ...], confirm: tuple[str, ...], held_out: tuple[str, ...], further: int) -> Design:
+def _design(
+    tune: tuple[str, ...], confirm: tuple[str, ...], held_out: tuple[str, ...], further: int
+) -> Design:
     """Opening the sequences takes longer than a study here."""
     return design_of(make_spec(tune=tune, confirm=confirm, held_out=held_out), further=further)

@@ -23,9 +23,24 @@ from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.sequences.view import part_of
 from dynslam_bench.trackers import TRACKERS
-from dynslam_bench.tuning import Plan, Study, StudySpec, Verdict, finish, read_preset_text, run_study, write_page
+from dynslam_bench.tuning import (
+    Plan,
+    Study,
+    StudySpec,
+    Verdict,
+    finish,
+    read_preset_text,
+    run_study,
+    write_page,
+)
 from dynslam_bench.tuning.objectives import InstanceFailedError
-from dynslam_bench.tuning.plan import check_splits, design_of, seen_note, splits_seen, with_more_starts
+from dynslam_bench.tuning.plan import (
+    check_splits,
+    design_of,
+    seen_note,
+    splits_seen,
+    with_more_starts,
+)
 from dynslam_bench.tuning.storage import EARLIER, best_trials, importances
 from dynslam_bench.tuning.study_file import (
     ProblemInstance,
@@ -37,22 +52,35 @@ from dynslam_bench.tuning.study_file import (
 
 
 def make(folders: list[str], **changes: object) -> StudySpec:
-    return toy_spec(**{"tune": folders[:1], "confirm": folders[1:4], "held_out": folders[4:]} | changes)
+    return toy_spec(
+        **{"tune": folders[:1], "confirm": folders[1:4], "held_out": folders[4:]} | changes
+    )
 
 
 def check(tune: list[str], held_out: list[str]) -> None:
     study = toy_spec(tune=tune, held_out=held_out)
-    check_splits(study.name, {"tune": study.instances(*study.tune), "held_out": study.instances(*study.held_out)})
+    check_splits(
+        study.name,
+        {"tune": study.instances(*study.tune), "held_out": study.instances(*study.held_out)},
+    )
 
 
-def test_a_preview_takes_what_stored_runs_show_and_else_what_is_known(folders: list[str], tmp_path: Path) -> None:
+def test_a_preview_takes_what_stored_runs_show_and_else_what_is_known(
+    folders: list[str], tmp_path: Path
+) -> None:
     before = Plan(make(folders), tmp_path).preview()
-    assert before.runs == 0 and before.spread == pytest.approx(simulated.STARTS_SD, abs=0.05) and before.scenes == 3
+    assert before.runs == 0
+    assert before.spread == pytest.approx(simulated.STARTS_SD, abs=0.05)
+    assert before.scenes == 3
     assert not (tmp_path / "studies").exists(), "looking makes no study"
     run_study(make(folders), results=tmp_path)
     after = Plan(make(folders), tmp_path).preview(jobs=2)
-    assert after.runs == 3 and after.spread != before.spread and after.minutes != before.minutes
-    assert after.unused == {} and "10 %" in after.figures[0] and "3 stored runs" in after.figures[0]
+    assert after.runs == 3
+    assert after.spread != before.spread
+    assert after.minutes != before.minutes
+    assert after.unused == {}
+    assert "10 %" in after.figures[0]
+    assert "3 stored runs" in after.figures[0]
 
 
 def test_a_preview_names_the_settings_of_parts_that_decide_nothing(tmp_path: Path) -> None:
@@ -67,9 +95,13 @@ def test_a_preview_names_the_settings_of_parts_that_decide_nothing(tmp_path: Pat
     Study(spec, tmp_path).reference()
     preview = plan.preview()
     assert {name.split(".")[0] for name in preview.unused} == {"epipolar"}
-    assert preview.include == ["features.fast_threshold"] and preview.include[0] in preview.proposal[-1]
+    assert preview.include == ["features.fast_threshold"]
+    assert preview.include[0] in preview.proposal[-1]
     alone = spec.model_copy(update={"space": SpaceSpec(include=("epipolar.*",))})
-    assert Plan(alone, tmp_path).preview().proposal[-1] == "Nothing would be left of the space without them."
+    assert (
+        Plan(alone, tmp_path).preview().proposal[-1]
+        == "Nothing would be left of the space without them."
+    )
 
 
 def test_ratios_are_to_the_baseline_and_the_default_stands_beside(tmp_path: Path) -> None:
@@ -78,27 +110,35 @@ def test_ratios_are_to_the_baseline_and_the_default_stands_beside(tmp_path: Path
     spec = make_spec(baseline=str(preset), space={"include": ["gain"], "fixed": {"mode": "fine"}})
     tuner = SimulatedTuner(spec, tmp_path, effect=valley).run()
     assert tuner.study.get_trials()[0].params == {"gain": 3.0}, "trial 0 is the baseline"
-    assert tuner.configuration_of(tuner.study.get_trials()[1]).settings["wobble"] == 0, "trials build on it"
+    assert tuner.configuration_of(tuner.study.get_trials()[1]).settings["wobble"] == 0, (
+        "trials build on it"
+    )
     summary = finish(tuner)
-    assert set(summary.shipped) == {"confirm", "held_out"} and summary.baseline == str(preset)
+    assert set(summary.shipped) == {"confirm", "held_out"}
+    assert summary.baseline == str(preset)
     assert summary.shipped["held_out"].ratio == pytest.approx(math.exp(valley({}) - 1.5), abs=0.1)
     assert summary.verdict == Verdict.PROVEN
     best = tuner.folder / "best.toml"
     assert read_settings(best) == {**summary.candidates[0].params, "wobble": 0}
-    assert 'status = "proven"' in best.read_text() and "default settings" in write_page(tuner, summary).read_text()
+    assert 'status = "proven"' in best.read_text()
+    assert "default settings" in write_page(tuner, summary).read_text()
 
 
 def test_the_baseline_may_be_another_tracker(folders: list[str], tmp_path: Path) -> None:
     spec = make(folders, baseline="never-move", confirm=folders[1:2], held_out=[])
     summary = finish(run_study(spec, results=tmp_path))
-    assert summary.baseline == "never-move" and summary.shipped["confirm"].ratio < 1
-    assert 0 in {candidate.trial for candidate in summary.candidates}, "the default settings compete with it"
+    assert summary.baseline == "never-move"
+    assert summary.shipped["confirm"].ratio < 1
+    assert 0 in {candidate.trial for candidate in summary.candidates}, (
+        "the default settings compete with it"
+    )
     with pytest.raises(StudyError, match="stored with other baseline"):
         Study(spec.model_copy(update={"baseline": ""}), tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("baseline", "named"), [("nobody", "unknown tracker"), ("none.toml", "none.toml"), ("far.toml", "'gain' is 99")]
+    ("baseline", "named"),
+    [("nobody", "unknown tracker"), ("none.toml", "none.toml"), ("far.toml", "'gain' is 99")],
 )
 def test_a_baseline_that_cannot_be_is_one_clear_line(
     baseline: str, named: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -117,26 +157,46 @@ def earlier(tmp_path: Path) -> Study:
 
 
 def test_a_study_begins_with_what_an_earlier_one_learnt(earlier: Study, tmp_path: Path) -> None:
-    spec = make_spec(name="second", trials=5, pruner="none", start=[str(earlier.folder), {"gain": 0.9}])
-    tuner, resumed = (SimulatedTuner(spec, tmp_path, effect=valley, in_memory=False) for _ in range(2))
+    spec = make_spec(
+        name="second", trials=5, pruner="none", start=[str(earlier.folder), {"gain": 0.9}]
+    )
+    tuner, resumed = (
+        SimulatedTuner(spec, tmp_path, effect=valley, in_memory=False) for _ in range(2)
+    )
     trials = tuner.run().study.get_trials()
     taken = [trial for trial in trials if EARLIER in trial.user_attrs]
     own = [trial for trial in trials if trial not in taken]
-    assert len(taken) == 8 and {trial.user_attrs[EARLIER] for trial in taken} == {"study first"}
-    assert len(own) == 5 and own[0].params == {"gain": 1.5, "wobble": 2}
+    assert len(taken) == 8
+    assert {trial.user_attrs[EARLIER] for trial in taken} == {"study first"}
+    assert len(own) == 5
+    assert own[0].params == {"gain": 1.5, "wobble": 2}
     tried = [trial.params for trial in own[1:4]]
-    assert {"gain": 0.9, "wobble": 2} in tried and all(trial.params in tried for trial in best_trials(earlier.study, 2))
-    assert not any(trial in taken for trial in best_trials(tuner.study, 9)), "an earlier trial is no candidate"
-    assert importances(tuner.study) == {} and len(resumed.run().study.get_trials()) == len(trials)
+    assert {"gain": 0.9, "wobble": 2} in tried
+    assert all(trial.params in tried for trial in best_trials(earlier.study, 2))
+    assert not any(trial in taken for trial in best_trials(tuner.study, 9)), (
+        "an earlier trial is no candidate"
+    )
+    assert importances(tuner.study) == {}
+    assert len(resumed.run().study.get_trials()) == len(trials)
 
 
-def test_trials_of_other_code_are_marked(earlier: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trials_of_other_code_are_marked(
+    earlier: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(SimulatedTuner, "_identify", lambda self: {"code": "newer"})
-    tuner = SimulatedTuner(make_spec(name="second", start=[str(earlier.folder)]), tmp_path, in_memory=False)
-    marks = {trial.user_attrs[EARLIER] for trial in tuner.study.get_trials() if EARLIER in trial.user_attrs}
+    tuner = SimulatedTuner(
+        make_spec(name="second", start=[str(earlier.folder)]), tmp_path, in_memory=False
+    )
+    marks = {
+        trial.user_attrs[EARLIER]
+        for trial in tuner.study.get_trials()
+        if EARLIER in trial.user_attrs
+    }
     assert marks == {"study first, other code"}
     with pytest.raises(StudyError, match="'first' has other objectives"):
-        SimulatedTuner(make_spec(name="third", start=[str(earlier.folder)], objectives=["speed"]), tmp_path)
+        SimulatedTuner(
+            make_spec(name="third", start=[str(earlier.folder)], objectives=["speed"]), tmp_path
+        )
     with pytest.raises(StudyError, match="holds no study"):
         SimulatedTuner(make_spec(name="third", start=[str(tmp_path)]), tmp_path)
 
@@ -149,7 +209,9 @@ def test_trials_may_be_asked_for_and_told_one_by_one(tmp_path: Path) -> None:
         evaluation = tuner.evaluate(trials[-1])
         tuner.tell(trials[-1], evaluation)
         assert evaluation.state == TrialState.COMPLETE
-    assert [trial.params["gain"] for trial in trials] == [1.5, 1.0, 2.0], "the baseline is the first"
+    assert [trial.params["gain"] for trial in trials] == [1.5, 1.0, 2.0], (
+        "the baseline is the first"
+    )
     assert len(tuner.run().study.get_trials()) == 12, "the rest follows, with those that wait"
     with pytest.raises(StudyError, match="gain = 99"):
         tuner.ask({"gain": 99.0})
@@ -169,21 +231,27 @@ def test_an_extended_study_goes_on_with_more_scenes_and_trials(tmp_path: Path) -
 
 
 def test_any_trial_is_a_preset(tmp_path: Path) -> None:
-    spec, own = make_spec(trials=16, pruner="halving"), tmp_path / "own.toml"
+    spec = make_spec(trials=16, pruner="halving")
+    own = tmp_path / "own.toml"
     tuner = SimulatedTuner(spec, tmp_path, effect=valley, in_memory=False).run()
     for state in (TrialState.COMPLETE, TrialState.PRUNED):
         trial = tuner.study.get_trials(states=(state,))[-1]
         own.write_text(read_preset_text(spec, tmp_path, trial=trial.number))
-        assert read_settings(own) == trial.params and 'status = "not judged"' in own.read_text()
+        assert read_settings(own) == trial.params
+        assert 'status = "not judged"' in own.read_text()
     with pytest.raises(StudyError, match="no trial 99"):
         read_preset_text(spec, tmp_path, trial=99)
 
 
 def test_a_study_whose_trials_all_fail_is_not_judged(folders: list[str], tmp_path: Path) -> None:
-    tuner = run_study(make(folders, start=[{"mode": "crash"}], space={"include": ["mode"]}), results=tmp_path)
+    tuner = run_study(
+        make(folders, start=[{"mode": "crash"}], space={"include": ["mode"]}), results=tmp_path
+    )
     summary = finish(tuner)
-    assert summary.verdict == Verdict.NOT_JUDGED and "no trial with other settings" in summary.conclusion
-    assert read_settings(tuner.folder / "best.toml") == {} and write_page(tuner, summary).is_file()
+    assert summary.verdict == Verdict.NOT_JUDGED
+    assert "no trial with other settings" in summary.conclusion
+    assert read_settings(tuner.folder / "best.toml") == {}
+    assert write_page(tuner, summary).is_file()
 
 
 def test_one_recording_alone_is_not_judged(
@@ -191,28 +259,41 @@ def test_one_recording_alone_is_not_judged(
 ) -> None:
     tuner = run_study(make(folders, confirm=[], held_out=[], trials=3), results=tmp_path)
     summary = finish(tuner)
-    assert summary.verdict == Verdict.NOT_JUDGED and "no frames are left" in summary.conclusion
-    assert summary.best is not None and summary.best.confirm is None and summary.p_value is None
+    assert summary.verdict == Verdict.NOT_JUDGED
+    assert "no frames are left" in summary.conclusion
+    assert summary.best is not None
+    assert summary.best.confirm is None
+    assert summary.p_value is None
     page = write_page(tuner, summary).read_text()
-    assert summary.conclusion in page and "not recommended: not judged" in page
+    assert summary.conclusion in page
+    assert "not recommended: not judged" in page
     status(tuner.folder)
     assert "no frames are left" in " ".join(capsys.readouterr().out.split())
     with pytest.raises(StudyError, match="scenes can be made of rendered sequences alone"):
         tuner.extend(scenes=1)
 
 
-def test_scenes_of_uneven_lengths_and_starts_count_alike(folders: list[str], tmp_path: Path) -> None:
-    uneven = [f"{folders[0]}?offsets=0-2", f"{folders[1]}[0:8]", f"{folders[2]}?stride=2&offsets=0,3"]
+def test_scenes_of_uneven_lengths_and_starts_count_alike(
+    folders: list[str], tmp_path: Path
+) -> None:
+    uneven = [
+        f"{folders[0]}?offsets=0-2",
+        f"{folders[1]}[0:8]",
+        f"{folders[2]}?stride=2&offsets=0,3",
+    ]
     spec = make(folders, tune=uneven, confirm=folders[3:4], held_out=[])
     trial = run_study(spec, results=tmp_path).study.get_trials()[1]
-    assert len(trial.user_attrs["instances"]) == 6 and len(trial.user_attrs["scenes"]) == 3
+    assert len(trial.user_attrs["instances"]) == 6
+    assert len(trial.user_attrs["scenes"]) == 3
     assert trial.value == pytest.approx(sum(trial.user_attrs["scenes"].values()) / 3)
 
 
 class CrashingBaseline(SimulatedTuner):
     """Its baseline crashes on the scenes of the choice."""
 
-    def outcomes(self, settings: Mapping[str, Any], instances: Sequence[ProblemInstance], **how: Any) -> Any:
+    def outcomes(
+        self, settings: Mapping[str, Any], instances: Sequence[ProblemInstance], **how: Any
+    ) -> Any:
         if not settings and set(instances) & set(self.design.confirm):
             raise InstanceFailedError(f"{instances[0]}: crashed: it broke")
         return super().outcomes(settings, instances, **how)
@@ -227,7 +308,9 @@ def test_a_baseline_that_crashes_where_it_judges_is_one_clear_line(tmp_path: Pat
 WALK = "synthetic/walking_xyz"
 
 
-@pytest.mark.parametrize("other", ["?scene=0", "?scene=000", "@0", "?scene=0&frames=50", "?frames=10&noise=3", ""])
+@pytest.mark.parametrize(
+    "other", ["?scene=0", "?scene=000", "@0", "?scene=0&frames=50", "?frames=10&noise=3", ""]
+)
 def test_rendered_sequences_overlap_in_every_spelling(other: str) -> None:
     with pytest.raises(StudyError, match=r"^[^\n]*are the same sequence") as caught:
         check([WALK], [f"{WALK}{other}"])
@@ -237,16 +320,21 @@ def test_rendered_sequences_overlap_in_every_spelling(other: str) -> None:
 def test_a_copy_is_the_same_recording(tmp_path: Path) -> None:
     whole = str(toy_tracker.make_sequence(tmp_path / "whole", 0.3))
     copy = str(shutil.copytree(whole, tmp_path / "copy"))
-    for tune, held_out, named in (([whole], [copy], "same sequence"), ([whole, copy], [], "same frames")):
+    for tune, held_out, named in (
+        ([whole], [copy], "same sequence"),
+        ([whole, copy], [], "same frames"),
+    ):
         with pytest.raises(StudyError, match=f"are the {named}") as caught:
             check(tune, held_out)
-        assert whole in str(caught.value) and copy in str(caught.value)
+        assert whole in str(caught.value)
+        assert copy in str(caught.value)
 
 
 def disguised(whole: Path, copy: Path, how: str) -> Path:
     """A copy of a toy recording: renamed, shifted, re-encoded, beginning later, seen from elsewhere."""
     shutil.copytree(whole, copy)
-    shift, dropped = 1000.013 * (how == "shifted"), 5 * (how == "later")
+    shift = 1000.013 * (how == "shifted")
+    dropped = 5 * (how == "later")
     for kind in ("rgb", "depth", "groundtruth"):
         lines = [line.split() for line in (copy / f"{kind}.txt").read_text().splitlines()[dropped:]]
         for words in lines:
@@ -267,7 +355,9 @@ def disguised(whole: Path, copy: Path, how: str) -> Path:
 def test_a_copy_in_disguise_is_the_same_recording(tmp_path: Path, how: str) -> None:
     whole = toy_tracker.make_sequence(tmp_path / "whole", 0.3, 24)
     copy = disguised(whole, tmp_path / "copy", how)
-    assert part_of(open_sequence(str(copy))).scene != part_of(open_sequence(str(whole))).scene, "digests alone pass it"
+    assert part_of(open_sequence(str(copy))).scene != part_of(open_sequence(str(whole))).scene, (
+        "digests alone pass it"
+    )
     for pair in ((whole, copy), (copy, whole)):
         with pytest.raises(StudyError, match="are the same sequence"):
             check(*([str(folder)] for folder in pair))
@@ -303,30 +393,43 @@ def test_the_catalogues_split_is_enforced(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("source", "seen"), [("auto", ["tune", "confirm"]), ("embedded", ["tune", "confirm"]), ("oracle", [])]
+    ("source", "seen"),
+    [("auto", ["tune", "confirm"]), ("embedded", ["tune", "confirm"]), ("oracle", [])],
 )
 def test_the_embedded_network_alone_was_trained_on_the_scenes(source: str, seen: list[str]) -> None:
     design = simulated.simulated_design(make_spec())
-    settings = apply_overrides(TRACKERS.get("mask-rcnn").settings(), {"segmentation.source": source})
+    settings = apply_overrides(
+        TRACKERS.get("mask-rcnn").settings(), {"segmentation.source": source}
+    )
     assert splits_seen(settings, design) == seen
     assert splits_seen(TRACKERS.get(TRACKER).settings(), design) == [], "a system without masks"
 
 
 @pytest.mark.parametrize("masks", [True, False])
 def test_page_summary_and_preset_mark_scenes_of_the_training(masks: bool, tmp_path: Path) -> None:
-    changes = {"tracker": "mask-rcnn", "space": {"include": ["features.n_features"]}} if masks else {}
+    changes = (
+        {"tracker": "mask-rcnn", "space": {"include": ["features.n_features"]}} if masks else {}
+    )
     tuner = SimulatedTuner(make_spec(trials=3, **changes), tmp_path).run()
     summary = finish(tuner)
-    assert summary.seen == (["tune", "confirm"] if masks else []) and bool(seen_note(summary.seen)) == masks
-    page, preset = write_page(tuner, summary).read_text(), (tuner.folder / "best.toml").read_text()
-    assert ("in the trial §" in page, "unseen instances §" in page, "held-out §" in page) == (masks, masks, False)
-    assert page.count("trained on those very scenes") >= 3 * masks and ("trained on" in preset) == masks
+    assert summary.seen == (["tune", "confirm"] if masks else [])
+    assert bool(seen_note(summary.seen)) == masks
+    page = write_page(tuner, summary).read_text()
+    preset = (tuner.folder / "best.toml").read_text()
+    assert ("in the trial §" in page, "unseen instances §" in page, "held-out §" in page) == (
+        masks,
+        masks,
+        False,
+    )
+    assert page.count("trained on those very scenes") >= 3 * masks
+    assert ("trained on" in preset) == masks
 
 
 def test_a_text_names_scenes_lengths_and_starts() -> None:
     instances = parse_instances(f"{WALK}?scene=0-1,7&frames=80&offsets=0-4")
     assert instances[0] == ProblemInstance(f"{WALK}?scene=0&frames=80")
-    assert len(instances) == 15 and instances[-1] == ProblemInstance(f"{WALK}?scene=7&frames=80", offset=4)
+    assert len(instances) == 15
+    assert instances[-1] == ProblemInstance(f"{WALK}?scene=7&frames=80", offset=4)
     assert list(scenes(instances)) == [f"{WALK}?scene=0", f"{WALK}?scene=1", f"{WALK}?scene=7"]
 
 
@@ -336,14 +439,19 @@ def test_a_text_names_scenes_lengths_and_starts() -> None:
 ])  # fmt: skip
 def test_the_text_of_an_instance_names_it(text: str) -> None:
     instances = parse_instances(text)
-    assert [parse_instances(str(instance)) for instance in instances] == [(instance,) for instance in instances] != []
+    assert (
+        [parse_instances(str(instance)) for instance in instances]
+        == [(instance,) for instance in instances]
+        != []
+    )
 
 
 def test_parts_strides_and_degradation_reach_the_run() -> None:
     (instance,) = parse_instances("bonn/crowd[20:120]?offsets=3&stride=2&degrade=blur:0.5&seeds=4")
     run = instance.run_spec("orb-slam2", threads=2)
     assert (run.frames, run.offset, run.stride, run.seed, run.threads) == ((20, 120), 3, 2, 4, 2)
-    assert run.degrade == {"blur": 0.5} and parse_instances("bonn/crowd?frames=120")[0].frames == (0, 120)
+    assert run.degrade == {"blur": 0.5}
+    assert parse_instances("bonn/crowd?frames=120")[0].frames == (0, 120)
 
 
 @pytest.mark.parametrize(
@@ -387,7 +495,8 @@ def test_instances_are_measured_against_their_sequence(folder: str) -> None:
 
 
 def test_instances_of_one_recording_are_apart_or_repeats(folder: str) -> None:
-    one, later = ProblemInstance(folder, (0, 6)), ProblemInstance(folder, (6, 12))
+    one = ProblemInstance(folder, (0, 6))
+    later = ProblemInstance(folder, (6, 12))
     check_splits("s", {"tune": [one, replace(one, offset=1), later]})
     for instances, named in (
         ([one, ProblemInstance(folder, (4, 12))], "share 2 frames"),
@@ -402,26 +511,42 @@ def test_instances_of_one_recording_are_apart_or_repeats(folder: str) -> None:
 
 def test_the_baseline_runs_from_three_starts() -> None:
     few = parse_instances(f"{WALK}?scene=0-3&frames=20&offsets=0,3")
-    first = [instance.offset for instance in with_more_starts(few) if instance.scene.endswith("?scene=0")]
+    first = [
+        instance.offset for instance in with_more_starts(few) if instance.scene.endswith("?scene=0")
+    ]
     assert sorted(first) == [0, 1, 3]
 
 
 @pytest.mark.parametrize(("scenes_to_tune_on", "reserved"), [(1, 18), (11, 18), (40, 20)])
 def test_the_choice_is_made_on_further_scenes(scenes_to_tune_on: int, reserved: int) -> None:
-    design = design_of(StudySpec(name="s", tune=(f"{WALK}?scene=0-{scenes_to_tune_on - 1}&frames=20",), recorded=()))
-    confirm, tuned = scenes(design.confirm).keys(), scenes(design.tune).keys()
-    assert (len(tuned), len(confirm)) == (scenes_to_tune_on, reserved) and not confirm & tuned
+    design = design_of(
+        StudySpec(
+            name="s", tune=(f"{WALK}?scene=0-{scenes_to_tune_on - 1}&frames=20",), recorded=()
+        )
+    )
+    confirm = scenes(design.confirm).keys()
+    tuned = scenes(design.tune).keys()
+    assert (len(tuned), len(confirm)) == (scenes_to_tune_on, reserved)
+    assert not confirm & tuned
     assert len(scenes(design.tune[:scenes_to_tune_on])) == scenes_to_tune_on, "in turn"
     assert {instance.offset for instance in design.confirm} == {0, 3}
 
 
 def test_further_scenes_are_of_all_sequences_in_turn_and_of_their_split() -> None:
-    tune = (f"{WALK}?scene=0-1&frames=20&offsets=0", "synthetic/sitting_xyz?scene=5&frames=20&offsets=2&seeds=3")
+    tune = (
+        f"{WALK}?scene=0-1&frames=20&offsets=0",
+        "synthetic/sitting_xyz?scene=5&frames=20&offsets=2&seeds=3",
+    )
     spec = StudySpec(name="s", tune=tune, confirm=(tune[0].replace("0-1", "7"),), recorded=(),
                      held_out=(f"{WALK}?scene=100-101&frames=20&offsets=0",))  # fmt: skip
     design = design_of(spec, further=2)
     assert [instance.scene.rpartition("=")[2] for instance in design.confirm] == ["7", "2", "3"]
-    assert [instance.scene.rpartition("=")[2] for instance in design.held_out] == ["100", "101", "102", "103"]
+    assert [instance.scene.rpartition("=")[2] for instance in design.held_out] == [
+        "100",
+        "101",
+        "102",
+        "103",
+    ]
     added = further_scenes(spec.instances(*tune), 2, set(), range(3, 9))
     assert [str(instance) for instance in added] == [
         f"{WALK}?scene=3&frames=20&offsets=0", "synthetic/sitting_xyz?scene=3&frames=20&offsets=2&seeds=3"
@@ -432,7 +557,9 @@ def test_further_scenes_are_of_all_sequences_in_turn_and_of_their_split() -> Non
 
 def test_recordings_are_confirmed_on_other_stretches_or_not_at_all(folder: str) -> None:
     def confirm(*tune: str, **changes: object) -> list[str]:
-        spec = StudySpec.model_validate({"name": "s", "tune": tune, "recorded": (), "offsets": (0,), **changes})
+        spec = StudySpec.model_validate(
+            {"name": "s", "tune": tune, "recorded": (), "offsets": (0,), **changes}
+        )
         return [str(instance).removeprefix(folder) for instance in design_of(spec).confirm]
 
     assert confirm(f"{folder}[0:3]", f"{folder}[3:5]") == ["[5:8]?offsets=0", "[8:10]?offsets=0"]
@@ -446,6 +573,14 @@ def test_a_recording_that_is_here_is_in_the_check(folder: str, tmp_path: Path) -
     root = tmp_path / "data"
     toy_tracker.make_sequence(root / "bonn" / "rgbd_bonn_crowd", 0.2)
     recorded = design_of(StudySpec(name="s", tune=(folder,), data_root=str(root))).recorded
-    assert recorded == tuple(ProblemInstance("bonn/crowd", recorded[0].frames, offset) for offset in range(4))
-    assert design_of(StudySpec(name="s", tune=(folder,), recorded=(), data_root=str(root))).recorded == ()
-    assert design_of(StudySpec(name="s", tune=(folder,), data_root=str(tmp_path / "empty"))).recorded == ()
+    assert recorded == tuple(
+        ProblemInstance("bonn/crowd", recorded[0].frames, offset) for offset in range(4)
+    )
+    assert (
+        design_of(StudySpec(name="s", tune=(folder,), recorded=(), data_root=str(root))).recorded
+        == ()
+    )
+    assert (
+        design_of(StudySpec(name="s", tune=(folder,), data_root=str(tmp_path / "empty"))).recorded
+        == ()
+    )

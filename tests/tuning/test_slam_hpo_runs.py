@@ -28,9 +28,12 @@ def test_a_shorter_run_is_the_beginning_of_a_longer_one(tmp_path):
 
 
 def test_a_run_without_a_pose_has_the_error_of_a_static_camera(tmp_path):
-    lost = db.run("orb-slam2", SEQUENCE, settings={"features.n_features": 1}, frames=(0, 20), results=tmp_path)
+    lost = db.run(
+        "orb-slam2", SEQUENCE, settings={"features.n_features": 1}, frames=(0, 20), results=tmp_path
+    )
     found = real.evaluated(lost.store, lost.record, 20)
-    assert found.coverage == 0 and found.status == "lost"
+    assert found.coverage == 0
+    assert found.status == "lost"
     still = db.run("never-move", SEQUENCE, frames=(0, 20), results=tmp_path)
     assert found.ate_m == pytest.approx(still.metrics["ate_rmse_m"], rel=0.02)
 
@@ -42,12 +45,14 @@ def test_the_suite_holds_the_default_and_points_of_the_space(tmp_path):
     path = tmp_path / "suite.toml"
     path.write_text(make_table.suite("mask-rcnn", "0", "3"))
     specs = list(load_suite(path).specs())
-    assert len(specs) == 4 * 8 * 2 and len({str(spec.settings) for spec in specs}) == 4
+    assert len(specs) == 4 * 8 * 2
+    assert len({str(spec.settings) for spec in specs}) == 4
 
 
 def test_the_package_s_equations_are_those_of_the_flow():
     """SLAM-HPO is installed without this package, so it has a copy."""
-    own, copied = ROOT / "dynslam_bench/flow/moth_flame.py", PACKAGE / "slam_hpo/moth_flame.py"
+    own = ROOT / "dynslam_bench/flow/moth_flame.py"
+    copied = PACKAGE / "slam_hpo/moth_flame.py"
     assert own.read_bytes() == copied.read_bytes(), f"cp {own} {copied}"
 
 
@@ -55,5 +60,7 @@ def test_a_copy_of_the_package_s_folder_is_complete(tmp_path):
     copy = shutil.copytree(PACKAGE, tmp_path / "copy", symlinks=True)
     assert [path for path in copy.rglob("*") if path.is_symlink()] == []
     code = f"import sys; sys.path.insert(0, {str(copy)!r}); import slam_hpo.moth_flame as one; print(one.__file__)"
-    found = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    found = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
     assert Path(found.stdout.strip()) == copy / "slam_hpo" / "moth_flame.py"

@@ -16,7 +16,9 @@ from dynslam_bench.trackers import TrackerSpec
 
 
 class ToySettings(Settings):
-    gain: float = tunable(1.5, low=0.2, high=3.0, scale="log", meaning="scale of the motion; 1 is right")
+    gain: float = tunable(
+        1.5, low=0.2, high=3.0, scale="log", meaning="scale of the motion; 1 is right"
+    )
     wobble: int = tunable(2, low=0, high=8, meaning="noise", unit="mm")
     mode: Literal["fine", "crash"] = tunable("fine", meaning="whether it crashes")
     anger: float = tunable(0.5, low=0.0, high=1.0, meaning="nothing")
@@ -46,7 +48,8 @@ def make_sequence(folder: Path, phase: float, frames: int = 12) -> Path:
     """A folder in TUM layout of 16x12 images whose camera swings along x."""
     lists: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
     for i in range(frames):
-        x, stamp = 0.2 * np.sin(0.7 * i + phase), 100 + i / 30
+        x = 0.2 * np.sin(0.7 * i + phase)
+        stamp = 100 + i / 30
         images = {"rgb": np.full((12, 16, 3), 10 * i, np.uint8)}
         images["depth"] = np.full((12, 16), round(5000 * (1 + x)), np.uint16)
         for kind, image in images.items():

@@ -6,23 +6,41 @@ from typing import Any
 
 import numpy as np
 
-from dynslam_bench.core import RunError, TrajectoryError, raising, read_lines, temporary_folder, write_atomic
+from dynslam_bench.core import (
+    RunError,
+    TrajectoryError,
+    raising,
+    read_lines,
+    temporary_folder,
+    write_atomic,
+)
 from dynslam_bench.core.version import install_hint
-from dynslam_bench.geometry import Array, Camera, FileNotes, Trajectory, TumFile, is_number, load_trajectory, se3
+from dynslam_bench.geometry import (
+    Array,
+    Camera,
+    FileNotes,
+    Trajectory,
+    TumFile,
+    is_number,
+    load_trajectory,
+    se3,
+)
 from dynslam_bench.sequences.bags import read_bag_poses
 from dynslam_bench.sequences.readers.files import POSE, camera_truth, read_image_list
 from dynslam_bench.sequences.readers.layouts import is_bag
 from dynslam_bench.slam.map_files import Cloud
 
 
-def read_trajectory(path: str | Path, timestamps: str | Path | None = None, topic: str | None = None) -> TumFile:
+def read_trajectory(
+    path: str | Path, timestamps: str | Path | None = None, topic: str | None = None
+) -> TumFile:
     """Read a trajectory with the counts of what was not taken as it stands.
 
     Args:
-        path: A file in TUM's or KITTI's format, a table with a heading such as EuRoC's or VSLAM-LAB's, a folder of
-            COLMAP's text files (or its ``images.txt``), or a bag.
-        timestamps: Stamps where the format has none: for KITTI a file whose lines begin with one each, for COLMAP a
-            list of stamps and images such as ``rgb.txt``.
+        path: A file in TUM's or KITTI's format, a table with a heading such as EuRoC's or
+            VSLAM-LAB's, a folder of COLMAP's text files (or its ``images.txt``), or a bag.
+        timestamps: Stamps where the format has none: for KITTI a file whose lines begin with one
+            each, for COLMAP a list of stamps and images such as ``rgb.txt``.
         topic: Of a bag with several topics of poses, the one to take.
 
     Raises:
@@ -30,12 +48,16 @@ def read_trajectory(path: str | Path, timestamps: str | Path | None = None, topi
     """
     path = Path(path).expanduser()
     if path.name == IMAGES or (path / IMAGES).is_file():
-        trajectory = read_colmap(path, None if timestamps is None else _stamps_by_name(Path(timestamps)))
+        trajectory = read_colmap(
+            path, None if timestamps is None else _stamps_by_name(Path(timestamps))
+        )
         return TumFile(trajectory, FileNotes(lines=len(trajectory)))
     if is_bag(path):
         return read_bag_trajectory(path, topic)
     if path.is_dir():
-        raise TrajectoryError(f"the folder {path} holds neither {IMAGES} of COLMAP nor a bag of ROS 2")
+        raise TrajectoryError(
+            f"the folder {path} holds neither {IMAGES} of COLMAP nor a bag of ROS 2"
+        )
     return load_trajectory(path, timestamps)
 
 
@@ -77,7 +99,11 @@ IMAGES = "images.txt"
 
 
 def write_colmap(
-    folder: Path, trajectory: Trajectory, camera: Camera, names: Sequence[str], cloud: Cloud | None = None
+    folder: Path,
+    trajectory: Trajectory,
+    camera: Camera,
+    names: Sequence[str],
+    cloud: Cloud | None = None,
 ) -> None:
     """Write a reconstruction.
 
@@ -86,15 +112,21 @@ def write_colmap(
         trajectory: Camera-to-world poses, one an image.
         camera: Of all images.
         names: The image of each pose, relative to the folder of images.
-        cloud: Map points, written without tracks and with the error 0, neither of which is known; None for none.
+        cloud: Map points, written without tracks and with the error 0, neither of which is known;
+            None for none.
 
     Raises:
         DynslamError: A file cannot be written.
     """
-    values = [camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5]  # the corner of the first pixel is at 0
+    # the corner of the first pixel is at 0
+    values = [camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5]
     k1, k2, p1, p2, k3 = camera.distortion
     model = ("FULL_OPENCV" if k3 else "OPENCV") if camera.is_distorted else "PINHOLE"
-    values += {"PINHOLE": [], "OPENCV": [k1, k2, p1, p2], "FULL_OPENCV": [k1, k2, p1, p2, k3, 0, 0, 0]}[model]
+    values += {
+        "PINHOLE": [],
+        "OPENCV": [k1, k2, p1, p2],
+        "FULL_OPENCV": [k1, k2, p1, p2, k3, 0, 0, 0],
+    }[model]
     numbers = " ".join(f"{value:.12g}" for value in values)
     write_atomic(folder / "cameras.txt", f"# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n1 {model} {camera.width} "
                  f"{camera.height} {numbers}\n")  # fmt: skip
@@ -107,7 +139,10 @@ def write_colmap(
     points = ["# POINT3D_ID X Y Z R G B ERROR TRACK[]"]
     if cloud is not None:
         rows = zip(cloud.positions.tolist(), cloud.colours.tolist(), strict=True)
-        points += [f"{i} {x:.7g} {y:.7g} {z:.7g} {r} {g} {b} 0" for i, ((x, y, z), (r, g, b)) in enumerate(rows, 1)]
+        points += [
+            f"{i} {x:.7g} {y:.7g} {z:.7g} {r} {g} {b} 0"
+            for i, ((x, y, z), (r, g, b)) in enumerate(rows, 1)
+        ]
     write_atomic(folder / "points3D.txt", "\n".join(points) + "\n")
 
 
@@ -119,7 +154,8 @@ def read_colmap(folder: Path, stamps: Mapping[str, float] | None = None) -> Traj
         stamps: Stamp in seconds of each image by its name; None where the names are the stamps.
 
     Raises:
-        TrajectoryError: A line is malformed, an image has no stamp or that of another one, or there is no image.
+        TrajectoryError: A line is malformed, an image has no stamp or that of another one, or there
+            is no image.
     """
     path = folder / IMAGES if folder.is_dir() else folder
     poses_by_stamp: dict[float, Array] = {}
@@ -131,25 +167,33 @@ def read_colmap(folder: Path, stamps: Mapping[str, float] | None = None) -> Traj
         next(lines, None)  # the line of the image's points, often empty
         parts = line.split(maxsplit=9)
         if len(parts) != 10 or not all(map(is_number, parts[1:8])):
-            raise TrajectoryError(f"{path} line {number} is no image: expected ID QW QX QY QZ TX TY TZ CAMERA NAME")
+            raise TrajectoryError(
+                f"{path} line {number} is no image: expected ID QW QX QY QZ TX TY TZ CAMERA NAME"
+            )
         values = np.array(parts[1:8], dtype=np.float64)
         if not np.isfinite(values).all() or not np.any(values[:4]):
             raise TrajectoryError(f"{path} line {number} holds no pose")
         stamp = _stamp(parts[9].strip(), stamps, path)
         if stamp in poses_by_stamp:
-            raise TrajectoryError(f"{path} line {number} repeats a stamp, {stamp:.6f}", "keep one camera")
+            raise TrajectoryError(
+                f"{path} line {number} repeats a stamp, {stamp:.6f}", "keep one camera"
+            )
         poses_by_stamp[stamp] = se3.from_quaternion(values[4:], values[[1, 2, 3, 0]])
     if not poses_by_stamp:
         raise TrajectoryError(f"{path} names no image")
     order = sorted(poses_by_stamp)
-    return Trajectory(np.array(order), se3.inverse(np.array([poses_by_stamp[stamp] for stamp in order])))
+    return Trajectory(
+        np.array(order), se3.inverse(np.array([poses_by_stamp[stamp] for stamp in order]))
+    )
 
 
 def _stamp(name: str, stamps: Mapping[str, float] | None, path: Path) -> float:
     if stamps is not None:
         stamp = stamps.get(name, stamps.get(Path(name).name))
         if stamp is None:
-            raise TrajectoryError(f"{path} names the image '{name[:100]}', which the list of stamps does not")
+            raise TrajectoryError(
+                f"{path} names the image '{name[:100]}', which the list of stamps does not"
+            )
         return stamp
     stem = Path(name).stem
     if "." not in stem or not is_number(stem) or not np.isfinite(float(stem)):
@@ -160,7 +204,8 @@ def _stamp(name: str, stamps: Mapping[str, float] | None, path: Path) -> float:
     return float(stem)
 
 
-POSE_MESSAGE, PATH = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Path"
+POSE_MESSAGE = "geometry_msgs/msg/PoseStamped"
+PATH = "nav_msgs/msg/Path"
 
 
 def read_bag_trajectory(path: Path, topic: str | None = None) -> TumFile:
@@ -171,7 +216,8 @@ def read_bag_trajectory(path: Path, topic: str | None = None) -> TumFile:
         topic: Topic of the poses; needed where there are several.
 
     Raises:
-        DynslamError: `rosbags` is missing, the bag is damaged, or the topic is not the only one and was not named.
+        DynslamError: `rosbags` is missing, the bag is damaged, or the topic is not the only one and
+            was not named.
     """
     stamps, rows = read_bag_poses(path, topic)
     camera_poses = camera_truth(stamps, rows, np.eye(4), str(path)) if len(stamps) else None
@@ -184,14 +230,18 @@ def write_bag(folder: Path, trajectories: Mapping[str, Trajectory]) -> None:
     """Write trajectories, each on the topics ``/NAME/pose`` and ``/NAME/path``.
 
     Args:
-        folder: Where, it exists: it becomes a bag of ROS 2, ``trajectory.mcap`` with its ``metadata.yaml``.
+        folder: Where, it exists: it becomes a bag of ROS 2, ``trajectory.mcap`` with its
+            ``metadata.yaml``.
         trajectories: Camera-to-world poses by name.
 
     Raises:
         DynslamError: `rosbags` is not installed, or the file cannot be written.
     """
     with raising(
-        RunError, "MCAP is written with rosbags, which is not installed", install_hint("bags"), of=ImportError
+        RunError,
+        "MCAP is written with rosbags, which is not installed",
+        install_hint("bags"),
+        of=ImportError,
     ):
         from rosbags.rosbag2 import StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
@@ -207,7 +257,8 @@ def write_bag(folder: Path, trajectories: Mapping[str, Trajectory]) -> None:
 
 
 def _write_messages(writer: Any, store: Any, name: str, trajectory: Trajectory) -> None:
-    types, poses = store.types, []
+    types = store.types
+    poses = []
     topic = writer.add_connection(f"/{name}/pose", POSE_MESSAGE, typestore=store)
     rows = np.concatenate(se3.to_quaternion(trajectory.T_world_cam), axis=1).tolist()
     for ns, row in zip(trajectory.timestamps_ns.tolist(), rows, strict=True):
@@ -216,7 +267,11 @@ def _write_messages(writer: Any, store: Any, name: str, trajectory: Trajectory) 
         position = types["geometry_msgs/msg/Point"](*row[:3])
         orientation = types["geometry_msgs/msg/Quaternion"](*row[3:])
         pose = types["geometry_msgs/msg/Pose"](position=position, orientation=orientation)
-        poses.append(types[POSE_MESSAGE](header=types["std_msgs/msg/Header"](stamp=time, frame_id="world"), pose=pose))
+        poses.append(
+            types[POSE_MESSAGE](
+                header=types["std_msgs/msg/Header"](stamp=time, frame_id="world"), pose=pose
+            )
+        )
         writer.write(topic, ns, store.serialize_cdr(poses[-1], POSE_MESSAGE))
     if poses:
         whole = types[PATH](header=poses[0].header, poses=poses)

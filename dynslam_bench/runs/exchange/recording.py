@@ -1,12 +1,13 @@
 """A run as a recording for rerun's viewer: images, masks, static and dynamic features, map, trajectory against truth.
 
-Images are JPEG at half size, and everything in their plane is scaled with them. On the timelines ``frame`` (index) and
-``time`` (seconds since the first frame):
+Images are JPEG at half size, and everything in their plane is scaled with them. On the timelines
+``frame`` (index) and ``time`` (seconds since the first frame):
 
 - ``world/camera``: the causal pose; ``world/camera/image`` with ``mask``, ``kept`` and ``culled`` below it
 - ``error/trans_m``, ``features/kept``, ``features/culled``: numbers a frame; ``state``: where it changes
 
-and without time, from the end of the run: ``world/map``, ``world/estimate``, ``world/truth`` (aligned to the estimate).
+and without time, from the end of the run: ``world/map``, ``world/estimate``, ``world/truth``
+(aligned to the estimate).
 """
 
 import importlib.util
@@ -45,8 +46,10 @@ class RecordedFrame:
         index: Of the frame in the run's part of the sequence.
         stamp: Seconds.
         jpeg: The image at half size, see `encode`.
-        pose: Camera to world ``[4, 4]``; None where the tracker has none: the camera stays where it was.
-        shot: Features in pixels of the image, and the mask; None if they are not known, which shows none.
+        pose: Camera to world ``[4, 4]``; None where the tracker has none: the camera stays where it
+            was.
+        shot: Features in pixels of the image, and the mask; None if they are not known, which shows
+            none.
         state: ``ok``, ``lost``, ...
         error_m: Causal translational error in metres.
     """
@@ -74,7 +77,9 @@ def check_rerun() -> None:
         RunError: It is not installed.
     """
     if importlib.util.find_spec("rerun") is None:
-        raise RunError("recordings are written with rerun-sdk, which is not installed", install_hint("rerun"))
+        raise RunError(
+            "recordings are written with rerun-sdk, which is not installed", install_hint("rerun")
+        )
 
 
 def write_recording(
@@ -103,17 +108,30 @@ def write_recording(
 
     stream = rr.RecordingStream("dynslam-bench")
     with raising(
-        RunError, f"cannot write {path}", "check the permissions and the free space", of=(OSError, RuntimeError)
+        RunError,
+        f"cannot write {path}",
+        "check the permissions and the free space",
+        of=(OSError, RuntimeError),
     ):
         path.touch()
         stream.save(str(path), default_blueprint=_blueprint())
     stream.send_recording_name(name)
     _log_frames(rr, stream, camera, frames)
-    for track_name, track, colour in zip(("estimate", "truth"), tracks, (ESTIMATE, TRUTH), strict=True):
+    for track_name, track, colour in zip(
+        ("estimate", "truth"), tracks, (ESTIMATE, TRUTH), strict=True
+    ):
         if track is not None and len(track):
-            stream.log(f"world/{track_name}", rr.LineStrips3D([track.positions], colors=[colour]), static=True)
+            stream.log(
+                f"world/{track_name}",
+                rr.LineStrips3D([track.positions], colors=[colour]),
+                static=True,
+            )
     if cloud is not None and len(cloud.positions):
-        stream.log("world/map", rr.Points3D(cloud.positions, colors=cloud.colours, radii=0.005), static=True)
+        stream.log(
+            "world/map",
+            rr.Points3D(cloud.positions, colors=cloud.colours, radii=0.005),
+            static=True,
+        )
     stream.disconnect()
 
 
@@ -122,14 +140,19 @@ def _log_frames(rr: Any, stream: Any, camera: Camera, frames: Iterable[RecordedF
     scale = np.array([width / camera.width, height / camera.height])
     matrix = camera.matrix * np.array([*scale, 1.0])[:, None]
     matrix[:2, 2] += 0.5 * scale  # rerun puts the corner of the top-left pixel at 0, we its centre
-    pinhole = rr.Pinhole(image_from_camera=matrix, width=width, height=height, camera_xyz=rr.ViewCoordinates.RDF)
+    pinhole = rr.Pinhole(
+        image_from_camera=matrix, width=width, height=height, camera_xyz=rr.ViewCoordinates.RDF
+    )
     classes = rr.AnnotationContext([(0, "static", (0, 0, 0, 0)), (1, "dynamic", (*MASK, 110))])
     stream.log("world", rr.ViewCoordinates.RDF, static=True)
     stream.log(IMAGE, pinhole, classes, static=True)
     for layer, colour in (("kept", KEPT), ("culled", CULLED)):
-        stream.log(LAYERS[layer], rr.Points2D.from_fields(colors=[colour], radii=[1.0]), static=True)
+        stream.log(
+            LAYERS[layer], rr.Points2D.from_fields(colors=[colour], radii=[1.0]), static=True
+        )
     first: float | None = None
-    state, shown = "", set[str]()
+    shown = set[str]()
+    state = ""
     for frame in frames:
         first = frame.stamp if first is None else first
         stream.set_time("frame", sequence=frame.index)
@@ -137,18 +160,19 @@ def _log_frames(rr: Any, stream: Any, camera: Camera, frames: Iterable[RecordedF
         stream.log(IMAGE, rr.EncodedImage(contents=frame.jpeg, media_type="image/jpeg"))
         if frame.pose is not None:
             position, quaternion = se3.to_quaternion(frame.pose)
-            stream.log("world/camera", rr.Transform3D.from_fields(translation=position, quaternion=quaternion))
+            stream.log(
+                "world/camera",
+                rr.Transform3D.from_fields(translation=position, quaternion=quaternion),
+            )
         if frame.error_m is not None:
             stream.log("error/trans_m", rr.Scalars(frame.error_m))
         if frame.state != state:
             stream.log("state", rr.TextLog(frame.state))
         layers: dict[str, Any] = {}
         if frame.shot is not None:
-            points, kept, mask = (
-                ((frame.shot.points + 0.5) * scale).astype(np.float32),
-                frame.shot.kept,
-                frame.shot.mask,
-            )
+            points = ((frame.shot.points + 0.5) * scale).astype(np.float32)
+            kept = frame.shot.kept
+            mask = frame.shot.mask
             for layer, chosen in (("kept", points[kept]), ("culled", points[~kept])):
                 layers[layer] = rr.Points2D.from_fields(positions=chosen)
                 stream.log(f"features/{layer}", rr.Scalars(float(len(chosen))))
@@ -159,14 +183,17 @@ def _log_frames(rr: Any, stream: Any, camera: Camera, frames: Iterable[RecordedF
             stream.log(LAYERS[layer], rr.Clear(recursive=False))
         for layer, picture in layers.items():
             stream.log(LAYERS[layer], picture)
-        state, shown = frame.state, set(layers)
+        shown = set(layers)
+        state = frame.state
 
 
 def _blueprint() -> Any:
     """What the viewer shows at first: the scene on the left, the image and the numbers on the right."""
     import rerun.blueprint as rrb
 
-    numbers = rrb.Horizontal(rrb.TimeSeriesView(origin="error"), rrb.TimeSeriesView(origin="features"))
+    numbers = rrb.Horizontal(
+        rrb.TimeSeriesView(origin="error"), rrb.TimeSeriesView(origin="features")
+    )
     right = rrb.Vertical(rrb.Spatial2DView(origin=IMAGE), numbers, row_shares=[2, 1])
     return rrb.Blueprint(rrb.Horizontal(rrb.Spatial3DView(origin="world"), right))
 
@@ -181,7 +208,8 @@ def write_stored(
         store: The run's.
         record: The run.
         sequence: The frames that it was made on.
-        trajectory: What is drawn as its estimate, and where the camera goes if the run has no online poses.
+        trajectory: What is drawn as its estimate, and where the camera goes if the run has no
+            online poses.
 
     Returns:
         What a user should know, one line each.
@@ -192,20 +220,39 @@ def write_stored(
     """
     folder = store.folder(record.run_id)
     (height, width), snapshots = read_snapshots(folder)
-    scale = np.array([sequence.camera.width / max(width, 1), sequence.camera.height / max(height, 1)])
+    scale = np.array(
+        [sequence.camera.width / max(width, 1), sequence.camera.height / max(height, 1)]
+    )
     # in pixels of the sequence's images, which the tracker's preprocessing may have resized
     scaled = [((shot.points + 0.5) * scale - 0.5).round().astype(np.int16) for shot in snapshots]
-    shots = {shot.index: replace(shot, points=points) for shot, points in zip(snapshots, scaled, strict=True)}
+    shots = {
+        shot.index: replace(shot, points=points)
+        for shot, points in zip(snapshots, scaled, strict=True)
+    }
     online = store.trajectory(record.run_id, "online") or trajectory
-    tracked, rows_of_poses = associate(sequence.timestamps, online.timestamps, _TOLERANCE_S, strict=False)
+    tracked, rows_of_poses = associate(
+        sequence.timestamps, online.timestamps, _TOLERANCE_S, strict=False
+    )
     poses = dict(zip(tracked.tolist(), online.T_world_cam[rows_of_poses], strict=True))
-    rows = {row.index: row for row in read_csv(folder / CSV_FILE)} if (folder / CSV_FILE).is_file() else {}
+    rows = (
+        {row.index: row for row in read_csv(folder / CSV_FILE)}
+        if (folder / CSV_FILE).is_file()
+        else {}
+    )
 
     def frames() -> Iterator[RecordedFrame]:
         for index in range(len(sequence)):
-            frame, row = sequence[index], rows.get(index)
+            row = rows.get(index)
+            frame = sequence[index]
             state = ("", None) if row is None else (str(row.state), row.pose_error_trans_m)
-            yield RecordedFrame(index, frame.timestamp, encode(frame.rgb), poses.get(index), shots.get(index), *state)
+            yield RecordedFrame(
+                index,
+                frame.timestamp,
+                encode(frame.rgb),
+                poses.get(index),
+                shots.get(index),
+                *state,
+            )
 
     cloud = read_ply(folder / "map.ply") if (folder / "map.ply").is_file() else None
     truth = aligned_truth(sequence.ground_truth, trajectory)[0]
@@ -213,4 +260,6 @@ def write_stored(
     write_recording(path, sequence.camera, name, frames(), (trajectory, truth), cloud)
     if len(shots) == len(sequence):
         return []
-    return [f"features and masks are known of {len(shots)} of {len(sequence)} frames; `run --rrd` records all"]
+    return [
+        f"features and masks are known of {len(shots)} of {len(sequence)} frames; `run --rrd` records all"
+    ]

@@ -1,7 +1,7 @@
 """What code in this process is about to do, announced before it is done.
 
-Python announces openings, listings, imports and programs to audit hooks (`sys.audit`). What is looked up in
-``os.environ`` is announced by a subclass of its class, in the same way.
+Python announces openings, listings, imports and programs to audit hooks (`sys.audit`). What is
+looked up in ``os.environ`` is announced by a subclass of its class, in the same way.
 """
 
 import os
@@ -28,7 +28,9 @@ _Environment: Any = type(os.environ)
 
 
 def listen(
-    listener: Listener | None, events: Collection[str] = (), after_fork: Callable[[], None] | None = None
+    listener: Listener | None,
+    events: Collection[str] = (),
+    after_fork: Callable[[], None] | None = None,
 ) -> None:
     """Let a listener hear announcements from now on, in place of any other.
 

@@ -1,9 +1,10 @@
 """The process that makes a run: it steps an environment and reports to the parent.
 
-Messages are JSON bytes over the connection, never pickles. The parent sends the job (`make_job`) and may send ``stop``
-later. The child sends ``ready`` first (its time counts from then on), ``started``, ``frame`` (once a frame, the sign of
-life) and ``progress`` every so many frames; it ends with ``done``, ``stopped`` or ``failed``. Its results are files in
-the job's folder: ``frames.jsonl``, written frame by frame so that a crash loses nothing, and at the end the final
+Messages are JSON bytes over the connection, never pickles. The parent sends the job (`make_job`)
+and may send ``stop`` later. The child sends ``ready`` first (its time counts from then on),
+``started``, ``frame`` (once a frame, the sign of life) and ``progress`` every so many frames; it
+ends with ``done``, ``stopped`` or ``failed``. Its results are files in the job's folder:
+``frames.jsonl``, written frame by frame so that a crash loses nothing, and at the end the final
 trajectory and the map. Its temporary files lie in a private folder that is removed with it.
 """
 
@@ -67,7 +68,8 @@ def main(connection: Connection) -> int:
     """
     with contextlib.suppress(OSError):
         os.setsid()  # so that the parent can end this process together with what a tracker starts
-    adopt_orphans(die_with_parent=True)  # so that what a tracker starts and forgets stays below this process
+    # so that what a tracker starts and forgets stays below this process
+    adopt_orphans(die_with_parent=True)
     spare_ancestors()
     try:
         job = json.loads(connection.recv_bytes())
@@ -149,15 +151,17 @@ def recording_reads(job: dict[str, Any], temporary: Path) -> Iterator[Callable[[
 def spare_ancestors() -> None:
     """From now on refuse this process' own signals to the processes above it: the fork server, the program, its shell.
 
-    A tracker that ends its parent process, as a script does that ends what it was started by, would end all other runs.
-    Python's calls alone are refused; what a program or a library signals, `run_one` finds out.
+    A tracker that ends its parent process, as a script does that ends what it was started by, would
+    end all other runs. Python's calls alone are refused; what a program or a library signals,
+    `run_one` finds out.
     """
     ancestors = {process.pid for process in psutil.Process().parents()}
     groups = {1}  # it stands for all processes
     for pid in ancestors:
         with contextlib.suppress(OSError):  # it has just ended
             groups.add(os.getpgid(pid))
-    groups.discard(0)  # the group of a process outside of this container; in a call 0 stands for one's own
+    # the group of a process outside of this container; in a call 0 stands for one's own
+    groups.discard(0)
 
     def refuse(event: str, arguments: tuple[Any, ...]) -> None:
         if event not in ("os.kill", "os.killpg"):
@@ -166,14 +170,18 @@ def spare_ancestors() -> None:
         is_process = event == "os.kill" and target in ancestors
         is_group = (target if event == "os.killpg" else -target) in groups
         if number and (is_process or is_group):  # number 0 asks whether the process is there
-            raise PermissionError(errno.EPERM, f"a run may not signal process {target}, which it was started by")
+            raise PermissionError(
+                errno.EPERM, f"a run may not signal process {target}, which it was started by"
+            )
 
     sys.addaudithook(refuse)
 
 
 def peak_memory_mb() -> float:
     """Largest resident memory of this process so far."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (
+        1e6 if sys.platform == "darwin" else 1e3
+    )
 
 
 def _listen(connection: Connection, stop: threading.Event) -> None:
@@ -223,7 +231,8 @@ def limit_threads(threads: int) -> None:
     import cv2
 
     cv2.setNumThreads(threads)
-    torch, numba = sys.modules.get("torch"), sys.modules.get("numba")
+    torch = sys.modules.get("torch")
+    numba = sys.modules.get("numba")
     if torch is None:
         os.environ["OMP_NUM_THREADS"] = str(threads)
     else:
@@ -250,17 +259,21 @@ def at(where: Callable[[], str]) -> Iterator[None]:
 def describe_failure(error: BaseException) -> dict[str, Any]:
     """The last message of a run that an exception ended: ``status``, ``reason`` and ``refused``.
 
-    The key ``infrastructure`` says what broke beside the run. The key ``data`` says that something other than the
-    tracker's own code raised, or that its input cannot be read: the run says nothing about the tracker.
+    The key ``infrastructure`` says what broke beside the run. The key ``data`` says that something
+    other than the tracker's own code raised, or that its input cannot be read: the run says nothing
+    about the tracker.
 
     The reason reads ``frame 20 of 60: ValueError: too few points (my_tracker.py:31)``.
     """
     from dynslam_bench.contracts.checks import TrackerContractError, raised_by_tracker
 
-    where, cause = "", error
+    where = ""
+    cause = error
     if isinstance(error, FailedAt) and error.__cause__ is not None:
-        where, cause = str(error), error.__cause__
-    text, kind = _one_line(cause), type(cause).__name__
+        where = str(error)
+        cause = error.__cause__
+    text = _one_line(cause)
+    kind = type(cause).__name__
 
     def message(status: str, what: str, *, line: bool = False, **more: Any) -> dict[str, Any]:
         before = "" if not where or re.search(r"\bframe \d+", what) else f"{where}: "
@@ -272,10 +285,20 @@ def describe_failure(error: BaseException) -> dict[str, Any]:
         return message("crashed", broken, infrastructure=broken)
     if isinstance(cause, TrackerContractError):
         return message("invalid", text)
-    named = f"sys.exit({cause.code!r}) was called" if isinstance(cause, SystemExit) else f"{kind}: {text}".rstrip(": ")
-    if isinstance(cause, MemoryError) or "out of memory" in text.lower() or kind == "OutOfMemoryError":
+    named = (
+        f"sys.exit({cause.code!r}) was called"
+        if isinstance(cause, SystemExit)
+        else f"{kind}: {text}".rstrip(": ")
+    )
+    if (
+        isinstance(cause, MemoryError)
+        or "out of memory" in text.lower()
+        or kind == "OutOfMemoryError"
+    ):
         return message("out-of-memory", named, line=True)
-    data = {} if raised_by_tracker(cause) and not isinstance(cause, _DATA_FAULTS) else {"data": True}
+    data = (
+        {} if raised_by_tracker(cause) and not isinstance(cause, _DATA_FAULTS) else {"data": True}
+    )
     if isinstance(cause, TrackerTimeoutError):
         return message("timeout", text)
     if isinstance(cause, DynslamError):
@@ -290,7 +313,9 @@ def _one_line(error: BaseException) -> str:
 def _broken_infrastructure(error: BaseException | None) -> str:
     """What of the infrastructure broke, by an exception or one of its causes; empty if nothing did."""
     while error is not None:
-        if isinstance(error, InfrastructureError) or (isinstance(error, OSError) and error.errno in _DISK_ERRORS):
+        if isinstance(error, InfrastructureError) or (
+            isinstance(error, OSError) and error.errno in _DISK_ERRORS
+        ):
             return _one_line(error)
         error = error.__cause__ or error.__context__
     return ""
@@ -302,7 +327,9 @@ def source_line(error: BaseException) -> str:
     folders = map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib"))
     libraries = (*folders, "<", sys.base_prefix, __file__)
     outside = [
-        line for line in lines if "site-packages" not in line.filename and not line.filename.startswith(libraries)
+        line
+        for line in lines
+        if "site-packages" not in line.filename and not line.filename.startswith(libraries)
     ]
     return "".join(f"{Path(line.filename).name}:{line.lineno}" for line in (outside or lines)[-1:])
 
@@ -311,4 +338,5 @@ if __name__ == "__main__":
     # from the module, not from here: the loop raises the module's `FailedAt`
     from dynslam_bench.runs.process.child import main as make_run
 
-    os._exit(make_run(Connection(int(sys.argv[1]))))  # threads that a tracker left running must not hold it up
+    # threads that a tracker left running must not hold it up
+    os._exit(make_run(Connection(int(sys.argv[1]))))

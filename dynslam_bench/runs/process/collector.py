@@ -9,7 +9,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dynslam_bench.core.code_files import files_of_command
-from dynslam_bench.core.programs import Command, ProgramReads, folders_of, is_counted, is_file_name, mapped_files
+from dynslam_bench.core.programs import (
+    Command,
+    ProgramReads,
+    folders_of,
+    is_counted,
+    is_file_name,
+    mapped_files,
+)
 from dynslam_bench.core.reads import (
     ABSENT,
     COMMAND,
@@ -36,7 +43,21 @@ _MANY_FILES = 10_000
 """A folder with more files is not read whole where a program's arguments name it."""
 _TEXT = (".yaml", ".yml", ".toml", ".json", ".cfg", ".ini", ".conf", ".txt", ".xml")
 _READ_IN_MACHINE_CODE = (
-    *(".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".exr", ".pgm", ".ppm", ".webp", ".mp4", ".avi", ".mkv"),
+    *(
+        ".png",
+        ".jpg",
+        ".jpeg",
+        ".bmp",
+        ".tif",
+        ".tiff",
+        ".exr",
+        ".pgm",
+        ".ppm",
+        ".webp",
+        ".mp4",
+        ".avi",
+        ".mkv",
+    ),
     *(
         ".onnx",
         ".pb",
@@ -130,7 +151,8 @@ class Modules:
     Attributes:
         imports: The import path on which they are found.
         places: Where each top-level module is found.
-        distributions: Names of distributions, and whether they were loaded before the recorder was started.
+        distributions: Names of distributions, and whether they were loaded before the recorder was
+            started.
         files: The same of the files of modules that belong to no distribution.
     """
 
@@ -184,7 +206,9 @@ class Collector:
         named, missing = self._named_files(files)
         files |= {path: content_now(path) for path in named - files.keys()}
         files |= dict.fromkeys(missing - files.keys(), ABSENT)
-        folders = {path: self._folder(path, names) for path, names in dict(self.notes.folders).items()}
+        folders = {
+            path: self._folder(path, names) for path, names in dict(self.notes.folders).items()
+        }
 
         variables = self.notes.variables.union(*map(self._variables_of, dict(self.notes.commands)))
 
@@ -197,19 +221,26 @@ class Collector:
             environment={f"${key}": value_digest(self.environment.get(key)) for key in variables},
             search=self._search(),
             modules=modules.places,
-            distributions={key: imports.distribution(key) for key in modules.distributions.keys() | distributions},
+            distributions={
+                key: imports.distribution(key)
+                for key in modules.distributions.keys() | distributions
+            },
             programs={self._name(path): content_now(path) for path in programs},
         )
 
-    # -- what is an input ----------------------------------------------------------------------------------------------
+    # -- what is an input --------------------------------------------------------------------------
 
     def is_output(self, path: str) -> bool:
         """Whether the run has made what lies at a path."""
-        return path in self.notes.made or path.startswith((*self._private, *self.notes.made_folders))
+        return path in self.notes.made or path.startswith(
+            (*self._private, *self.notes.made_folders)
+        )
 
     def is_of_program(self, stamp: Stamp | None) -> bool:
         """Whether a file was written after a program was started."""
-        return stamp is not None and stamp[3] >= min(self.notes.commands.values(), default=sys.maxsize)
+        return stamp is not None and stamp[3] >= min(
+            self.notes.commands.values(), default=sys.maxsize
+        )
 
     def _is_input(self, path: str) -> bool:
         """Whether something lies at a path that was there before the run."""
@@ -234,7 +265,9 @@ class Collector:
         """
         if names is None:
             return ABSENT
-        made = {os.path.basename(file) for file in set(self.notes.made) if os.path.dirname(file) == path}
+        made = {
+            os.path.basename(file) for file in set(self.notes.made) if os.path.dirname(file) == path
+        }
         if made:
             names = sorted(set(names) - made | made.intersection(names_in(path)))
         return digest_of_names(names)
@@ -256,7 +289,7 @@ class Collector:
         names = (*SEARCH_PATHS, *(f"{COMMAND}{word}" for word in commands if os.sep not in word))
         return {name: search_now(name, self.environment, self._anchors) for name in names}
 
-    # -- what has changed while it was read ----------------------------------------------------------------------------
+    # -- what has changed while it was read --------------------------------------------------------
 
     def changed(self, modules: Modules) -> str:
         """The first thing that has changed since it was read, in words; empty where nothing has.
@@ -294,7 +327,7 @@ class Collector:
         since_ns = _LOADED_NS if was_loaded else self.began_ns
         return stamp is not None and stamp[4] > since_ns and self._is_input(path)
 
-    # -- modules and libraries -----------------------------------------------------------------------------------------
+    # -- modules and libraries ---------------------------------------------------------------------
 
     def modules(self) -> Modules:
         """Look at the modules that are loaded now."""
@@ -303,7 +336,11 @@ class Collector:
         files_of: dict[str, str] = {}
         for name, module in list(sys.modules.items()):
             file = vars(module).get("__file__") if hasattr(module, "__dict__") else None
-            if not isinstance(file, str) or name == "__main__" or self._origins.of_file(file) in ("own", "python"):
+            if (
+                not isinstance(file, str)
+                or name == "__main__"
+                or self._origins.of_file(file) in ("own", "python")
+            ):
                 continue
             top = name.partition(".")[0]
             was_loaded = top in self._loaded
@@ -320,8 +357,12 @@ class Collector:
                 modules.places[top] = imports.place(top, self._anchors)
         for top in set(self.notes.modules) - sys.modules.keys():
             modules.places[top] = imports.place(top, self._anchors)
-            modules.distributions |= dict.fromkeys(imports.distributions_of(top, imports.find(top)), False)
-        modules.files = {path: loaded for path, loaded in modules.files.items() if self._is_input(path)}
+            modules.distributions |= dict.fromkeys(
+                imports.distributions_of(top, imports.find(top)), False
+            )
+        modules.files = {
+            path: loaded for path, loaded in modules.files.items() if self._is_input(path)
+        }
         return modules
 
     def _libraries(self) -> set[str]:
@@ -335,7 +376,7 @@ class Collector:
         new = {path for path in new if not _OF_PYTHON.fullmatch(os.path.basename(path))}
         return set(filter(self._is_input, named | new))
 
-    # -- programs ------------------------------------------------------------------------------------------------------
+    # -- programs ----------------------------------------------------------------------------------
 
     def _programs(self, imports: ImportPath) -> tuple[set[str], set[str]]:
         """The files and folders that programs are made of, and the distributions of this environment that they use."""
@@ -357,7 +398,9 @@ class Collector:
     def _files_of(self, command: Command) -> set[str]:
         """The executable of a command, the files and folders that it names, and what these name or import."""
         executable = command.executable(self.environment.get("PATH"))
-        arguments = [word for word in command.words[1:] if not any(map(os.path.isdir, command.named([word])))]
+        arguments = [
+            word for word in command.words[1:] if not any(map(os.path.isdir, command.named([word])))
+        ]
         reached = files_of_command([command.words[0], *arguments], Path(command.folder))
         files = {executable, *map(str, reached)} - {""}
         return files | {path for path in command.named() if not self._is_too_wide(path)}
@@ -365,7 +408,8 @@ class Collector:
     def _variables_of(self, command: Command) -> set[str]:
         """The environment variables whose names are written in a command or in its files.
 
-        Those that are not set count, too, but in binary files: there thousands of words look like a variable's name.
+        Those that are not set count, too, but in binary files: there thousands of words look like a
+        variable's name.
         """
         if command not in self._variables:
             names = set(_VARIABLE.findall(" ".join(command.words)))
@@ -375,13 +419,23 @@ class Collector:
                     names |= {name for name in self.environment if os.fsencode(name) in content}
                 elif len(content) <= _LONGEST_SOURCE:
                     names |= set(_VARIABLE.findall(content.decode(errors="replace")))
-            self._variables[command] = {name for name in names if is_counted(name) and name not in SEARCH_PATHS}
+            self._variables[command] = {
+                name for name in names if is_counted(name) and name not in SEARCH_PATHS
+            }
         return self._variables[command]
 
     def _is_too_wide(self, folder: str) -> bool:
         """Whether a folder holds so much that a program that is told of it does not read it all."""
-        places = [str(self._anchors.work), str(self._anchors.plugin), str(Path.home()), sys.prefix, *self._path]
-        if any(place == folder or place.startswith(folder.rstrip(os.sep) + os.sep) for place in places):
+        places = [
+            str(self._anchors.work),
+            str(self._anchors.plugin),
+            str(Path.home()),
+            sys.prefix,
+            *self._path,
+        ]
+        if any(
+            place == folder or place.startswith(folder.rstrip(os.sep) + os.sep) for place in places
+        ):
             return True
         count = 0
         for _, _, names in os.walk(folder):
@@ -398,12 +452,13 @@ class Collector:
         inputs = set(filter(self._is_input, files))
         return {path} if inputs == files and self._is_input(path) else inputs
 
-    # -- files that are named in texts ---------------------------------------------------------------------------------
+    # -- files that are named in texts -------------------------------------------------------------
 
     def _named_files(self, texts: Iterable[str]) -> tuple[set[str], set[str]]:
         """The files that foreign sources and small text files name, and those that sources name and that are not there.
 
-        A name is looked for in the folder of the text, in that of the plug-in and in the working folder.
+        A name is looked for in the folder of the text, in that of the plug-in and in the working
+        folder.
         """
         named = set[str]()
         missing = set[str]()
@@ -414,7 +469,9 @@ class Collector:
                 named |= there
                 if not there and text.endswith(".py") and _can_be_missing(word):
                     missing |= places
-        return set(filter(self._is_input, named)), {path for path in missing if not self.is_output(path)}
+        return set(filter(self._is_input, named)), {
+            path for path in missing if not self.is_output(path)
+        }
 
     def _words(self, text: str) -> set[str]:
         """The words of a text file that could be names of files; none of a file that is no such text."""
@@ -425,7 +482,9 @@ class Collector:
         if (text, stamp) not in self._texts:
             content = Path(text).read_text(encoding="utf-8", errors="replace")
             words = set(_QUOTED.findall(content)) if is_source else set(_WORD.findall(content))
-            self._texts[text, stamp] = {word for word in words if is_source or "." in word or os.sep in word}
+            self._texts[text, stamp] = {
+                word for word in words if is_source or "." in word or os.sep in word
+            }
         return self._texts[text, stamp]
 
     def _places_of(self, word: str, text: str) -> set[str]:
@@ -440,7 +499,11 @@ class Collector:
 def _can_be_missing(word: str) -> bool:
     """Whether a text in a source looks like the name of a file, and not like that of a module."""
     top = word.partition(".")[0]
-    return _FILE_NAME.fullmatch(word) is not None and top not in sys.modules and top not in sys.stdlib_module_names
+    return (
+        _FILE_NAME.fullmatch(word) is not None
+        and top not in sys.modules
+        and top not in sys.stdlib_module_names
+    )
 
 
 def _on_disk(file: str) -> str:

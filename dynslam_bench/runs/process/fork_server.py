@@ -1,17 +1,18 @@
 """The fork server: a process that has imported everything heavy and forks the children of runs in 10 ms each.
 
-The parent asks for a child over a Unix socket: one byte with two file descriptors, the child's end of its connection
-and a pipe. On the pipe the server answers with the child's process id, with 0 once that process has ended, and with its
-exit code, a JSON line each. The exit code is reported after all processes that the run had started have ended and its
-temporary files are removed. When the socket closes, because the parent has ended, the server kills its children and
-ends. It has a session of its own, so that signals of a terminal do not reach it before.
+The parent asks for a child over a Unix socket: one byte with two file descriptors, the child's end
+of its connection and a pipe. On the pipe the server answers with the child's process id, with 0
+once that process has ended, and with its exit code, a JSON line each. The exit code is reported
+after all processes that the run had started have ended and its temporary files are removed. When
+the socket closes, because the parent has ended, the server kills its children and ends. It has a
+session of its own, so that signals of a terminal do not reach it before.
 
 Where forking is not safe (macOS) the server starts each child in a fresh interpreter instead.
 
-A tracker may start processes, put them into sessions of their own and forget them. On Linux the fork server and each
-run are subreapers (``prctl(2)``): they become the parents of the orphans below them, so that the tree stays complete.
-``multiprocessing``'s own fork server re-imports the caller's main script and may not be used in daemonic processes, see
-``docs/decisions/fork-server.md``.
+A tracker may start processes, put them into sessions of their own and forget them. On Linux the
+fork server and each run are subreapers (``prctl(2)``): they become the parents of the orphans below
+them, so that the tree stays complete. ``multiprocessing``'s own fork server re-imports the caller's
+main script and may not be used in daemonic processes, see ``docs/decisions/fork-server.md``.
 """
 
 import atexit
@@ -44,13 +45,23 @@ PRELOADED = (
     *("dynslam_bench.envs", "dynslam_bench.evaluation.evaluate"),
     *("dynslam_bench.slam.pipeline", "dynslam_bench.slam.backend", "dynslam_bench.features.orb"),
     *("dynslam_bench.flow.moth_flame", "dynslam_bench.segmentation.schedule", _CHILD),
-    *("dynslam_bench.runs.loop", "dynslam_bench.trackers.registry", "dynslam_bench.sequences.synthetic.sequence"),
+    *(
+        "dynslam_bench.runs.loop",
+        "dynslam_bench.trackers.registry",
+        "dynslam_bench.sequences.synthetic.sequence",
+    ),
 )
-THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS", "BLIS_NUM_THREADS")
+THREAD_VARIABLES = (
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+    "BLIS_NUM_THREADS",
+)
 """Set to 1 before anything is imported: BLAS must not spin up threads of its own beside the run's."""
 START_VARIABLE = "DYNSLAM_BENCH_START"
 """``fork`` or ``fresh``: how children start. Forking is the default on Linux; macOS' libraries do not survive it."""
-_SET_PARENT_DEATH_SIGNAL, _SET_CHILD_SUBREAPER = 1, 36
+_SET_PARENT_DEATH_SIGNAL = 1
+_SET_CHILD_SUBREAPER = 36
 _END_S = 5.0
 _REAP_S = 10.0
 """How long `Child.close` waits for the report of the child's end."""
@@ -92,7 +103,9 @@ class ForkServer:
             return read_fd
         except OSError as error:
             os.close(read_fd)
-            raise InfrastructureError(f"the fork server cannot be started or does not answer: {error}") from error
+            raise InfrastructureError(
+                f"the fork server cannot be started or does not answer: {error}"
+            ) from error
         finally:
             os.close(write_fd)
 
@@ -114,7 +127,8 @@ class ForkServer:
                 env=os.environ | dict.fromkeys(THREAD_VARIABLES, "1"),
                 start_new_session=True,
             )
-        self._running, self._owner = (ours, process), os.getpid()
+        self._owner = os.getpid()
+        self._running = (ours, process)
         return ours
 
     def _close(self) -> None:
@@ -148,9 +162,12 @@ class Child:
 
     Attributes:
         connection: The parent's end.
-        pid: Its process id; 0 until it is known, and when the process has ended: the system may give it to another.
-        members: Its process tree when it was last looked at; for the case that the server is killed.
-        lost: Why nothing is known of its end, if that is so: the server has died, or cannot start a process.
+        pid: Its process id; 0 until it is known, and when the process has ended: the system may
+            give it to another.
+        members: Its process tree when it was last looked at; for the case that the server is
+            killed.
+        lost: Why nothing is known of its end, if that is so: the server has died, or cannot start a
+            process.
         server_died: Whether the server has died.
 
     Raises:
@@ -190,7 +207,8 @@ class Child:
 
     def kill(self) -> None:
         """End it, with everything that it started."""
-        if self.poll() is None and self.pid:  # in this order: the answer may be that the process has ended
+        # in this order: the answer may be that the process has ended
+        if self.poll() is None and self.pid:
             end_tree(self.pid)
 
     def close(self) -> None:
@@ -210,16 +228,21 @@ def make_job(work: str, folder: Path | str, **details: Any) -> dict[str, Any]:
     """A job for a child, as JSON takes it.
 
     Args:
-        work: ``module:function`` that does it; called with the job, a function that tells the parent something, and
-            one that says whether the parent wants an early end.
+        work: ``module:function`` that does it; called with the job, a function that tells the
+            parent something, and one that says whether the parent wants an early end.
         folder: Where the child's log and what it finds go.
         details: What `work` wants to know; ``spec`` with the ``threads`` of the run among it.
 
     Returns:
-        The job; the child does it in this process's working folder, with its environment and import path.
+        The job; the child does it in this process's working folder, with its environment and import
+        path.
     """
     environment = {name: text for name, text in os.environ.items() if name not in THREAD_VARIABLES}
-    context = {"environment": environment, "working_folder": str(Path.cwd()), "path": list(sys.path)}
+    context = {
+        "environment": environment,
+        "working_folder": str(Path.cwd()),
+        "path": list(sys.path),
+    }
     return {"work": work, "folder": str(folder), **context, **details}
 
 
@@ -227,8 +250,10 @@ class _Server:
     """The server's loop: it waits for requests of the parent and for ends of children; SIGTERM ends it."""
 
     def __init__(self, control: socket.socket, start: str) -> None:
-        self.control, self.start = control, start
-        self.own = frozenset(child.pid for child in psutil.Process().children())  # helpers of libraries
+        self.control = control
+        self.start = start
+        # helpers of libraries
+        self.own = frozenset(child.pid for child in psutil.Process().children())
         self.runs: dict[int, int] = {}
         self.wake_fds = os.pipe()
         for end in self.wake_fds:
@@ -257,7 +282,11 @@ class _Server:
         connection_fd, status_fd = fds
         os.set_inheritable(status_fd, False)
         try:
-            pid = self._fork(connection_fd, status_fd) if self.start == "fork" else _spawn(connection_fd)
+            pid = (
+                self._fork(connection_fd, status_fd)
+                if self.start == "fork"
+                else _spawn(connection_fd)
+            )
         except OSError as error:
             _tell(status_fd, {"refused": f"no process can be started: {error.strerror}"})
             os.close(status_fd)
@@ -305,7 +334,9 @@ def _spawn(connection_fd: int) -> int:
     """Start a child in a fresh interpreter."""
     os.set_inheritable(connection_fd, True)
     command = [*module_command(_CHILD), str(connection_fd)]
-    return os.posix_spawn(sys.executable, command, os.environ, setsigdef=[signal.SIGINT, signal.SIGHUP])
+    return os.posix_spawn(
+        sys.executable, command, os.environ, setsigdef=[signal.SIGINT, signal.SIGHUP]
+    )
 
 
 def _tell(fd: int, message: dict[str, Any]) -> None:
@@ -324,23 +355,26 @@ def serve(fd: int, start: str) -> None:
     if start == "fork":
         with contextlib.suppress(Exception):  # what is not loaded here each child loads itself
             importlib.import_module("dynslam_bench.core.kernel_cache").load_kernels()
-            module_graph()  # remembered: the keys of the children's stage caches are of the code that is loaded here
-            # it dates what was loaded here; children that record what plug-ins read find the distributions read already
+            # remembered: the keys of the children's stage caches are of the code that is loaded
+            # here
+            module_graph()
+            # it dates what was loaded here; children that record what plug-ins read find the
+            # distributions read already
             importlib.import_module("dynslam_bench.runs.process.recorder")
             ImportPath(sys.path).read_all()
     adopt_orphans()
     _Server(control, start).run()
 
 
-# -- process trees -----------------------------------------------------------------------------------------------------
+# -- process trees ---------------------------------------------------------------------------------
 
 
 def adopt_orphans(*, die_with_parent: bool = False) -> None:
     """On Linux become the parent of every descendant whose own parent ends.
 
     Args:
-        die_with_parent: Whether this process is killed when the thread that forked it ends; elsewhere than on Linux the
-            closed connection has to do.
+        die_with_parent: Whether this process is killed when the thread that forked it ends;
+            elsewhere than on Linux the closed connection has to do.
     """
     if sys.platform == "linux":
         prctl = ctypes.CDLL(None).prctl

@@ -17,7 +17,8 @@ _SITE = (f"{os.sep}site-packages{os.sep}", f"{os.sep}dist-packages{os.sep}")
 class Origins:
     """Tells by their files whose modules and functions are.
 
-    Libraries are what is installed, and what has been imported when this is made: this package uses it.
+    Libraries are what is installed, and what has been imported when this is made: this package uses
+    it.
 
     Args:
         plugin: The folder of a plug-in's file: foreign.
@@ -28,7 +29,9 @@ class Origins:
         self._plugin = () if plugin is None else _folders([str(plugin)])
         self._modules = frozenset(modules)
         self._own = _folders(_own_folders())
-        self._python = _folders([*map(sysconfig.get_path, ("stdlib", "platstdlib")), os.path.dirname(os.__file__)])
+        self._python = _folders(
+            [*map(sysconfig.get_path, ("stdlib", "platstdlib")), os.path.dirname(os.__file__)]
+        )
         self._imported = _folders([])
         self._of_file: dict[str, Origin] = {}
         self._of_code: dict[str, Origin] = {}
@@ -63,7 +66,9 @@ class Origins:
         if file.startswith(self._own):
             return "own"
         for folder in self._plugin:
-            if file.startswith(folder) and not any(site in file[len(folder) - 1 :] for site in _SITE):
+            if file.startswith(folder) and not any(
+                site in file[len(folder) - 1 :] for site in _SITE
+            ):
                 return "foreign"
         if any(site in file for site in _SITE) or file.startswith(self._imported):
             return "library"
@@ -89,5 +94,9 @@ def _imported_places() -> Iterator[str]:
 
 def _folders(places: list[str] | Iterator[str]) -> tuple[str, ...]:
     """Beginnings of the paths of what lies in folders, as they are written and with their links followed."""
-    spellings = [spelling for place in places for spelling in (os.path.abspath(place), os.path.realpath(place))]
+    spellings = [
+        spelling
+        for place in places
+        for spelling in (os.path.abspath(place), os.path.realpath(place))
+    ]
     return tuple(f"{spelling}{os.sep}" for spelling in dict.fromkeys(spellings))

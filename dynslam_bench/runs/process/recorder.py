@@ -1,19 +1,21 @@
 """Records what foreign code reads while a run is made: files, folders, modules, environment variables and programs.
 
-Foreign are plug-ins, and libraries while a plug-in calls them (`origins`). Python announces what they are about to do
-(`sys.addaudithook`); a mapping in place of ``os.environ`` announces the variables that they look up.
+Foreign are plug-ins, and libraries while a plug-in calls them (`origins`). Python announces what
+they are about to do (`sys.addaudithook`); a mapping in place of ``os.environ`` announces the
+variables that they look up.
 
-Files that libraries open in machine code are not announced: by ``cv2.imread``, ``cv2.dnn.readNet``, ``onnxruntime``. In
-their place each file counts whose name is written in a plug-in's sources, or in a small text file that foreign code
-opened. So does each image and network in a folder that it listed. Nor is it announced that a plug-in asks whether a
-file is there (``Path.exists``): a file that its sources name and that is not there counts as absent. Files that are
-named by a descriptor of their folder are not seen, nor is what comes from the network.
+Files that libraries open in machine code are not announced: by ``cv2.imread``, ``cv2.dnn.readNet``,
+``onnxruntime``. In their place each file counts whose name is written in a plug-in's sources, or in
+a small text file that foreign code opened. So does each image and network in a folder that it
+listed. Nor is it announced that a plug-in asks whether a file is there (``Path.exists``): a file
+that its sources name and that is not there counts as absent. Files that are named by a descriptor
+of their folder are not seen, nor is what comes from the network.
 
-Of programs counts what `core.programs` shows, what their command lines name, and the environment variables whose names
-are written in the command or in its files.
+Of programs counts what `core.programs` shows, what their command lines name, and the environment
+variables whose names are written in the command or in its files.
 
-What a run makes is no input of it: its private folders, files that it writes before it reads them, files that are
-written after a program was started.
+What a run makes is no input of it: its private folders, files that it writes before it reads them,
+files that are written after a program was started.
 """
 
 import hashlib
@@ -73,19 +75,23 @@ _LOG = "reads-{}.jsonl"
 class ReadRecorder:
     """Records what foreign code reads in this process, and in those that are forked from it, until it is finished.
 
-    It belongs into the process that makes a run, and is started before a plug-in is loaded. One at a time is at work.
+    It belongs into the process that makes a run, and is started before a plug-in is loaded. One at
+    a time is at work.
 
     Args:
         anchors: The folders in which names of files begin.
-        private: Folders of the run's own, at least one: what lies there is no input. Forked processes write their
-            reads into the first one.
-        plugins: Top-level names of the modules of installed plug-ins; their sources count by their bytes.
+        private: Folders of the run's own, at least one: what lies there is no input. Forked
+            processes write their reads into the first one.
+        plugins: Top-level names of the modules of installed plug-ins; their sources count by their
+            bytes.
 
     Attributes:
         count: How many things were read so far.
     """
 
-    def __init__(self, anchors: Anchors, *, private: Iterable[Path], plugins: Collection[str] = ()) -> None:
+    def __init__(
+        self, anchors: Anchors, *, private: Iterable[Path], plugins: Collection[str] = ()
+    ) -> None:
         self.count = 0
         self._anchors = anchors
         self._folders = list(private)
@@ -124,9 +130,15 @@ class ReadRecorder:
     def start(self) -> None:
         """Begin to record."""
         owned = (*self._folders, stage_cache_folder(), digest_cache_folder())
-        spellings = [spelling for folder in owned for spelling in (os.path.abspath(folder), os.path.realpath(folder))]
+        spellings = [
+            spelling
+            for folder in owned
+            for spelling in (os.path.abspath(folder), os.path.realpath(folder))
+        ]
         self._origins = Origins(self._anchors.plugin, self._plugins)
-        self._collector = Collector(self._anchors, self._origins, tuple(f"{folder}{os.sep}" for folder in spellings))
+        self._collector = Collector(
+            self._anchors, self._origins, tuple(f"{folder}{os.sep}" for folder in spellings)
+        )
         self._notes = self._collector.notes
         listen(self.hear, self._handlers, self.begin_log)
 
@@ -139,7 +151,8 @@ class ReadRecorder:
         """Record no more, and give what was read; also of a run that failed.
 
         Raises:
-            RunError: Something has changed while the run read it, so that nobody knows what it read.
+            RunError: Something has changed while the run read it, so that nobody knows what it
+                read.
         """
         self._look_at_programs(0.0)
         self.stop()
@@ -169,7 +182,7 @@ class ReadRecorder:
             self._snapshot = (count, value)
         return value
 
-    # -- what is announced ---------------------------------------------------------------------------------------------
+    # -- what is announced -------------------------------------------------------------------------
 
     def hear(self, frame: FrameType, event: str, arguments: tuple[Any, ...]) -> None:
         """Take an announcement; what a recorder itself does is not announced.
@@ -185,7 +198,8 @@ class ReadRecorder:
             self._handlers[event](frame, *arguments)
         except _StaleByteCode:
             raise
-        except Exception as error:  # a fault of the recorder's own, which must not become one of the plug-in
+        # a fault of the recorder's own, which must not become one of the plug-in
+        except Exception as error:
             self._error = self._error or error
         finally:
             self._ignored_threads.discard(thread)
@@ -225,7 +239,7 @@ class ReadRecorder:
             frame = frame.f_back
         return threading.current_thread() is not threading.main_thread()
 
-    # -- files ---------------------------------------------------------------------------------------------------------
+    # -- files -------------------------------------------------------------------------------------
 
     def _on_open(self, frame: FrameType, name: Any, mode: str | None, flags: int) -> None:
         if isinstance(name, int):  # it was seen when the descriptor was opened
@@ -255,7 +269,11 @@ class ReadRecorder:
 
     def _on_library(self, frame: FrameType, name: Any) -> None:
         # one without a folder is found among what is mapped into memory
-        if isinstance(name, str | bytes) and os.sep in os.fsdecode(name) and (path := _absolute(name)):
+        if (
+            isinstance(name, str | bytes)
+            and os.sep in os.fsdecode(name)
+            and (path := _absolute(name))
+        ):
             self._read(frame, path)
 
     def _read(self, frame: FrameType, path: str, *, whole: bool = False) -> None:
@@ -264,7 +282,8 @@ class ReadRecorder:
         Args:
             frame: Who reads it.
             path: The file.
-            whole: Whether its content is digested now, however large: it is about to be written, too.
+            whole: Whether its content is digested now, however large: it is about to be written,
+                too.
         """
         if self._collector.is_output(path):  # it may be a link to what is none
             path = os.path.realpath(path)
@@ -276,7 +295,9 @@ class ReadRecorder:
         is_special = stamp is not None and not os.path.isfile(path)  # a folder, a pipe, a socket
         if is_special or not self._can_count(path) or not self._is_foreign(frame):
             return
-        if self._collector.is_output(os.path.realpath(path)) or self._collector.is_of_program(stamp):
+        if self._collector.is_output(os.path.realpath(path)) or self._collector.is_of_program(
+            stamp
+        ):
             return
         note = FileNote(stamp)
         if stamp is not None and whole:
@@ -290,8 +311,9 @@ class ReadRecorder:
         """The source of byte code, any other path as it is.
 
         Raises:
-            FileNotFoundError: The source has changed after the byte code was written. Python would not see a change
-                that left size and second of modification as they were; now it compiles the source.
+            FileNotFoundError: The source has changed after the byte code was written. Python would
+                not see a change that left size and second of modification as they were; now it
+                compiles the source.
         """
         if not path.endswith(".pyc") or BYTE_CODE_FOLDER not in path:
             return path
@@ -308,7 +330,12 @@ class ReadRecorder:
 
     def _can_count(self, path: str) -> bool:
         """Whether a file is none that counts in another way: by its distribution, as this package's code, as source."""
-        if not is_file_name(path) or path.endswith(_KERNELS) or BYTE_CODE_FOLDER in path or _METADATA.search(path):
+        if (
+            not is_file_name(path)
+            or path.endswith(_KERNELS)
+            or BYTE_CODE_FOLDER in path
+            or _METADATA.search(path)
+        ):
             return False
         if path in sys.path:  # an archive: it counts where a module is loaded from it
             return False
@@ -328,7 +355,9 @@ class ReadRecorder:
             self._notes.made.add(spelling)
             self._note("made", spelling)
 
-    def _on_rename(self, frame: FrameType, source: Any, target: Any, source_folder: int, target_folder: int) -> None:
+    def _on_rename(
+        self, frame: FrameType, source: Any, target: Any, source_folder: int, target_folder: int
+    ) -> None:
         if path := _absolute(source, source_folder):
             self._read(frame, path)
             self._make(path)
@@ -357,7 +386,12 @@ class ReadRecorder:
 
     def _on_list(self, frame: FrameType, name: Any) -> None:
         path = _absolute("." if name is None else name)
-        if path is None or path in self._notes.folders or not is_file_name(path) or _is_in(frame, _IMPORTING):
+        if (
+            path is None
+            or path in self._notes.folders
+            or not is_file_name(path)
+            or _is_in(frame, _IMPORTING)
+        ):
             return
         if self._collector.is_output(f"{path}{os.sep}") or not self._is_foreign(frame):
             return
@@ -367,11 +401,15 @@ class ReadRecorder:
             self._notes.folders[path] = None
         self._note("folder", path)
 
-    # -- modules and variables -----------------------------------------------------------------------------------------
+    # -- modules and variables ---------------------------------------------------------------------
 
     def _on_import(self, frame: FrameType, module: str, *_: Any) -> None:
         top = module.partition(".")[0]
-        if top not in self._notes.modules and top not in sys.stdlib_module_names and self._is_foreign(frame):
+        if (
+            top not in self._notes.modules
+            and top not in sys.stdlib_module_names
+            and self._is_foreign(frame)
+        ):
             self._notes.modules.add(top)
             self._note("module", top)
 
@@ -393,15 +431,22 @@ class ReadRecorder:
                 self._notes.variables.add(name)
                 self._note("variable", name)
 
-    # -- programs ------------------------------------------------------------------------------------------------------
+    # -- programs ----------------------------------------------------------------------------------
 
-    def _on_popen(self, frame: FrameType, executable: Any, words: Any, folder: Any, environment: Any) -> None:
+    def _on_popen(
+        self, frame: FrameType, executable: Any, words: Any, folder: Any, environment: Any
+    ) -> None:
         given = [words] if isinstance(words, str | bytes | os.PathLike) else list(words)
         self._start_program(frame, [executable, *given[1:]], folder)
-        if environment is not None and _is_adapter(frame):  # an adapter's program gets these variables and no others
-            self._note_variables([name for name in map(os.fsdecode, environment) if is_counted(name)])
+        # an adapter's program gets these variables and no others
+        if environment is not None and _is_adapter(frame):
+            self._note_variables(
+                [name for name in map(os.fsdecode, environment) if is_counted(name)]
+            )
 
-    def _on_exec(self, frame: FrameType, path: Any, words: Any, _: Mapping[Any, Any] | None) -> None:
+    def _on_exec(
+        self, frame: FrameType, path: Any, words: Any, _: Mapping[Any, Any] | None
+    ) -> None:
         self._start_program(frame, [path, *list(words)[1:]])
 
     def _on_spawn(self, frame: FrameType, _: int, path: Any, words: Any, __: Any) -> None:
@@ -415,7 +460,8 @@ class ReadRecorder:
         if not self._is_foreign(frame) and not _is_adapter(frame):
             return
         texts = [os.fsdecode(word) for word in words]
-        if texts[1:2] == ["-c"] and texts[0].endswith("sh"):  # what a shell's line names counts as arguments do
+        # what a shell's line names counts as arguments do
+        if texts[1:2] == ["-c"] and texts[0].endswith("sh"):
             texts += _SHELL_WORD.findall(texts[2])
         command = Command(tuple(texts), _absolute("." if folder is None else folder) or os.getcwd())
         if command not in self._notes.commands:
@@ -449,11 +495,13 @@ class ReadRecorder:
                 except psutil.Error:  # it has ended
                     continue
                 age_s = time.time() - born_s
-                if not is_fork and age_s >= max(least_age_s, 2 * self._looked.get((process.pid, born_s), 0.0)):
+                if not is_fork and age_s >= max(
+                    least_age_s, 2 * self._looked.get((process.pid, born_s), 0.0)
+                ):
                     self._looked[process.pid, born_s] = age_s
                     look_at(process, self._collector.programs)
 
-    # -- forked processes ----------------------------------------------------------------------------------------------
+    # -- forked processes --------------------------------------------------------------------------
 
     def begin_log(self) -> None:
         """In a forked process: write down what is read, as it ends without a word."""
@@ -464,7 +512,11 @@ class ReadRecorder:
 
     def _add_forked(self) -> None:
         """Take over what forked processes have read and made."""
-        lines = [line for log in self._folders[0].glob(_LOG.format("*")) for line in log.read_text().splitlines()]
+        lines = [
+            line
+            for log in self._folders[0].glob(_LOG.format("*"))
+            for line in log.read_text().splitlines()
+        ]
         entries = [json.loads(line) for line in lines]
         for kind, name in entries:
             if kind == "made":
@@ -483,7 +535,9 @@ class ReadRecorder:
                     self._notes.modules.add(name)
                 case "command":
                     words, folder = json.loads(name)
-                    self._notes.commands.setdefault(Command(tuple(words), folder), self._collector.began_ns)
+                    self._notes.commands.setdefault(
+                        Command(tuple(words), folder), self._collector.began_ns
+                    )
 
 
 class _StaleByteCode(FileNotFoundError):
@@ -523,8 +577,9 @@ def _of_descriptor(descriptor: int) -> str | None:
 def _time_after_files_so_far() -> int:
     """A time in nanoseconds that is later than the stamps of all files written so far, and not of those written next.
 
-    It waits for the next tick of the clock that stamps files. Where that clock cannot be read it gives the time less
-    the most that the clock may be behind: files of the last moments then count as written next.
+    It waits for the next tick of the clock that stamps files. Where that clock cannot be read it
+    gives the time less the most that the clock may be behind: files of the last moments then count
+    as written next.
     """
     if _FILE_CLOCK is None:
         return time.time_ns() - _CLOCK_NS

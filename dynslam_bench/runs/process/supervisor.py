@@ -30,7 +30,10 @@ _SIGNAL_GRACE_S = 0.5
 _GO_ON = "the run is not stored; the same command goes on from there"
 DEFAULT_SHARE = 0.8
 """Share of the machine's memory that all runs at a time may take together where no limit was given."""
-_CGROUP_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
+_CGROUP_LIMITS = (
+    Path("/sys/fs/cgroup/memory.max"),
+    Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
+)
 
 
 @dataclass
@@ -42,8 +45,8 @@ class Verdict:
         reason: One line.
         final: Its last message.
         peak_memory_mb: Largest memory measured or reported.
-        refused: Whether it is no outcome of a tracker: it failed before anything ran, because what was asked for
-            cannot be, or something else than the tracker's own code raised.
+        refused: Whether it is no outcome of a tracker: it failed before anything ran, because what
+            was asked for cannot be, or something else than the tracker's own code raised.
     """
 
     status: Status
@@ -61,7 +64,9 @@ class ServerDiedError(InfrastructureError):
     """
 
     def __init__(self, where: str) -> None:
-        super().__init__(f"the run could not go on: the fork server was ended from outside{where}", _GO_ON)
+        super().__init__(
+            f"the run could not go on: the fork server was ended from outside{where}", _GO_ON
+        )
         self.where = where
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -132,7 +137,9 @@ class _Supervisor:
         connection = self.child.connection
         is_open = True
         while True:
-            if connection in wait([self.child.status_fd, *([connection] if is_open else [])], _POLL_S):
+            if connection in wait(
+                [self.child.status_fd, *([connection] if is_open else [])], _POLL_S
+            ):
                 is_open = self._receive()
             if self.child.poll() is not None:
                 while is_open and connection.poll(0):
@@ -160,7 +167,8 @@ class _Supervisor:
                 return self._verdict(status, reason, refused=refused)
         code = self.child.poll()
         assert code is not None
-        if code < 0 and not self.cancelled():  # the signal that ends this process may have ended the child first
+        # the signal that ends this process may have ended the child first
+        if code < 0 and not self.cancelled():
             time.sleep(_SIGNAL_GRACE_S)
         if code < 0 and self.cancelled():
             return self._verdict("stopped", f"cancelled{self._where()}")
@@ -196,7 +204,9 @@ class _Supervisor:
         return True
 
     def _over_limit(self) -> Verdict | None:
-        now, limits, silent_s = time.monotonic(), self.limits, time.monotonic() - self.last_message
+        now = time.monotonic()
+        limits = self.limits
+        silent_s = time.monotonic() - self.last_message
         if self.final:
             return self.verdict_of_end() if silent_s > _END_GRACE_S else None
         if self.cancelled():
@@ -205,7 +215,9 @@ class _Supervisor:
             return self._verdict("stopped", f"stopped on request after frame {self.frame}")
         if self.began is None:
             if silent_s > limits.start_s:
-                raise InfrastructureError(f"no process for the run within {limits.start_s:g} s", _GO_ON)
+                raise InfrastructureError(
+                    f"no process for the run within {limits.start_s:g} s", _GO_ON
+                )
             return None
         if limits.time_s is not None and now - self.began > limits.time_s:
             return self._verdict("timeout", f"not done within {limits.time_s:g} s{self._where()}")
@@ -218,15 +230,22 @@ class _Supervisor:
         self.tick()
         if now >= self.next_tree:
             self.next_tree = now + _TREE_S
-            # only a part of it if the fork server is killed meanwhile; none if the process has ended
+            # only a part of it if the fork server is killed meanwhile; none if the process has
+            # ended
             tree = process_tree(self.child.pid) if self.child.pid else []
-            rest = [member for member in self.child.members if member not in tree and member.is_running()]
+            rest = [
+                member
+                for member in self.child.members
+                if member not in tree and member.is_running()
+            ]
             self.child.members = tree + rest
         used_mb = memory_mb(self.child.members)
         self.peak_mb = max(self.peak_mb, used_mb)
         if self.memory_mb is not None and used_mb > self.memory_mb:
             limit = f"the limit is {self.memory_mb:.0f} MB{self.memory_source}"
-            return self._verdict("out-of-memory", f"{used_mb:.0f} MB resident, {limit}{self._where()}")
+            return self._verdict(
+                "out-of-memory", f"{used_mb:.0f} MB resident, {limit}{self._where()}"
+            )
         return None
 
     def _where(self) -> str:
@@ -252,11 +271,13 @@ def _reason_of_exit(code: int) -> str:
 def memory_mb(members: list[psutil.Process]) -> float:
     """Memory in MB of a process tree, each page counted once.
 
-    Of one process this is its resident memory. Of several it is the larger of two lower bounds: the resident memory of
-    the first, and the sum of the proportional memories (a page that n processes share counts 1/n in each). Where the
-    system states no proportional memory, resident memory is summed.
+    Of one process this is its resident memory. Of several it is the larger of two lower bounds: the
+    resident memory of the first, and the sum of the proportional memories (a page that n processes
+    share counts 1/n in each). Where the system states no proportional memory, resident memory is
+    summed.
     """
-    resident, proportional = [], []
+    resident = []
+    proportional = []
     for process in members:
         with contextlib.suppress(psutil.Error):  # it has ended
             memory = process.memory_info() if len(members) == 1 else process.memory_full_info()
@@ -288,7 +309,9 @@ def memory_limit(asked_mb: float | None, at_a_time: int = 1) -> tuple[float | No
         return (asked_mb or None), ""
     machine_mb = machine_memory_mb()
     shared = f", shared by {at_a_time} runs at a time" if at_a_time > 1 else ""
-    source = f" (by default {100 * DEFAULT_SHARE:.0f} % of this machine's {machine_mb:.0f} MB{shared})"
+    source = (
+        f" (by default {100 * DEFAULT_SHARE:.0f} % of this machine's {machine_mb:.0f} MB{shared})"
+    )
     return DEFAULT_SHARE * machine_mb / at_a_time, source
 
 
@@ -304,7 +327,8 @@ def bound_log(log: Path, most: int) -> None:
     """Keep of a log that is longer than `most` bytes its beginning and its end; processes may append to it."""
     if not log.is_file() or log.stat().st_size <= most:
         return
-    with contextlib.suppress(OSError), log.open("r+b") as file:  # a full disk: the log stays as far as it came
+    # a full disk: the log stays as far as it came
+    with contextlib.suppress(OSError), log.open("r+b") as file:
         file.seek(-_KEPT, os.SEEK_END)
         end = file.read()
         file.truncate(_KEPT)

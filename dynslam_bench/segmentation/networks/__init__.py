@@ -5,7 +5,9 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def pinned_threads(get: Callable[[], int], put: Callable[[int], None], threads: int) -> Iterator[None]:
+def pinned_threads(
+    get: Callable[[], int], put: Callable[[int], None], threads: int
+) -> Iterator[None]:
     """Pin the thread count of a library while the block runs (it is one number for the whole process)."""
     before = get()
     put(threads)

@@ -1,7 +1,7 @@
 """Shape, residual trunk and feature pyramids of a Mask R-CNN; state-dict keys as torchvision's.
 
-Trunk: He et al. 2016, with the stride in the 3x3 convolution of a bottleneck (v1.5). FPN: Lin et al. 2017. CFPN: the
-paper's section on semantic segmentation; see `CFPN`.
+Trunk: He et al. 2016, with the stride in the 3x3 convolution of a bottleneck (v1.5). FPN: Lin et
+al. 2017. CFPN: the paper's section on semantic segmentation; see `CFPN`.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ class NetworkConfig(BaseModel):
         post_nms: Proposals an image after it.
         rpn_nms: IoU of the RPN's suppression.
         max_detections: Objects an image.
-        exact_paste: Masks are placed to the fraction of a pixel instead of as the published models place them.
+        exact_paste: Masks are placed to the fraction of a pixel instead of as the published models
+            place them.
         norm: ``frozen`` batch norm (published checkpoints) or ``batch`` (trained from scratch).
     """
 
@@ -63,7 +64,9 @@ class NetworkConfig(BaseModel):
     channels: Count = 256
     cfpn: bool = True
     classes: tuple[str, ...] = Field(default=COCO_CLASSES, max_length=4096)
-    anchor_sizes: tuple[Side, ...] = Field(default=(32.0, 64.0, 128.0, 256.0, 512.0), min_length=5, max_length=5)
+    anchor_sizes: tuple[Side, ...] = Field(
+        default=(32.0, 64.0, 128.0, 256.0, 512.0), min_length=5, max_length=5
+    )
     anchor_ratios: tuple[Side, ...] = Field(default=(0.5, 1.0, 2.0), min_length=1, max_length=16)
     box_hidden: Count = 1024
     mask_channels: Count = 256
@@ -85,7 +88,12 @@ class NetworkConfig(BaseModel):
     def stages(self) -> tuple[int, int, int, int]:
         """Output channels of the four residual stages."""
         expansion = 4 if self.bottleneck else 1
-        return (self.stem * expansion, 2 * self.stem * expansion, 4 * self.stem * expansion, 8 * self.stem * expansion)
+        return (
+            self.stem * expansion,
+            2 * self.stem * expansion,
+            4 * self.stem * expansion,
+            8 * self.stem * expansion,
+        )
 
 
 EMBEDDED = NetworkConfig(
@@ -102,8 +110,9 @@ RESNET18 = NetworkConfig(blocks=(2, 2, 2, 2), bottleneck=False, classes=("person
 def initialise(module: nn.Module, weights: Callable[[Tensor], object]) -> None:
     """Initialise the weights of all convolutions in a module, and their biases with zero.
 
-    Nothing on torch's ``meta`` device, on which a network lies whose shapes are only compared with a file: drawing
-    numbers there has no effect, but loads torch's compiler (1.6 s of processor, once a process).
+    Nothing on torch's ``meta`` device, on which a network lies whose shapes are only compared with
+    a file: drawing numbers there has no effect, but loads torch's compiler (1.6 s of processor,
+    once a process).
     """
     for conv in module.modules():
         if isinstance(conv, nn.Conv2d) and not conv.weight.is_meta:
@@ -141,14 +150,17 @@ class ResidualBlock(nn.Module):
         shapes = [(width, 3, stride), (width, 3, 1)]
         if config.bottleneck:
             shapes = [(width, 1, 1), (width, 3, stride), (outputs, 1, 1)]
-        self.convolutions, channels = len(shapes), inputs
+        self.convolutions = len(shapes)
+        channels = inputs
         for number, (wanted, kernel, step) in enumerate(shapes, start=1):
             self.add_module(f"conv{number}", _conv(channels, wanted, kernel, step))
             self.add_module(f"bn{number}", _norm(wanted, config))
             channels = wanted
         shortcut = stride > 1 or inputs != outputs
         self.downsample = (
-            nn.Sequential(_conv(inputs, outputs, 1, stride), _norm(outputs, config)) if shortcut else nn.Identity()
+            nn.Sequential(_conv(inputs, outputs, 1, stride), _norm(outputs, config))
+            if shortcut
+            else nn.Identity()
         )
 
     def forward(self, x: Tensor) -> Tensor:
@@ -191,8 +203,12 @@ class FPN(nn.Module):
 
     def __init__(self, stages: tuple[int, ...], channels: int) -> None:
         super().__init__()
-        self.inner_blocks = nn.ModuleList(nn.Sequential(nn.Conv2d(width, channels, 1)) for width in stages)
-        self.layer_blocks = nn.ModuleList(nn.Sequential(nn.Conv2d(channels, channels, 3, padding=1)) for _ in stages)
+        self.inner_blocks = nn.ModuleList(
+            nn.Sequential(nn.Conv2d(width, channels, 1)) for width in stages
+        )
+        self.layer_blocks = nn.ModuleList(
+            nn.Sequential(nn.Conv2d(channels, channels, 3, padding=1)) for _ in stages
+        )
         initialise(self, lambda weight: nn.init.kaiming_uniform_(weight, a=1))
 
     def forward(self, stages: list[Tensor]) -> list[Tensor]:
@@ -205,13 +221,13 @@ class FPN(nn.Module):
 class CFPN(nn.Module):
     """Cross-layer feature pyramid of the mask branch (paper, Figure 3 and its text).
 
-    C2..C5 are reduced by 1x1 convolutions; m5 comes from C5 directly, m4..m2 from fusing the upsampled higher levels
-    with the level itself; a 3x3 convolution against aliasing ends each level. Only the mask branch takes the result;
-    RPN and box head keep the FPN's.
+    C2..C5 are reduced by 1x1 convolutions; m5 comes from C5 directly, m4..m2 from fusing the
+    upsampled higher levels with the level itself; a 3x3 convolution against aliasing ends each
+    level. Only the mask branch takes the result; RPN and box head keep the FPN's.
 
-    Deviation: the mask branch takes the FPN's level *plus* the CFPN's, and the 3x3 convolutions start at zero. A plain
-    Mask R-CNN checkpoint therefore gives exactly its own output until the CFPN is trained (the paper is silent on
-    initialisation; it fine-tunes from COCO weights).
+    Deviation: the mask branch takes the FPN's level *plus* the CFPN's, and the 3x3 convolutions
+    start at zero. A plain Mask R-CNN checkpoint therefore gives exactly its own output until the
+    CFPN is trained (the paper is silent on initialisation; it fine-tunes from COCO weights).
     """
 
     def __init__(self, stages: tuple[int, ...], channels: int) -> None:
@@ -232,7 +248,9 @@ def top_down(laterals: list[Tensor]) -> list[Tensor]:
     """Add each level, upsampled to the size below, to the level below; from coarse to fine."""
     fused = [laterals[-1]]
     for lateral in reversed(laterals[:-1]):
-        fused.insert(0, lateral + functional.interpolate(fused[0], size=lateral.shape[-2:], mode="nearest"))
+        fused.insert(
+            0, lateral + functional.interpolate(fused[0], size=lateral.shape[-2:], mode="nearest")
+        )
     return fused
 
 

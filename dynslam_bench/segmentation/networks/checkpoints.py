@@ -62,14 +62,17 @@ def fetch_checkpoint(checkpoint: Checkpoint, progress: Report | None = None) -> 
         progress: Called with the progress of the download; see `core.download.download`.
 
     Raises:
-        SegmentationError: No network, no space, or the content's SHA-256 does not begin as published; names the
-            address, the size and the path under which the file may be put by hand.
+        SegmentationError: No network, no space, or the content's SHA-256 does not begin as
+            published; names the address, the size and the path under which the file may be put by
+            hand.
     """
     path = weights_folder() / checkpoint.file
     if path.is_file():
         return path
     try:
-        download(checkpoint.url, path, sha256=checkpoint.sha256_prefix, progress=progress, attempts=3)
+        download(
+            checkpoint.url, path, sha256=checkpoint.sha256_prefix, progress=progress, attempts=3
+        )
     except DownloadError as error:
         raise SegmentationError(
             f"cannot fetch the checkpoint '{checkpoint.id}': {error.args[0]}",

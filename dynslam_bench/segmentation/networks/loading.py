@@ -44,13 +44,13 @@ def load_network(path: Path) -> MaskRCNN:
     """Build the network of a checkpoint file, in inference mode.
 
     Three layouts of torchvision's keys are understood: 307 keys (frozen batch norm), 360 (with
-    ``num_batches_tracked``, which is dropped) and 307 with the names of the file published in 2019 (renamed). The
-    network's shape is inferred from the weights; this project's files carry it. A plain Mask R-CNN gets a CFPN that
-    starts at zero, so that its output does not change.
+    ``num_batches_tracked``, which is dropped) and 307 with the names of the file published in 2019
+    (renamed). The network's shape is inferred from the weights; this project's files carry it. A
+    plain Mask R-CNN gets a CFPN that starts at zero, so that its output does not change.
 
     Raises:
-        SegmentationError: The file cannot be read, is truncated, or does not fit: says which keys are missing or
-            unknown and which shapes differ.
+        SegmentationError: The file cannot be read, is truncated, or does not fit: says which keys
+            are missing or unknown and which shapes differ.
     """
     state, config = read_weights(path)
     config = config or infer_config(state, path)
@@ -65,7 +65,8 @@ def read_checkpoint(path: Path) -> Mapping[str, Any]:
     """The content of a torch file, on the CPU, with ``weights_only``.
 
     Raises:
-        SegmentationError: The file is missing, truncated, or holds anything but tensors and plain values.
+        SegmentationError: The file is missing, truncated, or holds anything but tensors and plain
+            values.
     """
     path = path.expanduser()
     with raising(SegmentationError, f"cannot read the checkpoint {path}"):
@@ -93,13 +94,20 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], NetworkConfig | None]:
     Raises:
         SegmentationError: The file holds no weights, or a shape that is not understood.
     """
-    content, config = read_checkpoint(path), None
+    content = read_checkpoint(path)
+    config = None
     if "config" in content and "format" in content:
         if content["format"] != FORMAT:
-            raise SegmentationError(f"{path} has the format {content['format']!r}, this version reads {FORMAT!r}")
-        with raising(SegmentationError, f"{path}: the network's shape is not understood", of=ValidationError):
+            raise SegmentationError(
+                f"{path} has the format {content['format']!r}, this version reads {FORMAT!r}"
+            )
+        with raising(
+            SegmentationError, f"{path}: the network's shape is not understood", of=ValidationError
+        ):
             config = NetworkConfig.model_validate_json(str(content["config"]))
-    content = next((content[key] for key in _WRAPPERS if isinstance(content.get(key), Mapping)), content)
+    content = next(
+        (content[key] for key in _WRAPPERS if isinstance(content.get(key), Mapping)), content
+    )
     state = {str(key): value for key, value in content.items() if isinstance(value, Tensor)}
     if not state:
         raise SegmentationError(f"{path} holds no weights; its keys: {_some(map(str, content))}")
@@ -142,7 +150,9 @@ def infer_config(state: Mapping[str, Tensor], path: Path) -> NetworkConfig:
         "ratios": "rpn.head.cls_logits.weight",
         "mask_channels": "roi_heads.mask_head.0.0.weight",
     }
-    if missing := [key for key in needed.values() if key not in state or state[key].dim() not in (2, 4)]:
+    if missing := [
+        key for key in needed.values() if key not in state or state[key].dim() not in (2, 4)
+    ]:
         raise SegmentationError(
             f"{path} is no Mask R-CNN of torchvision's layout: {missing[0]} is missing ({len(state)} keys, "
             f"for example {_some(state)})"
@@ -157,8 +167,13 @@ def infer_config(state: Mapping[str, Tensor], path: Path) -> NetworkConfig:
     if names == ("person",):
         warnings.warn(f"{path} does not name its only class: it is taken for person", stacklevel=2)
     if rows["ratios"] != 3:
-        raise SegmentationError(f"{path} has {rows['ratios']} anchors a cell, torchvision's models have 3")
-    stages = [[key.split(".")[3] for key in state if key.startswith(f"backbone.body.layer{n}.")] for n in range(1, 5)]
+        raise SegmentationError(
+            f"{path} has {rows['ratios']} anchors a cell, torchvision's models have 3"
+        )
+    stages = [
+        [key.split(".")[3] for key in state if key.startswith(f"backbone.body.layer{n}.")]
+        for n in range(1, 5)
+    ]
     shape = {
         "blocks": [len(set(blocks)) for blocks in stages],
         "bottleneck": "backbone.body.layer1.0.conv3.weight" in state,
@@ -167,10 +182,14 @@ def infer_config(state: Mapping[str, Tensor], path: Path) -> NetworkConfig:
         "classes": names,
         "box_hidden": int(state[needed["classes"]].shape[1]),
         "mask_channels": rows["mask_channels"],
-        "mask_layers": len({key.split(".")[2] for key in state if key.startswith("roi_heads.mask_head.")}),
+        "mask_layers": len(
+            {key.split(".")[2] for key in state if key.startswith("roi_heads.mask_head.")}
+        ),
         "cfpn": True,
     }
-    with raising(SegmentationError, f"{path}: the network's shape is not understood", of=ValidationError):
+    with raising(
+        SegmentationError, f"{path}: the network's shape is not understood", of=ValidationError
+    ):
         return NetworkConfig(**shape)
 
 
@@ -188,28 +207,41 @@ def load_strictly(network: MaskRCNN, state: Mapping[str, Tensor], path: Path) ->
 
 
 def _check_fit(network: MaskRCNN, state: Mapping[str, Tensor], path: Path) -> None:
-    own, has_cfpn = _weights(network), any(key.startswith(CFPN_PREFIX) for key in state)
-    missing = [key for key in own if key not in state and (has_cfpn or not key.startswith(CFPN_PREFIX))]
+    own = _weights(network)
+    has_cfpn = any(key.startswith(CFPN_PREFIX) for key in state)
+    missing = [
+        key for key in own if key not in state and (has_cfpn or not key.startswith(CFPN_PREFIX))
+    ]
     unknown = [key for key in state if key not in own]
     shapes = [
         f"{key} {list(state[key].shape)} instead of {list(own[key].shape)}"
         for key in own
         if key in state and state[key].shape != own[key].shape
     ]
-    checks = (("keys are missing", missing), ("keys are unknown", unknown), ("shapes differ", shapes))
+    checks = (
+        ("keys are missing", missing),
+        ("keys are unknown", unknown),
+        ("shapes differ", shapes),
+    )
     faults = [f"{len(keys)} {what} ({_some(keys)})" for what, keys in checks if keys]
     if faults:
         raise SegmentationError(f"{path} does not fit the network: " + "; ".join(faults))
 
 
 def _weights(network: MaskRCNN) -> dict[str, Tensor]:
-    return {key: value for key, value in network.state_dict().items() if not key.endswith("num_batches_tracked")}
+    return {
+        key: value
+        for key, value in network.state_dict().items()
+        if not key.endswith("num_batches_tracked")
+    }
 
 
 def save_network(network: MaskRCNN, path: Path, *, half: bool = False) -> None:
     """Write a network with its shape; `half` stores float16."""
     state = {
-        key: value.detach().cpu().half() if half and value.is_floating_point() else value.detach().cpu()
+        key: value.detach().cpu().half()
+        if half and value.is_floating_point()
+        else value.detach().cpu()
         for key, value in _weights(network).items()
     }
     content = {"format": FORMAT, "config": network.config.model_dump_json(), "model": state}

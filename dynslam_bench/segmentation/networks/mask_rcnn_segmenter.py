@@ -17,7 +17,12 @@ from dynslam_bench.segmentation.networks import pinned_threads
 from dynslam_bench.segmentation.networks.checkpoints import COCO, embedded_weights, fetch_checkpoint
 from dynslam_bench.segmentation.networks.loading import load_network
 from dynslam_bench.segmentation.networks.network import MaskRCNN
-from dynslam_bench.segmentation.settings import NMS_IOU, SegmentationSettings, canonical_name, check_classes
+from dynslam_bench.segmentation.settings import (
+    NMS_IOU,
+    SegmentationSettings,
+    canonical_name,
+    check_classes,
+)
 
 
 class MaskRCNNSegmenter:
@@ -41,7 +46,10 @@ class MaskRCNNSegmenter:
         floor: float = 0.1,
     ) -> None:
         self.network = network.eval().fuse().to(device)
-        self.settings, self.device, self.threads, self.floor = settings, device, threads, floor
+        self.settings = settings
+        self.device = device
+        self.threads = threads
+        self.floor = floor
 
     def __deepcopy__(self, memo: dict[int, Any]) -> MaskRCNNSegmenter:
         """Itself: no frame changes the network."""
@@ -51,21 +59,39 @@ class MaskRCNNSegmenter:
         """The objects of the dynamic classes in the frame; none is an empty result."""
         height, width = frame.rgb.shape[:2]
         with pinned_threads(torch.get_num_threads, torch.set_num_threads, self.threads):
-            image = torch.from_numpy(np.array(frame.rgb, order="C")).to(self.device).permute(2, 0, 1).float() / 255
+            image = (
+                torch.from_numpy(np.array(frame.rgb, order="C"))
+                .to(self.device)
+                .permute(2, 0, 1)
+                .float()
+                / 255
+            )
             detections = self.network.detect(image, score=self.floor, iou=NMS_IOU)
         boxes, labels, scores, planes = (part.cpu().numpy() for part in detections)
-        config, wanted = self.network.config, self.settings.class_names()
+        config = self.network.config
+        wanted = self.settings.class_names()
         names = [canonical_name(config.classes[label - 1]) for label in labels]
         masks = np.zeros((len(names), height, width), bool)
         for mask, plane, box, name in zip(masks, planes, boxes, names, strict=True):
             if name in wanted:
-                mask[:] = paste(plane, box, height, width, self.settings.mask_threshold, exact=config.exact_paste)
-        return Instances(masks, boxes.astype(np.float32), tuple(names), scores.astype(np.float32)).visible()
+                mask[:] = paste(
+                    plane,
+                    box,
+                    height,
+                    width,
+                    self.settings.mask_threshold,
+                    exact=config.exact_paste,
+                )
+        return Instances(
+            masks, boxes.astype(np.float32), tuple(names), scores.astype(np.float32)
+        ).visible()
 
 
 def build_embedded(settings: SegmentationSettings, context: SegmenterContext) -> MaskRCNNSegmenter:
     """The small network in this package, at the input size that it was trained with."""
-    return load_segmenter(embedded_weights(), settings.model_copy(update={"network_side": 0}), context)
+    return load_segmenter(
+        embedded_weights(), settings.model_copy(update={"network_side": 0}), context
+    )
 
 
 def build_coco(settings: SegmentationSettings, context: SegmenterContext) -> MaskRCNNSegmenter:
@@ -78,19 +104,26 @@ def build_weights(settings: SegmentationSettings, context: SegmenterContext) -> 
     return load_segmenter(Path(context.argument), settings, context)
 
 
-def load_segmenter(path: Path, settings: SegmentationSettings, context: SegmenterContext) -> MaskRCNNSegmenter:
+def load_segmenter(
+    path: Path, settings: SegmentationSettings, context: SegmenterContext
+) -> MaskRCNNSegmenter:
     """The segmenter of a checkpoint file; it works at `settings.network_side` pixels.
 
     Raises:
-        SegmentationError: The file does not fit, the device is missing, or the network knows none of the classes.
+        SegmentationError: The file does not fit, the device is missing, or the network knows none
+            of the classes.
     """
     if context.device.startswith("cuda") and not torch.cuda.is_available():
-        raise SegmentationError(f"device '{context.device}' is not available: torch {torch.__version__} sees no GPU")
+        raise SegmentationError(
+            f"device '{context.device}' is not available: torch {torch.__version__} sees no GPU"
+        )
     network = load_network(path)
     check_classes(filter(None, network.config.classes), settings, str(path), "the network")
     if settings.network_side > 0:
         network.set_input(settings.network_side)
-    return MaskRCNNSegmenter(network, settings, device=context.device, threads=context.threads, floor=context.floor)
+    return MaskRCNNSegmenter(
+        network, settings, device=context.device, threads=context.threads, floor=context.floor
+    )
 
 
 def paste(
@@ -110,21 +143,30 @@ def paste(
         height: Of the image.
         width: Of the image.
         threshold: Least probability of a pixel.
-        exact: Interpolate at the pixels' centres. Otherwise as in the published models: the mask gets a border of one
-            pixel, the box grows by the same share and is cut to whole pixels, which shifts edges by up to a pixel.
+        exact: Interpolate at the pixels' centres. Otherwise as in the published models: the mask
+            gets a border of one pixel, the box grows by the same share and is cut to whole pixels,
+            which shifts edges by up to a pixel.
     """
     mask = np.zeros((height, width), bool)
     if exact:
         _paste_exactly(plane, box, threshold, mask)
         return mask
     side = plane.shape[0]
-    centre, half = (box[:2] + box[2:]) / 2, (box[2:] - box[:2]) / 2 * ((side + 2) / side)
-    (x0, y0), (x1, y1) = (np.trunc(corner).astype(int).tolist() for corner in (centre - half, centre + half))
+    centre = (box[:2] + box[2:]) / 2
+    half = (box[2:] - box[:2]) / 2 * ((side + 2) / side)
+    (x0, y0), (x1, y1) = (
+        np.trunc(corner).astype(int).tolist() for corner in (centre - half, centre + half)
+    )
     size = (max(x1 - x0 + 1, 1), max(y1 - y0 + 1, 1))
     patch = cv2.resize(np.pad(plane, 1), size, interpolation=cv2.INTER_LINEAR)
-    left, top, right, bottom = max(x0, 0), max(y0, 0), min(x1 + 1, width), min(y1 + 1, height)
+    left = max(x0, 0)
+    top = max(y0, 0)
+    right = min(x1 + 1, width)
+    bottom = min(y1 + 1, height)
     if left < right and top < bottom:
-        mask[top:bottom, left:right] = patch[top - y0 : bottom - y0, left - x0 : right - x0] >= threshold
+        mask[top:bottom, left:right] = (
+            patch[top - y0 : bottom - y0, left - x0 : right - x0] >= threshold
+        )
     return mask
 
 
@@ -132,16 +174,25 @@ def _paste_exactly(
     plane: NDArray[np.float32], box: NDArray[np.float32], threshold: float, mask: NDArray[np.bool_]
 ) -> None:
     """Set the pixels of an empty mask by interpolation at their centres."""
-    left, top = max(math.floor(box[0]), 0), max(math.floor(box[1]), 0)
-    right, bottom = min(math.ceil(box[2]), mask.shape[1]), min(math.ceil(box[3]), mask.shape[0])
+    left = max(math.floor(box[0]), 0)
+    top = max(math.floor(box[1]), 0)
+    right = min(math.ceil(box[2]), mask.shape[1])
+    bottom = min(math.ceil(box[3]), mask.shape[0])
     if left >= right or top >= bottom or box[2] <= box[0] or box[3] <= box[1]:
         return
     scale = plane.shape[0] / (box[2:] - box[:2])
     to_plane = np.array(
-        [[scale[0], 0, (left + 0.5 - box[0]) * scale[0] - 0.5], [0, scale[1], (top + 0.5 - box[1]) * scale[1] - 0.5]]
+        [
+            [scale[0], 0, (left + 0.5 - box[0]) * scale[0] - 0.5],
+            [0, scale[1], (top + 0.5 - box[1]) * scale[1] - 0.5],
+        ]
     )
-    size, flags = (right - left, bottom - top), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    size = (right - left, bottom - top)
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     patch = cv2.warpAffine(plane, to_plane, size, borderMode=cv2.BORDER_REPLICATE, flags=flags)
-    columns, rows = np.arange(left, right) + 0.5, np.arange(top, bottom) + 0.5
-    inside = ((rows >= box[1]) & (rows <= box[3]))[:, None] & ((columns >= box[0]) & (columns <= box[2]))[None]
+    columns = np.arange(left, right) + 0.5
+    rows = np.arange(top, bottom) + 0.5
+    inside = ((rows >= box[1]) & (rows <= box[3]))[:, None] & (
+        (columns >= box[0]) & (columns <= box[2])
+    )[None]
     mask[top:bottom, left:right] = (patch >= threshold) & inside

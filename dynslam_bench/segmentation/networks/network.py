@@ -1,8 +1,8 @@
 """Mask R-CNN (He et al. 2017) with a CFPN mask branch, in plain torch: proposals, heads, and the whole network.
 
-RoIAlign over a feature pyramid is one weighted gather. Every output bin is a weighted sum of 4 x S^2 feature vectors
-(S^2 bilinear samples of four corners each). An embedding bag over the rows of all levels' feature maps computes it in
-one vectorised call for all boxes, levels and channels.
+RoIAlign over a feature pyramid is one weighted gather. Every output bin is a weighted sum of 4 x
+S^2 feature vectors (S^2 bilinear samples of four corners each). An embedding bag over the rows of
+all levels' feature maps computes it in one vectorised call for all boxes, levels and channels.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ MIN_BOX_PX = 1e-2
 def anchor_cells(config: NetworkConfig) -> list[Tensor]:
     """Anchors ``[A, 4]`` of each level around the origin, rounded to pixels as the published models have them."""
     ratios = torch.tensor(config.anchor_ratios, device="cpu")
-    heights, widths = ratios.sqrt(), 1 / ratios.sqrt()
+    heights = ratios.sqrt()
+    widths = 1 / ratios.sqrt()
     sides = [torch.stack([widths * size, heights * size], dim=1) for size in config.anchor_sizes]
     return [torch.cat([-side, side], dim=1).div(2).round() for side in sides]
 
@@ -52,7 +53,9 @@ class RPNHead(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         count = len(config.anchor_ratios)
-        self.conv = nn.Sequential(nn.Sequential(nn.Conv2d(config.channels, config.channels, 3, padding=1), nn.ReLU()))
+        self.conv = nn.Sequential(
+            nn.Sequential(nn.Conv2d(config.channels, config.channels, 3, padding=1), nn.ReLU())
+        )
         self.cls_logits = nn.Conv2d(config.channels, count, 1)
         self.bbox_pred = nn.Conv2d(config.channels, 4 * count, 1)
         initialise(self, lambda weight: nn.init.normal_(weight, std=0.01))
@@ -86,32 +89,55 @@ class RPN(nn.Module):
             sizes: Height and width of each image inside the padded input.
 
         Returns:
-            Proposals ``[K, 4]`` of each image, best first; anchors, logits and codes of each level (for the losses).
+            Proposals ``[K, 4]`` of each image, best first; anchors, logits and codes of each level
+            (for the losses).
         """
         logits, codes = self.head(levels)
         anchors = anchors_of(self._cells, levels, height, width)
         with torch.no_grad():
-            proposals = [self._propose(anchors, logits, codes, image, size) for image, size in enumerate(sizes)]
+            proposals = [
+                self._propose(anchors, logits, codes, image, size)
+                for image, size in enumerate(sizes)
+            ]
         return proposals, anchors, logits, codes
 
     def _propose(
-        self, anchors: list[Tensor], logits: list[Tensor], codes: list[Tensor], image: int, size: tuple[int, int]
+        self,
+        anchors: list[Tensor],
+        logits: list[Tensor],
+        codes: list[Tensor],
+        image: int,
+        size: tuple[int, int],
     ) -> Tensor:
-        boxes, scores, groups = [], [], []
+        boxes = []
+        scores = []
+        groups = []
         for level, anchor in enumerate(anchors):
             count = min(self.config.pre_nms, len(anchor))
             best, chosen = logits[level][image].detach().float().topk(count)
-            boxes.append(decode(codes[level][image].detach().float()[chosen], anchor[chosen], RPN_WEIGHTS)[:, 0])
+            boxes.append(
+                decode(codes[level][image].detach().float()[chosen], anchor[chosen], RPN_WEIGHTS)[
+                    :, 0
+                ]
+            )
             scores.append(best.sigmoid())
             groups.append(torch.full_like(chosen, level))
-        box, score, group = clip(torch.cat(boxes), *size), torch.cat(scores), torch.cat(groups)
+        box = clip(torch.cat(boxes), *size)
+        score = torch.cat(scores)
+        group = torch.cat(groups)
         large = ((box[:, 2:] - box[:, :2]) >= MIN_PROPOSAL_PX).all(dim=1)
-        box, score, group = box[large], score[large], group[large]
+        box = box[large]
+        score = score[large]
+        group = group[large]
         return box[grouped_nms(box, score, group, self.config.rpn_nms)[: self.config.post_nms]]
 
 
 def rpn_loss(
-    anchors: list[Tensor], logits: list[Tensor], codes: list[Tensor], truths: list[Tensor], generator: torch.Generator
+    anchors: list[Tensor],
+    logits: list[Tensor],
+    codes: list[Tensor],
+    truths: list[Tensor],
+    generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
     """Losses of objectness and of box codes (Ren et al. 2015, Eq. 1), 256 anchors an image, half of them positive.
 
@@ -122,19 +148,32 @@ def rpn_loss(
         truths: Boxes ``[G, 4]`` of each image.
         generator: Draws the sample.
     """
-    every, total = torch.cat(anchors), 0
-    all_logits, all_codes = torch.cat(logits, dim=1).float(), torch.cat(codes, dim=1).float()
-    objectness, regression = [], []
+    every = torch.cat(anchors)
+    total = 0
+    all_logits = torch.cat(logits, dim=1).float()
+    all_codes = torch.cat(codes, dim=1).float()
+    objectness = []
+    regression = []
     for image, truth in enumerate(truths):
         matched = match(every, truth, high=0.7, low=0.3, keep_best=True)
         positive, negative = sample(matched, count=256, positive_share=0.5, generator=generator)
         index = torch.cat([positive, negative])
         label = (matched[index] >= 0).float()
-        objectness.append(functional.binary_cross_entropy_with_logits(all_logits[image, index], label, reduction="sum"))
+        objectness.append(
+            functional.binary_cross_entropy_with_logits(
+                all_logits[image, index], label, reduction="sum"
+            )
+        )
         wanted = encode(truth[matched[positive]], every[positive], RPN_WEIGHTS)
-        regression.append(functional.smooth_l1_loss(all_codes[image, positive], wanted, beta=1 / 9, reduction="sum"))
+        regression.append(
+            functional.smooth_l1_loss(
+                all_codes[image, positive], wanted, beta=1 / 9, reduction="sum"
+            )
+        )
         total += len(index)
-    return torch.stack(objectness).sum() / max(total, 1), torch.stack(regression).sum() / max(total, 1)
+    return torch.stack(objectness).sum() / max(total, 1), torch.stack(regression).sum() / max(
+        total, 1
+    )
 
 
 def levels_of(boxes: Tensor, canonical: float, count: int) -> Tensor:
@@ -147,7 +186,9 @@ def levels_of(boxes: Tensor, canonical: float, count: int) -> Tensor:
     return (level.clamp(2, count + 1) - 2).long()
 
 
-def roi_align(features: list[Tensor], boxes: list[Tensor], image_height: int, size: int, *, canonical: float) -> Tensor:
+def roi_align(
+    features: list[Tensor], boxes: list[Tensor], image_height: int, size: int, *, canonical: float
+) -> Tensor:
     """Features of boxes, each from the pyramid level that fits its size.
 
     Args:
@@ -158,7 +199,8 @@ def roi_align(features: list[Tensor], boxes: list[Tensor], image_height: int, si
         canonical: Box side that goes to the third level.
 
     Returns:
-        ``[sum K_b, C, size, size]``; samples outside the feature map count as 0 (beyond one cell), as in the original.
+        ``[sum K_b, C, size, size]``; samples outside the feature map count as 0 (beyond one cell),
+        as in the original.
     """
     batch, channels = features[0].shape[:2]
     device = features[0].device
@@ -170,17 +212,26 @@ def roi_align(features: list[Tensor], boxes: list[Tensor], image_height: int, si
     level = levels_of(rois, canonical, len(features))
     heights = torch.tensor([f.shape[2] for f in features], device=device)[level]
     widths = torch.tensor([f.shape[3] for f in features], device=device)[level]
-    cells = torch.tensor([0, *(batch * f.shape[2] * f.shape[3] for f in features[:-1])], device=device)
+    cells = torch.tensor(
+        [0, *(batch * f.shape[2] * f.shape[3] for f in features[:-1])], device=device
+    )
     base = cells.cumsum(dim=0)[level] + image * heights * widths
-    scales = torch.tensor([level_scale(f.shape[2], image_height) for f in features], device=device)[level]
+    scales = torch.tensor([level_scale(f.shape[2], image_height) for f in features], device=device)[
+        level
+    ]
     scaled = rois.to(torch.float32) * scales[:, None]
     rows, row_weights = _axis(scaled[:, 1], scaled[:, 3], heights, size)
     columns, column_weights = _axis(scaled[:, 0], scaled[:, 2], widths, size)
-    index = (base[:, None, None] + rows * widths[:, None, None])[:, :, None, :, None] + columns[:, None, :, None, :]
+    index = (base[:, None, None] + rows * widths[:, None, None])[:, :, None, :, None] + columns[
+        :, None, :, None, :
+    ]
     weight = row_weights[:, :, None, :, None] * column_weights[:, None, :, None, :]
     taps = (2 * SAMPLES) ** 2
     bags = functional.embedding_bag(
-        index.reshape(-1, taps), table, mode="sum", per_sample_weights=weight.reshape(-1, taps).to(table.dtype)
+        index.reshape(-1, taps),
+        table,
+        mode="sum",
+        per_sample_weights=weight.reshape(-1, taps).to(table.dtype),
     )
     return bags.reshape(len(rois), size, size, channels).permute(0, 3, 1, 2)
 
@@ -193,14 +244,18 @@ def level_scale(level_height: int, image_height: int) -> float:
 def _axis(low: Tensor, high: Tensor, length: Tensor, size: int) -> tuple[Tensor, Tensor]:
     """Cells ``[K, size, 2 SAMPLES]`` along one axis that each bin's samples touch, and their weights."""
     extent = (high - low).clamp(min=1.0)
-    step = (torch.arange(size * SAMPLES, device=low.device, dtype=torch.float32) + 0.5) / (size * SAMPLES)
-    # bin by bin, as the original adds them up: start + bin * bin_size + (sample + .5) * bin_size / samples
+    step = (torch.arange(size * SAMPLES, device=low.device, dtype=torch.float32) + 0.5) / (
+        size * SAMPLES
+    )
+    # bin by bin, as the original adds them up: start + bin * bin_size + (sample + .5) * bin_size /
+    # samples
     at = low[:, None] + step * extent[:, None]
     last = (length - 1)[:, None].to(torch.float32)
     inside = (at >= -1.0) & (at <= last + 1.0)
     at = torch.minimum(at.clamp(min=0.0), last)
     floor = at.floor()
-    fraction, scale = at - floor, inside / SAMPLES
+    fraction = at - floor
+    scale = inside / SAMPLES
     cells = torch.stack([floor, torch.minimum(floor + 1, last)], dim=2).long()
     weights = torch.stack([(1 - fraction) * scale, fraction * scale], dim=2)
     return cells.reshape(len(low), size, 2 * SAMPLES), weights.reshape(len(low), size, 2 * SAMPLES)
@@ -307,15 +362,21 @@ class RoIHeads(nn.Module):
             score: Least score.
             iou: Of the suppression within a class.
         """
-        pooled = roi_align(levels, [proposals], image_height, BOX_POOL, canonical=self.config.canonical)
+        pooled = roi_align(
+            levels, [proposals], image_height, BOX_POOL, canonical=self.config.canonical
+        )
         logits, codes = self.box_predictor(self.box_head(pooled))
         scores = functional.softmax(logits, dim=1)[:, 1:]
         boxes = clip(decode(codes, proposals, BOX_WEIGHTS), *size)[:, 1:]
         labels = torch.arange(1, scores.shape[1] + 1, device=scores.device).expand_as(scores)
         keep = (scores > score) & ((boxes[:, :, 2:] - boxes[:, :, :2]) >= MIN_BOX_PX).all(dim=2)
-        box, best, label = boxes[keep], scores[keep], labels[keep]
+        box = boxes[keep]
+        best = scores[keep]
+        label = labels[keep]
         chosen = grouped_nms(box, best, label, iou)[: self.config.max_detections]
-        box, best, label = box[chosen], best[chosen], label[chosen]
+        box = box[chosen]
+        best = best[chosen]
+        label = label[chosen]
         mask_logits = self.masks(mask_levels, [box], image_height)
         masks = mask_logits[torch.arange(len(label), device=label.device), label].sigmoid()
         return Detections(box, label, best, masks)
@@ -323,7 +384,9 @@ class RoIHeads(nn.Module):
     def masks(self, mask_levels: list[Tensor], boxes: list[Tensor], image_height: int) -> Tensor:
         """Mask logits ``[sum K, n + 1, 2m, 2m]`` inside boxes."""
         config = self.config
-        pooled = roi_align(mask_levels, boxes, image_height, config.mask_pool, canonical=config.mask_canonical)
+        pooled = roi_align(
+            mask_levels, boxes, image_height, config.mask_pool, canonical=config.mask_canonical
+        )
         result: Tensor = self.mask_predictor(self.mask_head(pooled))
         return result
 
@@ -352,12 +415,19 @@ class RoIHeads(nn.Module):
             generator: Draws the sample.
             per_image: How many proposals an image enter the losses.
         """
-        rois, classes, codes, positives, targets = [], [], [], [], []
+        rois = []
+        classes = []
+        codes = []
+        positives = []
+        targets = []
         for proposal, truth, label, mask in zip(proposals, truths, labels, masks, strict=True):
             candidates = torch.cat([proposal, truth])
             matched = match(candidates, truth, high=0.5, low=0.5, keep_best=False)
-            positive, negative = sample(matched, count=per_image, positive_share=0.25, generator=generator)
-            hits, boxes = matched[positive], candidates[positive]
+            positive, negative = sample(
+                matched, count=per_image, positive_share=0.25, generator=generator
+            )
+            hits = matched[positive]
+            boxes = candidates[positive]
             rois.append(torch.cat([boxes, candidates[negative]]))
             classes.append(torch.cat([label[hits], label.new_zeros(len(negative))]))
             codes.append(encode(truth[hits], boxes, BOX_WEIGHTS))
@@ -370,7 +440,8 @@ class RoIHeads(nn.Module):
         own = predicted.reshape(len(predicted), -1, 4)[foreground, wanted[foreground]]
         losses = {
             "class": functional.cross_entropy(logits, wanted),
-            "box": functional.smooth_l1_loss(own, torch.cat(codes), beta=1 / 9, reduction="sum") / max(len(wanted), 1),
+            "box": functional.smooth_l1_loss(own, torch.cat(codes), beta=1 / 9, reduction="sum")
+            / max(len(wanted), 1),
         }
         target = torch.cat(targets)
         losses["mask"] = mask_levels[0].sum() * 0
@@ -388,7 +459,10 @@ def crop_masks(masks: Tensor, boxes: Tensor, size: int) -> Tensor:
     x = boxes[:, 0, None] + step * (boxes[:, 2] - boxes[:, 0])[:, None]
     y = boxes[:, 1, None] + step * (boxes[:, 3] - boxes[:, 1])[:, None]
     grid = torch.stack(
-        [(2 * x / width - 1)[:, None, :].expand(-1, size, -1), (2 * y / height - 1)[:, :, None].expand(-1, -1, size)],
+        [
+            (2 * x / width - 1)[:, None, :].expand(-1, size, -1),
+            (2 * y / height - 1)[:, :, None].expand(-1, -1, size),
+        ],
         dim=3,
     )
     planes = functional.grid_sample(masks[:, None].float(), grid, align_corners=False)
@@ -424,7 +498,8 @@ class MaskRCNN(nn.Module):
             ``[1, 3, H', W']`` and the height and width of the image inside it.
         """
         config = self.config
-        height, width = int(image.shape[-2]), int(image.shape[-1])
+        height = int(image.shape[-2])
+        width = int(image.shape[-1])
         x = normalise(image[None])
         scale = min(config.min_side / min(height, width), config.max_side / max(height, width))
         size = (max(1, math.floor(height * scale)), max(1, math.floor(width * scale)))
@@ -447,10 +522,15 @@ class MaskRCNN(nn.Module):
         """
         x, size = self.prepare(image)
         levels, mask_levels = self.backbone(x.contiguous(memory_format=torch.channels_last))
-        height, width = int(x.shape[2]), int(x.shape[3])
+        height = int(x.shape[2])
+        width = int(x.shape[3])
         proposals = self.rpn(levels, height, width, [size])[0][0]
-        detections = self.roi_heads.detect(levels[:4], mask_levels, proposals, height, size, score=score, iou=iou)
-        back = detections.boxes.new_tensor([image.shape[2] / size[1], image.shape[1] / size[0]]).repeat(2)
+        detections = self.roi_heads.detect(
+            levels[:4], mask_levels, proposals, height, size, score=score, iou=iou
+        )
+        back = detections.boxes.new_tensor(
+            [image.shape[2] / size[1], image.shape[1] / size[0]]
+        ).repeat(2)
         return detections._replace(boxes=detections.boxes * back)
 
     def losses(
@@ -474,9 +554,12 @@ class MaskRCNN(nn.Module):
         """
         batch, _, rows, columns = images.shape
         x = self._pad(normalise(images)).contiguous(memory_format=torch.channels_last)
-        height, width = int(x.shape[2]), int(x.shape[3])
+        height = int(x.shape[2])
+        width = int(x.shape[3])
         levels, mask_levels = self.backbone(x)
-        proposals, anchors, logits, codes = self.rpn(levels, height, width, [(rows, columns)] * batch)
+        proposals, anchors, logits, codes = self.rpn(
+            levels, height, width, [(rows, columns)] * batch
+        )
         objectness, regression = rpn_loss(anchors, logits, codes, boxes, generator)
         heads = self.roi_heads.losses(
             levels[:4], mask_levels, proposals, boxes, labels, masks, height, generator, per_image
@@ -503,25 +586,30 @@ def normalise(images: Tensor) -> Tensor:
 @torch.no_grad()
 def _fold(conv: nn.Conv2d, norm: nn.BatchNorm2d) -> None:
     """Fold a batch normalisation into the convolution before it, in place."""
-    assert norm.running_mean is not None and norm.running_var is not None
+    assert norm.running_mean is not None
+    assert norm.running_var is not None
     scale = norm.weight * (norm.running_var + norm.eps).rsqrt()
     conv.weight.mul_(scale.reshape(-1, 1, 1, 1))
     conv.bias = nn.Parameter(norm.bias - norm.running_mean * scale)
 
 
-# Boxes (x0, y0, x1, y1 in pixels): overlap, coding against anchors, non-maximum suppression, assignment to objects.
+# Boxes (x0, y0, x1, y1 in pixels): overlap, coding against anchors, non-maximum suppression,
+# assignment to objects.
 
 MAX_LOG_RATIO = math.log(1000.0 / 16)
 """Decoded boxes grow by at most this (log), so that exp() cannot overflow."""
 RPN_WEIGHTS = (1.0, 1.0, 1.0, 1.0)
 BOX_WEIGHTS = (10.0, 10.0, 5.0, 5.0)
-NEGATIVE, IGNORED = -1, -2
+NEGATIVE = -1
+IGNORED = -2
 """Values of `match` for boxes without an object."""
 
 
 def box_iou(a: Tensor, b: Tensor) -> Tensor:
     """Intersection over union ``[N, M]`` of boxes ``[N, 4]`` and ``[M, 4]``; 0 where both are empty."""
-    shared = torch.minimum(a[:, None, 2:], b[None, :, 2:]) - torch.maximum(a[:, None, :2], b[None, :, :2])
+    shared = torch.minimum(a[:, None, 2:], b[None, :, 2:]) - torch.maximum(
+        a[:, None, :2], b[None, :, :2]
+    )
     width, height = shared.clamp(min=0).unbind(dim=2)
     inter = width * height
     area_a, area_b = ((boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1]) for boxes in (a, b))
@@ -531,9 +619,9 @@ def box_iou(a: Tensor, b: Tensor) -> Tensor:
 def nms(boxes: Tensor, scores: Tensor, threshold: float) -> Tensor:
     """Greedy non-maximum suppression.
 
-    The greedy rule is "a box stays if no better box that stays overlaps it by more than `threshold`". It is solved
-    exactly, by fixed-point iteration over the whole overlap matrix. That needs as many rounds as the longest chain of
-    suppressions, usually a handful.
+    The greedy rule is "a box stays if no better box that stays overlaps it by more than
+    `threshold`". It is solved exactly, by fixed-point iteration over the whole overlap matrix. That
+    needs as many rounds as the longest chain of suppressions, usually a handful.
 
     Args:
         boxes: ``[N, 4]``.
@@ -572,7 +660,9 @@ def clip(boxes: Tensor, height: int, width: int) -> Tensor:
     return torch.minimum(boxes.clamp(min=0), limits)
 
 
-def encode(targets: Tensor, references: Tensor, weights: tuple[float, float, float, float]) -> Tensor:
+def encode(
+    targets: Tensor, references: Tensor, weights: tuple[float, float, float, float]
+) -> Tensor:
     """Regression targets ``[N, 4]`` (dx, dy, log dw, log dh) that move references onto targets."""
     size, centre = _size_centre(references)
     target_size, target_centre = _size_centre(targets)
@@ -617,7 +707,9 @@ def match(boxes: Tensor, truth: Tensor, *, high: float, low: float, keep_best: b
     return result
 
 
-def sample(matched: Tensor, *, count: int, positive_share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def sample(
+    matched: Tensor, *, count: int, positive_share: float, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
     """Indices of the positive and of the negative boxes that enter a loss, drawn at random.
 
     Args:

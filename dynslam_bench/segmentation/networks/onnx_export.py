@@ -36,7 +36,8 @@ OPSET = 18
 SIZE = (480, 640)
 """Height and width of the images, unless others are asked for: those of TUM and Bonn."""
 FLOOR = 0.1
-SMALLEST, LARGEST = 32, 4096
+SMALLEST = 32
+LARGEST = 4096
 """Sides of an image in pixels."""
 ROUNDS = 24
 """Rounds of suppression: the longest chain of boxes that suppress each other."""
@@ -46,25 +47,29 @@ CHUNK = 100
 """Boxes whose features are gathered at a time, which bounds the memory."""
 
 
-def export_network(source: str, path: Path, *, size: tuple[int, int] = SIZE, side: int | None = None) -> dict[int, str]:
+def export_network(
+    source: str, path: Path, *, size: tuple[int, int] = SIZE, side: int | None = None
+) -> dict[int, str]:
     """Write a Mask R-CNN checkpoint as an ONNX file that ``onnx:PATH`` takes.
 
-    The input ``image [1, 3, H, W]`` is RGB in [0, 1]. The outputs are those of torchvision's exports: boxes, labels,
-    scores, masks in the whole image. They have as many rows as the network finds objects at most, unused ones of score
+    The input ``image [1, 3, H, W]`` is RGB in [0, 1]. The outputs are those of torchvision's
+    exports: boxes, labels, scores, masks in the whole image. They have as many rows as the network
+    finds objects at most, unused ones of score
     0.
 
     Args:
         source: ``embedded``, ``coco`` (fetched if need be) or ``weights:PATH``.
         path: The file to write.
         size: Height and width of the images; others are fitted in when it is used.
-        side: Shorter side in pixels at which the network works; 0 for its own, None for that of a run.
+        side: Shorter side in pixels at which the network works; 0 for its own, None for that of a
+            run.
 
     Returns:
         The names of what the network finds, by number.
 
     Raises:
-        SegmentationError: There is no such checkpoint, it cannot be fetched or read, `onnx` or `onnxscript` is missing,
-            or torch cannot export it.
+        SegmentationError: There is no such checkpoint, it cannot be fetched or read, `onnx` or
+            `onnxscript` is missing, or torch cannot export it.
         OSError: The file cannot be written.
     """
     kind, _, argument = source.partition(":")
@@ -75,7 +80,9 @@ def export_network(source: str, path: Path, *, size: tuple[int, int] = SIZE, sid
     elif kind == "weights" and argument:
         weights = Path(argument).expanduser()
     else:
-        raise SegmentationError(f"'{source}' is no network of this project", "export embedded, coco or weights:PATH")
+        raise SegmentationError(
+            f"'{source}' is no network of this project", "export embedded, coco or weights:PATH"
+        )
     if side is None:
         side = 0 if source == "embedded" else SegmentationSettings().network_side
     network = load_network(weights)
@@ -94,7 +101,8 @@ def parse_size(text: str) -> tuple[int, int]:
     width, height = map(int, match.groups()) if match else (0, 0)
     if not (SMALLEST <= width <= LARGEST and SMALLEST <= height <= LARGEST):
         raise SegmentationError(
-            f"'{text}' is no size of an image", f"for example 640x480; sides from {SMALLEST} to {LARGEST} pixels"
+            f"'{text}' is no size of an image",
+            f"for example 640x480; sides from {SMALLEST} to {LARGEST} pixels",
         )
     return height, width
 
@@ -152,10 +160,15 @@ class StaticMaskRCNN(nn.Module):
         iou: Overlap of two boxes of one class above which the weaker one is dropped.
     """
 
-    def __init__(self, network: MaskRCNN, height: int, width: int, *, score: float, iou: float) -> None:
+    def __init__(
+        self, network: MaskRCNN, height: int, width: int, *, score: float, iou: float
+    ) -> None:
         super().__init__()
-        self.network, self.height, self.width = network, height, width
-        self.score, self.iou = score, iou
+        self.network = network
+        self.height = height
+        self.width = width
+        self.score = score
+        self.iou = iou
         with torch.no_grad():
             x, self.size = network.prepare(torch.zeros(3, height, width))
             levels, _ = network.backbone(x)
@@ -170,26 +183,32 @@ class StaticMaskRCNN(nn.Module):
             image: float ``[1, 3, H, W]`` in [0, 1].
 
         Returns:
-            Boxes ``[K, 4]`` in pixels of the image, labels ``[K]`` from 1, scores ``[K]`` and masks ``[K, 1, H, W]``,
-            probabilities in the whole image.
+            Boxes ``[K, 4]`` in pixels of the image, labels ``[K]`` from 1, scores ``[K]`` and masks
+            ``[K, 1, H, W]``, probabilities in the whole image.
         """
         levels, mask_levels = self.network.backbone(self.network.prepare(image[0])[0])
         boxes, labels, scores = self._classified(levels[:4], *self._proposals(levels))
-        config, heads = self.network.config, self.network.roi_heads
+        config = self.network.config
+        heads = self.network.roi_heads
         pooled = self._pooled(mask_levels, boxes, config.mask_pool, config.mask_canonical)
         logits = heads.mask_predictor(heads.mask_head(pooled))
         chosen = labels[:, None, None, None].expand(-1, 1, *logits.shape[2:])
         planes = torch.gather(logits, 1, chosen)[:, 0].sigmoid()
-        boxes = boxes * boxes.new_tensor([self.width / self.size[1], self.height / self.size[0]]).repeat(2)
+        boxes = boxes * boxes.new_tensor(
+            [self.width / self.size[1], self.height / self.size[0]]
+        ).repeat(2)
         return boxes, labels, scores, self._pasted(planes, boxes)[:, None]
 
     def _proposals(self, levels: list[Tensor]) -> tuple[Tensor, Tensor]:
         """Boxes ``[post_nms, 4]`` that may hold an object, and whether each is one, 0 or 1."""
-        config, boxes, scores = self.network.config, [], []
+        config = self.network.config
+        boxes = []
+        scores = []
         for level, (logits, codes) in enumerate(zip(*self.network.rpn.head(levels), strict=True)):
             anchors: Tensor = getattr(self, f"anchors{level}")
             best, chosen = logits[0].topk(min(config.pre_nms, len(anchors)))
-            codes, anchors = codes[0].index_select(0, chosen), anchors.index_select(0, chosen)
+            codes = codes[0].index_select(0, chosen)
+            anchors = anchors.index_select(0, chosen)
             box = clip(decode(codes, anchors, RPN_WEIGHTS)[:, 0], *self.size)
             large = ((box[:, 2:] - box[:, :2]) >= MIN_PROPOSAL_PX).all(dim=1).to(box.dtype)
             boxes.append(box)
@@ -198,9 +217,12 @@ class StaticMaskRCNN(nn.Module):
         score, order = torch.cat(scores).topk(count)
         return torch.cat(boxes).index_select(0, order), (score > 0).to(score.dtype)
 
-    def _classified(self, levels: list[Tensor], proposals: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _classified(
+        self, levels: list[Tensor], proposals: Tensor, valid: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Boxes ``[K, 4]`` in pixels of the input, labels and scores of the objects."""
-        config, heads = self.network.config, self.network.roi_heads
+        config = self.network.config
+        heads = self.network.roi_heads
         pooled = self._pooled(levels, proposals, BOX_POOL, config.canonical)
         logits, codes = heads.box_predictor(heads.box_head(pooled))
         scores = functional.softmax(logits, dim=1)[:, 1:]
@@ -209,28 +231,46 @@ class StaticMaskRCNN(nn.Module):
         large = ((boxes[:, :, 2:] - boxes[:, :, :2]) >= MIN_BOX_PX).all(dim=2)
         passed = scores * valid[:, None] * ((scores > self.score) & large).to(scores.dtype)
         best, order = passed.reshape(-1).topk(min(CANDIDATES, passed.numel()))
-        box, label = boxes.reshape(-1, 4).index_select(0, order), order % classes + 1
+        box = boxes.reshape(-1, 4).index_select(0, order)
+        label = order % classes + 1
         over = (box_iou(box, box) > self.iou) & (label[:, None] == label[None, :])
-        kept, order = (best * unsuppressed(over, (best > 0).to(best.dtype))).topk(min(config.max_detections, len(best)))
+        kept, order = (best * unsuppressed(over, (best > 0).to(best.dtype))).topk(
+            min(config.max_detections, len(best))
+        )
         return box.index_select(0, order), label.index_select(0, order), kept
 
     def _pooled(self, levels: list[Tensor], boxes: Tensor, size: int, canonical: float) -> Tensor:
         """RoIAlign ``[K, C, size, size]`` of one image's boxes; see `roi_align`."""
         if len(boxes) > CHUNK:
-            return torch.cat([self._pooled(levels, chunk, size, canonical) for chunk in torch.split(boxes, CHUNK)])
-        count, channels = len(boxes), levels[0].shape[1]
+            return torch.cat(
+                [
+                    self._pooled(levels, chunk, size, canonical)
+                    for chunk in torch.split(boxes, CHUNK)
+                ]
+            )
+        count = len(boxes)
+        channels = levels[0].shape[1]
         side = (boxes[:, 2:] - boxes[:, :2]).clamp(min=1e-3)  # padding may be empty
-        level = levels_of(torch.cat([boxes[:, :2], boxes[:, :2] + side], dim=1), canonical, len(levels))
+        level = levels_of(
+            torch.cat([boxes[:, :2], boxes[:, :2] + side], dim=1), canonical, len(levels)
+        )
         pooled: list[Tensor] = []
         for index, features in enumerate(levels):
-            rows, columns = int(features.shape[2]), int(features.shape[3])
+            rows = int(features.shape[2])
+            columns = int(features.shape[3])
             scaled = boxes * level_scale(rows, self.padded[0])
             mine = (level == index).to(boxes.dtype)[:, None, None]
             y = _bins(scaled[:, 1], scaled[:, 3], rows, size) * mine
             x = _bins(scaled[:, 0], scaled[:, 2], columns, size)
             table = features[0].permute(1, 0, 2).reshape(rows, channels * columns)
-            by_row = (y.reshape(count * size, rows) @ table).reshape(count, size * channels, columns)
-            pooled.append((by_row @ x.transpose(1, 2)).reshape(count, size, channels, size).permute(0, 2, 1, 3))
+            by_row = (y.reshape(count * size, rows) @ table).reshape(
+                count, size * channels, columns
+            )
+            pooled.append(
+                (by_row @ x.transpose(1, 2))
+                .reshape(count, size, channels, size)
+                .permute(0, 2, 1, 3)
+            )
         return torch.stack(pooled).sum(dim=0)
 
     def _pasted(self, planes: Tensor, boxes: Tensor) -> Tensor:
@@ -284,6 +324,10 @@ def _hat(at: Tensor, length: int) -> Tensor:
 def _grown(planes: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
     """Masks with a border of one cell, and their boxes grown by the same share and cut to whole pixels."""
     side = planes.shape[1]
-    centre, half = (boxes[:, :2] + boxes[:, 2:]) / 2, (boxes[:, 2:] - boxes[:, :2]) / 2 * ((side + 2) / side)
-    low, high = torch.trunc(centre - half), torch.trunc(centre + half) + 1
-    return functional.pad(planes, (1, 1, 1, 1)), torch.cat([low, torch.maximum(high, low + 1)], dim=1)
+    centre = (boxes[:, :2] + boxes[:, 2:]) / 2
+    half = (boxes[:, 2:] - boxes[:, :2]) / 2 * ((side + 2) / side)
+    low = torch.trunc(centre - half)
+    high = torch.trunc(centre + half) + 1
+    return functional.pad(planes, (1, 1, 1, 1)), torch.cat(
+        [low, torch.maximum(high, low + 1)], dim=1
+    )

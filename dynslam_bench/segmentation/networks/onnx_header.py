@@ -1,9 +1,9 @@
 """The header of an ONNX file: inputs, outputs, metadata. No dependency, no execution.
 
-An ONNX file is one protocol-buffer message. Only these fields are decoded (field numbers from the public onnx.proto):
-ModelProto.graph = 7, .metadata_props = 14; GraphProto.initializer = 5 (names only), .input = 11, .output = 12;
-ValueInfoProto.name = 1, .type = 2; TypeProto.tensor_type = 1; Tensor.elem_type = 1, .shape = 2;
-TensorShapeProto.dim = 1; Dimension.dim_value = 1.
+An ONNX file is one protocol-buffer message. Only these fields are decoded (field numbers from the
+public onnx.proto): ModelProto.graph = 7, .metadata_props = 14; GraphProto.initializer = 5 (names
+only), .input = 11, .output = 12; ValueInfoProto.name = 1, .type = 2; TypeProto.tensor_type = 1;
+Tensor.elem_type = 1, .shape = 2; TensorShapeProto.dim = 1; Dimension.dim_value = 1.
 """
 
 from __future__ import annotations
@@ -54,7 +54,9 @@ def read_header(path: Path) -> tuple[list[TensorInfo], list[TensorInfo], dict[st
     Raises:
         SegmentationError: The file is missing, truncated or no ONNX model.
     """
-    with raising(SegmentationError, f"cannot read the network {path}", "give the path of an .onnx file"):
+    with raising(
+        SegmentationError, f"cannot read the network {path}", "give the path of an .onnx file"
+    ):
         data = path.expanduser().read_bytes()
     with raising(
         SegmentationError,
@@ -65,13 +67,17 @@ def read_header(path: Path) -> tuple[list[TensorInfo], list[TensorInfo], dict[st
         model = _fields(memoryview(data))
         graph = _message(model, 7)
         initialised = {_text(_fields(tensor), 8) for tensor in graph.get(5, ())}
-        declared, outputs = ([_tensor(_fields(value)) for value in graph.get(number, ())] for number in (11, 12))
+        declared, outputs = (
+            [_tensor(_fields(value)) for value in graph.get(number, ())] for number in (11, 12)
+        )
         inputs = [tensor for tensor in declared if tensor.name not in initialised]
         entries = [(_text(entry, 1), _text(entry, 2)) for entry in map(_fields, model.get(14, ()))]
         metadata = dict(entries)
         for name, value in entries:
             if metadata[name] != value:
-                raise SegmentationError(f"{path}: the metadata hold two different entries '{name[:100]}'", "keep one")
+                raise SegmentationError(
+                    f"{path}: the metadata hold two different entries '{name[:100]}'", "keep one"
+                )
         if not inputs or not outputs:
             raise ValueError(f"it declares {len(inputs)} inputs and {len(outputs)} outputs")
     return inputs, outputs, metadata

@@ -1,8 +1,9 @@
 """Which layout the outputs of an ONNX network have: first by the file's metadata, then by exact shapes.
 
-Sizes of different layouts may coincide: detections of a network with two classes have as many channels before
-non-maximum suppression (a score a class) as after it (the best score and its class). So every layout that the outputs
-fit is listed, the metadata and the number of rows exclude some, and what still fits two layouts is refused.
+Sizes of different layouts may coincide: detections of a network with two classes have as many
+channels before non-maximum suppression (a score a class) as after it (the best score and its
+class). So every layout that the outputs fit is listed, the metadata and the number of rows exclude
+some, and what still fits two layouts is refused.
 
 C is the number of classes, M that of mask coefficients, N that of detections.
 """
@@ -56,8 +57,8 @@ class Layout:
         names: Class number to name, as the file spells it.
         channels_first: ``yolo`` only: detections lie along the last axis.
         objectness: ``yolo`` only: 1 if an objectness score precedes the class scores.
-        suppressed: ``yolo`` only: corners, the best score and its class in place of centre, size and class scores;
-            overlapping detections are left out already.
+        suppressed: ``yolo`` only: corners, the best score and its class in place of centre, size
+            and class scores; overlapping detections are left out already.
         aligned: ``semantic`` only: the corners of the logits are the corners of the input.
         scaling: Input scaling that such a network takes; see ``onnx_normalisation``.
     """
@@ -87,8 +88,10 @@ class Metadata:
 
     Attributes:
         names: Class number to name; None where the file names no classes.
-        numbered: Whether the file gives the classes' numbers; a mere list leaves open where counting begins.
-        suppressed: Whether overlapping detections are left out inside the network; None where the file does not say.
+        numbered: Whether the file gives the classes' numbers; a mere list leaves open where
+            counting begins.
+        suppressed: Whether overlapping detections are left out inside the network; None where the
+            file does not say.
         task: Ultralytics' task, a key of `_TASKS`; empty for another one or none.
     """
 
@@ -123,7 +126,8 @@ def read_metadata(metadata: Mapping[str, str], where: str) -> Metadata:
         where: The file, for the error.
 
     Raises:
-        SegmentationError: ``names`` is no table of class names, or ``end2end`` neither true nor false.
+        SegmentationError: ``names`` is no table of class names, or ``end2end`` neither true nor
+            false.
     """
     names: dict[int, str] | None = None
     value: Any = None
@@ -143,9 +147,12 @@ def read_metadata(metadata: Mapping[str, str], where: str) -> Metadata:
                 raise ValueError(f"a number is not between 0 and {MOST_CLASSES - 1}")
     inside = metadata.get("end2end", "").strip().casefold()
     if inside not in ("", "true", "false"):
-        raise SegmentationError(f"{where}: the metadata entry 'end2end' is '{inside[:100]}'", "expected True or False")
+        raise SegmentationError(
+            f"{where}: the metadata entry 'end2end' is '{inside[:100]}'", "expected True or False"
+        )
     arguments: Any = None
-    with suppress(ValueError, SyntaxError, MemoryError, RecursionError):  # other exporters write other things there
+    # other exporters write other things there
+    with suppress(ValueError, SyntaxError, MemoryError, RecursionError):
         arguments = ast.literal_eval(metadata.get("args", ""))
     suppressed = None if not inside else inside == "true"
     if isinstance(arguments, dict) and "nms" in arguments:
@@ -171,8 +178,8 @@ def detect_layout(
         asked: The setting ``onnx_layout``: ``auto``, or the layout's `Layout.id`.
 
     Raises:
-        SegmentationError: No known layout fits, two fit, the metadata contradict the shapes, or the class names are not
-            known; lists the outputs.
+        SegmentationError: No known layout fits, two fit, the metadata contradict the shapes, or the
+            class names are not known; lists the outputs.
     """
     facts = read_metadata(metadata, where)
     listed = "; ".join(map(str, outputs)) or "none"
@@ -183,7 +190,11 @@ def detect_layout(
         )
 
     # every layout that the shapes allow
-    fits = [*_instances(outputs, facts), *_yolo(outputs, facts, size), *_semantic(outputs, facts, size)]
+    fits = [
+        *_instances(outputs, facts),
+        *_yolo(outputs, facts, size),
+        *_semantic(outputs, facts, size),
+    ]
     shapes_allow = [fit for fit in fits if not fit.channels_last]
 
     # without those that the user, the metadata or the number of rows exclude
@@ -228,14 +239,23 @@ def _agrees(fit: _Fit, facts: Metadata) -> bool:
 
 def _by_rows(fits: list[_Fit], size: tuple[int, int]) -> list[_Fit]:
     """Without the layouts that the number of detections excludes, where it is exactly that of a YOLO network's grid."""
-    cells = {sum(-(-size[0] // stride) * -(-size[1] // stride) for stride in strides) for strides in _STRIDES}
-    anchored = [fit for fit in fits if fit.layout.objectness and fit.rows in {_ANCHORS * count for count in cells}]
+    cells = {
+        sum(-(-size[0] // stride) * -(-size[1] // stride) for stride in strides)
+        for strides in _STRIDES
+    }
+    anchored = [
+        fit
+        for fit in fits
+        if fit.layout.objectness and fit.rows in {_ANCHORS * count for count in cells}
+    ]
     if anchored:
-        return anchored  # no network without anchors has so many, and suppression does not leave so many
+        # no network without anchors has so many, and suppression does not leave so many
+        return anchored
     raw = [fit for fit in fits if fit.layout.kind == "yolo" and not fit.layout.suppressed]
     exact = [fit for fit in raw if not fit.layout.objectness and fit.rows in cells]
     if exact:
-        return [fit for fit in fits if fit in exact or fit not in raw]  # suppression may leave as many
+        # suppression may leave as many
+        return [fit for fit in fits if fit in exact or fit not in raw]
     return fits
 
 
@@ -266,11 +286,19 @@ def _yolo(outputs: Sequence[TensorInfo], facts: Metadata, size: tuple[int, int])
             for coefficients, plane, last in _planes(prototypes):
                 if _whole_stride(plane, size):
                     first, second = (int(length or 0) for length in detections.shape[1:])
-                    yield from _detections(names, first, second, coefficients, facts, channels_last=last)
+                    yield from _detections(
+                        names, first, second, coefficients, facts, channels_last=last
+                    )
 
 
 def _detections(
-    outputs: tuple[str, str], first: int, second: int, coefficients: int, facts: Metadata, *, channels_last: bool
+    outputs: tuple[str, str],
+    first: int,
+    second: int,
+    coefficients: int,
+    facts: Metadata,
+    *,
+    channels_last: bool,
 ) -> Iterator[_Fit]:
     """What detections of shape ``[1, first, second]`` may be, for so many mask coefficients."""
     last = f"M = {coefficients}" + (" and prototypes [1, h, w, M]" if channels_last else "")
@@ -280,33 +308,40 @@ def _detections(
             classes = channels - 4 - objectness - coefficients
             names = _YOLO_NAMES.get(classes, {}) if facts.names is None else facts.names
             # without names: any number, but then detections are more than the numbers of one
-            possible = _counts(names, classes) if names or facts.names is not None else rows > channels
+            possible = (
+                _counts(names, classes) if names or facts.names is not None else rows > channels
+            )
             if classes >= 1 and rows >= 1 and possible:
                 layout = Layout("yolo", outputs, names, channels_first, objectness)
                 width = f"{4 + objectness}+C+M"
                 shape = f"[1, {width}, N]" if channels_first else f"[1, N, {width}]"
                 text = f"'{layout.id}' {shape} with C = {classes}, {last}"
                 yield _Fit(layout, text, rows, channels_last)
-        # corners, best score, its class: no exporter writes this with detections along the last axis
+        # corners, best score, its class: no exporter writes this with detections along the last
+        # axis
         names = {} if facts.names is None else facts.names
         if not channels_first and channels == 6 + coefficients and _counts(names, len(names)):
             layout = Layout("yolo", outputs, names, channels_first=False, suppressed=True)
             yield _Fit(layout, f"'{layout.id}' [1, N, 6+M] with {last}", rows, channels_last)
 
 
-def _semantic(outputs: Sequence[TensorInfo], facts: Metadata, size: tuple[int, int]) -> Iterator[_Fit]:
+def _semantic(
+    outputs: Sequence[TensorInfo], facts: Metadata, size: tuple[int, int]
+) -> Iterator[_Fit]:
     """Logits of classes in planes; a label map may stand beside them, detections may not."""
     planes = _of_rank(outputs, 4)
     maps = {size, *(output.shape[2:] for output in planes)}
     if any(output.shape[1:] not in maps for output in _of_rank(outputs, 3)):
         return
-    if {"out", "aux"} <= {output.name for output in planes}:  # torchvision's auxiliary head serves training
+    # torchvision's auxiliary head serves training
+    if {"out", "aux"} <= {output.name for output in planes}:
         planes = [output for output in planes if output.name != "aux"]
     for output in planes:
         readings = []
         for classes, plane, last in _planes(output):
             names = _SEMANTIC_NAMES.get(classes, {}) if facts.names is None else facts.names
-            if classes >= 2 and names and _counts({0: "", **names}, classes):  # the background may have no name
+            # the background may have no name
+            if classes >= 2 and names and _counts({0: "", **names}, classes):
                 readings.append((classes, plane, last, names))
         # of two orders of the axes, the one whose planes have the shape of the image
         fitting = [reading for reading in readings if _any_stride(reading[1], size)]
@@ -329,7 +364,9 @@ def _usual_scaling(facts: Metadata, *, aligned: bool) -> Literal["unit", "symmet
 def _of_rank(outputs: Iterable[TensorInfo], rank: int) -> list[TensorInfo]:
     """Outputs of real numbers for one image, whose sizes are known."""
     real = [output for output in outputs if output.is_real and len(output.shape) == rank]
-    return [output for output in real if None not in output.shape[1:] and output.shape[0] in (1, None)]
+    return [
+        output for output in real if None not in output.shape[1:] and output.shape[0] in (1, None)
+    ]
 
 
 def _counts(names: Mapping[int, str], classes: int) -> bool:
@@ -364,7 +401,8 @@ def _any_stride(plane: tuple[int, int], size: tuple[int, int]) -> bool:
 
 def _alignments(plane: tuple[int, int], size: tuple[int, int]) -> tuple[bool, ...]:
     """Whether the corners of logits may be the corners of the input: no, yes, or both where the sizes allow both."""
-    (height, width), (rows, columns) = plane, size
+    (height, width) = plane
+    (rows, columns) = size
     if not (1 < height < rows and 1 < width < columns):
         return (False,)
     down, down_rest = divmod(rows - 1, height - 1)
@@ -377,13 +415,19 @@ def _alignments(plane: tuple[int, int], size: tuple[int, int]) -> tuple[bool, ..
 def _ambiguous(fits: Sequence[_Fit], facts: Metadata, where: str, listed: str) -> SegmentationError:
     """The error for outputs that fit several layouts: names them, and what decides."""
     ids = {fit.layout.id for fit in fits}
-    usable = dict.fromkeys(fit.layout.id for fit in fits if fit.layout.names and not fit.channels_last)
+    usable = dict.fromkeys(
+        fit.layout.id for fit in fits if fit.layout.names and not fit.channels_last
+    )
     texts = " and ".join(fit.text for fit in fits)
     cures = []
     if facts.names is None and fits[0].layout.kind == "yolo":
-        cures.append("the metadata entry 'names' of the file tells how many classes there are: {0: 'person', ...}")
+        cures.append(
+            "the metadata entry 'names' of the file tells how many classes there are: {0: 'person', ...}"
+        )
     if usable and (len(ids) > 1 or any(fit.channels_last for fit in fits)):
-        cures.append(" or ".join(f"--set segmentation.onnx_layout={name}" for name in usable) + " decides")
+        cures.append(
+            " or ".join(f"--set segmentation.onnx_layout={name}" for name in usable) + " decides"
+        )
     elif len({fit.layout.outputs for fit in fits}) > 1:
         cures.append("export one of the outputs alone")
     elif fits[0].layout.kind == "instances":
@@ -391,12 +435,20 @@ def _ambiguous(fits: Sequence[_Fit], facts: Metadata, where: str, listed: str) -
     elif not cures:
         cures.append("export it for images of another size")
     if len({fit.layout.suppressed for fit in fits}) > 1:
-        cures.append("so does the metadata entry 'end2end' of the file: True with suppression inside, else False")
-    return SegmentationError(f"{where}: the outputs {listed} fit {len(fits)} layouts: {texts}", "; ".join(cures))
+        cures.append(
+            "so does the metadata entry 'end2end' of the file: True with suppression inside, else False"
+        )
+    return SegmentationError(
+        f"{where}: the outputs {listed} fit {len(fits)} layouts: {texts}", "; ".join(cures)
+    )
 
 
 def _not_understood(
-    outputs: Sequence[TensorInfo], shapes_allow: Sequence[_Fit], facts: Metadata, where: str, asked: str
+    outputs: Sequence[TensorInfo],
+    shapes_allow: Sequence[_Fit],
+    facts: Metadata,
+    where: str,
+    asked: str,
 ) -> SegmentationError:
     """The error for outputs that fit no layout, or only some that the metadata or the user exclude."""
     listed = "; ".join(map(str, outputs)) or "none"
@@ -405,20 +457,28 @@ def _not_understood(
         texts = " or ".join(fit.text for fit in shapes_allow)
         ids = dict.fromkeys(fit.layout.id for fit in shapes_allow)
         cure = " or ".join(f"--set segmentation.onnx_layout={name}" for name in ids)
-        reason = f"segmentation.onnx_layout is {asked}" if asked != "auto" else f"the metadata say {said}"
+        reason = (
+            f"segmentation.onnx_layout is {asked}"
+            if asked != "auto"
+            else f"the metadata say {said}"
+        )
         return SegmentationError(
-            f"{where}: {reason}, but the outputs {listed} fit {texts}", f"if the shapes are right: {cure}"
+            f"{where}: {reason}, but the outputs {listed} fit {texts}",
+            f"if the shapes are right: {cure}",
         )
     reasons = ["no known layout fits"]
     if said:
         reasons.append(f"the metadata say {said}")
-    planes, maps = _of_rank(outputs, 4), [output for output in outputs if len(output.shape) in (3, 4)]
+    planes = _of_rank(outputs, 4)
+    maps = [output for output in outputs if len(output.shape) in (3, 4)]
     if any(not output.is_real for output in maps):
         reasons.append("an output holds class numbers: export the scores, without arg max")
     if len(planes) == len(outputs) and any(output.shape[1] == 1 for output in planes):
         reasons.append("one channel may hold logits or probabilities")
     elif len(planes) == len(outputs) and facts.names is None and planes:
-        reasons.append(f"{planes[0].shape[1]} semantic classes without names in the file's metadata")
+        reasons.append(
+            f"{planes[0].shape[1]} semantic classes without names in the file's metadata"
+        )
     return SegmentationError(
         f"{where}: the network's outputs are not understood ({'; '.join(reasons)}): {listed}", KNOWN
     )
@@ -428,7 +488,11 @@ def _said(facts: Metadata) -> str:
     """What the metadata say, for a message; empty if nothing."""
     parts = []
     if facts.suppressed is not None:
-        parts.append("that suppression is inside (end2end, nms)" if facts.suppressed else "that none is suppressed")
+        parts.append(
+            "that suppression is inside (end2end, nms)"
+            if facts.suppressed
+            else "that none is suppressed"
+        )
     if facts.task:
         parts.append(f"'task' = {facts.task}")
     if facts.names is not None:

@@ -3,8 +3,8 @@
 Three kinds of outputs are understood; `onnx_layout` finds out which of them a network has:
 
 * ``yolo``: boxes with class scores and mask coefficients ``[1, 4 + C + M, N]`` (or transposed, or with an objectness
-  score as YOLOv5 has it), or what non-maximum suppression in the network leaves of them, ``[1, N, 6 + M]``; and mask
-  prototypes ``[1, M, h, w]``;
+  score as YOLOv5 has it), or what non-maximum suppression in the network leaves of them,
+  ``[1, N, 6 + M]``; and mask prototypes ``[1, M, h, w]``;
 * ``semantic``: class logits ``[1, C, h, w]``;
 * ``instances``: ``boxes [K, 4]``, ``labels [K]``, ``scores [K]``, ``masks [K, 1, H, W]`` of a torchvision export.
 """
@@ -27,9 +27,20 @@ from dynslam_bench.contracts import Frame, Instances, SegmenterContext
 from dynslam_bench.core import SegmentationError, raising
 from dynslam_bench.segmentation.networks import pinned_threads
 from dynslam_bench.segmentation.networks.onnx_header import TensorInfo, read_header
-from dynslam_bench.segmentation.networks.onnx_layout import NO_OBJECT, Layout, assumed_names, detect_layout
+from dynslam_bench.segmentation.networks.onnx_layout import (
+    NO_OBJECT,
+    Layout,
+    assumed_names,
+    detect_layout,
+)
 from dynslam_bench.segmentation.postprocess import boxes_of
-from dynslam_bench.segmentation.settings import COCO_NAMES, NMS_IOU, SegmentationSettings, canonical_name, check_classes
+from dynslam_bench.segmentation.settings import (
+    COCO_NAMES,
+    NMS_IOU,
+    SegmentationSettings,
+    canonical_name,
+    check_classes,
+)
 
 Float: TypeAlias = "np.ndarray[Any, np.dtype[np.float32]]"
 _SCALINGS = {
@@ -63,12 +74,17 @@ class OnnxSegmenter:
         floor: Least score of a detection that is returned.
 
     Raises:
-        SegmentationError: The file is missing, damaged, not understood by OpenCV, its outputs fit no known layout or
-            several, or none of its classes is a dynamic one.
+        SegmentationError: The file is missing, damaged, not understood by OpenCV, its outputs fit
+            no known layout or several, or none of its classes is a dynamic one.
     """
 
-    def __init__(self, path: Path, settings: SegmentationSettings, *, threads: int = 1, floor: float = 0.1) -> None:
-        self.path, self.settings, self.threads, self.floor = path.expanduser(), settings, threads, floor
+    def __init__(
+        self, path: Path, settings: SegmentationSettings, *, threads: int = 1, floor: float = 0.1
+    ) -> None:
+        self.path = path.expanduser()
+        self.settings = settings
+        self.threads = threads
+        self.floor = floor
         inputs, outputs, metadata = read_header(self.path)
         self._size = _input_size(inputs, self.path)
         with raising(
@@ -84,17 +100,23 @@ class OnnxSegmenter:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copied and pickled by its arguments: OpenCV's network cannot be, nor be used by two threads."""
-        return partial(OnnxSegmenter, threads=self.threads, floor=self.floor), (self.path, self.settings)
+        return partial(OnnxSegmenter, threads=self.threads, floor=self.floor), (
+            self.path,
+            self.settings,
+        )
 
     def segment(self, frame: Frame) -> Instances:
         """The objects of the dynamic classes in the frame.
 
         Raises:
-            SegmentationError: The network cannot run on this image, or gives outputs that do not fit its layout.
+            SegmentationError: The network cannot run on this image, or gives outputs that do not
+                fit its layout.
         """
         height, width = frame.rgb.shape[:2]
         padded = (-(-height // STRIDE) * STRIDE, -(-width // STRIDE) * STRIDE)
-        image, place = fit(frame.rgb, self._size_of(padded), keep_aspect=self.layout.kind != "semantic")
+        image, place = fit(
+            frame.rgb, self._size_of(padded), keep_aspect=self.layout.kind != "semantic"
+        )
         values = self._forward(image, list(self.layout.outputs), self.layout.scaling)
         return decode(self.layout, values, place, self.settings, self.floor)
 
@@ -114,13 +136,18 @@ class OnnxSegmenter:
             elements = {output.name: output.element for output in outputs}
             values = self._forward(np.full((*size, 3), PAD, np.uint8), names, "unit")
             outputs = [
-                TensorInfo(name, value.shape, elements.get(name, "")) for name, value in zip(names, values, strict=True)
+                TensorInfo(name, value.shape, elements.get(name, ""))
+                for name, value in zip(names, values, strict=True)
             ]
         return detect_layout(outputs, metadata, size, str(self.path), self.settings.onnx_layout)
 
     def _check_classes(self, metadata: Mapping[str, str]) -> None:
         """Raise where no class is a dynamic one; warn of what is assumed of a dynamic one."""
-        objects = {number: name for number, name in self.layout.names.items() if canonical_name(name) not in NO_OBJECT}
+        objects = {
+            number: name
+            for number, name in self.layout.names.items()
+            if canonical_name(name) not in NO_OBJECT
+        }
         check_classes(objects.values(), self.settings, str(self.path), "the network")
         if assumed := assumed_names(self.layout, metadata):
             warnings.warn(f"{self.path}: {assumed}", stacklevel=2)
@@ -128,13 +155,24 @@ class OnnxSegmenter:
             name = self.layout.names[number]
             meant = canonical_name(name)
             if meant != name and meant in COCO_NAMES:
-                warnings.warn(f"{self.path}: the class '{name}' of the network is taken for '{meant}'", stacklevel=2)
+                warnings.warn(
+                    f"{self.path}: the class '{name}' of the network is taken for '{meant}'",
+                    stacklevel=2,
+                )
 
-    def _forward(self, image: NDArray[np.uint8], names: list[str], usual: str) -> list[NDArray[np.float32]]:
+    def _forward(
+        self, image: NDArray[np.uint8], names: list[str], usual: str
+    ) -> list[NDArray[np.float32]]:
         """The outputs for an image, scaled as the settings say or else as usual."""
-        scaling = usual if self.settings.onnx_normalisation == "auto" else self.settings.onnx_normalisation
+        scaling = (
+            usual
+            if self.settings.onnx_normalisation == "auto"
+            else self.settings.onnx_normalisation
+        )
         mean, divisor = _SCALINGS[scaling]
-        scaled = (image.astype(np.float32) - np.array(mean, np.float32)) / np.array(divisor, np.float32)
+        scaled = (image.astype(np.float32) - np.array(mean, np.float32)) / np.array(
+            divisor, np.float32
+        )
         blob: NDArray[np.float32] = np.ascontiguousarray(scaled.transpose(2, 0, 1)[None])
         with (
             pinned_threads(cv2.getNumThreads, cv2.setNumThreads, self.threads),
@@ -152,7 +190,9 @@ class OnnxSegmenter:
 
 def build(settings: SegmentationSettings, context: SegmenterContext) -> OnnxSegmenter:
     """A network from an ONNX file."""
-    return OnnxSegmenter(Path(context.argument), settings, threads=context.threads, floor=context.floor)
+    return OnnxSegmenter(
+        Path(context.argument), settings, threads=context.threads, floor=context.floor
+    )
 
 
 @dataclass(frozen=True)
@@ -172,7 +212,9 @@ class Placement:
     offset: tuple[float, float] = (0.0, 0.0)
 
 
-def fit(rgb: NDArray[np.uint8], size: tuple[int, int], *, keep_aspect: bool) -> tuple[NDArray[np.uint8], Placement]:
+def fit(
+    rgb: NDArray[np.uint8], size: tuple[int, int], *, keep_aspect: bool
+) -> tuple[NDArray[np.uint8], Placement]:
     """Resize an image to the network's input, with grey borders if the aspect ratio is kept.
 
     Args:
@@ -182,13 +224,18 @@ def fit(rgb: NDArray[np.uint8], size: tuple[int, int], *, keep_aspect: bool) -> 
     """
     height, width = rgb.shape[:2]
     ratio = min(size[0] / height, size[1] / width)
-    rows, columns = (max(1, round(height * ratio)), max(1, round(width * ratio))) if keep_aspect else size
-    top, left = (size[0] - rows) // 2, (size[1] - columns) // 2
+    rows, columns = (
+        (max(1, round(height * ratio)), max(1, round(width * ratio))) if keep_aspect else size
+    )
+    top = (size[0] - rows) // 2
+    left = (size[1] - columns) // 2
     canvas = np.full((*size, 3), PAD, np.uint8)
     canvas[top : top + rows, left : left + columns] = cv2.resize(
         rgb, (columns, rows), interpolation=cv2.INTER_LINEAR
     ).reshape(rows, columns, 3)
-    place = Placement((height, width), size, (columns / width, rows / height), (float(left), float(top)))
+    place = Placement(
+        (height, width), size, (columns / width, rows / height), (float(left), float(top))
+    )
     return canvas, place
 
 
@@ -205,13 +252,18 @@ def _input_size(inputs: Sequence[TensorInfo], path: Path) -> tuple[int | None, i
         raise SegmentationError(f"{path}: the input {inputs[0]} is no image", "expected 1x3xHxW")
     if not inputs[0].is_real:
         raise SegmentationError(
-            f"{path}: the input {inputs[0]} takes whole numbers", "export it for real numbers: see onnx_normalisation"
+            f"{path}: the input {inputs[0]} takes whole numbers",
+            "export it for real numbers: see onnx_normalisation",
         )
     return shape[2], shape[3]
 
 
 def decode(
-    layout: Layout, values: Sequence[Float], place: Placement, settings: SegmentationSettings, floor: float
+    layout: Layout,
+    values: Sequence[Float],
+    place: Placement,
+    settings: SegmentationSettings,
+    floor: float,
 ) -> Instances:
     """The objects of the dynamic classes in one frame.
 
@@ -228,7 +280,9 @@ def decode(
     for name, value in zip(layout.outputs, values, strict=True):
         if not np.isfinite(value).all():
             raise SegmentationError(f"the network's output '{name}' holds NaN or infinite values")
-    decoder = {"yolo": _decode_yolo, "semantic": _decode_semantic, "instances": _decode_instances}[layout.kind]
+    decoder = {"yolo": _decode_yolo, "semantic": _decode_semantic, "instances": _decode_instances}[
+        layout.kind
+    ]
     return decoder(values, layout, place, settings, floor)
 
 
@@ -245,8 +299,11 @@ def _check_detections(boxes: Float, scores: Float, labels: Float, layout: Layout
         return
     hint = f"are the outputs really '{layout.id}'? segmentation.onnx_layout names another"
     if float(scores.max()) > 1.001:
-        raise SegmentationError(f"the network's scores reach {scores.max():.4g}, scores end at 1", hint)
-    least, most = float(labels.min()), float(labels.max())
+        raise SegmentationError(
+            f"the network's scores reach {scores.max():.4g}, scores end at 1", hint
+        )
+    least = float(labels.min())
+    most = float(labels.max())
     if least < 0 or most > max(layout.names) or (labels != np.rint(labels)).any():
         raise SegmentationError(
             f"the network's class numbers lie between {least:.4g} and {most:.4g}, its names are numbered "
@@ -269,7 +326,11 @@ def _check_detections(boxes: Float, scores: Float, labels: Float, layout: Layout
 
 
 def _decode_yolo(
-    values: Sequence[Float], layout: Layout, place: Placement, settings: SegmentationSettings, floor: float
+    values: Sequence[Float],
+    layout: Layout,
+    place: Placement,
+    settings: SegmentationSettings,
+    floor: float,
 ) -> Instances:
     rows = values[0].reshape(values[0].shape[-2:])
     rows = rows.T if layout.channels_first else rows
@@ -287,7 +348,14 @@ def _decode_yolo(
     keep = _keep(boxes, best, labels, layout, settings, floor)
     logits = np.tensordot(rows[keep, first:], prototypes, axes=1).astype(np.float32)
     return _paste(
-        logits, boxes[keep], _logit(settings.mask_threshold), boxes[keep], best[keep], labels[keep], layout, place
+        logits,
+        boxes[keep],
+        _logit(settings.mask_threshold),
+        boxes[keep],
+        best[keep],
+        labels[keep],
+        layout,
+        place,
     )
 
 
@@ -301,17 +369,27 @@ def _best(rows: Float, first: int, layout: Layout) -> tuple[Float, Float, Float]
     scores = rows[:, 4 + layout.objectness : first]
     if layout.objectness:
         scores = scores * rows[:, 4:5]
-    centre, size = rows[:, 0:2], rows[:, 2:4]
+    centre = rows[:, 0:2]
+    size = rows[:, 2:4]
     corners = np.concatenate([centre - size / 2, centre + size / 2], axis=1)
     return corners, scores.max(axis=1), scores.argmax(axis=1).astype(np.float32)
 
 
 def _decode_instances(
-    values: Sequence[Float], layout: Layout, place: Placement, settings: SegmentationSettings, floor: float
+    values: Sequence[Float],
+    layout: Layout,
+    place: Placement,
+    settings: SegmentationSettings,
+    floor: float,
 ) -> Instances:
     boxes = values[0].reshape(-1, 4)
-    labels, scores = np.rint(values[1].reshape(-1)).astype(np.intp), values[2].reshape(-1)
-    planes = values[3].reshape(-1, *values[3].shape[-2:]) if values[3].size else np.zeros((0, *place.input), np.float32)
+    labels = np.rint(values[1].reshape(-1)).astype(np.intp)
+    scores = values[2].reshape(-1)
+    planes = (
+        values[3].reshape(-1, *values[3].shape[-2:])
+        if values[3].size
+        else np.zeros((0, *place.input), np.float32)
+    )
     if len({len(boxes), len(labels), len(scores), len(planes)}) != 1:
         raise SegmentationError(
             f"the network's outputs disagree: {len(boxes)} boxes, {len(labels)} labels, {len(scores)} scores, "
@@ -327,7 +405,16 @@ def _decode_instances(
     keep = _keep(boxes, scores, labels, layout, settings, floor)
     whole = np.tile(np.array([0, 0, *place.input[::-1]], np.float32), (len(keep), 1))
     planes = planes[keep].astype(np.float32)
-    return _paste(planes, whole, settings.mask_threshold, boxes[keep], scores[keep], labels[keep], layout, place)
+    return _paste(
+        planes,
+        whole,
+        settings.mask_threshold,
+        boxes[keep],
+        scores[keep],
+        labels[keep],
+        layout,
+        place,
+    )
 
 
 def _keep(
@@ -347,9 +434,12 @@ def _keep(
         return keep[:MAX_OBJECTS]
     corners = boxes[keep]
     extent = float(corners.max() - min(float(corners.min()), 0.0)) + 1.0
-    shifted = corners + labels[keep, None].astype(np.float32) * extent  # classes do not overlap any more
+    # classes do not overlap any more
+    shifted = corners + labels[keep, None].astype(np.float32) * extent
     sized = np.concatenate([shifted[:, :2], shifted[:, 2:] - shifted[:, :2]], axis=1)
-    kept = cv2.dnn.NMSBoxes(sized.astype(float).tolist(), scores[keep].astype(float).tolist(), 0.0, NMS_IOU)
+    kept = cv2.dnn.NMSBoxes(
+        sized.astype(float).tolist(), scores[keep].astype(float).tolist(), 0.0, NMS_IOU
+    )
     return keep[np.asarray(kept, np.intp).reshape(-1)][:MAX_OBJECTS]
 
 
@@ -376,7 +466,8 @@ def _paste(
         place: Where the frame lies in the input.
     """
     height, width = place.frame
-    scale, offset = np.array(place.scale), np.array(place.offset)
+    scale = np.array(place.scale)
+    offset = np.array(place.offset)
     masks = np.zeros((len(planes), height, width), bool)
     for mask, plane, window in zip(masks, planes, windows.astype(np.float64), strict=True):
         x0, y0 = np.maximum(np.floor((window[:2] - offset) / scale), 0).astype(int)
@@ -387,21 +478,31 @@ def _paste(
         first = ((np.array([x0, y0]) + 0.5) * scale + offset) * ratio - 0.5
         # pixel centres of the frame's patch -> pixel centres of the plane
         to_plane = np.column_stack([np.diag(scale * ratio), first])
-        size, flags = (int(x1 - x0), int(y1 - y0)), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        size = (int(x1 - x0), int(y1 - y0))
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         patch = cv2.warpAffine(plane, to_plane, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
         mask[y0:y1, x0:x1] = patch > level
-    shift, stretch = np.tile(offset, 2).astype(np.float32), np.tile(scale, 2).astype(np.float32)
-    in_frame = np.clip((boxes - shift) / stretch, 0, np.array([width, height] * 2)).astype(np.float32)
+    shift = np.tile(offset, 2).astype(np.float32)
+    stretch = np.tile(scale, 2).astype(np.float32)
+    in_frame = np.clip((boxes - shift) / stretch, 0, np.array([width, height] * 2)).astype(
+        np.float32
+    )
     names = tuple(canonical_name(layout.names[int(number)]) for number in labels)
     return Instances(masks, in_frame, names, scores.astype(np.float32)).visible()
 
 
 def _decode_semantic(
-    values: Sequence[Float], layout: Layout, place: Placement, settings: SegmentationSettings, floor: float
+    values: Sequence[Float],
+    layout: Layout,
+    place: Placement,
+    settings: SegmentationSettings,
+    floor: float,
 ) -> Instances:
     logits = values[0].reshape(values[0].shape[-3:])
     if logits.shape[0] <= max(layout.names):
-        raise SegmentationError(f"the network gives {logits.shape[0]} classes, its names end at {max(layout.names)}")
+        raise SegmentationError(
+            f"the network gives {logits.shape[0]} classes, its names end at {max(layout.names)}"
+        )
     rows, columns = (
         _interpolation(
             logits.shape[1 + axis], place.input[axis], place.scale[1 - axis], place.offset[1 - axis],
@@ -411,10 +512,14 @@ def _decode_semantic(
     )  # fmt: skip
     full = np.matmul(np.matmul(rows, logits), columns.T)
     level = _logit(settings.mask_threshold)
-    masks, names, scores = [np.zeros((0, *place.frame), bool)], [], []
+    masks = [np.zeros((0, *place.frame), bool)]
+    names = []
+    scores = []
     for number in _wanted(layout, settings):
         margin = full[number] - np.delete(full, number, axis=0).max(axis=0)  # > 0 is the arg max
-        _, labels, stats, _ = cv2.connectedComponentsWithStats((margin > level).astype(np.uint8), connectivity=8)
+        _, labels, stats, _ = cv2.connectedComponentsWithStats(
+            (margin > level).astype(np.uint8), connectivity=8
+        )
         for component in range(1, len(stats)):
             if stats[component, cv2.CC_STAT_AREA] < MIN_COMPONENT_PX:
                 continue
@@ -428,10 +533,16 @@ def _decode_semantic(
     return Instances(stack, boxes_of(stack), tuple(names), np.array(scores, np.float32))
 
 
-def _interpolation(cells: int, length: int, scale: float, offset: float, count: int, aligned: bool) -> Float:
+def _interpolation(
+    cells: int, length: int, scale: float, offset: float, count: int, aligned: bool
+) -> Float:
     """Matrix ``[count, cells]`` of linear interpolation from `cells` logits to `count` frame pixels along one axis."""
     at_input = (np.arange(count) + 0.5) * scale + offset - 0.5
-    at = at_input * (cells - 1) / max(length - 1, 1) if aligned else (at_input + 0.5) * cells / length - 0.5
+    at = (
+        at_input * (cells - 1) / max(length - 1, 1)
+        if aligned
+        else (at_input + 0.5) * cells / length - 0.5
+    )
     at = np.clip(at, 0, cells - 1)
     low = np.minimum(np.floor(at).astype(int), max(cells - 2, 0))
     matrix = np.zeros((count, cells), np.float32)

@@ -12,7 +12,11 @@ from dynslam_bench.contracts import Frame
 from dynslam_bench.core import SegmentationError, write_atomic
 from dynslam_bench.core.records import Record, schema
 from dynslam_bench.evaluation import MaskCounts, compare_masks
-from dynslam_bench.segmentation.build_segmenter import build_segmenter, resolve_source, weights_digest
+from dynslam_bench.segmentation.build_segmenter import (
+    build_segmenter,
+    resolve_source,
+    weights_digest,
+)
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.segmentation.training.labelled_images import open_labelled
 
@@ -29,7 +33,8 @@ class MaskTally:
     """
 
     def __init__(self, confidence: float = 0.5, min_area: int = 0) -> None:
-        self.confidence, self.min_area = confidence, min_area
+        self.confidence = confidence
+        self.min_area = min_area
         self.truths = 0
         self._counts = MaskCounts()
         self._frame_ious: list[float] = []
@@ -38,15 +43,20 @@ class MaskTally:
         self._hits: list[NDArray[np.bool_]] = []
         self._ignored: list[NDArray[np.bool_]] = []
 
-    def add(self, true: NDArray[np.bool_], guess: NDArray[np.bool_], scores: NDArray[np.float32]) -> None:
+    def add(
+        self, true: NDArray[np.bool_], guess: NDArray[np.bool_], scores: NDArray[np.float32]
+    ) -> None:
         """Compare the detections in an image with its labels: masks ``[M, H, W]``, ``[N, H, W]`` and scores ``[N]``."""
         order = np.argsort(-scores, kind="stable")
-        guess, scores = guess[order], scores[order]
+        guess = guess[order]
+        scores = scores[order]
         overlap = mask_iou(guess, true)
         large = np.count_nonzero(true, axis=(1, 2)) >= max(self.min_area, 1)
         sure = scores >= self.confidence
         if len(true) or sure.any():
-            counts = compare_masks(np.asarray(guess[sure].any(axis=0)), np.asarray(true.any(axis=0)))
+            counts = compare_masks(
+                np.asarray(guess[sure].any(axis=0)), np.asarray(true.any(axis=0))
+            )
             self._counts = self._counts + counts
             if counts.iou is not None:
                 self._frame_ious.append(counts.iou)
@@ -61,15 +71,20 @@ class MaskTally:
         """The quality over the images so far; None where there is nothing to measure.
 
         Returns:
-            ``truths`` and ``detections``: objects that are there, and that were found. ``ap``: mean over IoU thresholds
+            ``truths`` and ``detections``: objects that are there, and that were found. ``ap``: mean
+            over IoU thresholds
             0.50, 0.55 ... 0.95 of the average precision (COCO's 101 recall points). ``ap50``: average precision at IoU
             0.5. ``iou``: intersection over union of the class's pixels, added up over all images. ``frame_iou``: mean
-            over the images in which the class is there or was found of their IoU. ``instance_iou``: mean over the
-            objects of the IoU of the detection that fits best (0 if there is none). ``recall``: share of the objects
-            that a detection covers with IoU >= 0.5.
+            over the images in which the class is there or was found of their IoU. ``instance_iou``:
+            mean over the objects of the IoU of the detection that fits best (0 if there is none).
+            ``recall``: share of the objects that a detection covers with IoU >= 0.5.
         """
-        scores, best = np.array(self._scores), np.array(self._object_ious)
-        hits, ignored = (np.array(rows, bool).reshape(-1, len(THRESHOLDS)) for rows in (self._hits, self._ignored))
+        scores = np.array(self._scores)
+        best = np.array(self._object_ious)
+        hits, ignored = (
+            np.array(rows, bool).reshape(-1, len(THRESHOLDS))
+            for rows in (self._hits, self._ignored)
+        )
         precisions = [
             average_precision(scores[~ignored[:, k]], hits[~ignored[:, k], k], self.truths)
             for k in range(len(THRESHOLDS))
@@ -96,7 +111,8 @@ def mask_iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Intersection over union ``[N, M]`` of masks ``[N, H, W]`` and ``[M, H, W]``."""
     if not len(a) or not len(b):
         return np.zeros((len(a), len(b)))
-    x, y = a.reshape(len(a), -1).astype(np.float32), b.reshape(len(b), -1).astype(np.float32)
+    x = a.reshape(len(a), -1).astype(np.float32)
+    y = b.reshape(len(b), -1).astype(np.float32)
     inter = (x @ y.T).astype(np.float64)
     union = x.sum(axis=1, dtype=np.float64)[:, None] + y.sum(axis=1, dtype=np.float64)[None] - inter
     return np.asarray(inter / np.maximum(union, 1))
@@ -113,7 +129,8 @@ def assign(
         small: ``[N]``, detections that do not count if they hit nothing.
 
     Returns:
-        For each detection, bool ``[10]`` at each of `THRESHOLDS`: whether it hits, and whether it is ignored.
+        For each detection, bool ``[10]`` at each of `THRESHOLDS`: whether it hits, and whether it
+        is ignored.
     """
     count, objects = overlap.shape
     hits, ignored = np.zeros((2, count, len(THRESHOLDS)), bool)
@@ -158,7 +175,8 @@ class SegmenterScore(Record):
         min_area: Smaller objects are left out.
         mean_ap: Mask AP (IoU 0.50 to 0.95), mean over the classes that occur.
         mean_iou: Pixel IoU, mean over the classes that occur.
-        classes: By class: truths, detections, ap, ap50, iou, frame_iou, instance_iou, recall (see `MaskTally.quality`).
+        classes: By class: truths, detections, ap, ap50, iou, frame_iou, instance_iou, recall (see
+            `MaskTally.quality`).
         median_ms: Median time of one image.
         threads: Threads the network could use.
     """
@@ -193,7 +211,8 @@ def evaluate_segmenter(
     """Run a segmenter over labelled images and measure its masks.
 
     Args:
-        settings: The segmenter and its thresholds; the network's own masks are measured, without dilation and repair.
+        settings: The segmenter and its thresholds; the network's own masks are measured, without
+            dilation and repair.
         data: Names a set of labelled images (`open_labelled`).
         output: A JSON file for the result.
         device: ``cpu`` or ``cuda:N``.
@@ -203,16 +222,20 @@ def evaluate_segmenter(
         progress: Called with (images done, images in all).
 
     Raises:
-        SegmentationError: The segmenter or the data are not available, or no image shows an object of the classes.
+        SegmentationError: The segmenter or the data are not available, or no image shows an object
+            of the classes.
     """
     images = open_labelled(data)
-    low = settings.model_copy(update={"confidence": min(0.05, settings.confidence)})  # AP takes weak detections as well
+    # AP takes weak detections as well
+    low = settings.model_copy(update={"confidence": min(0.05, settings.confidence)})
     segmenter = build_segmenter(low, sequence_id="synthetic/", device=device, threads=threads)
     if segmenter is None:
         raise SegmentationError("segmentation.source=none has no masks to evaluate")
     count = len(images) if limit is None else min(limit, len(images))
     chosen = np.unique(np.linspace(0, len(images) - 1, count).round().astype(int))
-    tallies = {name: MaskTally(settings.confidence, min_area) for name in sorted(settings.class_names())}
+    tallies = {
+        name: MaskTally(settings.confidence, min_area) for name in sorted(settings.class_names())
+    }
     times = []
     shown: set[str] = set()
     for done, index in enumerate(chosen.tolist(), 1):
@@ -224,7 +247,11 @@ def evaluate_segmenter(
         shown.update(image.class_names)
         for name, tally in tallies.items():
             predicted = detections.of_classes([name])
-            tally.add(image.masks[[kind == name for kind in image.class_names]], predicted.masks, predicted.scores)
+            tally.add(
+                image.masks[[kind == name for kind in image.class_names]],
+                predicted.masks,
+                predicted.scores,
+            )
         progress(done, len(chosen))
     qualities = {name: tally.quality() for name, tally in tallies.items()}
     there = [quality for quality in qualities.values() if quality["truths"]]

@@ -48,7 +48,8 @@ class LabelledImage:
     Attributes:
         rgb: uint8 ``[H, W, 3]``.
         masks: bool ``[K, H, W]``.
-        class_names: Name of each object as `canonical_name` writes it; COCO's where COCO has the class.
+        class_names: Name of each object as `canonical_name` writes it; COCO's where COCO has the
+            class.
     """
 
     rgb: NDArray[np.uint8]
@@ -85,7 +86,8 @@ def coco_images(text: str) -> LabelledImages:
     Polygons and uncompressed and compressed run lengths are understood.
 
     Args:
-        text: ``ANNOTATIONS.json`` or ``ANNOTATIONS.json:IMAGES``, the folder of the images if it is another.
+        text: ``ANNOTATIONS.json`` or ``ANNOTATIONS.json:IMAGES``, the folder of the images if it is
+            another.
 
     Raises:
         SegmentationError: The file is missing or not in COCO's format.
@@ -100,17 +102,28 @@ def coco_images(text: str) -> LabelledImages:
         "it needs images, annotations and categories",
         of=(ValueError, LookupError, TypeError, AttributeError, OverflowError),
     ):
-        names = {int(entry["id"]): canonical_name(str(entry["name"])) for entry in content["categories"]}
-        shapes: dict[int, list[tuple[str, Any]]] = {int(entry["id"]): [] for entry in content["images"]}
+        names = {
+            int(entry["id"]): canonical_name(str(entry["name"])) for entry in content["categories"]
+        }
+        shapes: dict[int, list[tuple[str, Any]]] = {
+            int(entry["id"]): [] for entry in content["images"]
+        }
         for entry in content["annotations"]:
             if not entry.get("iscrowd"):
-                shapes[int(entry["image_id"])].append((names[int(entry["category_id"])], entry["segmentation"]))
+                shapes[int(entry["image_id"])].append(
+                    (names[int(entry["category_id"])], entry["segmentation"])
+                )
         files = [(str(entry["file_name"]), shapes[int(entry["id"])]) for entry in content["images"]]
     if not files:
         raise SegmentationError(f"{path} lists no images")
-    entries = [(inside(folder, name, where=str(path), kind=SegmentationError), objects) for name, objects in files]
+    entries = [
+        (inside(folder, name, where=str(path), kind=SegmentationError), objects)
+        for name, objects in files
+    ]
     version = _files_digest([path, *(image for image, _ in entries)])
-    return LabelledImages(f"coco:{path.name}", version, len(entries), lambda index: _read_coco(*entries[index]))
+    return LabelledImages(
+        f"coco:{path.name}", version, len(entries), lambda index: _read_coco(*entries[index])
+    )
 
 
 def _read_coco(path: Path, objects: list[tuple[str, Any]]) -> LabelledImage:
@@ -122,28 +135,38 @@ def _read_coco(path: Path, objects: list[tuple[str, Any]]) -> LabelledImage:
 def yolo_images(text: str) -> LabelledImages:
     """Images with YOLO polygon labels: ``images/**/NAME.jpg`` beside ``labels/**/NAME.txt``.
 
-    A label's line is ``class x1 y1 x2 y2 ...`` with coordinates in [0, 1]. The classes are numbered from 0 as ``names``
-    in ``data.yaml`` says, in the folder or the one above it; without that file they are COCO's. An image without a
-    label file has no objects.
+    A label's line is ``class x1 y1 x2 y2 ...`` with coordinates in [0, 1]. The classes are numbered
+    from 0 as ``names`` in ``data.yaml`` says, in the folder or the one above it; without that file
+    they are COCO's. An image without a label file has no objects.
 
     Args:
         text: The folder that holds ``images`` and ``labels``.
 
     Raises:
-        SegmentationError: The folder or its images are missing, or ``names`` is no table of class names.
+        SegmentationError: The folder or its images are missing, or ``names`` is no table of class
+            names.
         SequenceError: ``data.yaml`` cannot be read.
     """
     folder = Path(text).expanduser()
-    root, labels = folder / "images", folder / "labels"
-    images = sorted(path for path in root.rglob("*") if path.suffix.lower() in (".jpg", ".jpeg", ".png", ".bmp"))
+    root = folder / "images"
+    labels = folder / "labels"
+    images = sorted(
+        path for path in root.rglob("*") if path.suffix.lower() in (".jpg", ".jpeg", ".png", ".bmp")
+    )
     if not images:
-        raise SegmentationError(f"there are no images in {root}", "YOLO data has images/ and labels/ side by side")
+        raise SegmentationError(
+            f"there are no images in {root}", "YOLO data has images/ and labels/ side by side"
+        )
 
-    described = [place / "data.yaml" for place in (folder, folder.parent) if (place / "data.yaml").is_file()]
+    described = [
+        place / "data.yaml" for place in (folder, folder.parent) if (place / "data.yaml").is_file()
+    ]
     classes = _yolo_names(described[0]) if described else dict(enumerate(COCO_NAMES))
 
     def read(index: int) -> LabelledImage:
-        return _read_yolo(images[index], labels / images[index].relative_to(root).with_suffix(".txt"), classes)
+        return _read_yolo(
+            images[index], labels / images[index].relative_to(root).with_suffix(".txt"), classes
+        )
 
     version = _files_digest([*images, *sorted(labels.rglob("*.txt")), *described[:1]])
     return LabelledImages(f"yolo:{folder.name}", version, len(images), read)
@@ -166,7 +189,8 @@ def _yolo_names(path: Path) -> dict[int, str]:
 
 def _read_yolo(path: Path, label: Path, classes: Mapping[int, str]) -> LabelledImage:
     rgb = _read(path)
-    masks, names = [], []
+    masks = []
+    names = []
     lines = read_lines(label, kind=SegmentationError) if label.is_file() else []
     for number, line in enumerate(lines, 1):
         if not line.strip():
@@ -188,10 +212,14 @@ def _files_digest(paths: list[Path]) -> str:
 
 
 def _read(path: Path) -> NDArray[np.uint8]:
-    return np.ascontiguousarray(read_image(path, flags=cv2.IMREAD_COLOR, kind=SegmentationError)[:, :, ::-1], np.uint8)
+    return np.ascontiguousarray(
+        read_image(path, flags=cv2.IMREAD_COLOR, kind=SegmentationError)[:, :, ::-1], np.uint8
+    )
 
 
-def _labelled(rgb: NDArray[np.uint8], masks: list[NDArray[np.bool_]], names: list[str]) -> LabelledImage:
+def _labelled(
+    rgb: NDArray[np.uint8], masks: list[NDArray[np.bool_]], names: list[str]
+) -> LabelledImage:
     stack = np.stack(masks) if masks else np.zeros((0, *rgb.shape[:2]), bool)
     visible = np.asarray(stack.any(axis=(1, 2)))
     return LabelledImage(rgb, stack[visible], tuple(np.array(names, object)[visible]))
@@ -205,9 +233,12 @@ def _fill(polygons: list[NDArray[np.float64]], shape: tuple[int, ...]) -> NDArra
         high = np.minimum(np.ceil(polygon.max(axis=0)), shape[1::-1]).astype(int)
         if (high <= low).any():
             continue
-        size = (high - low) * FINER  # OpenCV also fills pixels that the outline touches: at this scale it hardly counts
+        # OpenCV also fills pixels that the outline touches: at this scale it hardly counts
+        size = (high - low) * FINER
         fine = np.zeros((size[1], size[0]), np.uint8)
-        cv2.fillPoly(fine, [np.rint(((polygon - low) * FINER - 0.5) * 16).astype(np.int32)], 255, shift=4)
+        cv2.fillPoly(
+            fine, [np.rint(((polygon - low) * FINER - 0.5) * 16).astype(np.int32)], 255, shift=4
+        )
         whole = cv2.resize(fine, (high - low).tolist(), interpolation=cv2.INTER_AREA)
         mask[low[1] : high[1], low[0] : high[0]] |= whole >= 128
     return mask
@@ -236,11 +267,16 @@ def _coco_mask(segmentation: Any, shape: tuple[int, ...], where: Path) -> NDArra
         height, width = (int(value) for value in segmentation["size"])
         total = sum(runs)
         if (height, width) != tuple(shape) or total != height * width or min(runs) < 0:
-            raise ValueError(f"a mask of {width}x{height} with {total} pixels, the image is {shape[1]}x{shape[0]}")
-        return np.ascontiguousarray(np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(width, height).T)
+            raise ValueError(
+                f"a mask of {width}x{height} with {total} pixels, the image is {shape[1]}x{shape[0]}"
+            )
+        return np.ascontiguousarray(
+            np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(width, height).T
+        )
 
 
-_NOT_LAST, _LAST = "[P-o]", "[0-O]"
+_NOT_LAST = "[P-o]"
+_LAST = "[0-O]"
 """Digits of COCO's run lengths, 48 less than the character's code: with bit 32 another digit follows."""
 
 
@@ -248,11 +284,14 @@ def decode_runs(text: str) -> list[int]:
     """COCO's compressed run lengths: base-32 digits, least first, differences to the run two before.
 
     Raises:
-        ValueError: The text ends within a number, a number is longer than any image, or a character is no digit.
+        ValueError: The text ends within a number, a number is longer than any image, or a character
+            is no digit.
     """
     rest = re.sub(rf"\A(?:{_NOT_LAST}{{0,12}}{_LAST})*", "", text, count=1)
     if rest:
-        raise ValueError(f"the run lengths are damaged at character {len(text) - len(rest)} of {len(text)}")
+        raise ValueError(
+            f"the run lengths are damaged at character {len(text) - len(rest)} of {len(text)}"
+        )
     runs: list[int] = []
     for number in re.findall(f"{_NOT_LAST}*{_LAST}", text):
         digits = [ord(character) - 48 for character in number]
@@ -284,17 +323,22 @@ def sequence_frames(sequence_id: str) -> LabelledImages:
     """
     sequence = open_sequence(sequence_id)
     if sequence.masks is None:
-        raise SegmentationError(f"sequence '{sequence.id}' has no masks to train on or compare with")
-    return LabelledImages(sequence.id, sequence.digest(), len(sequence), partial(_labelled_frame, sequence))
+        raise SegmentationError(
+            f"sequence '{sequence.id}' has no masks to train on or compare with"
+        )
+    return LabelledImages(
+        sequence.id, sequence.digest(), len(sequence), partial(_labelled_frame, sequence)
+    )
 
 
 def rendered_frames(text: str = "") -> LabelledImages:
     """Frames drawn at random from rendered sequences.
 
     Args:
-        text: ``scenes=0-99,frames=4,length=600,options=0.3,seed=0``, where what is left out keeps its default: scenes
-            (0-99 are for training, 100-199 held out), frames drawn from each of a scene's eight sequences, frames of a
-            sequence that are drawn from, share of the frames rendered with one of `VARIANTS`, seed of the draws.
+        text: ``scenes=0-99,frames=4,length=600,options=0.3,seed=0``, where what is left out keeps
+            its default: scenes (0-99 are for training, 100-199 held out), frames drawn from each of
+            a scene's eight sequences, frames of a sequence that are drawn from, share of the frames
+            rendered with one of `VARIANTS`, seed of the draws.
 
     Raises:
         SegmentationError: Unknown option, or a value that does not fit.
@@ -303,7 +347,9 @@ def rendered_frames(text: str = "") -> LabelledImages:
     for part in filter(None, text.split(",")):
         key, separator, value = part.partition("=")
         if key not in values or not separator:
-            raise SegmentationError(f"synthetic: unknown option '{part}'", "known: " + ", ".join(values))
+            raise SegmentationError(
+                f"synthetic: unknown option '{part}'", "known: " + ", ".join(values)
+            )
         values[key] = value
     with raising(SegmentationError, f"synthetic: '{text}' is not understood", of=ValueError):
         first, _, last = values["scenes"].partition("-")
@@ -312,7 +358,8 @@ def rendered_frames(text: str = "") -> LabelledImages:
         options = float(values["options"])
     if not scenes or scenes[0] < 0 or scenes[-1] > 199 or not 1 <= frames <= length:
         raise SegmentationError(
-            f"synthetic: '{text}' asks for scenes or frames that do not exist", "scenes 0-199, at least one frame"
+            f"synthetic: '{text}' asks for scenes or frames that do not exist",
+            "scenes 0-199, at least one frame",
         )
     name = f"scenes={scenes[0]}-{scenes[-1]},frames={frames},length={length},options={options:g},seed={seed}"
 
@@ -349,9 +396,10 @@ FORMS = "synthetic[:OPTIONS], sequence:ID, coco:ANNOTATIONS.json[:IMAGES], yolo:
 def open_labelled(text: str) -> LabelledImages:
     """The set that a text names.
 
-    ``synthetic:scenes=0-99,frames=4,seed=0,options=0.3`` is frames of rendered sequences (`rendered_frames`),
-    ``sequence:ID`` every frame of one sequence that has masks, ``coco:FILE[:IMAGES]`` a COCO annotation file,
-    ``yolo:DIR`` a folder with ``images/`` and ``labels/``.
+    ``synthetic:scenes=0-99,frames=4,seed=0,options=0.3`` is frames of rendered sequences
+    (`rendered_frames`), ``sequence:ID`` every frame of one sequence that has masks,
+    ``coco:FILE[:IMAGES]`` a COCO annotation file, ``yolo:DIR`` a folder with ``images/`` and
+    ``labels/``.
 
     Raises:
         SegmentationError: Another form, or the set does not exist.
@@ -363,11 +411,13 @@ def open_labelled(text: str) -> LabelledImages:
     if kind in kinds and (rest or kind == "synthetic"):
         return kinds[kind](rest)
     raise SegmentationError(
-        f"'{text}' names no set of labelled images; the forms are {FORMS}", did_you_mean(kind, list(kinds))
+        f"'{text}' names no set of labelled images; the forms are {FORMS}",
+        did_you_mean(kind, list(kinds)),
     )
 
 
-# Labelled images at the network's input size, kept in one file on disk, and their random variation for training.
+# Labelled images at the network's input size, kept in one file on disk, and their random variation
+# for training.
 
 MIN_VISIBLE_PX = 16
 """Objects with fewer pixels at the network's input size are not learned."""
@@ -411,7 +461,8 @@ class PreparedImages:
             of=Exception,
         ):  # numpy raises many types for a damaged header
             self.images, self.labels = (
-                np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in ("images", "labels")
+                np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
+                for name in ("images", "labels")
             )
             names = read_json(folder / "names.json", limit=TABLE_BYTES, kind=SegmentationError)
             self.names = [[canonical_name(name) for name in present] for present in names]
@@ -424,13 +475,17 @@ class PreparedImages:
 
     def example(self, index: int, rng: np.random.Generator | None = None) -> Example:
         """An image; with a generator at random scale, place, mirror image, colour, noise and blur."""
-        rgb, labels, names = np.array(self.images[index]), np.array(self.labels[index]), self.names[index]
+        rgb = np.array(self.images[index])
+        labels = np.array(self.labels[index])
+        names = self.names[index]
         if rng is not None:
             rgb, labels = vary(rgb, labels, rng)
         numbers = [k + 1 for k, name in enumerate(names) if name in self.classes]
         masks = labels[None] == np.array(numbers, np.uint8).reshape(-1, 1, 1)
         visible = np.count_nonzero(masks, axis=(1, 2)) >= MIN_VISIBLE_PX
-        classes = np.array([self.classes.index(names[number - 1]) + 1 for number in numbers], np.int64)
+        classes = np.array(
+            [self.classes.index(names[number - 1]) + 1 for number in numbers], np.int64
+        )
         return Example(rgb, masks[visible], boxes_of(masks[visible]), classes[visible])
 
 
@@ -445,7 +500,8 @@ def prepare(
 
     Args:
         source: The images.
-        folder: Under which a folder is made, named by the digest of the set's name, content and size.
+        folder: Under which a folder is made, named by the digest of the set's name, content and
+            size.
         height: Rows of the network's input.
         width: Columns.
         progress: Called with (images done, images in all).
@@ -453,13 +509,24 @@ def prepare(
     Returns:
         The folder for `PreparedImages`.
     """
-    key = digest({"name": source.name, "version": source.version, "count": len(source), "size": [height, width]})
+    key = digest(
+        {
+            "name": source.name,
+            "version": source.version,
+            "count": len(source),
+            "size": [height, width],
+        }
+    )
     target = folder / f"prepared-{key}"
     if (target / "names.json").is_file():
         return target
     with atomic_folder(target) as work:
-        images = np.lib.format.open_memmap(work / "images.npy", "w+", np.uint8, (len(source), height, width, 3))
-        labels = np.lib.format.open_memmap(work / "labels.npy", "w+", np.uint8, (len(source), height, width))
+        images = np.lib.format.open_memmap(
+            work / "images.npy", "w+", np.uint8, (len(source), height, width, 3)
+        )
+        labels = np.lib.format.open_memmap(
+            work / "labels.npy", "w+", np.uint8, (len(source), height, width)
+        )
         names: list[list[str]] = []
         for index in range(len(source)):
             images[index], labels[index], present = shrink(source[index], height, width)
@@ -469,18 +536,23 @@ def prepare(
     return target
 
 
-def shrink(image: LabelledImage, height: int, width: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8], list[str]]:
+def shrink(
+    image: LabelledImage, height: int, width: int
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8], list[str]]:
     """An image at another size with grey borders where the aspect ratio differs; objects as a label image.
 
     Returns:
-        uint8 ``[height, width, 3]``, label image uint8 ``[height, width]`` (0 = background) and the objects' names.
+        uint8 ``[height, width, 3]``, label image uint8 ``[height, width]`` (0 = background) and the
+        objects' names.
     """
     rows, columns = image.rgb.shape[:2]
     ratio = min(height / rows, width / columns)
     size = (max(1, round(columns * ratio)), max(1, round(rows * ratio)))
     how = cv2.INTER_AREA if ratio < 1 else cv2.INTER_LINEAR
-    rgb, labels = np.full((height, width, 3), 114, np.uint8), np.zeros((height, width), np.uint8)
-    top, left = (height - size[1]) // 2, (width - size[0]) // 2
+    rgb = np.full((height, width, 3), 114, np.uint8)
+    labels = np.zeros((height, width), np.uint8)
+    top = (height - size[1]) // 2
+    left = (width - size[0]) // 2
     rgb[top : top + size[1], left : left + size[0]] = cv2.resize(image.rgb, size, interpolation=how)
     patch = labels[top : top + size[1], left : left + size[0]]
     order = np.argsort([-int(np.count_nonzero(mask)) for mask in image.masks], kind="stable")[:255]
@@ -500,14 +572,20 @@ def vary(
     slack = np.abs(np.array([width, height]) * (scale - 1)) / 2 + 0.05 * np.array([width, height])
     shift = rng.uniform(-slack, slack) if scale != 1.0 else np.zeros(2)
     angle = float(rng.normal(0, 4.0)) if rng.random() < 0.5 else 0.0
-    cosine, sine = scale * np.cos(np.deg2rad(angle)), scale * np.sin(np.deg2rad(angle))
+    cosine = scale * np.cos(np.deg2rad(angle))
+    sine = scale * np.sin(np.deg2rad(angle))
     linear = np.array([[cosine * mirror, -sine], [sine * mirror, cosine]])
     middle = np.array([(width - 1) / 2, (height - 1) / 2])
     move = np.column_stack([linear, middle + shift - linear @ middle])
     rgb = np.asarray(
-        cv2.warpAffine(rgb, move, (width, height), flags=cv2.INTER_LINEAR, borderValue=(114, 114, 114)), np.uint8
+        cv2.warpAffine(
+            rgb, move, (width, height), flags=cv2.INTER_LINEAR, borderValue=(114, 114, 114)
+        ),
+        np.uint8,
     )
-    labels = np.asarray(cv2.warpAffine(labels, move, (width, height), flags=cv2.INTER_NEAREST), np.uint8)
+    labels = np.asarray(
+        cv2.warpAffine(labels, move, (width, height), flags=cv2.INTER_NEAREST), np.uint8
+    )
     return _photometric(rgb, rng), labels
 
 
@@ -515,7 +593,9 @@ def _photometric(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np
     value: NDArray[np.float32] = rgb.astype(np.float32) / np.float32(255)
     if rng.random() < 0.8:
         value = value ** np.float32(np.exp(rng.normal(0, 0.25)))
-        value = (value - 0.5) * np.float32(rng.uniform(0.7, 1.3)) + np.float32(0.5 + rng.uniform(-0.15, 0.15))
+        value = (value - 0.5) * np.float32(rng.uniform(0.7, 1.3)) + np.float32(
+            0.5 + rng.uniform(-0.15, 0.15)
+        )
         value = value * rng.uniform(0.85, 1.15, 3).astype(np.float32)
     if rng.random() < 0.3:
         grey = value.mean(axis=2, keepdims=True)
@@ -523,18 +603,28 @@ def _photometric(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np
     if rng.random() < 0.2:  # a veil, brighter to one side
         direction = rng.normal(size=2)
         y, x = np.mgrid[-1 : 1 : value.shape[0] * 1j, -1 : 1 : value.shape[1] * 1j]
-        ramp = np.clip(0.5 + (direction[0] * x + direction[1] * y) * 0.5, 0, 1)[:, :, None].astype(np.float32)
-        value = value * (1 - ramp * np.float32(rng.uniform(0, 0.6))) + ramp * np.float32(rng.uniform(0, 0.5))
+        ramp = np.clip(0.5 + (direction[0] * x + direction[1] * y) * 0.5, 0, 1)[:, :, None].astype(
+            np.float32
+        )
+        value = value * (1 - ramp * np.float32(rng.uniform(0, 0.6))) + ramp * np.float32(
+            rng.uniform(0, 0.5)
+        )
     if rng.random() < 0.25:
-        length, angle = int(rng.integers(3, 10)), rng.uniform(0, np.pi)
-        kernel, half = np.zeros((length, length), np.float32), (length - 1) / 2
+        angle = rng.uniform(0, np.pi)
+        length = int(rng.integers(3, 10))
+        kernel = np.zeros((length, length), np.float32)
+        half = (length - 1) / 2
         for t in np.linspace(-half, half, 4 * length):
             kernel[round(half + t * np.sin(angle)), round(half + t * np.cos(angle))] = 1
         value = np.asarray(cv2.filter2D(value, -1, kernel / kernel.sum()), np.float32)
     elif rng.random() < 0.2:
-        value = np.asarray(cv2.GaussianBlur(value, (0, 0), float(rng.uniform(0.4, 1.5))), np.float32)
+        value = np.asarray(
+            cv2.GaussianBlur(value, (0, 0), float(rng.uniform(0.4, 1.5))), np.float32
+        )
     if rng.random() < 0.4:
-        value = value + rng.standard_normal(value.shape, np.float32) * np.float32(rng.uniform(0, 0.05))
+        value = value + rng.standard_normal(value.shape, np.float32) * np.float32(
+            rng.uniform(0, 0.05)
+        )
     return np.asarray(np.rint(np.clip(value, 0, 1) * 255), np.uint8)
 
 

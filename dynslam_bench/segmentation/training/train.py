@@ -16,7 +16,12 @@ from dynslam_bench.core import SegmentationError, raising, read_json, replacing,
 from dynslam_bench.evaluation import MaskCounts, compare_masks
 from dynslam_bench.segmentation.networks import pinned_threads
 from dynslam_bench.segmentation.networks.backbone import EMBEDDED, RESNET18, NetworkConfig
-from dynslam_bench.segmentation.networks.loading import load_strictly, read_checkpoint, read_weights, save_network
+from dynslam_bench.segmentation.networks.loading import (
+    load_strictly,
+    read_checkpoint,
+    read_weights,
+    save_network,
+)
 from dynslam_bench.segmentation.networks.mask_rcnn_segmenter import paste
 from dynslam_bench.segmentation.networks.network import MaskRCNN
 from dynslam_bench.segmentation.settings import COCO_NAMES, PRESETS
@@ -44,9 +49,9 @@ def train(
 ) -> TrainResult:
     """Train a network.
 
-    `output` receives ``best.pt`` (weights), ``best-half.pt`` (the same in float16, for packaging), ``last.pt`` (the
-    whole state of the run), ``curve.csv``, ``curve.html`` and ``settings.json``. A run that is started again with the
-    same settings continues from ``last.pt``.
+    `output` receives ``best.pt`` (weights), ``best-half.pt`` (the same in float16, for packaging),
+    ``last.pt`` (the whole state of the run), ``curve.csv``, ``curve.html`` and ``settings.json``. A
+    run that is started again with the same settings continues from ``last.pt``.
 
     Args:
         settings: Network, data and schedule.
@@ -58,10 +63,13 @@ def train(
         progress: Called after each prepared image, step and evaluation.
 
     Raises:
-        SegmentationError: The data or the initial weights do not fit, or `output` holds a run with other settings.
+        SegmentationError: The data or the initial weights do not fit, or `output` holds a run with
+            other settings.
     """
     config = network_config(settings)
-    height, width = config.min_side, round(config.min_side * 4 / 3)  # as the frames of most sequences
+    # as the frames of most sequences
+    width = round(config.min_side * 4 / 3)
+    height = config.min_side
     output.mkdir(parents=True, exist_ok=True)
     if resume:
         _check_settings(settings, output / "settings.json")
@@ -81,7 +89,8 @@ def train(
             )
         return images
 
-    sets, validation = [load(text) for text in settings.data], load(settings.validation)
+    sets = [load(text) for text in settings.data]
+    validation = load(settings.validation)
     with pinned_threads(torch.get_num_threads, torch.set_num_threads, threads):
         run = TrainingRun(settings, config, output, device)
         if resume and (output / "last.pt").is_file():
@@ -101,7 +110,9 @@ def network_config(settings: TrainSettings) -> NetworkConfig:
     if unknown or len(set(names)) != len(names):
         reason = f"'{unknown[0]}' is no COCO class" if unknown else "one is named twice"
         raise SegmentationError(f"the classes '{settings.classes}' cannot be learned: {reason}")
-    shape = {"embedded": EMBEDDED, "resnet18": RESNET18, "resnet50": NetworkConfig()}[settings.network]
+    shape = {"embedded": EMBEDDED, "resnet18": RESNET18, "resnet50": NetworkConfig()}[
+        settings.network
+    ]
     sides = {} if settings.network == "embedded" else {"min_side": 480, "max_side": 800}
     return shape.model_copy(update={"classes": tuple(names), "cfpn": settings.cfpn, **sides})
 
@@ -110,7 +121,9 @@ def _check_settings(settings: TrainSettings, path: Path) -> None:
     """Raise where the folder's run has other settings than its length."""
     before = read_json(path, kind=SegmentationError) if path.is_file() else {}
     if not isinstance(before, dict):
-        raise SegmentationError(f"{path} holds no settings", "do not resume, or name another folder")
+        raise SegmentationError(
+            f"{path} holds no settings", "do not resume, or name another folder"
+        )
     for key, value in json.loads(settings.model_dump_json()).items():
         if before.get(key, value) != value and key != "iterations":
             raise SegmentationError(
@@ -132,9 +145,13 @@ class TrainingRun:
     _MODULES = ("network", "average", "optimiser")
     _PLAIN = {"step": int, "rows": list, "best": dict, "recent": dict}  # noqa: RUF012 - a constant
 
-    def __init__(self, settings: TrainSettings, config: NetworkConfig, output: Path, device: str) -> None:
+    def __init__(
+        self, settings: TrainSettings, config: NetworkConfig, output: Path, device: str
+    ) -> None:
         torch.manual_seed(settings.seed)
-        self.settings, self.output, self.device = settings, output, device
+        self.settings = settings
+        self.output = output
+        self.device = device
         self.network = MaskRCNN(config)
         if settings.init:
             _initialise(self.network, Path(settings.init))
@@ -142,19 +159,28 @@ class TrainingRun:
         self.average = copy.deepcopy(self.network).eval()
         groups: list[dict[str, Any]] = [
             {"params": [weight for weight in self.network.parameters() if weight.dim() > 1]},
-            {"params": [weight for weight in self.network.parameters() if weight.dim() <= 1], "weight_decay": 0.0},
+            {
+                "params": [weight for weight in self.network.parameters() if weight.dim() <= 1],
+                "weight_decay": 0.0,
+            },
         ]
-        self.optimiser = torch.optim.AdamW(groups, lr=settings.learning_rate, weight_decay=settings.weight_decay)
+        self.optimiser = torch.optim.AdamW(
+            groups, lr=settings.learning_rate, weight_decay=settings.weight_decay
+        )
         self.step = 0
         self.rows: list[dict[str, float]] = []
         self.best = {"iou": -1.0, "step": 0.0}
         self.recent: dict[str, list[float]] = {name: [] for name in LOSSES}
 
     def run(
-        self, sets: list[PreparedImages], validation: PreparedImages, report: Callable[[TrainProgress], object]
+        self,
+        sets: list[PreparedImages],
+        validation: PreparedImages,
+        report: Callable[[TrainProgress], object],
     ) -> TrainResult:
         """Learn until the last step."""
-        settings, total = self.settings, self.settings.iterations
+        settings = self.settings
+        total = self.settings.iterations
         if not sum(map(len, sets)) or not len(validation):
             raise SegmentationError("there are no images to learn from or to validate on")
         while self.step < total:
@@ -186,11 +212,17 @@ class TrainingRun:
             for name in ("boxes", "labels", "masks")
         )
         generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + self.step)
-        with torch.autocast(self.device.split(":")[0], torch.bfloat16, enabled=settings.precision == "bfloat16"):
-            losses = self.network.losses(images, boxes, labels, masks, generator, settings.proposals)
+        with torch.autocast(
+            self.device.split(":")[0], torch.bfloat16, enabled=settings.precision == "bfloat16"
+        ):
+            losses = self.network.losses(
+                images, boxes, labels, masks, generator, settings.proposals
+            )
         total = torch.stack(list(losses.values())).sum()
         if not torch.isfinite(total):
-            raise SegmentationError(f"training diverged at step {self.step}: the loss is {float(total)}")
+            raise SegmentationError(
+                f"training diverged at step {self.step}: the loss is {float(total)}"
+            )
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
@@ -228,7 +260,10 @@ class TrainingRun:
 
     def save(self) -> None:
         """Write the whole state of the run to ``last.pt``."""
-        content = {"format": "dynslam-bench/training/1", **{name: getattr(self, name) for name in self._PLAIN}}
+        content = {
+            "format": "dynslam-bench/training/1",
+            **{name: getattr(self, name) for name in self._PLAIN},
+        }
         content |= {name: getattr(self, name).state_dict() for name in self._MODULES}
         with replacing(self.output / "last.pt") as temporary, temporary.open("wb") as file:
             torch.save(content, file)
@@ -292,8 +327,8 @@ def validate(network: MaskRCNN, images: PreparedImages, device: str = "cpu") -> 
     """Scores of a network on prepared images, detections from score 0.5.
 
     Returns:
-        ``iou`` (mean over objects of the best detection's IoU), ``pixel_iou`` (all classes' pixels together) and
-        ``recall`` (share of objects with IoU >= 0.5).
+        ``iou`` (mean over objects of the best detection's IoU), ``pixel_iou`` (all classes' pixels
+        together) and ``recall`` (share of objects with IoU >= 0.5).
     """
     network.eval()
     best: list[float] = []
@@ -303,10 +338,17 @@ def validate(network: MaskRCNN, images: PreparedImages, device: str = "cpu") -> 
         height, width = example.rgb.shape[:2]
         image = torch.from_numpy(example.rgb).to(device).permute(2, 0, 1).float() / 255
         boxes, labels, _, planes = (part.cpu().numpy() for part in network.detect(image, score=0.5))
-        masks = [paste(plane, box, height, width, 0.5, exact=True) for plane, box in zip(planes, boxes, strict=True)]
+        masks = [
+            paste(plane, box, height, width, 0.5, exact=True)
+            for plane, box in zip(planes, boxes, strict=True)
+        ]
         for truth, label in zip(example.masks, example.labels.tolist(), strict=True):
-            same_class = [mask for mask, kind in zip(masks, labels.tolist(), strict=True) if kind == label]
-            best.append(max((compare_masks(mask, truth).iou or 0.0 for mask in same_class), default=0.0))
+            same_class = [
+                mask for mask, kind in zip(masks, labels.tolist(), strict=True) if kind == label
+            ]
+            best.append(
+                max((compare_masks(mask, truth).iou or 0.0 for mask in same_class), default=0.0)
+            )
         union = np.any(masks, axis=0) if masks else np.zeros((height, width), bool)
         counts = counts + compare_masks(union, np.asarray(example.masks.any(axis=0)))
     return {

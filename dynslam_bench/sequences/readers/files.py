@@ -83,17 +83,20 @@ def read_image_list(path: Path) -> ImageList:
     """Read lines ``timestamp filename``; ``#`` starts a comment, commas and tabs separate as well.
 
     Raises:
-        SequenceError: The file is missing or no text, a stamp is not a number, or two differ by less than 1 us.
+        SequenceError: The file is missing or no text, a stamp is not a number, or two differ by
+            less than 1 us.
     """
-    return make_image_list([(stamp, " ".join(rest)) for stamp, rest in read_stamped_lines(path)], described=str(path))
+    return make_image_list(
+        [(stamp, " ".join(rest)) for stamp, rest in read_stamped_lines(path)], described=str(path)
+    )
 
 
 def read_associations(path: Path) -> tuple[ImageList, ImageList]:
     """Read lines ``timestamp colour timestamp depth``, images that are paired already.
 
     Raises:
-        SequenceError: The file is missing or no text, a line does not have these four parts, or two stamps differ by
-            less than 1 us.
+        SequenceError: The file is missing or no text, a line does not have these four parts, or two
+            stamps differ by less than 1 us.
     """
     rows: list[tuple[int | None, str]] = []
     pairs: dict[int | None, tuple[int, str]] = {}
@@ -108,7 +111,9 @@ def read_associations(path: Path) -> tuple[ImageList, ImageList]:
             pairs[stamp] = depth_stamp, rest[2]
     colour = make_image_list(rows, described=str(path))
     depth = [pairs[stamp] for stamp in colour.stamps_ns.tolist()]
-    return colour, ImageList(np.array([stamp for stamp, _ in depth], np.int64), tuple(file for _, file in depth))
+    return colour, ImageList(
+        np.array([stamp for stamp, _ in depth], np.int64), tuple(file for _, file in depth)
+    )
 
 
 LEFT_OUT = "frame numbers without an image"
@@ -118,8 +123,9 @@ _IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 def list_folder(folder: Path, name: str, fps: float | None) -> ImageList:
     """The images of a folder without a list file, stamped by their names.
 
-    A name with a decimal point is a stamp in seconds. Of whole numbers, those of the size of Unix time are stamps in
-    seconds, milliseconds, microseconds or nanoseconds; others are frame numbers, which `fps` turns into seconds.
+    A name with a decimal point is a stamp in seconds. Of whole numbers, those of the size of Unix
+    time are stamps in seconds, milliseconds, microseconds or nanoseconds; others are frame numbers,
+    which `fps` turns into seconds.
 
     Raises:
         SequenceError: The folder does not exist, or the names give no stamps.
@@ -136,12 +142,16 @@ def list_folder(folder: Path, name: str, fps: float | None) -> ImageList:
     missing = 0
     if paths and all(path.stem.isascii() and path.stem.isdigit() for path in paths):
         numbers = [int(path.stem) for path in paths]
-        stamps, missing = stamps_of_numbers(numbers, fps, [f"{name}/{path.name}" for path in paths], folder)
+        stamps, missing = stamps_of_numbers(
+            numbers, fps, [f"{name}/{path.name}" for path in paths], folder
+        )
         rows = [(stamp, f"{name}/{path.name}") for stamp, path in zip(stamps, paths, strict=True)]
     else:
         hint = f"write {name}.txt with lines 'timestamp {name}/FILE'"
         rows = [(_number(path.stem, images, hint), f"{name}/{path.name}") for path in paths]
-    listed = make_image_list(sorted(rows, key=lambda row: (row[0] or 0, row[1])), described=str(images))
+    listed = make_image_list(
+        sorted(rows, key=lambda row: (row[0] or 0, row[1])), described=str(images)
+    )
     more = Counter({"files that are no images": len(shown) - len(paths), LEFT_OUT: missing})
     return ImageList(listed.stamps_ns, listed.files, listed.irregular + more)
 
@@ -168,10 +178,14 @@ _NO_VIDEO_S = 5.0
 def unix_unit(number: int) -> str | None:
     """The unit in which a whole number is Unix time of our days; None if it is in none."""
     low, high = _UNIX_S
-    return next((unit for unit, per_s in _UNITS.items() if low * per_s <= number < high * per_s), None)
+    return next(
+        (unit for unit, per_s in _UNITS.items() if low * per_s <= number < high * per_s), None
+    )
 
 
-def stamps_of_numbers(numbers: list[int], fps: float | None, files: list[str], folder: Path) -> tuple[list[int], int]:
+def stamps_of_numbers(
+    numbers: list[int], fps: float | None, files: list[str], folder: Path
+) -> tuple[list[int], int]:
     """Stamps in nanoseconds of images that are named by whole numbers.
 
     Args:
@@ -184,7 +198,8 @@ def stamps_of_numbers(numbers: list[int], fps: float | None, files: list[str], f
         The stamps, and how many frame numbers are left out between the first and the last.
 
     Raises:
-        SequenceError: The numbers are frame numbers and there is no `fps`; or they may be frame numbers or stamps.
+        SequenceError: The numbers are frame numbers and there is no `fps`; or they may be frame
+            numbers or stamps.
     """
     # 1. Unix time has a size of its own.
     units = {unix_unit(number) for number in numbers}
@@ -261,7 +276,9 @@ def make_image_list(rows: list[tuple[int | None, str]], *, described: str) -> Im
     irregular = {
         "stamps not finite": len(named) - len(finite),
         "duplicate stamps": len(finite) - len(unique),
-        "stamps out of order": sum(later < earlier for earlier, later in pairwise(stamp for stamp, _ in finite)),
+        "stamps out of order": sum(
+            later < earlier for earlier, later in pairwise(stamp for stamp, _ in finite)
+        ),
         "lines without a file name": len(rows) - len(named),
     }
     return ImageList(order, tuple(unique[stamp] for stamp in order.tolist()), Counter(irregular))
@@ -271,12 +288,15 @@ def read_stamped_lines(path: Path) -> list[tuple[int | None, list[str]]]:
     """Lines of a TUM list file, split at white space and commas, the first part in nanoseconds; None if not finite.
 
     Raises:
-        SequenceError: The file cannot be read, a first part is not a number (names the line), or there are too many.
+        SequenceError: The file cannot be read, a first part is not a number (names the line), or
+            there are too many.
     """
     rows: list[tuple[int | None, list[str]]] = []
     for number, line in enumerate(read_lines(path, kind=SequenceError), start=1):
         if number > MOST_LINES:
-            raise SequenceError(f"{path} has more than {MOST_LINES} lines, too many for a list of images")
+            raise SequenceError(
+                f"{path} has more than {MOST_LINES} lines, too many for a list of images"
+            )
         parts = line.replace(",", " ").split()
         if parts and not parts[0].startswith("#"):
             rows.append((_number(parts[0], f"{path} line {number}"), parts[1:]))
@@ -289,7 +309,9 @@ def _number(text: str, where: object, hint: str = "") -> int | None:
     except ValueError:
         whole = re.fullmatch(r"([0-9]{1,24})(\.[0-9]*)?", text, re.ASCII)
         unit = None if whole is None else unix_unit(int(whole[1]))
-        hint = hint if unit is None else f"it looks like {unit} of Unix time: divide by {_UNITS[unit]}"
+        hint = (
+            hint if unit is None else f"it looks like {unit} of Unix time: divide by {_UNITS[unit]}"
+        )
         raise SequenceError(f"{where}: '{text[:40]}' is not a timestamp in seconds", hint) from None
 
 
@@ -303,16 +325,19 @@ class Contents:
     Attributes:
         colour: Colour images and their stamps in seconds.
         depth: Depth images, registered to the colour images, and their stamps.
-        paired: Whether the two lists are paired already, entry by entry; otherwise they are associated by time.
+        paired: Whether the two lists are paired already, entry by entry; otherwise they are
+            associated by time.
         truth: Camera-to-world poses; None if there are none.
-        truth_of_body: Whether `truth` is that of whatever body the data set tracks, so that the camera's `R_body_cam`
-            applies; otherwise it is the camera's already.
+        truth_of_body: Whether `truth` is that of whatever body the data set tracks, so that the
+            camera's `R_body_cam` applies; otherwise it is the camera's already.
         truth_dropped: One phrase on the poses that were not taken as they stand; empty for none.
         notes: Phrases on files that are there and were not used.
         camera: Intrinsics that the folder states; None where it does not.
         fps: Nominal frame rate in Hz that the folder or the layout states; None where neither does.
-        furthest_m: Depth beyond this, in metres, is no measurement (a rendered sky); None for no limit.
-        people: Exact masks of people, with the stamps of the colour images; None where there are none.
+        furthest_m: Depth beyond this, in metres, is no measurement (a rendered sky); None for no
+            limit.
+        people: Exact masks of people, with the stamps of the colour images; None where there are
+            none.
     """
 
     colour: ImageList
@@ -339,7 +364,9 @@ def find_names(folder: Path, pattern: str) -> list[str]:
     """
     names = sorted(path.relative_to(folder).as_posix() for path in folder.glob(pattern))
     if not names or len(names) > MOST_LINES:
-        raise SequenceError(f"{folder} holds {len(names)} files {pattern}", "is it the folder of one sequence?")
+        raise SequenceError(
+            f"{folder} holds {len(names)} files {pattern}", "is it the folder of one sequence?"
+        )
     return names
 
 
@@ -350,7 +377,8 @@ def stamped(files: list[str], stamps: NDArray[np.int64], where: str) -> ImageLis
         SequenceError: Stamps are equal or less than 1 us apart.
     """
     order = np.argsort(stamps, kind="stable")
-    ordered, equal = stamps[order], np.flatnonzero(np.diff(stamps[order]) == 0)
+    ordered = stamps[order]
+    equal = np.flatnonzero(np.diff(stamps[order]) == 0)
     if len(equal):
         raise SequenceError(
             f"{where} holds {len(equal)} stamps twice, the first is {format_ns(int(ordered[equal[0]]))} s"
@@ -373,8 +401,13 @@ def checked_camera(
             f"{where}: size {size[0]:g}x{size[1]:g} and focal lengths {focal[0]:g} and {focal[1]:g} have to be above 0"
         )
     if depth_factor is not None and not depth_factor > 0:
-        raise SequenceError(f"{where}: depth_factor is {depth_factor:g} raw units a metre, expected more than 0")
-    (width, height), (fx, fy), (cx, cy), (k1, k2, p1, p2, k3) = size, focal, centre, (*distortion, *[0.0] * 5)[:5]
+        raise SequenceError(
+            f"{where}: depth_factor is {depth_factor:g} raw units a metre, expected more than 0"
+        )
+    (width, height) = size
+    (fx, fy) = focal
+    (cx, cy) = centre
+    (k1, k2, p1, p2, k3) = (*distortion, *[0.0] * 5)[:5]
     return Camera(int(width), int(height), fx, fy, cx, cy, (k1, k2, p1, p2, k3), depth_factor)
 
 
@@ -408,7 +441,9 @@ def read_yaml(path: Path) -> Mapping[str, Any]:
     text = read_text(path, limit=MOST_BYTES, kind=SequenceError)
     opened = text.count("[") + text.count("{")
     if opened > MOST_BRACKETS:
-        raise SequenceError(f"{path} opens {opened} lists and mappings, more than a calibration's {MOST_BRACKETS}")
+        raise SequenceError(
+            f"{path} opens {opened} lists and mappings, more than a calibration's {MOST_BRACKETS}"
+        )
     with raising(
         SequenceError, f"{path} is no valid YAML", of=Exception
     ):  # values such as dates make yaml's constructors raise whatever they like
@@ -477,14 +512,20 @@ def camera_on_body(sensor: Mapping[str, Any], where: str) -> Array:
     Raises:
         SequenceError: It is no rigid transformation.
     """
-    return np.eye(4) if sensor.get("T_BS") is None else rigid(numbers(sensor, "T_BS", 16, where), f"{where}: T_BS")
+    return (
+        np.eye(4)
+        if sensor.get("T_BS") is None
+        else rigid(numbers(sensor, "T_BS", 16, where), f"{where}: T_BS")
+    )
 
 
-def camera_truth(stamps: NDArray[np.int64], rows: Array, T_body_cam: Array, where: str) -> TumFile | None:
+def camera_truth(
+    stamps: NDArray[np.int64], rows: Array, T_body_cam: Array, where: str
+) -> TumFile | None:
     """Camera-to-world poses of the body's, rows ``tx ty tz qx qy qz qw`` ``[N, 7]`` at stamps in nanoseconds ``[N]``.
 
-    Rows without a rotation are left out and counted, of several with one stamp the last holds; None where nothing is
-    left.
+    Rows without a rotation are left out and counted, of several with one stamp the last holds; None
+    where nothing is left.
 
     Raises:
         SequenceError: Two stamps of `where` differ by less than 1 us.
@@ -494,7 +535,9 @@ def camera_truth(stamps: NDArray[np.int64], rows: Array, T_body_cam: Array, wher
     if not keep.any():
         return None
     notes = FileNotes(lines=len(rows), zero_quaternions=int(np.count_nonzero(~keep)))
-    return ordered_file(stamps[keep], se3.from_quaternion(rows[keep, :3], rows[keep, 3:]) @ T_body_cam, notes)
+    return ordered_file(
+        stamps[keep], se3.from_quaternion(rows[keep, :3], rows[keep, 3:]) @ T_body_cam, notes
+    )
 
 
 # Tables in CSV whose stamps are nanoseconds, as EuRoC and VSLAM-LAB write them.
@@ -511,13 +554,16 @@ def read_pose_table(path: Path, T_body_cam: Array) -> TumFile:
         T_body_cam: The camera's pose on the body whose poses the table holds, ``[4, 4]``.
 
     Raises:
-        TrajectoryError: A row is malformed, the heading is of neither kind, or no row holds a rotation.
+        TrajectoryError: A row is malformed, the heading is of neither kind, or no row holds a
+            rotation.
     """
     file = load_tum(path)
     trajectory = file.trajectory.with_poses(file.trajectory.T_world_cam @ T_body_cam)
     if file.every_line is None:
         return TumFile(trajectory, file.notes)
-    return TumFile(trajectory, file.notes, file.every_line.with_poses(file.every_line.T_world_cam @ T_body_cam))
+    return TumFile(
+        trajectory, file.notes, file.every_line.with_poses(file.every_line.T_world_cam @ T_body_cam)
+    )
 
 
 def read_rows(path: Path) -> tuple[list[str], list[list[str]]]:
@@ -533,7 +579,9 @@ def read_rows(path: Path) -> tuple[list[str], list[list[str]]]:
             continue
         table.append(parts)
         if len(parts) != len(table[0]):
-            raise SequenceError(f"{path} line {number} has {len(parts)} columns, the heading {len(table[0])}")
+            raise SequenceError(
+                f"{path} line {number} has {len(parts)} columns, the heading {len(table[0])}"
+            )
         if len(table) > MOST_LINES:
             raise SequenceError(f"{path} has more than {MOST_LINES} rows")
     if len(table) < 2:
@@ -541,7 +589,9 @@ def read_rows(path: Path) -> tuple[list[str], list[list[str]]]:
     return table[0], table[1:]
 
 
-def pick(heading: list[str], rows: list[list[str]], names: Sequence[str], path: Path) -> list[list[str]]:
+def pick(
+    heading: list[str], rows: list[list[str]], names: Sequence[str], path: Path
+) -> list[list[str]]:
     """The columns of these names.
 
     Raises:
@@ -549,7 +599,9 @@ def pick(heading: list[str], rows: list[list[str]], names: Sequence[str], path: 
     """
     missing = [name for name in names if name not in heading]
     if missing:
-        raise SequenceError(f"{path} has no column '{missing[0]}' (it has: {', '.join(heading)[:200]})")
+        raise SequenceError(
+            f"{path} has no column '{missing[0]}' (it has: {', '.join(heading)[:200]})"
+        )
     return [[row[heading.index(name)] for row in rows] for name in names]
 
 
@@ -562,7 +614,9 @@ def nanoseconds(texts: list[str], path: Path) -> NDArray[np.int64]:
     stamps = []
     for text in texts:
         try:
-            stamps.append(int(text) if text.isdigit() and len(text) < 19 else parse_ns(f"{Decimal(text)}e-9"))
+            stamps.append(
+                int(text) if text.isdigit() and len(text) < 19 else parse_ns(f"{Decimal(text)}e-9")
+            )
         except (ValueError, ArithmeticError):
             raise SequenceError(f"{path}: '{text[:40]}' is not a stamp in nanoseconds") from None
     return np.array(stamps, dtype=np.int64)

@@ -1,7 +1,8 @@
 """Every layout of recorded sequences that is read, and which one a folder has.
 
-A new layout is a function ``read(folder, fps) -> Contents`` and a row of `LAYOUTS` (``docs/how-to/dataset.md``). Each
-function raises a `SequenceError` for a file that is missing or malformed, a `TrajectoryError` for such a ground truth.
+A new layout is a function ``read(folder, fps) -> Contents`` and a row of `LAYOUTS`
+(``docs/how-to/dataset.md``). Each function raises a `SequenceError` for a file that is missing or
+malformed, a `TrajectoryError` for such a ground truth.
 """
 
 import os
@@ -67,7 +68,8 @@ TRUTHS = ("groundtruth.txt", "pose.txt")
 def read_tum(folder: Path, fps: float | None) -> Contents:
     """Read the lists ``rgb.txt`` and ``depth.txt``, else an ``associations.txt``, else the names of the images.
 
-    `fps` makes stamps of images that are named by frame numbers. What is there and not used is said in the notes.
+    `fps` makes stamps of images that are named by frame numbers. What is there and not used is said
+    in the notes.
     """
     truth, dropped = _tum_truth(folder)
     listed = stated_file(folder, PEOPLE_LIST)
@@ -83,17 +85,28 @@ def read_tum(folder: Path, fps: float | None) -> Contents:
     else:
         paired = False
         colour, depth = (
-            list_folder(folder, name, fps) if path is None else read_image_list(path) for name, path in lists.items()
+            list_folder(folder, name, fps) if path is None else read_image_list(path)
+            for name, path in lists.items()
         )
         if pairs is not None:
             notes.insert(0, f"{pairs.name} is not used: {' and '.join(present)} list the images")
         elif len(present) == 1:
             unlisted = next(name for name, path in lists.items() if path is None)
-            notes.append(f"there is no {unlisted}.txt: the images of {unlisted}/ are stamped by their names")
+            notes.append(
+                f"there is no {unlisted}.txt: the images of {unlisted}/ are stamped by their names"
+            )
     # a stated rate is that of the frame numbers, of which the images may be every n-th
     rate = rate_of(colour) if colour.irregular[LEFT_OUT] else None
     return Contents(
-        colour, depth, paired, truth, dropped, fps=rate, people=people, truth_of_body=True, notes=tuple(notes)
+        colour,
+        depth,
+        paired,
+        truth,
+        dropped,
+        fps=rate,
+        people=people,
+        truth_of_body=True,
+        notes=tuple(notes),
     )
 
 
@@ -119,18 +132,21 @@ def _not_taken(file: TumFile) -> str:
 def read_eth3d(folder: Path, fps: float | None) -> Contents:
     """ETH3D SLAM: TUM's lists, paired by ``associated.txt``, with the camera in ``calibration.txt``.
 
-    A sequence is published as two archives of one folder: ``*_mono.zip`` (colour, lists, calibration, ground truth) and
-    ``*_rgbd.zip`` (depth and ``associated.txt``).
+    A sequence is published as two archives of one folder: ``*_mono.zip`` (colour, lists,
+    calibration, ground truth) and ``*_rgbd.zip`` (depth and ``associated.txt``).
     """
     pairs = stated_file(folder, "associated.txt")
     if pairs is None:
         raise SequenceError(
-            f"{folder} has no associated.txt, that is no depth", "unpack the sequence's _rgbd archive into it as well"
+            f"{folder} has no associated.txt, that is no depth",
+            "unpack the sequence's _rgbd archive into it as well",
         )
     colour, depth = read_associations(pairs)
     calibration = folder / "calibration.txt"
     fx, fy, cx, cy = read_table(calibration, 4, "fx fy cx cy")[0].tolist()
-    camera = checked_camera(calibration, size_of_first(folder, colour), (fx, fy), (cx, cy), TUM_DEPTH_FACTOR)
+    camera = checked_camera(
+        calibration, size_of_first(folder, colour), (fx, fy), (cx, cy), TUM_DEPTH_FACTOR
+    )
     truth, dropped = _tum_truth(folder)
     return Contents(colour, depth, True, truth, dropped, camera, fps or 27.1)
 
@@ -142,16 +158,23 @@ _ICL_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 def read_icl_nuim(folder: Path, fps: float | None) -> Contents:
     """ICL-NUIM in its TUM-compatible form: ``rgb/N.png``, ``depth/N.png`` and a ``*.gt.freiburg`` by frame number.
 
-    Its camera has a negative fy: the y axis points up, in images and in poses alike. Turning it down mirrors the camera
-    and the world, ``M T M`` with ``M = diag(1, -1, 1)``, after which fy is positive and every pose is a rotation as
-    before. Its ``associations.txt`` names the depth image first; images are paired by their numbers instead.
+    Its camera has a negative fy: the y axis points up, in images and in poses alike. Turning it
+    down mirrors the camera and the world, ``M T M`` with ``M = diag(1, -1, 1)``, after which fy is
+    positive and every pose is a rotation as before. Its ``associations.txt`` names the depth image
+    first; images are paired by their numbers instead.
     """
-    rate, files = fps or 30.0, find_names(folder, "*.gt.freiburg")
+    rate = fps or 30.0
+    files = find_names(folder, "*.gt.freiburg")
     if len(files) > 1:
-        raise SequenceError(f"{folder} holds {len(files)} trajectories ({', '.join(files[:3])[:200]}), expected 1")
+        raise SequenceError(
+            f"{folder} holds {len(files)} trajectories ({', '.join(files[:3])[:200]}), expected 1"
+        )
     file = load_tum(folder / files[0])
-    truth = Trajectory(file.trajectory.timestamps / rate, _ICL_MIRROR @ file.trajectory.T_world_cam @ _ICL_MIRROR)
-    colour, depth = list_folder(folder, "rgb", rate), list_folder(folder, "depth", rate)
+    truth = Trajectory(
+        file.trajectory.timestamps / rate, _ICL_MIRROR @ file.trajectory.T_world_cam @ _ICL_MIRROR
+    )
+    colour = list_folder(folder, "rgb", rate)
+    depth = list_folder(folder, "depth", rate)
     return Contents(colour, depth, False, truth, _not_taken(file), _ICL_CAMERA, rate)
 
 
@@ -162,15 +185,22 @@ _LOST = ("nan", "inf", "#ind", "#qnan", "#inf")
 def read_seven_scenes(folder: Path, fps: float | None) -> Contents:
     """7-Scenes: ``frame-*.color.png``, ``.depth.png`` and ``.pose.txt``, the poses being KinectFusion's 4x4 matrices.
 
-    The poses are camera to world and taken to the last digit. A frame that KinectFusion lost (a pose that is no number)
-    stays a frame without ground truth. Raw depth 65535 is missing.
+    The poses are camera to world and taken to the last digit. A frame that KinectFusion lost (a
+    pose that is no number) stays a frame without ground truth. Raw depth 65535 is missing.
     """
-    rate, files = fps or 30.0, find_names(folder, "frame-*.color.png")
+    rate = fps or 30.0
+    files = find_names(folder, "frame-*.color.png")
     frames = [name.removeprefix("frame-").removesuffix(".color.png") for name in files]
-    bad = [number for number in frames if not (number.isascii() and number.isdigit() and len(number) < 16)]
+    bad = [
+        number
+        for number in frames
+        if not (number.isascii() and number.isdigit() and len(number) < 16)
+    ]
     if bad:
         raise SequenceError(f"frame-{bad[0][:40]}.color.png of {folder} is named by no number")
-    with raising(SequenceError, f"the numbers of the frames of {folder} are no frame numbers", of=ValueError):
+    with raising(
+        SequenceError, f"the numbers of the frames of {folder} are no frame numbers", of=ValueError
+    ):
         stamps = from_seconds(int(number) / rate for number in frames)
     colour = stamped(files, stamps, str(folder))
     depth = stamped([f"frame-{number}.depth.png" for number in frames], stamps, str(folder))
@@ -191,10 +221,14 @@ def _kinect_fusion_pose(path: Path) -> Array | None:
     try:
         return rigid([float(part) for part in parts], str(path))
     except ValueError:
-        raise SequenceError(f"{path} holds {len(parts)} values, expected the 16 numbers of a 4x4 pose") from None
+        raise SequenceError(
+            f"{path} holds {len(parts)} values, expected the 16 numbers of a 4x4 pose"
+        ) from None
 
 
-_SHIBUYA_CAMERA = Camera(640, 360, *2 * (772.5483399593904,), 320.0, 180.0, depth_factor=1.0, baseline_m=0.25)
+_SHIBUYA_CAMERA = Camera(
+    640, 360, *2 * (772.5483399593904,), 320.0, 180.0, depth_factor=1.0, baseline_m=0.25
+)
 _T_NED_CAM = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """From optical axes (x right, y down, z forward) to NED axes (x forward, y right, z down)."""
 
@@ -202,10 +236,11 @@ _T_NED_CAM = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]]
 def read_tartanair_shibuya(folder: Path, fps: float | None) -> Contents:
     """TartanAir-Shibuya: ``image_0``, ``depth_0`` (arrays of metres), ``times.txt``, and ``gt_pose.txt`` in NED axes.
 
-    Poses are those of a camera that looks along x, with y to the right and z down. The sky is rendered at thousands of
-    metres and is no measurement.
+    Poses are those of a camera that looks along x, with y to the right and z down. The sky is
+    rendered at thousands of metres and is no measurement.
     """
-    colour, depth = find_names(folder, "image_0/*.[pj][np]g"), find_names(folder, "depth_0/*.npy")
+    colour = find_names(folder, "image_0/*.[pj][np]g")
+    depth = find_names(folder, "depth_0/*.npy")
     stamps = read_stamps(folder / "times.txt")
     try:
         rows = read_table(folder / "gt_pose.txt", 8, "timestamp tx ty tz qx qy qz qw")[:, 1:]
@@ -218,26 +253,31 @@ def read_tartanair_shibuya(folder: Path, fps: float | None) -> Contents:
         )
     if not np.isfinite(rows).all() or (np.linalg.norm(rows[:, 3:], axis=1) < 1e-8).any():
         raise SequenceError(f"{folder / 'gt_pose.txt'} holds a pose that is none")
-    images, arrays = stamped(colour, stamps, str(folder)), stamped(depth, stamps, str(folder))
+    images = stamped(colour, stamps, str(folder))
+    arrays = stamped(depth, stamps, str(folder))
     order = np.argsort(stamps, kind="stable")
     poses = se3.from_quaternion(rows[order, :3], rows[order, 3:]) @ _T_NED_CAM
     truth = Trajectory(images.stamps, poses, images.stamps_ns)
     return Contents(images, arrays, True, truth, camera=_SHIBUYA_CAMERA, fps=fps, furthest_m=1000.0)
 
 
-_LORIS_BASE, _LORIS_CAMERA = "base_link", "d400_color_optical_frame"
+_LORIS_BASE = "base_link"
+_LORIS_CAMERA = "d400_color_optical_frame"
 _LORIS_GAP_S = 1.0
 
 
 def read_openloris(folder: Path, fps: float | None) -> Contents:
     """OpenLORIS-Scene: ``color.txt``, ``aligned_depth.txt``, ``groundtruth.txt`` of the robot's base, two YAML files.
 
-    Intrinsics are in the order fx cx fy cy. The ground truth is that of ``base_link``; ``trans_matrix.yaml`` says where
-    on it the camera sits. Stamps are said to carry a deliberate random bias, another for every sequence, so only those
-    of one sequence may be compared. A ground truth that shares no time with the images is refused.
+    Intrinsics are in the order fx cx fy cy. The ground truth is that of ``base_link``;
+    ``trans_matrix.yaml`` says where on it the camera sits. Stamps are said to carry a deliberate
+    random bias, another for every sequence, so only those of one sequence may be compared. A ground
+    truth that shares no time with the images is refused.
     """
-    colour, depth = read_image_list(folder / "color.txt"), read_image_list(folder / "aligned_depth.txt")
-    sensors, transforms = folder / "sensors.yaml", folder / "trans_matrix.yaml"
+    colour = read_image_list(folder / "color.txt")
+    depth = read_image_list(folder / "aligned_depth.txt")
+    sensors = folder / "sensors.yaml"
+    transforms = folder / "trans_matrix.yaml"
     sensor = section(read_yaml(sensors), _LORIS_CAMERA, str(sensors))
     fx, cx, fy, cy = numbers(sensor, "intrinsics", 4, str(sensors))
     camera = checked_camera(sensors, size_of_first(folder, colour), (fx, fy), (cx, cy), MILLIMETRES)
@@ -252,9 +292,14 @@ def read_openloris(folder: Path, fps: float | None) -> Contents:
         )
     entries = _mappings(section(read_yaml(transforms), "trans_matrix", str(transforms)))
     ends = {"parent_frame": _LORIS_BASE, "child_frame": _LORIS_CAMERA}
-    entry = next((entry for entry in entries if all(entry.get(key) == frame for key, frame in ends.items())), None)
+    entry = next(
+        (entry for entry in entries if all(entry.get(key) == frame for key, frame in ends.items())),
+        None,
+    )
     if entry is None:
-        raise SequenceError(f"{transforms} holds no rigid transformation from {_LORIS_BASE} to {_LORIS_CAMERA}")
+        raise SequenceError(
+            f"{transforms} holds no rigid transformation from {_LORIS_BASE} to {_LORIS_CAMERA}"
+        )
     matrix = numbers(entry, "matrix", 16, str(transforms))
     truth = base.with_poses(base.T_world_cam @ rigid(matrix, str(transforms)))
     return Contents(colour, depth, truth=truth, truth_dropped=dropped, camera=camera, fps=fps)
@@ -267,15 +312,20 @@ def _mappings(value: object) -> list[dict[str, object]]:
 def read_vslam_lab(folder: Path, fps: float | None) -> Contents:
     """VSLAM-LAB: ``rgb.csv`` (stamps in nanoseconds, pairs), ``calibration.yaml``, ``groundtruth.csv``.
 
-    The ground truth is that of the body, on which ``T_BS`` places the camera. VSLAM-LAB writes the identity where the
-    data set states nothing.
+    The ground truth is that of the body, on which ``T_BS`` places the camera. VSLAM-LAB writes the
+    identity where the data set states nothing.
     """
-    table, where = folder / "rgb.csv", str(folder / "calibration.yaml")
+    table = folder / "rgb.csv"
+    where = str(folder / "calibration.yaml")
     names = ("ts_rgb_0 (ns)", "path_rgb_0", "ts_depth_0 (ns)", "path_depth_0")
     stamps, files, depth_stamps, depth_files = pick(*read_rows(table), names, table)
     order = np.argsort(nanoseconds(stamps, table), kind="stable")
     colour = stamped(files, nanoseconds(stamps, table), str(table))
-    depth = stamped([depth_files[i] for i in order], nanoseconds([depth_stamps[i] for i in order], table), str(table))
+    depth = stamped(
+        [depth_files[i] for i in order],
+        nanoseconds([depth_stamps[i] for i in order], table),
+        str(table),
+    )
     entries = [entry for value in read_yaml(Path(where)).values() for entry in _mappings(value)]
     stated = next((entry for entry in entries if entry.get("cam_name") == "rgb_0"), None)
     if stated is None:
@@ -285,8 +335,14 @@ def read_vslam_lab(folder: Path, fps: float | None) -> Contents:
     factor = _depth_factor(stated, where)
     kind = stated.get("distortion_type")
     if kind not in (None, "radtan4", "radtan5"):
-        raise SequenceError(f"{where}: the distortion '{str(kind)[:40]}' is not read, only radtan4 and radtan5")
-    k = [] if kind is None else numbers(stated, "distortion_coefficients", 4 if kind == "radtan4" else 5, where)
+        raise SequenceError(
+            f"{where}: the distortion '{str(kind)[:40]}' is not read, only radtan4 and radtan5"
+        )
+    k = (
+        []
+        if kind is None
+        else numbers(stated, "distortion_coefficients", 4 if kind == "radtan4" else 5, where)
+    )
     camera = checked_camera(where, size, focal, centre, factor, k)
     T_body_cam = camera_on_body(stated, where)
     truth, dropped = _truth_of_table(stated_file(folder, "groundtruth.csv"), T_body_cam)
@@ -318,25 +374,33 @@ def _truth_of_table(path: Path | None, T_body_cam: Array) -> tuple[Trajectory | 
 def read_euroc(folder: Path, fps: float | None) -> Contents:
     """RGB-D in EuRoC's layout: ``mav0/cam0``, ``mav0/depth0`` (registered), ``mav0/state_groundtruth_estimate0``.
 
-    The folder holds ``mav0`` or is ``mav0`` itself. Stamps are nanoseconds. The ground truth is the body's, its
-    quaternion has w first, and ``T_BS`` of ``cam0`` places the camera on the body. EuRoC itself has no depth:
-    ``depth0`` is what others add, and its ``sensor.yaml`` or a ``camera.toml`` states the ``depth_factor``.
+    The folder holds ``mav0`` or is ``mav0`` itself. Stamps are nanoseconds. The ground truth is the
+    body's, its quaternion has w first, and ``T_BS`` of ``cam0`` places the camera on the body.
+    EuRoC itself has no depth: ``depth0`` is what others add, and its ``sensor.yaml`` or a
+    ``camera.toml`` states the ``depth_factor``.
     """
     base = "mav0/" if (folder / "mav0").is_dir() else ""
     if stated_file(folder, f"{base}depth0/data.csv") is None:
         raise SequenceError(
-            f"{folder} has no {base}depth0/data.csv, that is no depth", "EuRoC's own sequences are stereo"
+            f"{folder} has no {base}depth0/data.csv, that is no depth",
+            "EuRoC's own sequences are stereo",
         )
-    colour, depth = _euroc_images(folder, f"{base}cam0"), _euroc_images(folder, f"{base}depth0")
+    colour = _euroc_images(folder, f"{base}cam0")
+    depth = _euroc_images(folder, f"{base}depth0")
     where = str(folder / base / "cam0" / "sensor.yaml")
     sensor = read_yaml(Path(where))
-    size, intrinsics = numbers(sensor, "resolution", 2, where), numbers(sensor, "intrinsics", 4, where)
+    size = numbers(sensor, "resolution", 2, where)
+    intrinsics = numbers(sensor, "intrinsics", 4, where)
     k = numbers(sensor, "distortion_coefficients", 4, where)
     depth_sensor = stated_file(folder, f"{base}depth0/sensor.yaml")
-    factor = None if depth_sensor is None else _depth_factor(read_yaml(depth_sensor), str(depth_sensor))
+    factor = (
+        None if depth_sensor is None else _depth_factor(read_yaml(depth_sensor), str(depth_sensor))
+    )
     camera = checked_camera(where, size, intrinsics[:2], intrinsics[2:], factor, k)
     T_body_cam = camera_on_body(sensor, where)
-    truth, dropped = _truth_of_table(stated_file(folder, f"{base}state_groundtruth_estimate0/data.csv"), T_body_cam)
+    truth, dropped = _truth_of_table(
+        stated_file(folder, f"{base}state_groundtruth_estimate0/data.csv"), T_body_cam
+    )
     return Contents(
         colour, depth, False, truth, dropped, camera, fps or _frame_rate(sensor.get("rate_hz")),
         truth_of_body=is_identity(T_body_cam),
@@ -348,7 +412,11 @@ def _euroc_images(folder: Path, name: str) -> ImageList:
     heading, rows = read_rows(path)
     if len(heading) < 2:
         raise SequenceError(f"{path} has one column, expected a stamp and a file name")
-    return stamped([f"{name}/data/{row[1]}" for row in rows], nanoseconds([row[0] for row in rows], path), str(path))
+    return stamped(
+        [f"{name}/data/{row[1]}" for row in rows],
+        nanoseconds([row[0] for row in rows], path),
+        str(path),
+    )
 
 
 def _frame_rate(value: object) -> float | None:
@@ -365,10 +433,12 @@ class Layout:
 
     Attributes:
         name: For example ``7-scenes``; the catalogue names it.
-        marks: A folder has this layout if all of these files are in it (patterns), or in its folder ``mav0``.
-        read: Reads a folder of this layout, ``read(folder, fps)``, fps being the nominal frame rate in Hz, where the
-            user or the catalogue states one. It raises a `SequenceError` where the folder is not in this layout or
-            damaged, a `TrajectoryError` where its ground truth cannot be read.
+        marks: A folder has this layout if all of these files are in it (patterns), or in its folder
+            ``mav0``.
+        read: Reads a folder of this layout, ``read(folder, fps)``, fps being the nominal frame rate
+            in Hz, where the user or the catalogue states one. It raises a `SequenceError` where the
+            folder is not in this layout or damaged, a `TrajectoryError` where its ground truth
+            cannot be read.
         holds: Name of the layout whose marks its folders have as well; empty for none.
     """
 
@@ -379,7 +449,9 @@ class Layout:
 
     def fits(self, folder: Path) -> bool:
         """Whether a folder has this layout."""
-        return any(all(_has(base, mark) for mark in self.marks) for base in (folder, folder / "mav0"))
+        return any(
+            all(_has(base, mark) for mark in self.marks) for base in (folder, folder / "mav0")
+        )
 
 
 def _has(folder: Path, mark: str) -> bool:
@@ -405,8 +477,8 @@ def layouts_of(folder: Path, catalogued: str = "") -> list[Layout]:
 
     Args:
         folder: The folder.
-        catalogued: Name of the layout in which the data set is published. It comes first where the folder has it, and
-            what is a part of it is no layout of its own.
+        catalogued: Name of the layout in which the data set is published. It comes first where the
+            folder has it, and what is a part of it is no layout of its own.
     """
     fitting = [layout for layout in LAYOUTS if layout.fits(folder)]
     published = layout_of(catalogued) if catalogued else None
@@ -451,7 +523,9 @@ def layout_notes(folder: Path, taken: Layout, catalogued: str = "") -> tuple[str
     """Phrases on what else a folder could be, and on a layout other than the one in which the data set is published."""
     notes = []
     if catalogued and taken.name != catalogued:
-        notes.append(f"read in the layout {taken.name}, by its files; the data set is published in {catalogued}")
+        notes.append(
+            f"read in the layout {taken.name}, by its files; the data set is published in {catalogued}"
+        )
     for other in layouts_of(folder, catalogued):
         if other is not taken:
             notes.append(
@@ -469,12 +543,16 @@ def layout_of(name: str) -> Layout:
     """
     layout = next((layout for layout in LAYOUTS if layout.name == name), None)
     if layout is None:
-        raise SequenceError(f"unknown layout '{name}'", f"one of {', '.join(layout.name for layout in LAYOUTS)}")
+        raise SequenceError(
+            f"unknown layout '{name}'", f"one of {', '.join(layout.name for layout in LAYOUTS)}"
+        )
     return layout
 
 
 def is_bag(path: Path) -> bool:
     """Whether a path looks like a bag, rather than a folder of images."""
     if path.is_dir():
-        return (path / "metadata.yaml").is_file() and any([*path.glob("*.db3"), *path.glob("*.mcap")])
+        return (path / "metadata.yaml").is_file() and any(
+            [*path.glob("*.db3"), *path.glob("*.mcap")]
+        )
     return path.is_file() and path.suffix in (".bag", ".mcap", ".db3")

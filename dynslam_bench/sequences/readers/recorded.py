@@ -36,32 +36,36 @@ MISSING_TOLERATED = 0.02
 class RecordedSequence:
     """A folder with colour images, depth images and (maybe) a ground truth; frames are decoded when asked for.
 
-    Images that are not paired already are paired as TUM's ``associate.py`` pairs them. Files are looked for and the
-    first pair is decoded on opening, so that most damage shows at once.
+    Images that are not paired already are paired as TUM's ``associate.py`` pairs them. Files are
+    looked for and the first pair is decoded on opening, so that most damage shows at once.
 
     Args:
         folder: The sequence's folder.
         contents: What its reader found in it.
         camera: Of the colour images; its `R_body_cam` is applied to the ground truth.
         id: For example ``tum/fr3/walking_xyz``.
-        fps: Nominal frame rate in Hz; None to take it from the stamps, as is done where these contradict it.
+        fps: Nominal frame rate in Hz; None to take it from the stamps, as is done where these
+            contradict it.
         license: Licence of the data.
         citation: What to cite.
         tags: For example ``high-dynamic``.
         split: ``tune``, ``held-out`` or empty.
         notes: Phrases for `dropped` on how the folder was read.
         max_time_difference_s: Colour and depth further apart are not paired (strictly less is).
-        any_depth_size: True if the caller resizes, so that depth images may differ in size from colour images.
+        any_depth_size: True if the caller resizes, so that depth images may differ in size from
+            colour images.
 
     Attributes:
         folder: The sequence's folder.
         timestamps: Stamps of the colour images in seconds ``[N]``, strictly increasing.
         timestamps_ns: The same in nanoseconds, int64 ``[N]``.
-        depth_timestamps: Stamps of the frames' depth images in seconds ``[N]``, the camera's `depth_delay_s` added.
-        ground_truth: Camera-to-world poses in the frame of the motion capture, at their own stamps; None without any.
+        depth_timestamps: Stamps of the frames' depth images in seconds ``[N]``, the camera's
+            `depth_delay_s` added.
+        ground_truth: Camera-to-world poses in the frame of the motion capture, at their own stamps;
+            None without any.
         masks: Exact masks of people where the folder lists them (`PEOPLE_LIST`), else None.
-        fps: Nominal frame rate in Hz; where none is stated, or one that differs from the stamps' by `RATES_CONTRADICT`,
-            the inverse of the median interval (30 for one frame).
+        fps: Nominal frame rate in Hz; where none is stated, or one that differs from the stamps' by
+            `RATES_CONTRADICT`, the inverse of the median interval (30 for one frame).
         dropped: One line on the frames, and on all that was not used or not taken as it stands.
 
     Raises:
@@ -84,18 +88,31 @@ class RecordedSequence:
         max_time_difference_s: float = 0.02,
         any_depth_size: bool = False,
     ) -> None:
-        self.folder, self.id, self.camera = folder, id, camera
-        self.license, self.citation, self.tags, self.split = license, citation, tags, split
-        self._any_depth_size, self._furthest_m = any_depth_size, contents.furthest_m
+        self.folder = folder
+        self.id = id
+        self.camera = camera
+        self.license = license
+        self.citation = citation
+        self.tags = tags
+        self.split = split
+        self._any_depth_size = any_depth_size
+        self._furthest_m = contents.furthest_m
         delayed = contents.depth.stamps_ns + round(1e9 * camera.depth_delay_s)
-        colour, depth, people = contents.colour, replace(contents.depth, stamps_ns=delayed), contents.people
+        colour = contents.colour
+        depth = replace(contents.depth, stamps_ns=delayed)
+        people = contents.people
         for file in (*colour.files, *depth.files, *(people.files if people else ())):
             inside(folder, file, where=f"a list of images in {folder}", kind=SequenceError)
         paired = contents.paired and not camera.depth_delay_s
         tolerated = 0.0 if paired else MISSING_TOLERATED
-        colour, depth = _existing(folder, colour, "colour", tolerated), _existing(folder, depth, "depth", tolerated)
+        colour = _existing(folder, colour, "colour", tolerated)
+        depth = _existing(folder, depth, "depth", tolerated)
         every = np.arange(len(colour))
-        first, second = (every, every) if paired else associate(colour.stamps, depth.stamps, max_time_difference_s)
+        first, second = (
+            (every, every)
+            if paired
+            else associate(colour.stamps, depth.stamps, max_time_difference_s)
+        )
         if not len(first):
             gap = float(nearest_gap(colour.stamps, depth.stamps).min())
             raise SequenceError(
@@ -103,25 +120,33 @@ class RecordedSequence:
                 f"{max_time_difference_s:g} s (closest: {gap:.3f} s)",
                 "do both lists use the same clock?",
             )
-        self.timestamps_ns, self.timestamps = colour.stamps_ns[first], colour.stamps[first]
+        self.timestamps_ns = colour.stamps_ns[first]
+        self.timestamps = colour.stamps[first]
         self.timestamps_ns.flags.writeable = self.timestamps.flags.writeable = False
         _check_unit(folder, self.timestamps)
         self.fps, rate_note = _frame_rate(fps, self.timestamps)
         self.depth_timestamps = depth.stamps[second]
-        self._colour, self._depth = [colour.files[i] for i in first], [depth.files[i] for i in second]
+        self._colour = [colour.files[i] for i in first]
+        self._depth = [depth.files[i] for i in second]
         self._people: list[str] = []
         if people is not None:
             people = _existing(folder, people, "mask", 0.0)
             at = np.searchsorted(people.stamps_ns, self.timestamps_ns).clip(max=len(people) - 1)
             unmasked = int(np.count_nonzero(people.stamps_ns[at] != self.timestamps_ns))
             if unmasked:
-                raise SequenceError(f"{unmasked} of {len(self)} frames of {folder} have no mask of their stamp")
+                raise SequenceError(
+                    f"{unmasked} of {len(self)} frames of {folder} have no mask of their stamp"
+                )
             self._people = [people.files[i] for i in at]
         self.masks: MaskSource | None = Masks(self._masks_of) if self._people else None
         self.ground_truth = contents.truth
         R_body_cam = camera.R_body_cam
         turned = ""
-        if contents.truth is not None and R_body_cam is not None and not np.array_equal(R_body_cam, np.eye(3)):
+        if (
+            contents.truth is not None
+            and R_body_cam is not None
+            and not np.array_equal(R_body_cam, np.eye(3))
+        ):
             poses = in_camera_axes(contents.truth.T_world_cam, R_body_cam)
             self.ground_truth = contents.truth.with_poses(poses)
             turned = "ground truth: orientations of another body are turned into the camera's axes"
@@ -147,11 +172,14 @@ class RecordedSequence:
 
     def _count_poses(self) -> dict[str, int]:
         """How many poses the ground truth has, and how many frames have none."""
-        stamps, truth = self.timestamps, self.ground_truth
+        stamps = self.timestamps
+        truth = self.ground_truth
         if truth is None:
             return {}
         without = int(np.count_nonzero(nearest_gap(stamps, truth.timestamps) >= GROUND_TRUTH_DT_S))
-        within = truth.timestamps[(truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])]
+        within = truth.timestamps[
+            (truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])
+        ]
         hole = float(np.diff(np.concatenate([stamps[:1], within, stamps[-1:]])).max(initial=0.0))
         gap = f"frames without ground truth within {GROUND_TRUTH_DT_S:g} s (largest hole {hole:.2f} s)"
         return {"ground-truth poses": len(truth), gap: without}
@@ -168,7 +196,9 @@ class RecordedSequence:
     @cached_property
     def _digest(self) -> str:
         truth = self.ground_truth
-        poses = None if truth is None else [truth.timestamps_ns.tolist(), truth.T_world_cam.tolist()]
+        poses = (
+            None if truth is None else [truth.timestamps_ns.tolist(), truth.T_world_cam.tolist()]
+        )
         try:
             # Text, not paths: joining those takes longer than asking for the files' times.
             files = (*self._colour, *self._depth, *self._people)
@@ -184,10 +214,13 @@ class RecordedSequence:
         return len(self._colour)
 
     def __getitem__(self, index: int) -> Frame:
-        index, size = range(len(self))[index], (self.camera.width, self.camera.height)
+        index = range(len(self))[index]
+        size = (self.camera.width, self.camera.height)
         expected = f"{size[0]}x{size[1]}"
         rgb = read_colour(
-            self.folder / self._colour[index], size=size, mismatch=f"but the camera of {self.id} is {expected}"
+            self.folder / self._colour[index],
+            size=size,
+            mismatch=f"but the camera of {self.id} is {expected}",
         )
         depth = read_depth(
             self.folder / self._depth[index],
@@ -199,7 +232,8 @@ class RecordedSequence:
         return Frame(index, float(self.timestamps[index]), rgb, depth)
 
     def _masks_of(self, index: int) -> FrameMasks:
-        path, size = self.folder / self._people[index], (self.camera.width, self.camera.height)
+        path = self.folder / self._people[index]
+        size = (self.camera.width, self.camera.height)
         people = read_image(path, size=size, mismatch="unlike its colour image", kind=SequenceError)
         if people.dtype != np.uint8 or people.ndim != 2:
             raise SequenceError(f"mask {path} has another form than 8 bits in one channel")
@@ -238,7 +272,11 @@ def _check_unit(folder: Path, stamps: NDArray[np.float64]) -> None:
     if interval <= SLOWEST_S:
         return
     units = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
-    likely = [f"{name} ({per_s / interval:.3g} Hz)" for name, per_s in units.items() if 1 <= per_s / interval <= 1000]
+    likely = [
+        f"{name} ({per_s / interval:.3g} Hz)"
+        for name, per_s in units.items()
+        if 1 <= per_s / interval <= 1000
+    ]
     raise SequenceError(
         f"the colour images of {folder} are {interval:g} s apart by the median of their stamps ({1 / interval:.2g} Hz)",
         f"stamps are in seconds; these look like {likely[0] if likely else 'another unit'}",
@@ -247,9 +285,14 @@ def _check_unit(folder: Path, stamps: NDArray[np.float64]) -> None:
 
 def _existing(folder: Path, images: ImageList, kind: str, tolerated: float) -> ImageList:
     """The images whose files are there; a share may be missing, as in some published sequences, and none empty."""
-    sizes = [path.stat().st_size if path.is_file() else None for path in (folder / file for file in images.files)]
+    sizes = [
+        path.stat().st_size if path.is_file() else None
+        for path in (folder / file for file in images.files)
+    ]
     for state, size_then, allowed in (("missing", None, tolerated), ("empty (0 bytes)", 0, 0.0)):
-        at_fault = [file for file, size in zip(images.files, sizes, strict=True) if size == size_then]
+        at_fault = [
+            file for file, size in zip(images.files, sizes, strict=True) if size == size_then
+        ]
         if len(at_fault) > allowed * len(images):
             raise SequenceError(
                 f"{len(at_fault)} of {len(images)} {kind} images of {folder} are {state}, the first is {at_fault[0]}",
@@ -257,13 +300,17 @@ def _existing(folder: Path, images: ImageList, kind: str, tolerated: float) -> I
             )
     there = [i for i, size in enumerate(sizes) if size is not None]
     missing = Counter({"listed files that do not exist": len(images) - len(there)})
-    return ImageList(images.stamps_ns[there], tuple(images.files[i] for i in there), images.irregular + missing)
+    return ImageList(
+        images.stamps_ns[there], tuple(images.files[i] for i in there), images.irregular + missing
+    )
 
 
 # Decoding of colour and depth images.
 
 
-def read_colour(path: Path, *, size: tuple[int, int] | None = None, mismatch: str = "") -> NDArray[np.uint8]:
+def read_colour(
+    path: Path, *, size: tuple[int, int] | None = None, mismatch: str = ""
+) -> NDArray[np.uint8]:
     """The image as uint8 ``[H, W, 3]``, red first; grey images are repeated over the channels.
 
     Args:
@@ -272,11 +319,15 @@ def read_colour(path: Path, *, size: tuple[int, int] | None = None, mismatch: st
         mismatch: Ends the message where it has another one.
 
     Raises:
-        SequenceError: The file is missing, empty, truncated, of another size, no image, or has more than 8 bits a
-            channel.
+        SequenceError: The file is missing, empty, truncated, of another size, no image, or has more
+            than 8 bits a channel.
     """
     image = read_image(
-        path, size=size, mismatch=mismatch, hint="name the right camera with --camera", kind=SequenceError
+        path,
+        size=size,
+        mismatch=mismatch,
+        hint="name the right camera with --camera",
+        kind=SequenceError,
     )
     if image.dtype != np.uint8:
         raise SequenceError(
@@ -311,8 +362,8 @@ def read_depth(
         furthest_m: Depth beyond this is missing; None for no limit.
 
     Raises:
-        SequenceError: The file is missing, empty, truncated, of another size, no image, or not of 16 bits in one
-            channel.
+        SequenceError: The file is missing, empty, truncated, of another size, no image, or not of
+            16 bits in one channel.
     """
     if path.suffix == ".npy":
         depth = read_metres(path, size=size, mismatch=mismatch)
@@ -320,7 +371,9 @@ def read_depth(
         hint = "set the preprocessing's width and height to resize both"
         raw = read_image(path, size=size, mismatch=mismatch, hint=hint, kind=SequenceError)
         if depth_factor is None:
-            raise SequenceError(f"nothing says how many units of the depth image {path} make a metre: no depth_factor")
+            raise SequenceError(
+                f"nothing says how many units of the depth image {path} make a metre: no depth_factor"
+            )
         if raw.dtype != np.uint16 or raw.ndim != 2:
             channels = 1 if raw.ndim == 2 else raw.shape[2]
             raise SequenceError(
@@ -335,10 +388,13 @@ def read_depth(
     return depth
 
 
-# Depth as arrays of metres in NumPy's own format; they are mapped, so that one that lies about its size costs nothing.
+# Depth as arrays of metres in NumPy's own format; they are mapped, so that one that lies about its
+# size costs nothing.
 
 
-def read_metres(path: Path, *, size: tuple[int, int] | None = None, mismatch: str = "") -> NDArray[np.float32]:
+def read_metres(
+    path: Path, *, size: tuple[int, int] | None = None, mismatch: str = ""
+) -> NDArray[np.float32]:
     """The array as float32 ``[H, W]`` in metres; what is not finite or below 0 is missing, that is 0.
 
     Args:
@@ -350,11 +406,16 @@ def read_metres(path: Path, *, size: tuple[int, int] | None = None, mismatch: st
         SequenceError: The file is missing, damaged, of another size, or holds something else.
     """
     # a damaged header makes numpy's reader raise whatever it likes
-    with raising(SequenceError, f"depth array {path} cannot be read", "is it an .npy file?", of=Exception):
+    with raising(
+        SequenceError, f"depth array {path} cannot be read", "is it an .npy file?", of=Exception
+    ):
         values = np.load(path, mmap_mode="r", allow_pickle=False)
-        shape, kind = values.shape, values.dtype
+        shape = values.shape
+        kind = values.dtype
     if len(shape) != 2 or kind.kind != "f":
-        raise SequenceError(f"depth array {path} is {kind} of shape {str(shape)[:60]}, expected rows of metres")
+        raise SequenceError(
+            f"depth array {path} is {kind} of shape {str(shape)[:60]}, expected rows of metres"
+        )
     if size is not None and shape != size[::-1]:
         raise SequenceError(f"depth array {path} is {shape[1]}x{shape[0]}, {mismatch}")
     with np.errstate(invalid="ignore", over="ignore"):

@@ -9,8 +9,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dynslam_bench.sequences.synthetic.ids import REPLICA_IDS, SYNTHETIC_IDS, SyntheticId, parse_synthetic_id
-from dynslam_bench.sequences.synthetic.settings import CAMERA, HELD_OUT_SCENES, TUNE_SCENES, RenderSettings
+from dynslam_bench.sequences.synthetic.ids import (
+    REPLICA_IDS,
+    SYNTHETIC_IDS,
+    SyntheticId,
+    parse_synthetic_id,
+)
+from dynslam_bench.sequences.synthetic.settings import (
+    CAMERA,
+    HELD_OUT_SCENES,
+    TUNE_SCENES,
+    RenderSettings,
+)
 
 if TYPE_CHECKING:
     from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence
@@ -49,7 +59,9 @@ def open_synthetic(
     """
     from dynslam_bench.sequences.synthetic.sequence import SyntheticSequence
 
-    return SyntheticSequence(parse_synthetic_id(id), cache_root, settings or RenderSettings(), threads)
+    return SyntheticSequence(
+        parse_synthetic_id(id), cache_root, settings or RenderSettings(), threads
+    )
 
 
 def render_synthetic(
@@ -71,7 +83,8 @@ def render_synthetic(
 
     Raises:
         SequenceError: Unknown id.
-        DynslamError: The cache cannot be written; what was rendered stays and is not rendered again.
+        DynslamError: The cache cannot be written; what was rendered stays and is not rendered
+            again.
     """
     sequence = open_synthetic(id, cache_root, settings=settings, threads=threads)
     sequence.render(progress)

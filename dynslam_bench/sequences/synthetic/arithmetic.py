@@ -1,9 +1,10 @@
 """Functions and products that give the same bits on every processor.
 
-They are made of additions, multiplications, divisions and square roots, which IEEE 754 defines to the bit. The last
-bits of others differ. Numpy's `@` and `norm` call a BLAS with a kernel for each processor, and its functions have one
-for each width of SIMD vectors. Those of the C library depend on its version and on fused multiply-adds. The functions
-here differ from numpy's by one unit in the last place at most where the result is above 1, else by 2.3e-16.
+They are made of additions, multiplications, divisions and square roots, which IEEE 754 defines to
+the bit. The last bits of others differ. Numpy's `@` and `norm` call a BLAS with a kernel for each
+processor, and its functions have one for each width of SIMD vectors. Those of the C library depend
+on its version and on fused multiply-adds. The functions here differ from numpy's by one unit in the
+last place at most where the result is above 1, else by 2.3e-16.
 """
 
 import math
@@ -38,7 +39,9 @@ def _sine(x: float | Array, quarters: int) -> Any:
     """The sine of x + quarters * pi / 2."""
     many = isinstance(x, np.ndarray)
     x = x if many else float(x)
-    turns: Any = np.floor(x * 0.6366197723675814 + 0.5) if many else math.floor(x * 0.6366197723675814 + 0.5)
+    turns: Any = (
+        np.floor(x * 0.6366197723675814 + 0.5) if many else math.floor(x * 0.6366197723675814 + 0.5)
+    )
     rest = ((x - turns * _HALF_PI[0]) - turns * _HALF_PI[1]) - turns * _HALF_PI[2]
     square = rest * rest
     if not many:
@@ -46,7 +49,9 @@ def _sine(x: float | Array, quarters: int) -> Any:
         value = _polynomial(_COSINE, square) if quadrant & 1 else rest * _polynomial(_SINE, square)
         return -value if quadrant & 2 else value
     quadrants = (turns.astype(np.int64) + quarters) & 3
-    values = np.where(quadrants & 1, _polynomial(_COSINE, square), rest * _polynomial(_SINE, square))
+    values = np.where(
+        quadrants & 1, _polynomial(_COSINE, square), rest * _polynomial(_SINE, square)
+    )
     return np.where(quadrants & 2, -values, values)
 
 
@@ -62,13 +67,15 @@ def cos(x: Reals) -> Reals:
 
 def atan2(y: float, x: float) -> float:
     """The angle of a vector (x, y); 0 for the zero vector. It is compiled into a kernel as well."""
-    large, small = max(abs(x), abs(y)), min(abs(x), abs(y))
+    large = max(abs(x), abs(y))
+    small = min(abs(x), abs(y))
     if large == 0.0:
         return 0.0
     ratio = small / large
     for _ in range(2):  # the angle is halved twice
         ratio = ratio / (1.0 + math.sqrt(1.0 + ratio * ratio))
-    square, total = ratio * ratio, 0.0
+    square = ratio * ratio
+    total = 0.0
     for k in range(len(_ARCTANGENT) - 1, -1, -1):
         total = total * square + _ARCTANGENT[k]
     angle = 4.0 * ratio * total
@@ -97,7 +104,8 @@ def power(x: float, exponent: float) -> float:
         return float(0.0**exponent)
     part, twos = math.frexp(x)
     if part < 0.7071067811865476:
-        part, twos = 2.0 * part, twos - 1
+        part = 2.0 * part
+        twos = twos - 1
     z = (part - 1.0) / (part + 1.0)
     logarithm = 2.0 * z * _polynomial(_LOGARITHM, z * z) + twos * _LN_2[1] + twos * _LN_2[0]
     return float(exp(np.array(exponent * logarithm)))

@@ -28,7 +28,11 @@ REPLICA_IDS = tuple(f"synthetic/{name}" for name in REPLICAS)
 SYNTHETIC_IDS = tuple(f"synthetic/{name}" for name in VARIANTS)
 """Every rendered sequence that is listed, scene 0, default length."""
 
-_OPTIONS = {"scene": (0, HELD_OUT_SCENES.stop - 1), "frames": (1, MAX_FRAMES), "noise": (0, 999_999_999)}
+_OPTIONS = {
+    "scene": (0, HELD_OUT_SCENES.stop - 1),
+    "frames": (1, MAX_FRAMES),
+    "noise": (0, 999_999_999),
+}
 """What may stand behind the question mark, with the least and the largest value."""
 _ID = re.compile(r"synthetic/(?P<name>[^@?]*)(?:@(?P<scene>[^?]*))?(?:\?(?P<query>.*))?", re.DOTALL)
 
@@ -39,9 +43,11 @@ class SyntheticId:
 
     Attributes:
         name: For example ``walking_xyz``.
-        scene: Selects room, textures, clothes and paths: 0-99 for tuning and training, 100-199 held out.
+        scene: Selects room, textures, clothes and paths: 0-99 for tuning and training, 100-199 held
+            out.
         frames: Length of the sequence; frames are the same whatever the length.
-        noise: Seed of the sensors' noise: another draw of the same scene. None is the scene's own draw.
+        noise: Seed of the sensors' noise: another draw of the same scene. None is the scene's own
+            draw.
     """
 
     name: str
@@ -73,11 +79,14 @@ def parse_synthetic_id(text: str) -> SyntheticId:
     """Parse an id such as ``synthetic/walking_xyz?scene=101&frames=150``; ``walking_xyz@101`` is read as scene 101.
 
     Raises:
-        SequenceError: Unknown name (with a did-you-mean), or a scene, length or noise seed out of range.
+        SequenceError: Unknown name (with a did-you-mean), or a scene, length or noise seed out of
+            range.
     """
     match = _ID.fullmatch(text)
     if match is None:
-        raise SequenceError(f"'{text}' is not the id of a rendered sequence", did_you_mean(text, SYNTHETIC_IDS))
+        raise SequenceError(
+            f"'{text}' is not the id of a rendered sequence", did_you_mean(text, SYNTHETIC_IDS)
+        )
     name = match["name"]
     if name not in VARIANTS:
         near = did_you_mean(f"synthetic/{name}", SYNTHETIC_IDS)
@@ -94,6 +103,8 @@ def parse_synthetic_id(text: str) -> SyntheticId:
             raise SequenceError(f"'{text}' names {key} twice", "leave one out")
         low, high = _OPTIONS[key]
         if not re.fullmatch(r"[0-9]{1,9}", value) or not low <= int(value) <= high:
-            raise SequenceError(f"{key} '{value}' of '{text}' is not a whole number from {low} to {high}")
+            raise SequenceError(
+                f"{key} '{value}' of '{text}' is not a whole number from {low} to {high}"
+            )
         options[key] = int(value)
     return replace(SyntheticId(name, frames=VARIANTS[name].frames), **options)  # type: ignore[arg-type]  # all integers

@@ -11,7 +11,9 @@ from numpy.typing import ArrayLike
 
 from dynslam_bench.sequences.synthetic.arithmetic import Array, cos, norm, product, sin
 
-BOX, ROUND_CONE, QUAD = 0, 1, 2
+BOX = 0
+ROUND_CONE = 1
+QUAD = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +47,8 @@ def primitive(kind: int, rotation: Array, origin: ArrayLike, shape: tuple[float,
     """One primitive; see `box`, `cone` and `quad`.
 
     Args:
-        kind: `BOX` (half extents), `ROUND_CONE` (height, radius below, radius above) or `QUAD` (half extents x, y).
+        kind: `BOX` (half extents), `ROUND_CONE` (height, radius below, radius above) or `QUAD`
+            (half extents x, y).
         rotation: 3x3, local to world.
         origin: World position of the local origin, metres.
         shape: See `kind`.
@@ -62,11 +65,15 @@ def primitive(kind: int, rotation: Array, origin: ArrayLike, shape: tuple[float,
     for face in fit:
         du, dv = ((1, 2), (0, 2), (0, 1))[face // 2]
         uv[face] = (0.5 / shape[du], 0.5 / shape[dv], 0.5, 0.5)
-    place, size, extent, color = (np.asarray(row, dtype=np.float64) for row in (origin, scale, shape, tint))
+    place, size, extent, color = (
+        np.asarray(row, dtype=np.float64) for row in (origin, scale, shape, tint)
+    )
     return Primitive(kind, rotation, place, size, extent, instance, names, uv, color)
 
 
-box, cone, quad = partial(primitive, BOX), partial(primitive, ROUND_CONE), partial(primitive, QUAD)
+box = partial(primitive, BOX)
+cone = partial(primitive, ROUND_CONE)
+quad = partial(primitive, QUAD)
 
 
 def copies(parts: Parts, yaw: float, shift: tuple[float, float, float], suffix: str = "") -> Parts:
@@ -93,13 +100,15 @@ def copies(parts: Parts, yaw: float, shift: tuple[float, float, float], suffix: 
 def turn(degrees: float) -> Array:
     """Rotation about the world's z axis."""
     a = np.radians(degrees)
-    c, s = cos(a), sin(a)
+    c = cos(a)
+    s = sin(a)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def wall(x_axis: tuple[float, float, float], y_axis: tuple[float, float, float]) -> Array:
     """Rotation of a quad whose local x and y run along these world axes."""
-    x, y = np.array(x_axis), np.array(y_axis)
+    x = np.array(x_axis)
+    y = np.array(y_axis)
     return np.stack([x, y, np.cross(x, y)], axis=1)
 
 

@@ -1,7 +1,7 @@
 """Rooms and furniture of a scene: plans, walls, desks, shelves, posters, chairs, and things that move.
 
-Scenes for tuning and held-out ones share no size and no place: each is drawn from the half of its pool that belongs to
-the scene's split.
+Scenes for tuning and held-out ones share no size and no place: each is drawn from the half of its
+pool that belongs to the scene's split.
 """
 
 import math
@@ -93,7 +93,8 @@ def plan_room(scene: int, number: int | None = None) -> Plan:
     )
 
 
-# The office's furniture: desk with monitors and clutter, shelf, posters, cabinet with a plant, office chairs.
+# The office's furniture: desk with monitors and clutter, shelf, posters, cabinet with a plant,
+# office chairs.
 
 TOP = 0.74
 """Height of a desk, metres."""
@@ -102,20 +103,34 @@ _EYE = np.eye(3)
 
 def desk(rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) -> Parts:
     """A desk (0.8 m deep, 0.74 m high) with drawers, monitors, keyboards, books, papers, mugs and a lamp."""
-    tint, side, leg = plan.tints, 1 if plan.mirrored else -1, (TOP - 0.036) / 2
-    unit, lamp = np.array([x + side * (half - 0.3), y + 0.38, 0.3]), np.array([x + side * (0.55 - half), y + 0.62, TOP])
+    tint = plan.tints
+    side = 1 if plan.mirrored else -1
+    leg = (TOP - 0.036) / 2
+    unit = np.array([x + side * (half - 0.3), y + 0.38, 0.3])
+    lamp = np.array([x + side * (0.55 - half), y + 0.62, TOP])
     wood: Style = {"texture": "wood", "tint": tint["desk"]}
     parts = [
         box(_EYE, (x, y + 0.4, TOP - 0.018), (half, 0.4, 0.018), repeat=(1.2, 1.6), **wood),
         *(
-            box(_EYE, (x + end * (half - 0.04), y + 0.4, leg), (0.02, 0.36, leg), **wood | {"tint": tint["desk"] * 0.9})
+            box(
+                _EYE,
+                (x + end * (half - 0.04), y + 0.4, leg),
+                (0.02, 0.36, leg),
+                **wood | {"tint": tint["desk"] * 0.9},
+            )
             for end in (-1, 1)
         ),
-        box(_EYE, (x, y + 0.74, 0.45), (half - 0.06, 0.01, 0.25), **wood | {"tint": tint["desk"] * 0.85}),
+        box(
+            _EYE,
+            (x, y + 0.74, 0.45),
+            (half - 0.06, 0.01, 0.25),
+            **wood | {"tint": tint["desk"] * 0.85},
+        ),
         box(_EYE, unit, (0.21, 0.3, 0.29), tint=tint["cabinet"]),
     ]
     for k in range(3):
-        front, handle = unit + np.array([0, -0.305, 0.19 - 0.19 * k]), unit + np.array([0, -0.32, 0.22 - 0.19 * k])
+        front = unit + np.array([0, -0.305, 0.19 - 0.19 * k])
+        handle = unit + np.array([0, -0.32, 0.22 - 0.19 * k])
         parts += [
             box(_EYE, front, (0.195, 0.008, 0.085), tint=tint["cabinet"] * 0.92),
             box(_EYE, handle, (0.05, 0.008, 0.008), tint=tint["metal"]),
@@ -156,28 +171,50 @@ def desk(rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) 
     ]
 
 
-_FRAME = ((0, 0.18, 0.285, 0.013), (0, -0.18, 0.285, 0.013), (-0.277, 0, 0.013, 0.19), (0.277, 0, 0.013, 0.19))
+_FRAME = (
+    (0, 0.18, 0.285, 0.013),
+    (0, -0.18, 0.285, 0.013),
+    (-0.277, 0, 0.013, 0.19),
+    (0.277, 0, 0.013, 0.19),
+)
 """Bars around a monitor's picture: middle and half extents along both of its sides, metres."""
 
 
 def _monitors(rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) -> Parts:
     """Monitors, each with its foot, a keyboard and a mouse."""
-    plastic, spacing = plan.tints["plastic"], 2 * half / (plan.monitors + 0.6)
+    plastic = plan.tints["plastic"]
+    spacing = 2 * half / (plan.monitors + 0.6)
     parts: Parts = []
     for k in range(plan.monitors):
         mx = x + (k - (plan.monitors - 1) / 2) * spacing + 0.06 * (rng.random() - 0.5)
         facing = turn((rng.random() - 0.5) * 24)
         my = y + 0.52 + 0.08 * rng.random()
-        middle, faces = np.array([mx, my, TOP + 0.3]), ("plain", "plain", f"screen:{k}", "plain", "plain", "plain")
-        bars = [(middle + product(facing, np.array([dx, -0.012, dz])), (hx, 0.024, hz)) for dx, dz, hx, hz in _FRAME]
+        middle = np.array([mx, my, TOP + 0.3])
+        faces = ("plain", "plain", f"screen:{k}", "plain", "plain", "plain")
+        bars = [
+            (middle + product(facing, np.array([dx, -0.012, dz])), (hx, 0.024, hz))
+            for dx, dz, hx, hz in _FRAME
+        ]
         keys = turn(6 * (rng.random() - 0.5))
         parts += [
             box(facing, middle, (0.27, 0.02, 0.175), texture=faces, fit=(2,)),
             *(box(facing, bar, extents, tint=plastic) for bar, extents in bars),
             box(facing, (mx, my + 0.03, TOP + 0.09), (0.03, 0.02, 0.09), tint=plastic),
             box(facing, (mx, my + 0.01, TOP + 0.008), (0.12, 0.09, 0.008), tint=plastic),
-            box(keys, (mx - 0.03, my - 0.3, TOP + 0.012), (0.22, 0.075, 0.012), texture="keyboard", fit=(5,)),
-            cone(turn(20), (mx + 0.27, my - 0.3, TOP + 0.005), (0, 1, 1), scale=(0.032, 0.055, 0.025), tint=plastic),
+            box(
+                keys,
+                (mx - 0.03, my - 0.3, TOP + 0.012),
+                (0.22, 0.075, 0.012),
+                texture="keyboard",
+                fit=(5,),
+            ),
+            cone(
+                turn(20),
+                (mx + 0.27, my - 0.3, TOP + 0.005),
+                (0, 1, 1),
+                scale=(0.032, 0.055, 0.025),
+                tint=plastic,
+            ),
         ]
     return parts
 
@@ -186,11 +223,19 @@ def shelf(rng: np.random.Generator, plan: Plan, side: int) -> Parts:
     """A bookcase against the back wall with rows of books and boxes."""
     tint = plan.tints["shelf"]
     x = (plan.right_x - 0.5 if side > 0 else plan.left_x + 0.5) - side * 0.25 * rng.random()
-    y, half, height = plan.back_y - 0.17, 0.42, 1.95
+    y = plan.back_y - 0.17
+    half = 0.42
+    height = 1.95
     parts = [
         box(_EYE, (x - half, y, height / 2), (0.015, 0.15, height / 2), texture="wood", tint=tint),
         box(_EYE, (x + half, y, height / 2), (0.015, 0.15, height / 2), texture="wood", tint=tint),
-        box(_EYE, (x, y + 0.145, height / 2), (half, 0.008, height / 2), texture="wood", tint=tint * 0.8),
+        box(
+            _EYE,
+            (x, y + 0.145, height / 2),
+            (half, 0.008, height / 2),
+            texture="wood",
+            tint=tint * 0.8,
+        ),
     ]
     for k in range(6):
         z = 0.06 + k * (height - 0.08) / 5
@@ -207,13 +252,21 @@ def shelf(rng: np.random.Generator, plan: Plan, side: int) -> Parts:
             )
         )  # fmt: skip
         if width < half * 0.75:
-            parts.append(box(_EYE, (x - offset * 1.9, y, z + 0.1), (0.1, 0.1, 0.085), tint=0.3 + 0.6 * rng.random(3)))
+            parts.append(
+                box(
+                    _EYE,
+                    (x - offset * 1.9, y, z + 0.1),
+                    (0.1, 0.1, 0.085),
+                    tint=0.3 + 0.6 * rng.random(3),
+                )
+            )
     return parts
 
 
 def posters(rng: np.random.Generator, plan: Plan) -> Parts:
     """Posters on the back wall."""
-    parts, span = [], plan.right_x - plan.left_x - 1.6
+    parts = []
+    span = plan.right_x - plan.left_x - 1.6
     for k in range(plan.posters):
         x = plan.left_x + 0.8 + span * (k + 0.3 + 0.4 * rng.random()) / plan.posters
         half_x, half_z = ((0.3, 0.42), (0.42, 0.3), (0.21, 0.3))[int(rng.integers(3))]
@@ -224,7 +277,8 @@ def posters(rng: np.random.Generator, plan: Plan) -> Parts:
 
 def cabinet(rng: np.random.Generator, plan: Plan, side: int) -> Parts:
     """A low cabinet with a plant and boxes on it, at the other end of the back wall; a waste bin."""
-    tint, y = plan.tints, plan.back_y - 0.25
+    tint = plan.tints
+    y = plan.back_y - 0.25
     x = plan.right_x - 0.5 if side > 0 else plan.left_x + 0.5
     parts = [box(_EYE, (x, y, 0.42), (0.45, 0.22, 0.42), tint=tint["cabinet"])]
     for dx in (-0.225, 0.225):
@@ -235,14 +289,20 @@ def cabinet(rng: np.random.Generator, plan: Plan, side: int) -> Parts:
     pot = np.array([x - 0.2 * side, y, 0.85])
     parts.append(cone(_EYE, pot + np.array([0, 0, 0.06]), (0.1, 0.08, 0.1), tint=(0.7, 0.38, 0.25)))
     for _ in range(9):
-        a, lean = turn(rng.random() * 360), 0.3 + 0.7 * rng.random()
-        tip = pot + product(a, np.array([0.24 * lean, 0, 0.3 + 0.3 * (1 - lean) + 0.1 * rng.random()]))
+        a = turn(rng.random() * 360)
+        lean = 0.3 + 0.7 * rng.random()
+        tip = pot + product(
+            a, np.array([0.24 * lean, 0, 0.3 + 0.3 * (1 - lean) + 0.1 * rng.random()])
+        )
         stem = pot + np.array([0, 0, 0.14])
-        length, green = norm(tip - stem), np.array([0.2, 0.45, 0.16]) * (0.7 + 0.6 * rng.random())
+        length = norm(tip - stem)
+        green = np.array([0.2, 0.45, 0.16]) * (0.7 + 0.6 * rng.random())
         z = (tip - stem) / length
         u = np.cross(z, product(a, np.array([0.0, 1.0, 0.0])))
         axes = np.stack([u / norm(u), np.cross(z, u / norm(u)), z], 1)
-        parts.append(cone(axes, stem, (float(length), 0.012, 0.04), scale=(0.25, 1.0, 1.0), tint=green))
+        parts.append(
+            cone(axes, stem, (float(length), 0.012, 0.04), scale=(0.25, 1.0, 1.0), tint=green)
+        )
     for k in range(2):
         s = 0.1 + 0.05 * rng.random()
         faces = ("plain", "plain", f"poster:{k}", "plain", "plain", "plain")
@@ -259,10 +319,15 @@ def cabinet(rng: np.random.Generator, plan: Plan, side: int) -> Parts:
 def build_room(scene: int, plan: Plan) -> Parts:
     """All fixed primitives of the office: walls, floor and ceiling, and its furniture."""
     rng = stream(scene, "synthetic", "furniture")
-    tint, back, front = plan.tints, plan.back_y, -2.5
-    mid_y, half_y = (back + front) / 2, (back - front) / 2
-    mid_x, half_x = (plan.left_x + plan.right_x) / 2, (plan.right_x - plan.left_x) / 2
-    across, along = (half_x, HEIGHT_M / 2, 0), (half_y, HEIGHT_M / 2, 0)
+    tint = plan.tints
+    back = plan.back_y
+    front = -2.5
+    mid_y = (back + front) / 2
+    half_y = (back - front) / 2
+    mid_x = (plan.left_x + plan.right_x) / 2
+    half_x = (plan.right_x - plan.left_x) / 2
+    across = (half_x, HEIGHT_M / 2, 0)
+    along = (half_y, HEIGHT_M / 2, 0)
     sides = (
         ((0, -1, 0), plan.left_x, mid_y, along, "side"),
         ((0, 1, 0), plan.right_x, mid_y, along, "side"),
@@ -276,7 +341,8 @@ def build_room(scene: int, plan: Plan) -> Parts:
             quad(wall(right, (0, 0, 1)), (x, y, HEIGHT_M / 2), half, tint=tint[name], **plaster)
             for right, x, y, half, name in sides
         ),
-        box(_EYE, (mid_x, back - 0.01, 0.05), (half_x, 0.01, 0.05), tint=tint["shelf"]),  # skirting board
+        # skirting board
+        box(_EYE, (mid_x, back - 0.01, 0.05), (half_x, 0.01, 0.05), tint=tint["shelf"]),
         box(_EYE, (mid_x, back - 0.02, 0.95), (half_x, 0.02, 0.04), tint=(0.82,) * 3),  # cable duct
         *desk(rng, plan, plan.desk_x, plan.desk_y, half=1.15),
         *shelf(rng, plan, plan.shelf_side),
@@ -292,7 +358,8 @@ def build_room(scene: int, plan: Plan) -> Parts:
     ]  # fmt: skip
 
 
-# Larger interiors: floors, walls with doorways, furnished stretches of wall, and pieces that may be moved.
+# Larger interiors: floors, walls with doorways, furnished stretches of wall, and pieces that may be
+# moved.
 
 HEIGHT_M = 2.8
 DOOR_M = 1.3
@@ -303,9 +370,17 @@ Point = tuple[float, float]
 def floor(low: Point, high: Point, plan: Plan, shift: Point = (0.0, 0.0)) -> Parts:
     """Floor and ceiling of a rectangle; `shift` is that of the carpet's texture."""
     middle = (low[0] + high[0]) / 2, (low[1] + high[1]) / 2
-    half, tint = ((high[0] - low[0]) / 2, (high[1] - low[1]) / 2, 0.0), plan.tints["floor"]
+    half = ((high[0] - low[0]) / 2, (high[1] - low[1]) / 2, 0.0)
+    tint = plan.tints["floor"]
     return [
-        quad(wall((1, 0, 0), (0, 1, 0)), (*middle, 0.0), half, texture="carpet", tint=tint, shift=shift),
+        quad(
+            wall((1, 0, 0), (0, 1, 0)),
+            (*middle, 0.0),
+            half,
+            texture="carpet",
+            tint=tint,
+            shift=shift,
+        ),
         quad(wall((1, 0, 0), (0, -1, 0)), (*middle, HEIGHT_M), half, tint=(0.95,) * 3),
     ]
 
@@ -319,16 +394,20 @@ def partition(start: Point, end: Point, plan: Plan, doors: tuple[float, ...] = (
         plan: Its colour.
         doors: Middles of the doorways, metres from `start`, in order.
     """
-    dx, dy = end[0] - start[0], end[1] - start[1]
+    dx = end[0] - start[0]
+    dy = end[1] - start[1]
     length = math.sqrt(dx * dx + dy * dy)
-    facing, direction = turn(math.degrees(atan2(dy, dx))), np.array([dx, dy, 0.0]) / length
+    facing = turn(math.degrees(atan2(dy, dx)))
+    direction = np.array([dx, dy, 0.0]) / length
     edges = [0.0, *(door + side * DOOR_M / 2 for door in doors for side in (-1, 1)), length]
     pieces = [(a, b, 0.0) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     pieces += [(door - DOOR_M / 2, door + DOOR_M / 2, _LINTEL_M) for door in doors]
     return [
         box(
             facing,
-            np.array([*start, 0.0]) + (a + b) / 2 * direction + np.array([0.0, 0.0, (HEIGHT_M + bottom) / 2]),
+            np.array([*start, 0.0])
+            + (a + b) / 2 * direction
+            + np.array([0.0, 0.0, (HEIGHT_M + bottom) / 2]),
             ((b - a) / 2, 0.05, (HEIGHT_M - bottom) / 2),
             texture="plaster",
             repeat=(0.5, 0.5),
@@ -340,7 +419,9 @@ def partition(start: Point, end: Point, plan: Plan, doors: tuple[float, ...] = (
 
 def _stretch(scene: int, number: int, half: float) -> tuple[Plan, np.random.Generator]:
     """The plan of a stretch of wall about its own origin, and its stream."""
-    plan = replace(plan_room(scene, number), back_y=0.0, left_x=-half, right_x=half, desk_x=0.0, desk_y=-1.0)
+    plan = replace(
+        plan_room(scene, number), back_y=0.0, left_x=-half, right_x=half, desk_x=0.0, desk_y=-1.0
+    )
     return plan, stream(scene, "synthetic", "bay", number)
 
 
@@ -358,7 +439,8 @@ def office_bay(scene: int, number: int) -> Parts:
 def corridor_bay(scene: int, number: int) -> Parts:
     """Two metres of a corridor's wall: posters, a shelf, a closed door or a notice board."""
     plan, rng = _stretch(scene, number, 0.7)
-    kind, tint = number % 4, plan.tints
+    kind = number % 4
+    tint = plan.tints
     if kind == 0:
         return posters(rng, replace(plan, left_x=-1.5, right_x=1.5))
     if kind == 1:
@@ -381,7 +463,8 @@ def corridor_bay(scene: int, number: int) -> Parts:
 
 def notices(scene: int, number: int) -> Parts:
     """Nearly two metres of wall with four sheets on it at different heights."""
-    rng, parts = stream(scene, "synthetic", "notices", number), []
+    rng = stream(scene, "synthetic", "notices", number)
+    parts = []
     for k in range(4):
         half = ((0.21, 0.005, 0.3), (0.3, 0.005, 0.21))[int(rng.integers(2))]
         at = (-0.69 + 0.46 * k, -0.006 - 0.002 * k, 1.15 + 0.6 * rng.random())
@@ -397,9 +480,15 @@ _PRINT: Style = {"texture": tuple(f"poster:{face}" for face in range(6)), "fit":
 
 def office_chair(plan: Plan, instance: int, shade: float = 1.0) -> Parts:
     """An office chair facing -y: seat, back, column, five-pointed base; the origin lies on the floor."""
-    metal, hub = plan.tints["metal"], np.array([0, 0, 0.09])
+    metal = plan.tints["metal"]
+    hub = np.array([0, 0, 0.09])
     lean = np.array([[1.0, 0, 0], [0, 0.985, -0.17], [0, 0.17, 0.985]])
-    cloth: Style = {"instance": instance, "texture": "denim", "repeat": (3, 3), "tint": plan.tints["chair"] * shade}
+    cloth: Style = {
+        "instance": instance,
+        "texture": "denim",
+        "repeat": (3, 3),
+        "tint": plan.tints["chair"] * shade,
+    }
     frame: Style = {"instance": instance, "tint": metal}
     parts = [
         box(_EYE, (0, 0, 0.45), (0.23, 0.22, 0.035), **cloth),
@@ -409,7 +498,8 @@ def office_chair(plan: Plan, instance: int, shade: float = 1.0) -> Parts:
     ]
     for k in range(5):
         a = turn(72 * k + 18)
-        tip, u = product(a, np.array([0.28, 0, 0.05])), product(a, np.array([0.0, 1.0, 0.0]))
+        tip = product(a, np.array([0.28, 0, 0.05]))
+        u = product(a, np.array([0.0, 1.0, 0.0]))
         z = (tip - hub) / norm(tip - hub)
         parts += [
             cone(np.stack([u, np.cross(z, u), z], 1), hub, (0.28, 0.024, 0.02), **frame),
@@ -417,7 +507,12 @@ def office_chair(plan: Plan, instance: int, shade: float = 1.0) -> Parts:
         ]
     for side in (-1, 1):
         parts += [
-            box(_EYE, (side * 0.27, 0.03, 0.66), (0.025, 0.13, 0.015), **frame | {"tint": metal * 0.8}),
+            box(
+                _EYE,
+                (side * 0.27, 0.03, 0.66),
+                (0.025, 0.13, 0.015),
+                **frame | {"tint": metal * 0.8},
+            ),
             box(_EYE, (side * 0.27, 0.05, 0.55), (0.015, 0.02, 0.1), **frame),
         ]
     return parts
@@ -425,11 +520,18 @@ def office_chair(plan: Plan, instance: int, shade: float = 1.0) -> Parts:
 
 def cartons(scene: int, number: int, id: int) -> Parts:
     """Two printed cartons on each other."""
-    parts, rng, bottom = [], stream(scene, "synthetic", "cartons", number), 0.0
+    parts = []
+    rng = stream(scene, "synthetic", "cartons", number)
+    bottom = 0.0
     for k in range(2):
         half = (0.19 + 0.08 * rng.random(), 0.16 + 0.06 * rng.random(), 0.14 + 0.05 * rng.random())
         names = (*(f"poster:{(face + k) % 4}" for face in range(4)), "plain", "plain")
-        style: Style = {"instance": id, "texture": names, "fit": (0, 1, 2, 3), "tint": (0.9, 0.8, 0.66)}
+        style: Style = {
+            "instance": id,
+            "texture": names,
+            "fit": (0, 1, 2, 3),
+            "tint": (0.9, 0.8, 0.66),
+        }
         parts.append(box(turn(30 * rng.random()), (0.0, 0.0, bottom + half[2]), half, **style))
         bottom += 2 * half[2]
     return parts
@@ -445,37 +547,64 @@ def balloon(id: int, radius: float) -> Parts:
     skin: Style = {"texture": "print:balloon", "repeat": (2.0, 2.0), "scale": (1.0, 1.0, 1.15)}
     return [
         cone(_EYE, np.zeros(3), (0.0, radius, radius), instance=id, **skin),
-        cone(_EYE, (0.0, 0.0, -1.2 * radius), (0.05, 0.02, 0.01), instance=id, tint=(0.8, 0.3, 0.3)),
+        cone(
+            _EYE, (0.0, 0.0, -1.2 * radius), (0.05, 0.02, 0.01), instance=id, tint=(0.8, 0.3, 0.3)
+        ),
     ]
 
 
 def trolley(id: int, scene: int, plan: Plan) -> Parts:
     """A platform on wheels with a handle and three cartons; the origin lies on the floor."""
-    rng, bottom = stream(scene, "synthetic", "trolley"), 0.18
+    rng = stream(scene, "synthetic", "trolley")
+    bottom = 0.18
     metal: Style = {"instance": id, "tint": plan.tints["metal"]}
     wheels = ((-0.38, -0.24), (-0.38, 0.24), (0.38, -0.24), (0.38, 0.24))
     parts = [
         box(_EYE, (0, 0, 0.16), (0.45, 0.3, 0.02), **metal),
-        *(cone(_EYE, (x, y, 0.07), (0, 0.07, 0.07), instance=id, tint=(0.15,) * 3) for x, y in wheels),
+        *(
+            cone(_EYE, (x, y, 0.07), (0, 0.07, 0.07), instance=id, tint=(0.15,) * 3)
+            for x, y in wheels
+        ),
         *(cone(_EYE, (-0.43, y, 0.16), (0.85, 0.015, 0.015), **metal) for y in (-0.26, 0.26)),
         box(_EYE, (-0.43, 0, 1.01), (0.015, 0.27, 0.015), **metal),
     ]
     for _ in range(3):
         half = (0.26 + 0.12 * rng.random(), 0.2 + 0.08 * rng.random(), 0.15 + 0.06 * rng.random())
-        parts.append(box(_EYE, np.array([0.02, 0.0, bottom + half[2]]), half, instance=id, **_PRINT))
+        parts.append(
+            box(_EYE, np.array([0.02, 0.0, bottom + half[2]]), half, instance=id, **_PRINT)
+        )
         bottom += 2 * half[2]
     return parts
 
 
 def door_leaf(id: int, plan: Plan, width: float) -> Parts:
     """A door leaf whose hinge stands at the origin and which runs along +x; posters on both sides."""
-    leaf, places = (width / 2, 0.02, 1.02), ((0.3, 1.55), (0.7, 1.5), (0.3, 1.0), (0.68, 0.95))
-    faces = [("plain", "plain", f"poster:{k}", f"poster:{(k + 1) % 4}", "plain", "plain") for k in range(4)]
+    leaf = (width / 2, 0.02, 1.02)
+    places = ((0.3, 1.55), (0.7, 1.5), (0.3, 1.0), (0.68, 0.95))
+    faces = [
+        ("plain", "plain", f"poster:{k}", f"poster:{(k + 1) % 4}", "plain", "plain")
+        for k in range(4)
+    ]
     return [
-        box(_EYE, (width / 2, 0.0, 1.03), leaf, instance=id, texture="wood", tint=plan.tints["door"]),
+        box(
+            _EYE, (width / 2, 0.0, 1.03), leaf, instance=id, texture="wood", tint=plan.tints["door"]
+        ),
         *(
-            box(_EYE, (x * width, 0.0, z), (0.15, 0.024, 0.2), instance=id, texture=names, fit=(2, 3))
+            box(
+                _EYE,
+                (x * width, 0.0, z),
+                (0.15, 0.024, 0.2),
+                instance=id,
+                texture=names,
+                fit=(2, 3),
+            )
             for (x, z), names in zip(places, faces, strict=True)
         ),
-        box(_EYE, (width - 0.08, 0.0, 1.03), (0.06, 0.05, 0.012), instance=id, tint=plan.tints["metal"]),
+        box(
+            _EYE,
+            (width - 0.08, 0.0, 1.03),
+            (0.06, 0.05, 0.012),
+            instance=id,
+            tint=plan.tints["metal"],
+        ),
     ]

@@ -1,6 +1,7 @@
 """What a scene films: static parts, rigid bodies on paths, people, a camera, two sensors.
 
-`World` is the description, `Scene` its primitives at any time, `View` how the rows of one frame see them.
+`World` is the description, `Scene` its primitives at any time, `View` how the rows of one frame see
+them.
 """
 
 from collections.abc import Callable, Mapping
@@ -49,8 +50,8 @@ class Optics:
     """What a sequence's sensors do beside the defaults.
 
     Attributes:
-        readout_s: From the first row's exposure to the last one's; 0 is a global shutter. The frame's stamp and pose
-            belong to the middle of the image.
+        readout_s: From the first row's exposure to the last one's; 0 is a global shutter. The
+            frame's stamp and pose belong to the middle of the image.
         auto_exposure: 0 keeps the exposure, 1 brings every image to the same mean brightness.
         gain: Brightness of the lamps, or what gives it for a time in seconds.
         color: Settings of `ColorSensor` that differ, where the user left them.
@@ -99,7 +100,8 @@ class Variant:
         build: Scene number to the world that is filmed.
         tag: How much of the scene moves.
         frames: Default length.
-        version: Raised whenever any pixel, pose or mask changes; 0 where the renderer's version alone counts.
+        version: Raised whenever any pixel, pose or mask changes; 0 where the renderer's version
+            alone counts.
     """
 
     build: Callable[[int], World]
@@ -120,7 +122,8 @@ class View:
 
     Attributes:
         pose: The camera's pose when the middle of the image is exposed.
-        rows: ``[R, 4, 4]`` poses of all rows; R is 1 under a global shutter, else the height of the image.
+        rows: ``[R, 4, 4]`` poses of all rows; R is 1 under a global shutter, else the height of the
+            image.
         rotation: ``[P, 3, 3]`` local (scaled) to world, when the middle of the image is exposed.
         origin: ``[P, 3]``, then.
     """
@@ -156,7 +159,8 @@ class Scene:
     """
 
     def __init__(self, world: World, scene: int, settings: RenderSettings) -> None:
-        self.world, self.seed = world, scene
+        self.world = world
+        self.seed = scene
         self.moves = settings.people == "moving"
         self.actors = () if settings.people == "none" else world.actors
         people = (build_person(person, posture(0.0)) for person, posture in self.actors)
@@ -165,12 +169,20 @@ class Scene:
             name: np.array([getattr(part, name) for part in parts])
             for name in ("kind", "instance", "scale", "shape", "uv", "tint", "rotation", "origin")
         }
-        self.kind, self.instance = columns["kind"].astype(np.int32), columns["instance"].astype(np.int32)
-        self.scale, self.shape, self.uv, self.tint = (columns[name] for name in ("scale", "shape", "uv", "tint"))
-        self._rotation, self._origin = columns["rotation"], columns["origin"]
+        self.kind, self.instance = (
+            columns["kind"].astype(np.int32),
+            columns["instance"].astype(np.int32),
+        )
+        self.scale, self.shape, self.uv, self.tint = (
+            columns[name] for name in ("scale", "shape", "uv", "tint")
+        )
+        self._rotation = columns["rotation"]
+        self._origin = columns["origin"]
         self.texture_names = sorted({name for part in parts for name in part.texture})
         index = {name: i for i, name in enumerate(self.texture_names)}
-        self.texture = np.array([[index[name] for name in part.texture] for part in parts], np.int32)
+        self.texture = np.array(
+            [[index[name] for name in part.texture] for part in parts], np.int32
+        )
         self.corners = self._corners()
         self._placed = lru_cache(maxsize=8)(self._place)
         self.view = lru_cache(maxsize=8)(self._view)
@@ -190,20 +202,28 @@ class Scene:
         return self._placed(time if self.moves else 0.0)
 
     def _place(self, time: float) -> tuple[Array, Array]:
-        rotation, origin, end = self._rotation.copy(), self._origin.copy(), len(self.world.static)
+        rotation = self._rotation.copy()
+        origin = self._origin.copy()
+        end = len(self.world.static)
         for body in self.world.bodies:
             part = slice(end, end + len(body.parts))
             turned, shift = body.path(time)
-            rotation[part], origin[part] = product(turned, rotation[part]), product(origin[part], turned.T) + shift
+            rotation[part], origin[part] = (
+                product(turned, rotation[part]),
+                product(origin[part], turned.T) + shift,
+            )
             end = part.stop
-        people = list(chain(*(build_person(person, posture(time)) for person, posture in self.actors)))
+        people = list(
+            chain(*(build_person(person, posture(time)) for person, posture in self.actors))
+        )
         if people:
             rotation[end:] = [part.rotation for part in people]
             origin[end:] = [part.origin for part in people]
         return rotation, origin
 
     def _view(self, index: int) -> View:
-        time, readout_s = index / FPS, self.world.optics.readout_s
+        time = index / FPS
+        readout_s = self.world.optics.readout_s
         pose = self.world.camera(np.array([time]))[0]
         rows = self.world.camera(row_times(index, readout_s)) if readout_s else pose[None]
         return View(pose, rows, *self.place(time))
@@ -212,15 +232,20 @@ class Scene:
         """Instances with a point that moved by more than `MOVED_M` since the previous frame; frame 0 has none."""
         if index == 0 or not self.moves:
             return frozenset()
-        before, after = self.place((index - 1) / FPS), self.place(index / FPS)
+        before = self.place((index - 1) / FPS)
+        after = self.place(index / FPS)
         box = self.corners * self.scale[:, None, :]
-        shift = product(box, np.swapaxes(after[0] - before[0], 1, 2)) + (after[1] - before[1])[:, None, :]
+        shift = (
+            product(box, np.swapaxes(after[0] - before[0], 1, 2))
+            + (after[1] - before[1])[:, None, :]
+        )
         moved = norm(shift).max(axis=1) > MOVED_M
         return frozenset(int(k) for k in np.unique(self.instance[moved]) if k > 0)
 
     def _corners(self) -> Array:
         """Corners ``[P, 8, 3]`` of each primitive's box in its local frame."""
-        low, high = -self.shape.copy(), self.shape.copy()
+        low = -self.shape.copy()
+        high = self.shape.copy()
         low[self.kind == QUAD, 2] = high[self.kind == QUAD, 2] = 0.0
         cones = self.kind == ROUND_CONE
         h, r1, r2 = self.shape[cones].T

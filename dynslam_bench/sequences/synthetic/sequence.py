@@ -1,8 +1,9 @@
 """The rendered sequence: frames are rendered when first read, then come from the cache.
 
-The cache is a folder in TUM layout. ``rgb/``, ``depth/`` and ``masks/`` hold one PNG a frame, named by its stamp; lists
-name them. Every file appears by an atomic rename and every read checks the PNG's checksums, so several processes may
-render into one folder, an interrupted rendering is resumed, and a damaged file counts as missing.
+The cache is a folder in TUM layout. ``rgb/``, ``depth/`` and ``masks/`` hold one PNG a frame, named
+by its stamp; lists name them. Every file appears by an atomic rename and every read checks the
+PNG's checksums, so several processes may render into one folder, an interrupted rendering is
+resumed, and a damaged file counts as missing.
 """
 
 import struct
@@ -36,8 +37,14 @@ _MODES = {"masks": ("L",), "depth": ("I;16", "I"), "rgb": ("RGB",)}
 """Kinds of images, in the order in which they are stored, and Pillow's names of their pixel formats."""
 
 
-# Huffman coding after the SUB filter: as small as level 1 on noisy images, and more than twice as fast.
-_FAST_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
+# Huffman coding after the SUB filter: as small as level 1 on noisy images, and more than twice as
+# fast.
+_FAST_PNG = [
+    cv2.IMWRITE_PNG_COMPRESSION,
+    1,
+    cv2.IMWRITE_PNG_STRATEGY,
+    cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY,
+]
 if hasattr(cv2, "IMWRITE_PNG_FILTER"):
     _FAST_PNG += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
 _MASK_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
@@ -61,7 +68,8 @@ def is_intact_png(data: bytes, size: tuple[int, int], modes: tuple[str, ...]) ->
     try:
         with Image.open(BytesIO(data), formats=["PNG"]) as image:
             image.verify()
-    except (OSError, SyntaxError, ValueError, struct.error, Image.DecompressionBombError):  # Pillow's, if damaged
+    # Pillow's, if damaged
+    except (OSError, SyntaxError, ValueError, struct.error, Image.DecompressionBombError):
         return False
     return data.endswith(_END) and image.size == size and image.mode in modes
 
@@ -75,7 +83,8 @@ class FrameStore:
     """
 
     def __init__(self, folder: Path, camera: Camera) -> None:
-        self.folder, self.camera = folder, camera
+        self.folder = folder
+        self.camera = camera
 
     def path(self, kind: str, stamp: float) -> Path:
         """Where a frame's image of a kind (``rgb``, ``depth``, ``masks``) lies."""
@@ -95,13 +104,23 @@ class FrameStore:
         except OSError as error:
             hint = "check the permissions of the cache"
             raise SequenceError(f"cannot read {path}: {error.strerror}", hint) from error
-        return data if is_intact_png(data, (self.camera.width, self.camera.height), _MODES[kind]) else None
+        return (
+            data
+            if is_intact_png(data, (self.camera.width, self.camera.height), _MODES[kind])
+            else None
+        )
 
     def read(self, kind: str, stamp: float) -> NDArray[Any] | None:
         """An image (RGB order), or None if it is missing or damaged; raises as `bytes_of`."""
         data = self.bytes_of(kind, stamp)
-        image = None if data is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if image is not None and kind == "rgb" else image
+        image = (
+            None
+            if data is None
+            else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        )
+        return (
+            cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if image is not None and kind == "rgb" else image
+        )
 
     def write(self, stamp: float, frame: Rendered) -> None:
         """Store a frame; the colour image comes last, so that a frame with one is complete.
@@ -124,7 +143,10 @@ class FrameStore:
             lines += [f"{stamp} {kind}/{stamp}.png" for stamp in stamps]
             write_atomic(self.folder / f"{kind}.txt", "\n".join(lines) + "\n")
         poses = self.folder / "groundtruth.txt"
-        if not poses.is_file() or sum(1 for _ in read_lines(poses, kind=SequenceError)) < len(truth) + 2:
+        if (
+            not poses.is_file()
+            or sum(1 for _ in read_lines(poses, kind=SequenceError)) < len(truth) + 2
+        ):
             write_tum(poses, truth, comment="exact poses of a rendered sequence")
         write_camera(self.folder / "camera.toml", self.camera, fps=FPS)
 
@@ -139,14 +161,16 @@ class SyntheticSequence:
 
     Args:
         sequence: Which sequence.
-        cache_root: Folder under which rendered frames are kept; None keeps nothing and renders every time.
+        cache_root: Folder under which rendered frames are kept; None keeps nothing and renders
+            every time.
         settings: What differs from the default rendering.
-        threads: Threads a frame; None for the cores there are, at most four. The frames do not depend on it.
+        threads: Threads a frame; None for the cores there are, at most four. The frames do not
+            depend on it.
 
     Attributes:
         id: For example ``synthetic/walking_xyz?scene=0&frames=600``.
-        whole_id: The id without its length, for example ``synthetic/walking_xyz?scene=0``: all lengths cut the same
-            script.
+        whole_id: The id without its length, for example ``synthetic/walking_xyz?scene=0``: all
+            lengths cut the same script.
         split: ``tune`` (scenes 0-99) or ``held-out`` (100-199).
         tags: How much of the scene moves.
         noise: Seed of the sensors' noise; None for the scene's own.
@@ -155,21 +179,37 @@ class SyntheticSequence:
     """
 
     def __init__(
-        self, sequence: SyntheticId, cache_root: Path | None, settings: RenderSettings, threads: int | None = None
+        self,
+        sequence: SyntheticId,
+        cache_root: Path | None,
+        settings: RenderSettings,
+        threads: int | None = None,
     ) -> None:
-        self._id, self._cache_root = sequence, cache_root
-        self.settings, self.threads = settings, threads or default_threads()
-        self.id, self.whole_id = str(sequence), sequence.whole
-        self.split, self.noise = sequence.split, sequence.noise
+        self._id = sequence
+        self._cache_root = cache_root
+        self.threads = threads or default_threads()
+        self.settings = settings
+        self.id = str(sequence)
+        self.whole_id = sequence.whole
+        self.split = sequence.split
+        self.noise = sequence.noise
         self.tags = frozenset({sequence.variant.tag if settings.people == "moving" else "static"})
-        self.fps, self.license = FPS, "CC0-1.0"
-        self.citation = f"dynslam-bench rendered sequence {self.id}, renderer version {RENDERER_VERSION}"
+        self.fps = FPS
+        self.license = "CC0-1.0"
+        self.citation = (
+            f"dynslam-bench rendered sequence {self.id}, renderer version {RENDERER_VERSION}"
+        )
         self.timestamps = np.round(START_S + np.arange(sequence.frames) / FPS, 6)
         noise = "" if sequence.noise is None else f"-noise{sequence.noise}"
         # Stored frames are those of this code: an edited renderer renders again.
         rendered_by = digest([self._key(), module_graph().digest([_RENDERER], PLUMBING)], 8)
-        label = f"{sequence.name}@{sequence.scene}{noise}-{rendered_by}"  # no "?": Windows has none in names
-        self.store = None if cache_root is None else FrameStore(Path(cache_root) / "synthetic" / label, CAMERA)
+        # no "?": Windows has none in names
+        label = f"{sequence.name}@{sequence.scene}{noise}-{rendered_by}"
+        self.store = (
+            None
+            if cache_root is None
+            else FrameStore(Path(cache_root) / "synthetic" / label, CAMERA)
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self._id, self._cache_root, self.settings, self.threads)
@@ -216,7 +256,11 @@ class SyntheticSequence:
 
     def _key(self) -> str:
         family = {"family": self._id.variant.version} if self._id.variant.version else {}
-        return digest({"version": RENDERER_VERSION, "settings": self.settings.model_dump(mode="json")} | family, 8)
+        return digest(
+            {"version": RENDERER_VERSION, "settings": self.settings.model_dump(mode="json")}
+            | family,
+            8,
+        )
 
     def __len__(self) -> int:
         return self._id.frames
@@ -225,7 +269,8 @@ class SyntheticSequence:
         i = range(len(self))[index]
         stamp = float(self.timestamps[i])
         if self.store is not None:
-            rgb, raw = self.store.read("rgb", stamp), self.store.read("depth", stamp)
+            rgb = self.store.read("rgb", stamp)
+            raw = self.store.read("depth", stamp)
             if rgb is not None and raw is not None:
                 return Frame(i, stamp, rgb, _metres(raw))
         made = self._make(i, self.renderer)
@@ -236,8 +281,9 @@ class SyntheticSequence:
     def flow(self, index: int, other: int | None = None) -> NDArray[np.float32]:
         """Exact optical flow float32 ``[H, W, 2]`` in pixels (u, v) from a frame to another (default: the next).
 
-        It is the motion of the surface point at each pixel centre, also where that point is hidden in the other frame;
-        NaN where it comes to lie behind the camera. Recomputed from the geometry, nothing is stored.
+        It is the motion of the surface point at each pixel centre, also where that point is hidden
+        in the other frame; NaN where it comes to lie behind the camera. Recomputed from the
+        geometry, nothing is stored.
         """
         i = range(len(self))[index]
         return self.renderer.flow(i, i + 1 if other is None else range(len(self))[other])
@@ -247,7 +293,9 @@ class SyntheticSequence:
 
         The frame's own pose (`ground_truth`) is that of the middle of the image.
         """
-        return self.scene.world.camera(row_times(range(len(self))[index], self.scene.world.optics.readout_s))
+        return self.scene.world.camera(
+            row_times(range(len(self))[index], self.scene.world.optics.readout_s)
+        )
 
     def exact_depth(self, index: int) -> NDArray[np.float64]:
         """Exact z-depth float64 ``[H, W]`` in metres at the pixel centres, 0 where nothing is hit."""
@@ -265,7 +313,8 @@ class SyntheticSequence:
         Raises:
             DynslamError: The cache cannot be written; frames already rendered stay.
         """
-        store, total = self.store, len(self)
+        store = self.store
+        total = len(self)
         todo = [i for i in range(total) if store is None or not self._is_stored(store, i)]
         report = progress or (lambda done, total: None)
         report(total - len(todo), total)
@@ -281,7 +330,9 @@ class SyntheticSequence:
         return len(todo)
 
     def _is_stored(self, store: FrameStore, index: int) -> bool:
-        return all(store.bytes_of(kind, float(self.timestamps[index])) is not None for kind in _MODES)
+        return all(
+            store.bytes_of(kind, float(self.timestamps[index])) is not None for kind in _MODES
+        )
 
     def _make(self, index: int, renderer: Renderer) -> Rendered:
         """Render a frame and store it."""

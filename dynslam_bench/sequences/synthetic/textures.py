@@ -13,7 +13,8 @@ Image = NDArray[np.float64]
 
 Atlas = tuple[NDArray[np.uint8], NDArray[np.int64], NDArray[np.int32]]
 """All textures and their mip levels as one array: uint8 texels, four bytes each (the last unused), level after level,
-texture after texture; int64 ``[T, L]`` offset of each level's first byte; int32 ``[T]`` base-2 logarithm of each
+texture after texture; int64 ``[T, L]`` offset of each level's first byte; int32 ``[T]`` base-2
+logarithm of each
 texture's edge."""
 
 
@@ -35,11 +36,15 @@ def build_atlas(textures: list[Image]) -> Atlas:
             position += texels.size
             if current.shape[0] == 1:
                 break
-            current = 0.25 * (current[::2, ::2] + current[1::2, ::2] + current[::2, 1::2] + current[1::2, 1::2])
+            current = 0.25 * (
+                current[::2, ::2] + current[1::2, ::2] + current[::2, 1::2] + current[1::2, 1::2]
+            )
     return np.concatenate(parts), offsets, log2
 
 
-def smooth_noise(rng: np.random.Generator, size: int, cells: int, cells_v: int | None = None) -> NDArray[np.float64]:
+def smooth_noise(
+    rng: np.random.Generator, size: int, cells: int, cells_v: int | None = None
+) -> NDArray[np.float64]:
     """Wrapping value noise in [-1, 1], ``[size, size]``, with `cells` x `cells_v` lattice cells, cosine-blended."""
     cells_v = cells if cells_v is None else cells_v
     lattice = rng.random((cells_v, cells)) * 2 - 1
@@ -96,9 +101,13 @@ def carpet(rng: np.random.Generator, size: int = 512) -> Image:
     return _gray(values)
 
 
-def _rect(image: Image, u0: float, v0: float, u1: float, v1: float, color: NDArray[np.float64]) -> None:
+def _rect(
+    image: Image, u0: float, v0: float, u1: float, v1: float, color: NDArray[np.float64]
+) -> None:
     s = image.shape[0]
-    image[int(max(v0, 0) * s) : int(min(v1, 1) * s), int(max(u0, 0) * s) : int(min(u1, 1) * s)] = color
+    image[int(max(v0, 0) * s) : int(min(v1, 1) * s), int(max(u0, 0) * s) : int(min(u1, 1) * s)] = (
+        color
+    )
 
 
 def _text(rng: np.random.Generator, image: Image, u0: float, v0: float, u1: float, v1: float, lines: int,
@@ -122,7 +131,8 @@ def poster(rng: np.random.Generator, size: int = 256) -> Image:
     _rect(image, 0.03, 0.03, 0.97, 0.97, ground * 0.92)
     _rect(image, 0.1, 0.06, 0.55 + 0.3 * rng.random(), 0.13, ink)
     yy, xx = (np.mgrid[0:size, 0:size] + 0.5) / size
-    top, bottom = 0.18, 0.62
+    top = 0.18
+    bottom = 0.62
     _rect(image, 0.08, top, 0.92, bottom, 60 + 150 * rng.random(3))
     for _ in range(int(rng.integers(5, 10))):
         u, v, r = (
@@ -130,11 +140,24 @@ def poster(rng: np.random.Generator, size: int = 256) -> Image:
             top + 0.06 + (bottom - top - 0.12) * rng.random(),
             0.03 + 0.1 * rng.random(),
         )
-        inside = ((xx - u) ** 2 + (yy - v) ** 2 < r * r) & (yy > top) & (yy < bottom) & (xx > 0.08) & (xx < 0.92)
+        inside = (
+            ((xx - u) ** 2 + (yy - v) ** 2 < r * r)
+            & (yy > top)
+            & (yy < bottom)
+            & (xx > 0.08)
+            & (xx < 0.92)
+        )
         image[inside] = 40 + 200 * rng.random(3)
     for _ in range(int(rng.integers(2, 5))):
         u, v = 0.1 + 0.6 * rng.random(), top + (bottom - top) * 0.8 * rng.random()
-        _rect(image, u, v, min(u + 0.2 * rng.random() + 0.05, 0.92), min(v + 0.12, bottom), 40 + 200 * rng.random(3))
+        _rect(
+            image,
+            u,
+            v,
+            min(u + 0.2 * rng.random() + 0.05, 0.92),
+            min(v + 0.12, bottom),
+            40 + 200 * rng.random(3),
+        )
     _text(rng, image, 0.08, 0.67, 0.47, 0.95, 8, ink)
     _text(rng, image, 0.53, 0.67, 0.92, 0.95, 8, ink)
     return image
@@ -145,11 +168,21 @@ def screen(rng: np.random.Generator, size: int = 256) -> Image:
     image = np.tile(np.array([40.0, 70.0, 110.0]) + 50 * rng.random(3), (size, size, 1))
     for _ in range(3):
         u, v = 0.02 + 0.4 * rng.random(), 0.02 + 0.35 * rng.random()
-        w, h = 0.35 + 0.2 * rng.random(), 0.35 + 0.25 * rng.random()
+        w = 0.35 + 0.2 * rng.random()
+        h = 0.35 + 0.25 * rng.random()
         dark = rng.random() < 0.4
         _rect(image, u, v, u + w, v + h, np.full(3, 40.0 if dark else 235.0))
         _rect(image, u, v, u + w, v + 0.05, 90 + 90 * rng.random(3))
-        _text(rng, image, u + 0.02, v + 0.08, u + w - 0.03, v + h - 0.03, 8, np.full(3, 200.0 if dark else 60.0))
+        _text(
+            rng,
+            image,
+            u + 0.02,
+            v + 0.08,
+            u + w - 0.03,
+            v + h - 0.03,
+            8,
+            np.full(3, 200.0 if dark else 60.0),
+        )
     _rect(image, 0, 0.95, 1, 1, np.full(3, 60.0))
     return image
 
@@ -167,7 +200,9 @@ def books(rng: np.random.Generator, size: int = 256) -> Image:
         image[top:, u : u + 1] = color * 0.5
         if rng.random() < 0.8:
             v = top + int(size * (0.1 + 0.2 * rng.random()))
-            image[v : v + int(size * 0.25), u + w // 3 : u + max(2 * w // 3, w // 3 + 2)] = 255 - 0.6 * color
+            image[v : v + int(size * 0.25), u + w // 3 : u + max(2 * w // 3, w // 3 + 2)] = (
+                255 - 0.6 * color
+            )
         u += w
     return image
 
@@ -178,7 +213,14 @@ def keyboard(rng: np.random.Generator, size: int = 256) -> Image:
     for row in range(5):
         for key in range(15):
             shade = 75 + 20 * rng.random()
-            _rect(image, (key + 0.12) / 15, (row + 0.1) / 5, (key + 0.9) / 15, (row + 0.85) / 5, np.full(3, shade))
+            _rect(
+                image,
+                (key + 0.12) / 15,
+                (row + 0.1) / 5,
+                (key + 0.9) / 15,
+                (row + 0.85) / 5,
+                np.full(3, shade),
+            )
     return image
 
 
@@ -198,7 +240,8 @@ def plaid(rng: np.random.Generator, size: int = 256) -> Image:
             weight[near, i % 2] = 1.0
         return weight
 
-    bu, bv = bands(), bands()
+    bu = bands()
+    bv = bands()
     image = np.tile(base, (size, size, 1))
     for weight, color in ((0, second), (1, third)):
         alpha = 0.45 * bu[None, :, weight] + 0.45 * bv[:, None, weight]
@@ -215,9 +258,11 @@ def print_shirt(rng: np.random.Generator, size: int = 256) -> Image:
     for _ in range(26):
         color = 20 + 225 * rng.random(3)
         u, v, r = rng.random(), rng.random(), 0.03 + 0.06 * rng.random()
-        du, dv = (xx - u + 0.5) % 1 - 0.5, (yy - v + 0.5) % 1 - 0.5
+        du = (xx - u + 0.5) % 1 - 0.5
+        dv = (yy - v + 0.5) % 1 - 0.5
         square = du * du + dv * dv
-        disc, bar = square < r * r, (np.abs(du) < r) & (np.abs(dv) < 0.35 * r)
+        disc = square < r * r
+        bar = (np.abs(du) < r) & (np.abs(dv) < 0.35 * r)
         ring = (np.sqrt(square) < r) & (np.sqrt(square) > 0.6 * r)
         image[(disc, bar, ring)[rng.integers(3)]] = color
     return image + 4 * fractal(rng, size, 32, 2)[..., None]
@@ -225,11 +270,13 @@ def print_shirt(rng: np.random.Generator, size: int = 256) -> Image:
 
 def stripes(rng: np.random.Generator, size: int = 256) -> Image:
     """Horizontal stripes of two colours and a few widths."""
-    first, second = 30 + 100 * rng.random(3), 140 + 110 * rng.random(3)
+    first = 30 + 100 * rng.random(3)
+    second = 140 + 110 * rng.random(3)
     image = np.tile(first, (size, size, 1))
     v = 0
     while v < size:
-        w, gap = int(rng.integers(8, 22)), int(rng.integers(8, 26))
+        w = int(rng.integers(8, 22))
+        gap = int(rng.integers(8, 26))
         image[v : v + w] = second
         v += w + gap
     return image + 5 * fractal(rng, size, 32, 2)[..., None]
@@ -248,10 +295,15 @@ def hair(rng: np.random.Generator, size: int = 128) -> Image:
 
 def face(rng: np.random.Generator, size: int = 256) -> Image:
     """A face, unrolled: u = 0.5 is the front, v from the crown (0) to the chin (1); to be tinted with the skin."""
-    image = np.tile(np.array([240.0, 236.0, 232.0]), (size, size, 1)) + 4 * fractal(rng, size, 8, 3)[..., None]
+    image = (
+        np.tile(np.array([240.0, 236.0, 232.0]), (size, size, 1))
+        + 4 * fractal(rng, size, 8, 3)[..., None]
+    )
     yy, xx = (np.mgrid[0:size, 0:size] + 0.5) / size
 
-    def blob(u: float, v: float, ru: float, rv: float, color: tuple[float, float, float], strength: float) -> None:
+    def blob(
+        u: float, v: float, ru: float, rv: float, color: tuple[float, float, float], strength: float
+    ) -> None:
         d = ((xx - u) / ru) ** 2 + ((yy - v) / rv) ** 2
         alpha = np.clip(1.6 * (1.2 - d), 0, 1)[..., None] * strength
         image[:] = image * (1 - alpha) + np.array(color) * alpha

@@ -14,7 +14,13 @@ import numpy as np
 import psutil
 
 from dynslam_bench.contracts import Frame, TrackerContext, TrackResult
-from dynslam_bench.core import TemporaryFolder, TrackerError, TrackerTimeoutError, TrajectoryError, raising
+from dynslam_bench.core import (
+    TemporaryFolder,
+    TrackerError,
+    TrackerTimeoutError,
+    TrajectoryError,
+    raising,
+)
 from dynslam_bench.core.code_files import files_of_command
 from dynslam_bench.core.programs import program_environment
 from dynslam_bench.geometry import Camera, Trajectory, load_tum, nearest_gap, read_table, se3
@@ -38,8 +44,8 @@ def files(settings: BatchSettings) -> list[Path]:
 class BatchTracker:
     """Collects the frames in a folder in TUM layout and runs the program on it at the end.
 
-    No frame has a pose before: only the final trajectory exists. Time and memory are those of the program, measured
-    from outside.
+    No frame has a pose before: only the final trajectory exists. Time and memory are those of the
+    program, measured from outside.
 
     Args:
         settings: The program and its time limit.
@@ -52,7 +58,8 @@ class BatchTracker:
     def __init__(self, settings: BatchSettings, context: TrackerContext) -> None:
         self._program, self._place = settings.read()
         self._file = settings.path
-        self._limit_s, self._context = settings.timeout_s, context
+        self._limit_s = settings.timeout_s
+        self._context = context
         self._folder: TemporaryFolder | None = None
         self.measured: dict[str, Any] = {}
         """After `finalize`: ``program_s``, ``program_memory_mb`` (resident, all its processes) and ``notes``."""
@@ -60,7 +67,9 @@ class BatchTracker:
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
         """Begin a new sequence in a new folder."""
         self.close()
-        self._camera, self._stamps, self.measured = camera, list[float](), {}
+        self._stamps = list[float]()
+        self._camera = camera
+        self.measured = {}
         self._folder = TemporaryFolder()
         for name in ("rgb", "depth"):
             (self._folder.path / "sequence" / name).mkdir(parents=True)
@@ -73,7 +82,12 @@ class BatchTracker:
         """
         name = f"{frame.timestamp:.6f}.png"
         rgb, depth = (self._open() / "sequence" / kind / name for kind in ("rgb", "depth"))
-        write_images(frame, rgb, None if self._program.sensors == "rgb" else depth, self._camera.written_depth_factor)
+        write_images(
+            frame,
+            rgb,
+            None if self._program.sensors == "rgb" else depth,
+            self._camera.written_depth_factor,
+        )
         self._stamps.append(frame.timestamp)
         return TrackResult(None, "initialising")
 
@@ -81,11 +95,13 @@ class BatchTracker:
         """Run the program and read what it wrote.
 
         Raises:
-            TrackerError: It cannot be started, ended with an exit code that is not among the program's `exit_codes`,
-                wrote no trajectory, or one that is not of these frames or not of this run; with its last words.
+            TrackerError: It cannot be started, ended with an exit code that is not among the
+                program's `exit_codes`, wrote no trajectory, or one that is not of these frames or
+                not of this run; with its last words.
             TrackerTimeoutError: It did not end in time.
         """
-        folder, program = self._open(), self._program
+        folder = self._open()
+        program = self._program
         work = folder / "work"
         if work.exists():  # of an earlier call
             shutil.rmtree(work)
@@ -106,27 +122,41 @@ class BatchTracker:
         code = self._run(words, folder)
         said = _tail(folder / "log.txt")
         LOGGER.info("[%s] %s", program.name, said)
-        last = next((line.strip()[:300] for line in reversed(said.splitlines()) if line.strip()), "")
+        last = next(
+            (line.strip()[:300] for line in reversed(said.splitlines()) if line.strip()), ""
+        )
         words_said = f"its last words: '{last}'" if last else "it wrote no message"
         display = re.search("display|x11|glx|opengl", said, re.IGNORECASE)
-        hint = "does it need a display? switch its viewer off, or put xvfb-run before it" if display else ""
+        hint = (
+            "does it need a display? switch its viewer off, or put xvfb-run before it"
+            if display
+            else ""
+        )
         if code is None:
             raise TrackerTimeoutError(
                 f"{program.name}: not done within {self._limit_s:g} s, killed; {words_said}", hint
             )
-        ended = f"killed by signal {-code} ({signal.strsignal(-code)})" if code < 0 else f"ended with exit code {code}"
+        ended = (
+            f"killed by signal {-code} ({signal.strsignal(-code)})"
+            if code < 0
+            else f"ended with exit code {code}"
+        )
         missing = "" if output.is_file() else f", and wrote no {program.output}"
         if code not in program.exit_codes:
             fine = f"if that is no failure: exit_codes = {[*program.exit_codes, code]} in {self._file.name}"
             raise TrackerError(f"{program.name}: {ended}{missing}; {words_said}", hint or fine)
         if missing:
-            raise TrackerError(f"{program.name}: {ended}{missing}; {words_said}", hint or WRITE_THERE)
+            raise TrackerError(
+                f"{program.name}: {ended}{missing}; {words_said}", hint or WRITE_THERE
+            )
         self._check_own(output)
         try:
             trajectory, read_notes = self._read(output)
         except TrajectoryError as error:
             text = str(error.args[0]).replace(str(output), program.output)
-            raise TrackerError(f"{program.name}: {text}; it {ended}; {words_said}", error.hint) from None
+            raise TrackerError(
+                f"{program.name}: {text}; it {ended}; {words_said}", error.hint
+            ) from None
         odd = code or len(trajectory) < len(self._stamps)
         self.measured["notes"] = [f"the program {ended}; {words_said}"] if odd else []
         self.measured["notes"] += [f"{program.output}: {note}" for note in read_notes]
@@ -144,14 +174,19 @@ class BatchTracker:
         Raises:
             TrackerError: It is a link to a file elsewhere, or older than the program's start.
         """
-        name, real = f"{self._program.name}: {self._program.output}", output.resolve()
+        name = f"{self._program.name}: {self._program.output}"
+        real = output.resolve()
         if not real.is_relative_to(self._open().resolve() / "work"):
-            raise TrackerError(f"{name} is a link to {real}, outside of the working folder of this run", WRITE_THERE)
+            raise TrackerError(
+                f"{name} is a link to {real}, outside of the working folder of this run",
+                WRITE_THERE,
+            )
         # Both stamps are of one file system; the log was made right before the program was started.
         early_s = (self._started_ns - real.stat().st_mtime_ns) / 1e9
         if early_s > 0:
             raise TrackerError(
-                f"{name} was written {early_s:.3g} s before the program started: it is not of this run", WRITE_THERE
+                f"{name} was written {early_s:.3g} s before the program started: it is not of this run",
+                WRITE_THERE,
             )
 
     def _open(self) -> Path:
@@ -168,8 +203,12 @@ class BatchTracker:
 
     def _run(self, words: list[str], folder: Path) -> int | None:
         """Run the program to its end; its exit code, or None if it had to be killed."""
-        began, log = time.perf_counter(), folder / "log.txt"
-        with log.open("wb") as out, raising(TrackerError, f"{self._program.name}: cannot start '{words[0]}'"):
+        began = time.perf_counter()
+        log = folder / "log.txt"
+        with (
+            log.open("wb") as out,
+            raising(TrackerError, f"{self._program.name}: cannot start '{words[0]}'"),
+        ):
             self._started_ns = os.fstat(out.fileno()).st_mtime_ns
             process = subprocess.Popen(
                 words, stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT, cwd=folder / "work",
@@ -177,7 +216,8 @@ class BatchTracker:
                 start_new_session=True,
                 preexec_fn=end_with_parent(),
             )  # fmt: skip
-        code, peak = None, 0
+        code = None
+        peak = 0
         try:
             while code is None and time.perf_counter() - began < self._limit_s:
                 peak = max(peak, _resident(process.pid))
@@ -202,14 +242,19 @@ class BatchTracker:
             rows = read_table(output, 8, "index tx ty tz qx qy qz qw")
             index, first = np.unique(rows[:, 0], return_index=True)
             if not len(index) or not (np.isin(index, np.arange(len(stamps)))).all():
-                raise TrajectoryError(f"{output} does not hold indices of frames 0 to {len(stamps) - 1}")
+                raise TrajectoryError(
+                    f"{output} does not hold indices of frames 0 to {len(stamps) - 1}"
+                )
             repeats = len(rows) - len(index)
-            repeated = [f"{repeats} of {len(rows)} lines repeat an index, the first of each is taken"] * (repeats > 0)
+            repeated = [
+                f"{repeats} of {len(rows)} lines repeat an index, the first of each is taken"
+            ] * (repeats > 0)
             poses = se3.from_quaternion(rows[first, 1:4], rows[first, 4:])
             return Trajectory(stamps[index.astype(int)], poses), repeated
         file = load_tum(output)
         trajectory = file.trajectory
-        gap, interval = nearest_gap(trajectory.timestamps, stamps), float(np.median(np.diff(stamps)))
+        gap = nearest_gap(trajectory.timestamps, stamps)
+        interval = float(np.median(np.diff(stamps)))
         if gap.min() > interval / 2:
             raise TrajectoryError(
                 f"none of the {len(trajectory)} poses in {output} is of a frame: they have stamps from "
@@ -223,7 +268,9 @@ class BatchTracker:
 def camera_yaml(camera: Camera, fps: float) -> str:
     """A settings file for ORB-SLAM3 (format 1.0) with the keys of ORB-SLAM2 beside them, for 16-bit depth images."""
     names = ("fx", "fy", "cx", "cy"), ("k1", "k2", "p1", "p2", "k3")
-    values = {name: getattr(camera, name) for name in names[0]} | dict(zip(names[1], camera.distortion, strict=True))
+    values = {name: getattr(camera, name) for name in names[0]} | dict(
+        zip(names[1], camera.distortion, strict=True)
+    )
     old = {f"Camera.{name}": value for name, value in values.items()}
     settings = OrbSlam3Settings()
     old |= {"Camera.bf": camera.fx * camera.baseline_m, "ThDepth": settings.close_depth_baselines}

@@ -20,7 +20,8 @@ REPROJECTION_PX = 2.0
 class NeverMove:
     """The static-camera baseline: the identity pose on every frame.
 
-    Its error is the spread of the ground truth: a tracker that is not better gains nothing from the images.
+    Its error is the spread of the ground truth: a tracker that is not better gains nothing from the
+    images.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -37,10 +38,10 @@ class NeverMove:
 class ConstantVelocity:
     """The motion model of a SLAM system without its measurements.
 
-    The first `frames` frames are aligned to their predecessors (corners tracked by Lucas-Kanade, P3P with RANSAC on
-    their depth). The velocity is their mean twist: the last pose relative to the first over the time between. Every
-    later pose is extrapolated with it, by time stamp. Where a frame cannot be aligned, the velocity so far is kept,
-    zero at first.
+    The first `frames` frames are aligned to their predecessors (corners tracked by Lucas-Kanade,
+    P3P with RANSAC on their depth). The velocity is their mean twist: the last pose relative to the
+    first over the time between. Every later pose is extrapolated with it, by time stamp. Where a
+    frame cannot be aligned, the velocity so far is kept, zero at first.
     """
 
     def __init__(self, settings: ConstantVelocitySettings) -> None:
@@ -59,7 +60,8 @@ class ConstantVelocity:
         start = time.perf_counter()
         if self._count == 0:
             self._first_stamp = self._stamp = frame.timestamp
-        motion, inliers = None, 0
+        motion = None
+        inliers = 0
         measured = self._count < self.settings.frames
         if measured:
             grey = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
@@ -78,7 +80,10 @@ class ConstantVelocity:
 
 
 def relative_motion(
-    camera: Camera, grey_a: NDArray[np.uint8], depth_a: NDArray[np.float32], grey_b: NDArray[np.uint8]
+    camera: Camera,
+    grey_a: NDArray[np.uint8],
+    depth_a: NDArray[np.float32],
+    grey_b: NDArray[np.uint8],
 ) -> tuple[NDArray[np.float64] | None, int]:
     """Pose of camera b in the frame of camera a.
 
@@ -89,16 +94,25 @@ def relative_motion(
         grey_b: Second image ``[H, W]``.
 
     Returns:
-        ``T_a_b`` ``[4, 4]`` and the number of inliers; None and their number if fewer than 12 points agree.
+        ``T_a_b`` ``[4, 4]`` and the number of inliers; None and their number if fewer than 12
+        points agree.
     """
-    detected: object = cv2.goodFeaturesToTrack(grey_a, MAX_CORNERS, 0.01, 8)  # None if there are none
-    corners = np.zeros((0, 2), np.float32) if detected is None else np.asarray(detected, np.float32).reshape(-1, 2)
+    # None if there are none
+    detected: object = cv2.goodFeaturesToTrack(grey_a, MAX_CORNERS, 0.01, 8)
+    corners = (
+        np.zeros((0, 2), np.float32)
+        if detected is None
+        else np.asarray(detected, np.float32).reshape(-1, 2)
+    )
     column, row = np.rint(corners).astype(np.intp).clip(0, np.array(depth_a.shape[::-1]) - 1).T
     depth = depth_a[row, column].astype(np.float64)
-    corners, depth = corners[depth > 0], depth[depth > 0]
+    corners = corners[depth > 0]
+    depth = depth[depth > 0]
     if len(corners) < MIN_INLIERS:
         return None, 0
-    tracked, status, _ = cv2.calcOpticalFlowPyrLK(grey_a, grey_b, corners[:, None], corners[:, None].copy())
+    tracked, status, _ = cv2.calcOpticalFlowPyrLK(
+        grey_a, grey_b, corners[:, None], corners[:, None].copy()
+    )
     good = status.reshape(-1) == 1
     if good.sum() < MIN_INLIERS:
         return None, 0
@@ -128,7 +142,8 @@ def relative_motion(
 class Replay:
     """A trajectory file as a tracker: each frame gets the pose with the nearest stamp.
 
-    A frame without a pose within the tolerance is lost; poses are not interpolated and keep the file's world frame.
+    A frame without a pose within the tolerance is lost; poses are not interpolated and keep the
+    file's world frame.
 
     Args:
         settings: The file and the tolerance.
@@ -152,4 +167,6 @@ class Replay:
         stats = {"stamp_gap_s": gap}
         if gap > self.settings.tolerance_s + 1e-9:  # rounding of the difference
             return TrackResult(T_world_cam=None, state="lost", stats=stats)
-        return TrackResult(T_world_cam=self._trajectory.T_world_cam[nearest].copy(), state="ok", stats=stats)
+        return TrackResult(
+            T_world_cam=self._trajectory.T_world_cam[nearest].copy(), state="ok", stats=stats
+        )

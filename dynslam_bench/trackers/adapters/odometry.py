@@ -1,7 +1,7 @@
 """Dense frame-to-frame odometries of OpenCV and Open3D: the chain of relative motions, and the alignments.
 
-OpenCV's is `cv2.Odometry` of OpenCV 5, or `cv2.rgbd` of the contrib packages of OpenCV 4. Open3D's is the multi-scale
-odometry of the tensor pipeline, on the CPU.
+OpenCV's is `cv2.Odometry` of OpenCV 5, or `cv2.rgbd` of the contrib packages of OpenCV 4. Open3D's
+is the multi-scale odometry of the tensor pipeline, on the CPU.
 """
 
 from __future__ import annotations
@@ -23,14 +23,17 @@ LEAST_DEPTH_PIXELS = 1000
 """Pixels with depth that an alignment needs."""
 MAX_FAILURES = 5
 """Lost frames in a row after which the chain continues from the newest frame."""
-INSTALL = "pip install 'opencv-python-headless>=5' (or, for OpenCV 4, opencv-contrib-python-headless)"
+INSTALL = (
+    "pip install 'opencv-python-headless>=5' (or, for OpenCV 4, opencv-contrib-python-headless)"
+)
 
 
 class FrameToFrame(ABC):
     """Chains the motions from frame to frame; subclasses align two RGB-D images of one camera.
 
-    A frame that cannot be aligned is lost. The next one is aligned to the last good frame again, at most five times in
-    a row; then the chain continues from the newest frame as if the camera had not moved since.
+    A frame that cannot be aligned is lost. The next one is aligned to the last good frame again, at
+    most five times in a row; then the chain continues from the newest frame as if the camera had
+    not moved since.
     """
 
     def __deepcopy__(self, memo: dict[int, Any]) -> FrameToFrame:
@@ -60,7 +63,8 @@ class FrameToFrame(ABC):
     def track(self, frame: Frame) -> TrackResult:
         """``initialising`` until a frame has depth, then ``ok``, or ``lost`` where it cannot be aligned."""
         start = time.perf_counter()
-        rgb, depth = frame.rgb, np.nan_to_num(frame.depth, nan=0.0, posinf=0.0, neginf=0.0)
+        rgb = frame.rgb
+        depth = np.nan_to_num(frame.depth, nan=0.0, posinf=0.0, neginf=0.0)
         if self._maps is not None:
             rgb = np.asarray(cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR), dtype=np.uint8)
             depth = np.asarray(cv2.remap(depth, *self._maps, cv2.INTER_NEAREST), dtype=np.float32)
@@ -86,7 +90,11 @@ class FrameToFrame(ABC):
 
 def unavailable() -> str:
     """How to get an OpenCV with RGB-D odometry; empty if this one has it."""
-    return "" if hasattr(cv2, "Odometry") or hasattr(cv2, "rgbd") else f"OpenCV {cv2.__version__} lacks it: {INSTALL}"
+    return (
+        ""
+        if hasattr(cv2, "Odometry") or hasattr(cv2, "rgbd")
+        else f"OpenCV {cv2.__version__} lacks it: {INSTALL}"
+    )
 
 
 class OpenCvOdometry(FrameToFrame):
@@ -97,19 +105,30 @@ class OpenCvOdometry(FrameToFrame):
 
     def start(self, camera: Camera) -> None:
         """Set up that of the OpenCV at hand."""
-        settings, matrix = self.settings, camera.matrix.astype(np.float32)
+        settings = self.settings
+        matrix = camera.matrix.astype(np.float32)
         if hasattr(cv2, "Odometry"):
             options = cv2.OdometrySettings()
             options.setCameraMatrix(matrix)
             options.setMinDepth(settings.min_depth_m)
             options.setMaxDepth(settings.max_depth_m)
             options.setMaxDepthDiff(settings.max_depth_difference_m)
-            kinds = {"rgbd": cv2.OdometryType_RGB_DEPTH, "icp": cv2.OdometryType_DEPTH, "rgb": cv2.OdometryType_RGB}
+            kinds = {
+                "rgbd": cv2.OdometryType_RGB_DEPTH,
+                "icp": cv2.OdometryType_DEPTH,
+                "rgb": cv2.OdometryType_RGB,
+            }
             # OdometryAlgoType_FAST fails for colour alone in 5.0.0 and was no faster here
-            self._odometry: Any = cv2.Odometry(kinds[settings.method], options, cv2.OdometryAlgoType_COMMON)
+            self._odometry: Any = cv2.Odometry(
+                kinds[settings.method], options, cv2.OdometryAlgoType_COMMON
+            )
         else:
             rgbd: Any = getattr(cv2, "rgbd")  # noqa: B009 - only the contrib packages of OpenCV 4 have it
-            names = {"rgbd": "RgbdICPOdometry_create", "icp": "ICPOdometry_create", "rgb": "RgbdOdometry_create"}
+            names = {
+                "rgbd": "RgbdICPOdometry_create",
+                "icp": "ICPOdometry_create",
+                "rgb": "RgbdOdometry_create",
+            }
             self._odometry = getattr(rgbd, names[settings.method])(
                 matrix,
                 minDepth=settings.min_depth_m,
@@ -119,7 +138,8 @@ class OpenCvOdometry(FrameToFrame):
 
     def prepare(self, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> Any:
         """OpenCV 5's frame, or the arguments of OpenCV 4: intensities, depth (missing is NaN) and its mask."""
-        grey, measured = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.where(depth > 0, depth, np.float32(np.nan))
+        grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+        measured = np.where(depth > 0, depth, np.float32(np.nan))
         if hasattr(cv2, "Odometry"):
             return cv2.OdometryFrame(measured, grey)
         return grey, measured, (depth > 0).astype(np.uint8) * 255
@@ -148,7 +168,8 @@ class Open3dOdometry(FrameToFrame):
         """Set up Open3D's multi-scale alignment."""
         import open3d as o3d
 
-        settings, odometry = self.settings, o3d.t.pipelines.odometry
+        settings = self.settings
+        odometry = o3d.t.pipelines.odometry
         self._o3d = o3d
         method = {
             "hybrid": odometry.Method.Hybrid,
@@ -175,7 +196,13 @@ class Open3dOdometry(FrameToFrame):
         """The motion that Open3D finds."""
         try:
             with self._o3d.utility.VerbosityContextManager(self._o3d.utility.VerbosityLevel.Error):
-                result = self._o3d.t.pipelines.odometry.rgbd_odometry_multi_scale(current, reference, *self._arguments)
+                result = self._o3d.t.pipelines.odometry.rgbd_odometry_multi_scale(
+                    current, reference, *self._arguments
+                )
         except RuntimeError:  # singular: too little texture or depth
             return None
-        return np.asarray(result.transformation.numpy(), dtype=np.float64) if result.fitness > 0 else None
+        return (
+            np.asarray(result.transformation.numpy(), dtype=np.float64)
+            if result.fitness > 0
+            else None
+        )

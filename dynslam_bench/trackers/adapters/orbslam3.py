@@ -10,11 +10,21 @@ from pathlib import Path
 from typing import Any
 
 from dynslam_bench.contracts import TrackerContext
-from dynslam_bench.core import MEGABYTE, TrackerError, raising, read_bytes, vocabularies_folder, write_atomic
+from dynslam_bench.core import (
+    MEGABYTE,
+    TrackerError,
+    raising,
+    read_bytes,
+    vocabularies_folder,
+    write_atomic,
+)
 from dynslam_bench.core.plugins import module_command
 from dynslam_bench.geometry import Camera
 from dynslam_bench.trackers.adapters.specs import OrbSlam3Settings
-from dynslam_bench.trackers.adapters.subprocess_tracker import FinalizingProgramTracker, ProgramTracker
+from dynslam_bench.trackers.adapters.subprocess_tracker import (
+    FinalizingProgramTracker,
+    ProgramTracker,
+)
 
 ENVIRONMENT_VARIABLE = "DYNSLAM_BENCH_ORB_VOCABULARY"
 HINT = (
@@ -103,7 +113,9 @@ def _check(text: bytes, path: Path) -> None:
             HINT,
         )
     if fault := _first_fault(text.rstrip().splitlines()[1:]):
-        raise TrackerError(f"orbslam3: the vocabulary {path} ({len(lines)} lines) is damaged: {fault}", HINT)
+        raise TrackerError(
+            f"orbslam3: the vocabulary {path} ({len(lines)} lines) is damaged: {fault}", HINT
+        )
 
 
 def _first_fault(nodes: Iterable[bytes]) -> str:
@@ -119,7 +131,11 @@ def _first_fault(nodes: Iterable[bytes]) -> str:
         childless.discard(parent)
         if tokens[1] == b"0":
             childless.add(node)
-    return f"{len(childless)} inner nodes have no children, as if its end were missing" if childless else ""
+    return (
+        f"{len(childless)} inner nodes have no children, as if its end were missing"
+        if childless
+        else ""
+    )
 
 
 WORKER = "dynslam_bench.trackers.adapters.orbslam3_worker"
@@ -135,8 +151,8 @@ _VIEWER = (
 class OrbSlam3Program(ProgramTracker):
     """ORB-SLAM3, untouched: its own threads, loop closing and relocalisation included.
 
-    It runs in a child process: ORB-SLAM3 ends its process on bad input, writes to standard output and cannot be
-    stopped otherwise.
+    It runs in a child process: ORB-SLAM3 ends its process on bad input, writes to standard output
+    and cannot be stopped otherwise.
 
     Args:
         settings: What goes into its settings file, the vocabulary, and time limits.
@@ -150,7 +166,8 @@ class OrbSlam3Program(ProgramTracker):
     """ORB-SLAM3's name of the sensor."""
 
     def __init__(self, settings: OrbSlam3Settings, context: TrackerContext) -> None:
-        self.settings, self._vocabulary = settings, find_vocabulary(settings.vocabulary)
+        self._vocabulary = find_vocabulary(settings.vocabulary)
+        self.settings = settings
         super().__init__("orbslam3", settings, context, module_command(WORKER))
 
     def options(self, camera: Camera, folder: Path) -> dict[str, Any]:
@@ -162,7 +179,11 @@ class OrbSlam3Program(ProgramTracker):
         check_camera(camera, self.settings)
         path = folder / "settings.yaml"
         path.write_text(settings_yaml(camera, self.settings, self.context.fps))
-        return {"vocabulary": str(self._vocabulary), "settings_file": str(path), "sensor": self.sensor}
+        return {
+            "vocabulary": str(self._vocabulary),
+            "settings_file": str(path),
+            "sensor": self.sensor,
+        }
 
 
 class OrbSlam3(OrbSlam3Program, FinalizingProgramTracker):
@@ -181,7 +202,8 @@ def check_camera(camera: Camera, settings: OrbSlam3Settings) -> None:
     """Refuse cameras with which ORB-SLAM3 crashes or returns meaningless poses.
 
     Raises:
-        TrackerError: Another camera model, intrinsics that are none, or an image too small for the pyramid.
+        TrackerError: Another camera model, intrinsics that are none, or an image too small for the
+            pyramid.
     """
     if type(camera) is not Camera or len(camera.distortion) != 5:
         raise TrackerError(
@@ -189,7 +211,10 @@ def check_camera(camera: Camera, settings: OrbSlam3Settings) -> None:
             "its RGB-D mode knows the pinhole camera with k1 k2 p1 p2 k3 only; undistort the images",
         )
     values = (camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline_m, *camera.distortion)
-    if not all(math.isfinite(value) for value in values) or min(camera.fx, camera.fy, camera.baseline_m) <= 0:
+    if (
+        not all(math.isfinite(value) for value in values)
+        or min(camera.fx, camera.fy, camera.baseline_m) <= 0
+    ):
         raise TrackerError(
             f"orbslam3 cannot take the camera fx={camera.fx:g} fy={camera.fy:g} cx={camera.cx:g} cy={camera.cy:g} "
             f"baseline={camera.baseline_m:g} m distortion={camera.distortion}",
@@ -197,9 +222,8 @@ def check_camera(camera: Camera, settings: OrbSlam3Settings) -> None:
         )
     shrunk = settings.scale_factor ** (settings.levels - 1)
     columns, rows = (round(side / shrunk) - 2 * BORDER_PX for side in (camera.width, camera.height))
-    size = (
-        f"images of {camera.width}x{camera.height} with {settings.levels} pyramid levels of {settings.scale_factor:g}"
-    )
+    pyramid = f"{settings.levels} pyramid levels of {settings.scale_factor:g}"
+    size = f"images of {camera.width}x{camera.height} with {pyramid}"
     if min(columns, rows) < 1:
         raise TrackerError(
             f"orbslam3 cannot take {size}: the smallest level has no pixel inside its border of {BORDER_PX}",
@@ -212,7 +236,9 @@ def check_camera(camera: Camera, settings: OrbSlam3Settings) -> None:
         )
 
 
-def settings_yaml(camera: Camera, settings: OrbSlam3Settings, fps: float, depth_factor: float = 1.0) -> str:
+def settings_yaml(
+    camera: Camera, settings: OrbSlam3Settings, fps: float, depth_factor: float = 1.0
+) -> str:
     """ORB-SLAM3's settings file (format 1.0) for images of this camera; depth comes in metres unless a factor says."""
     k1, k2, p1, p2, k3 = camera.distortion
     numbers = {

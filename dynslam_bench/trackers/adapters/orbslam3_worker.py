@@ -34,10 +34,14 @@ class Worker:
         self._final: list[list[float]] | None = None
         self._slam: Any = pyorbslam3.Slam(options["vocabulary"], options["settings_file"], sensor)
 
-    def track(self, index: int, timestamp: float, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> dict[str, Any]:
+    def track(
+        self, index: int, timestamp: float, rgb: NDArray[np.uint8], depth: NDArray[np.float32]
+    ) -> dict[str, Any]:
         """One frame; without depth in monocular mode."""
         if self._final is not None:
-            raise RuntimeError("finalize() has stopped ORB-SLAM3's threads: only reset() starts again")
+            raise RuntimeError(
+                "finalize() has stopped ORB-SLAM3's threads: only reset() starts again"
+            )
         start = time.perf_counter()
         image = np.ascontiguousarray(rgb)
         if self._monocular:
@@ -46,7 +50,11 @@ class Worker:
             result = self._slam.track_rgbd(image, np.ascontiguousarray(depth), timestamp)
         seconds = time.perf_counter() - start
         state = STATES.get(result.state.name, "initialising")
-        pose = None if result.pose_wc is None or state == "initialising" else result.pose_wc.astype(float).tolist()
+        pose = (
+            None
+            if result.pose_wc is None or state == "initialising"
+            else result.pose_wc.astype(float).tolist()
+        )
         if state == "ok" and pose is None:
             state = "lost"
         if state == "ok":
@@ -55,14 +63,19 @@ class Worker:
         return {
             "state": state,
             "T_world_cam": pose,
-            "stats": {"keypoints": float(len(self._slam.tracked_keypoints())), "matches": points, "inliers": points},
+            "stats": {
+                "keypoints": float(len(self._slam.tracked_keypoints())),
+                "matches": points,
+                "inliers": points,
+            },
             "timings": {"tracking": seconds},
         }
 
     def finalize(self) -> list[list[float]]:
         """Stop the threads; the poses of all frames that were tracked, after its last optimisation.
 
-        Its file also holds predicted poses of lost frames, and repeats a stamp where a frame had no pose at all.
+        Its file also holds predicted poses of lost frames, and repeats a stamp where a frame had no
+        pose at all.
         """
         if self._final is not None:
             return self._final
@@ -70,9 +83,12 @@ class Worker:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "final.txt"
             self._slam.save_trajectory_tum(str(path))
-            rows = [[float(value) for value in line.split()] for line in path.read_text().splitlines()]
+            rows = [
+                [float(value) for value in line.split()] for line in path.read_text().splitlines()
+            ]
         own = {f"{stamp:.6f}": stamp for stamp in self._tracked}  # the file rounds the stamps
-        named = [(own.get(f"{stamp:.6f}"), pose) for stamp, *pose in reversed(rows)]  # the first of a stamp counts
+        # the first of a stamp counts
+        named = [(own.get(f"{stamp:.6f}"), pose) for stamp, *pose in reversed(rows)]
         poses = {stamp: [stamp, *pose] for stamp, pose in named if stamp is not None}
         self._final = [poses[stamp] for stamp in sorted(poses)]
         return self._final

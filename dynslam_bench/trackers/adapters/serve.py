@@ -21,14 +21,17 @@ def serve(
 ) -> None:
     """Answer requests on standard input until ``close`` or its end.
 
-    Whatever is written to standard output in the meantime, by C++ threads too, goes to standard error, so that it
-    cannot get between the answers. The process also ends when its parent has died. An exception becomes an ``error``
-    answer. Only images handed over as ``raw`` are understood.
+    Whatever is written to standard output in the meantime, by C++ threads too, goes to standard
+    error, so that it cannot get between the answers. The process also ends when its parent has
+    died. An exception becomes an ``error`` answer. Only images handed over as ``raw`` are
+    understood.
 
     Args:
         reset: Called with the ``reset`` request.
-        track: Called with index, stamp, colour ``[H, W, 3]`` and depth ``[H, W]``; returns the answer's fields.
-        finalize: Returns rows ``[timestamp, tx, ty, tz, qx, qy, qz, qw]``; None if there is no final trajectory.
+        track: Called with index, stamp, colour ``[H, W, 3]`` and depth ``[H, W]``; returns the
+            answer's fields.
+        finalize: Returns rows ``[timestamp, tx, ty, tz, qx, qy, qz, qw]``; None if there is no
+            final trajectory.
     """
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     sys.stdout.flush()
@@ -37,10 +40,12 @@ def serve(
     images: tuple[NDArray[np.uint8], NDArray[np.float32]] | None = None
     for line in sys.stdin:
         request = json.loads(line)
-        operation, answer = request.get("op"), Answer()
+        operation = request.get("op")
+        answer = Answer()
         try:
             if operation == "reset":
-                images, answer = map_images(request), {"ok": True}
+                images = map_images(request)
+                answer = {"ok": True}
                 reset(request)
             elif operation == "track":
                 if images is None:
@@ -65,14 +70,21 @@ def map_images(request: dict[str, Any]) -> tuple[NDArray[np.uint8], NDArray[np.f
     Raises:
         ValueError: The images do not come as ``raw``.
     """
-    images, camera = request["images"], request["camera"]
+    images = request["images"]
+    camera = request["camera"]
     if images["mode"] != "raw":
-        raise ValueError(f"images come as '{images['mode']}', only 'raw' is understood; set images=raw")
-    height, width = int(camera["height"]), int(camera["width"])
+        raise ValueError(
+            f"images come as '{images['mode']}', only 'raw' is understood; set images=raw"
+        )
+    height = int(camera["height"])
+    width = int(camera["width"])
     memory = np.memmap(images["file"], np.uint8, "r", shape=(int(images["bytes"]),))
-    start, depth_start = int(images["rgb_offset"]), int(images["depth_offset"])
+    start = int(images["rgb_offset"])
+    depth_start = int(images["depth_offset"])
     rgb = memory[start : start + height * width * 3].reshape(height, width, 3)
-    depth = memory[depth_start : depth_start + height * width * 4].view("<f4").reshape(height, width)
+    depth = (
+        memory[depth_start : depth_start + height * width * 4].view("<f4").reshape(height, width)
+    )
     return rgb, depth
 
 

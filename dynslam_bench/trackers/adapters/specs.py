@@ -38,10 +38,15 @@ class ReplaySettings(Settings):
     """Settings of `replay:FILE`."""
 
     file: str = names(
-        "", "file", meaning="trajectory file in TUM format (timestamp tx ty tz qx qy qz qw, camera to world)"
+        "",
+        "file",
+        meaning="trajectory file in TUM format (timestamp tx ty tz qx qy qz qw, camera to world)",
     )
     tolerance_s: float = Field(
-        0.01, gt=0, le=1, description="largest difference in seconds between a frame's stamp and its pose's"
+        0.01,
+        gt=0,
+        le=1,
+        description="largest difference in seconds between a frame's stamp and its pose's",
     )
 
     def verify(self) -> None:
@@ -49,7 +54,9 @@ class ReplaySettings(Settings):
         from dynslam_bench.geometry import read_tum
 
         if not self.file.strip():
-            raise SettingsError("replay needs a trajectory file", "write replay:FILE or --set file=FILE")
+            raise SettingsError(
+                "replay needs a trajectory file", "write replay:FILE or --set file=FILE"
+            )
         read_tum(Path(self.file).expanduser())
 
 
@@ -60,27 +67,41 @@ ExitCode = Annotated[int, Field(ge=-64, le=255)]
 class ProgramSettings(Settings):
     """Time limits of an external program."""
 
-    start_timeout_s: float = Field(120.0, gt=0, description="seconds for starting and answering `reset`")
+    start_timeout_s: float = Field(
+        120.0, gt=0, description="seconds for starting and answering `reset`"
+    )
     frame_timeout_s: float = Field(30.0, gt=0, description="seconds for answering one `track`")
     final_timeout_s: float = Field(120.0, gt=0, description="seconds for answering `finalize`")
-    close_timeout_s: float = Field(5.0, gt=0, description="seconds for ending after `close` before it is killed")
+    close_timeout_s: float = Field(
+        5.0, gt=0, description="seconds for ending after `close` before it is killed"
+    )
 
 
 class SubprocessSettings(ProgramSettings):
     """Settings of `subprocess:COMMAND`."""
 
-    command: str = Field("", description="program and arguments, split as a shell would; run without a shell")
+    command: str = Field(
+        "", description="program and arguments, split as a shell would; run without a shell"
+    )
     images: Literal["raw", "png"] = Field(
-        "raw", description="raw: one memory-mapped file, overwritten at each frame; png: two PNG files a frame"
+        "raw",
+        description="raw: one memory-mapped file, overwritten at each frame; png: two PNG files a frame",
     )
     folder: str = Field("", description="working folder of the program; empty for the current one")
-    version: str = Field("", description="free text, part of a run's identity; change it with the program")
-    final: bool = Field(False, description="whether the program answers `finalize` with a final trajectory")
+    version: str = Field(
+        "", description="free text, part of a run's identity; change it with the program"
+    )
+    final: bool = Field(
+        False, description="whether the program answers `finalize` with a final trajectory"
+    )
     exit_codes: tuple[ExitCode, ...] = Field(
-        (0,), min_length=1, description="exit codes after `close` that are no failure; -N: killed by signal N"
+        (0,),
+        min_length=1,
+        description="exit codes after `close` that are no failure; -N: killed by signal N",
     )
     environment: tuple[str, ...] = Field(
-        (), description="names of environment variables that the program gets beside the usual ones; their values count"
+        (),
+        description="names of environment variables that the program gets beside the usual ones; their values count",
     )
 
     def words(self) -> list[str]:
@@ -89,7 +110,9 @@ class SubprocessSettings(ProgramSettings):
         Raises:
             SettingsError: There are none, or its quotes do not match.
         """
-        with raising(SettingsError, f"subprocess: cannot split the command '{self.command}'", of=ValueError):
+        with raising(
+            SettingsError, f"subprocess: cannot split the command '{self.command}'", of=ValueError
+        ):
             command = shlex.split(self.command)
         if not command:
             hint = "write 'subprocess:PROGRAM ARGUMENTS' or --set command=..."
@@ -103,12 +126,20 @@ class SubprocessSettings(ProgramSettings):
 
     def verify(self) -> None:
         """The program and its folder must be there."""
-        command, folder = self.words(), self.working_folder
+        command = self.words()
+        folder = self.working_folder
         if not folder.is_dir():
             raise SettingsError(f"subprocess: no folder {folder}")
-        program = command[0] if os.sep not in command[0] else str((folder / Path(command[0]).expanduser()).absolute())
+        program = (
+            command[0]
+            if os.sep not in command[0]
+            else str((folder / Path(command[0]).expanduser()).absolute())
+        )
         if shutil.which(program) is None:
-            raise SettingsError(f"subprocess: cannot start '{command[0]}': no such program", "check its path and mode")
+            raise SettingsError(
+                f"subprocess: cannot start '{command[0]}': no such program",
+                "check its path and mode",
+            )
 
 
 class BatchProgram(Record):
@@ -116,15 +147,17 @@ class BatchProgram(Record):
 
     Attributes:
         name: Shown in tables.
-        command: Program and arguments, run without a shell. ``{sequence}`` (a folder in TUM layout), ``{camera}``
-            (ORB-SLAM's YAML), ``{associations}``, ``{output}``, ``{folder}`` (which holds these), ``{threads}``,
-            ``{here}`` (the TOML file's folder) and ``{python}`` (this one) are put in. A word that names a file below
-            the TOML file's folder is that file.
+        command: Program and arguments, run without a shell. ``{sequence}`` (a folder in TUM
+            layout), ``{camera}`` (ORB-SLAM's YAML), ``{associations}``, ``{output}``, ``{folder}``
+            (which holds these), ``{threads}``, ``{here}`` (the TOML file's folder) and ``{python}``
+            (this one) are put in. A word that names a file below the TOML file's folder is that
+            file.
         output: What it writes, a relative path in its working folder, which is new for every run.
         exit_codes: Exit codes that are no failure; -N if signal N killed it.
-        environment: Names of environment variables that it gets beside the usual ones; their values count in a run's
-            identity.
-        format: ``tum`` (stamp tx ty tz qx qy qz qw, camera to world), or ``indices``: the frame's index for the stamp.
+        environment: Names of environment variables that it gets beside the usual ones; their values
+            count in a run's identity.
+        format: ``tum`` (stamp tx ty tz qx qy qz qw, camera to world), or ``indices``: the frame's
+            index for the stamp.
         sensors: ``rgb`` for a program without depth.
         version: Part of a run's identity.
         license: SPDX id.
@@ -160,7 +193,9 @@ class BatchProgram(Record):
     def words(self, here: Path, **places: str) -> list[str]:
         """The command with these paths for its placeholders."""
         words = [
-            str(here / word) if re.search(r"[./]", word) and (here / word).is_file() and word != self.output else word
+            str(here / word)
+            if re.search(r"[./]", word) and (here / word).is_file() and word != self.output
+            else word
             for word in self.command
         ]
         for name, place in {"here": str(here), "python": sys.executable, **places}.items():
@@ -171,7 +206,9 @@ class BatchProgram(Record):
 class BatchSettings(Settings):
     """Settings of `batch:FILE`."""
 
-    program: str = names("", "file", meaning="TOML file that describes the program, see docs/how-to/program.md")
+    program: str = names(
+        "", "file", meaning="TOML file that describes the program, see docs/how-to/program.md"
+    )
     timeout_s: float = Field(3600.0, gt=0, description="seconds that the program may take")
 
     @property
@@ -186,7 +223,9 @@ class BatchSettings(Settings):
             SettingsError: The file is missing or damaged.
         """
         if not self.program.strip():
-            raise SettingsError("batch needs a file that describes the program", "write batch:FILE.toml")
+            raise SettingsError(
+                "batch needs a file that describes the program", "write batch:FILE.toml"
+            )
         document = read_toml(self.path, kind=SettingsError)
         return validated(BatchProgram, document, str(self.path), SettingsError), self.path.parent
 
@@ -195,7 +234,9 @@ class BatchSettings(Settings):
         program, here = self.read()
         first = program.words(here)[0]
         if shutil.which(first) is None:
-            raise SettingsError(f"batch: cannot start '{first}': no such program", f"see command in {self.path}")
+            raise SettingsError(
+                f"batch: cannot start '{first}': no such program", f"see command in {self.path}"
+            )
 
 
 class OrbSlam3Settings(ProgramSettings):
@@ -208,25 +249,45 @@ class OrbSlam3Settings(ProgramSettings):
         meaning="DBoW2 text vocabulary (.txt or .txt.xz); empty for $DYNSLAM_BENCH_ORB_VOCABULARY",
     )
     features: int = tunable(
-        1000, meaning="ORB features a frame", low=500, high=2500, scale="log", limits=(100, 10000), unit="features"
+        1000,
+        meaning="ORB features a frame",
+        low=500,
+        high=2500,
+        scale="log",
+        limits=(100, 10000),
+        unit="features",
     )
-    levels: int = tunable(8, meaning="levels of the image pyramid", low=4, high=12, limits=(1, 16), unit="levels")
+    levels: int = tunable(
+        8, meaning="levels of the image pyramid", low=4, high=12, limits=(1, 16), unit="levels"
+    )
     scale_factor: float = tunable(
         1.2, meaning="scale between levels of the pyramid", low=1.1, high=1.5, limits=(1.01, 3.0)
     )
-    fast_threshold: int = tunable(20, meaning="first FAST threshold of a cell", low=7, high=40, limits=(1, 255))
+    fast_threshold: int = tunable(
+        20, meaning="first FAST threshold of a cell", low=7, high=40, limits=(1, 255)
+    )
     min_fast_threshold: int = tunable(
-        7, meaning="FAST threshold of a cell where the first finds nothing", low=3, high=20, limits=(1, 255)
+        7,
+        meaning="FAST threshold of a cell where the first finds nothing",
+        low=3,
+        high=20,
+        limits=(1, 255),
     )
     close_depth_baselines: float = tunable(
-        40.0, meaning="points nearer than this many baselines count as close", low=20, high=80, limits=(1, 1000)
+        40.0,
+        meaning="points nearer than this many baselines count as close",
+        low=20,
+        high=80,
+        limits=(1, 1000),
     )
 
 
 class SvoSettings(ProgramSettings):
     """Settings of `svo`."""
 
-    features: int = tunable(120, meaning="features a frame", low=60, high=400, scale="log", limits=(20, 5000))
+    features: int = tunable(
+        120, meaning="features a frame", low=60, high=400, scale="log", limits=(20, 5000)
+    )
     init_disparity_px: float = tunable(
         50.0,
         meaning="median disparity at which the map begins",
@@ -237,7 +298,12 @@ class SvoSettings(ProgramSettings):
         unit="px",
     )
     max_lost_features: int = tunable(
-        40, meaning="a frame that loses more features is lost", low=20, high=400, scale="log", limits=(1, None)
+        40,
+        meaning="a frame that loses more features is lost",
+        low=20,
+        high=400,
+        scale="log",
+        limits=(1, None),
     )
 
 
@@ -247,10 +313,19 @@ class OpenCvOdometrySettings(Settings):
     method: Literal["rgbd", "icp", "rgb"] = tunable(
         "rgbd", meaning="what is aligned: colour and depth, depth alone, or colour alone"
     )
-    min_depth_m: float = tunable(0.1, meaning="nearest depth that is used", low=0.05, high=1.0, unit="m")
-    max_depth_m: float = tunable(8.0, meaning="farthest depth that is used", low=3.0, high=10.0, unit="m")
+    min_depth_m: float = tunable(
+        0.1, meaning="nearest depth that is used", low=0.05, high=1.0, unit="m"
+    )
+    max_depth_m: float = tunable(
+        8.0, meaning="farthest depth that is used", low=3.0, high=10.0, unit="m"
+    )
     max_depth_difference_m: float = tunable(
-        0.07, meaning="largest depth difference of corresponding pixels", low=0.02, high=0.3, scale="log", unit="m"
+        0.07,
+        meaning="largest depth difference of corresponding pixels",
+        low=0.02,
+        high=0.3,
+        scale="log",
+        unit="m",
     )
 
 
@@ -260,11 +335,20 @@ class Open3dOdometrySettings(Settings):
     method: Literal["hybrid", "intensity", "point-to-plane"] = tunable(
         "hybrid", meaning="cost: colour and depth, colour alone, or point to plane"
     )
-    max_depth_m: float = tunable(8.0, meaning="farthest depth that is used", low=3.0, high=10.0, unit="m")
-    max_depth_difference_m: float = tunable(
-        0.07, meaning="largest depth difference of corresponding pixels", low=0.02, high=0.3, scale="log", unit="m"
+    max_depth_m: float = tunable(
+        8.0, meaning="farthest depth that is used", low=3.0, high=10.0, unit="m"
     )
-    iterations_coarse: int = tunable(10, meaning="iterations at a quarter of the resolution", low=5, high=40)
+    max_depth_difference_m: float = tunable(
+        0.07,
+        meaning="largest depth difference of corresponding pixels",
+        low=0.02,
+        high=0.3,
+        scale="log",
+        unit="m",
+    )
+    iterations_coarse: int = tunable(
+        10, meaning="iterations at a quarter of the resolution", low=5, high=40
+    )
     iterations_middle: int = tunable(5, meaning="iterations at half the resolution", low=2, high=40)
     iterations_fine: int = tunable(3, meaning="iterations at full resolution", low=1, high=40)
 

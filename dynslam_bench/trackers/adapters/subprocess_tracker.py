@@ -56,17 +56,18 @@ CAMERA_FIELDS = ("width", "height", "fx", "fy", "cx", "cy", "baseline_m", "reado
 class Program:
     """One run of an external program.
 
-    Requests go to its standard input, one JSON object a line; it answers each with one JSON object a line on its
-    standard output. Lines that do not begin with ``{`` are log output and skipped, as is its standard error; the last
-    ones are kept for error messages, all of them go to `LOGGER`. It has a session of its own, so that its child
-    processes end with it. It should end by itself at the end of its standard input; on Linux it is killed when the
-    process that started it dies.
+    Requests go to its standard input, one JSON object a line; it answers each with one JSON object
+    a line on its standard output. Lines that do not begin with ``{`` are log output and skipped, as
+    is its standard error; the last ones are kept for error messages, all of them go to `LOGGER`. It
+    has a session of its own, so that its child processes end with it. It should end by itself at
+    the end of its standard input; on Linux it is killed when the process that started it dies.
 
     Args:
         name: For messages.
         command: Program and arguments.
         folder: Its working folder; None for the current one.
-        environment: All environment variables that it gets; None for those of `program_environment`.
+        environment: All environment variables that it gets; None for those of
+            `program_environment`.
 
     Raises:
         TrackerError: The program cannot be started.
@@ -81,7 +82,12 @@ class Program:
         environment: Mapping[str, str] | None = None,
     ) -> None:
         self.name = name
-        with raising(TrackerError, f"{name}: cannot start '{command[0]}'", "check its path", of=(OSError, ValueError)):
+        with raising(
+            TrackerError,
+            f"{name}: cannot start '{command[0]}'",
+            "check its path",
+            of=(OSError, ValueError),
+        ):
             self._process = subprocess.Popen(
                 list(command),
                 stdin=subprocess.PIPE,
@@ -93,10 +99,16 @@ class Program:
                 preexec_fn=end_with_parent(),
             )
         self._kill = weakref.finalize(self, _kill_group, self._process)
-        self._answers: queue.SimpleQueue[str | None] = queue.SimpleQueue()  # None: standard output has ended
-        self._old_lines, self._new_lines = dict[str, str](), dict[str, str]()  # new: since the last request
+        # None: standard output has ended
+        self._answers: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        # new: since the last request
+        self._old_lines, self._new_lines = dict[str, str](), dict[str, str]()
         self._readers = [
-            threading.Thread(target=_read, args=(name, channel, stream, self._answers, self._new_lines), daemon=True)
+            threading.Thread(
+                target=_read,
+                args=(name, channel, stream, self._answers, self._new_lines),
+                daemon=True,
+            )
             for channel, stream in (("out", self._process.stdout), ("err", self._process.stderr))
         ]
         for reader in self._readers:
@@ -111,7 +123,8 @@ class Program:
             doing: For messages, e.g. ``at frame 12``.
 
         Raises:
-            TrackerError: It died, did not answer in time, answered no JSON object, or answered ``{"error": ...}``.
+            TrackerError: It died, did not answer in time, answered no JSON object, or answered
+                ``{"error": ...}``.
         """
         self._old_lines.update(self._new_lines)
         self._new_lines.clear()
@@ -123,16 +136,22 @@ class Program:
         except queue.Empty:
             line_shown = f"; its last line: '{self._last_line()}'" if self._last_line() else ""
             self.kill()
-            raise TrackerError(f"{self.name} {doing}: no answer within {timeout_s:g} s, killed{line_shown}") from None
+            raise TrackerError(
+                f"{self.name} {doing}: no answer within {timeout_s:g} s, killed{line_shown}"
+            ) from None
         if text is None:
             raise self._death(doing)
         try:
             answer = parse_answer(text)
         except TrackerError as error:
             self.kill()
-            raise TrackerError(f"{self.name} {doing}: {error.args[0]}", "one JSON object a line") from None
+            raise TrackerError(
+                f"{self.name} {doing}: {error.args[0]}", "one JSON object a line"
+            ) from None
         if answer.get("error"):
-            raise TrackerError(f"{self.name} {doing}: {' '.join(str(answer['error']).split())[:400]}")
+            raise TrackerError(
+                f"{self.name} {doing}: {' '.join(str(answer['error']).split())[:400]}"
+            )
         return answer
 
     def close(self, timeout_s: float) -> int | None:
@@ -152,9 +171,13 @@ class Program:
 
     def ending(self, code: int) -> str:
         """How it ended, with its last line, in words."""
-        shown = f"its last line: '{self._last_line()}'" if self._last_line() else "it wrote no message"
+        shown = (
+            f"its last line: '{self._last_line()}'" if self._last_line() else "it wrote no message"
+        )
         ended = (
-            f"was killed by signal {-code} ({signal.strsignal(-code)})" if code < 0 else f"ended with exit code {code}"
+            f"was killed by signal {-code} ({signal.strsignal(-code)})"
+            if code < 0
+            else f"ended with exit code {code}"
         )
         return f"the program {ended}; {shown}"
 
@@ -172,8 +195,8 @@ class Program:
     def _last_line(self) -> str:
         """The last line of its log.
 
-        Lines since the last request count before earlier ones, and standard error before standard output, which often
-        arrives late, when it is flushed at the end.
+        Lines since the last request count before earlier ones, and standard error before standard
+        output, which often arrives late, when it is flushed at the end.
         """
         lines = (self._new_lines.get("err"), self._new_lines.get("out"), self._old_lines.get("err"))
         return next(filter(None, lines), self._old_lines.get("out", ""))
@@ -189,7 +212,11 @@ class Program:
 
 
 def _read(
-    name: str, channel: str, stream: IO[bytes], answers: queue.SimpleQueue[str | None], lines: dict[str, str]
+    name: str,
+    channel: str,
+    stream: IO[bytes],
+    answers: queue.SimpleQueue[str | None],
+    lines: dict[str, str],
 ) -> None:
     """Sort the lines of a program's output into answers and log until it ends; runs in a thread of its own."""
     with stream:
@@ -223,7 +250,8 @@ def end_with_parent() -> Callable[[], object] | None:
     """
     if sys.platform != "linux" or threading.current_thread() is not threading.main_thread():
         return None
-    prctl = ctypes.CDLL(None).prctl  # loaded here: between fork and exec as little as possible is done
+    # loaded here: between fork and exec as little as possible is done
+    prctl = ctypes.CDLL(None).prctl
     return lambda: prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
 
 
@@ -239,7 +267,9 @@ def _kill_group(process: subprocess.Popen[bytes]) -> None:
         process.stdin.close()
 
 
-def read_track_answer(answer: Mapping[str, Any], frame: Frame, who: str, elapsed_s: Callable[[], float]) -> TrackResult:
+def read_track_answer(
+    answer: Mapping[str, Any], frame: Frame, who: str, elapsed_s: Callable[[], float]
+) -> TrackResult:
     """The result of one frame.
 
     Args:
@@ -251,8 +281,14 @@ def read_track_answer(answer: Mapping[str, Any], frame: Frame, who: str, elapsed
     Raises:
         TrackerError: It is no valid result, see `faults`.
     """
-    value, fitting = answer.get("T_world_cam"), (AttributeError, TypeError, ValueError, OverflowError)
-    with raising(TrackerError, f"{who}: T_world_cam is not 16 numbers", "row by row, camera to world", of=fitting):
+    value = answer.get("T_world_cam")
+    fitting = (AttributeError, TypeError, ValueError, OverflowError)
+    with raising(
+        TrackerError,
+        f"{who}: T_world_cam is not 16 numbers",
+        "row by row, camera to world",
+        of=fitting,
+    ):
         pose = None if value is None else np.asarray(value, dtype=np.float64).reshape(4, 4)
     with raising(TrackerError, f"{who}: stats and timings are not objects of numbers", of=fitting):
         stats, timings = (
@@ -291,11 +327,12 @@ def read_final_answer(answer: Mapping[str, Any], who: str) -> Trajectory:
 class ImageExchange:
     """A private folder through which the frames reach a program; removed by `close`, at the latest with the object.
 
-    ``raw``: one file ``frame.raw`` of fixed size, in shared memory where the system has it. It holds the colour image
-    (uint8 ``[H, W, 3]``, red first, row by row) at `rgb_offset` and the depth (little-endian float32 ``[H, W]``,
-    metres, 0 = missing) at `depth_offset`, and is overwritten before each ``track``. ``png``: for each frame an 8-bit
-    colour PNG and a 16-bit depth PNG in units of ``1 / depth_factor`` metres, as in TUM's files; those of the frame
-    before are removed.
+    ``raw``: one file ``frame.raw`` of fixed size, in shared memory where the system has it. It
+    holds the colour image (uint8 ``[H, W, 3]``, red first, row by row) at `rgb_offset` and the
+    depth (little-endian float32 ``[H, W]``, metres, 0 = missing) at `depth_offset`, and is
+    overwritten before each ``track``. ``png``: for each frame an 8-bit colour PNG and a 16-bit
+    depth PNG in units of ``1 / depth_factor`` metres, as in TUM's files; those of the frame before
+    are removed.
 
     Args:
         camera: Of the frames.
@@ -303,7 +340,8 @@ class ImageExchange:
     """
 
     def __init__(self, camera: Camera, mode: Literal["raw", "png"]) -> None:
-        self.camera, self.mode = camera, mode
+        self.camera = camera
+        self.mode = mode
         colour = camera.height * camera.width * 3
         self.depth_offset = -(-colour // 16) * 16
         size = self.depth_offset + camera.height * camera.width * 4
@@ -312,7 +350,9 @@ class ImageExchange:
         if mode == "raw":
             self._memory = np.memmap(self.folder / FRAME_FILE, np.uint8, "r+", shape=(size,))
             self._rgb = self._memory[:colour].reshape(camera.height, camera.width, 3)
-            self._depth = self._memory[self.depth_offset :].view("<f4").reshape(camera.height, camera.width)
+            self._depth = (
+                self._memory[self.depth_offset :].view("<f4").reshape(camera.height, camera.width)
+            )
 
     def announce(self) -> dict[str, Any]:
         """The part ``images`` of the ``reset`` request."""
@@ -355,7 +395,9 @@ def write_images(frame: Frame, rgb: Path, depth: Path | None, depth_factor: floa
     """
     images = {rgb: cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR)}
     if depth is not None:
-        images[depth] = np.rint(np.nan_to_num(frame.depth) * depth_factor).clip(0, 65535).astype(np.uint16)
+        images[depth] = (
+            np.rint(np.nan_to_num(frame.depth) * depth_factor).clip(0, 65535).astype(np.uint16)
+        )
     for path, image in images.items():
         if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
             raise TrackerError(f"cannot write {path}", "is the temporary folder full?")
@@ -365,17 +407,21 @@ def _with_space(size: int) -> TemporaryFolder:
     """A folder with the file for the frames, its space allocated: on a full disk SIGBUS would end the run later.
 
     Raises:
-        InfrastructureError: There is no room, neither in shared memory nor among the temporary files.
+        InfrastructureError: There is no room, neither in shared memory nor among the temporary
+            files.
     """
     reasons = []
     for base in (SHARED_MEMORY, Path(tempfile.gettempdir())):
         try:
-            folder = TemporaryFolder(base)  # where the file does not fit, it is removed with the object
+            # where the file does not fit, it is removed with the object
+            folder = TemporaryFolder(base)
             (folder.path / FRAME_FILE).write_bytes(bytes(size))
             return folder
         except OSError as error:
             reasons.append(f"{base}: {error.strerror}")
-    raise InfrastructureError(f"no room for a frame of {size / 1e6:.1f} MB: {'; '.join(reasons)}", "free some space")
+    raise InfrastructureError(
+        f"no room for a frame of {size / 1e6:.1f} MB: {'; '.join(reasons)}", "free some space"
+    )
 
 
 class ProgramTracker:
@@ -389,7 +435,8 @@ class ProgramTracker:
         images: How it gets the images, see `ImageExchange`.
         folder: Its working folder; None for the current one.
         exit_codes: Exit codes with which it may end after `close`; None for any.
-        variables: Names of environment variables that it gets beside those of `program_environment`.
+        variables: Names of environment variables that it gets beside those of
+            `program_environment`.
     """
 
     def __init__(
@@ -408,8 +455,11 @@ class ProgramTracker:
         self._variables = variables
         self._failed = False  # whether a fault of the program was raised
         self._images: Literal["raw", "png"] = images
-        self.name, self.limits, self.context = name, settings, context
-        self._command, self._folder = list(command), folder
+        self.name = name
+        self.limits = settings
+        self.context = context
+        self._command = list(command)
+        self._folder = folder
         self._program: Program | None = None
         self._exchange: ImageExchange | None = None
 
@@ -429,7 +479,9 @@ class ProgramTracker:
         """
         self._end()
         names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-        environment = program_environment(self._variables) | dict.fromkeys(names, str(self.context.threads))
+        environment = program_environment(self._variables) | dict.fromkeys(
+            names, str(self.context.threads)
+        )
         self._exchange = ImageExchange(camera, self._images)
         request = {
             "op": "reset",
@@ -447,7 +499,9 @@ class ProgramTracker:
             "options": self.options(camera, self._exchange.folder),
         }
         self._failed = False
-        self._program = Program(self.name, self._command, folder=self._folder, environment=environment)
+        self._program = Program(
+            self.name, self._command, folder=self._folder, environment=environment
+        )
         try:
             if self._ask(request, self.limits.start_timeout_s, "at reset").get("ok") is False:
                 raise TrackerError(f"{self.name} answered reset with ok: false")
@@ -478,15 +532,19 @@ class ProgramTracker:
                     f"{self.name} {doing}: answered index {str(answer.get('index'))[:20]}",
                     "each answer repeats the index of its track request",
                 )
-            return read_track_answer(answer, frame, f"{self.name} {doing}", lambda: time.perf_counter() - start)
+            return read_track_answer(
+                answer, frame, f"{self.name} {doing}", lambda: time.perf_counter() - start
+            )
 
     def close(self) -> None:
         """End the program (killed if it does not end by itself) and remove the exchanged files.
 
         Raises:
-            TrackerError: It ended by itself, with an exit code that counts as a failure, though it answered all.
+            TrackerError: It ended by itself, with an exit code that counts as a failure, though it
+                answered all.
         """
-        program, code = self._program, self._end()
+        program = self._program
+        code = self._end()
         allowed = self._exit_codes
         if program is None or code is None or allowed is None or code in allowed:
             return
@@ -550,8 +608,10 @@ def build(settings: SubprocessSettings, context: TrackerContext) -> ProgramTrack
     Raises:
         SettingsError: No command was given, or its quotes do not match.
     """
-    command, kind = settings.words(), FinalizingProgramTracker if settings.final else ProgramTracker
-    name, folder = Path(command[0]).name, settings.working_folder
+    command = settings.words()
+    kind = FinalizingProgramTracker if settings.final else ProgramTracker
+    name = Path(command[0]).name
+    folder = settings.working_folder
     return kind(
         name,
         settings,

@@ -57,10 +57,14 @@ class Worker:
         camera = Camera(**{name: stated[name] for name in names})
         self._maps = camera.undistortion_maps() if camera.is_distorted else None
         self._svo.set_svo_config(request["options"])
-        self._system = self._svo.SVO(self._svo.PinholeCamera(*(float(stated[name]) for name in names[:6])))
+        self._system = self._svo.SVO(
+            self._svo.PinholeCamera(*(float(stated[name]) for name in names[:6]))
+        )
         self._system.start()
 
-    def track(self, index: int, timestamp: float, rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> dict[str, Any]:
+    def track(
+        self, index: int, timestamp: float, rgb: NDArray[np.uint8], depth: NDArray[np.float32]
+    ) -> dict[str, Any]:
         """One frame, without its depth; SVO has no model of distortion, so the image is undistorted first."""
         start = time.perf_counter()
         grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
@@ -81,8 +85,9 @@ class Worker:
 def pose_of(T_cam_world: Any) -> NDArray[np.float64]:
     """``T_world_cam`` ``[4, 4]`` of a transformation of the bindings.
 
-    They cannot hand out its quaternion. It is read where the object keeps it, before the translation, and checked
-    against the translations of the transformation and of its inverse, which they do hand out.
+    They cannot hand out its quaternion. It is read where the object keeps it, before the
+    translation, and checked against the translations of the transformation and of its inverse,
+    which they do hand out.
 
     Raises:
         RuntimeError: What lies there is not the transformation.
@@ -91,9 +96,17 @@ def pose_of(T_cam_world: Any) -> NDArray[np.float64]:
     values = np.array((ctypes.c_double * 7).from_address(address or 0))
     translation, centre = (np.ravel(T.translation()) for T in (T_cam_world, T_cam_world.inverse()))
     norm = np.linalg.norm(values[:4])
-    inverse = se3.from_quaternion(values[None, 4:], values[None, :4])[0] if abs(norm - 1) < 1e-6 else np.zeros((4, 4))
-    if not np.array_equal(values[4:], translation) or not np.allclose(-inverse[:3, :3] @ centre, translation):
-        raise RuntimeError("this build of svo-cpp keeps its poses in another way, and cannot hand out rotations")
+    inverse = (
+        se3.from_quaternion(values[None, 4:], values[None, :4])[0]
+        if abs(norm - 1) < 1e-6
+        else np.zeros((4, 4))
+    )
+    if not np.array_equal(values[4:], translation) or not np.allclose(
+        -inverse[:3, :3] @ centre, translation
+    ):
+        raise RuntimeError(
+            "this build of svo-cpp keeps its poses in another way, and cannot hand out rotations"
+        )
     return se3.inverse(inverse)
 
 

@@ -49,7 +49,8 @@ class UnfilteredSystemSettings(Settings):
 
     filters: ClassVar[tuple[tuple[str, ...], ...]] = ()
     """The rules in the order of application: ``module:Class`` below ``dynslam_bench.culling``, and the groups of the
-    settings that the class takes, its own first. A rule is left out where the settings lack one of its groups, or where
+    settings that the class takes, its own first. A rule is left out where the settings lack one of
+    its groups, or where
     its own group has ``enabled = false``."""
     preprocessing: PreprocessingSettings = PreprocessingSettings()
     features: FeatureSettings = FeatureSettings()
@@ -74,7 +75,9 @@ class SemanticSystemSettings(SystemSettings):
     def verify(self) -> None:
         """Raise `SettingsError` where a system that needs masks has none: it would become another system."""
         super().verify()
-        default: SegmentationSettings = type(self).model_fields["segmentation"].get_default(call_default_factory=True)
+        default: SegmentationSettings = (
+            type(self).model_fields["segmentation"].get_default(call_default_factory=True)
+        )
         if self.segmentation.source == "none" != default.source:
             raise SettingsError(
                 "this system needs masks, but segmentation.source is 'none'",
@@ -143,7 +146,8 @@ def compose(
 
     Raises:
         SegmentationError: The semantic source is not available.
-        SettingsError: The settings hold an online setting that has an effect and that no part takes.
+        SettingsError: The settings hold an online setting that has an effect and that no part
+            takes.
     """
     from dynslam_bench.core.stage_cache import StageCache
     from dynslam_bench.features.registry import build_extractor, cached_extractor
@@ -164,7 +168,9 @@ def compose(
     # Masks, for systems with a semantic stage.
     masks = None
     if isinstance(settings, SemanticSystemSettings):
-        masks, cached_masks = load_object(MASK_STAGE)(settings.segmentation, context, filters, cache)
+        masks, cached_masks = load_object(MASK_STAGE)(
+            settings.segmentation, context, filters, cache
+        )
         if cached_masks is not None:
             cached["segmentation"] = cached_masks
     if masks is None:
@@ -183,13 +189,17 @@ def compose(
         filters=filters,
         flow=estimate_flow,
         refine_prediction=refine_prediction,
-        backend=build_backend(settings.backend, features.scale_factor, features.levels, features.extractor),
+        backend=build_backend(
+            settings.backend, features.scale_factor, features.levels, features.extractor
+        ),
         settings=settings,
         cached=cached,
     )
 
 
-def _check_masks_not_needed(settings: UnfilteredSystemSettings, filters: Sequence[DynamicFilter]) -> None:
+def _check_masks_not_needed(
+    settings: UnfilteredSystemSettings, filters: Sequence[DynamicFilter]
+) -> None:
     """Raise `SegmentationError` where a filter needs masks of a system that has none."""
     needing = [block.name for block in filters if {"masks", "boxes"} & block.needs]
     if not needing:
@@ -223,7 +233,8 @@ def system(
     filters: Sequence[tuple[str, ...]],
     groups: Mapping[str, Settings],
     *,
-    base: type[UnfilteredSystemSettings] | tuple[type[UnfilteredSystemSettings], ...] = SemanticSystemSettings,
+    base: type[UnfilteredSystemSettings]
+    | tuple[type[UnfilteredSystemSettings], ...] = SemanticSystemSettings,
     assumptions: Sequence[str] = (),
     entry_point: str = f"{__name__}:build",
     **spec: Any,
@@ -234,9 +245,11 @@ def system(
         name: Its id.
         label: Its name in tables.
         filters: Its rules, see `UnfilteredSystemSettings.filters`.
-        groups: Groups of its settings, with their defaults, that `base` lacks or has with other defaults.
+        groups: Groups of its settings, with their defaults, that `base` lacks or has with other
+            defaults.
         base: Settings of the kind of system that it is.
-        assumptions: Where it deviates from its source, or the source is silent; `sentences` fills in ``{masks}``, ...
+        assumptions: Where it deviates from its source, or the source is silent; `sentences` fills
+            in ``{masks}``, ...
         entry_point: Its factory, where it is none of the rules alone.
         **spec: Further fields of `TrackerSpec`.
     """
@@ -260,9 +273,9 @@ def system(
 def sentences(settings: UnfilteredSystemSettings) -> dict[str, str]:
     """Sentences of specs by name, made from the settings, so that a spec states the numbers in force.
 
-    ``masks``, ``boxes``: their source; ``dilation``: how far masks are grown, where the source is silent; ``tracks``:
-    how the flow is computed; ``matches``: the same, of a system that tests matches; ``links``: the same, of one with a
-    memory of features.
+    ``masks``, ``boxes``: their source; ``dilation``: how far masks are grown, where the source is
+    silent; ``tracks``: how the flow is computed; ``matches``: the same, of a system that tests
+    matches; ``links``: the same, of one with a memory of features.
     """
     stated: dict[str, str] = {}
     if isinstance(settings, SemanticSystemSettings):
@@ -276,9 +289,15 @@ def sentences(settings: UnfilteredSystemSettings) -> dict[str, str]:
     flow = getattr(settings, "flow", None)
     if flow is not None:
         tracks = describe_tracks(flow)
-        unmatched: Unmatched = next((group.unmatched for _, group in settings if hasattr(group, "unmatched")), "keep")
+        unmatched: Unmatched = next(
+            (group.unmatched for _, group in settings if hasattr(group, "unmatched")), "keep"
+        )
         links = f"features are followed by {tracks}, not by descriptors; one without a past begins at 0.5"
-        stated |= {"tracks": tracks, "matches": f"matches are {tracks}; {UNMATCHED[unmatched]}", "links": links}
+        stated |= {
+            "tracks": tracks,
+            "matches": f"matches are {tracks}; {UNMATCHED[unmatched]}",
+            "links": links,
+        }
     return stated
 
 

@@ -1,11 +1,12 @@
 """EMFOA-OFT-SLAM as the paper describes it, this project's system made from it, and the ablations of both.
 
-A variant of a system is an ablation, but for ``emfoa-oft?masks=none``, a system of its own: its id says what differs.
+A variant of a system is an ablation, but for ``emfoa-oft?masks=none``, a system of its own: its id
+says what differs.
 
-The paper: masks of an improved Mask R-CNN drop the features on people; DAISY Filter Flow, optimised by the elite
-moth-flame algorithm, matches the remaining ORB points with the previous image; the fundamental matrix of those matches
-culls points off their epipolar lines; the rest is tracked and mapped. `docs/explanation/paper.md` lists who runs which
-equation.
+The paper: masks of an improved Mask R-CNN drop the features on people; DAISY Filter Flow, optimised
+by the elite moth-flame algorithm, matches the remaining ORB points with the previous image; the
+fundamental matrix of those matches culls points off their epipolar lines; the rest is tracked and
+mapped. `docs/explanation/paper.md` lists who runs which equation.
 """
 
 from collections.abc import Mapping
@@ -45,8 +46,11 @@ PAPER: Groups = {"flow": DenseFlowSettings(terms=3), "epipolar": UNGUARDED}
 
 
 def _assumptions(name: str, base: type[SystemSettings], groups: Groups) -> list[str]:
-    masks, monocular, tested = base is not SystemSettings, base is MonocularSemanticSettings, "epipolar" in groups
-    paper, sparse = name.startswith("emfoa-oft-paper"), isinstance(groups.get("flow"), FlowSettings)
+    masks = base is not SystemSettings
+    monocular = base is MonocularSemanticSettings
+    tested = "epipolar" in groups
+    paper = name.startswith("emfoa-oft-paper")
+    sparse = isinstance(groups.get("flow"), FlowSettings)
     guarded = tested and not paper
     sentences: list[tuple[bool, str]] = [
         (name == "emfoa-oft", "the paper's are the masks, the EMFOA-optimised DAISY Filter Flow and the epipolar test; "
@@ -75,7 +79,9 @@ def _assumptions(name: str, base: type[SystemSettings], groups: Groups) -> list[
     return [sentence for holds, sentence in sentences if holds]
 
 
-def _spec(name: str, label: str, base: type[SystemSettings], groups: Groups, summary: str, **more: Any) -> TrackerSpec:
+def _spec(
+    name: str, label: str, base: type[SystemSettings], groups: Groups, summary: str, **more: Any
+) -> TrackerSpec:
     filters = TESTS if "masks=vote" in name else (SEMANTIC, *TESTS)
     return system(
         name,
@@ -92,8 +98,16 @@ def _spec(name: str, label: str, base: type[SystemSettings], groups: Groups, sum
 
 
 VARIANTS: dict[str, tuple[type[SystemSettings], Groups, str]] = {
-    "emfoa-oft?depth=none": (SemanticSystemSettings, EPIPOLAR, "without the tests of depth, which are ours"),
-    "emfoa-oft?masks=none&depth=none": (SystemSettings, EPIPOLAR, "the guarded epipolar test alone"),
+    "emfoa-oft?depth=none": (
+        SemanticSystemSettings,
+        EPIPOLAR,
+        "without the tests of depth, which are ours",
+    ),
+    "emfoa-oft?masks=none&depth=none": (
+        SystemSettings,
+        EPIPOLAR,
+        "the guarded epipolar test alone",
+    ),
     "emfoa-oft?masks=vote": (
         SemanticSystemSettings,
         {**OWN, **VOTE},
@@ -125,7 +139,11 @@ VARIANTS: dict[str, tuple[type[SystemSettings], Groups, str]] = {
         {**PAPER, "flow": FlowSettings()},
         "the paper's test on the flow of our own system",
     ),
-    "emfoa-oft-paper?masks=none": (SystemSettings, PAPER, "the paper's flow and epipolar test alone"),
+    "emfoa-oft-paper?masks=none": (
+        SystemSettings,
+        PAPER,
+        "the paper's flow and epipolar test alone",
+    ),
 }
 """Ablations: id, settings, and what differs."""
 SPECS = (

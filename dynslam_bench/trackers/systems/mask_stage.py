@@ -20,11 +20,13 @@ def build_mask_stage(
     Args:
         settings: The source of the masks and the schedule.
         context: Where the system runs.
-        filters: The system's filters, some of which watch classes that are not dynamic by themselves.
+        filters: The system's filters, some of which watch classes that are not dynamic by
+            themselves.
         cache: The stage cache; None to compute each mask.
 
     Returns:
-        The stage, None where the source is ``none``; and its network if that answers from the stage cache.
+        The stage, None where the source is ``none``; and its network if that answers from the stage
+        cache.
 
     Raises:
         SegmentationError: The semantic source is not available.

@@ -45,11 +45,16 @@ BOX_EPIPOLAR = ("epipolar:BoxEpipolarFilter", "box_epipolar", "segmentation")
 CLASS_RULE = ("epipolar:ClassRuleFilter", "class_rule", "segmentation")
 PROBABILITY = ("moving_probability:ProbabilityFilter", "probability", "segmentation")
 MULTIVIEW = ("multiview_depth:MultiViewFilter", "multiview")
-LUCAS_KANADE, WHOLE_OBJECTS = PublishedFlowSettings(), ObjectSettings()
+LUCAS_KANADE = PublishedFlowSettings()
+WHOLE_OBJECTS = ObjectSettings()
 BOTH_SIDES = BoxEpipolarSettings(inside_px=1.0, outside_px=1.0, fit="kept")
 """The epipolar test of Chen et al. and of MOR-SLAM."""
 UNGUARDED = EpipolarSettings(
-    min_parallax_px=0.0, parallax_share=0.0, homography_share=1.0, min_share=0.0, max_contradiction=1.0
+    min_parallax_px=0.0,
+    parallax_share=0.0,
+    homography_share=1.0,
+    min_share=0.0,
+    max_contradiction=1.0,
 )
 """The epipolar test on every frame and for every feature, as papers state it."""
 REIMPLEMENTED = "MIT (re-implemented from the description)"
@@ -108,8 +113,9 @@ DYNASLAM_UNION = "the masks of N and G are united, as in the code (the paper kee
 NO_INPAINTING = "background inpainting is left out: it rejects nothing"
 
 SPECS = (
-    # The shared back end alone, in the manner of ORB-SLAM2 (Mur-Artal and Tardos 2017), with depth and without: no
-    # dynamic handling beyond the robust kernel and the chi-square tests of the pose optimiser.
+    # The shared back end alone, in the manner of ORB-SLAM2 (Mur-Artal and Tardos 2017), with depth
+    # and without: no dynamic handling beyond the robust kernel and the chi-square tests of the pose
+    # optimiser.
     system(
         "orb-slam2",
         "ORB-SLAM2 style (our back end)",
@@ -161,7 +167,8 @@ SPECS = (
             "no further drop of features at the border of the grown mask",
         ),
     ),
-    # Blitz-SLAM (Fan et al. 2022): masks repaired by depth, then a strict epipolar test inside the boxes.
+    # Blitz-SLAM (Fan et al. 2022): masks repaired by depth, then a strict epipolar test inside the
+    # boxes.
     system(
         "blitz-slam",
         "Blitz-SLAM (our back end)",
@@ -216,8 +223,9 @@ SPECS = (
             "greedy association of boxes instead of the Hungarian one",
         ),
     ),
-    # Chen et al. (Micromachines 2022), the paper's direct parent: masks, Lucas-Kanade, epipolar culling. Theirs is
-    # monocular: chen-slam is the same with depth, to stand beside the other systems.
+    # Chen et al. (Micromachines 2022), the paper's direct parent: masks, Lucas-Kanade, epipolar
+    # culling. Theirs is monocular: chen-slam is the same with depth, to stand beside the other
+    # systems.
     system(
         "chen-slam",
         "Chen et al. 2022 (our back end)",
@@ -268,7 +276,8 @@ SPECS = (
         "room: 4 % of the features on people go on a rendered half sphere; its authors' name DSLAM also stands for "
         "Decentralised SLAM elsewhere",
     ),
-    # Detect-SLAM (Zhong et al. 2018): a moving probability for every feature, fed by boxes on keyframes.
+    # Detect-SLAM (Zhong et al. 2018): a moving probability for every feature, fed by boxes on
+    # keyframes.
     system(
         "detect-slam",
         "Detect-SLAM (our back end)",
@@ -328,7 +337,9 @@ SPECS = (
         {
             "segmentation": ObjectSettings(confidence=0.1),
             "guard": GuardSettings(min_fraction=0.1),
-            "box_epipolar": BoxEpipolarSettings(inside_px=0.2, outside_px=1.0, fit="outside previous"),
+            "box_epipolar": BoxEpipolarSettings(
+                inside_px=0.2, outside_px=1.0, fit="outside previous"
+            ),
             "multiview": MultiViewSettings(grow=False, min_keyframes=5),
             "flow": LUCAS_KANADE,
         },
@@ -369,7 +380,8 @@ SPECS = (
         ),
         remarks="has no degeneracy guard: the published system fails on walking_rpy (0.44 m)",
     ),
-    # DynaSLAM (Bescos et al. 2018): masks of a-priori dynamic classes, multi-view geometry, or both.
+    # DynaSLAM (Bescos et al. 2018): masks of a-priori dynamic classes, multi-view geometry, or
+    # both.
     system(
         "dynaslam",
         "DynaSLAM N+G (our back end)",
@@ -390,7 +402,9 @@ SPECS = (
         (SEMANTIC, MULTIVIEW),
         {
             "segmentation": NINETEEN,
-            "multiview": MultiViewSettings(tau_m=0.6, order="farthest", min_keyframes=5, border_px=15),
+            "multiview": MultiViewSettings(
+                tau_m=0.6, order="farthest", min_keyframes=5, border_px=15
+            ),
         },
         summary="DynaSLAM, variant N+G (code's constants)",
         provenance="faithful-code",
@@ -454,13 +468,16 @@ SPECS = (
             "no object constraints in bundle adjustment",
         ),
     ),
-    # Huai et al. (Sensors 2025): missed masks bridged, split by depth, moving probability of keypoints.
+    # Huai et al. (Sensors 2025): missed masks bridged, split by depth, moving probability of
+    # keypoints.
     system(
         "huai-slam",
         "Huai et al. 2025 (our back end)",
         (PROBABILITY,),
         {
-            "segmentation": SegmentationSettings(compensate=5, repair="depth", repair_depth_m=0.33, dilation_px=7),
+            "segmentation": SegmentationSettings(
+                compensate=5, repair="depth", repair_depth_m=0.33, dilation_px=7
+            ),
             "probability": ProbabilitySettings(),
             "flow": LUCAS_KANADE,
         },
@@ -588,12 +605,16 @@ SPECS = (
             "its improved quadtree of features is left out",
         ),
     ),
-    # SOF-SLAM (Cui and Ma 2019): F from static-labelled points, tested on movable things; people go.
+    # SOF-SLAM (Cui and Ma 2019): F from static-labelled points, tested on movable things; people
+    # go.
     system(
         "sof-slam",
         "SOF-SLAM (our back end)",
         (CLASS_RULE,),
-        {"class_rule": ClassRuleSettings(movable="chair,tv", depth_m=0.0, vote_share=1.0), "flow": LUCAS_KANADE},
+        {
+            "class_rule": ClassRuleSettings(movable="chair,tv", depth_m=0.0, vote_share=1.0),
+            "flow": LUCAS_KANADE,
+        },
         summary="people go, movable things are tested against the epipolar line",
         provenance="inspired",
         ranked=False,

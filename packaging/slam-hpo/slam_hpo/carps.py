@@ -15,8 +15,8 @@ from slam_hpo.table import load
 class SlamHpo(ObjectiveFunction):
     """ATE in metres of a SLAM system on one instance.
 
-    ``TrialInfo.instance`` is an index of `SEQUENCES` (default 0), ``seed`` of `STARTS` (modulo), ``budget`` one of
-    `FRAMES` (default the most).
+    ``TrialInfo.instance`` is an index of `SEQUENCES` (default 0), ``seed`` of `STARTS` (modulo),
+    ``budget`` one of `FRAMES` (default the most).
 
     Args:
         system: ``mask-rcnn`` or ``emfoa-oft?masks=none``.
@@ -43,5 +43,9 @@ class SlamHpo(ObjectiveFunction):
         instance = known("instance", trial_info.instance or 0, range(len(SEQUENCES)))
         frames = FRAMES[-1] if trial_info.budget is None else trial_info.budget
         start = STARTS[(trial_info.seed or 0) % len(STARTS)]
-        found = self._bench.predicted(dict(trial_info.config), SEQUENCES[instance], start=start, frames=frames)
-        return TrialValue(cost=found.ate_m, time=found.processor_s * frames, status=StatusType.SUCCESS)
+        found = self._bench.predicted(
+            dict(trial_info.config), SEQUENCES[instance], start=start, frames=frames
+        )
+        return TrialValue(
+            cost=found.ate_m, time=found.processor_s * frames, status=StatusType.SUCCESS
+        )

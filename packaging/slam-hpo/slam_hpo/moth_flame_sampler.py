@@ -22,10 +22,11 @@ CAUCHY_SHARE = 0.05
 class MothFlameSampler(optunahub.samplers.SimpleBaseSampler):
     """Trial n is the flight of moth n mod N around its flame, which is one of the best finished trials.
 
-    The first population is drawn uniformly; of EMFOA, its second half are opposites of the first (Eq. 19-22).
-    Then a moth flies a logarithmic spiral from its last position around its flame (Eq. 8-10); of EMFOA with a Cauchy
-    step in the first half of the budget (Eq. 13-16), and the pull of the best flame in the second (Eq. 17-18). The
-    number of flames falls over the budget (Eq. 11). Moths move in the unit cube. Pruned trials are worse than complete.
+    The first population is drawn uniformly; of EMFOA, its second half are opposites of the first
+    (Eq. 19-22). Then a moth flies a logarithmic spiral from its last position around its flame (Eq.
+    8-10); of EMFOA with a Cauchy step in the first half of the budget (Eq. 13-16), and the pull of
+    the best flame in the second (Eq. 17-18). The number of flames falls over the budget (Eq. 11).
+    Moths move in the unit cube. Pruned trials are worse than complete.
 
     Args:
         elite: EMFOA; plain moth-flame optimisation otherwise.
@@ -34,18 +35,26 @@ class MothFlameSampler(optunahub.samplers.SimpleBaseSampler):
         population: Moths, and flames.
 
     Raises:
-        ValueError: `seed`, `n_trials` or `population` is no whole number, or below 0, 1 or 2; when sampling, the study
-            has several objectives.
+        ValueError: `seed`, `n_trials` or `population` is no whole number, or below 0, 1 or 2; when
+            sampling, the study has several objectives.
     """
 
     def __init__(
-        self, *, elite: bool = True, seed: int | None = None, n_trials: int = 100, population: int = 8
+        self,
+        *,
+        elite: bool = True,
+        seed: int | None = None,
+        n_trials: int = 100,
+        population: int = 8,
     ) -> None:
         seed = None if seed is None else whole("seed", seed)
         super().__init__(seed=seed)
         self._rules = EMFOA if elite else MFO
         self._rng = np.random.default_rng(seed)
-        self._n_trials, self._population = whole("n_trials", n_trials, 1), whole("population", population, 2)
+        self._n_trials, self._population = (
+            whole("n_trials", n_trials, 1),
+            whole("population", population, 2),
+        )
 
     def reseed_rng(self) -> None:
         """Draw a new seed, for parallel workers."""
@@ -62,23 +71,38 @@ class MothFlameSampler(optunahub.samplers.SimpleBaseSampler):
         cube = _SearchSpaceTransform(search_space, transform_0_1=True)
         sign = -1.0 if study.direction == StudyDirection.MAXIMIZE else 1.0
         trials = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE, TrialState.PRUNED))
-        finished = [one for one in trials if one.value is not None and search_space.keys() <= one.params.keys()]
-        units = [cube.transform({name: one.params[name] for name in search_space}) for one in finished]
+        finished = [
+            one
+            for one in trials
+            if one.value is not None and search_space.keys() <= one.params.keys()
+        ]
+        units = [
+            cube.transform({name: one.params[name] for name in search_space}) for one in finished
+        ]
         moths = np.array(units).reshape(-1, len(cube.bounds))
         if len(moths) < self._population:
             return cube.untransform(self._first_population(moths))
-        ranks = [(one.state == TrialState.PRUNED, sign * float(one.value or 0.0)) for one in finished]
+        ranks = [
+            (one.state == TrialState.PRUNED, sign * float(one.value or 0.0)) for one in finished
+        ]
         flames = moths[sorted(range(len(moths)), key=ranks.__getitem__)[: self._population]]
-        index, at = trial.number % self._population, min(trial.number, self._n_trials)
+        index = trial.number % self._population
+        at = min(trial.number, self._n_trials)
         own = [row for row, one in enumerate(finished) if one.number % self._population == index]
         moth = moths[own[-1] if own else -1]
         around = flames[min(index, flames_left(self._population, at, self._n_trials) - 1)]
         now = flight(at / self._n_trials, self._rules)
-        landed = moth_positions(moth, flames[index], around, flames[0], now, CAUCHY_SHARE, self._rng.random)
+        landed = moth_positions(
+            moth, flames[index], around, flames[0], now, CAUCHY_SHARE, self._rng.random
+        )
         return cube.untransform(np.clip(landed, 0.0, 1.0))
 
     def sample_independent(
-        self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
+        self,
+        study: Study,
+        trial: FrozenTrial,
+        param_name: str,
+        param_distribution: BaseDistribution,
     ) -> Any:
         """Uniformly, for parameters that not all trials share."""
         _check_single(study)
@@ -89,8 +113,12 @@ class MothFlameSampler(optunahub.samplers.SimpleBaseSampler):
         half = self._population // 2
         if self._rules.opposition and len(members) >= half:
             drawn = members[:half]
-            least, greatest = drawn.min(axis=0), drawn.max(axis=0)  # dynamic bounds, Eq. 20
-            unit = opposites(members[len(members) - half], least, greatest, 0.0, 1.0, self._rng.random)
+            # dynamic bounds, Eq. 20
+            least = drawn.min(axis=0)
+            greatest = drawn.max(axis=0)
+            unit = opposites(
+                members[len(members) - half], least, greatest, 0.0, 1.0, self._rng.random
+            )
         return np.asarray(unit)
 
 

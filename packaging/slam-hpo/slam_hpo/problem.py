@@ -29,7 +29,8 @@ class Problem(optunahub.benchmarks.BaseProblem):
         frames: Frames of a run: 20, 40 or 60.
         metrics: ``ate_m``, ``processor_s``, or both.
         source: ``surrogate``, or ``run`` for real runs, which need dynslam-bench.
-        noise: Add noise of the size that two starts of a run differ by, drawn again at each evaluation.
+        noise: Add noise of the size that two starts of a run differ by, drawn again at each
+            evaluation.
         seed: Of the noise.
 
     Raises:
@@ -48,11 +49,18 @@ class Problem(optunahub.benchmarks.BaseProblem):
         seed: int | None = None,
     ) -> None:
         self._bench, self._split = load(system), known("split", split, SPLITS)
-        self._frames, self._source = known("frames", frames, FRAMES), known("source", source, get_args(Source))
+        self._frames, self._source = (
+            known("frames", frames, FRAMES),
+            known("source", source, get_args(Source)),
+        )
         if not isinstance(metrics, list | tuple) or not metrics:
             raise SlamHpoError(f"metrics are {metrics!r}: give a list of {', '.join(OBJECTIVES)}")
         self.metric_names = [known("metric", name, OBJECTIVES) for name in metrics]
-        one = np.array([self._bench.noise(frames, metric) for metric in metrics]) if noise else np.zeros(len(metrics))
+        one = (
+            np.array([self._bench.noise(frames, metric) for metric in metrics])
+            if noise
+            else np.zeros(len(metrics))
+        )
         self._noise = one / np.sqrt(len(SPLITS[split]) * len(STARTS))
         self.reseed(seed)
         self._default = self._measured(defaults(system))
@@ -81,7 +89,8 @@ class Problem(optunahub.benchmarks.BaseProblem):
         ratios = np.log(self._measured(params) / self._default).mean(axis=0)
         noises = self._noise * self._rng.standard_normal(len(self._noise))
         values = [
-            float(ratios[METRICS.index(name)] + noise) for name, noise in zip(self.metric_names, noises, strict=True)
+            float(ratios[METRICS.index(name)] + noise)
+            for name, noise in zip(self.metric_names, noises, strict=True)
         ]
         return values[0] if len(values) == 1 else values
 
@@ -93,7 +102,10 @@ class Problem(optunahub.benchmarks.BaseProblem):
         """ATE, coverage and processor time of every instance, ``[instances, 3]``."""
         if self._source == "run":
             instances = [(sequence, start) for sequence in SPLITS[self._split] for start in STARTS]
-            runs = [run(self._bench.system, params, *instance, frames=self._frames) for instance in instances]
+            runs = [
+                run(self._bench.system, params, *instance, frames=self._frames)
+                for instance in instances
+            ]
             return np.array([one[:3] for one in runs])
         sequences = [SEQUENCES.index(sequence) for sequence in SPLITS[self._split]]
         mean, _ = self._bench.surrogate.predict(self._bench.units(params)[None])

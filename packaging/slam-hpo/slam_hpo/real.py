@@ -34,10 +34,20 @@ def run(
     try:
         import dynslam_bench as db
     except ModuleNotFoundError as error:
-        raise SlamHpoError(f"real runs need dynslam-bench ({error}): in its checkout, pip install .") from error
+        raise SlamHpoError(
+            f"real runs need dynslam-bench ({error}): in its checkout, pip install ."
+        ) from error
 
     window = (start, start + STRIDE * frames)
-    made = db.run(system, sequence, settings=settings, frames=window, stride=STRIDE, cache=True, results=results)
+    made = db.run(
+        system,
+        sequence,
+        settings=settings,
+        frames=window,
+        stride=STRIDE,
+        cache=True,
+        results=results,
+    )
     return evaluated(made.store, made.record, frames)
 
 
@@ -50,17 +60,28 @@ def evaluated(store: RunStore, record: RunRecord, frames: int) -> Evaluation:
     from dynslam_bench.tuning.objectives import held_protocol
 
     part = load_frames(record, store).head(frames)
-    stamps, truth = part["timestamp"].to_numpy(), store.ground_truth(record.sequence.part)
+    stamps = part["timestamp"].to_numpy()
+    truth = store.ground_truth(record.sequence.part)
     ok = (part["state"] == "ok").to_numpy()
-    estimate, tracked = store.trajectory(record.run_id), int(ok.sum())
+    estimate = store.trajectory(record.run_id)
+    tracked = int(ok.sum())
     assert truth is not None  # every sequence is rendered
     if estimate is not None and tracked > 1:
         begun = Trajectory(estimate.timestamps[:tracked], estimate.T_world_cam[:tracked])
-        error = evaluate(begun, truth, held_protocol(PROTOCOL), input_timestamps=stamps).metrics["ate_rmse_m"]
+        error = evaluate(begun, truth, held_protocol(PROTOCOL), input_timestamps=stamps).metrics[
+            "ate_rmse_m"
+        ]
     else:
-        positions = truth.positions[(truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])]
+        positions = truth.positions[
+            (truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])
+        ]
         error = float(np.sqrt(np.square(positions - positions.mean(axis=0)).sum(axis=1).mean()))
-    processor = float(part["processor_s"].iloc[2:].mean())  # the first two load networks and kernels
+    # the first two load networks and kernels
+    processor = float(part["processor_s"].iloc[2:].mean())
     lost_at_end = int(ok[::-1].argmax()) if tracked else len(ok)
-    status = record.status if record.failed else judge_coverage(tracked, len(ok), lost_at_end, len(ok))[0]
+    status = (
+        record.status
+        if record.failed
+        else judge_coverage(tracked, len(ok), lost_at_end, len(ok))[0]
+    )
     return Evaluation(error, tracked / len(ok), processor, status)

@@ -45,9 +45,13 @@ class Range(NamedTuple):
 
     def unit(self, values: ArrayLike) -> NDArray[np.float64]:
         """Places of values in the unit interval."""
-        values, low, high = (np.asarray(part, dtype=float) for part in (values, self.low, self.high))
+        values, low, high = (
+            np.asarray(part, dtype=float) for part in (values, self.low, self.high)
+        )
         if self.log:
-            values, low, high = np.log(values), np.log(low), np.log(high)
+            values = np.log(values)
+            low = np.log(low)
+            high = np.log(high)
         return np.asarray((values - low) / (high - low))
 
 
@@ -122,4 +126,6 @@ def defaults(system: str) -> dict[str, Value]:
     Raises:
         SlamHpoError: There is no such system.
     """
-    return {name: setting.default for name, setting in SPACES[known("system", system, SPACES)].items()}
+    return {
+        name: setting.default for name, setting in SPACES[known("system", system, SPACES)].items()
+    }

@@ -25,11 +25,13 @@ class Evaluation(NamedTuple):
     """What a configuration has on an instance.
 
     Attributes:
-        ate_m: Online ATE RMSE in metres after rigid alignment; lost frames are held at the last pose.
+        ate_m: Online ATE RMSE in metres after rigid alignment; lost frames are held at the last
+            pose.
         coverage: Share of the frames that were tracked.
         processor_s: Mean processor seconds a frame; varies with the machine's load by a quarter.
         status: How the run ended: ``ok``, ``lost``, ``crashed``, ``timeout``, ``out-of-memory``.
-        log_ate_std: Standard deviation of log ATE as the surrogate knows it; 0 where it was measured.
+        log_ate_std: Standard deviation of log ATE as the surrogate knows it; 0 where it was
+            measured.
     """
 
     ate_m: float
@@ -51,16 +53,23 @@ class Benchmark:
     """
 
     def __init__(self, system: str, rows: pd.DataFrame) -> None:
-        self.system, self.space = system, SPACES[system]
+        self.system = system
+        self.space = SPACES[system]
         names = [*self.space]
         keys = rows[names].round(6)
         unique = keys.drop_duplicates()
         first = (unique == pd.Series(defaults(system))).all(axis=1)
         self.configurations = pd.concat([unique[first], unique[~first]], ignore_index=True)
-        self._index = {row: index for index, row in enumerate(self.configurations.itertuples(index=False, name=None))}
+        self._index = {
+            row: index
+            for index, row in enumerate(self.configurations.itertuples(index=False, name=None))
+        }
         at = [
             np.array([self._index[row] for row in keys.itertuples(index=False, name=None)]),
-            *(pd.Categorical(rows[column], categories=choices).codes for column, choices in INSTANCE),
+            *(
+                pd.Categorical(rows[column], categories=choices).codes
+                for column, choices in INSTANCE
+            ),
         ]
         shape = (len(unique), len(SEQUENCES), len(STARTS), len(FRAMES))
         self.values = np.full((*shape, len(METRICS)), np.nan)
@@ -74,7 +83,9 @@ class Benchmark:
         Raises:
             SlamHpoError: There is none of this number.
         """
-        row = self.configurations.iloc[known("configuration", index, range(len(self.configurations)))]
+        row = self.configurations.iloc[
+            known("configuration", index, range(len(self.configurations)))
+        ]
         return {name: (int if self.space[name].whole else float)(row[name]) for name in self.space}
 
     def units(self, settings: Mapping[str, Any]) -> NDArray[np.float64]:
@@ -84,19 +95,27 @@ class Benchmark:
             SlamHpoError: A setting is missing, unknown or out of its range.
         """
         if not isinstance(settings, Mapping):
-            raise SlamHpoError(f"the settings are {settings!r}: give a value for each of {', '.join(self.space)}")
+            raise SlamHpoError(
+                f"the settings are {settings!r}: give a value for each of {', '.join(self.space)}"
+            )
         if settings.keys() != self.space.keys():
             wrong = ", ".join(sorted(map(str, settings.keys() ^ self.space.keys())))
-            raise SlamHpoError(f"{self.system} has the settings {', '.join(self.space)}; missing or unknown: {wrong}")
+            raise SlamHpoError(
+                f"{self.system} has the settings {', '.join(self.space)}; missing or unknown: {wrong}"
+            )
         for name, value in settings.items():
             low, high = self.space[name][:2]
             if not isinstance(value, Real) or (self.space[name].whole and value % 1):
-                raise SlamHpoError(f"{name} = {value!r} is no {'whole ' * self.space[name].whole}number")
+                raise SlamHpoError(
+                    f"{name} = {value!r} is no {'whole ' * self.space[name].whole}number"
+                )
             if not low <= value <= high:
                 raise SlamHpoError(f"{name} = {value} is outside {low} to {high}")
         return np.array([setting.unit(settings[name]) for name, setting in self.space.items()])
 
-    def measured(self, settings: Mapping[str, Any], sequence: str, *, start: int = 0, frames: int = 60) -> Evaluation:
+    def measured(
+        self, settings: Mapping[str, Any], sequence: str, *, start: int = 0, frames: int = 60
+    ) -> Evaluation:
         """What a run of the table has.
 
         Args:
@@ -119,14 +138,18 @@ class Benchmark:
         ate, coverage, processor = self.values[(index, *where)].tolist()
         return Evaluation(ate, coverage, processor, self.status[(index, *where)])
 
-    def predicted(self, settings: Mapping[str, Any], sequence: str, *, start: int = 0, frames: int = 60) -> Evaluation:
+    def predicted(
+        self, settings: Mapping[str, Any], sequence: str, *, start: int = 0, frames: int = 60
+    ) -> Evaluation:
         """What the surrogate expects of any configuration; arguments as for `measured`.
 
         Raises:
             SlamHpoError: A setting, sequence, start or number of frames is not of the benchmark.
         """
         where = _place(sequence, start, frames)
-        mean, std = (part[(0, *where)] for part in self.surrogate.predict(self.units(settings)[None]))
+        mean, std = (
+            part[(0, *where)] for part in self.surrogate.predict(self.units(settings)[None])
+        )
         ate, coverage, processor = natural(mean).tolist()
         status = "ok" if coverage >= LOST_COVERAGE else "lost"
         return Evaluation(ate, coverage, processor, status, log_ate_std=float(std[0]))
@@ -137,14 +160,17 @@ class Benchmark:
         Raises:
             SlamHpoError: No such number of frames or metric.
         """
-        fidelity, column = known("frames", frames, FRAMES), known("metric", metric, METRICS)
+        fidelity = known("frames", frames, FRAMES)
+        column = known("metric", metric, METRICS)
         logarithm = np.log(self.values[:, :, :, FRAMES.index(fidelity), METRICS.index(column)])
         between = logarithm[:, :, 0] - logarithm[:, :, 1]
         return float(np.sqrt(np.mean((between - between.mean(axis=0)) ** 2) / 2))
 
     @cached_property
     def _units(self) -> NDArray[np.float64]:
-        return np.stack([self.space[name].unit(self.configurations[name]) for name in self.space], axis=1)
+        return np.stack(
+            [self.space[name].unit(self.configurations[name]) for name in self.space], axis=1
+        )
 
     @cached_property
     def surrogate(self) -> Surrogate:
@@ -159,7 +185,10 @@ class Benchmark:
         points = self._units.tolist()
         return {
             self.system: {
-                f"{sequence}, start {start}": {"X": points, "y": (-self.values[:, s, k, -1, :1]).tolist()}
+                f"{sequence}, start {start}": {
+                    "X": points,
+                    "y": (-self.values[:, s, k, -1, :1]).tolist(),
+                }
                 for s, sequence in enumerate(SEQUENCES)
                 for k, start in enumerate(STARTS)
             }
@@ -169,7 +198,8 @@ class Benchmark:
 class Surrogate:
     """A Gaussian process for every instance: Matern-5/2 kernel, one length a setting, shared by all instances.
 
-    Standard deviations are scaled per instance and metric so that they fit the leave-one-out residuals.
+    Standard deviations are scaled per instance and metric so that they fit the leave-one-out
+    residuals.
 
     Args:
         units: float64 ``[N, D]``, configurations in the unit cube.
@@ -184,7 +214,9 @@ class Surrogate:
         self._shape = values.shape[1:]
         targets = transformed(values).reshape(len(values), -1)
         lengths = [1.0] * units.shape[1]
-        kernel = ConstantKernel() * Matern(lengths, (0.05, 50.0), nu=2.5) + WhiteKernel(0.2, (1e-3, 2.0))
+        kernel = ConstantKernel() * Matern(lengths, (0.05, 50.0), nu=2.5) + WhiteKernel(
+            0.2, (1e-3, 2.0)
+        )
         self.process = GaussianProcessRegressor(kernel, normalize_y=True, random_state=0)
         with warnings.catch_warnings():  # a setting without effect has the longest length
             warnings.simplefilter("ignore", ConvergenceWarning)
@@ -192,10 +224,14 @@ class Surrogate:
         precision = np.diag(np.linalg.inv(self.process.L_ @ self.process.L_.T))
         self._calibration = np.sqrt(np.mean(self.process.alpha_**2 / precision[:, None], axis=0))
 
-    def predict(self, units: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def predict(
+        self, units: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Means and standard deviations ``[N, sequences, starts, fidelities, 3]``, see `transformed`."""
         mean, std = self.process.predict(units, return_std=True)
-        return mean.reshape(len(units), *self._shape), (std * self._calibration).reshape(len(units), *self._shape)
+        return mean.reshape(len(units), *self._shape), (std * self._calibration).reshape(
+            len(units), *self._shape
+        )
 
 
 def transformed(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -213,7 +249,9 @@ def natural(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _place(sequence: str, start: int, frames: int) -> tuple[int, int, int]:
     values = (sequence, start, frames)
-    first, second, third = (c.index(known(n, v, c)) for (n, c), v in zip(INSTANCE, values, strict=True))
+    first, second, third = (
+        c.index(known(n, v, c)) for (n, c), v in zip(INSTANCE, values, strict=True)
+    )
     return first, second, third
 
 
@@ -228,5 +266,7 @@ def load(system: str) -> Benchmark:
 
 @lru_cache
 def _load(system: str) -> Benchmark:
-    with files("slam_hpo").joinpath("data", f"{system.partition('?')[0]}.parquet").open("rb") as file:
+    with (
+        files("slam_hpo").joinpath("data", f"{system.partition('?')[0]}.parquet").open("rb") as file
+    ):
         return Benchmark(system, pd.read_parquet(file))

@@ -27,7 +27,13 @@ from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.geometry import Camera, Trajectory, se3, write_tum
 from dynslam_bench.segmentation.build_segmenter import SEGMENTERS
 from dynslam_bench.sequences.catalogue import DATASETS, open_sequence, sequence_ids
-from dynslam_bench.testing import CornerSequence, check_filter, check_segmenter, check_sequence, check_tracker
+from dynslam_bench.testing import (
+    CornerSequence,
+    check_filter,
+    check_segmenter,
+    check_sequence,
+    check_tracker,
+)
 from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
 from dynslam_bench.trackers.adapters import odometry as opencv_odometry
 from dynslam_bench.trackers.adapters.odometry import FrameToFrame
@@ -62,7 +68,8 @@ def test_controls_stand_still_without_images(name):
     tracker = reset(build_tracker(name))
     for index in range(12):
         result = tracker.track(blank(index, index / 30))
-        assert result.state == "ok" and np.allclose(result.T_world_cam, np.eye(4), atol=1e-12)
+        assert result.state == "ok"
+        assert np.allclose(result.T_world_cam, np.eye(4), atol=1e-12)
 
 
 def test_constant_velocity_repeats_the_measured_motion():
@@ -77,10 +84,13 @@ def test_constant_velocity_repeats_the_measured_motion():
     assert np.linalg.norm(measured[:, :3, 3] - truth[:4, :3, 3], axis=1).max() < 0.01
     assert min(result.stats["inliers"] for result in results[1:]) >= 12
     velocity = se3.log(measured[3]) / (stamps[3] - stamps[0])
-    pose, stamp = measured[3], stamps[3]
+    pose = measured[3]
+    stamp = stamps[3]
     for index, gap in ((4, 0.04), (5, 0.5), (6, 0.01)):
         stamp += gap
-        frame = Frame(index, stamp, np.zeros_like(sequence[0].rgb), np.zeros_like(sequence[0].depth))
+        frame = Frame(
+            index, stamp, np.zeros_like(sequence[0].rgb), np.zeros_like(sequence[0].depth)
+        )
         pose = pose @ se3.exp(velocity * gap)
         assert np.allclose(tracker.track(frame).T_world_cam, pose, atol=1e-6)
 
@@ -108,7 +118,8 @@ def test_replay_skips_a_hole(trajectory, tmp_path):
 def test_replay_id_carries_the_file(trajectory):
     path = trajectory[0]
     spec = TRACKERS.get(f"replay:{path}")
-    assert spec.id == f"replay:{path}" and resolve_settings(spec).file == str(path)
+    assert spec.id == f"replay:{path}"
+    assert resolve_settings(spec).file == str(path)
     assert "estimate.txt" in spec.label
     path.write_text(path.read_text() + "1400000000.0 0 0 0 0 0 0 1\n")
     assert TRACKERS.get(f"replay:{path}").version != spec.version, "another content is another run"
@@ -157,8 +168,12 @@ def test_replay_faults(tmp_path, monkeypatch, trajectory, name, settings, error,
 
 XYZ = Path(__file__).resolve().parents[4] / "shared" / "data" / "tum" / "rgbd_dataset_freiburg1_xyz"
 needs_data = pytest.mark.skipif(not XYZ.is_dir(), reason="no TUM excerpt beside the checkout")
-needs_opencv = pytest.mark.skipif(bool(opencv_odometry.unavailable()), reason=opencv_odometry.unavailable())
-needs_open3d = pytest.mark.skipif(importlib.util.find_spec("open3d") is None, reason="open3d is not installed")
+needs_opencv = pytest.mark.skipif(
+    bool(opencv_odometry.unavailable()), reason=opencv_odometry.unavailable()
+)
+needs_open3d = pytest.mark.skipif(
+    importlib.util.find_spec("open3d") is None, reason="open3d is not installed"
+)
 
 
 @needs_opencv
@@ -190,7 +205,9 @@ def test_without_the_api_it_is_listed_and_says_what_to_install(monkeypatch):
         monkeypatch.delattr(cv2, name, raising=False)
     assert "opencv-odometry" in [found.spec.id for found in TRACKERS.all()]
     hints = TRACKERS.get("opencv-odometry").missing()
-    assert len(hints) == 1 and "opencv-contrib-python-headless" in hints[0] and cv2.__version__ in hints[0]
+    assert len(hints) == 1
+    assert "opencv-contrib-python-headless" in hints[0]
+    assert cv2.__version__ in hints[0]
     with pytest.raises(TrackerError, match="opencv-contrib"):
         build_tracker("opencv-odometry")
 
@@ -208,22 +225,30 @@ class Scripted(FrameToFrame):
         return int(rgb[0, 0, 0])
 
     def align(self, reference, current):
-        return None if current in self.failing else se3.exp(np.array([current - reference, 0.0, 0, 0, 0, 0]))
+        return (
+            None
+            if current in self.failing
+            else se3.exp(np.array([current - reference, 0.0, 0, 0, 0, 0]))
+        )
 
 
 @pytest.mark.parametrize(
     ("failing", "blind", "states", "place"),
     [
         ((2, 3), (), "ok ok lost lost ok", 4),
-        ((1, 2, 3, 4, 5), (), "ok lost lost lost lost lost ok ok", 2),  # as if it had not moved while it was lost
+        # as if it had not moved while it was lost
+        ((1, 2, 3, 4, 5), (), "ok lost lost lost lost lost ok ok", 2),
         ((), (0, 1, 3), "initialising initialising ok lost ok", 2),
     ],
 )
 def test_lost_frames_are_bridged_from_the_last_good_one(failing, blind, states, place):
-    tracker, results = reset(Scripted(failing)), []
+    tracker = reset(Scripted(failing))
+    results = []
     for index in range(len(states.split())):
         depth = np.full((48, 64), 0.0 if index in blind else 1.0, np.float32)
-        results.append(tracker.track(Frame(index, float(index), np.full((48, 64, 3), index, np.uint8), depth)))
+        results.append(
+            tracker.track(Frame(index, float(index), np.full((48, 64, 3), index, np.uint8), depth))
+        )
     assert " ".join(result.state for result in results) == states
     assert results[-1].T_world_cam[0, 3] == place
     assert all((result.T_world_cam is None) == (result.state != "ok") for result in results)
@@ -234,16 +259,25 @@ def test_undistortion_maps_invert_the_distortion():
     columns, rows = camera.undistortion_maps()
     grid = np.stack(np.meshgrid(np.arange(64.0), np.arange(48.0)), axis=-1).reshape(-1, 2)
     expected = camera.distort_points(grid).reshape(48, 64, 2)
-    assert np.abs(columns - expected[..., 0]).max() < 1e-3 and np.abs(rows - expected[..., 1]).max() < 1e-3
+    assert np.abs(columns - expected[..., 0]).max() < 1e-3
+    assert np.abs(rows - expected[..., 1]).max() < 1e-3
 
 
-PAGES = ("reference/plugins.md", "how-to/dataset.md", "how-to/filter.md", "how-to/program.md", "how-to/segmenter.md")
+PAGES = (
+    "reference/plugins.md",
+    "how-to/dataset.md",
+    "how-to/filter.md",
+    "how-to/program.md",
+    "how-to/segmenter.md",
+)
 
 
 @pytest.fixture
 def example(tmp_path):
     """Writes a named example of the pages and gives its path."""
-    text = "\n".join((Path(__file__).parents[3] / "docs" / page).read_text(encoding="utf-8") for page in PAGES)
+    text = "\n".join(
+        (Path(__file__).parents[3] / "docs" / page).read_text(encoding="utf-8") for page in PAGES
+    )
     blocks = re.findall(r"```python\n(# (\w+\.py)\n.*?)```", text, re.DOTALL)
     texts = {name: text for text, name in blocks}
     assert len(texts) == len(blocks) >= 7
@@ -278,14 +312,17 @@ def test_tracker(example):
     check_tracker(f"{path}:SPEC", frames=3)
     sequence = CornerSequence(4)
     tracker = reset(build_tracker(f"{path}:SPEC", {"step_m": "0.02"}), sequence.camera)
-    assert [tracker.track(sequence[i]).T_world_cam[2, 3] for i in range(4)] == pytest.approx([0, 0.02, 0.04, 0.06])
+    assert [tracker.track(sequence[i]).T_world_cam[2, 3] for i in range(4)] == pytest.approx(
+        [0, 0.02, 0.04, 0.06]
+    )
 
 
 def test_data_set(example, plugged, tmp_path):
     plugged("sequences", example("my_data.py"), DATASETS)
     sequence = open_sequence("grey/wall", data_root=tmp_path)
     check_sequence(sequence)
-    assert "grey/wall" in sequence_ids() and len(sequence) == 20
+    assert "grey/wall" in sequence_ids()
+    assert len(sequence) == 20
     assert open_sequence("grey/wall", data_root=tmp_path, frames="5:8")[0].timestamp == 5 / 30
     with pytest.raises(SequenceError, match="known: grey/wall"):
         open_sequence("grey/door", data_root=tmp_path)
@@ -296,7 +333,9 @@ def test_segmenter(example, plugged):
     build = load_object(SEGMENTERS.get("near").entry_point)
     check_segmenter(lambda: build(None, None))
     sequence = CornerSequence(3)
-    tracker = reset(build_tracker("mask-rcnn", {"segmentation.source": "plugin:near"}), sequence.camera)
+    tracker = reset(
+        build_tracker("mask-rcnn", {"segmentation.source": "plugin:near"}), sequence.camera
+    )
     assert tracker.track(sequence[0]).state == "ok"
 
 
@@ -307,7 +346,8 @@ def test_flow(example, plugged):
     guess = np.array([[np.nan, np.nan], [11, 21]], np.float32)
     image = np.zeros((48, 64), np.uint8)
     result = flow.track(flow.prepare(image), flow.prepare(image), points, guess=guess)
-    assert result.xy.tolist() == [[3.5, 4.5], [11, 21]] and result.valid.all()
+    assert result.xy.tolist() == [[3.5, 4.5], [11, 21]]
+    assert result.valid.all()
 
 
 def test_filter_and_system(example):
@@ -348,7 +388,9 @@ INSTALLED = importlib.util.find_spec("pyorbslam3") is not None
 FR1 = Camera(640, 480, 517.3, 516.5, 318.6, 255.3, (0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
 
 needs_orbslam3 = pytest.mark.skipif(not INSTALLED, reason="pyorbslam3 is not installed")
-needs_vocabulary = pytest.mark.skipif(not PACKED.is_file(), reason="no ORB vocabulary beside the checkout")
+needs_vocabulary = pytest.mark.skipif(
+    not PACKED.is_file(), reason="no ORB vocabulary beside the checkout"
+)
 
 
 @pytest.fixture(autouse=True)
@@ -372,7 +414,9 @@ def test_settings_file_holds_our_camera(tmp_path):
     """Read back with OpenCV, whose parser is the one that ORB-SLAM3 uses; reals must not turn into integers."""
     path = tmp_path / "settings.yaml"
     camera = replace(FR1, fx=500.0, baseline_m=0.08, distortion=(1e-7, -0.5, 0.0, 2.0, 1.0))
-    path.write_text(settings_yaml(camera, OrbSlam3Settings(features=1500, close_depth_baselines=35), 29.7))
+    path.write_text(
+        settings_yaml(camera, OrbSlam3Settings(features=1500, close_depth_baselines=35), 29.7)
+    )
     stored = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
     reals = {
         "Camera1.fx": 500.0, "Camera1.fy": 516.5, "Camera1.cx": 318.6, "Camera1.cy": 255.3, "Camera1.k1": 1e-7,
@@ -385,8 +429,11 @@ def test_settings_file_holds_our_camera(tmp_path):
     }  # fmt: skip
     for key, value in (reals | integers).items():
         node = stored.getNode(key)
-        assert node.isReal() == (key in reals) and node.isInt() == (key in integers) and node.real() == value, key
-    assert stored.getNode("File.version").string() == "1.0" and stored.getNode("Camera.type").string() == "PinHole"
+        assert node.isReal() == (key in reals), key
+        assert node.isInt() == (key in integers), key
+        assert node.real() == value, key
+    assert stored.getNode("File.version").string() == "1.0"
+    assert stored.getNode("Camera.type").string() == "PinHole"
 
 
 class Fisheye(Camera):
@@ -421,15 +468,20 @@ def test_cameras_it_can_take():
 
 def test_vocabulary_is_found_unpacked_and_cached(tmp_path, monkeypatch):
     text = toy_vocabulary()
-    plain, packed = tmp_path / "voc.txt", tmp_path / "voc.txt.xz"
+    plain = tmp_path / "voc.txt"
+    packed = tmp_path / "voc.txt.xz"
     plain.write_text(text)
     packed.write_bytes(lzma.compress(text.encode()))
     assert find_vocabulary(str(plain)) == plain
     unpacked = find_vocabulary(str(packed))
-    assert unpacked.read_text() == text and unpacked != plain
+    assert unpacked.read_text() == text
+    assert unpacked != plain
     stamp = unpacked.stat().st_mtime_ns
-    assert find_vocabulary(str(packed)) == unpacked and unpacked.stat().st_mtime_ns == stamp
-    assert [path.name for path in unpacked.parent.iterdir()] == [unpacked.name], "nothing half written beside it"
+    assert find_vocabulary(str(packed)) == unpacked
+    assert unpacked.stat().st_mtime_ns == stamp
+    assert [path.name for path in unpacked.parent.iterdir()] == [unpacked.name], (
+        "nothing half written beside it"
+    )
     monkeypatch.setenv("DYNSLAM_BENCH_ORB_VOCABULARY", str(packed))
     assert find_vocabulary("") == unpacked
     assert find_vocabulary(str(plain)) == plain, "the setting wins"
@@ -450,7 +502,10 @@ LINES = TEXT.splitlines(keepends=True)
         (TEXT[: len(TEXT) // 2], "line 7 is not a node of 35 numbers"),
         ("".join(LINES[:-3]), "1 inner nodes have no children, as if its end were missing"),
         ("".join([*LINES[:5], "garbage\n", *LINES[5:]]), "line 6 is not a node"),
-        ("".join([*LINES[:2], LINES[2].replace("0 0", "9 0", 1), *LINES[3:]]), "line 3 names parent 9"),
+        (
+            "".join([*LINES[:2], LINES[2].replace("0 0", "9 0", 1), *LINES[3:]]),
+            "line 3 names parent 9",
+        ),
     ],
 )
 def test_damaged_vocabularies(tmp_path, content, expected):
@@ -459,7 +514,9 @@ def test_damaged_vocabularies(tmp_path, content, expected):
         (tmp_path / "v.txt.xz", lzma.compress(content.encode())),
     ):
         path.write_bytes(data)
-        with pytest.raises(TrackerError, match=rf"v\.txt.*{expected}.*DYNSLAM_BENCH_ORB_VOCABULARY"):
+        with pytest.raises(
+            TrackerError, match=rf"v\.txt.*{expected}.*DYNSLAM_BENCH_ORB_VOCABULARY"
+        ):
             find_vocabulary(str(path))
 
 
@@ -482,13 +539,18 @@ def test_vocabularies_that_are_not_there(tmp_path):
 def test_two_resets_on_real_frames():
     """25 frames of fr1_xyz, twice in one process: poses, stats, final trajectory, and nothing left running."""
     sequence = open_sequence(XYZ, frames=(0, 25))
-    with closing(build_tracker("orbslam3", {"vocabulary": str(PACKED)}, TrackerContext(fps=sequence.fps))) as tracker:
+    with closing(
+        build_tracker("orbslam3", {"vocabulary": str(PACKED)}, TrackerContext(fps=sequence.fps))
+    ) as tracker:
         for _ in range(2):
             tracker.reset(sequence.camera, rng=np.random.default_rng(0))
             results = [tracker.track(sequence[index]) for index in range(25)]
             assert {result.state for result in results} == {"ok"}
             assert np.allclose(results[0].T_world_cam, np.eye(4))
-            assert all(result.stats["inliers"] > 50 and result.stats["keypoints"] > 500 for result in results)
+            assert all(
+                result.stats["inliers"] > 50 and result.stats["keypoints"] > 500
+                for result in results
+            )
             assert list(results[-1].timings) == ["tracking", "transfer"]
             final = tracker.finalize()
             assert final.timestamps.tolist() == sequence.timestamps.tolist()
@@ -496,7 +558,10 @@ def test_two_resets_on_real_frames():
             assert np.abs(final.T_world_cam - poses).max() < 0.05
             truth = sequence.ground_truth.positions
             at = np.searchsorted(sequence.ground_truth.timestamps, sequence.timestamps)
-            assert abs(np.linalg.norm(poses[-1, :3, 3]) - np.linalg.norm(truth[at[-1]] - truth[at[0]])) < 0.02
+            assert (
+                abs(np.linalg.norm(poses[-1, :3, 3]) - np.linalg.norm(truth[at[-1]] - truth[at[0]]))
+                < 0.02
+            )
         process = tracker._program._process
     assert process.poll() is not None
 
@@ -508,11 +573,19 @@ def test_frames_without_features():
     camera = replace(FR1, distortion=(0.0,) * 5)
     with closing(reset(build_tracker("orbslam3", {"vocabulary": str(PACKED)}), camera)) as tracker:
         for index in range(4):
-            black = Frame(index, index / 30, np.zeros((480, 640, 3), np.uint8), np.zeros((480, 640), np.float32))
+            black = Frame(
+                index,
+                index / 30,
+                np.zeros((480, 640, 3), np.uint8),
+                np.zeros((480, 640), np.float32),
+            )
             result = tracker.track(black)
-            assert result.state == "initialising" and result.T_world_cam is None
+            assert result.state == "initialising"
+            assert result.T_world_cam is None
         texture = np.random.default_rng(0).integers(0, 256, (60, 80), dtype=np.uint8)
         grey = cv2.resize(texture, (640, 480), interpolation=cv2.INTER_NEAREST)
-        seen = Frame(4, 4 / 30, np.repeat(grey[..., None], 3, axis=2), np.full((480, 640), 2.0, np.float32))
+        seen = Frame(
+            4, 4 / 30, np.repeat(grey[..., None], 3, axis=2), np.full((480, 640), 2.0, np.float32)
+        )
         assert tracker.track(seen).state == "ok"
         assert tracker.finalize().timestamps.tolist() == [4 / 30]

@@ -42,7 +42,9 @@ from dynslam_bench.trackers.adapters import subprocess_tracker as exchange
 from dynslam_bench.trackers.adapters.specs import BatchSettings, SubprocessSettings
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "examples" / "batch"
-CAMERA = Camera(64, 48, 60.0, 61.0, 31.5, 23.5, distortion=(0.1, -0.2, 0.001, 0.002, 0.3), baseline_m=0.08)
+CAMERA = Camera(
+    64, 48, 60.0, 61.0, 31.5, 23.5, distortion=(0.1, -0.2, 0.001, 0.002, 0.3), baseline_m=0.08
+)
 
 PRELUDE = """
 import json, os, sys, time
@@ -90,7 +92,11 @@ def program(tmp_path):
     def make(text, context=None, **settings):
         path = tmp_path / f"program{len(made)}.py"
         path.write_text(PRELUDE + textwrap.dedent(text))
-        made.append(build_tracker(f"subprocess:{shlex.join([sys.executable, str(path)])}", settings, context))
+        made.append(
+            build_tracker(
+                f"subprocess:{shlex.join([sys.executable, str(path)])}", settings, context
+            )
+        )
         return made[-1]
 
     yield make
@@ -118,7 +124,8 @@ def test_reset_tells_all(program, tmp_path):
         "width": 64, "height": 48, "fx": 60.0, "fy": 61.0, "distortion": [0.1, -0.2, 0.001, 0.002, 0.3],
         "baseline_m": 0.08, "fps": 25.0,
     }  # fmt: skip
-    assert request == request | {"threads": 3, "device": "cuda:1", "sequence": "tum/fr1/xyz"} and threads == "3"
+    assert request == request | {"threads": 3, "device": "cuda:1", "sequence": "tum/fr1/xyz"}
+    assert threads == "3"
     assert Path(folder).resolve() == tmp_path.resolve()
 
 
@@ -152,8 +159,10 @@ def test_raw_images_arrive_exactly(program):
         assert result.stats["rgb"] == float((weights * sent.rgb.reshape(-1).astype(np.int64)).sum())
         expected = (weights[: 48 * 64] * sent.depth.reshape(-1).astype(np.float64)).sum()
         assert result.stats["depth"] == pytest.approx(expected, rel=1e-12)
-        assert result.stats["index"] == index and result.stats["timestamp"] == sent.timestamp
-        assert list(result.timings) == ["tracking", "transfer"] and result.timings["transfer"] >= 0
+        assert result.stats["index"] == index
+        assert result.stats["timestamp"] == sent.timestamp
+        assert list(result.timings) == ["tracking", "transfer"]
+        assert result.timings["transfer"] >= 0
 
 
 def test_png_images_arrive_exactly(program, tmp_path):
@@ -176,7 +185,8 @@ def test_png_images_arrive_exactly(program, tmp_path):
         rgb = cv2.imread(str(tmp_path / f"rgb-{index:06d}.png"), cv2.IMREAD_COLOR)[..., ::-1]
         depth = cv2.imread(str(tmp_path / f"depth-{index:06d}.png"), cv2.IMREAD_UNCHANGED)
         assert np.array_equal(rgb, sent.rgb)
-        assert depth.dtype == np.uint16 and np.array_equal(depth, np.rint(sent.depth * result.stats["factor"]))
+        assert depth.dtype == np.uint16
+        assert np.array_equal(depth, np.rint(sent.depth * result.stats["factor"]))
         assert result.stats["files"] <= 4, "files of frames before the last one are removed"
 
 
@@ -191,7 +201,10 @@ def test_final_trajectory(program):
     tracker = reset(program(text, final=True))
     tracker.track(frame(0))
     final = tracker.finalize()
-    assert (final.timestamps.tolist(), final.positions.tolist()) == ([1.5, 1.6], [[1, 2, 3], [0, 0, 0]])
+    assert (final.timestamps.tolist(), final.positions.tolist()) == (
+        [1.5, 1.6],
+        [[1, 2, 3], [0, 0, 0]],
+    )
     assert np.allclose(final.T_world_cam[0, :3, :3], [[0.28, -0.96, 0], [0.96, 0.28, 0], [0, 0, 1]])
     assert not hasattr(program(text), "finalize")
 
@@ -218,7 +231,8 @@ def test_lost_and_initialising(program):
     tracker = reset(program(text))
     results = [tracker.track(frame(index)) for index in range(3)]
     assert [result.state for result in results] == ["initialising", "lost", "lost"]
-    assert results[0].T_world_cam is None and results[2].T_world_cam is not None
+    assert results[0].T_world_cam is None
+    assert results[2].T_world_cam is not None
 
 
 def test_second_reset_starts_afresh(program):
@@ -264,7 +278,9 @@ def test_a_program_that_fails_behind_its_last_answer_fails(program, end, words, 
     tracker = reset(program(text))
     for index in range(2):
         tracker.track(frame(index))
-    with pytest.raises(TrackerError, match=f"after its last answer: the program .*{words}") as raised:
+    with pytest.raises(
+        TrackerError, match=f"after its last answer: the program .*{words}"
+    ) as raised:
         tracker.close()
     tracker.close()
     code = int(re.search(r"exit_codes=\[0,(-?\d+)\]", raised.value.hint).group(1))
@@ -277,7 +293,12 @@ def test_a_program_that_fails_behind_its_last_answer_fails(program, end, words, 
 def test_a_run_of_a_program_that_fails_behind_its_last_answer_has_crashed(toy_folder, tmp_path):
     path = tmp_path / "program.py"
     path.write_text(PRELUDE + textwrap.dedent(GOOD) + "sys.exit('cannot write the map')\n")
-    run = db.run(f"subprocess:{shlex.join([sys.executable, str(path)])}", toy_folder, frames=(0, 3), results=tmp_path)
+    run = db.run(
+        f"subprocess:{shlex.join([sys.executable, str(path)])}",
+        toy_folder,
+        frames=(0, 3),
+        results=tmp_path,
+    )
     assert run.status == "crashed"
     assert "exit code 1; its last line: 'cannot write the map'" in run.record.reason
 
@@ -308,7 +329,10 @@ def test_a_tracker_in_one_cpp_file_follows_the_camera(tmp_path: Path) -> None:
 
 
 FAULTS = {
-    "raises": ("raise ValueError('no such camera')", "exit code 1; its last line: 'ValueError: no such camera'"),
+    "raises": (
+        "raise ValueError('no such camera')",
+        "exit code 1; its last line: 'ValueError: no such camera'",
+    ),
     "exits": (
         "sys.stderr.write('cannot open\\nconfig.yaml\\n'); sys.exit(3)",
         "exit code 3; its last line: 'config.yaml'",
@@ -318,18 +342,33 @@ FAULTS = {
     "no json": ("print('{pose: 1}', flush=True)", "is no valid JSON"),
     "error": ("say({'error': 'out of\\nmemory'})", "at frame 7: out of memory"),
     "no pose": ("say({'state': 'ok'})", "state 'ok' without a pose"),
-    "state": ("say({'state': 'fine', 'T_world_cam': STILL})", "expected one of initialising, ok, lost"),
+    "state": (
+        "say({'state': 'fine', 'T_world_cam': STILL})",
+        "expected one of initialising, ok, lost",
+    ),
     "shape": ("say({'state': 'ok', 'T_world_cam': STILL[:12]})", "not 16 numbers"),
     "text": ("say({'state': 'ok', 'T_world_cam': 'identity'})", "not 16 numbers"),
-    "not rigid": ("say({'state': 'ok', 'T_world_cam': [2 * v for v in STILL]})", "no rigid transformation"),
+    "not rigid": (
+        "say({'state': 'ok', 'T_world_cam': [2 * v for v in STILL]})",
+        "no rigid transformation",
+    ),
     "nan": ("say({'state': 'ok', 'T_world_cam': [float('nan')] * 16})", "no valid JSON|not finite"),
-    "stats": ("say({'state': 'ok', 'T_world_cam': STILL, 'stats': {'a': 'b'}})", "stats and timings are not"),
+    "stats": (
+        "say({'state': 'ok', 'T_world_cam': STILL, 'stats': {'a': 'b'}})",
+        "stats and timings are not",
+    ),
     "hangs": (
         "sys.stderr.write('optimising\\n'); sys.stderr.flush(); time.sleep(60)",
         "no answer within 0.5 s.*'optimising'",
     ),
-    "of another frame": ("index['index'] = 6; say({'state': 'ok', 'T_world_cam': STILL})", "answered index 6"),
-    "of no frame": ("index.clear(); say({'state': 'ok', 'T_world_cam': STILL})", "answered index None"),
+    "of another frame": (
+        "index['index'] = 6; say({'state': 'ok', 'T_world_cam': STILL})",
+        "answered index 6",
+    ),
+    "of no frame": (
+        "index.clear(); say({'state': 'ok', 'T_world_cam': STILL})",
+        "answered index None",
+    ),
     "closes": ("os.close(1); time.sleep(60)", "closed its output"),
 }
 
@@ -360,7 +399,12 @@ def test_faults_become_one_line(program, fault):
 
 def test_refusals_at_reset(program):
     with pytest.raises(TrackerError, match="at reset: fisheye cameras only"):
-        reset(program("next(requests); say({'error': 'fisheye cameras only'}); time.sleep(60)", close_timeout_s=0.1))
+        reset(
+            program(
+                "next(requests); say({'error': 'fisheye cameras only'}); time.sleep(60)",
+                close_timeout_s=0.1,
+            )
+        )
 
 
 def test_faults_at_finalize(program):
@@ -368,7 +412,10 @@ def test_faults_at_finalize(program):
         ("{'trajectory': [[1, 2]]}", "rows of 8"),
         ("{}", "rows of 8"),
         ("{'trajectory': [[1, 0, 0, 0, 0, 0, 0, 0]]}", "norm 0"),
-        ("{'trajectory': [[2, 0, 0, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 0, 0, 1]]}", "strictly increasing"),
+        (
+            "{'trajectory': [[2, 0, 0, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 0, 0, 1]]}",
+            "strictly increasing",
+        ),
     ):
         tracker = reset(program(f"for request in requests: say({answer})", final=True))
         with pytest.raises(TrackerError, match=expected):
@@ -395,7 +442,9 @@ def test_last_words_are_the_last_ones(program):
         "sys.stdout.write('loading vocabulary\\n'); sys.stderr.write('FATAL: no such camera model\\n'); "
         "sys.stderr.flush(); sys.stdout.flush(); os._exit(3)"
     )
-    with pytest.raises(TrackerError, match=r"exit code 3; its last line: 'FATAL: no such camera model'"):
+    with pytest.raises(
+        TrackerError, match=r"exit code 3; its last line: 'FATAL: no such camera model'"
+    ):
         reset(program(said))
     early = (
         "sys.stderr.write('warning: old driver\\n'); sys.stderr.flush(); next(requests); time.sleep(1); "
@@ -440,14 +489,19 @@ def test_serve_answers_for_a_python_tracker(program):
     tracker = reset(program(text, final=True))
     for index in range(2):
         sent = frame(index)
-        assert tracker.track(sent).stats == {"sum": float(sent.rgb.sum()), "known": float((sent.depth > 0).sum())}
+        assert tracker.track(sent).stats == {
+            "sum": float(sent.rgb.sum()),
+            "known": float((sent.depth > 0).sum()),
+        }
     with pytest.raises(TrackerError, match="at frame 2: RuntimeError: no features"):
         tracker.track(frame(2))
     assert tracker.track(frame(3)).state == "ok", "an answered error does not end the program"
     assert len(tracker.finalize()) == 1
 
 
-def test_a_program_in_the_present_folder_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_in_the_present_folder_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     program = tmp_path / "odometry"
     program.write_text("#!/bin/sh\nexit 0\n")
     program.chmod(0o755)
@@ -457,18 +511,23 @@ def test_a_program_in_the_present_folder_is_found(tmp_path: Path, monkeypatch: p
         SubprocessSettings(command="odometry").verify()  # as in a shell: by its path, or on PATH
 
 
-def test_room_for_a_frame_is_taken_first_elsewhere_if_need_be(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_room_for_a_frame_is_taken_first_elsewhere_if_need_be(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     camera = Camera(640, 480, 500.0, 500.0, 320.0, 240.0)
     monkeypatch.setattr(exchange, "SHARED_MEMORY", tmp_path / "missing")
     beside = exchange.ImageExchange(camera, "raw")
     file = beside.folder / exchange.FRAME_FILE
-    assert file.is_relative_to(tmp_path) and file.stat().st_blocks * 512 >= 640 * 480 * 7, "not a file of holes"
+    assert file.is_relative_to(tmp_path), "not a file of holes"
+    assert file.stat().st_blocks * 512 >= 640 * 480 * 7, "not a file of holes"
     beside.close()
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, hard))  # as if the disk were full
     try:
-        with pytest.raises(InfrastructureError, match=r"no room for a frame of 2.2 MB: .*free some space"):
+        with pytest.raises(
+            InfrastructureError, match=r"no room for a frame of 2.2 MB: .*free some space"
+        ):
             exchange.ImageExchange(camera, "raw")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -513,7 +572,9 @@ def ran(path, folder, **settings):
     tracker.reset(sequence.camera, rng=np.random.default_rng(0))
     with closing(tracker):
         results = [tracker.track(sequence[index]) for index in range(len(sequence))]
-        assert {(result.state, result.T_world_cam) for result in results} == {("initialising", None)}
+        assert {(result.state, result.T_world_cam) for result in results} == {
+            ("initialising", None)
+        }
         return tracker.finalize(), tracker, sequence
 
 
@@ -527,12 +588,18 @@ assert threads == os.environ["OMP_NUM_THREADS"] == "3" and os.listdir() == []
     trajectory, tracker, sequence = ran(toml(copies + GOOD_BATCH), toy_folder)
     assert np.allclose(trajectory.timestamps, sequence.timestamps, atol=1e-6)
     assert np.allclose(trajectory.positions[:, 0], 0.01 * np.arange(12))
-    assert tracker.measured["program_s"] > 0 and tracker.measured["notes"] == []
-    stamp, rgb, _, depth = (tmp_path / "seen" / "associations.txt").read_text().splitlines()[5].split()
+    assert tracker.measured["program_s"] > 0
+    assert tracker.measured["notes"] == []
+    stamp, rgb, _, depth = (
+        (tmp_path / "seen" / "associations.txt").read_text().splitlines()[5].split()
+    )
     assert float(stamp) == pytest.approx(sequence.timestamps[5], abs=1e-6)
     assert np.array_equal(cv2.imread(str(tmp_path / "seen" / rgb))[:, :, ::-1], sequence[5].rgb)
     units = cv2.imread(str(tmp_path / "seen" / depth), cv2.IMREAD_UNCHANGED)
-    assert np.abs(units / sequence.camera.depth_factor - sequence[5].depth).max() <= 0.51 / sequence.camera.depth_factor
+    assert (
+        np.abs(units / sequence.camera.depth_factor - sequence[5].depth).max()
+        <= 0.51 / sequence.camera.depth_factor
+    )
     stored = cv2.FileStorage(str(tmp_path / "camera.yaml"), cv2.FILE_STORAGE_READ)
     for new, old in (("Camera1.fx", "Camera.fx"), ("RGBD.DepthMapFactor", "DepthMapFactor")):
         assert stored.getNode(new).real() == stored.getNode(old).real() > 0
@@ -540,7 +607,9 @@ assert threads == os.environ["OMP_NUM_THREADS"] == "3" and os.listdir() == []
 
 
 def test_indices_stand_for_stamps(toml, toy_folder):
-    trajectory, _, sequence = ran(toml("write([[i, 0.01 * i] for i in (8, 4, 0)])", format="indices"), toy_folder)
+    trajectory, _, sequence = ran(
+        toml("write([[i, 0.01 * i] for i in (8, 4, 0)])", format="indices"), toy_folder
+    )
     assert trajectory.timestamps.tolist() == sequence.timestamps[[0, 4, 8]].tolist()
     assert np.allclose(trajectory.positions[:, 0], [0.0, 0.04, 0.08])
 
@@ -553,14 +622,17 @@ def test_indices_stand_for_stamps(toml, toy_folder):
         ("os.kill(os.getpid(), 11)", -11, "killed by signal 11 "),
     ],
 )
-def test_an_exit_code_other_than_0_is_a_failure_unless_the_file_names_it(toml, toy_folder, end, code, words):
+def test_an_exit_code_other_than_0_is_a_failure_unless_the_file_names_it(
+    toml, toy_folder, end, code, words
+):
     program = GOOD_BATCH + f"print('bye', flush=True); {end}"
     with pytest.raises(TrackerError, match=f"^Toy: .*{words}") as raised:
         ran(toml(program), toy_folder)
     assert raised.value.hint == f"if that is no failure: exit_codes = [0, {code}] in slam.toml"
     trajectory, tracker, _ = ran(toml(program, exit_codes=[0, code]), toy_folder)
     (note,) = tracker.measured["notes"]
-    assert len(trajectory) == 12 and re.search(words, note)
+    assert len(trajectory) == 12
+    assert re.search(words, note)
     with pytest.raises(TrackerError, match="exit code 0"):
         ran(toml(GOOD_BATCH, exit_codes=[code]), toy_folder)
 
@@ -580,18 +652,25 @@ LEFT_OVER = {
 def test_a_trajectory_that_was_there_before_is_not_scored(toml, toy_folder, tmp_path, code):
     old = tmp_path / "elsewhere" / "traj.txt"
     old.parent.mkdir()
-    rows = [f"{stamp:.6f} 0 0 0 0 0 0 1\n" for stamp in open_sequence(toy_folder, frames=(0, 12)).timestamps]
+    rows = [
+        f"{stamp:.6f} 0 0 0 0 0 0 1\n"
+        for stamp in open_sequence(toy_folder, frames=(0, 12)).timestamps
+    ]
     old.write_text("".join(rows))
     os.utime(old, (1.7e9, 1.7e9))
     output = "traj.txt" if "dirname" not in code else "run/traj.txt"
-    with pytest.raises(TrackerError, match=r"outside of the working folder|before the program started") as raised:
+    with pytest.raises(
+        TrackerError, match=r"outside of the working folder|before the program started"
+    ) as raised:
         ran(toml(f"import shutil; old = {str(old)!r}; {code}", output=output), toy_folder)
     assert "{output}" in raised.value.hint
 
 
 def test_a_link_within_the_working_folder_is_taken(toml, toy_folder):
     """Some programs keep their trajectories apart, and a link to the last one."""
-    trajectory, *_ = ran(toml(GOOD_BATCH + "os.rename(output, 'run-1'); os.symlink('run-1', output)"), toy_folder)
+    trajectory, *_ = ran(
+        toml(GOOD_BATCH + "os.rename(output, 'run-1'); os.symlink('run-1', output)"), toy_folder
+    )
     assert len(trajectory) == 12
 
 
@@ -617,9 +696,17 @@ def test_stamps_that_lost_their_digits_are_named(toml, toy_folder, tmp_path, dig
     shifted = tmp_path / "late"
     shutil.copytree(toy_folder, shifted)
     for name in ("rgb.txt", "depth.txt", "groundtruth.txt"):
-        rows = [line.split(maxsplit=1) for line in (shifted / name).read_text().splitlines() if line[0] != "#"]
-        (shifted / name).write_text("".join(f"{1.3e9 + float(stamp):.6f} {rest}\n" for stamp, rest in rows))
-    with pytest.raises(TrackerError, match=r"^Toy: 11 of 12 lines .*repeat .*digits were lost") as raised:
+        rows = [
+            line.split(maxsplit=1)
+            for line in (shifted / name).read_text().splitlines()
+            if line[0] != "#"
+        ]
+        (shifted / name).write_text(
+            "".join(f"{1.3e9 + float(stamp):.6f} {rest}\n" for stamp, rest in rows)
+        )
+    with pytest.raises(
+        TrackerError, match=r"^Toy: 11 of 12 lines .*repeat .*digits were lost"
+    ) as raised:
         ran(toml(write), shifted)
     assert "%.9f" in raised.value.hint
 
@@ -638,7 +725,10 @@ def test_what_was_not_taken_of_a_trajectory_is_noted(toml, toy_folder):
             "write([[f'{float(row[0]) * 1e9:.0f}', 0] for row in rows])",
             r"traj\.txt: stamps are 33333000 apart by the median: taken as nanoseconds \(30 Hz\)",
         ),
-        ("write([[row[0], 0] for row in rows] + [['nan', 0]])", "traj.txt: 1 of 13 lines skipped: not finite"),
+        (
+            "write([[row[0], 0] for row in rows] + [['nan', 0]])",
+            "traj.txt: 1 of 13 lines skipped: not finite",
+        ),
     ],
 )
 def test_what_was_not_taken_as_it_stands_is_noted(toml, toy_folder, code, note):
@@ -649,18 +739,38 @@ def test_what_was_not_taken_as_it_stands_is_noted(toml, toy_folder, code, note):
 
 
 def test_repeated_indices_are_noted(toml, toy_folder):
-    _, tracker, _ = ran(toml("write([[i // 2, i] for i in range(24)])", format="indices"), toy_folder)
-    assert tracker.measured["notes"] == ["trajectory.txt: 12 of 24 lines repeat an index, the first of each is taken"]
+    _, tracker, _ = ran(
+        toml("write([[i // 2, i] for i in range(24)])", format="indices"), toy_folder
+    )
+    assert tracker.measured["notes"] == [
+        "trajectory.txt: 12 of 24 lines repeat an index, the first of each is taken"
+    ]
 
 
 BAD = {
-    "writes no file": ("print('loading'); sys.exit('no licence')", {}, "exit code 1, and wrote no .*'no licence'"),
-    "in colours": ("print('\\x1b[31mbroken\\x1b[0m\\n\\x1b[0;m'); sys.exit(2)", {}, "its last words: 'broken'"),
-    "needs a display": ("sys.exit('Pangolin X11: Failed to open X display')", {}, "X display'.*xvfb-run"),
+    "writes no file": (
+        "print('loading'); sys.exit('no licence')",
+        {},
+        "exit code 1, and wrote no .*'no licence'",
+    ),
+    "in colours": (
+        "print('\\x1b[31mbroken\\x1b[0m\\n\\x1b[0;m'); sys.exit(2)",
+        {},
+        "its last words: 'broken'",
+    ),
+    "needs a display": (
+        "sys.exit('Pangolin X11: Failed to open X display')",
+        {},
+        "X display'.*xvfb-run",
+    ),
     "half a line": ("write(rows, '{} 0.5 0 0')", {}, "line 1"),
     "without stamps": ("write(rows, '1 0 0 0 0 1 0 0 0 0 1 0')", {}, "line 1"),
     "no pose": ("write([])", {}, "holds no poses"),
-    "another clock": ("write([[9e5 + i, 0] for i in range(12)])", {}, "none of the 12 poses .*900000.000.*frames from"),
+    "another clock": (
+        "write([[9e5 + i, 0] for i in range(12)])",
+        {},
+        "none of the 12 poses .*900000.000.*frames from",
+    ),
     "lost digits": (
         "write([[f'{1e9 + float(row[0]):g}', 0] for row in rows])",
         {},
@@ -671,7 +781,11 @@ BAD = {
         {},
         "11 of 12 lines of .* digits were lost",
     ),
-    "two units": ("write([[33.3 * i, 0] for i in range(60)])", {}, "milliseconds .* or seconds .* name the unit"),
+    "two units": (
+        "write([[33.3 * i, 0] for i in range(60)])",
+        {},
+        "milliseconds .* or seconds .* name the unit",
+    ),
     "index too large": ("write([[99, 0]])", {"format": "indices"}, "indices of frames 0 to 11"),
     "dies": ("os.abort()", {}, "killed by signal 6"),
 }
@@ -684,10 +798,12 @@ def test_what_a_program_does_wrong_is_one_line(toml, toy_folder, code, fields, w
 
 
 def test_one_that_never_ends_is_killed_with_what_it_started(toml, toy_folder, tmp_path):
-    child = (
-        f"import subprocess; print(subprocess.Popen(['sleep', '60']).pid, file=open({str(tmp_path / 'pid')!r}, 'w'))\n"
-    )
-    with pytest.raises(TrackerTimeoutError, match="not done within 1 s, killed; its last words: 'frame 3'"):
+    pid_file = str(tmp_path / "pid")
+    start = "subprocess.Popen(['sleep', '60'])"
+    child = f"import subprocess; print({start}.pid, file=open({pid_file!r}, 'w'))\n"
+    with pytest.raises(
+        TrackerTimeoutError, match="not done within 1 s, killed; its last words: 'frame 3'"
+    ):
         ran(toml(child + "print('frame 3', flush=True)\ntime.sleep(60)"), toy_folder, timeout_s=1)
     until(lambda: not alive([int((tmp_path / "pid").read_text())]), 2)
 
@@ -700,8 +816,14 @@ def test_one_that_never_ends_is_killed_with_what_it_started(toml, toy_folder, tm
         ({"command": ["nowhere-to-be-found"]}, "cannot start 'nowhere-to-be-found'"),
         ({"format": "kitti"}, "format"),
         ({"name": ""}, "name"),
-        ({"output": "/tmp/traj.txt"}, "output: '/tmp/traj.txt' is no file in the program's working folder"),
-        ({"output": "../traj.txt"}, "output: '../traj.txt' is no file in the program's working folder"),
+        (
+            {"output": "/tmp/traj.txt"},
+            "output: '/tmp/traj.txt' is no file in the program's working folder",
+        ),
+        (
+            {"output": "../traj.txt"},
+            "output: '../traj.txt' is no file in the program's working folder",
+        ),
         ({"output": "a/../../traj.txt"}, "is no file in the program's working folder"),
         ({"output": "~/traj.txt"}, "is no file in the program's working folder"),
         ({"output": ""}, "is no file in the program's working folder"),
@@ -715,33 +837,62 @@ def test_files_that_describe_no_program(toml, fields, words):
         build_tracker(f"batch:{toml(GOOD_BATCH, **fields)}")
 
 
-def test_the_record_and_the_board_say_that_only_the_final_trajectory_exists(toml, toy_folder, tmp_path):
+def test_the_record_and_the_board_say_that_only_the_final_trajectory_exists(
+    toml, toy_folder, tmp_path
+):
     results = tmp_path / "results"
     path = toml(GOOD_BATCH.replace("enumerate(rows)", "enumerate(rows[:15])"))
     spec = TRACKERS.get(f"batch:{path}")
-    assert (spec.label, spec.license, spec.online) == ("Toy", "MIT", False) and spec.version.startswith("7+")
+    assert (spec.label, spec.license, spec.online) == ("Toy", "MIT", False)
+    assert spec.version.startswith("7+")
     run = db.run(f"batch:{path}", toy_folder, frames=(0, 20), results=results)
     record = run.record
-    assert run.status == "ok" and record.coverage == 0.75 and (record.n_tracked, record.n_lost) == (15, 5)
-    assert record.timings["total"].median_s > 0 and any("only the final trajectory" in note for note in record.notes)
+    assert run.status == "ok"
+    assert record.coverage == 0.75
+    assert (record.n_tracked, record.n_lost) == (15, 5)
+    assert record.timings["total"].median_s > 0
+    assert any("only the final trajectory" in note for note in record.notes)
     assert run.metrics["ate_rmse_m"] >= 0
     gone = db.run(f"batch:{toml('sys.exit(3)')}", toy_folder, frames=(0, 20), results=results)
-    assert gone.status == "crashed" and "exit code 3" in gone.record.reason and gone.record.run_id != record.run_id
+    assert gone.status == "crashed"
+    assert "exit code 3" in gone.record.reason
+    assert gone.record.run_id != record.run_id
     board = load_board(results)
-    assert len(board.final_only) == 1 and not board.ranked
+    assert len(board.final_only) == 1
+    assert not board.ranked
     assert board.runs(board.final_only[0])[0].trajectory == "final"
 
 
 ROWS = {
-    "no file": ("print('loading'); sys.exit('no licence')", "crashed", "exit code 1, and wrote no .*'no licence'"),
-    "half a file": ("write([[row[0], 0] for row in rows[:3]]); print('lost')", "lost", "tracked on 3 of 12.*'lost'"),
-    "never ends": ("print('frame 3', flush=True); time.sleep(60)", "timeout", "not done within 2 s.*'frame 3'"),
+    "no file": (
+        "print('loading'); sys.exit('no licence')",
+        "crashed",
+        "exit code 1, and wrote no .*'no licence'",
+    ),
+    "half a file": (
+        "write([[row[0], 0] for row in rows[:3]]); print('lost')",
+        "lost",
+        "tracked on 3 of 12.*'lost'",
+    ),
+    "never ends": (
+        "print('frame 3', flush=True); time.sleep(60)",
+        "timeout",
+        "not done within 2 s.*'frame 3'",
+    ),
 }
 
 
 @pytest.mark.parametrize("code, status, words", ROWS.values(), ids=ROWS)
-def test_each_way_to_fail_is_a_row_with_the_program_s_last_words(toml, toy_folder, tmp_path, code, status, words):
-    run = db.run(f"batch:{toml(code)}", toy_folder, frames=(0, 12), settings={"timeout_s": 2}, results=tmp_path / "r")
+def test_each_way_to_fail_is_a_row_with_the_program_s_last_words(
+    toml, toy_folder, tmp_path, code, status, words
+):
+    run = db.run(
+        f"batch:{toml(code)}",
+        toy_folder,
+        frames=(0, 12),
+        settings={"timeout_s": 2},
+        results=tmp_path / "r",
+    )
     assert run.status == status
     assert re.search(words, " ".join([run.record.reason, *run.record.notes]))
 
@@ -770,10 +921,13 @@ def test_the_conformance_kit_checks_the_final_trajectory(toml, tmp_path, inverte
 @pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.toml")), ids=lambda file: file.stem)
 def test_the_examples_describe_programs(file):
     program, here = BatchSettings(program=str(file)).read()
-    words = program.words(here, **dict.fromkeys(("sequence", "camera", "associations", "output", "folder"), "/x"))
+    words = program.words(
+        here, **dict.fromkeys(("sequence", "camera", "associations", "output", "folder"), "/x")
+    )
     assert not any(re.search(r"\{\w+\}", word) for word in words)
     scripts = [word for word in words if word.endswith(".py") and Path(word).is_absolute()]
-    assert all(Path(script).is_file() for script in scripts) and program.license
+    assert all(Path(script).is_file() for script in scripts)
+    assert program.license
 
 
 PIXI = r"""#!{python}
@@ -801,12 +955,16 @@ def test_a_system_of_vslam_lab_gets_its_tables(tmp_path, toy_folder, monkeypatch
     assert np.allclose(trajectory.timestamps, sequence.timestamps, atol=1e-6)
     assert np.allclose(trajectory.positions[:, 0], 0.5)
     camera = read_vslam_lab(tmp_path / "seen", None).camera
-    assert camera.matrix == pytest.approx(sequence.camera.matrix) and camera.width == sequence.camera.width
+    assert camera.matrix == pytest.approx(sequence.camera.matrix)
+    assert camera.width == sequence.camera.width
 
 
-@pytest.mark.skipif(importlib.util.find_spec("pyorbslam3") is None, reason="pyorbslam3 is not installed")
 @pytest.mark.skipif(
-    not (PACKED.is_file() and XYZ.is_dir()), reason="no ORB vocabulary or TUM excerpt beside the checkout"
+    importlib.util.find_spec("pyorbslam3") is None, reason="pyorbslam3 is not installed"
+)
+@pytest.mark.skipif(
+    not (PACKED.is_file() and XYZ.is_dir()),
+    reason="no ORB vocabulary or TUM excerpt beside the checkout",
 )
 def test_orb_slam3_as_a_batch_program(tmp_path, monkeypatch):
     """Its final trajectory is as near to the truth as that of the same system, frame by frame."""
@@ -814,17 +972,23 @@ def test_orb_slam3_as_a_batch_program(tmp_path, monkeypatch):
     how = {"frames": (0, 40), "results": tmp_path / "results", "protocol": "tum-rgbd/v1"}
     batch = db.run(f"batch:{EXAMPLES / 'orb_slam3.toml'}", XYZ, **how)
     online = db.run("orbslam3", XYZ, **how)
-    assert batch.status == online.status == "ok" and batch.record.coverage == 1.0
+    assert batch.status == online.status == "ok"
+    assert batch.record.coverage == 1.0
     final = online.store.score(online.record, "tum-rgbd/v1").final.metrics["ate_rmse_m"]
-    assert batch.metrics["ate_rmse_m"] == pytest.approx(final, rel=0.5) and final < 0.03
+    assert batch.metrics["ate_rmse_m"] == pytest.approx(final, rel=0.5)
+    assert final < 0.03
     assert batch.record.peak_memory_mb > 100
 
 
-@pytest.mark.skipif(importlib.util.find_spec("open3d") is None, reason="open3d is not installed (its wheel has 400 MB)")
+@pytest.mark.skipif(
+    importlib.util.find_spec("open3d") is None,
+    reason="open3d is not installed (its wheel has 400 MB)",
+)
 @pytest.mark.skipif(not XYZ.is_dir(), reason="no TUM excerpt beside the checkout")
 def test_open3d_as_a_batch_program(tmp_path):
     run = db.run(f"batch:{EXAMPLES / 'open3d.toml'}", XYZ, frames=(0, 20), results=tmp_path)
-    assert run.status == "ok" and run.record.coverage == 1.0
+    assert run.status == "ok"
+    assert run.record.coverage == 1.0
     assert run.metrics["ate_rmse_m"] < 0.5 * run.metrics["static_camera_ate_rmse_m"]
 
 
@@ -842,7 +1006,8 @@ def test_without_its_package_one_line_says_how_to_get_it():
 @needs_data
 def test_on_real_frames(tmp_path):
     run = db.run("svo", XYZ, results=tmp_path, protocol="tum-rgbd/v1-sim3")
-    assert run.status == "ok" and run.record.coverage > 0.5
+    assert run.status == "ok"
+    assert run.record.coverage > 0.5
     assert run.metrics["ate_rmse_m"] < 0.4 * run.metrics["static_camera_ate_rmse_m"]
     assert run.metrics["rpe_1f_rot_rmse_deg"] < 3
 
@@ -850,15 +1015,20 @@ def test_on_real_frames(tmp_path):
 @needs_svo
 @needs_data
 def test_as_a_batch_program(tmp_path):
-    run = db.run(f"batch:{EXAMPLES / 'svo.toml'}", XYZ, results=tmp_path, protocol="tum-rgbd/v1-sim3")
-    assert run.status == "ok" and run.record.coverage > 0.5 and run.record.tracker.sensors == "rgb"
+    run = db.run(
+        f"batch:{EXAMPLES / 'svo.toml'}", XYZ, results=tmp_path, protocol="tum-rgbd/v1-sim3"
+    )
+    assert run.status == "ok"
+    assert run.record.coverage > 0.5
+    assert run.record.tracker.sensors == "rgb"
 
 
 @needs_svo
 @needs_data
 def test_settings_reach_it():
     """With a smaller disparity the map begins earlier."""
-    sequence, begun = open_sequence(XYZ, frames=(0, 12)), []
+    sequence = open_sequence(XYZ, frames=(0, 12))
+    begun = []
     for disparity in (50, 10):
         tracker = build_tracker("svo", {"init_disparity_px": disparity})
         tracker.reset(sequence.camera, rng=np.random.default_rng(0))

@@ -39,7 +39,8 @@ SYSTEMS = [spec for spec in all_specs() if issubclass(spec.settings, UnfilteredS
 MASKED = [
     spec
     for spec in SYSTEMS
-    if issubclass(spec.settings, SemanticSystemSettings) and spec.settings().segmentation.source == "auto"
+    if issubclass(spec.settings, SemanticSystemSettings)
+    and spec.settings().segmentation.source == "auto"
 ]
 
 
@@ -50,7 +51,9 @@ def walking():
 
 def build(spec: TrackerSpec, sequence) -> SlamPipeline:
     settings = quick(spec.settings) | ({"segmentation.source": "oracle"} if spec in MASKED else {})
-    return build_tracker(spec, settings, TrackerContext(sequence_id=sequence.id, masks=sequence.masks))
+    return build_tracker(
+        spec, settings, TrackerContext(sequence_id=sequence.id, masks=sequence.masks)
+    )
 
 
 def run(spec: TrackerSpec, sequence) -> list[TrackResult]:
@@ -68,15 +71,21 @@ def test_no_masks_where_a_system_needs_them_is_a_clear_error(name: str) -> None:
 @pytest.mark.parametrize("spec", MASKED, ids=lambda spec: spec.id)
 def test_online_segmentation_settings_reach_every_filter(spec: TrackerSpec, walking) -> None:
     tracker = build(spec, walking)
-    tracker.configure(spec.settings.model_validate({"segmentation": {"source": "oracle", "confidence": 0.77}}))
+    tracker.configure(
+        spec.settings.model_validate({"segmentation": {"source": "oracle", "confidence": 0.77}})
+    )
     held = [(getattr(rule, "segmentation", None), rule.settings) for rule in tracker._filters]
-    for settings in (settings for pair in held for settings in pair if isinstance(settings, SegmentationSettings)):
+    for settings in (
+        settings for pair in held for settings in pair if isinstance(settings, SegmentationSettings)
+    ):
         assert settings.confidence == 0.77
 
 
 @pytest.mark.parametrize("name", ["sof-slam", "seg-slam"])
 def test_movable_things_reach_the_rule_that_judges_them(name: str, walking) -> None:
-    assert any(result.stats["class_rule_on_movable"] > 0 for result in run(TRACKERS.get(name), walking))
+    assert any(
+        result.stats["class_rule_on_movable"] > 0 for result in run(TRACKERS.get(name), walking)
+    )
 
 
 def test_a_networks_movable_things_pass_only_where_a_filter_wants_them(walking) -> None:
@@ -95,26 +104,33 @@ def test_a_networks_movable_things_pass_only_where_a_filter_wants_them(walking) 
 
 @pytest.mark.parametrize("spec", all_specs(), ids=lambda spec: spec.id)
 def test_specs_are_complete(spec: TrackerSpec) -> None:
-    assert spec.label and spec.summary and spec.provenance
+    assert spec.label
+    assert spec.summary
+    assert spec.provenance
     assert all(parameter.meaning for parameter in parameters(spec.settings))
     assert settings_table(spec.settings).count("\n") >= 2
     if spec.provenance in ("inspired", "assumed"):
-        assert not spec.ranked and spec.assumptions
+        assert not spec.ranked
+        assert spec.assumptions
     if issubclass(spec.settings, UnfilteredSystemSettings):
-        assert spec.citation and ("our back end" in spec.label or "ablation" in spec.label)
+        assert spec.citation
+        assert "our back end" in spec.label or "ablation" in spec.label
 
 
 def test_variants_are_listed_under_their_system_and_ablations_rank_never() -> None:
     groups = tracker_groups()
     names = {spec.id for group in groups.values() for family in group for spec in family}
-    assert names == {tracker.spec.id for tracker in TRACKERS.all()} and "never-move" in {
-        f[0].id for f in groups["control"]
-    }
+    assert names == {tracker.spec.id for tracker in TRACKERS.all()}
+    assert "never-move" in {f[0].id for f in groups["control"]}
     ours = next(family for family in groups["this project's"] if family[0].id == "emfoa-oft")
     paper = next(family for family in groups["published"] if family[0].id == "emfoa-oft-paper")
-    assert len(ours) == 10 and len(paper) == 3 and ours[0].ranked and paper[0].provenance == "faithful-paper"
+    assert len(ours) == 10
+    assert len(paper) == 3
+    assert ours[0].ranked
+    assert paper[0].provenance == "faithful-paper"
     for spec in (*ours[1:], *paper[1:]):
-        assert spec.provenance == "own" and spec.ranked == (spec.id == "emfoa-oft?masks=none")
+        assert spec.provenance == "own"
+        assert spec.ranked == (spec.id == "emfoa-oft?masks=none")
         assert spec.id.startswith(("emfoa-oft?", "emfoa-oft-paper?"))
 
 
@@ -129,53 +145,75 @@ def test_variants_are_listed_under_their_system_and_ablations_rank_never() -> No
     ],
 )
 def test_a_variant_lacks_the_settings_of_what_it_leaves_out(name: str, missing: set[str]) -> None:
-    assert TRACKERS.get("emfoa-oft").settings.model_fields.keys() - TRACKERS.get(name).settings.model_fields == missing
+    assert (
+        TRACKERS.get("emfoa-oft").settings.model_fields.keys()
+        - TRACKERS.get(name).settings.model_fields
+        == missing
+    )
 
 
 def test_systems_with_a_compensation_of_their_own_bridge_longer() -> None:
     masked = [spec for spec in all_specs() if issubclass(spec.settings, SemanticSystemSettings)]
     longer = {spec.id: spec.settings().segmentation.compensate for spec in masked}
     shared = SegmentationSettings().compensate
-    assert {name: frames for name, frames in longer.items() if frames != shared} == {"huai-slam": 5, "cfp-slam": 5}
+    assert {name: frames for name, frames in longer.items() if frames != shared} == {
+        "huai-slam": 5,
+        "cfp-slam": 5,
+    }
 
 
-# People fill the view: they must not take the places of the few features that the camera's pose is found with.
+# People fill the view: they must not take the places of the few features that the camera's pose is
+# found with.
 
 
 def test_a_crowd_in_front_of_the_camera_leaves_enough_features() -> None:
     """People cover 85 % of the features; with all of them counted the camera was lost from frame 14 on."""
     sequence = open_sequence("synthetic/walking_halfsphere?scene=102", frames=(0, 24))
-    kept, states = {}, {}
+    kept = {}
+    states = {}
     for share in (0.0, 0.3):
         settings = {"segmentation.source": "oracle", "segmentation.outside_share": share}
-        tracker = build_tracker("mask-rcnn", settings, TrackerContext(sequence.id, masks=sequence.masks))
+        tracker = build_tracker(
+            "mask-rcnn", settings, TrackerContext(sequence.id, masks=sequence.masks)
+        )
         tracker.reset(sequence.camera, rng=np.random.default_rng(0))
         results = [tracker.track(sequence[index]) for index in range(len(sequence))]
         kept[share] = np.median([result.keypoints_keep.sum() for result in results])
         states[share] = [result.state for result in results]
     assert kept[0.0] < 200 < 400 < kept[0.3]
-    assert "lost" in states[0.0] and set(states[0.3]) == {"ok"}
+    assert "lost" in states[0.0]
+    assert set(states[0.3]) == {"ok"}
 
 
-# What published systems get from the shared stages is the same as their sources say, or stands in their specs.
+# What published systems get from the shared stages is the same as their sources say, or stands in
+# their specs.
 
 
 @pytest.mark.parametrize("spec", SYSTEMS, ids=lambda spec: spec.id)
 def test_specs_state_how_masks_and_flow_are_computed(spec) -> None:
-    text, settings = "; ".join(spec.assumptions), spec.settings()
+    text = "; ".join(spec.assumptions)
+    settings = spec.settings()
     if isinstance(settings, SemanticSystemSettings):
         assert describe_masks(settings.segmentation).partition("come from")[2] in text
-    if isinstance(getattr(settings, "flow", None), PublishedFlowSettings) and spec.provenance != "assumed":
+    if (
+        isinstance(getattr(settings, "flow", None), PublishedFlowSettings)
+        and spec.provenance != "assumed"
+    ):
         assert describe_tracks(settings.flow) in text
 
 
 def test_no_published_system_has_a_check_on_its_flow_but_one_that_says_so() -> None:
     published = [
-        spec for spec in SYSTEMS if not spec.id.startswith("emfoa-oft") and "flow" in spec.settings.model_fields
+        spec
+        for spec in SYSTEMS
+        if not spec.id.startswith("emfoa-oft") and "flow" in spec.settings.model_fields
     ]
     checked = [spec.id for spec in published if spec.settings().flow.forward_backward_px > 0]
-    assert len(published) > 8 and checked == ["dai-slam"]
-    assert describe_tracks(TRACKERS.get("dai-slam").settings().flow) in "; ".join(TRACKERS.get("dai-slam").assumptions)
+    assert len(published) > 8
+    assert checked == ["dai-slam"]
+    assert describe_tracks(TRACKERS.get("dai-slam").settings().flow) in "; ".join(
+        TRACKERS.get("dai-slam").assumptions
+    )
 
 
 # Systems that judge by boxes or by whole objects, and the one that grows its masks.
@@ -184,7 +222,9 @@ def test_no_published_system_has_a_check_on_its_flow_but_one_that_says_so() -> N
 ])  # fmt: skip
 def test_masks_are_grown_and_repaired_only_where_the_system_does_it(name: str) -> None:
     settings = TRACKERS.get(name).settings
-    assert ("segmentation.dilation_px" in {each.name for each in parameters(settings)}) == (name == "blitz-slam")
+    assert ("segmentation.dilation_px" in {each.name for each in parameters(settings)}) == (
+        name == "blitz-slam"
+    )
     with pytest.raises(SettingsError):
         core_settings.build(settings, {"segmentation": {"repair": "depth"}})
 
@@ -193,7 +233,9 @@ def test_masks_are_grown_and_repaired_only_where_the_system_does_it(name: str) -
 
 
 @pytest.mark.parametrize(("name", "terms"), [("emfoa-oft", 1), ("emfoa-oft-paper", 3)])
-def test_the_papers_tracker_runs_eq_1_to_3_and_ours_the_first_term(monkeypatch, name: str, terms: int) -> None:
+def test_the_papers_tracker_runs_eq_1_to_3_and_ours_the_first_term(
+    monkeypatch, name: str, terms: int
+) -> None:
     calls: list[bool] = []
     chosen = dense.aggregate_and_choose
 
@@ -205,7 +247,8 @@ def test_the_papers_tracker_runs_eq_1_to_3_and_ours_the_first_term(monkeypatch, 
     small = SmallScene(frames=2)
     rounds = {"flow.second_round": True} if terms == 3 else {}
     stats = list(play_small(construct(TRACKERS.get(name), small, **rounds), small))[1].stats
-    assert stats["flow_valid"] > 100 and stats["epipolar_f_asked"] == 1
+    assert stats["flow_valid"] > 100
+    assert stats["epipolar_f_asked"] == 1
     assert terms == 1 or stats["epipolar_f_judged"] == 1, "the paper knows no guard"
     assert calls == [True] * (4 if terms == 3 else 0)  # there and back, two rounds
 
@@ -239,7 +282,10 @@ def test_measured_classes(ate: float, coverage: float, broken: bool, expected: s
     ],
 )
 def test_published_classes(tracker: str, sequence: str, expected: str | None) -> None:
-    assert signatures.published_class(tracker, signatures.recorded(f"synthetic/{sequence}?scene=3")) == expected
+    assert (
+        signatures.published_class(tracker, signatures.recorded(f"synthetic/{sequence}?scene=3"))
+        == expected
+    )
 
 
 def test_table_of_a_store_of_computed_trajectories(tmp_path: Path) -> None:
@@ -271,12 +317,15 @@ def test_table_of_a_store_of_computed_trajectories(tmp_path: Path) -> None:
         "`cfp-slam`": "match (not counted)",
     }
     assert "match: 3 of 4 (75 %; the bar is 75 %)" in text
-    assert "yolo-slam on walking_rpy: survives" in text and "published fails" in text
+    assert "yolo-slam on walking_rpy: survives" in text
+    assert "published fails" in text
 
 
 def test_a_store_without_the_reference_system_is_a_clear_error(tmp_path: Path) -> None:
     add_run(RunStore(tmp_path), "orb-slam2", "synthetic/walking_xyz", 0)
-    with pytest.raises(DynslamError, match=r"exact masks on synthetic/walking_xyz.*suite 'dynamic'"):
+    with pytest.raises(
+        DynslamError, match=r"exact masks on synthetic/walking_xyz.*suite 'dynamic'"
+    ):
         signatures.report(tmp_path)
 
 
@@ -285,8 +334,9 @@ YOLO = SHARED / "weights" / "yolov8n-seg_480x640_fp32.onnx"
 GEOMETRY = "emfoa-oft?masks=none"
 
 
-# Excerpt, tracker, frames, stride, and the least ATE so far in mm. Of Bonn crowd as many frames as are needed for a
-# system that culls nothing to fail (295 and 206 mm there): all 200 with a network would take a minute.
+# Excerpt, tracker, frames, stride, and the least ATE so far in mm. Of Bonn crowd as many frames as
+# are needed for a system that culls nothing to fail (295 and 206 mm there): all 200 with a network
+# would take a minute.
 @pytest.mark.parametrize("excerpt, tracker, frames, stride, least_mm", [
     pytest.param("tum/rgbd_dataset_freiburg1_xyz", "orb-slam2", None, 1, 4.9, id="fr1_xyz"),
     pytest.param("tum/rgbd_dataset_freiburg1_rpy", "orb-slam2", None, 1, 5.2, id="fr1_rpy"),
@@ -300,9 +350,12 @@ def test_the_error_on_a_recording_has_not_grown(excerpt, tracker, frames, stride
     if missing:
         pytest.skip(f"not here: {', '.join(missing)}")
     masks = {"segmentation.source": f"onnx:{YOLO}"} if tracker == "mask-rcnn" else {}
-    _, infos, _ = play(SlamEnv(str(needed[0]), tracker, settings=masks, frames=frames, stride=stride))
+    _, infos, _ = play(
+        SlamEnv(str(needed[0]), tracker, settings=masks, frames=frames, stride=stride)
+    )
     metrics = infos[-1]["episode_metrics"]
-    assert metrics["coverage"] == 1.0 and 1000 * metrics["ate_rmse_m"] < 1.3 * least_mm
+    assert metrics["coverage"] == 1.0
+    assert 1000 * metrics["ate_rmse_m"] < 1.3 * least_mm
 
 
 TESTED = {
@@ -323,7 +376,9 @@ def system(name: str, **settings: object) -> SlamPipeline:
 def test_every_published_flow_is_covered() -> None:
     with_flow = {spec.id for spec in all_specs() if "flow" in spec.settings.model_fields}
     # the tracks of dai-slam are judged over a window: `correlation_graph.py`
-    assert {name for name in with_flow if not name.startswith("emfoa-oft")} == TESTED | FOLLOWED | {"dai-slam"}
+    assert {name for name in with_flow if not name.startswith("emfoa-oft")} == TESTED | FOLLOWED | {
+        "dai-slam"
+    }
 
 
 @pytest.mark.parametrize("rule", ["keep", "drop", "judge"])
@@ -336,22 +391,28 @@ def test_a_moving_region_whose_flow_fails_goes_by_the_named_rule(name: str, rule
     thing = box_instance(*BOX, name="chair" if movable else "person")
     made = scene(SIDEWAYS, n_moving=80, motion=ACROSS, instances=thing)
     made.state.previous.instances = thing
-    lost = made.moving & (np.arange(len(made.frame)) % 2 == 1)  # the flow of every second of its features fails
+    # the flow of every second of its features fails
+    lost = made.moving & (np.arange(len(made.frame)) % 2 == 1)
     made.state.flow.valid[lost] = False
-    if movable:  # the depth of a moving thing takes its unmatched features along: not what is tested here
+    # the depth of a moving thing takes its unmatched features along: not what is tested here
+    if movable:
         block.settings = block.settings.model_copy(update={"depth_m": 0.0})
     keep = block.apply(made.frame, made.state).keep
-    assert keep[~on_rectangle(made, *BOX)].mean() > 0.99 and not keep[made.moving & ~lost].any()
+    assert keep[~on_rectangle(made, *BOX)].mean() > 0.99
+    assert not keep[made.moving & ~lost].any()
     assert keep[lost].all() if rule == "keep" else not keep[lost].any()
 
 
 @pytest.mark.parametrize("name", sorted(TESTED | FOLLOWED))
 def test_published_flows_are_lucas_kanade_without_a_check_of_ours(name: str) -> None:
     """What the flow of a system finds is what OpenCV's tracker finds, though a way back would contradict some of it."""
-    texture = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (240, 320), dtype=np.uint8), (0, 0), 2.0)
+    texture = cv2.GaussianBlur(
+        np.random.default_rng(0).integers(0, 255, (240, 320), dtype=np.uint8), (0, 0), 2.0
+    )
     first = cv2.normalize(texture, None, 0, 255, cv2.NORM_MINMAX)
     second = np.roll(first, (3, 9), (0, 1))
-    second[60:180, 80:240] = cv2.GaussianBlur(second[60:180, 240:80:-1], (0, 0), 4.0)  # something else came in
+    # something else came in
+    second[60:180, 80:240] = cv2.GaussianBlur(second[60:180, 240:80:-1], (0, 0), 4.0)
     grid = np.mgrid[20:300:12, 20:220:12].reshape(2, -1).T.astype(np.float32)
     flow = system(name)._flow
     found = flow.track(flow.prepare(first), flow.prepare(second), grid)
@@ -371,4 +432,6 @@ def test_published_flows_are_lucas_kanade_without_a_check_of_ours(name: str) -> 
     np.testing.assert_array_equal(found.valid, (status.ravel() > 0) & in_image)
     checked = system(name, **{"flow.forward_backward_px": 1.5})._flow
     kept = checked.track(checked.prepare(first), checked.prepare(second), grid).valid
-    assert np.count_nonzero(kept) < 0.9 * np.count_nonzero(found.valid), "the check would have changed the verdicts"
+    assert np.count_nonzero(kept) < 0.9 * np.count_nonzero(found.valid), (
+        "the check would have changed the verdicts"
+    )
