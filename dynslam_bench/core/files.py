@@ -19,9 +19,7 @@ from pathlib import Path
 
 from dynslam_bench.core.errors import InfrastructureError, raising
 
-_TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.(tmp|new)")
-_NEW_S = 60.0
-"""A temporary name ends in ``.new`` until it is locked, which takes no time, and in ``.tmp`` from then on."""
+_TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.tmp")
 _TURN_S = 0.1
 _CURE = "check the permissions and the free space"
 _AT_FDCWD = -100
@@ -113,11 +111,23 @@ def _exchange(one: Path, other: Path) -> bool:
 
 
 def _reserve(path: Path, make: Callable[[Path], None]) -> tuple[Path, int]:
-    """Make something of a temporary name beside `path`, and hold it; gives its path and the lock's descriptor."""
-    fresh = path.with_name(f".{path.name}.{secrets.token_hex(6)}.new")
-    make(fresh)
-    lock = hold(fresh)
-    return fresh.rename(fresh.with_suffix(".tmp")), lock
+    """Make a file or folder of a temporary name beside `path`, and lock it.
+
+    Another process may remove it as abandoned before it is locked; then it is made again.
+
+    Returns:
+        Its path, and the descriptor that holds the lock.
+    """
+    while True:
+        temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp")
+        make(temporary)
+        with suppress(FileNotFoundError):
+            lock = os.open(temporary, os.O_RDONLY)
+            with suppress(OSError):  # the file system knows no locks
+                fcntl.flock(lock, fcntl.LOCK_EX)  # waits for a process that is looking at it
+            if _is_at(lock, temporary):
+                return temporary, lock
+            os.close(lock)
 
 
 def is_temporary(path: Path) -> bool:
@@ -132,12 +142,15 @@ def sweep_temporary(folder: Path, pattern: str = ".*") -> None:
         folder: Where; nothing happens if it is missing.
         pattern: Of the paths below it to look at, e.g. ``runs/.*``.
     """
-    for path in folder.glob(pattern):
-        if not is_temporary(path) or not is_abandoned(path):
-            continue
-        with suppress(OSError):  # another process was faster, or it is another user's
-            if path.suffix == ".tmp" or time.time() - path.stat().st_mtime > _NEW_S:
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
+    for path in filter(is_temporary, folder.glob(pattern)):
+        # it is locked while it is removed: a process that has just made it waits, and makes it again
+        with _locked_if_abandoned(path) as is_ours, suppress(OSError):  # it is another user's
+            if not is_ours:
+                continue
+            if path.is_dir():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
 
 
 @contextmanager
@@ -216,25 +229,26 @@ def turn(path: Path) -> Iterator[None]:
         time.sleep(_TURN_S)
 
 
-def hold(path: Path) -> int:
-    """Lock a file or folder until the descriptor is closed, or this process and those that it forked have ended.
-
-    Raises:
-        OSError: It is not there.
-    """
-    handle = os.open(path, os.O_RDONLY)
-    _lock(handle)
-    return handle
-
-
 def is_abandoned(path: Path) -> bool:
-    """Whether a file or folder is there and no process holds it; False where the file system knows no locks."""
+    """Whether a file or folder is there and no process holds it; False where there are no locks."""
+    with _locked_if_abandoned(path) as is_ours:
+        return is_ours
+
+
+@contextmanager
+def _locked_if_abandoned(path: Path) -> Iterator[bool]:
+    """Lock a file or folder while the block lasts, if it is there and no other process holds it.
+
+    Yields:
+        Whether it is locked; False where the file system knows no locks.
+    """
     try:
         handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
     except OSError:
-        return False
+        yield False
+        return
     try:
-        return _lock(handle) is True
+        yield _lock(handle) is True
     finally:
         os.close(handle)
 

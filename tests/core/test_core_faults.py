@@ -25,6 +25,7 @@ from dynslam_bench.core import (
     TemporaryFolder,
     atomic_folder,
     claimed,
+    files,
     inside,
     is_abandoned,
     parse_json,
@@ -61,9 +62,7 @@ def sweep_below(root: Path) -> None:
 
 
 def swept(root: Path, sweep: Callable[[Path], None] = sweep_below) -> dict[str, bytes | str]:
-    """What is left once those have swept up who come a minute later."""
-    for new in root.rglob(".*.new"):
-        os.utime(new, (0, 0))
+    """What is left once those have swept up who come next."""
     sweep(root)
     return tree(root)
 
@@ -175,7 +174,7 @@ def test_a_run_is_removed_or_still_there(tmp_path: Path) -> None:
         faults=("kill", "full"),
     )
     assert not RunStore(root).ids()
-    assert found.operations > 5
+    assert found.operations > 4
     assert found.ends["kill", -9] == found.operations
 
 
@@ -216,6 +215,31 @@ def test_many_replace_a_folder_at_the_same_time(
             )
     assert [writer.result() for writer in writers] == [None] * 4
     assert [path.name for path in tmp_path.iterdir()] == ["folder"]
+
+
+def test_what_is_swept_before_it_is_locked_is_made_again(tmp_path: Path) -> None:
+    """Another process may look at a file or folder in the moment between its making and its lock."""
+    made: list[Path] = []
+
+    def make_and_lose(fresh: Path, make: Callable[[], None]) -> None:
+        made.append(fresh)
+        make()
+        if len(made) % 2:
+            sweep_temporary(tmp_path)
+            assert not fresh.exists()
+
+    for kind in ("touch", "mkdir"):
+        path, lock = files._reserve(
+            tmp_path / "x", lambda fresh, kind=kind: make_and_lose(fresh, getattr(fresh, kind))
+        )
+        assert path == made[-1]
+        assert path.exists()
+        sweep_temporary(tmp_path)
+        assert path.exists(), "it is locked"
+        os.close(lock)
+        sweep_temporary(tmp_path)
+        assert not path.exists()
+    assert len(made) == 4
 
 
 def test_a_name_is_claimed_once(tmp_path: Path) -> None:

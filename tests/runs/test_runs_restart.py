@@ -1,6 +1,5 @@
 """What of a results folder is locked, removed, full or killed in the middle: one line, and the same command goes on."""
 
-import os
 import shutil
 import sqlite3
 import warnings
@@ -117,9 +116,7 @@ def test_results_are_merged_again_after_any_fault(tmp_path: Path) -> None:
 
 
 def swept(root: Path) -> dict[str, bytes | str]:
-    """What is there once a command has swept up that comes a minute later."""
-    for new in root.rglob(".*.new"):
-        os.utime(new, (0, 0))
+    """What is there once the next command has swept up."""
     RunStore(root).prepare()
     return tree(root)
 
@@ -143,11 +140,10 @@ def test_what_was_changed_in_an_unfinished_bank_is_a_fault_all_the_same(
 def test_what_a_killed_process_left_is_no_part_of_a_bank(
     three: RunStore, tmp_path: Path, folder: str
 ) -> None:
-    """Its name ends in ``.new``: it may be that of a process which is about to lock it."""
     target = tmp_path / "bank"
     add(three, target)
     listed = (target / bank.SUMS).read_text()
-    left = target / folder / ".x.0123456789ab.new"
+    left = target / folder / ".x.0123456789ab.tmp"
     left.parent.mkdir(parents=True, exist_ok=True)
     left.write_text("half")
     assert bank.verify(target) == []
