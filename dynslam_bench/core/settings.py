@@ -6,9 +6,10 @@ Optuna or Gymnasium.
 
 Example:
     >>> class Epipolar(Settings):
-    ...     threshold_px: float = tunable(1.0, low=0.1, high=5.0, scale="log", unit="px",
-    online=True, ...                                   meaning="distance to the epipolar line above
-    which a point is dynamic")
+    ...     threshold_px: float = tunable(
+    ...         1.0, low=0.1, high=5.0, scale="log", unit="px", online=True,
+    ...         meaning="distance to the epipolar line above which a point is dynamic",
+    ...     )
     >>> class Tracker(Settings):
     ...     epipolar: Epipolar = Epipolar()
     >>> apply_overrides(Tracker(), {"epipolar.threshold_px": "1.5"}).epipolar.threshold_px

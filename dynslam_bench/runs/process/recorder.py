@@ -55,7 +55,7 @@ _SMALL = 1 << 20
 _LOOK_S = 0.5
 """Seconds between two looks at the programs. One that has ended before the first look counts by its command."""
 _FILE_CLOCK = 5 if sys.platform == "linux" else None
-"""The clock that stamps files, ``CLOCK_REALTIME_COARSE``; it moves on every 1 to 10 ms."""
+"""Number of the clock that stamps files, the coarse one; it moves on every 1 to 10 ms."""
 _CLOCK_NS = 10_000_000
 """So far the clock that stamps files may be behind that of the system."""
 _ADAPTERS = "dynslam_bench.trackers.adapters"
