@@ -196,10 +196,11 @@ def anchors_of(tracker: TrackerSpec, parts: Iterable[str]) -> Anchors:
     """
     files = [Path(module_of(part)).absolute() for part in parts if is_file(part)]
     if is_file(tracker.entry_point):
-        first = Path(module_of(tracker.entry_point)).absolute()
-    else:
-        first = min(files, key=lambda file: (file.name, file), default=None)
-    return Anchors(plugin=None if first is None else first.parent, work=Path.cwd())
+        files = [Path(module_of(tracker.entry_point)).absolute()]
+    if not files:
+        return Anchors(plugin=None, work=Path.cwd())
+    first = min(files, key=lambda file: (file.name, file))
+    return Anchors(plugin=first.parent, work=Path.cwd())
 
 
 def named_part(part: str, anchors: Anchors) -> str:
