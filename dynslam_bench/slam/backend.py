@@ -1,11 +1,19 @@
-"""The back end that all trackers share: what turns the static features of a frame into a pose and a map."""
+"""The back end that all trackers share: what turns the static features of a frame into a pose and a map.
+
+`RgbdBackend.track` follows ORB-SLAM3's ``Tracking::Track``. A frame's initial pose comes from the
+last frame or, if that is not trusted, from keyframes (relocalisation). The local map is matched
+around it and the pose is fitted to all matches. A frame that shows enough new becomes a keyframe,
+with local mapping and loop closing. A camera that is not recognised for some frames begins a submap.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from enum import Enum
 from pathlib import Path
 from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +24,7 @@ from dynslam_bench.geometry import Camera, Trajectory, se3
 from dynslam_bench.slam.atlas import open_atlas, save_atlas
 from dynslam_bench.slam.initialisation import InitialMap, TwoViewInitialiser
 from dynslam_bench.slam.local_mapping import KeyframePolicy, LocalMapper, refined
-from dynslam_bench.slam.loop_closing import LoopCloser
+from dynslam_bench.slam.loop_closing import LoopCloser, RootMapPose
 from dynslam_bench.slam.map import DEPTH_IMAGES, Array, Map, MapView, MapViews, map_outputs
 from dynslam_bench.slam.map_files import MapFeatures
 from dynslam_bench.slam.motion_model import (
@@ -30,15 +38,15 @@ from dynslam_bench.slam.motion_model import (
     rescale,
     trajectory,
 )
-from dynslam_bench.slam.relocalisation import PoseSearch, RelocalisationGate
+from dynslam_bench.slam.observations import Observations, observe
+from dynslam_bench.slam.relocalisation import MotionBound, PoseSearch, RelocalisationGate
 from dynslam_bench.slam.settings import BackendSettings, MonocularBackendSettings
 from dynslam_bench.slam.tracking import (
     InitialPose,
     LocalMap,
     MapFit,
-    Observations,
     TrackedFrame,
-    observe,
+    observe_points,
     pose_from_last_frame,
     track_local_map,
 )
@@ -47,13 +55,57 @@ MIN_INITIAL = 60
 """Features with depth that the first keyframe needs."""
 KNOWN_POSE = 1e6 * np.eye(6)
 """Information of a pose that defines a map's frame of reference."""
+ROOT_MAP = 0
+"""Number of the root map in the atlas; poses count in its world alone."""
+
+
+class CameraStatus(Enum):
+    """What is known of the camera's place; the back end's states.
+
+    `INITIALISING` becomes `TRACKED` with the first keyframe or, in a loaded map, when the camera is
+    found. `TRACKED` becomes `LOST` with a frame that the map does not explain. `LOST` becomes
+    `TRACKED` by relocalisation or with the first keyframe of a submap.
+    """
+
+    INITIALISING = "initialising"
+    """No frame has been tracked yet."""
+    TRACKED = "tracked"
+    """The last frame has a pose in the active map, which is the root map or a submap."""
+    LOST = "lost"
+    """The last frame was not recognised."""
+
+
+@dataclass(frozen=True, eq=False)
+class CurrentFrame:
+    """The frame that is being tracked.
+
+    Attributes:
+        bundle: The frame.
+        measured: Its features as they were measured.
+        observations: Its features, compensated for the rolling shutter where that is known.
+        last: The last tracked frame.
+        prediction: World-to-camera pose ``[4, 4]`` by the motion model.
+    """
+
+    bundle: FrameBundle
+    measured: Observations
+    observations: Observations
+    last: TrackedFrame
+    prediction: Array
+
+
+class UncompensatedFrame(NamedTuple):
+    """The first keyframe of a map, whose rolling shutter can be compensated once the motion is known."""
+
+    bundle: FrameBundle
+    measured: Observations
 
 
 class RgbdBackend:
     """Tracks frames against a map that it builds.
 
     Args:
-        settings: Of tracking, mapping, bundle adjustment, keyframes and relocalisation.
+        settings: Settings of tracking, mapping, bundle adjustment, keyframes and relocalisation.
         scale_factor: Ratio of consecutive pyramid levels of the features.
         levels: Number of pyramid levels of the features.
         extractor: Id of the feature extractor; a saved map serves the same features alone.
@@ -79,20 +131,21 @@ class RgbdBackend:
         """Put other settings into force from the next frame on."""
         self.settings = settings
         if hasattr(self, "mapper"):
-            self.mapper.settings = self.loops.settings = settings
-            self._keyframes.settings = settings.keyframes
+            self.mapper.settings = settings
+            self.loops.settings = settings
+            self._keyframe_policy.settings = settings.keyframes
 
     def reset(self, camera: Camera, seed: int) -> None:
-        """Forget everything: a new sequence begins, in the map that the settings name, if they do.
+        """Forget everything and begin a new sequence, in a loaded map if the settings name one.
 
         Args:
             camera: Intrinsics; keypoints' `xy` come undistorted, so its distortion plays no role
                 here.
-            seed: Founds all random draws.
+            seed: Seed of all random draws.
 
         Raises:
-            SettingsError: That map cannot be read, or is of another camera, other features or
-                another sensor.
+            SettingsError: The map cannot be read, or was made with another camera, other features
+                or another sensor.
         """
         s = self.settings
         self.camera = camera.undistorted()
@@ -106,20 +159,27 @@ class RgbdBackend:
         self.loops = LoopCloser(
             self.atlas, self.mapper, s, self.seed, scale_is_known=self.uses_depth
         )
-        self.state: TrackingState = "initialising"
-        self._grows = not s.map.localisation_only
+        self._status = CameraStatus.INITIALISING
+        self._mapping_enabled = not s.map.localisation_only
         self._gate = RelocalisationGate(
             self.atlas, s.relocalisation.max_speed, anywhere=bool(s.map.file)
         )
-        self._keyframes = KeyframePolicy(s.keyframes, self.mapper.close_m)
+        self._keyframe_policy = KeyframePolicy(s.keyframes, self.mapper.close_m)
         self._local_map = LocalMap(self.world, connected_only=s.loop_closing.enabled)
-        self._views = MapViews(self.world, DEPTH_IMAGES if self.uses_depth else 0)
-        self._tracked = False
-        self._unrecognised = 0
-        self._reference = -1
-        self._last: TrackedFrame | None = None
-        self._first: tuple[FrameBundle, Observations] | None = None
-        self._refined: Map | None = None
+        self._map_views = MapViews(self.world, DEPTH_IMAGES if self.uses_depth else 0)
+        self._unrecognised_frames = 0
+        self._reference_keyframe = -1
+        self._last_frame: TrackedFrame | None = None
+        self._uncompensated_first: UncompensatedFrame | None = None
+        self._refined_map: Map | None = None
+
+    @property
+    def state(self) -> TrackingState:
+        """The tracking state of the last frame; a camera that is tracked in a submap counts as lost."""
+        if self._status is CameraStatus.INITIALISING:
+            return "initialising"
+        in_root_map = self._status is CameraStatus.TRACKED and self.atlas.active == ROOT_MAP
+        return "ok" if in_root_map else "lost"
 
     # ------------------------------------------------------------------ one frame
 
@@ -145,168 +205,251 @@ class RgbdBackend:
             ``bundle_adjustment`` and ``loop_closing``, where they worked.
         """
         begin = perf_counter()
-        self._refined = None
-        observations = observe(frame, keep, weight, self.camera, self.world.scales)
-        result = (
-            self._track(frame, observations)
-            if self.world.next_keyframe
-            else self._initialise(frame, observations)
-        )
-        stages = {"tracking": perf_counter() - begin - sum(result.timings.values())}
-        return replace(
-            result, timings={**stages, "mapping": 0.0, "bundle_adjustment": 0.0, **result.timings}
-        )
+        self._refined_map = None
+        measured = observe(frame, keep, weight, self.camera, self.world.scales)
+        has_map = self.world.next_keyframe > 0
+        if has_map:
+            result = self._track(frame, measured)
+        else:
+            result = self._initialise(frame, measured)
 
-    def _track(self, frame: FrameBundle, raw: Observations) -> TrackResult:
-        """Predict, match the last frame or relocalise, track the local map, insert a keyframe."""
-        last = self._last_frame(frame, raw)
-        stamp = frame.timestamp
-        tracking = self.settings.tracking
-        rolling = bool(tracking.rolling_shutter and self.camera.readout_s and self._tracked)
-        observations = self.shutter.predicted(raw, last, stamp) if rolling else raw
-        prediction, _ = self.motion.expected(last, stamp)
-        initial, root = self._initial_pose(frame, raw, observations, last, prediction)
+        # what the other stages did not take is tracking
+        tracking_s = perf_counter() - begin - sum(result.timings.values())
+        timings = {"tracking": tracking_s, "mapping": 0.0, "bundle_adjustment": 0.0}
+        return replace(result, timings={**timings, **result.timings})
+
+    def _track(self, frame: FrameBundle, measured: Observations) -> TrackResult:
+        """Track a frame against the map (ORB-SLAM3's ``Tracking::Track``)."""
+        # predict the pose, and undo the rolling shutter by the last frame's velocity
+        current = self._predict_frame(frame, measured)
+
+        # initial pose: from the last frame, else from keyframes (relocalisation)
+        initial, in_root_map = self._estimate_initial_pose(current)
+        if initial is None and in_root_map is not None:
+            # the camera is lost in the submap, and found in the root map
+            self._leave_submap(current.last)
+            initial = in_root_map
+            in_root_map = None
         if initial is None:
-            return self._lose(frame, raw, last, prediction)
+            return self._lose(current)
+
+        # match the local map around the initial pose, and fit the pose to all matches
         _, points = self._local_map.around(initial.keyframe)
         fit = track_local_map(
-            self.world, observations, initial.matches, initial.T_cam_world, points, tracking
+            self.world,
+            current.observations,
+            initial.matches,
+            initial.T_cam_world,
+            points,
+            self.settings.tracking,
         )
-        velocity = None
-        if rolling and self._tracked:
-            observations, fit, velocity = self.shutter.refitted(
-                raw, observations, fit, last, stamp, force=self._first is not None
-            )
-        if self._grows:
+
+        # undo the rolling shutter by the motion to the fitted pose, and fit again
+        observations, fit, velocity = self._refit_rolling_shutter(current, fit)
+
+        # a pose that too few map points agree with is rejected
+        if self._mapping_enabled:
             self.world.visible[fit.in_view] += 1
-        required = (
-            tracking.min_inliers if self._tracked else self.settings.relocalisation.min_inliers
-        )
-        if fit.count < required:
-            result = self._lose(frame, raw, last, prediction)
-        else:
-            tracked = self._accept(frame, observations, fit, last)
-            self.shutter.velocity = velocity
-            first = self._first
-            self._first = None
-            if first is not None and velocity is not None:
-                return self._restart(frame, raw, first, velocity, fit.count)
-            result = self._update_map(frame, tracked, fit, root)
-        counts = {
-            "matches": len(fit.matches.feature),
-            "inliers": fit.count,
-            "relocalised": initial.relocalised,
-        }
-        return replace(result, stats={**result.stats, **counts})
+        if fit.count < self._min_inliers():
+            return _with_match_counts(self._lose(current), fit, initial)
 
-    def _initial_pose(
-        self,
-        frame: FrameBundle,
-        raw: Observations,
-        observations: Observations,
-        last: TrackedFrame,
-        prediction: Array,
-    ) -> tuple[InitialPose | None, InitialPose | None]:
-        """The frame's initial pose, and its pose in the root map where a submap's camera is found there, too."""
-        world = self.world
-        reference = self._reference
-        candidate, trusted = pose_from_last_frame(
-            world, last, observations, prediction, reference, self.settings.tracking
-        )
-        initial = candidate if trusted and self._tracked else None
-        if initial is not None and not self.atlas.active:
-            return initial, None
-        if self._tracked:
-            keyframes, _ = self._local_map.around(reference)
-            bound = self._gate.while_tracked(last, raw, frame.timestamp, prediction)
-        else:  # how other submaps lie to the active one is unknown
-            keyframes = world.keyframes
-            keyframes = keyframes[np.isin(world.kf_map[keyframes], (0, self.atlas.active))]
-            bound = self._gate.while_lost(last, raw, frame.timestamp)
-        search = PoseSearch(
-            observations,
-            reference,
-            keyframes,
-            not self._tracked,
-            bound,
-            self.settings,
-            self.seed,
-            frame.index,
-        )
-        root = search.in_root_map() if self._tracked and self.atlas.active else None
-        initial = initial or search.relocalised(candidate)
-        # the camera is lost in the submap, and found in the root map
-        if initial is None and root is not None:
-            self._tracked = False
-            self._gate.start(last)
-            self._forget_motion()
-            return root, None
-        return initial, root
+        # weigh the pose against the motion model
+        tracked = self._accept_pose(current, observations, fit)
+        self.shutter.velocity = velocity
 
-    def _last_frame(self, frame: FrameBundle, observations: Observations) -> TrackedFrame:
-        """The last tracked frame; an empty one before the camera is found in a loaded map."""
-        if self._last is not None:
-            return self._last
-        stored, own = (8 * words.shape[1] for words in (self.world.words, observations.words))
-        if len(observations) and own != stored:
+        # the second frame of a map tells the motion in the first: begin the map again without its distortion
+        first = self._uncompensated_first
+        self._uncompensated_first = None
+        if first is not None and velocity is not None:
+            return self._restart_compensated(current, first, velocity, fit.count)
+
+        # insert a keyframe if the frame shows enough new
+        result = self._update_map(frame, tracked, fit, in_root_map)
+        return _with_match_counts(result, fit, initial)
+
+    # ------------------------------------------------------------------ steps of tracking
+
+    def _predict_frame(self, frame: FrameBundle, measured: Observations) -> CurrentFrame:
+        """The frame with its pose by the motion model and its features by the last frame's velocity."""
+        last = self._last_tracked_frame(frame, measured)
+        prediction, _ = self.motion.expected(last, frame.timestamp)
+        observations = measured
+        if self._compensates_rolling_shutter():
+            observations = self.shutter.predicted(measured, last, frame.timestamp)
+        return CurrentFrame(frame, measured, observations, last, prediction)
+
+    def _compensates_rolling_shutter(self) -> bool:
+        """Whether the rolling shutter is compensated; a lost camera's motion is unknown."""
+        return bool(
+            self.settings.tracking.rolling_shutter
+            and self.camera.readout_s
+            and self._status is CameraStatus.TRACKED
+        )
+
+    def _last_tracked_frame(self, frame: FrameBundle, measured: Observations) -> TrackedFrame:
+        """The last tracked frame; an empty one before the camera is found in a loaded map.
+
+        Raises:
+            TrackerError: The loaded map's descriptors have another length than the frame's.
+        """
+        if self._last_frame is not None:
+            return self._last_frame
+        stored_bytes = 8 * self.world.words.shape[1]
+        frame_bytes = 8 * measured.words.shape[1]
+        if len(measured) and frame_bytes != stored_bytes:
             raise TrackerError(
-                f"the map's descriptors have {stored} bytes, frame {frame.index}'s {own}",
+                f"the map's descriptors have {stored_bytes} bytes, frame {frame.index}'s {frame_bytes}",
                 "make the map with the same features",
             )
-        keep = np.zeros(len(frame.xy), bool)
-        none = observe(frame, keep, keep.astype(np.float32), self.camera, self.world.scales)
-        return TrackedFrame(none, np.zeros(0, np.int64), np.eye(4), frame.timestamp)
+        keep_none = np.zeros(len(frame.xy), bool)
+        weight = keep_none.astype(np.float32)
+        empty = observe(frame, keep_none, weight, self.camera, self.world.scales)
+        return TrackedFrame(empty, np.zeros(0, np.int64), np.eye(4), frame.timestamp)
 
-    def _accept(
-        self, frame: FrameBundle, observations: Observations, fit: MapFit, last: TrackedFrame
+    def _estimate_initial_pose(
+        self, current: CurrentFrame
+    ) -> tuple[InitialPose | None, InitialPose | None]:
+        """The frame's pose in the active map and, where that is a submap, its pose in the root map."""
+        tracked = self._status is CameraStatus.TRACKED
+        in_submap = self.atlas.active != ROOT_MAP
+
+        # from the last frame
+        from_last_frame, trusted = pose_from_last_frame(
+            self.world,
+            current.last,
+            current.observations,
+            current.prediction,
+            self._reference_keyframe,
+            self.settings.tracking,
+        )
+        initial = from_last_frame if trusted and tracked else None
+        if initial is not None and not in_submap:
+            return initial, None
+
+        # from keyframes, within the motion bound
+        keyframes, bound = self._relocalisation_candidates(current)
+        search = PoseSearch(
+            current.observations,
+            self._reference_keyframe,
+            keyframes,
+            lost=not tracked,
+            bound=bound,
+            settings=self.settings,
+            seed=self.seed,
+            frame=current.bundle.index,
+        )
+        in_root_map = search.in_root_map() if tracked and in_submap else None
+        if initial is None:
+            initial = search.relocalised(from_last_frame)
+        return initial, in_root_map
+
+    def _relocalisation_candidates(
+        self, current: CurrentFrame
+    ) -> tuple[NDArray[np.int64], MotionBound]:
+        """Slots of the keyframes that the frame is compared with, and where the camera can be."""
+        last = current.last
+        stamp = current.bundle.timestamp
+        if self._status is CameraStatus.TRACKED:
+            keyframes, _ = self._local_map.around(self._reference_keyframe)
+            bound = self._gate.while_tracked(last, current.measured, stamp, current.prediction)
+            return keyframes, bound
+        # how other submaps lie to the active one is unknown
+        keyframes = self.world.keyframes
+        maps = (ROOT_MAP, self.atlas.active)
+        keyframes = keyframes[np.isin(self.world.kf_map[keyframes], maps)]
+        return keyframes, self._gate.while_lost(last, current.measured, stamp)
+
+    def _leave_submap(self, last: TrackedFrame) -> None:
+        """The camera is lost in the submap where it was tracked."""
+        self._status = CameraStatus.LOST
+        self._gate.start(last)
+        self._forget_motion()
+
+    def _refit_rolling_shutter(
+        self, current: CurrentFrame, fit: MapFit
+    ) -> tuple[Observations, MapFit, CameraVelocity | None]:
+        """The features compensated by the motion to the frame's pose, the pose fitted to them, and that motion.
+
+        The motion is None, and nothing changes, where the rolling shutter is not compensated.
+        """
+        if not self._compensates_rolling_shutter():
+            return current.observations, fit, None
+        return self.shutter.refitted(
+            current.measured,
+            current.observations,
+            fit,
+            current.last,
+            current.bundle.timestamp,
+            force=self._uncompensated_first is not None,
+        )
+
+    def _min_inliers(self) -> int:
+        """Map points that must agree with a pose; a camera that was lost needs more."""
+        if self._status is CameraStatus.TRACKED:
+            return self.settings.tracking.min_inliers
+        return self.settings.relocalisation.min_inliers
+
+    def _accept_pose(
+        self, current: CurrentFrame, observations: Observations, fit: MapFit
     ) -> TrackedFrame:
         """The frame is tracked: its pose is weighed against the motion model, its inliers count as found."""
         points = fit.matches.point[fit.inliers]
-        if self._grows:
+        if self._mapping_enabled:
             self.world.found[points] += 1
-        point = np.full(len(observations.xy), -1, np.int64)
-        point[fit.matches.feature[fit.inliers]] = points
+        stamp = current.bundle.timestamp
         pose = self.motion.filtered(
-            last, frame.timestamp, fit.estimate.T_cam_world, fit.estimate.information
+            current.last, stamp, fit.estimate.T_cam_world, fit.estimate.information
         )
-        self._tracked = True
-        self._unrecognised = 0
-        self._last = tracked = TrackedFrame(observations, point, pose, frame.timestamp)
-        near, _ = self.world.covisible_of(points)
-        self._reference = int(near[0]) if len(near) else self._reference
-        self._update_state()
+        observed = observe_points(observations, fit.matches.feature[fit.inliers], points)
+        tracked = TrackedFrame(observations, observed, pose, stamp)
+        self._status = CameraStatus.TRACKED
+        self._unrecognised_frames = 0
+        self._last_frame = tracked
+        # the reference keyframe shares most points with the frame
+        covisible, _ = self.world.covisible_of(points)
+        if len(covisible):
+            self._reference_keyframe = int(covisible[0])
+        self._update_active_map()
         return tracked
 
-    def _lose(
-        self, frame: FrameBundle, observations: Observations, last: TrackedFrame, prediction: Array
-    ) -> TrackResult:
+    def _lose(self, current: CurrentFrame) -> TrackResult:
         """Nothing is recognised; after some such frames, with loop closing, a submap begins."""
-        self.state = "lost"
-        self._first = None
-        textured = int(((observations.z > 0) | (not self.uses_depth)).sum()) >= MIN_INITIAL
-        if self._tracked:
-            self._gate.lose(last, observations, textured=textured)
-        self._tracked = False
+        measured = current.measured
+        usable = measured.z > 0 if self.uses_depth else np.ones(len(measured), bool)
+        # more than a blank wall or a covered lens
+        textured = int(usable.sum()) >= MIN_INITIAL
+
+        # the gate bounds the motion from the last tracked frame on
+        if self._status is CameraStatus.TRACKED:
+            self._gate.lose(current.last, measured, textured=textured)
+        self._status = CameraStatus.LOST
+        self._uncompensated_first = None
         self._forget_motion()
-        self._unrecognised = self._unrecognised + 1 if textured else 0
-        begun = None
+
+        self._unrecognised_frames = self._unrecognised_frames + 1 if textured else 0
+        if self._submap_is_due():
+            begun = self._create_submap(current)
+            if begun is not None:
+                return begun
+        return self._result(None if self._last_frame is None else current.prediction)
+
+    def _submap_is_due(self) -> bool:
+        """Whether enough textured frames in a row were not recognised, with loop closing to merge a submap."""
         s = self.settings
-        if (
-            self._grows
+        return (
+            self._mapping_enabled
             and s.loop_closing.enabled
-            and self._unrecognised >= s.relocalisation.new_map_after
-        ):
-            begun = self._begin_submap(frame, observations, last)
-        return begun or self._result(None if self._last is None else prediction)
+            and self._unrecognised_frames >= s.relocalisation.new_map_after
+        )
 
     def _forget_motion(self) -> None:
+        """The camera's velocity is unknown from now on."""
         self.motion.state = None
         self.shutter.velocity = None
 
-    def _update_state(self) -> None:
-        """Poses count in the world of the root map alone."""
-        self.atlas.active = int(self.world.kf_map[self._reference])
-        self.state = "ok" if self._tracked and self.atlas.active == 0 else "lost"
+    def _update_active_map(self) -> None:
+        """The active map is that of the reference keyframe, which a merge may have changed."""
+        self.atlas.active = int(self.world.kf_map[self._reference_keyframe])
 
     def _result(
         self, T_cam_world: Array | None, timings: Mapping[str, float] | None = None, **stats: float
@@ -314,11 +457,18 @@ class RgbdBackend:
         """A frame's result with the state and the map as they are now; with `timings` if it became a keyframe."""
         world = self.world
         pose = None if T_cam_world is None else se3.inverse(T_cam_world)
+        maps = set(world.kf_map[world.kf_alive].tolist())
         counts = {
-            "matches": 0, "inliers": 0, "map_points": len(world.points), "keyframes": world.keyframe_count,
-            "keyframe": bool(timings), "maps": len(set(world.kf_map[world.kf_alive].tolist())),
-            "loops": len(self.loops.closed), "residual_px": 0.0, "relocalised": False,
-        }  # fmt: skip
+            "matches": 0,
+            "inliers": 0,
+            "map_points": len(world.points),
+            "keyframes": world.keyframe_count,
+            "keyframe": bool(timings),
+            "maps": len(maps),
+            "loops": len(self.loops.closed),
+            "residual_px": 0.0,
+            "relocalised": False,
+        }
         return TrackResult(pose, self.state, counts | stats, timings or {})
 
     # ------------------------------------------------------------------ beginning a map
@@ -328,115 +478,149 @@ class RgbdBackend:
         if np.count_nonzero(observations.z > 0) < MIN_INITIAL:
             return self._result(None)
         if self.settings.tracking.rolling_shutter and self.camera.readout_s:
-            self._first = frame, observations
-        return self._begin_map(frame, observations, np.eye(4))
+            self._uncompensated_first = UncompensatedFrame(frame, observations)
+        return self._create_initial_map(frame, observations, np.eye(4))
 
-    def _begin_map(
+    def _create_initial_map(
         self, frame: FrameBundle, observations: Observations, T_cam_world: Array
     ) -> TrackResult:
         """The frame becomes the first keyframe of the active map."""
-        self._tracked = True
-        point = np.full(len(observations), -1, np.int64)
-        self._last = tracked = TrackedFrame(observations, point, T_cam_world, frame.timestamp)
-        timings = self._insert_keyframe(frame, tracked)
-        self._update_state()
-        self._remember(frame, np.eye(4), KNOWN_POSE)
+        self._status = CameraStatus.TRACKED
+        no_points = np.full(len(observations), -1, np.int64)
+        tracked = TrackedFrame(observations, no_points, T_cam_world, frame.timestamp)
+        self._last_frame = tracked
+        timings, _ = self._insert_keyframe(frame, tracked)
+        self._update_active_map()
+        self._record_pose(frame, np.eye(4), KNOWN_POSE)
         points = int(np.count_nonzero(tracked.point >= 0))
         return self._result(T_cam_world, timings, matches=points, inliers=points)
 
-    def _restart(
+    def _restart_compensated(
         self,
-        frame: FrameBundle,
-        raw: Observations,
-        first: tuple[FrameBundle, Observations],
+        current: CurrentFrame,
+        first: UncompensatedFrame,
         velocity: CameraVelocity,
         inliers: int,
     ) -> TrackResult:
-        """Begin the map again: the second frame tells the camera's motion in the first, whose points were distorted.
+        """Begin the map again with a compensated first frame, and track the current frame in it.
 
-        Where fewer points agree then than the `inliers` before, the first frame is left
-        uncompensated.
+        The second frame tells the camera's motion in the first, whose points were distorted. Where
+        fewer points agree then than the `inliers` before, the first frame is left uncompensated.
         """
+        compensated = compensate_rolling_shutter(first.measured, self.camera, velocity)
         seconds = dict[str, float]()
-        for assumed in (velocity, None):
+        for observations, known_velocity in ((compensated, velocity), (first.measured, None)):
             self.reset(self.camera, self.seed)
-            self.shutter.velocity = assumed
-            observations = (
-                first[1]
-                if assumed is None
-                else compensate_rolling_shutter(first[1], self.camera, assumed)
-            )
-            begun = self._begin_map(first[0], observations, np.eye(4))
-            result = self._track(frame, raw)
+            self.shutter.velocity = known_velocity
+            begun = self._create_initial_map(first.bundle, observations, np.eye(4))
+            result = self._track(current.bundle, current.measured)
+            # both attempts took time
             for stage, spent in (*begun.timings.items(), *result.timings.items()):
                 seconds[stage] = seconds.get(stage, 0.0) + spent
             if result.state == "ok" and result.stats["inliers"] >= MIN_AGREEING * inliers:
                 break
         return replace(result, timings=seconds)
 
-    def _begin_submap(
-        self, frame: FrameBundle, observations: Observations, last: TrackedFrame
-    ) -> TrackResult | None:
+    def _create_submap(self, current: CurrentFrame) -> TrackResult | None:
         """Begin a submap where the camera was lost, rotated as the images tell; None if not yet."""
-        self._note_submap(last, frame.timestamp)
-        return self._begin_map(frame, observations, self._gate.rotated(last))
+        frame = current.bundle
+        self._add_submap(current.last, frame.timestamp)
+        T_cam_world = self._gate.rotated(current.last)
+        return self._create_initial_map(frame, current.measured, T_cam_world)
 
-    def _note_submap(self, last: TrackedFrame, timestamp: float) -> None:
-        """A submap begins with the frame of this stamp."""
-        self._unrecognised = 0
+    def _add_submap(self, last: TrackedFrame, timestamp: float) -> None:
+        """Add an empty submap to the atlas, which begins with the frame of a stamp, and make it active."""
+        self._unrecognised_frames = 0
         start = se3.inverse(last.T_cam_world)[:3, 3]
         self.atlas.begin_submap(start, self._gate.distance_m(last, timestamp), self._gate.slack)
 
     # ------------------------------------------------------------------ keyframes
 
     def _update_map(
-        self, frame: FrameBundle, tracked: TrackedFrame, fit: MapFit, root: InitialPose | None
+        self,
+        frame: FrameBundle,
+        tracked: TrackedFrame,
+        fit: MapFit,
+        in_root_map: InitialPose | None,
     ) -> TrackResult:
-        """Make the tracked frame a keyframe if the policy or a merge asks for it, and add its pose to the history."""
-        timings = {}
+        """Insert the tracked frame as a keyframe if the policy or a merge asks for it, and record its pose.
+
+        Args:
+            frame: The frame.
+            tracked: Its pose and map points in the active map.
+            fit: The fit that gave them.
+            in_root_map: Its pose in the root map, if the camera is in a submap and was found there.
+        """
+        timings: dict[str, float] = {}
+        verdict = RootMapPose.REJECTED
         pose = fit.estimate.T_cam_world
-        needed = root is not None or self._keyframes.needs_keyframe(
-            self.world, tracked, frame.index, self._reference
+        needed = in_root_map is not None or self._keyframe_policy.needs_keyframe(
+            self.world, tracked, frame.index, self._reference_keyframe
         )
-        if self._grows and needed:
-            timings = self._insert_keyframe(frame, tracked, root)
+        if self._mapping_enabled and needed:
+            timings, verdict = self._insert_keyframe(frame, tracked, in_root_map)
+            # bundle adjustment and loop closing have moved the frame
             pose = tracked.T_cam_world
             self.motion.relocated(pose)
-        self._remember(
-            frame, pose @ se3.inverse(self.world.kf_pose[self._reference]), fit.estimate.information
-        )
-        self._update_state()
-        result = self._result(tracked.T_cam_world, timings, residual_px=fit.estimate.residual_px)
-        if root is None or not self.atlas.active or not self.loops.in_root_map:
-            return result
-        # the camera is in the root map, too: there its pose counts, and it may continue there
-        self.history[-1].reference = root.keyframe
-        self.history[-1].T_cam_ref = root.T_cam_world @ se3.inverse(
-            self.world.kf_pose[root.keyframe]
-        )
-        if self.loops.leaves_submap:
-            point = np.full(len(tracked.observations), -1, np.int64)
-            point[root.matches.feature] = np.where(
-                self.world.alive[root.matches.point], root.matches.point, -1
-            )
-            self._last = replace(tracked, point=point, T_cam_world=root.T_cam_world)
-            self._reference = root.keyframe
-            self._forget_motion()
-            self._update_state()
-        return replace(result, T_world_cam=se3.inverse(root.T_cam_world), state="ok")
 
-    def _remember(self, frame: FrameBundle, T_cam_ref: Array, information: Array) -> None:
-        self.history.append(
-            FramePose(frame.timestamp, self._reference, T_cam_ref, information.astype(np.float32))
+        T_ref_world = self.world.kf_pose[self._reference_keyframe]
+        T_cam_ref = pose @ se3.inverse(T_ref_world)
+        self._record_pose(frame, T_cam_ref, fit.estimate.information)
+        self._update_active_map()
+        result = self._result(tracked.T_cam_world, timings, residual_px=fit.estimate.residual_px)
+
+        merged = self.atlas.active == ROOT_MAP
+        if in_root_map is None or merged or verdict is RootMapPose.REJECTED:
+            return result
+        # the camera is in the root map, too: there its pose counts
+        self._record_root_map_pose(in_root_map)
+        if verdict is RootMapPose.CONTINUE_THERE:
+            self._continue_in_root_map(tracked, in_root_map)
+        return replace(result, T_world_cam=se3.inverse(in_root_map.T_cam_world), state="ok")
+
+    def _record_root_map_pose(self, in_root_map: InitialPose) -> None:
+        """The last recorded pose becomes relative to a keyframe of the root map."""
+        T_ref_world = self.world.kf_pose[in_root_map.keyframe]
+        recorded = self.history[-1]
+        recorded.reference = in_root_map.keyframe
+        recorded.T_cam_ref = in_root_map.T_cam_world @ se3.inverse(T_ref_world)
+
+    def _continue_in_root_map(self, tracked: TrackedFrame, in_root_map: InitialPose) -> None:
+        """Tracking continues in the root map; the submap stays apart."""
+        matched = in_root_map.matches.point
+        # mapping may have removed some of the matched points since
+        alive = np.where(self.world.alive[matched], matched, -1)
+        observed = observe_points(tracked.observations, in_root_map.matches.feature, alive)
+        self._last_frame = replace(tracked, point=observed, T_cam_world=in_root_map.T_cam_world)
+        self._reference_keyframe = in_root_map.keyframe
+        self._forget_motion()
+        self._update_active_map()
+
+    def _record_pose(self, frame: FrameBundle, T_cam_ref: Array, information: Array) -> None:
+        """Add a frame to the history, relative to the reference keyframe."""
+        recorded = FramePose(
+            frame.timestamp, self._reference_keyframe, T_cam_ref, information.astype(np.float32)
         )
+        self.history.append(recorded)
 
     def _insert_keyframe(
-        self, frame: FrameBundle, tracked: TrackedFrame, root: InitialPose | None = None
-    ) -> dict[str, float]:
-        """Make a tracked frame a keyframe, with bundle adjustment and loop closing; returns seconds by stage."""
+        self, frame: FrameBundle, tracked: TrackedFrame, in_root_map: InitialPose | None = None
+    ) -> tuple[dict[str, float], RootMapPose]:
+        """Make a tracked frame a keyframe, with bundle adjustment and loop closing.
+
+        Args:
+            frame: The frame.
+            tracked: Its features, pose and map points; the latter two become those after mapping.
+            in_root_map: Its pose in the root map, if the camera is in a submap and was found there.
+
+        Returns:
+            Seconds by stage, and whether the pose in the root map counts.
+        """
         world = self.world
-        mapper = self.mapper
-        slot, timings = mapper.insert(
+        verdict = RootMapPose.REJECTED
+
+        # local mapping
+        slot, timings = self.mapper.insert(
             tracked.observations,
             tracked.point,
             tracked.T_cam_world,
@@ -444,26 +628,36 @@ class RgbdBackend:
             frame.timestamp,
             self.atlas.active,
         )
-        self._reference = slot
-        for culled, replacement, relative in mapper.culled:
-            for pose in (pose for pose in self.history if pose.reference == culled):
-                pose.reference = replacement
-                pose.T_cam_ref = pose.T_cam_ref @ relative
+        self._reference_keyframe = slot
+        self._transfer_history()
+
+        # loop closing
         if self.settings.loop_closing.enabled:
             begin = perf_counter()
-            before = world.kf_pose[slot].copy()
-            self.loops.close(slot, tracked.observations, root)
-            rescale(self.history, self.loops.rescaled)
+            T_before = world.kf_pose[slot].copy()
+            closing = self.loops.close(slot, tracked.observations, in_root_map)
+            verdict = closing.root_map_pose
+            rescale(self.history, closing.rescaled)
             # the rotation by a loop with depth is within the motion's noise
-            if slot in self.loops.rescaled:
-                self.motion.transformed(before, world.kf_pose[slot], self.loops.rescaled[slot])
+            if slot in closing.rescaled:
+                self.motion.transformed(T_before, world.kf_pose[slot], closing.rescaled[slot])
             timings["loop_closing"] = perf_counter() - begin
-        self._keyframes.made(frame.index)
-        self._views.add_keyframe(slot, frame.depth)
+
+        # the tracked frame takes over what mapping made of it
+        self._keyframe_policy.made(frame.index)
+        self._map_views.add_keyframe(slot, frame.depth)
         tracked.point = world.kf_point[slot, : len(tracked.observations)].astype(np.int64)
         tracked.T_cam_world = world.kf_pose[slot].copy()
         world.release()
-        return timings
+        return timings, verdict
+
+    def _transfer_history(self) -> None:
+        """Poses relative to a culled keyframe become relative to its replacement."""
+        for culled, replacement, T_culled_replacement in self.mapper.culled:
+            for pose in self.history:
+                if pose.reference == culled:
+                    pose.reference = replacement
+                    pose.T_cam_ref = pose.T_cam_ref @ T_culled_replacement
 
     # ------------------------------------------------------------------ what filters and files read
 
@@ -477,18 +671,18 @@ class RgbdBackend:
         Args:
             timestamp: The stamp of the next frame, seconds.
         """
-        if self._last is None or not self._tracked:
+        if self._last_frame is None or self._status is not CameraStatus.TRACKED:
             return None, None
-        T_cam_world, covariance = self.motion.expected(self._last, timestamp, jitter=JITTER)
+        T_cam_world, covariance = self.motion.expected(self._last_frame, timestamp, jitter=JITTER)
         return se3.inverse(T_cam_world), covariance
 
     def view(self) -> MapView:
-        """What filters may read of the map that the camera is in, as it was before a `finalize`."""
-        return self._views.of(self.atlas.active)
+        """What filters may read of the map that the camera is in; `finalize` does not change it."""
+        return self._map_views.of(self.atlas.active)
 
     def outputs(self) -> MapOutputs:
         """Keyframes and map points for ``keyframes.csv``, ``map.ply`` and pictures."""
-        return map_outputs(self._refined or self.world)
+        return map_outputs(self._refined_map or self.world)
 
     def save_map(self, path: Path, made_by: str = "") -> None:
         """Write the map to a file from which a later run may start (`backend.map.file`).
@@ -501,7 +695,7 @@ class RgbdBackend:
             TrackerError: There is no map yet, or it is too large for a file.
             DynslamError: The file cannot be written.
         """
-        world = self._refined or self.world
+        world = self._refined_map or self.world
         save_atlas(path, self.atlas, world, self._features, depth=self.uses_depth, made_by=made_by)
 
     def finalize(self) -> Trajectory:
@@ -510,9 +704,20 @@ class RgbdBackend:
         With `bundle_adjustment.full` a copy of the whole map is refined first, unless the run only
         localises in it.
         """
-        if self._grows and self.settings.bundle_adjustment.full and self._refined is None:
-            self._refined = refined(self.world)
-        return trajectory(self.history, self._refined or self.world, self.settings.motion)
+        refines = self._mapping_enabled and self.settings.bundle_adjustment.full
+        if refines and self._refined_map is None:
+            self._refined_map = refined(self.world)
+        return trajectory(self.history, self._refined_map or self.world, self.settings.motion)
+
+
+def _with_match_counts(result: TrackResult, fit: MapFit, initial: InitialPose) -> TrackResult:
+    """The result with the stats of matching."""
+    counts = {
+        "matches": len(fit.matches.feature),
+        "inliers": fit.count,
+        "relocalised": initial.relocalised,
+    }
+    return replace(result, stats={**result.stats, **counts})
 
 
 class MonocularBackend(RgbdBackend):
@@ -525,7 +730,7 @@ class MonocularBackend(RgbdBackend):
     settings: MonocularBackendSettings
 
     def reset(self, camera: Camera, seed: int) -> None:
-        """Forget everything: a new sequence begins."""
+        """Forget everything and begin a new sequence, as `RgbdBackend.reset` does."""
         super().reset(camera, seed)
         self._initialiser = TwoViewInitialiser()
 
@@ -535,25 +740,29 @@ class MonocularBackend(RgbdBackend):
         initial = self._initialiser.add(frame, observations, self.camera, self.settings.two_views)
         if initial is None:
             return self._result(None)
-        return self._begin_from_two(initial, np.eye(4), perf_counter() - begin)
+        return self._create_map_from_two_views(initial, np.eye(4), perf_counter() - begin)
 
-    def _begin_submap(
-        self, frame: FrameBundle, observations: Observations, last: TrackedFrame
-    ) -> TrackResult | None:
+    def _create_submap(self, current: CurrentFrame) -> TrackResult | None:
         """Begin a submap as the root map began; its unit of length is the median depth of its own views."""
         begin = perf_counter()
-        if self._unrecognised == self.settings.relocalisation.new_map_after:
+        last = current.last
+        first_try = self._unrecognised_frames == self.settings.relocalisation.new_map_after
+        if first_try:
             self._initialiser = TwoViewInitialiser()
-        initial = self._initialiser.add(frame, observations, self.camera, self.settings.two_views)
+        initial = self._initialiser.add(
+            current.bundle, current.measured, self.camera, self.settings.two_views
+        )
         if initial is None:
             return None
         seconds = perf_counter() - begin
-        self._note_submap(last, initial.first.frame.timestamp)
+        self._add_submap(last, initial.first.frame.timestamp)
+        # the current frame is the second view, and is rotated as the images tell
+        R_first_second = initial.motion.T_second_first[:3, :3].T
         T_first_world = last.T_cam_world.copy()
-        T_first_world[:3] = initial.motion.T_second_first[:3, :3].T @ self._gate.rotated(last)[:3]
-        return self._begin_from_two(initial, T_first_world, seconds)
+        T_first_world[:3] = R_first_second @ self._gate.rotated(last)[:3]
+        return self._create_map_from_two_views(initial, T_first_world, seconds)
 
-    def _begin_from_two(
+    def _create_map_from_two_views(
         self, initial: InitialMap, T_first_world: Array, seconds: float
     ) -> TrackResult:
         """The two views become keyframes; the second, which is the current frame, is tracked."""
@@ -561,16 +770,16 @@ class MonocularBackend(RgbdBackend):
         frame = initial.second.frame
         observations = initial.second.observations
         pose = self.world.kf_pose[second].copy()
-        self._initialiser = TwoViewInitialiser()
-        self._tracked = True
         point = self.world.kf_point[second, : len(observations)].astype(np.int64)
-        self._last = TrackedFrame(observations, point, pose, frame.timestamp)
-        self._reference = second
-        self._keyframes.made(frame.index)
-        self._views.add_keyframe(first, initial.first.frame.depth)
-        self._views.add_keyframe(second, frame.depth)
-        self._update_state()
-        self._remember(frame, np.eye(4), KNOWN_POSE)
+        self._initialiser = TwoViewInitialiser()
+        self._status = CameraStatus.TRACKED
+        self._last_frame = TrackedFrame(observations, point, pose, frame.timestamp)
+        self._reference_keyframe = second
+        self._keyframe_policy.made(frame.index)
+        self._map_views.add_keyframe(first, initial.first.frame.depth)
+        self._map_views.add_keyframe(second, frame.depth)
+        self._update_active_map()
+        self._record_pose(frame, np.eye(4), KNOWN_POSE)
         count = len(initial.motion.points)
         return self._result(pose, {"mapping": seconds}, matches=count, inliers=count)
 
@@ -578,10 +787,10 @@ class MonocularBackend(RgbdBackend):
 def build_backend(
     settings: BackendSettings, scale_factor: float, levels: int, extractor: str
 ) -> RgbdBackend:
-    """The back end that settings ask for: with depth or, of `MonocularBackendSettings`, without.
+    """Build the back end that settings ask for: without depth for `MonocularBackendSettings`, else with depth.
 
     Args:
-        settings: Of the back end.
+        settings: Settings of the back end.
         scale_factor: Ratio of consecutive pyramid levels of the features.
         levels: Number of pyramid levels of the features.
         extractor: Id of the feature extractor.

@@ -25,9 +25,9 @@ from dynslam_bench.features.matching import rotation_consistent, search_in_radiu
 from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.slam.bundle_adjustment import BundleProblem, adjust_bundle
 from dynslam_bench.slam.map import Array, Map, Slots
+from dynslam_bench.slam.observations import Observations
 from dynslam_bench.slam.pose_optimisation import NEAR_M, optimise_pose
 from dynslam_bench.slam.settings import TwoViewSettings
-from dynslam_bench.slam.tracking import Observations
 
 MAX_DISTANCE = 50
 RATIO = 0.9

@@ -24,8 +24,9 @@ from dynslam_bench.features.matching import (
 from dynslam_bench.geometry import se3
 from dynslam_bench.slam.bundle_adjustment import Bundle, adjust_bundle, full_bundle, local_bundle
 from dynslam_bench.slam.map import Array, Map, Slots
+from dynslam_bench.slam.observations import Observations
 from dynslam_bench.slam.settings import BackendSettings, KeyframeSettings
-from dynslam_bench.slam.tracking import CLOSE_BASELINES, Observations, TrackedFrame
+from dynslam_bench.slam.tracking import CLOSE_BASELINES, TrackedFrame
 
 MAX_DISTANCE = 50
 """Largest Hamming distance in fusion and triangulation (ORB-SLAM2's lower threshold)."""

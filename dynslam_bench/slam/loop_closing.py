@@ -17,7 +17,8 @@ Lengths are metres; without depth they are in units of the root map's median dep
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from enum import Enum
 
 import numpy as np
 from scipy.sparse import bsr_array, coo_array, diags_array
@@ -29,6 +30,7 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.slam.atlas import Atlas
 from dynslam_bench.slam.local_mapping import LocalMapper
 from dynslam_bench.slam.map import Array, Slots
+from dynslam_bench.slam.observations import Observations
 from dynslam_bench.slam.relocalisation import (
     around,
     is_aliased,
@@ -37,7 +39,7 @@ from dynslam_bench.slam.relocalisation import (
     recognition_scores,
 )
 from dynslam_bench.slam.settings import BackendSettings
-from dynslam_bench.slam.tracking import InitialPose, Observations, weakly_connected
+from dynslam_bench.slam.tracking import InitialPose, weakly_connected
 
 CANDIDATES = 3
 """Best-ranked keyframes that are matched feature by feature."""
@@ -46,21 +48,24 @@ MIN_MATCHES = 20
 MIN_SHARE = 0.3
 """Share of the candidate's own points in view that must be seen."""
 MERGE_INLIERS = 100
+"""Inliers that a merge of two maps needs, which no drift bounds."""
 MERGE_SHARE = 0.5
-"""The same, and the number of inliers, where two maps are merged, which no drift bounds."""
+"""`MIN_SHARE` where two maps are merged."""
 MERGE_UNCERTAINTY = 0.4
 """Largest `relocalisation.pose_uncertainty` of a pose by which maps are merged."""
 STRONG_COVISIBILITY = 100
 """Keyframes that share so many points have an edge in the pose graph (ORB-SLAM2's number)."""
 SLACK_M = 0.1
+"""Distance that is accepted as a correction however short the path is."""
 SLACK_DEG = 3.0
-"""Correction that is accepted however short the path is."""
+"""Rotation that is accepted as a correction however short the path is."""
 DRIFT_DEG = 0.5
 """Largest rotation that is accepted, degrees a metre (or unit of length) of path."""
 ROTATION_M = 3.0
+"""Path length that a rotation by one radian counts as with depth: it renews the view as much as passing a wall so far
+away."""
 ROTATION_DEPTHS = 1.0
-"""Path length that a rotation by one radian counts as, with depth and without: it renews the view as much as passing a
-wall so far away."""
+"""`ROTATION_M` without depth, in median depths of the initial map."""
 DRIFT_SECTION = 100.0
 """Path along which drift adds up; sections of a longer one drift independently, so that its root counts."""
 NEGLIGIBLE = 0.01, 0.3, 0.01
@@ -74,14 +79,17 @@ LOOP_WEIGHT = 100.0
 PATIENCE = 5
 """Frames after which a camera leaves a submap for the root map if the two were not merged by then."""
 AGREE_M = 0.1
+"""Largest distance between the corrections of consecutive keyframes, metres or units of length."""
 AGREE_DEG = 2.0
+"""Largest rotation between the corrections of consecutive keyframes, degrees."""
 AGREE_SCALE = 0.1
-"""Largest difference of the corrections of consecutive keyframes; of a scale, its logarithm."""
+"""Largest difference of the logarithms of their scales."""
 SIGMAS = (0.02, 0.02, 0.02, 0.01, 0.01, 0.01)
 """Of an edge of weight 1: metres, or units of length without depth, then radians; only their ratio matters."""
 GRAPH_ITERATIONS = 20
+"""Levenberg-Marquardt steps of the pose graph at most."""
 MIN_GAIN = 1e-9
-"""The search ends after so many steps, or when one lowers the cost by a smaller share."""
+"""The pose graph is solved when a step lowers its cost by a smaller share."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +162,31 @@ class Loop:
     fits: bool = True
 
 
+class RootMapPose(Enum):
+    """What follows from a pose in the root map that was found for a camera in a submap."""
+
+    REJECTED = "rejected"
+    """There is none, or it is ambiguous or cannot be reached: the frame is tracked in the submap alone."""
+    ACCEPTED = "accepted"
+    """The pose counts for the frame; tracking continues in the submap, which may be merged later."""
+    CONTINUE_THERE = "continue there"
+    """The pose counts, and tracking continues in the root map: the two maps are not merged."""
+
+
+@dataclass(frozen=True, eq=False)
+class LoopClosingResult:
+    """What `LoopCloser.close` did.
+
+    Attributes:
+        rescaled: What lengths around keyframes were multiplied by, by the keyframes' slots; with
+            depth the keyframes that were moved to another map.
+        root_map_pose: Whether the camera's pose in the root map counts.
+    """
+
+    rescaled: dict[int, float] = field(default_factory=dict)
+    root_map_pose: RootMapPose = RootMapPose.REJECTED
+
+
 class LoopCloser:
     """Looks for loops at every new keyframe, and closes them.
 
@@ -166,10 +199,6 @@ class LoopCloser:
 
     Attributes:
         closed: All loops that were closed.
-        rescaled: Scales of the keyframes, by slot, that the last `close` rescaled (or with depth
-            moved to another map).
-        in_root_map: Whether the last `close` found a submap's camera in the root map.
-        leaves_submap: Whether the camera is to continue in the root map.
     """
 
     def __init__(
@@ -186,64 +215,98 @@ class LoopCloser:
         self.mapper = mapper
         self.settings = settings
         self.closed: list[Loop] = []
-        self.rescaled: dict[int, float] = {}
-        self.in_root_map = self.leaves_submap = False
         self._seed = seed
         self._scale_is_known = scale_is_known
+        # path length up to each keyframe, by its id
         self._path: dict[int, float] = {}
         self._path_length = 0.0
+        # path lengths at the two ends of each closed loop
         self._shortcuts: list[tuple[float, float]] = []
         self._last_pose: Array | None = None
-        self._row: list[Correction] = []
-        self._met_at: int | None = None
+        # corrections of the latest consecutive keyframes, which agree with each other
+        self._consistent: list[Correction] = []
+        # frame since which a submap's camera is in the root map, too
+        self._in_root_map_since: int | None = None
         self._loop_edges: list[Edge] = []
 
-    def close(self, slot: int, observations: Observations, root: InitialPose | None = None) -> None:
+    def close(
+        self, slot: int, observations: Observations, in_root_map: InitialPose | None = None
+    ) -> LoopClosingResult:
         """Look for a loop at a new keyframe; correct and fuse the map if enough consecutive keyframes agree on one.
 
         Args:
             slot: The keyframe.
             observations: Its features.
-            root: Its pose in the root map, if the camera is in a submap and was found there.
+            in_root_map: Its pose in the root map, if the camera is in a submap and was found there.
         """
-        self.rescaled = {}
-        self.in_root_map = False
-        self.leaves_submap = False
         self._extend_path(slot)
-        for culled, replacement, relative in self.mapper.culled if self._loop_edges else ():
-            ids = int(self.world.kf_id[culled]), int(self.world.kf_id[replacement])
-            self._loop_edges = transferred_edges(self._loop_edges, *ids, relative)
-        loop = (
-            self._verified(slot, observations)
-            if root is None
-            else self._loop_to_root(slot, observations, root)
-        )
-        self._met_at = self._met_at if self.in_root_map else None
-        if loop is None or (
-            self._row and not loop.correction.agrees(self._row[-1], self.world.kf_centre[slot])
-        ):
-            self._row.clear()
-        if loop is None:
-            return
-        self._row.append(loop.correction)
-        if len(self._row) < self.settings.loop_closing.confirmations:
-            return
-        scale = float(np.median([correction.scale for correction in self._row]))
-        loop = replace(loop, correction=replace(loop.correction, scale=scale))
-        self._row.clear()
-        if not loop.fits:
-            self.leaves_submap = self.in_root_map = root is not None
-            return
-        if not loop.merges:
-            self._correct(slot, loop)
-        elif root is None and self._aliased(slot, observations, loop):
-            return
+        self._transfer_loop_edges()
+
+        # detect a place and verify it
+        root_map_pose = RootMapPose.REJECTED
+        if in_root_map is None:
+            loop = self._verified(slot, observations)
         else:
-            self._merge(slot, loop)
-        self._fuse(slot, loop.place.keyframe)
-        self._shortcuts.append((self._path_at(loop.place.keyframe), self._path_length))
-        self.closed.append(loop)
+            loop, root_map_pose = self._loop_to_root_map(slot, observations, in_root_map)
+        if root_map_pose is RootMapPose.REJECTED:
+            self._in_root_map_since = None
+
+        # consecutive keyframes have to agree on the correction
+        confirmed = self._confirmed(slot, loop)
+        if confirmed is None:
+            return LoopClosingResult(root_map_pose=root_map_pose)
+        if not confirmed.fits:
+            # the submap has drifted too far to be merged
+            if in_root_map is not None:
+                root_map_pose = RootMapPose.CONTINUE_THERE
+            return LoopClosingResult(root_map_pose=root_map_pose)
+        # the loop to the root map was tested for aliasing before
+        if (
+            confirmed.merges
+            and in_root_map is None
+            and self._aliased(slot, observations, confirmed)
+        ):
+            return LoopClosingResult(root_map_pose=root_map_pose)
+
+        # correct the map, or merge two maps
+        if confirmed.merges:
+            rescaled = self._merge(slot, confirmed)
+        else:
+            rescaled = self._correct(slot, confirmed)
+
+        # fuse the points of both visits
+        self._fuse(slot, confirmed.place.keyframe)
+        self._shortcuts.append((self._path_at(confirmed.place.keyframe), self._path_length))
+        self.closed.append(confirmed)
         self._last_pose = self.world.kf_pose[slot].copy()  # a correction adds no path
+        return LoopClosingResult(rescaled, root_map_pose)
+
+    def _transfer_loop_edges(self) -> None:
+        """Move the loop edges of culled keyframes to the replacements."""
+        if not self._loop_edges:
+            return
+        for culled, replacement, T_culled_replacement in self.mapper.culled:
+            self._loop_edges = transferred_edges(
+                self._loop_edges,
+                int(self.world.kf_id[culled]),
+                int(self.world.kf_id[replacement]),
+                T_culled_replacement,
+            )
+
+    def _confirmed(self, slot: int, loop: Loop | None) -> Loop | None:
+        """The loop with the median scale of all keyframes that agree on it, once there are enough; else None."""
+        if loop is None:
+            self._consistent.clear()
+            return None
+        centre = self.world.kf_centre[slot]
+        if self._consistent and not loop.correction.agrees(self._consistent[-1], centre):
+            self._consistent.clear()
+        self._consistent.append(loop.correction)
+        if len(self._consistent) < self.settings.loop_closing.confirmations:
+            return None
+        scale = float(np.median([correction.scale for correction in self._consistent]))
+        self._consistent.clear()
+        return replace(loop, correction=replace(loop.correction, scale=scale))
 
     # ------------------------------------------------------------------ detect and verify
 
@@ -302,25 +365,38 @@ class LoopCloser:
             return None
         return loop if self._within_drift(slot, loop) else None
 
-    def _loop_to_root(
-        self, slot: int, observations: Observations, root: InitialPose
-    ) -> Loop | None:
-        """The loop to the place in the root map where a submap's camera is, if it determines the merge well enough."""
-        frame = int(self.world.kf_frame[slot])
-        loop = self._loop(slot, root)
-        if loop is None or not self.world.kf_alive[root.keyframe]:
-            return None
-        if (loop.fits or self._scale_is_known) and self._aliased(slot, observations, loop):
-            return None
-        enough = (
-            len(root.matches) >= self.settings.loop_closing.min_inliers
-            and root.share >= MERGE_SHARE
+    def _loop_to_root_map(
+        self, slot: int, observations: Observations, place: InitialPose
+    ) -> tuple[Loop | None, RootMapPose]:
+        """The loop to the place in the root map where a submap's camera is, and whether the pose there counts.
+
+        The loop is None where the place does not determine the merge well enough.
+        """
+        loop = self._loop(slot, place)
+        if loop is None or not self.world.kf_alive[place.keyframe]:
+            return None, RootMapPose.REJECTED
+        matters = loop.fits or self._scale_is_known
+        if matters and self._aliased(slot, observations, loop):
+            return None, RootMapPose.REJECTED
+
+        # a merge needs more than a pose
+        determined = (
+            len(place.matches) >= self.settings.loop_closing.min_inliers
+            and place.share >= MERGE_SHARE
+            and place.uncertainty <= MERGE_UNCERTAINTY
         )
-        well = enough and root.uncertainty <= MERGE_UNCERTAINTY
-        self.in_root_map = loop.fits
-        self._met_at = frame if self._met_at is None else self._met_at
-        self.leaves_submap = self.in_root_map and not well and frame - self._met_at >= PATIENCE
-        return loop if well else None
+        merge = loop if determined else None
+        if not loop.fits:
+            return merge, RootMapPose.REJECTED
+
+        # a camera that waits too long for a merge leaves the submap
+        frame = int(self.world.kf_frame[slot])
+        if self._in_root_map_since is None:
+            self._in_root_map_since = frame
+        waited = frame - self._in_root_map_since
+        if not determined and waited >= PATIENCE:
+            return merge, RootMapPose.CONTINUE_THERE
+        return merge, RootMapPose.ACCEPTED
 
     def _loop(self, slot: int, place: InitialPose) -> Loop | None:
         """The correction to a place; None where too few points determine the scale."""
@@ -407,40 +483,56 @@ class LoopCloser:
 
     # ------------------------------------------------------------------ correct and fuse
 
-    def _correct(self, slot: int, loop: Loop) -> None:
-        """Spread the correction over all keyframes; each point moves with the first keyframe that observes it."""
+    def _correct(self, slot: int, loop: Loop) -> dict[int, float]:
+        """Spread the correction over all keyframes of the map by a pose graph; returns the scales of those rescaled."""
         world = self.world
         correction = loop.correction
         loop_edge = self._edge(loop.place.keyframe, slot, correction.T_cam_now, LOOP_WEIGHT)
         older = edges_within(world.kf_id[world.keyframes], self._loop_edges)
         self._loop_edges = [*older, loop_edge]
-        if (
-            np.array([correction.moved_m, correction.rotated_deg, abs(np.log(correction.scale))])
-            < NEGLIGIBLE
-        ).all():
-            return
+        log_scale = abs(np.log(correction.scale))
+        size = np.array([correction.moved_m, correction.rotated_deg, log_scale])
+        if (size < NEGLIGIBLE).all():
+            return {}
+
         submap = int(world.kf_map[slot])
         slots = world.submap(submap)
-        before = world.kf_pose.copy()
         ids = world.kf_id[slots]
+        poses_before = world.kf_pose.copy()
         edges = self._covisibility_edges(slots)
+
+        # without depth the scales first
+        rescaled: dict[int, float] = {}
         scales = np.ones(world.kf_alive.size)
         if not self._scale_is_known:
-            scales[slots] = spread_scale(
-                ids, [*edges, *edges_within(ids, older)], loop_edge, correction.scale
-            )
+            kept_scale = [*edges, *edges_within(ids, older)]
+            scales[slots] = spread_scale(ids, kept_scale, loop_edge, correction.scale)
             edges = rescaled_edges(edges, ids, scales[slots])
-            self._note_scales(slots, scales[slots])
-        after = optimise_poses(ids, before[slots], [*edges, *edges_within(ids, self._loop_edges)])
-        for at, pose in zip(slots.tolist(), after, strict=True):
-            world.set_pose(at, pose)
-        self.atlas.move_nearby(submap, before[slots], after, scales[slots])
+            rescaled = self._rescale_loop_edges(slots, scales[slots])
+
+        # then the poses
+        graph = [*edges, *edges_within(ids, self._loop_edges)]
+        poses = optimise_poses(ids, poses_before[slots], graph)
+        for keyframe, pose in zip(slots.tolist(), poses, strict=True):
+            world.set_pose(keyframe, pose)
+        self.atlas.move_nearby(submap, poses_before[slots], poses, scales[slots])
+        self._move_points(slots, poses_before, scales)
+        return rescaled
+
+    def _move_points(self, slots: Slots, poses_before: Array, scales: Array) -> None:
+        """Move each point of corrected keyframes with the first keyframe that observes it.
+
+        Args:
+            slots: The keyframes.
+            poses_before: World-to-camera poses ``[S, 4, 4]`` of all slots before the correction.
+            scales: What lengths around each slot are multiplied by ``[S]``.
+        """
+        world = self.world
         points = world.points_of(slots)
         reference = world.obs_kf[points, 0]
-        local = (
-            np.einsum("nij,nj->ni", before[reference, :3, :3], world.position[points])
-            + before[reference, :3, 3]
-        )
+        R_before = poses_before[reference, :3, :3]
+        t_before = poses_before[reference, :3, 3]
+        local = np.einsum("nij,nj->ni", R_before, world.position[points]) + t_before
         local *= scales[reference, None]
         now = se3.inverse(world.kf_pose[reference])
         world.position[points] = np.einsum("nij,nj->ni", now[:, :3, :3], local) + now[:, :3, 3]
@@ -453,20 +545,23 @@ class LoopCloser:
             (own, other, loop.correction) if own > other else (other, own, loop.correction.inverse)
         )
 
-    def _merge(self, slot: int, loop: Loop) -> None:
-        """Merge two submaps (ORB-SLAM3's ``MergeLocal``): the younger moves onto the older or the root map."""
+    def _merge(self, slot: int, loop: Loop) -> dict[int, float]:
+        """Merge two submaps (ORB-SLAM3's ``MergeLocal``): the younger moves onto the older or the root map.
+
+        Returns the scales of the keyframes that were moved, by slot.
+        """
         world = self.world
         younger, older, correction = self._merge_of(slot, loop)
         slots = world.move_submap(younger, correction.T_now_before, older, correction.scale)
-        self._note_scales(slots, np.full(len(slots), correction.scale))
-        self._loop_edges.append(
-            self._edge(loop.place.keyframe, slot, world.kf_pose[slot], LOOP_WEIGHT)
-        )
+        rescaled = self._rescale_loop_edges(slots, np.full(len(slots), correction.scale))
+        loop_edge = self._edge(loop.place.keyframe, slot, world.kf_pose[slot], LOOP_WEIGHT)
+        self._loop_edges.append(loop_edge)
+        return rescaled
 
-    def _note_scales(self, slots: Slots, scales: Array) -> None:
-        """Lengths around keyframes were multiplied."""
+    def _rescale_loop_edges(self, slots: Slots, scales: Array) -> dict[int, float]:
+        """Multiply the lengths of loop edges at keyframes ``[N]`` by scales ``[N]``; returns the scales by slot."""
         self._loop_edges = rescaled_edges(self._loop_edges, self.world.kf_id[slots], scales)
-        self.rescaled = dict(zip(slots.tolist(), scales.tolist(), strict=True))
+        return dict(zip(slots.tolist(), scales.tolist(), strict=True))
 
     def _edge(self, one: int, other: int, pose_of_other: Array, weight: float = 1.0) -> Edge:
         id_one, id_other = self.world.kf_id[[one, other]].tolist()

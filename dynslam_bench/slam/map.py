@@ -17,9 +17,7 @@ from dynslam_bench.core.compiled import kernel
 from dynslam_bench.features.matching import distance
 from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.geometry.gauss_newton import moved_point
-
-if TYPE_CHECKING:
-    from dynslam_bench.slam.tracking import Observations
+from dynslam_bench.slam.observations import Observations
 
 Array = NDArray[np.float64]
 Slots = NDArray[np.int64]

@@ -27,13 +27,12 @@ from dynslam_bench.features.matching import CellGrid
 from dynslam_bench.geometry import Camera, Trajectory, se3
 from dynslam_bench.geometry.gauss_newton import apply_twist
 from dynslam_bench.slam.map import Array, Map
+from dynslam_bench.slam.observations import Observations, right_coordinates
 from dynslam_bench.slam.settings import MotionModelSettings
 from dynslam_bench.slam.tracking import (
     MapFit,
-    Observations,
     TrackedFrame,
     fit_pose,
-    right_coordinates,
 )
 
 CHI2_POSE = 12.592

@@ -34,12 +34,12 @@ from dynslam_bench.geometry import Camera, pixel_index, se3
 from dynslam_bench.slam.atlas import Atlas
 from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.motion_model import pose_covariance
+from dynslam_bench.slam.observations import Observations
 from dynslam_bench.slam.settings import BackendSettings, TrackingSettings
 from dynslam_bench.slam.tracking import (
     MIN_MATCHES,
     InitialPose,
     Matches,
-    Observations,
     TrackedFrame,
     match_map,
     solve,

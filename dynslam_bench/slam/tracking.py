@@ -10,25 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.contracts import FrameBundle, Keypoints
-from dynslam_bench.features.matching import (
-    CellGrid,
-    Words,
-    as_words,
-    rotation_consistent,
-    search_in_radius,
-)
+from dynslam_bench.features.matching import rotation_consistent, search_in_radius
 from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.slam.map import Array, Map, Slots
+from dynslam_bench.slam.observations import Observations
 from dynslam_bench.slam.pose_optimisation import PoseEstimate, optimise_pose
 from dynslam_bench.slam.settings import TrackingSettings
 
-MAX_DEPTH_M = 40.0
-"""Depth beyond this is treated as missing."""
-RIGHT_SIGMA_PX = 1.5
-"""Standard deviation of the right coordinate at octave 0, beside the depth sensor's noise."""
-DEPTH_NOISE = 0.0025
-"""Standard deviation of the depth over its square, 1/m (structured-light sensors)."""
 CLOSE_BASELINES = 40.0
 """Points nearer than this many stereo baselines are close: their depth is trusted at once (ORB-SLAM2's number)."""
 MARGIN_PX = 8.0
@@ -53,102 +41,6 @@ TRUSTED_SHARE = 0.5
 """Inliers, and their share of the matches, that make a pose from the last frame trusted by itself."""
 
 
-@dataclass(frozen=True, eq=False)
-class Observations:
-    """Features of one frame that no filter removed, one row each, ready for matching.
-
-    Attributes:
-        keypoints: Raw keypoints (distorted pixels).
-        xy: float64 ``[N, 2]`` undistorted pixels.
-        z: float64 ``[N]`` depth in metres, 0 missing.
-        right: float64 ``[N]`` right coordinate ``u - fx * baseline / z``, NaN without depth.
-        octave: int64 ``[N]``.
-        angle: float64 ``[N]`` degrees.
-        words: uint64 ``[N, W]`` descriptors.
-        info: float64 ``[N]`` inverse variance of the pixel coordinates, 1/px^2, times the filters'
-            weight.
-        info_right: float64 ``[N]`` inverse variance of the right coordinate, times the weight; 0
-            without depth.
-        grid: Cells of the features.
-        rgb: uint8 ``[N, 3]`` colour at the feature.
-        mask: bool ``[H, W]``, dynamic pixels, behind which no map point is visible; None without
-            masks.
-    """
-
-    keypoints: Keypoints
-    xy: Array
-    z: Array
-    right: Array
-    octave: Slots
-    angle: Array
-    words: Words
-    info: Array
-    info_right: Array
-    grid: CellGrid
-    rgb: NDArray[np.uint8]
-    mask: NDArray[np.bool_] | None = None
-
-    def __len__(self) -> int:
-        return len(self.xy)
-
-
-def observe(
-    frame: FrameBundle,
-    keep: NDArray[np.bool_],
-    weight: NDArray[np.float32],
-    camera: Camera,
-    scales: Array,
-) -> Observations:
-    """Select and prepare the features of a frame.
-
-    The right coordinate ``u - b f / z`` carries the depth (ORB-SLAM2, Eq. for RGB-D). Its variance
-    is the pixel's plus that of the depth sensor, ``(b f / z^2 * c z^2)^2 = (b f c)^2``, constant in
-    disparity.
-
-    Args:
-        frame: The frame with its keypoints.
-        keep: bool ``[N]``, False rows are left out entirely.
-        weight: float32 ``[N]`` in [0, 1], scales the information of a feature.
-        camera: Intrinsics.
-        scales: Scale of each octave.
-    """
-    weight = np.clip(np.nan_to_num(np.asarray(weight, np.float64), nan=0.0), 0.0, 1.0)
-    index = np.flatnonzero(
-        np.asarray(keep, bool) & np.isfinite(frame.xy).all(axis=1) & (weight > 0)
-    )
-    xy = np.ascontiguousarray(frame.xy[index], dtype=np.float64)
-    z = frame.z[index].astype(np.float64)
-    z = np.where((z > 0) & (z < MAX_DEPTH_M), z, 0.0)
-    keypoints = frame.keypoints.select(index)
-    octave = np.clip(keypoints.octave.astype(np.int64), 0, len(scales) - 1)
-    variance = scales[octave] ** 2
-    noise = RIGHT_SIGMA_PX**2 * variance + (camera.fx * camera.baseline_m * DEPTH_NOISE) ** 2
-    height, width = frame.rgb.shape[:2]
-    column, row = np.rint(keypoints.xy).astype(np.int64).T
-    return Observations(
-        keypoints,
-        xy,
-        z,
-        right_coordinates(xy, z, camera),
-        octave,
-        keypoints.angle.astype(np.float64),
-        as_words(keypoints.descriptors),
-        weight[index] / variance,
-        np.where(z > 0, weight[index] / noise, 0.0),
-        CellGrid.of(xy, camera.width, camera.height),
-        frame.rgb[row.clip(0, height - 1), column.clip(0, width - 1)],
-        frame.mask,
-    )
-
-
-def right_coordinates(xy: Array, z: Array, camera: Camera) -> Array:
-    """Right coordinates ``[N]`` of pixels ``[N, 2]`` with depths ``[N]`` in metres; NaN where the depth is 0."""
-    has_depth = z > 0
-    return np.where(
-        has_depth, xy[:, 0] - camera.fx * camera.baseline_m / np.where(has_depth, z, 1.0), np.nan
-    )
-
-
 @dataclass(eq=False)
 class TrackedFrame:
     """A frame with a pose, kept until the next one was tracked.
@@ -165,6 +57,19 @@ class TrackedFrame:
     point: Slots
     T_cam_world: Array
     timestamp: float
+
+
+def observe_points(observations: Observations, features: Slots, points: Slots) -> Slots:
+    """The map point that each feature of a frame observes, ``[N]``, or -1.
+
+    Args:
+        observations: The frame's N features.
+        features: Those that observe a point, ``[M]``.
+        points: Slots of their points, ``[M]``; -1 for none.
+    """
+    observed = np.full(len(observations), -1, np.int64)
+    observed[features] = points
+    return observed
 
 
 @dataclass(frozen=True, eq=False)

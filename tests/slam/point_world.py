@@ -9,8 +9,8 @@ from dynslam_bench.contracts import FrameBundle, Keypoints
 from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.slam.backend import MonocularBackend, RgbdBackend
+from dynslam_bench.slam.observations import observe
 from dynslam_bench.slam.settings import BackendSettings, MonocularBackendSettings
-from dynslam_bench.slam.tracking import observe
 
 
 class PointWorld:
