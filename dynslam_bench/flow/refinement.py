@@ -120,14 +120,14 @@ class Gradients(NamedTuple):
         determinant: Of that Hessian.
     """
 
-    levels: float
-    x: float
-    y: float
-    xx: float
-    xy: float
-    yy: float
-    trace: float
-    determinant: float
+    levels: Scalar
+    x: Scalar
+    y: Scalar
+    xx: Scalar
+    xy: Scalar
+    yy: Scalar
+    trace: Scalar
+    determinant: Scalar
 
 
 class Template(NamedTuple):
@@ -140,10 +140,10 @@ class Template(NamedTuple):
         y: Sum of the products with the gradients along y.
     """
 
-    mean: float
-    energy: float
-    x: float
-    y: float
+    mean: Scalar
+    energy: Scalar
+    x: Scalar
+    y: Scalar
 
 
 class Warp(NamedTuple):
@@ -156,10 +156,10 @@ class Warp(NamedTuple):
         y: Row in the target image with its border.
     """
 
-    a: float
-    b: float
-    x: float
-    y: float
+    a: Scalar
+    b: Scalar
+    x: Scalar
+    y: Scalar
 
 
 class Alignment(NamedTuple):
@@ -176,14 +176,14 @@ class Alignment(NamedTuple):
         initial: Correlation before the first step.
     """
 
-    x: float
-    y: float
-    sampled_x: float
-    sampled_y: float
-    mean: float
-    residual_x: float
-    residual_y: float
-    initial: float
+    x: Scalar
+    y: Scalar
+    sampled_x: Scalar
+    sampled_y: Scalar
+    mean: Scalar
+    residual_x: Scalar
+    residual_y: Scalar
+    initial: Scalar
 
 
 @kernel
@@ -344,7 +344,7 @@ def framed(position: Scalar, scale_down: Scalar) -> Scalar:
 
 
 @inlined
-def template_fits(px: Scalar, py: Scalar, window: Window, image: Bytes) -> bool:
+def template_fits(px: Scalar, py: Scalar, window: Window, image: Bytes) -> Scalar:
     """Whether the window around (px, py), and what vectors read beyond it, lies in the image with its border."""
     rows, columns = image.shape
     room = np.float32(window.radius + 2)
@@ -352,7 +352,7 @@ def template_fits(px: Scalar, py: Scalar, window: Window, image: Bytes) -> bool:
 
 
 @inlined
-def target_fits(warp: Warp, window: Window, image: Bytes) -> bool:
+def target_fits(warp: Warp, window: Window, image: Bytes) -> Scalar:
     """Whether the warp's centre lies in the image without its border, and its patch in the image with it."""
     rows, columns = image.shape
     reach = window.radius + window.margin
@@ -452,7 +452,7 @@ def template_gradients(space: Workspace, n: float) -> Gradients:
 
 
 @inlined
-def smaller_eigenvalue(gradients: Gradients) -> float:
+def smaller_eigenvalue(gradients: Gradients) -> Scalar:
     """The smaller eigenvalue of the translation's Hessian: texture along the worse direction."""
     trace = gradients.trace
     return 0.5 * (trace - np.sqrt(max(trace * trace - 4 * gradients.determinant, 0.0)))
@@ -499,7 +499,7 @@ def shifted(
 @inlined
 def patch_shift(
     x: Scalar, y: Scalar, margin: int, pitch: int
-) -> tuple[int, tuple[Scalar, Scalar, Scalar, Scalar]]:
+) -> tuple[Scalar, tuple[Scalar, Scalar, Scalar, Scalar]]:
     """An offset of the window in the patch: index of the window's first pixel, weights of the part of a pixel."""
     left = x + np.float32(margin)
     top = y + np.float32(margin)

@@ -188,7 +188,8 @@ class SparseDaisyFlow:
         self.workers.run(
             similarity_lucas_kanade, 0, count, ends, inverse, *images, window, correlation
         )
-        return np.hypot(*(ends + inverse[:, :2] - points).T)
+        error: NDArray[np.float32] = np.hypot(*(ends + inverse[:, :2] - points).T)
+        return error
 
     def describe(
         self, image: OrientationMaps, points: NDArray[np.float32], tables: CostTables
