@@ -5,6 +5,11 @@ instructions. A lane is the place of one number in a vector, as in SIMD hardware
 every sum is part of the program, so that results do not depend on the processor. The uint16
 operations are exact but for one square root and division, which IEEE 754 defines to the last bit;
 `tests/flow/exact_reference.py` gives the same bytes.
+
+How an instruction is written: the function under `instruction` gets numba's types of the arguments
+and returns the signature and a function `generate`, which writes LLVM's code with a builder. The
+arguments of `generate` are LLVM's values; ``kind.args`` has numba's types of them, which tell how an
+array lies in memory.
 """
 
 from __future__ import annotations
@@ -45,20 +50,30 @@ def instruction(define: Callable[..., Definition]) -> Code:
 
 
 FLOAT_LANES = 16
+"""Numbers of a float32 vector, 64 bytes."""
 UINT16_LANES = 32
-_FLOAT, _INT64, _INT32, _UINT16, _BYTE = (
-    ir.FloatType(),
-    ir.IntType(64),
-    ir.IntType(32),
-    ir.IntType(16),
-    ir.IntType(8),
-)
-_FLOATS, _INTS = ir.VectorType(_FLOAT, FLOAT_LANES), ir.VectorType(_INT32, FLOAT_LANES)
-_BYTES16 = ir.VectorType(_BYTE, FLOAT_LANES)
-_HALVES, _BYTES32 = ir.VectorType(_UINT16, UINT16_LANES), ir.VectorType(_BYTE, UINT16_LANES)
+"""Numbers of a uint16 vector, 64 bytes: four histograms of eight bins."""
 BYTE_LANES = 64
+"""Numbers of a uint8 vector, 64 bytes."""
+
+# LLVM's types of numbers; its integers have no sign
+_FLOAT = ir.FloatType()
+_INT64 = ir.IntType(64)
+_INT32 = ir.IntType(32)
+_UINT16 = ir.IntType(16)
+_BYTE = ir.IntType(8)
+
+# LLVM's types of vectors: sixteen numbers for float32, thirty-two for uint16, sixty-four for uint8
+_FLOATS = ir.VectorType(_FLOAT, FLOAT_LANES)
+_INTS = ir.VectorType(_INT32, FLOAT_LANES)
+_BYTES16 = ir.VectorType(_BYTE, FLOAT_LANES)
+_HALVES = ir.VectorType(_UINT16, UINT16_LANES)
+_BYTES32 = ir.VectorType(_BYTE, UINT16_LANES)
+_INTS32 = ir.VectorType(_INT32, UINT16_LANES)
+_FLOATS32 = ir.VectorType(_FLOAT, UINT16_LANES)
+_BYTES64 = ir.VectorType(_BYTE, BYTE_LANES)
 _DOUBLES = ir.VectorType(ir.DoubleType(), 8)
-_BYTES64, _INTS32 = ir.VectorType(_BYTE, BYTE_LANES), ir.VectorType(_INT32, UINT16_LANES)
+
 PATCH_ROWS = 31
 """Rows of the patches that `patch_sum` reads."""
 COSINES = (32768, 23170, 0, -23170, -32768, -23170, 0, 23170)
@@ -89,14 +104,20 @@ class _SimdModel(models.PrimitiveModel):
 FLOAT32X16 = SimdType("Float32x16", _FLOATS)
 UINT16X32 = SimdType("UInt16x32", _HALVES)
 SUMS = types.UniTuple(SimdType("Float64x8", _DOUBLES), 6)
-"""Of normal equations: six rows of six numbers of the matrix, one of the vector and a zero."""
+"""Sums of normal equations: six rows, each of six numbers of the matrix, one of the right side and a zero."""
 
 
 class _Arithmetic(AbstractTemplate):
+    """Numba's typing of ``+``, ``-`` and ``*`` on two float32 vectors."""
+
     def generic(self, arguments: Code, keywords: Code) -> Code:
-        return signature(FLOAT32X16, *arguments) if arguments == (FLOAT32X16, FLOAT32X16) else None
+        """The signature of the operation; None for other types."""
+        if arguments != (FLOAT32X16, FLOAT32X16):
+            return None
+        return signature(FLOAT32X16, *arguments)
 
 
+# a + b, a - b and a * b of float32 vectors, lane by lane
 for _symbol, _operation in ((operator.add, "fadd"), (operator.sub, "fsub"), (operator.mul, "fmul")):
     infer_global(_symbol)(type(f"_Lanes_{_operation}", (_Arithmetic,), {}))
 
@@ -121,20 +142,20 @@ def constant(kind: ir.VectorType, value: float) -> Code:
     return ir.Constant(kind, [value] * kind.count)
 
 
-def _places(*places: int) -> Code:
-    """The constant that tells `shuffle_vector` which numbers to take."""
-    return ir.Constant(ir.VectorType(_INT32, len(places)), list(places))
+def _lanes(*lanes: int) -> Code:
+    """The constant that tells `shuffle_vector` which lanes to take; those of a second vector follow the first's."""
+    return ir.Constant(ir.VectorType(_INT32, len(lanes)), list(lanes))
 
 
-_EACH_EIGHT_TIMES = _places(*(pixel for pixel in range(4) for _ in range(8)))
+_EACH_EIGHT_TIMES = _lanes(*(pixel for pixel in range(4) for _ in range(8)))
+"""Four numbers to thirty-two: 0 0 0 0 0 0 0 0 1 1 ..., a number for each bin of four histograms."""
 
 
 def splat(builder: Code, kind: ir.VectorType, value: Code) -> Code:
     """Code for a vector of equal numbers."""
-    first = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(_INT32, 0))
-    return builder.shuffle_vector(
-        first, ir.Constant(kind, ir.Undefined), _places(*([0] * kind.count))
-    )
+    undefined = ir.Constant(kind, ir.Undefined)
+    first = builder.insert_element(undefined, value, ir.Constant(_INT32, 0))
+    return builder.shuffle_vector(first, undefined, _lanes(*([0] * kind.count)))
 
 
 def load_vector(
@@ -160,9 +181,8 @@ def _loading(
     def load(typing_context: Code, array: Code, index: Code) -> Definition:
         def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
             array, index = arguments
-            return convert(
-                builder, load_vector(context, builder, kind.args[0], array, index, vector, align)
-            )
+            loaded = load_vector(context, builder, kind.args[0], array, index, vector, align)
+            return convert(builder, loaded)
 
         return result(array, types.int64), generate
 
@@ -175,11 +195,8 @@ def _storing(value: SimdType, align: int) -> Code:
     def store(typing_context: Code, array: Code, index: Code, vector: Code) -> Definition:
         def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
             array, index, vector = arguments
-            builder.store(
-                vector,
-                pointer_to(context, builder, kind.args[0], array, index, value.vector),
-                align=align,
-            )
+            pointer = pointer_to(context, builder, kind.args[0], array, index, value.vector)
+            builder.store(vector, pointer, align=align)
             return context.get_dummy_value()
 
         return types.void(array, types.int64, value), generate
@@ -187,21 +204,24 @@ def _storing(value: SimdType, align: int) -> Code:
     return instruction(store)
 
 
-load = _loading(FLOAT32X16, _FLOATS, 4, lambda builder, loaded: loaded)
-"""Sixteen adjacent numbers of a flat float32 array."""
-load_bytes = _loading(
-    FLOAT32X16,
-    _BYTES16,
-    1,
-    lambda builder, loaded: builder.sitofp(builder.zext(loaded, _INTS), _FLOATS),
-)
-"""Sixteen adjacent numbers of a flat uint8 array, as floats."""
-load_uint16 = _loading(UINT16X32, _HALVES, 2, lambda builder, loaded: loaded)
-"""Thirty-two adjacent numbers of a flat uint16 array."""
+def _unchanged(builder: Code, loaded: Code) -> Code:
+    return loaded
+
+
+def _bytes_to_floats(builder: Code, loaded: Code) -> Code:
+    return builder.sitofp(builder.zext(loaded, _INTS), _FLOATS)
+
+
+load = _loading(FLOAT32X16, _FLOATS, 4, _unchanged)
+"""``load(array, index)``: sixteen adjacent numbers of a flat float32 array."""
+load_bytes = _loading(FLOAT32X16, _BYTES16, 1, _bytes_to_floats)
+"""``load_bytes(array, index)``: sixteen adjacent numbers of a flat uint8 array, as floats."""
+load_uint16 = _loading(UINT16X32, _HALVES, 2, _unchanged)
+"""``load_uint16(array, index)``: thirty-two adjacent numbers of a flat uint16 array."""
 store = _storing(FLOAT32X16, 4)
-"""Write sixteen adjacent numbers of a flat float32 array."""
+"""``store(array, index, vector)``: write sixteen adjacent numbers of a flat float32 array."""
 store_uint16 = _storing(UINT16X32, 2)
-"""Write thirty-two adjacent numbers of a flat uint16 array."""
+"""``store_uint16(array, index, vector)``: write thirty-two adjacent numbers of a flat uint16 array."""
 
 
 def _sum_of_lanes(builder: Code, vector: Code, add: Callable[[Code, Code], Code]) -> Code:
@@ -209,18 +229,15 @@ def _sum_of_lanes(builder: Code, vector: Code, add: Callable[[Code, Code], Code]
     width = vector.type.count
     while width > 1:
         width //= 2
-        vector = add(
-            *(
-                builder.shuffle_vector(vector, vector, _places(*range(k, k + width)))
-                for k in (0, width)
-            )
-        )
+        lower = builder.shuffle_vector(vector, vector, _lanes(*range(width)))
+        upper = builder.shuffle_vector(vector, vector, _lanes(*range(width, 2 * width)))
+        vector = add(lower, upper)
     return builder.extract_element(vector, ir.Constant(_INT32, 0))
 
 
 @instruction
 def spread(typing_context: Code, value: Code) -> Definition:
-    """The same float32 in every place."""
+    """A float32 vector with the same number in every lane."""
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         return splat(builder, _FLOATS, arguments[0])
@@ -230,7 +247,7 @@ def spread(typing_context: Code, value: Code) -> Definition:
 
 @instruction
 def total(typing_context: Code, vector: Code) -> Definition:
-    """Sum of the numbers: halves onto halves, always in the same order."""
+    """Sum of the numbers of a float32 vector: halves onto halves, always in the same order."""
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         return _sum_of_lanes(builder, arguments[0], builder.fadd)
@@ -239,13 +256,20 @@ def total(typing_context: Code, vector: Code) -> Definition:
 
 
 def _grid_places(context: Code, builder: Code, kinds: Code, grid: Code) -> tuple[Code, Code]:
-    """Code for columns and rows, in 65536ths of a pixel, of sixteen places of a rotated and scaled grid (`sample`)."""
-    at = grid[2]
-    origin_and_steps = grid[3:]
-    right, down = (
-        load_vector(context, builder, kinds[k], grid[k - 1], at, _INTS, 4) for k in (1, 2)
-    )
+    """Code for columns and rows, in 65536ths of a pixel, of sixteen places of a rotated and scaled grid.
+
+    Args:
+        context: Numba's.
+        builder: LLVM's.
+        kinds: Types of the instruction's arguments, of which the second and third are `columns` and
+            `rows`.
+        grid: Values of ``columns, rows, at, column, row, step_x, step_y`` as in `sample`.
+    """
+    columns, rows, at, *origin_and_steps = grid
+    right = load_vector(context, builder, kinds[1], columns, at, _INTS, 4)
+    down = load_vector(context, builder, kinds[2], rows, at, _INTS, 4)
     column, row, dx, dy = (splat(builder, _INTS, value) for value in origin_and_steps)
+    # x = column + right dx - down dy, y = row + right dy + down dx
     x = builder.sub(builder.add(column, builder.mul(right, dx)), builder.mul(down, dy))
     y = builder.add(builder.add(row, builder.mul(right, dy)), builder.mul(down, dx))
     return x, y
@@ -263,14 +287,13 @@ def store_offsets(
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         offsets, *grid, stride = arguments
-        x, y = (
-            builder.ashr(c, constant(_INTS, 16))
-            for c in _grid_places(context, builder, kind.args, grid)
-        )
-        offset = builder.add(builder.mul(y, splat(builder, _INTS, stride)), x)
-        builder.store(
-            offset, pointer_to(context, builder, kind.args[0], offsets, grid[2], _INTS), align=4
-        )
+        x, y = _grid_places(context, builder, kind.args, grid)
+        # whole pixels of 65536ths
+        column = builder.ashr(x, constant(_INTS, 16))
+        row = builder.ashr(y, constant(_INTS, 16))
+        offset = builder.add(builder.mul(row, splat(builder, _INTS, stride)), column)
+        pointer = pointer_to(context, builder, kind.args[0], offsets, grid[2], _INTS)
+        builder.store(offset, pointer, align=4)
         return context.get_dummy_value()
 
     return types.void(offsets, columns, rows, types.int64, *([types.int32] * 5)), generate
@@ -285,12 +308,13 @@ def square(typing_context: Code, image: Code, at: Code, stride: Code) -> Definit
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         image, at, stride = arguments
-        above, below = (
-            builder.zext(
-                load_vector(context, builder, kind.args[0], image, index, _UINT16, 1), _INT32
-            )
-            for index in (at, builder.add(at, stride))
-        )
+
+        def two_pixels(index: Code) -> Code:
+            pair = load_vector(context, builder, kind.args[0], image, index, _UINT16, 1)
+            return builder.zext(pair, _INT32)
+
+        above = two_pixels(at)
+        below = two_pixels(builder.add(at, stride))
         return builder.or_(above, builder.shl(below, ir.Constant(_INT32, 16)))
 
     return types.int32(image, types.int64, types.int64), generate
@@ -321,40 +345,43 @@ def sample(
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         squares, *grid = arguments
-        right, down = (
-            builder.fmul(
-                builder.sitofp(builder.and_(c, constant(_INTS, 65535)), _FLOATS),
-                constant(_FLOATS, 1 / 65536),
-            )
-            for c in _grid_places(context, builder, kind.args, grid)
-        )
+
+        def part_of_pixel(position: Code) -> Code:
+            part = builder.and_(position, constant(_INTS, 65535))
+            return builder.fmul(builder.sitofp(part, _FLOATS), constant(_FLOATS, 1 / 65536))
+
+        def between(first: Code, second: Code, part: Code) -> Code:
+            return builder.fadd(first, builder.fmul(part, builder.fsub(second, first)))
+
+        x, y = _grid_places(context, builder, kind.args, grid)
+        right = part_of_pixel(x)
+        down = part_of_pixel(y)
+
+        # the four bytes of every square: above left, above right, below left, below right
         pixels = load_vector(context, builder, kind.args[0], squares, grid[2], _INTS, 4)
-        corners = [
-            builder.sitofp(
-                builder.and_(builder.lshr(pixels, constant(_INTS, 8 * k)), constant(_INTS, 255)),
-                _FLOATS,
-            )
-            for k in range(4)
-        ]
-        above, below = (
-            builder.fadd(corners[k], builder.fmul(right, builder.fsub(corners[k + 1], corners[k])))
-            for k in (0, 2)
-        )
-        return builder.fadd(above, builder.fmul(down, builder.fsub(below, above)))
+        corners = []
+        for k in range(4):
+            byte = builder.lshr(pixels, constant(_INTS, 8 * k))
+            corners.append(builder.sitofp(builder.and_(byte, constant(_INTS, 255)), _FLOATS))
+
+        # along the rows, then between them
+        above = between(corners[0], corners[1], right)
+        below = between(corners[2], corners[3], right)
+        return between(above, below, down)
 
     return FLOAT32X16(squares, columns, rows, types.int64, *([types.int32] * 4)), generate
 
 
 def _average(builder: Code, first: Code, second: Code) -> Code:
-    wide = ir.VectorType(_INT32, UINT16_LANES)
-    total = builder.add(builder.zext(first, wide), builder.zext(second, wide))
-    one = constant(wide, 1)
+    """Code for ``(a + b + 1) >> 1`` of uint16 vectors, in 32 bits."""
+    total = builder.add(builder.zext(first, _INTS32), builder.zext(second, _INTS32))
+    one = constant(_INTS32, 1)
     return builder.trunc(builder.lshr(builder.add(total, one), one), _HALVES)
 
 
 @instruction
 def average(typing_context: Code, first: Code, second: Code) -> Definition:
-    """Rounded mean ``(a + b + 1) >> 1`` of every number."""
+    """Rounded mean ``(a + b + 1) >> 1`` of two uint16 vectors, lane by lane."""
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         return _average(builder, *arguments)
@@ -364,16 +391,15 @@ def average(typing_context: Code, first: Code, second: Code) -> Definition:
 
 @instruction
 def average_of_pairs(typing_context: Code, first: Code, second: Code) -> Definition:
-    """Rounded means of adjacent histograms: eight histograms to four."""
+    """Rounded means of adjacent histograms of eight bins: the four of each vector, eight in all, to four."""
+    # of each pair of histograms, sixteen numbers, the first eight and the last eight
+    even = [16 * pair + b for pair in range(4) for b in range(8)]
+    odd = [lane + 8 for lane in even]
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        parts = [
-            builder.shuffle_vector(
-                *arguments, _places(*(16 * pair + odd + b for pair in range(4) for b in range(8)))
-            )
-            for odd in (0, 8)
-        ]
-        return _average(builder, *parts)
+        left = builder.shuffle_vector(*arguments, _lanes(*even))
+        right = builder.shuffle_vector(*arguments, _lanes(*odd))
+        return _average(builder, left, right)
 
     return UINT16X32(first, second), generate
 
@@ -394,31 +420,33 @@ def derivatives(
     Returns:
         Eight bins a pixel, 256ths of a grey level a full-image pixel.
     """
+    four = ir.VectorType(_UINT16, 4)
+    four_wide = ir.VectorType(_INT32, 4)
+    # bins of 45 degrees, of four pixels one after the other
+    cosines = ir.Constant(_INTS32, [COSINES[b % 8] for b in range(UINT16_LANES)])
+    sines = ir.Constant(_INTS32, [COSINES[(b - 2) % 8] for b in range(UINT16_LANES)])
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        four, wide = ir.VectorType(_UINT16, 4), ir.VectorType(_INT32, 4)
+        sums, here, above, below = arguments
 
         def pixels(index: Code) -> Code:
-            return builder.zext(
-                load_vector(context, builder, kind.args[0], arguments[0], index, four, 2), wide
-            )
+            loaded = load_vector(context, builder, kind.args[0], sums, index, four, 2)
+            return builder.zext(loaded, four_wide)
 
-        one = ir.Constant(ir.IntType(64), 1)
-        gx = builder.sub(
-            pixels(builder.add(arguments[1], one)), pixels(builder.sub(arguments[1], one))
-        )
-        gy = builder.sub(pixels(arguments[3]), pixels(arguments[2]))
-        gx, gy = (builder.shuffle_vector(g, g, _EACH_EIGHT_TIMES) for g in (gx, gy))
-        cosines, sines = (
-            _places(*(COSINES[(b - turn) % 8] for b in range(UINT16_LANES))) for turn in (0, 2)
-        )
+        # central differences of four pixels, each eight times
+        one = ir.Constant(_INT64, 1)
+        gx = builder.sub(pixels(builder.add(here, one)), pixels(builder.sub(here, one)))
+        gy = builder.sub(pixels(below), pixels(above))
+        gx = builder.shuffle_vector(gx, gx, _EACH_EIGHT_TIMES)
+        gy = builder.shuffle_vector(gy, gy, _EACH_EIGHT_TIMES)
+
+        # the derivative along each bin's direction, rounded; negative ones become 0
         along = builder.add(builder.mul(gx, cosines), builder.mul(gy, sines))
-        rounded = builder.add(along, constant(cosines.type, 1 << (DERIVATIVE_SHIFT - 1)))
-        value = builder.ashr(rounded, constant(cosines.type, DERIVATIVE_SHIFT))
-        zero = constant(cosines.type, 0)
-        return builder.trunc(
-            builder.select(builder.icmp_signed(">", value, zero), value, zero), _HALVES
-        )
+        rounded = builder.add(along, constant(_INTS32, 1 << (DERIVATIVE_SHIFT - 1)))
+        value = builder.ashr(rounded, constant(_INTS32, DERIVATIVE_SHIFT))
+        zero = constant(_INTS32, 0)
+        rectified = builder.select(builder.icmp_signed(">", value, zero), value, zero)
+        return builder.trunc(rectified, _HALVES)
 
     return UINT16X32(sums, types.int64, types.int64, types.int64), generate
 
@@ -428,30 +456,31 @@ def store_normalised(
     typing_context: Code, array: Code, index: Code, halves: Code, floor: Code
 ) -> Definition:
     """Write four histograms as 32 bytes: each divided by its Euclidean norm plus `floor`, times 255, rounded."""
+    four = ir.VectorType(_FLOAT, 4)
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         array, index, halves, floor = arguments
-        ints, many = ir.VectorType(_INT32, UINT16_LANES), ir.VectorType(_FLOAT, UINT16_LANES)
-        wide = builder.zext(halves, ints)
-        squares = builder.mul(wide, wide)
+        numbers = builder.zext(halves, _INTS32)
+
+        # sums of squares of each histogram: neighbours are added until four numbers are left
+        squares = builder.mul(numbers, numbers)
         for count in (32, 16, 8):
-            parts = (
-                builder.shuffle_vector(squares, squares, _places(*range(odd, count, 2)))
-                for odd in (0, 1)
-            )
-            squares = builder.add(*parts)
-        floats = ir.VectorType(_FLOAT, 4)
-        root = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(floats, [floats]), "llvm.sqrt.v4f32"
+            even = builder.shuffle_vector(squares, squares, _lanes(*range(0, count, 2)))
+            odd = builder.shuffle_vector(squares, squares, _lanes(*range(1, count, 2)))
+            squares = builder.add(even, odd)
+
+        # 255 / (norm + floor), a factor for each histogram
+        square_root = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(four, [four]), "llvm.sqrt.v4f32"
         )
-        norm = builder.call(root, [builder.sitofp(squares, floats)])
-        gain = builder.fdiv(
-            constant(floats, 255.0), builder.fadd(norm, splat(builder, floats, floor))
-        )
-        scaled = builder.fmul(
-            builder.sitofp(wide, many), builder.shuffle_vector(gain, gain, _EACH_EIGHT_TIMES)
-        )
-        rounded = builder.fptosi(builder.fadd(scaled, constant(many, 0.5)), ints)
+        norm = builder.call(square_root, [builder.sitofp(squares, four)])
+        divisor = builder.fadd(norm, splat(builder, four, floor))
+        gain = builder.fdiv(constant(four, 255.0), divisor)
+
+        # the bins times their histogram's factor, rounded to bytes
+        gains = builder.shuffle_vector(gain, gain, _EACH_EIGHT_TIMES)
+        scaled = builder.fmul(builder.sitofp(numbers, _FLOATS32), gains)
+        rounded = builder.fptosi(builder.fadd(scaled, constant(_FLOATS32, 0.5)), _INTS32)
         pointer = pointer_to(context, builder, kind.args[0], array, index, _BYTES32)
         builder.store(builder.trunc(rounded, _BYTES32), pointer, align=1)
         return context.get_dummy_value()
@@ -460,13 +489,15 @@ def store_normalised(
 
 
 def _histogram_distances(builder: Code, first: Code, second: Code, count: int) -> Code:
-    """L1 distances of `count` histograms of eight bytes, as ``count`` 64-bit lanes."""
+    """Code for L1 distances of `count` histograms of eight bytes, as ``count`` 64-bit lanes."""
+    # absolute differences of bytes: the larger less the smaller
     bytes_ = ir.VectorType(_BYTE, 8 * count)
     second = builder.bitcast(second, bytes_)
     first = builder.bitcast(first, bytes_)
     above = builder.icmp_unsigned(">", first, second)
     total = builder.sub(builder.select(above, first, second), builder.select(above, second, first))
-    for bits in (8, 16, 32):  # add neighbours until a histogram is one number
+    # add neighbours until a histogram is one number: lanes of 16, 32, then 64 bits
+    for bits in (8, 16, 32):
         pairs = ir.VectorType(ir.IntType(2 * bits), 32 * count // bits)
         total = builder.bitcast(total, pairs)
         low = builder.and_(total, constant(pairs, (1 << bits) - 1))
@@ -501,46 +532,52 @@ def descriptor_sum(
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         image, samples, near_row, far_row, near, far, descriptor, at, truncation = arguments
-        cells, offsets, mine = (
-            context.make_array(kind.args[k])(context, builder, array).data
-            for k, array in ((0, image), (1, samples), (6, descriptor))
-        )
-        mine = builder.gep(mine, [at])
-        total = ir.Constant(_INT64, 0)
-        for first, count, cell, row in (
-            (0, 1, near, near_row),
-            (1, 8, near, near_row),
-            (9, 8, far, far_row),
-        ):
+        cells = context.make_array(kind.args[0])(context, builder, image).data
+        offsets = context.make_array(kind.args[1])(context, builder, samples).data
+        own = context.make_array(kind.args[6])(context, builder, descriptor).data
+        own = builder.gep(own, [at])
+
+        def add_distances(total: Code, first: int, count: int, cell: Code, row: Code) -> Code:
+            """Code that adds the distances of `count` histograms from the `first` on."""
             lanes = ir.VectorType(_INT64, count)
-            base, theirs = builder.gep(cells, [cell]), ir.Constant(lanes, ir.Undefined)
+
+            # the image's histograms, a 64-bit lane each, from where the samples lie
+            sampled = ir.Constant(lanes, ir.Undefined)
+            base = builder.gep(cells, [cell])
             line = builder.gep(offsets, [builder.mul(row, ir.Constant(_INT64, 17))])
             for k in range(count):
                 offset = builder.load(builder.gep(line, [ir.Constant(_INT64, first + k)]))
                 place = builder.gep(base, [builder.sext(offset, _INT64)])
                 histogram = builder.load(builder.bitcast(place, _INT64.as_pointer()))
                 histogram.align = 1
-                theirs = builder.insert_element(theirs, histogram, ir.Constant(_INT32, k))
-            own = builder.load(
-                builder.bitcast(
-                    builder.gep(mine, [ir.Constant(_INT64, 8 * first)]), lanes.as_pointer()
-                )
-            )
-            own.align = 1
-            distances = _histogram_distances(builder, theirs, own, count)
+                sampled = builder.insert_element(sampled, histogram, ir.Constant(_INT32, k))
+
+            # the descriptor's own, which lie side by side
+            place = builder.gep(own, [ir.Constant(_INT64, 8 * first)])
+            compared = builder.load(builder.bitcast(place, lanes.as_pointer()))
+            compared.align = 1
+
+            distances = _histogram_distances(builder, sampled, compared, count)
             limit = splat(builder, lanes, truncation)
-            kept = builder.select(builder.icmp_unsigned("<", distances, limit), distances, limit)
-            total = builder.add(total, _sum_of_lanes(builder, kept, builder.add))
-        return total
+            truncated = _smaller(builder, distances, limit)
+            return builder.add(total, _sum_of_lanes(builder, truncated, builder.add))
+
+        # the centre, the first ring, the second ring
+        total = ir.Constant(_INT64, 0)
+        total = add_distances(total, 0, 1, near, near_row)
+        total = add_distances(total, 1, 8, near, near_row)
+        return add_distances(total, 9, 8, far, far_row)
 
     return signature, generate
 
 
 def _smaller(builder: Code, first: Code, second: Code) -> Code:
+    """Code for the smaller of two numbers without sign, lane by lane."""
     return builder.select(builder.icmp_unsigned("<", first, second), first, second)
 
 
 def _larger(builder: Code, first: Code, second: Code) -> Code:
+    """Code for the larger of two numbers without sign, lane by lane."""
     return builder.select(builder.icmp_unsigned(">", first, second), first, second)
 
 
@@ -564,36 +601,38 @@ def store_corner_scores(
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         scores, image, at, circle = arguments
+        smaller = partial(_smaller, builder)
+        larger = partial(_larger, builder)
+
+        def pixels(index: Code) -> Code:
+            return load_vector(context, builder, kind.args[1], image, index, _BYTES64, 1)
+
+        # the sixteen pixels of the circle, for sixty-four centres at once
         offsets = context.make_array(kind.args[3])(context, builder, circle).data
-        load = partial(load_vector, context, builder, kind.args[1], image, vector=_BYTES64, align=1)
-        ring = [
-            load(
-                index=builder.add(at, builder.load(builder.gep(offsets, [ir.Constant(_INT64, k)])))
-            )
-            for k in range(16)
-        ]
-        smaller, larger, centre = (
-            partial(_smaller, builder),
-            partial(_larger, builder),
-            load(index=at),
-        )
+        ring = []
+        for k in range(16):
+            offset = builder.load(builder.gep(offsets, [ir.Constant(_INT64, k)]))
+            ring.append(pixels(builder.add(at, offset)))
+        centre = pixels(at)
 
         def best_arc(worse: Callable[..., Code], better: Callable[..., Code]) -> Code:
             """The grey level that all pixels of the best arc of nine reach."""
+            # the worst of two, four and eight pixels that follow each other, from every odd one on
             twos = [worse(ring[k], ring[(k + 1) % 16]) for k in range(1, 16, 2)]
             fours = [worse(twos[k], twos[(k + 1) % 8]) for k in range(8)]
-            # with one more pixel at either end
             eights = [worse(fours[k], fours[(k + 2) % 8]) for k in range(8)]
+            # with one more pixel at either end these are all sixteen arcs of nine
             arcs = [worse(eights[k], better(ring[2 * k], ring[(2 * k + 9) % 16])) for k in range(8)]
             return reduce(better, arcs)
 
+        # differences that are negative become 0, because the centre takes part
         brighter = builder.sub(larger(best_arc(smaller, larger), centre), centre)
         darker = builder.sub(centre, smaller(best_arc(larger, smaller), centre))
+        # the largest threshold that the difference exceeds
         one = constant(_BYTES64, 1)
         score = builder.sub(larger(larger(brighter, darker), one), one)
-        builder.store(
-            score, pointer_to(context, builder, kind.args[0], scores, at, _BYTES64), align=1
-        )
+        pointer = pointer_to(context, builder, kind.args[0], scores, at, _BYTES64)
+        builder.store(score, pointer, align=1)
         return context.get_dummy_value()
 
     return types.void(scores, image, types.int64, circle), generate
@@ -616,26 +655,28 @@ def store_maxima(
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         maxima, scores, at, width, least = arguments
-        load = partial(
-            load_vector, context, builder, kind.args[1], scores, vector=_BYTES64, align=1
-        )
-        steps = [builder.sub(at, width), at, builder.add(at, width)]
+
+        def scores_at(row: Code, dx: int) -> Code:
+            index = builder.add(row, ir.Constant(_INT64, dx))
+            return load_vector(context, builder, kind.args[1], scores, index, _BYTES64, 1)
+
+        above = builder.sub(at, width)
+        below = builder.add(at, width)
         around = [
-            load(index=builder.add(step, ir.Constant(_INT64, dx)))
-            for step in steps
-            for dx in (-1, 0, 1)
-            if dx or step is not at
+            *(scores_at(above, dx) for dx in (-1, 0, 1)),
+            *(scores_at(at, dx) for dx in (-1, 1)),
+            *(scores_at(below, dx) for dx in (-1, 0, 1)),
         ]
-        limit = builder.sub(
-            splat(builder, _BYTES64, builder.trunc(least, _BYTE)), constant(_BYTES64, 1)
-        )
-        score, bound = load(index=at), reduce(partial(_larger, builder), around, limit)
-        kept = builder.select(
-            builder.icmp_unsigned(">", score, bound), score, constant(_BYTES64, 0)
-        )
-        builder.store(
-            kept, pointer_to(context, builder, kind.args[0], maxima, at, _BYTES64), align=1
-        )
+
+        # a maximum exceeds the eight around it, and the largest score that is too small
+        least_byte = splat(builder, _BYTES64, builder.trunc(least, _BYTE))
+        too_small = builder.sub(least_byte, constant(_BYTES64, 1))
+        bound = reduce(partial(_larger, builder), around, too_small)
+        score = load_vector(context, builder, kind.args[1], scores, at, _BYTES64, 1)
+        is_maximum = builder.icmp_unsigned(">", score, bound)
+        kept = builder.select(is_maximum, score, constant(_BYTES64, 0))
+        pointer = pointer_to(context, builder, kind.args[0], maxima, at, _BYTES64)
+        builder.store(kept, pointer, align=1)
         return context.get_dummy_value()
 
     return types.void(maxima, scores, types.int64, types.int64, types.int64), generate
@@ -662,9 +703,8 @@ def patch_sum(
             pixels = load_vector(context, builder, kind.args[0], image, at, _BYTES32, 1)
             first = ir.Constant(_INT64, UINT16_LANES * row)
             factors = load_vector(context, builder, kind.args[3], weights, first, _HALVES, 2)
-            total = builder.add(
-                total, builder.mul(builder.zext(pixels, _INTS32), builder.sext(factors, _INTS32))
-            )
+            products = builder.mul(builder.zext(pixels, _INTS32), builder.sext(factors, _INTS32))
+            total = builder.add(total, products)
             at = builder.add(at, width)
         return _sum_of_lanes(builder, total, builder.add)
 
@@ -673,7 +713,7 @@ def patch_sum(
 
 @instruction
 def normal_equations(typing_context: Code) -> Definition:
-    """Sums of no residuals, for `add_normal_equation`."""
+    """Normal equations of no residuals, all zero, for `add_normal_equation`."""
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         return context.make_tuple(builder, kind.return_type, [constant(_DOUBLES, 0.0)] * 6)
@@ -690,16 +730,16 @@ def add_normal_equation(
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         sums, weight, *numbers = arguments
+        # the row (j, residual, 0)
         row = constant(_DOUBLES, 0.0)
-        for place, number in enumerate(numbers):
-            row = builder.insert_element(row, number, ir.Constant(_INT32, place))
-        scaled = builder.fmul(splat(builder, _DOUBLES, weight), row)
-        factors = [builder.shuffle_vector(scaled, scaled, _places(*([m] * 8))) for m in range(6)]
-        rows = cgutils.unpack_tuple(builder, sums, 6)
-        added = [
-            builder.fadd(old, builder.fmul(factor, row))
-            for old, factor in zip(rows, factors, strict=True)
-        ]
+        for lane, number in enumerate(numbers):
+            row = builder.insert_element(row, number, ir.Constant(_INT32, lane))
+        # row m of the sums grows by weight j_m (j, residual, 0)
+        weighted = builder.fmul(splat(builder, _DOUBLES, weight), row)
+        added = []
+        for m, old in enumerate(cgutils.unpack_tuple(builder, sums, 6)):
+            factor = builder.shuffle_vector(weighted, weighted, _lanes(*([m] * 8)))
+            added.append(builder.fadd(old, builder.fmul(factor, row)))
         return context.make_tuple(builder, kind.return_type, added)
 
     return SUMS(SUMS, *([types.float64] * 8)), generate
@@ -712,15 +752,15 @@ def store_normal_equations(
     """Write the matrix ``[6, 6]`` and the vector ``[6]`` of the sums into float64 arrays."""
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        sums, *arrays = arguments
-        data = [
-            context.make_array(k)(context, builder, array).data
-            for k, array in zip(kind.args[1:], arrays, strict=True)
-        ]
+        sums, matrix, vector = arguments
+        matrix_data = context.make_array(kind.args[1])(context, builder, matrix).data
+        vector_data = context.make_array(kind.args[2])(context, builder, vector).data
         for m, row in enumerate(cgutils.unpack_tuple(builder, sums, 6)):
-            for n in range(7):
-                place = builder.gep(data[n // 6], [ir.Constant(_INT64, m if n == 6 else 6 * m + n)])
-                builder.store(builder.extract_element(row, ir.Constant(_INT32, n)), place)
+            for n in range(6):
+                pointer = builder.gep(matrix_data, [ir.Constant(_INT64, 6 * m + n)])
+                builder.store(builder.extract_element(row, ir.Constant(_INT32, n)), pointer)
+            pointer = builder.gep(vector_data, [ir.Constant(_INT64, m)])
+            builder.store(builder.extract_element(row, ir.Constant(_INT32, 6)), pointer)
         return context.get_dummy_value()
 
     return types.void(sums, matrix, vector), generate

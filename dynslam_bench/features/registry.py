@@ -41,8 +41,12 @@ def build_extractor(settings: FeatureSettings | None = None) -> FeatureExtractor
     settings = settings or FeatureSettings()
     spec = FEATURES.get(settings.extractor)
     return build_plugin(
-        "extractor", spec, FeatureExtractor, PluginError, lambda build: build(settings)
-    )  # type: ignore[type-abstract]
+        "extractor",
+        spec,
+        FeatureExtractor,  # type: ignore[type-abstract]
+        PluginError,
+        lambda build: build(settings),
+    )
 
 
 # Keypoints from the stage cache.

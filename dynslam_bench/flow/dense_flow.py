@@ -28,6 +28,7 @@ from dynslam_bench.flow.label_search import labels_as_seen, nearest, search_labe
 from dynslam_bench.flow.matching_cost import (
     MAX_COST,
     CostTables,
+    MatchingCost,
     Reference,
     appearance,
     cost_tables,
@@ -36,10 +37,10 @@ from dynslam_bench.flow.matching_cost import (
     read_descriptor,
     rotate_descriptor,
 )
-from dynslam_bench.flow.orientation_maps import OrientationMaps, Side
+from dynslam_bench.flow.orientation_maps import ImageArrays, OrientationMaps
 from dynslam_bench.flow.refinement import BORDER
 from dynslam_bench.flow.settings import DaisySettings, DenseFlowSettings, FlowSettings
-from dynslam_bench.flow.sparse import SparseDaisyFlow, side_of
+from dynslam_bench.flow.sparse import SparseDaisyFlow, image_arrays
 from dynslam_bench.geometry import pixel_index
 
 NEIGHBOURS = 9
@@ -212,7 +213,7 @@ def describe_image(
     centres = regions.centres * 2 + 0.5  # half-resolution pixel i covers 2 i and 2 i + 1
     tables = sparse.pair(maps, maps).tables
     descriptors = np.empty(half.size * layout.HISTOGRAMS, dtype=np.uint64)
-    sparse.workers.run(read_descriptors, 0, *half.shape, maps.side, tables, descriptors)
+    sparse.workers.run(read_descriptors, 0, *half.shape, maps.arrays, tables, descriptors)
     neighbours = nearest(centres, sparse.workers.run)
     return DescribedImage(
         maps,
@@ -249,8 +250,9 @@ class _RegionLabels:
         self._winner = np.zeros((*reference.half.shape, 4), dtype=np.float32)
         centres = reference.centres
         neighbours = reference.neighbours
-        costs = reference.described, side_of(pair.target, pair.tables), pair.tables
-        state = search_labels(sparse.settings, sparse.workers.run, costs, neighbours, None, seed)
+        target_arrays = image_arrays(pair.target, pair.tables)
+        matching = MatchingCost(reference.described, target_arrays, pair.tables)
+        state = search_labels(sparse.settings, sparse.workers.run, matching, neighbours, None, seed)
         labels = np.ascontiguousarray(state.flames[:, 0])
         if settings.refinement == "lucas-kanade":
             sparse.refine_together(centres, labels, neighbours, pair)
@@ -286,10 +288,8 @@ class _RegionLabels:
         pair = self._pair
         evaluations = np.zeros(len(centres), dtype=np.int64)
         regions = (image.regions.members, image.regions.starts, centres, candidates)
-        sides = (
-            *(side_of(maps, self._tables) for maps in (pair.reference, pair.target)),
-            self._tables,
-        )
+        reference = image_arrays(pair.reference, self._tables)
+        target = image_arrays(pair.target, self._tables)
         guide = image.half.astype(np.float32) / np.float32(255)
         radius = max(1, self.settings.filter_radius_px // 2)
         smoothing = (guide, radius, np.float32(self.settings.filter_epsilon))
@@ -299,7 +299,9 @@ class _RegionLabels:
             0,
             len(centres),
             *regions,
-            *sides,
+            reference,
+            target,
+            self._tables,
             image.descriptors,
             *smoothing,
             *chosen,
@@ -501,7 +503,7 @@ def superpixels(
 
     Args:
         gray: The image.
-        size: Side of the initial squares, pixels.
+        size: ImageArrays of the initial squares, pixels.
         compactness: Grey levels that weigh as much as a distance of `size`.
         iterations: Of k-means.
     """
@@ -693,7 +695,7 @@ def filter_patch(
 
 @kernel
 def read_descriptors(
-    start: int, stop: int, columns: int, image: Side, tables: CostTables, out: Words
+    start: int, stop: int, columns: int, image: ImageArrays, tables: CostTables, out: Words
 ) -> None:
     """Fill rows start..stop of ``out``, uint64, flat ``[h, columns, 17]``, with half-resolution pixels' descriptors."""
     for y in range(start, stop):
@@ -703,14 +705,14 @@ def read_descriptors(
             read_descriptor(px, py, image, tables, out, (y * columns + x) * 17)
 
 
-Label: TypeAlias = tuple[Scalar, Scalar, Scalar, Scalar]
-"""Displacement, log2 of the scale, rotation."""
+Similarity: TypeAlias = tuple[Scalar, Scalar, Scalar, Scalar]
+"""Displacement u, v at a centre, and a, b: scale times cosine and sine of the rotation."""
 
 
 @kernel
 def aggregate_and_choose(
-    start: int, stop: int, members: Longs, starts: Longs, centres: Floats, candidates: Floats, reference: Side,
-    target: Side, tables: CostTables, straight: Words, guide: Floats, radius: int, epsilon: Scalar, best: Floats,
+    start: int, stop: int, members: Longs, starts: Longs, centres: Floats, candidates: Floats, reference: ImageArrays,
+    target: ImageArrays, tables: CostTables, straight: Words, guide: Floats, radius: int, epsilon: Scalar, best: Floats,
     winner: Floats, evaluations: Longs,
 ) -> None:  # fmt: skip
     """Raw cost, guided filter and winner takes all (Eq. 1-3) for regions start..stop, at half resolution.
@@ -722,8 +724,8 @@ def aggregate_and_choose(
         starts: `Superpixels.starts`.
         centres: float32 ``[K, 2]``, full-image pixels.
         candidates: float32 ``[K, C, 4]``, labels around the centres; NaN means none.
-        reference: `orientation_maps.Side`.
-        target: `orientation_maps.Side`.
+        reference: `orientation_maps.ImageArrays`.
+        target: `orientation_maps.ImageArrays`.
         tables: `matching_cost.CostTables` without support.
         straight: `DescribedImage.descriptors` of the reference.
         guide: float32 ``[h, w]``, half-resolution grey levels in [0, 1].
@@ -776,9 +778,9 @@ def aggregate_and_choose(
                 values[:n] = 0
                 framed = True
             si, ti = quantised(s, theta)
-            sides = (reference, target, tables)
+            images = (reference, target, tables)
             raw_costs(
-                (u, v, a, b), (si, ti), centre, corner, radius, sides, straight, columns, rotated, size, described,
+                (u, v, a, b), (si, ti), centre, corner, radius, images, straight, columns, rotated, size, described,
                 turned, values[:n],
             )  # fmt: skip
             described[ti] = True
@@ -798,7 +800,7 @@ def aggregate_and_choose(
 
 @inlined
 def differs(
-    label: Label,
+    label: Similarity,
     centre: tuple[Scalar, Scalar],
     region: Longs,
     columns: int,
@@ -847,9 +849,9 @@ def patch_around(members: Longs, rows: int, columns: int, margin: int) -> tuple[
 
 @inlined
 def raw_costs(
-    label: Label, index: tuple[Scalar, Scalar], centre: tuple[Scalar, Scalar], patch: tuple[int, int, int, int],
-    radius: int, sides: tuple[Side, Side, CostTables], straight: Words, columns: int, rotated: Bytes, size: int,
-    described: Flags, turned: Words, raw: Floats,
+    label: Similarity, index: tuple[Scalar, Scalar], centre: tuple[Scalar, Scalar], patch: tuple[int, int, int, int],
+    radius: int, images: tuple[ImageArrays, ImageArrays, CostTables], straight: Words, columns: int, rotated: Bytes,
+    size: int, described: Flags, turned: Words, raw: Floats,
 ) -> None:  # fmt: skip
     """Fill `raw` with Eq. 1 of a label around a centre, for every half-resolution pixel of a patch.
 
@@ -859,7 +861,7 @@ def raw_costs(
         centre: Full-image pixels.
         patch: Its left and top, width and height, half-resolution pixels.
         radius: Width of the frame around it in `raw`.
-        sides: Reference, target and tables.
+        images: Reference, target and tables.
         straight: `DescribedImage.descriptors` of the reference.
         columns: Half-resolution pixels a row of the image.
         rotated: uint8, flat ``[13, size, 136]``, filled for rotations that are not `described` yet.
@@ -870,7 +872,7 @@ def raw_costs(
     """
     (u, v, a, b) = label
     (left, top, wide, high) = patch
-    (reference, target, tables) = sides
+    (reference, target, tables) = images
     (si, ti) = index
     height, width = target.gray.shape
     neutral = ti == -layout.ANGLE_LOW
@@ -891,7 +893,7 @@ def raw_costs(
             ty = centre[1] + v + b * dx + a * dy
             cost = np.int64(tables.ceiling)
             if tx >= 0 and ty >= 0 and tx <= width - 1 and ty <= height - 1:
-                cost = np.int64(descriptor_distance(tx, ty, si, ti, mine, own, target, tables))
+                cost = np.int64(descriptor_distance(tx, ty, si, ti, own, mine, target, tables))
                 if tables.appearance:
                     gray, gradient = appearance(target, tx, ty)
                     own_gray, own_gradient = appearance(reference, px, py)

@@ -18,21 +18,35 @@ from numpy.typing import NDArray
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
 from dynslam_bench.core.simd import Flags, Floats, Longs
 from dynslam_bench.flow import moth_flame
-from dynslam_bench.flow.matching_cost import CostTables, Reference, label_cost
+from dynslam_bench.flow.matching_cost import Label, MatchingCost, label_cost
 from dynslam_bench.flow.moth_flame import FlightTable
-from dynslam_bench.flow.orientation_maps import Side
 from dynslam_bench.flow.settings import DaisySettings, SearchName
 
 Run = Callable[..., Any]
 """`Workers.run`, which divides a kernel's points among threads."""
-VOTE = (192, np.float32(5.0))
-"""Pairs of points tried for a common motion, and the distance in pixels at which a point agrees with one."""
+HYPOTHESES = 192
+"""Pairs of points tried for a common motion (RANSAC)."""
+INLIER_PX = np.float32(5.0)
+"""Distance in pixels at which a point agrees with a motion."""
 VOTERS = 256
 """Approximate number of points that vote on a hypothesis."""
+LEAST_INLIERS = 6
+"""Points that must agree with a common motion."""
+SHORTEST_PAIR_PX2 = 400
+"""Squared distance in pixels of two points, below which their motion is not tried."""
+LEAST_SCALE2 = 0.15
+"""Smallest square of a common motion's scale."""
+MOST_SCALE2 = 6.5
+"""Largest square of a common motion's scale."""
 NO_MOTION = np.empty((0, 4), dtype=np.float32)
+"""No common motions."""
 NEIGHBOUR_WINDOW = 40
 """Points compared on each side, in the order of x, to find the nearest neighbours."""
 MOST_NEIGHBOURS = 8
+"""Neighbours that are found of each point; settings use as many or fewer."""
+BOUND_MARGIN_PX = np.float32(8)
+"""The bounds of a point leave at least this much around its best displacement."""
+# constants of splitmix64: the state's step, and the factors of its two mixing rounds
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX2 = np.uint64(0x94D049BB133111EB)
@@ -68,26 +82,64 @@ STRATEGIES: dict[SearchName, Strategy] = {
 }
 
 
-def make_plan(settings: DaisySettings) -> tuple[int, tuple[int, ...], tuple[Any, ...]]:
-    """Divide `FlowSettings.budget`; small budgets get fewer sweeps and smaller populations.
+class SearchRules(NamedTuple):
+    """How `run_phase` chooses labels: a `Strategy` with its tables.
 
-    Returns:
-        The number of labels kept a point; the evaluations a point at which each phase ends (between
-        phases labels are exchanged); the last arguments of `run_phase`.
+    Attributes:
+        flights: Number of flames and coefficients of each iteration.
+        spiral: `moth_flame.spiral_table`.
+        cauchy: `moth_flame.cauchy_table`.
+        steps: float32 ``[4]``, scale of the Cauchy steps of Eq. 13 by dimension of a label.
+        moth_flame: Whether moths fly; else labels are drawn from a window that shrinks.
+        shrink: Factor of that window an evaluation, see `Strategy.shrink`; with 0 the rest of the
+            budget is left.
     """
+
+    flights: FlightTable
+    spiral: NDArray[np.float32]
+    cauchy: NDArray[np.float32]
+    steps: NDArray[np.float32]
+    moth_flame: bool
+    shrink: np.float32
+
+
+class SearchPlan(NamedTuple):
+    """How a budget is spent.
+
+    Attributes:
+        population: Labels kept a point.
+        ends: Evaluations a point at which each phase ends; labels are exchanged between phases.
+        rules: How labels are chosen within a phase.
+    """
+
+    population: int
+    ends: tuple[int, ...]
+    rules: SearchRules
+
+
+def make_plan(settings: DaisySettings) -> SearchPlan:
+    """Divide `FlowSettings.budget`; small budgets get fewer sweeps and smaller populations."""
     budget = settings.budget
-    rules, shrink, propagates = STRATEGIES[settings.search]
-    sweeps = min(settings.sweeps, max(1, budget // 16)) if propagates else 0
+    strategy = STRATEGIES[settings.search]
+    equations = strategy.rules
     # initialising the population takes a double share
+    sweeps = min(settings.sweeps, max(1, budget // 16)) if strategy.propagates else 0
     ends = tuple(budget * (k + 2) // (sweeps + 2) for k in range(sweeps + 1))
-    population = max(2, min(settings.population, budget // 8)) if rules else 1
-    founding = population * (2 if rules and rules.opposition else 1)
-    iterations = max(1, -(-(budget - founding) // population))
-    table = moth_flame.flight_table(population, iterations, rules or moth_flame.MFO)
+    # with opposition the first population is evaluated twice: itself and its opposites
+    population = max(2, min(settings.population, budget // 8)) if equations else 1
+    initial = population * (2 if equations and equations.opposition else 1)
+    iterations = max(1, -(-(budget - initial) // population))
     # of Eq. 13, per dimension of a label: px, px, octaves, radians
-    steps = np.array([*[settings.cauchy_step_px] * 2, 0.1, np.deg2rad(5.0)], dtype=np.float32)
-    tables = table, moth_flame.spiral_table(), moth_flame.cauchy_table(), steps
-    return population, ends, (*tables, rules is not None, np.float32(shrink))
+    steps = [settings.cauchy_step_px, settings.cauchy_step_px, 0.1, np.deg2rad(5.0)]
+    rules = SearchRules(
+        flights=moth_flame.flight_table(population, iterations, equations or moth_flame.MFO),
+        spiral=moth_flame.spiral_table(),
+        cauchy=moth_flame.cauchy_table(),
+        steps=np.array(steps, dtype=np.float32),
+        moth_flame=equations is not None,
+        shrink=np.float32(strategy.shrink),
+    )
+    return SearchPlan(population, ends, rules)
 
 
 class SearchState(NamedTuple):
@@ -111,7 +163,7 @@ class SearchState(NamedTuple):
 
 
 def search_labels(
-    settings: DaisySettings, run: Run, costs: tuple[Reference, Side, CostTables], neighbours: NDArray[np.int64],
+    settings: DaisySettings, run: Run, matching: MatchingCost, neighbours: NDArray[np.int64],
     guess: NDArray[np.float32] | None, seed: int,
 ) -> SearchState:  # fmt: skip
     """The label search of all points: phases of `DaisySettings.search` with propagation between them.
@@ -119,7 +171,7 @@ def search_labels(
     Args:
         settings: Which search, its budget and its range.
         run: Divides the points among threads.
-        costs: Points, target and tables of the matching cost.
+        matching: Points, target and tables of the matching cost.
         neighbours: int64 ``[N, K]`` of `nearest`.
         guess: float32 ``[N, 2]``, predicted positions; not finite means none.
         seed: Of the frame.
@@ -127,22 +179,11 @@ def search_labels(
     Returns:
         The final state; ``flames[:, 0]`` and ``costs[:, 0]`` are the best labels and their costs.
     """
-    (points, *_), _, tables = costs
+    points = matching.reference.points
     n = len(points)
-    start = np.zeros((n, 1, 4), dtype=np.float32)  # zero flow, or the motion model's prediction
-    if guess is not None:
-        offset = guess - points
-        start[:, 0, :2] = np.where(np.isfinite(offset).all(axis=1, keepdims=True), offset, 0)
-    rotation = np.deg2rad(settings.rotation_range_deg)
-    extent = np.array(
-        [settings.range_px, settings.range_px, settings.scale_range_octaves, rotation], np.float32
-    )
-    lower = start[:, 0] - extent
-    upper = start[:, 0] + extent
-    population, ends, options = make_plan(settings)
-    flames = np.repeat(start, population, axis=1)
-    unknown = np.full((n, population), tables.ceiling, np.int64)  # nothing has been evaluated
-    state = SearchState(np.zeros_like(flames), flames, unknown, np.zeros(n, np.int64), lower, upper)
+    plan = make_plan(settings)
+    start = start_labels(points, guess)
+    state = initial_state(settings, start, plan.population, matching.tables.ceiling)
     candidates = start
     # nothing is drawn: zero flow is tried beside the prediction
     if STRATEGIES[settings.search].shrink == 0:
@@ -150,16 +191,49 @@ def search_labels(
         candidates = np.concatenate([start, np.broadcast_to(zero, start.shape)], axis=1)
     neighbours = np.ascontiguousarray(neighbours[:, : settings.neighbours])
     motions = np.full((2, 4), np.nan, dtype=np.float32)
-    for phase, end in enumerate(ends):
+    for phase, end in enumerate(plan.ends):
+        # propagation: the neighbours' best labels and the common motions are tried first
         if phase > 0:
             best = state.flames[:, 0].copy()
             if settings.similarity_seeds:
                 motions = common_motions(points, best, state.costs[:, 0], seed + phase)
             candidates = np.empty((n, neighbours.shape[1] + 2, 4), dtype=np.float32)
-            sources = (points, best, label_turns(best), neighbours, motions)
-            run(transported_labels, 0, n, *sources, lower, upper, candidates)
-        run(run_phase, 0, n, *costs, state, candidates, end, phase, np.uint64(seed), *options)
+            sources = (points, best, scaled_rotations(best), neighbours, motions)
+            run(propagated_labels, 0, n, *sources, state.lower, state.upper, candidates)
+        # then every point spends its evaluations of the phase
+        run(run_phase, 0, n, matching, state, candidates, end, phase, np.uint64(seed), plan.rules)
     return state
+
+
+def start_labels(
+    points: NDArray[np.float32], guess: NDArray[np.float32] | None
+) -> NDArray[np.float32]:
+    """Labels ``[N, 1, 4]`` of zero flow, or of the motion model's prediction where it is finite."""
+    start = np.zeros((len(points), 1, 4), dtype=np.float32)
+    if guess is not None:
+        offset = guess - points
+        start[:, 0, :2] = np.where(np.isfinite(offset).all(axis=1, keepdims=True), offset, 0)
+    return start
+
+
+def initial_state(
+    settings: DaisySettings, start: NDArray[np.float32], population: int, ceiling: int
+) -> SearchState:
+    """The state before anything was evaluated, with bounds around the start labels ``[N, 1, 4]``."""
+    n = len(start)
+    rotation = np.deg2rad(settings.rotation_range_deg)
+    extent = np.array(
+        [settings.range_px, settings.range_px, settings.scale_range_octaves, rotation], np.float32
+    )
+    flames = np.repeat(start, population, axis=1)
+    return SearchState(
+        moths=np.zeros_like(flames),
+        flames=flames,
+        costs=np.full((n, population), ceiling, np.int64),
+        used=np.zeros(n, np.int64),
+        lower=start[:, 0] - extent,
+        upper=start[:, 0] + extent,
+    )
 
 
 @inlined
@@ -179,9 +253,8 @@ def advance(state: Scalar) -> Scalar:
 @inlined
 def uniform(bits: Scalar, quarter: int) -> Scalar:
     """One of the four float32 in [0, 1) that `scrambled` bits make, in steps of 2**-16."""
-    return np.float32(np.int32((bits >> np.uint64(16 * quarter)) & np.uint64(65535))) * np.float32(
-        1.0 / 65536
-    )
+    number = np.int32((bits >> np.uint64(16 * quarter)) & np.uint64(65535))
+    return np.float32(number) * np.float32(1.0 / 65536)
 
 
 @inlined
@@ -190,7 +263,7 @@ def insert(flames: Floats, costs: Longs, trials: Floats, trial: int, cost: Scala
 
     Args:
         flames: float32 ``[P, 4]``, changed in place.
-        costs: int64 ``[P]``, likewise.
+        costs: int64 ``[P]``, their costs, changed in place.
         trials: float32 ``[T, 4]``, evaluated labels.
         trial: Which of them.
         cost: Its cost.
@@ -212,31 +285,32 @@ def insert(flames: Floats, costs: Longs, trials: Floats, trial: int, cost: Scala
 def widen(lower: Floats, upper: Floats, flames: Floats) -> None:
     """Extend a point's bounds to 8 px around its best displacement, which may come from a neighbour."""
     for j in range(2):
-        lower[j] = min(lower[j], flames[0, j] - np.float32(8))
-        upper[j] = max(upper[j], flames[0, j] + np.float32(8))
+        lower[j] = min(lower[j], flames[0, j] - BOUND_MARGIN_PX)
+        upper[j] = max(upper[j], flames[0, j] + BOUND_MARGIN_PX)
 
 
+# Stages of a phase, in this order; the second and the third belong to phase 0 of a moth-flame search.
 CANDIDATES = 0
+"""Labels of neighbours, of common motions, or of the guess."""
 INITIAL = 1
+"""The first population."""
 OPPOSITES = 2
+"""Its opposites."""
 SEARCH = 3
-"""Stages of a phase; the second and the third belong to phase 0 of a moth-flame search."""
+"""Moths that fly, or labels that are drawn, until the evaluations are spent."""
 
 
 @kernel
 def run_phase(
-    start: int, stop: int, reference: Reference, target: Side, tables: CostTables, state: SearchState,
-    candidates: Floats, end: int, phase: int, seed: Scalar, table: FlightTable, spiral: Floats, cauchy: Floats,
-    steps: Floats, moth_flame: bool, shrink: Scalar,
+    start: int, stop: int, matching: MatchingCost, state: SearchState, candidates: Floats, end: int, phase: int,
+    seed: Scalar, rules: SearchRules,
 ) -> None:  # fmt: skip
     """Spend evaluations on points start..stop until each has used `end`.
 
     Args:
         start: First point.
         stop: One past the last.
-        reference: `matching_cost.Reference`.
-        target: `orientation_maps.Side`.
-        tables: `matching_cost.CostTables`.
+        matching: `matching_cost.MatchingCost`.
         state: `SearchState`, changed in place; a search that is no moth-flame search has a
             population of one.
         candidates: float32 ``[N, C, 4]``, labels to try first (neighbours', the guess, ...); not
@@ -244,17 +318,13 @@ def run_phase(
         end: Evaluations a point, counted from the very start, at which the phase ends.
         phase: Number of the phase; 0 initialises the population.
         seed: Of the frame.
-        table: `moth_flame.FlightTable`.
-        spiral: `moth_flame.spiral_table`.
-        cauchy: `moth_flame.cauchy_table`.
-        steps: float32 ``[4]``, scale of the Cauchy steps.
-        moth_flame: Whether moths fly; else labels are drawn from a window that shrinks.
-        shrink: Factor of that window an evaluation, see `Strategy.shrink`; with 0 the rest of the
-            budget is left.
+        rules: `SearchRules`.
     """
     population = state.costs.shape[1]
-    iterations = len(table.counts)
-    initial = population * (2 if table.opposition else 1)
+    opposition = rules.flights.opposition
+    iterations = len(rules.flights.counts)
+    initial = population * (2 if opposition else 1)
+    ceiling = matching.tables.ceiling
     low = np.empty(4, dtype=np.float32)
     high = np.empty(4, dtype=np.float32)
     trials = np.empty((max(population, candidates.shape[1]), 4), dtype=np.float32)
@@ -264,70 +334,60 @@ def run_phase(
         moths = state.moths[i]
         flames = state.flames[i]
         costs = state.costs[i]
-        random = scrambled(
-            np.uint64(seed)
-            + _GOLDEN * (np.uint64(i) * np.uint64(64) + np.uint64(phase) + np.uint64(1))
-        )
+        # random numbers of the point and the phase, whatever the order of the points
+        stream = np.uint64(i) * np.uint64(64) + np.uint64(phase) + np.uint64(1)
+        random = scrambled(np.uint64(seed) + _GOLDEN * stream)
         used = state.used[i]
         placed = 0
         stage = CANDIDATES
         window = np.float32(0.5)
         # costs are computed in one place; the stages differ in the labels that are tried
         while True:
+            # choose `count` labels to try
             count = population
             if stage == CANDIDATES:
                 count = finite_labels(candidates[i], trials)
-                if phase == 0 and moth_flame:
+                if phase == 0 and rules.moth_flame:
                     placed = min(count, population, end - used)
                     moths[:placed] = trials[:placed]
             elif stage == INITIAL:
                 random = place_moths(moths, placed, lower, upper, trials, random)
                 count = population - placed
             elif stage == OPPOSITES:
-                random = oppose(moths, lower, upper, low, high, trials, random)
+                random = opposite_labels(moths, lower, upper, low, high, trials, random)
             elif used >= end:
                 break
-            elif moth_flame:
+            elif rules.moth_flame:
                 iteration = min(max((used - initial) // population, 0), iterations - 1)
-                random = move_moths(
-                    moths,
-                    flames,
-                    lower,
-                    upper,
-                    iteration,
-                    table,
-                    spiral,
-                    cauchy,
-                    steps,
-                    trials,
-                    random,
-                )
-            elif shrink == 0:
+                random = move_moths(moths, flames, lower, upper, iteration, rules, trials, random)
+            elif rules.shrink == 0:
                 break
             else:
                 random = advance(random)
-                draw(trials[0], scrambled(random), lower, upper, flames, window, shrink)
-                window *= shrink
+                draw_label(
+                    trials[0], scrambled(random), lower, upper, flames[0], window, rules.shrink
+                )
+                window *= rules.shrink
+                # below a pixel the window begins anew
                 if window * (upper[0] - lower[0]) < np.float32(1):
                     window = np.float32(0.5)
+
+            # evaluate them
             for k in range(min(count, end - used)):
-                u = trials[k, 0]
-                v = trials[k, 1]
-                s = trials[k, 2]
-                theta = trials[k, 3]
-                cost = label_cost(
-                    i, u, v, s, theta, reference, target, tables, costs[population - 1]
-                )
+                label = (trials[k, 0], trials[k, 1], trials[k, 2], trials[k, 3])
+                cost = label_cost(i, label, matching, costs[population - 1])
                 insert(flames, costs, trials, k, cost)
                 used += 1
+
+            # the next stage
             if stage == CANDIDATES:
                 widen(lower, upper, flames)
-                stage = INITIAL if phase == 0 and moth_flame else SEARCH
+                stage = INITIAL if phase == 0 and rules.moth_flame else SEARCH
             elif stage == INITIAL:
-                stage = OPPOSITES if table.opposition else SEARCH
+                stage = OPPOSITES if opposition else SEARCH
             elif stage == OPPOSITES:
                 for m in range(population):  # the best N of X and its opposites
-                    if costs[m] < tables.ceiling:
+                    if costs[m] < ceiling:
                         moths[m] = flames[m]
                 stage = SEARCH
         state.used[i] = used
@@ -340,9 +400,9 @@ def finite_labels(candidates: Floats, trials: Floats) -> int:
     for c in range(len(candidates)):
         for j in range(4):
             trials[count, j] = candidates[c, j]
-        count += np.isfinite(
-            candidates[c, 0] + candidates[c, 1] + candidates[c, 2] + candidates[c, 3]
-        )
+        # one that is not finite is written over
+        total = candidates[c, 0] + candidates[c, 1] + candidates[c, 2] + candidates[c, 3]
+        count += np.isfinite(total)
     return count
 
 
@@ -361,7 +421,7 @@ def place_moths(
 
 
 @inlined
-def oppose(
+def opposite_labels(
     moths: Floats,
     lower: Floats,
     upper: Floats,
@@ -370,12 +430,17 @@ def oppose(
     trials: Floats,
     random: Scalar,
 ) -> Scalar:
-    """Fill `trials` with the moths' opposites (`moth_flame.opposites`); returns the next random state."""
+    """Fill `trials` with the moths' opposites (`moth_flame.opposites`); returns the next random state.
+
+    `low` and `high`, float32 ``[4]``, are scratch.
+    """
     population = len(moths)
     for j in range(4):  # dynamic bounds dy, dz (Eq. 20)
-        low[j], high[j] = moths[0, j], moths[0, j]
+        low[j] = moths[0, j]
+        high[j] = moths[0, j]
         for m in range(1, population):
-            low[j], high[j] = min(low[j], moths[m, j]), max(high[j], moths[m, j])
+            low[j] = min(low[j], moths[m, j])
+            high[j] = max(high[j], moths[m, j])
     for m in range(population):
         random = advance(random)
         factor = uniform(scrambled(random), 0)
@@ -391,76 +456,84 @@ def oppose(
 
 @inlined
 def move_moths(
-    moths: Floats, flames: Floats, lower: Floats, upper: Floats, iteration: int, table: FlightTable, spiral: Floats,
-    cauchy: Floats, steps: Floats, trials: Floats, random: Scalar,
+    moths: Floats, flames: Floats, lower: Floats, upper: Floats, iteration: int, rules: SearchRules, trials: Floats,
+    random: Scalar,
 ) -> Scalar:  # fmt: skip
     """Move every moth once (Eq. 8, 10, 12, 13, 17), as `moth_flame.moth_positions`, and try where it is.
+
+    Args:
+        moths: float32 ``[P, 4]``, changed in place.
+        flames: float32 ``[P, 4]``, best first.
+        lower: float32 ``[4]``, bounds that moths are moved into.
+        upper: float32 ``[4]``.
+        iteration: Row of ``rules.flights``.
+        rules: `SearchRules`.
+        trials: float32 ``[P, 4]``, filled with the moths.
+        random: State of the draws.
 
     Returns:
         The next random state.
     """
-    population = len(moths)
-    now = table.coefficients[iteration]
-    span = now[0]
-    own = now[1]
-    best = now[2]
-    stepping = now[3] > 0
-    pulling = now[2] > 0
-    fewest = table.counts[iteration] - 1
-    for m in range(population):
-        flame = min(m, fewest)  # Eq. 8
+    # the fields of `moth_flame.Flight`
+    flight = rules.flights.coefficients[iteration]
+    span = flight[0]
+    own = flight[1]
+    best = flight[2]
+    pulling = flight[2] > 0
+    stepping = flight[3] > 0
+    last_flame = rules.flights.counts[iteration] - 1
+    for m in range(len(moths)):
+        flame = min(m, last_flame)  # Eq. 8
         random = advance(random)
         bits = scrambled(random)
-        jumps = np.uint64(0)
+        cauchy_bits = np.uint64(0)
         if stepping:
             random = advance(random)
-            jumps = scrambled(random)
+            cauchy_bits = scrambled(random)
         for j in range(4):
             t = span * uniform(bits, j) + np.float32(1)  # Eq. 10
-            turn = spiral[
-                min(
-                    max(np.int64((t + np.float32(2)) * np.float32(1024)), np.int64(0)),
-                    np.int64(4095),
-                )
-            ]
             distance = abs(flames[m, j] - moths[m, j])
             goal = flames[flame, j]
             if pulling:  # Eq. 17
                 goal = own * goal + best * flames[0, j]
-            position = distance * turn + goal
+            position = distance * spiral_factor(t, rules.spiral) + goal  # Eq. 8, 12
             if stepping:  # Eq. 13
-                position += (
-                    cauchy[np.int64((jumps >> np.uint64(16 * j)) & np.uint64(4095))] * steps[j]
-                )
-            moths[m, j] = trials[m, j] = min(max(position, lower[j]), upper[j])
+                draw = np.int64((cauchy_bits >> np.uint64(16 * j)) & np.uint64(4095))
+                position += rules.cauchy[draw] * rules.steps[j]
+            position = min(max(position, lower[j]), upper[j])
+            moths[m, j] = position
+            trials[m, j] = position
     return random
 
 
 @inlined
-def draw(
-    label: Floats,
-    bits: Scalar,
-    lower: Floats,
-    upper: Floats,
-    flames: Floats,
-    window: Scalar,
-    shrink: Scalar,
-) -> None:
-    """Fill a label: anywhere in the box (`shrink` 1), or in a window of it around the best label."""
+def spiral_factor(t: Scalar, spiral: Floats) -> Scalar:
+    """``e^t cos(2 pi t)`` from `moth_flame.spiral_table`: t from -2 on, 1024 steps a unit."""
+    step = np.int64((t + np.float32(2)) * np.float32(1024))
+    return spiral[min(max(step, np.int64(0)), np.int64(4095))]
+
+
+@inlined
+def draw_label(
+    label: Floats, bits: Scalar, lower: Floats, upper: Floats, best: Floats, window: Scalar, shrink: Scalar
+) -> None:  # fmt: skip
+    """Fill a label: anywhere in the bounds (`shrink` 1), or in a window around the best label.
+
+    `window` is half the window's side as a share of the bounds' extent.
+    """
     for j in range(4):
         extent = upper[j] - lower[j]
         if shrink == 1:
             label[j] = lower[j] + extent * uniform(bits, j)
         else:
             step = (np.float32(2) * uniform(bits, j) - np.float32(1)) * window * extent
-            label[j] = min(max(flames[0, j] + step, lower[j]), upper[j])
+            label[j] = min(max(best[j] + step, lower[j]), upper[j])
 
 
 @kernel
 def parabola(
-    start: int, stop: int, labels: Floats, step: float, reference: Reference, target: Side, tables: CostTables,
-    used: Longs,
-) -> None:  # fmt: skip
+    start: int, stop: int, labels: Floats, step: float, matching: MatchingCost, used: Longs
+) -> None:
     """Move each label to the vertex of the parabolas through its cost and those `step` pixels beside it.
 
     Args:
@@ -468,22 +541,20 @@ def parabola(
         stop: One past the last.
         labels: float32 ``[N, 4]``, changed in place; moves by at most `step`.
         step: Pixels.
-        reference: `Reference`.
-        target: `orientation_maps.Side`.
-        tables: `CostTables`.
+        matching: `matching_cost.MatchingCost`.
         used: int64 ``[N]``, cost evaluations, counted on.
     """
-    far = np.int64(1 << 40)
+    unbounded = np.int64(1 << 40)
     for i in range(start, stop):
         u = labels[i, 0]
         v = labels[i, 1]
         s = labels[i, 2]
         theta = labels[i, 3]
-        middle = label_cost(i, u, v, s, theta, reference, target, tables, far)
-        left = label_cost(i, u - step, v, s, theta, reference, target, tables, far)
-        right = label_cost(i, u + step, v, s, theta, reference, target, tables, far)
-        up = label_cost(i, u, v - step, s, theta, reference, target, tables, far)
-        down = label_cost(i, u, v + step, s, theta, reference, target, tables, far)
+        middle = label_cost(i, (u, v, s, theta), matching, unbounded)
+        left = label_cost(i, (u - step, v, s, theta), matching, unbounded)
+        right = label_cost(i, (u + step, v, s, theta), matching, unbounded)
+        up = label_cost(i, (u, v - step, s, theta), matching, unbounded)
+        down = label_cost(i, (u, v + step, s, theta), matching, unbounded)
         used[i] += 5
         labels[i, 0] = u + step * vertex(left, middle, right)
         labels[i, 1] = v + step * vertex(up, middle, down)
@@ -495,18 +566,16 @@ def vertex(before: Scalar, middle: Scalar, after: Scalar) -> Scalar:
     curvature = before + after - 2 * middle
     if curvature <= 0:
         return np.float32(0)
-    return min(
-        max(np.float32(before - after) / np.float32(2 * curvature), np.float32(-1)), np.float32(1)
-    )
+    position = np.float32(before - after) / np.float32(2 * curvature)
+    return min(max(position, np.float32(-1)), np.float32(1))
 
 
-# ------------------------------------------------------------------ propagation between
-# neighbouring points
+# Propagation between neighbouring points.
 
 
 @kernel
-def transported_labels(
-    start: int, stop: int, points: Floats, labels: Floats, turns: Floats, neighbours: Longs, motions: Floats,
+def propagated_labels(
+    start: int, stop: int, points: Floats, labels: Floats, rotations: Floats, neighbours: Longs, motions: Floats,
     lower: Floats, upper: Floats, out: Floats,
 ) -> None:  # fmt: skip
     """Labels of neighbours and of common motions, as seen from each point.
@@ -521,7 +590,7 @@ def transported_labels(
         stop: One past the last.
         points: float32 ``[N, 2]``.
         labels: float32 ``[N, 4]``, best labels of the previous phase.
-        turns: float32 ``[N, 2]`` of `label_turns`.
+        rotations: float32 ``[N, 2]`` of `scaled_rotations`.
         neighbours: int64 ``[N, K]``, indices; negative means none.
         motions: float32 ``[M, 4]``, similarities ``(a, b, tx, ty)``:
             ``p' = [[a, -b], [b, a]] p + t``; NaN means none.
@@ -530,12 +599,13 @@ def transported_labels(
         out: float32 ``[N, K + M, 4]``, NaN where there is none.
     """
     count = neighbours.shape[1]
-    sizes = np.empty(len(motions), dtype=np.float32)
+    # log2 of the scale, and rotation of each common motion
+    octaves = np.empty(len(motions), dtype=np.float32)
     angles = np.empty(len(motions), dtype=np.float32)
     for m in range(len(motions)):
         a = motions[m, 0]
         b = motions[m, 1]
-        sizes[m] = np.float32(0.5) * np.float32(np.log2(max(a * a + b * b, np.float32(1e-12))))
+        octaves[m] = np.float32(0.5) * np.float32(np.log2(max(a * a + b * b, np.float32(1e-12))))
         angles[m] = np.float32(np.arctan2(b, a))
     for i in range(start, stop):
         x = points[i, 0]
@@ -545,60 +615,62 @@ def transported_labels(
             if j < 0:
                 out[i, k, 0] = np.nan
                 continue
-            c = turns[j, 0]
-            n = turns[j, 1]
+            # the neighbour's similarity, applied to this point
+            c = rotations[j, 0]
+            n = rotations[j, 1]
             dx = x - points[j, 0]
             dy = y - points[j, 1]
             u = points[j, 0] + labels[j, 0] + c * dx - n * dy - x
             v = points[j, 1] + labels[j, 1] + n * dx + c * dy - y
-            admit(out, i, k, u, v, labels[j, 2], labels[j, 3], lower, upper)
+            store_candidate(out[i, k], (u, v, labels[j, 2], labels[j, 3]), lower[i], upper[i])
         for m in range(len(motions)):
             a = motions[m, 0]
             b = motions[m, 1]
             u = a * x - b * y + motions[m, 2] - x
             v = b * x + a * y + motions[m, 3] - y
-            admit(out, i, count + m, u, v, sizes[m], angles[m], lower, upper)
+            store_candidate(out[i, count + m], (u, v, octaves[m], angles[m]), lower[i], upper[i])
 
 
 @inlined
-def admit(
-    out: Floats,
-    i: int,
-    k: int,
-    u: Scalar,
-    v: Scalar,
-    s: Scalar,
-    theta: Scalar,
-    lower: Floats,
-    upper: Floats,
-) -> None:
-    """Store a candidate."""
-    out[i, k, 0] = u
-    out[i, k, 1] = v
-    out[i, k, 2] = min(max(s, lower[i, 2]), upper[i, 2])
-    out[i, k, 3] = min(max(theta, lower[i, 3]), upper[i, 3])
+def store_candidate(out: Floats, label: Label, lower: Floats, upper: Floats) -> None:
+    """Write a label ``[4]`` whose scale and rotation are clipped to the bounds ``[4]``."""
+    u, v, s, theta = label
+    out[0] = u
+    out[1] = v
+    out[2] = min(max(s, lower[2]), upper[2])
+    out[3] = min(max(theta, lower[3]), upper[3])
 
 
 @kernel
-def label_turns(labels: Floats) -> Floats:
-    """What labels ``[N, 4]`` do to directions: ``2**s (cos theta, sin theta)``, float32 ``[N, 2]``."""
-    turns = np.empty((len(labels), 2), dtype=np.float32)
+def scaled_rotations(labels: Floats) -> Floats:
+    """``2**s (cos theta, sin theta)`` of labels ``[N, 4]``, float32 ``[N, 2]``: a, b of ``[[a, -b], [b, a]]``."""
+    rotations = np.empty((len(labels), 2), dtype=np.float32)
     for i in range(len(labels)):
         scale = np.float32(np.exp2(labels[i, 2]))
-        turns[i, 0] = np.float32(np.cos(labels[i, 3])) * scale
-        turns[i, 1] = np.float32(np.sin(labels[i, 3])) * scale
-    return turns
+        rotations[i, 0] = np.float32(np.cos(labels[i, 3])) * scale
+        rotations[i, 1] = np.float32(np.sin(labels[i, 3])) * scale
+    return rotations
 
 
 def labels_as_seen(
     points: Floats, labels: Floats, neighbours: Longs, motions: Floats = NO_MOTION
 ) -> Floats:
-    """`transported_labels` without bounds that matter, float32 ``[N, K + M, 4]``."""
+    """`propagated_labels` without bounds that matter, float32 ``[N, K + M, 4]``."""
     count = len(points)
+    # octaves and radians that no label reaches
     extent = np.full((count, 4), 8.0, dtype=np.float32)
     out = np.empty((count, neighbours.shape[1] + len(motions), 4), dtype=np.float32)
-    transported_labels(
-        0, count, points, labels, label_turns(labels), neighbours, motions, -extent, extent, out
+    propagated_labels(
+        0,
+        count,
+        points,
+        labels,
+        scaled_rotations(labels),
+        neighbours,
+        motions,
+        -extent,
+        extent,
+        out,
     )
     return out
 
@@ -618,8 +690,9 @@ def common_motions(points: Floats, labels: Floats, costs: Longs, seed: int) -> F
     motions = np.full((2, 4), np.nan, dtype=np.float32)
     if len(points) < 4:
         return motions
+    # the better half by cost; of equal costs the first
     half = max(len(costs) // 2, 4)
-    keys = costs * len(costs) + np.arange(len(costs))  # of equal costs the first
+    keys = costs * len(costs) + np.arange(len(costs))
     # partitioned in numpy: in a kernel it would add a tenth to the compile time of all kernels
     good = np.sort(np.argpartition(keys, half - 1)[:half])
     # where the good points lie and where their labels take them, one coordinate after the other for
@@ -627,20 +700,22 @@ def common_motions(points: Floats, labels: Floats, costs: Longs, seed: int) -> F
     tracks = np.concatenate([points[good], points[good] + labels[good, :2]], axis=1).T.copy()
     random = np.uint64(seed) ^ np.uint64(0x5DEECE66D)
     for motion in motions:
-        if tracks.shape[1] < 6:
+        count = tracks.shape[1]
+        if count < LEAST_INLIERS:
             break
-        voters = tracks[:, :: -(-tracks.shape[1] // VOTERS)].copy()
-        random = np.uint64(vote(tracks, voters, *VOTE, random, motion))
+        every = -(-count // VOTERS)
+        voters = tracks[:, ::every].copy()
+        random = np.uint64(ransac_similarity(tracks, voters, HYPOTHESES, INLIER_PX, random, motion))
         # the second motion is fitted to the points that do not follow the first
-        (x, y, to_x, to_y) = tracks
-        (a, b, tx, ty) = motion
+        x, y, to_x, to_y = tracks
+        a, b, tx, ty = motion
         missed = (a * x - b * y + tx - to_x) ** 2 + (b * x + a * y + ty - to_y) ** 2
-        tracks = np.compress(missed >= 4 * VOTE[1] ** 2, tracks, axis=1)
+        tracks = np.compress(missed >= 4 * INLIER_PX**2, tracks, axis=1)
     return motions
 
 
 @kernel
-def vote(
+def ransac_similarity(
     tracks: Floats,
     voters: Floats,
     hypotheses: int,
@@ -652,11 +727,12 @@ def vote(
 
     Args:
         tracks: float32 ``[4, N]``, x and y of points, and where they go.
-        voters: float32 ``[4, M]``, likewise.
+        voters: float32 ``[4, M]``, the tracks that vote.
         hypotheses: Number of pairs tried.
         tolerance: Distance in pixels at which a voter agrees.
         random: State of the draws.
-        motion: float32 ``[4]``, filled with ``(a, b, tx, ty)`` if at least 6 voters agree.
+        motion: float32 ``[4]``, filled with ``(a, b, tx, ty)`` if at least `LEAST_INLIERS` voters
+            agree.
 
     Returns:
         The next state of the draws.
@@ -667,8 +743,9 @@ def vote(
     to_y = tracks[3]
     count = np.uint64(len(x))
     limit = np.float32(tolerance * tolerance)
-    most = 5
+    most = LEAST_INLIERS - 1
     for _ in range(hypotheses):
+        # draw a pair
         random = advance(random)
         bits = scrambled(random)
         i = np.int64(((bits & np.uint64(0xFFFFFFFF)) * count) >> np.uint64(32))
@@ -676,20 +753,21 @@ def vote(
         dx = x[j] - x[i]
         dy = y[j] - y[i]
         length = dx * dx + dy * dy
-        if length < 400:
+        if length < SHORTEST_PAIR_PX2:
             continue
+        # the similarity that takes both where their labels do: rotation and scale, then translation
         ex = to_x[j] - to_x[i]
         ey = to_y[j] - to_y[i]
         a = (ex * dx + ey * dy) / length
         b = (ey * dx - ex * dy) / length
-        grown = a * a + b * b
-        if grown < 0.15 or grown > 6.5:
+        scale2 = a * a + b * b
+        if scale2 < LEAST_SCALE2 or scale2 > MOST_SCALE2:
             continue
         tx = to_x[i] - a * x[i] + b * y[i]
         ty = to_y[i] - b * x[i] - a * y[i]
-        votes = count_votes(voters, a, b, tx, ty, limit)
-        if votes > most:
-            most = votes
+        inliers = count_inliers(voters, a, b, tx, ty, limit)
+        if inliers > most:
+            most = inliers
             motion[0] = a
             motion[1] = b
             motion[2] = tx
@@ -698,18 +776,20 @@ def vote(
 
 
 @inlined
-def count_votes(voters: Floats, a: Scalar, b: Scalar, tx: Scalar, ty: Scalar, limit: Scalar) -> int:
+def count_inliers(
+    voters: Floats, a: Scalar, b: Scalar, tx: Scalar, ty: Scalar, limit: Scalar
+) -> int:
     """How many voters a motion takes to where their labels do, by squared distance."""
     from_x = voters[0]
     from_y = voters[1]
     goal_x = voters[2]
     goal_y = voters[3]
-    votes = np.int32(0)
+    inliers = np.int32(0)
     for k in range(voters.shape[1]):
         rx = a * from_x[k] - b * from_y[k] + tx - goal_x[k]
         ry = b * from_x[k] + a * from_y[k] + ty - goal_y[k]
-        votes = np.int32(votes + np.int32(rx * rx + ry * ry < limit))
-    return int(votes)
+        inliers = np.int32(inliers + np.int32(rx * rx + ry * ry < limit))
+    return int(inliers)
 
 
 def nearest(points: Floats, run: Run) -> Longs:
@@ -726,7 +806,7 @@ def nearest(points: Floats, run: Run) -> Longs:
 def nearest_neighbours(
     start: int, stop: int, ordered: Floats, order: Longs, width: int, out: Longs
 ) -> None:
-    """The nearest other points of each point, in an approximate but deterministic search over rows of equal bands.
+    """The nearest other points of each point, among those that follow each other in x: approximate, deterministic.
 
     Args:
         start: First position in the order.
@@ -741,6 +821,7 @@ def nearest_neighbours(
     best = np.empty(count, dtype=np.float32)
     distances = np.empty(2 * width + 1, dtype=np.float32)
     for place in range(start, stop):
+        # squared distances of the points near it in x
         x = ordered[place, 0]
         y = ordered[place, 1]
         first = max(0, place - width)
@@ -750,6 +831,7 @@ def nearest_neighbours(
             dy = ordered[first + k, 1] - y
             distances[k] = dx * dx + dy * dy
         distances[place - first] = np.inf
+        # the nearest ones, by insertion into a sorted list
         index = out[order[place]]
         best[:] = np.inf
         index[:] = -1
@@ -759,7 +841,8 @@ def nearest_neighbours(
             if distance < worst:
                 slot = count - 1
                 while slot > 0 and best[slot - 1] > distance:
-                    best[slot], index[slot] = best[slot - 1], index[slot - 1]
+                    best[slot] = best[slot - 1]
+                    index[slot] = index[slot - 1]
                     slot -= 1
                 index[slot] = order[first + k]
                 best[slot] = distance
@@ -782,14 +865,19 @@ def dissenting_labels(
         it has more support than the point's own label.
     """
     limit = tolerance * tolerance
-    (u, v) = np.ascontiguousarray(predictions[:, :, :2].T)
+    u, v = np.ascontiguousarray(predictions[:, :, :2].T)  # [K, N] each
+    # how many predictions agree with each: [K, N]
     du = u[:, None] - u
     dv = v[:, None] - v
     support = np.count_nonzero(du * du + dv * dv < limit, axis=1)
+    # and how many with the point's own label: [N]
     du = u - labels[:, 0]
     dv = v - labels[:, 1]
     away = du * du + dv * dv
-    choice = support.argmax(axis=0), np.arange(len(labels))
-    most = support[choice]
     own = np.count_nonzero(away < limit, axis=0)
-    return predictions[choice[::-1]], (most > 1) & (most > own) & (away[choice] >= limit)
+    # the prediction of most support, where it has more than one supporter and is another one
+    neighbour = support.argmax(axis=0)
+    point = np.arange(len(labels))
+    most = support[neighbour, point]
+    dissents = (most > 1) & (most > own) & (away[neighbour, point] >= limit)
+    return predictions[point, neighbour], dissents

@@ -12,7 +12,7 @@ summation order, vector width or device.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
 from dynslam_bench.core.simd import Bytes, Floats, Ints, Longs, Words, descriptor_sum
 from dynslam_bench.flow import layout
-from dynslam_bench.flow.orientation_maps import Side
+from dynslam_bench.flow.orientation_maps import ImageArrays
 
 OUTSIDE = 1 << 20
 """Cost of a label that leaves the target image."""
@@ -31,7 +31,12 @@ TRUNCATION = 0.882
 INTENSITY = (55.0, 7 / 255)
 """alpha and t1 of Eq. 1, for images in [0, 1] (not stated in the paper)."""
 GRADIENT = (190.0, 2 / 255)
-"""beta and t2 of Eq. 1, likewise."""
+"""beta and t2 of Eq. 1, for images in [0, 1] (not stated in the paper)."""
+SUPPORT = ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1))
+"""Points around p over which the cost may be summed: the first one, five (a cross) or nine (a square)."""
+
+Label: TypeAlias = tuple[Scalar, Scalar, Scalar, Scalar]
+"""Displacement u, v in pixels, log2 of the scale, rotation in radians."""
 
 
 class CostTables(NamedTuple):
@@ -66,7 +71,7 @@ class CostTables(NamedTuple):
 
 
 class Reference(NamedTuple):
-    """The points as the kernels see them.
+    """The points of the reference image and their descriptors.
 
     Attributes:
         points: float32 ``[N, 2]``.
@@ -77,6 +82,20 @@ class Reference(NamedTuple):
     points: NDArray[np.float32]
     descriptors: NDArray[np.uint8]
     appearance: NDArray[np.int32]
+
+
+class MatchingCost(NamedTuple):
+    """All that the cost of a label at a point depends on (`label_cost`).
+
+    Attributes:
+        reference: The points.
+        target: The image that they are searched in.
+        tables: Of the image size and the weights.
+    """
+
+    reference: Reference
+    target: ImageArrays
+    tables: CostTables
 
 
 @lru_cache(maxsize=32)
@@ -94,88 +113,115 @@ def cost_tables(
     offsets, ring_level = layout.sampling_table()
     geometry = layout.map_geometry(*shape)
     per_level = np.stack([geometry.base, geometry.stride, geometry.shift, geometry.bias], axis=1)
+
+    # byte offset of each histogram, for every scale, rotation, quarter of the centre's cell, histogram
     level = np.repeat(ring_level, (9, 8), axis=1)  # [scales, 17]
     steps = np.asarray(layout.LEVEL_STEPS)[level][:, None, None, :, None]
-    half_cell = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])[
-        None, None, :, None, :
-    ]
-    cells = np.floor(half_cell + offsets[:, :, None] / (layout.SUBPIXEL * steps)).astype(np.int64)
-    samples = 8 * (cells[..., 1] * geometry.stride[level][:, None, None, :] + cells[..., 0])
-    grey = np.arange(256) / 255.0
-    square = [(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)][
-        :support
-    ]
-    intensity, gradient = (
-        np.rint(255 * weight * np.minimum(grey, limit) * (terms == 3)).astype(np.int32)
-        for weight, limit in (INTENSITY, GRADIENT)
+    quarters = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
+    centres = quarters[None, None, :, None, :]
+    displacements = offsets[:, :, None] / (layout.SUBPIXEL * steps)
+    cells = np.floor(centres + displacements).astype(np.int64)
+    columns = cells[..., 0]
+    rows = cells[..., 1]
+    strides = geometry.stride[level][:, None, None, :]
+    samples = layout.BINS * (rows * strides + columns)
+
+    # truncated linear penalties; an image's cost is 0 where the term does not count
+    difference = np.arange(256) / 255.0
+    counts = terms == 3
+    intensity = truncated_penalty(difference, *INTENSITY, counts)
+    gradient = truncated_penalty(difference, *GRADIENT, counts)
+    truncation = round(TRUNCATION * 255)
+    ceiling = support * (
+        layout.HISTOGRAMS * truncation + int(intensity.max()) + int(gradient.max())
     )
-    limit = round(TRUNCATION * 255)
     return CostTables(
-        samples.astype(np.int32),
-        per_level[ring_level[:, 0]],
-        per_level[ring_level[:, 1]],
-        limit,
-        intensity,
-        gradient,
-        terms == 3,
-        np.asarray(square, dtype=np.int64) * spacing,
-        support * (layout.HISTOGRAMS * limit + int(intensity.max()) + int(gradient.max())),
+        samples=samples.astype(np.int32),
+        ring0=per_level[ring_level[:, 0]],
+        ring1=per_level[ring_level[:, 1]],
+        truncation=truncation,
+        intensity=intensity,
+        gradient=gradient,
+        appearance=counts,
+        support=np.asarray(SUPPORT[:support], dtype=np.int64) * spacing,
+        ceiling=ceiling,
     )
+
+
+def truncated_penalty(
+    difference: NDArray[np.float64], weight: float, limit: float, counts: bool
+) -> NDArray[np.int32]:
+    """``weight * min(difference, limit)`` in 255ths, int32; 0 for a term that does not count."""
+    return np.rint(255 * weight * np.minimum(difference, limit) * counts).astype(np.int32)
 
 
 @inlined
 def cell_of(x: Scalar, y: Scalar, level: Longs) -> tuple[Scalar, Scalar]:
-    """Byte offset of the map cell that holds a full-image position, and the quarter of the cell it lies in."""
-    xq = np.int64(x * np.float32(4) + np.float32(0.5)) + level[3]
-    yq = np.int64(y * np.float32(4) + np.float32(0.5)) + level[3]
-    finer = level[2] - 1
-    xh = xq >> finer
-    yh = yq >> finer
-    return 8 * (level[0] + (yh >> 1) * level[1] + (xh >> 1)), 2 * (yh & 1) + (xh & 1)
+    """Byte offset of the map cell that holds a full-image position, and the quarter of the cell it lies in.
+
+    `level` is a row of `CostTables.ring0` or `ring1`: base, stride, shift, bias.
+    """
+    base = level[0]
+    stride = level[1]
+    shift = level[2]
+    bias = level[3]
+    # quarter pixels, then half cells
+    xq = np.int64(x * np.float32(4) + np.float32(0.5)) + bias
+    yq = np.int64(y * np.float32(4) + np.float32(0.5)) + bias
+    xh = xq >> (shift - 1)
+    yh = yq >> (shift - 1)
+    cell = base + (yh >> 1) * stride + (xh >> 1)
+    return 8 * cell, 2 * (yh & 1) + (xh & 1)
 
 
 @inlined
 def read_descriptor(
-    x: Scalar, y: Scalar, image: Side, tables: CostTables, out: Words, first: int
+    x: Scalar, y: Scalar, image: ImageArrays, tables: CostTables, out: Words, first: int
 ) -> None:
     """Write the unrotated descriptor of a position: 17 histograms, a number each, of `out` from `first` on."""
     neutral = -layout.SCALE_LOW
     straight = -layout.ANGLE_LOW
     histograms = image.histograms.view(np.uint64)
-    near, near_phase = cell_of(x, y, tables.ring0[neutral])
-    far, far_phase = cell_of(x, y, tables.ring1[neutral])
+    near, near_quarter = cell_of(x, y, tables.ring0[neutral])
+    far, far_quarter = cell_of(x, y, tables.ring1[neutral])
+    # bytes to histograms: eight bytes each
+    near_samples = tables.samples[neutral, straight, near_quarter]
+    far_samples = tables.samples[neutral, straight, far_quarter]
     for k in range(9):
-        out[first + k] = histograms[(near + tables.samples[neutral, straight, near_phase, k]) >> 3]
+        out[first + k] = histograms[(near + near_samples[k]) >> 3]
     for k in range(9, 17):
-        out[first + k] = histograms[(far + tables.samples[neutral, straight, far_phase, k]) >> 3]
+        out[first + k] = histograms[(far + far_samples[k]) >> 3]
 
 
 @inlined
 def rotate_descriptor(
-    descriptor: Words, at: int, a: int, turned: Words, out: Bytes, first: int
+    descriptor: Words, at: int, a: int, shifted: Words, out: Bytes, first: int
 ) -> None:
     """Write a descriptor for rotation index `a`: 136 bytes of `out` from `first` on.
 
     Args:
         descriptor: Unrotated, 17 numbers from `at` on.
         at: Where it begins.
-        a: Index of the rotation.
-        turned: uint64 ``[2, 17]``, scratch.
+        a: Index of the rotation, 0 to 12 in steps of 7.5 degrees, 6 for none.
+        shifted: uint64 ``[2, 17]``, scratch.
         out: Flat uint8 array.
         first: Index in it.
     """
-    # bin b of the histogram rotated by theta is the unrotated one's at b - theta / 45 degrees
+    # bin b of the histogram rotated by theta is the unrotated one's at b - theta / 45 degrees;
+    # a step of the rotation is a sixth of a bin
     sixths = a - 6
     whole = sixths // 6
-    far_weight = np.int32((sixths - 6 * whole) * 171)  # 1026 / 6
+    # weights of the two bins between which it lies, in 1026ths: 171 a sixth
+    far_weight = np.int32((sixths - 6 * whole) * 171)
     near_weight = np.int32(1026) - far_weight
-    for turn in range(2):
-        left = np.uint64(8 * (whole + turn) & 63)
-        right = np.uint64(-8 * (whole + turn) & 63)
+    # histograms shifted by whole bins: 64-bit rotations by bytes
+    for bin_ in range(2):
+        left = np.uint64(8 * (whole + bin_) & 63)
+        right = np.uint64(-8 * (whole + bin_) & 63)
         for k in range(17):
-            turned[turn, k] = descriptor[at + k] << left | descriptor[at + k] >> right
-    near = turned[0].view(np.uint8)
-    far = turned[1].view(np.uint8)
+            shifted[bin_, k] = descriptor[at + k] << left | descriptor[at + k] >> right
+    near = shifted[0].view(np.uint8)
+    far = shifted[1].view(np.uint8)
     rotated = out[first : first + 136]
     for b in range(136):
         rotated[b] = np.uint8((near_weight * near[b] + far_weight * far[b] + np.int32(512)) >> 10)
@@ -186,7 +232,7 @@ def describe(
     start: int,
     stop: int,
     points: Floats,
-    image: Side,
+    image: ImageArrays,
     tables: CostTables,
     out: Bytes,
     appearances: Ints,
@@ -197,7 +243,7 @@ def describe(
         start: First point.
         stop: One past the last point.
         points: float32 ``[N, 2]``.
-        image: `Side` of the reference.
+        image: `ImageArrays` of the reference.
         tables: `CostTables`.
         out: uint8, flat ``[N, S, ROTATIONS, 17 * 8]``.
         appearances: int32 ``[N, S, 2]``, filled with grey levels and gradient magnitudes where the
@@ -205,79 +251,78 @@ def describe(
     """
     height, width = image.gray.shape
     descriptor = np.empty(17, dtype=np.uint64)
-    turned = np.empty((2, 17), dtype=np.uint64)
+    shifted = np.empty((2, 17), dtype=np.uint64)
     supports = len(tables.support)
     for i in range(start, stop):
         for q in range(supports):
-            x = min(
-                max(points[i, 0] + np.float32(tables.support[q, 0]), np.float32(0)),
-                np.float32(width - 1),
-            )
-            y = min(
-                max(points[i, 1] + np.float32(tables.support[q, 1]), np.float32(0)),
-                np.float32(height - 1),
-            )
+            # the point of the support, moved into the image
+            x = clamped(points[i, 0] + np.float32(tables.support[q, 0]), width)
+            y = clamped(points[i, 1] + np.float32(tables.support[q, 1]), height)
             read_descriptor(x, y, image, tables, descriptor, 0)
             for a in range(13):
-                rotate_descriptor(
-                    descriptor, 0, a, turned, out, ((i * supports + q) * 13 + a) * 136
-                )
+                place = ((i * supports + q) * 13 + a) * 136
+                rotate_descriptor(descriptor, 0, a, shifted, out, place)
             if tables.appearance:
                 appearances[i, q, 0], appearances[i, q, 1] = appearance(image, x, y)
 
 
 @inlined
+def clamped(coordinate: Scalar, size: int) -> Scalar:
+    """A coordinate moved into an image of `size` pixels, float32."""
+    return min(max(coordinate, np.float32(0)), np.float32(size - 1))
+
+
+@inlined
 def descriptor_distance(
-    x: Scalar,
-    y: Scalar,
-    si: int,
-    ti: int,
-    mine: int,
-    descriptor: Bytes,
-    target: Side,
-    tables: CostTables,
-) -> Scalar:
-    """First term of Eq. 1: truncated distance of 136 bytes at `mine` to the target at (x, y), scale si, rotation ti."""
-    near, near_phase = cell_of(x, y, tables.ring0[si])
-    far, far_phase = cell_of(x, y, tables.ring1[si])
+    x: Scalar, y: Scalar, si: int, ti: int, descriptor: Bytes, first: int, target: ImageArrays, tables: CostTables
+) -> Scalar:  # fmt: skip
+    """First term of Eq. 1: the truncated distance of a descriptor to the target's at a position.
+
+    Args:
+        x: Column in the target, pixels.
+        y: Row in the target, pixels.
+        si: Index of the scale at which the target is sampled.
+        ti: Index of the rotation at which it is sampled.
+        descriptor: Flat uint8 array, with bins rotated by that rotation.
+        first: Index of the first of its 136 bytes.
+        target: The image.
+        tables: `CostTables`.
+    """
+    near, near_quarter = cell_of(x, y, tables.ring0[si])
+    far, far_quarter = cell_of(x, y, tables.ring1[si])
     row = 4 * (si * layout.ROTATIONS + ti)
-    theirs = target.histograms
-    near_row = row + near_phase
-    far_row = row + far_phase
+    near_row = row + near_quarter
+    far_row = row + far_quarter
     return descriptor_sum(
-        theirs, tables.samples, near_row, far_row, near, far, descriptor, mine, tables.truncation
-    )
+        target.histograms, tables.samples, near_row, far_row, near, far, descriptor, first, tables.truncation
+    )  # fmt: skip
 
 
 @inlined
 def quantised(s: Scalar, theta: Scalar) -> tuple[Scalar, Scalar]:
-    """Scale and rotation index of a label."""
+    """Indices of the nearest scale and rotation of `layout`, from log2 of the scale and the rotation in radians."""
+    # steps of a quarter of an octave, and of 7.5 degrees
     si = np.int64(np.floor(s * np.float32(4) + np.float32(0.5))) - layout.SCALE_LOW
-    ti = (
-        np.int64(np.floor(theta * np.float32(7.639437268410976) + np.float32(0.5)))
-        - layout.ANGLE_LOW
-    )
+    steps = theta * np.float32(7.639437268410976)
+    ti = np.int64(np.floor(steps + np.float32(0.5))) - layout.ANGLE_LOW
     return min(max(si, 0), 9), min(max(ti, 0), 12)
 
 
 @inlined
-def label_cost(
-    i: int, u: Scalar, v: Scalar, s: Scalar, theta: Scalar, reference: Reference, target: Side, tables: CostTables,
-    bound: Scalar,
-) -> Scalar:  # fmt: skip
+def label_cost(i: int, label: Label, matching: MatchingCost, bound: Scalar) -> Scalar:
     """Eq. 1 of one label at point i, summed over the support; may stop early once `bound` is reached.
 
     Args:
         i: Index of the point.
-        u: Displacement, pixels.
-        v: Displacement, pixels.
-        s: Log2 of the scale.
-        theta: Rotation, radians.
-        reference: `Reference`.
-        target: `Side` of the target.
-        tables: `CostTables`.
+        label: `Label`.
+        matching: `MatchingCost`.
         bound: A cost from which on the exact value does not matter.
+
+    Returns:
+        int64; `OUTSIDE` for a label that leaves the target.
     """
+    u, v, s, theta = label
+    reference, target, tables = matching
     height, width = target.gray.shape
     cx = reference.points[i, 0] + u
     cy = reference.points[i, 1] + v
@@ -286,6 +331,7 @@ def label_cost(
     si, ti = quantised(s, theta)
     supports = len(tables.support)
     total = np.int64(0)
+    # the similarity that moves the support: [[c, -n], [n, c]]
     c = np.float32(0)
     n = np.float32(0)
     if supports > 1:
@@ -298,10 +344,11 @@ def label_cost(
         if q > 0:
             dx = np.float32(tables.support[q, 0])
             dy = np.float32(tables.support[q, 1])
-            tx = min(max(cx + c * dx - n * dy, np.float32(0)), np.float32(width - 1))
-            ty = min(max(cy + n * dx + c * dy, np.float32(0)), np.float32(height - 1))
-        mine = ((i * supports + q) * 13 + ti) * 136
-        total += descriptor_distance(tx, ty, si, ti, mine, reference.descriptors, target, tables)
+            tx = clamped(cx + c * dx - n * dy, width)
+            ty = clamped(cy + n * dx + c * dy, height)
+        # the reference descriptor whose bins are rotated by the label's angle
+        own = ((i * supports + q) * 13 + ti) * 136
+        total += descriptor_distance(tx, ty, si, ti, reference.descriptors, own, target, tables)
         if tables.appearance:
             gray, gradient = appearance(target, tx, ty)
             total += tables.intensity[abs(gray - reference.appearance[i, q, 0])]
@@ -312,7 +359,7 @@ def label_cost(
 
 
 @inlined
-def appearance(image: Side, x: Scalar, y: Scalar) -> tuple[Scalar, Scalar]:
+def appearance(image: ImageArrays, x: Scalar, y: Scalar) -> tuple[Scalar, Scalar]:
     """Grey level and gradient magnitude at the pixel nearest to a position."""
     height, width = image.gray.shape
     column = min(max(np.int64(x + np.float32(0.5)), 0), width - 1)

@@ -47,14 +47,21 @@ Buffers = list[tuple[NDArray[np.uint8], ...]]
 """Arrays of maps that were deleted. The first access to a page of fresh memory costs more than computing its content
 (`docs/lab/README.md`)."""
 NO_GRADIENTS = np.empty((0, 0), dtype=np.uint8)
+"""In place of the gradients where the terms of Eq. 1 do not need them."""
 RING = 16
 """Lines stored of each level; a power of two above twice the farthest tap."""
 SPILL = 64
 """Numbers that vector code may access beyond a line's end."""
 
 
-class Side(NamedTuple):
-    """One image as the kernels see it: flat histogram bytes, grey levels and, for all terms of Eq. 1, gradients."""
+class ImageArrays(NamedTuple):
+    """Arrays of one prepared image for the kernels.
+
+    Attributes:
+        histograms: uint8, flat, `OrientationMaps.histograms`.
+        gray: uint8 ``[H, W]``, the image.
+        gradients: uint8 ``[H, W]``, `gradient_magnitudes`, for all terms of Eq. 1; else ``[0, 0]``.
+    """
 
     histograms: NDArray[np.uint8]
     gray: NDArray[np.uint8]
@@ -68,22 +75,22 @@ class OrientationMaps:
     Attributes:
         gray: uint8 ``[H, W]``, the image.
         framed: uint8 ``[H + 96, W + 96]``, the image with its edges repeated (`refinement.BORDER`).
-        framed_half: uint8 ``[H / 2 + 96, W / 2 + 96]``, its mean over 2 x 2 pixels, likewise.
+        framed_half: uint8 ``[H / 2 + 96, W / 2 + 96]``, its mean over 2 x 2 pixels, edges repeated.
         histograms: uint8 ``[total, 8]``, all levels as `layout.map_geometry` arranges them; a
             unit-norm histogram has Euclidean length 255.
-        side: Histograms and image for the kernels, without gradients.
-        full_side: The same with gradients.
+        arrays: For the kernels, without gradients.
+        arrays_with_gradients: For the kernels, with gradients.
     """
 
     gray: NDArray[np.uint8]
     framed: NDArray[np.uint8]
     framed_half: NDArray[np.uint8]
     histograms: NDArray[np.uint8]
-    side: Side
+    arrays: ImageArrays
 
     @cached_property
-    def full_side(self) -> Side:  # noqa: D102 - see the class
-        return self.side._replace(gradients=gradient_magnitudes(self.gray))
+    def arrays_with_gradients(self) -> ImageArrays:  # noqa: D102 - see the class
+        return self.arrays._replace(gradients=gradient_magnitudes(self.gray))
 
 
 def gradient_magnitudes(gray: Bytes) -> Bytes:
@@ -91,9 +98,9 @@ def gradient_magnitudes(gray: Bytes) -> Bytes:
     levels = np.pad(gray, 1, mode="edge").astype(np.float32)
     gx = levels[1:-1, 2:] - levels[1:-1, :-2]
     gy = levels[2:, 1:-1] - levels[:-2, 1:-1]
-    return np.asarray(
-        np.sqrt(gx * gx + gy * gy) * np.float32(0.5) + np.float32(0.5), dtype=np.uint8
-    )
+    # half, because the differences are over two pixels; half a level more, to round
+    magnitudes = np.sqrt(gx * gx + gy * gy) * np.float32(0.5)
+    return np.asarray(magnitudes + np.float32(0.5), dtype=np.uint8)
 
 
 def orientation_maps(
@@ -112,52 +119,67 @@ def orientation_maps(
     gray = np.ascontiguousarray(gray)
     height, width = gray.shape
     geometry = map_geometry(height, width)
-    (rows, quarter_rows), (columns, quarter_columns) = (
-        (max(1, n // 2), max(1, n // 4)) for n in gray.shape
+    rows = max(1, height // 2)
+    columns = max(1, width // 2)
+    quarter_rows = max(1, height // 4)
+    quarter_columns = max(1, width // 4)
+
+    # the arrays of maps that were deleted, where they have the same size; they keep the zeros of
+    # their margins
+    shapes = (
+        (geometry.total, layout.BINS),
+        (height + 2 * BORDER, width + 2 * BORDER),
+        (rows + 2 * BORDER, columns + 2 * BORDER),
     )
-    framed = (height + 2 * BORDER, width + 2 * BORDER)
-    framed_half = (rows + 2 * BORDER, columns + 2 * BORDER)
-    shapes = (geometry.total, layout.BINS), framed, framed_half
-    while buffers and tuple(array.shape for array in buffers[-1]) != shapes:
-        buffers.pop()
-    arrays = (
-        buffers.pop() if buffers else tuple(np.zeros(shape, dtype=np.uint8) for shape in shapes)
-    )
-    histograms, whole, half = arrays  # used ones keep the zeros of their margins
-    coarse = np.empty((quarter_rows, 32 * -(-8 * quarter_columns // 32)), dtype=np.uint16)
+    arrays = take_buffers(buffers, shapes)
+    histograms, framed, framed_half = arrays
+    cells = histograms.reshape(-1)
+
+    # the cascade of blurs, at half and then at quarter resolution
     floor = np.float32(NORM_FLOOR * FIXED_POINT)
     blurs = np.asarray(layout.LEVEL_BLURS, dtype=np.int64)
     fine = layout.LEVEL_STEPS.count(2)
-    cells = histograms.reshape(-1)
-    run(fine_levels, 0, -(-rows // 2), gray, half, blurs[:fine], geometry, floor, cells, coarse)
+    # whole vectors of 32 numbers a row
+    coarse = np.empty((quarter_rows, 32 * -(-8 * quarter_columns // 32)), dtype=np.uint16)
+    half_row_pairs = -(-rows // 2)
     run(
-        coarse_levels,
-        0,
-        quarter_rows,
-        coarse,
-        quarter_columns,
-        blurs[fine:],
-        fine,
-        geometry,
-        floor,
-        cells,
-    )
-    whole[BORDER:-BORDER, BORDER:-BORDER] = gray
-    repeat_edges(half)
-    repeat_edges(whole)
-    maps = OrientationMaps(gray, whole, half, histograms, Side(cells, gray, NO_GRADIENTS))
+        fine_levels, 0, half_row_pairs,
+        gray, framed_half, blurs[:fine], geometry, floor, cells, coarse,
+    )  # fmt: skip
+    run(
+        coarse_levels, 0, quarter_rows,
+        coarse, quarter_columns, blurs[fine:], fine, geometry, floor, cells,
+    )  # fmt: skip
+
+    # the images with their borders
+    framed[BORDER:-BORDER, BORDER:-BORDER] = gray
+    repeat_edges(framed_half)
+    repeat_edges(framed)
+    arrays_of_image = ImageArrays(cells, gray, NO_GRADIENTS)
+    maps = OrientationMaps(gray, framed, framed_half, histograms, arrays_of_image)
     weakref.finalize(maps, buffers.append, arrays)
     return maps
+
+
+def take_buffers(
+    buffers: Buffers, shapes: tuple[tuple[int, int], ...]
+) -> tuple[NDArray[np.uint8], ...]:
+    """Take arrays of these shapes from the buffers, or make them, filled with zeros; other sizes are dropped."""
+    while buffers and tuple(array.shape for array in buffers[-1]) != shapes:
+        buffers.pop()
+    if buffers:
+        return buffers.pop()
+    return tuple(np.zeros(shape, dtype=np.uint8) for shape in shapes)
 
 
 def repeat_edges(framed: NDArray[np.uint8]) -> None:
     """Fill the border of an image, `BORDER` wide, with its outermost pixels."""
     rows = framed[BORDER:-BORDER]
-    rows[:, :BORDER], rows[:, -BORDER:] = (
-        rows[:, BORDER : BORDER + 1],
-        rows[:, -BORDER - 1 : -BORDER],
-    )
-    framed[:BORDER], framed[-BORDER:] = rows[0], rows[-1]
+    rows[:, :BORDER] = rows[:, BORDER : BORDER + 1]
+    rows[:, -BORDER:] = rows[:, -BORDER - 1 : -BORDER]
+    # whole rows, their ends included, so that the corners are filled too
+    framed[:BORDER] = rows[0]
+    framed[-BORDER:] = rows[-1]
 
 
 @inlined
@@ -165,7 +187,18 @@ def blur(
     source: Halves, middle: int, near: tuple[int, int], far: tuple[int, int], taps: int, out: Halves, out_at: int,
     length: int,
 ) -> None:  # fmt: skip
-    """A binomial blur of 3 or 5 taps, which begin at the given indices of the flat source."""
+    """A binomial blur of 3 or 5 taps, made of rounded means.
+
+    Args:
+        source: uint16, flat.
+        middle: Where the middle tap begins in it.
+        near: Where the taps beside the middle one begin.
+        far: Where the outermost of five taps begin.
+        taps: 3, ``[1 2 1] / 4``, or 5, ``[1 4 6 4 1] / 16``.
+        out: uint16, flat, receives the result ...
+        out_at: ... from this index on.
+        length: How many numbers, rounded up to 32.
+    """
     for i in range(0, length, 32):
         centre = load_uint16(source, middle + i)
         beside = average(load_uint16(source, near[0] + i), load_uint16(source, near[1] + i))
@@ -196,31 +229,28 @@ def smooth_line(
         out_at: ... from this index on.
     """
     length = 8 * columns
-    pad = 16 * distance
     last = rows - 1
     wrap = RING - 1
+
+    # across the rows; the taps are rows of the ring
     above = (max(row - distance, 0) & wrap) * pitch
     below = (min(row + distance, last) & wrap) * pitch
-    far = (
-        (max(row - 2 * distance, 0) & wrap) * pitch,
-        (min(row + 2 * distance, last) & wrap) * pitch,
-    )
-    blur(ring, (row & wrap) * pitch, (above, below), far, taps, line, pad, length)
+    far_above = (max(row - 2 * distance, 0) & wrap) * pitch
+    far_below = (min(row + 2 * distance, last) & wrap) * pitch
+    # eight bins a pixel, and room for two taps on each side
+    pad = 16 * distance
+    middle = (row & wrap) * pitch
+    blur(ring, middle, (above, below), (far_above, far_below), taps, line, pad, length)
+
+    # along the row, after its first and last histogram are repeated beyond the edges
     for t in range(0, pad, 8):
         for k in range(8):
             line[t + k] = line[pad + k]
             line[pad + length + t + k] = line[pad + length - 8 + k]
     step = 8 * distance
-    blur(
-        line,
-        pad,
-        (pad - step, pad + step),
-        (pad - 2 * step, pad + 2 * step),
-        taps,
-        out,
-        out_at,
-        length,
-    )
+    near = (pad - step, pad + step)
+    far = (pad - 2 * step, pad + 2 * step)
+    blur(line, pad, near, far, taps, out, out_at, length)
 
 
 @inlined
@@ -242,13 +272,13 @@ def sum_line(gray: Bytes, row: int, sums: Halves, at: int, columns: int) -> None
     upper = gray[min(2 * row, height - 1)]
     lower = gray[min(2 * row + 1, height - 1)]
     for x in range(min(columns, width // 2)):
-        sums[at + x] = np.uint16(
-            (np.uint16(upper[2 * x]) + np.uint16(upper[2 * x + 1]))
-            + (np.uint16(lower[2 * x]) + np.uint16(lower[2 * x + 1]))
-        )
+        above = np.uint16(upper[2 * x]) + np.uint16(upper[2 * x + 1])
+        below = np.uint16(lower[2 * x]) + np.uint16(lower[2 * x + 1])
+        sums[at + x] = np.uint16(above + below)
     if width == 1:
         sums[at] = np.uint16(2 * (np.uint16(upper[0]) + np.uint16(lower[0])))
-    sums[at - 1], sums[at + columns] = sums[at], sums[at + columns - 1]
+    sums[at - 1] = sums[at]
+    sums[at + columns] = sums[at + columns - 1]
 
 
 @inlined
@@ -302,6 +332,7 @@ def blur_cascade(
     for level in range(len(blurs)):
         taps = blurs[level, 0]
         distance = blurs[level, 1]
+        # the last row of this level whose taps are all there
         y -= (taps // 2) * distance
         if not (max(top - reach[level + 1], 0) <= y < min(bottom + reach[level + 1], rows)):
             continue
@@ -309,6 +340,7 @@ def blur_cascade(
         smooth_line(
             rings[level], pitch, y, rows, columns, taps, distance, line, rings[level + 1], at
         )
+        # the stripe's own rows become histograms
         if top <= y < bottom:
             number = first_level + level
             cell = geometry.base[number] + (margin + y) * geometry.stride[number] + margin
@@ -349,8 +381,10 @@ def fine_levels(
     reach = level_reach(blurs)
     first = max(top - reach[0], 0)
     summed = max(top - reach[0] - 1, 0)
+    # rows beyond the last one complete the levels, which lag behind
     for row in range(first, bottom + reach[0]):
         if row < min(bottom + reach[0], rows):
+            # sums of 2 x 2 pixels up to the row below, in a ring of four lines
             while summed <= min(row + 1, rows - 1):
                 at = (summed & 3) * sum_pitch + 1
                 sum_line(gray, summed, sums, at, columns)
@@ -359,18 +393,19 @@ def fine_levels(
                     for x in range(columns):
                         target[BORDER + x] = np.uint8((sums[at + x] + np.uint16(2)) >> np.uint16(2))
                 summed += 1
+            # the row's rectified derivatives
             here = (row & 3) * sum_pitch + 1
             above = (max(row - 1, 0) & 3) * sum_pitch + 1
             below = (min(row + 1, rows - 1) & 3) * sum_pitch + 1
             at = (row & (RING - 1)) * pitch
             for x in range(0, columns, 4):
-                store_uint16(
-                    rings[0], at + 8 * x, derivatives(sums, here + x, above + x, below + x)
-                )
+                bins = derivatives(sums, here + x, above + x, below + x)
+                store_uint16(rings[0], at + 8 * x, bins)
         y = blur_cascade(
             rings, pitch, row, rows, columns, top, bottom, blurs, reach, 0, geometry, layout.MARGIN // 2, floor, cells,
             line,
         )  # fmt: skip
+        # every second row of the last level completes a row of quarter resolution
         if top <= y < bottom and (y & 1 or rows == 1) and y // 2 < len(coarse):
             upper = ((y & ~1) & (RING - 1)) * pitch
             lower = (y & (RING - 1)) * pitch

@@ -14,6 +14,7 @@ import numpy as np
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
 from dynslam_bench.core.simd import (
     Bytes,
+    Doubles,
     Floats,
     Ints,
     load,
@@ -32,7 +33,10 @@ BORDER = 48
 FLAT_VARIANCE = 1.0
 """Below this variance, in squared grey levels, a window is flat."""
 FLAT_GRADIENT = 4.0 * 0.05
-"""Smallest mean squared gradient along the worse direction: 0.05 squared levels a pixel, differences over two."""
+"""Smallest mean squared gradient along the worse direction, below which a window determines no translation.
+
+0.05 squared levels a pixel; the factor is 2 squared, because gradients are differences over two pixels.
+"""
 SIMILARITY_DAMPING = 0.1
 """Prior on the change of scale and rotation, relative to the translation's information at the window's edge."""
 
@@ -42,12 +46,12 @@ class Window(NamedTuple):
 
     Attributes:
         step: Full-image pixels a pixel of the images.
-        radius: In pixels of the images.
-        margin: Largest translation within one warp, in their pixels, at least 1.
+        radius: The window is ``2 radius + 1`` pixels of the images wide.
+        margin: Largest translation within one warp, pixels of the images, at least 1.
         warps: Times the target is warped, at most: once, or twice with a change of scale and
             rotation between.
         iterations: Translations a warp, at most.
-        tolerance: Stop below this change, in their pixels.
+        tolerance: Stop below this change, pixels of the images.
     """
 
     step: int
@@ -56,6 +60,312 @@ class Window(NamedTuple):
     warps: int
     iterations: int = 3
     tolerance: np.float32 = np.float32(0.03)
+
+
+class Workspace(NamedTuple):
+    """Arrays of one thread, made once a call; `points` are refined one after the other in them.
+
+    All are flat, with rows of `pitch` numbers: pixel (x, y) lies at ``y * pitch + x``, so that a
+    shift by whole pixels is an offset. The patch is the warped target, ``pitch = 2 (radius +
+    margin) + 1`` pixels wide and high. The window is its top left part of ``2 radius + 1`` rows
+    and columns; elements to the right of it have a mask of zero. Lengths are rounded up to whole
+    SIMD vectors of sixteen numbers.
+
+    Attributes:
+        pitch: Numbers a row.
+        length: Numbers of a window's rows, a multiple of 16.
+        mask: float32 ``[length]``, 1 inside the window.
+        right: float32 ``[length]``, column from the window's centre.
+        down: float32 ``[length]``, row from the window's centre.
+        grid_columns: int32 ``[pitch * pitch ...]``, column of each pixel of the patch.
+        grid_rows: int32, likewise, its row.
+        squares: int32, likewise, scratch of `warp_patch`.
+        patch: float32 ``[pitch * pitch ...]``, the warped target.
+        frame: float32, the template's samples: the window with a frame of one pixel.
+        template: float32 ``[length]``, the window's grey levels without their mean.
+        gradient_x: float32 ``[length]``, differences over two pixels along x.
+        gradient_y: float32 ``[length]``, likewise along y.
+        hessian: float64 ``[4, 4]``, normal equations of translation, scale and rotation.
+        steepest: float64 ``[4]``, their right side, then their solution.
+    """
+
+    pitch: int
+    length: int
+    mask: Floats
+    right: Floats
+    down: Floats
+    grid_columns: Ints
+    grid_rows: Ints
+    squares: Ints
+    patch: Floats
+    frame: Floats
+    template: Floats
+    gradient_x: Floats
+    gradient_y: Floats
+    hessian: Doubles
+    steepest: Doubles
+
+
+class Gradients(NamedTuple):
+    """Sums of the template's gradients over the window.
+
+    Attributes:
+        levels: Sum of the grey levels.
+        x: Sum of the gradients along x.
+        y: Sum of the gradients along y.
+        xx: Hessian of the translation, the patch's mean removed.
+        xy: Likewise.
+        yy: Likewise.
+        trace: Of that Hessian.
+        determinant: Of that Hessian.
+    """
+
+    levels: Scalar
+    x: Scalar
+    y: Scalar
+    xx: Scalar
+    xy: Scalar
+    yy: Scalar
+    trace: Scalar
+    determinant: Scalar
+
+
+class Template(NamedTuple):
+    """Sums over the template without its mean.
+
+    Attributes:
+        mean: Mean grey level of the window.
+        energy: Sum of squares.
+        x: Sum of the products with the gradients along x.
+        y: Sum of the products with the gradients along y.
+    """
+
+    mean: Scalar
+    energy: Scalar
+    x: Scalar
+    y: Scalar
+
+
+class Warp(NamedTuple):
+    """The window in the target: offset d from its centre lies at ``[[a, -b], [b, a]] d + (x, y)``.
+
+    Attributes:
+        a: Scale times cosine of the rotation.
+        b: Scale times sine of the rotation.
+        x: Column in the target image with its border.
+        y: Row in the target image with its border.
+    """
+
+    a: Scalar
+    b: Scalar
+    x: Scalar
+    y: Scalar
+
+
+class Alignment(NamedTuple):
+    """Where the translations within one warp ended, in pixels of the patch.
+
+    Attributes:
+        x: Offset after the last step.
+        y: Likewise.
+        sampled_x: Offset at which the patch was last compared with the template.
+        sampled_y: Likewise.
+        mean: Mean there of the patch, less the template's.
+        residual_x: Sum there of the residuals times the gradients along x.
+        residual_y: Likewise along y.
+        initial: Correlation before the first step.
+    """
+
+    x: Scalar
+    y: Scalar
+    sampled_x: Scalar
+    sampled_y: Scalar
+    mean: Scalar
+    residual_x: Scalar
+    residual_y: Scalar
+    initial: Scalar
+
+
+@kernel
+def make_workspace(radius: int, margin: int) -> Workspace:
+    """The arrays for windows of a radius and translations up to a margin, pixels."""
+    side = 2 * radius + 1
+    pitch = 2 * (radius + margin) + 1
+    length = 16 * ((side * pitch + 15) // 16)
+    patch_length = 16 * ((pitch * pitch + 15) // 16)
+    # vectors that begin inside the window read up to two rows and two vectors beyond it
+    slack = 2 * pitch + 32
+    grid_columns = np.zeros(patch_length, dtype=np.int32)
+    grid_rows = np.zeros(patch_length, dtype=np.int32)
+    for k in range(pitch * pitch):
+        grid_columns[k] = k % pitch
+        grid_rows[k] = k // pitch
+    mask = np.zeros(length, dtype=np.float32)
+    right = np.zeros(length, dtype=np.float32)
+    down = np.zeros(length, dtype=np.float32)
+    for y in range(side):
+        for x in range(side):
+            k = y * pitch + x
+            mask[k] = np.float32(1)
+            right[k] = np.float32(x - radius)
+            down[k] = np.float32(y - radius)
+    return Workspace(
+        pitch,
+        length,
+        mask,
+        right,
+        down,
+        grid_columns,
+        grid_rows,
+        np.empty(patch_length, dtype=np.int32),
+        np.zeros(patch_length + slack, dtype=np.float32),
+        np.zeros((side + 2) * pitch + slack, dtype=np.float32),
+        np.zeros(length, dtype=np.float32),
+        np.zeros(length, dtype=np.float32),
+        np.zeros(length, dtype=np.float32),
+        np.empty((4, 4), dtype=np.float64),
+        np.empty(4, dtype=np.float64),
+    )
+
+
+@kernel
+def similarity_lucas_kanade(
+    start: int, stop: int, points: Floats, labels: Floats, template_image: Bytes, target_image: Bytes, window: Window,
+    correlation: Floats,
+) -> None:  # fmt: skip
+    """Refine labels by photometric alignment of a square window.
+
+    The target is warped by the label into the template's frame. Within that patch only the
+    translation changes (cheap); between two warps scale and rotation are corrected as well. A label
+    changes only if the windows' correlation grows.
+
+    Args:
+        start: First point.
+        stop: One past the last.
+        points: float32 ``[N, 2]``, full-image pixels of the template image.
+        labels: float32 ``[N, 4]``, changed in place.
+        template_image: uint8 ``[h + 2 BORDER, w + 2 BORDER]``, at 1 / `step` of the full
+            resolution, edges repeated.
+        target_image: uint8 ``[h + 2 BORDER, w + 2 BORDER]``, likewise.
+        window: `Window`, and when to stop.
+        correlation: float32 ``[N]``, filled with the windows' zero-mean normalised correlation, -1
+            if flat or outside.
+    """
+    side = 2 * window.radius + 1
+    n = np.float64(side * side)
+    half = np.float32(0.5)
+    scale_down = np.float32(1) / np.float32(window.step)
+    space = make_workspace(window.radius, window.margin)
+    for i in range(start, stop):
+        correlation[i] = np.float32(-1)
+
+        # the template: samples, gradients and the Hessian of the translation, once a point
+        px = framed(points[i, 0], scale_down)
+        py = framed(points[i, 1], scale_down)
+        if not template_fits(px, py, window, target_image):
+            continue
+        corner = np.float32(window.radius + 1)
+        read_frame(template_image, px - corner, py - corner, side + 2, space.pitch, space.frame)
+        gradients = template_gradients(space, n)
+        if not smaller_eigenvalue(gradients) >= n * FLAT_GRADIENT:
+            continue
+        template = centre_template(space, gradients, n)
+        if template.energy < n * FLAT_VARIANCE:
+            continue
+
+        # the label as a warp; its translation is in pixels of the target with its border
+        scale = np.float32(np.exp2(labels[i, 2]))
+        warp = Warp(
+            np.float64(scale * np.float32(np.cos(labels[i, 3]))),
+            np.float64(scale * np.float32(np.sin(labels[i, 3]))),
+            framed(points[i, 0] + labels[i, 0], scale_down),
+            framed(points[i, 1] + labels[i, 1], scale_down),
+        )
+        initial = np.float32(-1)
+        best = np.float32(-1)
+        best_warp = warp
+        for number in range(window.warps):
+            if not target_fits(warp, window, target_image):
+                break
+            warp_patch(target_image, warp, window.radius + window.margin, space)
+
+            # inverse compositional steps of the translation within the patch
+            alignment, best, best_warp = align_translation(
+                space, gradients, template, warp, window, n, best, best_warp
+            )
+            if number == 0:
+                initial = alignment.initial
+            warp = Warp(
+                warp.a,
+                warp.b,
+                warp.x + (warp.a * alignment.x - warp.b * alignment.y),
+                warp.y + (warp.b * alignment.x + warp.a * alignment.y),
+            )
+            if number == window.warps - 1:
+                break
+
+            # one step of translation, scale and rotation together, before the next warp
+            similarity_equations(space, gradients, template, alignment, window, n)
+            if not cholesky_solve(space.hessian, space.steepest):
+                break
+            da = np.float32(1) + 2 * np.float32(space.steepest[2])
+            db = 2 * np.float32(space.steepest[3])
+            size = da * da + db * db
+            if not 0.25 < size < 4:
+                break
+            # compose with the inverse of the increment: A (I + dA)^-1
+            warp = Warp(
+                (warp.a * da + warp.b * db) / size,
+                (warp.b * da - warp.a * db) / size,
+                warp.x,
+                warp.y,
+            )
+
+        # the best warp as a label, where it is better than the label that was given
+        correlation[i] = best
+        if best > initial:
+            a = best_warp.a
+            b = best_warp.b
+            labels[i, 0] = (
+                (best_warp.x - BORDER + half) * np.float32(window.step) - half - points[i, 0]
+            )
+            labels[i, 1] = (
+                (best_warp.y - BORDER + half) * np.float32(window.step) - half - points[i, 1]
+            )
+            labels[i, 2] = half * np.float32(np.log2(a * a + b * b))
+            labels[i, 3] = np.float32(np.arctan2(b, a))
+
+
+@inlined
+def framed(position: Scalar, scale_down: Scalar) -> Scalar:
+    """A full-image coordinate (pixel centres at whole numbers) in the smaller image with its border."""
+    half = np.float32(0.5)
+    return (position + half) * scale_down - half + BORDER
+
+
+@inlined
+def template_fits(px: Scalar, py: Scalar, window: Window, image: Bytes) -> Scalar:
+    """Whether the window around (px, py), and what vectors read beyond it, lies in the image with its border."""
+    rows, columns = image.shape
+    room = np.float32(window.radius + 2)
+    return px >= room and py >= room and px < columns - room - 17 and py < rows - room - 2
+
+
+@inlined
+def target_fits(warp: Warp, window: Window, image: Bytes) -> Scalar:
+    """Whether the warp's centre lies in the image without its border, and its patch in the image with it."""
+    rows, columns = image.shape
+    reach = window.radius + window.margin
+    span = (abs(warp.a) + abs(warp.b)) * np.float32(reach) + np.float32(2)
+    least = max(span, np.float32(BORDER))
+    most_x = columns - BORDER - 1
+    most_y = rows - BORDER - 1
+    return (
+        least <= warp.x <= most_x
+        and least <= warp.y <= most_y
+        and warp.x < columns - span
+        and warp.y < rows - span
+    )
 
 
 @inlined
@@ -67,6 +377,7 @@ def read_frame(image: Bytes, x: Scalar, y: Scalar, rows: int, pitch: int, out: F
     row = np.int64(y)
     right = spread(x - np.float32(column))
     lower = spread(y - np.float32(row))
+    # sixteen columns at a time, all rows of these; the last vector overlaps the one before
     for block in range((pitch + 15) // 16):
         first = min(16 * block, max(pitch - 16, 0))
         at = row * stride + column + first
@@ -81,307 +392,290 @@ def read_frame(image: Bytes, x: Scalar, y: Scalar, rows: int, pitch: int, out: F
 
 
 @inlined
-def warp_patch(
-    image: Bytes, x: Scalar, y: Scalar, a: Scalar, b: Scalar, reach: int, columns: Ints, rows: Ints, scratch: Ints,
-    out: Floats,
-) -> None:  # fmt: skip
-    """Samples of a square patch of radius `reach` under the similarity ``[[a, -b], [b, a]]`` around (x, y)."""
+def warp_patch(image: Bytes, warp: Warp, reach: int, space: Workspace) -> None:
+    """Fill the patch: bilinear samples of a square of radius `reach` pixels under the warp."""
+    # positions are whole numbers of 65536ths of a pixel
     one = np.float32(65536)
     far = np.float32(reach)
-    column = np.int32((x - a * far + b * far) * one)
-    row = np.int32((y - b * far - a * far) * one)
-    step_x = np.int32(a * one)
-    step_y = np.int32(b * one)
+    column = np.int32((warp.x - warp.a * far + warp.b * far) * one)
+    row = np.int32((warp.y - warp.b * far - warp.a * far) * one)
+    step_x = np.int32(warp.a * one)
+    step_y = np.int32(warp.b * one)
     flat = image.reshape(-1)
     stride = np.int64(image.shape[1])
+    columns = space.grid_columns
+    rows = space.grid_rows
+    squares = space.squares
+    # where the four pixels around each sample lie, these pixels, and the samples between them
     for k in range(0, len(columns), 16):
-        store_offsets(scratch, columns, rows, k, column, row, step_x, step_y, np.int32(stride))
+        store_offsets(squares, columns, rows, k, column, row, step_x, step_y, np.int32(stride))
     for k in range(len(columns)):
-        scratch[k] = square(flat, np.int64(scratch[k]), stride)
+        squares[k] = square(flat, np.int64(squares[k]), stride)
     for k in range(0, len(columns), 16):
-        store(out, k, sample(scratch, columns, rows, k, column, row, step_x, step_y))
+        store(space.patch, k, sample(squares, columns, rows, k, column, row, step_x, step_y))
 
 
-@kernel
-def similarity_lucas_kanade(
-    start: int, stop: int, points: Floats, labels: Floats, template_image: Bytes, target_image: Bytes, window: Window,
-    correlation: Floats,
-) -> None:  # fmt: skip
-    """Refine labels by photometric alignment of a square window.
+@inlined
+def template_gradients(space: Workspace, n: float) -> Gradients:
+    """Fill the template's gradients from its samples, central differences; returns their sums over `n` pixels."""
+    pitch = space.pitch
+    frame = space.frame
+    zero = spread(np.float32(0))
+    sum_t = zero
+    sum_x = zero
+    sum_y = zero
+    xx = zero
+    xy = zero
+    yy = zero
+    for k in range(0, space.length, 16):
+        # the window's pixel k is the frame's at k + pitch + 1
+        inside = load(space.mask, k)
+        gx = inside * (load(frame, k + pitch + 2) - load(frame, k + pitch))
+        gy = inside * (load(frame, k + 2 * pitch + 1) - load(frame, k + 1))
+        sum_t = sum_t + inside * load(frame, k + pitch + 1)
+        sum_x = sum_x + gx
+        sum_y = sum_y + gy
+        xx = xx + gx * gx
+        xy = xy + gx * gy
+        yy = yy + gy * gy
+        store(space.gradient_x, k, gx)
+        store(space.gradient_y, k, gy)
+    x = np.float64(total(sum_x))
+    y = np.float64(total(sum_y))
+    # removing a patch's mean removes the gradients' means from the Hessian
+    h_xx = total(xx) - x * x / n
+    h_xy = total(xy) - x * y / n
+    h_yy = total(yy) - y * y / n
+    trace = h_xx + h_yy
+    determinant = h_xx * h_yy - h_xy * h_xy
+    return Gradients(total(sum_t), x, y, h_xx, h_xy, h_yy, trace, determinant)
 
-    The target is warped by the label into the template's frame. Within that patch only the
-    translation changes (cheap); between two warps scale and rotation are corrected as well. A label
-    changes only if the windows' correlation grows.
 
-    All windows are flat arrays at the patch's pitch, so that a shift by whole pixels is an offset.
-    Elements outside the window have zero gradients and mask.
+@inlined
+def smaller_eigenvalue(gradients: Gradients) -> Scalar:
+    """The smaller eigenvalue of the translation's Hessian: texture along the worse direction."""
+    trace = gradients.trace
+    return 0.5 * (trace - np.sqrt(max(trace * trace - 4 * gradients.determinant, 0.0)))
+
+
+@inlined
+def centre_template(space: Workspace, gradients: Gradients, n: float) -> Template:
+    """Fill the template, the samples less their mean over `n` pixels; returns its sums."""
+    mean = np.float32(gradients.levels / n)
+    mean_t = spread(mean)
+    zero = spread(np.float32(0))
+    tt = zero
+    xt = zero
+    yt = zero
+    for k in range(0, space.length, 16):
+        t = load(space.mask, k) * (load(space.frame, k + space.pitch + 1) - mean_t)
+        tt = tt + t * t
+        xt = xt + t * load(space.gradient_x, k)
+        yt = yt + t * load(space.gradient_y, k)
+        store(space.template, k, t)
+    return Template(mean, np.float64(total(tt)), np.float64(total(xt)), np.float64(total(yt)))
+
+
+@inlined
+def bilinear_weights(x: Scalar, y: Scalar) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+    """Weights, a vector each, of a pixel, the ones right of it, below it, and below right, for a shift by parts."""
+    w11 = spread(x * y)
+    w01 = spread(x - x * y)
+    w10 = spread(y - x * y)
+    w00 = spread(np.float32(1) - x - y + x * y)
+    return w00, w01, w10, w11
+
+
+@inlined
+def shifted(
+    patch: Floats, k: int, pitch: int, weights: tuple[Scalar, Scalar, Scalar, Scalar]
+) -> Scalar:
+    """Sixteen pixels of the patch from index k on, shifted by a part of a pixel (`bilinear_weights`)."""
+    w00, w01, w10, w11 = weights
+    upper = w00 * load(patch, k) + w01 * load(patch, k + 1)
+    return upper + w10 * load(patch, k + pitch) + w11 * load(patch, k + pitch + 1)
+
+
+@inlined
+def patch_shift(
+    x: Scalar, y: Scalar, margin: int, pitch: int
+) -> tuple[Scalar, tuple[Scalar, Scalar, Scalar, Scalar]]:
+    """An offset of the window in the patch: index of the window's first pixel, weights of the part of a pixel."""
+    left = x + np.float32(margin)
+    top = y + np.float32(margin)
+    column = np.int64(left)
+    row = np.int64(top)
+    return row * pitch + column, bilinear_weights(left - np.float32(column), top - np.float32(row))
+
+
+@inlined
+def compare_with_template(
+    space: Workspace, mean: Scalar, at: int, weights: tuple[Scalar, Scalar, Scalar, Scalar]
+) -> tuple[Scalar, Scalar, Scalar, Scalar, Scalar]:
+    """Sums over the window of the patch w, less the template's mean: of w, w^2, and w times template and gradients."""
+    mean_t = spread(mean)
+    zero = spread(np.float32(0))
+    sum_w = zero
+    ww = zero
+    wt = zero
+    wx = zero
+    wy = zero
+    for k in range(0, space.length, 16):
+        w = load(space.mask, k) * (shifted(space.patch, at + k, space.pitch, weights) - mean_t)
+        sum_w = sum_w + w
+        ww = ww + w * w
+        wt = wt + w * load(space.template, k)
+        wx = wx + w * load(space.gradient_x, k)
+        wy = wy + w * load(space.gradient_y, k)
+    return total(sum_w), total(ww), total(wt), total(wx), total(wy)
+
+
+@inlined
+def align_translation(
+    space: Workspace, gradients: Gradients, template: Template, warp: Warp, window: Window, n: float, best: Scalar,
+    best_warp: Warp,
+) -> tuple[Alignment, Scalar, Warp]:  # fmt: skip
+    """Translate the window within the warped patch until it fits the template.
 
     Args:
-        start: First point.
-        stop: One past the last.
-        points: float32 ``[N, 2]``, full-image pixels of the template image.
-        labels: float32 ``[N, 4]``, changed in place.
-        template_image: uint8 ``[h + 2 BORDER, w + 2 BORDER]``, at 1 / `step` of the full
-            resolution, edges repeated.
-        target_image: Likewise.
-        window: `Window`, and when to stop.
-        correlation: float32 ``[N]``, filled with the windows' zero-mean normalised correlation, -1
-            if flat or outside.
+        space: `Workspace` with patch, template and gradients.
+        gradients: Of the template.
+        template: Its sums.
+        warp: Of the patch.
+        window: Largest translation, number of steps, tolerance.
+        n: Pixels of the window.
+        best: Highest correlation so far.
+        best_warp: Its warp.
+
+    Returns:
+        Where the translation ended, and the highest correlation with its warp.
     """
-    step, radius, margin, warps, iterations, tolerance = window
-    border = BORDER
-    side = 2 * radius + 1
-    reach = radius + margin
-    pitch = 2 * reach + 1
-    length = 16 * ((side * pitch + 15) // 16)
-    slack = 2 * pitch + 32
-    patch = np.zeros(16 * ((pitch * pitch + 15) // 16) + slack, dtype=np.float32)
-    grid_columns = np.zeros(len(patch) - slack, dtype=np.int32)
-    grid_rows = np.zeros(len(patch) - slack, dtype=np.int32)
-    scratch = np.empty(len(patch) - slack, dtype=np.int32)
-    for k in range(pitch * pitch):
-        grid_columns[k] = k % pitch
-        grid_rows[k] = k // pitch
-    frame = np.zeros((side + 2) * pitch + slack, dtype=np.float32)
-    template = np.zeros(length, dtype=np.float32)
-    mask = np.zeros(length, dtype=np.float32)
-    gradient_x = np.zeros(length, dtype=np.float32)
-    gradient_y = np.zeros(length, dtype=np.float32)
-    right = np.zeros(length, dtype=np.float32)
-    down = np.zeros(length, dtype=np.float32)
-    for y in range(side):
-        for x in range(side):
-            k = y * pitch + x
-            mask[k], right[k], down[k] = (
-                np.float32(1),
-                np.float32(x - radius),
-                np.float32(y - radius),
+    limit = np.float32(window.margin) - np.float32(0.01)
+    x = np.float32(0)
+    y = np.float32(0)
+    sampled_x = x
+    sampled_y = y
+    mean = 0.0
+    residual_x = 0.0
+    residual_y = 0.0
+    initial = np.float32(-1)
+    for iteration in range(window.iterations + 1):
+        sampled_x = x
+        sampled_y = y
+        at, weights = patch_shift(x, y, window.margin, space.pitch)
+        sum_w, ww, wt, wx, wy = compare_with_template(space, template.mean, at, weights)
+
+        # zero-mean normalised correlation
+        sum_of_w = np.float64(sum_w)
+        mean = sum_of_w / n
+        variance = ww - mean * sum_of_w
+        score = np.float32(-1)  # a flat target looks like anything
+        if variance >= n * FLAT_VARIANCE:
+            score = np.float32(wt / np.sqrt(variance * template.energy))
+        if iteration == 0:
+            initial = score
+        if score > best:
+            best = score
+            best_warp = Warp(
+                warp.a,
+                warp.b,
+                warp.x + warp.a * x - warp.b * y,
+                warp.y + warp.b * x + warp.a * y,
             )
-    h = np.empty((4, 4), dtype=np.float64)
-    g = np.empty(4, dtype=np.float64)
-    rows, columns = target_image.shape
-    n = np.float64(side * side)
-    half = np.float32(0.5)
-    zero = spread(np.float32(0))
-    scale_down = np.float32(1) / np.float32(step)
-    limit = np.float32(margin) - np.float32(0.01)
-    room = np.float32(radius + 2)
-    for i in range(start, stop):
-        correlation[i] = np.float32(-1)
-        px = (points[i, 0] + half) * scale_down - half + border
-        py = (points[i, 1] + half) * scale_down - half + border
-        if not (px >= room and py >= room and px < columns - room - 17 and py < rows - room - 2):
-            continue
-        read_frame(
-            template_image,
-            px - np.float32(radius + 1),
-            py - np.float32(radius + 1),
-            side + 2,
-            pitch,
-            frame,
+
+        # residuals, patch less template without their means, times the gradients
+        residual_x = wx - mean * gradients.x - template.x
+        residual_y = wy - mean * gradients.y - template.y
+        if iteration == window.iterations:
+            break
+
+        # solve the 2 x 2 equations; 2, because gradients are differences over two pixels
+        dx = np.float32(
+            2 * (gradients.yy * residual_x - gradients.xy * residual_y) / gradients.determinant
         )
-        sum_t = zero
-        sum_x = zero
-        sum_y = zero
-        xx = zero
-        xy = zero
-        yy = zero
-        for k in range(0, length, 16):
-            inside = load(mask, k)
-            gx = inside * (load(frame, k + pitch + 2) - load(frame, k + pitch))
-            gy = inside * (load(frame, k + 2 * pitch + 1) - load(frame, k + 1))
-            sum_t = sum_t + inside * load(frame, k + pitch + 1)
-            sum_x = sum_x + gx
-            sum_y = sum_y + gy
-            xx = xx + gx * gx
-            xy = xy + gx * gy
-            yy = yy + gy * gy
-            store(gradient_x, k, gx)
-            store(gradient_y, k, gy)
-        j0 = np.float64(total(sum_x))
-        j1 = np.float64(total(sum_y))
-        # differences over two pixels
-        h00 = total(xx) - j0 * j0 / n
-        h01 = total(xy) - j0 * j1 / n
-        h11 = total(yy) - j1 * j1 / n
-        trace = h00 + h11
-        determinant = h00 * h11 - h01 * h01
-        smaller = 0.5 * (trace - np.sqrt(max(trace * trace - 4 * determinant, 0.0)))
-        if not smaller >= n * FLAT_GRADIENT:
-            continue
-        mean_t = spread(np.float32(total(sum_t) / n))
-        tt = zero
-        xt = zero
-        yt = zero
-        for k in range(0, length, 16):
-            t = load(mask, k) * (load(frame, k + pitch + 1) - mean_t)
-            tt = tt + t * t
-            xt = xt + t * load(gradient_x, k)
-            yt = yt + t * load(gradient_y, k)
-            store(template, k, t)
-        energy = np.float64(total(tt))
-        rest0 = np.float64(total(xt))
-        rest1 = np.float64(total(yt))
-        if energy < n * FLAT_VARIANCE:
-            continue
-        scale = np.float32(np.exp2(labels[i, 2]))
-        a = scale * np.float32(np.cos(labels[i, 3]))
-        b = scale * np.float32(np.sin(labels[i, 3]))
-        tx = (points[i, 0] + labels[i, 0] + half) * scale_down - half + border
-        ty = (points[i, 1] + labels[i, 1] + half) * scale_down - half + border
-        first = np.float32(-1)
-        best = np.float32(-1)
-        best_a = a
-        best_b = b
-        best_x = tx
-        best_y = ty
-        for warp in range(warps):
-            span = (abs(a) + abs(b)) * np.float32(reach) + np.float32(2)
-            least = max(span, np.float32(border))
-            most_x = columns - border - 1
-            most_y = rows - border - 1
-            if not (
-                least <= tx <= most_x
-                and least <= ty <= most_y
-                and tx < columns - span
-                and ty < rows - span
-            ):
-                break
-            warp_patch(target_image, tx, ty, a, b, reach, grid_columns, grid_rows, scratch, patch)
-            ox = oy = np.float32(0)
-            mean = 0.0
-            at = np.int64(0)
-            w00 = zero
-            w01 = zero
-            w10 = zero
-            w11 = zero
-            for iteration in range(iterations + 1):
-                left = ox + np.float32(margin)
-                top = oy + np.float32(margin)
-                column = np.int64(left)
-                row = np.int64(top)
-                fx = left - np.float32(column)
-                fy = top - np.float32(row)
-                at = row * pitch + column
-                w11 = spread(fx * fy)
-                w01 = spread(fx - fx * fy)
-                w10 = spread(fy - fx * fy)
-                w00 = spread(np.float32(1) - fx - fy + fx * fy)
-                sum_w = zero
-                ww = zero
-                wt = zero
-                wx = zero
-                wy = zero
-                for k in range(0, length, 16):
-                    j = at + k
-                    w = (
-                        w00 * load(patch, j)
-                        + w01 * load(patch, j + 1)
-                        + w10 * load(patch, j + pitch)
-                    )
-                    w = load(mask, k) * (w + w11 * load(patch, j + pitch + 1) - mean_t)
-                    sum_w = sum_w + w
-                    ww = ww + w * w
-                    wt = wt + w * load(template, k)
-                    wx = wx + w * load(gradient_x, k)
-                    wy = wy + w * load(gradient_y, k)
-                sum_of_w = np.float64(total(sum_w))
-                mean = sum_of_w / n
-                variance = total(ww) - mean * sum_of_w
-                score = np.float32(-1)  # a flat target looks like anything
-                if variance >= n * FLAT_VARIANCE:
-                    score = np.float32(total(wt) / np.sqrt(variance * energy))
-                if warp == 0 and iteration == 0:
-                    first = score
-                if score > best:
-                    best = score
-                    best_a = a
-                    best_b = b
-                    best_x = tx + a * ox - b * oy
-                    best_y = ty + b * ox + a * oy
-                g[0], g[1] = total(wx) - mean * j0 - rest0, total(wy) - mean * j1 - rest1
-                if iteration == iterations:
-                    break
-                d0 = np.float32(2 * (h11 * g[0] - h01 * g[1]) / determinant)
-                d1 = np.float32(2 * (h00 * g[1] - h01 * g[0]) / determinant)
-                ox = ox - d0
-                oy = oy - d1
-                if not (abs(ox) < limit and abs(oy) < limit):
-                    ox = min(max(ox, -limit), limit)
-                    oy = min(max(oy, -limit), limit)
-                    break
-                if d0 * d0 + d1 * d1 < tolerance * tolerance:
-                    break
-            mx = a * ox - b * oy
-            my = b * ox + a * oy
-            tx = tx + mx
-            ty = ty + my
-            if warp == warps - 1:
-                break
-            # the change of scale and rotation
-            sum_s = zero
-            sum_r = zero
-            sx = zero
-            sy = zero
-            rx = zero
-            ry = zero
-            ss = zero
-            rr = zero
-            rs = zero
-            st = zero
-            rt = zero
-            ws = zero
-            wr = zero
-            for k in range(0, length, 16):
-                j = at + k
-                w = w00 * load(patch, j) + w01 * load(patch, j + 1) + w10 * load(patch, j + pitch)
-                w = w + w11 * load(patch, j + pitch + 1) - mean_t
-                gx = load(gradient_x, k)
-                gy = load(gradient_y, k)
-                dx = load(right, k)
-                dy = load(down, k)
-                swell = gx * dx + gy * dy
-                turn = gy * dx - gx * dy
-                t = load(template, k)
-                sum_s = sum_s + swell
-                sum_r = sum_r + turn
-                sx = sx + swell * gx
-                sy = sy + swell * gy
-                rx = rx + turn * gx
-                ry = ry + turn * gy
-                ss = ss + swell * swell
-                rr = rr + turn * turn
-                rs = rs + turn * swell
-                st = st + swell * t
-                rt = rt + turn * t
-                ws = ws + w * swell
-                wr = wr + w * turn
-            j2 = np.float64(total(sum_s))
-            j3 = np.float64(total(sum_r))
-            g[2], g[3] = (
-                total(ws) - mean * j2 - np.float64(total(st)),
-                total(wr) - mean * j3 - np.float64(total(rt)),
-            )
-            h[0, 0] = h00
-            h[1, 0] = h01
-            h[1, 1] = h11
-            h[2, 0], h[2, 1] = total(sx) - j2 * j0 / n, total(sy) - j2 * j1 / n
-            h[3, 0], h[3, 1] = total(rx) - j3 * j0 / n, total(ry) - j3 * j1 / n
-            damping = SIMILARITY_DAMPING * trace * (radius * radius)
-            h[2, 2], h[3, 3] = total(ss) - j2 * j2 / n + damping, total(rr) - j3 * j3 / n + damping
-            h[3, 2] = total(rs) - j3 * j2 / n
-            if not cholesky_solve(h, g):
-                break
-            da = np.float32(1) + 2 * np.float32(g[2])
-            db = 2 * np.float32(g[3])
-            size = da * da + db * db
-            if not 0.25 < size < 4:
-                break
-            # compose with the inverse of the increment: A (I + dA)^-1
-            a, b = (a * da + b * db) / size, (b * da - a * db) / size
-        correlation[i] = best
-        if best > first:
-            labels[i, 0] = (best_x - border + half) * np.float32(step) - half - points[i, 0]
-            labels[i, 1] = (best_y - border + half) * np.float32(step) - half - points[i, 1]
-            labels[i, 2] = half * np.float32(np.log2(best_a * best_a + best_b * best_b))
-            labels[i, 3] = np.float32(np.arctan2(best_b, best_a))
+        dy = np.float32(
+            2 * (gradients.xx * residual_y - gradients.xy * residual_x) / gradients.determinant
+        )
+        x = x - dx
+        y = y - dy
+        if not (abs(x) < limit and abs(y) < limit):
+            x = min(max(x, -limit), limit)
+            y = min(max(y, -limit), limit)
+            break
+        if dx * dx + dy * dy < window.tolerance * window.tolerance:
+            break
+    alignment = Alignment(x, y, sampled_x, sampled_y, mean, residual_x, residual_y, initial)
+    return alignment, best, best_warp
+
+
+@inlined
+def similarity_equations(
+    space: Workspace, gradients: Gradients, template: Template, alignment: Alignment, window: Window, n: float
+) -> None:  # fmt: skip
+    """Fill the normal equations of translation, scale (s) and rotation (r) where the patch was last sampled.
+
+    Derivatives at offset (dx, dy) from the window's centre: ``s = gx dx + gy dy``, ``r = gy dx - gx
+    dy``. As in `align_translation` the means of all derivatives are removed.
+    """
+    at, weights = patch_shift(alignment.sampled_x, alignment.sampled_y, window.margin, space.pitch)
+    mean_t = spread(template.mean)
+    zero = spread(np.float32(0))
+    sum_s = zero
+    sum_r = zero
+    sx = zero
+    sy = zero
+    rx = zero
+    ry = zero
+    ss = zero
+    rr = zero
+    rs = zero
+    st = zero
+    rt = zero
+    ws = zero
+    wr = zero
+    for k in range(0, space.length, 16):
+        w = shifted(space.patch, at + k, space.pitch, weights) - mean_t
+        gx = load(space.gradient_x, k)
+        gy = load(space.gradient_y, k)
+        dx = load(space.right, k)
+        dy = load(space.down, k)
+        s = gx * dx + gy * dy
+        r = gy * dx - gx * dy
+        t = load(space.template, k)
+        sum_s = sum_s + s
+        sum_r = sum_r + r
+        sx = sx + s * gx
+        sy = sy + s * gy
+        rx = rx + r * gx
+        ry = ry + r * gy
+        ss = ss + s * s
+        rr = rr + r * r
+        rs = rs + r * s
+        st = st + s * t
+        rt = rt + r * t
+        ws = ws + w * s
+        wr = wr + w * r
+    s_total = np.float64(total(sum_s))
+    r_total = np.float64(total(sum_r))
+    mean = alignment.mean
+
+    # the right side: residuals times derivatives
+    g = space.steepest
+    g[0] = alignment.residual_x
+    g[1] = alignment.residual_y
+    g[2] = total(ws) - mean * s_total - np.float64(total(st))
+    g[3] = total(wr) - mean * r_total - np.float64(total(rt))
+
+    # the lower triangle of the Hessian; a prior holds scale and rotation back
+    h = space.hessian
+    damping = SIMILARITY_DAMPING * gradients.trace * (window.radius * window.radius)
+    h[0, 0] = gradients.xx
+    h[1, 0] = gradients.xy
+    h[1, 1] = gradients.yy
+    h[2, 0] = total(sx) - s_total * gradients.x / n
+    h[2, 1] = total(sy) - s_total * gradients.y / n
+    h[2, 2] = total(ss) - s_total * s_total / n + damping
+    h[3, 0] = total(rx) - r_total * gradients.x / n
+    h[3, 1] = total(ry) - r_total * gradients.y / n
+    h[3, 2] = total(rs) - r_total * s_total / n
+    h[3, 3] = total(rr) - r_total * r_total / n + damping

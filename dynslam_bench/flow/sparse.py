@@ -30,17 +30,36 @@ from dynslam_bench.flow.label_search import (
     parabola,
     search_labels,
 )
-from dynslam_bench.flow.matching_cost import MAX_COST, CostTables, Reference, cost_tables, describe
-from dynslam_bench.flow.orientation_maps import Buffers, OrientationMaps, Side, orientation_maps
+from dynslam_bench.flow.matching_cost import (
+    MAX_COST,
+    CostTables,
+    MatchingCost,
+    Reference,
+    cost_tables,
+    describe,
+)
+from dynslam_bench.flow.orientation_maps import (
+    Buffers,
+    ImageArrays,
+    OrientationMaps,
+    orientation_maps,
+)
 from dynslam_bench.flow.refinement import Window, similarity_lucas_kanade
 from dynslam_bench.flow.settings import FlowSettings
 from dynslam_bench.flow.workers import Workers
 
 PARABOLA_STEP_PX = np.float32(2.0)
+"""Distance of the costs through which the parabola of the first sub-pixel step is laid."""
 COARSE = Window(step=2, radius=7, margin=3, warps=2)
 """The refinement at half resolution."""
+BACKWARD_MARGIN = 3
+"""Largest translation within one warp of the forward-backward check, pixels."""
 CONSENSUS_PX = 3.0
+"""Displacements this close agree, pixels."""
 CONSENSUS_MARGIN = 0.02
+"""A label that neighbours agree on is taken if its correlation is lower by less than this."""
+COSTS_PER_CORRELATION = 1000
+"""Correlations become whole-number costs in this many steps, to rank points for the common motions."""
 
 
 class Pair(NamedTuple):
@@ -51,9 +70,9 @@ class Pair(NamedTuple):
     tables: CostTables
 
 
-def side_of(image: OrientationMaps, tables: CostTables) -> Side:
-    """The image as the kernels see it, with gradients where the terms of Eq. 1 need them."""
-    return image.full_side if tables.appearance else image.side
+def image_arrays(image: OrientationMaps, tables: CostTables) -> ImageArrays:
+    """The image's arrays for the kernels, with gradients where the terms of Eq. 1 need them."""
+    return image.arrays_with_gradients if tables.appearance else image.arrays
 
 
 class SparseDaisyFlow:
@@ -101,46 +120,45 @@ class SparseDaisyFlow:
             return invalid_result(xy, degenerate=False)
         settings = self.settings
         points = xy[usable]
-        pair = self.pair(reference, target)
         if guess is not None:
             guess = np.asarray(guess, dtype=np.float32).reshape(-1, 2)[usable]
-        costs = (
-            self.describe(reference, points, pair.tables),
-            side_of(target, pair.tables),
-            pair.tables,
-        )
+
+        # search a label for each point, with propagation between neighbours
+        pair = self.pair(reference, target)
+        matching = self.matching(pair, points)
         neighbours = nearest(points, self.workers.run)
-        state = search_labels(settings, self.workers.run, costs, neighbours, guess, seed)
+        state = search_labels(settings, self.workers.run, matching, neighbours, guess, seed)
         labels = state.flames[:, 0].copy()
         cost = state.costs[:, 0]
         evaluations = state.used
+        ceiling = pair.tables.ceiling
+
+        # refine it to sub-pixels: a parabola through the costs, then Lucas-Kanade
         if settings.refinement == "lucas-kanade":
             self.workers.run(
-                parabola, 0, len(points), labels, PARABOLA_STEP_PX, *costs, evaluations
+                parabola, 0, len(points), labels, PARABOLA_STEP_PX, matching, evaluations
             )
-        good = (cost < MAX_COST * pair.tables.ceiling) & (evaluations > 0)
+        good = (cost < MAX_COST * ceiling) & (evaluations > 0)
         if settings.refinement == "lucas-kanade":
-            good &= (
-                self.refine_together(points, labels, neighbours, pair) > settings.min_correlation
-            )
+            correlation = self.refine_together(points, labels, neighbours, pair)
+            good &= correlation > settings.min_correlation
+
+        # check it: back to the reference, and inside the image
         ends = points + labels[:, :2]
         if settings.forward_backward_px > 0:
             rows = np.flatnonzero(good)
-            inverse = -labels[rows]
-            window = Window(1, settings.refinement_window_px // 2, margin=3, warps=1)
-            back = target.framed, reference.framed, window, np.empty(len(rows), np.float32)
-            self.workers.run(similarity_lucas_kanade, 0, len(rows), ends[rows], inverse, *back)
-            error = np.hypot(*(ends[rows] + inverse[:, :2] - points[rows]).T)
+            error = self.forward_backward_error(points[rows], labels[rows], pair)
             good[rows] = error <= settings.forward_backward_px
         good &= usable_points(ends, target.gray.shape)
+
+        # the result of all points, those that could not be used included
         valid = np.zeros(len(xy), np.bool_)
         share = np.ones(len(xy), np.float32)
         xy[usable] = ends
         valid[usable] = good
-        share[usable] = cost / pair.tables.ceiling
-        return FlowResult(
-            xy, valid, share, flow_stats(len(xy), int(good.sum()), int(evaluations.sum()))
-        )
+        share[usable] = cost / ceiling
+        stats = flow_stats(len(xy), int(good.sum()), int(evaluations.sum()))
+        return FlowResult(xy, valid, share, stats)
 
     def pair(self, reference: OrientationMaps, target: OrientationMaps) -> Pair:
         """Two images with the tables of the settings' terms and support of Eq. 1."""
@@ -152,6 +170,27 @@ class SparseDaisyFlow:
             cost_tables(shape, settings.terms, settings.support, settings.support_spacing_px),
         )
 
+    def matching(self, pair: Pair, points: NDArray[np.float32]) -> MatchingCost:
+        """The matching cost of labels at points ``[N, 2]`` of the reference."""
+        described = self.describe(pair.reference, points, pair.tables)
+        return MatchingCost(described, image_arrays(pair.target, pair.tables), pair.tables)
+
+    def forward_backward_error(
+        self, points: NDArray[np.float32], labels: NDArray[np.float32], pair: Pair
+    ) -> NDArray[np.float32]:
+        """Distance in pixels ``[N]`` from each point to where its end in the target is refined back to."""
+        count = len(points)
+        ends = points + labels[:, :2]
+        inverse = -labels
+        window = Window(1, self.settings.refinement_window_px // 2, margin=BACKWARD_MARGIN, warps=1)
+        correlation = np.empty(count, np.float32)
+        images = (pair.target.framed, pair.reference.framed)
+        self.workers.run(
+            similarity_lucas_kanade, 0, count, ends, inverse, *images, window, correlation
+        )
+        error: NDArray[np.float32] = np.hypot(*(ends + inverse[:, :2] - points).T)
+        return error
+
     def describe(
         self, image: OrientationMaps, points: NDArray[np.float32], tables: CostTables
     ) -> Reference:
@@ -160,9 +199,8 @@ class SparseDaisyFlow:
         supports = len(tables.support)
         descriptors = np.empty(count * supports * layout.ROTATIONS * layout.LENGTH, dtype=np.uint8)
         appearance = np.zeros((count, supports, 2), dtype=np.int32)
-        self.workers.run(
-            describe, 0, count, points, side_of(image, tables), tables, descriptors, appearance
-        )
+        arrays = image_arrays(image, tables)
+        self.workers.run(describe, 0, count, points, arrays, tables, descriptors, appearance)
         return Reference(points, descriptors, appearance)
 
     def refine_together(
@@ -181,18 +219,19 @@ class SparseDaisyFlow:
         correlation = self.refine(points, labels, pair)
         if not STRATEGIES[self.settings.search].propagates or len(points) < 3:
             return correlation
+        # what neighbours agree on
         predictions = labels_as_seen(points, labels, neighbours)
         alternative, dissents = dissenting_labels(predictions, labels, np.float32(CONSENSUS_PX))
         self._take_better(points, labels, correlation, alternative, dissents, pair)
         if self.settings.similarity_seeds:
-            motions = common_motions(
-                points, labels, np.rint(1000 * (1 - correlation)).astype(np.int64), 1
-            )
-            alternative = labels_as_seen(
-                points, labels, np.empty((len(points), 0), np.int64), motions
-            )[:, 0]
+            # the motion that most points share; without one it is NaN, and no point dissents
+            costs = np.rint(COSTS_PER_CORRELATION * (1 - correlation)).astype(np.int64)
+            motions = common_motions(points, labels, costs, 1)
+            no_neighbours = np.empty((len(points), 0), np.int64)
+            alternative = labels_as_seen(points, labels, no_neighbours, motions)[:, 0]
             with np.errstate(invalid="ignore"):
-                dissents = np.hypot(*(alternative[:, :2] - labels[:, :2]).T) > CONSENSUS_PX
+                distance = np.hypot(*(alternative[:, :2] - labels[:, :2]).T)
+                dissents = distance > CONSENSUS_PX
             self._take_better(points, labels, correlation, alternative, dissents, pair)
         return correlation
 
@@ -205,16 +244,24 @@ class SparseDaisyFlow:
         dissents: NDArray[np.bool_],
         pair: Pair,
     ) -> None:
-        """Replace labels in place where the alternative, refined, correlates as well."""
+        """Replace labels and correlations in place where the alternative, refined, correlates as well.
+
+        Args:
+            points: ``[N, 2]``.
+            labels: ``[N, 4]``.
+            correlation: ``[N]``, of the refined labels.
+            alternative: ``[N, 4]``, other labels.
+            dissents: bool ``[N]``, where the alternative is tried.
+            pair: The images.
+        """
         rows = np.flatnonzero(dissents)
-        if len(rows):
-            other = alternative[rows]
-            other_correlation = self.refine(points[rows], other, pair)
-            better = other_correlation > correlation[rows] - CONSENSUS_MARGIN
-            labels[rows[better]], correlation[rows[better]] = (
-                other[better],
-                other_correlation[better],
-            )
+        if not len(rows):
+            return
+        other = alternative[rows]
+        other_correlation = self.refine(points[rows], other, pair)
+        better = other_correlation > correlation[rows] - CONSENSUS_MARGIN
+        labels[rows[better]] = other[better]
+        correlation[rows[better]] = other_correlation[better]
 
     def refine(
         self, points: NDArray[np.float32], labels: NDArray[np.float32], pair: Pair

@@ -67,25 +67,22 @@ def test_resembles_scikit_image():
 
 
 @kernel
-def label_costs(labels, reference, target, tables, out):
+def label_costs(labels, matching, out):
     for i in range(len(labels)):
         u, v, s, theta = labels[i]
-        out[i] = matching_cost.label_cost(
-            i, u, v, s, theta, reference, target, tables, matching_cost.OUTSIDE
-        )
+        out[i] = matching_cost.label_cost(i, (u, v, s, theta), matching, matching_cost.OUTSIDE)
 
 
 def compiled_cost(first, second, points, labels, terms=1, support=1):
     """Costs ``[N]`` of one label a point, the tables, and the reference descriptors."""
     tables = matching_cost.cost_tables(first.shape, terms, support)
-    here, there = (orientation_maps(image).full_side for image in (first, second))
+    here, there = (orientation_maps(image).arrays_with_gradients for image in (first, second))
     descriptors = np.empty(len(points) * support * 13 * 136, np.uint8)
     appearance = np.zeros((len(points), support, 2), np.int32)
     matching_cost.describe(0, len(points), points, here, tables, descriptors, appearance)
     out = np.empty(len(points), np.int64)
-    label_costs(
-        labels, matching_cost.Reference(points, descriptors, appearance), there, tables, out
-    )
+    reference = matching_cost.Reference(points, descriptors, appearance)
+    label_costs(labels, matching_cost.MatchingCost(reference, there, tables), out)
     return out, tables, descriptors
 
 

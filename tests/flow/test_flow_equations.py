@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 
 from dynslam_bench.flow import moth_flame as rules
-from dynslam_bench.flow.label_search import advance, move_moths, nearest, scrambled, search_labels
+from dynslam_bench.flow.label_search import (
+    SearchRules,
+    advance,
+    move_moths,
+    nearest,
+    scrambled,
+    search_labels,
+)
 from dynslam_bench.flow.settings import FlowSettings
-from dynslam_bench.flow.sparse import SparseDaisyFlow, side_of
+from dynslam_bench.flow.sparse import SparseDaisyFlow
 
 FAMILY = {"emfoa": rules.EMFOA, "mfo": rules.MFO, "printed": rules.EMFOA_LITERAL}
 POPULATION = 6
@@ -90,10 +97,11 @@ def test_numpy_and_the_kernel_follow_the_equations(family, iteration):
     flying = moths.copy()
     tried = np.empty_like(moths)
     steps = scale.astype(np.float32)
-    tables = table, rules.spiral_table(), rules.cauchy_table()
-    move_moths(
-        flying, flames, -box, box, iteration - 1, *tables, steps, tried, np.uint64(iteration + 77)
+    search = SearchRules(
+        table, rules.spiral_table(), rules.cauchy_table(), steps, True, np.float32(0.5)
     )
+    random = np.uint64(iteration + 77)
+    move_moths(flying, flames, -box, box, iteration - 1, search, tried, random)
     # the spiral is looked up in steps of 1/1024: its slope is at most 2 pi e^2 outside, 2 pi e
     # inside t <= 1
     looked_up = (
@@ -136,14 +144,9 @@ def searched(search):
     guess[::2] = np.nan
     flow = SparseDaisyFlow(FlowSettings(search=search))
     pair = flow.pair(flow.prepare(image), flow.prepare(target))
-    costs = (
-        flow.describe(pair.reference, points, pair.tables),
-        side_of(pair.target, pair.tables),
-        pair.tables,
-    )
-    return search_labels(
-        flow.settings, flow.workers.run, costs, nearest(points, flow.workers.run), guess, 9
-    )
+    run = flow.workers.run
+    matching = flow.matching(pair, points)
+    return search_labels(flow.settings, run, matching, nearest(points, run), guess, 9)
 
 
 STORED = {
