@@ -137,7 +137,7 @@ def speed_figure(board: Board) -> go.Figure | None:
     `timing_computer`.
     """
     look = looks(board)
-    placed = board.placed
+    placed = board.standing_by_key
     points = []
     comparable: set[str] = set()
     for key in board.trackers:

@@ -17,7 +17,7 @@ from dynslam_bench.reports.model.statistics import FLOOR_M, Interval, Standing, 
 from dynslam_bench.reports.tables.leaderboard import (
     frame_time_cell,
     leaderboard_cells,
-    middle,
+    median_of,
     rank_cell,
     run_link,
 )
@@ -61,7 +61,7 @@ def entries_of(
     limits = _limits([s.ratio for s in board.standings])
     entries = []
     for key in board.trackers:
-        standing = board.placed.get(key)
+        standing = board.standing_by_key.get(key)
         cells = leaderboard_cells(board, key)
         runs = board.cells[key]
         first = board.first(key)
@@ -139,7 +139,9 @@ def _bar(ratio: Interval, limits: tuple[float, float]) -> dict[str, float]:
 def _by_category(key: str, boards: Mapping[str, Board]) -> list[tuple[str, float, float]]:
     """A dot a category: its name, the ratio there, and the height of a ratio from 1/8 to 8 in pixels from above."""
     ratios = {
-        name: board.placed[key].ratio.value for name, board in boards.items() if key in board.placed
+        name: board.standing_by_key[key].ratio.value
+        for name, board in boards.items()
+        if key in board.standing_by_key
     }
     return [
         (name, ratio, 12 - 8 * min(max(math.log(max(ratio, FLOOR_M)) / math.log(8), -1.0), 1.0))
@@ -260,7 +262,9 @@ def cell_content(
     doubt = any(not row.rotation_reliable for row in cell.rows) + 2 * (
         cell.in_training and not rank_seen
     )
-    medians = [significant(middle(_value(row, metric) for row in cell.kept)) for metric in metrics]
+    medians = [
+        significant(median_of(_value(row, metric) for row in cell.kept)) for metric in metrics
+    ]
     quartiles = np.percentile(cell.scores, [25, 75]).tolist() if len(cell.scores) > 1 else []
     place = [tracker, sequence, len(cell.rows), cell.failed, doubt]
     return [*place, medians, cell.typical.run_id, [significant(value) for value in quartiles]]

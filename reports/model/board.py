@@ -96,7 +96,7 @@ class Board:
         no_better: Variant keys of trackers that are not ranked since they are no better than a
             static camera: the geometric mean of their errors over its on the common sequences is 1
             or more.
-        hopeless: Variant keys that never succeeded on the common sequences.
+        never_succeeded: Variant keys that never succeeded on the common sequences.
     """
 
     rows: list[RunRow]
@@ -122,7 +122,7 @@ class Board:
     ranked: list[str] = field(default_factory=list)
     incomplete: list[str] = field(default_factory=list)
     no_better: list[str] = field(default_factory=list)
-    hopeless: list[str] = field(default_factory=list)
+    never_succeeded: list[str] = field(default_factory=list)
 
     @cached_property
     def _by_key(self) -> dict[str, list[RunRow]]:
@@ -164,7 +164,7 @@ class Board:
         return dict(zip(self.common, group_weights(groups).tolist(), strict=True))
 
     @property
-    def placed(self) -> dict[str, Standing]:
+    def standing_by_key(self) -> dict[str, Standing]:
         """Variant key to its standing, in order."""
         return {standing.key: standing for standing in self.standings}
 
@@ -204,7 +204,7 @@ class Board:
         row = self.first(key)
         reasons = {
             "no better than a static camera": key in self.no_better,
-            "nothing succeeded": key in self.hopeless,
+            "nothing succeeded": key in self.never_succeeded,
             "lacks sequences": key in self.incomplete,
             "in real time": row.realtime,
             "exact masks: a bound": row.segmentation == EXACT_MASKS,
@@ -330,7 +330,7 @@ class Board:
 
     def separators(self) -> set[int]:
         """Rows of a table of all trackers above which a line is drawn: the unranked, and those that never succeeded."""
-        failed = len(self.trackers) - sum(key in self.hopeless for key in self.trackers)
+        failed = len(self.trackers) - sum(key in self.never_succeeded for key in self.trackers)
         return {at for at in (len(self.ranked), failed) if 0 < at < len(self.trackers)}
 
 
@@ -420,8 +420,10 @@ def _completed(board: Board) -> Board:
     _choose_ranked(board, scored)
     _choose_reference(board, scored, board.asked_reference or DEFAULT_REFERENCE)
     board.standings = rank(board, scored, board.ranked)
-    others = sorted(set(shown) - board.placed.keys(), key=board.labels.__getitem__)
-    board.trackers = sorted([*board.placed, *others], key=lambda key: key in board.hopeless)
+    others = sorted(set(shown) - board.standing_by_key.keys(), key=board.labels.__getitem__)
+    board.trackers = sorted(
+        [*board.standing_by_key, *others], key=lambda key: key in board.never_succeeded
+    )
     board.ranked = [key for key in board.trackers if key in board.ranked]
     return board
 
@@ -610,7 +612,7 @@ def _choose_ranked(board: Board, scored: Sequence[str]) -> None:
         cells = board.cells[key]
         judged = [name for name in board.common if name in cells] or list(cells)
         if not any(cells[name].success for name in judged):
-            board.hopeless.append(key)
+            board.never_succeeded.append(key)
         elif key in competing and board.static_ratio(key) >= 1 - 1e-9:
             board.no_better.append(key)
         elif key in competing:

@@ -105,7 +105,13 @@ def run_jobs(
 
 @contextmanager
 def _without_main() -> Iterator[None]:
-    """Let workers start without the caller's script, which need not guard what it does at import."""
+    """Let workers start without the caller's script, which need not guard what it does at import.
+
+    A worker that is spawned imports the parent's ``__main__`` before it does anything: a script without
+    ``if __name__ == "__main__"`` would run again in every worker. The spawn and the forkserver contexts
+    both do so, and neither has an option against it. They look the module up in `sys.modules` when a
+    worker starts, so an empty one stands there meanwhile.
+    """
     main = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:

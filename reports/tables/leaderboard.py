@@ -4,6 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import zip_longest
 from statistics import median
 
@@ -17,6 +18,7 @@ from dynslam_bench.reports.model.board import (
     STATIC_CAMERA,
     Board,
     Cell,
+    Pair,
     compare_pairs,
     mean_of,
     rank,
@@ -52,37 +54,47 @@ _PROVENANCE = {
     "external": "not part of this project",
     "control": "a control, not a system",
 }
-_NAMES = {"own": "our composition"}
+"""What each provenance of a tracker means: the tip of its cell."""
+_PROVENANCE_NAMES = {"own": "our composition"}
+"""Provenances that tables call by another name than the tracker's spec does."""
 CACHED_MARK = "†"
+"""Behind times of which some come from the stage cache."""
 COMPUTER_MARK = "‖"
 """Behind times of trackers with runs on other computers than most."""
 CACHED_NOTE = (
     f"{CACHED_MARK} Times of features and masks come from the stage cache, not from the run itself."
 )
+"""What `CACHED_MARK` means, for captions."""
 SEEN_NOTE = (
     f"{SEEN} The masks come from a network that was trained on this very scene (the embedded one, on rendered "
     "scenes 0-99): its best case, no judgement."
 )
+"""What the mark `SEEN` means, for captions and tips."""
 
 
 def leaderboard(board: Board, protocol: Protocol) -> Table:
     """Ranking with what the data leave open, success, coverage, speed and provenance."""
-    epipolar = any(row.epipolar_skipped is not None for row in board.rows)
-    columns = [
-        replace(column, meaning=column.meaning.replace("{reference}", board.reference_name))
-        for column in COLUMNS
-        if epipolar or column.name != "F skipped"
-    ]
-    lines = [leaderboard_cells(board, key) for key in board.trackers]
-    rows = [[cells[column.name] for column in columns] for cells in lines]
+    # only epipolar systems have an entry in the column "F skipped"
+    has_epipolar = any(row.epipolar_skipped is not None for row in board.rows)
+    columns = []
+    for column in COLUMNS:
+        if column.name == "F skipped" and not has_epipolar:
+            continue
+        meaning = column.meaning.replace("{reference}", board.reference_name)
+        columns.append(replace(column, meaning=meaning))
+
+    rows = []
+    for key in board.trackers:
+        cells = leaderboard_cells(board, key)
+        rows.append([cells[column.name] for column in columns])
+
     brief = f"Geometric mean of the ATE over that of {board.reference_name}"
-    brief += ", with 95 % intervals" * any(
-        math.isfinite(standing.ratio.low) for standing in board.standings
-    )
+    if any(math.isfinite(standing.ratio.low) for standing in board.standings):
+        brief += ", with 95 % intervals"
     return Table(
         "leaderboard",
         "Leaderboard",
-        _caption(board, protocol, epipolar),
+        _leaderboard_caption(board, protocol, has_epipolar=has_epipolar),
         columns,
         rows,
         board.unranked_rows(board.trackers),
@@ -126,129 +138,184 @@ COLUMNS = (
 """The leaderboard's columns; `leaderboard_cells` fills them."""
 
 
-def _caption(board: Board, protocol: Protocol, epipolar: bool) -> str:
-    failed = sum(row.failed for row in board.rows)
-    groups = dict.fromkeys(board.groups[name] for name in board.common)
-    several = len(groups) > 1 and board.category == OVERALL
-    mean = f"It is a mean over {len(groups)} categories ({', '.join(groups)}), which all weigh the same. "
-    intervals = (
-        "Brackets: Student's 95 % intervals over sequences."
-        if len(board.common) >= FEWEST
-        else f"No intervals: they would need {FEWEST} sequences."
-    )
-    parts = [
+def _leaderboard_caption(board: Board, protocol: Protocol, *, has_epipolar: bool) -> str:
+    """How to read the leaderboard: what always holds, then remarks on what this board shows."""
+    n_failed = sum(row.failed for row in board.rows)
+    sentences = [
         f"{protocol.describe()}; for the ranking a lost frame counts as not having moved since the last tracked one.",
-        f"ATE ratio: geometric mean over {_count(len(board.common), 'sequence')} of the median ATE over that of "
-        f"{board.reference_name}; below 1 is better. {mean if several else ''}{intervals}",
-        f"A run that failed or was lost counts as a static camera, or worse ({failed} of "
+        _ratio_rule(board),
+        f"A run that failed or was lost counts as a static camera, or worse ({n_failed} of "
         f"{_count(len(board.rows), 'run')}); trackers without any success stand below the last line.",
         "Grey rows are shown but not ranked: controls, inspired or assumed re-implementations, runs that begin "
         "in the map of an earlier one or by another program, real-time runs and exact masks beside others, "
         "trackers that lack sequences, never succeeded, or are no better than a static camera.",
+        *_leaderboard_remarks(board, has_epipolar=has_epipolar),
     ]
-    counts = {
-        key: sum(board.no_better_than_static(key, name) for name in board.sequences)
-        for key in board.trackers
-    }
-    worse = "; ".join(
-        f"{board.labels[key]} on {count} of {_count(len(board.cells[key]), 'sequence')}"
-        for key, count in counts.items()
-        if count
-    )
-    hinted = _hinted(board.rows)
-    rule = (
-        "Such runs rank, since that was asked for." if board.rank_seen else "Such runs do not rank."
-    )
-    remarks = {
-        f"No better than a static camera, although their runs ended: {worse}.": worse,
-        f"{board.asked_reference} was asked for as the reference, but has not every ranked sequence: a static "
-        "camera takes its place.": board.asked_reference and board.reference is None,
-        "F skipped: frames on which an epipolar system did not use its fundamental matrix.": epipolar,
-        CACHED_NOTE: any(row.cached for row in board.rows),
-        computer_note(board): True,
-        f"{SEEN_NOTE} {rule} Instances 100-199 are held out.": any(
-            row.seen_in_training for row in board.rows
-        ),
-        f"{HINTED} The trajectories of {_count(sum(bool(row.hints) for row in board.rows), 'run')} are probably faulty "
-        f"({hinted}), as the diagnostics say; no number is changed for that.": hinted,
-    }
-    return " ".join(parts + [remark for remark, holds in remarks.items() if remark and holds])
+    return " ".join(sentences)
 
 
-def _hinted(rows: Iterable[RunRow]) -> str:
+def _ratio_rule(board: Board) -> str:
+    """What the ATE ratio is a mean over, and whether it has intervals."""
+    groups = dict.fromkeys(board.groups[name] for name in board.common)
+    over_categories = ""
+    if board.category == OVERALL and len(groups) > 1:
+        names = ", ".join(groups)
+        over_categories = (
+            f"It is a mean over {len(groups)} categories ({names}), which all weigh the same. "
+        )
+    if len(board.common) >= FEWEST:
+        intervals = "Brackets: Student's 95 % intervals over sequences."
+    else:
+        intervals = f"No intervals: they would need {FEWEST} sequences."
+    return (
+        f"ATE ratio: geometric mean over {_count(len(board.common), 'sequence')} of the median ATE over that of "
+        f"{board.reference_name}; below 1 is better. {over_categories}{intervals}"
+    )
+
+
+def _leaderboard_remarks(board: Board, *, has_epipolar: bool) -> list[str]:
+    """Sentences of the caption that hold for some boards only."""
+    remarks = []
+    if static_like := _no_better_than_static_words(board):
+        remarks.append(f"No better than a static camera, although their runs ended: {static_like}.")
+    if board.asked_reference and board.reference is None:
+        remarks.append(
+            f"{board.asked_reference} was asked for as the reference, but has not every ranked sequence: a static "
+            "camera takes its place."
+        )
+    if has_epipolar:
+        remarks.append(
+            "F skipped: frames on which an epipolar system did not use its fundamental matrix."
+        )
+    if any(row.cached for row in board.rows):
+        remarks.append(CACHED_NOTE)
+    if times_of_others := computer_note(board):
+        remarks.append(times_of_others)
+    if any(row.seen_in_training for row in board.rows):
+        rule = "Such runs do not rank."
+        if board.rank_seen:
+            rule = "Such runs rank, since that was asked for."
+        remarks.append(f"{SEEN_NOTE} {rule} Instances 100-199 are held out.")
+    if hinted := _hint_counts(board.rows):
+        n_hinted = sum(bool(row.hints) for row in board.rows)
+        remarks.append(
+            f"{HINTED} The trajectories of {_count(n_hinted, 'run')} are probably faulty "
+            f"({hinted}), as the diagnostics say; no number is changed for that."
+        )
+    return remarks
+
+
+def _no_better_than_static_words(board: Board) -> str:
+    """Trackers that a static camera beats on some sequences, with the number of these; empty for none."""
+    parts = []
+    for key in board.trackers:
+        count = sum(board.no_better_than_static(key, name) for name in board.sequences)
+        if count:
+            parts.append(
+                f"{board.labels[key]} on {count} of {_count(len(board.cells[key]), 'sequence')}"
+            )
+    return "; ".join(parts)
+
+
+def _hint_counts(rows: Iterable[RunRow]) -> str:
     """What is probably wrong with trajectories, with the number of runs; empty if nothing is."""
+    # a hint is a line "<id>: <text>"
     counts = Counter(line.partition(":")[0] for row in rows for line in row.hints)
-    return ", ".join(f"{name} {count}" for name, count in counts.most_common())
+    return ", ".join(f"{hint} {count}" for hint, count in counts.most_common())
 
 
 def leaderboard_cells(board: Board, key: str) -> dict[str, TableCell]:
     """The cells of a tracker by the names of their columns; what is not known is empty."""
+    cells = {column.name: TableCell() for column in COLUMNS}
+    cells |= _run_cells(board, key)
+    standing = board.standing_by_key.get(key)
+    if key in board.never_succeeded:
+        cells["ATE ratio"] = TableCell("nothing succeeded", emphasis="failed")
+    elif standing is not None:
+        cells |= _standing_cells(board, standing)
+    return cells
+
+
+def _run_cells(board: Board, key: str) -> dict[str, TableCell]:
+    """Cells that follow from a tracker's runs alone, ranked or not."""
     runs = board.runs(key)
-    standing = board.placed.get(key)
     ended = [row for row in runs if not row.failed]
-    coverage = mean_of(row.coverage for row in runs)
-    hinted = _hinted(runs)
-    masks = " + ".join(
-        sorted(
-            {label_text(row.segmentation) for row in runs if row.segmentation not in ("", "none")}
-        )
-    )
     tracker = runs[0].tracker
+    coverage = mean_of(row.coverage for row in runs)
+
+    # the name, marked where a trajectory is probably faulty
+    hinted = _hint_counts(runs)
+    label = f"{board.labels[key]} {HINTED}" if hinted else board.labels[key]
+
+    # share of the tracked frames without a fundamental matrix, of epipolar systems
     skipped = mean_of(row.epipolar_skipped for row in runs)
-    cells = dict.fromkeys((column.name for column in COLUMNS), TableCell()) | {
+    skipped_cell = TableCell() if skipped is None else TableCell(percent(skipped), value=skipped)
+
+    # how many runs come from where
+    origins = Counter(row.origin for row in runs)
+    origin_words = " + ".join(f"{count} {origin}" for origin, count in origins.items())
+    return {
         "#": TableCell("–"),
         "success": TableCell(f"{len(ended)}/{len(runs)}", value=len(ended) / len(runs)),
-        "tracker": TableCell(
-            board.labels[key] + f" {HINTED}" * bool(hinted), hinted, tip=tracker.id
-        ),
+        "tracker": TableCell(label, hinted, tip=tracker.id),
         "coverage": TableCell(coverage_text(coverage), value=coverage),
         "× real time": speed_cell(board, ended),
-        "MB": number(middle(row.peak_memory_mb for row in ended), ".0f"),
-        "rows": TableCell(
-            small=runs[0].program_remark,
-            tag=" + ".join(
-                f"{n} {origin}" for origin, n in Counter(row.origin for row in runs).items()
-            ),
-        ),
-        "F skipped": TableCell() if skipped is None else TableCell(percent(skipped), value=skipped),
-        "provenance": TableCell(
-            _NAMES.get(tracker.provenance, tracker.provenance),
-            f"{masks} masks" if masks else "",
-            tip=_PROVENANCE.get(tracker.provenance, ""),
-        ),
+        "MB": number(median_of(row.peak_memory_mb for row in ended), ".0f"),
+        "rows": TableCell(small=runs[0].program_remark, tag=origin_words),
+        "F skipped": skipped_cell,
+        "provenance": _provenance_cell(runs),
     }
-    if key in board.hopeless:
-        return cells | {"ATE ratio": TableCell("nothing succeeded", emphasis="failed")}
-    if standing is None:
-        return cells
+
+
+def _provenance_cell(runs: Sequence[RunRow]) -> TableCell:
+    """How closely a tracker follows its source, and whose masks it used."""
+    provenance = runs[0].tracker.provenance
+    networks = {row.segmentation for row in runs} - {"", "none"}
+    masks = " + ".join(sorted({label_text(network) for network in networks}))
+    return TableCell(
+        _PROVENANCE_NAMES.get(provenance, provenance),
+        f"{masks} masks" if masks else "",
+        tip=_PROVENANCE.get(provenance, ""),
+    )
+
+
+def _standing_cells(board: Board, standing: Standing) -> dict[str, TableCell]:
+    """Cells that need scores on the common sequences: rank, ratio, verdict, wins and mean rank."""
+    # rank, or why there is none
+    why_unranked = board.unranked_why(standing.key)
+    rank_or_reason = TableCell("–", why_unranked) if why_unranked else rank_cell(standing)
+
+    # ratio, with the number of sequences where some are missing
     ratio = ratio_cell(board, standing)
     if standing.sequences < len(board.common):
         small = f"{ratio.small} on {standing.sequences} of {len(board.common)}".strip()
         ratio = TableCell(ratio.text, small, ratio.value)
-    wins = TableCell(f"{standing.wins} of {standing.sequences}", value=standing.wins)
-    return cells | {
-        "#": TableCell("–", why) if (why := board.unranked_why(key)) else rank_cell(standing),
+
+    # the reference wins nothing against itself
+    wins = TableCell()
+    if standing.key != board.reference:
+        wins = TableCell(f"{standing.wins} of {standing.sequences}", value=standing.wins)
+    return {
+        "#": rank_or_reason,
         "ATE ratio": ratio,
         "better?": verdict_cell(board, standing),
-        "wins": TableCell() if key == board.reference else wins,
+        "wins": wins,
         "mean rank": number(standing.mean_rank, ".2f"),
     }
 
 
 def verdict_cell(board: Board, standing: Standing) -> TableCell:
     """Better than the reference, worse, or cannot tell, with the corrected p value; coloured where it is shown."""
-    if not standing.verdict or (len(board.common) < FEWEST and standing.verdict != "reference"):
+    verdict = standing.verdict
+    if not verdict:
         return TableCell()
-    p = (
-        ""
-        if standing.p_value is None
-        else "p < 0.001"
-        if standing.p_value < 0.001
-        else f"p {standing.p_value:.3f}"
-    )
-    return TableCell(
-        standing.verdict, p, shade={"better": shade(0.5), "worse": shade(2.0)}.get(standing.verdict)
-    )
+    if len(board.common) < FEWEST and verdict != "reference":
+        return TableCell()
+
+    p_text = ""
+    if standing.p_value is not None:
+        p_text = "p < 0.001" if standing.p_value < 0.001 else f"p {standing.p_value:.3f}"
+    return TableCell(verdict, p_text, shade=_VERDICT_SHADES.get(verdict))
 
 
 def category_table(boards: Mapping[str, Board]) -> Table | None:
@@ -260,34 +327,38 @@ def category_table(boards: Mapping[str, Board]) -> Table | None:
     if len(boards) < 2:
         return None
     overall = boards[OVERALL]
+    columns = texts("tracker")
+    for name, board in boards.items():
+        meaning = f"{_count(len(board.common), 'sequence')}, against {board.reference_name}"
+        columns.append(Column(name, meaning=meaning))
 
-    cells = [
-        {
-            key: replace(ratio_cell(board, s), shade=verdict_cell(board, s).shade, tip=s.verdict)
-            for key, s in board.placed.items()
-        }
-        for board in boards.values()
-    ]
-    rows = [
-        [TableCell(overall.labels[key]), *(placed.get(key, TableCell()) for placed in cells)]
-        for key in overall.trackers
-    ]
-    columns = [
-        Column(
-            name, meaning=f"{_count(len(board.common), 'sequence')}, against {board.reference_name}"
-        )
-        for name, board in boards.items()
-    ]
+    rows = []
+    for key in overall.trackers:
+        cells = [TableCell(overall.labels[key])]
+        for board in boards.values():
+            standing = board.standing_by_key.get(key)
+            cells.append(TableCell() if standing is None else _category_cell(board, standing))
+        rows.append(cells)
     caption = (
         "Geometric mean of the median ATE over that of the reference, by category; brackets are 95 % intervals from "
         f"{FEWEST} sequences on. Blue: better than the reference; orange: worse; no colour: cannot tell or not ranked. "
         "A sequence may be in several categories: what moves there, how the camera moves, recorded or rendered."
     )
-    muted = overall.unranked_rows(overall.trackers)
-    separators = overall.separators()
     return Table(
-        "categories", "By category", caption, [*texts("tracker"), *columns], rows, muted, separators
+        "categories",
+        "By category",
+        caption,
+        columns,
+        rows,
+        overall.unranked_rows(overall.trackers),
+        overall.separators(),
     )
+
+
+def _category_cell(board: Board, standing: Standing) -> TableCell:
+    """The ratio of a tracker in one category, coloured by its verdict there."""
+    colour = verdict_cell(board, standing).shade
+    return replace(ratio_cell(board, standing), shade=colour, tip=standing.verdict)
 
 
 def pair_table(board: Board) -> Table | None:
@@ -296,21 +367,15 @@ def pair_table(board: Board) -> Table | None:
         return None
     pairs = {frozenset((pair.one, pair.other)): pair for pair in compare_pairs(board, board.ranked)}
 
-    def shown(key: str, other: str) -> TableCell:
-        if other == key:
-            return TableCell("–", emphasis="muted")
-        pair = pairs[frozenset((key, other))]
-        ratio = pair.ratio.value if pair.one == key else 1.0 / pair.ratio.value
-        apart = pair.verdict != "cannot tell"
-        colour = shade(0.5 if ratio < 1 else 2.0) if apart else None
-        return TableCell(
-            f"{ratio:.2f}", "" if apart else "?", ratio, shade=colour, tip=f"p {pair.p_value:.3f}"
-        )
-
-    rows = [
-        [TableCell(board.labels[key]), *(shown(key, other) for other in board.ranked)]
-        for key in board.ranked
-    ]
+    rows = []
+    for key in board.ranked:
+        cells = [TableCell(board.labels[key])]
+        for other in board.ranked:
+            if other == key:
+                cells.append(TableCell("–", emphasis="muted"))
+            else:
+                cells.append(_pair_cell(pairs[frozenset((key, other))], key))
+        rows.append(cells)
     caption = (
         "Geometric mean of the errors of the row over those of the column. Coloured: the two can be told apart (paired "
         "t tests of the log errors over sequences, Holm-corrected over all pairs); '?': they cannot."
@@ -319,23 +384,32 @@ def pair_table(board: Board) -> Table | None:
     return Table("pairs", "All pairs", caption, columns, rows)
 
 
+def _pair_cell(pair: Pair, key: str) -> TableCell:
+    """The ratio of one tracker of a pair to the other; coloured where the two can be told apart."""
+    ratio = pair.ratio.value if pair.one == key else 1.0 / pair.ratio.value
+    tip = f"p {pair.p_value:.3f}"
+    if pair.verdict == "cannot tell":
+        return TableCell(f"{ratio:.2f}", "?", ratio, tip=tip)
+    colour = _VERDICT_SHADES["better" if ratio < 1 else "worse"]
+    return TableCell(f"{ratio:.2f}", "", ratio, shade=colour, tip=tip)
+
+
 def speed_cell(board: Board, ended: Sequence[RunRow]) -> TableCell:
     """Real-time factor and frame time on one computer, with their marks (`time_marks`)."""
     rows = timed_on_one(ended, board.timing_computer)
-    factor = middle(row.real_time_factor for row in rows)
-    frame_ms = middle(row.frame_ms for row in rows)
+    factor = median_of(row.real_time_factor for row in rows)
+    frame_ms = median_of(row.frame_ms for row in rows)
     if factor is None:
         return TableCell()
     mark, tip = time_marks(board, ended)
+    factor_text = f"{factor:.2f}" if factor < 100 else f"{factor:.0f}"
     small = "" if frame_ms is None else f"{frame_ms:.1f} ms{mark}"
-    return TableCell(
-        (f"{factor:.2f}" if factor < 100 else f"{factor:.0f}") + mark, small, factor, tip=tip
-    )
+    return TableCell(factor_text + mark, small, factor, tip=tip)
 
 
 def frame_time_cell(board: Board, ended: Sequence[RunRow]) -> TableCell:
     """Median frame time in milliseconds on one computer, with its marks (`time_marks`)."""
-    frame_ms = middle(row.frame_ms for row in timed_on_one(ended, board.timing_computer))
+    frame_ms = median_of(row.frame_ms for row in timed_on_one(ended, board.timing_computer))
     if frame_ms is None:
         return TableCell()
     mark, tip = time_marks(board, ended)
@@ -349,12 +423,14 @@ def time_marks(board: Board, ended: Sequence[RunRow]) -> tuple[str, str]:
     if any(row.cached for row in timed_on_one(ended, board.timing_computer)):
         marks.append(CACHED_MARK)
         tips.append(CACHED_NOTE)
+
     by_computer = grouped(timed(ended), lambda row: row.computer)
     if by_computer and by_computer.keys() != {board.timing_computer}:
         marks.append(COMPUTER_MARK)
-        by_number = sorted(by_computer.items(), key=lambda entry: (-len(entry[1]), entry[0]))
-        for computer, rows in by_number:
-            frame_ms = middle(row.frame_ms for row in rows) or 0.0
+        # the computer with most runs first
+        most_runs_first = sorted(by_computer.items(), key=lambda entry: (-len(entry[1]), entry[0]))
+        for computer, rows in most_runs_first:
+            frame_ms = median_of(row.frame_ms for row in rows) or 0.0
             tips.append(
                 f"{frame_ms:.1f} ms on {computer_words(computer)} ({_count(len(rows), 'run')})"
             )
@@ -368,9 +444,8 @@ def computer_words(computer: str) -> str:
 
 def computer_note(board: Board) -> str:
     """On which computer times were taken, and that some are of others; empty where all are of one."""
-    others = {row.computer for row in timed([row for row in board.rows if not row.failed])} - {
-        board.timing_computer
-    }
+    ended = [row for row in board.rows if not row.failed]
+    others = {row.computer for row in timed(ended)} - {board.timing_computer}
     if not others:
         return ""
     return (
@@ -380,8 +455,12 @@ def computer_note(board: Board) -> str:
 
 
 def rank_cell(standing: Standing) -> TableCell:
-    """The ranks that the data leave open."""
-    return TableCell("–".join(map(str, dict.fromkeys(standing.group))) if standing.group else "–")
+    """The ranks that the data leave open, e.g. ``1–3``; a dash for an unranked tracker."""
+    if standing.group is None:
+        return TableCell("–")
+    # first and last rank, once where they are equal
+    ranks = dict.fromkeys(standing.group)
+    return TableCell("–".join(map(str, ranks)))
 
 
 def ratio_cell(board: Board, standing: Standing) -> TableCell:
@@ -391,21 +470,20 @@ def ratio_cell(board: Board, standing: Standing) -> TableCell:
 
 def interval_cell(interval: Interval, digits: str, emphasis: Emphasis = "") -> TableCell:
     """A value with its interval, if it has one."""
-    small = (
-        f"[{interval.low:{digits}}, {interval.high:{digits}}]"
-        if math.isfinite(interval.low)
-        else ""
-    )
+    small = ""
+    if math.isfinite(interval.low):
+        small = f"[{interval.low:{digits}}, {interval.high:{digits}}]"
     return TableCell(f"{interval.value:{digits}}", small, interval.value, emphasis)
 
 
-def middle(values: Iterable[float | None]) -> float | None:
+def median_of(values: Iterable[float | None]) -> float | None:
     """Median of what is present; None if nothing is."""
     present = [value for value in values if value is not None]
     return median(present) if present else None
 
 
 def _count(count: int, noun: str) -> str:
+    """A number with its noun, in the plural where it is not one."""
     return f"{count} {noun}{'s' if count != 1 else ''}"
 
 
@@ -448,11 +526,24 @@ def metric_table(
     values = medians(board, value)
     if not values:
         return None
-    doubtful: dict[tuple[str, str], Emphasis] = {
-        (k, s): "muted" for k, s in values if doubt(board.cells[k][s])
-    }
+
+    # doubtful numbers are muted, and take no part in best and second best
+    doubtful: dict[tuple[str, str], Emphasis] = {}
+    compared: dict[tuple[str, str], float] = {}
     sign = -1.0 if larger_is_better else 1.0
-    compared = {place: sign * number for place, number in values.items() if place not in doubtful}
+    for (key, sequence), cell_median in values.items():
+        if doubt(board.cells[key][sequence]):
+            doubtful[key, sequence] = "muted"
+        else:
+            compared[key, sequence] = sign * cell_median
+    marks = column_marks(board, compared) | doubtful
+
+    def behind(cell: Cell) -> str:
+        return DOUBT * bool(doubt(cell)) + SEEN * cell.in_training
+
+    def tip(cell: Cell) -> str:
+        return doubt(cell) or (SEEN_NOTE if cell.in_training else cell.ending)
+
     return _sequence_table(
         board,
         {"": values},
@@ -461,9 +552,9 @@ def metric_table(
         caption,
         f"{title} ({unit})",
         text=text,
-        behind=lambda cell: DOUBT * bool(doubt(cell)) + SEEN * cell.in_training,
-        tip=lambda cell: doubt(cell) or (SEEN_NOTE if cell.in_training else cell.ending),
-        marks={"": column_marks(board, compared) | doubtful},
+        behind=behind,
+        tip=tip,
+        marks={"": marks},
     )
 
 
@@ -484,7 +575,7 @@ def _sequence_table(
     tip: Callable[[Cell], str] = lambda cell: "",
     marks: Mapping[str, Mapping[tuple[str, str], Emphasis]] | None = None,
 ) -> Table:
-    """A row a tracker that has any of the numbers, a column a sequence and kind of number.
+    """A table with a row a tracker that has any of the numbers, and a column a sequence and kind of number.
 
     Args:
         board: The board.
@@ -499,46 +590,47 @@ def _sequence_table(
         marks: Emphasis of the numbers of each kind; None for the best and second best of every
             column.
     """
-    marks = (
-        {kind: column_marks(board, values) for kind, values in measures.items()}
-        if marks is None
-        else marks
-    )
+    if marks is None:
+        marks = {kind: column_marks(board, values) for kind, values in measures.items()}
     measured = {key for values in measures.values() for key, _ in values}
     keys = [key for key in (*board.trackers, *board.final_only) if key in measured]
 
-    def shown(place: tuple[str, str], kind: str) -> TableCell:
-        cell, value = board.cells[place[0]].get(place[1]), measures[kind].get(place)
-        if cell is not None and not cell.success:
-            return TableCell(emphasis="failed", tip=cell.ending)
-        if cell is None or value is None:
-            return TableCell()
-        mark = marks.get(kind, {}).get(place, "")
-        return TableCell(text(value) + behind(cell), value=value, emphasis=mark, tip=tip(cell))
+    rows = []
+    for key in keys:
+        cells = [TableCell(board.labels[key])]
+        for sequence in board.sequences:
+            cell = board.cells[key].get(sequence)
+            for kind, values in measures.items():
+                value = values.get((key, sequence))
+                if cell is not None and not cell.success:
+                    cells.append(TableCell(emphasis="failed", tip=cell.ending))
+                elif cell is None or value is None:
+                    cells.append(TableCell())
+                else:
+                    mark = marks.get(kind, {}).get((key, sequence), "")
+                    words = text(value) + behind(cell)
+                    cells.append(TableCell(words, value=value, emphasis=mark, tip=tip(cell)))
+        rows.append(cells)
 
-    rows = [
-        [
-            TableCell(board.labels[key]),
-            *(shown((key, name), kind) for name in board.sequences for kind in measures),
-        ]
-        for key in keys
-    ]
+    # a line between the ranked trackers and the others
     muted = board.unranked_rows(keys)
-    ranked = len(keys) - len(muted)
-    separators = {ranked} if 0 < ranked < len(rows) else set()
+    n_ranked = len(keys) - len(muted)
+    separators = {n_ranked} if 0 < n_ranked < len(rows) else set()
     columns = [*texts("tracker"), *sequence_columns(board, list(measures))]
     return Table(name, title, caption, columns, rows, muted, separators, brief)
 
 
 def medians(board: Board, value: Value) -> dict[tuple[str, str], float]:
     """Median of a number over the runs that count and succeeded, by tracker and sequence."""
-    of_cell = {
-        (key, name): middle(value(row) for row in cell.kept if not row.failed)
-        for key, cells in board.cells.items()
-        for name, cell in cells.items()
-        if name in board.sequences
-    }
-    return {place: number for place, number in of_cell.items() if number is not None}
+    by_cell = {}
+    for key, cells in board.cells.items():
+        for sequence, cell in cells.items():
+            if sequence not in board.sequences:
+                continue
+            cell_median = median_of(value(row) for row in cell.kept if not row.failed)
+            if cell_median is not None:
+                by_cell[key, sequence] = cell_median
+    return by_cell
 
 
 def column_marks(board: Board, values: Values) -> dict[tuple[str, str], Emphasis]:
@@ -551,84 +643,50 @@ def column_marks(board: Board, values: Values) -> dict[tuple[str, str], Emphasis
         values: A number a cell, less is better; a cell that has none takes no part.
     """
     marks: dict[tuple[str, str], Emphasis] = {}
-    for name in board.sequences:
-        keys = [
-            key
-            for key in board.ranked
-            if name in board.cells[key] and not board.cells[key][name].failed
-        ]
-        places = [
-            (k, name)
-            for k in keys
-            if board.competes(k, name) and not board.no_better_than_static(k, name)
-        ]
-        marks |= zip(places, emphasise([values.get(place) for place in places]), strict=True)
+    for sequence in board.sequences:
+        competing = [(key, sequence) for key in board.ranked if _may_be_best(board, key, sequence)]
+        emphasis = emphasise([values.get(place) for place in competing])
+        marks |= zip(competing, emphasis, strict=True)
     return marks
 
 
+def _may_be_best(board: Board, key: str, sequence: str) -> bool:
+    """Whether a tracker's number on a sequence may be bold: all its runs succeeded, compete, and beat not moving."""
+    cell = board.cells[key].get(sequence)
+    if cell is None or cell.failed:
+        return False
+    return board.competes(key, sequence) and not board.no_better_than_static(key, sequence)
+
+
 def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCell] = ()) -> Table:
-    """Median ATE of every tracker on every sequence, with spread, number of runs and failures."""
+    """Median ATE of every tracker on every sequence, with spread, number of runs and failures.
+
+    Args:
+        board: The board.
+        protocol: How errors were computed.
+        reported: Published numbers, which stand in rows of their own below the last line.
+    """
+    # the usual number of runs a cell: only other numbers are printed
     sizes = Counter(len(cell.rows) for key in board.trackers for cell in board.cells[key].values())
-    usual = sizes.most_common(1)[0][0] if sizes else 1
-    marks = column_marks(
-        board,
-        {
-            (key, name): board.cells[key][name].median or 0.0
-            for key in board.ranked
-            for name in board.scored(key)
-        },
-    )
-    rows = []
-    for key in board.trackers:
-        name_cell = TableCell(board.labels[key], tag="imported" * board.first(key).imported)
-        errors = (
-            _error_cell(board, key, name, marks.get((key, name), ""), usual)
-            for name in board.sequences
-        )
-        rows.append([name_cell, *errors])
+    usual_runs = sizes.most_common(1)[0][0] if sizes else 1
+
+    rows = _ate_rows(board, usual_runs)
     rows.append(
         [TableCell(STATIC_CAMERA), *(_static_camera_cell(board, name) for name in board.sequences)]
     )
-    separators = board.separators() | {len(board.trackers)} | ({len(rows)} if reported else set())
-    for (name, tag), published in grouped(reported, lambda cell: (cell.system, cell.tag)).items():
-        line = {cell.sequence: cell for cell in reversed(published)}
-        printed = [line.get(sequence) for sequence in board.sequences]
-        cells = [
-            TableCell(mm(p.value), value=p.value, tip=p.source) if p else TableCell()
-            for p in printed
-        ]
-        rows.append([TableCell(name, tag=tag), *cells])
-    muted = board.unranked_rows(board.trackers) | set(range(len(board.trackers), len(rows)))
-    first = board.sequences[0]
-    names = (
-        ""
-        if board.short[first] == first
-        else f"'{board.short[first]}' stands for {first}, and so on. "
-    )
-    caption = (
-        f"Median ATE (RMSE, millimetres; metres in the CSV) over the runs of a cell ({usual} unless n says otherwise), "
-        "lost frames held at the last tracked pose. Behind it half the interquartile range of the runs that differ, or "
-        "'deterministic' where several seeds gave one result to the last digit. A run that failed counts as a static "
-        "camera, or worse; a cell with a failure is neither bold nor blue, and is marked where "
-        f"nothing succeeded. Colour: ratio to {board.reference_name}, from blue (a quarter or less) to orange (four "
-        f"times or more). Bold best, italic second among ranked trackers. {names}{protocol.describe()}."
-    )
+    separators = board.separators() | {len(board.trackers)}
     if reported:
-        caption += (
-            " Rows marked 'reported' are published numbers, not runs: their protocol is stated by their source only, "
-            "and lost frames are left out of most. Rows marked 'claimed by the paper' are the implemented paper's own, "
-            "which contradict themselves (see the audit). Rows marked 'record' are the lowest errors found in print "
-            "under such a protocol, by sequence: whose each is, and how it was read, is told by its cell."
-        )
+        separators |= {len(rows)}
+        rows += _reported_rows(board, reported)
+    muted = board.unranked_rows(board.trackers) | set(range(len(board.trackers), len(rows)))
+
+    caption = _per_sequence_caption(board, protocol, usual_runs)
+    if reported:
+        caption += f" {_REPORTED_NOTE}"
     columns = [*texts("tracker"), *sequence_columns(board)]
     if any(row.seen_in_training for row in board.rows):
         columns.append(Column(f"{SEEN} trained on", numeric=False, meaning=SEEN_NOTE))
-        for key, row in zip_longest(board.trackers, rows):
-            cells_of = board.cells.get(key, {})
-            trained = [
-                name for name in board.sequences if name in cells_of and cells_of[name].in_training
-            ]
-            row.append(TableCell(", ".join(board.short[name] for name in trained)))
+        _append_trained_scenes(board, rows)
         caption += f" {SEEN_NOTE}"
     return Table(
         "per_sequence",
@@ -640,6 +698,78 @@ def per_sequence(board: Board, protocol: Protocol, reported: Sequence[ReportedCe
         separators,
         "Absolute trajectory error (RMSE, mm), lost frames held",
     )
+
+
+def _ate_rows(board: Board, usual_runs: int) -> list[list[TableCell]]:
+    """The rows of the trackers: name, and the median ATE on each sequence."""
+    medians_m = {}
+    for key in board.ranked:
+        for sequence in board.scored(key):
+            medians_m[key, sequence] = board.cells[key][sequence].median or 0.0
+    marks = column_marks(board, medians_m)
+
+    rows = []
+    for key in board.trackers:
+        tag = "imported" if board.first(key).imported else ""
+        cells = [TableCell(board.labels[key], tag=tag)]
+        for sequence in board.sequences:
+            mark = marks.get((key, sequence), "")
+            cells.append(_ate_cell(board, key, sequence, mark, usual_runs))
+        rows.append(cells)
+    return rows
+
+
+def _reported_rows(board: Board, reported: Sequence[ReportedCell]) -> list[list[TableCell]]:
+    """The rows of published numbers: one a system and kind of source."""
+    rows = []
+    by_system = grouped(reported, lambda cell: (cell.system, cell.tag))
+    for (system, tag), published in by_system.items():
+        # of several numbers for a sequence the first one stands
+        by_sequence = {cell.sequence: cell for cell in reversed(published)}
+        cells = [TableCell(system, tag=tag)]
+        for sequence in board.sequences:
+            printed = by_sequence.get(sequence)
+            if printed is None:
+                cells.append(TableCell())
+            else:
+                cells.append(TableCell(mm(printed.value), value=printed.value, tip=printed.source))
+        rows.append(cells)
+    return rows
+
+
+def _append_trained_scenes(board: Board, rows: Sequence[list[TableCell]]) -> None:
+    """Append to every row the sequences that the tracker's network was trained on."""
+    # rows behind those of the trackers have no key, and get an empty cell
+    for key, row in zip_longest(board.trackers, rows):
+        cells = board.cells.get(key, {})
+        trained = [name for name in board.sequences if name in cells and cells[name].in_training]
+        row.append(TableCell(", ".join(board.short[name] for name in trained)))
+
+
+def _per_sequence_caption(board: Board, protocol: Protocol, usual_runs: int) -> str:
+    """How to read the errors by sequence."""
+    first = board.sequences[0]
+    short_names = ""
+    if board.short[first] != first:
+        short_names = f"'{board.short[first]}' stands for {first}, and so on. "
+    return (
+        f"Median ATE (RMSE, millimetres; metres in the CSV) over the runs of a cell ({usual_runs} unless n says "
+        "otherwise), lost frames held at the last tracked pose. Behind it half the interquartile range of the runs "
+        "that differ, or 'deterministic' where several seeds gave one result to the last digit. A run that "
+        "failed counts as a static camera, or worse; a cell with a failure is neither bold nor blue, and is marked "
+        f"where nothing succeeded. Colour: ratio to {board.reference_name}, from blue (a quarter or less) to "
+        f"orange (four times or more). Bold best, italic second among ranked trackers. {short_names}"
+        f"{protocol.describe()}."
+    )
+
+
+_REPORTED_NOTE = (
+    "Rows marked 'reported' are published numbers, not runs: their protocol is stated by their source only, "
+    "and lost frames are left out of most. Rows marked 'claimed by the paper' are the implemented paper's own, "
+    "which contradict themselves (see the audit). Rows marked 'record' are the lowest errors found in print "
+    "under such a protocol, by sequence: whose each is, and how it was read, is told by its cell."
+)
+"""How to read the rows of published numbers."""
 
 
 def final_errors(board: Board, protocol: Protocol) -> Table | None:
@@ -658,17 +788,15 @@ def final_errors(board: Board, protocol: Protocol) -> Table | None:
 
 def _final_doubt(cell: Cell) -> str:
     """Why the error of a final trajectory says little: it lacks poses of frames that were tracked."""
-    shares = [
-        row.final_coverage / row.coverage
-        for row in cell.rows
-        if row.final_coverage and row.coverage
-    ]
+    # share of the tracked frames with a pose in the final trajectory, by run
+    shares = []
+    for row in cell.rows:
+        if row.final_coverage and row.coverage:
+            shares.append(row.final_coverage / row.coverage)
     least = min(shares, default=1.0)
-    return (
-        f"it has poses of only {100 * least:.0f} % of the tracked frames"
-        if least < FINAL_SHARE
-        else ""
-    )
+    if least >= FINAL_SHARE:
+        return ""
+    return f"it has poses of only {100 * least:.0f} % of the tracked frames"
 
 
 def tracked_errors(board: Board, protocol: Protocol) -> Table | None:
@@ -684,32 +812,44 @@ def tracked_errors(board: Board, protocol: Protocol) -> Table | None:
 
 
 def relative_errors(board: Board, protocol: Protocol) -> list[Table]:
-    """One table for each relative error of the protocol and each of its parts."""
+    """One table for each relative error of the protocol and each of its parts, translation and rotation."""
+    tables = []
+    for spec in protocol.rpe:
+        for part, unit, name in (("trans", "mm", "translation"), ("rot", "°", "rotation")):
+            table = _relative_error_table(board, protocol, spec, part, unit, name)
+            if table is not None:
+                tables.append(table)
+    return tables
 
-    def table(spec: RPESpec, part: str, unit: str, name: str) -> Table | None:
-        per = (
-            {"s": "/s", "f": " per frame"}.get(spec.unit, "")
-            if spec.delta == 1 or spec.rate
-            else ""
-        )
-        return metric_table(
-            board,
-            lambda row: row.metrics.get(spec.metric(part)),
-            f"rpe_{spec.key}_{part}",
-            f"Relative pose error over {spec.describe()}: {name}",
-            f"RMSE in {unit}{per}, median over the runs that succeeded, on the frames that they tracked. "
-            f"{protocol.describe()}.",
-            unit=f"RMSE, {unit}{per}",
-            text=mm if unit == "mm" else significant_text,
-        )
 
-    parts = (("trans", "mm", "translation"), ("rot", "°", "rotation"))
-    return [
-        shown
-        for spec in protocol.rpe
-        for part in parts
-        if (shown := table(spec, *part)) is not None
-    ]
+def _relative_error_table(
+    board: Board, protocol: Protocol, spec: RPESpec, part: str, unit: str, name: str
+) -> Table | None:
+    """The table of one part of a relative error; None if no run has it.
+
+    Args:
+        board: The board.
+        protocol: How errors were computed.
+        spec: The relative error.
+        part: ``trans`` or ``rot``, as metrics name it.
+        unit: Its unit.
+        name: Its name in words.
+    """
+    # an error over one second or frame is a drift in that time
+    per = ""
+    if spec.delta == 1 or spec.rate:
+        per = {"s": "/s", "f": " per frame"}.get(spec.unit, "")
+    metric = spec.metric(part)
+    return metric_table(
+        board,
+        lambda row: row.metrics.get(metric),
+        f"rpe_{spec.key}_{part}",
+        f"Relative pose error over {spec.describe()}: {name}",
+        f"RMSE in {unit}{per}, median over the runs that succeeded, on the frames that they tracked. "
+        f"{protocol.describe()}.",
+        unit=f"RMSE, {unit}{per}",
+        text=mm if unit == "mm" else significant_text,
+    )
 
 
 def rotation_errors(board: Board, protocol: Protocol) -> Table | None:
@@ -718,7 +858,8 @@ def rotation_errors(board: Board, protocol: Protocol) -> Table | None:
         "Absolute rotational error (RMSE in °), median over the runs that succeeded, after the alignment of the "
         f"positions, on the frames that they tracked. {protocol.describe()}."
     )
-    if any(_rotation_doubt(cell) for cells in board.cells.values() for cell in cells.values()):
+    cells = [cell for by_sequence in board.cells.values() for cell in by_sequence.values()]
+    if any(_rotation_doubt(cell) for cell in cells):
         caption += (
             f" {DOUBT} Unreliable: the path hardly determines the alignment's rotation (its standard error is above "
             f"{RELIABLE_DEG:.0f}° in a run of the cell), so the number says nothing of the tracker and takes no part "
@@ -776,71 +917,91 @@ def mask_quality(board: Board) -> Table | None:
 def _rotation_doubt(cell: Cell) -> str:
     """Why the absolute rotational error of a cell says nothing, with the largest uncertainty; empty if it does."""
     uncertain = [row for row in cell.kept if not row.failed and not row.rotation_reliable]
-    largest = max((row.rotation_uncertainty_deg or 0.0 for row in uncertain), default=0.0)
-    return (
-        f"unreliable: the alignment's rotation is known to ±{largest:.0f}° only"
-        if uncertain
-        else ""
-    )
+    if not uncertain:
+        return ""
+    largest_deg = max(row.rotation_uncertainty_deg or 0.0 for row in uncertain)
+    return f"unreliable: the alignment's rotation is known to ±{largest_deg:.0f}° only"
 
 
-def _error_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual: int) -> TableCell:
+def _ate_cell(board: Board, key: str, sequence: str, mark: Emphasis, usual_runs: int) -> TableCell:
+    """The median ATE of a tracker on a sequence, with its spread, remarks and colour.
+
+    Args:
+        board: The board.
+        key: The tracker.
+        sequence: Name of the sequence.
+        mark: Emphasis of the number.
+        usual_runs: Runs that most cells have: only another number is written.
+    """
     cell = board.cells[key].get(sequence)
     if cell is None:
         return TableCell("–", emphasis="muted", tip="not run")
     coverage = f"coverage {coverage_text(mean_of(row.coverage for row in cell.rows))}"
     link = run_link(cell.typical)
-    count = "" if len(cell.rows) == usual else f"n={len(cell.rows)}"
+    count = "" if len(cell.rows) == usual_runs else f"n={len(cell.rows)}"
+
+    # nothing succeeded, or there is no ground truth
     if not cell.success:
-        tip = f"counts as {mm(cell.median)} mm, {coverage}" if cell.median is not None else coverage
+        tip = coverage
+        if cell.median is not None:
+            tip = f"counts as {mm(cell.median)} mm, {coverage}"
         return TableCell(cell.ending, count, emphasis="failed", tip=tip, link=link)
     if cell.median is None:
         return TableCell("", emphasis="muted")
-    skipped = mean_of(row.epipolar_skipped for row in cell.rows)
-    base = board.reference_median(sequence)
+
+    # the number, with remarks behind it
     no_better = board.no_better_than_static(key, sequence)
-    ratio = None if base is None else cell.median / max(base, FLOOR_M)
-    notes = [
-        _spread(cell),
+    skipped = mean_of(row.epipolar_skipped for row in cell.rows)
+    remarks = [
+        _spread_words(cell),
         count,
         "" if skipped is None else f"F skipped {percent(skipped)}",
-        "no better than a static camera" * no_better,
+        "no better than a static camera" if no_better else "",
         f"{cell.success}/{len(cell.rows)} succeeded" if cell.failed else "",
     ]
-    shown = TableCell(
-        mm(cell.median) + SEEN * cell.in_training,
-        ", ".join(filter(None, notes)),
-        cell.median,
-        mark,
-        link=link,
-    )
-    if ratio is None or cell.in_training:
-        return replace(shown, tip=coverage if ratio is None else SEEN_NOTE)
-    best = 0.0 if cell.failed or no_better else -1.0
-    tip = f"{ratio:.2f} × the reference, {coverage}" + (f"; {cell.ending}" if cell.failed else "")
-    return replace(shown, shade=max(shade(ratio), best), tip=tip)
+    words = mm(cell.median) + SEEN * cell.in_training
+    shown = TableCell(words, ", ".join(filter(None, remarks)), cell.median, mark, link=link)
+
+    # its colour: the ratio to the reference; never blue with a failure, or where not moving is as good
+    reference_m = board.reference_median(sequence)
+    if cell.in_training:
+        return replace(shown, tip=coverage if reference_m is None else SEEN_NOTE)
+    if reference_m is None:
+        return replace(shown, tip=coverage)
+    ratio = cell.median / max(reference_m, FLOOR_M)
+    bluest = 0.0 if cell.failed or no_better else -1.0
+    tip = f"{ratio:.2f} × the reference, {coverage}"
+    if cell.failed:
+        tip += f"; {cell.ending}"
+    return replace(shown, shade=max(shade(ratio), bluest), tip=tip)
 
 
-def _spread(cell: Cell) -> str:
+def _spread_words(cell: Cell) -> str:
     """Half the interquartile range in mm, or that there is none."""
     if len(cell.scores) > 1:
-        low, high = np.percentile(cell.scores, [25, 75])
-        return f"±{significant_text(500.0 * float(high - low), 2)}"
+        low_m, high_m = np.percentile(cell.scores, [25, 75])
+        return f"±{significant_text(500.0 * float(high_m - low_m), 2)}"
     return "deterministic" if cell.deterministic else ""
 
 
 def _static_camera_cell(board: Board, sequence: str) -> TableCell:
-    base = board.reference_median(sequence)
-    value = board.static_camera[sequence]
-    if base is None:
-        return TableCell(mm(value), value=value)
-    ratio = value / max(base, FLOOR_M)
-    return TableCell(mm(value), value=value, shade=shade(ratio), tip=f"{ratio:.2f} × the reference")
+    """The error of a static camera on a sequence, coloured by its ratio to the reference's."""
+    static_m = board.static_camera[sequence]
+    reference_m = board.reference_median(sequence)
+    if reference_m is None:
+        return TableCell(mm(static_m), value=static_m)
+    ratio = static_m / max(reference_m, FLOOR_M)
+    tip = f"{ratio:.2f} × the reference"
+    return TableCell(mm(static_m), value=static_m, shade=shade(ratio), tip=tip)
 
 
 def shade(ratio: float) -> float:
-    """-1 at a quarter of the reference's error or less, 0 at the same, 1 at four times or more."""
+    """Colour of a ratio to the reference: -1 at a quarter or less, 0 at the same, 1 at four times or more."""
     return float(np.clip(np.log(max(ratio, 1e-9)) / np.log(4), -1, 1))
+
+
+_VERDICT_SHADES = {"better": shade(0.5), "worse": shade(2.0)}
+"""Colours of verdicts: those of half and of twice the reference's error."""
 
 
 # -- the rules, and the runs
@@ -855,22 +1016,23 @@ def failure_rule_table(board: Board) -> Table | None:
         "lost frames left out": _tracked_error,
         "failures left out too": lambda row: None if row.failed else _tracked_error(row),
     }
-    columns = [
-        *texts("tracker"),
-        *(column for name in rules for column in numbers("#", "ATE ratio", group=name)),
-    ]
-    cells = [
-        {
-            s.key: [rank_cell(s), interval_cell(s.ratio, ".2f")]
-            for s in rank(board, board.ranked, board.ranked, rule)
-        }
-        for rule in rules.values()
-    ]
-    empty = [TableCell(), TableCell()]
-    rows = [
-        [TableCell(board.labels[key]), *(cell for pairs in cells for cell in pairs.get(key, empty))]
-        for key in board.ranked
-    ]
+    columns = texts("tracker")
+    standings_by_rule = []
+    for name, rule in rules.items():
+        columns += numbers("#", "ATE ratio", group=name)
+        standings = rank(board, board.ranked, board.ranked, rule)
+        standings_by_rule.append({standing.key: standing for standing in standings})
+
+    rows = []
+    for key in board.ranked:
+        cells = [TableCell(board.labels[key])]
+        for standings_of in standings_by_rule:
+            standing = standings_of.get(key)
+            if standing is None:
+                cells += [TableCell(), TableCell()]
+            else:
+                cells += [rank_cell(standing), interval_cell(standing.ratio, ".2f")]
+        rows.append(cells)
     return Table(
         "failure_rules",
         "Sensitivity to the rule for lost frames and failures",
@@ -899,6 +1061,7 @@ def failures(board: Board) -> Table | None:
     failed = [row for row in board.rows if row.failed]
     if not failed:
         return None
+    failed.sort(key=lambda r: (board.labels[r.variant_key], board.sequence(r), r.repeat_key))
     columns = [
         *texts("tracker", "sequence", "repeat", "ended"),
         Column("coverage"),
@@ -914,9 +1077,7 @@ def failures(board: Board) -> Table | None:
             TableCell(row.reason),
             TableCell(row.run_id, link=run_link(row)),
         ]
-        for row in sorted(
-            failed, key=lambda r: (board.labels[r.variant_key], board.sequence(r), r.repeat_key)
-        )
+        for row in failed
     ]
     return Table(
         "failures",
@@ -958,19 +1119,27 @@ def repeatability(board: Board) -> Table | None:
 def _spread_cells(board: Board, key: str) -> list[TableCell]:
     """How far the runs of a tracker lie apart; empty if it has no cell with several."""
     cells = {name: board.cells[key][name] for name in board.sequences if name in board.cells[key]}
-    copies = sum(cell.deterministic and cell.success > 1 for cell in cells.values())
+    # cells whose seeds all gave one result, and cells with several different ones
+    n_copies = sum(cell.deterministic and cell.success > 1 for cell in cells.values())
     several = {name: cell for name, cell in cells.items() if len(cell.succeeded) > 1}
-    counts = [TableCell(board.labels[key]), number(len(several)), number(copies)]
+    counts = [TableCell(board.labels[key]), number(len(several)), number(n_copies)]
     if not several:
-        return [*counts, *[TableCell()] * 4] if copies else []
-    errors = {
-        name: [row.score_m or 0.0 for row in cell.succeeded] for name, cell in several.items()
-    }
-    spreads = {name: max(values) / max(min(values), FLOOR_M) for name, values in errors.items()}
+        return [*counts, *[TableCell()] * 4] if n_copies else []
+
+    # the largest error over the smallest one, by sequence
+    spreads = {}
+    for name, cell in several.items():
+        errors_m = [row.score_m or 0.0 for row in cell.succeeded]
+        spreads[name] = max(errors_m) / max(min(errors_m), FLOOR_M)
     widest = max(spreads, key=lambda name: (spreads[name], name))
-    size = f"{median(len(cell.succeeded) for cell in several.values()):g}"
-    ratios = [number(median(spreads.values()), ".2f"), number(spreads[widest], ".2f")]
-    return [*counts, TableCell(size), *ratios, TableCell(widest)]
+    runs_a_cell = median(len(cell.succeeded) for cell in several.values())
+    return [
+        *counts,
+        TableCell(f"{runs_a_cell:g}"),
+        number(median(spreads.values()), ".2f"),
+        number(spreads[widest], ".2f"),
+        TableCell(widest),
+    ]
 
 
 def machines(board: Board) -> Table:
@@ -992,21 +1161,24 @@ def machines(board: Board) -> Table:
 SUBJECT = "emfoa-oft"
 """Tracker whose improvement over the others is shown, where it was run."""
 STATISTICS = {"rmse": "RMSE", "mean": "mean", "median": "median", "std": "SD"}
+"""The statistics of the paper's Tables 1 and 2: their names in metrics, and in headings."""
 LOST_MARK = "¶"
+"""Behind errors of cells in which frames were lost."""
 LOST_NOTE = (
     f"{LOST_MARK} Frames were lost in a run of the cell: the error is of the tracked ones only."
 )
+"""What `LOST_MARK` means, for captions."""
 
 
 def subject_of(board: Board) -> str | None:
     """The tracker that is compared with the others: `SUBJECT` as it is by default, else the best ranked one."""
-    own = [
-        key
-        for key in board.trackers
-        if board.first(key).tracker.id == SUBJECT and key not in board.hopeless
-    ]
+    variants = []
+    for key in board.trackers:
+        if board.first(key).tracker.id == SUBJECT and key not in board.never_succeeded:
+            variants.append(key)
     best = board.ranked[0] if board.ranked else None
-    return min(own, key=lambda key: len(board.first(key).variant), default=best)
+    # the variant with the fewest changed settings
+    return min(variants, key=lambda key: len(board.first(key).variant), default=best)
 
 
 def absolute_table(board: Board, protocol: Protocol) -> Table | None:
@@ -1018,7 +1190,7 @@ def absolute_table(board: Board, protocol: Protocol) -> Table | None:
 
 
 def relative_table(board: Board, protocol: Protocol) -> Table | None:
-    """Table 2: the same of the protocol's first relative error; None if it has none."""
+    """Table 2: the four statistics of the protocol's first relative error; None if it has none."""
     if not protocol.rpe:
         return None
     spec = protocol.rpe[0]
@@ -1034,15 +1206,14 @@ def relative_table(board: Board, protocol: Protocol) -> Table | None:
 
 def time_table(board: Board) -> Table | None:
     """Table 3: accuracy, error and time of a frame; None if nothing was scored."""
+    errors = medians(board, _percent_of_static_camera)
+    if not errors:
+        return None
     measures = {
-        "accuracy (%)": medians(
-            board, lambda row: None if (share := _share(row)) is None else 100 - share
-        ),
-        "error (%)": medians(board, _share),
+        "accuracy (%)": medians(board, _accuracy_percent),
+        "error (%)": errors,
         "time (ms)": _frame_times(board),
     }
-    if not measures["error (%)"]:
-        return None
     caption = (
         "As the paper's Table 3. Error: the median ATE, lost frames held, in percent of that of a static camera"
         "; accuracy: what is left of 100 %, negative for a tracker that is worse than that. (The paper does "
@@ -1064,32 +1235,46 @@ def time_table(board: Board) -> Table | None:
 
 def _frame_times(board: Board) -> dict[tuple[str, str], float]:
     """Median frame time in milliseconds by tracker and sequence, of runs on the board's `timing_computer`."""
-    times = {}
+    times_ms = {}
     for key, cells in board.cells.items():
-        for name, cell in cells.items():
+        for sequence, cell in cells.items():
             rows = [row for row in cell.succeeded if row.computer == board.timing_computer]
-            frame_ms = middle(row.frame_ms for row in timed(rows))
+            frame_ms = median_of(row.frame_ms for row in timed(rows))
             if frame_ms is not None:
-                times[key, name] = frame_ms
-    return times
+                times_ms[key, sequence] = frame_ms
+    return times_ms
 
 
-def _share(row: RunRow) -> float | None:
+def _percent_of_static_camera(row: RunRow) -> float | None:
     """A run's error in percent of that of a static camera."""
     static_m = row.static_camera_ate_rmse_m
-    return (
-        None
-        if not static_m or row.hold_last_pose_ate_m is None
-        else 100 * row.hold_last_pose_ate_m / static_m
-    )
+    if not static_m or row.hold_last_pose_ate_m is None:
+        return None
+    return 100 * row.hold_last_pose_ate_m / static_m
+
+
+def _accuracy_percent(row: RunRow) -> float | None:
+    """What a run's error in percent of a static camera's leaves of 100 %."""
+    error_percent = _percent_of_static_camera(row)
+    return None if error_percent is None else 100 - error_percent
 
 
 def _statistics_table(
     board: Board, metrics: Mapping[str, str], name: str, title: str, source: str, brief: str
 ) -> Table | None:
+    """A table of several statistics of one error, with the subject's improvement over the others below a line.
+
+    Args:
+        board: The board.
+        metrics: Statistic to the name of the metric.
+        name: Id of the table.
+        title: Heading.
+        source: First sentences of the caption.
+        brief: Caption where there is little room.
+    """
     errors = {
-        kind: medians(board, lambda row, metric=metric: row.metrics.get(metric))  # type: ignore[misc]
-        for kind, metric in metrics.items()
+        statistic: medians(board, partial(_metric_of, metric=metric))
+        for statistic, metric in metrics.items()
     }
     if not errors["rmse"]:
         return None
@@ -1102,51 +1287,54 @@ def _statistics_table(
         brief,
         behind=lambda cell: SEEN * cell.in_training + LOST_MARK * has_lost(cell),
     )
-    table.caption += f" {LOST_NOTE}" * any(
-        cell.text.endswith(LOST_MARK) for row in table.rows for cell in row
-    )
-    keys = {key for key, _ in errors["rmse"]}
+    if any(cell.text.endswith(LOST_MARK) for row in table.rows for cell in row):
+        table.caption += f" {LOST_NOTE}"
+    _append_improvements(board, table, errors)
+    return table
+
+
+def _metric_of(row: RunRow, metric: str) -> float | None:
+    """A metric of a run by its name; None if the run has none."""
+    return row.metrics.get(metric)
+
+
+def _append_improvements(board: Board, table: Table, errors: Mapping[str, Values]) -> None:
+    """Append a row for each other ranked tracker: by how many percent the subject's errors are smaller."""
+    measured = {key for key, _ in errors["rmse"]}
     subject = subject_of(board)
-    others = [key for key in board.ranked if key in keys and key != subject]
-    if subject not in keys or not others:
-        return table
+    others = [key for key in board.ranked if key in measured and key != subject]
+    if subject not in measured or not others:
+        return
     table.caption += (
         f" Below the line: by how many percent the error of {board.labels[subject]} is smaller than that of "
         "the other tracker."
     )
     table.separators |= {len(table.rows)}
-
-    def gain(other: str, sequence: str, values: Values) -> float | None:
-        ours, theirs = values.get((subject, sequence)), values.get((other, sequence))
-        return None if ours is None or not theirs else 100 * (theirs - ours) / theirs
-
     for other in others:
-        gains = (
-            gain(other, sequence, values)
-            for sequence in board.sequences
-            for values in errors.values()
-        )
-        name_cell = TableCell(f"improvement on {board.labels[other]}")
-        table.rows.append([name_cell, *(number(percents, ".1f", " %") for percents in gains)])
-    return table
+        cells = [TableCell(f"improvement on {board.labels[other]}")]
+        for sequence in board.sequences:
+            for values in errors.values():
+                ours = values.get((subject, sequence))
+                theirs = values.get((other, sequence))
+                if ours is None or not theirs:
+                    cells.append(TableCell())
+                else:
+                    cells.append(number(100 * (theirs - ours) / theirs, ".1f", " %"))
+        table.rows.append(cells)
 
 
 def sequence_columns(board: Board, kinds: Sequence[str] = ("",)) -> list[Column]:
-    """One column for every sequence, grouped; of several kinds of numbers one for each of them."""
-    if len(kinds) == 1:
-        return [
-            Column(board.short[name], group=board.groups[name], meaning=name, full=name)
-            for name in board.sequences
-        ]
-    return [
-        Column(
-            STATISTICS.get(kind, kind),
-            board.short[name],
-            full=f"{name}: {STATISTICS.get(kind, kind)}",
-        )
-        for name in board.sequences
-        for kind in kinds
-    ]
+    """One column for every sequence, in its group; for several kinds of numbers one column a sequence and kind."""
+    columns = []
+    for name in board.sequences:
+        if len(kinds) == 1:
+            column = Column(board.short[name], group=board.groups[name], meaning=name, full=name)
+            columns.append(column)
+            continue
+        for kind in kinds:
+            heading = STATISTICS.get(kind, kind)
+            columns.append(Column(heading, board.short[name], full=f"{name}: {heading}"))
+    return columns
 
 
 def has_lost(cell: Cell) -> bool:

@@ -288,7 +288,7 @@ def test_two_trackers_side_by_side_have_the_numbers_of_the_board(boards):
     shown = ratios_content(board)
     assert len(shown) == len(board.trackers) * (len(board.trackers) - 1) // 2
     for a, b, *ratio, sequences, verdict in (line for line in shown if reference in line[:2]):
-        standing = board.placed[board.trackers[b if a == reference else a]]
+        standing = board.standing_by_key[board.trackers[b if a == reference else a]]
         value, low, high = ratio if a == reference else (1 / ratio[0], 1 / ratio[2], 1 / ratio[1])
         expected = standing.ratio
         assert (value, low, high) == pytest.approx(
@@ -310,7 +310,7 @@ def test_exact_masks_are_a_bound_and_never_rank_beside_others():
     bound = next(key for key in board.labels if "oracle" in key)
     assert bound not in board.ranked
     assert len(board.ranked) == 4
-    assert board.placed[bound].ratio.value == pytest.approx(0.1)
+    assert board.standing_by_key[bound].ratio.value == pytest.approx(0.1)
     assert make_board(exact).ranked == [bound], "alone they rank"
 
 
