@@ -475,9 +475,7 @@ def test_an_edit_counts_for_the_kernels_that_it_is_compiled_into(tmp_path: Path)
 
     # a constant, where it is used
     layout = package / "flow" / "layout.py"
-    assert changed_by(layout, "ANGLE_LOW = -6", "ANGLE_LOW = -5") == {
-        "flow.matching_cost.describe"
-    }
+    assert changed_by(layout, "ANGLE_LOW = -6", "ANGLE_LOW = -5") == {"flow.matching_cost.describe"}
 
     # an inlined function
     solver = package / "geometry" / "gauss_newton.py"
