@@ -368,7 +368,7 @@ def run_phase(
                     trials[0], scrambled(random), lower, upper, flames[0], window, rules.shrink
                 )
                 window *= rules.shrink
-                # below a pixel the window begins anew
+                # below a pixel the window begins again
                 if window * (upper[0] - lower[0]) < np.float32(1):
                     window = np.float32(0.5)
 
