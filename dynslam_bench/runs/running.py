@@ -38,7 +38,7 @@ from dynslam_bench.core import (
     raising,
     reason_of,
 )
-from dynslam_bench.core.fingerprint import git_revision, this_machine, versions
+from dynslam_bench.core.fingerprint import git_revision, path_digest, this_machine, versions
 from dynslam_bench.core.plugins import ENVIRONMENT_VARIABLE
 from dynslam_bench.core.reads import Reads
 from dynslam_bench.core.records import digest
@@ -49,7 +49,7 @@ from dynslam_bench.runs.exchange.recording import RECORDING_FILE
 from dynslam_bench.runs.frames import FRAMES_FILE, FrameLog
 from dynslam_bench.runs.identity import ResolvedRun, Resolver, check_unchanged, resolve
 from dynslam_bench.runs.lookup import LookUp
-from dynslam_bench.runs.own_code import plugins_of_run
+from dynslam_bench.runs.own_code import is_file, module_of, plugins_of_run
 from dynslam_bench.runs.process.child import LOG_FILE, READS_FILE
 from dynslam_bench.runs.process.fork_server import Child, ForkServer, make_job
 from dynslam_bench.runs.process.supervisor import (
@@ -687,7 +687,7 @@ class _Bench:
                     run, _ = self.waiting.pop(0)
                     self._report("started", run)
                     spec = run.spec.model_copy(update={"device": run.device})
-                    asked = (spec.model_dump_json(), protocol, json.dumps(run.stated))
+                    asked = (spec.model_dump_json(), protocol, json.dumps(_expected(run)))
                     sent[_asked(executor.submit, run_packed, *asked)] = run
                 for future in wait(sent, return_when=FIRST_COMPLETED).done:
                     self._attempt(sent.pop(future), partial(self._take, future))
@@ -770,6 +770,16 @@ def _lacks_pictures(store: RunStore, run: ResolvedRun, stored: RunRecord) -> boo
 _ENTRY = re.compile(r"(runs|sequences)/([0-9a-f]{16}(?:[0-9a-f]{4})?)/([A-Za-z0-9_]+\.[a-z0-9]+)")
 
 
+def _expected(run: ResolvedRun) -> dict[str, Any]:
+    """What a worker has to find where it looks a run up: its identity, and the same files of plug-ins.
+
+    A plug-in's file counts in the identity as it is read, which is after the run.
+    """
+    parts = [part for part in run.identity["parts"] if is_file(part)]
+    files = {part: path_digest(Path(run.anchors.path(module_of(part)))) for part in parts}
+    return run.stated | {"plug-ins": files}
+
+
 def run_packed(
     spec_json: str, protocol_json: str, identity_json: str, *, at_a_time: int = 1
 ) -> bytes:
@@ -795,7 +805,7 @@ def run_packed(
     except DynslamError as error:
         raise RunError(f"{name} cannot make the run: {error.args[0]}", error.hint) from error
     asked = json.loads(identity_json)
-    own = resolved.stated
+    own = _expected(resolved)
     differing = [
         key for key in sorted(asked | own) if asked.get(key) != own.get(key) and key != "machine"
     ]

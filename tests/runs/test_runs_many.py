@@ -601,7 +601,7 @@ def test_runs_are_made_by_the_workers_that_can_make_them(
     reasons = sorted(str(reason) for reason in refusals.values())
     assert len(reasons) == 2
     assert "is not at" in reasons[0]
-    assert "source differ" in reasons[1]
+    assert "plug-ins differ" in reasons[1]
     run_many(asked, results=here)
     assert by_request(here) == by_request(there)
 
