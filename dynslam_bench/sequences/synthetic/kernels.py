@@ -1,6 +1,7 @@
 """The renderer's numba kernels: intersections of rays, tiles, antialiased shading, flow, motion blur, two sensors."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,75 +9,141 @@ from numpy.typing import NDArray
 from dynslam_bench.core.compiled import Scalar, dividing_kernel
 from dynslam_bench.sequences.synthetic.arithmetic import atan2 as _atan2
 from dynslam_bench.sequences.synthetic.parts import BOX, ROUND_CONE
+from dynslam_bench.sequences.synthetic.textures import Atlas
 
 Ints = NDArray[np.integer]
 Reals = NDArray[np.floating]
 Intrinsics = tuple[float, float, float, float]
 """Focal lengths and principal point, pixels."""
+Vector = tuple[float, float, float]
+
+
+class Tiles(NamedTuple):
+    """For each tile of the image the primitives that may be seen in it.
+
+    Attributes:
+        columns: Tiles in a row.
+        start: int32 ``[tiles + 1]`` where each tile's list begins in `members`.
+        members: int32, the lists; the primitive with the nearest bound comes first.
+        nearest: ``[P]`` least depth of every primitive, metres.
+    """
+
+    columns: int
+    start: Ints
+    members: Ints
+    nearest: Reals
+
+
+class Primitives(NamedTuple):
+    """The shapes of a scene and where a frame sees them.
+
+    Attributes:
+        kind: int32 ``[P]``: `BOX`, `ROUND_CONE` or `QUAD`.
+        camera_to_local: ``[R, P, 12]`` maps (row-major 3x4) from the camera to the primitives'
+            frames: one for all rows of the image, or one for each row under a rolling shutter.
+        shape: ``[P, 3]``: half extents, or height and two radii of a round cone.
+    """
+
+    kind: Ints
+    camera_to_local: Reals
+    shape: Reals
+
+
+class Materials(NamedTuple):
+    """What the faces of the primitives look like.
+
+    Attributes:
+        texture: int32 ``[P, 6]`` number of each face's texture in the atlas.
+        uv: ``[P, 6, 4]`` repeats and shift of the texture along both axes of each face.
+        tint: ``[P, 3]`` factor of each colour channel.
+        facets: ``[P, 6, 5]`` unit normal of each face in the camera frame (boxes and quads), its
+            light, and for all primitives the texels a pixel at 1 m.
+    """
+
+    texture: Ints
+    uv: Reals
+    tint: Reals
+    facets: Reals
+
+
+class DepthModel(NamedTuple):
+    """What the structured-light depth camera measures; see `settings.DepthSensor`.
+
+    Attributes:
+        fx: Focal length, pixels.
+        baseline_m: From the camera to the projector.
+        disparity_noise_px: Standard deviation of the disparity.
+        near_m: Nothing nearer is measured.
+        far_m: Nothing further is measured.
+        edge_px: Half the window in which a depth edge spoils the correlation.
+        dark: Least albedo x cosine / z^2 that still gives a measurement.
+        units_per_m: Raw units of the depth images a metre.
+    """
+
+    fx: float
+    baseline_m: float
+    disparity_noise_px: float
+    near_m: float
+    far_m: float
+    edge_px: int
+    dark: float
+    units_per_m: float
 
 
 # Intersections of rays with primitives.
+#
+# A ray is given in the local frame of a primitive: origin + t * direction. The direction has depth
+# 1 in the camera frame, so that t is the z-depth of the hit.
 
 NEAR_M = 0.05
 """Nothing nearer than this is seen, metres."""
 
 
 @dividing_kernel
-def hit_box(
-    ox: float,
-    oy: float,
-    oz: float,
-    dx: float,
-    dy: float,
-    dz: float,
-    hx: float,
-    hy: float,
-    hz: float,
-    t_max: float,
-) -> tuple[float, int]:
-    """Nearest hit of a ray with a box from outside: (t, face), face = 2 * axis + (1 if the positive side)."""
+def hit_box(origin: Vector, direction: Vector, half: Vector, t_max: float) -> tuple[float, int]:
+    """Nearest hit of a ray with a box from outside: (t, face), face = 2 * axis + (1 if the positive side).
+
+    Args:
+        origin: Origin of the ray in the box's frame.
+        direction: Direction of the ray.
+        half: Half extents of the box.
+        t_max: Hits from here on do not count.
+    """
+    # Slab method: the ray is inside the box between its last entry into and its first exit from a
+    # pair of parallel planes.
     t_in = -1.0e30
     t_out = 1.0e30
     face = -1
-    origin = (ox, oy, oz)
-    direction = (dx, dy, dz)
-    half = (hx, hy, hz)
     for axis in range(3):
         o = origin[axis]
         d = direction[axis]
         h = half[axis]
         if abs(d) < 1e-12:
+            # parallel to the planes: between them or never
             if abs(o) > h:
                 return 1e30, -1
         else:
             inv = 1.0 / d
-            a = (-h - o) * inv
-            b = (h - o) * inv
-            side = 2 * axis
-            if a > b:
-                a, b, side = b, a, side + 1
-            if a > t_in:
-                t_in = a
-                face = side
-            t_out = min(t_out, b)
+            entry = (-h - o) * inv
+            leave = (h - o) * inv
+            entry_face = 2 * axis
+            if entry > leave:
+                entry, leave, entry_face = leave, entry, entry_face + 1
+            if entry > t_in:
+                t_in = entry
+                face = entry_face
+            t_out = min(t_out, leave)
     if t_in > t_out or t_in < NEAR_M or t_in >= t_max:
         return 1e30, -1
     return t_in, face
 
 
 @dividing_kernel
-def hit_sphere(
-    ox: float,
-    oy: float,
-    oz: float,
-    dx: float,
-    dy: float,
-    dz: float,
-    dd: float,
-    r: float,
-    best: float,
-) -> float:
+def hit_sphere(origin: Vector, direction: Vector, dd: float, r: float, best: float) -> float:
     """Nearest hit with a sphere about the origin if it is before `best`, else that; dd is the direction's square."""
+    ox, oy, oz = origin
+    dx, dy, dz = direction
+    # |o + t d|^2 = r^2, by half the linear coefficient
     b = ox * dx + oy * dy + oz * dz
     disc = b * b - dd * (ox * ox + oy * oy + oz * oz - r * r)
     if disc < 0.0:
@@ -86,19 +153,18 @@ def hit_sphere(
 
 
 @dividing_kernel
-def hit_round_cone(
-    ox: float,
-    oy: float,
-    oz: float,
-    dx: float,
-    dy: float,
-    dz: float,
-    h: float,
-    r1: float,
-    r2: float,
-    t_max: float,
-) -> float:
-    """Nearest hit with the hull of a sphere r1 at the origin and a sphere r2 at (0, 0, h); h = 0 is a sphere."""
+def hit_round_cone(origin: Vector, direction: Vector, shape: Vector, t_max: float) -> float:
+    """Nearest hit with the hull of a sphere r1 at the origin and a sphere r2 at (0, 0, h); h = 0 is a sphere.
+
+    Args:
+        origin: Origin of the ray in the cone's frame.
+        direction: Direction of the ray.
+        shape: h, r1 and r2.
+        t_max: Hits from here on do not count.
+    """
+    ox, oy, oz = origin
+    dx, dy, dz = direction
+    h, r1, r2 = shape
     best = 1e30
     dd = dx * dx + dy * dy + dz * dz
     # Bounding sphere first: most rays of a tile miss.
@@ -107,9 +173,8 @@ def hit_round_cone(
     b = ox * dx + oy * dy + cz * dz
     if b * b < dd * (ox * ox + oy * oy + cz * cz - rb * rb):
         return best
+    # The side. Tangent cone: sin(alpha) = s = (r1 - r2) / h; x^2 + y^2 = (r1 - s z)^2 / (1 - s^2).
     if h > 0.0:
-        # Tangent cone: sin(alpha) = s = (r1 - r2) / h; its side is x^2 + y^2 = (r1 - s z)^2 / (1 -
-        # s^2).
         s = (r1 - r2) / h
         k = 1.0 / (1.0 - s * s)
         w = r1 - s * oz
@@ -124,33 +189,37 @@ def hit_round_cone(
             # The side counts between the two circles of tangency.
             if NEAR_M < t and r1 * s <= z <= h + r2 * s and r1 - s * z > 0.0:
                 best = t
-    best = hit_sphere(ox, oy, oz, dx, dy, dz, dd, r1, best)
+    # The two spheres.
+    best = hit_sphere(origin, direction, dd, r1, best)
     if h > 0.0:
-        best = hit_sphere(ox, oy, oz - h, dx, dy, dz, dd, r2, best)
+        best = hit_sphere((ox, oy, oz - h), direction, dd, r2, best)
     return 1e30 if best >= t_max else best
-
-
-# Ray casting over tiles, and antialiasing of edges.
 
 
 @dividing_kernel
 def hit_primitive(
-    kind: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, a: float, b: float, c: float,
-    t_max: float,
-) -> tuple[float, int]:  # fmt: skip
+    kind: int, origin: Vector, direction: Vector, shape: Vector, t_max: float
+) -> tuple[float, int]:
     """Nearest hit of a ray with a primitive before `t_max`: (t, face); face is -1 without one."""
     if kind == ROUND_CONE:
-        t = hit_round_cone(ox, oy, oz, dx, dy, dz, a, b, c, t_max)
+        t = hit_round_cone(origin, direction, shape, t_max)
         return t, 0 if t < t_max else -1
     if kind == BOX:
-        return hit_box(ox, oy, oz, dx, dy, dz, a, b, c, t_max)
-    t = -oz / dz
-    return t, 4 if NEAR_M < t < t_max and abs(ox + t * dx) <= a and abs(oy + t * dy) <= b else -1
+        return hit_box(origin, direction, shape, t_max)
+    # a quad in the plane z = 0
+    t = -origin[2] / direction[2]
+    x = origin[0] + t * direction[0]
+    y = origin[1] + t * direction[1]
+    return t, 4 if NEAR_M < t < t_max and abs(x) <= shape[0] and abs(y) <= shape[1] else -1
 
+
+# Ray casting over tiles, and antialiasing of edges.
 
 TILE = 8
-atan2 = dividing_kernel(_atan2)
+"""Edge of a tile, pixels."""
 _PER_TURN = 1.0 / (2.0 * math.pi)
+"""Radians to turns."""
+atan2 = dividing_kernel(_atan2)
 
 
 @dividing_kernel
@@ -166,6 +235,7 @@ def bin_tiles(order: Ints, boxes: Ints, tiles_x: int, tiles_y: int) -> tuple[Int
     Returns:
         (start int32 ``[tiles + 1]``, list int32).
     """
+    # Counting sort: lengths of the lists, their starts, then the lists.
     start = np.zeros(tiles_x * tiles_y + 1, np.int32)
     for n in range(order.shape[0]):
         p = order[n]
@@ -192,18 +262,31 @@ def bin_tiles(order: Ints, boxes: Ints, tiles_x: int, tiles_y: int) -> tuple[Int
 
 @dividing_kernel
 def cast_geometry(
-    row0: int, row1: int, intrinsics: Intrinsics, tiles_x: int, start: Ints, members: Ints, zmin: Reals, kind: Ints,
-    local: Reals, shape: Reals, hit: Ints, depth: Reals,
-) -> None:  # fmt: skip
-    """Primitive (``hit`` int32, 8 * index + face, -1 for none) and z-depth (float64) at the pixel centres of rows.
+    row0: int,
+    row1: int,
+    intrinsics: Intrinsics,
+    tiles: Tiles,
+    primitives: Primitives,
+    hit: Ints,
+    depth: Reals,
+) -> None:
+    """Cast a ray through every pixel centre of the rows `row0` to `row1` - 1.
 
-    ``local`` [R, P, 12] maps the camera to the primitives' frames: one for all rows, or one for
-    each row of the image. What the neighbouring pixel of the tile saw is tried first.
+    Args:
+        row0: First row.
+        row1: One past the last row.
+        intrinsics: The camera.
+        tiles: Candidates of each tile.
+        primitives: The shapes.
+        hit: int32 ``[H, W]``, filled with 8 * primitive + face, -1 for none.
+        depth: float64 ``[H, W]``, filled with z-depths in metres, 0 for none.
     """
     fx, fy, cx, cy = intrinsics
+    tiles_x, start, members, zmin = tiles
+    kind, camera_to_local, shape = primitives
     width = hit.shape[1]
     for row in range(row0, row1):
-        maps = local[row % len(local)]
+        maps = camera_to_local[row % len(camera_to_local)]
         y = (row - cy) / fy
         last = -1
         for column in range(width):
@@ -216,24 +299,26 @@ def cast_geometry(
             t = 1e30
             p = -1
             face = 0
+            # What the neighbouring pixel of the tile saw is tried first: its hit ends the search
+            # soon.
             for n in range(first - 1 if last >= 0 else first, end):
                 q = last
                 if n >= first:
                     q = members[n]
+                    # no later one of the list is nearer than this hit
                     if zmin[q] >= t:
                         break
                     if q == last:
                         continue
-                dx = maps[q, 0] * x + maps[q, 1] * y + maps[q, 2]
-                dy = maps[q, 4] * x + maps[q, 5] * y + maps[q, 6]
-                dz = maps[q, 8] * x + maps[q, 9] * y + maps[q, 10]
-                ox = maps[q, 3]
-                oy = maps[q, 7]
-                oz = maps[q, 11]
-                a = shape[q, 0]
-                b = shape[q, 1]
-                c = shape[q, 2]
-                t_hit, face_hit = hit_primitive(kind[q], ox, oy, oz, dx, dy, dz, a, b, c, t)
+                # the ray in the primitive's frame
+                direction = (
+                    maps[q, 0] * x + maps[q, 1] * y + maps[q, 2],
+                    maps[q, 4] * x + maps[q, 5] * y + maps[q, 6],
+                    maps[q, 8] * x + maps[q, 9] * y + maps[q, 10],
+                )
+                origin = (maps[q, 3], maps[q, 7], maps[q, 11])
+                extent = (shape[q, 0], shape[q, 1], shape[q, 2])
+                t_hit, face_hit = hit_primitive(kind[q], origin, direction, extent, t)
                 if face_hit >= 0:
                     t = t_hit
                     p = q
@@ -244,47 +329,115 @@ def cast_geometry(
 
 
 @dividing_kernel
-def shade_pixels(
-    row0: int, row1: int, intrinsics: Intrinsics, tiles_x: int, start: Ints, members: Ints, zmin: Reals, kind: Ints,
-    local: Reals, shape: Reals, texture: Ints, uv: Reals, tint: Reals, facets: Reals, atlas: Ints, level_offset: Ints,
-    log2_size: Ints, lights: Reals, hit: Ints, depth: Reals, jitter: Reals, color: Reals, cosine: Reals,
-) -> None:  # fmt: skip
-    """Colour (float32, 0-255 scale) and cosine of incidence of rows.
+def round_cone_normal_z(z: float, shape: Vector) -> float:
+    """Third component n of the normal (x, y, n), of no special length, at a point (x, y, z) of a round cone.
 
-    ``facets`` [P, 6, 5] holds for each face its unit normal in the camera frame (boxes and quads),
-    its light, and for all primitives the texels a pixel at 1 m. Pixels on an edge are the mean of
-    the ``jitter`` [S, 2] samples (offsets in pixels); each surface that these meet is shaded once,
-    at the first of its samples.
+    Args:
+        z: Local height of the point.
+        shape: h, r1 and r2 of the round cone.
+    """
+    h, r1, r2 = shape
+    normal_z = z
+    if h > 0.0:
+        s = (r1 - r2) / h
+        if z >= h + r2 * s:
+            # the sphere at (0, 0, h)
+            normal_z = z - h
+        elif z > r1 * s:
+            # the side between the circles of tangency
+            normal_z = s * (r1 - s * z) / (1.0 - s * s)
+    return normal_z
+
+
+@dividing_kernel
+def mip_level(footprint: float, log2_size: int) -> tuple[int, float]:
+    """The mip level at which a pixel covers one to two texels, and the weight of the next coarser level.
+
+    Args:
+        footprint: Square of the texels that the pixel covers, at the finest level.
+        log2_size: Base-2 logarithm of the texture's edge.
+    """
+    level = 0
+    while footprint > 4.0 and level < log2_size - 1:
+        footprint *= 0.25
+        level += 1
+    return level, min(max((footprint - 1.0) * (1.0 / 3.0), 0.0), 1.0)
+
+
+@dividing_kernel
+def shade_pixels(
+    row0: int,
+    row1: int,
+    intrinsics: Intrinsics,
+    tiles: Tiles,
+    primitives: Primitives,
+    materials: Materials,
+    atlas: Atlas,
+    lights: Reals,
+    hit: Ints,
+    depth: Reals,
+    jitter: Reals,
+    color: Reals,
+    cosine: Reals,
+) -> None:
+    """Shade the pixels of the rows `row0` to `row1` - 1.
+
+    A pixel inside a surface has the colour at its centre. A pixel on an edge has the mean of the
+    `jitter` samples; each surface that these meet is shaded once, at the first of its samples.
+
+    Args:
+        row0: First row.
+        row1: One past the last row.
+        intrinsics: The camera.
+        tiles: Candidates of each tile.
+        primitives: The shapes.
+        materials: What their faces look like.
+        atlas: The textures.
+        lights: ``[1 + lamps, 4]`` direction in the camera frame and strength; row 0 is the ambient
+            light.
+        hit: int32 ``[H, W]``, see `cast_geometry`.
+        depth: float64 ``[H, W]``, see `cast_geometry`.
+        jitter: ``[S, 2]`` offsets of the samples from the pixel's centre, pixels.
+        color: float32 ``[H, W, 3]``, filled with colours from 0 to 255.
+        cosine: float32 ``[H, W]``, filled with the cosine of incidence at the pixel's centre.
     """
     fx, fy, cx, cy = intrinsics
+    tiles_x, start, members, zmin = tiles
+    kind, camera_to_local, shape = primitives
+    texture, uv, tint, facets = materials
+    texels, level_offset, log2_size = atlas
     height, width = hit.shape
     samples = jitter.shape[0]
-    share = 1.0 / samples
+    sample_weight = 1.0 / samples
     # unsigned: an index that may be negative costs a test
     one = np.uint64(1)
     two = np.uint64(2)
     for row in range(row0, row1):
-        maps = local[row % len(local)]
+        maps = camera_to_local[row % len(camera_to_local)]
         for column in range(width):
-            key = hit[row, column]
+            # A pixel lies on an edge if one of its four neighbours shows another surface.
+            centre_surface = hit[row, column]
             edge = (
-                (column > 0 and hit[row, column - 1] != key)
-                or (column + 1 < width and hit[row, column + 1] != key)
-                or (row > 0 and hit[row - 1, column] != key)
-                or (row + 1 < height and hit[row + 1, column] != key)
+                (column > 0 and hit[row, column - 1] != centre_surface)
+                or (column + 1 < width and hit[row, column + 1] != centre_surface)
+                or (row > 0 and hit[row - 1, column] != centre_surface)
+                or (row + 1 < height and hit[row + 1, column] != centre_surface)
             )
+            # sum of the samples
             red = 0.0
             green = 0.0
             blue = 0.0
-            own_red = 0.0
-            own_green = 0.0
-            own_blue = 0.0
-            new_red = 0.0
-            new_green = 0.0
-            new_blue = 0.0
-            own_cos = 0.0
-            last = -2
-            centre = key >> 3
+            # the surface at the pixel's centre
+            centre_red = 0.0
+            centre_green = 0.0
+            centre_blue = 0.0
+            centre_cos = 0.0
+            # the surface that was shaded last
+            last_surface = -2
+            last_red = 0.0
+            last_green = 0.0
+            last_blue = 0.0
+            centre_primitive = centre_surface >> 3
             tile = (row // TILE) * tiles_x + column // TILE
             first = start[tile]
             end = start[tile + 1]
@@ -292,78 +445,73 @@ def shade_pixels(
             for sample in range(-1, samples if edge else 0):
                 x = (column - cx) / fx
                 y = (row - cy) / fy
-                surface = key
+                surface = centre_surface
                 t = depth[row, column]
-                p = centre
-                face = key & 7
+                p = centre_primitive
+                face = centre_surface & 7
+                # Cast the ray of a sample beside the centre, as `cast_geometry` does.
                 if sample >= 0:
                     x = (column + jitter[sample, 0] - cx) / fx
                     y = (row + jitter[sample, 1] - cy) / fy
                     t = 1e30
                     p = -1
                     face = 0
-                    for n in range(first - 1 if centre >= 0 else first, end):
-                        q = centre
+                    for n in range(first - 1 if centre_primitive >= 0 else first, end):
+                        q = centre_primitive
                         if n >= first:
                             q = members[n]
                             if zmin[q] >= t:
                                 break
-                            if q == centre:
+                            if q == centre_primitive:
                                 continue
-                        dx = maps[q, 0] * x + maps[q, 1] * y + maps[q, 2]
-                        dy = maps[q, 4] * x + maps[q, 5] * y + maps[q, 6]
-                        dz = maps[q, 8] * x + maps[q, 9] * y + maps[q, 10]
-                        ox = maps[q, 3]
-                        oy = maps[q, 7]
-                        oz = maps[q, 11]
-                        a = shape[q, 0]
-                        b = shape[q, 1]
-                        c = shape[q, 2]
-                        t_hit, face_hit = hit_primitive(kind[q], ox, oy, oz, dx, dy, dz, a, b, c, t)
+                        direction = (
+                            maps[q, 0] * x + maps[q, 1] * y + maps[q, 2],
+                            maps[q, 4] * x + maps[q, 5] * y + maps[q, 6],
+                            maps[q, 8] * x + maps[q, 9] * y + maps[q, 10],
+                        )
+                        origin = (maps[q, 3], maps[q, 7], maps[q, 11])
+                        extent = (shape[q, 0], shape[q, 1], shape[q, 2])
+                        t_hit, face_hit = hit_primitive(kind[q], origin, direction, extent, t)
                         if face_hit >= 0:
                             t = t_hit
                             p = q
                             face = face_hit
+                    # A surface that is shaded already is not shaded again.
                     surface = 8 * p + face if p >= 0 else -1
-                    if surface == key:
-                        red = red + own_red
-                        green = green + own_green
-                        blue = blue + own_blue
+                    if surface == centre_surface:
+                        red = red + centre_red
+                        green = green + centre_green
+                        blue = blue + centre_blue
                         continue
-                if surface == last:
-                    red = red + new_red
-                    green = green + new_green
-                    blue = blue + new_blue
+                if surface == last_surface:
+                    red = red + last_red
+                    green = green + last_green
+                    blue = blue + last_blue
                     continue
-                last = surface
-                new_red = 0.0
-                new_green = 0.0
-                new_blue = 0.0
+                last_surface = surface
+                last_red = 0.0
+                last_green = 0.0
+                last_blue = 0.0
                 cos = 0.0
                 if surface >= 0:
-                    su = uv[p, face, 0]
-                    sv = uv[p, face, 1]
-                    u = uv[p, face, 2]
-                    v = uv[p, face, 3]
+                    # The point in the primitive's frame.
                     lx = maps[p, 3] + t * (maps[p, 0] * x + maps[p, 1] * y + maps[p, 2])
                     ly = maps[p, 7] + t * (maps[p, 4] * x + maps[p, 5] * y + maps[p, 6])
                     lz = maps[p, 11] + t * (maps[p, 8] * x + maps[p, 9] * y + maps[p, 10])
                     norm = math.sqrt(x * x + y * y + 1.0)
+                    # Texture coordinates, cosine of incidence and light (Lambert's law).
+                    repeats_u = uv[p, face, 0]
+                    repeats_v = uv[p, face, 1]
+                    u = uv[p, face, 2]
+                    v = uv[p, face, 3]
                     if kind[p] == ROUND_CONE:
-                        h = shape[p, 0]
-                        r1 = shape[p, 1]
-                        r2 = shape[p, 2]
-                        nz = lz
-                        if h > 0.0:
-                            s = (r1 - r2) / h
-                            if lz >= h + r2 * s:
-                                nz = lz - h
-                            elif lz > r1 * s:
-                                nz = s * (r1 - s * lz) / (1.0 - s * s)
-                        u += atan2(lx, ly) * _PER_TURN * su
-                        v -= lz * sv
-                        # Normal into the camera frame: transpose of the (camera to local) linear
-                        # part.
+                        # u runs around the axis, v along it
+                        u += atan2(lx, ly) * _PER_TURN * repeats_u
+                        v -= lz * repeats_v
+                        # Normal into the camera frame: transpose of the linear part of (camera to
+                        # local).
+                        extent = (shape[p, 0], shape[p, 1], shape[p, 2])
+                        nz = round_cone_normal_z(lz, extent)
                         nu = maps[p, 0] * lx + maps[p, 4] * ly + maps[p, 8] * nz
                         nv = maps[p, 1] * lx + maps[p, 5] * ly + maps[p, 9] * nz
                         nw = maps[p, 2] * lx + maps[p, 6] * ly + maps[p, 10] * nz
@@ -377,31 +525,27 @@ def shade_pixels(
                             if facing > 0.0:
                                 light += facing * lights[i, 3]
                     else:
-                        cos = (
-                            abs(
-                                facets[p, face, 0] * x + facets[p, face, 1] * y + facets[p, face, 2]
-                            )
-                            / norm
+                        # normal and light are the same all over a flat face
+                        along_ray = (
+                            facets[p, face, 0] * x + facets[p, face, 1] * y + facets[p, face, 2]
                         )
+                        cos = abs(along_ray) / norm
                         light = facets[p, face, 3]
                         if face < 4:
-                            side = su if (face & 1) else -su
+                            # upright faces: v runs down, u to the right as seen from outside
+                            side = repeats_u if (face & 1) else -repeats_u
                             u += ly * side if face < 2 else -lx * side
-                            v -= lz * sv
+                            v -= lz * repeats_v
                         else:
-                            u += lx * su
-                            v -= ly * sv
-                    # Texel footprint squared, between those along and across a slanted surface;
-                    # then two mip levels.
+                            u += lx * repeats_u
+                            v -= ly * repeats_v
+                    # Texel footprint squared, between those along and across a slanted surface.
                     tex = texture[p, face]
                     log2 = log2_size[tex]
                     footprint = facets[p, face, 4] * t
                     footprint = footprint * footprint / max(cos, 0.05)
-                    level = 0
-                    while footprint > 4.0 and level < log2 - 1:
-                        footprint *= 0.25
-                        level += 1
-                    blend = min(max((footprint - 1.0) * (1.0 / 3.0), 0.0), 1.0)
+                    # Trilinear filtering: bilinear samples of two mip levels.
+                    level, blend = mip_level(footprint, log2)
                     u -= math.floor(u)
                     v -= math.floor(v)
                     for upper in range(2 if blend > 0.0 else 1):
@@ -415,6 +559,7 @@ def shade_pixels(
                         iv = int(fv)
                         au = fu - iu
                         av = fv - iv
+                        # the four texels around the point; the texture wraps around
                         u0 = iu & (size - 1)
                         v0 = (iv & (size - 1)) << bits
                         u1 = (iu + 1) & (size - 1)
@@ -428,49 +573,53 @@ def shade_pixels(
                         wb = au * (1.0 - av) * weight
                         wc = (1.0 - au) * av * weight
                         wd = au * av * weight
-                        new_red += wa * atlas[a] + wb * atlas[b] + wc * atlas[c] + wd * atlas[d]
-                        new_green += (
-                            wa * atlas[a + one]
-                            + wb * atlas[b + one]
-                            + wc * atlas[c + one]
-                            + wd * atlas[d + one]
+                        last_red += (
+                            wa * texels[a] + wb * texels[b] + wc * texels[c] + wd * texels[d]
                         )
-                        new_blue += (
-                            wa * atlas[a + two]
-                            + wb * atlas[b + two]
-                            + wc * atlas[c + two]
-                            + wd * atlas[d + two]
+                        last_green += (
+                            wa * texels[a + one]
+                            + wb * texels[b + one]
+                            + wc * texels[c + one]
+                            + wd * texels[d + one]
                         )
-                    new_red = new_red * tint[p, 0]
-                    new_green = new_green * tint[p, 1]
-                    new_blue = new_blue * tint[p, 2]
+                        last_blue += (
+                            wa * texels[a + two]
+                            + wb * texels[b + two]
+                            + wc * texels[c + two]
+                            + wd * texels[d + two]
+                        )
+                    last_red = last_red * tint[p, 0]
+                    last_green = last_green * tint[p, 1]
+                    last_blue = last_blue * tint[p, 2]
                 if sample < 0:
-                    own_red = new_red
-                    own_green = new_green
-                    own_blue = new_blue
-                    own_cos = cos
+                    centre_red = last_red
+                    centre_green = last_green
+                    centre_blue = last_blue
+                    centre_cos = cos
                 else:
-                    red = red + new_red
-                    green = green + new_green
-                    blue = blue + new_blue
+                    red = red + last_red
+                    green = green + last_green
+                    blue = blue + last_blue
             if edge:
-                red = red * share
-                green = green * share
-                blue = blue * share
+                red = red * sample_weight
+                green = green * sample_weight
+                blue = blue * sample_weight
             else:
-                red = own_red
-                green = own_green
-                blue = own_blue
+                red = centre_red
+                green = centre_green
+                blue = centre_blue
             color[row, column, 0] = red
             color[row, column, 1] = green
             color[row, column, 2] = blue
-            cosine[row, column] = own_cos
+            cosine[row, column] = centre_cos
 
 
 # Motion in the image: exact flow, and blur along it. Rows are independent.
 
 MOST_TAPS = 16
 """Samples of the longest blur."""
+_SHORTEST_BLUR_PX = 0.75
+"""Below this motion while the shutter is open a pixel keeps its colour."""
 
 
 def tap_shares() -> Reals:
@@ -501,10 +650,12 @@ def flow_field(
     for row in range(row0, row1):
         for column in range(width):
             flow[row, column, 0] = flow[row, column, 1] = np.nan
+            # unproject
             p = hit[row, column] >> 3
             z = depth[row, column]
             x = (column - cx) / fx * z
             y = (row - cy) / fy * z
+            # into the other camera's frame, and project
             w = motion[p, 8] * x + motion[p, 9] * y + motion[p, 10] * z + motion[p, 11]
             if p >= 0 and w > NEAR_M:
                 u = motion[p, 0] * x + motion[p, 1] * y + motion[p, 2] * z + motion[p, 3]
@@ -530,6 +681,7 @@ def motion_blur(
     ``shares`` are `tap_shares`. Unsigned indices need no test for negative ones.
     """
     height, width = color.shape[:2]
+    # taps stay where a texel to the right and one below exist
     right = width - 1.001
     below = height - 1.001
     stride = np.uint64(3 * width)
@@ -540,13 +692,16 @@ def motion_blur(
     five = np.uint64(5)
     for row in range(row0, row1):
         for column in range(width):
+            # motion of the pixel while the shutter is open
             du = flow[row, column, 0] * shutter
             dv = flow[row, column, 1] * shutter
             length = math.sqrt(du * du + dv * dv)
-            if not length > 0.75:
+            # also where the flow is NaN
+            if not length > _SHORTEST_BLUR_PX:
                 for ch in range(3):
                     blurred[row, column, ch] = color[row, column, ch]
                 continue
+            # Mean of bilinear samples along it, about one a pixel.
             taps = min(int(length) + 2, MOST_TAPS)
             r = 0.0
             g = 0.0
@@ -596,9 +751,11 @@ def motion_blur(
 # Depth model, in the order of the physics of a Kinect-like sensor:
 #
 # 1. The projector stands one baseline beside the camera; what it cannot see is in its shadow and
-# has no depth. 2. The disparity fx * baseline / z carries noise and is quantised to 1/8 pixel: the
-# depth steps grow with z^2. 3. Correlation fails near depth edges, on dark surfaces far away, on
-# slanted surfaces, and outside the range.
+#    has no depth.
+# 2. The disparity fx * baseline / z carries noise and is quantised to 1/8 pixel: the depth steps
+#    grow with z^2.
+# 3. Correlation fails near depth edges, on dark surfaces far away, on slanted surfaces, and outside
+#    the range.
 
 
 @dividing_kernel
@@ -620,12 +777,43 @@ def _normal(h: Scalar) -> float:
         + float((h >> np.uint64(32)) & m)
         + float(h >> np.uint64(48))
     )
+    # mean 4 * 65535 / 2; a uniform part has the variance 65536^2 / 12
     return (total - 131070.0) * (1.7320508075688772 / 65536.0)
 
 
 @dividing_kernel
 def _uniform(h: Scalar) -> float:
+    """Uniform in [0, 1): the upper 53 bits of a hash."""
     return float(h >> np.uint64(11)) * (1.0 / 9007199254740992.0)
+
+
+@dividing_kernel
+def _mark_projector_shadow(
+    depth: Reals, row: int, fx_baseline: float, in_shadow: NDArray[np.bool_]
+) -> None:
+    """Mark the pixels of a row that have no depth or that the projector cannot see.
+
+    The projector stands to the right of the camera: its column is u + disparity - const. Scanning
+    from the right, a pixel is lit only if its projector column lies left of all columns taken so
+    far.
+
+    Args:
+        depth: Exact z-depth ``[H, W]``, metres.
+        row: The row.
+        fx_baseline: Focal length times baseline, pixels x metres.
+        in_shadow: ``[W]``, filled.
+    """
+    width = depth.shape[1]
+    leftmost = 1e30
+    for i in range(width):
+        u = width - 1 - i
+        z = depth[row, u]
+        if z <= 0.0:
+            in_shadow[u] = True
+            continue
+        column = u + fx_baseline / z
+        in_shadow[u] = column >= leftmost + 0.5
+        leftmost = min(leftmost, column)
 
 
 @dividing_kernel
@@ -647,77 +835,97 @@ def _depths_around(depth: Reals, row: int, u: int, reach: int) -> tuple[float, f
 
 @dividing_kernel
 def measure_depth(
-    row0: int, row1: int, seed: Scalar, fx: float, baseline: float, depth: Reals, cosine: Reals, color: Reals,
-    disparity_noise: float, near: float, far: float, edge_px: int, dark: float, factor: float, out: Ints,
-) -> None:  # fmt: skip
-    """Raw depth (uint16, `factor` units a metre, 0 = missing) of rows from the exact z-depth."""
+    row0: int,
+    row1: int,
+    seed: Scalar,
+    sensor: DepthModel,
+    depth: Reals,
+    cosine: Reals,
+    color: Reals,
+    out: Ints,
+) -> None:
+    """Measure the depth of the rows `row0` to `row1` - 1, by the model above.
+
+    Args:
+        row0: First row.
+        row1: One past the last row.
+        seed: Of this frame's noise.
+        sensor: The depth camera.
+        depth: Exact z-depth ``[H, W]``, metres.
+        cosine: Cosine of incidence ``[H, W]``.
+        color: Colour ``[H, W, 3]`` from 0 to 255, which stands for the albedo.
+        out: uint16 ``[H, W]``, filled with raw depths; 0 is missing.
+    """
     width = depth.shape[1]
-    shadow_right = np.empty(width, np.bool_)
+    fx_baseline = sensor.fx * sensor.baseline_m
+    near = sensor.near_m
+    far = sensor.far_m
+    factor = sensor.units_per_m
+    in_shadow = np.empty(width, np.bool_)
     for row in range(row0, row1):
-        # 1. Projector to the right of the camera: its column is u + d - const; scanning from the
-        # right, a pixel is lit only if its projector column lies left of all columns taken so far.
-        limit = 1e30
-        for i in range(width):
-            u = width - 1 - i
-            z = depth[row, u]
-            if z <= 0.0:
-                shadow_right[u] = True
-                continue
-            column = u + fx * baseline / z
-            shadow_right[u] = column >= limit + 0.5
-            limit = min(limit, column)
+        # 1. Shadow of the projector.
+        _mark_projector_shadow(depth, row, fx_baseline, in_shadow)
         for u in range(width):
             z = depth[row, u]
             out[row, u] = 0
-            if shadow_right[u] or z < near or z > far:
+            if in_shadow[u] or z < near or z > far:
                 continue
             h = _hash(seed, row * width + u)
             # 3a. Depth edges: the correlation window (about 9x9 pixels) mixes two surfaces.
-            lowest, highest = _depths_around(depth, row, u, edge_px)
-            chance = 0.0
-            step = fx * baseline * (1.0 / lowest - 1.0 / highest)
-            if step > 1.0:
-                chance = 0.75 if z > 0.5 * (lowest + highest) else 0.35
+            lowest, highest = _depths_around(depth, row, u, sensor.edge_px)
+            loss_probability = 0.0
+            disparity_step = fx_baseline * (1.0 / lowest - 1.0 / highest)
+            if disparity_step > 1.0:
+                # the farther surface is lost more often
+                loss_probability = 0.75 if z > 0.5 * (lowest + highest) else 0.35
             # 3b. Returned light: albedo x cosine / z^2, against a threshold that varies in blotches
             # of 4x4 pixels.
-            light = (
+            albedo = (
                 0.3 * color[row, u, 0] + 0.59 * color[row, u, 1] + 0.11 * color[row, u, 2]
             ) / 255.0
-            power = (light + 0.04) * cosine[row, u] / (z * z)
+            returned_light = (albedo + 0.04) * cosine[row, u] / (z * z)
             blotch = _uniform(_hash(seed ^ np.uint64(0x5DEECE66D), (row >> 2) * width + (u >> 2)))
-            if power < dark * (0.4 + 1.2 * blotch):
-                chance = 1.0
+            if returned_light < sensor.dark * (0.4 + 1.2 * blotch):
+                loss_probability = 1.0
             # 3c. Slant, and the far end of the range.
             if cosine[row, u] < 0.12 + 0.1 * blotch:
-                chance = 1.0
+                loss_probability = 1.0
             fade = (z - 0.8 * far) / (0.2 * far)
             if fade > 0.0:
-                chance = max(chance, fade * fade)
-            if _uniform(_hash(h, 1)) < chance:
+                loss_probability = max(loss_probability, fade * fade)
+            if _uniform(_hash(h, 1)) < loss_probability:
                 continue
             # 2. Disparity noise (partly common to a correlation window) and quantisation.
             common = _normal(_hash(seed ^ np.uint64(0xA5A5A5A5), (row >> 1) * width + (u >> 1)))
-            noise = disparity_noise * (0.8 * common + 0.6 * _normal(h))
-            disparity = math.floor((fx * baseline / z + noise) * 8.0 + 0.5) / 8.0
+            noise = sensor.disparity_noise_px * (0.8 * common + 0.6 * _normal(h))
+            disparity = math.floor((fx_baseline / z + noise) * 8.0 + 0.5) / 8.0
             if disparity > 0.0:
-                measured = fx * baseline / disparity * factor + 0.5
-                if near * factor <= measured < 65535.0:
-                    out[row, u] = int(measured)
+                raw = fx_baseline / disparity * factor + 0.5
+                if near * factor <= raw < 65535.0:
+                    out[row, u] = int(raw)
 
 
 @dividing_kernel
 def expose(
-    row0: int, row1: int, seed: Scalar, color: Reals, gain: Reals, read_noise: float, shot_noise: float,
+    row0: int,
+    row1: int,
+    seed: Scalar,
+    color: Reals,
+    gain: Reals,
+    read_noise: float,
+    shot_noise: float,
     out: Ints,
-) -> None:  # fmt: skip
+) -> None:
     """8-bit colours of rows: gain of each row, shot and read noise, rounding, clipping."""
     width = color.shape[1]
     for row in range(row0, row1):
         for u in range(width):
             h = _hash(seed, row * width + u)
+            # noise that the three channels of a pixel share
             common = _normal(h)
             for ch in range(3):
                 value = color[row, u, ch] * gain[row]
+                # variances of read noise (constant) and shot noise (proportional to the signal) add
                 sigma = math.sqrt(read_noise * read_noise + shot_noise * max(value, 0.0))
                 value += sigma * (0.75 * common + 0.66 * _normal(_hash(h, ch + 7)))
                 out[row, u, ch] = (

@@ -26,6 +26,7 @@ from dynslam_bench.sequences.synthetic.rooms import pick, pick_one
 
 _X, _Y, _Z = np.eye(3)
 
+# Colours of people, factors of red, green and blue.
 _SKINS = np.array(
     [
         [1.0, 0.84, 0.74],
@@ -47,12 +48,28 @@ _HAIRS = np.array(
     ]
 )
 _TROUSERS = np.array([[0.25, 0.32, 0.5], [0.2, 0.21, 0.25], [0.55, 0.48, 0.37], [0.32, 0.34, 0.3]])
+# Texture of a shirt, each as likely as the others.
 _SHIRTS = ("print", "print", "plaid:1", "plaid:1", "stripes", "stripes")
 
 
 @dataclass(frozen=True)
 class Person:
-    """What does not change about a person: size, build, colours and clothes."""
+    """What does not change about a person: size, build, colours and clothes.
+
+    Attributes:
+        instance: Id in the masks.
+        height: Metres.
+        build: Relative width of the limbs.
+        skin: Factors of red, green and blue; so are the other colours.
+        hair: Colour.
+        trousers: Colour.
+        shoes: Colour.
+        shirt: Name of its texture.
+        shirt_tint: Colour.
+        long_hair: Whether the hair falls to the shoulders.
+        long_sleeves: Whether the shirt covers the forearms.
+        cap: Whether they wear one.
+    """
 
     instance: int
     height: float
@@ -128,6 +145,7 @@ def _roll(angle: float) -> Array:
 
 
 def _yaw(angle: float) -> Array:
+    """About the vertical; positive turns to the left."""
     return turn(math.degrees(angle))
 
 
@@ -137,77 +155,119 @@ def _in(frame: Array, x: float, y: float, z: float) -> Array:
 
 
 class _Figure:
-    """A person in a posture, and how limbs of theirs are made.
+    """A person in a posture: joint angles and axes by forward kinematics, and how their limbs are made.
+
+    Axes are rotations 3x3 to the world: x points to the person's right, y forward, z up.
 
     Attributes:
-        k: Size relative to a height of 1.75 m.
-        b: Build, relative width of the limbs.
-        hips: Angle of the left and the right hip, radians.
-        knees: Angle of the left and the right knee, radians.
-        root: The middle of the pelvis, metres.
-        trunk: Axes of the trunk. Who sits leans back: arms and head go on, the trunk hardly moves.
-        hipline: Axes of the pelvis.
-        neck: Where the neck begins.
+        size: Height relative to 1.75 m.
+        build: Relative width of the limbs.
+        hip_angles: Flexion of the left and the right hip, radians.
+        knee_angles: Flexion of the left and the right knee, radians.
+        pelvis: The middle of the pelvis in the world, metres.
+        trunk: Axes of the trunk.
+        hips: Axes of the pelvis.
+        neck: Where the neck begins, world coordinates in metres.
     """
 
     def __init__(self, who: Person, how: Posture) -> None:
         self.who = who
         self.how = how
-        self.k = k = who.height / 1.75
-        self.b = who.build
-        gait = how.gait
-        sit = how.sit
-        lively = how.gesture
-        wave = self.wave
+        self.size = who.height / 1.75
+        self.build = who.build
         body = turn(how.facing)
-        self.hips = []
-        self.knees = []
+        self._bend_legs()
+        self.pelvis = self._pelvis_position(body)
+        self._twist_trunk(body)
+        rise = _in(self.trunk, 0.0, -0.005, 0.46 * self.size + 0.05 * self.size)
+        self.neck = self.pelvis + rise
+        self.jeans = self.style("denim", who.trousers, repeat=(2.0, 3.0))
+        self.shirt = self.style(who.shirt, who.shirt_tint)
+        self.bare = self.style("plain", who.skin)
+
+    def _bend_legs(self) -> None:
+        """Angles of hips and knees: a walking cycle, blended with the angles of a seated person."""
+        gait = self.how.gait
+        sit = self.how.sit
+        self.hip_angles = []
+        self.knee_angles = []
         for side in (-1, 1):
-            swing = how.stride + (0.0 if side < 0 else math.pi)
-            bent = max(0.0, cos(swing))
-            self.hips.append(
-                gait * (0.08 + 0.46 * sin(swing)) * (1 - sit) + sit * (1.45 + 0.03 * side)
-            )
-            knee = gait * (0.12 + 0.85 * bent * bent) + 0.03
-            self.knees.append(knee * (1 - sit) + sit * (1.35 + 0.12 * side))
-        legs = zip(self.hips, self.knees, strict=True)
-        standing = (
-            max(0.43 * k * cos(hip) + 0.41 * k * cos(hip - knee) for hip, knee in legs) + 0.085 * k
-        )
-        # on the lower foot, or on the seat
-        pelvis_z = standing * (1 - sit) + sit * (0.485 + 0.085 * self.b)
-        sway = (1 - gait) * (1 - 0.85 * sit)
+            # the legs are half a stride apart
+            phase = self.how.stride + (0.0 if side < 0 else math.pi)
+            walking_hip = gait * (0.08 + 0.46 * sin(phase)) * (1 - sit)
+            seated_hip = sit * (1.45 + 0.03 * side)
+            self.hip_angles.append(walking_hip + seated_hip)
+            # the knee bends while the leg swings forward
+            swing = max(0.0, cos(phase))
+            walking_knee = gait * (0.12 + 0.85 * swing * swing) + 0.03
+            self.knee_angles.append(walking_knee * (1 - sit) + sit * (1.35 + 0.12 * side))
+
+    def _pelvis_position(self, body: Array) -> Array:
+        """Where the pelvis is: above the lower foot or on the seat, and swaying where the person stands."""
+        how = self.how
+        k = self.size
+        # height over the foot of each leg, by the lengths of thigh and shin
+        heights = []
+        for hip, knee in zip(self.hip_angles, self.knee_angles, strict=True):
+            heights.append(0.43 * k * cos(hip) + 0.41 * k * cos(hip - knee))
+        standing = max(heights) + 0.085 * k
+        seated = 0.485 + 0.085 * self.build
+        height = standing * (1 - how.sit) + how.sit * seated
+        sway = (1 - how.gait) * (1 - 0.85 * how.sit)
+        sway_right = 0.012 * sway * self.wave(0.31, 0.0)
+        sway_forward = 0.012 * sway * self.wave(0.23, 2.0)
+        return np.array([how.x, how.y, height]) + _in(body, sway_right, sway_forward, 0.0)
+
+    def _twist_trunk(self, body: Array) -> None:
+        """Axes of trunk and pelvis, which twist against each other.
+
+        Who sits leans back: arms and head go on, the trunk hardly moves.
+        """
+        gait = self.how.gait
+        sit = self.how.sit
+        gesture = self.how.gesture
+        wave = self.wave
         supple = 1 - 0.8 * sit
-        swaying = _in(body, 0.012 * sway * wave(0.31, 0.0), 0.012 * sway * wave(0.23, 2.0), 0.0)
-        self.root = np.array([how.x, how.y, pelvis_z]) + swaying
-        twist = gait * 0.1 * sin(how.stride) + supple * lively * 0.12 * wave(0.27, 0.4)
+        twist = gait * 0.1 * sin(self.how.stride) + supple * gesture * 0.12 * wave(0.27, 0.4)
         lean = (
             0.05 * gait
             + sit * 0.06
-            + supple * (0.02 * wave(0.19, 1.0) + lively * 0.04 * wave(0.43, 0.2))
+            + supple * (0.02 * wave(0.19, 1.0) + gesture * 0.04 * wave(0.43, 0.2))
         )
-        self.trunk = product(
-            body, _yaw(twist), _pitch(-lean), _roll(0.02 * supple * wave(0.17, 0.7))
-        )
-        self.hipline = product(body, _yaw(-twist))
-        self.neck = self.root + _in(self.trunk, 0.0, -0.005, 0.46 * k + 0.05 * k)
-        self.jeans = self.style("denim", who.trousers, repeat=(2.0, 3.0))
-        self.shirt, self.bare = self.style(who.shirt, who.shirt_tint), self.style("plain", who.skin)
+        tilt = 0.02 * supple * wave(0.17, 0.7)
+        self.trunk = product(body, _yaw(twist), _pitch(-lean), _roll(tilt))
+        self.hips = product(body, _yaw(-twist))
 
     def style(self, texture: str, tint: Array, **more: Any) -> dict[str, Any]:
         """How a limb of this person looks."""
         return {"instance": self.who.instance, "texture": texture, "tint": tint, **more}
 
-    def wave(self, f: float, p: float) -> float:
-        """Idle movement: a sine of frequency f in Hz and phase p."""
-        return sin(2 * math.pi * f * self.how.clock + p + 1.7 * self.who.instance)
+    def wave(self, frequency: float, phase: float) -> float:
+        """Idle movement: a sine of a frequency in Hz and a phase in radians, shifted for each person."""
+        angle = 2 * math.pi * frequency * self.how.clock + phase
+        return sin(angle + 1.7 * self.who.instance)
 
     def limb(
-        self, a: Array, c: Array, ra: float, rc: float, side: Array, flat: float = 1.0, **style: Any
+        self,
+        start: Array,
+        end: Array,
+        radii: tuple[float, float],
+        side: Array,
+        depth: float = 1.0,
+        **style: Any,
     ) -> Primitive:
-        """A round cone from a to c; its section is `flat` times as wide across `side`'s normal."""
-        rotation, length = along(a, c, side)
-        return cone(rotation, a, (length, ra, rc), scale=(1.0, flat, 1.0), **style)
+        """A round cone between two points.
+
+        Args:
+            start: World position, metres.
+            end: World position, metres.
+            radii: At the start and at the end, along `side`.
+            side: World direction of the section's first axis.
+            depth: Width of the section across `side`, relative to that along it.
+            **style: See `style`.
+        """
+        rotation, length = along(start, end, side)
+        return cone(rotation, start, (length, *radii), scale=(1.0, depth, 1.0), **style)
 
     def ball(
         self, centre: Array, rotation: Array, radii: tuple[float, float, float], **style: Any
@@ -218,184 +278,203 @@ class _Figure:
 
 def build_person(who: Person, how: Posture) -> Parts:
     """The person's primitives, always as many and in the same order."""
-    f = _Figure(who, how)
-    limbs = ((*_arm(f, side), *_leg(f, side, index)) for index, side in enumerate((-1, 1)))
-    return [*_trunk(f), *_head(f), *itertools.chain(*limbs)]
-
-
-def _trunk(f: _Figure) -> Parts:
-    """Pelvis, belly, chest, shoulders; wider than deep."""
-    k = f.k
-    root = f.root
-    trunk = f.trunk
-    hipline = f.hipline
-    left, right = (root + _in(hipline, side * 0.055 * k, 0, 0.01) for side in (-1, 1))
-    waist = root + _in(trunk, 0.0, 0.0, 0.08 * k)
-    chest = root + _in(trunk, 0.0, 0.005, 0.36 * k)
-    across = product(trunk, _X)
-    up = _in(trunk, 0, 0, 0.05 * k)
-    one, other = (chest + side * across * 0.11 * k * f.b + up for side in (-1, 1))
-    return [
-        f.limb(
-            left, right, 0.115 * k * f.b, 0.115 * k * f.b, product(hipline, _Z), 0.95, **f.jeans
-        ),
-        f.limb(
-            waist,
-            chest,
-            0.148 * k * f.b,
-            0.168 * k * f.b,
-            across,
-            0.68,
-            repeat=(5.0, 6.0),
-            **f.shirt,
-        ),
-        f.limb(
-            one,
-            other,
-            0.088 * k * f.b,
-            0.088 * k * f.b,
-            product(trunk, _Y),
-            repeat=(3.0, 6.0),
-            **f.shirt,
-        ),
-    ]
-
-
-def _head(f: _Figure) -> Parts:
-    """Neck and head, which looks about, with its hair."""
-    k = f.k
-    who = f.who
-    trunk = f.trunk
-    neck = f.neck
-    skull = neck + _in(trunk, 0.0, 0.015 * k, 0.15 * k)
-    looking = _yaw(
-        0.3 * f.wave(0.13, 0.9) * (1 - f.how.gait) + 0.1 * f.how.gesture * f.wave(0.4, 0.1)
-    )
-    head = product(trunk, looking, _pitch(0.06 * f.wave(0.29, 0.3) - 0.03))
-    low = neck - _in(trunk, 0, 0, 0.04 * k)
-    high = skull - _in(trunk, 0, 0.01, 0.03 * k)
-    face = f.style("face", who.skin, repeat=(1.0, 0.5), shift=(0.5, 0.5))
-    hair = f.style("hair", who.hair, repeat=(3.0, 0.5))
-    ears = [skull + _in(head, side * 0.077 * k, -0.005, -0.01) for side in (-1, 1)]
-    crown = skull + _in(head, 0, -0.018 * k, 0.03 * k)
-    parts = [
-        f.limb(low, high, 0.058 * k, 0.052 * k, product(trunk, _X), **f.bare),
-        f.ball(skull, head, (0.077 * k, 0.098 * k, 0.122 * k), **face),
-        f.ball(
-            skull + _in(head, 0, 0.092 * k, -0.012 * k),
-            head,
-            (0.015 * k, 0.022 * k, 0.026 * k),
-            **f.bare,
-        ),
-        *(f.ball(ear, head, (0.012 * k, 0.024 * k, 0.033 * k), **f.bare) for ear in ears),
-        f.ball(crown, product(head, _pitch(0.35)), (0.086 * k, 0.101 * k, 0.108 * k), **hair),
-    ]
-    if who.long_hair:
-        high = skull + _in(head, 0, -0.06, 0.0)
-        low = skull + _in(head, 0, -0.075, -0.15 * k)
-        parts.append(
-            f.limb(
-                high,
-                low,
-                0.075 * k,
-                0.055 * k,
-                product(head, _X),
-                0.6,
-                **hair | {"repeat": (4.0, 2.0)},
-            )
-        )
-    if who.cap:
-        cap = hair | {"tint": who.trousers}
-        top = skull + _in(head, 0, 0.01, 0.075 * k)
-        parts += [
-            f.ball(top, product(head, _pitch(0.15)), (0.088 * k, 0.108 * k, 0.065 * k), **cap),
-            f.ball(
-                skull + _in(head, 0, 0.12 * k, 0.06 * k),
-                head,
-                (0.07 * k, 0.06 * k, 0.008 * k),
-                **cap,
-            ),
-        ]
+    figure = _Figure(who, how)
+    parts = [*_trunk(figure), *_head(figure)]
+    for index, side in enumerate((-1, 1)):
+        parts += _arm(figure, side)
+        parts += _leg(figure, side, index)
     return parts
 
 
-def _arm(f: _Figure, side: int) -> Parts:
-    """Counter-swing of the gait, gestures with the hands before the chest, hands on the lap when sitting."""
-    k = f.k
-    b = f.b
-    gait = f.how.gait
-    sit = f.how.sit
-    swing = f.how.stride + (math.pi if side < 0 else 0.0)
-    talk = f.how.gesture * power(0.5 + 0.5 * f.wave(0.11, 1.5 * side), 0.7)
-    pitch = (
-        gait * 0.42 * sin(swing)
-        + sit * (1 - talk) * 0.35
-        + talk * (0.45 + 0.35 * f.wave(0.47 + 0.06 * side, side))
+# Sizes of limbs are metres of a person of 1.75 m; k scales them by the person's height, and b the
+# widths by their build.
+
+
+def _trunk(figure: _Figure) -> Parts:
+    """Pelvis, belly and chest, shoulders; wider than deep."""
+    k = figure.size
+    b = figure.build
+    trunk = figure.trunk
+    across = product(trunk, _X)
+    waist = figure.pelvis + _in(trunk, 0.0, 0.0, 0.08 * k)
+    chest = figure.pelvis + _in(trunk, 0.0, 0.005, 0.36 * k)
+    left_hip, right_hip = (
+        figure.pelvis + _in(figure.hips, side * 0.055 * k, 0, 0.01) for side in (-1, 1)
     )
-    abduct = side * (0.14 + 0.05 * (1 - gait) + talk * (0.12 + 0.15 * f.wave(0.33, 2.0 * side)))
-    bend = (
-        0.2
-        + gait * (0.25 + 0.15 * sin(swing))
-        + sit * (1 - talk) * 0.95
-        + talk * (1.35 + 0.5 * f.wave(0.61, 1.1 * side))
+    shoulder_rise = _in(trunk, 0, 0, 0.05 * k)
+    left_shoulder, right_shoulder = (
+        chest + side * across * 0.11 * k * b + shoulder_rise for side in (-1, 1)
     )
-    shoulder = f.neck + _in(f.trunk, side * 0.185 * k * b, 0.0, -0.055 * k)
-    arm = product(f.trunk, _roll(-abduct), _pitch(pitch))
-    lower = product(arm, _roll(side * 0.35 * min(bend, 1.0)), _pitch(bend))
-    elbow = shoulder + _in(arm, 0, 0, -(0.29 * k))
-    wrist = elbow + _in(lower, 0, 0, -(0.26 * k))
-    across = product(lower, _Y)
-    hand = product(lower, _pitch(0.25 * f.wave(0.7, side)))
-    thumb = wrist + _in(hand, 0.0, 0.035 * k, -0.035 * k)
+    pelvis_radii = (0.115 * k * b, 0.115 * k * b)
+    belly_radii = (0.148 * k * b, 0.168 * k * b)
+    shoulder_radii = (0.088 * k * b, 0.088 * k * b)
+    up = product(figure.hips, _Z)
+    forward = product(trunk, _Y)
     return [
-        f.limb(
-            shoulder,
-            elbow,
-            0.062 * k * b,
-            0.046 * k * b,
-            product(arm, _Y),
-            repeat=(2.0, 6.0),
-            **f.shirt,
+        figure.limb(left_hip, right_hip, pelvis_radii, up, 0.95, **figure.jeans),
+        figure.limb(waist, chest, belly_radii, across, 0.68, repeat=(5.0, 6.0), **figure.shirt),
+        figure.limb(
+            left_shoulder,
+            right_shoulder,
+            shoulder_radii,
+            forward,
+            repeat=(3.0, 6.0),
+            **figure.shirt,
         ),
-        f.limb(elbow, wrist, 0.045 * k * b, 0.034 * k * b, across, repeat=(2.0, 6.0), **f.shirt)
-        if f.who.long_sleeves
-        else f.limb(elbow, wrist, 0.041 * k * b, 0.028 * k * b, across, **f.bare),
-        f.ball(
-            wrist + _in(hand, 0, 0.005, -0.055 * k),
-            hand,
-            (0.022 * k, 0.038 * k, 0.058 * k),
-            **f.bare,
-        ),
-        f.ball(thumb, product(hand, _pitch(0.6)), (0.011 * k, 0.013 * k, 0.034 * k), **f.bare),
     ]
 
 
-def _leg(f: _Figure, side: int, index: int) -> Parts:
-    k = f.k
-    b = f.b
-    sit = f.how.sit
-    hip = f.hips[index]
-    knee = f.knees[index]
-    upper = product(f.hipline, _roll(-side * (0.02 + 0.1 * sit)), _pitch(hip))
-    lower = product(upper, _pitch(-knee))
-    joint = f.root + _in(f.hipline, side * 0.095 * k * b, 0.0, -0.01)
-    knee_at = joint + _in(upper, 0, 0, -(0.43 * k))
-    ankle = knee_at + _in(lower, 0, 0, -(0.41 * k))
-    ground = product(f.hipline, _pitch((hip - knee) * 0.6 * (1 - sit)))
-    heel = ankle + _in(ground, 0, -0.03, -0.035 * k)
-    toe = ankle + _in(ground, 0, 0.15 * k, -0.05 * k)
+def _head(figure: _Figure) -> Parts:
+    """Neck and head, which looks about, with its hair and cap."""
+    k = figure.size
+    trunk = figure.trunk
+    neck = figure.neck
+    skull = neck + _in(trunk, 0.0, 0.015 * k, 0.15 * k)
+
+    # Axes of the head: it looks about less while walking, and nods.
+    look = 0.3 * figure.wave(0.13, 0.9) * (1 - figure.how.gait)
+    look = look + 0.1 * figure.how.gesture * figure.wave(0.4, 0.1)
+    nod = 0.06 * figure.wave(0.29, 0.3) - 0.03
+    head = product(trunk, _yaw(look), _pitch(nod))
+
+    # Neck, skull, nose, ears.
+    neck_low = neck - _in(trunk, 0, 0, 0.04 * k)
+    neck_high = skull - _in(trunk, 0, 0.01, 0.03 * k)
+    neck_radii = (0.058 * k, 0.052 * k)
+    nose = skull + _in(head, 0, 0.092 * k, -0.012 * k)
+    nose_radii = (0.015 * k, 0.022 * k, 0.026 * k)
+    face = figure.style("face", figure.who.skin, repeat=(1.0, 0.5), shift=(0.5, 0.5))
+    parts = [
+        figure.limb(neck_low, neck_high, neck_radii, product(trunk, _X), **figure.bare),
+        figure.ball(skull, head, (0.077 * k, 0.098 * k, 0.122 * k), **face),
+        figure.ball(nose, head, nose_radii, **figure.bare),
+    ]
+    for side in (-1, 1):
+        ear = skull + _in(head, side * 0.077 * k, -0.005, -0.01)
+        parts.append(figure.ball(ear, head, (0.012 * k, 0.024 * k, 0.033 * k), **figure.bare))
+    return parts + _hair(figure, skull, head)
+
+
+def _hair(figure: _Figure, skull: Array, head: Array) -> Parts:
+    """What covers the head.
+
+    Args:
+        figure: The person.
+        skull: Middle of the skull in the world, metres.
+        head: Axes of the head.
+    """
+    k = figure.size
+    who = figure.who
+    hair = figure.style("hair", who.hair, repeat=(3.0, 0.5))
+    crown = skull + _in(head, 0, -0.018 * k, 0.03 * k)
+    crown_radii = (0.086 * k, 0.101 * k, 0.108 * k)
+    parts = [figure.ball(crown, product(head, _pitch(0.35)), crown_radii, **hair)]
+    if who.long_hair:
+        high = skull + _in(head, 0, -0.06, 0.0)
+        low = skull + _in(head, 0, -0.075, -0.15 * k)
+        strands = hair | {"repeat": (4.0, 2.0)}
+        across = product(head, _X)
+        parts.append(figure.limb(high, low, (0.075 * k, 0.055 * k), across, 0.6, **strands))
+    if who.cap:
+        cap = hair | {"tint": who.trousers}
+        top = skull + _in(head, 0, 0.01, 0.075 * k)
+        top_radii = (0.088 * k, 0.108 * k, 0.065 * k)
+        peak = skull + _in(head, 0, 0.12 * k, 0.06 * k)
+        peak_radii = (0.07 * k, 0.06 * k, 0.008 * k)
+        parts.append(figure.ball(top, product(head, _pitch(0.15)), top_radii, **cap))
+        parts.append(figure.ball(peak, head, peak_radii, **cap))
+    return parts
+
+
+def _arm_angles(figure: _Figure, side: int) -> tuple[float, float, float]:
+    """Pitch and abduction of the upper arm, and bend of the elbow, radians.
+
+    Counter-swing of the gait, gestures with the hands before the chest, hands on the lap when
+    sitting.
+    """
+    gait = figure.how.gait
+    sit = figure.how.sit
+    wave = figure.wave
+    # the arms swing against the legs
+    phase = figure.how.stride + (math.pi if side < 0 else 0.0)
+    talk = figure.how.gesture * power(0.5 + 0.5 * wave(0.11, 1.5 * side), 0.7)
+    pitch = (
+        gait * 0.42 * sin(phase)
+        + sit * (1 - talk) * 0.35
+        + talk * (0.45 + 0.35 * wave(0.47 + 0.06 * side, side))
+    )
+    abduction = side * (0.14 + 0.05 * (1 - gait) + talk * (0.12 + 0.15 * wave(0.33, 2.0 * side)))
+    bend = (
+        0.2
+        + gait * (0.25 + 0.15 * sin(phase))
+        + sit * (1 - talk) * 0.95
+        + talk * (1.35 + 0.5 * wave(0.61, 1.1 * side))
+    )
+    return pitch, abduction, bend
+
+
+def _arm(figure: _Figure, side: int) -> Parts:
+    """Upper arm, forearm, hand and thumb of the left (-1) or right (1) side."""
+    k = figure.size
+    b = figure.build
+    pitch, abduction, bend = _arm_angles(figure, side)
+
+    # Forward kinematics from the shoulder to the hand.
+    shoulder = figure.neck + _in(figure.trunk, side * 0.185 * k * b, 0.0, -0.055 * k)
+    upper = product(figure.trunk, _roll(-abduction), _pitch(pitch))
+    lower = product(upper, _roll(side * 0.35 * min(bend, 1.0)), _pitch(bend))
+    elbow = shoulder + _in(upper, 0, 0, -(0.29 * k))
+    wrist = elbow + _in(lower, 0, 0, -(0.26 * k))
+    hand = product(lower, _pitch(0.25 * figure.wave(0.7, side)))
+    palm = wrist + _in(hand, 0, 0.005, -0.055 * k)
+    thumb = wrist + _in(hand, 0.0, 0.035 * k, -0.035 * k)
+
+    forward = product(upper, _Y)
+    lower_forward = product(lower, _Y)
+    sleeve = figure.shirt | {"repeat": (2.0, 6.0)}
+    upper_arm = figure.limb(shoulder, elbow, (0.062 * k * b, 0.046 * k * b), forward, **sleeve)
+    if figure.who.long_sleeves:
+        radii = (0.045 * k * b, 0.034 * k * b)
+        forearm = figure.limb(elbow, wrist, radii, lower_forward, **sleeve)
+    else:
+        radii = (0.041 * k * b, 0.028 * k * b)
+        forearm = figure.limb(elbow, wrist, radii, lower_forward, **figure.bare)
+    palm_radii = (0.022 * k, 0.038 * k, 0.058 * k)
+    thumb_radii = (0.011 * k, 0.013 * k, 0.034 * k)
     return [
-        f.limb(joint, knee_at, 0.088 * k * b, 0.061 * k * b, product(upper, _Y), **f.jeans),
-        f.limb(knee_at, ankle, 0.06 * k * b, 0.045 * k * b, product(lower, _Y), **f.jeans),
-        f.limb(
-            heel,
-            toe,
-            0.045 * k,
-            0.034 * k,
-            product(ground, _X),
-            0.95,
-            **f.style("plain", f.who.shoes),
-        ),
+        upper_arm,
+        forearm,
+        figure.ball(palm, hand, palm_radii, **figure.bare),
+        figure.ball(thumb, product(hand, _pitch(0.6)), thumb_radii, **figure.bare),
+    ]
+
+
+def _leg(figure: _Figure, side: int, index: int) -> Parts:
+    """Thigh, shin and shoe of the left (-1, index 0) or right (1, index 1) side."""
+    k = figure.size
+    b = figure.build
+    sit = figure.how.sit
+    hip_angle = figure.hip_angles[index]
+    knee_angle = figure.knee_angles[index]
+
+    # Forward kinematics from the hip to the foot.
+    upper = product(figure.hips, _roll(-side * (0.02 + 0.1 * sit)), _pitch(hip_angle))
+    lower = product(upper, _pitch(-knee_angle))
+    hip = figure.pelvis + _in(figure.hips, side * 0.095 * k * b, 0.0, -0.01)
+    knee = hip + _in(upper, 0, 0, -(0.43 * k))
+    ankle = knee + _in(lower, 0, 0, -(0.41 * k))
+    foot = product(figure.hips, _pitch((hip_angle - knee_angle) * 0.6 * (1 - sit)))
+    heel = ankle + _in(foot, 0, -0.03, -0.035 * k)
+    toe = ankle + _in(foot, 0, 0.15 * k, -0.05 * k)
+
+    thigh_radii = (0.088 * k * b, 0.061 * k * b)
+    shin_radii = (0.06 * k * b, 0.045 * k * b)
+    shoe_radii = (0.045 * k, 0.034 * k)
+    shoe = figure.style("plain", figure.who.shoes)
+    return [
+        figure.limb(hip, knee, thigh_radii, product(upper, _Y), **figure.jeans),
+        figure.limb(knee, ankle, shin_radii, product(lower, _Y), **figure.jeans),
+        figure.limb(heel, toe, shoe_radii, product(foot, _X), 0.95, **shoe),
     ]
 
 
@@ -403,6 +482,10 @@ def _leg(f: _Figure, side: int, index: int) -> Parts:
 
 Draw = Callable[[float, float], float]
 """A number between two limits, drawn from a scene's stream."""
+_STRIDE_M = 1.35
+"""Path of two steps, in which the gait's phase advances by 2 pi."""
+_FULL_GAIT_M_S = 0.9
+"""Speed from which a person walks at full stride."""
 
 
 @dataclass(frozen=True)
@@ -418,24 +501,29 @@ def write_script(people: str, scene: int) -> Script:
     """The script of a scene; half of the scenes have it with left and right exchanged."""
     rng = stream(scene, "synthetic", "script", people)
     mirrored = rng.random() < 0.5
-    script = (_sitting if people == "sitting" else _walking)(partial(pick, rng, scene))
+    write = _sitting if people == "sitting" else _walking
+    script = write(partial(pick, rng, scene))
     if not mirrored:
         return script
-    walkers, chairs = (
-        [tuple(replace(key, x=-key.x, facing=-key.facing) for key in keys) for keys in timelines]
-        for timelines in (script.people, script.chairs)
-    )
-    return Script(script.period, walkers, chairs)
+    people_keys = [_mirrored(keys) for keys in script.people]
+    chair_keys = [_mirrored(keys) for keys in script.chairs]
+    return Script(script.period, people_keys, chair_keys)
 
 
-def _sitting(j: Draw) -> Script:
+def _mirrored(keys: tuple[Key, ...]) -> tuple[Key, ...]:
+    """A timeline with left and right exchanged."""
+    return tuple(replace(key, x=-key.x, facing=-key.facing) for key in keys)
+
+
+def _sitting(draw: Draw) -> Script:
     """Two people at the desk, talking with their hands."""
-    ax = -j(0.5, 0.62)
-    ay = j(1.62, 1.74)
-    bx = j(0.46, 0.58)
-    by = j(1.68, 1.8)
-    fa = 180 + j(18, 35)
-    fb = 180 - j(22, 40)
+    # Where both sit (ax, ay and bx, by) and face (fa, fb): metres, degrees.
+    ax = -draw(0.5, 0.62)
+    ay = draw(1.62, 1.74)
+    bx = draw(0.46, 0.58)
+    by = draw(1.68, 1.8)
+    fa = 180 + draw(18, 35)
+    fb = 180 - draw(22, 40)
     first = (
         Key(0, ax, ay, fa, 1, 0.39),
         Key(4, ax, ay, fa + 1.5, 1, 0.55),
@@ -448,20 +536,33 @@ def _sitting(j: Draw) -> Script:
         Key(7, bx, by, fb + 1.5, 1, 0.55),
         Key(12, bx, by, fb, 1, 0.33),
     )
+    # their chairs stand still
     chairs = [(Key(0, ax, ay, fa), Key(12, ax, ay, fa)), (Key(0, bx, by, fb), Key(12, bx, by, fb))]
     return Script(12.0, [first, second], chairs)
 
 
-def _walking(j: Draw) -> Script:
+def _walking(draw: Draw) -> Script:
     """Two people who walk across the room, stand talking, and sit down."""
-    ax = -j(0.28, 0.4)
-    ay = j(1.26, 1.38)
-    bx = j(0.3, 0.42)
-    by = j(1.44, 1.58)
-    cx = -j(0.55, 0.7)
-    cy = j(1.62, 1.7)
-    side = 1.65
-    first = (
+    # Where they stand talking (ax, ay and bx, by) and where the first one sits (cx, cy), metres.
+    ax = -draw(0.28, 0.4)
+    ay = draw(1.26, 1.38)
+    bx = draw(0.3, 0.42)
+    by = draw(1.44, 1.58)
+    cx = -draw(0.55, 0.7)
+    cy = draw(1.62, 1.7)
+    first = _first_walker(ax, ay, cx, cy)
+    second = _second_walker(bx, by)
+    return Script(20.0, [first, second], [_used_chair(cx, cy), _PUSHED_CHAIR])
+
+
+_OUT_OF_VIEW_M = 1.65
+"""People who walk across the room turn round this far to the side."""
+
+
+def _first_walker(ax: float, ay: float, cx: float, cy: float) -> tuple[Key, ...]:
+    """Talks at (ax, ay), walks to the right, back and to the left, sits down at (cx, cy), and returns."""
+    side = _OUT_OF_VIEW_M
+    return (
         Key(0.0, ax, ay, 200, 0, 1),
         Key(2.1, ax, ay, 220, 0, 1),
         Key(2.4, ax + 0.1, ay, 270, 0, 0.2),
@@ -481,7 +582,12 @@ def _walking(j: Draw) -> Script:
         Key(18.6, ax, ay, 200, 0, 0.5),
         Key(20.0, ax, ay, 200, 0, 1),
     )
-    second = (
+
+
+def _second_walker(bx: float, by: float) -> tuple[Key, ...]:
+    """Talks at (bx, by), walks to the right, talks further left, walks to the left, and returns."""
+    side = _OUT_OF_VIEW_M
+    return (
         Key(0.0, bx, by, 160, 0, 0.8),
         Key(2.0, bx, by, 170, 0, 1),
         Key(2.3, bx, by, 270),
@@ -498,9 +604,12 @@ def _walking(j: Draw) -> Script:
         Key(18.0, bx, by, 150, 0, 1),
         Key(20.0, bx, by, 160, 0, 0.8),
     )
-    # A chair rolls when a person sits down on it and rises; another one is pushed in passing.
+
+
+def _used_chair(cx: float, cy: float) -> tuple[Key, ...]:
+    """A chair at (cx, cy) that rolls when a person sits down on it and rises."""
     rest_y = cy + 0.2
-    own_chair = (
+    return (
         Key(0, cx, rest_y, 100),
         Key(13.2, cx, rest_y, 100),
         Key(14.3, cx, cy, 185),
@@ -510,42 +619,49 @@ def _walking(j: Draw) -> Script:
         Key(17.5, cx, rest_y, 110),
         Key(20, cx, rest_y, 100),
     )
-    other_chair = (
-        Key(0, 0.85, 1.88, 20),
-        Key(2.6, 0.85, 1.88, 20),
-        Key(3.2, 0.9, 2.0, 45),
-        Key(4.9, 0.9, 2.0, 45),
-        Key(5.5, 0.84, 1.93, 5),
-        Key(13.0, 0.84, 1.93, 5),
-        Key(13.8, 0.85, 1.88, 20),
-        Key(20, 0.85, 1.88, 20),
-    )
-    return Script(20.0, [first, second], [own_chair, other_chair])
+
+
+_PUSHED_CHAIR = (
+    Key(0, 0.85, 1.88, 20),
+    Key(2.6, 0.85, 1.88, 20),
+    Key(3.2, 0.9, 2.0, 45),
+    Key(4.9, 0.9, 2.0, 45),
+    Key(5.5, 0.84, 1.93, 5),
+    Key(13.0, 0.84, 1.93, 5),
+    Key(13.8, 0.85, 1.88, 20),
+    Key(20, 0.85, 1.88, 20),
+)
+"""A chair that is pushed in passing."""
 
 
 def posture(keys: tuple[Key, ...], period: float, t: float) -> Posture:
     """The posture of a person at time t (seconds)."""
     local = t % period
-    a, b, share = between(keys, local)
+    before, after, share = between(keys, local)
+    # Path that was walked since the beginning of the timeline, for the phase of the gait.
     walked = 0.0
-    for before, after in itertools.pairwise(keys):
-        walked += _distance(before, after) if local >= after.t else 0.0
-    distance = _distance(a, b)
-    e = ease(share)
-    speed = distance / (b.t - a.t) * 6 * share * (1 - share)
+    for start, end in itertools.pairwise(keys):
+        walked += _distance(start, end) if local >= end.t else 0.0
+    distance = _distance(before, after)
+    eased = ease(share)
+    # derivative of `ease`
+    speed = distance / (after.t - before.t) * 6 * share * (1 - share)
+    # people turn in the first two thirds of a way
+    facing = angle_between(before.facing, after.facing, ease(min(share * 1.5, 1.0)))
     return Posture(
-        a.x + e * (b.x - a.x),
-        a.y + e * (b.y - a.y),
-        angle_between(a.facing, b.facing, ease(min(share * 1.5, 1.0))),
-        (walked + distance * e) * 2 * math.pi / 1.35,
-        min(speed / 0.9, 1.0),
-        a.sit + e * (b.sit - a.sit),
-        a.gesture + e * (b.gesture - a.gesture),
-        t,
+        x=before.x + eased * (after.x - before.x),
+        y=before.y + eased * (after.y - before.y),
+        facing=facing,
+        stride=(walked + distance * eased) * 2 * math.pi / _STRIDE_M,
+        gait=min(speed / _FULL_GAIT_M_S, 1.0),
+        sit=before.sit + eased * (after.sit - before.sit),
+        gesture=before.gesture + eased * (after.gesture - before.gesture),
+        clock=t,
     )
 
 
 def _distance(a: Key, b: Key) -> float:
+    """Metres between two places."""
     dx = b.x - a.x
     dy = b.y - a.y
     return math.sqrt(dx * dx + dy * dy)

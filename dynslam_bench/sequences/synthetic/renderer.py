@@ -21,33 +21,54 @@ from dynslam_bench.core.settings import Settings
 from dynslam_bench.sequences.synthetic import kernels
 from dynslam_bench.sequences.synthetic.arithmetic import Array, cos, exp, norm, power, product, sin
 from dynslam_bench.sequences.synthetic.ids import SyntheticId
-from dynslam_bench.sequences.synthetic.kernels import NEAR_M, TILE
+from dynslam_bench.sequences.synthetic.kernels import (
+    NEAR_M,
+    TILE,
+    DepthModel,
+    Materials,
+    Primitives,
+    Tiles,
+)
 from dynslam_bench.sequences.synthetic.parts import QUAD, ROUND_CONE
 from dynslam_bench.sequences.synthetic.scene import Scene, View
 from dynslam_bench.sequences.synthetic.settings import CAMERA, FPS, RenderSettings
 
 SIZE = CAMERA.height, CAMERA.width
+"""Height and width of the images, pixels."""
 _INTRINSICS = CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy
 _FOCAL = _INTRINSICS[:2]
 _CENTRE = _INTRINSICS[2:]
-_ROUNDS = 5
-"""Rounds of the search for the row that sees a point; each shrinks the error by the rows' motion a row, 0.1 or less."""
-_MARGIN_PX = 2.0
 _BAND = 48
+"""Rows that a thread renders at a time."""
 _JITTER = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])
-_MEAN_GREY = 105.0
-"""What automatic exposure aims at."""
-_NOISE_VERSION = 5
-"""Seeds the noise of the sensors. It stays while versions of the renderer differ in last bits only."""
+"""Samples of a pixel on an edge (a rotated grid), pixels from its centre."""
+
+_ROW_ITERATIONS = 5
+"""Of the search for the row that sees a point; each shrinks the error by the rows' motion a row, 0.1 or less."""
+_MARGIN_PX = 2.0
+"""Added around the bounds of a primitive in the image."""
+_SAMPLED_ROWS = 9
+"""Rows of a rolling shutter by whose poses primitives are sorted into tiles."""
 _SLACK_M = 0.01
-"""How much nearer than in the rows that were looked at a thing may be in another one."""
+"""How much nearer than in the sampled rows a primitive may be in another one."""
+
 _LAMPS = np.array(
     [[0, 0, 1.0, 0.52], [0.25, -0.45, 0.86, 0.36], [-0.75, -0.6, 0.25, 0.2], [0.6, -0.7, 0.1, 0.1]]
 )
 """Direction to each lamp in the world (not normalised) and its strength; row 0 is the ambient light."""
+_SHADOW_PLANE_M = 2.2
+"""Height of the plane in which the things lie that cast the soft shadows."""
+_MEAN_GREY = 105.0
+"""What automatic exposure aims at."""
+_MAINS_HZ = 100.0
+"""Lamps flicker at twice the frequency of the mains."""
+_NOISE_VERSION = 5
+"""Seeds the noise of the sensors. It stays while versions of the renderer differ in last bits only."""
 
-Tiles = tuple[int, NDArray[np.integer[Any]], NDArray[np.integer[Any]], Array]
-"""Tiles in a row, start of each tile's list, the lists, and the least depth of every primitive."""
+HitImage = NDArray[np.int32]
+"""What every pixel sees, ``[H, W]``: 8 * primitive + face, -1 for nothing."""
+ColorImage = NDArray[np.float32]
+"""Colours ``[H, W, 3]`` from 0 to 255 before exposure and noise."""
 
 
 def motion_of_primitives(now: View, other: View) -> tuple[Array, Array]:
@@ -56,43 +77,45 @@ def motion_of_primitives(now: View, other: View) -> tuple[Array, Array]:
     return rotation, other.origin - product(rotation, now.origin[:, :, None])[:, :, 0]
 
 
-def rolling_flow(
-    now: View, other: View, hit: NDArray[np.int32], depth: Array
-) -> NDArray[np.float32]:
+def rolling_flow(now: View, other: View, hit: HitImage, depth: Array) -> NDArray[np.float32]:
     """Exact flow float32 ``[H, W, 2]`` in pixels between frames whose rows have poses of their own.
 
     A point is seen in the other frame by the row onto which that very row's pose projects it.
     Beyond the image's first and last row the pose goes on as that row's.
     """
+    # Points seen at the pixel centres, in the world, now.
     v, u = np.mgrid[0 : CAMERA.height, 0 : CAMERA.width].astype(np.float64)
     rays = np.stack(
         [(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones_like(u)], axis=-1
     )
-    world = (
-        product(rays * depth[..., None], np.swapaxes(now.rows[:, :3, :3], 1, 2))
-        + now.rows[:, None, :3, 3]
-    )
+    row_rotations = np.swapaxes(now.rows[:, :3, :3], 1, 2)
+    row_positions = now.rows[:, None, :3, 3]
+    points = product(rays * depth[..., None], row_rotations) + row_positions
+    # Where they are in the other frame.
     rotation, shift = motion_of_primitives(now, other)
     primitive = np.maximum(hit >> 3, 0)
-    world = product(rotation[primitive], world[..., None])[..., 0] + shift[primitive]
+    points = product(rotation[primitive], points[..., None])[..., 0] + shift[primitive]
+    # Fixed-point iteration: project with the pose of the row, take the row of the projection.
     row = v.copy()
-    for _ in range(_ROUNDS):
+    for _ in range(_ROW_ITERATIONS):
         first = np.clip(np.floor(row), 0, CAMERA.height - 2).astype(np.int64)
         share = np.clip(row - first, 0.0, 1.0)[..., None]
-        before, after = (
-            product((world - other.rows[near, :3, 3])[..., None, :], other.rows[near, :3, :3])[
-                ..., 0, :
-            ]
-            for near in (first, first + 1)
-        )
-        points = (1 - share) * before + share * after
-        w = np.where(points[..., 2] > 0.05, points[..., 2], np.nan)
-        x = points[..., 0] / w * CAMERA.fx + CAMERA.cx
-        y = points[..., 1] / w * CAMERA.fy + CAMERA.cy
+        before = _in_camera(points, other.rows[first])
+        after = _in_camera(points, other.rows[first + 1])
+        seen = (1 - share) * before + share * after
+        z = np.where(seen[..., 2] > NEAR_M, seen[..., 2], np.nan)
+        x = seen[..., 0] / z * CAMERA.fx + CAMERA.cx
+        y = seen[..., 1] / z * CAMERA.fy + CAMERA.cy
         row = np.where(np.isfinite(y), y, row)
     flow = np.stack([x - u, y - v], axis=-1)
     flow[hit < 0] = np.nan
     return flow.astype(np.float32)
+
+
+def _in_camera(points: Array, poses: Array) -> Array:
+    """World points ``[H, W, 3]`` in the frames of cameras at `poses` ``[H, W, 4, 4]``."""
+    offsets = points - poses[..., :3, 3]
+    return product(offsets[..., None, :], poses[..., :3, :3])[..., 0, :]
 
 
 _EDGES = np.array(
@@ -111,13 +134,17 @@ def bounds_of(corners: Array) -> Array:
         ``[5, P]``: least depth of all corners, and least u, least v, greatest u, greatest v
         (pixels, with a margin); least above greatest where a box lies behind the camera.
     """
+    # Edges are cut at the near plane, so that no point behind the camera is projected.
     start = corners[:, _EDGES[0]]
     end = corners[:, _EDGES[1]]
     cut = (start[..., 2] > NEAR_M) != (end[..., 2] > NEAR_M)
     share = (NEAR_M - start[..., 2]) / np.where(cut, end[..., 2] - start[..., 2], 1.0)
-    points = np.concatenate([corners, start + share[..., None] * (end - start)], axis=1)
+    cut_points = start + share[..., None] * (end - start)
+    points = np.concatenate([corners, cut_points], axis=1)
     valid = np.concatenate([corners[..., 2] > NEAR_M, cut], axis=1)
-    pixels = points[..., :2] / np.where(valid, points[..., 2], 1.0)[..., None] * _FOCAL + _CENTRE
+    # Bounds of the projections.
+    z = np.where(valid, points[..., 2], 1.0)[..., None]
+    pixels = points[..., :2] / z * _FOCAL + _CENTRE
     low = np.where(valid[..., None], pixels, np.inf).min(axis=1) - _MARGIN_PX
     high = np.where(valid[..., None], pixels, -np.inf).max(axis=1) + _MARGIN_PX
     return np.stack([corners[..., 2].min(axis=1), *low.T, *high.T])
@@ -128,9 +155,9 @@ class Rendered:
     """One frame as it is stored.
 
     Attributes:
-        rgb: uint8 ``[H, W, 3]``.
+        rgb: uint8 ``[H, W, 3]``, as the sensor measures it.
         raw_depth: uint16 ``[H, W]`` in units of 1 / 5000 m, 0 = missing, as the sensor measures it.
-        instances: uint8 ``[H, W]``.
+        instances: uint8 ``[H, W]`` instance ids, 0 is the background.
     """
 
     rgb: NDArray[np.uint8]
@@ -159,16 +186,23 @@ class Renderer:
         text = f"{_NOISE_VERSION}/{sequence.name}@{sequence.scene}"
         text += "" if sequence.noise is None else f"/noise={sequence.noise}"
         self._seed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:6], "little")
+        # the last one is that of pixels that see nothing: hit >> 3 is -1
         self._ids = np.append(scene.instance, 0).astype(np.uint8)
 
     def render(self, index: int) -> Rendered:
         """Render frame `index`."""
         now = self.scene.view(index)
         time = index / FPS
-        tiles, local = self._tiles(now)
-        hit, depth = self._cast(tiles, local)
-        color, cosine = self._shade(now, tiles, local, hit, depth, time)
+
+        # Geometry and colour.
+        tiles, primitives = self._tiles(now)
+        hit, depth = self._cast(tiles, primitives)
+        color, cosine = self._shade(now, tiles, primitives, hit, depth, time)
+
+        # Depth sensor, by the colour before light and blur change it.
         raw = self._measure(index, depth, cosine, color)
+
+        # Light and motion blur, then the colour sensor.
         if self.settings.shadow:
             self._shadow(now.pose, time, depth, color)
         if self.settings.glare:
@@ -183,73 +217,79 @@ class Renderer:
         It is the motion of the surface point seen at each pixel centre, also where it is hidden in
         the other frame.
         """
-        now, after = self.scene.view(index), self.scene.view(other)
+        now = self.scene.view(index)
+        after = self.scene.view(other)
         hit, depth = self.cast(now)
-        return (
-            rolling_flow(now, after, hit, depth)
-            if now.rolling
-            else self._flow(now, after, hit, depth)
-        )
+        if now.rolling:
+            return rolling_flow(now, after, hit, depth)
+        return self._flow(now, after, hit, depth)
 
     def geometry(self, index: int) -> tuple[Array, NDArray[np.uint8]]:
         """Exact z-depth (metres, 0 = nothing) and instance ids of frame `index`, without shading."""
         hit, depth = self.cast(self.scene.view(index))
         return depth, self._ids[hit >> 3]
 
-    def cast(self, view: View) -> tuple[NDArray[np.int32], Array]:
+    def cast(self, view: View) -> tuple[HitImage, Array]:
         """What every pixel of a view sees (8 * primitive + face, -1 for nothing) and its z-depth in metres."""
         return self._cast(*self._tiles(view))
 
     def _rows(self, work: Callable[[int, int], None]) -> None:
-        """Share the bands of an image among the threads; under a rolling shutter they do not depend on their number."""
+        """Call `work` for bands of rows in all threads: with the first row and one past the last one.
+
+        Under a rolling shutter the bands do not depend on the number of threads.
+        """
         whole = self.threads == 1 and not self.scene.world.optics.readout_s
         height = CAMERA.height if whole else _BAND
         starts = range(0, CAMERA.height, height)
         with ThreadPoolExecutor(self.threads) as pool:
             list(pool.map(work, starts, [first + height for first in starts]))
 
-    def _tiles(self, view: View) -> tuple[Tiles, Array]:
-        """Bin the primitives into tiles by the bounds of their boxes, as seen by several rows of a rolling shutter.
+    def _tiles(self, view: View) -> tuple[Tiles, Primitives]:
+        """Sort the primitives into tiles by the bounds of their boxes, as seen by several rows of a rolling shutter.
 
         Returns:
-            The tiles, and maps ``[R, P, 12]`` from the camera at each row of the view to the local
-            frames of what lies in the tiles (row-major 3x4).
+            The tiles, and the primitives as the camera sees them; maps of those that lie in no tile
+            are not filled.
         """
         scene = self.scene
-        corners = self.scene.corners * self.scene.scale[:, None, :]
+        # Bounds of every primitive's box in the image, and its least depth.
+        corners = scene.corners * scene.scale[:, None, :]
         world = product(corners, np.swapaxes(view.rotation, 1, 2)) + view.origin[:, None, :]
-        chosen = np.linspace(0, len(view.rows) - 1, 9 if view.rolling else 1).astype(int)
+        samples = _SAMPLED_ROWS if view.rolling else 1
+        sampled = np.linspace(0, len(view.rows) - 1, samples).astype(int)
         bounds = [
-            bounds_of(product(world - pose[:3, 3], pose[:3, :3])) for pose in view.rows[chosen]
+            bounds_of(product(world - pose[:3, 3], pose[:3, :3])) for pose in view.rows[sampled]
         ]
         nearest, *low = np.min(bounds, axis=0)[:3]
         high = np.max(bounds, axis=0)[3:]
         nearest = nearest - (_SLACK_M if view.rolling else 0.0)
+
+        # Visible primitives in order of depth, and the tiles that each covers.
         last = np.array([[CAMERA.width - 1], [CAMERA.height - 1]])
         visible = ((high >= 0) & (low <= last)).all(axis=0)
         order = np.argsort(nearest, kind="stable")
         order = order[visible[order]].astype(np.int32)
         boxes = np.concatenate([np.clip(low, 0, last), np.clip(high, 0, last)]).T // TILE
-        tiles_x = -(-CAMERA.width // TILE)
-        tiles_y = -(-CAMERA.height // TILE)
-        tiles = (
-            tiles_x,
-            *kernels.bin_tiles(order, boxes.astype(np.int32), tiles_x, tiles_y),
-            nearest,
-        )
+        columns = -(-CAMERA.width // TILE)
+        rows = -(-CAMERA.height // TILE)
+        start, members = kernels.bin_tiles(order, boxes.astype(np.int32), columns, rows)
+        tiles = Tiles(columns, start, members, nearest)
+
+        # Maps from the camera at each row to the primitives' frames.
         inverse = np.swapaxes(view.rotation[order], 1, 2) / scene.scale[order, :, None]
         poses = np.repeat(view.rows[:, None, :3], len(order), axis=1)
         poses[..., 3] -= view.origin[order]
-        local = np.empty((len(poses), len(scene.kind), 12))
-        local[:, order] = product(inverse, poses).reshape(len(poses), -1, 12)
-        return tiles, local
+        camera_to_local = np.empty((len(poses), len(scene.kind), 12))
+        camera_to_local[:, order] = product(inverse, poses).reshape(len(poses), -1, 12)
+        return tiles, Primitives(scene.kind, camera_to_local, scene.shape)
 
-    def _cast(self, tiles: Tiles, local: Array) -> tuple[NDArray[np.int32], Array]:
+    def _cast(self, tiles: Tiles, primitives: Primitives) -> tuple[HitImage, Array]:
         """What every pixel sees (`cast_geometry`) and its z-depth in metres."""
-        hit, depth, scene = np.empty(SIZE, np.int32), np.empty(SIZE), self.scene
+        hit = np.empty(SIZE, np.int32)
+        depth = np.empty(SIZE)
         self._rows(
-            lambda a, b: kernels.cast_geometry(
-                a, b, _INTRINSICS, *tiles, scene.kind, local, scene.shape, hit, depth
+            lambda row0, row1: kernels.cast_geometry(
+                row0, row1, _INTRINSICS, tiles, primitives, hit, depth
             )
         )
         return hit, depth
@@ -258,66 +298,67 @@ class Renderer:
         self,
         now: View,
         tiles: Tiles,
-        local: Array,
-        hit: NDArray[np.int32],
+        primitives: Primitives,
+        hit: HitImage,
         depth: Array,
         time: float,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    ) -> tuple[ColorImage, NDArray[np.float32]]:
         """Colour ``[H, W, 3]`` and cosine of incidence ``[H, W]``; a rolling shutter's normals are those of a band."""
         scene = self.scene
-        density = self._density
-        color, cosine = np.empty((*SIZE, 3), np.float32), np.empty(SIZE, np.float32)
+        texel_density = self._texel_density
+        color = np.empty((*SIZE, 3), np.float32)
+        cosine = np.empty(SIZE, np.float32)
         jitter = _JITTER if self.settings.antialias else np.zeros((1, 2))
 
-        def work(a: int, b: int) -> None:
-            pose = now.pose_of((a + b) // 2)
+        def shade_band(row0: int, row1: int) -> None:
+            pose = now.pose_of((row0 + row1) // 2)
             lights = self._lights(pose, time)
-            facets = self._facets(now, pose, lights, density)
+            facets = self._facets(now, pose, lights, texel_density)
+            materials = Materials(scene.texture, scene.uv, scene.tint, facets)
             kernels.shade_pixels(
-                a, b, _INTRINSICS, *tiles, scene.kind, local, scene.shape, scene.texture, scene.uv, scene.tint, facets,
-                *scene.atlas, lights, hit, depth, jitter, color, cosine,
+                row0, row1, _INTRINSICS, tiles, primitives, materials, scene.atlas, lights, hit, depth, jitter,
+                color, cosine,
             )  # fmt: skip
 
-        self._rows(work)
+        self._rows(shade_band)
         return color, cosine
 
-    def _flow(
-        self, now: View, other: View, hit: NDArray[np.int32], depth: Array
-    ) -> NDArray[np.float32]:
+    def _flow(self, now: View, other: View, hit: HitImage, depth: Array) -> NDArray[np.float32]:
         """Exact flow under a global shutter; under a rolling one along the motion of each band's middle row."""
         flow = np.empty((*SIZE, 2), np.float32)
         rotation, shift = motion_of_primitives(now, other)
 
-        def work(a: int, b: int) -> None:
-            pose, after = now.pose_of((a + b) // 2), other.pose_of((a + b) // 2)
+        def flow_of_band(row0: int, row1: int) -> None:
+            pose = now.pose_of((row0 + row1) // 2)
+            after = other.pose_of((row0 + row1) // 2)
             # from points in this camera's frame to the other camera's frame
             motion = np.empty((len(shift), 3, 4))
             motion[:, :, :3] = product(after[:3, :3].T, rotation, pose[:3, :3])
-            motion[:, :, 3] = product(
-                product(rotation, pose[:3, 3]) + shift - after[:3, 3], after[:3, :3]
-            )
-            kernels.flow_field(a, b, _INTRINSICS, hit, depth, motion.reshape(-1, 12), flow)
+            position_after = product(rotation, pose[:3, 3]) + shift
+            motion[:, :, 3] = product(position_after - after[:3, 3], after[:3, :3])
+            kernels.flow_field(row0, row1, _INTRINSICS, hit, depth, motion.reshape(-1, 12), flow)
 
-        self._rows(work)
+        self._rows(flow_of_band)
         return flow
 
     def _blur(
         self,
         now: View,
         after: View,
-        hit: NDArray[np.int32],
+        hit: HitImage,
         depth: Array,
-        sharp: NDArray[np.float32],
-    ) -> NDArray[np.float32]:
+        sharp: ColorImage,
+    ) -> ColorImage:
         """Motion blur while the shutter is open."""
-        flow, blurred = self._flow(now, after, hit, depth), np.empty_like(sharp)
-        exact, shares, shutter = (
-            sharp.astype(np.float64).ravel(),
-            kernels.tap_shares(),
-            self.color_sensor.shutter,
-        )
+        flow = self._flow(now, after, hit, depth)
+        blurred = np.empty_like(sharp)
+        exact = sharp.astype(np.float64).ravel()
+        shares = kernels.tap_shares()
+        shutter = self.color_sensor.shutter
         self._rows(
-            lambda a, b: kernels.motion_blur(a, b, sharp, exact, shares, flow, shutter, blurred)
+            lambda row0, row1: kernels.motion_blur(
+                row0, row1, sharp, exact, shares, flow, shutter, blurred
+            )
         )
         return blurred
 
@@ -331,52 +372,59 @@ class Renderer:
         rows[:, :3] = product(rows[:, :3], pose[:3, :3])
         return rows
 
-    def _facets(self, view: View, pose: Array, lights: Array, density: Array) -> Array:
+    def _facets(self, view: View, pose: Array, lights: Array, texel_density: Array) -> Array:
         """What is the same all over a face ``[P, 6, 5]``: normal in the camera frame, light, texels a pixel at 1 m."""
+        # Normals of boxes point outwards, those of quads along their z axis ...
         quads = self.scene.kind == QUAD
         axes = product(pose[:3, :3].T, view.rotation).transpose(0, 2, 1)
         facets = np.empty((len(axes), 6, 5))
         facets[:, 0::2, :3] = -axes
         facets[:, 1::2, :3] = axes
         facets[quads, 4:, :3] = axes[quads, 2:]
+        # ... or against it, where the camera is behind them: quads are seen from both sides.
         to_camera = pose[:3, 3] - view.origin
         behind = (product(to_camera[:, None, :], view.rotation) < 0)[:, 0, 2] & quads
         facets[behind, 4:, :3] *= -1
+        # Ambient light and Lambert's law.
         facing = np.maximum(product(facets[:, :, :3], lights[1:, :3].T), 0)
         facets[:, :, 3] = lights[0, 3] + product(facing, lights[1:, 3])
-        facets[:, :, 4] = density
+        facets[:, :, 4] = texel_density
         return facets
 
     @cached_property
-    def _density(self) -> Array:
+    def _texel_density(self) -> Array:
         """Texels a pixel at 1 m on each face ``[P, 6]`` seen at right angles."""
         scene = self.scene
-        log2_size = self.scene.atlas[2]
+        # Repeats a metre; those around a round cone are stated a turn, of its mean circumference.
         repeats = np.abs(scene.uv[:, :, :2])
         cones = scene.kind == ROUND_CONE
-        repeats[cones, :, 0] /= (
-            math.pi * np.maximum(scene.shape[cones, 1] + scene.shape[cones, 2], 2e-3)
-        )[:, None]
+        diameter = np.maximum(scene.shape[cones, 1] + scene.shape[cones, 2], 2e-3)
+        repeats[cones, :, 0] /= (math.pi * diameter)[:, None]
         repeats[cones] /= scene.scale[cones].mean(axis=1)[:, None, None]
-        return np.asarray(repeats.max(axis=2) * (1 << log2_size[scene.texture]) / CAMERA.fx)
+        texture_size = 1 << scene.atlas.log2_size[scene.texture]
+        return np.asarray(repeats.max(axis=2) * texture_size / CAMERA.fx)
 
     def _shadow(self, pose: Array, time: float, depth: Array, color: NDArray[np.float32]) -> None:
         """Soft shadows of things outside the picture, sweeping over the scene."""
-        light = _LAMPS[1, :3] / _LAMPS[1, 2]
+        direction = _LAMPS[1, :3] / _LAMPS[1, 2]
+        # Spots in the plane: x, y, radius in metres, and darkness.
         sweep = 1.6 * sin(2 * math.pi * time / 6.3)
-        first = [sweep + light[0] * 1.2, 0.7 + 0.3 * sin(1.1 * time), 1.0, 0.5]
-        # x, y, radius in metres, and darkness
-        spots = (first, [-0.7 * sweep + light[0] * 1.2, 2.9, 0.9, 0.4])
+        first = (sweep + direction[0] * 1.2, 0.7 + 0.3 * sin(1.1 * time), 1.0, 0.5)
+        second = (-0.7 * sweep + direction[0] * 1.2, 2.9, 0.9, 0.4)
+
+        # The points that the pixels see, in the world.
         v, u = np.mgrid[0 : CAMERA.height, 0 : CAMERA.width].astype(np.float64)
         x = (u - CAMERA.cx) / CAMERA.fx * depth
         y = (v - CAMERA.cy) / CAMERA.fy * depth
         wx, wy, wz = (row[0] * x + row[1] * y + row[2] * depth + row[3] for row in pose[:3])
-        up = (2.2 - wz) / light[2]  # along the light to the plane in which the spots lie
-        wx = wx + light[0] * up
-        wy = wy + light[1] * up
+
+        # From there along the light to the plane.
+        up = (_SHADOW_PLANE_M - wz) / direction[2]
+        wx = wx + direction[0] * up
+        wy = wy + direction[1] * up
         factor = np.ones(SIZE)
-        for at_x, at_y, radius, darkness in spots:
-            near = 1.0 - ((wx - at_x) ** 2 + (wy - at_y) ** 2) / (radius * radius)
+        for spot_x, spot_y, radius, darkness in (first, second):
+            near = 1.0 - ((wx - spot_x) ** 2 + (wy - spot_y) ** 2) / (radius * radius)
             factor *= 1.0 - darkness * np.clip(2.0 * near, 0.0, 1.0)
         color *= np.where((depth > 0.0) & (up > 0.0), factor, 1.0)[..., None]
 
@@ -390,27 +438,36 @@ class Renderer:
         strength = 110 * (0.6 + 0.4 * sin(2 * math.pi * time / 5.3))
         across = exp(-(((np.arange(CAMERA.width) - u) / 210.0) ** 2))
         down = exp(-(((np.arange(CAMERA.height) - v) / 180.0) ** 2))
-        return np.asarray((strength * down[:, None] * across[None, :])[..., None], np.float32)
+        veil = strength * down[:, None] * across[None, :]
+        return np.asarray(veil[..., None], np.float32)
 
     def _noise_seed(self, number: int) -> np.uint64:
+        """Seed of a frame's noise: even numbers are for the depth sensor, odd ones for the colour sensor."""
         return np.uint64((self._seed + 0x9E3779B97F4A7C15 * number) & 0xFFFFFFFFFFFFFFFF)
 
     def _measure(
         self, index: int, depth: Array, cosine: NDArray[np.float32], color: NDArray[np.float32]
     ) -> NDArray[np.uint16]:
         """The depth as the sensor measures it."""
-        sensor, raw, seed = (
-            self.depth_sensor,
-            np.empty(SIZE, np.uint16),
-            self._noise_seed(2 * index),
-        )
-        factor = CAMERA.written_depth_factor
+        sensor = self.depth_sensor
+        units_per_m = CAMERA.written_depth_factor
         if not sensor.noise:
-            return np.clip(np.floor(depth * factor + 0.5), 0, 65535).astype(np.uint16)
-        values = sensor.disparity_noise_px, sensor.near_m, sensor.far_m, sensor.edge_px, sensor.dark
+            return np.clip(np.floor(depth * units_per_m + 0.5), 0, 65535).astype(np.uint16)
+        model = DepthModel(
+            fx=CAMERA.fx,
+            baseline_m=CAMERA.baseline_m,
+            disparity_noise_px=sensor.disparity_noise_px,
+            near_m=sensor.near_m,
+            far_m=sensor.far_m,
+            edge_px=sensor.edge_px,
+            dark=sensor.dark,
+            units_per_m=units_per_m,
+        )
+        raw = np.empty(SIZE, np.uint16)
+        seed = self._noise_seed(2 * index)
         self._rows(
-            lambda a, b: kernels.measure_depth(
-                a, b, seed, CAMERA.fx, CAMERA.baseline_m, depth, cosine, color, *values, factor, raw
+            lambda row0, row1: kernels.measure_depth(
+                row0, row1, seed, model, depth, cosine, color, raw
             )
         )
         return raw
@@ -420,17 +477,27 @@ class Renderer:
         sensor = self.color_sensor
         optics = self.scene.world.optics
         rgb = np.empty(color.shape, np.uint8)
+        # Gain of each row: rows are read one after the other during 0.9 of the frame's interval.
         time = index / FPS + np.arange(CAMERA.height) / CAMERA.height / FPS * 0.9
         drift = 0.7 * sin(2 * math.pi * time / 6.1) + 0.3 * sin(2 * math.pi * time / 1.9 + 1.0)
         gain = 1 + sensor.exposure_drift * drift
-        gain *= 1 + sensor.flicker * sin(2 * math.pi * 100.0 * time * 1.0013)
+        # mains whose frequency is 0.13 % off
+        gain *= 1 + sensor.flicker * sin(2 * math.pi * _MAINS_HZ * time * 1.0013)
+
+        # Brightness of the lamps, and automatic exposure against it.
         lamps = optics.gain(index / FPS) if callable(optics.gain) else optics.gain
         if lamps != 1 or optics.auto_exposure:
             mean = max(float(color.mean(dtype=np.float64)) * lamps, 1.0)
             gain *= lamps * power(_MEAN_GREY / mean, optics.auto_exposure)
+
         seed = self._noise_seed(2 * index + 1)
-        read, shot = (sensor.read_noise, sensor.shot_noise) if sensor.noise else (0.0, 0.0)
-        self._rows(lambda a, b: kernels.expose(a, b, seed, color, gain, read, shot, rgb))
+        read_noise = sensor.read_noise if sensor.noise else 0.0
+        shot_noise = sensor.shot_noise if sensor.noise else 0.0
+        self._rows(
+            lambda row0, row1: kernels.expose(
+                row0, row1, seed, color, gain, read_noise, shot_noise, rgb
+            )
+        )
         return rgb
 
 
@@ -439,15 +506,19 @@ SensorSettings = TypeVar("SensorSettings", bound=Settings)
 
 def _adapted(sensor: SensorSettings, world: Mapping[str, Any]) -> SensorSettings:
     """The sensor's settings with those of the world where the user left the default."""
-    return sensor.model_copy(
-        update={k: v for k, v in world.items() if k not in sensor.model_fields_set}
-    )
+    changes = {name: value for name, value in world.items() if name not in sensor.model_fields_set}
+    return sensor.model_copy(update=changes)
+
+
+_MOST_THREADS = 4
 
 
 def default_threads() -> int:
     """Cores this process may use, at most four; ``NUMBA_NUM_THREADS`` lowers it."""
-    cores = (
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    )
-    limit = os.environ.get("NUMBA_NUM_THREADS", "")
-    return max(1, min(cores, 4, int(limit) if limit.isdigit() and int(limit) > 0 else 4))
+    if hasattr(os, "sched_getaffinity"):
+        cores = len(os.sched_getaffinity(0))
+    else:
+        cores = os.cpu_count() or 1
+    text = os.environ.get("NUMBA_NUM_THREADS", "")
+    limit = int(text) if text.isdigit() and int(text) > 0 else _MOST_THREADS
+    return max(1, min(cores, _MOST_THREADS, limit))

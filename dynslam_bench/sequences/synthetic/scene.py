@@ -32,7 +32,7 @@ class Body:
         instance: Its id in the masks, 1-255; its parts carry the same.
         name: Class name; a COCO name where there is one.
         parts: Its primitives about its own origin.
-        path: Where it is.
+        path: Where it is at a time.
     """
 
     instance: int
@@ -97,7 +97,7 @@ class Variant:
     """A rendered sequence in all its scenes, ``synthetic/<name>``.
 
     Attributes:
-        build: Scene number to the world that is filmed.
+        build: Makes the world that is filmed in a scene, from the scene's number.
         tag: How much of the scene moves.
         frames: Default length.
         version: Raised whenever any pixel, pose or mask changes; 0 where the renderer's version
@@ -125,7 +125,7 @@ class View:
         rows: ``[R, 4, 4]`` poses of all rows; R is 1 under a global shutter, else the height of the
             image.
         rotation: ``[P, 3, 3]`` local (scaled) to world, when the middle of the image is exposed.
-        origin: ``[P, 3]``, then.
+        origin: ``[P, 3]`` world positions of the local origins at that time, metres.
     """
 
     pose: Array
@@ -163,65 +163,65 @@ class Scene:
         self.seed = scene
         self.moves = settings.people == "moving"
         self.actors = () if settings.people == "none" else world.actors
+        # All primitives, in the order in which `_place` moves them: static parts, bodies, people.
+        bodies = (body.parts for body in world.bodies)
         people = (build_person(person, posture(0.0)) for person, posture in self.actors)
-        parts = [*world.static, *chain(*(body.parts for body in world.bodies), *people)]
-        columns = {
-            name: np.array([getattr(part, name) for part in parts])
-            for name in ("kind", "instance", "scale", "shape", "uv", "tint", "rotation", "origin")
-        }
-        self.kind, self.instance = (
-            columns["kind"].astype(np.int32),
-            columns["instance"].astype(np.int32),
-        )
-        self.scale, self.shape, self.uv, self.tint = (
-            columns[name] for name in ("scale", "shape", "uv", "tint")
-        )
-        self._rotation = columns["rotation"]
-        self._origin = columns["origin"]
+        parts = [*world.static, *chain(*bodies, *people)]
+        # Their attributes as arrays ``[P, ...]``.
+        self.kind = np.array([part.kind for part in parts]).astype(np.int32)
+        self.instance = np.array([part.instance for part in parts]).astype(np.int32)
+        self.scale = np.array([part.scale for part in parts])
+        self.shape = np.array([part.shape for part in parts])
+        self.uv = np.array([part.uv for part in parts])
+        self.tint = np.array([part.tint for part in parts])
+        self._rotation = np.array([part.rotation for part in parts])
+        self._origin = np.array([part.origin for part in parts])
+        # Textures by number.
         self.texture_names = sorted({name for part in parts for name in part.texture})
-        index = {name: i for i, name in enumerate(self.texture_names)}
-        self.texture = np.array(
-            [[index[name] for name in part.texture] for part in parts], np.int32
-        )
+        number = {name: i for i, name in enumerate(self.texture_names)}
+        faces = [[number[name] for name in part.texture] for part in parts]
+        self.texture = np.array(faces, np.int32)
         self.corners = self._corners()
+        # neighbouring frames ask for the same places and views
         self._placed = lru_cache(maxsize=8)(self._place)
         self.view = lru_cache(maxsize=8)(self._view)
-        """How frame `index` sees the scene; neighbouring frames ask for the same views."""
+        """How frame `index` sees the scene."""
 
     @cached_property
     def atlas(self) -> textures.Atlas:
         """The scene's textures; drawn when the first frame is coloured."""
-        drawn = (
-            textures.MAKERS[name.partition(":")[0]](stream(self.seed, "synthetic", "texture", name))
-            for name in self.texture_names
-        )
-        return textures.build_atlas(list(drawn))
+        drawn = []
+        for name in self.texture_names:
+            draw = textures.MAKERS[name.partition(":")[0]]
+            drawn.append(draw(stream(self.seed, "synthetic", "texture", name)))
+        return textures.build_atlas(drawn)
 
     def place(self, time: float) -> tuple[Array, Array]:
         """Rotation ``[P, 3, 3]`` and origin ``[P, 3]`` of every primitive at a time (seconds from the start)."""
         return self._placed(time if self.moves else 0.0)
 
     def _place(self, time: float) -> tuple[Array, Array]:
+        """Place static parts, bodies and people at a time."""
         rotation = self._rotation.copy()
         origin = self._origin.copy()
         end = len(self.world.static)
+        # Bodies: their parts turn and move with them.
         for body in self.world.bodies:
             part = slice(end, end + len(body.parts))
-            turned, shift = body.path(time)
-            rotation[part], origin[part] = (
-                product(turned, rotation[part]),
-                product(origin[part], turned.T) + shift,
-            )
+            R_world_body, position = body.path(time)
+            rotation[part] = product(R_world_body, rotation[part])
+            origin[part] = product(origin[part], R_world_body.T) + position
             end = part.stop
-        people = list(
-            chain(*(build_person(person, posture(time)) for person, posture in self.actors))
-        )
-        if people:
-            rotation[end:] = [part.rotation for part in people]
-            origin[end:] = [part.origin for part in people]
+        # People: built anew in their posture.
+        people = [build_person(person, posture(time)) for person, posture in self.actors]
+        limbs = list(chain(*people))
+        if limbs:
+            rotation[end:] = [part.rotation for part in limbs]
+            origin[end:] = [part.origin for part in limbs]
         return rotation, origin
 
     def _view(self, index: int) -> View:
+        """How frame `index` sees the scene; things stand still while its rows are read."""
         time = index / FPS
         readout_s = self.world.optics.readout_s
         pose = self.world.camera(np.array([time]))[0]
@@ -232,25 +232,28 @@ class Scene:
         """Instances with a point that moved by more than `MOVED_M` since the previous frame; frame 0 has none."""
         if index == 0 or not self.moves:
             return frozenset()
-        before = self.place((index - 1) / FPS)
-        after = self.place(index / FPS)
+        rotation_before, origin_before = self.place((index - 1) / FPS)
+        rotation, origin = self.place(index / FPS)
+        # Motion of the corners of every primitive's box: no point inside moves by more.
         box = self.corners * self.scale[:, None, :]
-        shift = (
-            product(box, np.swapaxes(after[0] - before[0], 1, 2))
-            + (after[1] - before[1])[:, None, :]
-        )
+        turned = product(box, np.swapaxes(rotation - rotation_before, 1, 2))
+        shift = turned + (origin - origin_before)[:, None, :]
         moved = norm(shift).max(axis=1) > MOVED_M
         return frozenset(int(k) for k in np.unique(self.instance[moved]) if k > 0)
 
     def _corners(self) -> Array:
         """Corners ``[P, 8, 3]`` of each primitive's box in its local frame."""
+        # Boxes: half extents. Quads: the same, without depth.
         low = -self.shape.copy()
         high = self.shape.copy()
-        low[self.kind == QUAD, 2] = high[self.kind == QUAD, 2] = 0.0
+        low[self.kind == QUAD, 2] = 0.0
+        high[self.kind == QUAD, 2] = 0.0
+        # Round cones: around the spheres at both ends.
         cones = self.kind == ROUND_CONE
         h, r1, r2 = self.shape[cones].T
         radius = np.maximum(r1, r2)
         low[cones] = np.stack([-radius, -radius, np.minimum(-r1, h - r2)], 1)
         high[cones] = np.stack([radius, radius, np.maximum(h + r2, r1)], 1)
-        choose = np.array([[(i >> a) & 1 for a in range(3)] for i in range(8)], dtype=bool)
-        return np.where(choose[None], high[:, None, :], low[:, None, :])
+        # Bit k of a corner's number is its side along axis k.
+        is_high = np.array([[(i >> axis) & 1 for axis in range(3)] for i in range(8)], dtype=bool)
+        return np.where(is_high[None], high[:, None, :], low[:, None, :])

@@ -1,6 +1,7 @@
 """Procedural textures, drawn from a seed and packed with their mip levels into one atlas."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,25 +12,37 @@ Image = NDArray[np.float64]
 """Float ``[S, S, 3]`` in 0-255, S a power of two; it wraps around."""
 
 
-Atlas = tuple[NDArray[np.uint8], NDArray[np.int64], NDArray[np.int32]]
-"""All textures and their mip levels as one array: uint8 texels, four bytes each (the last unused), level after level,
-texture after texture; int64 ``[T, L]`` offset of each level's first byte; int32 ``[T]`` base-2
-logarithm of each
-texture's edge."""
+class Atlas(NamedTuple):
+    """All T textures and their mip levels as one array.
+
+    Attributes:
+        texels: uint8, four bytes a texel (the last unused), level after level, texture after
+            texture.
+        level_offset: int64 ``[T, L]`` offset of each level's first byte.
+        log2_size: int32 ``[T]`` base-2 logarithm of each texture's edge.
+    """
+
+    texels: NDArray[np.uint8]
+    level_offset: NDArray[np.int64]
+    log2_size: NDArray[np.int32]
+
+
+_LEVELS = 12
+"""Mip levels of a texture, at most: of an edge of 2048 texels."""
 
 
 def build_atlas(textures: list[Image]) -> Atlas:
     """Pack textures; each is halved by 2x2 means down to one texel."""
-    levels = 12
-    offsets = np.zeros((len(textures), levels), np.int64)
-    log2 = np.zeros(len(textures), np.int32)
+    level_offset = np.zeros((len(textures), _LEVELS), np.int64)
+    log2_size = np.zeros(len(textures), np.int32)
     parts: list[NDArray[np.uint8]] = []
     position = 0
     for index, image in enumerate(textures):
-        log2[index] = len(image).bit_length() - 1
+        log2_size[index] = len(image).bit_length() - 1
         current = np.clip(image, 0, 255)
-        for level in range(levels):
-            offsets[index, level:] = position
+        for level in range(_LEVELS):
+            # levels that the texture does not have are its last one
+            level_offset[index, level:] = position
             texels = np.zeros((*current.shape[:2], 4), np.uint8)
             texels[..., :3] = np.floor(current + 0.5)
             parts.append(texels.ravel())
@@ -39,24 +52,27 @@ def build_atlas(textures: list[Image]) -> Atlas:
             current = 0.25 * (
                 current[::2, ::2] + current[1::2, ::2] + current[::2, 1::2] + current[1::2, 1::2]
             )
-    return np.concatenate(parts), offsets, log2
+    return Atlas(np.concatenate(parts), level_offset, log2_size)
 
 
 def smooth_noise(
     rng: np.random.Generator, size: int, cells: int, cells_v: int | None = None
 ) -> NDArray[np.float64]:
-    """Wrapping value noise in [-1, 1], ``[size, size]``, with `cells` x `cells_v` lattice cells, cosine-blended."""
+    """Wrapping value noise in [-1, 1], ``[size, size]``, with `cells` x `cells_v` lattice cells, smoothly blended."""
     cells_v = cells if cells_v is None else cells_v
     lattice = rng.random((cells_v, cells)) * 2 - 1
 
-    def weights(n: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    def corners_and_blend(
+        n: int,
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """The lattice points before and after each pixel along one axis, and the second one's weight."""
         x = np.arange(size) * n / size
         i = np.floor(x).astype(np.int64)
         f = x - i
         return i % n, (i + 1) % n, f * f * (3 - 2 * f)
 
-    u0, u1, fu = weights(cells)
-    v0, v1, fv = weights(cells_v)
+    u0, u1, fu = corners_and_blend(cells)
+    v0, v1, fv = corners_and_blend(cells_v)
     top = lattice[v0][:, u0] * (1 - fu) + lattice[v0][:, u1] * fu
     bottom = lattice[v1][:, u0] * (1 - fu) + lattice[v1][:, u1] * fu
     return top * (1 - fv[:, None]) + bottom * fv[:, None]
@@ -71,6 +87,7 @@ def fractal(rng: np.random.Generator, size: int, cells: int, octaves: int) -> ND
 
 
 def _gray(values: NDArray[np.float64]) -> Image:
+    """A grey image ``[S, S, 3]`` of values ``[S, S]``."""
     return np.repeat(values[..., None], 3, axis=2)
 
 
@@ -96,7 +113,9 @@ def wood(rng: np.random.Generator, size: int = 256) -> Image:
 def carpet(rng: np.random.Generator, size: int = 512) -> Image:
     """Office carpet tiles: speckle, faint tile joints."""
     values = 200 + 14 * fractal(rng, size, 24, 3) + 12 * (rng.random((size, size)) - 0.5)
-    joint = np.minimum(np.arange(size) % (size // 2), size // 2 - np.arange(size) % (size // 2))
+    # distance to the next joint: a tile is half the texture
+    in_tile = np.arange(size) % (size // 2)
+    joint = np.minimum(in_tile, size // 2 - in_tile)
     values -= 10 * exp(-((joint[:, None] / 1.5) ** 2)) + 10 * exp(-((joint[None, :] / 1.5) ** 2))
     return _gray(values)
 
@@ -104,15 +123,22 @@ def carpet(rng: np.random.Generator, size: int = 512) -> Image:
 def _rect(
     image: Image, u0: float, v0: float, u1: float, v1: float, color: NDArray[np.float64]
 ) -> None:
-    s = image.shape[0]
-    image[int(max(v0, 0) * s) : int(min(v1, 1) * s), int(max(u0, 0) * s) : int(min(u1, 1) * s)] = (
-        color
-    )
+    """Fill a rectangle; its corners are given as shares of the image's edge."""
+    size = image.shape[0]
+    rows = slice(int(max(v0, 0) * size), int(min(v1, 1) * size))
+    columns = slice(int(max(u0, 0) * size), int(min(u1, 1) * size))
+    image[rows, columns] = color
 
 
-def _text(rng: np.random.Generator, image: Image, u0: float, v0: float, u1: float, v1: float, lines: int,
-          color: NDArray[np.float64]) -> None:  # fmt: skip
-    """Rows of word-like dashes."""
+def _text(
+    rng: np.random.Generator,
+    image: Image,
+    area: tuple[float, float, float, float],
+    lines: int,
+    color: NDArray[np.float64],
+) -> None:
+    """Rows of word-like dashes in the area u0, v0, u1, v1."""
+    u0, v0, u1, v1 = area
     pitch = (v1 - v0) / lines
     for line in range(lines):
         u = u0
@@ -125,41 +151,35 @@ def _text(rng: np.random.Generator, image: Image, u0: float, v0: float, u1: floa
 
 def poster(rng: np.random.Generator, size: int = 256) -> Image:
     """A poster: a ground, a picture of discs and bars, a headline and text."""
+    # ground and headline
     ground = 150 + 100 * rng.random(3)
     image = np.tile(ground, (size, size, 1))
     ink = 20 + 90 * rng.random(3)
     _rect(image, 0.03, 0.03, 0.97, 0.97, ground * 0.92)
     _rect(image, 0.1, 0.06, 0.55 + 0.3 * rng.random(), 0.13, ink)
+    # a picture with discs, cut at its frame, ...
     yy, xx = (np.mgrid[0:size, 0:size] + 0.5) / size
+    left = 0.08
+    right = 0.92
     top = 0.18
     bottom = 0.62
-    _rect(image, 0.08, top, 0.92, bottom, 60 + 150 * rng.random(3))
+    in_picture = (yy > top) & (yy < bottom) & (xx > left) & (xx < right)
+    _rect(image, left, top, right, bottom, 60 + 150 * rng.random(3))
     for _ in range(int(rng.integers(5, 10))):
-        u, v, r = (
-            0.15 + 0.7 * rng.random(),
-            top + 0.06 + (bottom - top - 0.12) * rng.random(),
-            0.03 + 0.1 * rng.random(),
-        )
-        inside = (
-            ((xx - u) ** 2 + (yy - v) ** 2 < r * r)
-            & (yy > top)
-            & (yy < bottom)
-            & (xx > 0.08)
-            & (xx < 0.92)
-        )
-        image[inside] = 40 + 200 * rng.random(3)
+        u = 0.15 + 0.7 * rng.random()
+        v = top + 0.06 + (bottom - top - 0.12) * rng.random()
+        radius = 0.03 + 0.1 * rng.random()
+        in_disc = (xx - u) ** 2 + (yy - v) ** 2 < radius * radius
+        image[in_disc & in_picture] = 40 + 200 * rng.random(3)
+    # ... and bars
     for _ in range(int(rng.integers(2, 5))):
-        u, v = 0.1 + 0.6 * rng.random(), top + (bottom - top) * 0.8 * rng.random()
-        _rect(
-            image,
-            u,
-            v,
-            min(u + 0.2 * rng.random() + 0.05, 0.92),
-            min(v + 0.12, bottom),
-            40 + 200 * rng.random(3),
-        )
-    _text(rng, image, 0.08, 0.67, 0.47, 0.95, 8, ink)
-    _text(rng, image, 0.53, 0.67, 0.92, 0.95, 8, ink)
+        u = 0.1 + 0.6 * rng.random()
+        v = top + (bottom - top) * 0.8 * rng.random()
+        end = min(u + 0.2 * rng.random() + 0.05, right)
+        _rect(image, u, v, end, min(v + 0.12, bottom), 40 + 200 * rng.random(3))
+    # two columns of text
+    _text(rng, image, (0.08, 0.67, 0.47, 0.95), 8, ink)
+    _text(rng, image, (0.53, 0.67, 0.92, 0.95), 8, ink)
     return image
 
 
@@ -167,22 +187,17 @@ def screen(rng: np.random.Generator, size: int = 256) -> Image:
     """A monitor's picture: windows with title bars and text."""
     image = np.tile(np.array([40.0, 70.0, 110.0]) + 50 * rng.random(3), (size, size, 1))
     for _ in range(3):
-        u, v = 0.02 + 0.4 * rng.random(), 0.02 + 0.35 * rng.random()
+        u = 0.02 + 0.4 * rng.random()
+        v = 0.02 + 0.35 * rng.random()
         w = 0.35 + 0.2 * rng.random()
         h = 0.35 + 0.25 * rng.random()
         dark = rng.random() < 0.4
-        _rect(image, u, v, u + w, v + h, np.full(3, 40.0 if dark else 235.0))
+        background = np.full(3, 40.0 if dark else 235.0)
+        ink = np.full(3, 200.0 if dark else 60.0)
+        _rect(image, u, v, u + w, v + h, background)
         _rect(image, u, v, u + w, v + 0.05, 90 + 90 * rng.random(3))
-        _text(
-            rng,
-            image,
-            u + 0.02,
-            v + 0.08,
-            u + w - 0.03,
-            v + h - 0.03,
-            8,
-            np.full(3, 200.0 if dark else 60.0),
-        )
+        _text(rng, image, (u + 0.02, v + 0.08, u + w - 0.03, v + h - 0.03), 8, ink)
+    # the task bar
     _rect(image, 0, 0.95, 1, 1, np.full(3, 60.0))
     return image
 
@@ -197,12 +212,12 @@ def books(rng: np.random.Generator, size: int = 256) -> Image:
         top = int(size * 0.3 * share * share)
         color = 50 + 170 * rng.random(3)
         image[top:, u : u + w] = color
+        # a dark line between it and the book before
         image[top:, u : u + 1] = color * 0.5
         if rng.random() < 0.8:
             v = top + int(size * (0.1 + 0.2 * rng.random()))
-            image[v : v + int(size * 0.25), u + w // 3 : u + max(2 * w // 3, w // 3 + 2)] = (
-                255 - 0.6 * color
-            )
+            title = slice(u + w // 3, u + max(2 * w // 3, w // 3 + 2))
+            image[v : v + int(size * 0.25), title] = 255 - 0.6 * color
         u += w
     return image
 
@@ -212,30 +227,29 @@ def keyboard(rng: np.random.Generator, size: int = 256) -> Image:
     image = np.full((size, size, 3), 40.0)
     for row in range(5):
         for key in range(15):
-            shade = 75 + 20 * rng.random()
-            _rect(
-                image,
-                (key + 0.12) / 15,
-                (row + 0.1) / 5,
-                (key + 0.9) / 15,
-                (row + 0.85) / 5,
-                np.full(3, shade),
-            )
+            shade = np.full(3, 75 + 20 * rng.random())
+            left = (key + 0.12) / 15
+            right = (key + 0.9) / 15
+            _rect(image, left, (row + 0.1) / 5, right, (row + 0.85) / 5, shade)
     return image
 
 
 def plaid(rng: np.random.Generator, size: int = 256) -> Image:
     """A plaid weave: crossing bands of three colours, one tile of the repeat."""
     base, second, third = (30 + 200 * rng.random(3) for _ in range(3))
+    # the first two must differ in brightness
     while abs(base.mean() - second.mean()) < 60:
         second = 20 + 220 * rng.random(3)
     repeats = 2
     t = (np.arange(size) * repeats / size) % 1.0
 
     def bands() -> NDArray[np.float64]:
-        centres, widths = rng.random(3), 0.05 + 0.12 * rng.random(3)
+        """Where along one axis the second and the third colour have their bands ``[S, 2]``."""
+        centres = rng.random(3)
+        widths = 0.05 + 0.12 * rng.random(3)
         weight = np.zeros((size, 2))
         for i in range(3):
+            # distance on a circle: the texture wraps around
             near = np.abs((t - centres[i] + 0.5) % 1.0 - 0.5) < widths[i]
             weight[near, i % 2] = 1.0
         return weight
@@ -257,7 +271,10 @@ def print_shirt(rng: np.random.Generator, size: int = 256) -> Image:
     yy, xx = (np.mgrid[0:size, 0:size] + 0.5) / size
     for _ in range(26):
         color = 20 + 225 * rng.random(3)
-        u, v, r = rng.random(), rng.random(), 0.03 + 0.06 * rng.random()
+        u = rng.random()
+        v = rng.random()
+        r = 0.03 + 0.06 * rng.random()
+        # distance to its centre on a torus: the texture wraps around
         du = (xx - u + 0.5) % 1 - 0.5
         dv = (yy - v + 0.5) % 1 - 0.5
         square = du * du + dv * dv
@@ -304,10 +321,12 @@ def face(rng: np.random.Generator, size: int = 256) -> Image:
     def blob(
         u: float, v: float, ru: float, rv: float, color: tuple[float, float, float], strength: float
     ) -> None:
+        """Blend a soft ellipse with radii `ru` and `rv` about (u, v) into the image."""
         d = ((xx - u) / ru) ** 2 + ((yy - v) / rv) ** 2
         alpha = np.clip(1.6 * (1.2 - d), 0, 1)[..., None] * strength
         image[:] = image * (1 - alpha) + np.array(color) * alpha
 
+    # on either side socket, white and iris of the eye, brow, and cheek
     gap = 0.075 + 0.01 * rng.random()
     for side in (-1, 1):
         blob(0.5 + side * gap, 0.43, 0.042, 0.034, (190, 170, 165), 0.7)
@@ -315,6 +334,7 @@ def face(rng: np.random.Generator, size: int = 256) -> Image:
         blob(0.5 + side * gap, 0.44, 0.013, 0.016, (50, 40, 35), 1.0)
         blob(0.5 + side * gap, 0.375, 0.048, 0.012, (90, 70, 60), 0.9)
         blob(0.5 + side * 0.13, 0.6, 0.05, 0.06, (245, 200, 190), 0.35)
+    # nose and mouth
     blob(0.5, 0.6, 0.035, 0.02, (180, 150, 145), 0.6)
     blob(0.5, 0.715, 0.06, 0.018, (190, 100, 100), 0.9)
     blob(0.5, 0.716, 0.055, 0.005, (110, 50, 50), 0.8)
