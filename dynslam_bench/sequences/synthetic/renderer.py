@@ -102,10 +102,10 @@ def rolling_flow(now: View, other: View, hit: HitImage, depth: Array) -> NDArray
         share = np.clip(row - first, 0.0, 1.0)[..., None]
         before = _in_camera(points, other.rows[first])
         after = _in_camera(points, other.rows[first + 1])
-        seen = (1 - share) * before + share * after
-        z = np.where(seen[..., 2] > NEAR_M, seen[..., 2], np.nan)
-        x = seen[..., 0] / z * CAMERA.fx + CAMERA.cx
-        y = seen[..., 1] / z * CAMERA.fy + CAMERA.cy
+        in_camera = (1 - share) * before + share * after
+        z = np.where(in_camera[..., 2] > NEAR_M, in_camera[..., 2], np.nan)
+        x = in_camera[..., 0] / z * CAMERA.fx + CAMERA.cx
+        y = in_camera[..., 1] / z * CAMERA.fy + CAMERA.cy
         row = np.where(np.isfinite(y), y, row)
     flow = np.stack([x - u, y - v], axis=-1)
     flow[hit < 0] = np.nan

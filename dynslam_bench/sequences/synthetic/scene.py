@@ -212,7 +212,7 @@ class Scene:
             rotation[part] = product(R_world_body, rotation[part])
             origin[part] = product(origin[part], R_world_body.T) + position
             end = part.stop
-        # People: built anew in their posture.
+        # People: built again in their posture.
         people = [build_person(person, posture(time)) for person, posture in self.actors]
         limbs = list(chain(*people))
         if limbs:
