@@ -116,9 +116,12 @@ class AuditReport:
             if not finding.holds
         ]
         columns = [
-            *texts("check"), *numbers("table"), *texts("system", "sequence", "quantity"),
-            *numbers("printed", "held against"), *texts("remark"),
-        ]  # fmt: skip
+            *texts("check"),
+            *numbers("table"),
+            *texts("system", "sequence", "quantity"),
+            *numbers("printed", "held against"),
+            *texts("remark"),
+        ]
         return Table(
             "audit_findings",
             "Numbers that do not hold",

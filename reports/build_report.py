@@ -167,9 +167,13 @@ def build_report(
         paged = _paged(board, typical, most_pages)
         pictured = {row.run_id for row in paged if row.failed or row.run_id in typical}
         pages = write_run_pages(
-            paged, pictured, protocol, output, pool,
+            paged,
+            pictured,
+            protocol,
+            output,
+            pool,
             lambda done, total: on_progress(done, total, "writing the pages of the runs"),
-        )  # fmt: skip
+        )
     on_progress(0, None, "putting the tables and figures together")
     pageless = _pageless(len(paged), len(board.rows))
     again = command or _command(
@@ -352,9 +356,15 @@ def _write(
     for page, sections in pages.items():
         name = dict(LINKS)[page]
         text = sections_page(
-            sections, title=f"{title}: {name}", links=LINKS, here=page, footer=footer, protocol=protocol.describe(),
-            errors_table=page == "errors.html", scripts=["errors.js"] if page == "errors.html" else [],
-        )  # fmt: skip
+            sections,
+            title=f"{title}: {name}",
+            links=LINKS,
+            here=page,
+            footer=footer,
+            protocol=protocol.describe(),
+            errors_table=page == "errors.html",
+            scripts=["errors.js"] if page == "errors.html" else [],
+        )
         write_atomic(output / page, text)
     write_atomic(
         paths.run,
@@ -696,9 +706,14 @@ def publish(
     for part in ("leaderboard/data", "leaderboard/csv", "leaderboard/frames", "study"):
         shutil.rmtree(output / part, ignore_errors=True)
     report = build_report(
-        list(runs), output / "leaderboard", protocol=protocol, title=title, command="dynslam-bench report RESULTS",
-        most_pages=most_pages, on_progress=on_progress,
-    )  # fmt: skip
+        list(runs),
+        output / "leaderboard",
+        protocol=protocol,
+        title=title,
+        command="dynslam-bench report RESULTS",
+        most_pages=most_pages,
+        on_progress=on_progress,
+    )
     for path in (report.data, report.latex):  # for work with the results, not for looking at them
         path.unlink()
     report.markdown.replace(output / "leaderboard" / README)

@@ -54,13 +54,22 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
     )
     sections = [
         Section(
-            "result", "Tried, confirmed, held out", [note] if (note := seen_note(summary.seen)) else [],
+            "result",
+            "Tried, confirmed, held out",
+            [note] if (note := seen_note(summary.seen)) else [],
             [*figure_blocks(_funnel_figure(tuner, summary), caption), Block(table=candidates)],
         ),
-        Section("preset", "Settings: baseline, best trial, range", [], _preset(tuner, summary, settings)),
-        Section("course", "How it went", [*warnings_of(tuner), _importance_note(summary)], _plots(tuner, summary)),
+        Section(
+            "preset", "Settings: baseline, best trial, range", [], _preset(tuner, summary, settings)
+        ),
+        Section(
+            "course",
+            "How it went",
+            [*warnings_of(tuner), _importance_note(summary)],
+            _plots(tuner, summary),
+        ),
         Section("trials", "All trials", [], [Block("All trials", trials, folded=True)]),
-    ]  # fmt: skip
+    ]
     html = sections_page(
         sections,
         title=f"Study {spec.name}: {spec.tracker}",
@@ -177,11 +186,15 @@ def _funnel_figure(tuner: Study, summary: StudySummary) -> go.Figure:
     stages = [f"tried: {len(tried)} whole trials"]
     traces = [
         go.Scatter(
-            x=spread, y=[math.exp(trial.values[0]) for trial in tried], mode="markers", name="trials",
-            text=[f"trial {trial.number}" for trial in tried], marker={"color": NEUTRAL, "opacity": 0.7, "size": 7},
+            x=spread,
+            y=[math.exp(trial.values[0]) for trial in tried],
+            mode="markers",
+            name="trials",
+            text=[f"trial {trial.number}" for trial in tried],
+            marker={"color": NEUTRAL, "opacity": 0.7, "size": 7},
             hovertemplate="%{text}: %{y:.3f}<extra></extra>",
         )
-    ]  # fmt: skip
+    ]
     splits = {"confirm": "confirmed", "held_out": "held out", "recorded": "recordings"}
     for (split, words), colour in zip(splits.items(), COLOURS, strict=False):
         judged: list[tuple[Candidate, Ratio]] = [
@@ -209,12 +222,16 @@ def _funnel_figure(tuner: Study, summary: StudySummary) -> go.Figure:
         }
         traces.append(
             go.Scatter(
-                x=at, y=[ratio.ratio for _, ratio in judged], mode="markers", name=words, error_y=bars,
+                x=at,
+                y=[ratio.ratio for _, ratio in judged],
+                mode="markers",
+                name=words,
+                error_y=bars,
                 text=[f"trial {candidate.trial}" for candidate, _ in judged],
                 marker={"color": colour, "symbol": symbols, "size": 12},
                 hovertemplate="%{text}: %{y:.3f}<extra></extra>",
             )
-        )  # fmt: skip
+        )
     axis = {
         "tickvals": list(range(len(stages))),
         "ticktext": stages,

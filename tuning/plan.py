@@ -319,10 +319,17 @@ class Plan:
         runs = len(design.reference) + spec.trials * len(design.tune) + chosen
         unused = self._unused(list(records.values()))
         return Preview(
-            scenes=len(judged), runs=len(records), spread=spread, detectable=detectable(spread, len(judged)),
-            needed=scenes_needed(GAIN, spread), minutes=math.ceil(runs / jobs) * run_s / 60, unused=unused,
-            include=[parameter.name for parameter in self.space if parameter.name not in unused] if unused else [],
-        )  # fmt: skip
+            scenes=len(judged),
+            runs=len(records),
+            spread=spread,
+            detectable=detectable(spread, len(judged)),
+            needed=scenes_needed(GAIN, spread),
+            minutes=math.ceil(runs / jobs) * run_s / 60,
+            unused=unused,
+            include=[parameter.name for parameter in self.space if parameter.name not in unused]
+            if unused
+            else [],
+        )
 
     def run_spec(
         self, instance: ProblemInstance, configuration: Configuration, *, cache: bool | None = None

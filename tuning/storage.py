@@ -354,8 +354,12 @@ def _patient(method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 _CALLED_BY_CACHE = (
-    "_create_new_trial", "_get_best_trial_id", "_get_stale_trial_ids", "_get_trials", "_set_trial_param"
-)  # fmt: skip
+    "_create_new_trial",
+    "_get_best_trial_id",
+    "_get_stale_trial_ids",
+    "_get_trials",
+    "_set_trial_param",
+)
 for _name, _method in inspect.getmembers(RDBStorage, inspect.isfunction):
     if not _name.startswith("_") or _name in _CALLED_BY_CACHE:
         setattr(PatientStorage, _name, _patient(_method))

@@ -27,9 +27,14 @@ _NUMBER = "[1-9][0-9]{0,8}"
 _NUMBERS = "[0-9]{1,9}(-[0-9]{1,9})?(,[0-9]{1,9}(-[0-9]{1,9})?)*"
 _STRENGTHS = r"[a-z]+:[0-9]*\.?[0-9]+(,[a-z]+:[0-9]*\.?[0-9]+)*"
 _OPTIONS = {
-    "scene": _NUMBERS, "frames": _NUMBER, "offsets": _NUMBERS, "stride": _NUMBER, "seeds": _NUMBERS,
-    "degrade": _STRENGTHS, "noise": "[0-9]{1,9}",
-}  # fmt: skip
+    "scene": _NUMBERS,
+    "frames": _NUMBER,
+    "offsets": _NUMBERS,
+    "stride": _NUMBER,
+    "seeds": _NUMBERS,
+    "degrade": _STRENGTHS,
+    "noise": "[0-9]{1,9}",
+}
 """What may stand behind the question mark, and how its value is written."""
 _FORM = (
     'write it as "bonn/crowd[0:120]" or "synthetic/walking_xyz?scene=0-19&frames=80&offsets=0-4"'
@@ -83,9 +88,15 @@ class ProblemInstance:
     def run_spec(self, tracker: str, **how: Any) -> RunSpec:
         """The run of a tracker on this instance; `how` holds further fields of `RunSpec`."""
         return RunSpec(
-            tracker=tracker, sequence=self.sequence, frames=self.frames, offset=self.offset, stride=self.stride,
-            seed=self.seed, degrade=dict(self.degradation), **how,
-        )  # fmt: skip
+            tracker=tracker,
+            sequence=self.sequence,
+            frames=self.frames,
+            offset=self.offset,
+            stride=self.stride,
+            seed=self.seed,
+            degrade=dict(self.degradation),
+            **how,
+        )
 
     def open(self, data_root: str | None = None) -> SequenceView:
         """The sequence, cut to what a tracker sees of it; see `cut` for what is raised beside `SequenceError`."""

@@ -143,9 +143,15 @@ def publish(
 
     with progress("site") as advance:
         site = publish_site(
-            results, output, studies=study or [], title=title, note=remark, protocol=protocol, most_pages=most_pages,
+            results,
+            output,
+            studies=study or [],
+            title=title,
+            note=remark,
+            protocol=protocol,
+            most_pages=most_pages,
             on_progress=advance,
-        )  # fmt: skip
+        )
     present(site, f"{site.index} ({site.files} files, {site.size_mb:.1f} MB)")
 
 

@@ -186,13 +186,30 @@ def run(
     if localisation_only:
         overrides["backend.map.localisation_only"] = True
     specs = make_specs(
-        tracker, sequences, settings=overrides, preset=preset, seeds=seed or [0], offsets=offset or [0],
-        frames=frames, stride=stride, camera=camera, data_root=None if data_root is None else str(data_root),
-        device=device, threads=threads, realtime=realtime, drop_share=drop, cache=cache, video=video, sheet=sheet,
-        snapshots=snapshots, rrd=rrd, save_map=save_map, label=label,
+        tracker,
+        sequences,
+        settings=overrides,
+        preset=preset,
+        seeds=seed or [0],
+        offsets=offset or [0],
+        frames=frames,
+        stride=stride,
+        camera=camera,
+        data_root=None if data_root is None else str(data_root),
+        device=device,
+        threads=threads,
+        realtime=realtime,
+        drop_share=drop,
+        cache=cache,
+        video=video,
+        sheet=sheet,
+        snapshots=snapshots,
+        rrd=rrd,
+        save_map=save_map,
+        label=label,
         degrade=opts.gather_settings(degrade),
         limits=checked(runs.Limits, time_s=time_limit, memory_mb=memory_limit),
-    )  # fmt: skip
+    )
     scored_under = protocol or default_protocol(tracker)
     make = partial(
         run_specs, specs, results=results, jobs=jobs, retry=retry or (), protocol=scored_under

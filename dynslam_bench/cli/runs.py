@@ -71,8 +71,14 @@ MOST_REMARKS = 10
 HINT_FRAMES = 60
 """Frames of a recording that are checked when a run on it fails: a few seconds."""
 COLOURS = {
-    "ok": 32, "lost": 33, "stopped": 33, "crashed": 31, "timeout": 31, "out-of-memory": 31, "invalid": 31,
-}  # fmt: skip
+    "ok": 32,
+    "lost": 33,
+    "stopped": 33,
+    "crashed": 31,
+    "timeout": 31,
+    "out-of-memory": 31,
+    "invalid": 31,
+}
 """Colours of the statuses on a terminal, as ANSI codes."""
 SORTED_BY = ("started", "tracker", "sequence", "status", "ate", "ms", "coverage")
 _SORT_KEYS = {"ate": "ate_rmse_m", "ms": "frame_ms"}

@@ -14,8 +14,29 @@ from pathlib import Path
 from dynslam_bench.core.module_graph import parsed
 
 CODE = (".py", ".so", ".pyd", ".dylib", ".dll")
-_TEXT = (".py", ".sh", ".bash", ".pl", ".rb", ".lua", ".js", ".jl", ".yaml", ".yml", ".toml", ".json", ".cfg", ".ini",
-         ".xml", ".c", ".cc", ".cpp", ".cu", ".h", ".hpp")  # fmt: skip
+_TEXT = (
+    ".py",
+    ".sh",
+    ".bash",
+    ".pl",
+    ".rb",
+    ".lua",
+    ".js",
+    ".jl",
+    ".yaml",
+    ".yml",
+    ".toml",
+    ".json",
+    ".cfg",
+    ".ini",
+    ".xml",
+    ".c",
+    ".cc",
+    ".cpp",
+    ".cu",
+    ".h",
+    ".hpp",
+)
 _LARGEST_TEXT = 1 << 20
 _WORD = re.compile(rb"[\w./~+\-]+")
 _QUOTED = re.compile(rb"[\"']([\w.+\-]+)(?:/[^\"'\n]*)?[\"']")

@@ -277,9 +277,17 @@ def _grid_places(context: Code, builder: Code, kinds: Code, grid: Code) -> tuple
 
 @instruction
 def store_offsets(
-    typing_context: Code, offsets: Code, columns: Code, rows: Code, at: Code, column: Code, row: Code, step_x: Code,
-    step_y: Code, stride: Code,
-) -> Definition:  # fmt: skip
+    typing_context: Code,
+    offsets: Code,
+    columns: Code,
+    rows: Code,
+    at: Code,
+    column: Code,
+    row: Code,
+    step_x: Code,
+    step_y: Code,
+    stride: Code,
+) -> Definition:
     """Write where in a flat image the pixels lie that are up and left of sixteen places, int32; see `sample`.
 
     `stride` is the number of pixels a row of the image, int32.
@@ -322,9 +330,16 @@ def square(typing_context: Code, image: Code, at: Code, stride: Code) -> Definit
 
 @instruction
 def sample(
-    typing_context: Code, squares: Code, columns: Code, rows: Code, at: Code, column: Code, row: Code, step_x: Code,
+    typing_context: Code,
+    squares: Code,
+    columns: Code,
+    rows: Code,
+    at: Code,
+    column: Code,
+    row: Code,
+    step_x: Code,
     step_y: Code,
-) -> Definition:  # fmt: skip
+) -> Definition:
     """Bilinear samples of an image at sixteen places of a rotated and scaled grid.
 
     Args:
@@ -507,9 +522,17 @@ def _histogram_distances(builder: Code, first: Code, second: Code, count: int) -
 
 @instruction
 def descriptor_sum(
-    typing_context: Code, image: Code, samples: Code, near_row: Code, far_row: Code, near: Code, far: Code,
-    descriptor: Code, at: Code, truncation: Code,
-) -> Definition:  # fmt: skip
+    typing_context: Code,
+    image: Code,
+    samples: Code,
+    near_row: Code,
+    far_row: Code,
+    near: Code,
+    far: Code,
+    descriptor: Code,
+    at: Code,
+    truncation: Code,
+) -> Definition:
     """Sum of the truncated L1 distances of 17 histograms of eight bytes (first term of Eq. 1), without a branch.
 
     Written as generic vector code. Nothing is checked.
@@ -723,9 +746,17 @@ def normal_equations(typing_context: Code) -> Definition:
 
 @instruction
 def add_normal_equation(
-    typing_context: Code, sums: Code, weight: Code, j0: Code, j1: Code, j2: Code, j3: Code, j4: Code, j5: Code,
+    typing_context: Code,
+    sums: Code,
+    weight: Code,
+    j0: Code,
+    j1: Code,
+    j2: Code,
+    j3: Code,
+    j4: Code,
+    j5: Code,
     residual: Code,
-) -> Definition:  # fmt: skip
+) -> Definition:
     """Sums with ``weight j^T j`` and ``weight j^T residual`` of one residual more, j its derivatives by six numbers."""
 
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:

@@ -215,9 +215,18 @@ def prior_information(state: FilterState, T_prev_cur: NDArray[np.float64]) -> ND
 
 @kernel
 def _align(
-    start: Array, points: Array, pixels: Array, prior_weight: Array, information: Array, scales: Array, turns: int,
-    fx: float, fy: float, cx: float, cy: float,
-) -> tuple[Array, float]:  # fmt: skip
+    start: Array,
+    points: Array,
+    pixels: Array,
+    prior_weight: Array,
+    information: Array,
+    scales: Array,
+    turns: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+) -> tuple[Array, float]:
     """The pose T that projects ``T @ points`` ``[N, 3]`` onto `pixels` ``[N, 2]``, and the sum of the points' weights.
 
     `information` ``[6, 6]`` is that of the prior, the start pose. `scales` are the kernel's, one a
@@ -266,9 +275,17 @@ def _squared_errors(
 
 @kernel
 def _linearise(
-    pose: Array, points: Array, pixels: Array, prior_weight: Array, shutter: Array, scale2: float,
-    fx: float, fy: float, cx: float, cy: float,
-) -> tuple[Array, Array, float]:  # fmt: skip
+    pose: Array,
+    points: Array,
+    pixels: Array,
+    prior_weight: Array,
+    shutter: Array,
+    scale2: float,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+) -> tuple[Array, Array, float]:
     """Gauss-Newton matrix ``[6, 6]``, gradient ``[6]`` of a left twist, sum of the weights."""
     hessian = np.empty((6, 6))
     gradient = np.empty(6)

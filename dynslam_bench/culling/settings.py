@@ -29,9 +29,13 @@ class GuardSettings(Settings):
     """The starvation guard, which all filters share (SG-SLAM restores all features below 10 %)."""
 
     min_features: int = tunable(
-        60, low=10, high=200, limits=(0, 2000), online=True,
+        60,
+        low=10,
+        high=200,
+        limits=(0, 2000),
+        online=True,
         meaning="fewest keypoints that culling must leave: as many as the back end needs to initialise a map",
-    )  # fmt: skip
+    )
     min_fraction: float = Field(
         0.05, ge=0.0, le=1.0, description="smallest share of the keypoints that culling must leave"
     )
@@ -41,13 +45,24 @@ class EpipolarSettings(Settings):
     """The epipolar test (paper, Eq. 23-25) and its degeneracy guard."""
 
     threshold_px: float = tunable(
-        1.0, low=0.2, high=5.0, scale="log", limits=(0.01, 50.0), unit="px", online=True,
+        1.0,
+        low=0.2,
+        high=5.0,
+        scale="log",
+        limits=(0.01, 50.0),
+        unit="px",
+        online=True,
         meaning="distance to the epipolar line above which a point is dynamic (Eq. 25)",
-    )  # fmt: skip
+    )
     min_parallax_px: float = tunable(
-        1.0, low=0.0, high=5.0, limits=(0.0, 50.0), unit="px", online=True,
+        1.0,
+        low=0.0,
+        high=5.0,
+        limits=(0.0, 50.0),
+        unit="px",
+        online=True,
         meaning="median parallax (flow beyond a pure rotation) below which the test is skipped as degenerate",
-    )  # fmt: skip
+    )
     parallax_share: float = Field(
         0.05,
         ge=0.0,
@@ -83,13 +98,24 @@ class RigidMotionSettings(Settings):
 
     enabled: bool = tunable(True, meaning="whether the test runs")
     threshold_px: float = tunable(
-        2.5, low=0.5, high=10.0, scale="log", limits=(0.05, 100.0), unit="px", online=True,
+        2.5,
+        low=0.5,
+        high=10.0,
+        scale="log",
+        limits=(0.05, 100.0),
+        unit="px",
+        online=True,
         meaning="reprojection distance after the camera's motion above which a point is dynamic",
-    )  # fmt: skip
+    )
     threshold_sigma: float = tunable(
-        4.0, low=1.0, high=12.0, scale="log", limits=(0.1, 100.0), online=True,
+        4.0,
+        low=1.0,
+        high=12.0,
+        scale="log",
+        limits=(0.1, 100.0),
+        online=True,
         meaning="depth difference, in standard deviations of the sensor, above which a point is dynamic",
-    )  # fmt: skip
+    )
     min_share: float = _MIN_SHARE
 
 
@@ -102,9 +128,15 @@ class FreeSpaceSettings(Settings):
 
     enabled: bool = tunable(True, meaning="whether the test runs")
     threshold_m: float = tunable(
-        0.15, low=0.05, high=0.6, scale="log", limits=(0.01, 5.0), unit="m", online=True,
+        0.15,
+        low=0.05,
+        high=0.6,
+        scale="log",
+        limits=(0.01, 5.0),
+        unit="m",
+        online=True,
         meaning="least depth by which a keyframe must have measured beyond the point",
-    )  # fmt: skip
+    )
     threshold_sigma: float = Field(
         5.0,
         ge=0.0,
@@ -158,9 +190,15 @@ class BoxEpipolarSettings(Settings):
     """B3 with different limits inside and outside the boxes (Blitz-SLAM, SGC-VSLAM, SG-SLAM)."""
 
     inside_px: float = tunable(
-        0.5, low=0.1, high=3.0, scale="log", limits=(0.01, 50.0), unit="px", online=True,
+        0.5,
+        low=0.1,
+        high=3.0,
+        scale="log",
+        limits=(0.01, 50.0),
+        unit="px",
+        online=True,
         meaning="epipolar distance above which a point inside a dynamic box is dropped",
-    )  # fmt: skip
+    )
     outside_px: float = Field(
         1.0,
         ge=0.01,
@@ -194,13 +232,24 @@ class ClassRuleSettings(Settings):
         MOVABLE, description="classes that move only at times: comma-separated COCO names"
     )
     threshold_px: float = tunable(
-        1.0, low=0.2, high=5.0, scale="log", limits=(0.01, 50.0), unit="px", online=True,
+        1.0,
+        low=0.2,
+        high=5.0,
+        scale="log",
+        limits=(0.01, 50.0),
+        unit="px",
+        online=True,
         meaning="epipolar distance above which a point on a movable object is dropped",
-    )  # fmt: skip
+    )
     depth_m: float = tunable(
-        0.3, low=0.0, high=1.0, limits=(0.0, 10.0), unit="m", online=True,
+        0.3,
+        low=0.0,
+        high=1.0,
+        limits=(0.0, 10.0),
+        unit="m",
+        online=True,
         meaning="points within this distance of the depth of a moving object are dropped with it",
-    )  # fmt: skip
+    )
     vote_share: float = tunable(
         0.3,
         low=0.05,
@@ -259,13 +308,23 @@ class DepthBlockSettings(Settings):
     """B9 as in Blitz-SLAM: masks completed by blocks of continuous depth."""
 
     edge_m: float = tunable(
-        0.1, low=0.03, high=0.5, scale="log", limits=(0.001, 10.0), unit="m", online=True,
+        0.1,
+        low=0.03,
+        high=0.5,
+        scale="log",
+        limits=(0.001, 10.0),
+        unit="m",
+        online=True,
         meaning="depth range in a 2x2 block above which it is an edge between blocks (tau 1 and 2)",
-    )  # fmt: skip
+    )
     min_share: float = tunable(
-        0.25, low=0.05, high=0.9, limits=(0.0, 1.0), online=True,
+        0.25,
+        low=0.05,
+        high=0.9,
+        limits=(0.0, 1.0),
+        online=True,
         meaning="share of a block that must lie on the mask for all of it to be taken (tau 3)",
-    )  # fmt: skip
+    )
     max_depth_m: float = tunable(
         6.0,
         low=3.0,
@@ -284,9 +343,15 @@ class DepthRansacSettings(Settings):
     """B6, YOLO-SLAM's depth RANSAC inside boxes."""
 
     variance_m2: float = tunable(
-        0.43, low=0.01, high=1.0, scale="log", limits=(1e-4, 100.0), unit="m^2", online=True,
+        0.43,
+        low=0.01,
+        high=1.0,
+        scale="log",
+        limits=(1e-4, 100.0),
+        unit="m^2",
+        online=True,
         meaning="largest depth variance of the set that is taken for the person",
-    )  # fmt: skip
+    )
     confidence: float = tunable(
         0.99, low=0.9, high=0.999, limits=(0.5, 0.9999), meaning="sets the number of draws"
     )
@@ -309,9 +374,13 @@ class ProbabilitySettings(Settings):
         False, description="weight the kept points by their static probability (CFP-SLAM)"
     )
     link_px: float = tunable(
-        2.5, low=1.0, high=6.0, limits=(0.1, 50.0), unit="px",
+        2.5,
+        low=1.0,
+        high=6.0,
+        limits=(0.1, 50.0),
+        unit="px",
         meaning="largest distance between the end of a feature's flow and the earlier feature that it continues",
-    )  # fmt: skip
+    )
     expand_px: float = Field(
         0.0,
         ge=0.0,
@@ -339,9 +408,15 @@ class MovingVoteSettings(Settings):
         meaning="RANSAC's inlier threshold",
     )
     threshold_px: float = tunable(
-        1.0, low=0.3, high=3.0, scale="log", limits=(0.01, 50.0), unit="px", online=True,
+        1.0,
+        low=0.3,
+        high=3.0,
+        scale="log",
+        limits=(0.01, 50.0),
+        unit="px",
+        online=True,
         meaning="epipolar distance above which a corner moves",
-    )  # fmt: skip
+    )
     radius_px: int = tunable(
         15,
         low=0,
@@ -359,9 +434,15 @@ class MultiViewSettings(Settings):
     """B4 and B5, DynaSLAM's multi-view geometry with region growing."""
 
     tau_m: float = tunable(
-        0.4, low=0.1, high=1.0, scale="log", limits=(0.01, 10.0), unit="m", online=True,
+        0.4,
+        low=0.1,
+        high=1.0,
+        scale="log",
+        limits=(0.01, 10.0),
+        unit="m",
+        online=True,
         meaning="depth by which a keyframe's point must be hidden (paper 0.4, code 0.6)",
-    )  # fmt: skip
+    )
     order: Literal["nearest", "farthest"] = tunable(
         "nearest",
         meaning="which keyframes are compared (the paper means nearest, the code takes farthest)",
@@ -370,9 +451,12 @@ class MultiViewSettings(Settings):
         5, low=1, high=10, limits=(1, 20), meaning="keyframes that are compared"
     )
     min_keyframes: int = tunable(
-        1, low=1, high=10, limits=(1, 20),
+        1,
+        low=1,
+        high=10,
+        limits=(1, 20),
         meaning="keyframes before the test is active (not stated in the paper; the code waits for 5)",
-    )  # fmt: skip
+    )
     max_parallax_deg: float = tunable(
         30.0,
         low=10.0,
@@ -382,9 +466,14 @@ class MultiViewSettings(Settings):
         meaning="largest angle between the two views",
     )
     max_variance: float = tunable(
-        0.001, low=1e-4, high=0.1, scale="log", limits=(0.0, 100.0), unit="m^2",
+        0.001,
+        low=1e-4,
+        high=0.1,
+        scale="log",
+        limits=(0.0, 100.0),
+        unit="m^2",
         meaning="largest variance of the depth around the point (rejects depth edges)",
-    )  # fmt: skip
+    )
     grow: bool = Field(True, description="grow regions of equal depth from the hidden points (B5)")
     dilation_px: int = tunable(
         15,
@@ -395,9 +484,13 @@ class MultiViewSettings(Settings):
         meaning="radius by which the result is grown",
     )
     border_px: int = tunable(
-        0, low=0, high=30, limits=(0, 100), unit="px",
+        0,
+        low=0,
+        high=30,
+        limits=(0, 100),
+        unit="px",
         meaning="further radius within which features at the result's border are dropped (15 in the code)",
-    )  # fmt: skip
+    )
 
 
 class ReseedingSettings(Settings):
@@ -407,9 +500,14 @@ class ReseedingSettings(Settings):
     """
 
     budget: int = tunable(
-        1000, low=300, high=2000, limits=(1, 20000), scale="log", online=True,
+        1000,
+        low=300,
+        high=2000,
+        limits=(1, 20000),
+        scale="log",
+        online=True,
         meaning="features used at most after culling; features.n_features must be larger",
-    )  # fmt: skip
+    )
 
 
 class ResidualSettings(Settings):
@@ -419,9 +517,13 @@ class ResidualSettings(Settings):
         24, low=8, high=48, limits=(2, 200), meaning="clusters of image position and depth"
     )
     depth_weight: float = tunable(
-        2.0, low=0.2, high=10.0, scale="log", limits=(0.0, 100.0),
+        2.0,
+        low=0.2,
+        high=10.0,
+        scale="log",
+        limits=(0.0, 100.0),
         meaning="weight of the relative depth residual beside the intensity residual",
-    )  # fmt: skip
+    )
     prior: float = tunable(
         0.9,
         low=0.5,
@@ -449,6 +551,10 @@ class TemplateSettings(Settings):
         5, low=2, high=10, limits=(1, 30), unit="frames", meaning="earlier frames that are searched"
     )
     zncc: float = tunable(
-        0.8, low=0.5, high=0.95, limits=(-1.0, 1.0), online=True,
+        0.8,
+        low=0.5,
+        high=0.95,
+        limits=(-1.0, 1.0),
+        online=True,
         meaning="median correlation below which a point is dropped",
-    )  # fmt: skip
+    )

@@ -118,9 +118,16 @@ def compare(
     truth = ground_truth.T_world_cam[truth_index]
     similarity = align(matched, truth, protocol.alignment)
     return Comparison(
-        protocol, estimate, ground_truth, estimate_index, truth_index, association, similarity, input_timestamps,
+        protocol,
+        estimate,
+        ground_truth,
+        estimate_index,
+        truth_index,
+        association,
+        similarity,
+        input_timestamps,
         diagnostics,
-    )  # fmt: skip
+    )
 
 
 LARGEST_M = 1e150

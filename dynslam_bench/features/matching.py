@@ -165,13 +165,25 @@ class Features(NamedTuple):
 
 @kernel
 def _search(
-    cell: float, columns: int, rows: int, start: NDArray[np.int64], order: NDArray[np.int64],
-    xy: NDArray[np.float64], right: NDArray[np.float64], octave: NDArray[np.int64], words: Words,
+    cell: float,
+    columns: int,
+    rows: int,
+    start: NDArray[np.int64],
+    order: NDArray[np.int64],
+    xy: NDArray[np.float64],
+    right: NDArray[np.float64],
+    octave: NDArray[np.int64],
+    words: Words,
     free: NDArray[np.bool_],
-    target: NDArray[np.float64], target_right: NDArray[np.float64], radius: NDArray[np.float64],
-    octave_low: NDArray[np.int64], octave_high: NDArray[np.int64], target_words: Words,
-    max_distance: int, ratio: float,
-) -> NDArray[np.int64]:  # fmt: skip
+    target: NDArray[np.float64],
+    target_right: NDArray[np.float64],
+    radius: NDArray[np.float64],
+    octave_low: NDArray[np.int64],
+    octave_high: NDArray[np.int64],
+    target_words: Words,
+    max_distance: int,
+    ratio: float,
+) -> NDArray[np.int64]:
     count = target.shape[0]
     match = np.full(count, -1, np.int64)
     match_distance = np.full(count, FAR, np.int64)
@@ -258,9 +270,23 @@ def search_in_radius(
     f = features
     grid = features.grid
     return _search(
-        grid.cell, grid.columns, grid.rows, grid.start, grid.order, f.xy, f.right, f.octave, f.words, free,
-        *windows, octave - 1, octave + 1, words, max_distance, ratio,
-    )  # fmt: skip
+        grid.cell,
+        grid.columns,
+        grid.rows,
+        grid.start,
+        grid.order,
+        f.xy,
+        f.right,
+        f.octave,
+        f.words,
+        free,
+        *windows,
+        octave - 1,
+        octave + 1,
+        words,
+        max_distance,
+        ratio,
+    )
 
 
 def rotation_consistent(

@@ -39,10 +39,26 @@ _DISC = ((_COLUMN * _IN_DISC).reshape(-1), (_ROW * _IN_DISC).reshape(-1))
 EDGE = 19
 """Corners nearer to a level's border than this are not used: the rotated descriptor pattern would leave the image."""
 
-CIRCLE = np.array([
-    (0, 3), (1, 3), (2, 2), (3, 1), (3, 0), (3, -1), (2, -2), (1, -3),
-    (0, -3), (-1, -3), (-2, -2), (-3, -1), (-3, 0), (-3, 1), (-2, 2), (-1, 3),
-])  # fmt: skip
+CIRCLE = np.array(
+    [
+        (0, 3),
+        (1, 3),
+        (2, 2),
+        (3, 1),
+        (3, 0),
+        (3, -1),
+        (2, -2),
+        (1, -3),
+        (0, -3),
+        (-1, -3),
+        (-2, -2),
+        (-3, -1),
+        (-3, 0),
+        (-3, 1),
+        (-2, 2),
+        (-1, 3),
+    ]
+)
 """The sixteen pixels of FAST around a corner, (column, row) each."""
 
 

@@ -16,9 +16,14 @@ class FeatureSettings(Settings):
         meaning="id of the extractor: built in ('orb') or a plug-in of kind 'features'",
     )
     n_features: int = tunable(
-        1000, low=300, high=3000, limits=(1, 20000), scale="log", online=True,
+        1000,
+        low=300,
+        high=3000,
+        limits=(1, 20000),
+        scale="log",
+        online=True,
         meaning="keypoints extracted from each image",
-    )  # fmt: skip
+    )
     fast_threshold: int = tunable(
         20,
         low=8,
@@ -29,9 +34,14 @@ class FeatureSettings(Settings):
         meaning="FAST contrast tried first",
     )
     fast_threshold_min: int = tunable(
-        7, low=3, high=20, limits=(1, 254), unit="grey levels", online=True,
+        7,
+        low=3,
+        high=20,
+        limits=(1, 254),
+        unit="grey levels",
+        online=True,
         meaning="FAST contrast accepted in cells where the first threshold gives no corner",
-    )  # fmt: skip
+    )
     levels: int = Field(8, ge=1, le=16, description="levels of the image pyramid")
     scale_factor: float = Field(
         1.2, ge=1.01, le=3.0, description="ratio of the sizes of consecutive pyramid levels"

@@ -711,10 +711,23 @@ Similarity: TypeAlias = tuple[Scalar, Scalar, Scalar, Scalar]
 
 @kernel
 def aggregate_and_choose(
-    start: int, stop: int, members: Longs, starts: Longs, centres: Floats, candidates: Floats, reference: ImageArrays,
-    target: ImageArrays, tables: CostTables, straight: Words, guide: Floats, radius: int, epsilon: Scalar, best: Floats,
-    winner: Floats, evaluations: Longs,
-) -> None:  # fmt: skip
+    start: int,
+    stop: int,
+    members: Longs,
+    starts: Longs,
+    centres: Floats,
+    candidates: Floats,
+    reference: ImageArrays,
+    target: ImageArrays,
+    tables: CostTables,
+    straight: Words,
+    guide: Floats,
+    radius: int,
+    epsilon: Scalar,
+    best: Floats,
+    winner: Floats,
+    evaluations: Longs,
+) -> None:
     """Raw cost, guided filter and winner takes all (Eq. 1-3) for regions start..stop, at half resolution.
 
     Args:
@@ -780,9 +793,20 @@ def aggregate_and_choose(
             si, ti = quantised(s, theta)
             images = (reference, target, tables)
             raw_costs(
-                (u, v, a, b), (si, ti), centre, corner, radius, images, straight, columns, rotated, size, described,
-                turned, values[:n],
-            )  # fmt: skip
+                (u, v, a, b),
+                (si, ti),
+                centre,
+                corner,
+                radius,
+                images,
+                straight,
+                columns,
+                rotated,
+                size,
+                described,
+                turned,
+                values[:n],
+            )
             described[ti] = True
             evaluations[r] += high * wide
             filter_patch(patch[:n], values[:n], pitch, radius, epsilon, work)
@@ -849,10 +873,20 @@ def patch_around(members: Longs, rows: int, columns: int, margin: int) -> tuple[
 
 @inlined
 def raw_costs(
-    label: Similarity, index: tuple[Scalar, Scalar], centre: tuple[Scalar, Scalar], patch: tuple[int, int, int, int],
-    radius: int, images: tuple[ImageArrays, ImageArrays, CostTables], straight: Words, columns: int, rotated: Bytes,
-    size: int, described: Flags, turned: Words, raw: Floats,
-) -> None:  # fmt: skip
+    label: Similarity,
+    index: tuple[Scalar, Scalar],
+    centre: tuple[Scalar, Scalar],
+    patch: tuple[int, int, int, int],
+    radius: int,
+    images: tuple[ImageArrays, ImageArrays, CostTables],
+    straight: Words,
+    columns: int,
+    rotated: Bytes,
+    size: int,
+    described: Flags,
+    turned: Words,
+    raw: Floats,
+) -> None:
     """Fill `raw` with Eq. 1 of a label around a centre, for every half-resolution pixel of a patch.
 
     Args:

@@ -163,9 +163,13 @@ class SearchState(NamedTuple):
 
 
 def search_labels(
-    settings: DaisySettings, run: Run, matching: MatchingCost, neighbours: NDArray[np.int64],
-    guess: NDArray[np.float32] | None, seed: int,
-) -> SearchState:  # fmt: skip
+    settings: DaisySettings,
+    run: Run,
+    matching: MatchingCost,
+    neighbours: NDArray[np.int64],
+    guess: NDArray[np.float32] | None,
+    seed: int,
+) -> SearchState:
     """The label search of all points: phases of `DaisySettings.search` with propagation between them.
 
     Args:
@@ -302,9 +306,16 @@ SEARCH = 3
 
 @kernel
 def run_phase(
-    start: int, stop: int, matching: MatchingCost, state: SearchState, candidates: Floats, end: int, phase: int,
-    seed: Scalar, rules: SearchRules,
-) -> None:  # fmt: skip
+    start: int,
+    stop: int,
+    matching: MatchingCost,
+    state: SearchState,
+    candidates: Floats,
+    end: int,
+    phase: int,
+    seed: Scalar,
+    rules: SearchRules,
+) -> None:
     """Spend evaluations on points start..stop until each has used `end`.
 
     Args:
@@ -456,9 +467,15 @@ def opposite_labels(
 
 @inlined
 def move_moths(
-    moths: Floats, flames: Floats, lower: Floats, upper: Floats, iteration: int, rules: SearchRules, trials: Floats,
+    moths: Floats,
+    flames: Floats,
+    lower: Floats,
+    upper: Floats,
+    iteration: int,
+    rules: SearchRules,
+    trials: Floats,
     random: Scalar,
-) -> Scalar:  # fmt: skip
+) -> Scalar:
     """Move every moth once (Eq. 8, 10, 12, 13, 17), as `moth_flame.moth_positions`, and try where it is.
 
     Args:
@@ -515,8 +532,14 @@ def spiral_factor(t: Scalar, spiral: Floats) -> Scalar:
 
 @inlined
 def draw_label(
-    label: Floats, bits: Scalar, lower: Floats, upper: Floats, best: Floats, window: Scalar, shrink: Scalar
-) -> None:  # fmt: skip
+    label: Floats,
+    bits: Scalar,
+    lower: Floats,
+    upper: Floats,
+    best: Floats,
+    window: Scalar,
+    shrink: Scalar,
+) -> None:
     """Fill a label: anywhere in the bounds (`shrink` 1), or in a window around the best label.
 
     `window` is half the window's side as a share of the bounds' extent.
@@ -575,9 +598,17 @@ def vertex(before: Scalar, middle: Scalar, after: Scalar) -> Scalar:
 
 @kernel
 def propagated_labels(
-    start: int, stop: int, points: Floats, labels: Floats, rotations: Floats, neighbours: Longs, motions: Floats,
-    lower: Floats, upper: Floats, out: Floats,
-) -> None:  # fmt: skip
+    start: int,
+    stop: int,
+    points: Floats,
+    labels: Floats,
+    rotations: Floats,
+    neighbours: Longs,
+    motions: Floats,
+    lower: Floats,
+    upper: Floats,
+    out: Floats,
+) -> None:
     """Labels of neighbours and of common motions, as seen from each point.
 
     A neighbour's label is a similarity around the neighbour; at point p it means the displacement

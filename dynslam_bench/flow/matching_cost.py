@@ -274,8 +274,15 @@ def clamped(coordinate: Scalar, size: int) -> Scalar:
 
 @inlined
 def descriptor_distance(
-    x: Scalar, y: Scalar, si: int, ti: int, descriptor: Bytes, first: int, target: ImageArrays, tables: CostTables
-) -> Scalar:  # fmt: skip
+    x: Scalar,
+    y: Scalar,
+    si: int,
+    ti: int,
+    descriptor: Bytes,
+    first: int,
+    target: ImageArrays,
+    tables: CostTables,
+) -> Scalar:
     """First term of Eq. 1: the truncated distance of a descriptor to the target's at a position.
 
     Args:
@@ -294,8 +301,16 @@ def descriptor_distance(
     near_row = row + near_quarter
     far_row = row + far_quarter
     return descriptor_sum(
-        target.histograms, tables.samples, near_row, far_row, near, far, descriptor, first, tables.truncation
-    )  # fmt: skip
+        target.histograms,
+        tables.samples,
+        near_row,
+        far_row,
+        near,
+        far,
+        descriptor,
+        first,
+        tables.truncation,
+    )
 
 
 @inlined

@@ -95,9 +95,16 @@ class LucasKanadeFlow:
         """Positions in the second image, whether the tracker found them, and its cost."""
         side = self.settings.window_px | 1
         xy, status, error = cv2.calcOpticalFlowPyrLK(
-            first, second, points, initial.astype(np.float32).copy(), winSize=(side, side), maxLevel=LEVELS - 1,
-            criteria=CRITERIA, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=MIN_EIGENVALUE,
-        )  # fmt: skip
+            first,
+            second,
+            points,
+            initial.astype(np.float32).copy(),
+            winSize=(side, side),
+            maxLevel=LEVELS - 1,
+            criteria=CRITERIA,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+            minEigThreshold=MIN_EIGENVALUE,
+        )
         tracked = np.asarray(status).reshape(-1) > 0
         cost = np.where(tracked, np.asarray(error, dtype=np.float32).reshape(-1), 255.0)
         return np.asarray(xy, dtype=np.float32), tracked, np.asarray(cost, dtype=np.float32)

@@ -143,13 +143,29 @@ def orientation_maps(
     coarse = np.empty((quarter_rows, 32 * -(-8 * quarter_columns // 32)), dtype=np.uint16)
     half_row_pairs = -(-rows // 2)
     run(
-        fine_levels, 0, half_row_pairs,
-        gray, framed_half, blurs[:fine], geometry, floor, cells, coarse,
-    )  # fmt: skip
+        fine_levels,
+        0,
+        half_row_pairs,
+        gray,
+        framed_half,
+        blurs[:fine],
+        geometry,
+        floor,
+        cells,
+        coarse,
+    )
     run(
-        coarse_levels, 0, quarter_rows,
-        coarse, quarter_columns, blurs[fine:], fine, geometry, floor, cells,
-    )  # fmt: skip
+        coarse_levels,
+        0,
+        quarter_rows,
+        coarse,
+        quarter_columns,
+        blurs[fine:],
+        fine,
+        geometry,
+        floor,
+        cells,
+    )
 
     # the images with their borders
     framed[BORDER:-BORDER, BORDER:-BORDER] = gray
@@ -184,9 +200,15 @@ def repeat_edges(framed: NDArray[np.uint8]) -> None:
 
 @inlined
 def blur(
-    source: Halves, middle: int, near: tuple[int, int], far: tuple[int, int], taps: int, out: Halves, out_at: int,
+    source: Halves,
+    middle: int,
+    near: tuple[int, int],
+    far: tuple[int, int],
+    taps: int,
+    out: Halves,
+    out_at: int,
     length: int,
-) -> None:  # fmt: skip
+) -> None:
     """A binomial blur of 3 or 5 taps, made of rounded means.
 
     Args:
@@ -211,9 +233,17 @@ def blur(
 
 @inlined
 def smooth_line(
-    ring: Halves, pitch: int, row: int, rows: int, columns: int, taps: int, distance: int, line: Halves, out: Halves,
+    ring: Halves,
+    pitch: int,
+    row: int,
+    rows: int,
+    columns: int,
+    taps: int,
+    distance: int,
+    line: Halves,
+    out: Halves,
     out_at: int,
-) -> None:  # fmt: skip
+) -> None:
     """One row of a separable binomial blur, edges repeated.
 
     Args:
@@ -306,9 +336,22 @@ def level_reach(blurs: Longs) -> Longs:
 
 @inlined
 def blur_cascade(
-    rings: Halves, pitch: int, row: int, rows: int, columns: int, top: int, bottom: int, blurs: Longs, reach: Longs,
-    first_level: int, geometry: MapGeometry, margin: int, floor: float, cells: Bytes, line: Halves,
-) -> int:  # fmt: skip
+    rings: Halves,
+    pitch: int,
+    row: int,
+    rows: int,
+    columns: int,
+    top: int,
+    bottom: int,
+    blurs: Longs,
+    reach: Longs,
+    first_level: int,
+    geometry: MapGeometry,
+    margin: int,
+    floor: float,
+    cells: Bytes,
+    line: Halves,
+) -> int:
     """Compute the rows of all levels that the newest source row completes; returns the last level's row.
 
     Args:
@@ -350,9 +393,16 @@ def blur_cascade(
 
 @kernel
 def fine_levels(
-    start: int, stop: int, gray: Bytes, half: Bytes, blurs: Longs, geometry: MapGeometry, floor: float, cells: Bytes,
+    start: int,
+    stop: int,
+    gray: Bytes,
+    half: Bytes,
+    blurs: Longs,
+    geometry: MapGeometry,
+    floor: float,
+    cells: Bytes,
     coarse: Halves,
-) -> None:  # fmt: skip
+) -> None:
     """The half-resolution levels, and the means of the last one at quarter resolution.
 
     Args:
@@ -402,9 +452,22 @@ def fine_levels(
                 bins = derivatives(sums, here + x, above + x, below + x)
                 store_uint16(rings[0], at + 8 * x, bins)
         y = blur_cascade(
-            rings, pitch, row, rows, columns, top, bottom, blurs, reach, 0, geometry, layout.MARGIN // 2, floor, cells,
+            rings,
+            pitch,
+            row,
+            rows,
+            columns,
+            top,
+            bottom,
+            blurs,
+            reach,
+            0,
+            geometry,
+            layout.MARGIN // 2,
+            floor,
+            cells,
             line,
-        )  # fmt: skip
+        )
         # every second row of the last level completes a row of quarter resolution
         if top <= y < bottom and (y & 1 or rows == 1) and y // 2 < len(coarse):
             upper = ((y & ~1) & (RING - 1)) * pitch
@@ -414,9 +477,16 @@ def fine_levels(
 
 @kernel
 def coarse_levels(
-    start: int, stop: int, coarse: Halves, columns: int, blurs: Longs, first_level: int, geometry: MapGeometry,
-    floor: float, cells: Bytes,
-) -> None:  # fmt: skip
+    start: int,
+    stop: int,
+    coarse: Halves,
+    columns: int,
+    blurs: Longs,
+    first_level: int,
+    geometry: MapGeometry,
+    floor: float,
+    cells: Bytes,
+) -> None:
     """The quarter-resolution levels of rows start..stop.
 
     Args:
@@ -443,6 +513,19 @@ def coarse_levels(
             for i in range(0, length, 32):
                 store_uint16(rings[0], at + i, load_uint16(source, i))
         blur_cascade(
-            rings, pitch, row, rows, columns, start, stop, blurs, reach, first_level, geometry, layout.MARGIN // 4,
-            floor, cells, line,
-        )  # fmt: skip
+            rings,
+            pitch,
+            row,
+            rows,
+            columns,
+            start,
+            stop,
+            blurs,
+            reach,
+            first_level,
+            geometry,
+            layout.MARGIN // 4,
+            floor,
+            cells,
+            line,
+        )

@@ -230,9 +230,15 @@ def make_workspace(radius: int, margin: int) -> Workspace:
 
 @kernel
 def similarity_lucas_kanade(
-    start: int, stop: int, points: Floats, labels: Floats, template_image: Bytes, target_image: Bytes, window: Window,
+    start: int,
+    stop: int,
+    points: Floats,
+    labels: Floats,
+    template_image: Bytes,
+    target_image: Bytes,
+    window: Window,
     correlation: Floats,
-) -> None:  # fmt: skip
+) -> None:
     """Refine labels by photometric alignment of a square window.
 
     The target is warped by the label into the template's frame. Within that patch only the
@@ -532,9 +538,15 @@ def compare_with_template(
 
 @inlined
 def align_translation(
-    space: Workspace, gradients: Gradients, template: Template, warp: Warp, window: Window, n: float, best: Scalar,
+    space: Workspace,
+    gradients: Gradients,
+    template: Template,
+    warp: Warp,
+    window: Window,
+    n: float,
+    best: Scalar,
     best_warp: Warp,
-) -> tuple[Alignment, Scalar, Warp]:  # fmt: skip
+) -> tuple[Alignment, Scalar, Warp]:
     """Translate the window within the warped patch until it fits the template.
 
     Args:
@@ -610,8 +622,13 @@ def align_translation(
 
 @inlined
 def similarity_equations(
-    space: Workspace, gradients: Gradients, template: Template, alignment: Alignment, window: Window, n: float
-) -> None:  # fmt: skip
+    space: Workspace,
+    gradients: Gradients,
+    template: Template,
+    alignment: Alignment,
+    window: Window,
+    n: float,
+) -> None:
     """Fill the normal equations of translation, scale (s) and rotation (r) where the patch was last sampled.
 
     Derivatives at offset (dx, dy) from the window's centre: ``s = gx dx + gy dy``, ``r = gy dx - gx

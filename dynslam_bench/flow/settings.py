@@ -9,9 +9,17 @@ from pydantic import Field
 from dynslam_bench.core.settings import Settings, names, tunable
 
 SearchName = Literal[
-    "emfoa+propagation", "emfoa-literal+propagation", "mfo+propagation", "patchmatch", "random+propagation",
-    "none+propagation", "emfoa", "mfo", "emfoa-literal", "random",
-]  # fmt: skip
+    "emfoa+propagation",
+    "emfoa-literal+propagation",
+    "mfo+propagation",
+    "patchmatch",
+    "random+propagation",
+    "none+propagation",
+    "emfoa",
+    "mfo",
+    "emfoa-literal",
+    "random",
+]
 
 
 class FlowMethodSettings(Settings):
@@ -33,9 +41,15 @@ class FlowMethodSettings(Settings):
         "medium", description="dense inverse search: OpenCV's preset"
     )
     forward_backward_px: float = tunable(
-        1.5, low=0.25, high=8.0, limits=(0.0, 100.0), scale="log", unit="px", online=True,
+        1.5,
+        low=0.25,
+        high=8.0,
+        limits=(0.0, 100.0),
+        scale="log",
+        unit="px",
+        online=True,
         meaning="largest forward-backward error of a valid point; 0 disables the check",
-    )  # fmt: skip
+    )
 
 
 class DaisySettings(FlowMethodSettings):
@@ -47,9 +61,14 @@ class DaisySettings(FlowMethodSettings):
         "propagation between neighbours; or moth-flame and random without propagation",
     )
     budget: int = tunable(
-        64, low=24, high=384, limits=(8, 4096), scale="log", online=True,
+        64,
+        low=24,
+        high=384,
+        limits=(8, 4096),
+        scale="log",
+        online=True,
         meaning="cost evaluations a point in the label search",
-    )  # fmt: skip
+    )
     population: int = tunable(
         6, low=4, high=16, limits=(2, 32), meaning="moths (and flames) a point or superpixel"
     )
@@ -65,9 +84,15 @@ class DaisySettings(FlowMethodSettings):
         meaning="scale of the Cauchy steps of Eq. 13",
     )
     range_px: float = tunable(
-        96.0, low=16.0, high=192.0, limits=(1.0, 1024.0), scale="log", unit="px", online=True,
+        96.0,
+        low=16.0,
+        high=192.0,
+        limits=(1.0, 1024.0),
+        scale="log",
+        unit="px",
+        online=True,
         meaning="largest displacement searched, around the guess where there is one",
-    )  # fmt: skip
+    )
     neighbours: int = Field(
         4, ge=0, le=8, description="neighbours whose labels are tried in each sweep"
     )
@@ -98,9 +123,13 @@ class FlowSettings(DaisySettings):
     """DAISY Filter Flow at sparse points."""
 
     min_correlation: float = tunable(
-        0.85, low=0.5, high=0.97, limits=(-1.0, 1.0), online=True,
+        0.85,
+        low=0.5,
+        high=0.97,
+        limits=(-1.0, 1.0),
+        online=True,
         meaning="zero-mean normalised correlation of the refined windows below which a point is not valid",
-    )  # fmt: skip
+    )
     support: Literal[1, 5, 9] = Field(
         1, description="points around each point over which Eq. 1 is summed (Eq. 6)"
     )
@@ -111,13 +140,23 @@ class DenseFlowSettings(DaisySettings):
     """DAISY Filter Flow of every pixel (Eq. 1-3): superpixels, guided filter, winner takes all; read at the points."""
 
     range_px: float = tunable(
-        160.0, low=16.0, high=256.0, limits=(1.0, 1024.0), scale="log", unit="px",
+        160.0,
+        low=16.0,
+        high=256.0,
+        limits=(1.0, 1024.0),
+        scale="log",
+        unit="px",
         meaning="largest displacement searched",
-    )  # fmt: skip
+    )
     budget: int = tunable(
-        96, low=24, high=384, limits=(8, 4096), scale="log", online=True,
+        96,
+        low=24,
+        high=384,
+        limits=(8, 4096),
+        scale="log",
+        online=True,
         meaning="cost evaluations a superpixel in the label search",
-    )  # fmt: skip
+    )
     sweeps: int = tunable(
         6, low=1, high=8, limits=(1, 32), meaning="times neighbours exchange their best labels"
     )

@@ -185,9 +185,15 @@ def _import(manifest: Path, store: RunStore) -> Iterator[Unreadable]:
                     else None
                 )
                 import_trajectory(
-                    file, entry.tracker, entry.sequence, results=store, label=entry.label, which=entry.which,
-                    provenance=entry.provenance or entry.file, truth=truth,
-                )  # fmt: skip
+                    file,
+                    entry.tracker,
+                    entry.sequence,
+                    results=store,
+                    label=entry.label,
+                    which=entry.which,
+                    provenance=entry.provenance or entry.file,
+                    truth=truth,
+                )
             except InfrastructureError:
                 raise
             except DynslamError as error:

@@ -55,19 +55,41 @@ def _builtin() -> Iterable[SegmenterSpec]:
     mask_rcnn = "He et al., Mask R-CNN, ICCV 2017"
     return (
         SegmenterSpec("oracle", f"{recorded}:build_oracle", "exact masks of rendered sequences"),
-        SegmenterSpec("oracle-classes", f"{recorded}:build_oracle",
-                      "exact masks of rendered sequences, by class alone: a perfect network"),
-        SegmenterSpec("recorded", f"{recorded}:build_recorded", "PNG masks from a folder (recorded:DIR)"),
-        SegmenterSpec("onnx", f"{networks}.onnx_segmenter:build",
-                      "YOLO-seg, semantic or torchvision networks (onnx:PATH)"),
-        SegmenterSpec("embedded", f"{networks}.mask_rcnn_segmenter:build_embedded",
-                      "small CFPN Mask R-CNN trained on rendered sequences", "MIT", mask_rcnn),
-        SegmenterSpec("coco", f"{networks}.mask_rcnn_segmenter:build_coco",
-                      "Mask R-CNN, ResNet-50 FPN, with torchvision's COCO weights", "BSD-3-Clause (weights)",
-                      mask_rcnn),
-        SegmenterSpec("weights", f"{networks}.mask_rcnn_segmenter:build_weights",
-                      "Mask R-CNN with weights of your own (weights:PATH)", "", mask_rcnn),
-    )  # fmt: skip
+        SegmenterSpec(
+            "oracle-classes",
+            f"{recorded}:build_oracle",
+            "exact masks of rendered sequences, by class alone: a perfect network",
+        ),
+        SegmenterSpec(
+            "recorded", f"{recorded}:build_recorded", "PNG masks from a folder (recorded:DIR)"
+        ),
+        SegmenterSpec(
+            "onnx",
+            f"{networks}.onnx_segmenter:build",
+            "YOLO-seg, semantic or torchvision networks (onnx:PATH)",
+        ),
+        SegmenterSpec(
+            "embedded",
+            f"{networks}.mask_rcnn_segmenter:build_embedded",
+            "small CFPN Mask R-CNN trained on rendered sequences",
+            "MIT",
+            mask_rcnn,
+        ),
+        SegmenterSpec(
+            "coco",
+            f"{networks}.mask_rcnn_segmenter:build_coco",
+            "Mask R-CNN, ResNet-50 FPN, with torchvision's COCO weights",
+            "BSD-3-Clause (weights)",
+            mask_rcnn,
+        ),
+        SegmenterSpec(
+            "weights",
+            f"{networks}.mask_rcnn_segmenter:build_weights",
+            "Mask R-CNN with weights of your own (weights:PATH)",
+            "",
+            mask_rcnn,
+        ),
+    )
 
 
 SEGMENTERS: Registry[SegmenterSpec] = Registry("segmenters", SegmenterSpec, _builtin)

@@ -15,16 +15,87 @@ from dynslam_bench.core import SegmentationError, did_you_mean
 from dynslam_bench.core.settings import Settings, tunable
 
 COCO_NAMES: tuple[str, ...] = (
-    "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat", "traffic light",
-    "fire hydrant", "stop sign", "parking meter", "bench", "bird", "cat", "dog", "horse", "sheep", "cow",
-    "elephant", "bear", "zebra", "giraffe", "backpack", "umbrella", "handbag", "tie", "suitcase", "frisbee",
-    "skis", "snowboard", "sports ball", "kite", "baseball bat", "baseball glove", "skateboard", "surfboard",
-    "tennis racket", "bottle", "wine glass", "cup", "fork", "knife", "spoon", "bowl", "banana", "apple",
-    "sandwich", "orange", "broccoli", "carrot", "hot dog", "pizza", "donut", "cake", "chair", "couch",
-    "potted plant", "bed", "dining table", "toilet", "tv", "laptop", "mouse", "remote", "keyboard",
-    "cell phone", "microwave", "oven", "toaster", "sink", "refrigerator", "book", "clock", "vase", "scissors",
-    "teddy bear", "hair drier", "toothbrush",
-)  # fmt: skip
+    "person",
+    "bicycle",
+    "car",
+    "motorcycle",
+    "airplane",
+    "bus",
+    "train",
+    "truck",
+    "boat",
+    "traffic light",
+    "fire hydrant",
+    "stop sign",
+    "parking meter",
+    "bench",
+    "bird",
+    "cat",
+    "dog",
+    "horse",
+    "sheep",
+    "cow",
+    "elephant",
+    "bear",
+    "zebra",
+    "giraffe",
+    "backpack",
+    "umbrella",
+    "handbag",
+    "tie",
+    "suitcase",
+    "frisbee",
+    "skis",
+    "snowboard",
+    "sports ball",
+    "kite",
+    "baseball bat",
+    "baseball glove",
+    "skateboard",
+    "surfboard",
+    "tennis racket",
+    "bottle",
+    "wine glass",
+    "cup",
+    "fork",
+    "knife",
+    "spoon",
+    "bowl",
+    "banana",
+    "apple",
+    "sandwich",
+    "orange",
+    "broccoli",
+    "carrot",
+    "hot dog",
+    "pizza",
+    "donut",
+    "cake",
+    "chair",
+    "couch",
+    "potted plant",
+    "bed",
+    "dining table",
+    "toilet",
+    "tv",
+    "laptop",
+    "mouse",
+    "remote",
+    "keyboard",
+    "cell phone",
+    "microwave",
+    "oven",
+    "toaster",
+    "sink",
+    "refrigerator",
+    "book",
+    "clock",
+    "vase",
+    "scissors",
+    "teddy bear",
+    "hair drier",
+    "toothbrush",
+)
 """The 80 object classes of COCO in order; YOLO networks number them from 0."""
 
 _COCO_GAPS = frozenset({12, 26, 29, 30, 45, 66, 68, 69, 71, 83})
@@ -36,15 +107,51 @@ COCO_IDS: dict[int, str] = dict(
 """COCO category id (1..90 with gaps, as torchvision's detection networks number them) to name; 0 is background."""
 
 VOC_NAMES: tuple[str, ...] = (
-    "background", "airplane", "bicycle", "bird", "boat", "bottle", "bus", "car", "cat", "chair", "cow",
-    "dining table", "dog", "horse", "motorcycle", "person", "potted plant", "sheep", "couch", "train", "tv",
-)  # fmt: skip
+    "background",
+    "airplane",
+    "bicycle",
+    "bird",
+    "boat",
+    "bottle",
+    "bus",
+    "car",
+    "cat",
+    "chair",
+    "cow",
+    "dining table",
+    "dog",
+    "horse",
+    "motorcycle",
+    "person",
+    "potted plant",
+    "sheep",
+    "couch",
+    "train",
+    "tv",
+)
 """The 21 labels of Pascal VOC in order, under their COCO names."""
 
 DYNASLAM_NAMES: tuple[str, ...] = (
-    "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat", "bird", "cat", "dog",
-    "horse", "sheep", "cow", "elephant", "bear", "zebra", "giraffe",
-)  # fmt: skip
+    "person",
+    "bicycle",
+    "car",
+    "motorcycle",
+    "airplane",
+    "bus",
+    "train",
+    "truck",
+    "boat",
+    "bird",
+    "cat",
+    "dog",
+    "horse",
+    "sheep",
+    "cow",
+    "elephant",
+    "bear",
+    "zebra",
+    "giraffe",
+)
 """The classes that DynaSLAM (Bescos et al. 2018) holds for movable of their own accord."""
 
 PRESETS: dict[str, tuple[str, ...]] = {
@@ -200,9 +307,14 @@ class SegmentationSettings(Settings):
         meaning="probability above which a pixel belongs to a mask",
     )
     dilation_px: int = tunable(
-        15, low=0, high=30, limits=(0, 200), unit="px", online=True,
+        15,
+        low=0,
+        high=30,
+        limits=(0, 200),
+        unit="px",
+        online=True,
         meaning="radius by which masks are grown (ellipse of 2r + 1 pixels)",
-    )  # fmt: skip
+    )
     schedule: Literal["every", "every_nth", "keyframes", "async"] = tunable(
         "every",
         online=True,
@@ -212,9 +324,11 @@ class SegmentationSettings(Settings):
         3, ge=1, description="schedule every_nth: the segmenter runs on every n-th frame"
     )
     latency_s: float = Field(
-        0.1, ge=0, le=10,
+        0.1,
+        ge=0,
+        le=10,
         description="schedule async: masks come so many seconds after a frame; 0: when they are done, not repeatable",
-    )  # fmt: skip
+    )
     crowded_share: float = Field(
         1.0,
         ge=0,
@@ -226,9 +340,14 @@ class SegmentationSettings(Settings):
         description="flow that carries masks: dense (DIS) or a similarity of tracked corners a mask",
     )
     compensate: int = tunable(
-        3, low=0, high=10, limits=(0, None), unit="frames", online=True,
+        3,
+        low=0,
+        high=10,
+        limits=(0, None),
+        unit="frames",
+        online=True,
         meaning="segmented frames for which a missed detection is bridged (constant-velocity box); 0 = off",
-    )  # fmt: skip
+    )
     repair: Literal["none", "depth"] = Field(
         "none", description="mask repair: none, or fill holes and fit the border to depth edges"
     )
@@ -239,9 +358,13 @@ class SegmentationSettings(Settings):
         description="repair: depth step in metres from a mask to a pixel outside of it",
     )
     outside_share: float = tunable(
-        0.3, low=0.0, high=1.0, limits=(0.0, 1.0), online=True,
+        0.3,
+        low=0.0,
+        high=1.0,
+        limits=(0.0, 1.0),
+        online=True,
         meaning="least share of n_features outside the masks; with fewer, n_features are extracted there as well",
-    )  # fmt: skip
+    )
     network_side: int = Field(
         480,
         ge=0,

@@ -372,12 +372,21 @@ def _delay(estimate: Estimate, camera: Camera) -> Quantity:
     beyond = f"beyond +- {1e3 * LARGEST_DELAY_S:g} ms: do colour and depth use the same clock?"
     synchronous = value - half <= 0 <= value + half or abs(value) < SMALLEST_DELAY_S
     side = "later" if value > 0 else "earlier"
-    return _judged("depth_delay_s", (own + value, own + (value - half), own + (value + half)), (
-        (not estimate.resolved, False, None, _too_wide(estimate, "too slow a motion")),
-        (abs(value) > LARGEST_DELAY_S, False, None, beyond),
-        (synchronous, True, None, "colour and depth are exposed as their stamps say, to a sixth of a frame"),
-        (True, True, round(own + value, 4), f"depth is exposed {side} than its stamps say"),
-    ))  # fmt: skip
+    return _judged(
+        "depth_delay_s",
+        (own + value, own + (value - half), own + (value + half)),
+        (
+            (not estimate.resolved, False, None, _too_wide(estimate, "too slow a motion")),
+            (abs(value) > LARGEST_DELAY_S, False, None, beyond),
+            (
+                synchronous,
+                True,
+                None,
+                "colour and depth are exposed as their stamps say, to a sixth of a frame",
+            ),
+            (True, True, round(own + value, 4), f"depth is exposed {side} than its stamps say"),
+        ),
+    )
 
 
 def _too_wide(estimate: Estimate, why: str) -> str:

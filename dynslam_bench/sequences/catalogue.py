@@ -272,8 +272,13 @@ def open_folder(
         notes = (*notes, f"{CAMERA_FILE} of the folder is not used: another camera was chosen")
     about: dict[str, Any] = {"id": f"folder/{folder.resolve().name}"}
     if entry is not None:
-        about = {"id": entry.id, "license": entry.license, "citation": entry.citation,
-                 "tags": frozenset(entry.tags), "split": entry.split}  # fmt: skip
+        about = {
+            "id": entry.id,
+            "license": entry.license,
+            "citation": entry.citation,
+            "tags": frozenset(entry.tags),
+            "split": entry.split,
+        }
     return RecordedSequence(
         folder,
         contents,
@@ -386,17 +391,31 @@ def summaries(*, data_root: str | Path | None = None) -> list[dict[str, Any]]:
         for name in spec.sequences:
             entry = catalogue().get(name)
             row: dict[str, Any] = {
-                "id": name, "here": True, "size": "", "tags": (), "split": "", "ground_truth": True,
-                "license": spec.license, "url": "", "dataset": spec.summary or spec.id, "layout": "", "by_hand": "",
+                "id": name,
+                "here": True,
+                "size": "",
+                "tags": (),
+                "split": "",
+                "ground_truth": True,
+                "license": spec.license,
+                "url": "",
+                "dataset": spec.summary or spec.id,
+                "layout": "",
+                "by_hand": "",
                 "checksum": None,
-            }  # fmt: skip
+            }
             if entry is not None:
                 row |= entry.model_dump(
                     include={"tags", "split", "ground_truth", "license", "url", "by_hand"}
                 )
                 layout = "verified" if entry.verified else "not verified"
-                row |= {"here": entry.find(root) is not None, "size": entry.size_text(), "dataset": entry.title,
-                        "layout": layout, "checksum": entry.sha256 is not None}  # fmt: skip
+                row |= {
+                    "here": entry.find(root) is not None,
+                    "size": entry.size_text(),
+                    "dataset": entry.title,
+                    "layout": layout,
+                    "checksum": entry.sha256 is not None,
+                }
             elif spec.id == "synthetic":
                 parsed = parse_synthetic_id(name)
                 row |= {"size": "rendered", "tags": (parsed.variant.tag,), "split": parsed.split}
@@ -422,16 +441,25 @@ def describe(
     facts: dict[str, Any] = {}
     if entry is not None:
         facts = {
-            "id": entry.id, "alias": entry.folder, "url": entry.url, "page": entry.page, "size": entry.size_text(),
-            "size_bytes": entry.size_bytes, "sha256": entry.sha256, "license": entry.license,
-            "checksum": "known: another archive is refused" if entry.sha256 else
-            "not published: the first fetch takes it, every later one has to bring the same",
-            "citation": entry.citation, "tags": list(entry.tags), "split": entry.split,
+            "id": entry.id,
+            "alias": entry.folder,
+            "url": entry.url,
+            "page": entry.page,
+            "size": entry.size_text(),
+            "size_bytes": entry.size_bytes,
+            "sha256": entry.sha256,
+            "license": entry.license,
+            "checksum": "known: another archive is refused"
+            if entry.sha256
+            else "not published: the first fetch takes it, every later one has to bring the same",
+            "citation": entry.citation,
+            "tags": list(entry.tags),
+            "split": entry.split,
             "ground_truth": "public" if entry.ground_truth else "not public",
             "camera": repr(CAMERAS.get(entry.camera, "as its files or its layout state")),
             "layout": f"{entry.layout}: {'' if entry.verified else 'not '}verified on the publisher's files",
             "remark": entry.remark,
-        }  # fmt: skip
+        }
         if entry.find(root) is None:
             return facts | {"here": False, "fetch": entry.how_to_get()}
     sequence = open_sequence(name, data_root=data_root, camera=camera)

@@ -1324,8 +1324,14 @@ class Fit:
     cost: float
 
 
-_PARAMETERS = {"focal": slice(0, 1), "cx": slice(1, 2), "cy": slice(2, 3), "scale": slice(3, 4),
-               "turn": slice(4, 7), "lever": slice(7, 10)}  # fmt: skip
+_PARAMETERS = {
+    "focal": slice(0, 1),
+    "cx": slice(1, 2),
+    "cy": slice(2, 3),
+    "scale": slice(3, 4),
+    "turn": slice(4, 7),
+    "lever": slice(7, 10),
+}
 _PRIOR = np.array([1.0, 200.0, 200.0, 2.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
 _SCALES = np.array([0.1, 10, 10, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1])
 _STEPS = np.array([1e-4, 0.05, 0.05, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4])

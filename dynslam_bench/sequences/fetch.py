@@ -164,9 +164,15 @@ def fetch(
         archive = root / ".downloads" / (own if named else f"{entry.folder}.archive")
         most_bytes = (entry.size_bytes if checksum else None) or MOST_BYTES
         sha256 = download(
-            address, archive, sha256=expected, most_bytes=most_bytes, attempts=attempts, wait_s=wait_s,
-            timeout_s=timeout_s, progress=progress,
-        )  # fmt: skip
+            address,
+            archive,
+            sha256=expected,
+            most_bytes=most_bytes,
+            attempts=attempts,
+            wait_s=wait_s,
+            timeout_s=timeout_s,
+            progress=progress,
+        )
         parts.append(Download(address, archive, sha256))
     place = entry.folders(root)[0]
     unstated = parts if entry.sha256 is None else parts[1:]
@@ -205,9 +211,13 @@ def _install(
                 shutil.copytree(top, work, copy_function=os.replace, dirs_exist_ok=True)
                 shutil.rmtree(unpacked)
                 receipt = Receipt(
-                    id=entry.id, url=parts[0].address, sha256=parts[0].sha256, size_bytes=size, checked=checked,
+                    id=entry.id,
+                    url=parts[0].address,
+                    sha256=parts[0].sha256,
+                    size_bytes=size,
+                    checked=checked,
                     files=len(files),
-                )  # fmt: skip
+                )
                 write_atomic(work / RECEIPT, receipt.to_json())
                 write_atomic(
                     work / MANIFEST,

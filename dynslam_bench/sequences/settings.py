@@ -57,9 +57,11 @@ class PreprocessingSettings(Settings):
         description="mean luminance after normalisation, of [0, 1] (`mean-std`)",
     )
     target_std: float = Field(
-        0.22, ge=0.001, le=1.0,
+        0.22,
+        ge=0.001,
+        le=1.0,
         description="standard deviation of the luminance after normalisation, of [0, 1] (`mean-std`)",
-    )  # fmt: skip
+    )
 
     @field_validator("height")
     @classmethod

@@ -84,9 +84,22 @@ class BundleResult:
 
 @kernel
 def _cost(
-    poses: Array, points: Array, obs_pose: Slots, obs_point: Slots, uv: Array, right: Array, info: Array,
-    info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float, width: float, chi2: Array,
-) -> float:  # fmt: skip
+    poses: Array,
+    points: Array,
+    obs_pose: Slots,
+    obs_point: Slots,
+    uv: Array,
+    right: Array,
+    info: Array,
+    info_right: Array,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    bf: float,
+    width: float,
+    chi2: Array,
+) -> float:
     """Cost of all observations under a kernel of this squared width; fills `chi2` (inf behind the camera)."""
     total = 0.0
     for k in range(obs_pose.shape[0]):
@@ -109,10 +122,27 @@ def _cost(
 
 @kernel
 def _step(
-    poses: Array, variable: int, points: Array, obs_pose: Slots, obs_point: Slots, start: Slots, uv: Array,
-    right: Array, info: Array, info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float, width: float,
-    damping: float, chi2: Array, new_poses: Array, new_points: Array,
-) -> bool:  # fmt: skip
+    poses: Array,
+    variable: int,
+    points: Array,
+    obs_pose: Slots,
+    obs_point: Slots,
+    start: Slots,
+    uv: Array,
+    right: Array,
+    info: Array,
+    info_right: Array,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    bf: float,
+    width: float,
+    damping: float,
+    chi2: Array,
+    new_poses: Array,
+    new_points: Array,
+) -> bool:
     """One damped Gauss-Newton step from (poses, points) into (new_poses, new_points); False if it cannot be solved."""
     n = obs_pose.shape[0]
     q = points.shape[0]
@@ -269,10 +299,24 @@ def _step(
 
 @kernel
 def _adjust(
-    poses: Array, variable: int, points: Array, obs_pose: Slots, obs_point: Slots, start: Slots, uv: Array,
-    right: Array, info: Array, info_right: Array, fx: float, fy: float, cx: float, cy: float, bf: float,
-    iterations: int, chi2: Array,
-) -> tuple[Array, Array, float]:  # fmt: skip
+    poses: Array,
+    variable: int,
+    points: Array,
+    obs_pose: Slots,
+    obs_point: Slots,
+    start: Slots,
+    uv: Array,
+    right: Array,
+    info: Array,
+    info_right: Array,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    bf: float,
+    iterations: int,
+    chi2: Array,
+) -> tuple[Array, Array, float]:
     _cost(
         poses,
         points,
@@ -314,14 +358,45 @@ def _adjust(
         new_poses = poses.copy()
         new_points = points.copy()
         solved = _step(
-            poses, variable, points, obs_pose, obs_point, start, uv, right, info, info_right, fx, fy, cx, cy, bf,
-            width, damping, chi2, new_poses, new_points,
-        )  # fmt: skip
+            poses,
+            variable,
+            points,
+            obs_pose,
+            obs_point,
+            start,
+            uv,
+            right,
+            info,
+            info_right,
+            fx,
+            fy,
+            cx,
+            cy,
+            bf,
+            width,
+            damping,
+            chi2,
+            new_poses,
+            new_points,
+        )
         if solved:
             new = _cost(
-                new_poses, new_points, obs_pose, obs_point, uv, right, info, info_right, fx, fy, cx, cy, bf, width,
+                new_poses,
+                new_points,
+                obs_pose,
+                obs_point,
+                uv,
+                right,
+                info,
+                info_right,
+                fx,
+                fy,
+                cx,
+                cy,
+                bf,
+                width,
                 trial,
-            )  # fmt: skip
+            )
             if new < cost:
                 gain = cost - new
                 damping = max(damping * 0.2, 1e-8)
@@ -437,8 +512,15 @@ def _bundle(
     features = all_features[used].astype(np.int64)
     at = poses[obs_pose]
     problem = BundleProblem(
-        world.kf_pose[poses], len(variable), world.position[points], obs_pose, obs_point,
-        world.kf_xy[at, features], world.kf_right[at, features], world.kf_info[at, features],
-        world.kf_info_right[at, features], world.camera,
-    )  # fmt: skip
+        world.kf_pose[poses],
+        len(variable),
+        world.position[points],
+        obs_pose,
+        obs_point,
+        world.kf_xy[at, features],
+        world.kf_right[at, features],
+        world.kf_info[at, features],
+        world.kf_info_right[at, features],
+        world.camera,
+    )
     return Bundle(problem, poses, points, features)

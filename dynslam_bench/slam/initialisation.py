@@ -350,9 +350,17 @@ def _adjusted(
     xy = xy[order]
     info = info[order]
     problem = BundleProblem(
-        np.concatenate([poses, np.eye(4)[None]]), count, points, (view - 1) % (count + 1), point,
-        xy, np.full(len(xy), np.nan), info, np.zeros(len(xy)), camera,
-    )  # fmt: skip
+        np.concatenate([poses, np.eye(4)[None]]),
+        count,
+        points,
+        (view - 1) % (count + 1),
+        point,
+        xy,
+        np.full(len(xy), np.nan),
+        info,
+        np.zeros(len(xy)),
+        camera,
+    )
     result = adjust_bundle(problem, BUNDLE_ITERATIONS)
     kept = np.asarray(np.isfinite(result.points).all(axis=1))
     kept[point[~result.inliers & ((view == 0) | (view == count))]] = False

@@ -379,10 +379,24 @@ def share_in_view(world: Map, keyframe: int, T_cam_world: Array) -> float:
 
 @kernel
 def _triangulate(
-    pose_a: Array, pose_b: Array, rows_a: Slots, rows_b: Slots, xy_a: Array, xy_b: Array, z_b: Array,
-    octave_a: Slots, octave_b: Slots, words_a: Words, words_b: Words, scales: Array,
-    fx: float, fy: float, cx: float, cy: float, sigmas: float,
-) -> tuple[Slots, Slots, Array]:  # fmt: skip
+    pose_a: Array,
+    pose_b: Array,
+    rows_a: Slots,
+    rows_b: Slots,
+    xy_a: Array,
+    xy_b: Array,
+    z_b: Array,
+    octave_a: Slots,
+    octave_b: Slots,
+    words_a: Words,
+    words_b: Words,
+    scales: Array,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    sigmas: float,
+) -> tuple[Slots, Slots, Array]:
     """Pairs of rows that fit one point, and its depth along the ray of camera `a`."""
     # x_b = r x_a + t
     r = np.zeros((3, 3))
@@ -490,12 +504,23 @@ def triangulate(
     m = int(world.kf_count[other])
     camera = world.camera
     features, others, depth = _triangulate(
-        world.kf_pose[slot], world.kf_pose[other],
-        np.flatnonzero(world.kf_point[slot, :n] < 0), np.flatnonzero(world.kf_point[other, :m] < 0),
-        world.kf_xy[slot], world.kf_xy[other], world.kf_z[other].astype(np.float64),
-        world.kf_octave[slot].astype(np.int64), world.kf_octave[other].astype(np.int64),
-        world.kf_words[slot], world.kf_words[other], world.scales,
-        camera.fx, camera.fy, camera.cx, camera.cy, float(min_parallax_sigmas),
-    )  # fmt: skip
+        world.kf_pose[slot],
+        world.kf_pose[other],
+        np.flatnonzero(world.kf_point[slot, :n] < 0),
+        np.flatnonzero(world.kf_point[other, :m] < 0),
+        world.kf_xy[slot],
+        world.kf_xy[other],
+        world.kf_z[other].astype(np.float64),
+        world.kf_octave[slot].astype(np.int64),
+        world.kf_octave[other].astype(np.int64),
+        world.kf_words[slot],
+        world.kf_words[other],
+        world.scales,
+        camera.fx,
+        camera.fy,
+        camera.cx,
+        camera.cy,
+        float(min_parallax_sigmas),
+    )
     local = camera.unproject(world.kf_xy[slot, features], depth)
     return features, others, se3.transform(se3.inverse(world.kf_pose[slot]), local)

@@ -24,21 +24,45 @@ Slots = NDArray[np.int64]
 Ints = NDArray[np.int32]
 
 KEYFRAME_TABLES = {
-    "kf_alive": (bool,), "kf_id": (np.int64,), "kf_map": (np.int64,), "kf_frame": (np.int64,), "kf_stamp": (float,),
-    "kf_pose": (float, 4, 4), "kf_centre": (float, 3), "kf_count": (np.int64,),
-}  # fmt: skip
+    "kf_alive": (bool,),
+    "kf_id": (np.int64,),
+    "kf_map": (np.int64,),
+    "kf_frame": (np.int64,),
+    "kf_stamp": (float,),
+    "kf_pose": (float, 4, 4),
+    "kf_centre": (float, 3),
+    "kf_count": (np.int64,),
+}
 """Type and shape of what is stored of each keyframe, see `Map`."""
 FEATURE_TABLES = {
-    "kf_raw": (np.float32, 0, 2), "kf_response": (np.float32, 0), "kf_xy": (float, 0, 2), "kf_right": (float, 0),
-    "kf_z": (np.float32, 0), "kf_octave": (np.int8, 0), "kf_angle": (np.float32, 0), "kf_info": (float, 0),
-    "kf_info_right": (float, 0), "kf_words": (np.uint64, 0, 4), "kf_point": (np.int32, 0),
-}  # fmt: skip
+    "kf_raw": (np.float32, 0, 2),
+    "kf_response": (np.float32, 0),
+    "kf_xy": (float, 0, 2),
+    "kf_right": (float, 0),
+    "kf_z": (np.float32, 0),
+    "kf_octave": (np.int8, 0),
+    "kf_angle": (np.float32, 0),
+    "kf_info": (float, 0),
+    "kf_info_right": (float, 0),
+    "kf_words": (np.uint64, 0, 4),
+    "kf_point": (np.int32, 0),
+}
 """Of each feature of each keyframe."""
 POINT_TABLES = {
-    "alive": (bool,), "id": (np.int64,), "position": (float, 3), "normal": (float, 3), "far": (float,),
-    "words": (np.uint64, 4), "rgb": (np.uint8, 3), "visible": (np.int32,), "found": (np.int32,), "born": (np.int64,),
-    "n_obs": (np.int32,), "obs_kf": (np.int32, 8), "obs_ft": (np.int32, 8),
-}  # fmt: skip
+    "alive": (bool,),
+    "id": (np.int64,),
+    "position": (float, 3),
+    "normal": (float, 3),
+    "far": (float,),
+    "words": (np.uint64, 4),
+    "rgb": (np.uint8, 3),
+    "visible": (np.int32,),
+    "found": (np.int32,),
+    "born": (np.int64,),
+    "n_obs": (np.int32,),
+    "obs_kf": (np.int32, 8),
+    "obs_ft": (np.int32, 8),
+}
 """Of each point."""
 MIN_COSINE = 0.5
 """Smallest cosine between a point's mean viewing direction and the ray to the camera (ORB-SLAM2's number)."""
@@ -157,9 +181,17 @@ class Map:
         self.set_pose(slot, T_cam_world)
         raw = observations.keypoints
         described = (
-            raw.xy, raw.response, observations.xy, observations.right, observations.z, observations.octave,
-            observations.angle, observations.info, observations.info_right, observations.words,
-        )  # fmt: skip
+            raw.xy,
+            raw.response,
+            observations.xy,
+            observations.right,
+            observations.z,
+            observations.octave,
+            observations.angle,
+            observations.info,
+            observations.info_right,
+            observations.words,
+        )
         for name, values in zip(FEATURE_TABLES, described, strict=False):
             getattr(self, name)[slot, :n] = values
         self.kf_point[slot] = -1
@@ -320,10 +352,21 @@ class Map:
         """The points that a camera should see, with pixels, right coordinates, octaves and viewing cosines."""
         c = self.camera
         return _project(
-            np.ascontiguousarray(T_cam_world), candidates, self.position, self.normal, self.far,
-            c.fx, c.fy, c.cx, c.cy, c.fx * c.baseline_m, float(c.width), float(c.height),
-            float(self.scales[1] / self.scales[0]) if len(self.scales) > 1 else 1.2, len(self.scales),
-        )  # fmt: skip
+            np.ascontiguousarray(T_cam_world),
+            candidates,
+            self.position,
+            self.normal,
+            self.far,
+            c.fx,
+            c.fy,
+            c.cx,
+            c.cy,
+            c.fx * c.baseline_m,
+            float(c.width),
+            float(c.height),
+            float(self.scales[1] / self.scales[0]) if len(self.scales) > 1 else 1.2,
+            len(self.scales),
+        )
 
     def redundancy(self, slot: int, close_m: float) -> tuple[int, int]:
         """A keyframe's close points, and how many of them three other keyframes see, at most one octave coarser.
@@ -485,9 +528,19 @@ def _replace(obs_kf: Ints, obs_ft: Ints, n_obs: Ints, kf_point: Ints, old: int, 
 
 @kernel
 def _refresh(
-    points: Slots, position: Array, normal: Array, far: Array, words: Any, obs_kf: Ints, obs_ft: Ints, n_obs: Ints,
-    kf_words: Any, kf_octave: Any, kf_centre: Array, scales: Array,
-) -> None:  # fmt: skip
+    points: Slots,
+    position: Array,
+    normal: Array,
+    far: Array,
+    words: Any,
+    obs_kf: Ints,
+    obs_ft: Ints,
+    n_obs: Ints,
+    kf_words: Any,
+    kf_octave: Any,
+    kf_centre: Array,
+    scales: Array,
+) -> None:
     """Renew descriptor (the medoid of the observed ones), viewing direction and scale range of the points."""
     for i in range(points.shape[0]):
         p = points[i]
@@ -533,10 +586,21 @@ def _refresh(
 
 @kernel
 def _project(
-    pose: Array, candidates: Slots, position: Array, normal: Array, far: Array,
-    fx: float, fy: float, cx: float, cy: float, bf: float, width: float, height: float, scale_factor: float,
+    pose: Array,
+    candidates: Slots,
+    position: Array,
+    normal: Array,
+    far: Array,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    bf: float,
+    width: float,
+    height: float,
+    scale_factor: float,
     levels: int,
-) -> tuple[Slots, Array, Array, Slots, Array]:  # fmt: skip
+) -> tuple[Slots, Array, Array, Slots, Array]:
     """The candidate points that the camera should see: in the image, at a fit distance, from a fit side.
 
     Returns:

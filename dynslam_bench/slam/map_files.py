@@ -35,19 +35,37 @@ Sensors = Literal["rgbd", "rgb"]
 Arrays = Mapping[str, NDArray[Any]]
 
 KEYFRAME_ARRAYS = {
-    "kf_id": ("i8", "S"), "kf_map": ("i8", "S"), "kf_pose": ("f8", "S44"), "kf_count": ("i8", "S"),
-}  # fmt: skip
+    "kf_id": ("i8", "S"),
+    "kf_map": ("i8", "S"),
+    "kf_pose": ("f8", "S44"),
+    "kf_count": ("i8", "S"),
+}
 """Type and shape of what is stored of each keyframe; S keyframes."""
 FEATURE_ARRAYS = {
-    "kf_raw": ("f4", "F2"), "kf_response": ("f4", "F"), "kf_xy": ("f8", "F2"), "kf_right": ("f8", "F"),
-    "kf_z": ("f4", "F"), "kf_octave": ("i1", "F"), "kf_angle": ("f4", "F"), "kf_info": ("f8", "F"),
-    "kf_info_right": ("f8", "F"), "kf_words": ("u8", "FW"),
-}  # fmt: skip
+    "kf_raw": ("f4", "F2"),
+    "kf_response": ("f4", "F"),
+    "kf_xy": ("f8", "F2"),
+    "kf_right": ("f8", "F"),
+    "kf_z": ("f4", "F"),
+    "kf_octave": ("i1", "F"),
+    "kf_angle": ("f4", "F"),
+    "kf_info": ("f8", "F"),
+    "kf_info_right": ("f8", "F"),
+    "kf_words": ("u8", "FW"),
+}
 """Of each feature of each keyframe, one keyframe after the other; F features, W words of 64 bits a descriptor."""
 POINT_ARRAYS = {
-    "id": ("i8", "P"), "position": ("f8", "P3"), "normal": ("f8", "P3"), "far": ("f8", "P"), "words": ("u8", "PW"),
-    "rgb": ("u1", "P3"), "visible": ("i4", "P"), "found": ("i4", "P"), "born": ("i8", "P"), "n_obs": ("i4", "P"),
-}  # fmt: skip
+    "id": ("i8", "P"),
+    "position": ("f8", "P3"),
+    "normal": ("f8", "P3"),
+    "far": ("f8", "P"),
+    "words": ("u8", "PW"),
+    "rgb": ("u1", "P3"),
+    "visible": ("i4", "P"),
+    "found": ("i4", "P"),
+    "born": ("i8", "P"),
+    "n_obs": ("i4", "P"),
+}
 """Of each point; P points."""
 OBSERVATION_ARRAYS = {"obs_kf": ("i4", "O"), "obs_ft": ("i4", "O")}
 """Of each observation, one point after the other: row of the keyframe, and which of its features; O observations."""
@@ -219,8 +237,10 @@ def _faults(arrays: Arrays, header: MapHeader) -> Iterator[str]:
     sizes: dict[str, int] = {}
     for name, (kind, axes) in _LAYOUT.items():
         array = arrays[name]
-        expected = [int(axis) if axis.isdigit() else sizes.setdefault(axis, size)
-                    for axis, size in zip(axes, array.shape, strict=False)]  # fmt: skip
+        expected = [
+            int(axis) if axis.isdigit() else sizes.setdefault(axis, size)
+            for axis, size in zip(axes, array.shape, strict=False)
+        ]
         if (
             array.dtype != np.dtype(kind)
             or array.ndim != len(axes)
@@ -229,10 +249,16 @@ def _faults(arrays: Arrays, header: MapHeader) -> Iterator[str]:
             shape = ", ".join(map(str, expected)) + ", ?" * max(len(axes) - array.ndim, 0)
             yield f"'{name}' is {array.dtype} of shape {str(array.shape)[:60]}, expected {np.dtype(kind)} of ({shape})"
     last = {
-        "kf_id": header.next_keyframe - 1, "born": header.next_keyframe - 1, "id": header.next_point - 1,
-        "kf_map": len(arrays["submap_bound"]), "kf_octave": header.features.levels - 1, "kf_count": np.inf,
-        "n_obs": np.inf, "obs_kf": len(arrays["kf_id"]) - 1, "obs_ft": np.inf,
-    }  # fmt: skip
+        "kf_id": header.next_keyframe - 1,
+        "born": header.next_keyframe - 1,
+        "id": header.next_point - 1,
+        "kf_map": len(arrays["submap_bound"]),
+        "kf_octave": header.features.levels - 1,
+        "kf_count": np.inf,
+        "n_obs": np.inf,
+        "obs_kf": len(arrays["kf_id"]) - 1,
+        "obs_ft": np.inf,
+    }
     for name, most in last.items():
         if not ((arrays[name] >= 0) & (arrays[name] <= most)).all():
             yield f"'{name}' holds values below 0 or above {most}"
@@ -252,8 +278,9 @@ def _checks(arrays: Arrays) -> Iterator[tuple[Any, str]]:
     n_obs = arrays["n_obs"].astype(np.int64)
     yield len(count) and n_obs.all(), "it holds no keyframe, or a point that none observes"
     for name, counts, size, held in (
-        ("kf_count", count, 64 + 8 * words, len(arrays["kf_xy"])), ("n_obs", n_obs, 8, len(arrays["obs_kf"]))
-    ):  # fmt: skip
+        ("kf_count", count, 64 + 8 * words, len(arrays["kf_xy"])),
+        ("n_obs", n_obs, 8, len(arrays["obs_kf"])),
+    ):
         # as tables, as wide as the longest row
         claimed = len(counts) * int(counts.max(initial=0)) * size
         yield (

@@ -67,9 +67,22 @@ def cauchy_width(chi2: Array) -> float:
 
 @kernel
 def _linearise(
-    pose: Array, points: Array, uv: Array, right: Array, info: Array, info_right: Array, active: NDArray[np.bool_],
-    width: float, fx: float, fy: float, cx: float, cy: float, bf: float, h: Array, g: Array,
-) -> float:  # fmt: skip
+    pose: Array,
+    points: Array,
+    uv: Array,
+    right: Array,
+    info: Array,
+    info_right: Array,
+    active: NDArray[np.bool_],
+    width: float,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    bf: float,
+    h: Array,
+    g: Array,
+) -> float:
     """Fill the Gauss-Newton system; returns the cost.
 
     The cost is that of Cauchy's kernel of a squared width, or of Huber's where that is 0.
@@ -122,9 +135,18 @@ def _linearise(
 
 @kernel
 def observation_chi2(
-    pose: Array, point: Array, uv: Array, right: float, info: float, info_right: float,
-    fx: float, fy: float, cx: float, cy: float, bf: float,
-) -> tuple[float, float]:  # fmt: skip
+    pose: Array,
+    point: Array,
+    uv: Array,
+    right: float,
+    info: float,
+    info_right: float,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    bf: float,
+) -> tuple[float, float]:
     """Chi-square of one observation by its pixel alone, and with its right coordinate; inf behind the camera."""
     x, y, z = moved_point(pose, point)
     if z < NEAR_M:
@@ -141,9 +163,20 @@ def observation_chi2(
 
 @kernel
 def _classify(
-    pose: Array, points: Array, uv: Array, right: Array, info: Array, info_right: Array,
-    fx: float, fy: float, cx: float, cy: float, bf: float, inlier: NDArray[np.bool_], error: Array,
-) -> None:  # fmt: skip
+    pose: Array,
+    points: Array,
+    uv: Array,
+    right: Array,
+    info: Array,
+    info_right: Array,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    bf: float,
+    inlier: NDArray[np.bool_],
+    error: Array,
+) -> None:
     for i in range(points.shape[0]):
         pixel, whole = observation_chi2(
             pose, points[i], uv[i], right[i], info[i], info_right[i], fx, fy, cx, cy, bf
@@ -154,9 +187,20 @@ def _classify(
 
 @kernel
 def _optimise(
-    pose: Array, points: Array, uv: Array, right: Array, info: Array, info_right: Array,
-    fx: float, fy: float, cx: float, cy: float, bf: float, rounds: int, iterations: int,
-) -> tuple[Array, NDArray[np.bool_], Array, Array]:  # fmt: skip
+    pose: Array,
+    points: Array,
+    uv: Array,
+    right: Array,
+    info: Array,
+    info_right: Array,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    bf: float,
+    rounds: int,
+    iterations: int,
+) -> tuple[Array, NDArray[np.bool_], Array, Array]:
     inlier = np.ones(len(points), np.bool_)
     error = np.zeros(len(points))
     h = np.zeros((6, 6))

@@ -114,7 +114,7 @@ def filter_scene(frames: int = 4, *, points: int = 400) -> Steps:
         z = frame.depth[row, column]
         bundle = FrameBundle(
             index, frame.timestamp, frame.rgb, grey(frame), frame.depth, keypoints, xy, z, instances
-        )  # fmt: skip
+        )
         state = FilterState(camera, np.ones(points, dtype=bool), seed=index)
         if steps:
             world = se3.transform(pose, camera.unproject(xy, z))

@@ -204,8 +204,11 @@ def flow_report(construct: Callable[[], FlowEstimator], *, points: int = 200) ->
         reference, target = first.copy(), second.copy()
         require_unchanged(
             lambda: flow.track(flow.prepare(reference), flow.prepare(target), grid),
-            reference, target, grid, what="an image, or the points,",
-        )  # fmt: skip
+            reference,
+            target,
+            grid,
+            what="an image, or the points,",
+        )
 
     def outside() -> None:
         strange = np.array([[-5, 5], [1e6, 5], [np.nan, 5]], np.float32)

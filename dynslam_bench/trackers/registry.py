@@ -15,9 +15,14 @@ from dynslam_bench.trackers.adapters.specs import ADAPTERS
 from dynslam_bench.trackers.systems import emfoa_oft, published
 
 KINDS = {
-    "own": "this project's", "faithful-code": "published", "faithful-paper": "published", "inspired": "published",
-    "assumed": "published", "external": "external", "control": "control",
-}  # fmt: skip
+    "own": "this project's",
+    "faithful-code": "published",
+    "faithful-paper": "published",
+    "inspired": "published",
+    "assumed": "published",
+    "external": "external",
+    "control": "control",
+}
 """Kind of a tracker by its provenance."""
 
 

@@ -198,12 +198,20 @@ def side_content(
         "referenceAt": None if board.reference is None else place[board.reference],
         "metrics": metrics,
         "trackers": [
-            {"label": board.names[key], "ranked": key in board.ranked, "settings": settings_content(board.first(key))}
+            {
+                "label": board.names[key],
+                "ranked": key in board.ranked,
+                "settings": settings_content(board.first(key)),
+            }
             for key in keys
         ],
         "sequences": [
-            {"name": name, "short": board.short.get(name, name), "tags": sorted(tags[name]),
-             "static": significant(board.static_camera.get(name))}
+            {
+                "name": name,
+                "short": board.short.get(name, name),
+                "tags": sorted(tags[name]),
+                "static": significant(board.static_camera.get(name)),
+            }
             for name in names
         ],
         "categories": {category: sorted(members) for category, members in categories.items()},
@@ -213,12 +221,18 @@ def side_content(
             for name, cell in board.cells[key].items()
         ],
         "runs": [
-            [row.run_id, place[row.variant_key], column[board.sequence(row)], row.repeat, row.ending,
-             (row.run_id in paged) + 2 * (row.run_id in pictured)]
+            [
+                row.run_id,
+                place[row.variant_key],
+                column[board.sequence(row)],
+                row.repeat,
+                row.ending,
+                (row.run_id in paged) + 2 * (row.run_id in pictured),
+            ]
             for row in ordered
         ],
         "unlisted": len(board.rows) - len(listed),
-    }  # fmt: skip
+    }
 
 
 def ratios_content(board: Board) -> list[list[Any]]:

@@ -214,8 +214,10 @@ def run_content(
         row, protocol, float(frames.columns["timestamp"][0]) if frames.columns else None
     )
     level, verdict = verdict_of(row, frames)
-    settings = {name: value if isinstance(value, str | int | bool) else str(value)
-                for name, value in record.settings.items()}  # fmt: skip
+    settings = {
+        name: value if isinstance(value, str | int | bool) else str(value)
+        for name, value in record.settings.items()
+    }
     changed = [name for name in settings if name in record.overrides]
     figures = {
         "time": _time_figure(row, frames, series, track, lost),
@@ -511,12 +513,33 @@ def _time_figure(
     """Error, inliers and people's share on one time axis, lost spans shaded."""
     unit = {"hovertemplate": "%{y:.3g} at %{x:.2f} s<extra>%{fullData.name}</extra>"}
     panels: list[tuple[str, list[tuple[str, str, str, str, dict[str, Any]]]]] = [
-        ("error (mm)", [("absolute error", "track_t", "track_error", COLOURS[1], {}),
-                        ("frame-to-frame error", "t", "frame_error", COLOURS[0], {"line": {"dash": "dot"}})]),
-        ("features", [("inliers", "t", "inliers", COLOURS[2], {}),
-                      ("dynamic (culled)", "t", "culled", COLOURS[1], {"line": {"dash": "dash"}})]),
-        ("people (%)", [(f"share of people: {frames.share_source}", "t", "share", COLOURS[4], {"fill": "tozeroy"})]),
-    ]  # fmt: skip
+        (
+            "error (mm)",
+            [
+                ("absolute error", "track_t", "track_error", COLOURS[1], {}),
+                ("frame-to-frame error", "t", "frame_error", COLOURS[0], {"line": {"dash": "dot"}}),
+            ],
+        ),
+        (
+            "features",
+            [
+                ("inliers", "t", "inliers", COLOURS[2], {}),
+                ("dynamic (culled)", "t", "culled", COLOURS[1], {"line": {"dash": "dash"}}),
+            ],
+        ),
+        (
+            "people (%)",
+            [
+                (
+                    f"share of people: {frames.share_source}",
+                    "t",
+                    "share",
+                    COLOURS[4],
+                    {"fill": "tozeroy"},
+                )
+            ],
+        ),
+    ]
     columns = series | track
     measured = {
         title: [
@@ -573,9 +596,14 @@ HEAT = {
     "colorscale": [[0, COLOURS[0]], [0.5, "#b9b3aa"], [1, COLOURS[1]]],
     "cmin": 0,
     "cmax": 3,
-    "colorbar": {"title": {"text": "error (mm)"}, "tickvals": [0, 1, 2, 3], "ticktext": ["1", "10", "100", "1000"],
-                 "thickness": 12, "len": 0.6},
-}  # fmt: skip
+    "colorbar": {
+        "title": {"text": "error (mm)"},
+        "tickvals": [0, 1, 2, 3],
+        "ticktext": ["1", "10", "100", "1000"],
+        "thickness": 12,
+        "len": 0.6,
+    },
+}
 """Colours of an error along a track, by its logarithm: the same scale for all runs."""
 
 

@@ -30,9 +30,14 @@ published with the code of DynaSLAM (walking_xyz: of DANI-SLAM). Bonn: the last 
 that is numbered as
 in the whole, counted from 0. Of others no source was read."""
 METRICS = (
-    "ate_rmse_m", "ate_mean_m", "ate_median_m", "ate_sd_m", "rpe_1s_trans_rmse_m", "rpe_1s_rot_rmse_deg",
+    "ate_rmse_m",
+    "ate_mean_m",
+    "ate_median_m",
+    "ate_sd_m",
+    "rpe_1s_trans_rmse_m",
+    "rpe_1s_rot_rmse_deg",
     "coverage_percent",
-)  # fmt: skip
+)
 """What was published of a sequence, the error that is always sought first."""
 NOT_STATED = "not stated"
 RECORD = "record"

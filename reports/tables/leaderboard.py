@@ -1184,9 +1184,13 @@ def subject_of(board: Board) -> str | None:
 def absolute_table(board: Board, protocol: Protocol) -> Table | None:
     """Table 1: RMSE, mean, median and standard deviation of the absolute error; None if no run has it."""
     return _statistics_table(
-        board, {name: f"ate_{name}_m" for name in STATISTICS}, "paper_ape", "Absolute pose error, four statistics",
-        f"As the paper's Table 1. {protocol.describe()}.", "Absolute pose error (mm)",
-    )  # fmt: skip
+        board,
+        {name: f"ate_{name}_m" for name in STATISTICS},
+        "paper_ape",
+        "Absolute pose error, four statistics",
+        f"As the paper's Table 1. {protocol.describe()}.",
+        "Absolute pose error (mm)",
+    )
 
 
 def relative_table(board: Board, protocol: Protocol) -> Table | None:

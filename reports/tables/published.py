@@ -41,9 +41,14 @@ def published_table(lines: pd.DataFrame) -> Table | None:
         for p in lines_of(lines)
     ]
     columns = [
-        *texts("sequence", "system"), *numbers("ATE (mm)"), *texts("by", "source", "alignment"),
-        *numbers("year"), *texts("hardware"), *numbers(*_IN_TABLE), *texts("remarks"),
-    ]  # fmt: skip
+        *texts("sequence", "system"),
+        *numbers("ATE (mm)"),
+        *texts("by", "source", "alignment"),
+        *numbers("year"),
+        *texts("hardware"),
+        *numbers(*_IN_TABLE),
+        *texts("remarks"),
+    ]
     caption = (
         "Absolute trajectory errors (RMSE) and what else is printed with them, as printed; metres in the CSV. By: the "
         "authors of the system, or a third party, which may have run it or quote them. Year: of the source. Most leave "
@@ -81,8 +86,9 @@ def span_table(spans: pd.DataFrame) -> Table | None:
         for s in lines_of(spans)
     ]
     columns = [
-        *texts("sequence", "system", "alignment"), *numbers("numbers", "from (mm)", "to (mm)", "ratio", "authors (mm)")
-    ]  # fmt: skip
+        *texts("sequence", "system", "alignment"),
+        *numbers("numbers", "from (mm)", "to (mm)", "ratio", "authors (mm)"),
+    ]
     caption = (
         "The lowest and the highest published ATE of one system under one alignment. By its authors: the lowest that "
         "they print."

@@ -202,9 +202,8 @@ def regret(studies: int, folder: Path) -> Iterable[str]:
                 seed=seed,
             )
             trials = tuner.run().study.get_trials(deepcopy=False)
-            runs.append(
-                sum(len(trial.user_attrs["instances"]) for trial in trials)
-            )  # the baseline's too, as in `plain`
+            # the baseline's too, as in `plain`
+            runs.append(sum(len(trial.user_attrs["instances"]) for trial in trials))
             ours.append((simulated.valley(finish(tuner).best.params), len(trials)))
             for kind, found in others.items():
                 found.append(plain(tuner, seed, runs[-1], kind()))

@@ -564,9 +564,8 @@ def test_fixed_shapes_give_the_same_objects(exact: bool) -> None:
     assert np.abs(np.array([row[1] for row in rows]) - expected.scores).max() < 1e-5
     assert np.abs(np.array([row[2] for row in rows]) - expected.boxes).max() < 1e-3
     for row, mask in zip(rows, expected.masks, strict=True):
-        assert np.logical_xor(row[3], mask).sum() < 0.03 * max(
-            mask.sum(), 20
-        )  # OpenCV interpolates at 32nds of a pixel
+        # OpenCV interpolates at 32nds of a pixel
+        assert np.logical_xor(row[3], mask).sum() < 0.03 * max(mask.sum(), 20)
 
 
 def test_suppression_in_rounds_is_the_greedy_one() -> None:

@@ -128,8 +128,11 @@ def write_colmap(
         "FULL_OPENCV": [k1, k2, p1, p2, k3, 0, 0, 0],
     }[model]
     numbers = " ".join(f"{value:.12g}" for value in values)
-    write_atomic(folder / "cameras.txt", f"# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n1 {model} {camera.width} "
-                 f"{camera.height} {numbers}\n")  # fmt: skip
+    write_atomic(
+        folder / "cameras.txt",
+        f"# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n1 {model} {camera.width} "
+        f"{camera.height} {numbers}\n",
+    )
     position, quaternion = se3.to_quaternion(se3.inverse(trajectory.T_world_cam))
     lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then POINTS2D[] (none)"]
     for number, (t, q, name) in enumerate(zip(position, quaternion, names, strict=True), start=1):

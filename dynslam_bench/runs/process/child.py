@@ -140,9 +140,8 @@ def recording_reads(job: dict[str, Any], temporary: Path) -> Iterator[Callable[[
     try:
         yield lambda: keep(recorder.so_far())
     except BaseException:
-        with contextlib.suppress(
-            RunError
-        ):  # the run's own error is the one to tell; what changed meanwhile shows at the look-up
+        with contextlib.suppress(RunError):
+            # the run's own error is the one to tell; what changed meanwhile shows at the look-up
             keep(recorder.finish())
         raise
     keep(recorder.finish())

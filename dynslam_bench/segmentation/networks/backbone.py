@@ -97,11 +97,24 @@ class NetworkConfig(BaseModel):
 
 
 EMBEDDED = NetworkConfig(
-    blocks=(2, 2, 2, 2), bottleneck=False, stem=32, channels=64, classes=("person",),
-    anchor_sizes=(16.0, 32.0, 64.0, 128.0, 224.0), anchor_ratios=(1.0, 2.0, 3.0), box_hidden=256, mask_channels=64,
-    canonical=112.0, min_side=240, max_side=427, pre_nms=200, post_nms=100, max_detections=20, exact_paste=True,
+    blocks=(2, 2, 2, 2),
+    bottleneck=False,
+    stem=32,
+    channels=64,
+    classes=("person",),
+    anchor_sizes=(16.0, 32.0, 64.0, 128.0, 224.0),
+    anchor_ratios=(1.0, 2.0, 3.0),
+    box_hidden=256,
+    mask_channels=64,
+    canonical=112.0,
+    min_side=240,
+    max_side=427,
+    pre_nms=200,
+    post_nms=100,
+    max_detections=20,
+    exact_paste=True,
     norm="batch",
-)  # fmt: skip
+)
 """The small network of this package: half-width ResNet-18, 64-channel pyramid, 320 x 240 input, persons only."""
 RESNET18 = NetworkConfig(blocks=(2, 2, 2, 2), bottleneck=False, classes=("person",), norm="batch")
 """Mask R-CNN on a full-width ResNet-18."""

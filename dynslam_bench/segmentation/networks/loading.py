@@ -76,7 +76,8 @@ def read_checkpoint(path: Path) -> Mapping[str, Any]:
         f"{path} ({size} bytes) is no torch checkpoint of plain weights",
         "it is truncated or of another format",
         of=Exception,
-    ):  # torch raises many types for a damaged file
+    ):
+        # torch raises many types for a damaged file
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:
                 unpacked = sum(entry.file_size for entry in archive.infolist())
@@ -248,7 +249,8 @@ def save_network(network: MaskRCNN, path: Path, *, half: bool = False) -> None:
     with (
         replacing(path) as temporary,
         temporary.open("wb") as file,
-    ):  # an open file: torch.save writes no file name into it
+    ):
+        # an open file: torch.save writes no file name into it
         torch.save(content, file)
 
 

@@ -128,7 +128,8 @@ def write_onnx(network: MaskRCNN, path: Path, *, size: tuple[int, int] = SIZE) -
             f"torch {torch.__version__} cannot export the network",
             "torch >= 2.6",
             of=(torch.onnx.errors.OnnxExporterError, TypeError),
-        ):  # TypeError: options of a newer torch
+        ):
+            # TypeError: options of a newer torch
             with torch.no_grad(), warnings.catch_warnings(), redirect_stdout(StringIO()):
                 warnings.simplefilter("ignore")
                 torch.onnx.export(

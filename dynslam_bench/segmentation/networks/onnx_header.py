@@ -18,9 +18,21 @@ Fields: TypeAlias = dict[int, list[Any]]
 """Values of a message, each an integer or a memoryview, by field number."""
 _NOTHING = memoryview(b"")
 ELEMENTS = {
-    1: "float32", 2: "uint8", 3: "int8", 4: "uint16", 5: "int16", 6: "int32", 7: "int64", 8: "string", 9: "bool",
-    10: "float16", 11: "float64", 12: "uint32", 13: "uint64", 16: "bfloat16",
-}  # fmt: skip
+    1: "float32",
+    2: "uint8",
+    3: "int8",
+    4: "uint16",
+    5: "int16",
+    6: "int32",
+    7: "int64",
+    8: "string",
+    9: "bool",
+    10: "float16",
+    11: "float64",
+    12: "uint32",
+    13: "uint64",
+    16: "bfloat16",
+}
 """Types of a tensor's numbers, by the value of TensorProto.DataType."""
 
 
@@ -63,7 +75,8 @@ def read_header(path: Path) -> tuple[list[TensorInfo], list[TensorInfo], dict[st
         f"{path} is not an ONNX model ({len(data)} bytes)",
         "the file is truncated or of another format",
         of=(ValueError, IndexError, TypeError, AttributeError),
-    ):  # also a field of another type
+    ):
+        # also a field of another type
         model = _fields(memoryview(data))
         graph = _message(model, 7)
         initialised = {_text(_fields(tensor), 8) for tensor in graph.get(5, ())}

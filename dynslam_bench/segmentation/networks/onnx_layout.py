@@ -38,8 +38,13 @@ NO_OBJECT = frozenset({"", "background", "n/a"})
 MOST_CLASSES = 1 << 16
 """Numbers of classes lie below it."""
 _TASKS = {
-    "segment": ("yolo", "instances"), "semantic": ("semantic",), "detect": (), "pose": (), "obb": (), "classify": (),
-}  # fmt: skip
+    "segment": ("yolo", "instances"),
+    "semantic": ("semantic",),
+    "detect": (),
+    "pose": (),
+    "obb": (),
+    "classify": (),
+}
 """Ultralytics' tasks, and the kinds of layouts whose masks they give."""
 _STRIDES = ((8, 16, 32), (8, 16, 32, 64), (4, 8, 16, 32))
 """Strides of the grids of YOLO networks: of most, of those named P6 and of those named P2."""

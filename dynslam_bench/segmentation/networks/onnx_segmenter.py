@@ -505,11 +505,15 @@ def _decode_semantic(
         )
     rows, columns = (
         _interpolation(
-            logits.shape[1 + axis], place.input[axis], place.scale[1 - axis], place.offset[1 - axis],
-            place.frame[axis], layout.aligned,
+            logits.shape[1 + axis],
+            place.input[axis],
+            place.scale[1 - axis],
+            place.offset[1 - axis],
+            place.frame[axis],
+            layout.aligned,
         )
         for axis in (0, 1)
-    )  # fmt: skip
+    )
     full = np.matmul(np.matmul(rows, logits), columns.T)
     level = _logit(settings.mask_threshold)
     masks = [np.zeros((0, *place.frame), bool)]

@@ -262,12 +262,22 @@ def evaluate_segmenter(
             f"labelled are: {', '.join(sorted(shown)) or 'none'}",
         )
     score = SegmenterScore(
-        segmenter=resolve_source(settings, "synthetic/"), weights=weights_digest(settings, "synthetic/"),
-        data=images.name, images=len(chosen), confidence=settings.confidence, min_area=min_area,
-        mean_ap=mean([quality["ap"] for quality in there]), mean_iou=mean([quality["iou"] for quality in there]),
-        classes={name: quality for name, quality in qualities.items() if quality["truths"] or quality["detections"]},
-        median_ms=1000 * float(np.median(times)) if times else float("nan"), threads=threads,
-    )  # fmt: skip
+        segmenter=resolve_source(settings, "synthetic/"),
+        weights=weights_digest(settings, "synthetic/"),
+        data=images.name,
+        images=len(chosen),
+        confidence=settings.confidence,
+        min_area=min_area,
+        mean_ap=mean([quality["ap"] for quality in there]),
+        mean_iou=mean([quality["iou"] for quality in there]),
+        classes={
+            name: quality
+            for name, quality in qualities.items()
+            if quality["truths"] or quality["detections"]
+        },
+        median_ms=1000 * float(np.median(times)) if times else float("nan"),
+        threads=threads,
+    )
     if output is not None:
         write_atomic(output, score.to_json())
     return score

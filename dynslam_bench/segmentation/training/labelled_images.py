@@ -406,8 +406,11 @@ def open_labelled(text: str) -> LabelledImages:
     """
     kind, _, rest = text.partition(":")
     kinds: dict[str, Callable[[str], LabelledImages]] = {
-        "synthetic": rendered_frames, "sequence": sequence_frames, "coco": coco_images, "yolo": yolo_images,
-    }  # fmt: skip
+        "synthetic": rendered_frames,
+        "sequence": sequence_frames,
+        "coco": coco_images,
+        "yolo": yolo_images,
+    }
     if kind in kinds and (rest or kind == "synthetic"):
         return kinds[kind](rest)
     raise SegmentationError(
@@ -459,7 +462,8 @@ class PreparedImages:
             f"the prepared images in {folder} are damaged",
             "delete the folder, they are prepared again",
             of=Exception,
-        ):  # numpy raises many types for a damaged header
+        ):
+            # numpy raises many types for a damaged header
             self.images, self.labels = (
                 np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
                 for name in ("images", "labels")

@@ -77,9 +77,12 @@ def train(
 
     def load(text: str) -> PreparedImages:
         folder = prepare(
-            open_labelled(text), data_cache or output / "data", height, width,
+            open_labelled(text),
+            data_cache or output / "data",
+            height,
+            width,
             lambda done, total: progress(TrainProgress("data", done, total, {})),
-        )  # fmt: skip
+        )
         images = PreparedImages(folder, config.classes)
         labelled = {name for names in images.names for name in names}
         if labelled.isdisjoint(config.classes):

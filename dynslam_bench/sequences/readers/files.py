@@ -388,9 +388,13 @@ def stamped(files: list[str], stamps: NDArray[np.int64], where: str) -> ImageLis
 
 
 def checked_camera(
-    where: object, size: Sequence[float], focal: Sequence[float], centre: Sequence[float],
-    depth_factor: float | None, distortion: Sequence[float] = (),
-) -> Camera:  # fmt: skip
+    where: object,
+    size: Sequence[float],
+    focal: Sequence[float],
+    centre: Sequence[float],
+    depth_factor: float | None,
+    distortion: Sequence[float] = (),
+) -> Camera:
     """A camera by its size, focal lengths and principal point in pixels, and up to five coefficients of distortion.
 
     Raises:
@@ -444,9 +448,8 @@ def read_yaml(path: Path) -> Mapping[str, Any]:
         raise SequenceError(
             f"{path} opens {opened} lists and mappings, more than a calibration's {MOST_BRACKETS}"
         )
-    with raising(
-        SequenceError, f"{path} is no valid YAML", of=Exception
-    ):  # values such as dates make yaml's constructors raise whatever they like
+    with raising(SequenceError, f"{path} is no valid YAML", of=Exception):
+        # values such as dates make yaml's constructors raise whatever they like
         document = yaml.safe_load(re.sub(r"^%YAML.*|!!opencv-matrix", "", text, flags=re.MULTILINE))
     if not isinstance(document, Mapping):
         raise SequenceError(f"{path} holds no YAML mapping")

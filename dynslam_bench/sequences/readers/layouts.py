@@ -347,9 +347,15 @@ def read_vslam_lab(folder: Path, fps: float | None) -> Contents:
     T_body_cam = camera_on_body(stated, where)
     truth, dropped = _truth_of_table(stated_file(folder, "groundtruth.csv"), T_body_cam)
     return Contents(
-        colour, depth, True, truth, dropped, camera, fps or _frame_rate(stated.get("fps")),
+        colour,
+        depth,
+        True,
+        truth,
+        dropped,
+        camera,
+        fps or _frame_rate(stated.get("fps")),
         truth_of_body=is_identity(T_body_cam),
-    )  # fmt: skip
+    )
 
 
 def _depth_factor(mapping: object, where: str) -> float | None:
@@ -402,9 +408,15 @@ def read_euroc(folder: Path, fps: float | None) -> Contents:
         stated_file(folder, f"{base}state_groundtruth_estimate0/data.csv"), T_body_cam
     )
     return Contents(
-        colour, depth, False, truth, dropped, camera, fps or _frame_rate(sensor.get("rate_hz")),
+        colour,
+        depth,
+        False,
+        truth,
+        dropped,
+        camera,
+        fps or _frame_rate(sensor.get("rate_hz")),
         truth_of_body=is_identity(T_body_cam),
-    )  # fmt: skip
+    )
 
 
 def _euroc_images(folder: Path, name: str) -> ImageList:

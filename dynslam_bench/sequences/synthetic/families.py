@@ -336,10 +336,14 @@ def _lane_keys(
     stop = pick(rng, scene, -0.5, 0.5)
     cross = pick(rng, scene, 2.6, 3.4)
     stations = [
-        (0.0, -side * reach, side, 0.0), (cross * 0.5, side * stop, side, 0.0), (pause, side * stop, 0, 1.0),
-        (cross * 0.5, side * reach, side, 0.0), (0.7, side * reach, -side, 0.0),
-        (cross, -side * reach, -side, 0.0), (0.6, -side * reach, side, 0.0),
-    ]  # fmt: skip
+        (0.0, -side * reach, side, 0.0),
+        (cross * 0.5, side * stop, side, 0.0),
+        (pause, side * stop, 0, 1.0),
+        (cross * 0.5, side * reach, side, 0.0),
+        (0.7, side * reach, -side, 0.0),
+        (cross, -side * reach, -side, 0.0),
+        (0.6, -side * reach, side, 0.0),
+    ]
     times = itertools.accumulate(station[0] for station in stations)
     keys = tuple(
         Key(t, x, lane, 180.0 - 90.0 * direction if direction else 180.0, 0, talk)
@@ -607,10 +611,17 @@ def _box_obstructing(j: Draw, scene: int, plan: Plan) -> Cast:
     yaw = j(10, 25)
     box = printed_box(1, (j(0.34, 0.4), j(0.18, 0.24), j(0.28, 0.34)))
     keys = (
-        At(0, -1.7, y, z), At(2.0, -1.7, y, z), At(4.0, -0.25, y, z, yaw), At(7.0, 0.25, y, z + 0.05, -yaw),
-        At(9.0, 1.7, y, z), At(11.5, 1.7, y, z), At(14.0, 0.1, y - 0.08, z, yaw), At(16.5, -0.2, y, z, 0.0),
-        At(18.5, -1.7, y, z), At(20.0, -1.7, y, z),
-    )  # fmt: skip
+        At(0, -1.7, y, z),
+        At(2.0, -1.7, y, z),
+        At(4.0, -0.25, y, z, yaw),
+        At(7.0, 0.25, y, z + 0.05, -yaw),
+        At(9.0, 1.7, y, z),
+        At(11.5, 1.7, y, z),
+        At(14.0, 0.1, y - 0.08, z, yaw),
+        At(16.5, -0.2, y, z, 0.0),
+        At(18.5, -1.7, y, z),
+        At(20.0, -1.7, y, z),
+    )
     return (_body(1, "box", box, keys),), ()
 
 
@@ -619,8 +630,17 @@ def _box_aside(j: Draw, scene: int, plan: Plan) -> Cast:
     y = j(1.3, 1.4)
     z = j(0.95, 1.05)
     box = printed_box(1, (j(0.21, 0.25), j(0.15, 0.19), j(0.17, 0.21)))
-    times = ((0, -1.6), (1.5, -1.6), (5.5, 0.35), (7.5, 0.2), (10.0, 1.6), (12.0, 1.6), (16.0, -0.3), (18.5, -1.6),
-             (20, -1.6))  # fmt: skip
+    times = (
+        (0, -1.6),
+        (1.5, -1.6),
+        (5.5, 0.35),
+        (7.5, 0.2),
+        (10.0, 1.6),
+        (12.0, 1.6),
+        (16.0, -0.3),
+        (18.5, -1.6),
+        (20, -1.6),
+    )
     keys = tuple(At(t, x, y, z, 8.0 * k) for k, (t, x) in enumerate(times))
     walker = tuple(Key(k.t, k.x, y + 0.38, 180) for k in keys)
     return (_body(1, "box", box, keys),), walker
@@ -669,18 +689,35 @@ def _kidnapped(j: Draw, scene: int, plan: Plan) -> Cast:
     z = j(1.1, 1.2)
     box = printed_box(1, (j(1.15, 1.25), 0.12, j(0.8, 0.9)))
     keys = (
-        At(0, -2.6, y, z), At(3.0, -2.6, y, z), At(5.0, -0.3, y, z), At(7.5, 0.3, y - 0.06, z + 0.05),
-        At(9.5, 2.7, y, z), At(13.0, 2.7, y, z), At(15.0, 0.25, y, z), At(17.0, -0.3, y - 0.05, z - 0.04),
-        At(19.0, -2.6, y, z), At(20.0, -2.6, y, z),
-    )  # fmt: skip
+        At(0, -2.6, y, z),
+        At(3.0, -2.6, y, z),
+        At(5.0, -0.3, y, z),
+        At(7.5, 0.3, y - 0.06, z + 0.05),
+        At(9.5, 2.7, y, z),
+        At(13.0, 2.7, y, z),
+        At(15.0, 0.25, y, z),
+        At(17.0, -0.3, y - 0.05, z - 0.04),
+        At(19.0, -2.6, y, z),
+        At(20.0, -2.6, y, z),
+    )
     return (_body(1, "box", box, keys),), ()
 
 
 def _trolley(j: Draw, scene: int, plan: Plan) -> Cast:
     """A person pushes a loaded trolley to and fro before the desk."""
     y = j(1.3, 1.4)
-    stops = ((0, -2.0, 0), (1.5, -2.0, 0), (6.0, 0.15, 0), (8.0, 0.2, 6), (11.5, 2.3, 0), (12.5, 2.3, 180),
-             (15.5, 0.1, 180), (16.5, 0.05, 174), (19.5, -2.0, 180), (20.0, -2.0, 360))  # fmt: skip
+    stops = (
+        (0, -2.0, 0),
+        (1.5, -2.0, 0),
+        (6.0, 0.15, 0),
+        (8.0, 0.2, 6),
+        (11.5, 2.3, 0),
+        (12.5, 2.3, 180),
+        (15.5, 0.1, 180),
+        (16.5, 0.05, 174),
+        (19.5, -2.0, 180),
+        (20.0, -2.0, 360),
+    )
     keys = tuple(At(t, x, y, 0.0, yaw) for t, x, yaw in stops)
     walker = tuple(Key(k.t, k.x - 0.75 * cos(np.radians(k.yaw)), y, k.yaw - 90.0) for k in keys)
     return (_body(1, "trolley", trolley(1, scene, plan), keys),), walker
@@ -696,10 +733,17 @@ def _chair(j: Draw, scene: int, plan: Plan) -> Cast:
         *copies(printed_box(1, (0.2, 0.17, 0.2)), 15.0, (0.0, -0.02, 0.69)),
     ]
     keys = (
-        At(0, x, y), At(1.5, x, y), At(5, x + 0.1, y, 0, turned), At(7, x, y, 0, turned), At(9.5, x - 0.5, y + 0.2),
-        At(11, x - 0.5, y + 0.2), At(14, x + 0.45, y + 0.1, 0, -turned), At(16, x + 0.45, y + 0.1, 0, -turned),
-        At(19, x, y), At(20, x, y),
-    )  # fmt: skip
+        At(0, x, y),
+        At(1.5, x, y),
+        At(5, x + 0.1, y, 0, turned),
+        At(7, x, y, 0, turned),
+        At(9.5, x - 0.5, y + 0.2),
+        At(11, x - 0.5, y + 0.2),
+        At(14, x + 0.45, y + 0.1, 0, -turned),
+        At(16, x + 0.45, y + 0.1, 0, -turned),
+        At(19, x, y),
+        At(20, x, y),
+    )
     return (_body(1, "chair", parts, keys),), ()
 
 
@@ -712,8 +756,18 @@ def _door(j: Draw, scene: int, plan: Plan) -> Cast:
     x, y, width = _DOOR
     wide = j(72, 80)
     ajar = j(20, 30)
-    angles = ((0, 0), (1.5, 0), (4.0, -wide), (6.5, -wide), (9.0, -ajar), (10.5, -ajar), (13.0, -wide), (15.0, -wide),
-              (18.0, 0), (20, 0))  # fmt: skip
+    angles = (
+        (0, 0),
+        (1.5, 0),
+        (4.0, -wide),
+        (6.5, -wide),
+        (9.0, -ajar),
+        (10.5, -ajar),
+        (13.0, -wide),
+        (15.0, -wide),
+        (18.0, 0),
+        (20, 0),
+    )
     keys = tuple(At(t, x, y, 0.0, yaw) for t, yaw in angles)
     return (_body(1, "door", door_leaf(1, plan, width), keys),), ()
 
@@ -726,19 +780,29 @@ def _doorway(plan: Plan) -> Parts:
         *partition((x + width + 0.02, y + 0.05), (plan.right_x, y + 0.05), plan),
         *(
             box(
-                np.eye(3), (at, y - 0.006, z), (0.19, 0.005, 0.26), texture=f"poster:{(k + int(2 * z)) % 4}", fit=(2,)
+                np.eye(3),
+                (at, y - 0.006, z),
+                (0.19, 0.005, 0.26),
+                texture=f"poster:{(k + int(2 * z)) % 4}",
+                fit=(2,),
             )
             for k, at in enumerate((x - 0.28, x - 0.75, x + width + 0.28, x + width + 0.75))
             for z in (1.0, 1.62)
         ),
-    ]  # fmt: skip
+    ]
 
 
 _SCRIPTS: dict[str, Callable[[Draw, int, Plan], Cast]] = {
-    "balloon": _balloon, "box_obstructing": _box_obstructing, "box_aside": _box_aside,
-    "placed": partial(_carried, True), "removed": partial(_carried, False), "kidnapped": _kidnapped,
-    "trolley": _trolley, "chair": _chair, "door": _door,
-}  # fmt: skip
+    "balloon": _balloon,
+    "box_obstructing": _box_obstructing,
+    "box_aside": _box_aside,
+    "placed": partial(_carried, True),
+    "removed": partial(_carried, False),
+    "kidnapped": _kidnapped,
+    "trolley": _trolley,
+    "chair": _chair,
+    "door": _door,
+}
 
 OBJECTS = {
     f"objects_{name}": Variant(partial(build_objects, name), "unknown-objects") for name in _SCRIPTS
@@ -898,9 +962,17 @@ def _rooms(b: _Building) -> Walk:
             _furnish(b, x, side, wide, half, half + deep)
             corners += [
                 (x + side * u, side * v)
-                for u, v in ((-0.2, 0.3), (-0.2, 2.2), (-1.9, 3.1), (-1.9, 5.0), (1.9, 5.0), (1.9, 3.1), (0.2, 2.2),
-                             (0.2, 0.3))
-            ]  # fmt: skip
+                for u, v in (
+                    (-0.2, 0.3),
+                    (-0.2, 2.2),
+                    (-1.9, 3.1),
+                    (-1.9, 5.0),
+                    (1.9, 5.0),
+                    (1.9, 3.1),
+                    (0.2, 2.2),
+                    (0.2, 0.3),
+                )
+            ]
             if k < 2:
                 at = (x + side * wide / 2, side * (half - 0.05))
                 b.bay(corridor_bay, 180.0 if side < 0 else 0.0, at)

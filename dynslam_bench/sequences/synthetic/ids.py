@@ -20,8 +20,16 @@ from dynslam_bench.sequences.synthetic.scene import Variant
 from dynslam_bench.sequences.synthetic.settings import DEFAULT_FRAMES, HELD_OUT_SCENES, MAX_FRAMES
 
 VARIANTS: dict[str, Variant] = {
-    **REPLICAS, **LOOPS, **FAST, **OBJECTS, **CROWDS, **SYNCHRONOUS, **TRACKING, **CONDITIONS, **CHANGING,
-}  # fmt: skip
+    **REPLICAS,
+    **LOOPS,
+    **FAST,
+    **OBJECTS,
+    **CROWDS,
+    **SYNCHRONOUS,
+    **TRACKING,
+    **CONDITIONS,
+    **CHANGING,
+}
 """Every rendered sequence by its name, for example ``walking_xyz``."""
 REPLICA_IDS = tuple(f"synthetic/{name}" for name in REPLICAS)
 """The eight synthetic replicas of TUM's fr3 dynamic sequences."""

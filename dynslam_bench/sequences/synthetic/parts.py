@@ -39,11 +39,20 @@ class Primitive:
 Parts = list[Primitive]
 
 
-def primitive(kind: int, rotation: Array, origin: ArrayLike, shape: tuple[float, float, float], *, instance: int = 0,
-              texture: str | tuple[str, ...] = "plain", repeat: tuple[float, float] = (1.0, 1.0),
-              shift: tuple[float, float] = (0.0, 0.0), tint: tuple[float, float, float] | Array = (1.0, 1.0, 1.0),
-              scale: tuple[float, float, float] = (1.0, 1.0, 1.0),
-              fit: tuple[int, ...] = ()) -> Primitive:  # fmt: skip
+def primitive(
+    kind: int,
+    rotation: Array,
+    origin: ArrayLike,
+    shape: tuple[float, float, float],
+    *,
+    instance: int = 0,
+    texture: str | tuple[str, ...] = "plain",
+    repeat: tuple[float, float] = (1.0, 1.0),
+    shift: tuple[float, float] = (0.0, 0.0),
+    tint: tuple[float, float, float] | Array = (1.0, 1.0, 1.0),
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    fit: tuple[int, ...] = (),
+) -> Primitive:
     """One primitive; see `box`, `cone` and `quad`.
 
     Args:

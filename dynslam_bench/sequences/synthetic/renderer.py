@@ -316,9 +316,20 @@ class Renderer:
             facets = self._facets(now, pose, lights, texel_density)
             materials = Materials(scene.texture, scene.uv, scene.tint, facets)
             kernels.shade_pixels(
-                row0, row1, _INTRINSICS, tiles, primitives, materials, scene.atlas, lights, hit, depth, jitter,
-                color, cosine,
-            )  # fmt: skip
+                row0,
+                row1,
+                _INTRINSICS,
+                tiles,
+                primitives,
+                materials,
+                scene.atlas,
+                lights,
+                hit,
+                depth,
+                jitter,
+                color,
+                cosine,
+            )
 
         self._rows(shade_band)
         return color, cosine

@@ -140,28 +140,40 @@ def desk(rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) 
         px = x + (rng.random() - 0.5) * 2 * (half - 0.15)
         parts.append(
             box(
-                turn(rng.random() * 50 - 25), (px, y + 0.1 + 0.2 * rng.random(), TOP + 0.002 + 0.001 * k),
-                (0.105, 0.148, 0.001), texture=f"poster:{k % 4}", fit=(5,), tint=(0.95,) * 3,
+                turn(rng.random() * 50 - 25),
+                (px, y + 0.1 + 0.2 * rng.random(), TOP + 0.002 + 0.001 * k),
+                (0.105, 0.148, 0.001),
+                texture=f"poster:{k % 4}",
+                fit=(5,),
+                tint=(0.95,) * 3,
             )
-        )  # fmt: skip
+        )
     for k in range(2):  # a pile of books at either end
         bx = x + (-1 if k else 1) * (half - 0.2 - 0.1 * rng.random())
         for level in range(int(rng.integers(2, 5))):
             shade = 0.25 + 0.7 * rng.random(3)
             parts.append(
                 box(
-                    turn(rng.random() * 30 - 15), (bx, y + 0.3 + 0.1 * k, TOP + 0.018 + 0.036 * level),
-                    (0.12, 0.085, 0.017), texture=(*["books"] * 4, "plain", f"poster:{level % 4}"), fit=(5,),
-                    tint=shade, repeat=(0.4, 3.0),
+                    turn(rng.random() * 30 - 15),
+                    (bx, y + 0.3 + 0.1 * k, TOP + 0.018 + 0.036 * level),
+                    (0.12, 0.085, 0.017),
+                    texture=(*["books"] * 4, "plain", f"poster:{level % 4}"),
+                    fit=(5,),
+                    tint=shade,
+                    repeat=(0.4, 3.0),
                 )
-            )  # fmt: skip
+            )
     mugs = (
         cone(
-            _EYE, (x + (rng.random() - 0.5) * 1.4, y + 0.12 + 0.12 * rng.random(), TOP + 0.012), (0.085, 0.04, 0.042),
-            texture="stripes" if k else "plain", repeat=(1.0, 4.0), tint=0.35 + 0.6 * rng.random(3),
+            _EYE,
+            (x + (rng.random() - 0.5) * 1.4, y + 0.12 + 0.12 * rng.random(), TOP + 0.012),
+            (0.085, 0.04, 0.042),
+            texture="stripes" if k else "plain",
+            repeat=(1.0, 4.0),
+            tint=0.35 + 0.6 * rng.random(3),
         )
         for k in range(2)
-    )  # fmt: skip
+    )
     return [
         *parts,
         *mugs,
@@ -247,10 +259,15 @@ def shelf(rng: np.random.Generator, plan: Plan, side: int) -> Parts:
         offset = (half - width - 0.02) * (1 if rng.random() < 0.5 else -1)
         parts.append(
             box(
-                _EYE, (x + offset, y - 0.01, z + 0.014 + tall), (width, 0.1, tall), texture="books",
-                repeat=(0.9, 0.5 / tall), shift=(float(rng.random()), 0.5), tint=(0.9,) * 3,
+                _EYE,
+                (x + offset, y - 0.01, z + 0.014 + tall),
+                (width, 0.1, tall),
+                texture="books",
+                repeat=(0.9, 0.5 / tall),
+                shift=(float(rng.random()), 0.5),
+                tint=(0.9,) * 3,
             )
-        )  # fmt: skip
+        )
         if width < half * 0.75:
             parts.append(
                 box(
@@ -308,10 +325,14 @@ def cabinet(rng: np.random.Generator, plan: Plan, side: int) -> Parts:
         faces = ("plain", "plain", f"poster:{k}", "plain", "plain", "plain")
         parts.append(
             box(
-                turn(rng.random() * 30), (x + side * (0.1 + 0.2 * k), y, 0.84 + s), (s, s * 0.8, s), texture=faces,
-                fit=(2,), tint=(0.85, 0.72, 0.55),
+                turn(rng.random() * 30),
+                (x + side * (0.1 + 0.2 * k), y, 0.84 + s),
+                (s, s * 0.8, s),
+                texture=faces,
+                fit=(2,),
+                tint=(0.85, 0.72, 0.55),
             )
-        )  # fmt: skip
+        )
     bin_at = (plan.desk_x + side * 1.35, plan.desk_y + 0.2, 0.13)
     return [*parts, cone(_EYE, bin_at, (0.16, 0.12, 0.14), tint=tint["bin"])]
 
@@ -336,7 +357,12 @@ def build_room(scene: int, plan: Plan) -> Parts:
     )
     plaster: Style = {"texture": "plaster", "repeat": (0.5, 0.5)}
     return [
-        *floor((plan.left_x, front), (plan.right_x, back), plan, (float(rng.random()), float(rng.random()))),
+        *floor(
+            (plan.left_x, front),
+            (plan.right_x, back),
+            plan,
+            (float(rng.random()), float(rng.random())),
+        ),
         *(
             quad(wall(right, (0, 0, 1)), (x, y, HEIGHT_M / 2), half, tint=tint[name], **plaster)
             for right, x, y, half, name in sides
@@ -349,13 +375,16 @@ def build_room(scene: int, plan: Plan) -> Parts:
         *posters(rng, plan),
         *(
             box(
-                turn(90), (x + sign * 0.006, 1.6 + 1.2 * rng.random(), 1.55), (0.36, 0.006, 0.26),
-                texture=f"poster:{k}", fit=(2, 3),
+                turn(90),
+                (x + sign * 0.006, 1.6 + 1.2 * rng.random(), 1.55),
+                (0.36, 0.006, 0.26),
+                texture=f"poster:{k}",
+                fit=(2, 3),
             )
             for x, sign, k in ((plan.left_x, 1.0, 2), (plan.right_x, -1.0, 3))
         ),
         *cabinet(rng, plan, -plan.shelf_side),
-    ]  # fmt: skip
+    ]
 
 
 # Larger interiors: floors, walls with doorways, furnished stretches of wall, and pieces that may be
@@ -454,11 +483,14 @@ def corridor_bay(scene: int, number: int) -> Parts:
         ]
     return [
         box(
-            turn(8 * rng.random() - 4), (-0.6 + 0.6 * (k % 3), -0.006, 1.35 + 0.5 * (k // 3)), (0.15, 0.005, 0.21),
-            texture=f"poster:{k % 4}", fit=(2,),
+            turn(8 * rng.random() - 4),
+            (-0.6 + 0.6 * (k % 3), -0.006, 1.35 + 0.5 * (k // 3)),
+            (0.15, 0.005, 0.21),
+            texture=f"poster:{k % 4}",
+            fit=(2,),
         )
         for k in range(6)
-    ]  # fmt: skip
+    ]
 
 
 def notices(scene: int, number: int) -> Parts:
@@ -474,8 +506,11 @@ def notices(scene: int, number: int) -> Parts:
 
 # Things that are moved, each about its own origin: chair, cartons, box, balloon, trolley, door.
 
-_PRINT: Style = {"texture": tuple(f"poster:{face}" for face in range(6)), "fit": tuple(range(6)),
-                 "tint": (0.95, 0.86, 0.74)}  # fmt: skip
+_PRINT: Style = {
+    "texture": tuple(f"poster:{face}" for face in range(6)),
+    "fit": tuple(range(6)),
+    "tint": (0.95, 0.86, 0.74),
+}
 
 
 def office_chair(plan: Plan, instance: int, shade: float = 1.0) -> Parts:

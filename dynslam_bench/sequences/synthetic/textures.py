@@ -342,8 +342,19 @@ def face(rng: np.random.Generator, size: int = 256) -> Image:
 
 
 MAKERS: dict[str, Callable[[np.random.Generator], Image]] = {
-    "plain": plain, "plaster": plaster, "wood": wood, "carpet": carpet, "poster": poster, "screen": screen,
-    "books": books, "keyboard": keyboard, "plaid": plaid, "print": print_shirt, "stripes": stripes, "denim": denim,
-    "hair": hair, "face": face,
-}  # fmt: skip
+    "plain": plain,
+    "plaster": plaster,
+    "wood": wood,
+    "carpet": carpet,
+    "poster": poster,
+    "screen": screen,
+    "books": books,
+    "keyboard": keyboard,
+    "plaid": plaid,
+    "print": print_shirt,
+    "stripes": stripes,
+    "denim": denim,
+    "hair": hair,
+    "face": face,
+}
 """Texture makers by kind; a texture is named ``kind`` or ``kind:variant``."""

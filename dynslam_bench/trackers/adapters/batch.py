@@ -211,11 +211,16 @@ class BatchTracker:
         ):
             self._started_ns = os.fstat(out.fileno()).st_mtime_ns
             process = subprocess.Popen(
-                words, stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT, cwd=folder / "work",
-                env=program_environment(self._program.environment) | {"OMP_NUM_THREADS": str(self._context.threads)},
+                words,
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=subprocess.STDOUT,
+                cwd=folder / "work",
+                env=program_environment(self._program.environment)
+                | {"OMP_NUM_THREADS": str(self._context.threads)},
                 start_new_session=True,
                 preexec_fn=end_with_parent(),
-            )  # fmt: skip
+            )
         code = None
         peak = 0
         try:

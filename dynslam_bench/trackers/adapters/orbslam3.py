@@ -142,10 +142,17 @@ WORKER = "dynslam_bench.trackers.adapters.orbslam3_worker"
 BORDER_PX = 16
 """ORB-SLAM3 extracts no corners so near to the edge of a pyramid level."""
 _VIEWER = (
-    ("KeyFrameSize", 0.05), ("KeyFrameLineWidth", 1.0), ("GraphLineWidth", 0.9), ("PointSize", 2.0),
-    ("CameraSize", 0.08), ("CameraLineWidth", 3.0), ("ViewpointX", 0.0), ("ViewpointY", -0.7), ("ViewpointZ", -1.8),
+    ("KeyFrameSize", 0.05),
+    ("KeyFrameLineWidth", 1.0),
+    ("GraphLineWidth", 0.9),
+    ("PointSize", 2.0),
+    ("CameraSize", 0.08),
+    ("CameraLineWidth", 3.0),
+    ("ViewpointX", 0.0),
+    ("ViewpointY", -0.7),
+    ("ViewpointZ", -1.8),
     ("ViewpointF", 500.0),
-)  # fmt: skip
+)
 
 
 class OrbSlam3Program(ProgramTracker):
@@ -242,18 +249,31 @@ def settings_yaml(
     """ORB-SLAM3's settings file (format 1.0) for images of this camera; depth comes in metres unless a factor says."""
     k1, k2, p1, p2, k3 = camera.distortion
     numbers = {
-        "Camera1.fx": camera.fx, "Camera1.fy": camera.fy, "Camera1.cx": camera.cx, "Camera1.cy": camera.cy,
-        "Camera1.k1": k1, "Camera1.k2": k2, "Camera1.p1": p1, "Camera1.p2": p2, "Camera1.k3": k3,
-        "Stereo.b": camera.baseline_m, "Stereo.ThDepth": settings.close_depth_baselines,
+        "Camera1.fx": camera.fx,
+        "Camera1.fy": camera.fy,
+        "Camera1.cx": camera.cx,
+        "Camera1.cy": camera.cy,
+        "Camera1.k1": k1,
+        "Camera1.k2": k2,
+        "Camera1.p1": p1,
+        "Camera1.p2": p2,
+        "Camera1.k3": k3,
+        "Stereo.b": camera.baseline_m,
+        "Stereo.ThDepth": settings.close_depth_baselines,
         "RGBD.DepthMapFactor": depth_factor,
         "ORBextractor.scaleFactor": settings.scale_factor,
         **{f"Viewer.{key}": value for key, value in _VIEWER},
-    }  # fmt: skip
+    }
     integers = {
-        "Camera.width": camera.width, "Camera.height": camera.height, "Camera.fps": max(1, round(fps)), "Camera.RGB": 1,
-        "ORBextractor.nFeatures": settings.features, "ORBextractor.nLevels": settings.levels,
-        "ORBextractor.iniThFAST": settings.fast_threshold, "ORBextractor.minThFAST": settings.min_fast_threshold,
-    }  # fmt: skip
+        "Camera.width": camera.width,
+        "Camera.height": camera.height,
+        "Camera.fps": max(1, round(fps)),
+        "Camera.RGB": 1,
+        "ORBextractor.nFeatures": settings.features,
+        "ORBextractor.nLevels": settings.levels,
+        "ORBextractor.iniThFAST": settings.fast_threshold,
+        "ORBextractor.minThFAST": settings.min_fast_threshold,
+    }
     lines = ["%YAML:1.0", "---", 'File.version: "1.0"', 'Camera.type: "PinHole"']
     lines += [f"{key}: {_real(float(value))}" for key, value in numbers.items()]
     lines += [f"{key}: {int(value)}" for key, value in integers.items()]

@@ -53,29 +53,50 @@ def _assumptions(name: str, base: type[SystemSettings], groups: Groups) -> list[
     sparse = isinstance(groups.get("flow"), FlowSettings)
     guarded = tested and not paper
     sentences: list[tuple[bool, str]] = [
-        (name == "emfoa-oft", "the paper's are the masks, the EMFOA-optimised DAISY Filter Flow and the epipolar test; "
-         "ours are the flow at the points alone without aggregated costs, the conditions under which the epipolar test "
-         "may cull, and the tests of motion and free space in depth"),
+        (
+            name == "emfoa-oft",
+            "the paper's are the masks, the EMFOA-optimised DAISY Filter Flow and the epipolar test; "
+            "ours are the flow at the points alone without aggregated costs, the conditions under "
+            "which the epipolar test may cull, and the tests of motion and free space in depth",
+        ),
         (masks, "{masks}"),
         (masks, CFPN),
         (masks and "segmentation" not in groups, "{dilation}"),
         (tested, "epipolar threshold 1 px and RANSAC (not stated in the paper)"),
         (not monocular, "RGB-D back end (the paper says monocular, depth-based and RGB-D in turn)"),
-        (sparse, "labels are searched at the points alone and by the descriptors' term of Eq. 1 alone; "
-         "no Eq. 2 and 3 (ours)"),
-        (paper and not sparse, "weights and truncations of Eq. 1 (not stated): alpha 55, beta 190, 0.882 a histogram, "
-         "7 and 2 grey levels"),
-        (paper and not sparse, "labels live on superpixels, pass between them, are refined by Lucas-Kanade and tried "
-         "on every pixel of the region (as in DAISY Filter Flow; the refinement, the way back of 1.5 px and the "
-         "smoothing by regions are ours)"),
-        (guarded, "the epipolar test is skipped where F means nothing: too little parallax, one plane (ours)"),
+        (
+            sparse,
+            "labels are searched at the points alone and by the descriptors' term of Eq. 1 alone; "
+            "no Eq. 2 and 3 (ours)",
+        ),
+        (
+            paper and not sparse,
+            "weights and truncations of Eq. 1 (not stated): alpha 55, beta 190, 0.882 a histogram, "
+            "7 and 2 grey levels",
+        ),
+        (
+            paper and not sparse,
+            "labels live on superpixels, pass between them, are refined by Lucas-Kanade and tried "
+            "on every pixel of the region (as in DAISY Filter Flow; the refinement, the way back of 1.5 px and the "
+            "smoothing by regions are ours)",
+        ),
+        (
+            guarded,
+            "the epipolar test is skipped where F means nothing: too little parallax, one plane (ours)",
+        ),
         (guarded and monocular, "a failing point goes only where its neighbours fail too (ours)"),
-        (guarded and not monocular, "a failing point goes only where its neighbours fail too, and an F that depth "
-         "contradicts is not used (ours)"),
-        ("motion" in groups, "rigid motion in depth and free space seen before are tested as well "
-         "(ours, no part of the paper)"),
+        (
+            guarded and not monocular,
+            "a failing point goes only where its neighbours fail too, and an F that depth "
+            "contradicts is not used (ours)",
+        ),
+        (
+            "motion" in groups,
+            "rigid motion in depth and free space seen before are tested as well "
+            "(ours, no part of the paper)",
+        ),
         (monocular, BACKEND),
-    ]  # fmt: skip
+    ]
     return [sentence for holds, sentence in sentences if holds]
 
 
