@@ -173,7 +173,7 @@ def neg_pose_error(episode: Episode) -> float:
     error = episode.outcomes[-1].error
     if error is None:
         return 0.0
-    return -min(error.trans_m, error.way_m) if error.tracked else -error.way_m
+    return -min(error.trans_m, error.path_length_m) if error.tracked else -error.path_length_m
 
 
 @names_wrong_arguments

@@ -26,10 +26,10 @@ from dynslam_bench.tuning.objectives import (
     Outcomes,
     bounds,
     centre,
-    held_protocol,
+    combined_objective,
+    hold_last_pose_protocol,
     scenes_needed,
     spread_test,
-    together,
     violations,
 )
 from dynslam_bench.tuning.plan import held_settings, seen_note, splits_seen
@@ -476,7 +476,7 @@ def finish(
         name=spec.name,
         tracker=spec.tracker,
         baseline=spec.baseline or "default settings",
-        protocol=held_protocol(spec.protocol).describe(),
+        protocol=hold_last_pose_protocol(spec.protocol).describe(),
         trials=count_states(tuner.study),
         candidates=candidates,
         verdict=verdict,
@@ -514,7 +514,7 @@ def _judge(
     instances: tuple[ProblemInstance, ...] = getattr(tuner.design, split)
     if not instances or not candidates:
         return list(candidates)
-    objective = ACCURACY if split == "recorded" else together(tuner.objectives)
+    objective = ACCURACY if split == "recorded" else combined_objective(tuner.objectives)
     tuned = [
         Configuration(tuner.spec.tracker, {**tuner.held, **candidate.params})
         for candidate in candidates

@@ -101,7 +101,7 @@ def outcome(
     )
 
 
-def held_protocol(protocol: Protocol | str) -> Protocol:
+def hold_last_pose_protocol(protocol: Protocol | str) -> Protocol:
     """The protocol with lost frames held at the last pose, so that losing track never pays."""
     protocol = get_protocol(protocol)
     held = protocol.model_copy(update={"id": f"{protocol.id}+hold", "lost_frames": "hold"})
@@ -207,7 +207,7 @@ ACCURACY = OBJECTIVES["accuracy"]
 SPEED = OBJECTIVES["speed"]
 
 
-def together(objectives: Sequence[Objective]) -> Objective:
+def combined_objective(objectives: Sequence[Objective]) -> Objective:
     """Several objectives as one: the geometric mean of their ratios; one stays what it is."""
     if len(objectives) == 1:
         return objectives[0]

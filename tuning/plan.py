@@ -49,7 +49,7 @@ from dynslam_bench.tuning.objectives import (
     Objective,
     detectable,
     find_objective,
-    held_protocol,
+    hold_last_pose_protocol,
     log_errors,
     outcome,
     place_of,
@@ -289,7 +289,9 @@ class Plan:
             self.baseline = Configuration(
                 spec.baseline, {name: fixed[name] for name in fixed if name in names}
             )
-        held_protocol(spec.protocol).check_scale(spec.tracker, TRACKERS.get(spec.tracker).sensors)
+        hold_last_pose_protocol(spec.protocol).check_scale(
+            spec.tracker, TRACKERS.get(spec.tracker).sensors
+        )
         self.shipped = Configuration(spec.tracker, fixed) if spec.baseline else None
         self.defaults: Settings = apply_overrides(settings(), self.held)
         self.base = flatten(self.defaults)
@@ -370,7 +372,7 @@ class Plan:
 
     def _scatter(self, records: dict[ProblemInstance, RunRecord]) -> float:
         """Standard deviation between starts of the log ratio of two runs; 0 where no scene has two stored runs."""
-        protocol = held_protocol(self.spec.protocol)
+        protocol = hold_last_pose_protocol(self.spec.protocol)
         root = self.spec.data_root
         errors = {
             at: outcome(self.store, record, at, protocol, root).ate_m

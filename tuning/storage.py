@@ -27,7 +27,14 @@ from optuna.storages import BaseStorage, RDBStorage, journal
 from optuna.trial import FrozenTrial, TrialState, create_trial
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError, PendingRollbackError
 
-from dynslam_bench.core import HIDDEN, StudyError, raising, read_json, repeating, without_passwords
+from dynslam_bench.core import (
+    HIDDEN,
+    StudyError,
+    call_periodically,
+    read_json,
+    translate_errors,
+    without_passwords,
+)
 from dynslam_bench.core.records import Record, validated
 from dynslam_bench.tuning.objectives import centre
 from dynslam_bench.tuning.study_file import StudySpec
@@ -502,7 +509,7 @@ class Heartbeats:
             with suppress(Exception):  # the trials themselves say what is wrong with the storage
                 self.beat()
 
-        return repeating(HEARTBEAT_S, beat)
+        return call_periodically(HEARTBEAT_S, beat)
 
 
 class JournalFile(journal.JournalFileBackend):
@@ -554,6 +561,6 @@ class JournalFile(journal.JournalFileBackend):
 
 
 def _writing(path: Path) -> AbstractContextManager[None]:
-    return raising(
+    return translate_errors(
         StudyError, f"cannot write {path}", "free some space, or check the folder; then go on"
     )

@@ -23,9 +23,9 @@ from optuna.trial import FrozenTrial, TrialState, create_trial
 from dynslam_bench.core import (
     DynslamError,
     StudyError,
-    raising,
     read_settings,
     storable,
+    translate_errors,
     turn,
     words_without_passwords,
     write_atomic,
@@ -43,13 +43,13 @@ from dynslam_bench.tuning.objectives import (
     Objective,
     Outcome,
     Outcomes,
+    combined_objective,
     coverage,
     find_objective,
     fps,
-    held_protocol,
+    hold_last_pose_protocol,
     outcome,
     own_objective,
-    together,
     violations,
 )
 from dynslam_bench.tuning.plan import Plan, design_of, distributions, starting_point
@@ -308,7 +308,7 @@ class Study(Plan):
         """
         spec = self.spec
         results = dict[ProblemInstance, Outcome]()
-        protocol = held_protocol(spec.protocol)
+        protocol = hold_last_pose_protocol(spec.protocol)
         interrupted = self._interrupted.is_set
         for instance in instances:
             if interrupted():
@@ -438,7 +438,7 @@ class Study(Plan):
             [str(place), run.run_id, run.ate_m, run.coverage, run.frame_s]
             for place, run in outcomes.items()
         ]
-        scenes = together(self.objectives).ratios(outcomes, reference)
+        scenes = combined_objective(self.objectives).ratios(outcomes, reference)
         facts = {
             "coverage": coverage(outcomes),
             "fps": fps(outcomes),
@@ -521,7 +521,7 @@ class Study(Plan):
         """
         if self.spec.storage:
             return nullcontext()
-        with raising(
+        with translate_errors(
             StudyError, f"cannot write {self.folder}", "check the permissions and the free space"
         ):
             self.folder.mkdir(parents=True, exist_ok=True)

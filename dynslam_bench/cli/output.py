@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 from pydantic_core import from_json, to_json
 
-from dynslam_bench.core import DynslamError, printable, repeating
+from dynslam_bench.core import DynslamError, call_periodically, printable
 
 if TYPE_CHECKING:
     from dynslam_bench.core.download import Report
@@ -263,7 +263,9 @@ def _progress_lines(label: str) -> Iterator[Advance]:
         )
         text = f"{label}{share}{left}" + (f" ({step})" if step else "")
 
-    with repeating(HEARTBEAT_S, lambda: warn(f"{text}, {time.monotonic() - began:.0f} s so far")):
+    with call_periodically(
+        HEARTBEAT_S, lambda: warn(f"{text}, {time.monotonic() - began:.0f} s so far")
+    ):
         yield update
 
 

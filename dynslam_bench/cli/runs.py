@@ -38,7 +38,7 @@ from dynslam_bench.core import (
     assignments,
     did_you_mean,
     label_text,
-    raising,
+    translate_errors,
     write_atomic,
 )
 from dynslam_bench.core.version import install_hint
@@ -241,7 +241,9 @@ def export(
     if kind not in (".csv", ".parquet"):
         raise RunError(f"a table is not written as '{output.name}'", "name a .csv or .parquet file")
     frame = stored.open_store(results).frame(protocol)
-    with raising(RunError, f"cannot write {output}", install_hint("parquet"), of=ImportError):
+    with translate_errors(
+        RunError, f"cannot write {output}", install_hint("parquet"), of=ImportError
+    ):
         write_atomic(output, csv_text(frame) if kind == ".csv" else frame.to_parquet())
     write(str(output))
 

@@ -20,8 +20,8 @@ from dynslam_bench.core.errors import (
     TrackerTimeoutError,
     TrajectoryError,
     did_you_mean,
-    raising,
     reason_of,
+    translate_errors,
 )
 from dynslam_bench.core.files import (
     SHARED_MEMORY,
@@ -49,6 +49,7 @@ from dynslam_bench.core.folders import (
     vocabularies_folder,
     weights_folder,
 )
+from dynslam_bench.core.periodic import call_periodically
 from dynslam_bench.core.reading import (
     MEGABYTE,
     TABLE_BYTES,
@@ -61,7 +62,6 @@ from dynslam_bench.core.reading import (
     read_npz,
     read_text,
 )
-from dynslam_bench.core.repeating import repeating
 from dynslam_bench.core.sanitise import (
     HIDDEN,
     inside,
@@ -104,6 +104,7 @@ __all__ = [
     "TrajectoryError",
     "assignments",
     "atomic_folder",
+    "call_periodically",
     "claimed",
     "compare_sums",
     "did_you_mean",
@@ -118,7 +119,6 @@ __all__ = [
     "parse_json",
     "parse_toml",
     "printable",
-    "raising",
     "read_bytes",
     "read_json",
     "read_lines",
@@ -127,7 +127,6 @@ __all__ = [
     "read_text",
     "read_toml",
     "reason_of",
-    "repeating",
     "replace_folder",
     "replacing",
     "setting_text",
@@ -136,6 +135,7 @@ __all__ = [
     "sweep",
     "sweep_temporary",
     "temporary_folder",
+    "translate_errors",
     "turn",
     "user_cache",
     "vocabularies_folder",

@@ -30,7 +30,7 @@ def dividing_kernel(function: Function) -> Function:
     return _compiled(function, error_model="numpy")
 
 
-def spliced(function: Function) -> Function:
+def inlined_statements(function: Function) -> Function:
     """Compile a function whose statements numba copies into its callers: arrays that are passed to it cost nothing."""
     return _compiled(function, error_model="python", inline="always")
 

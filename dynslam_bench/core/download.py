@@ -14,7 +14,7 @@ from urllib.error import HTTPError
 from urllib.parse import urlsplit
 from urllib.request import HTTPRedirectHandler, Request, build_opener
 
-from dynslam_bench.core.errors import DownloadError, DynslamError, raising
+from dynslam_bench.core.errors import DownloadError, DynslamError, translate_errors
 from dynslam_bench.core.files import claimed
 from dynslam_bench.core.reading import file_sha256, read_json
 from dynslam_bench.core.sanitise import without_passwords
@@ -91,7 +91,7 @@ def download(
     """
     check_address(url, checked=sha256 is not None)
     part = target.with_name(target.name + ".part")
-    with raising(DownloadError, f"cannot write {target}", "name another folder"):
+    with translate_errors(DownloadError, f"cannot write {target}", "name another folder"):
         target.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.ExitStack() as stack:
             if not stack.enter_context(claimed(part.with_name(part.name + ".lock"))):
@@ -265,7 +265,7 @@ def check_address(url: str, *, checked: bool) -> None:
         DownloadError: Another scheme, no host, characters that no address has, or a password.
     """
     shown = f"cannot download {url[:200]!r}"
-    with raising(DownloadError, f"{shown}", of=ValueError):
+    with translate_errors(DownloadError, f"{shown}", of=ValueError):
         parts = urlsplit(url)
         host = (parts.hostname or "").encode("idna").decode()
         port = parts.port

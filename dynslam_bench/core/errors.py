@@ -65,18 +65,18 @@ LONGEST = 1000
 """Characters of the longest message, and of the longest hint."""
 
 
-_LEFT_OUT: list[str] = []
+_HIDDEN_FOLDERS: list[str] = []
 
 
-def left_out_of_messages(folder: Path) -> Path:
+def hide_folder_in_messages(folder: Path) -> Path:
     """A temporary folder whose path messages leave out: they name what lies below it, e.g. an unpacked archive."""
-    _LEFT_OUT.append(f"{folder}{os.sep}")
+    _HIDDEN_FOLDERS.append(f"{folder}{os.sep}")
     return folder
 
 
 def _one_line(text: str) -> str:
     text = without_passwords(" ".join(text.splitlines()))
-    for folder in _LEFT_OUT:
+    for folder in _HIDDEN_FOLDERS:
         text = text.replace(folder, "")
     return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} [...] {text[-LONGEST // 2 :]}"
 
@@ -137,7 +137,7 @@ class ReportError(DynslamError):
 
 
 @contextmanager
-def raising(
+def translate_errors(
     kind: type[DynslamError],
     message: str,
     hint: str = "",

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from dynslam_bench.core.errors import InfrastructureError, raising
+from dynslam_bench.core.errors import InfrastructureError, translate_errors
 
 _TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.tmp")
 _TURN_S = 0.1
@@ -54,7 +54,10 @@ def write_atomic(path: Path, content: str | bytes | memoryview) -> None:
         InfrastructureError: The folder cannot be written (full disk, permissions); nothing is left
             behind.
     """
-    with raising(InfrastructureError, f"cannot write {path}", _CURE), replacing(path) as temporary:
+    with (
+        translate_errors(InfrastructureError, f"cannot write {path}", _CURE),
+        replacing(path) as temporary,
+    ):
         temporary.write_bytes(
             content.encode(errors="backslashreplace") if isinstance(content, str) else content
         )
@@ -67,7 +70,7 @@ def write_lines(path: Path, lines: Iterable[str]) -> None:
         InfrastructureError: As `write_atomic`.
     """
     with (
-        raising(InfrastructureError, f"cannot write {path}", _CURE),
+        translate_errors(InfrastructureError, f"cannot write {path}", _CURE),
         replacing(path) as temporary,
         temporary.open("wb") as file,
     ):
@@ -160,7 +163,9 @@ def temporary_folder(target: Path) -> Iterator[Path]:
     Raises:
         InfrastructureError: The parent folder cannot be written.
     """
-    with raising(InfrastructureError, f"cannot write into {target.parent}", "name another folder"):
+    with translate_errors(
+        InfrastructureError, f"cannot write into {target.parent}", "name another folder"
+    ):
         target.parent.mkdir(parents=True, exist_ok=True)
         work, lock = _reserve(target, Path.mkdir)
     try:
@@ -183,7 +188,9 @@ def atomic_folder(target: Path) -> Iterator[Path]:
     sweep_temporary(target.parent)
     with temporary_folder(target) as work:
         yield work
-        with raising(InfrastructureError, f"cannot write {target}", "check the permissions"):
+        with translate_errors(
+            InfrastructureError, f"cannot write {target}", "check the permissions"
+        ):
             replace_folder(work, target)
 
 
@@ -203,7 +210,9 @@ def claimed(path: Path) -> Iterator[bool]:
     Raises:
         InfrastructureError: The file cannot be made.
     """
-    with raising(InfrastructureError, f"cannot write {path}", "check the permissions and the disk"):
+    with translate_errors(
+        InfrastructureError, f"cannot write {path}", "check the permissions and the disk"
+    ):
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     try:
         # else its last holder has just removed it

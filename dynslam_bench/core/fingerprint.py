@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 import dynslam_bench
 from dynslam_bench.core.code_files import leads_back
-from dynslam_bench.core.errors import DynslamError, PluginError, raising
+from dynslam_bench.core.errors import DynslamError, PluginError, translate_errors
 from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.folders import digest_cache_folder
 from dynslam_bench.core.reading import file_sha256
@@ -87,7 +87,7 @@ def named_digest(name: str, value: str | Path) -> str:
 
 def _digest_at(text: str, setting: str) -> str:
     path = Path(os.path.expandvars(text)).expanduser()
-    with raising(PluginError, f"cannot read {path}, which the setting '{setting}' names"):
+    with translate_errors(PluginError, f"cannot read {path}, which the setting '{setting}' names"):
         return path_digest(path)[:16] if path.exists() else ""
 
 

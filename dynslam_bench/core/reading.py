@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dynslam_bench.core.errors import DynslamError, raising
+from dynslam_bench.core.errors import DynslamError, translate_errors
 from dynslam_bench.core.sanitise import inside
 
 if TYPE_CHECKING:
@@ -45,7 +45,10 @@ def read_bytes(
         DynslamError: Of the given kind: it cannot be read, or is larger.
     """
     # ValueError: a name with a null byte
-    with raising(kind, f"cannot read {path}", of=(OSError, ValueError)), path.open("rb") as file:
+    with (
+        translate_errors(kind, f"cannot read {path}", of=(OSError, ValueError)),
+        path.open("rb") as file,
+    ):
         # in two steps: taking memory for `limit` bytes costs as much as reading them
         data = file.read(min(_MOST_FILES, limit + 1))
         data += file.read(limit + 1 - len(data)) if len(data) == _MOST_FILES else b""
@@ -62,7 +65,7 @@ def read_text(
     Raises:
         DynslamError: Of the given kind: it cannot be read, is larger, or is no UTF-8.
     """
-    with raising(kind, f"{path} is not a text file", of=UnicodeDecodeError):
+    with translate_errors(kind, f"{path} is not a text file", of=UnicodeDecodeError):
         return read_bytes(path, limit=limit, kind=kind).decode("utf-8-sig")
 
 
@@ -77,8 +80,8 @@ def read_lines(
     """
     done = 0
     with (
-        raising(kind, f"cannot read {path}", of=(OSError, ValueError)),
-        raising(kind, f"{path} is not a text file", of=UnicodeDecodeError),
+        translate_errors(kind, f"cannot read {path}", of=(OSError, ValueError)),
+        translate_errors(kind, f"{path} is not a text file", of=UnicodeDecodeError),
         path.open(encoding="utf-8-sig") as file,
     ):
         while line := file.readline(limit + 1):
@@ -112,7 +115,7 @@ def parse_json(text: str, where: str, *, kind: type[DynslamError] = DynslamError
         DynslamError: Of the given kind: it is no JSON, nested too deeply, or holds a number of
             thousands of digits.
     """
-    with raising(kind, f"{where} is no valid JSON", of=(ValueError, RecursionError)):
+    with translate_errors(kind, f"{where} is no valid JSON", of=(ValueError, RecursionError)):
         return json.loads(text)
 
 
@@ -132,7 +135,7 @@ def read_npz(path: Path, *, kind: type[DynslamError] = DynslamError) -> dict[str
     data = read_bytes(path, limit=MOST_BYTES, kind=kind)
     # zipfile and numpy raise almost anything over damaged files
     with (
-        raising(kind, f"{path} holds no arrays", of=Exception),
+        translate_errors(kind, f"{path} holds no arrays", of=Exception),
         np.load(io.BytesIO(data), allow_pickle=False) as archive,
     ):
         claimed = sum(entry.file_size for entry in archive.zip.infolist())
@@ -182,7 +185,7 @@ def compare_sums(folder: Path, sums: Path, kind: type[DynslamError] = DynslamErr
         if not path.is_file():
             faults.append(f"{name} is missing")
             continue
-        with raising(kind, f"cannot read {path}", "check the disk and the permissions"):
+        with translate_errors(kind, f"cannot read {path}", "check the disk and the permissions"):
             actual = file_sha256(path)
         if actual != expected:
             faults.append(f"{name} is not what {sums.name} says")

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.errors import DynslamError, raising
+from dynslam_bench.core.errors import DynslamError, translate_errors
 from dynslam_bench.core.files import replacing
 from dynslam_bench.core.folders import STAGES_VARIABLE, stage_cache_folder
 from dynslam_bench.core.module_graph import PLUMBING, module_graph
@@ -112,7 +112,7 @@ class StageCache:
         """
         path = self.path(stage, key)
         with (
-            raising(
+            translate_errors(
                 DynslamError,
                 f"cannot write the stage cache {self.folder}",
                 f"free some space, or name another folder by {STAGES_VARIABLE}",

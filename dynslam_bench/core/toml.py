@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, raising
+from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, translate_errors
 from dynslam_bench.core.reading import read_text
 
 if sys.version_info >= (3, 11):
@@ -47,7 +47,7 @@ def parse_toml(
         DynslamError: Of the given kind: it is no TOML, nested too deeply, or holds a number of
             thousands of digits.
     """
-    with raising(
+    with translate_errors(
         kind, f"{where} is not valid TOML", of=(ValueError, OverflowError, RecursionError)
     ):
         return tomllib.loads(text)

@@ -14,7 +14,12 @@ from dynslam_bench.core.simd import add_normal_equation, normal_equations, store
 from dynslam_bench.culling import Rule
 from dynslam_bench.culling.settings import RigidMotionSettings
 from dynslam_bench.geometry import Camera, pixel_index, se3
-from dynslam_bench.geometry.gauss_newton import apply_twist, cholesky_solve, moved_point, twist_of
+from dynslam_bench.geometry.gauss_newton import (
+    apply_twist,
+    cholesky_solve,
+    transform_point,
+    twist_of,
+)
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
@@ -265,7 +270,7 @@ def _squared_errors(
     """Squared distances ``[N]`` of the projected points ``pose @ points`` from their pixels; inf behind the camera."""
     errors = np.full(len(points), np.inf)
     for i in range(len(points)):
-        x, y, z = moved_point(pose, points[i])
+        x, y, z = transform_point(pose, points[i])
         if z > 0:
             errors[i] = (fx * (x / z) + cx - pixels[i, 0]) ** 2 + (
                 fy * (y / z) + cy - pixels[i, 1]
@@ -292,7 +297,7 @@ def _linearise(
     sums = normal_equations()
     total = 0.0
     for i in range(len(points)):
-        x, y, z = moved_point(pose, points[i])
+        x, y, z = transform_point(pose, points[i])
         if z <= NEAR_M:
             continue
         x = x / z

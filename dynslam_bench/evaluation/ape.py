@@ -150,7 +150,7 @@ def false_motion_metrics(comparison: Comparison) -> dict[str, float]:
     They are the length of the estimated path and its largest distance from its first pose.
     Alignment does not change them; where it would fit the scale, they are left out.
     """
-    if comparison.protocol.finds_scale or not se3.stands_still(comparison.truth):
+    if comparison.protocol.finds_scale or not se3.is_static(comparison.truth):
         return {}
     positions = comparison.aligned[:, :3, 3]
     return {

@@ -556,7 +556,7 @@ def _pairs(stamps: Array) -> NDArray[np.intp]:
 
 def _axes(motions: Array, true: Array) -> Array:
     """Rotation from the truth's axes to the estimate's that explains most of the rotations."""
-    u, _, vt = np.linalg.svd(se3.sine_axes(motions)[0].T @ se3.sine_axes(true)[0])
+    u, _, vt = np.linalg.svd(se3.scaled_axes(motions)[0].T @ se3.scaled_axes(true)[0])
     return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt)
 
 
@@ -589,7 +589,7 @@ def _compare(motions: Array, true: Array, R_est_cam: Array | None = None) -> tup
         scores.append(
             (
                 float(np.median(off)) / turned,
-                _correlation(se3.sine_axes(motions)[0], se3.sine_axes(true)[0]),
+                _correlation(se3.scaled_axes(motions)[0], se3.scaled_axes(true)[0]),
             )
         )
     length = np.linalg.norm(true[:, :3, 3], axis=1)
@@ -639,7 +639,7 @@ CONVENTIONS = (
         "quaternion-order",
         "the quaternions seem to be in the order qw qx qy qz",
         "after re-ordering; write them as qx qy qz qw",
-        se3.w_first,
+        se3.from_wxyz_read_as_xyzw,
     ),
     Convention(
         "inverted-rotations",

@@ -18,7 +18,7 @@ class OnlineSample:
         frame_trans_m: Frame-to-frame translational error in metres (Eq. 26 over one frame); None
             where the frame before has no ground truth.
         frame_rot_deg: Frame-to-frame rotational error in degrees, likewise.
-        way_m: Length in metres of the true path since the first frame with ground truth, straight
+        path_length_m: Length in metres of the true path since the first frame with ground truth, straight
             across frames that have none (it was at least that); no tracker changes it.
         tracked: Whether the frame was tracked.
         lost_way_m: Metres that the camera truly moved over the lost frames since the last tracked
@@ -32,7 +32,7 @@ class OnlineSample:
     rot_deg: float
     frame_trans_m: float | None
     frame_rot_deg: float | None
-    way_m: float = 0.0
+    path_length_m: float = 0.0
     tracked: bool = True
     lost_way_m: float = 0.0
     T_world_true: Array = field(default_factory=lambda: np.eye(4), compare=False, repr=False)

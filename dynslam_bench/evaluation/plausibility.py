@@ -110,7 +110,7 @@ def _of_static_camera(comparison: Comparison, metrics: dict[str, float]) -> list
     """An error that hardly differs from that of a camera that does not move."""
     error = metrics["ate_rmse_m"]
     static = metrics["static_camera_ate_rmse_m"]
-    if static == 0 or error < NEARLY_STATIC * static or se3.stands_still(comparison.truth):
+    if static == 0 or error < NEARLY_STATIC * static or se3.is_static(comparison.truth):
         return []
     share = f"{100 * error / static:.0f} %"
     return [

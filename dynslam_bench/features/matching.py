@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.compiled import Scalar, kernel, spliced
+from dynslam_bench.core.compiled import Scalar, inlined_statements, kernel
 
 Words = NDArray[np.uint64]
 
@@ -36,7 +36,7 @@ def as_words(descriptors: NDArray[np.uint8]) -> Words:
     return padded.view(np.uint64)
 
 
-@spliced
+@inlined_statements
 def distance(a: Words, b: Words) -> Scalar:
     """Hamming distance of two descriptors ``[W]``; for use inside compiled kernels."""
     total = np.int64(0)

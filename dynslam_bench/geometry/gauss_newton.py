@@ -9,7 +9,7 @@ Array = NDArray[np.float64]
 
 
 @inlined
-def moved_point(pose: Array, point: Array) -> tuple[float, float, float]:
+def transform_point(pose: Array, point: Array) -> tuple[float, float, float]:
     """Coordinates of a point ``[3]`` that is moved by a pose ``[4, 4]``."""
     x = point[0]
     y = point[1]

@@ -93,13 +93,13 @@ def to_quaternion(pose: Array) -> tuple[Array, Array]:
 
 def rotation_angle(pose: Array) -> Array:
     """Rotation angles ``[...]`` in rad, in [0, pi], all of them accurate: by sine and cosine together."""
-    return sine_axes(pose)[1]
+    return scaled_axes(pose)[1]
 
 
 def rotation_vectors(pose: Array) -> Array:
     """Rotation vectors ``[..., 3]`` in rad of poses or rotation matrices, of length in [0, pi]."""
     pose = np.asarray(pose, dtype=np.float64)
-    axes, angle = sine_axes(pose)
+    axes, angle = scaled_axes(pose)
     if np.max(angle, initial=0.0) > 3.0:  # near a half turn the sine does not tell the axis
         from scipy.spatial.transform import Rotation
 
@@ -111,7 +111,7 @@ def rotation_vectors(pose: Array) -> Array:
     )
 
 
-def sine_axes(pose: Array) -> tuple[Array, Array]:
+def scaled_axes(pose: Array) -> tuple[Array, Array]:
     """Axes ``[..., 3]`` times the sine of the angle, and the angles ``[...]``, of rotations."""
     pose = np.asarray(pose, dtype=np.float64)
     x = pose[..., 2, 1] - pose[..., 1, 2]
@@ -127,7 +127,7 @@ STILL_DEG = 0.1
 """How far the poses of a camera that stands still may lie apart: the noise of a motion capture system."""
 
 
-def stands_still(poses: Array) -> bool:
+def is_static(poses: Array) -> bool:
     """Whether all poses ``[N, 4, 4]``, N > 0, are the first one, to a millimetre and a tenth of a degree."""
     moved = inverse(poses[0]) @ poses
     within = np.linalg.norm(moved[:, :3, 3], axis=1).max() <= STILL_M
@@ -144,7 +144,7 @@ def transform(pose: Array, points: Array) -> Array:
     return points @ pose[:3, :3].T + pose[:3, 3]
 
 
-def w_first(pose: Array) -> Array:
+def from_wxyz_read_as_xyzw(pose: Array) -> Array:
     """The poses ``[N, 4, 4]`` of a file that holds qw qx qy qz and was read as if it held qx qy qz qw."""
     translation, quaternion = to_quaternion(pose)
     return from_quaternion(translation, np.roll(quaternion, -1, axis=1))

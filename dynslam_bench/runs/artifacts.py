@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import MapOutputs, TrackResult
-from dynslam_bench.core import RunError, TrackerError, raising, read_npz
+from dynslam_bench.core import RunError, TrackerError, read_npz, translate_errors
 from dynslam_bench.envs import FrameOutcome, SlamEnv
 from dynslam_bench.envs.rendering import CULLED, KEPT, MASK, Canvas, Image, annotated
 from dynslam_bench.evaluation.alignment import align
@@ -173,7 +173,7 @@ def read_snapshots(folder: Path) -> tuple[tuple[int, int], list[Snapshot]]:
     if not path.is_file():
         return (0, 0), []
     arrays = read_npz(path, kind=RunError)
-    with raising(
+    with translate_errors(
         RunError,
         f"{path} holds no snapshots",
         of=(LookupError, ValueError, TypeError, ArithmeticError),

@@ -27,15 +27,15 @@ from dynslam_bench.core import (
     compare_sums,
     file_sha256,
     is_temporary,
-    raising,
     read_lines,
     read_toml,
     replace_folder,
+    translate_errors,
     turn,
     write_atomic,
 )
 from dynslam_bench.core.download import download
-from dynslam_bench.core.errors import left_out_of_messages
+from dynslam_bench.core.errors import hide_folder_in_messages
 from dynslam_bench.core.records import Record, digest, validated
 from dynslam_bench.runs.exchange.transfer import import_trajectory
 from dynslam_bench.runs.record import RunRecord, run_id_of
@@ -76,7 +76,7 @@ class Bank(RunStore):
                         shutil.copyfile(file, work / file.name)
                 (work / RUN_FILE).write_text(record.public().to_json(), encoding="utf-8")
             self.check_copy(work, record)
-            with raising(
+            with translate_errors(
                 InfrastructureError,
                 f"cannot write {self.folder(record.run_id)}",
                 "check the free space",
@@ -206,7 +206,7 @@ def _fetched(place: str, sha256: str, base: Path, folder: Path) -> Path:
         target = folder / f"{digest(place)}.txt"
         download(place, target, sha256=sha256 or None)
         return target
-    with raising(RunError, f"cannot read {place}"):
+    with translate_errors(RunError, f"cannot read {place}"):
         actual = file_sha256(base / place)
     if not actual.startswith(sha256):
         raise RunError(f"{place} has the checksum {actual}, expected {sha256}")
@@ -359,7 +359,7 @@ def _merge(sources: Sequence[RunStore], bank: str | Path) -> Merged:
     """
     store = Bank(bank)
     mark = store.root / UNFINISHED
-    with raising(InfrastructureError, f"cannot write {store.root}", "name another folder"):
+    with translate_errors(InfrastructureError, f"cannot write {store.root}", "name another folder"):
         store.root.mkdir(parents=True, exist_ok=True)
     with turn(store.root / ".merging"):
         if mark.exists():
@@ -371,7 +371,9 @@ def _merge(sources: Sequence[RunStore], bank: str | Path) -> Merged:
             return merge(sources, store, trials=False)
         finally:  # what was copied before a fault is whole
             _write_sums(store)
-            with raising(InfrastructureError, f"cannot remove {mark}", "repeat the command"):
+            with translate_errors(
+                InfrastructureError, f"cannot remove {mark}", "repeat the command"
+            ):
                 mark.unlink(missing_ok=True)
 
 
@@ -383,7 +385,9 @@ def _write_sums(store: Bank) -> None:
     """
     lines = []
     for name in store.files():
-        with raising(InfrastructureError, f"cannot read {store.root / name}", "repeat the command"):
+        with translate_errors(
+            InfrastructureError, f"cannot read {store.root / name}", "repeat the command"
+        ):
             lines.append(f"{file_sha256(store.root / name)}  {name}\n")
     write_atomic(store.root / SUMS, "".join(lines))
 
@@ -410,7 +414,7 @@ def _is_repository(place: str) -> bool:
 def _cloned(repository: str) -> Iterator[Path]:
     with closing(TemporaryFolder()) as folder:
         origin = repository if _ADDRESS.fullmatch(repository) else str(Path(repository).absolute())
-        clone = left_out_of_messages(folder.path) / (
+        clone = hide_folder_in_messages(folder.path) / (
             re.sub(r"[^\w.-]", "-", Path(origin).resolve().name) or "bank"
         )
         _git(
@@ -432,7 +436,7 @@ def _git(folder: Path, verb: str, *words: str) -> None:
     Raises:
         RunError: It is not installed, or refuses.
     """
-    with raising(RunError, "cannot start git", "install it"):
+    with translate_errors(RunError, "cannot start git", "install it"):
         done = subprocess.run(
             ["git", verb, *words],
             cwd=folder,

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from dynslam_bench.core import RunError, find_data_root, raising
+from dynslam_bench.core import RunError, find_data_root, translate_errors
 from dynslam_bench.core.fingerprint import versions
 from dynslam_bench.core.version import install_hint
 from dynslam_bench.envs import resolve_device
@@ -45,7 +45,7 @@ class DaskWorkers(Executor):
     """
 
     def __init__(self, address: str) -> None:
-        with raising(
+        with translate_errors(
             RunError,
             "a scheduler needs the package distributed",
             install_hint("cluster"),
@@ -56,7 +56,7 @@ class DaskWorkers(Executor):
         for name in ("distributed", "distributed.client"):
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
         hint = "for example tcp://host:8786"
-        with raising(
+        with translate_errors(
             RunError, f"no Dask scheduler answers at {address}", hint, of=(OSError, ValueError)
         ):
             self._client = Client(address, timeout="10s")

@@ -13,7 +13,7 @@ from typing import Any
 
 from dynslam_bench.contracts import Sequence, TrackerSpec
 from dynslam_bench.contracts.checks import check_sensors
-from dynslam_bench.core import PluginError, RunError, SettingsError, did_you_mean, raising
+from dynslam_bench.core import PluginError, RunError, SettingsError, did_you_mean, translate_errors
 from dynslam_bench.core.fingerprint import (
     contents_digest,
     distribution_of_module,
@@ -268,7 +268,7 @@ def _files_of(
     named: dict[str, Any] = {"weights": weights}
     if not tracker.files:
         return named, ()
-    with raising(PluginError, f"cannot read a file of tracker '{tracker.id}'"):
+    with translate_errors(PluginError, f"cannot read a file of tracker '{tracker.id}'"):
         files = tuple(map(Path, load_object(tracker.files)(settings)))
         return named | {"files": contents_digest(files)}, files
 
@@ -317,7 +317,7 @@ def check_unchanged(run: ResolvedRun, *, begun: bool = False) -> None:
         )
     before = run.identity
     now = resolve(run.spec).identity
-    with raising(PluginError, f"cannot read a file of tracker '{run.tracker.id}'"):
+    with translate_errors(PluginError, f"cannot read a file of tracker '{run.tracker.id}'"):
         now |= {
             "files": contents_digest(run.files) if run.files and not begun else before.get("files")
         }

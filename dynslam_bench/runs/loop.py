@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from dynslam_bench.core import repeating
+from dynslam_bench.core import call_periodically
 from dynslam_bench.envs import DegradeFrames, DropFrames, SlamEnv
 from dynslam_bench.evaluation import Protocol, compare_masks
 from dynslam_bench.evaluation.comparison import tracked_frames
@@ -104,7 +104,7 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
         signs: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
         # a batch program, which has a time limit of its own, is at work
         if not base.tracker_spec.online:
-            signs = repeating(_BEAT_S, lambda: send({"type": "frame", "index": total - 1}))
+            signs = call_periodically(_BEAT_S, lambda: send({"type": "frame", "index": total - 1}))
         with at(lambda: "after the last frame"), signs:
             outcome = recorder.finish()
             env.close()

@@ -35,8 +35,8 @@ from dynslam_bench.core import (
     SequenceError,
     TemporaryFolder,
     TrajectoryError,
-    raising,
     reason_of,
+    translate_errors,
 )
 from dynslam_bench.core.fingerprint import git_revision, path_digest, this_machine, versions
 from dynslam_bench.core.plugins import ENVIRONMENT_VARIABLE
@@ -171,7 +171,7 @@ def run_one(
                 f"{resolved.tracker.id} cannot run on {resolved.sequence.id}: {verdict.reason}",
                 "nothing is stored",
             )
-        with raising(InfrastructureError, f"cannot write {work}", "the run is not stored"):
+        with translate_errors(InfrastructureError, f"cannot write {work}", "the run is not stored"):
             bound_log(log, LONGEST_LOG)
             frames = FrameLog.read(work / FRAMES_FILE)
             title = f"{resolved.tracker.id} on {resolved.sequence.id}, seed {resolved.spec.seed}, online"
@@ -239,7 +239,7 @@ def _watched(work: Path, watch: Callable[[Child], Verdict]) -> Verdict:
 
 def _empty(work: Path) -> None:
     """Leave in a work folder an empty log of frames and nothing else."""
-    with raising(
+    with translate_errors(
         InfrastructureError, f"cannot write {work}", "check the free space; nothing is stored"
     ):
         for path in work.iterdir():
@@ -814,7 +814,7 @@ def run_packed(
             f"{name} would make another run: {', '.join(differing)} differ",
             "give all workers the same code, packages and data",
         )
-    no_space = raising(
+    no_space = translate_errors(
         InfrastructureError, f"{name} cannot write its temporary files", "check the free space"
     )
     with no_space, contextlib.closing(TemporaryFolder()) as folder:
@@ -843,14 +843,18 @@ def unpack(data: bytes, store: RunStore) -> RunRecord:
     Raises:
         RunError: The bytes are no packed run, or hold names that do not belong there.
     """
-    no_space = raising(
+    no_space = translate_errors(
         InfrastructureError, "cannot unpack a run that a worker has made", "check the free space"
     )
     with no_space, contextlib.closing(TemporaryFolder()) as folder:
         sent = RunStore(folder.path)
         with (  # zipfile raises almost anything over damaged archives
-            raising(RunError, f"{len(data)} bytes from a worker are no packed run", of=Exception),
-            raising(InfrastructureError, f"cannot write {folder.path}", "check the free space"),
+            translate_errors(
+                RunError, f"{len(data)} bytes from a worker are no packed run", of=Exception
+            ),
+            translate_errors(
+                InfrastructureError, f"cannot write {folder.path}", "check the free space"
+            ),
             zipfile.ZipFile(io.BytesIO(data)) as archive,
         ):
             odd = [name for name in archive.namelist() if not _ENTRY.fullmatch(name)]

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from dynslam_bench.core import InfrastructureError, TemporaryFolder
-from dynslam_bench.core.errors import left_out_of_messages
+from dynslam_bench.core.errors import hide_folder_in_messages
 from dynslam_bench.evaluation import Protocol
 from dynslam_bench.runs.process.fork_server import Child, make_job
 from dynslam_bench.runs.process.supervisor import supervise
@@ -57,7 +57,7 @@ def score_job(
     store.source = Path(job["source"])  # what messages call it
     for folder in store.root.parents:
         if folder.name == store.source.name:  # an archive, unpacked into a folder of its name
-            left_out_of_messages(folder.parent)
+            hide_folder_in_messages(folder.parent)
     record = store.read_whole(job["run_id"])
     metrics = store.score(record, Protocol.model_validate(job["protocol"]), again=job["again"])
     return {"type": "done", "metrics": metrics.to_line()}

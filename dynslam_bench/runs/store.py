@@ -31,14 +31,14 @@ from dynslam_bench.core import (
     claimed,
     did_you_mean,
     file_sha256,
-    raising,
     read_lines,
     replace_folder,
     sweep_temporary,
     temporary_folder,
+    translate_errors,
     write_atomic,
 )
-from dynslam_bench.core.errors import left_out_of_messages
+from dynslam_bench.core.errors import hide_folder_in_messages
 from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, module_graph
 from dynslam_bench.core.plugins import ISOLATED_VARIABLE, has_imported_plugins
 from dynslam_bench.core.reads import remembered
@@ -348,7 +348,9 @@ class RunStore:
         record = self._under_free_id(record)
         target = self.folder(record.run_id)
         record = self._with_alarm(record, work)
-        with raising(InfrastructureError, f"cannot write {target}", "check the free space"):
+        with translate_errors(
+            InfrastructureError, f"cannot write {target}", "check the free space"
+        ):
             files = record.files or self._files(record.sequence.part, work)
             record = record.model_copy(update={"files": files})
             (work / RUN_FILE).write_text(record.to_json(), encoding="utf-8")
@@ -390,7 +392,7 @@ class RunStore:
         for path in paths:
             if not path.is_file():
                 continue
-            with raising(RunError, f"cannot read {path}", _REMOVED):
+            with translate_errors(RunError, f"cannot read {path}", _REMOVED):
                 # many runs share the files of a sequence: each is read once a process
                 checksums[path.name] = remembered("sha256", str(path), partial(file_sha256, path))
         return checksums
@@ -446,7 +448,7 @@ class RunStore:
         """
         source = other.folder(record.run_id)
         try:
-            with raising(
+            with translate_errors(
                 InfrastructureError,
                 f"cannot write {self.folder(record.run_id)}",
                 "check the free space",
@@ -482,7 +484,7 @@ class RunStore:
         folder = self._part(record.sequence.part)
         if not (folder / "timestamps.txt").is_file():
             for file in sorted(other._part(record.sequence.part).glob("*.txt")):
-                with raising(RunError, f"cannot read {file}", _REMOVED):
+                with translate_errors(RunError, f"cannot read {file}", _REMOVED):
                     content = file.read_bytes()
                 write_atomic(folder / file.name, content)
 
@@ -515,7 +517,10 @@ class RunStore:
             RunError: There is no such run, or it cannot be deleted.
         """
         run_id = self.find(run_id)
-        with raising(RunError, f"cannot remove run {run_id}"), self.work_folder(run_id) as removed:
+        with (
+            translate_errors(RunError, f"cannot remove run {run_id}"),
+            self.work_folder(run_id) as removed,
+        ):
             self.folder(run_id).rename(removed / run_id)
         self._unlink_dangling()
 
@@ -840,9 +845,11 @@ def open_store(results: str | Path) -> RunStore:
     if store.root.is_file():
         from dynslam_bench.sequences.fetch import extract  # loads what fetches sequences
 
-        with raising(InfrastructureError, f"cannot unpack {results}", "check the free space"):
+        with translate_errors(
+            InfrastructureError, f"cannot unpack {results}", "check the free space"
+        ):
             temporary = TemporaryFolder()
-            unpacked = left_out_of_messages(temporary.path) / store.root.name
+            unpacked = hide_folder_in_messages(temporary.path) / store.root.name
             unpacked.mkdir()
             extract(store.root, unpacked)
         roots = [path.parent for path in unpacked.rglob("runs") if path.is_dir()]
@@ -894,7 +901,7 @@ def _read_truth(path: Path, _stamp: str) -> TumFile:
 @lru_cache(maxsize=64)
 def _read_stamps(path: Path, _stamp: str) -> NDArray[np.float64]:
     """The stamps of a part, likewise shared."""
-    with raising(
+    with translate_errors(
         RunError, f"cannot read {path}", "the results folder is incomplete", of=ValueError
     ):
         stamps = np.array(
@@ -1005,7 +1012,7 @@ def _content(file: Path) -> bytes:
     """
     if not file.is_file():
         return b""
-    with raising(RunError, f"cannot read {file}", _REMOVED):
+    with translate_errors(RunError, f"cannot read {file}", _REMOVED):
         return file.read_bytes()
 
 

@@ -21,7 +21,7 @@ from dynslam_bench.contracts import (
     SegmenterSpec,
     Sequence,
 )
-from dynslam_bench.core import SegmentationError, raising
+from dynslam_bench.core import SegmentationError, translate_errors
 from dynslam_bench.core.fingerprint import content_digest, machine_digest, path_digest
 from dynslam_bench.core.plugins import Registry, build_plugin
 from dynslam_bench.core.records import digest
@@ -517,5 +517,5 @@ def weights_digest(
         return COCO.sha256_prefix
     if kind in ("onnx", "weights", "recorded"):
         path = Path(argument).expanduser()
-    with raising(SegmentationError, f"cannot read {path}"):
+    with translate_errors(SegmentationError, f"cannot read {path}"):
         return path_digest(path)[:12] if path is not None and path.exists() else ""

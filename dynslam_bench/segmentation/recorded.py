@@ -20,7 +20,7 @@ from dynslam_bench.contracts import (
     SegmenterContext,
     Sequence,
 )
-from dynslam_bench.core import SegmentationError, raising, read_json, write_atomic
+from dynslam_bench.core import SegmentationError, read_json, translate_errors, write_atomic
 from dynslam_bench.core.images import read_image
 from dynslam_bench.segmentation.build_segmenter import build_segmenter, weights_digest
 from dynslam_bench.segmentation.postprocess import boxes_of
@@ -75,7 +75,7 @@ class RecordedSegmenter:
             )
         self.by_stamp = stamped > 0
         self._tolerance = MAX_DIFFERENCE_S if self.by_stamp else 0.5
-        with raising(
+        with translate_errors(
             SegmentationError,
             f"{self.folder}: a mask file is named neither by stamp nor by index",
             "for example 1311868164.363181.png or 000012.png",
@@ -182,7 +182,7 @@ def read_classes(path: Path) -> dict[int, str]:
     """
     if not path.is_file():
         return {}
-    with raising(
+    with translate_errors(
         SegmentationError,
         f"cannot read {path}",
         'expected {"1": "person", ...}',

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core import SequenceError, atomic_folder, raising, write_lines
+from dynslam_bench.core import SequenceError, atomic_folder, translate_errors, write_lines
 from dynslam_bench.geometry import Camera, parse_ns
 from dynslam_bench.sequences.cameras import CAMERA_FILE, write_camera
 from dynslam_bench.sequences.catalogue import open_folder
@@ -215,7 +215,7 @@ def _opened(source: Path) -> Iterator[Any]:
     """The bag's reader; whatever it raises over a damaged bag becomes one line."""
     if not source.exists():
         raise SequenceError(f"there is no bag {source}")
-    with raising(
+    with translate_errors(
         SequenceError,
         "bags are read with rosbags, which is not installed",
         "pip install rosbags",
@@ -225,7 +225,7 @@ def _opened(source: Path) -> Iterator[Any]:
         from rosbags.typesys import Stores, get_typestore
     # a damaged bag makes its readers raise whatever they like
     with (
-        raising(SequenceError, f"bag {source} cannot be read", of=Exception),
+        translate_errors(SequenceError, f"bag {source} cannot be read", of=Exception),
         AnyReader([source], default_typestore=get_typestore(Stores.LATEST)) as reader,
     ):
         yield reader

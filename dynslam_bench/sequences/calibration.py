@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
 
 from dynslam_bench.contracts import Sequence
-from dynslam_bench.core import SequenceError, raising
+from dynslam_bench.core import SequenceError, translate_errors
 from dynslam_bench.geometry import Array, Camera, se3
 from dynslam_bench.sequences.rgbd_motion import follow_corners
 
@@ -148,7 +148,7 @@ def calibrate(
             f"{len(windows)} of {len(starts)} windows of {sequence.id} can be used, expected {LEAST_WINDOWS}: {common}",
             "record a well-lit, textured, static scene within the depth camera's reach",
         )
-    with raising(
+    with translate_errors(
         SequenceError,
         f"the windows of {sequence.id} cannot be adjusted",
         "try another part",

@@ -173,7 +173,7 @@ def _check_fixed(people: Sequence) -> None:
     """Refuse people of a camera that moves, by its truth, else by the shift of its images against the first one."""
     cure = "people are cut out of recordings by a fixed camera"
     truth = people.ground_truth
-    if truth is not None and len(truth) > 1 and not se3.stands_still(truth.T_world_cam):
+    if truth is not None and len(truth) > 1 and not se3.is_static(truth.T_world_cam):
         raise SequenceError(f"the camera of '{people.id}' moves", cure)
     sampled = np.linspace(0, len(people) - 1, _SAMPLED).astype(int).tolist()
     first, *others = (

@@ -13,8 +13,8 @@ from dynslam_bench.core import (
     STAGES_VARIABLE,
     DynslamError,
     SequenceError,
-    raising,
     replacing,
+    translate_errors,
     turn,
 )
 from dynslam_bench.core.fingerprint import opencv_version
@@ -67,7 +67,7 @@ def _mapped(sequence: Sequence) -> NDArray[np.void]:
         "frames", digest([sequence.digest(), part.start, part.stop, part.stride, code]), ".npy"
     )
     if (frames := _read(path)) is None:
-        with raising(
+        with translate_errors(
             DynslamError, f"cannot write the stage cache {cache.folder}", f"set {STAGES_VARIABLE}"
         ):
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -102,7 +102,7 @@ def _write(sequence: Sequence, path: Path, max_bytes: int) -> None:
     fault = f"cannot write the {count / 1e6:.0f} MB of decoded frames of '{sequence.id}' to {path.parent}"
     hint = f"free some space, or name another folder by {STAGES_VARIABLE}"
     with (
-        raising(DynslamError, fault, hint),
+        translate_errors(DynslamError, fault, hint),
         replacing(path) as temporary,
         temporary.open("wb") as file,
     ):

@@ -24,9 +24,9 @@ from dynslam_bench.core import (
     did_you_mean,
     find_data_root,
     is_inside,
-    raising,
     read_text,
     temporary_folder,
+    translate_errors,
     without_passwords,
     write_atomic,
 )
@@ -196,7 +196,7 @@ def _install(
     size = parts[0].archive.stat().st_size
     fault = f"cannot extract {first.name} ({size / 1e9:.2f} GB) into {place.parent}"
     hint = "make room or check the permissions and run the same command again, the archive is kept"
-    with raising(SequenceError, fault, hint):
+    with translate_errors(SequenceError, fault, hint):
         try:
             with atomic_folder(place) as work:
                 unpacked = work / ".unpacked"

@@ -283,7 +283,7 @@ class TruthMotion:
 def read_as(poses: Array, reading: str) -> Array:
     """Poses ``[N, 4, 4]`` of a file that was written in the convention `reading` and read as if in TUM's."""
     if reading.startswith("w first"):
-        poses = se3.w_first(poses)
+        poses = se3.from_wxyz_read_as_xyzw(poses)
     if reading == "rotations inverted":
         poses = se3.with_rotation(poses, np.swapaxes(poses[:, :3, :3], 1, 2))
     return se3.inverse(poses) if reading in ("inverted", "w first, inverted") else poses

@@ -34,7 +34,7 @@ def sequence_tags(sequence: Any) -> list[str]:
 
 def motion_tags(truth: Trajectory) -> set[str]:
     """``fast``, ``loop`` or ``fixed-camera``, as far as they hold for the truth of a camera of two poses or more."""
-    if se3.stands_still(truth.T_world_cam):
+    if se3.is_static(truth.T_world_cam):
         return {FIXED_CAMERA}
     times = truth.timestamps
     # the first pose of each step of time: work by poses, however long the holes between them are

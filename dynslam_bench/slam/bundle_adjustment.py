@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.gauss_newton import apply_twist, cholesky_solve, moved_point
+from dynslam_bench.geometry.gauss_newton import apply_twist, cholesky_solve, transform_point
 from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.pose_optimisation import (
     CHI2_DEPTH,
@@ -166,7 +166,7 @@ def _step(
             weight = 1.0 / (1.0 + chi2[k] / width)
             c = obs_pose[k]
             r = poses[obs_pose[k]]
-            xc, yc, zc = moved_point(r, points[i])
+            xc, yc, zc = transform_point(r, points[i])
             iz = 1.0 / zc
             a = fx * iz
             d = fy * iz

@@ -16,7 +16,7 @@ from dynslam_bench.contracts import KeyframeRecord, KeyframeView, Keypoints, Map
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.features.matching import distance
 from dynslam_bench.geometry import Camera, se3
-from dynslam_bench.geometry.gauss_newton import moved_point
+from dynslam_bench.geometry.gauss_newton import transform_point
 from dynslam_bench.slam.observations import Observations
 
 Array = NDArray[np.float64]
@@ -622,7 +622,7 @@ def _project(
     count = 0
     for i in range(n):
         p = candidates[i]
-        xc, yc, zc = moved_point(pose, position[p])
+        xc, yc, zc = transform_point(pose, position[p])
         if zc < 0.05:
             continue
         u = fx * xc / zc + cx

@@ -265,7 +265,7 @@ class SlamPipeline:
             state.keep = state.keep & verdict.keep
             verdicts.append(verdict)
             stats |= {f"{dynamic_filter.name}_{key}": value for key, value in verdict.stats.items()}
-        keep, undone = restore_starved(
+        keep, undone = combine_verdicts(
             [verdict.keep for verdict in verdicts], self._guard, len(frame.xy)
         )
         used = verdicts[: len(verdicts) - undone]
@@ -390,7 +390,7 @@ class SlamPipeline:
         return self._backend
 
 
-def restore_starved(
+def combine_verdicts(
     verdicts: Sequence[NDArray[np.bool_]], settings: GuardSettings, total: int
 ) -> tuple[NDArray[np.bool_], int]:
     """The starvation guard: combine the filters' verdicts, without the last ones while too few features remain.

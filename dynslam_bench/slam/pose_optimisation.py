@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.core.simd import add_normal_equation, normal_equations, store_normal_equations
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.gauss_newton import apply_twist, cholesky_solve, moved_point
+from dynslam_bench.geometry.gauss_newton import apply_twist, cholesky_solve, transform_point
 
 Array = NDArray[np.float64]
 
@@ -92,7 +92,7 @@ def _linearise(
     for i in range(points.shape[0]):
         if not active[i]:
             continue
-        x, y, z = moved_point(pose, points[i])
+        x, y, z = transform_point(pose, points[i])
         depth = info_right[i] > 0.0
         limit = CHI2_DEPTH if depth else CHI2_MONO
         if z < NEAR_M:
@@ -148,7 +148,7 @@ def observation_chi2(
     bf: float,
 ) -> tuple[float, float]:
     """Chi-square of one observation by its pixel alone, and with its right coordinate; inf behind the camera."""
-    x, y, z = moved_point(pose, point)
+    x, y, z = transform_point(pose, point)
     if z < NEAR_M:
         return np.inf, np.inf
     u = fx * x / z + cx

@@ -22,7 +22,7 @@ from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from dynslam_bench.core import DynslamError, InfrastructureError, ReportError, raising
+from dynslam_bench.core import DynslamError, InfrastructureError, ReportError, translate_errors
 from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, module_graph
 from dynslam_bench.evaluation.protocol import MONOCULAR, Protocol
 from dynslam_bench.reports.model.programs import choose_runs
@@ -97,7 +97,7 @@ def run_jobs(
         return
     with _without_main():
         answers = pool.map(function, *zip(*jobs, strict=True), chunksize=_AT_ONCE)
-    with raising(
+    with translate_errors(
         InfrastructureError, "a worker process of the report ended early", of=BrokenProcessPool
     ):
         yield from answers

@@ -26,7 +26,7 @@ TOYS = {
     "toys/__init__.py": "",
     "toys/constants.py": '"""Numbers."""\nSCALE = 2.0\nOFFSETS = (1.0, 10.0)\nTABLE = [0.0]\nUNUSED = 1\n',
     "toys/inner.py": '''
-from dynslam_bench.core.compiled import inlined, kernel, spliced
+from dynslam_bench.core.compiled import inlined, kernel, inlined_statements
 from toys import constants
 from toys.constants import OFFSETS
 
@@ -35,7 +35,7 @@ def scaled(x):
     """Docs."""
     return constants.SCALE * x
 
-@spliced
+@inlined_statements
 def moved(x):
     return x + OFFSETS[1]
 

@@ -58,7 +58,7 @@ from dynslam_bench.culling.settings import (
 from dynslam_bench.culling.template_matching import TemplateFilter
 from dynslam_bench.features.orb import OrbExtractor
 from dynslam_bench.features.settings import FeatureSettings
-from dynslam_bench.slam.pipeline import restore_starved
+from dynslam_bench.slam.pipeline import combine_verdicts
 
 RESEEDING = ReseedingFilter(ReseedingSettings(budget=600), FeatureSettings(n_features=900))
 
@@ -421,10 +421,12 @@ def test_guard_undoes_the_least_reliable_verdict_first() -> None:
         ([nothing, nothing], ~nothing, 2),
         ([semantic], semantic, 0),
     ):
-        keep, count = restore_starved(verdicts, GuardSettings(min_features=40), 100)
+        keep, count = combine_verdicts(verdicts, GuardSettings(min_features=40), 100)
         assert count == undone
         np.testing.assert_array_equal(keep, expected)
-    assert restore_starved([semantic], GuardSettings(min_features=0, min_fraction=0.8), 100)[1] == 1
+    assert (
+        combine_verdicts([semantic], GuardSettings(min_features=0, min_fraction=0.8), 100)[1] == 1
+    )
 
 
 # Settings of culling rules that no short episode shows: each changes the verdict on a scene made

@@ -532,13 +532,13 @@ def test_holes_give_none_and_the_pose_goes_on():
     assert samples[20:30] == [None] * 10
     assert samples[30].frame_trans_m is None
     assert samples[30].trans_m == pytest.approx(SAMPLES[30].trans_m, abs=1e-12)
-    assert replace(samples[31], way_m=0.0) == replace(SAMPLES[31], way_m=0.0)
+    assert replace(samples[31], path_length_m=0.0) == replace(SAMPLES[31], path_length_m=0.0)
     steps = np.linalg.norm(np.diff(SHORT.positions[seen], axis=0), axis=1)
-    ways = [samples[index].way_m for index in seen]
+    ways = [samples[index].path_length_m for index in seen]
     assert ways == pytest.approx([0.0, *np.cumsum(steps)], abs=1e-12), (
         "the true way goes straight across holes"
     )
-    assert ways[-1] < SAMPLES[-1].way_m
+    assert ways[-1] < SAMPLES[-1].path_length_m
 
 
 @pytest.mark.parametrize("truth", [None, EMPTY], ids=["none", "empty"])

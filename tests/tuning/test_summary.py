@@ -49,11 +49,11 @@ from dynslam_bench.tuning.objectives import (
     bounds,
     by_scene,
     centre,
+    combined_objective,
     detectable,
     own_objective,
     scenes_needed,
     spread_test,
-    together,
 )
 from dynslam_bench.tuning.page import fewer_starts, settings_table, warnings_of
 from dynslam_bench.tuning.plan import Design, with_more_starts
@@ -346,7 +346,7 @@ def test_objectives_are_logarithms_of_ratios_by_hand() -> None:
     assert values["coverage"] == pytest.approx(math.log(3)), "2 % more lost, beside a floor of 1 %"
     blurred = {**tuned, BLURRED: outcome(BLURRED, 0.06)}
     assert OBJECTIVES["robustness"].value(blurred, default) == pytest.approx(math.log(3))
-    balance = together([OBJECTIVES["accuracy"], OBJECTIVES["speed"]])
+    balance = combined_objective([OBJECTIVES["accuracy"], OBJECTIVES["speed"]])
     assert balance.value(tuned, default) == pytest.approx(
         (values["accuracy"] + values["speed"]) / 2
     )

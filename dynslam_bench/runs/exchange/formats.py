@@ -9,9 +9,9 @@ import numpy as np
 from dynslam_bench.core import (
     RunError,
     TrajectoryError,
-    raising,
     read_lines,
     temporary_folder,
+    translate_errors,
     write_atomic,
 )
 from dynslam_bench.core.version import install_hint
@@ -240,7 +240,7 @@ def write_bag(folder: Path, trajectories: Mapping[str, Trajectory]) -> None:
     Raises:
         DynslamError: `rosbags` is not installed, or the file cannot be written.
     """
-    with raising(
+    with translate_errors(
         RunError,
         "MCAP is written with rosbags, which is not installed",
         install_hint("bags"),
@@ -251,7 +251,7 @@ def write_bag(folder: Path, trajectories: Mapping[str, Trajectory]) -> None:
     store = get_typestore(Stores.LATEST)
     with temporary_folder(folder / "trajectory") as work:
         bag = work / "trajectory"
-        with raising(RunError, f"cannot write {folder}", "check the free space"):
+        with translate_errors(RunError, f"cannot write {folder}", "check the free space"):
             with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
                 for name, trajectory in trajectories.items():
                     _write_messages(writer, store, name, trajectory)

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Sequence
-from dynslam_bench.core import RunError, raising
+from dynslam_bench.core import RunError, translate_errors
 from dynslam_bench.core.version import install_hint
 from dynslam_bench.envs.rendering import CULLED, ESTIMATE, KEPT, MASK, TRUTH
 from dynslam_bench.geometry import Camera, Trajectory, associate, se3
@@ -107,7 +107,7 @@ def write_recording(
     import rerun as rr
 
     stream = rr.RecordingStream("dynslam-bench")
-    with raising(
+    with translate_errors(
         RunError,
         f"cannot write {path}",
         "check the permissions and the free space",

@@ -15,7 +15,7 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor
 
-from dynslam_bench.core import SegmentationError, raising, replacing
+from dynslam_bench.core import SegmentationError, replacing, translate_errors
 from dynslam_bench.segmentation.networks.backbone import COCO_CLASSES, NetworkConfig
 from dynslam_bench.segmentation.networks.network import MaskRCNN
 
@@ -69,9 +69,9 @@ def read_checkpoint(path: Path) -> Mapping[str, Any]:
             values.
     """
     path = path.expanduser()
-    with raising(SegmentationError, f"cannot read the checkpoint {path}"):
+    with translate_errors(SegmentationError, f"cannot read the checkpoint {path}"):
         size = path.stat().st_size
-    with raising(
+    with translate_errors(
         SegmentationError,
         f"{path} ({size} bytes) is no torch checkpoint of plain weights",
         "it is truncated or of another format",
@@ -102,7 +102,7 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], NetworkConfig | None]:
             raise SegmentationError(
                 f"{path} has the format {content['format']!r}, this version reads {FORMAT!r}"
             )
-        with raising(
+        with translate_errors(
             SegmentationError, f"{path}: the network's shape is not understood", of=ValidationError
         ):
             config = NetworkConfig.model_validate_json(str(content["config"]))
@@ -188,7 +188,7 @@ def infer_config(state: Mapping[str, Tensor], path: Path) -> NetworkConfig:
         ),
         "cfpn": True,
     }
-    with raising(
+    with translate_errors(
         SegmentationError, f"{path}: the network's shape is not understood", of=ValidationError
     ):
         return NetworkConfig(**shape)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dynslam_bench.core import SegmentationError, raising, replacing
+from dynslam_bench.core import SegmentationError, replacing, translate_errors
 from dynslam_bench.core.version import install_hint
 from dynslam_bench.segmentation.networks.checkpoints import COCO, embedded_weights, fetch_checkpoint
 from dynslam_bench.segmentation.networks.loading import load_network
@@ -115,7 +115,7 @@ def write_onnx(network: MaskRCNN, path: Path, *, size: tuple[int, int] = SIZE) -
         OSError: The file cannot be written.
     """
     missing = "networks are exported with onnx and onnxscript, which are not both installed"
-    with raising(SegmentationError, missing, install_hint("onnx"), of=ImportError):
+    with translate_errors(SegmentationError, missing, install_hint("onnx"), of=ImportError):
         import onnx
         import onnxscript  # noqa: F401 - torch's exporter asks for it
     static = StaticMaskRCNN(network, *size, score=FLOOR, iou=NMS_IOU).eval()
@@ -123,7 +123,7 @@ def write_onnx(network: MaskRCNN, path: Path, *, size: tuple[int, int] = SIZE) -
     classes = {number: name for number, name in enumerate(network.config.classes, start=1) if name}
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with replacing(path) as temporary:
-        with raising(
+        with translate_errors(
             SegmentationError,
             f"torch {torch.__version__} cannot export the network",
             "torch >= 2.6",

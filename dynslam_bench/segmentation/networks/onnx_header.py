@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from dynslam_bench.core import SegmentationError, raising
+from dynslam_bench.core import SegmentationError, translate_errors
 
 Fields: TypeAlias = dict[int, list[Any]]
 """Values of a message, each an integer or a memoryview, by field number."""
@@ -66,11 +66,11 @@ def read_header(path: Path) -> tuple[list[TensorInfo], list[TensorInfo], dict[st
     Raises:
         SegmentationError: The file is missing, truncated or no ONNX model.
     """
-    with raising(
+    with translate_errors(
         SegmentationError, f"cannot read the network {path}", "give the path of an .onnx file"
     ):
         data = path.expanduser().read_bytes()
-    with raising(
+    with translate_errors(
         SegmentationError,
         f"{path} is not an ONNX model ({len(data)} bytes)",
         "the file is truncated or of another format",

@@ -16,7 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from dynslam_bench.core import SegmentationError, raising
+from dynslam_bench.core import SegmentationError, translate_errors
 from dynslam_bench.segmentation.networks.onnx_header import TensorInfo
 from dynslam_bench.segmentation.settings import COCO_IDS, COCO_NAMES, VOC_NAMES, canonical_name
 
@@ -137,7 +137,7 @@ def read_metadata(metadata: Mapping[str, str], where: str) -> Metadata:
     names: dict[int, str] | None = None
     value: Any = None
     if "names" in metadata:
-        with raising(
+        with translate_errors(
             SegmentationError,
             f"{where}: the metadata entry 'names' is not a table of class names",
             "expected {0: 'person', ...}",

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, Instances, SegmenterContext
-from dynslam_bench.core import SegmentationError, raising
+from dynslam_bench.core import SegmentationError, translate_errors
 from dynslam_bench.segmentation.networks import pinned_threads
 from dynslam_bench.segmentation.networks.onnx_header import TensorInfo, read_header
 from dynslam_bench.segmentation.networks.onnx_layout import (
@@ -87,7 +87,7 @@ class OnnxSegmenter:
         self.floor = floor
         inputs, outputs, metadata = read_header(self.path)
         self._size = _input_size(inputs, self.path)
-        with raising(
+        with translate_errors(
             SegmentationError,
             f"OpenCV {cv2.__version__} cannot load {self.path}",
             "export it with static shapes and plain operators",
@@ -176,7 +176,7 @@ class OnnxSegmenter:
         blob: NDArray[np.float32] = np.ascontiguousarray(scaled.transpose(2, 0, 1)[None])
         with (
             pinned_threads(cv2.getNumThreads, cv2.setNumThreads, self.threads),
-            raising(
+            translate_errors(
                 SegmentationError,
                 f"{self.path} cannot run on a {image.shape[1]}x{image.shape[0]} image",
                 f"OpenCV {cv2.__version__}",

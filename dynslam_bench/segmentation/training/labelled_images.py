@@ -19,9 +19,9 @@ from dynslam_bench.core import (
     atomic_folder,
     did_you_mean,
     inside,
-    raising,
     read_json,
     read_lines,
+    translate_errors,
 )
 from dynslam_bench.core.images import read_image
 from dynslam_bench.core.records import digest
@@ -96,7 +96,7 @@ def coco_images(text: str) -> LabelledImages:
     path = Path(annotations).expanduser()
     folder = Path(images).expanduser() if images else path.parent
     content = read_json(path, limit=TABLE_BYTES, kind=SegmentationError)
-    with raising(
+    with translate_errors(
         SegmentationError,
         f"{path} is not in COCO's annotation format",
         "it needs images, annotations and categories",
@@ -175,7 +175,7 @@ def yolo_images(text: str) -> LabelledImages:
 def _yolo_names(path: Path) -> dict[int, str]:
     """The names of the classes that a YOLO data set's description gives, a list or a mapping."""
     names = read_yaml(path).get("names")
-    with raising(
+    with translate_errors(
         SegmentationError,
         f"{path}: 'names' is not a table of class names",
         "expected names: [person, ...] or names: {0: person, ...}",
@@ -195,7 +195,7 @@ def _read_yolo(path: Path, label: Path, classes: Mapping[int, str]) -> LabelledI
     for number, line in enumerate(lines, 1):
         if not line.strip():
             continue
-        with raising(
+        with translate_errors(
             SegmentationError,
             f"{label} line {number} is no polygon label",
             "expected class x1 y1 x2 y2 ...",
@@ -254,7 +254,7 @@ def _polygon(points: Any) -> NDArray[np.float64]:
 
 def _coco_mask(segmentation: Any, shape: tuple[int, ...], where: Path) -> NDArray[np.bool_]:
     """A mask from polygons, or from run lengths column by column, which must fill the image exactly."""
-    with raising(
+    with translate_errors(
         SegmentationError,
         f"{where}: a segmentation is damaged",
         "COCO's are polygons or run lengths",
@@ -351,7 +351,9 @@ def rendered_frames(text: str = "") -> LabelledImages:
                 f"synthetic: unknown option '{part}'", "known: " + ", ".join(values)
             )
         values[key] = value
-    with raising(SegmentationError, f"synthetic: '{text}' is not understood", of=ValueError):
+    with translate_errors(
+        SegmentationError, f"synthetic: '{text}' is not understood", of=ValueError
+    ):
         first, _, last = values["scenes"].partition("-")
         scenes = range(int(first), int(last or first) + 1)
         frames, length, seed = (int(values[key]) for key in ("frames", "length", "seed"))
@@ -457,7 +459,7 @@ class PreparedImages:
     """
 
     def __init__(self, folder: Path, classes: Sequence[str]) -> None:
-        with raising(
+        with translate_errors(
             SegmentationError,
             f"the prepared images in {folder} are damaged",
             "delete the folder, they are prepared again",

@@ -12,7 +12,13 @@ import pandas as pd
 import torch
 from torch import nn
 
-from dynslam_bench.core import SegmentationError, raising, read_json, replacing, write_atomic
+from dynslam_bench.core import (
+    SegmentationError,
+    read_json,
+    replacing,
+    translate_errors,
+    write_atomic,
+)
 from dynslam_bench.evaluation import MaskCounts, compare_masks
 from dynslam_bench.segmentation.networks import pinned_threads
 from dynslam_bench.segmentation.networks.backbone import EMBEDDED, RESNET18, NetworkConfig
@@ -278,7 +284,7 @@ class TrainingRun:
             SegmentationError: The file does not fit.
         """
         content = read_checkpoint(self.output / "last.pt")
-        with raising(
+        with translate_errors(
             SegmentationError,
             f"{self.output / 'last.pt'} does not fit these settings",
             of=(LookupError, RuntimeError, ValueError, TypeError, AttributeError),

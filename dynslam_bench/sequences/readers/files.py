@@ -16,7 +16,14 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from dynslam_bench.core import MEGABYTE, SequenceError, raising, read_bytes, read_lines, read_text
+from dynslam_bench.core import (
+    MEGABYTE,
+    SequenceError,
+    read_bytes,
+    read_lines,
+    read_text,
+    translate_errors,
+)
 from dynslam_bench.core.images import image_size
 from dynslam_bench.geometry import (
     Array,
@@ -222,7 +229,7 @@ def stamps_of_numbers(
             "folder's, or the one that --camera names)",
         )
     fault = f"{files[0]} of {folder} is no frame number at {fps:g} Hz"
-    with raising(SequenceError, fault, of=(ValueError, OverflowError)):
+    with translate_errors(SequenceError, fault, of=(ValueError, OverflowError)):
         stamps = [ns_of(number / fps) for number in numbers]
     return stamps, ordered[-1] - ordered[0] + 1 - len(ordered)
 
@@ -448,7 +455,7 @@ def read_yaml(path: Path) -> Mapping[str, Any]:
         raise SequenceError(
             f"{path} opens {opened} lists and mappings, more than a calibration's {MOST_BRACKETS}"
         )
-    with raising(SequenceError, f"{path} is no valid YAML", of=Exception):
+    with translate_errors(SequenceError, f"{path} is no valid YAML", of=Exception):
         # values such as dates make yaml's constructors raise whatever they like
         document = yaml.safe_load(re.sub(r"^%YAML.*|!!opencv-matrix", "", text, flags=re.MULTILINE))
     if not isinstance(document, Mapping):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dynslam_bench.core import SequenceError, TrajectoryError, raising, read_text
+from dynslam_bench.core import SequenceError, TrajectoryError, read_text, translate_errors
 from dynslam_bench.geometry import (
     Array,
     Camera,
@@ -198,7 +198,7 @@ def read_seven_scenes(folder: Path, fps: float | None) -> Contents:
     ]
     if bad:
         raise SequenceError(f"frame-{bad[0][:40]}.color.png of {folder} is named by no number")
-    with raising(
+    with translate_errors(
         SequenceError, f"the numbers of the frames of {folder} are no frame numbers", of=ValueError
     ):
         stamps = from_seconds(int(number) / rate for number in frames)

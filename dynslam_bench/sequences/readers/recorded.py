@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, FrameMasks, MaskSource
-from dynslam_bench.core import SequenceError, inside, raising
+from dynslam_bench.core import SequenceError, inside, translate_errors
 from dynslam_bench.core.fingerprint import contents_digest
 from dynslam_bench.core.images import read_image
 from dynslam_bench.core.records import digest
@@ -406,7 +406,7 @@ def read_metres(
         SequenceError: The file is missing, damaged, of another size, or holds something else.
     """
     # a damaged header makes numpy's reader raise whatever it likes
-    with raising(
+    with translate_errors(
         SequenceError, f"depth array {path} cannot be read", "is it an .npy file?", of=Exception
     ):
         values = np.load(path, mmap_mode="r", allow_pickle=False)

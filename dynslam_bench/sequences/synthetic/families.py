@@ -34,7 +34,7 @@ from dynslam_bench.sequences.synthetic.parts import (
     copies,
     ease,
     on_track,
-    turn,
+    rotation_about_z,
 )
 from dynslam_bench.sequences.synthetic.people import (
     Draw,
@@ -290,7 +290,7 @@ def _roll(keys: tuple[Key, ...], period: float, time: float) -> tuple[Array, Arr
     a, b, share = between(keys, time % period)
     e = ease(share)
     place = np.array([a.x + e * (b.x - a.x), a.y + e * (b.y - a.y), 0.0])
-    return turn(angle_between(a.facing, b.facing, e) + 180.0), place
+    return rotation_about_z(angle_between(a.facing, b.facing, e) + 180.0), place
 
 
 REPLICAS = {
@@ -870,12 +870,15 @@ def _moves(building: _Building, walk: Walk, moved: bool, number: int) -> Placeme
     """The place of a loose piece, by lap."""
     rng = stream(building.scene, "synthetic", "moved", number)
     (_, _, yaw, at) = building.loose[number]
-    places = [(turn(yaw), np.array([*at, 0.0]))]
+    places = [(rotation_about_z(yaw), np.array([*at, 0.0]))]
     for _ in range(2 if moved else 0):
         angle = np.radians(pick(rng, building.scene, 0.0, 360.0))
         away = pick(rng, building.scene, 0.3, 0.55) * np.array([cos(angle), sin(angle), 0.0])
         places.append(
-            (turn(yaw + pick(rng, building.scene, 40.0, 320.0)), np.array([*at, 0.0]) + away)
+            (
+                rotation_about_z(yaw + pick(rng, building.scene, 40.0, 320.0)),
+                np.array([*at, 0.0]) + away,
+            )
         )
     return partial(_by_lap, places, walk.time_nearest(at), walk.lap_s)
 

@@ -94,7 +94,7 @@ def copies(parts: Parts, yaw: float, shift: tuple[float, float, float], suffix: 
         shift: ... moved by this much, metres.
         suffix: Put behind the names of patterned textures, so that they are drawn again.
     """
-    body = turn(yaw)
+    body = rotation_about_z(yaw)
     return [
         replace(
             part,
@@ -106,7 +106,7 @@ def copies(parts: Parts, yaw: float, shift: tuple[float, float, float], suffix: 
     ]
 
 
-def turn(degrees: float) -> Array:
+def rotation_about_z(degrees: float) -> Array:
     """Rotation about the world's z axis."""
     a = np.radians(degrees)
     c = cos(a)
@@ -188,4 +188,4 @@ def on_track(keys: tuple[At, ...], period: float | None, time: float) -> tuple[A
     a, b, share = between(keys, time if period is None else time % period)
     e = ease(share)
     place = np.array([a.x + e * (b.x - a.x), a.y + e * (b.y - a.y), a.z + e * (b.z - a.z)])
-    return turn(a.yaw + e * (b.yaw - a.yaw)), place
+    return rotation_about_z(a.yaw + e * (b.yaw - a.yaw)), place

@@ -20,7 +20,7 @@ from dynslam_bench.sequences.synthetic.parts import (
     between,
     cone,
     ease,
-    turn,
+    rotation_about_z,
 )
 from dynslam_bench.sequences.synthetic.rooms import pick, pick_one
 
@@ -146,7 +146,7 @@ def _roll(angle: float) -> Array:
 
 def _yaw(angle: float) -> Array:
     """About the vertical; positive turns to the left."""
-    return turn(math.degrees(angle))
+    return rotation_about_z(math.degrees(angle))
 
 
 def _in(frame: Array, x: float, y: float, z: float) -> Array:
@@ -175,7 +175,7 @@ class _Figure:
         self.how = how
         self.size = who.height / 1.75
         self.build = who.build
-        body = turn(how.facing)
+        body = rotation_about_z(how.facing)
         self._bend_legs()
         self.pelvis = self._pelvis_position(body)
         self._twist_trunk(body)

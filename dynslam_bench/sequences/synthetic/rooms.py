@@ -12,7 +12,7 @@ import numpy as np
 
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.sequences.synthetic.arithmetic import Array, atan2, norm, product
-from dynslam_bench.sequences.synthetic.parts import Parts, box, cone, quad, turn, wall
+from dynslam_bench.sequences.synthetic.parts import Parts, box, cone, quad, rotation_about_z, wall
 from dynslam_bench.sequences.synthetic.settings import HELD_OUT_SCENES
 
 
@@ -140,7 +140,7 @@ def desk(rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) 
         px = x + (rng.random() - 0.5) * 2 * (half - 0.15)
         parts.append(
             box(
-                turn(rng.random() * 50 - 25),
+                rotation_about_z(rng.random() * 50 - 25),
                 (px, y + 0.1 + 0.2 * rng.random(), TOP + 0.002 + 0.001 * k),
                 (0.105, 0.148, 0.001),
                 texture=f"poster:{k % 4}",
@@ -154,7 +154,7 @@ def desk(rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) 
             shade = 0.25 + 0.7 * rng.random(3)
             parts.append(
                 box(
-                    turn(rng.random() * 30 - 15),
+                    rotation_about_z(rng.random() * 30 - 15),
                     (bx, y + 0.3 + 0.1 * k, TOP + 0.018 + 0.036 * level),
                     (0.12, 0.085, 0.017),
                     texture=(*["books"] * 4, "plain", f"poster:{level % 4}"),
@@ -199,7 +199,7 @@ def _monitors(rng: np.random.Generator, plan: Plan, x: float, y: float, half: fl
     parts: Parts = []
     for k in range(plan.monitors):
         mx = x + (k - (plan.monitors - 1) / 2) * spacing + 0.06 * (rng.random() - 0.5)
-        facing = turn((rng.random() - 0.5) * 24)
+        facing = rotation_about_z((rng.random() - 0.5) * 24)
         my = y + 0.52 + 0.08 * rng.random()
         middle = np.array([mx, my, TOP + 0.3])
         faces = ("plain", "plain", f"screen:{k}", "plain", "plain", "plain")
@@ -207,7 +207,7 @@ def _monitors(rng: np.random.Generator, plan: Plan, x: float, y: float, half: fl
             (middle + product(facing, np.array([dx, -0.012, dz])), (hx, 0.024, hz))
             for dx, dz, hx, hz in _FRAME
         ]
-        keys = turn(6 * (rng.random() - 0.5))
+        keys = rotation_about_z(6 * (rng.random() - 0.5))
         parts += [
             box(facing, middle, (0.27, 0.02, 0.175), texture=faces, fit=(2,)),
             *(box(facing, bar, extents, tint=plastic) for bar, extents in bars),
@@ -221,7 +221,7 @@ def _monitors(rng: np.random.Generator, plan: Plan, x: float, y: float, half: fl
                 fit=(5,),
             ),
             cone(
-                turn(20),
+                rotation_about_z(20),
                 (mx + 0.27, my - 0.3, TOP + 0.005),
                 (0, 1, 1),
                 scale=(0.032, 0.055, 0.025),
@@ -306,7 +306,7 @@ def cabinet(rng: np.random.Generator, plan: Plan, side: int) -> Parts:
     pot = np.array([x - 0.2 * side, y, 0.85])
     parts.append(cone(_EYE, pot + np.array([0, 0, 0.06]), (0.1, 0.08, 0.1), tint=(0.7, 0.38, 0.25)))
     for _ in range(9):
-        a = turn(rng.random() * 360)
+        a = rotation_about_z(rng.random() * 360)
         lean = 0.3 + 0.7 * rng.random()
         tip = pot + product(
             a, np.array([0.24 * lean, 0, 0.3 + 0.3 * (1 - lean) + 0.1 * rng.random()])
@@ -325,7 +325,7 @@ def cabinet(rng: np.random.Generator, plan: Plan, side: int) -> Parts:
         faces = ("plain", "plain", f"poster:{k}", "plain", "plain", "plain")
         parts.append(
             box(
-                turn(rng.random() * 30),
+                rotation_about_z(rng.random() * 30),
                 (x + side * (0.1 + 0.2 * k), y, 0.84 + s),
                 (s, s * 0.8, s),
                 texture=faces,
@@ -375,7 +375,7 @@ def build_room(scene: int, plan: Plan) -> Parts:
         *posters(rng, plan),
         *(
             box(
-                turn(90),
+                rotation_about_z(90),
                 (x + sign * 0.006, 1.6 + 1.2 * rng.random(), 1.55),
                 (0.36, 0.006, 0.26),
                 texture=f"poster:{k}",
@@ -426,7 +426,7 @@ def partition(start: Point, end: Point, plan: Plan, doors: tuple[float, ...] = (
     dx = end[0] - start[0]
     dy = end[1] - start[1]
     length = math.sqrt(dx * dx + dy * dy)
-    facing = turn(math.degrees(atan2(dy, dx)))
+    facing = rotation_about_z(math.degrees(atan2(dy, dx)))
     direction = np.array([dx, dy, 0.0]) / length
     edges = [0.0, *(door + side * DOOR_M / 2 for door in doors for side in (-1, 1)), length]
     pieces = [(a, b, 0.0) for a, b in zip(edges[::2], edges[1::2], strict=True)]
@@ -483,7 +483,7 @@ def corridor_bay(scene: int, number: int) -> Parts:
         ]
     return [
         box(
-            turn(8 * rng.random() - 4),
+            rotation_about_z(8 * rng.random() - 4),
             (-0.6 + 0.6 * (k % 3), -0.006, 1.35 + 0.5 * (k // 3)),
             (0.15, 0.005, 0.21),
             texture=f"poster:{k % 4}",
@@ -532,7 +532,7 @@ def office_chair(plan: Plan, instance: int, shade: float = 1.0) -> Parts:
         cone(_EYE, (0, 0, 0.1), (0.32, 0.03, 0.028), **frame),
     ]
     for k in range(5):
-        a = turn(72 * k + 18)
+        a = rotation_about_z(72 * k + 18)
         tip = product(a, np.array([0.28, 0, 0.05]))
         u = product(a, np.array([0.0, 1.0, 0.0]))
         z = (tip - hub) / norm(tip - hub)
@@ -567,7 +567,9 @@ def cartons(scene: int, number: int, id: int) -> Parts:
             "fit": (0, 1, 2, 3),
             "tint": (0.9, 0.8, 0.66),
         }
-        parts.append(box(turn(30 * rng.random()), (0.0, 0.0, bottom + half[2]), half, **style))
+        parts.append(
+            box(rotation_about_z(30 * rng.random()), (0.0, 0.0, bottom + half[2]), half, **style)
+        )
         bottom += 2 * half[2]
     return parts
 

@@ -19,7 +19,7 @@ from dynslam_bench.core import (
     TrackerError,
     TrackerTimeoutError,
     TrajectoryError,
-    raising,
+    translate_errors,
 )
 from dynslam_bench.core.code_files import files_of_command
 from dynslam_bench.core.programs import program_environment
@@ -207,7 +207,7 @@ class BatchTracker:
         log = folder / "log.txt"
         with (
             log.open("wb") as out,
-            raising(TrackerError, f"{self._program.name}: cannot start '{words[0]}'"),
+            translate_errors(TrackerError, f"{self._program.name}: cannot start '{words[0]}'"),
         ):
             self._started_ns = os.fstat(out.fileno()).st_mtime_ns
             process = subprocess.Popen(

@@ -13,8 +13,8 @@ from dynslam_bench.contracts import TrackerContext
 from dynslam_bench.core import (
     MEGABYTE,
     TrackerError,
-    raising,
     read_bytes,
+    translate_errors,
     vocabularies_folder,
     write_atomic,
 )
@@ -63,7 +63,7 @@ def find_vocabulary(setting: str) -> Path:
     path = Path(named).expanduser().absolute()
     if not path.is_file():
         raise TrackerError(f"orbslam3: no vocabulary file {path}", HINT)
-    with raising(TrackerError, f"orbslam3: cannot read the vocabulary {path}", HINT):
+    with translate_errors(TrackerError, f"orbslam3: cannot read the vocabulary {path}", HINT):
         stamp = path.stat()
         return _prepared(path, stamp.st_size, stamp.st_mtime_ns)
 
@@ -78,7 +78,7 @@ def _prepared(path: Path, size: int, modified_ns: int) -> Path:
     target = vocabularies_folder() / f"{hashlib.sha256(packed).hexdigest()[:16]}.txt"
     if target.is_file():
         return _prepared(target, target.stat().st_size, target.stat().st_mtime_ns)
-    with raising(
+    with translate_errors(
         TrackerError,
         f"orbslam3: the vocabulary {path} ({size} bytes) is no intact .xz file",
         HINT,

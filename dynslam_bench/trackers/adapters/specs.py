@@ -15,7 +15,7 @@ from typing import Annotated, Literal
 from pydantic import ConfigDict, Field, field_validator
 
 from dynslam_bench.contracts import TrackerSpec
-from dynslam_bench.core import SettingsError, raising, read_toml
+from dynslam_bench.core import SettingsError, read_toml, translate_errors
 from dynslam_bench.core.records import Record, validated
 from dynslam_bench.core.settings import Settings, names, tunable
 from dynslam_bench.core.version import install_hint
@@ -110,7 +110,7 @@ class SubprocessSettings(ProgramSettings):
         Raises:
             SettingsError: There are none, or its quotes do not match.
         """
-        with raising(
+        with translate_errors(
             SettingsError, f"subprocess: cannot split the command '{self.command}'", of=ValueError
         ):
             command = shlex.split(self.command)

@@ -34,7 +34,7 @@ from dynslam_bench.core import (
     TemporaryFolder,
     TrackerError,
     parse_json,
-    raising,
+    translate_errors,
 )
 from dynslam_bench.core.code_files import files_of_command
 from dynslam_bench.core.programs import program_environment
@@ -82,7 +82,7 @@ class Program:
         environment: Mapping[str, str] | None = None,
     ) -> None:
         self.name = name
-        with raising(
+        with translate_errors(
             TrackerError,
             f"{name}: cannot start '{command[0]}'",
             "check its path",
@@ -283,14 +283,16 @@ def read_track_answer(
     """
     value = answer.get("T_world_cam")
     fitting = (AttributeError, TypeError, ValueError, OverflowError)
-    with raising(
+    with translate_errors(
         TrackerError,
         f"{who}: T_world_cam is not 16 numbers",
         "row by row, camera to world",
         of=fitting,
     ):
         pose = None if value is None else np.asarray(value, dtype=np.float64).reshape(4, 4)
-    with raising(TrackerError, f"{who}: stats and timings are not objects of numbers", of=fitting):
+    with translate_errors(
+        TrackerError, f"{who}: stats and timings are not objects of numbers", of=fitting
+    ):
         stats, timings = (
             {str(key): float(number) for key, number in (answer.get(name) or {}).items()}
             for name in ("stats", "timings")
@@ -308,7 +310,7 @@ def read_final_answer(answer: Mapping[str, Any], who: str) -> Trajectory:
     Raises:
         TrackerError: It is no trajectory.
     """
-    with raising(
+    with translate_errors(
         TrackerError,
         f"{who}: 'trajectory' is not a list of rows of 8 numbers",
         "timestamp tx ty tz qx qy qz qw",

@@ -57,7 +57,7 @@ def evaluated(store: RunStore, record: RunRecord, frames: int) -> Evaluation:
     from dynslam_bench.evaluation import evaluate
     from dynslam_bench.runs import load_frames
     from dynslam_bench.runs.running import judge_coverage
-    from dynslam_bench.tuning.objectives import held_protocol
+    from dynslam_bench.tuning.objectives import hold_last_pose_protocol
 
     part = load_frames(record, store).head(frames)
     stamps = part["timestamp"].to_numpy()
@@ -68,9 +68,9 @@ def evaluated(store: RunStore, record: RunRecord, frames: int) -> Evaluation:
     assert truth is not None  # every sequence is rendered
     if estimate is not None and tracked > 1:
         begun = Trajectory(estimate.timestamps[:tracked], estimate.T_world_cam[:tracked])
-        error = evaluate(begun, truth, held_protocol(PROTOCOL), input_timestamps=stamps).metrics[
-            "ate_rmse_m"
-        ]
+        error = evaluate(
+            begun, truth, hold_last_pose_protocol(PROTOCOL), input_timestamps=stamps
+        ).metrics["ate_rmse_m"]
     else:
         positions = truth.positions[
             (truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def repeating(interval_s: float, call: Callable[[], object]) -> Iterator[None]:
+def call_periodically(interval_s: float, call: Callable[[], object]) -> Iterator[None]:
     """Make a call every so many seconds while the block lasts; the first one after the first interval."""
     ended = threading.Event()
 
