@@ -50,11 +50,6 @@ class Verdict(str, Enum):
     CANNOT_TELL = "cannot tell"
     WORSE = "worse"
 
-    @property
-    def recommends(self) -> bool:
-        """Whether the candidate is offered as a result to use."""
-        return self is Verdict.PROVEN
-
 
 # -- the typical ratio ------------------------------------------------------------------------------
 
@@ -314,51 +309,80 @@ def verdict_of(comparison: PairedRatio, margin: float = MARGIN) -> Verdict:
     return Verdict.CANNOT_TELL
 
 
-def verdict_sentence(comparison: PairedRatio, margin: float = MARGIN) -> str:
-    """The verdict with its numbers, what it excludes, every loss, and what would settle it: no final full stop."""
+def findings(
+    comparison: PairedRatio, subject: str = "the candidate", margin: float = MARGIN
+) -> list[str]:
+    """What a comparison found, in short sentences without their full stops: claim, exclusion, every loss.
+
+    Args:
+        comparison: The candidate beside the baseline.
+        subject: What to call the candidate, e.g. ``trial 7``.
+        margin: As `verdict_of` takes it.
+    """
     verdict = verdict_of(comparison, margin)
-    losses = _loss_words(comparison)
-    ratio = f"{comparison} on {_scenes(comparison.scenes)}"
-    if comparison.ratio is None:
-        text = f"{verdict.value}: {comparison}"
-    elif verdict is Verdict.BUT_LOST:
-        lost_in = f"{len(comparison.losses)} of {_scenes(comparison.all_scenes)}"
-        text = f"smaller typical error, but lost in {lost_in}: {ratio}"
-    elif verdict is Verdict.WORSE and comparison.loses_more:
-        text = f"{verdict.value}: it loses more scenes than the baseline; {ratio}"
-    elif comparison.scenes < FEWEST:
-        text = f"{verdict.value}: {ratio}, and {FEWEST} are the fewest for a claim"
-    else:
-        text = f"{verdict.value}: {ratio}"
+    sentences = [_claim(comparison, verdict, subject)]
     excluded = comparison.excluded
-    if verdict in (Verdict.NO_DIFFERENCE, Verdict.CANNOT_TELL) and excluded is not None:
-        text += f"; differences above {100 * excluded:.0f} % are excluded"
-    return f"{text}{losses}"
+    states_exclusion = verdict in (Verdict.NO_DIFFERENCE, Verdict.CANNOT_TELL)
+    if states_exclusion and excluded is not None and comparison.scenes >= FEWEST:
+        sentences.append(f"Differences above {100 * excluded:.0f} % are excluded")
+    return sentences + _loss_sentences(comparison, subject)
 
 
-def _loss_words(comparison: PairedRatio) -> str:
-    """Losses of either side, by name; empty without any."""
-    parts = []
+def _claim(comparison: PairedRatio, verdict: Verdict, subject: str) -> str:
+    """The first sentence: what the candidate has, beside the numbers that show it."""
+    if comparison.ratio is None:
+        if not comparison.all_scenes:
+            return f"{subject} was compared on no scene"
+        return (
+            f"{subject} and the baseline both succeed on none of {_scenes(comparison.all_scenes)}"
+        )
+    numbers = f"{comparison} on {_scenes(comparison.scenes)}"
+    percent = abs(100.0 * (1.0 - comparison.ratio))
+    if verdict is Verdict.PROVEN:
+        return f"{subject} has {percent:.1f} % less {comparison.what}: {numbers}"
+    if verdict is Verdict.BUT_LOST:
+        lost_in = f"{len(comparison.losses)} of {_scenes(comparison.all_scenes)}"
+        return (
+            f"{subject} has a smaller typical {comparison.what}, but lost in {lost_in}: {numbers}"
+        )
+    if verdict is Verdict.PROMISING:
+        return f"{subject} has perhaps {percent:.1f} % less {comparison.what}: {numbers}"
+    if verdict is Verdict.WORSE and comparison.loses_more:
+        return f"{subject} loses more scenes than the baseline, where both succeed {numbers}"
+    if verdict is Verdict.WORSE:
+        return f"{subject} has {percent:.1f} % more {comparison.what}: {numbers}"
+    if comparison.scenes < FEWEST:
+        return f"{subject} has {numbers}, and {FEWEST} are the fewest for a claim"
+    return f"{subject} has {numbers}"
+
+
+def _loss_sentences(comparison: PairedRatio, subject: str) -> list[str]:
+    """Every loss of either side, with names and numbers; empty without any."""
+    sentences = []
+    if comparison.lost:
+        sentences.append(f"{subject} alone lost {_named(comparison.lost)}")
+    if comparison.much_worse:
+        times = f"more than {CATASTROPHE:g} times the error"
+        worst = f"at worst x {comparison.worst_ratio:.3g} in {comparison.worst}"
+        sentences.append(f"{subject} has {times} in {_scenes(len(comparison.much_worse))}, {worst}")
     if comparison.losses:
-        bound = f"at most {100 * comparison.loss_share:.0f} % of scenes"
-        parts.append(f"the candidate alone lost {_named(comparison.losses)} ({bound})")
+        share = 100 * comparison.loss_share
+        sentences.append(f"Such losses are at most {share:.0f} % of scenes, with 95 % confidence")
     if comparison.losses_baseline:
-        parts.append(f"the baseline alone lost {_named(comparison.losses_baseline)}")
+        sentences.append(f"The baseline alone lost {_named(comparison.losses_baseline)}")
     if comparison.lost_both:
-        parts.append(f"both lost {_named(comparison.lost_both)}")
-    if comparison.much_worse and comparison.worst_ratio is not None:
-        parts.append(f"the worst is {comparison.worst}, x {comparison.worst_ratio:.3g}")
-    return "".join(f"; {part}" for part in parts)
+        sentences.append(f"Both lost {_named(comparison.lost_both)}")
+    return sentences
 
 
 _MOST_NAMED = 3
 """Scenes that a sentence names; it counts the rest."""
 
 
-def _named(names: tuple[str, ...]) -> str:
+def _named(names: Sequence[str]) -> str:
     shown = ", ".join(names[:_MOST_NAMED])
     rest = len(names) - _MOST_NAMED
-    return f"{len(names)} ({shown} and {rest} more)" if rest > 0 else f"{len(names)} ({shown})"
+    return f"{_scenes(len(names))} ({shown}{f' and {rest} more' if rest > 0 else ''})"
 
 
 def _scenes(count: int) -> str:

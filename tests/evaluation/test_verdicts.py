@@ -15,6 +15,7 @@ from dynslam_bench.evaluation.verdicts import (
     Verdict,
     detectable,
     family_test,
+    findings,
     hodges_lehmann,
     may_be_best,
     paired_ratio,
@@ -24,7 +25,6 @@ from dynslam_bench.evaluation.verdicts import (
     scenes_to_exclude,
     scenes_to_settle,
     verdict_of,
-    verdict_sentence,
 )
 
 PROTOTYPE = Path(__file__).parents[3] / "shared/prototypes/statistics.py"
@@ -93,7 +93,7 @@ def test_no_verdict_says_that_nothing_matters_where_nothing_is_known() -> None:
 def test_a_catastrophe_is_said_and_takes_the_proof_away() -> None:
     one_of_fourteen = judged([0.85 + 0.001 * number for number in range(13)] + [20.0])
     assert verdict_of(one_of_fourteen) is Verdict.BUT_LOST
-    sentence = verdict_sentence(one_of_fourteen)
+    sentence = ". ".join(findings(one_of_fourteen))
     assert "lost in 1 of 14 scenes" in sentence
     assert "x 20" in sentence
     assert "13" in sentence
@@ -104,7 +104,7 @@ def test_losses_on_both_sides_leave_the_proof_and_are_said() -> None:
     logs = {name: math.log(0.8) + 0.001 * len(name) for name in names}
     comparison = paired_ratio(logs, ["scene 3"], ["scene 4", "scene 5"])
     assert verdict_of(comparison) is Verdict.PROVEN
-    assert "scene 3" in verdict_sentence(comparison)
+    assert "scene 3" in " ".join(findings(comparison))
     assert comparison.scenes == 11
     assert comparison.all_scenes == 14
 
@@ -133,7 +133,7 @@ def test_all_lost_a_lost_baseline_and_no_scenes_cannot_tell() -> None:
         judged([]),
     ):
         assert verdict_of(comparison) is Verdict.CANNOT_TELL
-        assert verdict_sentence(comparison)
+        assert findings(comparison)
     assert verdict_of(judged([0.9] * 8, every)) is Verdict.WORSE
 
 
