@@ -469,61 +469,80 @@ class FamilyTest(NamedTuple):
 
     Attributes:
         centre: Mean over families of their mean log ratios.
+        families: How many families have a sequence where both succeed.
         these_error: Standard error from the scatter within families, which says nothing of others.
         these_free: Its degrees of freedom.
         these_p: Two-sided p value of no difference on these families; 1 where nothing can be said.
         beyond_error: Standard error from the scatter of the family means.
-        beyond_free: Its degrees of freedom.
+        beyond_free: Its degrees of freedom; of Kish's effective number of families where weights differ.
         beyond_p: Two-sided p value of no difference over all such families; 1 likewise.
     """
 
     centre: float
+    families: int
     these_error: float
     these_free: int
     these_p: float
     beyond_error: float
-    beyond_free: int
+    beyond_free: float
     beyond_p: float
 
 
-def family_test(log_ratios: ArrayLike, families: Sequence[str]) -> FamilyTest:
-    """Test one tracker's log ratios to the reference, on these families and beyond them; families weigh the same.
+def family_test(
+    log_ratios: ArrayLike, families: Sequence[str], weights: Mapping[str, float] | None = None
+) -> FamilyTest:
+    """Test one tracker's log ratios to the reference, on these families and beyond them.
 
     Args:
         log_ratios: One a sequence ``[S]``; nan where either side is lost: it does not count.
         families: Family of each sequence.
+        weights: Weight of each family; all the same where there are none.
     """
     values = np.asarray(log_ratios, dtype=np.float64)
-    groups = []
+    groups = {}
     for family in dict.fromkeys(families):
         of_family = np.array([name == family for name in families], dtype=bool)
         group = values[of_family & np.isfinite(values)]
         if len(group):
-            groups.append(group)
+            groups[family] = group
     if not groups:
-        return FamilyTest(math.nan, math.nan, 0, 1.0, math.nan, 0, 1.0)
-    means = np.array([group.mean() for group in groups])
+        return FamilyTest(math.nan, 0, math.nan, 0, 1.0, math.nan, 0.0, 1.0)
+    means = np.array([group.mean() for group in groups.values()])
+    sizes = np.array([len(group) for group in groups.values()])
     count = len(groups)
-    centre = float(means.mean())
+    share = np.array([1.0 if weights is None else weights[family] for family in groups])
+    share = share / share.sum()
+    centre = float(share @ means)
 
     # on these families: the pooled variance within them
-    free = sum(len(group) - 1 for group in groups)
-    squares = sum(float(np.square(group - group.mean()).sum()) for group in groups)
+    free = int(sizes.sum()) - count
+    squares = sum(float(np.square(group - group.mean()).sum()) for group in groups.values())
     pooled = squares / max(free, 1)
-    these_error = math.sqrt(pooled * sum(1.0 / len(group) for group in groups)) / count
+    these_error = math.sqrt(pooled * float((share**2 / sizes).sum()))
     these_p = _two_sided(centre, these_error, free) if free >= FEWEST_FREE else 1.0
 
-    # beyond them: the family is the sample
-    beyond_error = float(means.std(ddof=1)) / math.sqrt(count) if count > 1 else math.nan
-    beyond_p = _two_sided(centre, beyond_error, count - 1) if count >= FEWEST_FAMILIES else 1.0
-    return FamilyTest(centre, these_error, free, these_p, beyond_error, count - 1, beyond_p)
+    # beyond them: the family is the sample; with equal weights this is Student's t test
+    effective = 1.0 / float((share**2).sum())
+    beyond_free = effective - 1.0
+    beyond_error = math.nan
+    beyond_p = 1.0
+    if count > 1:
+        squares = float(np.square(share * (means - centre)).sum())
+        beyond_error = math.sqrt(squares * effective / beyond_free)
+    if count >= FEWEST_FAMILIES:
+        beyond_p = _two_sided(centre, beyond_error, beyond_free)
+    return FamilyTest(
+        centre, count, these_error, free, these_p, beyond_error, beyond_free, beyond_p
+    )
 
 
-def _two_sided(centre: float, error: float, free: int) -> float:
+def _two_sided(centre: float, error: float, free: float) -> float:
+    if abs(centre) < _SMALLEST_ERROR:
+        return 1.0
     return float(2.0 * stats.t.sf(abs(centre) / max(error, _SMALLEST_ERROR), free))
 
 
-def resolution_floor(error: float, free: int, trackers: int, level: float) -> float:
+def resolution_floor(error: float, free: float, trackers: int, level: float) -> float:
     """Smallest gain, as a share, that a board of so many trackers shows in four of five; 1 where it shows none.
 
     Args:
