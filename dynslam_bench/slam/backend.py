@@ -644,7 +644,7 @@ class RgbdBackend:
             timings["loop_closing"] = perf_counter() - begin
 
         # the tracked frame takes over what mapping made of it
-        self._keyframe_policy.made(frame.index)
+        self._keyframe_policy.keyframe_added(frame.index)
         self._map_views.add_keyframe(slot, frame.depth)
         tracked.point = world.kf_point[slot, : len(tracked.observations)].astype(np.int64)
         tracked.T_cam_world = world.kf_pose[slot].copy()
@@ -775,7 +775,7 @@ class MonocularBackend(RgbdBackend):
         self._status = CameraStatus.TRACKED
         self._last_frame = TrackedFrame(observations, point, pose, frame.timestamp)
         self._reference_keyframe = second
-        self._keyframe_policy.made(frame.index)
+        self._keyframe_policy.keyframe_added(frame.index)
         self._map_views.add_keyframe(first, initial.first.frame.depth)
         self._map_views.add_keyframe(second, frame.depth)
         self._update_active_map()
