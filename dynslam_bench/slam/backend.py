@@ -314,7 +314,7 @@ class RgbdBackend:
         in_submap = self.atlas.active != ROOT_MAP
 
         # from the last frame
-        from_last_frame, trusted = pose_from_last_frame(
+        from_last_frame = pose_from_last_frame(
             self.world,
             current.last,
             current.observations,
@@ -322,7 +322,9 @@ class RgbdBackend:
             self._reference_keyframe,
             self.settings.tracking,
         )
-        initial = from_last_frame if trusted and tracked else None
+        initial = None
+        if from_last_frame is not None and from_last_frame.trusted and tracked:
+            initial = from_last_frame
         if initial is not None and not in_submap:
             return initial, None
 
