@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.culling import Rule
-from dynslam_bench.culling.ego_motion import NEAR, depth_sigma
+from dynslam_bench.culling.ego_motion import PATCH_3X3, depth_sigma
 from dynslam_bench.culling.moving_probability import link_to_previous
 from dynslam_bench.culling.settings import CorrelationSettings
 from dynslam_bench.geometry import Camera, pixel_index, se3
@@ -192,7 +192,7 @@ def depth_variance(depth: NDArray[np.float32], xy: NDArray[np.floating]) -> NDAr
     The mixture's weights are [1 2 1; 2 4 2; 1 2 1] / 16 over the pixels that have depth, its
     components' variances those of the sensor. Depth edges thus get a large variance.
     """
-    at, _ = pixel_index(np.rint(xy)[:, None] + NEAR, depth.shape)
+    at, _ = pixel_index(np.rint(xy)[:, None] + PATCH_3X3, depth.shape)
     z = np.nan_to_num(depth[at].astype(np.float64), posinf=0.0, neginf=0.0)
     weight = np.where(z > 0, _WEIGHT, 0.0)
     weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
