@@ -40,13 +40,18 @@ from dynslam_bench.trackers.systems.composition import (
     system,
 )
 
+# Rules and the groups of settings that they take, see `UnfilteredSystemSettings.filters`.
 SEMANTIC = ("semantic:SemanticFilter", "segmentation")
 BOX_EPIPOLAR = ("epipolar:BoxEpipolarFilter", "box_epipolar", "segmentation")
 CLASS_RULE = ("epipolar:ClassRuleFilter", "class_rule", "segmentation")
 PROBABILITY = ("moving_probability:ProbabilityFilter", "probability", "segmentation")
 MULTIVIEW = ("multiview_depth:MultiViewFilter", "multiview")
+
+# Settings and texts that several systems share.
 LUCAS_KANADE = PublishedFlowSettings()
+"""The flow of all published systems."""
 WHOLE_OBJECTS = ObjectSettings()
+"""Masks as they are, neither repaired nor grown."""
 BOTH_SIDES = BoxEpipolarSettings(inside_px=1.0, outside_px=1.0, fit="kept")
 """The epipolar test of Chen et al. and of MOR-SLAM."""
 UNGUARDED = EpipolarSettings(
@@ -58,14 +63,15 @@ UNGUARDED = EpipolarSettings(
 )
 """The epipolar test on every frame and for every feature, as papers state it."""
 REIMPLEMENTED = "MIT (re-implemented from the description)"
+"""License of a system without the authors' code."""
 
 
 def build_detect_slam(settings: SemanticSystemSettings, context: TrackerContext) -> Tracker:
     """Detect-SLAM: boxes on keyframes, in place of masks, feed the moving probability."""
     from dynslam_bench.culling.moving_probability import ProbabilityFilter
 
-    block = ProbabilityFilter(settings.probability, settings.segmentation, evidence="boxes")  # type: ignore[attr-defined]
-    return compose(settings, context, [block], settings.flow)  # type: ignore[attr-defined]
+    rule = ProbabilityFilter(settings.probability, settings.segmentation, evidence="boxes")  # type: ignore[attr-defined]
+    return compose(settings, context, [rule], settings.flow)  # type: ignore[attr-defined]
 
 
 ORB_SLAM2 = (
@@ -75,7 +81,7 @@ ORB_SLAM2 = (
     "residuals weigh by Cauchy's kernel, as wide as they are, where ORB-SLAM2 has Huber's",
     "the rolling shutter of a camera whose readout is known is undone, which ORB-SLAM2 does not do",
 )
-"""Deviations with depth and without."""
+"""Deviations of the shared back end from ORB-SLAM2, with depth and without."""
 ORB_SLAM2_LICENSE = "MIT (our code; ORB-SLAM2 itself is GPL-3.0 and not used)"
 ORB_SLAM2_REMARKS = "the identity filter on our own back end, not the ORB-SLAM2 program"
 CHEN: dict[str, Any] = {
