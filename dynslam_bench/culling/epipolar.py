@@ -551,4 +551,4 @@ def _patch_difference(
 def _patches(image: NDArray[np.uint8], xy: NDArray[np.float32]) -> NDArray[np.int64]:
     """Grey levels ``[9, N]`` of the 3x3 pixels around truncated pixels ``[N, 2]``."""
     columns, rows = (xy[:, None].astype(np.intp) + PATCH_3X3).T
-    return image[rows, columns].astype(np.int64)
+    return np.asarray(image[rows, columns], np.int64)

@@ -448,7 +448,8 @@ def _depth_at(keypoints: Keypoints, depth: NDArray[np.float32]) -> NDArray[np.fl
     """Depth ``[N]`` in metres at the nearest pixel of each keypoint; 0 missing."""
     height, width = depth.shape
     column, row = np.rint(keypoints.xy).astype(np.intp).T
-    return depth[row.clip(0, height - 1), column.clip(0, width - 1)].clip(min=0)
+    nearest = depth[row.clip(0, height - 1), column.clip(0, width - 1)]
+    return np.asarray(nearest.clip(min=0))
 
 
 def combine_verdicts(

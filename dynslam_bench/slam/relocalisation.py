@@ -295,9 +295,8 @@ def _three_point_poses(position: Array, xy: Array, camera: Camera) -> Array:
         except cv2.error:
             # a degenerate sample, e.g. collinear points
             continue
-        rotations = np.reshape(rotations, (-1, 3))
-        translations = np.reshape(translations, (-1, 3))
-        solutions.append(np.hstack([rotations, translations]))
+        vectors = np.reshape(rotations, (-1, 3))
+        solutions.append(np.hstack([vectors, np.reshape(translations, (-1, 3))]))
     flat = np.concatenate(solutions)
     flat = flat[np.isfinite(flat).all(axis=1)]
     poses = np.tile(np.eye(4), (len(flat), 1, 1))
@@ -584,9 +583,7 @@ class RotationEstimate:
         xy_before = self.observations.xy[before]
         xy_now = observations.xy[now]
         homography, mask = cv2.findHomography(xy_before, xy_now, cv2.RANSAC, HOMOGRAPHY_PX)
-        if homography is None:
-            return None
-        fits = mask.ravel() > 0
+        fits = np.zeros(len(before), bool) if homography is None else mask.ravel() > 0
         if np.count_nonzero(fits) < max(CONNECTED, CONNECTED_SHARE * len(before)):
             return None
 
