@@ -267,20 +267,17 @@ SPECS = (
         citation="Dai et al., RGB-D SLAM in Dynamic Environments Using Point Correlations, TPAMI 2020",
         assumptions=(
             "the graph is over tracked features and their last frames; the paper's is over map points and their "
-            "keyframes, "
-            "with a second one over a window of keyframes",
+            "keyframes, with a second one over a window of keyframes",
             "features are followed by {tracks}; one that it loses is not judged",
             "each edge is tested against the oldest common observation of at most 8 frames ago; no Huber step",
             "components are those of points observed for 4 frames or more; younger points follow the settled ones "
-            "around "
-            "them; what has neither flow nor depth is never judged",
+            "around them; what has neither flow nor depth is never judged",
             "the static part is the component of the largest volume, as in the back end of the paper",
             "chi-square quantile of 0.95 and 1 px per keypoint (not stated)",
         ),
         remarks="within 8 frames people move less than depth noise shows, edges stay whole and one component holds "
-        "people and "
-        "room: 4 % of the features on people go on a rendered half sphere; its authors' name DSLAM also stands for "
-        "Decentralised SLAM elsewhere",
+        "people and room: 4 % of the features on people go on a rendered half sphere; its authors' name "
+        "DSLAM also stands for Decentralised SLAM elsewhere",
     ),
     # Detect-SLAM (Zhong et al. 2018): a moving probability for every feature, fed by boxes on
     # keyframes.
@@ -303,8 +300,8 @@ SPECS = (
             "{boxes}",
             "{links}",
             "rate 0.3 and threshold 0.75 (no readable source)",
-            "between keyframes boxes are carried by optical flow, and probabilities updated with them; a detection at "
-            "least on every tenth frame",
+            "between keyframes boxes are carried by optical flow, and probabilities updated with them; a detection "
+            "at least on every tenth frame",
             "GrabCut inside boxes is left out",
             "matching point expansion: nearest sure feature within 32 px, with a Gaussian of half that",
         ),
@@ -324,8 +321,7 @@ SPECS = (
         assumptions=(
             "{masks}",
             "the warp: every eighth pixel of the frame goes to the nearest one of the previous image by the motion "
-            "model's "
-            "prediction, before the frame's own pose is known",
+            "model's prediction, before the frame's own pose is known",
             "24 clusters that move with a prior of 0.9 (people) or 0.05, four times the residual where they do",
             "its classes of features with priority in tracking are left out",
             "segmentation on every frame instead of selected ones",
@@ -358,11 +354,11 @@ SPECS = (
         assumptions=(
             "{boxes}",
             "{matches}",
-            "the published code of SG-SLAM stands in for the epipolar half; that code judges a feature that the flow "
-            "loses "
-            "by the place where it was lost (`unmatched = judge`), and takes distances in the previous image",
-            "F is refitted to RANSAC's inliers; with fewer than 20 matches outside the boxes it is fitted to all kept "
-            "ones",
+            "the published code of SG-SLAM stands in for the epipolar half; that code judges a feature that the "
+            "flow loses by the place where it was lost (`unmatched = judge`), and takes distances in the previous "
+            "image",
+            "F is refitted to RANSAC's inliers; with fewer than 20 matches outside the boxes it is fitted to all "
+            "kept ones",
             "seeds of the multi-view test are grown by 15 px",
             "multi-view depth without growing regions; where fewer than a tenth of the features remain the guard "
             "undoes it first (SG-SLAM restores all)",
@@ -450,9 +446,8 @@ SPECS = (
         assumptions=(*DYNASLAM_GEOMETRY, *DYNASLAM_PAPER),
         remarks=(
             f"{NO_INPAINTING}; worse than a static camera where people fill the view from the start (Bonn from frames "
-            "80 "
-            "and 120: 0.074 and 0.044 m against 0.053 and 0.029), which nobody reports of the authors' program: hence "
-            "inspired"
+            "80 and 120: 0.074 and 0.044 m against 0.053 and 0.029), which nobody reports of the authors' program: "
+            "hence inspired"
         ),
     ),
     # DynaTM-SLAM (Zhong et al. 2024): template matching over a window inside boxes.
