@@ -406,7 +406,7 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
         tested = flow.valid & (frame.z > 0)
         failed = np.zeros(len(xy), dtype=bool)
         residual = np.zeros((len(xy), 2))
-        failed[tested], residual[tested], allowed = self._fails(frame, state, tested)
+        failed[tested], residual[tested], allowed = self._test(frame, state, tested)
 
         # what is remembered around the points' origins in the previous frame
         before = np.zeros((len(xy), 3))
@@ -434,7 +434,7 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
         keep = ~failed & (failures <= MAX_FAILURES)
         return self.verdict(keep, tested=np.count_nonzero(tested), failed=np.count_nonzero(failed))
 
-    def _fails(
+    def _test(
         self, frame: FrameBundle, state: FilterState, tested: NDArray[np.bool_]
     ) -> tuple[NDArray[np.bool_], Array, Array]:
         """Which of K tested points fail now, residuals ``[K, 2]`` and what is added to a threshold ``[K]``, pixels."""

@@ -258,7 +258,7 @@ def contradiction(
         frame: The current frame.
         state: With previous and predicted pose.
         failing: bool ``[N]``, points that fail the epipolar test.
-        matches: Of the points.
+        matches: Matches of the points.
 
     Returns:
         The share, 0 to 1; 0 where too few points have depth or no pose is known.

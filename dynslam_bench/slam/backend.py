@@ -399,7 +399,7 @@ class RgbdBackend:
         if self._mapping_enabled:
             self.world.found[points] += 1
         stamp = current.bundle.timestamp
-        pose = self.motion.filtered(
+        pose = self.motion.update(
             current.last, stamp, fit.estimate.T_cam_world, fit.estimate.information
         )
         observed = observe_points(observations, fit.matches.feature[fit.inliers], points)
@@ -563,7 +563,7 @@ class RgbdBackend:
             timings, verdict = self._insert_keyframe(frame, tracked, in_root_map)
             # bundle adjustment and loop closing have moved the frame
             pose = tracked.T_cam_world
-            self.motion.relocated(pose)
+            self.motion.relocate(pose)
 
         T_ref_world = self.world.kf_pose[self._reference_keyframe]
         T_cam_ref = pose @ se3.inverse(T_ref_world)
@@ -642,7 +642,7 @@ class RgbdBackend:
             rescale(self.history, closing.rescaled)
             # the rotation by a loop with depth is within the motion's noise
             if slot in closing.rescaled:
-                self.motion.transformed(T_before, world.kf_pose[slot], closing.rescaled[slot])
+                self.motion.transform(T_before, world.kf_pose[slot], closing.rescaled[slot])
             timings["loop_closing"] = perf_counter() - begin
 
         # the tracked frame takes over what mapping made of it

@@ -59,7 +59,7 @@ OBSERVED_AFTER = 2
 FULL_ITERATIONS = 10
 """Levenberg-Marquardt iterations of full bundle adjustment."""
 RECENT_SHARE = 4
-"""Of the largest number of keyframes, one in so many, the newest, are kept where there are too many."""
+"""One in so many of `keyframes.maximum`, the newest keyframes, are not culled where there are too many."""
 COMPARED = 16
 """Keyframes of which the most redundant one is culled where there are too many; the next time others are compared."""
 
@@ -82,7 +82,7 @@ class LocalMapper:
 
     Args:
         world: The map to work on.
-        settings: Of the back end.
+        settings: Settings of the back end.
 
     Attributes:
         culled: Keyframes that the last `insert` removed: slot, slot of the replacement, and the

@@ -505,6 +505,7 @@ def map_outputs(world: Map) -> MapOutputs:
 
 
 def _keyframe_record(world: Map, slot: int) -> KeyframeRecord:
+    """What files hold of a keyframe."""
     return KeyframeRecord(
         int(world.kf_id[slot]),
         int(world.kf_frame[slot]),
@@ -550,6 +551,7 @@ class MapViews:
         return self._view
 
     def _keyframe(self, slot: int) -> KeyframeView:
+        """What filters may read of a keyframe."""
         world = self._world
         n = int(world.kf_count[slot])
         keypoints = Keypoints(

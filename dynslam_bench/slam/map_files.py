@@ -124,7 +124,7 @@ class MapHeader(Record):
 
     Attributes:
         kind: Says that the file is a map.
-        schema_version: Of the file; newer ones are refused.
+        schema_version: Version of the file's layout; newer ones are refused.
         sensors: ``rgbd``, or ``rgb`` for a map whose unit of length is its own.
         camera: Intrinsics of the undistorted camera, see `Camera`.
         features: What it is made of.

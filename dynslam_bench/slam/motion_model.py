@@ -140,7 +140,7 @@ class MotionState:
         )
 
     def transformed(self, rotation: Array, scale: float) -> MotionState:
-        """The same motion after the world was rotated by ``[3, 3]`` and its lengths were multiplied."""
+        """The state after the world was rotated by ``[3, 3]`` and its lengths were multiplied by `scale`."""
         by = np.eye(12)
         by[:3, :3] = by[6:9, 6:9] = scale * rotation
         return MotionState(
@@ -189,7 +189,7 @@ def smooth(
     Args:
         stamps: Seconds ``[N]``, ascending.
         T_cam_world: Measured poses ``[N, 4, 4]``.
-        covariances: Of `pose_covariance` ``[N, 6, 6]``.
+        covariances: Covariances of the poses ``[N, 6, 6]``, see `pose_covariance`.
         settings: Accelerations.
 
     Returns:
@@ -249,14 +249,18 @@ class CameraMotion:
         self.state: MotionState | None = None
         self.intervals: deque[float] = deque(maxlen=INTERVALS)
 
-    def relocated(self, T_cam_world: Array) -> None:
-        """The same motion at another pose, as after bundle adjustment."""
+    def relocate(self, T_cam_world: Array) -> None:
+        """Move to another pose with the motion unchanged, as after bundle adjustment.
+
+        Args:
+            T_cam_world: The new world-to-camera pose ``[4, 4]``.
+        """
         if self.state is not None:
             r = T_cam_world[:3, :3]
             self.state = replace(self.state, position=-r.T @ T_cam_world[:3, 3], rotation=r.copy())
 
-    def transformed(self, T_cam_before: Array, T_cam_now: Array, scale: float) -> None:
-        """The same motion after a loop was closed.
+    def transform(self, T_cam_before: Array, T_cam_now: Array, scale: float) -> None:
+        """Move the motion with the world around the camera, as after a loop was closed.
 
         Args:
             T_cam_before: World-to-camera pose of a keyframe nearby as it was before.
@@ -287,7 +291,7 @@ class CameraMotion:
         covariance = self.state.motion_covariance(dt, self._settings)
         return self.state.predicted(dt, self._settings).T_cam_world, covariance
 
-    def filtered(
+    def update(
         self, last: TrackedFrame, timestamp: float, measured: Array, information: Array
     ) -> Array:
         """Weigh the image's pose against the motion model, and remember the motion.

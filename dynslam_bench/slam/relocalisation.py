@@ -516,7 +516,7 @@ def is_aliased(
         observations: The features.
         hypotheses: The frame's pose by submap, as far as it is known.
         keyframes: Slots of the keyframes whose places may be others.
-        settings: Of tracking.
+        settings: Settings of tracking.
         seed: Seed of RANSAC's draws.
         possible: Whether the frame can have been taken in a submap at a world-to-camera pose.
     """
@@ -757,8 +757,8 @@ class PoseSearch:
         keyframes: Slots of the candidate keyframes.
         lost: Whether the camera was lost since then; else it was tracked in the frame before.
         bound: Where the camera can be.
-        settings: Of the back end.
-        seed: Of the sequence's random draws.
+        settings: Settings of the back end.
+        seed: Seed of the sequence's random draws.
         frame: Index of the frame.
     """
 

@@ -95,7 +95,7 @@ def relative_motion(
     """Pose of camera b in the frame of camera a.
 
     Args:
-        camera: Of both images.
+        camera: The camera of both images.
         grey_a: First image ``[H, W]``.
         depth_a: Its depth ``[H, W]`` in metres, 0 where missing.
         grey_b: Second image ``[H, W]``.

@@ -203,7 +203,8 @@ class Open3dOdometry(FrameToFrame):
                 result = self._o3d.t.pipelines.odometry.rgbd_odometry_multi_scale(
                     current, reference, *self._arguments
                 )
-        except RuntimeError:  # singular: too little texture or depth
+        except RuntimeError:
+            # singular: too little texture or depth
             return None
         return (
             np.asarray(result.transformation.numpy(), dtype=np.float64)

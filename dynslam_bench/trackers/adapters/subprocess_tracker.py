@@ -353,7 +353,7 @@ class ImageExchange:
     are removed.
 
     Args:
-        camera: Of the frames.
+        camera: The camera of the frames.
         mode: ``raw`` or ``png``.
     """
 
