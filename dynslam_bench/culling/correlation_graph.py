@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.culling import Rule
-from dynslam_bench.culling.ego_motion import NEAR, depth_sigma
+from dynslam_bench.culling.ego_motion import PATCH_3X3, depth_sigma
 from dynslam_bench.culling.moving_probability import link_to_previous
 from dynslam_bench.culling.settings import CorrelationSettings
 from dynslam_bench.geometry import Camera, pixel_index, se3
@@ -17,7 +17,9 @@ from dynslam_bench.geometry import Camera, pixel_index, se3
 Numbers = NDArray[np.floating]
 
 MIN_POINTS = 20
-_WEIGHT = np.array([1, 2, 1, 2, 4, 2, 1, 2, 1]) / 16
+"""Points without which no component counts as static."""
+MIXTURE_WEIGHTS = np.array([1, 2, 1, 2, 4, 2, 1, 2, 1]) / 16
+"""Weights of the 3x3 pixels around a point in the mixture of `depth_variance`."""
 
 
 class CorrelationFilter(Rule[CorrelationSettings]):
@@ -46,10 +48,12 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         """Forget all tracks."""
         # [frames ago - 1, point of the previous frame, position and covariance]
         self._past = np.zeros((0, 0, 12))
-        self._last = np.zeros((0, 12))  # the previous frame's points in its camera
+        # the previous frame's points in its camera
+        self._last = np.zeros((0, 12))
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Build the graph over the points that have been observed before."""
+        # points of this frame, and where they were in earlier ones
         keep = np.ones(len(frame.xy), dtype=bool)
         local = self._observe(frame.xy, frame.keypoints.xy, frame.z, frame.depth, state.camera)
         past = self._past_observations(frame, state)
@@ -57,14 +61,15 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         self._last = local
         if state.T_world_pred is None or not len(past):
             return self.verdict(keep)
+
+        # points that were observed before; those observed long enough are settled
         now = _in_world(local, state.T_world_pred)
         observed = np.asarray(np.isfinite(past).all(axis=2) & np.isfinite(now).all(axis=1))
         rows = np.flatnonzero(observed.any(axis=0))
         if len(rows) < MIN_POINTS:
             return self.verdict(keep)
-        settled = len(past) - observed[::-1, rows].argmax(axis=0) >= min(
-            self.settings.settled, len(past)
-        )
+        age = len(past) - observed[::-1, rows].argmax(axis=0)
+        settled = age >= min(self.settings.settled, len(past))
         now = now[rows]
         past = past[:, rows]
         observed = observed[:, rows]
@@ -72,12 +77,16 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         old = np.flatnonzero(settled)
         if len(old) < MIN_POINTS:
             return self.verdict(keep, tracked=len(rows), settled=len(old))
+
+        # the largest component of the settled points is static
         static = np.ones(len(rows), dtype=bool)
         edges = _delaunay_edges(xy[old])
         uncut = self._agree(now[old], past[:, old], observed[:, old], edges)
         static[old], components = self._static_component(edges[uncut], now[old, :3])
         total = len(edges)
         cut = np.count_nonzero(~uncut)
+
+        # younger points follow their settled neighbours
         if len(old) < len(rows):
             edges = _delaunay_edges(xy)
             edges = edges[settled[edges].sum(axis=1) == 1]
@@ -86,7 +95,10 @@ class CorrelationFilter(Rule[CorrelationSettings]):
             uncut = self._agree(now, past, observed, edges)
             total = total + len(edges)
             cut = cut + np.count_nonzero(~uncut)
-            vote = np.where(static[edges[:, 1]], np.where(uncut, 1, -1), np.where(uncut, -1, 0))
+            # a static neighbour votes for or against, a moving one that agrees votes against
+            by_static = np.where(uncut, 1, -1)
+            by_moving = np.where(uncut, -1, 0)
+            vote = np.where(static[edges[:, 1]], by_static, by_moving)
             static[~settled] = np.bincount(edges[:, 0], vote, len(rows))[~settled] >= 0
         keep[rows[~static]] = False
         return self.verdict(
@@ -100,16 +112,19 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         flow = state.flow
         if previous is None or pose is None or flow is None or len(self._last) != len(previous.xy):
             return np.zeros((0, len(frame.xy), 12))
+
+        # a point that continues a keypoint of the last frame takes over its observations
         link = link_to_previous(frame, state)
-        before = np.concatenate([_in_world(self._last, pose)[None], self._past])[
-            : self.settings.window
-        ]
+        last = _in_world(self._last, pose)
+        before = np.concatenate([last[None], self._past])[: self.settings.window]
         past = np.full((len(before), len(frame.xy), 12), np.nan)
         past[:, link >= 0] = before[:, link[link >= 0]]
+
+        # any other was at the end of its flow, at the depth that the last frame has there
         loose = np.flatnonzero((link < 0) & flow.valid & np.isfinite(flow.xy).all(axis=1))
         raw = flow.xy[loose]
-        at, visible = pixel_index(raw, previous.depth.shape)
-        z = np.where(visible, previous.depth[at], 0)
+        pixels, visible = pixel_index(raw, previous.depth.shape)
+        z = np.where(visible, previous.depth[pixels], 0)
         observations = self._observe(
             state.camera.undistort_points(raw), raw, z, previous.depth, state.camera
         )
@@ -124,9 +139,8 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         valid = np.isfinite(z) & (z > 0)
         pixels = np.asarray(xy[valid], np.float64)
         z = z[valid]
-        covariance = point_covariance(
-            pixels, z, depth_variance(depth, raw[valid]), camera, self.settings.pixel_sigma
-        )
+        variance = depth_variance(depth, raw[valid])
+        covariance = point_covariance(pixels, z, variance, camera, self.settings.pixel_sigma)
         points[valid] = np.column_stack([camera.unproject(pixels, z), covariance.reshape(-1, 9)])
         return points
 
@@ -141,34 +155,39 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         both = observed[:, edges[:, 0]] & observed[:, edges[:, 1]]
         oldest = len(past) - 1 - both[::-1].argmax(axis=0)
         first, second = edges.T
-        then = past[oldest, first], past[oldest, second]
-        change = now[first, :3] - now[second, :3] - then[0][:, :3] + then[1][:, :3]
-        total = (now[first, 3:] + now[second, 3:] + then[0][:, 3:] + then[1][:, 3:]).reshape(
-            -1, 3, 3
-        )
+
+        # change of the vector, and the sum of the four points' covariances
+        first_then = past[oldest, first]
+        second_then = past[oldest, second]
+        change = now[first, :3] - now[second, :3] - first_then[:, :3] + second_then[:, :3]
+        total = now[first, 3:] + now[second, 3:] + first_then[:, 3:] + second_then[:, 3:]
+        covariance = total.reshape(-1, 3, 3)
+
+        # squared Mahalanobis distance; edges that cannot be compared are not cut
         comparable = both.any(axis=0)
-        solved = np.linalg.solve(total[comparable], change[comparable, :, None])[:, :, 0]
+        solved = np.linalg.solve(covariance[comparable], change[comparable, :, None])[:, :, 0]
+        squared_distance = (change[comparable] * solved).sum(axis=1)
         cut = np.zeros(len(edges), bool)
-        cut[comparable] = (change[comparable] * solved).sum(axis=1) > chi2.ppf(
-            self.settings.quantile, 3
-        )
+        cut[comparable] = squared_distance > chi2.ppf(self.settings.quantile, 3)
         return ~cut
 
     def _static_component(
         self, edges: NDArray[np.intp], points: NDArray[np.float64]
     ) -> tuple[NDArray[np.bool_], int]:
+        """Which points ``[N]`` are in the largest component of the edges ``[E, 2]``, and the number of components."""
         graph = coo_matrix((np.ones(len(edges)), tuple(edges.T)), shape=(len(points), len(points)))
         _, label = connected_components(graph, directed=False)
         size = np.bincount(label)
         measure = size.astype(np.float64)
         if self.settings.largest == "volume":
             measure = np.array([_volume(points[label == body]) for body in range(len(size))])
-        static = int(np.lexsort((size, measure))[-1])  # with equal volumes the one with more points
+        # with equal volumes the one with more points
+        static = int(np.lexsort((size, measure))[-1])
         return np.asarray(label == static), len(size)
 
 
 def _in_world(local: NDArray[np.float64], T_world_cam: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points and covariances ``[N, 3 + 9]`` of a camera's frame in the world's."""
+    """Points and covariances ``[N, 3 + 9]`` in the world, from those in a camera frame."""
     R = T_world_cam[:3, :3]
     covariance = R @ local[:, 3:].reshape(-1, 3, 3) @ R.T
     return np.column_stack([se3.transform(T_world_cam, local[:, :3]), covariance.reshape(-1, 9)])
@@ -180,9 +199,8 @@ def _delaunay_edges(xy: NDArray[np.float64]) -> NDArray[np.intp]:
         simplices = Delaunay(xy, qhull_options="QJ").simplices
     except QhullError:
         return np.zeros((0, 2), np.intp)
-    pairs = np.sort(
-        np.concatenate([simplices[:, [0, 1]], simplices[:, [1, 2]], simplices[:, [0, 2]]]), axis=1
-    )
+    sides = [simplices[:, [0, 1]], simplices[:, [1, 2]], simplices[:, [0, 2]]]
+    pairs = np.sort(np.concatenate(sides), axis=1)
     return np.asarray(np.unique(pairs, axis=0), dtype=np.intp)
 
 
@@ -192,14 +210,14 @@ def depth_variance(depth: NDArray[np.float32], xy: NDArray[np.floating]) -> NDAr
     The mixture's weights are [1 2 1; 2 4 2; 1 2 1] / 16 over the pixels that have depth, its
     components' variances those of the sensor. Depth edges thus get a large variance.
     """
-    at, _ = pixel_index(np.rint(xy)[:, None] + NEAR, depth.shape)
+    at, _ = pixel_index(np.rint(xy)[:, None] + PATCH_3X3, depth.shape)
     z = np.nan_to_num(depth[at].astype(np.float64), posinf=0.0, neginf=0.0)
-    weight = np.where(z > 0, _WEIGHT, 0.0)
+    weight = np.where(z > 0, MIXTURE_WEIGHTS, 0.0)
     weight /= np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
     mean = (weight * z).sum(axis=1)
-    return np.asarray(
-        (weight * (np.square(depth_sigma(z)) + np.square(z - mean[:, None]))).sum(axis=1)
-    )
+    # variance within each component and between them
+    variance = np.square(depth_sigma(z)) + np.square(z - mean[:, None])
+    return np.asarray((weight * variance).sum(axis=1))
 
 
 def point_covariance(
@@ -218,20 +236,20 @@ def point_covariance(
         camera: Intrinsics.
         pixel_sigma: Standard deviation of a pixel coordinate.
     """
+    # derivative of the point by (u, v, z)
     depth = np.asarray(z, dtype=np.float64)
     jacobian = np.zeros((len(depth), 3, 3))
     jacobian[:, 0, 0] = depth / camera.fx
     jacobian[:, 1, 1] = depth / camera.fy
-    jacobian[:, 0, 2], jacobian[:, 1, 2] = (
-        (xy - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-    ).T
+    jacobian[:, :2, 2] = (xy - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
     jacobian[:, 2, 2] = 1.0
     noise = np.column_stack([np.full((len(depth), 2), pixel_sigma**2), np.maximum(variance, 1e-12)])
     return np.asarray((jacobian * noise[:, None]) @ jacobian.transpose(0, 2, 1))
 
 
 def _volume(points: NDArray[np.float64]) -> float:
+    """Volume of the convex hull of points ``[N, 3]``; 0 of too few."""
     try:
         return float(ConvexHull(points, qhull_options="QJ").volume)
-    except QhullError:  # too few points
+    except QhullError:
         return 0.0

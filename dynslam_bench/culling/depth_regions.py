@@ -33,9 +33,8 @@ class DepthRansacFilter(ObjectRule[DepthRansacSettings]):
         member = in_boxes(frame.keypoints.xy, boxes)
         for number, in_box in enumerate(member):
             measured = np.flatnonzero(in_box & (frame.z > 0))
-            person = person_set(
-                frame.z[measured], self.settings, stream(state.seed, self.name, number)
-            )
+            rng = stream(state.seed, self.name, number)
+            person = person_set(frame.z[measured], self.settings, rng)
             keep[measured[person]] = False
             keep[in_box & ~(frame.z > 0)] = False
         return self.verdict(keep, objects=len(boxes), in_boxes=np.count_nonzero(member.any(axis=0)))
@@ -62,22 +61,25 @@ def person_set(
     drawn = 0
     best = np.zeros(count, dtype=bool)
     while drawn < draws and count >= MIN_POINTS:
+        # a pair, then all others by their distance from its mean depth
         drawn += 1
         pair = rng.choice(count, 2, replace=False)
         order = np.argsort(np.abs(z - z[pair].mean()), kind="stable")
         order = np.concatenate([pair, order[~np.isin(order, pair)]])
+
+        # variance of the first n depths, for every n; the set ends before the limit
         chosen = z[order].astype(np.float64)
         n = np.arange(1, count + 1)
         variance = np.cumsum(chosen**2) / n - np.square(np.cumsum(chosen) / n)
         size = int(np.argmax(np.append(variance, np.inf) >= settings.variance_m2))
         if size > np.count_nonzero(best):
             best = np.isin(np.arange(count), order[:size])
+
+            # RANSAC's number of draws for a pair of inliers
             share = size / count
-            needed = (
-                np.log(1 - settings.confidence) / np.log(max(1 - share**2, 1e-12))
-                if share < 1
-                else 0
-            )
+            needed = 0.0
+            if share < 1:
+                needed = np.log(1 - settings.confidence) / np.log(max(1 - share**2, 1e-12))
             draws = min(draws, max(drawn, int(np.ceil(needed))))
     return best
 
@@ -97,10 +99,10 @@ class BoxDepthFilter(ObjectRule[BoxDepthSettings]):
         """Segment the person in every box and drop the features on them."""
         depth = np.nan_to_num(frame.depth)
         boxes = dynamic_boxes(frame, self.segmentation)
-        people = [mask for mask in (self._segment(box, depth) for box in boxes) if mask is not None]
-        mask = dilate(
-            np.logical_or.reduce([np.zeros(depth.shape, bool), *people]), self.settings.dilation_px
-        )
+        segmented = [self._segment(box, depth) for box in boxes]
+        people = [mask for mask in segmented if mask is not None]
+        union = np.logical_or.reduce([np.zeros(depth.shape, bool), *people])
+        mask = dilate(union, self.settings.dilation_px)
         keep = ~inside(mask, frame.keypoints.xy)
         ignored = len(boxes) - len(people)
         return self.verdict(
@@ -111,12 +113,15 @@ class BoxDepthFilter(ObjectRule[BoxDepthSettings]):
         self, box: NDArray[np.float32], depth: NDArray[np.float32]
     ) -> NDArray[np.bool_] | None:
         """The mask ``[H, W]`` of the person in a box; None where the box is ignored."""
+        # median depth of the box's middle
         x0, y0, x1, y1 = box.astype(np.float64)
         shrink = (1 - self.settings.core) / 2
         core = depth[_window(box, -shrink * (x1 - x0), -shrink * (y1 - y0), depth.shape)]
         valid = core[core > 0]
         if not core.size or len(valid) < max(self.settings.min_valid * core.size, 1):
             return None
+
+        # the largest connected region at that depth, in the box with a margin
         place = _window(box, self.settings.margin_px, self.settings.margin_px, depth.shape)
         window = depth[place]
         near = (window > 0) & (np.abs(window - np.median(valid)) <= self.settings.depth_m)
@@ -157,19 +162,21 @@ class DepthBlockFilter(ObjectRule[DepthBlockSettings]):
         """Complete the masks and drop what lies on them."""
         if frame.instances is None or not len(frame.instances):
             return self.verdict(np.ones(len(frame.xy), dtype=bool))
+
+        # people, and movable objects that a person touches
         people = select(frame.instances, self.segmentation)
         mask = people.union()
-        blocks = 0
-        movable = select(
-            frame.instances, self.segmentation.model_copy(update={"classes": self.settings.movable})
-        )
+        movable_classes = self.segmentation.model_copy(update={"classes": self.settings.movable})
+        movable = select(frame.instances, movable_classes)
         neighbourhood = dilate(mask, 1) if len(movable) else mask
-        touched = [
-            other
-            for other in movable.masks
-            if (other & neighbourhood).any() and (other & ~mask).any()
-        ]
+        touched: list[NDArray[np.bool_]] = []
+        for movable_mask in movable.masks:
+            if (movable_mask & neighbourhood).any() and (movable_mask & ~mask).any():
+                touched.append(movable_mask)
         mask = np.logical_or.reduce([mask, *touched])
+
+        # complete the masks by blocks of depth
+        blocks = 0
         if mask.any():
             whole, blocks = covered_blocks(mask, frame.depth, self.settings)
             mask = dilate(mask | whole, self.segmentation.dilation_px)
@@ -194,12 +201,16 @@ def covered_blocks(
     Returns:
         Bool ``[H, W]`` of the pixels in such blocks, and the number of blocks.
     """
+    # edges: pixels whose depth differs from a neighbour's
     valid = (depth > 0) & (depth <= settings.max_depth_m)
     z = np.where(valid, depth, 0).astype(np.float32)
     square = np.ones((2, 2), np.uint8)
     edge = cv2.dilate(z, square) - cv2.erode(z, square) > settings.edge_m
+
+    # connected components between the edges, and which of them the mask covers enough
     count, label = cv2.connectedComponents((valid & ~edge).view(np.uint8), connectivity=4)
     size = np.bincount(label.ravel(), minlength=count)
     whole = np.bincount(label[mask], minlength=count) >= np.maximum(settings.min_share * size, 1)
-    whole[0] = False  # label 0: edges and pixels without depth
+    # label 0 are edges and pixels without depth
+    whole[0] = False
     return np.asarray(whole[label]), int(np.count_nonzero(whole))

@@ -4,6 +4,8 @@ The test finds motion along epipolar lines, and any motion while the camera only
 still.
 """
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -25,16 +27,19 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.floating]
 
 MIN_POINTS = 12
+"""Points with flow and depth without which the prediction is not refined."""
 NEAR_M = 0.05
 """Points nearer than this to the camera plane have no weight."""
 MIN_AGREEING = 6.0
 """Least sum of the points' weights in a fit."""
-TURN_PX = (12.0, 6.0, 4.0)
+ROTATION_STEPS_PX = (12.0, 6.0, 4.0)
 """Scale of the redescending kernel in the first Gauss-Newton steps, which change the rotation only."""
-KERNEL_PX = (4.0, 2.0, 1.0, 1.0)
-"""The same in the later steps; narrow, since the flow is exact and moving points must not influence the fit."""
-STEPS_PX = np.array(TURN_PX + KERNEL_PX)
+POSE_STEPS_PX = (4.0, 2.0, 1.0, 1.0)
+"""Scale of the kernel in the later steps; narrow, since the flow is exact and moving points must not influence it."""
+STEPS_PX = np.array(ROTATION_STEPS_PX + POSE_STEPS_PX)
+"""Scale of the kernel in all steps."""
 NO_PRIOR = np.zeros((6, 6))
+"""Information of a motion that nothing is known of."""
 NEAR_FAR = (0.1, 0.9)
 """Quantiles of the depths whose geometric mean separates near points from distant ones."""
 LOWER_COST = 0.95
@@ -56,13 +61,13 @@ MEAN_S = 0.07
 MEMORY_S = 1.65
 """Time constant with which the count of a point's failures decays."""
 NEARBY_PX = 24.0
+"""Points within this distance along both axes share their counts if their depths are similar."""
 SIMILAR_DEPTH = 0.1
-"""Points within this distance share their counts if their depths differ by no more than this share."""
+"""Depths are similar if they differ by no more than this share."""
 MAX_FAILURES = 2.5
 """Above this count a point is dropped although it passes now: from the third failure in a row on, and for some seconds
-after an object has stopped. It would otherwise become a part of the map, and take the camera along
-when it moves on. A
-whole image that fails in a frame or two, as after a wrong stamp, stays below."""
+after an object has stopped. It would otherwise become a part of the map, and take the camera along when it moves on.
+A whole image that fails in a frame or two, as after a wrong stamp, stays below."""
 
 CELL = 16
 """Side of the cells in which failing points are counted, pixels."""
@@ -70,8 +75,24 @@ NEIGHBOURHOOD = (5, 5)
 """Cells around a point in which it needs company: 80 x 80 px."""
 MIN_FAILING = 3
 """Fewest failing points of a moving region."""
-NEAR = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
+PATCH_3X3 = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
 """Offsets of the 3x3 pixels around a pixel, row by row."""
+
+
+class Intrinsics(NamedTuple):
+    """A pinhole camera, as compiled loops take it.
+
+    Attributes:
+        fx: Focal length along x, pixels.
+        fy: Focal length along y, pixels.
+        cx: Principal point, pixels.
+        cy: Principal point, pixels.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
 
 
 def depth_sigma(z: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -149,48 +170,70 @@ def refine_prediction(frame: FrameBundle, state: FilterState) -> NDArray[np.floa
     use = flow.valid & state.keep & (frame.z > 0)
     if np.count_nonzero(use) < MIN_POINTS:
         return state.T_world_pred
+
+    # points in this camera's frame, their pixels in the previous image, and how static their origin was
+    points = state.camera.unproject(frame.xy[use], frame.z[use])
+    pixels = state.flow_xy[use]
+    weight = static_share(frame, state, flow.xy[use])
+    camera = Intrinsics(state.camera.fx, state.camera.fy, state.camera.cx, state.camera.cy)
+
+    # the motion model's prediction is the start and the prior
     start = np.eye(4)
     prior = NO_PRIOR
-    share = static_share(frame, state, flow.xy[use])
-    points = state.camera.unproject(frame.xy[use], frame.z[use])
-    before = state.flow_xy[use]
     if state.T_world_pred is not None:
         start = se3.inverse(state.T_world_prev) @ state.T_world_pred
         prior = prior_information(state, start)
-    lens = state.camera.fx, state.camera.fy, state.camera.cx, state.camera.cy
+
+    # maximum a posteriori estimate, from the rotation to the pose
+    rotation_steps = len(ROTATION_STEPS_PX)
     T_prev_cur, agreeing = _align(
-        start, points, before, share, prior, STEPS_PX, len(TURN_PX), *lens
+        start, points, pixels, weight, prior, STEPS_PX, rotation_steps, camera
     )
     if agreeing < MIN_AGREEING:
         return state.T_world_pred
-    return state.T_world_prev @ _compared(T_prev_cur, points, before, start, share, lens)
+
+    # the motion of the distant points, if clearly more points agree with it
+    distant = _motion_of_distant_points(start, points, pixels, weight, camera)
+    if distant is not None:
+        T_distant, scale = distant
+        cost = _geman_mcclure_cost(T_prev_cur, points, pixels, weight, scale, camera)
+        if _geman_mcclure_cost(T_distant, points, pixels, weight, scale, camera) < (
+            LOWER_COST * cost
+        ):
+            T_prev_cur = T_distant
+    return state.T_world_prev @ T_prev_cur
 
 
-def _compared(
-    T_prev_cur: Array,
-    points: Array,
-    pixels: Array,
-    start: Array,
-    weight: Array,
-    lens: tuple[float, ...],
-) -> Array:
-    """The given motion, or that of the distant points if clearly more agree with it; arguments as of `_align`."""
+def _motion_of_distant_points(
+    start: Array, points: Array, pixels: Array, weight: Array, camera: Intrinsics
+) -> tuple[Array, float] | None:
+    """The motion ``[4, 4]`` that begins with the distant points, without a prior, and the scale of its kernel, pixels.
+
+    None where too few points agree. Arguments as of `_align`.
+    """
     far = points[:, 2] > np.sqrt(np.prod(np.quantile(points[:, 2], NEAR_FAR)))
-    other, agreeing = _align(
-        start, points[far], pixels[far], weight[far], NO_PRIOR, STEPS_PX, len(TURN_PX), *lens
+    rotation_steps = len(ROTATION_STEPS_PX)
+    T_prev_cur, agreeing = _align(
+        start, points[far], pixels[far], weight[far], NO_PRIOR, STEPS_PX, rotation_steps, camera
     )
     if agreeing < MIN_AGREEING:
-        return T_prev_cur
-    noise = np.sqrt(np.median(_squared_errors(other, points[far], pixels[far], *lens)))
+        return None
+
+    # all points, under a kernel as wide as the distant points' residuals are
+    noise = np.sqrt(np.median(_squared_errors(T_prev_cur, points[far], pixels[far], camera)))
     scale = np.clip(3 * noise, *NOISE_PX)
-    other, agreeing = _align(other, points, pixels, weight, NO_PRIOR, np.repeat(scale, 2), 0, *lens)
-    if agreeing < MIN_AGREEING:
-        return T_prev_cur
-    costs = [
-        (weight * (1 - scale**2 / (_squared_errors(pose, points, pixels, *lens) + scale**2))).sum()
-        for pose in (other, T_prev_cur)
-    ]
-    return other if costs[0] < LOWER_COST * costs[1] else T_prev_cur
+    T_prev_cur, agreeing = _align(
+        T_prev_cur, points, pixels, weight, NO_PRIOR, np.repeat(scale, 2), 0, camera
+    )
+    return None if agreeing < MIN_AGREEING else (T_prev_cur, scale)
+
+
+def _geman_mcclure_cost(
+    pose: Array, points: Array, pixels: Array, weight: Array, scale: float, camera: Intrinsics
+) -> float:
+    """Weighted cost of all points under a kernel of a scale in pixels; arguments as of `_align`."""
+    errors = _squared_errors(pose, points, pixels, camera)
+    return float((weight * (1 - scale**2 / (errors + scale**2))).sum())
 
 
 def prior_information(state: FilterState, T_prev_cur: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -226,35 +269,39 @@ def _align(
     prior_weight: Array,
     information: Array,
     scales: Array,
-    turns: int,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
+    rotation_steps: int,
+    camera: Intrinsics,
 ) -> tuple[Array, float]:
     """The pose T that projects ``T @ points`` ``[N, 3]`` onto `pixels` ``[N, 2]``, and the sum of the points' weights.
 
-    `information` ``[6, 6]`` is that of the prior, the start pose. `scales` are the kernel's, one a
-    step, of which the first `turns` change the rotation only. Where the system cannot be solved the
-    sum is 0.
+    `prior_weight` ``[N]`` is each point's weight before its residual counts. `information` ``[6, 6]``
+    is that of the prior, the start pose. `scales` are the kernel's, one a step, of which the first
+    `rotation_steps` change the rotation only. Where the system cannot be solved the sum is 0.
     """
     pose = start
     total = 0.0
     inverse_start = start.copy()
     inverse_start[:3, :3] = start[:3, :3].T
     inverse_start[:3, 3] = -inverse_start[:3, :3] @ np.ascontiguousarray(start[:3, 3])
-    shutter = ROLLING_SHUTTER_SHARE**2 * _squared_errors(np.eye(4), points, pixels, fx, fy, cx, cy)
+
+    # a rolling shutter distorts fast motion: the kernel is wider for points with a long flow
+    shutter = ROLLING_SHUTTER_SHARE**2 * _squared_errors(np.eye(4), points, pixels, camera)
     for number in range(len(scales)):
+        # normal equations of the points and of the prior
         hessian, gradient, total = _linearise(
-            pose, points, pixels, prior_weight, shutter, scales[number] ** 2, fx, fy, cx, cy
+            pose, points, pixels, prior_weight, shutter, scales[number] ** 2, camera
         )
         hessian += information
         gradient += information @ twist_of(pose @ inverse_start)
-        if number < turns:
+
+        # rotation only: no gradient of the translation, and no coupling with it
+        if number < rotation_steps:
             hessian[:3] = 0.0
             hessian[:, :3] = 0.0
             gradient[:3] = 0.0
             hessian[:3, :3] = np.trace(hessian) * np.eye(3)
+
+        # Gauss-Newton step; a rotation by more than a radian is no refinement
         step = -gradient
         solved = cholesky_solve(hessian + 1e-9 * np.trace(hessian) * np.eye(6), step)
         if not solved or not np.linalg.norm(step[3:]) <= 1.0:
@@ -264,16 +311,14 @@ def _align(
 
 
 @kernel
-def _squared_errors(
-    pose: Array, points: Array, pixels: Array, fx: float, fy: float, cx: float, cy: float
-) -> Array:
+def _squared_errors(pose: Array, points: Array, pixels: Array, camera: Intrinsics) -> Array:
     """Squared distances ``[N]`` of the projected points ``pose @ points`` from their pixels; inf behind the camera."""
     errors = np.full(len(points), np.inf)
     for i in range(len(points)):
         x, y, z = transform_point(pose, points[i])
         if z > 0:
-            errors[i] = (fx * (x / z) + cx - pixels[i, 0]) ** 2 + (
-                fy * (y / z) + cy - pixels[i, 1]
+            errors[i] = (camera.fx * (x / z) + camera.cx - pixels[i, 0]) ** 2 + (
+                camera.fy * (y / z) + camera.cy - pixels[i, 1]
             ) ** 2
     return errors
 
@@ -286,12 +331,14 @@ def _linearise(
     prior_weight: Array,
     shutter: Array,
     scale2: float,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
+    camera: Intrinsics,
 ) -> tuple[Array, Array, float]:
-    """Gauss-Newton matrix ``[6, 6]``, gradient ``[6]`` of a left twist, sum of the weights."""
+    """Gauss-Newton matrix ``[6, 6]``, gradient ``[6]`` of a left twist, sum of the weights.
+
+    `shutter` ``[N]`` is added to the squared scale of the Geman-McClure kernel, squared pixels.
+    """
+    fx = camera.fx
+    fy = camera.fy
     hessian = np.empty((6, 6))
     gradient = np.empty(6)
     sums = normal_equations()
@@ -300,12 +347,16 @@ def _linearise(
         x, y, z = transform_point(pose, points[i])
         if z <= NEAR_M:
             continue
+
+        # residual in pixels, weighted by the kernel
         x = x / z
         y = y / z
-        du = fx * x + cx - pixels[i, 0]
-        dv = fy * y + cy - pixels[i, 1]
+        du = fx * x + camera.cx - pixels[i, 0]
+        dv = fy * y + camera.cy - pixels[i, 1]
         weight = prior_weight[i] / (1 + (du * du + dv * dv) / (scale2 + shutter[i])) ** 2
         total += weight
+
+        # rows of the Jacobian by (translation, rotation): of u and of v
         a = fx / z
         b = fy / z
         sums = add_normal_equation(
@@ -350,10 +401,14 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
         ):
             self._memory = None
             return self.verdict(np.ones(len(xy), dtype=bool))
+
+        # test flow and depth of this frame
         tested = flow.valid & (frame.z > 0)
         failed = np.zeros(len(xy), dtype=bool)
         residual = np.zeros((len(xy), 2))
-        failed[tested], residual[tested], allowed = self._fails(frame, state, tested)
+        failed[tested], residual[tested], allowed = self._test(frame, state, tested)
+
+        # what is remembered around the points' origins in the previous frame
         before = np.zeros((len(xy), 3))
         dt = frame.timestamp - state.previous.timestamp
         if self._memory is not None:
@@ -361,30 +416,38 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
             before = nearby_mean(
                 state.previous.keypoints.xy, state.previous.z, self._memory, origin, frame.z
             )
+
+        # mean residual over its limit; the mean's noise is this share of one residual's
         carried = np.exp(-dt / MEAN_S)
-        noise = np.sqrt((1 - carried) / (1 + carried))  # of the mean, as a share of one residual's
+        noise = np.sqrt((1 - carried) / (1 + carried))
         step = (1 - carried) * residual
         step[tested] /= (noise * self.settings.threshold_px + allowed)[:, None]
         # after one bad frame the mean passes
         step /= np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1)
         mean = step + carried * before[:, 1:]
         failed |= tested & (np.linalg.norm(mean, axis=1) > 1)
+
+        # lone failures are noise; failures are counted, and the count decays
         failed = failing_regions(failed, tested, xy, self.settings.min_share, shape)
         failures = failed + np.exp(-dt / MEMORY_S) * before[:, 0]
         self._memory = np.column_stack([failures, mean])
         keep = ~failed & (failures <= MAX_FAILURES)
         return self.verdict(keep, tested=np.count_nonzero(tested), failed=np.count_nonzero(failed))
 
-    def _fails(
+    def _test(
         self, frame: FrameBundle, state: FilterState, tested: NDArray[np.bool_]
     ) -> tuple[NDArray[np.bool_], Array, Array]:
         """Which of K tested points fail now, residuals ``[K, 2]`` and what is added to a threshold ``[K]``, pixels."""
         assert state.flow is not None
         assert state.previous is not None
+
+        # flow: distance from where the camera's motion takes the point
         moved, expected = rigid_flow(frame, state, tested)
         residual = expected - state.flow_xy[tested]
         distance = np.linalg.norm(residual, axis=1)
         allowed = THRESHOLD_SHARE * np.linalg.norm(expected - frame.xy[tested], axis=1)
+
+        # depth: what was measured there must be the point; both measurements are noisy
         measured = nearest_depth(state.previous.depth, state.flow.xy[tested], moved[:, 2])
         limit = self.settings.threshold_sigma * np.sqrt(2) * depth_sigma(moved[:, 2])
         off_depth = (measured > 0) & (np.abs(measured - moved[:, 2]) > limit)
@@ -405,6 +468,7 @@ def nearby_mean(xy: Floats, z: Floats, values: Array, at: Floats, at_z: Floats) 
     Returns:
         Means ``[M, K]``; 0 where there is no such point.
     """
+    # sorted by rows, so that few points are compared
     order = np.argsort(xy[:, 1])
     columns = xy[order, 0].copy()
     rows = xy[order, 1].copy()
@@ -446,7 +510,7 @@ def nearest_depth(
     Returns:
         Depths ``[N]``, metres; 0 where the patch has none or lies outside the image.
     """
-    at, visible = pixel_index(np.rint(xy)[:, None] + NEAR, depth.shape)
+    at, visible = pixel_index(np.rint(xy)[:, None] + PATCH_3X3, depth.shape)
     patch = depth[at].astype(np.float64)
     patch[~visible | ~np.isfinite(patch)] = 0
     gap = np.where(patch > 0, np.abs(patch - np.asarray(expected)[:, None]), np.inf)
@@ -499,7 +563,6 @@ def failing_regions(
     if share <= 0 or not failing.any():
         return failing
     index, grid = cell_index(xy, CELL, size)
-    failures, tests = (
-        _neighbourhood_sum(flags, index, grid)[index] for flags in (failing & tested, tested)
-    )
+    failures = _neighbourhood_sum(failing & tested, index, grid)[index]
+    tests = _neighbourhood_sum(tested, index, grid)[index]
     return np.asarray(failing & (failures >= MIN_FAILING) & (failures >= share * tests))

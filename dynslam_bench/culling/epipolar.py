@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.culling import Number, ObjectRule, Rule
-from dynslam_bench.culling.ego_motion import NEAR, failing_regions, rigid_flow
+from dynslam_bench.culling.ego_motion import PATCH_3X3, failing_regions, rigid_flow
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import (
     BoxEpipolarSettings,
@@ -29,7 +29,7 @@ Flags = NDArray[np.bool_]
 MIN_MATCHES = 16
 """Twice the minimum of the eight-point algorithm."""
 CONFIDENCE = 0.99
-"""Of RANSAC."""
+"""Probability at which RANSAC has drawn a sample without outliers."""
 RIGID_PX = 2.0
 """A point within this distance of its prediction by the camera's motion counts as static in `contradiction`."""
 VOTE_SHARE = 0.3
@@ -65,6 +65,7 @@ def fundamental_matrix(
     for fit in range(refits + 1):
         if np.count_nonzero(agree) < min_matches:
             return None
+        # RANSAC at first, then the eight-point algorithm on all that agree
         if fit == 0:
             matrix, _ = cv2.findFundamentalMat(
                 first, second, cv2.FM_RANSAC, inlier_px, CONFIDENCE, max_draws
@@ -128,11 +129,12 @@ def matches_by_flow(
     flow = state.flow
     if flow is None or state.previous is None:
         return None
-    tested = flow.valid
-    if unmatched is not None:
-        tested = state.keep & (
-            np.isfinite(flow.xy).all(axis=1) if unmatched == "judge" else flow.valid
-        )
+    if unmatched is None:
+        tested = flow.valid
+    elif unmatched == "judge":
+        tested = state.keep & np.isfinite(flow.xy).all(axis=1)
+    else:
+        tested = state.keep & flow.valid
     return Matches(state.flow_xy, frame.xy, flow.valid, tested)
 
 
@@ -149,16 +151,16 @@ class EpipolarFilter(Rule[EpipolarSettings]):
     name = "epipolar"
     needs: frozenset[Need] = frozenset({"flow", "previous"})
     stats_names = (
-        *(
-            "dropped",
-            "matches",
-            "inliers",
-            "parallax_px",
-            "homography_share",
-            "contradiction",
-            "degenerate",
-        ),
-        *("moving_objects", "f_asked", "f_judged"),
+        "dropped",
+        "matches",
+        "inliers",
+        "parallax_px",
+        "homography_share",
+        "contradiction",
+        "degenerate",
+        "moving_objects",
+        "f_asked",
+        "f_judged",
     )
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
@@ -167,28 +169,39 @@ class EpipolarFilter(Rule[EpipolarSettings]):
         matches = matches_by_flow(frame, state)
         if matches is None:
             return self.verdict(keep)
+
+        # views that determine no F are not judged
         fit = matches.valid & state.keep
         stats: dict[str, Number] = {"matches": np.count_nonzero(fit), "degenerate": 1, "f_asked": 1}
         if self._is_degenerate(matches.before[fit], matches.now[fit], state.camera, stats):
             return self.verdict(keep, **stats)
+
+        # F of the kept points (Eq. 24); points too far from their epipolar line fail (Eq. 25)
         distance = matches.distances(fit)
         if distance is None:
             return self.verdict(keep, **stats)
-        failing = distance > self.settings.threshold_px  # too far from the epipolar line, Eq. 25
+        failing = distance > self.settings.threshold_px
         stats["inliers"] = np.count_nonzero(fit & ~failing)
+
+        # an F that rejects what follows the camera's motion is not that of the static scene
         if self.settings.max_contradiction < 1:
             share = stats["contradiction"] = contradiction(frame, state, failing, matches)
             if share > self.settings.max_contradiction:
                 return self.verdict(keep, **stats)
         stats |= {"degenerate": 0, "f_judged": 1}
+
+        # drop whole objects, or regions in which enough points fail
         if self.settings.mode == "object":
             keep, stats["moving_objects"] = vote_on_objects(frame, failing, matches.valid)
             return self.verdict(keep, **stats)
-        xy = frame.keypoints.xy
-        shape = frame.gray.shape
-        return self.verdict(
-            ~failing_regions(failing, matches.valid, xy, self.settings.min_share, shape), **stats
+        moving = failing_regions(
+            failing,
+            matches.valid,
+            frame.keypoints.xy,
+            self.settings.min_share,
+            frame.gray.shape,
         )
+        return self.verdict(~moving, **stats)
 
     def _is_degenerate(
         self, before: Points, now: Points, camera: Camera, stats: dict[str, Number]
@@ -196,10 +209,12 @@ class EpipolarFilter(Rule[EpipolarSettings]):
         """Whether matches or parallax are too small or one homography explains the view; fills in both stats."""
         if len(before) < MIN_MATCHES:
             return True
+        # no parallax: a pure rotation
         parallax_px = stats["parallax_px"] = rotation_residual(before, now, camera)
         flow_px = float(np.median(np.linalg.norm(before - now, axis=1)))
         if parallax_px < max(self.settings.min_parallax_px, self.settings.parallax_share * flow_px):
             return True
+        # a plane
         share = stats["homography_share"] = homography_share(before, now)
         return share > self.settings.homography_share
 
@@ -212,6 +227,7 @@ def rotation_residual(first: Points, second: Points, camera: Camera) -> float:
     residual = np.zeros(len(first))
     # iteratively reweighted, so that moving objects do not influence the rotation
     for _ in range(3):
+        # the rotation that aligns the rays best (Kabsch), by singular value decomposition
         u, _, vt = np.linalg.svd((rays[1] * weight[:, None]).T @ rays[0])
         rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
         residual = np.linalg.norm(camera.project(rays[0] @ rotation.T) - second, axis=1)
@@ -242,7 +258,7 @@ def contradiction(
         frame: The current frame.
         state: With previous and predicted pose.
         failing: bool ``[N]``, points that fail the epipolar test.
-        matches: Of the points.
+        matches: Matches of the points.
 
     Returns:
         The share, 0 to 1; 0 where too few points have depth or no pose is known.
@@ -250,10 +266,11 @@ def contradiction(
     if state.T_world_prev is None or state.T_world_pred is None:
         return 0.0
     rows = matches.valid & state.keep & (frame.z > 0)
-    rows[rows] = (
-        np.linalg.norm(rigid_flow(frame, state, rows)[1] - matches.before[rows], axis=1) < RIGID_PX
-    )
-    return float(failing[rows].mean()) if np.count_nonzero(rows) >= MIN_MATCHES else 0.0
+    _, expected = rigid_flow(frame, state, rows)
+    rows[rows] = np.linalg.norm(expected - matches.before[rows], axis=1) < RIGID_PX
+    if np.count_nonzero(rows) < MIN_MATCHES:
+        return 0.0
+    return float(failing[rows].mean())
 
 
 def vote_on_objects(frame: FrameBundle, failing: Flags, tested: Flags) -> tuple[Flags, float]:
@@ -269,7 +286,9 @@ def vote_on_objects(frame: FrameBundle, failing: Flags, tested: Flags) -> tuple[
     """
     keep = np.ones(len(frame.xy), dtype=bool)
     moving = 0
-    for mask in () if frame.instances is None else frame.instances.masks:
+    if frame.instances is None:
+        return keep, moving
+    for mask in frame.instances.masks:
         on_object = inside(mask, frame.keypoints.xy)
         voters = on_object & tested
         if voters.any() and failing[voters].mean() >= VOTE_SHARE:
@@ -303,26 +322,33 @@ class BoxEpipolarFilter(ObjectRule[BoxEpipolarSettings]):
         tested = matches.tested
         if settings.unmatched == "drop":
             keep &= ~lost
+
+        # matches that F is fitted to: outside this frame's boxes, outside the previous one's, or all
         in_box = in_boxes(frame.keypoints.xy, boxes).any(axis=0)
-        fit = tested & ~in_box
         if settings.fit == "kept":
             fit = tested
         elif settings.fit == "outside previous":
-            previous = dynamic_boxes(state.previous, self.segmentation)
-            fit = tested & ~in_boxes(np.nan_to_num(state.flow.xy, nan=-1e6), previous).any(axis=0)
+            previous_boxes = dynamic_boxes(state.previous, self.segmentation)
+            # a place that no box contains, where there is no flow
+            before = np.nan_to_num(state.flow.xy, nan=-1e6)
+            fit = tested & ~in_boxes(before, previous_boxes).any(axis=0)
+        else:
+            fit = tested & ~in_box
         if np.count_nonzero(fit) < MIN_OUTSIDE:
             fit = tested
         stats: dict[str, Number] = {
             "matches": np.count_nonzero(fit),
             "lost": np.count_nonzero(lost),
+            "boxes": len(boxes),
+            "f_asked": 1,
         }
-        stats |= {"boxes": len(boxes), "f_asked": 1}
         distance = matches.distances(fit, settings.inlier_px)
         if distance is None:
             return self.verdict(keep, failed=1, **stats)
-        limit = np.where(
-            in_box, settings.inside_px, settings.outside_px if settings.test_outside else np.inf
-        )
+
+        # one limit inside boxes, another outside
+        outside_px = settings.outside_px if settings.test_outside else np.inf
+        limit = np.where(in_box, settings.inside_px, outside_px)
         keep[tested] = (distance <= limit)[tested]
         return self.verdict(keep, f_judged=1, **stats)
 
@@ -361,12 +387,15 @@ class ClassRuleFilter(ObjectRule[ClassRuleSettings]):
         }
         if frame.instances is None or not len(frame.instances):
             return self.verdict(keep, **stats)
+
+        # by class: people
         people = dynamic_mask(frame.instances, self.segmentation, frame.depth)
         keep &= ~inside(people, xy)
         stats["on_people"] = np.count_nonzero(~keep)
-        movable = select(
-            frame.instances, self.segmentation.model_copy(update={"classes": settings.movable})
-        )
+
+        # by epipolar line: F of what lies neither on people nor on movable objects
+        movable_classes = self.segmentation.model_copy(update={"classes": settings.movable})
+        movable = select(frame.instances, movable_classes)
         off_line = none
         tested = none
         lost = none
@@ -377,15 +406,14 @@ class ClassRuleFilter(ObjectRule[ClassRuleSettings]):
                 off_line = distance > settings.threshold_px
                 tested = matches.tested
         stats |= {"lost": np.count_nonzero(lost), "f_judged": tested.any()}
+
+        # movable objects: failing points, and all points at the depth of an object that moves
         for mask in movable.masks:
             on_object = inside(mask, xy) & keep
             stats["on_movable"] += np.count_nonzero(on_object)
             voters = on_object & tested
-            drop = (
-                on_object & (off_line | lost)
-                if settings.unmatched == "drop"
-                else on_object & off_line
-            )
+            failed = off_line | lost if settings.unmatched == "drop" else off_line
+            drop = on_object & failed
             if voters.any() and off_line[voters].mean() >= settings.vote_share:
                 stats["moving_objects"] += 1
                 depth = frame.depth[mask]
@@ -399,12 +427,15 @@ class ClassRuleFilter(ObjectRule[ClassRuleSettings]):
 # B3 and B11 as in DS-SLAM's code: one moving corner near a person drops the features of all people.
 
 VOTE_BORDER_PX = 5
+"""Corners nearer to the image's border are left out."""
 HARRIS_K = 0.04
-"""Of the corner measure that the authors' code chooses (Harris, blocks of 3 px)."""
+"""Parameter of the corner measure that the authors' code chooses (Harris, blocks of 3 px)."""
 VOTE_LEVELS = 5
+"""Coarsest pyramid level of Lucas-Kanade."""
 VOTE_MATCHES = 8
 """Eight matches suffice and RANSAC's own F is taken, as in the authors' code."""
 VOTE_WINDOW = (22, 22)
+"""Window of Lucas-Kanade, pixels."""
 
 
 class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
@@ -425,15 +456,17 @@ class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
         asked = state.previous is not None
         if state.previous is None or frame.instances is None:
             return self.verdict(keep, f_asked=asked)
+
+        # moving corners vote if they lie near a person, in a square window as in the authors' code
         people = select(frame.instances, self.segmentation).union()
         moving, corners, judged = self._moving_corners(
             state.previous.gray, frame.gray, state.camera
         )
-        side = 2 * self.settings.radius_px + 1  # a square window, as in the authors' code
-        near_people = cv2.dilate(people.view(np.uint8), np.ones((side, side), np.uint8)).astype(
-            bool
-        )
-        votes = np.count_nonzero(inside(near_people, moving))
+        side = 2 * self.settings.radius_px + 1
+        dilated = cv2.dilate(people.view(np.uint8), np.ones((side, side), np.uint8))
+        votes = np.count_nonzero(inside(dilated.astype(bool), moving))
+
+        # enough votes drop the points on all people
         mask = people if votes >= self.settings.min_votes else None
         if mask is not None:
             keep = ~inside(people, frame.keypoints.xy)
@@ -451,6 +484,7 @@ class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
         self, previous: NDArray[np.uint8], current: NDArray[np.uint8], camera: Camera
     ) -> tuple[NDArray[np.float32], int, bool]:
         """Pixels ``[M, 2]`` of the corners off their line, the number of tracked corners, whether F was estimated."""
+        # corners of the previous image, to a fraction of a pixel
         no_corners = np.zeros((0, 2), np.float32)
         corners = cv2.goodFeaturesToTrack(
             previous,
@@ -465,6 +499,8 @@ class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
             return no_corners, 0, False
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.03)
         corners = cv2.cornerSubPix(previous, corners, (10, 10), (-1, -1), criteria)
+
+        # their flow to the current image
         tracked, status, _ = cv2.calcOpticalFlowPyrLK(
             previous,
             current,
@@ -476,17 +512,19 @@ class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
         )
         before = corners.reshape(-1, 2)
         after = tracked.reshape(-1, 2)
+
+        # without corners at the border, and those whose patches differ
         low = VOTE_BORDER_PX
         high = np.array(current.shape[::-1]) - VOTE_BORDER_PX - 1
         good = status.ravel().astype(bool)
         for xy in (before, after):
             good &= (xy >= low).all(axis=1) & (xy <= high).all(axis=1)
-        good[good] = (
-            _patch_difference(previous, current, before[good], after[good])
-            <= self.settings.sad_limit
-        )
+        difference = _patch_difference(previous, current, before[good], after[good])
+        good[good] = difference <= self.settings.sad_limit
         before = before[good]
         after = after[good]
+
+        # F by RANSAC, and the corners off their epipolar line
         first = camera.undistort_points(before)
         second = camera.undistort_points(after)
         inlier_px = self.settings.inlier_px
@@ -495,11 +533,8 @@ class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
         )
         if matrix is None:
             return no_corners, len(before), False
-        return (
-            after[epipolar_distance(matrix, first, second) > self.settings.threshold_px],
-            len(before),
-            True,
-        )
+        off_line = epipolar_distance(matrix, first, second) > self.settings.threshold_px
+        return after[off_line], len(before), True
 
 
 def _patch_difference(
@@ -509,8 +544,11 @@ def _patch_difference(
     xy2: NDArray[np.float32],
 ) -> NDArray[np.int64]:
     """Sum of absolute differences of the 3x3 patches around truncated pixels inside both images, ``[N]``."""
-    a, b = (
-        image[tuple((xy[:, None].astype(np.intp) + NEAR).T[::-1])].astype(np.int64)
-        for image, xy in ((first, xy1), (second, xy2))
-    )
-    return np.asarray(np.abs(a - b).sum(axis=0))
+    difference = _patches(first, xy1) - _patches(second, xy2)
+    return np.asarray(np.abs(difference).sum(axis=0))
+
+
+def _patches(image: NDArray[np.uint8], xy: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Grey levels ``[9, N]`` of the 3x3 pixels around truncated pixels ``[N, 2]``."""
+    columns, rows = (xy[:, None].astype(np.intp) + PATCH_3X3).T
+    return np.asarray(image[rows, columns], np.int64)

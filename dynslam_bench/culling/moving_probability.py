@@ -15,6 +15,7 @@ from dynslam_bench.segmentation.postprocess import dynamic_mask
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 UNKNOWN = 0.5
+"""Probability of a new feature."""
 CERTAIN = (0.25, 0.75)
 """Below the first a feature is certainly static, above the second certainly dynamic (Detect-SLAM)."""
 HIT = 0.9
@@ -55,6 +56,8 @@ class ProbabilityFilter(ObjectRule[ProbabilitySettings]):
         """Update the probabilities by this frame's masks."""
         settings = self.settings
         xy = frame.keypoints.xy
+
+        # features that continue one of the previous frame take over its probability
         link = link_to_previous(frame, state, settings.link_px)
         if state.previous is None or len(self._probability) != len(state.previous.xy):
             link[:] = -1
@@ -63,13 +66,14 @@ class ProbabilityFilter(ObjectRule[ProbabilitySettings]):
         moving[linked] = self._probability[link[linked]]
         if settings.expand_px > 0:
             moving = expand(xy, moving, linked, settings.expand_px)
+
+        # update by whether they lie on a dynamic object: moving average, or Bayes' rule
         if frame.instances is not None:
             if self._boxes:
                 on_object = in_boxes(xy, dynamic_boxes(frame, self.segmentation)).any(axis=0)
             else:
-                on_object = inside(
-                    dynamic_mask(frame.instances, self.segmentation, frame.depth), xy
-                )
+                mask = dynamic_mask(frame.instances, self.segmentation, frame.depth)
+                on_object = inside(mask, xy)
             if settings.rule == "average":
                 moving = (1 - RATE) * moving + RATE * on_object
             else:
@@ -77,6 +81,8 @@ class ProbabilityFilter(ObjectRule[ProbabilitySettings]):
                 evidence = likelihood * moving
                 moving = (evidence / (evidence + (1 - likelihood) * (1 - moving))).clip(0.01, 0.99)
         self._probability = moving
+
+        # drop above the threshold; softly, static features weigh by their probability
         mean = moving.mean() if len(moving) else UNKNOWN
         verdict = self.verdict(
             moving <= settings.threshold, linked=np.count_nonzero(linked), mean_probability=mean
@@ -100,9 +106,8 @@ def link_to_previous(
     if state.flow is None or state.previous is None or not len(state.previous.xy):
         return link
     rows = np.flatnonzero(state.flow.valid & np.isfinite(state.flow.xy).all(axis=1))
-    distance, nearest = cKDTree(state.previous.keypoints.xy).query(
-        state.flow.xy[rows], distance_upper_bound=radius_px
-    )
+    previous = cKDTree(state.previous.keypoints.xy)
+    distance, nearest = previous.query(state.flow.xy[rows], distance_upper_bound=radius_px)
     near = np.isfinite(distance)
     link[rows[near]] = np.asarray(nearest)[near]
     return link
@@ -131,7 +136,6 @@ def expand(
     distance, nearest = cKDTree(xy[certain]).query(xy[new], distance_upper_bound=radius_px)
     near = np.isfinite(distance)
     influence = np.exp(-0.5 * np.square(np.asarray(distance)[near] / (0.5 * radius_px)))
-    expanded[new[near]] = UNKNOWN + influence * (
-        probability[certain[np.asarray(nearest)[near]]] - UNKNOWN
-    )
+    of_nearest = probability[certain[np.asarray(nearest)[near]]]
+    expanded[new[near]] = UNKNOWN + influence * (of_nearest - UNKNOWN)
     return expanded

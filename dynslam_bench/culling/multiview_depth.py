@@ -23,7 +23,11 @@ from dynslam_bench.geometry import Camera, inside, se3
 from dynslam_bench.segmentation.postprocess import dilate
 
 MAX_REFERENCE_DEPTH_M = 6.0
+"""Points that their keyframe measured farther away are not tested."""
 MAX_PROJECTED_DEPTH_M = 7.0
+"""Points that should be seen farther away in the frame are not tested."""
+MIN_DEPTH_M = 0.1
+"""Points nearer than this to the camera plane are not tested."""
 MAX_DEPTH_M = 40.0
 """Measured depth beyond this counts as missing, as in the back end."""
 GROW_M = 0.2
@@ -50,14 +54,20 @@ class MultiViewFilter(Rule[MultiViewSettings]):
         keep = np.ones(len(frame.xy), dtype=bool)
         if state.T_world_pred is None or len(state.keyframes) < self.settings.min_keyframes:
             return self.verdict(keep)
+
+        # low-cost tracking, and the keyframes that are compared
         pose = refine_by_matches(frame, state)
         assert pose is not None
         references = self._choose(state.keyframes, pose)
+
+        # pixels at which an object hides the keyframes' points
         measured = (frame.depth > 0) & (frame.depth < MAX_DEPTH_M)
         depth = np.ascontiguousarray(np.where(measured, frame.depth, 0), dtype=np.float32)
         seeds = self._seeds(references, depth, pose, state.camera)
         if not len(seeds):
             return self.verdict(keep, references=len(references))
+
+        # the objects: regions of similar depth around them
         region = np.zeros(depth.shape, np.uint8)
         if self.settings.grow:
             region = grow(depth, np.ascontiguousarray(seeds), GROW_M, BIN_M)
@@ -91,28 +101,33 @@ class MultiViewFilter(Rule[MultiViewSettings]):
         camera: Camera,
     ) -> NDArray[np.int64]:
         """Pixels ``[M, 2]`` at which an object hides the references' points, reference by reference."""
+        # the keyframes' points in the world, and the rays to them from both cameras
         world = []
         from_view = []
         for view in views:
             usable = (view.z > 0) & (view.z <= MAX_REFERENCE_DEPTH_M)
-            world.append(
-                se3.transform(view.T_world_cam, camera.unproject(view.xy[usable], view.z[usable]))
-            )
+            local = camera.unproject(view.xy[usable], view.z[usable])
+            world.append(se3.transform(view.T_world_cam, local))
             from_view.append(world[-1] - view.T_world_cam[:3, 3])
         from_frame = np.concatenate(world) - pose[:3, 3]
         from_reference = np.concatenate(from_view)
         norms = np.linalg.norm(from_reference, axis=1) * np.linalg.norm(from_frame, axis=1)
         cosine = (from_reference * from_frame).sum(axis=1) / np.maximum(norms, 1e-12)
+
+        # points in view of the frame with a small parallax, not near the border
         local = from_frame @ pose[:3, :3]
         pixels = np.full((len(local), 2), -1.0)
-        ahead = local[:, 2] > 0.1
+        ahead = local[:, 2] > MIN_DEPTH_M
         pixels[ahead] = camera.distort_points(camera.project(local[ahead]))
         visible = ahead & (cosine > np.cos(np.deg2rad(self.settings.max_parallax_deg)))
         visible &= local[:, 2] < MAX_PROJECTED_DEPTH_M
         size = (camera.width - MARGIN_PX - 2, camera.height - MARGIN_PX - 2)
         visible &= ((pixels >= MARGIN_PX) & (pixels <= size)).all(axis=1)
+
+        # hidden by something nearer, where depth is even
         centre = np.ceil(pixels[visible]).astype(np.int64)
-        seeds = centre[hidden(depth, centre, local[visible, 2], self.settings.tau_m, MARGIN_PX)]
+        is_hidden = hidden(depth, centre, local[visible, 2], self.settings.tau_m, MARGIN_PX)
+        seeds = centre[is_hidden]
         return np.asarray(seeds[_depth_variance(depth, seeds) < self.settings.max_variance])
 
 
@@ -122,15 +137,17 @@ def _depth_variance(depth: NDArray[np.float32], xy: NDArray[np.int64]) -> NDArra
     Missing depth counts as 0, as in the authors' code: no seed lies beside missing depth.
     """
     height, width = depth.shape
-    (x0, y0) = (xy - MARGIN_PX).clip(0).T
-    (x1, y1) = np.minimum(xy + MARGIN_PX + 1, (width, height)).T
+    x0, y0 = (xy - MARGIN_PX).clip(0).T
+    x1, y1 = np.minimum(xy + MARGIN_PX + 1, (width, height)).T
     n = (x1 - x0) * (y1 - y0)
-    total, squares = (
-        np.asarray(table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0], dtype=np.float64)
-        / n
-        for table in cv2.integral2(depth, sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
-    )
-    return np.asarray(squares - np.square(total))
+
+    def window_means(table: NDArray[np.generic]) -> NDArray[np.float64]:
+        """Means ``[N]`` over the windows by an integral image."""
+        total = table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0]
+        return np.asarray(np.asarray(total, dtype=np.float64) / n)
+
+    sums, squared_sums = cv2.integral2(depth, sdepth=cv2.CV_64F, sqdepth=cv2.CV_64F)
+    return np.asarray(window_means(squared_sums) - np.square(window_means(sums)))
 
 
 # Compiled loops of DynaSLAM's multi-view geometry: which projected points are hidden, and what
@@ -171,6 +188,7 @@ def hidden(
         column, row = centre[i]
         if not depth[row, column] > 0:
             continue
+        # something is nearer, and nothing that is nearer lies within tau of the point
         nearer = False
         all_far = True
         for y in range(row - radius, row + radius + 1):
@@ -208,7 +226,9 @@ def grow(
     """
     height, width = depth.shape
     mask = np.zeros((height, width), np.uint8)
-    visited = np.zeros(height * width, np.int32)  # number of the region that last touched the pixel
+    # number of the region that last touched the pixel
+    visited = np.zeros(height * width, np.int32)
+    # candidates by depth: a list of pixels for each bin, `head` its first and `following` the next
     following = np.empty(height * width, np.int64)
     bins = int(np.ceil(depth.max() / bin_m)) + 2
     head = np.full(bins, -1, np.int64)
@@ -225,6 +245,7 @@ def grow(
         pixel = start
         visited[start] = k + 1
         while pixel >= 0:
+            # the pixel joins, and its four neighbours become candidates
             out[pixel] = 1
             mean = (mean * size + flat[pixel]) / (size + 1)
             size += 1
@@ -240,6 +261,8 @@ def grow(
                         b = int(flat[other] / bin_m)
                         following[other] = head[b]
                         head[b] = other
+
+            # the candidate nearest to the mean is next, if it is near enough
             pixel = -1
             middle = int(mean / bin_m)
             for away in range(reach + 1):
@@ -286,22 +309,25 @@ def refine_by_matches(
         or state.T_world_pred is None
     ):
         return state.T_world_pred
-    trusted = (
-        previous.z > 0 if state.previous_keep is None else state.previous_keep & (previous.z > 0)
-    )
+    trusted = previous.z > 0
+    if state.previous_keep is not None:
+        trusted &= state.previous_keep
     rows = np.flatnonzero(trusted)
     if len(rows) < MIN_MATCHES or np.count_nonzero(state.keep) < MIN_MATCHES:
         return state.T_world_pred
+
+    # where the previous frame's points are expected
     camera = state.camera
     xy = np.ascontiguousarray(frame.xy, dtype=np.float64)
     T_cur_prev = se3.inverse(state.T_world_pred) @ state.T_world_prev
     points = se3.transform(T_cur_prev, camera.unproject(previous.xy[rows], previous.z[rows]))
-    rows = rows[points[:, 2] > 0.1]
-    points = points[points[:, 2] > 0.1]
+    rows = rows[points[:, 2] > MIN_DEPTH_M]
+    points = points[points[:, 2] > MIN_DEPTH_M]
     expected = np.asarray(camera.project(points), dtype=np.float64)
-    octave, before = (
-        keypoints.octave.astype(np.int64) for keypoints in (frame.keypoints, previous.keypoints)
-    )
+
+    # match by descriptor around, in a wider window if few are found
+    octave = frame.keypoints.octave.astype(np.int64)
+    previous_octave = previous.keypoints.octave.astype(np.int64)
     grid = CellGrid.of(xy, camera.width, camera.height)
     words = as_words(previous.keypoints.descriptors[rows])
     features = Features(
@@ -310,11 +336,12 @@ def refine_by_matches(
     for radius in (radius_px, 2 * radius_px):
         windows = expected, np.full(len(rows), np.nan), np.full(len(rows), radius)
         match = search_in_radius(
-            features, state.keep, windows, before[rows], words, max_distance=MAX_DISTANCE
+            features, state.keep, windows, previous_octave[rows], words, max_distance=MAX_DISTANCE
         )
         rows_matched = rows[match >= 0]
         now = match[match >= 0]
         if len(now) >= MIN_MATCHES:
+            # refine the pose by the matches as if they were a flow
             ends = np.full((len(xy), 2), np.nan, np.float32)
             ends[now] = previous.keypoints.xy[rows_matched]
             matches = FlowResult(ends, np.isfinite(ends[:, 0]), np.zeros(len(xy), np.float32))

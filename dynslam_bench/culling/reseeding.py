@@ -43,8 +43,9 @@ class ReseedingFilter(Rule[ReseedingSettings]):
         static = state.keep
         used = self._choose(frame, static)
         usual = self._choose(frame, np.ones(len(static), dtype=bool))
+        # features that earlier filters dropped are not judged again
         return self.verdict(
-            used | ~static,  # features that earlier filters dropped are not judged again
+            used | ~static,
             static=np.count_nonzero(static),
             reseeded=np.count_nonzero(used & ~usual),
             missing=max(self.settings.budget - int(np.count_nonzero(used)), 0),
@@ -62,15 +63,18 @@ class ReseedingFilter(Rule[ReseedingSettings]):
         for level in range(levels - 1, -1, -1):
             rows = np.flatnonzero((octave == level) & allowed)
             quota = quotas[level] + missing
-            xy = np.rint(
-                frame.keypoints.xy[rows] / self._features.scale_factor**level - ORIGIN
-            ).clip(0)
+
+            # cell of each feature in its level
+            at_level = frame.keypoints.xy[rows] / self._features.scale_factor**level
+            xy = np.rint(at_level - ORIGIN).clip(0)
             column, row = (xy / self._features.cell_px).astype(np.int64).T
-            # ranks of the responses, so that equal ones stay equal and keep their order
-            strength = np.unique(frame.keypoints.response[rows], return_inverse=True)[1].astype(
-                np.int16
-            )
             cells = row * (column.max(initial=0) + 1) + column
+
+            # ranks of the responses, so that equal ones stay equal and keep their order
+            _, rank = np.unique(frame.keypoints.response[rows], return_inverse=True)
+            strength = rank.astype(np.int16)
+
+            # the strongest of all cells
             everyone = np.ones(len(rows), dtype=bool)
             picked = rows[spread(cells, strength, everyone, quota)]
             # a coarse level's missing features are added to the next finer level

@@ -13,6 +13,12 @@ from dynslam_bench.segmentation.postprocess import select
 
 STEP = 8
 """The image is sampled on every eighth pixel."""
+CLUSTER_PX = 160.0
+"""Distance in the image that counts as much as `CLUSTER_M` in depth."""
+CLUSTER_M = 0.5
+"""Difference in depth that counts as much as `CLUSTER_PX` in the image, metres."""
+MIN_DEPTH_M = 0.1
+"""Points nearer than this to the previous camera plane have no residual; depth errors are relative to this at least."""
 RATIO = 4.0
 """A moving cluster's residual is expected to be this many times the static ones'."""
 STATIC_PRIOR = 0.05
@@ -36,26 +42,31 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
         keep = np.ones(len(frame.xy), dtype=bool)
         if state.previous is None or state.T_world_prev is None or state.T_world_pred is None:
             return self.verdict(keep)
-        rows, columns = np.mgrid[
-            STEP // 2 : frame.depth.shape[0] : STEP, STEP // 2 : frame.depth.shape[1] : STEP
-        ]
+
+        # sample the image where it has depth
+        height, width = frame.depth.shape
+        rows, columns = np.mgrid[STEP // 2 : height : STEP, STEP // 2 : width : STEP]
         z = np.nan_to_num(frame.depth[rows, columns]).ravel()
         valid = z > 0
         if np.count_nonzero(valid) < 4 * self.settings.clusters:
             return self.verdict(keep)
         xy = np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64)[valid]
+
+        # residuals after warping, clusters in the image and in depth, and which of them move
         residual = self._residual(frame, state, xy, z[valid])
         label = self._cluster(xy, z[valid], state.seed)
         people = np.zeros(len(xy), bool)
         if frame.instances is not None:
             people = inside(select(frame.instances, self.segmentation).union(), xy)
         moving = self._moving_clusters(residual, label, people)
+
+        # the moving clusters as a mask of the whole image
         sampled = np.zeros(rows.size, dtype=np.uint8)
         sampled[valid] = moving[label]
-        size = frame.depth.shape[::-1]
-        mask = cv2.resize(
-            sampled.reshape(rows.shape), size, interpolation=cv2.INTER_NEAREST
-        ).astype(bool)
+        resized = cv2.resize(
+            sampled.reshape(rows.shape), (width, height), interpolation=cv2.INTER_NEAREST
+        )
+        mask = resized.astype(bool)
         keep = ~inside(mask, frame.keypoints.xy)
         moves = np.count_nonzero(moving)
         return self.verdict(
@@ -73,24 +84,32 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
         assert state.previous is not None
         assert state.T_world_prev is not None
         assert state.T_world_pred is not None
+
+        # the samples in the previous image, as the predicted motion takes them there
+        camera = state.camera
         T_prev_cur = se3.inverse(state.T_world_prev) @ state.T_world_pred
-        points = se3.transform(
-            T_prev_cur, state.camera.unproject(state.camera.undistort_points(xy), z)
-        )
-        pixels = state.camera.distort_points(state.camera.project(points))
-        at, visible = pixel_index(pixels, frame.gray.shape)
+        points = se3.transform(T_prev_cur, camera.unproject(camera.undistort_points(xy), z))
+        pixels = camera.distort_points(camera.project(points))
+        warped, visible = pixel_index(pixels, frame.gray.shape)
+
+        # difference in grey levels and in depth
         x, y = xy.astype(np.intp).T
-        colour = np.abs(frame.gray[y, x].astype(np.float64) - state.previous.gray[at]) / 255
-        before = np.nan_to_num(state.previous.depth[at])
-        depth = np.where(before > 0, np.abs(points[:, 2] - before) / np.maximum(z, 0.1), 0.0)
+        gray = frame.gray[y, x].astype(np.float64)
+        colour = np.abs(gray - state.previous.gray[warped]) / 255
+        before = np.nan_to_num(state.previous.depth[warped])
+        relative = np.abs(points[:, 2] - before) / np.maximum(z, MIN_DEPTH_M)
+        depth = np.where(before > 0, relative, 0.0)
         return np.where(
-            visible & (points[:, 2] > 0.1), colour + self.settings.depth_weight * depth, np.nan
+            visible & (points[:, 2] > MIN_DEPTH_M),
+            colour + self.settings.depth_weight * depth,
+            np.nan,
         )
 
     def _cluster(
         self, xy: NDArray[np.float64], z: NDArray[np.floating], seed: int
     ) -> NDArray[np.intp]:
-        features = np.column_stack([xy / 160.0, np.asarray(z) / 0.5]).astype(np.float32)
+        """Cluster ``[N]`` of each sample by k-means over pixels ``[N, 2]`` and depth ``[N]``, from random centres."""
+        features = np.column_stack([xy / CLUSTER_PX, np.asarray(z) / CLUSTER_M]).astype(np.float32)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 6, 0.05)
         centres = stream(seed, self.name).choice(
             len(features), self.settings.clusters, replace=False
@@ -110,15 +129,19 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
         measured = np.isfinite(residual)
         if not measured.any():
             return np.zeros(count, dtype=bool)
+
+        # mean residual of each cluster; that of most clusters is the static ones'
         members = np.bincount(label[measured], minlength=count)
-        mean = np.bincount(
-            label[measured], weights=residual[measured], minlength=count
-        ) / np.maximum(members, 1)
+        total = np.bincount(label[measured], weights=residual[measured], minlength=count)
+        mean = total / np.maximum(members, 1)
         static = max(float(np.median(mean[members > 0])), 1e-4)
-        share = np.bincount(label, weights=people, minlength=count) / np.maximum(
-            np.bincount(label, minlength=count), 1
-        )
+
+        # prior by the share of the cluster that lies on people
+        on_people = np.bincount(label, weights=people, minlength=count)
+        share = on_people / np.maximum(np.bincount(label, minlength=count), 1)
         prior = STATIC_PRIOR + (self.settings.prior - STATIC_PRIOR) * share
+
+        # exponential residuals, with a larger mean where the cluster moves
         likelihood = np.exp(-mean / (RATIO * static)) / RATIO
         posterior = prior * likelihood / (prior * likelihood + (1 - prior) * np.exp(-mean / static))
         return np.asarray((posterior > self.settings.threshold) & (members > 0))

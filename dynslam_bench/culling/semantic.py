@@ -26,11 +26,10 @@ class SemanticFilter(Rule[SegmentationSettings]):
         if frame.instances is None or not frame.instances.class_names:
             return self.verdict(np.ones(len(frame.xy), bool))
         objects = np.count_nonzero(dynamic_objects(frame.instances, self.settings))
-        mask = (
-            dynamic_mask(frame.instances, self.settings, frame.depth)
-            if frame.mask is None
-            else frame.mask
-        )
+        # the frame has the mask already if the pipeline made one
+        mask = frame.mask
+        if mask is None:
+            mask = dynamic_mask(frame.instances, self.settings, frame.depth)
         return self.verdict(
             ~inside(mask, frame.keypoints.xy), mask, objects=objects, mask_fraction=mask.mean()
         )

@@ -9,6 +9,9 @@ from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import TemplateSettings
 from dynslam_bench.geometry import Camera, se3
 
+MIN_DEPTH_M = 0.1
+"""Points nearer than this to the camera plane are not compared."""
+
 
 class TemplateFilter(ObjectRule[TemplateSettings]):
     """Drops features in dynamic boxes whose patch does not match at its predicted place in the latest frames.
@@ -26,9 +29,12 @@ class TemplateFilter(ObjectRule[TemplateSettings]):
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Compare patches; features in boxes without depth or history are dropped."""
+        # the latest frames and their poses
         if state.previous is not None and state.T_world_prev is not None:
             self._window = [(state.previous.gray, state.T_world_prev), *self._window]
         self._window = self._window[: self.settings.window]
+
+        # features in boxes have to prove that they are static
         xy = frame.keypoints.xy
         boxed = in_boxes(xy, dynamic_boxes(frame, self.segmentation)).any(axis=0)
         keep = np.asarray(~boxed)
@@ -36,17 +42,20 @@ class TemplateFilter(ObjectRule[TemplateSettings]):
         stats: dict[str, Number] = {"in_boxes": float(np.count_nonzero(boxed))}
         if state.T_world_pred is None or not self._window or not len(rows):
             return self.verdict(keep, **stats)
-        world = se3.transform(
-            state.T_world_pred, state.camera.unproject(frame.xy[rows], frame.z[rows])
-        )
+
+        # scores of the patches ``[window, K]`` at their predicted places in each of the frames
+        local = state.camera.unproject(frame.xy[rows], frame.z[rows])
+        world = se3.transform(state.T_world_pred, local)
         current = patches(frame.gray, xy[rows].astype(np.float64), self.settings.patch_px)
         scores = np.full((len(self._window), len(rows)), np.nan)
         for number, (gray, pose) in enumerate(self._window):
             local = se3.transform(se3.inverse(pose), world)
-            ahead = local[:, 2] > 0.1
+            ahead = local[:, 2] > MIN_DEPTH_M
             pixels = np.full((len(rows), 2), -1e3)
             pixels[ahead] = state.camera.distort_points(state.camera.project(local[ahead]))
             scores[number] = zncc(current, patches(gray, pixels, self.settings.patch_px))
+
+        # the median score decides; what was never tested is dropped
         tested = np.isfinite(scores).any(axis=0)
         median = np.full(len(rows), -1.0)
         median[tested] = np.nanmedian(scores[:, tested], axis=0)
@@ -62,7 +71,7 @@ class TemplateFilter(ObjectRule[TemplateSettings]):
 def patches(gray: NDArray[np.uint8], xy: NDArray[np.float64], size: int) -> NDArray[np.float64]:
     """Square patches ``[N, size * size]`` around rounded pixels ``[N, 2]``; NaN where they leave the image."""
     half = size // 2
-    (height, width) = gray.shape
+    height, width = gray.shape
     centre = np.rint(xy.clip(-1e6, 1e6)).astype(np.intp)
     fits = ((centre >= half) & (centre < (width - half, height - half))).all(axis=1)
     span = np.arange(-half, half + 1)
@@ -75,7 +84,8 @@ def patches(gray: NDArray[np.uint8], xy: NDArray[np.float64], size: int) -> NDAr
 
 def zncc(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
     """Zero-mean normalised cross-correlation ``[N]`` of patches ``[N, M]``; NaN where a patch is flat or missing."""
-    a, b = (patch - patch.mean(axis=1, keepdims=True) for patch in (first, second))
+    a = first - first.mean(axis=1, keepdims=True)
+    b = second - second.mean(axis=1, keepdims=True)
     norm = np.sqrt((a * a).sum(axis=1) * (b * b).sum(axis=1))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.where(norm > 1e-6, (a * b).sum(axis=1) / norm, np.nan))

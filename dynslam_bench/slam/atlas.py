@@ -106,12 +106,16 @@ class Atlas:
         for other, submap in self.submaps.items():
             if number not in (0, other):
                 continue
+            # the place in that map's world: a submap began at its start, and left the root map at its anchor
             place = submap.start if number else submap.anchor
             nearest = int(np.linalg.norm(centres - place, axis=1).argmin())
             scale = float(scales[nearest])
-            back = se3.inverse(after[nearest])
-            moved = se3.transform(back, scale * se3.transform(before[nearest], place))
-            slack = min(submap.slack + float(se3.rotation_angle(back @ before[nearest])), np.pi)
+
+            # it stays where it is as seen from the nearest keyframe
+            T_world_cam = se3.inverse(after[nearest])
+            moved = se3.transform(T_world_cam, scale * se3.transform(before[nearest], place))
+            rotation = float(se3.rotation_angle(T_world_cam @ before[nearest]))
+            slack = min(submap.slack + rotation, np.pi)
             if number:
                 self.submaps[other] = replace(submap, start=moved, slack=slack)
             else:
@@ -123,9 +127,9 @@ class Atlas:
         """How far the worlds of two maps may be rotated against each other, radians."""
         if one == other:
             return 0.0
-        return float(
-            sum(self.submaps[number].slack for number in (one, other) if number in self.submaps)
-        )
+        # the root map has none
+        slacks = [self.submaps[number].slack for number in (one, other) if number in self.submaps]
+        return float(sum(slacks))
 
     def reachable(self, left: int, there: int, last: Array, now: Array, bound_m: float) -> bool:
         """Whether a camera can have moved from one place to another.
@@ -137,8 +141,12 @@ class Atlas:
             now: Its centre now.
             bound_m: How far it may have moved.
         """
-        anchor, bound = (last, bound_m) if there == left else self._from_root(left, last, bound_m)
-        return there in (left, 0) and bool(np.linalg.norm(now - anchor) <= bound)
+        if there == left:
+            return bool(np.linalg.norm(now - last) <= bound_m)
+        if there != 0:
+            return False
+        anchor, bound = self._from_root(left, last, bound_m)
+        return bool(np.linalg.norm(now - anchor) <= bound)
 
     def admits_start(
         self, number: int, moved: Callable[[Array], Array], drift_m: float = 0.0
@@ -155,13 +163,19 @@ class Atlas:
         return bool(np.linalg.norm(moved(submap.start) - submap.anchor) <= submap.bound_m + drift_m)
 
     def _from_root(self, left: int, last: Array, bound_m: float) -> tuple[Array, float]:
-        """Where the root map was left, and how far from there the camera can be now."""
+        """Where the root map was left ``[3]``, and how far from there the camera can be now.
+
+        Args:
+            left: The map in which the camera was tracked last.
+            last: Its centre then ``[3]``.
+            bound_m: How far it may have moved since.
+        """
         submap = self.submaps.get(left)
         if submap is None:
             return last.copy(), bound_m
-        return submap.anchor, submap.bound_m + self._unit_ratio * float(
-            np.linalg.norm(last - submap.start)
-        ) + bound_m
+        # to the submap's beginning, then within it, then since it was left
+        within_m = float(np.linalg.norm(last - submap.start))
+        return submap.anchor, submap.bound_m + self._unit_ratio * within_m + bound_m
 
 
 # ---------------------------------------------------------------------- from and to a file
@@ -220,20 +234,26 @@ def save_atlas(
 
 def packed(world: Map, submaps: Collection[Submap]) -> dict[str, NDArray[Any]]:
     """The arrays of a map and its submaps, as `map_files` describes them."""
+    # keyframes and points, oldest first; features of each keyframe, without the unused columns
     slots = world.keyframes
     points = world.points
     points = points[np.argsort(world.id[points], kind="stable")]
     features = np.arange(world.kf_point.shape[1]) < world.kf_count[slots][:, None]
-    keyframe, feature = world.observations(points)
     arrays = {name: getattr(world, name)[slots] for name in KEYFRAME_ARRAYS}
     arrays |= {name: getattr(world, name)[slots][features] for name in FEATURE_ARRAYS}
     arrays |= {name: getattr(world, name)[points] for name in POINT_ARRAYS}
+
+    # observations, one point after the other; they name keyframes by row
+    keyframe, feature = world.observations(points)
     row_of_keyframe = np.zeros(world.kf_alive.size, np.int32)
     row_of_keyframe[slots] = np.arange(len(slots))
     arrays["obs_kf"] = row_of_keyframe[keyframe]
     arrays["obs_ft"] = feature
+
+    # submaps
     places = np.array([(submap.start, submap.anchor) for submap in submaps]).reshape(-1, 2, 3)
-    arrays["submap_start"], arrays["submap_anchor"] = places[:, 0], places[:, 1]
+    arrays["submap_start"] = places[:, 0]
+    arrays["submap_anchor"] = places[:, 1]
     arrays["submap_bound"] = np.array([submap.bound_m for submap in submaps], np.float64)
     return arrays
 
@@ -253,23 +273,31 @@ def unpacked(saved: SavedMap, camera: Camera, scales: Array) -> Atlas:
     tables = {name: arrays[name].copy() for name in (*KEYFRAME_ARRAYS, *POINT_ARRAYS)}
     tables |= {name: _padded(arrays[name], count) for name in FEATURE_ARRAYS}
     tables |= {name: _padded(arrays[name], n_obs) for name in OBSERVATION_ARRAYS}
+
+    # what the file leaves out, as it follows from the rest or is of another run
     tables["kf_point"] = np.full(tables["kf_octave"].shape, -1, np.int32)
     tables["kf_point"][arrays["obs_kf"], arrays["obs_ft"]] = np.repeat(np.arange(len(n_obs)), n_obs)
-    tables["kf_alive"], tables["alive"] = np.ones(len(count), bool), np.ones(len(n_obs), bool)
+    tables["kf_alive"] = np.ones(len(count), bool)
+    tables["alive"] = np.ones(len(n_obs), bool)
     tables["kf_frame"] = np.full(len(count), UNKNOWN_FRAME, np.int64)
     tables["kf_stamp"] = np.full(len(count), np.nan)
     tables["kf_centre"] = np.zeros((len(count), 3))
     world = Map(camera, scales)
     world.take_over(tables, header.next_keyframe, header.next_point)
-    priors = zip(
+
+    submaps: list[Submap] = []
+    for start, anchor, bound in zip(
         arrays["submap_start"], arrays["submap_anchor"], arrays["submap_bound"], strict=True
-    )
-    submaps = [Submap(start.copy(), anchor.copy(), float(bound)) for start, anchor, bound in priors]
+    ):
+        submaps.append(Submap(start.copy(), anchor.copy(), float(bound)))
     return Atlas(world, submaps, unit_ratio=1.0 if header.sensors == "rgbd" else MAX_UNIT_RATIO)
 
 
 def _padded(rows: NDArray[Any], counts: NDArray[np.integer]) -> NDArray[Any]:
-    """A table with so many of the rows in each of its lines, filled up with zeros."""
+    """A table ``[N, most, ...]`` with the first `counts` ``[N]`` places of each line filled from the rows in turn.
+
+    The other places are 0.
+    """
     in_use = np.arange(int(counts.max(initial=1))) < counts[:, None]
     table = np.zeros((*in_use.shape, *rows.shape[1:]), rows.dtype)
     table[in_use] = rows

@@ -314,7 +314,7 @@ class RgbdBackend:
         in_submap = self.atlas.active != ROOT_MAP
 
         # from the last frame
-        from_last_frame, trusted = pose_from_last_frame(
+        from_last_frame = pose_from_last_frame(
             self.world,
             current.last,
             current.observations,
@@ -322,7 +322,9 @@ class RgbdBackend:
             self._reference_keyframe,
             self.settings.tracking,
         )
-        initial = from_last_frame if trusted and tracked else None
+        initial = None
+        if from_last_frame is not None and from_last_frame.trusted and tracked:
+            initial = from_last_frame
         if initial is not None and not in_submap:
             return initial, None
 
@@ -397,7 +399,7 @@ class RgbdBackend:
         if self._mapping_enabled:
             self.world.found[points] += 1
         stamp = current.bundle.timestamp
-        pose = self.motion.filtered(
+        pose = self.motion.update(
             current.last, stamp, fit.estimate.T_cam_world, fit.estimate.information
         )
         observed = observe_points(observations, fit.matches.feature[fit.inliers], points)
@@ -561,7 +563,7 @@ class RgbdBackend:
             timings, verdict = self._insert_keyframe(frame, tracked, in_root_map)
             # bundle adjustment and loop closing have moved the frame
             pose = tracked.T_cam_world
-            self.motion.relocated(pose)
+            self.motion.relocate(pose)
 
         T_ref_world = self.world.kf_pose[self._reference_keyframe]
         T_cam_ref = pose @ se3.inverse(T_ref_world)
@@ -640,11 +642,11 @@ class RgbdBackend:
             rescale(self.history, closing.rescaled)
             # the rotation by a loop with depth is within the motion's noise
             if slot in closing.rescaled:
-                self.motion.transformed(T_before, world.kf_pose[slot], closing.rescaled[slot])
+                self.motion.transform(T_before, world.kf_pose[slot], closing.rescaled[slot])
             timings["loop_closing"] = perf_counter() - begin
 
         # the tracked frame takes over what mapping made of it
-        self._keyframe_policy.made(frame.index)
+        self._keyframe_policy.keyframe_added(frame.index)
         self._map_views.add_keyframe(slot, frame.depth)
         tracked.point = world.kf_point[slot, : len(tracked.observations)].astype(np.int64)
         tracked.T_cam_world = world.kf_pose[slot].copy()
@@ -775,7 +777,7 @@ class MonocularBackend(RgbdBackend):
         self._status = CameraStatus.TRACKED
         self._last_frame = TrackedFrame(observations, point, pose, frame.timestamp)
         self._reference_keyframe = second
-        self._keyframe_policy.made(frame.index)
+        self._keyframe_policy.keyframe_added(frame.index)
         self._map_views.add_keyframe(first, initial.first.frame.depth)
         self._map_views.add_keyframe(second, frame.depth)
         self._update_active_map()

@@ -9,11 +9,12 @@ thread in a fixed order: equal input gives equal bits.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.compiled import kernel
+from dynslam_bench.core.compiled import inlined, kernel
 from dynslam_bench.geometry.camera import Camera
 from dynslam_bench.geometry.gauss_newton import apply_twist, cholesky_solve, transform_point
 from dynslam_bench.slam.map import Array, Map, Slots
@@ -21,7 +22,10 @@ from dynslam_bench.slam.pose_optimisation import (
     CHI2_DEPTH,
     CHI2_MONO,
     MEDIAN_CHI2,
+    Intrinsics,
+    Measurements,
     cauchy_width,
+    intrinsics_of,
     observation_chi2,
 )
 
@@ -31,6 +35,20 @@ DEPTH_SHARE = MEDIAN_CHI2 / 2.366
 """Median of chi-square with two degrees of freedom over that with three, which observations with depth have."""
 MAX_OBSERVATIONS = 6000
 """Observations used at most: the budget that bounds the time of a keyframe."""
+MIN_VIEWS = 2
+"""Keyframes of the bundle that must observe a point."""
+BEHIND_COST = 100.0 * CHI2_DEPTH
+"""Cost of an observation that lies behind the camera."""
+DAMPING = 1e-5
+"""Levenberg-Marquardt's damping at the start, relative to the diagonal."""
+LEAST_DAMPING = 1e-8
+"""Steps that reduce the cost lower the damping down to this."""
+DAMPING_FLOOR = 1e-9
+"""What the diagonal grows by in any case, so that directions without any information can be solved for."""
+CONVERGED_GAIN = 1e-5
+"""The optimisation ends when a step reduces the cost by less than this share."""
+MIN_DETERMINANT = 1e-18
+"""A point whose block has a smaller determinant stays where it is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,42 +100,305 @@ class BundleResult:
     cost: float
 
 
+class PointObservations(NamedTuple):
+    """N observations, sorted by the observed point, as compiled loops take them.
+
+    Attributes:
+        pose: int64 ``[N]``, observing pose.
+        point: int64 ``[N]``, observed point, ascending.
+        start: int64 ``[Q + 1]``, first observation of each point; then N.
+        measured: Pixels, right coordinates and their information.
+    """
+
+    pose: Slots
+    point: Slots
+    start: Slots
+    measured: Measurements
+
+
+class NormalEquations(NamedTuple):
+    """The Gauss-Newton system of P variable poses and Q points, in blocks.
+
+    ::
+
+        [ poses      coupling ] [twists]   [gradient      ]
+        [ coupling^T points   ] [moves ] = [point_gradient]
+
+    Attributes:
+        poses: ``[6 P, 6 P]``, of which the lower triangle is used; after the elimination of the
+            points the reduced camera system (their Schur complement).
+        gradient: ``[6 P]``; after the elimination that of the reduced system.
+        coupling: ``[N, 6, 3]``, the block of each observation's pose and point.
+        point_inverse: ``[Q, 3, 3]``, inverse of each point's damped block; 0 where that is
+            singular.
+        point_gradient: ``[Q, 3]``.
+    """
+
+    poses: Array
+    gradient: Array
+    coupling: Array
+    point_inverse: Array
+    point_gradient: Array
+
+
 @kernel
-def _cost(
+def _robust_cost(
     poses: Array,
     points: Array,
-    obs_pose: Slots,
-    obs_point: Slots,
-    uv: Array,
-    right: Array,
-    info: Array,
-    info_right: Array,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    bf: float,
+    observations: PointObservations,
+    camera: Intrinsics,
     width: float,
     chi2: Array,
 ) -> float:
-    """Cost of all observations under a kernel of this squared width; fills `chi2` (inf behind the camera)."""
+    """Cost of all observations by Cauchy's kernel of this squared width; fills `chi2` (inf behind the camera)."""
+    measured = observations.measured
     total = 0.0
-    for k in range(obs_pose.shape[0]):
+    for k in range(observations.pose.shape[0]):
         _, chi2[k] = observation_chi2(
-            poses[obs_pose[k]],
-            points[obs_point[k]],
-            uv[k],
-            right[k],
-            info[k],
-            info_right[k],
-            fx,
-            fy,
-            cx,
-            cy,
-            bf,
+            poses[observations.pose[k]],
+            points[observations.point[k]],
+            measured.uv[k],
+            measured.right[k],
+            measured.info[k],
+            measured.info_right[k],
+            camera,
         )
-        total += 100.0 * CHI2_DEPTH if chi2[k] == np.inf else width * np.log1p(chi2[k] / width)
+        total += BEHIND_COST if chi2[k] == np.inf else width * np.log1p(chi2[k] / width)
     return total
+
+
+@inlined
+def _fill_point_jacobian(
+    pose: Array, du_dx: float, du_dz: float, dv_dy: float, dv_dz: float, dr_dz: float, out: Array
+) -> None:
+    """Derivatives ``[3, 3]`` of (u, v, right) by the world point: those in the camera frame times the rotation."""
+    for m in range(3):
+        out[0, m] = du_dx * pose[0, m] + du_dz * pose[2, m]
+        out[1, m] = dv_dy * pose[1, m] + dv_dz * pose[2, m]
+        out[2, m] = du_dx * pose[0, m] + dr_dz * pose[2, m]
+
+
+@inlined
+def _fill_pose_jacobian(
+    x: float,
+    y: float,
+    z: float,
+    du_dx: float,
+    du_dz: float,
+    dv_dy: float,
+    dv_dz: float,
+    dr_dz: float,
+    out: Array,
+) -> None:
+    """Derivatives ``[3, 6]`` of (u, v, right) by a twist (translation, rotation) in the camera frame."""
+    out[0, 0] = du_dx
+    out[0, 1] = 0.0
+    out[0, 2] = du_dz
+    out[0, 3] = du_dz * y
+    out[0, 4] = du_dx * z - du_dz * x
+    out[0, 5] = -du_dx * y
+    out[1, 0] = 0.0
+    out[1, 1] = dv_dy
+    out[1, 2] = dv_dz
+    out[1, 3] = dv_dz * y - dv_dy * z
+    out[1, 4] = -dv_dz * x
+    out[1, 5] = dv_dy * x
+    out[2, 0] = du_dx
+    out[2, 1] = 0.0
+    out[2, 2] = dr_dz
+    out[2, 3] = dr_dz * y
+    out[2, 4] = du_dx * z - dr_dz * x
+    out[2, 5] = -du_dx * y
+
+
+@inlined
+def _invert_symmetric(h: Array, out: Array) -> None:
+    """The inverse of a symmetric matrix ``[3, 3]``, of which the lower triangle is read; nothing if it is singular."""
+    h00 = h[0, 0]
+    h10 = h[1, 0]
+    h11 = h[1, 1]
+    h20 = h[2, 0]
+    h21 = h[2, 1]
+    h22 = h[2, 2]
+    c00 = h11 * h22 - h21 * h21
+    c10 = h20 * h21 - h10 * h22
+    c20 = h10 * h21 - h20 * h11
+    determinant = h00 * c00 + h10 * c10 + h20 * c20
+    if determinant > MIN_DETERMINANT:
+        t = 1.0 / determinant
+        out[0, 0] = c00 * t
+        out[0, 1] = c10 * t
+        out[0, 2] = c20 * t
+        out[1, 0] = c10 * t
+        out[1, 1] = (h00 * h22 - h20 * h20) * t
+        out[1, 2] = (h10 * h20 - h00 * h21) * t
+        out[2, 0] = c20 * t
+        out[2, 1] = (h10 * h20 - h00 * h21) * t
+        out[2, 2] = (h00 * h11 - h10 * h10) * t
+
+
+@kernel
+def _linearise(
+    poses: Array,
+    variable: int,
+    points: Array,
+    observations: PointObservations,
+    camera: Intrinsics,
+    width: float,
+    damping: float,
+    chi2: Array,
+) -> NormalEquations:
+    """The damped Gauss-Newton system, each observation weighted by Cauchy's kernel of this squared width."""
+    start = observations.start
+    measured = observations.measured
+    n = observations.pose.shape[0]
+    q = points.shape[0]
+    size = 6 * variable
+    h_poses = np.zeros((size, size))
+    gradient = np.zeros(size)
+    coupling = np.zeros((n, 6, 3))
+    point_inverse = np.zeros((q, 3, 3))
+    point_gradient = np.zeros((q, 3))
+    # of one observation, of its point's block
+    j_pose = np.zeros((3, 6))
+    j_point = np.zeros((3, 3))
+    residual = np.zeros(3)
+    h_point = np.zeros((3, 3))
+    for i in range(q):
+        h_point[:] = 0.0
+        for k in range(start[i], start[i + 1]):
+            if chi2[k] == np.inf:
+                continue
+
+            # residuals of the pixel and of the right coordinate
+            depth = measured.info_right[k] > 0.0
+            weight = 1.0 / (1.0 + chi2[k] / width)
+            c = observations.pose[k]
+            pose = poses[observations.pose[k]]
+            x, y, z = transform_point(pose, points[i])
+            iz = 1.0 / z
+            u = camera.fx * x * iz + camera.cx
+            residual[0] = measured.uv[k, 0] - u
+            residual[1] = measured.uv[k, 1] - (camera.fy * y * iz + camera.cy)
+            residual[2] = measured.right[k] - (u - camera.bf * iz) if depth else 0.0
+
+            # derivatives by the point in the camera frame; those of `right` by x are those of u
+            du_dx = camera.fx * iz
+            dv_dy = camera.fy * iz
+            du_dz = -du_dx * x * iz
+            dv_dz = -dv_dy * y * iz
+            dr_dz = du_dz + camera.bf * iz * iz
+
+            # the point's block J^T W J and gradient J^T W r; the lower triangle is enough
+            _fill_point_jacobian(pose, du_dx, du_dz, dv_dy, dv_dz, dr_dz, j_point)
+            w_pixel = weight * measured.info[k]
+            w_right = weight * measured.info_right[k]
+            for m in range(3):
+                f0 = w_pixel * j_point[0, m]
+                f1 = w_pixel * j_point[1, m]
+                f2 = w_right * j_point[2, m] if depth else 0.0
+                point_gradient[i, m] += f0 * residual[0] + f1 * residual[1] + f2 * residual[2]
+                for o in range(m + 1):
+                    h_point[m, o] += f0 * j_point[0, o] + f1 * j_point[1, o] + f2 * j_point[2, o]
+
+            # the pose's block and gradient, and what couples it with the point; fixed poses have none
+            if c < variable:
+                _fill_pose_jacobian(x, y, z, du_dx, du_dz, dv_dy, dv_dz, dr_dz, j_pose)
+                base = 6 * c
+                for m in range(6):
+                    f0 = w_pixel * j_pose[0, m]
+                    f1 = w_pixel * j_pose[1, m]
+                    f2 = w_right * j_pose[2, m] if depth else 0.0
+                    gradient[base + m] += f0 * residual[0] + f1 * residual[1] + f2 * residual[2]
+                    for o in range(m + 1):
+                        h_poses[base + m, base + o] += (
+                            f0 * j_pose[0, o] + f1 * j_pose[1, o] + f2 * j_pose[2, o]
+                        )
+                    for o in range(3):
+                        coupling[k, m, o] = (
+                            f0 * j_point[0, o] + f1 * j_point[1, o] + f2 * j_point[2, o]
+                        )
+
+        # damp the point's block, and invert it
+        for m in range(3):
+            h_point[m, m] += damping * h_point[m, m] + DAMPING_FLOOR
+        _invert_symmetric(h_point, point_inverse[i])
+
+    # damp the pose blocks before the points are eliminated
+    for m in range(size):
+        h_poses[m, m] += damping * h_poses[m, m] + DAMPING_FLOOR
+    return NormalEquations(h_poses, gradient, coupling, point_inverse, point_gradient)
+
+
+@kernel
+def _eliminate_points(
+    system: NormalEquations, observations: PointObservations, variable: int
+) -> None:
+    """Reduce the system to the poses, in place: the Schur complement ``poses - coupling points^-1 coupling^T``."""
+    start = observations.start
+    y = np.zeros((6, 3))
+    for i in range(system.point_gradient.shape[0]):
+        inverse = system.point_inverse[i]
+        b = system.point_gradient[i]
+        for k in range(start[i], start[i + 1]):
+            c = observations.pose[k]
+            if c >= variable:
+                continue
+
+            # y = coupling points^-1 of this observation
+            w = system.coupling[k]
+            for m in range(6):
+                for o in range(3):
+                    y[m, o] = (
+                        w[m, 0] * inverse[0, o] + w[m, 1] * inverse[1, o] + w[m, 2] * inverse[2, o]
+                    )
+            base = 6 * c
+            for m in range(6):
+                system.gradient[base + m] -= y[m, 0] * b[0] + y[m, 1] * b[1] + y[m, 2] * b[2]
+
+            # with every pose that observes the point, too; the lower triangle is enough
+            for k2 in range(start[i], start[i + 1]):
+                c2 = observations.pose[k2]
+                if c2 > c:
+                    continue
+                w2 = system.coupling[k2]
+                base2 = 6 * c2
+                for m in range(6):
+                    y0 = y[m, 0]
+                    y1 = y[m, 1]
+                    y2 = y[m, 2]
+                    for o in range(6):
+                        system.poses[base + m, base2 + o] -= (
+                            y0 * w2[o, 0] + y1 * w2[o, 1] + y2 * w2[o, 2]
+                        )
+
+
+@kernel
+def _move_points(
+    points: Array,
+    system: NormalEquations,
+    twists: Array,
+    observations: PointObservations,
+    variable: int,
+    new_points: Array,
+) -> None:
+    """Solve for the points by back-substitution: ``points^-1 (point_gradient - coupling^T twists)``."""
+    start = observations.start
+    for i in range(points.shape[0]):
+        b0 = system.point_gradient[i, 0]
+        b1 = system.point_gradient[i, 1]
+        b2 = system.point_gradient[i, 2]
+        for k in range(start[i], start[i + 1]):
+            c = observations.pose[k]
+            if c < variable:
+                for m in range(6):
+                    x = twists[6 * c + m]
+                    b0 = b0 - system.coupling[k, m, 0] * x
+                    b1 = b1 - system.coupling[k, m, 1] * x
+                    b2 = b2 - system.coupling[k, m, 2] * x
+        v = system.point_inverse[i]
+        for m in range(3):
+            new_points[i, m] = points[i, m] + v[m, 0] * b0 + v[m, 1] * b1 + v[m, 2] * b2
 
 
 @kernel
@@ -125,18 +406,8 @@ def _step(
     poses: Array,
     variable: int,
     points: Array,
-    obs_pose: Slots,
-    obs_point: Slots,
-    start: Slots,
-    uv: Array,
-    right: Array,
-    info: Array,
-    info_right: Array,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    bf: float,
+    observations: PointObservations,
+    camera: Intrinsics,
     width: float,
     damping: float,
     chi2: Array,
@@ -144,156 +415,21 @@ def _step(
     new_points: Array,
 ) -> bool:
     """One damped Gauss-Newton step from (poses, points) into (new_poses, new_points); False if it cannot be solved."""
-    n = obs_pose.shape[0]
-    q = points.shape[0]
-    size = 6 * variable
-    s = np.zeros((size, size))
-    g = np.zeros(size)
-    w = np.zeros((n, 6, 3))  # J_pose^T Lambda J_point
-    inverse = np.zeros((q, 3, 3))
-    b = np.zeros((q, 3))
-    jc = np.zeros((3, 6))
-    jl = np.zeros((3, 3))
-    e = np.zeros(3)
-    hll = np.zeros((3, 3))
-    y = np.zeros((6, 3))
-    for i in range(q):
-        hll[:] = 0.0
-        for k in range(start[i], start[i + 1]):
-            if chi2[k] == np.inf:
-                continue
-            depth = info_right[k] > 0.0
-            weight = 1.0 / (1.0 + chi2[k] / width)
-            c = obs_pose[k]
-            r = poses[obs_pose[k]]
-            xc, yc, zc = transform_point(r, points[i])
-            iz = 1.0 / zc
-            a = fx * iz
-            d = fy * iz
-            au = -a * xc * iz
-            dv = -d * yc * iz
-            u = fx * xc * iz + cx
-            e[0] = uv[k, 0] - u
-            e[1] = uv[k, 1] - (fy * yc * iz + cy)
-            e[2] = right[k] - (u - bf * iz) if depth else 0.0
-            ar = au + bf * iz * iz
-            for m in range(3):
-                jl[0, m] = a * r[0, m] + au * r[2, m]
-                jl[1, m] = d * r[1, m] + dv * r[2, m]
-                jl[2, m] = a * r[0, m] + ar * r[2, m]
-            lu = weight * info[k]
-            lr = weight * info_right[k]
-            for m in range(3):
-                f0 = lu * jl[0, m]
-                f1 = lu * jl[1, m]
-                f2 = lr * jl[2, m] if depth else 0.0
-                b[i, m] += f0 * e[0] + f1 * e[1] + f2 * e[2]
-                for o in range(m + 1):
-                    hll[m, o] += f0 * jl[0, o] + f1 * jl[1, o] + f2 * jl[2, o]
-            if c < variable:
-                jc[0, 0] = a
-                jc[0, 1] = 0.0
-                jc[0, 2] = au
-                jc[0, 3] = au * yc
-                jc[0, 4] = a * zc - au * xc
-                jc[0, 5] = -a * yc
-                jc[1, 0] = 0.0
-                jc[1, 1] = d
-                jc[1, 2] = dv
-                jc[1, 3] = dv * yc - d * zc
-                jc[1, 4] = -dv * xc
-                jc[1, 5] = d * xc
-                jc[2, 0] = a
-                jc[2, 1] = 0.0
-                jc[2, 2] = ar
-                jc[2, 3] = ar * yc
-                jc[2, 4] = a * zc - ar * xc
-                jc[2, 5] = -a * yc
-                base = 6 * c
-                for m in range(6):
-                    f0 = lu * jc[0, m]
-                    f1 = lu * jc[1, m]
-                    f2 = lr * jc[2, m] if depth else 0.0
-                    g[base + m] += f0 * e[0] + f1 * e[1] + f2 * e[2]
-                    for o in range(m + 1):
-                        s[base + m, base + o] += f0 * jc[0, o] + f1 * jc[1, o] + f2 * jc[2, o]
-                    for o in range(3):
-                        w[k, m, o] = f0 * jl[0, o] + f1 * jl[1, o] + f2 * jl[2, o]
-        for m in range(3):
-            hll[m, m] += damping * hll[m, m] + 1e-9
-        # inverse of the symmetric 3x3 block
-        h00 = hll[0, 0]
-        h10 = hll[1, 0]
-        h11 = hll[1, 1]
-        h20 = hll[2, 0]
-        h21 = hll[2, 1]
-        h22 = hll[2, 2]
-        c00 = h11 * h22 - h21 * h21
-        c10 = h20 * h21 - h10 * h22
-        c20 = h10 * h21 - h20 * h11
-        det = h00 * c00 + h10 * c10 + h20 * c20
-        if not det > 1e-18:
-            continue
-        t = 1.0 / det
-        v = inverse[i]
-        v[0, 0] = c00 * t
-        v[0, 1] = c10 * t
-        v[0, 2] = c20 * t
-        v[1, 0] = c10 * t
-        v[1, 1] = (h00 * h22 - h20 * h20) * t
-        v[1, 2] = (h10 * h20 - h00 * h21) * t
-        v[2, 0] = c20 * t
-        v[2, 1] = (h10 * h20 - h00 * h21) * t
-        v[2, 2] = (h00 * h11 - h10 * h10) * t
-    for i in range(size):  # damp the pose blocks before the points are eliminated
-        s[i, i] += damping * s[i, i] + 1e-9
-    for i in range(q):
-        v = inverse[i]
-        for k in range(start[i], start[i + 1]):
-            c = obs_pose[k]
-            if c >= variable:
-                continue
-            wk = w[k]
-            for m in range(6):
-                for o in range(3):
-                    y[m, o] = wk[m, 0] * v[0, o] + wk[m, 1] * v[1, o] + wk[m, 2] * v[2, o]
-            base = 6 * c
-            for m in range(6):
-                g[base + m] -= y[m, 0] * b[i, 0] + y[m, 1] * b[i, 1] + y[m, 2] * b[i, 2]
-            for k2 in range(start[i], start[i + 1]):
-                c2 = obs_pose[k2]
-                if c2 > c:
-                    continue
-                wl = w[k2]
-                other = 6 * c2
-                for m in range(6):
-                    y0 = y[m, 0]
-                    y1 = y[m, 1]
-                    y2 = y[m, 2]
-                    for o in range(6):
-                        s[base + m, other + o] -= y0 * wl[o, 0] + y1 * wl[o, 1] + y2 * wl[o, 2]
-    if not cholesky_solve(s, g):
+    system = _linearise(poses, variable, points, observations, camera, width, damping, chi2)
+
+    # the points are many and depend on poses alone: eliminate them, and solve for the poses
+    _eliminate_points(system, observations, variable)
+    twists = system.gradient
+    if not cholesky_solve(system.poses, twists):
         return False
     for c in range(variable):
-        moved = apply_twist(poses[c], g[6 * c : 6 * c + 6])
+        moved = apply_twist(poses[c], twists[6 * c : 6 * c + 6])
         for m in range(4):
             for o in range(4):
                 new_poses[c, m, o] = moved[m, o]
-    for i in range(q):
-        b0 = b[i, 0]
-        b1 = b[i, 1]
-        b2 = b[i, 2]
-        for k in range(start[i], start[i + 1]):
-            c = obs_pose[k]
-            if c < variable:
-                for m in range(6):
-                    x = g[6 * c + m]
-                    b0 = b0 - w[k, m, 0] * x
-                    b1 = b1 - w[k, m, 1] * x
-                    b2 = b2 - w[k, m, 2] * x
-        v = inverse[i]
-        for m in range(3):
-            new_points[i, m] = points[i, m] + v[m, 0] * b0 + v[m, 1] * b1 + v[m, 2] * b2
+
+    # each point follows from the poses
+    _move_points(points, system, twists, observations, variable, new_points)
     return True
 
 
@@ -302,57 +438,17 @@ def _adjust(
     poses: Array,
     variable: int,
     points: Array,
-    obs_pose: Slots,
-    obs_point: Slots,
-    start: Slots,
-    uv: Array,
-    right: Array,
-    info: Array,
-    info_right: Array,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    bf: float,
+    observations: PointObservations,
+    camera: Intrinsics,
     iterations: int,
     chi2: Array,
 ) -> tuple[Array, Array, float]:
-    _cost(
-        poses,
-        points,
-        obs_pose,
-        obs_point,
-        uv,
-        right,
-        info,
-        info_right,
-        fx,
-        fy,
-        cx,
-        cy,
-        bf,
-        1.0,
-        chi2,
-    )
-    width = cauchy_width(np.where(info_right > 0.0, chi2 * DEPTH_SHARE, chi2))
-    cost = _cost(
-        poses,
-        points,
-        obs_pose,
-        obs_point,
-        uv,
-        right,
-        info,
-        info_right,
-        fx,
-        fy,
-        cx,
-        cy,
-        bf,
-        width,
-        chi2,
-    )
-    damping = 1e-5
+    """Poses ``[P, 4, 4]``, points ``[Q, 3]`` and their cost after Levenberg-Marquardt; fills `chi2`."""
+    # the kernel is as wide as the residuals are at the start
+    _robust_cost(poses, points, observations, camera, 1.0, chi2)
+    width = cauchy_width(np.where(observations.measured.info_right > 0.0, chi2 * DEPTH_SHARE, chi2))
+    cost = _robust_cost(poses, points, observations, camera, width, chi2)
+    damping = DAMPING
     trial = np.empty_like(chi2)
     for _ in range(iterations):
         new_poses = poses.copy()
@@ -361,18 +457,8 @@ def _adjust(
             poses,
             variable,
             points,
-            obs_pose,
-            obs_point,
-            start,
-            uv,
-            right,
-            info,
-            info_right,
-            fx,
-            fy,
-            cx,
-            cy,
-            bf,
+            observations,
+            camera,
             width,
             damping,
             chi2,
@@ -380,33 +466,19 @@ def _adjust(
             new_points,
         )
         if solved:
-            new = _cost(
-                new_poses,
-                new_points,
-                obs_pose,
-                obs_point,
-                uv,
-                right,
-                info,
-                info_right,
-                fx,
-                fy,
-                cx,
-                cy,
-                bf,
-                width,
-                trial,
-            )
+            # take a step that reduces the cost, and damp less
+            new = _robust_cost(new_poses, new_points, observations, camera, width, trial)
             if new < cost:
                 gain = cost - new
-                damping = max(damping * 0.2, 1e-8)
+                damping = max(damping * 0.2, LEAST_DAMPING)
                 poses = new_poses
                 points = new_points
                 cost = new
                 chi2[:] = trial
-                if gain < 1e-5 * cost:
+                if gain < CONVERGED_GAIN * cost:
                     break
                 continue
+        # else damp more
         damping *= 30.0
     return poses, points, cost
 
@@ -418,18 +490,18 @@ def adjust_bundle(problem: BundleProblem, iterations: int) -> BundleResult:
         problem: Start values and observations; every point should have two observations or depth.
         iterations: Levenberg-Marquardt iterations at most.
     """
-    c = problem.camera
     chi2 = np.zeros(len(problem.obs_pose))
     start = np.searchsorted(problem.obs_point, np.arange(len(problem.points) + 1)).astype(np.int64)
-    guess = (
+    measured = Measurements(problem.uv, problem.right, problem.info, problem.info_right)
+    observations = PointObservations(problem.obs_pose, problem.obs_point, start, measured)
+    poses, points, cost = _adjust(
         np.ascontiguousarray(problem.poses),
         problem.variable,
         np.ascontiguousarray(problem.points),
-    )
-    measured = problem.uv, problem.right, problem.info, problem.info_right
-    lens = c.fx, c.fy, c.cx, c.cy, c.fx * c.baseline_m
-    poses, points, cost = _adjust(
-        *guess, problem.obs_pose, problem.obs_point, start, *measured, *lens, iterations, chi2
+        observations,
+        intrinsics_of(problem.camera),
+        iterations,
+        chi2,
     )
     limit = np.where(problem.info_right > 0, CHI2_DEPTH, CHI2_MONO)
     return BundleResult(poses, points, chi2, chi2 <= limit, float(cost))
@@ -460,6 +532,11 @@ def local_bundle(world: Map, slot: int, window: int) -> Bundle | None:
 
     Variable are the keyframe and its most covisible ones; fixed are further keyframes that observe
     the same points, and always at least one. The oldest keyframe of all is never variable.
+
+    Args:
+        world: The map.
+        slot: The keyframe.
+        window: Variable keyframes at most.
     """
     near, _ = world.covisible(slot)
     variable = np.concatenate([[slot], near[: window - 1]]).astype(np.int64)
@@ -469,6 +546,8 @@ def local_bundle(world: Map, slot: int, window: int) -> Bundle | None:
     points = world.points_of(variable)
     fixed, _ = world.covisible_of(points)
     fixed = fixed[~np.isin(fixed, variable)][:FIXED_KEYFRAMES]
+
+    # without any other observer the least covisible keyframe stays
     if not len(fixed):
         if len(variable) < 2:
             return None
@@ -482,27 +561,31 @@ def full_bundle(world: Map) -> Bundle | None:
     keyframes = world.keyframes
     if len(keyframes) < 2:
         return None
-    return _bundle(
-        world, keyframes[1:], keyframes[:1], world.points, int(world.n_obs[world.points].sum())
-    )
+    everything = int(world.n_obs[world.points].sum())
+    return _bundle(world, keyframes[1:], keyframes[:1], world.points, everything)
 
 
 def _bundle(
     world: Map, variable: Slots, fixed: Slots, points: Slots, max_observations: int
 ) -> Bundle | None:
+    """The bundle of these keyframes and points (slots); None if no point is observed often enough."""
+    # observations of the points, and the number in the bundle of the pose that each is made from
     poses = np.concatenate([variable, fixed])
     pose_number = np.full(world.kf_alive.size, -1, np.int64)
     pose_number[poses] = np.arange(len(poses))
     keyframes, all_features = world.observations(points)
     of_point = np.repeat(np.arange(len(points)), world.n_obs[points])
     pose = pose_number[keyframes]
-    support = np.bincount(of_point[pose >= 0], minlength=len(points))
-    supported = np.flatnonzero(support >= 2)
-    # long tracks first
-    order = supported[np.lexsort((world.id[points[supported]], -support[supported]))]
-    order = np.sort(order[np.cumsum(support[order]) <= max_observations])
+
+    # points with the longest tracks first, while the budget lasts
+    views = np.bincount(of_point[pose >= 0], minlength=len(points))
+    supported = np.flatnonzero(views >= MIN_VIEWS)
+    order = supported[np.lexsort((world.id[points[supported]], -views[supported]))]
+    order = np.sort(order[np.cumsum(views[order]) <= max_observations])
     if not len(order):
         return None
+
+    # their observations, sorted by point
     point_number = np.full(len(points), -1, np.int64)
     point_number[order] = np.arange(len(order))
     used = (pose >= 0) & (point_number[of_point] >= 0)
@@ -510,17 +593,17 @@ def _bundle(
     obs_pose = pose[used]
     points = points[order]
     features = all_features[used].astype(np.int64)
-    at = poses[obs_pose]
+    observers = poses[obs_pose]
     problem = BundleProblem(
         world.kf_pose[poses],
         len(variable),
         world.position[points],
         obs_pose,
         obs_point,
-        world.kf_xy[at, features],
-        world.kf_right[at, features],
-        world.kf_info[at, features],
-        world.kf_info_right[at, features],
+        world.kf_xy[observers, features],
+        world.kf_right[observers, features],
+        world.kf_info[observers, features],
+        world.kf_info_right[observers, features],
         world.camera,
     )
     return Bundle(problem, poses, points, features)

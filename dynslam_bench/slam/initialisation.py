@@ -30,32 +30,39 @@ from dynslam_bench.slam.pose_optimisation import NEAR_M, optimise_pose
 from dynslam_bench.slam.settings import TwoViewSettings
 
 MAX_DISTANCE = 50
+"""Largest Hamming distance of a match (ORB-SLAM's number)."""
 RATIO = 0.9
-"""Largest Hamming distance of a match, and over that of the second nearest (ORB-SLAM's numbers)."""
+"""Largest ratio of that distance to the second nearest one's (ORB-SLAM's number)."""
 CHI2_LINE = 3.841
+"""95 % quantile of chi-square with one degree of freedom: distance from an epipolar line."""
 CHI2_POINT = 5.991
-"""95 % quantiles of chi-square: distance from a line, and from a point."""
+"""95 % quantile of chi-square with two degrees of freedom: distance from a point."""
 MIN_GOOD_SHARE = 0.8
 """Share of the matches that fit either model which must lie before both cameras and project back."""
 RIVAL_SHARE = 0.75
 """A motion that explains a smaller share of what the best one does is no rival."""
 RIVAL_COST = 30.0
+"""A motion is accepted if every rival has so much more chi-square."""
 RIVAL_FACTOR = 1.1
-"""A motion is accepted if every rival has so much more chi-square, and so many times as much."""
+"""A motion is accepted if every rival has so many times its chi-square as well."""
 VIEWS = 7
 """Views beside the first that are adjusted together at most: the newest, and others spread evenly before it."""
 MIN_VIEWS = 3
 """Views beside the first that are needed at least: two alone mistake a rotation for a translation."""
 CARRIED = 2
 """Best motions of one frame that are tried at the next one, too."""
-SAME_DEG = 1.0, 5.0
-"""Motions whose rotations and whose directions differ by less are the same."""
+SAME_ROTATION_DEG = 1.0
+"""Motions are the same if their rotations differ by less, and their directions too."""
+SAME_DIRECTION_DEG = 5.0
+"""Motions are the same if the directions of their translations differ by less, and their rotations too."""
 WIDE_POINTS = 50
 """Points that must be seen under the smallest parallax or more."""
 RANSAC_ITERATIONS = 2000
+"""RANSAC samples of either model at most."""
 CONFIDENCE = 0.999
+"""Probability at which RANSAC has drawn a sample without outliers."""
 BUNDLE_ITERATIONS = 20
-"""Of the bundle adjustment of a motion (ORB-SLAM2's number)."""
+"""Iterations of the bundle adjustment of a motion (ORB-SLAM2's number)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,35 +104,51 @@ class TwoViewMotion:
         """Angle under which `WIDE_POINTS` of the points are seen, or more."""
         to_second = self.points - se3.inverse(self.T_second_first)[:3, 3]
         lengths = np.linalg.norm(self.points, axis=1) * np.linalg.norm(to_second, axis=1)
+        # of the widest angles, smallest cosines first
         cosine = np.sort((self.points * to_second).sum(axis=1) / np.maximum(lengths, 1e-12))
-        return float(
-            np.degrees(np.arccos(np.clip(cosine[min(WIDE_POINTS, len(cosine)) - 1], -1.0, 1.0)))
-        )
+        widest = cosine[min(WIDE_POINTS, len(cosine)) - 1]
+        return float(np.degrees(np.arccos(np.clip(widest, -1.0, 1.0))))
 
     def continued(self, newest: View, camera: Camera) -> Array:
         """Pose ``[4, 4]`` from the first camera's frame to that of a newer view, which shows some of the points."""
-        _, ours, theirs = np.intersect1d(
+        # features of the first view that both match
+        _, in_motion, in_newest = np.intersect1d(
             self.matches[:, 0], newest.matches[:, 0], return_indices=True
         )
-        rows = newest.matches[theirs, 1]
-        newer = newest.observations
-        measured = newer.xy[rows], newer.right[rows], newer.info[rows], newer.info_right[rows]
-        return optimise_pose(self.T_second_first, self.points[ours], *measured, camera).T_cam_world
+        rows = newest.matches[in_newest, 1]
+        observations = newest.observations
+        estimate = optimise_pose(
+            self.T_second_first,
+            self.points[in_motion],
+            observations.xy[rows],
+            observations.right[rows],
+            observations.info[rows],
+            observations.info_right[rows],
+            camera,
+        )
+        return estimate.T_cam_world
 
     def same_as(self, other: TwoViewMotion) -> bool:
         """Whether it is the same motion as another."""
         rotation = se3.rotation_angle(self.T_second_first @ se3.inverse(other.T_second_first))
-        translations = self.T_second_first[:3, 3], other.T_second_first[:3, 3]
-        one, two = (t / max(float(np.linalg.norm(t)), 1e-12) for t in translations)
-        direction = np.arccos(np.clip(one @ two, -1.0, 1.0))
-        return bool(np.degrees(rotation) < SAME_DEG[0] and np.degrees(direction) < SAME_DEG[1])
+        cosine = _direction(self.T_second_first) @ _direction(other.T_second_first)
+        between = np.arccos(np.clip(cosine, -1.0, 1.0))
+        return bool(
+            np.degrees(rotation) < SAME_ROTATION_DEG and np.degrees(between) < SAME_DIRECTION_DEG
+        )
 
     def rules_out(self, other: TwoViewMotion) -> bool:
         """Whether it explains all views so much better than another motion that the other is ruled out."""
-        more = (other.cost - self.cost) * self.count
-        return self.same_as(other) or bool(
-            more > RIVAL_COST and other.cost > RIVAL_FACTOR * self.cost
-        )
+        if self.same_as(other):
+            return True
+        more_chi2 = (other.cost - self.cost) * self.count
+        return bool(more_chi2 > RIVAL_COST and other.cost > RIVAL_FACTOR * self.cost)
+
+
+def _direction(pose: Array) -> Array:
+    """Unit vector ``[3]`` of a pose's translation; 0 without any."""
+    translation = pose[:3, 3]
+    return np.asarray(translation / max(float(np.linalg.norm(translation)), 1e-12))
 
 
 def match_views(
@@ -171,6 +194,7 @@ def possible_motions(
     Returns:
         Each refined with its points, lowest cost first; none where too few matches agree with any.
     """
+    # motions by a homography, by an essential matrix, and those of the view before
     second = later[-1].observations
     matches = later[-1].matches
     xy_first = first.xy[matches[:, 0]]
@@ -179,23 +203,39 @@ def possible_motions(
     of_homography, on_plane = _homography(xy_first, xy_second, info, camera)
     of_essential, on_lines = _essential(xy_first, xy_second, info, camera)
     continued = [motion.continued(later[-1], camera) for motion in before]
+
+    # triangulate by each motion what fits either model
     rows = np.flatnonzero(on_plane | on_lines)
     if not len(rows):
         return []
-    tried = [
-        (motion, *_triangulated(motion, xy_first[rows], xy_second[rows], info[rows], camera))
-        for motion in (*of_homography, *of_essential, *continued)
-        if np.isfinite(motion).all()
-    ]
-    most = max((np.count_nonzero(good) for _, _, good in tried), default=0)
+    triangulated: list[tuple[Array, Array, NDArray[np.bool_]]] = []
+    for T_second_first in (*of_homography, *of_essential, *continued):
+        if np.isfinite(T_second_first).all():
+            points, good = _triangulated(
+                T_second_first, xy_first[rows], xy_second[rows], info[rows], camera
+            )
+            triangulated.append((T_second_first, points, good))
+
+    # one motion must explain nearly all of it
+    most = max((np.count_nonzero(good) for _, _, good in triangulated), default=0)
     if most < max(settings.min_points, MIN_GOOD_SHARE * len(rows)):
         return []
-    by_two = [
-        _adjusted(first, later[-1:], motion[None], matches[rows[good]], points[good], camera)
-        for motion, points, good in tried
-        if np.count_nonzero(good) >= RIVAL_SHARE * most
-    ]
-    rivals = distinct_motions(_by_cost(by_two, settings))
+
+    # adjust all that explain nearly as much: by the two views, then distinct ones by all views
+    by_two_views: list[TwoViewMotion] = []
+    for T_second_first, points, good in triangulated:
+        if np.count_nonzero(good) >= RIVAL_SHARE * most:
+            by_two_views.append(
+                _adjusted(
+                    first,
+                    later[-1:],
+                    T_second_first[None],
+                    matches[rows[good]],
+                    points[good],
+                    camera,
+                )
+            )
+    rivals = distinct_motions(_by_cost(by_two_views, settings))
     return _by_cost([_adjusted_by_all(first, later, motion, camera) for motion in rivals], settings)
 
 
@@ -215,13 +255,20 @@ def accepted_motion(
     another motion has and this one has not counts against it, and the same motion has to be the
     best either way.
     """
-    if not motions or not all(motions[0].rules_out(other) for other in motions[1:]):
+    if not motions:
         return None
+
+    # every other motion explains the matches clearly worse
+    best = motions[0]
+    if not all(best.rules_out(other) for other in motions[1:]):
+        return None
+
+    # it is the best as well where missing observations count as outliers
     most = max(motion.count for motion in motions)
     total = [motion.cost * motion.count + CHI2_POINT * (most - motion.count) for motion in motions]
-    if not motions[int(np.argmin(total))].same_as(motions[0]):
+    if not motions[int(np.argmin(total))].same_as(best):
         return None
-    return motions[0] if motions[0].parallax_deg >= settings.min_parallax_deg else None
+    return best if best.parallax_deg >= settings.min_parallax_deg else None
 
 
 def distinct_motions(motions: Sequence[TwoViewMotion]) -> list[TwoViewMotion]:
@@ -243,19 +290,22 @@ def _homography(
     )
     if model is None or abs(np.linalg.det(model)) < 1e-12:
         return [], np.zeros(len(xy_first), bool)
-    errors = [
-        info * np.square(cv2.perspectiveTransform(a[None], h)[0] - b).sum(axis=1)
-        for h, a, b in ((model, xy_first, xy_second), (np.linalg.inv(model), xy_second, xy_first))
-    ]
+
+    # symmetric transfer error, as chi-square
+    in_second = cv2.perspectiveTransform(xy_first[None], model)[0]
+    in_first = cv2.perspectiveTransform(xy_second[None], np.linalg.inv(model))[0]
+    error_second = info * np.square(in_second - xy_second).sum(axis=1)
+    error_first = info * np.square(in_first - xy_first).sum(axis=1)
+
+    # its motions; one without a translation gives no points
     _, rotations, translations, _ = cv2.decomposeHomographyMat(
         np.asarray(model, np.float64), camera.matrix
     )
-    motions = [
-        _pose(r, t)
-        for r, t in zip(rotations, translations, strict=True)
-        if np.linalg.norm(t) > 1e-9
-    ]
-    return motions, np.asarray(np.maximum(*errors) <= CHI2_POINT)
+    motions: list[Array] = []
+    for rotation, translation in zip(rotations, translations, strict=True):
+        if np.linalg.norm(translation) > 1e-9:
+            motions.append(_pose(rotation, translation))
+    return motions, np.asarray(np.maximum(error_second, error_first) <= CHI2_POINT)
 
 
 def _essential(
@@ -268,22 +318,31 @@ def _essential(
     )
     if model is None or model.shape != (3, 3):
         return [], np.zeros(len(xy_first), bool)
+
+    # fundamental matrix F = K^-T E K^-1, and the distances from the epipolar lines as chi-square
     inverse = np.linalg.inv(camera.matrix)
     f = inverse.T @ model @ inverse
-    a, b = (np.column_stack([xy, np.ones(len(xy))]) for xy in (xy_first, xy_second))
-    lines_in_second = a @ f.T
-    lines_in_first = b @ f
-    offset = np.square((b * lines_in_second).sum(axis=1))
-    errors = [
-        info * offset / np.square(lines[:, :2]).sum(axis=1)
-        for lines in (lines_in_second, lines_in_first)
-    ]
+    first = np.column_stack([xy_first, np.ones(len(xy_first))])
+    second = np.column_stack([xy_second, np.ones(len(xy_second))])
+    lines_in_second = first @ f.T
+    lines_in_first = second @ f
+    algebraic = np.square((second * lines_in_second).sum(axis=1))
+    error_second = info * algebraic / np.square(lines_in_second[:, :2]).sum(axis=1)
+    error_first = info * algebraic / np.square(lines_in_first[:, :2]).sum(axis=1)
+
+    # its four motions: two rotations, and the translation with either sign
     one, other, t = cv2.decomposeEssentialMat(np.asarray(model, np.float64))
-    motions = [_pose(r, sign * np.asarray(t)) for r in (one, other) for sign in (1.0, -1.0)]
-    return motions, np.asarray(np.maximum(*errors) <= CHI2_LINE)
+    motions = [
+        _pose(one, np.asarray(t)),
+        _pose(one, -1.0 * np.asarray(t)),
+        _pose(other, np.asarray(t)),
+        _pose(other, -1.0 * np.asarray(t)),
+    ]
+    return motions, np.asarray(np.maximum(error_second, error_first) <= CHI2_LINE)
 
 
 def _pose(rotation: Any, translation: Any) -> Array:
+    """The pose ``[4, 4]`` of a rotation and a translation that is made as long as 1."""
     return se3.from_matrix(np.ravel(translation) / np.linalg.norm(translation), rotation)
 
 
@@ -297,9 +356,10 @@ def _triangulated(
         points = np.nan_to_num(
             homogeneous[:, :3] / homogeneous[:, 3:], nan=0.0, posinf=0.0, neginf=0.0
         )
-    moved = se3.transform(T_second_first, points)
-    good = (points[:, 2] > NEAR_M) & (moved[:, 2] > NEAR_M)
-    for local, xy in ((points, xy_first), (moved, xy_second)):
+    in_second = se3.transform(T_second_first, points)
+    good = (points[:, 2] > NEAR_M) & (in_second[:, 2] > NEAR_M)
+    for local, xy in ((points, xy_first), (in_second, xy_second)):
+        # points behind a camera are not good, whatever their projection
         uv = camera.project(np.where(good[:, None], local, [0.0, 0.0, 1.0]))
         good = good & (info * np.square(uv - xy).sum(axis=1) < CHI2_POINT)
     return points, np.asarray(good)
@@ -311,11 +371,11 @@ def _adjusted_by_all(
     """Motion and points adjusted by the views between the two, too."""
     if len(later) == 1:
         return motion
+    # a few views, spread evenly; the motion is taken as constant for their initial poses
     chosen = np.unique(np.linspace(0, len(later) - 1, VIEWS).round().astype(int))
     poses = se3.exp((chosen[:, None] + 1) / len(later) * se3.log(motion.T_second_first))
-    return _adjusted(
-        first, [later[at] for at in chosen], poses, motion.matches, motion.points, camera
-    )
+    views = [later[number] for number in chosen]
+    return _adjusted(first, views, poses, motion.matches, motion.points, camera)
 
 
 def _adjusted(
@@ -327,28 +387,34 @@ def _adjusted(
     camera: Camera,
 ) -> TwoViewMotion:
     """Bundle adjustment of the later views' poses ``[V, 4, 4]`` and the points of the last one's `matches`."""
+    # observations of the points in the first view (number 0) and in the later ones
     count = len(later)
     point_of_feature = np.full(len(first), -1, np.int64)
     point_of_feature[matches[:, 0]] = np.arange(len(matches))
-    columns = []
-    views = [(first, matches[:, [0, 0]]), *((view.observations, view.matches) for view in later)]
-    for number, (observations, rows) in enumerate(views):
-        point = point_of_feature[rows[:, 0]]
-        rows = rows[point >= 0, 1]
-        columns.append(
-            (
-                np.full(len(rows), number),
-                point[point >= 0],
-                observations.xy[rows],
-                observations.info[rows],
-            )
-        )
-    view, point, xy, info = (np.concatenate(column) for column in zip(*columns, strict=True))
+    views = [(first, matches[:, [0, 0]])]
+    views += [(view.observations, view.matches) for view in later]
+    numbers = []
+    points_seen = []
+    pixels = []
+    infos = []
+    for number, (observations, pairs) in enumerate(views):
+        point = point_of_feature[pairs[:, 0]]
+        features = pairs[point >= 0, 1]
+        numbers.append(np.full(len(features), number))
+        points_seen.append(point[point >= 0])
+        pixels.append(observations.xy[features])
+        infos.append(observations.info[features])
+
+    # sorted by point, then by view
+    view = np.concatenate(numbers)
+    point = np.concatenate(points_seen)
     order = np.lexsort((view, point))
     view = view[order]
     point = point[order]
-    xy = xy[order]
-    info = info[order]
+    xy = np.concatenate(pixels)[order]
+    info = np.concatenate(infos)[order]
+
+    # bundle adjustment; the first view stays and is the last pose
     problem = BundleProblem(
         np.concatenate([poses, np.eye(4)[None]]),
         count,
@@ -362,6 +428,8 @@ def _adjusted(
         camera,
     )
     result = adjust_bundle(problem, BUNDLE_ITERATIONS)
+
+    # points that do not fit in the first or the last view are left out
     kept = np.asarray(np.isfinite(result.points).all(axis=1))
     kept[point[~result.inliers & ((view == 0) | (view == count))]] = False
     cost = float(np.minimum(result.chi2, CHI2_POINT).mean()) if len(result.chi2) else np.inf
@@ -375,7 +443,13 @@ def _adjusted(
 
 @dataclass(frozen=True, eq=False)
 class InitialMap:
-    """Two views and the motion between them; lengths in units of the first view's median depth."""
+    """Two views and the motion between them; lengths in units of the first view's median depth.
+
+    Attributes:
+        first: The first view.
+        second: The newest view.
+        motion: The accepted motion.
+    """
 
     first: View
     second: View
@@ -389,19 +463,21 @@ class InitialMap:
             T_first_world: Pose ``[4, 4]`` of the first view in the submap's world, world to camera.
             submap: The submap's number (`Map.kf_map`).
         """
-        first, second = self.motion.matches.T
-        slots = [
-            world.add_keyframe(
-                view.observations, pose, view.frame.index, view.frame.timestamp, submap
+        # two keyframes
+        T_second_world = self.motion.T_second_first @ T_first_world
+        slots: list[int] = []
+        for view, pose in ((self.first, T_first_world), (self.second, T_second_world)):
+            frame = view.frame
+            slots.append(
+                world.add_keyframe(view.observations, pose, frame.index, frame.timestamp, submap)
             )
-            for view, pose in (
-                (self.first, T_first_world),
-                (self.second, self.motion.T_second_first @ T_first_world),
-            )
-        ]
+
+        # points that both observe
+        first_features, second_features = self.motion.matches.T
         position = se3.transform(se3.inverse(T_first_world), self.motion.points)
-        points = world.add_points(position, self.first.observations.rgb[first], slots[0], first)
-        world.observe(slots[1], second, points)
+        rgb = self.first.observations.rgb[first_features]
+        points = world.add_points(position, rgb, slots[0], first_features)
+        world.observe(slots[1], second_features, points)
         world.refresh(points)
         return slots
 
@@ -435,6 +511,7 @@ class TwoViewInitialiser:
             camera: Intrinsics, without distortion.
             settings: Thresholds of the two views.
         """
+        # matches with the first view
         first = self._first
         matches = np.zeros((0, 2), np.int64)
         if first is not None:
@@ -442,28 +519,34 @@ class TwoViewInitialiser:
                 first.observations, observations, self._expected, settings.radius_px
             )
         view = View(frame, observations, matches)
+
+        # too few: begin anew with this frame
         if first is None or len(matches) < settings.min_matches:
             self._first = view if len(observations) >= settings.min_matches else None
             self._expected = observations.xy.copy()
             self.later = []
             self._motions = []
             return None
+
+        # features are expected next where they were seen last
         self._expected[matches[:, 0]] = observations.xy[matches[:, 1]]
         if len(self.later) >= 2 * VIEWS:
             del self.later[::2]
         self.later.append(view)
         if len(self.later) < MIN_VIEWS:
             return None
+
+        # the motion that rules out all others, if there is one
         motions = possible_motions(first.observations, self.later, camera, settings, self._motions)
-        motion, self._motions = (
-            accepted_motion(motions, settings),
-            distinct_motions(motions)[:CARRIED],
-        )
+        motion = accepted_motion(motions, settings)
+        self._motions = distinct_motions(motions)[:CARRIED]
         if motion is None:
             return None
+
+        # the median depth becomes the unit of length
         depth = float(np.median(motion.points[:, 2]))
-        pose = motion.T_second_first
-        pose = se3.from_matrix(pose[:3, 3] / depth, pose[:3, :3])
-        return InitialMap(
-            first, view, replace(motion, T_second_first=pose, points=motion.points / depth)
+        T_second_first = se3.from_matrix(
+            motion.T_second_first[:3, 3] / depth, motion.T_second_first[:3, :3]
         )
+        scaled = replace(motion, T_second_first=T_second_first, points=motion.points / depth)
+        return InitialMap(first, view, scaled)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from copy import deepcopy
 from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,23 +26,40 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.slam.bundle_adjustment import Bundle, adjust_bundle, full_bundle, local_bundle
 from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.observations import Observations
+from dynslam_bench.slam.pose_optimisation import Intrinsics, intrinsics_of
 from dynslam_bench.slam.settings import BackendSettings, KeyframeSettings
 from dynslam_bench.slam.tracking import CLOSE_BASELINES, TrackedFrame
 
 MAX_DISTANCE = 50
 """Largest Hamming distance in fusion and triangulation (ORB-SLAM2's lower threshold)."""
+FUSION_RADIUS_PX = 3.0
+"""Points are fused with features in a window of this half side at octave 0 (ORB-SLAM2's number)."""
 MIN_PARALLAX = np.deg2rad(1.0)
-"""Smallest parallax of a triangulated point."""
+"""Smallest parallax of a triangulated point, radians."""
+CHI2_LINE = 3.84
+"""95 % quantile of chi-square with one degree of freedom: how far a match may lie from the epipolar line."""
+CHI2_POINT = 5.991
+"""95 % quantile of chi-square with two degrees of freedom: how far a point may lie from its feature."""
+MIN_TRIANGULATED_DEPTH = 0.1
+"""Triangulated points lie farther than this before both cameras, metres (without depth the map's unit)."""
+MAX_TRIANGULATED_DEPTH = 40.0
+"""Triangulated points lie nearer than this to the new keyframe, metres (without depth the map's unit)."""
+DEPTH_TOLERANCE = 0.05
+"""A triangulated depth differs from a measured one by no more than this share."""
+SCALE_TOLERANCE = 1.8
+"""Octaves and distances of a match agree within this factor (ORB-SLAM2: 1.5 times the pyramid's factor, 1.2)."""
 MIN_DEPTH_POINTS = 100
 """Features whose depth makes points at every keyframe, the nearest ones, even if they are not close (ORB-SLAM2)."""
 YOUNG = 3
 """A point may be culled because it is seldom found within so many keyframes after its own."""
 MIN_OBSERVATIONS = 2
-"""A point is culled when, two keyframes after its creation, fewer keyframes observe it."""
+"""Keyframes that must observe a point `OBSERVED_AFTER` keyframes after its creation, or it is culled."""
+OBSERVED_AFTER = 2
+"""Keyframes after which a point must have `MIN_OBSERVATIONS`."""
 FULL_ITERATIONS = 10
 """Levenberg-Marquardt iterations of full bundle adjustment."""
 RECENT_SHARE = 4
-"""Of the largest number of keyframes, one in so many, the newest, are kept where there are too many."""
+"""One in so many of `keyframes.maximum`, the newest keyframes, are not culled where there are too many."""
 COMPARED = 16
 """Keyframes of which the most redundant one is culled where there are too many; the next time others are compared."""
 
@@ -50,8 +68,9 @@ MIN_KEYFRAME_INLIERS = 15
 ESTABLISHED = 3
 """Keyframes that observe an established point at least."""
 MIN_CLOSE = 100
+"""Fewer tracked close points than this are few (ORB-SLAM2)."""
 NEW_CLOSE = 70
-"""A keyframe is made when fewer close points are tracked and more close features are not in the map (ORB-SLAM2)."""
+"""More close features than this that are not in the map are many: where few are tracked, they make a keyframe."""
 VIEW_SHARE = 0.9
 """A keyframe is made when less than this share of the last keyframe's points lies in the image."""
 MOVED_SHARE = 0.97
@@ -63,7 +82,7 @@ class LocalMapper:
 
     Args:
         world: The map to work on.
-        settings: Of the back end.
+        settings: Settings of the back end.
 
     Attributes:
         culled: Keyframes that the last `insert` removed: slot, slot of the replacement, and the
@@ -102,31 +121,35 @@ class LocalMapper:
         """
         begin = perf_counter()
         world = self.world
-        s = self.settings.mapping
         self.culled.clear()
         first = not world.submap(submap).size
+
+        # the keyframe, and what it observes of the map
         slot = world.add_keyframe(observations, T_cam_world, frame, stamp, submap)
         features = np.flatnonzero(point >= 0)
         world.observe(slot, features, point[features])
         world.refresh(world.points_of(slot))
+
+        # remove bad points, create points from depth
         self._cull_points()
         self._points_from_depth(slot, observations, everything=first)
         if first:
             return slot, {"mapping": perf_counter() - begin, "bundle_adjustment": 0.0}
-        neighbours = world.covisible(slot)[0][: s.neighbours]
-        close = np.count_nonzero((observations.z > 0) & (observations.z < self.close_m)) / max(
-            len(observations), 1
-        )
-        if close < s.triangulate_below:
-            for other in neighbours.tolist():
-                features, others, position = triangulate(world, slot, other, s.min_parallax_sigmas)
-                self._add_points(slot, features, position, observations, (other, others))
+
+        # create points by triangulation, where few features are close enough for their depth
+        neighbours = world.covisible(slot)[0][: self.settings.mapping.neighbours]
+        close = np.count_nonzero((observations.z > 0) & (observations.z < self.close_m))
+        if close / max(len(observations), 1) < self.settings.mapping.triangulate_below:
+            self._points_from_triangulation(slot, neighbours, observations)
+
+        # merge duplicates, optimise, and remove redundant keyframes
         self._fuse(slot, neighbours)
-        start = perf_counter()
+        adjustment_begin = perf_counter()
         self.adjust(slot)
-        adjusted = perf_counter() - start
+        adjustment_s = perf_counter() - adjustment_begin
         self._cull_keyframes(slot)
-        return slot, {"mapping": perf_counter() - begin - adjusted, "bundle_adjustment": adjusted}
+        mapping_s = perf_counter() - begin - adjustment_s
+        return slot, {"mapping": mapping_s, "bundle_adjustment": adjustment_s}
 
     # ------------------------------------------------------------------ points
 
@@ -135,19 +158,28 @@ class LocalMapper:
     ) -> None:
         """Points for features without one: all close ones, and the nearest hundred in any case."""
         world = self.world
-        free = np.flatnonzero(
-            (world.kf_point[slot, : len(observations)] < 0) & (observations.z > 0)
-        )
-        free = free[np.argsort(observations.z[free], kind="stable")]
-        if not everything:
-            free = free[
-                : max(np.count_nonzero(observations.z[free] < self.close_m), MIN_DEPTH_POINTS)
-            ]
-        position = se3.transform(
-            se3.inverse(world.kf_pose[slot]),
-            world.camera.unproject(observations.xy[free], observations.z[free]),
-        )
-        self._add_points(slot, free, position, observations)
+        has_no_point = world.kf_point[slot, : len(observations)] < 0
+        free = np.flatnonzero(has_no_point & (observations.z > 0))
+        nearest_first = free[np.argsort(observations.z[free], kind="stable")]
+        if everything:
+            chosen = nearest_first
+        else:
+            close = np.count_nonzero(observations.z[free] < self.close_m)
+            chosen = nearest_first[: max(close, MIN_DEPTH_POINTS)]
+        T_world_cam = se3.inverse(world.kf_pose[slot])
+        local = world.camera.unproject(observations.xy[chosen], observations.z[chosen])
+        self._add_points(slot, chosen, se3.transform(T_world_cam, local), observations)
+
+    def _points_from_triangulation(
+        self, slot: int, neighbours: Slots, observations: Observations
+    ) -> None:
+        """Points for features without one, by triangulation with each neighbouring keyframe in turn."""
+        for neighbour in neighbours.tolist():
+            features, neighbour_features, position = triangulate(
+                self.world, slot, neighbour, self.settings.mapping.min_parallax_sigmas
+            )
+            second = (neighbour, neighbour_features)
+            self._add_points(slot, features, position, observations, second)
 
     def _add_points(
         self,
@@ -157,7 +189,15 @@ class LocalMapper:
         observations: Observations,
         second: tuple[int, Slots] | None = None,
     ) -> None:
-        """New points that features of a keyframe observe, and those of a `second` one, if there is one."""
+        """New points ``[N, 3]`` that features of a keyframe observe.
+
+        Args:
+            slot: The keyframe.
+            features: Its features, ``[N]``.
+            position: World points, metres.
+            observations: All features of the keyframe.
+            second: Another keyframe that observes the points, and its features ``[N]``.
+        """
         created = self.world.add_points(position, observations.rgb[features], slot, features)
         if second is not None:
             self.world.observe(*second, created)
@@ -168,11 +208,12 @@ class LocalMapper:
         """Remove young points that are seldom found where they should be seen, or that few keyframes observe."""
         world = self.world
         young = self._young[world.alive[self._young]]
+        # in keyframes
         age = world.next_keyframe - 1 - world.born[young]
-        seldom_found = (
-            world.found[young] < self.settings.mapping.min_found_ratio * world.visible[young]
-        )
-        bad = seldom_found | ((age >= 2) & (world.n_obs[young] < MIN_OBSERVATIONS))
+        min_found_ratio = self.settings.mapping.min_found_ratio
+        seldom_found = world.found[young] < min_found_ratio * world.visible[young]
+        seldom_observed = (age >= OBSERVED_AFTER) & (world.n_obs[young] < MIN_OBSERVATIONS)
+        bad = seldom_found | seldom_observed
         world.remove_points(young[bad])
         self._young = young[~bad & (age < YOUNG)]
 
@@ -188,34 +229,48 @@ class LocalMapper:
     def fuse_into(self, keyframe: int, candidates: Slots) -> None:
         """Match points in a keyframe: new observations of them, and duplicates among its own points."""
         world = self.world
-        n = int(self.world.kf_count[keyframe])
-        own = world.kf_point[keyframe, :n]
-        observed = np.zeros(world.alive.size, bool)
-        observed[own[own >= 0]] = True
-        candidates = candidates[world.alive[candidates] & ~observed[candidates]]
-        points, uv, right, octave, _ = world.project(world.kf_pose[keyframe], candidates)
+        n = int(world.kf_count[keyframe])
         xy = world.kf_xy[keyframe, :n]
+        octaves = world.kf_octave[keyframe, :n].astype(np.int64)
+        # a view: it follows what is observed and replaced below
+        observed = world.kf_point[keyframe, :n]
+
+        # project the points that the keyframe does not observe yet
+        is_observed = np.zeros(world.alive.size, bool)
+        is_observed[observed[observed >= 0]] = True
+        candidates = candidates[world.alive[candidates] & ~is_observed[candidates]]
+        points, uv, right, octave, _ = world.project(world.kf_pose[keyframe], candidates)
+
+        # match them with all features around
         grid = CellGrid.of(xy, world.camera.width, world.camera.height)
-        levels = world.kf_octave[keyframe, :n].astype(np.int64)
-        features = Features(
-            xy, world.kf_right[keyframe, :n], levels, world.kf_words[keyframe, :n], grid
-        )
-        windows = (uv, right, 3.0 * world.scales[octave])
-        words = world.words[points]
+        right_of_features = world.kf_right[keyframe, :n]
+        words_of_features = world.kf_words[keyframe, :n]
+        features = Features(xy, right_of_features, octaves, words_of_features, grid)
+        windows = (uv, right, FUSION_RADIUS_PX * world.scales[octave])
         feature = search_in_radius(
-            features, np.ones(n, bool), windows, octave, words, max_distance=MAX_DISTANCE
+            features,
+            np.ones(n, bool),
+            windows,
+            octave,
+            world.words[points],
+            max_distance=MAX_DISTANCE,
         )
-        good = feature >= 0
-        good &= ((xy[feature] - uv) ** 2).sum(axis=1) / world.scales[levels[feature]] ** 2 < 5.991
+        squared_error = ((xy[feature] - uv) ** 2).sum(axis=1)
+        variance = world.scales[octaves[feature]] ** 2
+        good = (feature >= 0) & (squared_error / variance < CHI2_POINT)
         points = points[good]
         feature = feature[good]
-        empty = own[feature] < 0
+
+        # a feature without a point observes the matched one
+        empty = observed[feature] < 0
         world.observe(keyframe, feature[empty], points[empty])
+
+        # a feature with a point shows a duplicate: the less observed point is replaced
         for row, point in zip(feature[~empty].tolist(), points[~empty].tolist(), strict=True):
-            duplicate = int(own[row])
+            duplicate = int(observed[row])
             if duplicate >= 0 and duplicate != point and world.alive[point]:
-                # the less observed one
-                world.replace_point(*sorted((duplicate, point), key=world.n_obs.__getitem__))
+                less, more = sorted((duplicate, point), key=world.n_obs.__getitem__)
+                world.replace_point(less, more)
 
     # ------------------------------------------------------------------ bundle adjustment
 
@@ -235,24 +290,29 @@ class LocalMapper:
     def _cull_keyframes(self, slot: int) -> None:
         """Remove redundant keyframes, and the most redundant ones where there are too many."""
         world = self.world
-        s = self.settings.keyframes
+        settings = self.settings.keyframes
+
+        # neighbours most of whose close points others see as well
         neighbours, _ = world.covisible(slot)
         newest = world.keyframes[-2:]
-        for other in neighbours.tolist():
-            if other in newest or world.kf_id[other] == 0:
+        for neighbour in neighbours.tolist():
+            if neighbour in newest or world.kf_id[neighbour] == 0:
                 continue
-            total, redundant = world.redundancy(other, self.close_m)
-            if total and redundant > s.redundant_share * total:
-                self.cull_keyframe(other)
-        while world.keyframe_count > s.maximum:
-            others = self._dispensable(slot)
-            if not len(others):
+            total, redundant = world.redundancy(neighbour, self.close_m)
+            if total and redundant > settings.redundant_share * total:
+                self.cull_keyframe(neighbour)
+
+        # too many keyframes in all: the most redundant one, of equal ones the oldest
+        while world.keyframe_count > settings.maximum:
+            candidates = self._dispensable(slot)
+            if not len(candidates):
                 break
-            counts = [world.redundancy(other, self.close_m) for other in others.tolist()]
-            shares = [redundant / max(total, 1) for total, redundant in counts]
-            self.cull_keyframe(
-                int(others[np.lexsort((world.kf_id[others], np.negative(shares)))[0]])
-            )
+            shares = []
+            for candidate in candidates.tolist():
+                total, redundant = world.redundancy(candidate, self.close_m)
+                shares.append(redundant / max(total, 1))
+            order = np.lexsort((world.kf_id[candidates], np.negative(shares)))
+            self.cull_keyframe(int(candidates[order[0]]))
 
     def _dispensable(self, slot: int) -> Slots:
         """Keyframes that may be culled where there are too many; at least one of each submap stays for its frames.
@@ -261,33 +321,44 @@ class LocalMapper:
         if others can be culled.
         """
         world = self.world
-        kept = self.world.keyframes[1:-2]
-        kept = kept[np.bincount(world.kf_map[world.keyframes])[world.kf_map[kept]] > 1]
+        # neither the first one nor the two newest, nor the last one of a submap
+        inner = world.keyframes[1:-2]
+        keyframes_by_submap = np.bincount(world.kf_map[world.keyframes])
+        inner = inner[keyframes_by_submap[world.kf_map[inner]] > 1]
+
+        # old and distant ones, else old ones, else any
         near, _ = world.covisible(slot)
-        older = kept[
-            world.kf_id[kept] < world.kf_id[slot] - self.settings.keyframes.maximum // RECENT_SHARE
-        ]
-        distant = older[~np.isin(older, near)]
-        chosen = next((slots for slots in (distant, older, kept) if len(slots)), kept)
+        recent = self.settings.keyframes.maximum // RECENT_SHARE
+        old = inner[world.kf_id[inner] < world.kf_id[slot] - recent]
+        distant = old[~np.isin(old, near)]
+        chosen = inner
+        for slots in (distant, old):
+            if len(slots):
+                chosen = slots
+                break
+
+        # compare a few, others each time
         return np.asarray(np.roll(chosen, -COMPARED * world.next_keyframe)[:COMPARED])
 
     def cull_keyframe(self, slot: int) -> None:
         """Remove a keyframe; `culled` names its replacement, the most covisible keyframe or the newest of its map."""
         world = self.world
-        same_map = self.world.submap(int(self.world.kf_map[slot]))
-        replacement = int(np.r_[world.covisible(slot)[0], same_map[same_map != slot][::-1]][0])
-        self.culled.append(
-            (slot, replacement, world.kf_pose[slot] @ se3.inverse(world.kf_pose[replacement]))
-        )
+        covisible, _ = world.covisible(slot)
+        if len(covisible):
+            replacement = int(covisible[0])
+        else:
+            same_map = world.submap(int(world.kf_map[slot]))
+            replacement = int(same_map[same_map != slot][-1])
+        T_culled_replacement = world.kf_pose[slot] @ se3.inverse(world.kf_pose[replacement])
+        self.culled.append((slot, replacement, T_culled_replacement))
         world.remove_keyframe(slot)
 
 
 def adjust(world: Map, bundle: Bundle, iterations: int) -> NDArray[np.bool_]:
     """Put refined poses and points into the map; returns which observations of the bundle fit them."""
     result = adjust_bundle(bundle.problem, iterations)
-    for slot, pose in zip(
-        bundle.poses[: bundle.problem.variable].tolist(), result.poses, strict=False
-    ):
+    variable = bundle.poses[: bundle.problem.variable]
+    for slot, pose in zip(variable.tolist(), result.poses, strict=False):
         world.set_pose(slot, pose)
     world.position[bundle.points] = result.points
     return result.inliers
@@ -303,8 +374,7 @@ def refined(world: Map) -> Map:
     return copy
 
 
-# ---------------------------------------------------------------------- when a frame becomes a
-# keyframe
+# ---------------------------------------------------------------------- keyframe decision
 
 
 class KeyframePolicy:
@@ -322,10 +392,10 @@ class KeyframePolicy:
     def __init__(self, settings: KeyframeSettings, close_m: float) -> None:
         self.settings = settings
         self._close_m = close_m
-        self.made(-1)
+        self.keyframe_added(-1)
 
-    def made(self, frame: int) -> None:
-        """The frame of this index has become a keyframe."""
+    def keyframe_added(self, frame: int) -> None:
+        """Note that the frame of this index has become a keyframe."""
         self._last = frame
         self._most_inliers = 0
 
@@ -338,25 +408,32 @@ class KeyframePolicy:
             frame: Its index.
             reference: Slot of the keyframe that shares most points with it.
         """
-        s = self.settings
-        gap = frame - self._last
+        settings = self.settings
         matched = tracked.point >= 0
-        close = (tracked.observations.z > 0) & (tracked.observations.z < self._close_m)
         inliers = int(np.count_nonzero(matched))
         self._most_inliers = max(self._most_inliers, inliers)
-        if s.schedule != "rule" or inliers <= MIN_KEYFRAME_INLIERS:
-            return s.schedule == "every" and inliers > MIN_KEYFRAME_INLIERS
+        if inliers <= MIN_KEYFRAME_INLIERS:
+            return False
+        if settings.schedule != "rule":
+            return settings.schedule == "every"
+
+        # many close features are not in the map, and few are tracked or the last keyframe is long ago
+        close = (tracked.observations.z > 0) & (tracked.observations.z < self._close_m)
+        many_new = np.count_nonzero(close & ~matched) > NEW_CLOSE
         few_close = np.count_nonzero(close & matched) < MIN_CLOSE
-        if np.count_nonzero(close & ~matched) > NEW_CLOSE and (few_close or gap >= s.max_gap):
+        if many_new and (few_close or frame - self._last >= settings.max_gap):
             return True
-        if inliers < s.tracked_share * established_points(world, reference):
+
+        # little of what the reference keyframe shows is tracked
+        if inliers < settings.tracked_share * established_points(world, reference):
             return True
-        view = share_in_view(
-            world, int(np.where(world.kf_alive, world.kf_id, -1).argmax()), tracked.T_cam_world
-        )
-        return view < VIEW_SHARE or (
-            view < MOVED_SHARE and inliers < s.tracked_share * self._most_inliers
-        )
+
+        # the view has moved on from the newest keyframe
+        newest = int(np.where(world.kf_alive, world.kf_id, -1).argmax())
+        view = share_in_view(world, newest, tracked.T_cam_world)
+        if view < VIEW_SHARE:
+            return True
+        return view < MOVED_SHARE and inliers < settings.tracked_share * self._most_inliers
 
 
 def established_points(world: Map, keyframe: int) -> int:
@@ -377,28 +454,29 @@ def share_in_view(world: Map, keyframe: int, T_cam_world: Array) -> float:
 # ---------------------------------------------------------------------- triangulation
 
 
+class View(NamedTuple):
+    """A keyframe's features, as triangulation reads them.
+
+    Attributes:
+        pose: World-to-camera pose ``[4, 4]``.
+        free: int64, features that observe no point yet.
+        xy: float64 ``[F, 2]``, undistorted pixels.
+        z: float64 ``[F]``, depth in metres, 0 missing.
+        octave: int64 ``[F]``.
+        words: uint64 ``[F, W]``, descriptors.
+    """
+
+    pose: Array
+    free: Slots
+    xy: Array
+    z: Array
+    octave: Slots
+    words: Words
+
+
 @kernel
-def _triangulate(
-    pose_a: Array,
-    pose_b: Array,
-    rows_a: Slots,
-    rows_b: Slots,
-    xy_a: Array,
-    xy_b: Array,
-    z_b: Array,
-    octave_a: Slots,
-    octave_b: Slots,
-    words_a: Words,
-    words_b: Words,
-    scales: Array,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    sigmas: float,
-) -> tuple[Slots, Slots, Array]:
-    """Pairs of rows that fit one point, and its depth along the ray of camera `a`."""
-    # x_b = r x_a + t
+def _relative_pose(pose_a: Array, pose_b: Array) -> tuple[Array, Array]:
+    """Rotation ``[3, 3]`` and translation ``[3]`` from camera `a` to camera `b`: ``x_b = r x_a + t``."""
     r = np.zeros((3, 3))
     t = np.zeros(3)
     for i in range(3):
@@ -409,24 +487,35 @@ def _triangulate(
         t[i] = pose_b[i, 3]
         for k in range(3):
             t[i] -= r[i, k] * pose_a[k, 3]
-    n = rows_a.shape[0]
-    m = rows_b.shape[0]
+    return r, t
+
+
+@kernel
+def _triangulate(
+    view_a: View, view_b: View, scales: Array, camera: Intrinsics, sigmas: float
+) -> tuple[Slots, Slots, Array]:
+    """Features of both views that fit one point ``[M]``, ``[M]``, and its depth in `view_a` ``[M]``."""
+    r, t = _relative_pose(view_a.pose, view_b.pose)
+    n = view_a.free.shape[0]
+    m = view_b.free.shape[0]
     match = np.full(n, -1, np.int64)
-    matched_by = np.full(m, -1, np.int64)
     depth = np.zeros(n)
     best_distance = np.full(n, FAR, np.int64)
-    bx = (xy_b[rows_b, 0] - cx) / fx
-    by = (xy_b[rows_b, 1] - cy) / fy
+    # rays of b's features, (bx, by, 1)
+    bx = (view_b.xy[view_b.free, 0] - camera.cx) / camera.fx
+    by = (view_b.xy[view_b.free, 1] - camera.cy) / camera.fy
     cosine_limit = np.cos(MIN_PARALLAX)
-    focal = 0.5 * (fx + fy)
+    focal = 0.5 * (camera.fx + camera.fy)
     for i in range(n):
-        a = rows_a[i]
-        x = (xy_a[a, 0] - cx) / fx
-        y = (xy_a[a, 1] - cy) / fy
+        # ray of a's feature, (x, y, 1) in camera a and d in camera b
+        a = view_a.free[i]
+        x = (view_a.xy[a, 0] - camera.cx) / camera.fx
+        y = (view_a.xy[a, 1] - camera.cy) / camera.fy
         d0 = r[0, 0] * x + r[0, 1] * y + r[0, 2]
         d1 = r[1, 0] * x + r[1, 1] * y + r[1, 2]
         d2 = r[2, 0] * x + r[2, 1] * y + r[2, 2]
-        # epipolar line of a's ray in b: t x d
+
+        # its epipolar line in b: t x d
         l0 = t[1] * d2 - t[2] * d1
         l1 = t[2] * d0 - t[0] * d2
         l2 = t[0] * d1 - t[1] * d0
@@ -435,14 +524,20 @@ def _triangulate(
             continue
         length = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
         for j in range(m):
-            b = rows_b[j]
-            sigma = scales[octave_b[b]] / focal
+            # b's feature must lie on the line
+            b = view_b.free[j]
+            sigma = scales[view_b.octave[b]] / focal
             off = (l0 * bx[j] + l1 * by[j] + l2) / norm
-            if off * off > 3.84 * sigma * sigma:
+            if off * off > CHI2_LINE * sigma * sigma:
                 continue
-            d = distance(words_a[a], words_b[b])
+
+            # and look more alike than the best one so far
+            d = distance(view_a.words[a], view_b.words[b])
             if d > MAX_DISTANCE or d >= best_distance[i]:
                 continue
+
+            # depth s along a's ray: by triangulation where there is parallax (least squares of
+            # ray_b x (s d + t) = 0 in its first two rows), else from b's measured depth
             p0 = d0 - bx[j] * d2
             p1 = d1 - by[j] * d2
             q0 = bx[j] * t[2] - t[0]
@@ -450,37 +545,50 @@ def _triangulate(
             cosine = (d0 * bx[j] + d1 * by[j] + d2) / (
                 length * np.sqrt(bx[j] * bx[j] + by[j] * by[j] + 1.0)
             )
-            least = sigmas * max(scales[octave_a[a]], scales[octave_b[b]]) / focal
+            least = sigmas * max(scales[view_a.octave[a]], scales[view_b.octave[b]]) / focal
             if cosine < cosine_limit and cosine < 1.0 - 0.5 * least * least:
                 s = (p0 * q0 + p1 * q1) / (p0 * p0 + p1 * p1)
-            elif z_b[b] > 0.0 and abs(d2) > 1e-6:
-                s = (z_b[b] - t[2]) / d2  # too little parallax, but the other keyframe has depth
+            elif view_b.z[b] > 0.0 and abs(d2) > 1e-6:
+                s = (view_b.z[b] - t[2]) / d2
             else:
                 continue
+
+            # the point must lie in front of both cameras, w in b, and where b measured it
             w = d2 * s + t[2]
-            if s < 0.1 or w < 0.1 or s > 40.0 or (z_b[b] > 0.0 and abs(w - z_b[b]) > 0.05 * z_b[b]):
+            z_b = view_b.z[b]
+            if (
+                s < MIN_TRIANGULATED_DEPTH
+                or w < MIN_TRIANGULATED_DEPTH
+                or s > MAX_TRIANGULATED_DEPTH
+                or (z_b > 0.0 and abs(w - z_b) > DEPTH_TOLERANCE * z_b)
+            ):
                 continue
+
+            # its projection must fit b's feature
             e0 = (d0 * s + t[0]) / w - bx[j]
             e1 = (d1 * s + t[1]) / w - by[j]
-            if e0 * e0 + e1 * e1 > 5.991 * sigma * sigma:
+            if e0 * e0 + e1 * e1 > CHI2_POINT * sigma * sigma:
                 continue
+
+            # the nearer view shows the patch larger, hence at a coarser octave
             ratio = (s * np.sqrt(x * x + y * y + 1.0)) / (
                 w * np.sqrt(bx[j] * bx[j] + by[j] * by[j] + 1.0)
             )
-            expected = scales[octave_b[b]] / scales[octave_a[a]]
-            # the nearer view shows the patch larger, hence at a coarser octave
-            if ratio > 1.8 * expected or ratio * 1.8 < expected:
+            expected = scales[view_b.octave[b]] / scales[view_a.octave[a]]
+            if ratio > SCALE_TOLERANCE * expected or ratio * SCALE_TOLERANCE < expected:
                 continue
             best_distance[i] = d
             match[i] = j
             depth[i] = s
+
     # one feature of b for one of a: the smaller distance wins, then the lower index
+    matched_by = np.full(m, -1, np.int64)
     for i in range(n):
         j = match[i]
         if j >= 0 and (matched_by[j] < 0 or best_distance[i] < best_distance[matched_by[j]]):
             matched_by[j] = i
     chosen = np.sort(matched_by[matched_by >= 0])
-    return rows_a[chosen], rows_b[match[chosen]], depth[chosen]
+    return view_a.free[chosen], view_b.free[match[chosen]], depth[chosen]
 
 
 def triangulate(
@@ -500,27 +608,26 @@ def triangulate(
     Returns:
         Features of `slot`, features of `other`, world points ``[M, 3]``.
     """
-    n = int(world.kf_count[slot])
-    m = int(world.kf_count[other])
-    camera = world.camera
-    features, others, depth = _triangulate(
-        world.kf_pose[slot],
-        world.kf_pose[other],
-        np.flatnonzero(world.kf_point[slot, :n] < 0),
-        np.flatnonzero(world.kf_point[other, :m] < 0),
-        world.kf_xy[slot],
-        world.kf_xy[other],
-        world.kf_z[other].astype(np.float64),
-        world.kf_octave[slot].astype(np.int64),
-        world.kf_octave[other].astype(np.int64),
-        world.kf_words[slot],
-        world.kf_words[other],
+    features, other_features, depth = _triangulate(
+        _view(world, slot),
+        _view(world, other),
         world.scales,
-        camera.fx,
-        camera.fy,
-        camera.cx,
-        camera.cy,
+        intrinsics_of(world.camera),
         float(min_parallax_sigmas),
     )
-    local = camera.unproject(world.kf_xy[slot, features], depth)
-    return features, others, se3.transform(se3.inverse(world.kf_pose[slot]), local)
+    local = world.camera.unproject(world.kf_xy[slot, features], depth)
+    position = se3.transform(se3.inverse(world.kf_pose[slot]), local)
+    return features, other_features, position
+
+
+def _view(world: Map, slot: int) -> View:
+    """What triangulation reads of a keyframe."""
+    n = int(world.kf_count[slot])
+    return View(
+        world.kf_pose[slot],
+        np.flatnonzero(world.kf_point[slot, :n] < 0),
+        world.kf_xy[slot],
+        world.kf_z[slot].astype(np.float64),
+        world.kf_octave[slot].astype(np.int64),
+        world.kf_words[slot],
+    )

@@ -85,7 +85,7 @@ AGREE_DEG = 2.0
 AGREE_SCALE = 0.1
 """Largest difference of the logarithms of their scales."""
 SIGMAS = (0.02, 0.02, 0.02, 0.01, 0.01, 0.01)
-"""Of an edge of weight 1: metres, or units of length without depth, then radians; only their ratio matters."""
+"""Standard deviations of an edge of weight 1: metres (units without depth) and radians; only their ratio matters."""
 GRAPH_ITERATIONS = 20
 """Levenberg-Marquardt steps of the pose graph at most."""
 MIN_GAIN = 1e-9

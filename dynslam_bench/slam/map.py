@@ -7,7 +7,7 @@ freed it.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from dynslam_bench.features.matching import distance
 from dynslam_bench.geometry import Camera, se3
 from dynslam_bench.geometry.gauss_newton import transform_point
 from dynslam_bench.slam.observations import Observations
+from dynslam_bench.slam.pose_optimisation import NEAR_M, Intrinsics, intrinsics_of
 
 Array = NDArray[np.float64]
 Slots = NDArray[np.int64]
@@ -33,7 +34,7 @@ KEYFRAME_TABLES = {
     "kf_centre": (float, 3),
     "kf_count": (np.int64,),
 }
-"""Type and shape of what is stored of each keyframe, see `Map`."""
+"""Type and shape of what is stored for each keyframe, see `Map`."""
 FEATURE_TABLES = {
     "kf_raw": (np.float32, 0, 2),
     "kf_response": (np.float32, 0),
@@ -47,7 +48,7 @@ FEATURE_TABLES = {
     "kf_words": (np.uint64, 0, 4),
     "kf_point": (np.int32, 0),
 }
-"""Of each feature of each keyframe."""
+"""Type and shape of what is stored for each feature of each keyframe; a 0 becomes the number of features."""
 POINT_TABLES = {
     "alive": (bool,),
     "id": (np.int64,),
@@ -63,13 +64,15 @@ POINT_TABLES = {
     "obs_kf": (np.int32, 8),
     "obs_ft": (np.int32, 8),
 }
-"""Of each point."""
+"""Type and shape of what is stored for each point; the observations' columns grow with the longest track."""
 MIN_COSINE = 0.5
 """Smallest cosine between a point's mean viewing direction and the ray to the camera (ORB-SLAM2's number)."""
 WIDEN_RANGE = 1.25
 """Factor by which the scale range of a point is widened."""
 REDUNDANT_VIEWS = 3
 """Other keyframes that see a redundant point (ORB-SLAM2's number)."""
+DESCRIBING_OBSERVATIONS = 12
+"""Newest observations of a point among which its descriptor is chosen."""
 
 VIEWS = 20
 """Newest keyframes that filters may read (DynaSLAM's window)."""
@@ -77,33 +80,125 @@ DEPTH_IMAGES = 8
 """Newest keyframes that keep their depth image, for filters."""
 
 
+class ObservationTables(NamedTuple):
+    """Which keyframe observes which point: both directions of the same relation, as compiled loops take them.
+
+    Attributes:
+        obs_kf: int32 ``[M, O]``, by point the slots of the keyframes that observe it, oldest first.
+        obs_ft: int32 ``[M, O]``, the features by which they do.
+        n_obs: int32 ``[M]``, how many these are.
+        kf_point: int32 ``[S, F]``, by keyframe and feature the observed point, or -1.
+    """
+
+    obs_kf: Ints
+    obs_ft: Ints
+    n_obs: Ints
+    kf_point: Ints
+
+
+class PointViews(NamedTuple):
+    """From where points are recognised.
+
+    Attributes:
+        position: float64 ``[M, 3]``, world points.
+        normal: float64 ``[M, 3]``, mean viewing directions.
+        far: float64 ``[M]``, largest distances.
+    """
+
+    position: Array
+    normal: Array
+    far: Array
+
+
+class KeyframeViews(NamedTuple):
+    """What keyframes tell of the points that they observe.
+
+    Attributes:
+        words: uint64 ``[S, F, W]``, descriptors.
+        octave: int8 ``[S, F]``.
+        centre: float64 ``[S, 3]``, camera centres in the world.
+    """
+
+    words: Any
+    octave: Any
+    centre: Array
+
+
+class VisiblePoints(NamedTuple):
+    """Points that a camera should see, N of them.
+
+    Attributes:
+        points: int64 ``[N]``, their slots.
+        uv: float64 ``[N, 2]``, undistorted pixels.
+        right: float64 ``[N]``, right coordinates.
+        octave: int64 ``[N]``, where their scale is expected in the pyramid.
+        cosine: float64 ``[N]``, cosines of the angle between the ray and the mean viewing direction.
+    """
+
+    points: Slots
+    uv: Array
+    right: Array
+    octave: Slots
+    cosine: Array
+
+
 class Map:
     """Keyframes, points and who observes what.
 
-    Attributes (keyframes, by slot; F is the largest number of features so far):
-        kf_alive, kf_id, kf_map (number of the submap, 0 for the root map),
-        kf_frame, kf_stamp, kf_pose (world to camera ``[S, 4, 4]``), kf_centre ``[S, 3]``, kf_count,
-        kf_raw ``[S, F, 2]`` raw pixels, kf_response, kf_xy ``[S, F, 2]`` undistorted pixels,
-        kf_right, kf_z, kf_octave, kf_angle, kf_info, kf_info_right, kf_words ``[S, F, W]``,
-        kf_point ``[S, F]`` (slot of the observed point, -1).
+    All tables are indexed by slots: S of keyframes, M of points. F is the largest number of
+    features of a keyframe so far, W the number of words of a descriptor, and O the largest number
+    of observations of a point so far, rounded up.
 
-    Attributes (points, by slot):
-        alive, id, position ``[M, 3]``, normal ``[M, 3]`` mean viewing direction, far ``[M]``
-        largest distance at which the point's reference scale is still in the pyramid, words
-        ``[M, W]``, rgb, visible and found (frames that should have and did observe it), born (id of
-        the keyframe that made it), n_obs (how many observations it has), obs_kf and obs_ft
-        ``[M, O]`` (observing keyframe slots and feature numbers, oldest first; O is the largest
-        number of observations so far, rounded up).
+    Args:
+        camera: Intrinsics without distortion.
+        scales: Scale of each octave.
 
-    Attributes (others):
+    Attributes:
+        kf_alive: bool ``[S]``, whether the slot is in use.
+        kf_id: int64 ``[S]``, number of the keyframe in the order of creation.
+        kf_map: int64 ``[S]``, number of its submap, 0 for the root map.
+        kf_frame: int64 ``[S]``, index of its frame.
+        kf_stamp: float64 ``[S]``, timestamp in seconds.
+        kf_pose: float64 ``[S, 4, 4]``, world to camera.
+        kf_centre: float64 ``[S, 3]``, camera centre in the world.
+        kf_count: int64 ``[S]``, number of features.
+        kf_raw: float32 ``[S, F, 2]``, raw (distorted) pixels.
+        kf_response: float32 ``[S, F]``, response of the detector.
+        kf_xy: float64 ``[S, F, 2]``, undistorted pixels.
+        kf_right: float64 ``[S, F]``, right coordinates, NaN without depth.
+        kf_z: float32 ``[S, F]``, depth in metres, 0 missing.
+        kf_octave: int8 ``[S, F]``.
+        kf_angle: float32 ``[S, F]``, degrees.
+        kf_info: float64 ``[S, F]``, inverse variance of the pixel, see `Observations`.
+        kf_info_right: float64 ``[S, F]``, inverse variance of the right coordinate.
+        kf_words: uint64 ``[S, F, W]``, descriptors.
+        kf_point: int32 ``[S, F]``, slot of the observed point, or -1.
+        alive: bool ``[M]``, whether the point's slot is in use.
+        id: int64 ``[M]``, number of the point in the order of creation.
+        position: float64 ``[M, 3]``, world point in metres.
+        normal: float64 ``[M, 3]``, mean viewing direction.
+        far: float64 ``[M]``, largest distance at which the point's reference scale is still in the
+            pyramid.
+        words: uint64 ``[M, W]``, descriptor.
+        rgb: uint8 ``[M, 3]``, colour.
+        visible: int32 ``[M]``, frames that should have observed it.
+        found: int32 ``[M]``, frames that did.
+        born: int64 ``[M]``, id of the keyframe that made it.
+        n_obs: int32 ``[M]``, number of observations.
+        obs_kf: int32 ``[M, O]``, slots of the observing keyframes, oldest first.
+        obs_ft: int32 ``[M, O]``, their features.
         substrings: By keyframe slot the keyframe's id, and sorted substrings of its descriptors
-        (`relocalisation`).
+            (`relocalisation`).
     """
 
     def __init__(self, camera: Camera, scales: Array) -> None:
         self.scales = np.ascontiguousarray(scales, np.float64)
         self.camera = camera
-        self.next_keyframe = self.next_point = self._top = 0
+        self.next_keyframe = 0
+        self.next_point = 0
+        # points lie in slots below it
+        self._top = 0
+        # a freed slot may be used again after `release`
         self._free_points: list[int] = []
         self._freed_points: list[int] = []
         self.substrings: dict[int, tuple[int, NDArray[np.uint16]]] = {}
@@ -115,6 +210,7 @@ class Map:
         def __getattr__(self, name: str) -> NDArray[Any]: ...
 
     def _grow(self, names: Iterable[str], length: int, axis: int = 0) -> None:
+        """Lengthen tables by zeros along an axis."""
         for name in names:
             table = getattr(self, name)
             shape = list(table.shape)
@@ -155,22 +251,8 @@ class Map:
         submap: int = 0,
     ) -> int:
         """Store a frame's features as a keyframe that observes no points yet; returns its slot."""
-        n, words = observations.words.shape
-        if not self.next_keyframe:
-            self.kf_words, self.words = (
-                np.zeros((0, 0, words), np.uint64),
-                np.zeros((0, words), np.uint64),
-            )
-        features = self.kf_point.shape[1]
-        if n > features:
-            self._grow(FEATURE_TABLES, n, axis=1)
-            self.kf_point[:, features:] = -1
-        if self.kf_alive.all():
-            self._grow(
-                KEYFRAME_TABLES | FEATURE_TABLES,
-                max(16, self.kf_alive.size + self.kf_alive.size // 2),
-            )
-        slot = int(self.kf_alive.argmin())
+        n = len(observations)
+        slot = self._free_keyframe_slot(*observations.words.shape)
         self.kf_id[slot] = self.next_keyframe
         self.kf_alive[slot] = True
         self.kf_map[slot] = submap
@@ -179,23 +261,36 @@ class Map:
         self.kf_count[slot] = n
         self.next_keyframe += 1
         self.set_pose(slot, T_cam_world)
+
         raw = observations.keypoints
-        described = (
-            raw.xy,
-            raw.response,
-            observations.xy,
-            observations.right,
-            observations.z,
-            observations.octave,
-            observations.angle,
-            observations.info,
-            observations.info_right,
-            observations.words,
-        )
-        for name, values in zip(FEATURE_TABLES, described, strict=False):
-            getattr(self, name)[slot, :n] = values
+        self.kf_raw[slot, :n] = raw.xy
+        self.kf_response[slot, :n] = raw.response
+        self.kf_xy[slot, :n] = observations.xy
+        self.kf_right[slot, :n] = observations.right
+        self.kf_z[slot, :n] = observations.z
+        self.kf_octave[slot, :n] = observations.octave
+        self.kf_angle[slot, :n] = observations.angle
+        self.kf_info[slot, :n] = observations.info
+        self.kf_info_right[slot, :n] = observations.info_right
+        self.kf_words[slot, :n] = observations.words
         self.kf_point[slot] = -1
         return slot
+
+    def _free_keyframe_slot(self, features: int, words: int) -> int:
+        """A free slot, in tables that have room for so many features with so many words of descriptor."""
+        # the first keyframe decides how long descriptors are
+        if not self.next_keyframe:
+            self.kf_words = np.zeros((0, 0, words), np.uint64)
+            self.words = np.zeros((0, words), np.uint64)
+
+        room = self.kf_point.shape[1]
+        if features > room:
+            self._grow(FEATURE_TABLES, features, axis=1)
+            self.kf_point[:, room:] = -1
+        slots = self.kf_alive.size
+        if self.kf_alive.all():
+            self._grow(KEYFRAME_TABLES | FEATURE_TABLES, max(16, slots + slots // 2))
+        return int(self.kf_alive.argmin())
 
     def set_pose(self, slot: int, T_cam_world: Array) -> None:
         """Set a keyframe's world-to-camera pose."""
@@ -264,20 +359,19 @@ class Map:
         self, position: Array, rgb: NDArray[np.uint8], keyframe: int, features: Slots
     ) -> Slots:
         """New points ``[N, 3]`` that features of a keyframe observe; returns their slots."""
+        # freed slots first, then new ones behind the others
         n = len(position)
         reused = [self._free_points.pop() for _ in range(min(n, len(self._free_points)))]
-        fresh = n - len(reused)
-        if self._top + fresh > self.alive.size:
-            self._grow(
-                POINT_TABLES, max(2048, self._top + fresh, self.alive.size + self.alive.size // 2)
-            )
-        slots = np.concatenate(
-            [np.array(reused, np.int64), np.arange(self._top, self._top + fresh, dtype=np.int64)]
-        )
+        end = self._top + n - len(reused)
+        size = self.alive.size
+        if end > size:
+            self._grow(POINT_TABLES, max(2048, end, size + size // 2))
+        fresh = np.arange(self._top, end, dtype=np.int64)
+        slots = np.concatenate([np.array(reused, np.int64), fresh])
+        self._top = end
         self.id[slots] = np.arange(self.next_point, self.next_point + n)
+        self.next_point += n
         self.alive[slots] = True
-        self._top = self._top + fresh
-        self.next_point = self.next_point + n
         self.born[slots] = self.kf_id[keyframe]
         self.position[slots] = position
         self.rgb[slots] = rgb
@@ -290,12 +384,12 @@ class Map:
     def observe(self, keyframe: int, features: Slots, points: Slots) -> None:
         """Add observations: features of a keyframe show points."""
         self._reserve(int(self.n_obs[points].max(initial=0)) + 1)
-        _link(*self._observed, self.kf_point, keyframe, features, points)
+        _link(self._observation_tables, keyframe, features, points)
 
     def unobserve(self, keyframes: Slots, features: Slots) -> None:
         """Remove observations; points that lose their last one are removed."""
         points = self.kf_point[keyframes, features].astype(np.int64)
-        _unlink(*self._observed, self.kf_point, keyframes, features)
+        _unlink(self._observation_tables, keyframes, features)
         points = np.unique(points[points >= 0])
         self.remove_points(points[self.n_obs[points] == 0])
 
@@ -310,7 +404,7 @@ class Map:
     def replace_point(self, old: int, new: int) -> None:
         """Replace a point by another that is the same point of the scene."""
         self._reserve(int(self.n_obs[new] + self.n_obs[old]))
-        _replace(*self._observed, self.kf_point, old, new)
+        _replace(self._observation_tables, old, new)
         for count in (self.visible, self.found):
             count[new] += count[old]
         self.alive[old] = False
@@ -318,9 +412,10 @@ class Map:
 
     def refresh(self, points: Slots) -> None:
         """Renew descriptor, viewing direction and scale range of points from their observations."""
-        of_points = (self.position, self.normal, self.far, self.words)
-        of_keyframes = (self.kf_words, self.kf_octave)
-        _refresh(points, *of_points, *self._observed, *of_keyframes, self.kf_centre, self.scales)
+        views = KeyframeViews(self.kf_words, self.kf_octave, self.kf_centre)
+        _refresh(
+            points, self._point_views, self.words, self._observation_tables, views, self.scales
+        )
 
     def release(self) -> None:
         """Allow the slots freed so far to be used again; called once nothing refers to them any more."""
@@ -328,8 +423,12 @@ class Map:
         self._freed_points.clear()
 
     @property
-    def _observed(self) -> tuple[Ints, Ints, Ints]:
-        return self.obs_kf, self.obs_ft, self.n_obs
+    def _observation_tables(self) -> ObservationTables:
+        return ObservationTables(self.obs_kf, self.obs_ft, self.n_obs, self.kf_point)
+
+    @property
+    def _point_views(self) -> PointViews:
+        return PointViews(self.position, self.normal, self.far)
 
     def observations(self, points: NDArray[np.integer]) -> tuple[Ints, Ints]:
         """Keyframe slots and feature numbers of the observations of points, one point after the other."""
@@ -346,26 +445,26 @@ class Map:
 
     # ------------------------------------------------------------------ views
 
-    def project(
-        self, T_cam_world: Array, candidates: Slots
-    ) -> tuple[Slots, Array, Array, Slots, Array]:
-        """The points that a camera should see, with pixels, right coordinates, octaves and viewing cosines."""
-        c = self.camera
-        return _project(
-            np.ascontiguousarray(T_cam_world),
-            candidates,
-            self.position,
-            self.normal,
-            self.far,
-            c.fx,
-            c.fy,
-            c.cx,
-            c.cy,
-            c.fx * c.baseline_m,
-            float(c.width),
-            float(c.height),
-            float(self.scales[1] / self.scales[0]) if len(self.scales) > 1 else 1.2,
-            len(self.scales),
+    def project(self, T_cam_world: Array, candidates: Slots) -> VisiblePoints:
+        """Which of the candidate points a camera should see, and where.
+
+        Args:
+            T_cam_world: World-to-camera pose ``[4, 4]``.
+            candidates: Slots of points.
+        """
+        # with a single level any factor gives octave 0
+        scale_factor = float(self.scales[1] / self.scales[0]) if len(self.scales) > 1 else 1.2
+        return VisiblePoints(
+            *_project(
+                np.ascontiguousarray(T_cam_world),
+                candidates,
+                self._point_views,
+                intrinsics_of(self.camera),
+                float(self.camera.width),
+                float(self.camera.height),
+                scale_factor,
+                len(self.scales),
+            )
         )
 
     def redundancy(self, slot: int, close_m: float) -> tuple[int, int]:
@@ -374,8 +473,11 @@ class Map:
         All points of a keyframe without any depth count as close.
         """
         depth = self.kf_z[slot, : self.kf_count[slot]]
-        close = (depth > 0) & (depth <= close_m) if depth.any() else np.ones(len(depth), bool)
-        return _redundancy(slot, close, self.kf_point, self.kf_octave, *self._observed)
+        if depth.any():
+            close = (depth > 0) & (depth <= close_m)
+        else:
+            close = np.ones(len(depth), bool)
+        return _redundancy(slot, close, self.kf_octave, self._observation_tables)
 
 
 # ---------------------------------------------------------------------- what filters and files read
@@ -395,26 +497,28 @@ def points_in(world: Map, submap: int) -> Slots:
 def map_outputs(world: Map) -> MapOutputs:
     """Keyframes and map points for files and pictures; of points the root map's alone."""
     points = points_in(world, 0)
-    records = tuple(
-        KeyframeRecord(
-            int(world.kf_id[slot]),
-            int(world.kf_frame[slot]),
-            float(world.kf_stamp[slot]),
-            se3.inverse(world.kf_pose[slot]),
-            int(world.kf_count[slot]),
-            int(np.count_nonzero(world.kf_point[slot] >= 0)),
-            int(world.kf_map[slot]),
-        )
-        for slot in world.keyframes.tolist()
-    )
+    records = tuple(_keyframe_record(world, slot) for slot in world.keyframes.tolist())
     observations = world.n_obs[points].astype(np.int64)
     return MapOutputs(
         records, world.id[points], world.position[points], world.rgb[points], observations
     )
 
 
+def _keyframe_record(world: Map, slot: int) -> KeyframeRecord:
+    """What files hold of a keyframe."""
+    return KeyframeRecord(
+        int(world.kf_id[slot]),
+        int(world.kf_frame[slot]),
+        float(world.kf_stamp[slot]),
+        se3.inverse(world.kf_pose[slot]),
+        int(world.kf_count[slot]),
+        int(np.count_nonzero(world.kf_point[slot] >= 0)),
+        int(world.kf_map[slot]),
+    )
+
+
 class MapViews:
-    """Views of a map for filters, made again after a keyframe or in another submap.
+    """Views of a map for filters; computed again after a keyframe or in another submap.
 
     Args:
         world: The map.
@@ -423,32 +527,33 @@ class MapViews:
 
     def __init__(self, world: Map, depth_images: int) -> None:
         self._world = world
-        self._most_images = depth_images
+        self._max_depth_images = depth_images
         self._depth_images: dict[int, NDArray[np.float32]] = {}
-        self._made_for: tuple[int, int] | None = None
+        self._computed_for: tuple[int, int] | None = None
 
     def add_keyframe(self, slot: int, depth: NDArray[np.float32]) -> None:
         """A keyframe was made; those that were culled for it lose their depth images."""
         self._depth_images[slot] = depth
-        newest = self._world.keyframes[::-1][: self._most_images]
-        self._depth_images = {at: image for at, image in self._depth_images.items() if at in newest}
+        newest = self._world.keyframes[::-1][: self._max_depth_images]
+        self._depth_images = {
+            stored: image for stored, image in self._depth_images.items() if stored in newest
+        }
 
     def of(self, submap: int) -> MapView:
         """What filters see while the camera is in a submap."""
         world = self._world
-        if self._made_for != (world.next_keyframe, submap):
-            self._made_for = world.next_keyframe, submap
+        if self._computed_for != (world.next_keyframe, submap):
+            self._computed_for = world.next_keyframe, submap
             newest = world.submap(submap)[::-1][:VIEWS].tolist()
             points = points_in(world, submap)
-            self._view: MapView = (
-                tuple(map(self._keyframe, newest)),
-                (world.id[points], world.position[points]),
-            )
+            keyframes = tuple(map(self._keyframe, newest))
+            self._view: MapView = (keyframes, (world.id[points], world.position[points]))
         return self._view
 
     def _keyframe(self, slot: int) -> KeyframeView:
+        """What filters may read of a keyframe."""
         world = self._world
-        n = int(self._world.kf_count[slot])
+        n = int(world.kf_count[slot])
         keypoints = Keypoints(
             world.kf_raw[slot, :n],
             world.kf_octave[slot, :n].astype(np.int32),
@@ -466,89 +571,79 @@ class MapViews:
         )
 
 
-# ---------------------------------------------------------------------- compiled loops over the
-# tables
+# ---------------------------------------------------------------------- compiled loops
 
 
 @kernel
-def _link_one(
-    obs_kf: Ints, obs_ft: Ints, n_obs: Ints, kf_point: Ints, keyframe: int, feature: int, point: int
-) -> None:
-    end = n_obs[point]
-    if (obs_kf[point, :end] == keyframe).any():
+def _link_one(tables: ObservationTables, keyframe: int, feature: int, point: int) -> None:
+    """Add an observation of a point; a second one by the same keyframe is skipped."""
+    end = tables.n_obs[point]
+    if (tables.obs_kf[point, :end] == keyframe).any():
         return
-    obs_kf[point, end] = keyframe
-    obs_ft[point, end] = feature
-    n_obs[point] += 1
-    kf_point[keyframe, feature] = point
+    tables.obs_kf[point, end] = keyframe
+    tables.obs_ft[point, end] = feature
+    tables.n_obs[point] += 1
+    tables.kf_point[keyframe, feature] = point
 
 
 @kernel
-def _link(
-    obs_kf: Ints,
-    obs_ft: Ints,
-    n_obs: Ints,
-    kf_point: Ints,
-    keyframe: int,
-    features: Slots,
-    points: Slots,
-) -> None:
-    """Add observations of the points by the keyframe's features; a second one by the same keyframe is skipped."""
+def _link(tables: ObservationTables, keyframe: int, features: Slots, points: Slots) -> None:
+    """Add observations of the points by the keyframe's features, where these observe nothing yet."""
     for i in range(points.shape[0]):
-        if kf_point[keyframe, features[i]] < 0:
-            _link_one(obs_kf, obs_ft, n_obs, kf_point, keyframe, features[i], points[i])
+        if tables.kf_point[keyframe, features[i]] < 0:
+            _link_one(tables, keyframe, features[i], points[i])
 
 
 @kernel
-def _unlink(
-    obs_kf: Ints, obs_ft: Ints, n_obs: Ints, kf_point: Ints, keyframes: Slots, features: Slots
-) -> None:
+def _unlink(tables: ObservationTables, keyframes: Slots, features: Slots) -> None:
     """Remove observations; the order of the others is kept."""
+    obs_kf = tables.obs_kf
+    obs_ft = tables.obs_ft
     for i in range(keyframes.shape[0]):
-        p = kf_point[keyframes[i], features[i]]
+        p = tables.kf_point[keyframes[i], features[i]]
         if p < 0:
             continue
-        kf_point[keyframes[i], features[i]] = -1
+        tables.kf_point[keyframes[i], features[i]] = -1
         left = 0
-        for o in range(n_obs[p]):
+        for o in range(tables.n_obs[p]):
             if obs_kf[p, o] != keyframes[i] or obs_ft[p, o] != features[i]:
-                obs_kf[p, left], obs_ft[p, left] = obs_kf[p, o], obs_ft[p, o]
+                obs_kf[p, left] = obs_kf[p, o]
+                obs_ft[p, left] = obs_ft[p, o]
                 left += 1
-        n_obs[p] = left
+        tables.n_obs[p] = left
 
 
 @kernel
-def _replace(obs_kf: Ints, obs_ft: Ints, n_obs: Ints, kf_point: Ints, old: int, new: int) -> None:
+def _replace(tables: ObservationTables, old: int, new: int) -> None:
     """Move the observations of `old` to `new`; where one keyframe observes both, that of `new` stays."""
-    for o in range(n_obs[old]):
-        kf_point[obs_kf[old, o], obs_ft[old, o]] = -1
-        _link_one(obs_kf, obs_ft, n_obs, kf_point, obs_kf[old, o], obs_ft[old, o], new)
-    n_obs[old] = 0
+    obs_kf = tables.obs_kf
+    obs_ft = tables.obs_ft
+    for o in range(tables.n_obs[old]):
+        tables.kf_point[obs_kf[old, o], obs_ft[old, o]] = -1
+        _link_one(tables, obs_kf[old, o], obs_ft[old, o], new)
+    tables.n_obs[old] = 0
 
 
 @kernel
 def _refresh(
     points: Slots,
-    position: Array,
-    normal: Array,
-    far: Array,
+    views: PointViews,
     words: Any,
-    obs_kf: Ints,
-    obs_ft: Ints,
-    n_obs: Ints,
-    kf_words: Any,
-    kf_octave: Any,
-    kf_centre: Array,
+    tables: ObservationTables,
+    keyframes: KeyframeViews,
     scales: Array,
 ) -> None:
-    """Renew descriptor (the medoid of the observed ones), viewing direction and scale range of the points."""
+    """Renew descriptor, viewing direction and scale range of the points from their observations."""
+    obs_kf = tables.obs_kf
+    obs_ft = tables.obs_ft
     for i in range(points.shape[0]):
         p = points[i]
-        n = n_obs[points[i]]
+        n = tables.n_obs[points[i]]
         if n == 0:
             continue
-        # only the newest observations count
-        first = max(n - 12, 0)
+
+        # descriptor: the medoid of the newest ones, by the sum of Hamming distances
+        first = max(n - DESCRIBING_OBSERVATIONS, 0)
         best = n - 1
         best_score = 1 << 40
         if n > 2:
@@ -556,55 +651,52 @@ def _refresh(
                 score = 0
                 for b in range(first, n):
                     score += distance(
-                        kf_words[obs_kf[p, a], obs_ft[p, a]], kf_words[obs_kf[p, b], obs_ft[p, b]]
+                        keyframes.words[obs_kf[p, a], obs_ft[p, a]],
+                        keyframes.words[obs_kf[p, b], obs_ft[p, b]],
                     )
                 if score < best_score:
                     best = a
                     best_score = score
         # whole rows would compile a message for shapes that differ, seconds of it
         for w in range(words.shape[1]):
-            words[p, w] = kf_words[obs_kf[p, best], obs_ft[p, best], w]
+            words[p, w] = keyframes.words[obs_kf[p, best], obs_ft[p, best], w]
+
+        # scale range by the oldest observation, and mean viewing direction
         sx = 0.0
         sy = 0.0
         sz = 0.0
         for o in range(n):
-            c = kf_centre[obs_kf[p, o]]
-            x = position[p, 0] - c[0]
-            y = position[p, 1] - c[1]
-            z = position[p, 2] - c[2]
+            c = keyframes.centre[obs_kf[p, o]]
+            x = views.position[p, 0] - c[0]
+            y = views.position[p, 1] - c[1]
+            z = views.position[p, 2] - c[2]
             d = np.sqrt(x * x + y * y + z * z) + 1e-12
             sx = sx + x / d
             sy = sy + y / d
             sz = sz + z / d
             if o == 0:
-                far[p] = d * scales[kf_octave[obs_kf[p, o], obs_ft[p, o]]]
+                views.far[p] = d * scales[keyframes.octave[obs_kf[p, o], obs_ft[p, o]]]
         length = np.sqrt(sx * sx + sy * sy + sz * sz) + 1e-12
-        normal[p, 0] = sx / length
-        normal[p, 1] = sy / length
-        normal[p, 2] = sz / length
+        views.normal[p, 0] = sx / length
+        views.normal[p, 1] = sy / length
+        views.normal[p, 2] = sz / length
 
 
 @kernel
 def _project(
     pose: Array,
     candidates: Slots,
-    position: Array,
-    normal: Array,
-    far: Array,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    bf: float,
+    views: PointViews,
+    camera: Intrinsics,
     width: float,
     height: float,
     scale_factor: float,
     levels: int,
 ) -> tuple[Slots, Array, Array, Slots, Array]:
-    """The candidate points that the camera should see: in the image, at a fit distance, from a fit side.
+    """The candidate points that the camera should see, see `VisiblePoints`.
 
-    Returns:
-        Points, pixels, right coordinates, predicted octaves and cosines of the viewing angle.
+    They lie in the image, within their scale range (widened by `WIDEN_RANGE`) and are seen from a
+    side that they were seen from before (ORB-SLAM2's ``isInFrustum``).
     """
     n = candidates.shape[0]
     index = np.empty(n, np.int64)
@@ -612,38 +704,48 @@ def _project(
     uv = np.empty((n, 2))
     right = np.empty(n)
     cosine = np.empty(n)
+
+    # camera centre in the world
     r = pose[:3, :3]
     t = pose[:3, 3]
     ox = -(r[0, 0] * t[0] + r[1, 0] * t[1] + r[2, 0] * t[2])
     oy = -(r[0, 1] * t[0] + r[1, 1] * t[1] + r[2, 1] * t[2])
     oz = -(r[0, 2] * t[0] + r[1, 2] * t[1] + r[2, 2] * t[2])
-    nearest = scale_factor ** (levels - 1)
+    coarsest_scale = scale_factor ** (levels - 1)
     inverse_log = 1.0 / np.log(scale_factor)
     count = 0
     for i in range(n):
+        # in the image
         p = candidates[i]
-        xc, yc, zc = transform_point(pose, position[p])
-        if zc < 0.05:
+        xc, yc, zc = transform_point(pose, views.position[p])
+        if zc < NEAR_M:
             continue
-        u = fx * xc / zc + cx
-        v = fy * yc / zc + cy
+        u = camera.fx * xc / zc + camera.cx
+        v = camera.fy * yc / zc + camera.cy
         if u < 0.0 or u >= width or v < 0.0 or v >= height:
             continue
-        dx = position[p, 0] - ox
-        dy = position[p, 1] - oy
-        dz = position[p, 2] - oz
+
+        # within the scale range
+        dx = views.position[p, 0] - ox
+        dy = views.position[p, 1] - oy
+        dz = views.position[p, 2] - oz
         d = np.sqrt(dx * dx + dy * dy + dz * dz)
-        if d > WIDEN_RANGE * far[p] or d * WIDEN_RANGE < far[p] / nearest:
+        far = views.far[p]
+        if d > WIDEN_RANGE * far or d * WIDEN_RANGE < far / coarsest_scale:
             continue
-        c = (dx * normal[p, 0] + dy * normal[p, 1] + dz * normal[p, 2]) / d
+
+        # from a known side
+        c = (dx * views.normal[p, 0] + dy * views.normal[p, 1] + dz * views.normal[p, 2]) / d
         if c < MIN_COSINE:
             continue
-        level = int(np.ceil(np.log(far[p] / d) * inverse_log - 1e-9))
+
+        # octave by the distance; the small term keeps exact powers at their own octave
+        level = int(np.ceil(np.log(far / d) * inverse_log - 1e-9))
         octave[count] = min(max(level, 0), levels - 1)
         index[count] = p
         uv[count, 0] = u
         uv[count, 1] = v
-        right[count] = u - bf / zc
+        right[count] = u - camera.bf / zc
         cosine[count] = c
         count += 1
     return (
@@ -657,24 +759,20 @@ def _project(
 
 @kernel
 def _redundancy(
-    keyframe: int,
-    close: NDArray[np.bool_],
-    kf_point: Ints,
-    kf_octave: Any,
-    obs_kf: Ints,
-    obs_ft: Ints,
-    n_obs: Ints,
+    keyframe: int, close: NDArray[np.bool_], kf_octave: Any, tables: ObservationTables
 ) -> tuple[int, int]:
     """Close points that the keyframe observes, and those that `REDUNDANT_VIEWS` see, at most one octave coarser."""
+    obs_kf = tables.obs_kf
+    obs_ft = tables.obs_ft
     total = 0
     redundant = 0
     for f in range(close.shape[0]):
-        p = kf_point[keyframe, f]
+        p = tables.kf_point[keyframe, f]
         if p < 0 or not close[f]:
             continue
         total = total + 1
         fine = 0
-        for o in range(n_obs[p]):
+        for o in range(tables.n_obs[p]):
             if (
                 obs_kf[p, o] != keyframe
                 and kf_octave[obs_kf[p, o], obs_ft[p, o]] <= kf_octave[keyframe, f] + 1

@@ -25,11 +25,15 @@ from dynslam_bench.core.records import Record, schema
 from dynslam_bench.geometry import Camera, format_ns, ns_of, se3
 
 MAP_FILE = "map.npz"
+"""Name of a run's saved map."""
 MAP_SCHEMA = 1
+"""Version of its layout."""
 HEADER = "header"
+"""Name of the array that holds the header's JSON text."""
 ARRAY_HEADER_BYTES = 256
 """What numpy writes before an array, at most."""
 MAKE_ONE = "a map is made by: run --save-map"
+"""What to do where a file is no map."""
 
 Sensors = Literal["rgbd", "rgb"]
 Arrays = Mapping[str, NDArray[Any]]
@@ -40,7 +44,7 @@ KEYFRAME_ARRAYS = {
     "kf_pose": ("f8", "S44"),
     "kf_count": ("i8", "S"),
 }
-"""Type and shape of what is stored of each keyframe; S keyframes."""
+"""Type and shape of what is stored for each keyframe; S keyframes."""
 FEATURE_ARRAYS = {
     "kf_raw": ("f4", "F2"),
     "kf_response": ("f4", "F"),
@@ -53,7 +57,10 @@ FEATURE_ARRAYS = {
     "kf_info_right": ("f8", "F"),
     "kf_words": ("u8", "FW"),
 }
-"""Of each feature of each keyframe, one keyframe after the other; F features, W words of 64 bits a descriptor."""
+"""Type and shape of what is stored for each feature, one keyframe after the other.
+
+F features of all keyframes, W words of 64 bits a descriptor.
+"""
 POINT_ARRAYS = {
     "id": ("i8", "P"),
     "position": ("f8", "P3"),
@@ -66,22 +73,29 @@ POINT_ARRAYS = {
     "born": ("i8", "P"),
     "n_obs": ("i4", "P"),
 }
-"""Of each point; P points."""
+"""Type and shape of what is stored for each point; P points."""
 OBSERVATION_ARRAYS = {"obs_kf": ("i4", "O"), "obs_ft": ("i4", "O")}
-"""Of each observation, one point after the other: row of the keyframe, and which of its features; O observations."""
+"""Type and shape of what is stored for each observation, one point after the other; O observations.
+
+Row of the keyframe, and which of its features.
+"""
 SUBMAP_ARRAYS = {
     "submap_start": ("f8", "I3"),
     "submap_anchor": ("f8", "I3"),
     "submap_bound": ("f8", "I"),
 }
-"""Of each submap that was not merged (`Atlas`); I of them."""
+"""Type and shape of what is stored for each submap that was not merged (`Atlas`); I submaps."""
 _LAYOUT = KEYFRAME_ARRAYS | FEATURE_ARRAYS | POINT_ARRAYS | OBSERVATION_ARRAYS | SUBMAP_ARRAYS
 
 
 MAX_TABLE_BYTES = 1 << 30
-"""Of all features of a map as tables; two thousand keyframes of a thousand features fill a fifth."""
+"""Bytes of all features of a map as tables, at most; two thousand keyframes of a thousand features fill a fifth."""
 MAX_WORDS = 64
-"""Words of 64 bits of a descriptor; ORB's has four."""
+"""Words of 64 bits of a descriptor, at most; ORB's has four."""
+FEATURE_BYTES = 64
+"""Bytes of a feature without its descriptor in the tables of a map, about."""
+OBSERVATION_BYTES = 8
+"""Bytes of an observation in the tables of a map."""
 
 
 class MapFeatures(Record):
@@ -110,7 +124,7 @@ class MapHeader(Record):
 
     Attributes:
         kind: Says that the file is a map.
-        schema_version: Of the file; newer ones are refused.
+        schema_version: Version of the file's layout; newer ones are refused.
         sensors: ``rgbd``, or ``rgb`` for a map whose unit of length is its own.
         camera: Intrinsics of the undistorted camera, see `Camera`.
         features: What it is made of.
@@ -162,11 +176,10 @@ class SavedMap:
             **header.camera,
         }
         own = {"sensors": sensors, **features.model_dump(), **described(camera)}
-        differing = [
-            f"{name} {saved.get(name)} instead of {own[name]}"
-            for name in own
-            if saved.get(name) != own[name]
-        ]
+        differing: list[str] = []
+        for name, value in own.items():
+            if saved.get(name) != value:
+                differing.append(f"{name} {saved.get(name)} instead of {value}")
         if differing:
             cure = "localise with the camera, sensors and features that the map was made with"
             raise SettingsError(f"{file} is a map of {', '.join(differing)}", cure)
@@ -228,26 +241,15 @@ def _faults(arrays: Arrays, header: MapHeader) -> Iterator[str]:
     that contradict each other. Later checks rely on earlier ones. Damage is found by the check sums
     of the zip file.
     """
+    # missing and unknown arrays
     for name in sorted(_LAYOUT.keys() ^ arrays.keys()):
-        yield (
-            f"it holds no array '{name}'"
-            if name in _LAYOUT
-            else f"it holds an unknown array '{name[:40]}'"
-        )
-    sizes: dict[str, int] = {}
-    for name, (kind, axes) in _LAYOUT.items():
-        array = arrays[name]
-        expected = [
-            int(axis) if axis.isdigit() else sizes.setdefault(axis, size)
-            for axis, size in zip(axes, array.shape, strict=False)
-        ]
-        if (
-            array.dtype != np.dtype(kind)
-            or array.ndim != len(axes)
-            or list(array.shape) != expected
-        ):
-            shape = ", ".join(map(str, expected)) + ", ?" * max(len(axes) - array.ndim, 0)
-            yield f"'{name}' is {array.dtype} of shape {str(array.shape)[:60]}, expected {np.dtype(kind)} of ({shape})"
+        if name in _LAYOUT:
+            yield f"it holds no array '{name}'"
+        else:
+            yield f"it holds an unknown array '{name[:40]}'"
+    yield from _layout_faults(arrays)
+
+    # indices out of bounds
     last = {
         "kf_id": header.next_keyframe - 1,
         "born": header.next_keyframe - 1,
@@ -262,47 +264,74 @@ def _faults(arrays: Arrays, header: MapHeader) -> Iterator[str]:
     for name, most in last.items():
         if not ((arrays[name] >= 0) & (arrays[name] <= most)).all():
             yield f"'{name}' holds values below 0 or above {most}"
-    yield from (fault for holds, fault in _checks(arrays) if not holds)
+
+    # sizes and references
+    yield from _size_faults(arrays)
+    yield from _reference_faults(arrays)
 
 
-def _checks(arrays: Arrays) -> Iterator[tuple[Any, str]]:
-    """What has to hold of sizes and references, and the fault if it does not."""
+def _layout_faults(arrays: Arrays) -> Iterator[str]:
+    """Arrays of another type or shape than `_LAYOUT` has; the first array with an axis decides how long it is."""
+    sizes: dict[str, int] = {}
+    for name, (kind, axes) in _LAYOUT.items():
+        array = arrays[name]
+        expected: list[int] = []
+        for axis, size in zip(axes, array.shape, strict=False):
+            expected.append(int(axis) if axis.isdigit() else sizes.setdefault(axis, size))
+        if (
+            array.dtype != np.dtype(kind)
+            or array.ndim != len(axes)
+            or list(array.shape) != expected
+        ):
+            shape = ", ".join(map(str, expected)) + ", ?" * max(len(axes) - array.ndim, 0)
+            yield f"'{name}' is {array.dtype} of shape {str(array.shape)[:60]}, expected {np.dtype(kind)} of ({shape})"
+
+
+def _size_faults(arrays: Arrays) -> Iterator[str]:
+    """Values that are not finite, tables that would be too large, and counts that do not add up."""
     for name in ("kf_pose", "kf_xy", "kf_z", "position", "normal", "far"):
-        yield np.isfinite(arrays[name]).all(), f"'{name}' holds values that are not finite"
+        if not np.isfinite(arrays[name]).all():
+            yield f"'{name}' holds values that are not finite"
     words = max(arrays["kf_words"].shape[1], arrays["words"].shape[1])
-    yield (
-        words <= MAX_WORDS,
-        f"a descriptor has {words} words of 64 bits, at most {MAX_WORDS} are read",
-    )
+    if words > MAX_WORDS:
+        yield f"a descriptor has {words} words of 64 bits, at most {MAX_WORDS} are read"
     count = arrays["kf_count"]
     n_obs = arrays["n_obs"].astype(np.int64)
-    yield len(count) and n_obs.all(), "it holds no keyframe, or a point that none observes"
+    if not (len(count) and n_obs.all()):
+        yield "it holds no keyframe, or a point that none observes"
     for name, counts, size, held in (
-        ("kf_count", count, 64 + 8 * words, len(arrays["kf_xy"])),
-        ("n_obs", n_obs, 8, len(arrays["obs_kf"])),
+        ("kf_count", count, FEATURE_BYTES + 8 * words, len(arrays["kf_xy"])),
+        ("n_obs", n_obs, OBSERVATION_BYTES, len(arrays["obs_kf"])),
     ):
         # as tables, as wide as the longest row
         claimed = len(counts) * int(counts.max(initial=0)) * size
-        yield (
-            claimed <= MAX_TABLE_BYTES,
-            f"'{name}' claims tables of {claimed} bytes, more than {MAX_TABLE_BYTES}",
-        )
-        yield int(counts.sum()) == held, f"'{name}' does not add up to {held}"
+        if claimed > MAX_TABLE_BYTES:
+            yield f"'{name}' claims tables of {claimed} bytes, more than {MAX_TABLE_BYTES}"
+        if int(counts.sum()) != held:
+            yield f"'{name}' does not add up to {held}"
+
+
+def _reference_faults(arrays: Arrays) -> Iterator[str]:
+    """Observations by features that do not exist, or that contradict each other."""
+    count = arrays["kf_count"]
+    n_obs = arrays["n_obs"].astype(np.int64)
     keyframe = arrays["obs_kf"]
     feature = arrays["obs_ft"]
-    yield (
-        (feature < count[keyframe]).all(),
-        "'obs_ft' names features that the keyframe does not have",
-    )
+    if not (feature < count[keyframe]).all():
+        yield "'obs_ft' names features that the keyframe does not have"
+
+    # row of each observation among all features, and its point
     row = (np.cumsum(count) - count)[keyframe] + feature
     point = np.repeat(np.arange(len(n_obs)), n_obs)
-    yield len(np.unique(row)) == len(row), "a feature observes two points"
-    once = len(np.unique(point * len(count) + keyframe)) == len(row)
-    yield once, "a keyframe observes a point with two features"
+    if len(np.unique(row)) != len(row):
+        yield "a feature observes two points"
+    if len(np.unique(point * len(count) + keyframe)) != len(row):
+        yield "a keyframe observes a point with two features"
 
 
 # ---------------------------------------------------------------------- keyframes.csv and map.ply
 
+# one row a point
 _PLY_LAYOUT = np.dtype([("position", "<f4", 3), ("colour", "u1", 3), ("observations", "<i4")])
 
 
@@ -320,14 +349,14 @@ def write_keyframes_csv(
     """
     lines = ["id,frame,timestamp,tx,ty,tz,qx,qy,qz,qw,features,observations,map"]
     for record in outputs.keyframes:
-        pose = (f"{value:.9f}" for value in np.concatenate(se3.to_quaternion(record.T_world_cam)))
-        when: tuple[object, object] = "", ""
+        position_and_quaternion = np.concatenate(se3.to_quaternion(record.T_world_cam))
+        pose = (f"{value:.9f}" for value in position_and_quaternion)
+        frame: object = ""
+        stamp = ""
         if record.frame >= 0:
-            when = (
-                record.frame,
-                format_ns((exact or {}).get(record.timestamp) or ns_of(record.timestamp)),
-            )
-        cells = (record.id, *when, *pose, record.features, record.observations, record.map)
+            frame = record.frame
+            stamp = format_ns((exact or {}).get(record.timestamp) or ns_of(record.timestamp))
+        cells = (record.id, frame, stamp, *pose, record.features, record.observations, record.map)
         lines.append(",".join(map(str, cells)))
     write_atomic(path, "\n".join([*lines, ""]))
 
@@ -366,6 +395,7 @@ def read_ply(path: Path) -> Cloud:
 
 
 def _ply_header(rows: int) -> bytes:
+    """The header of a PLY file of so many points, which `_PLY_LAYOUT` describes."""
     kinds = {"float": ("x", "y", "z"), "uchar": ("red", "green", "blue"), "int": ("observations",)}
     properties = [f"property {kind} {name}" for kind, names in kinds.items() for name in names]
     lines = [

@@ -63,14 +63,17 @@ def pose_covariance(T_cam_world: Array, information: Array, inflation: float = I
         information: Gauss-Newton matrix of (translation, rotation) for ``exp(xi) @ T_cam_world``.
         inflation: Factor on the covariance.
     """
+    # derivative of the twist by (position in the world, rotation in the camera frame)
     j = np.zeros((6, 6))
     j[:3, :3] = -T_cam_world[:3, :3]
     j[3:, 3:] = np.eye(3)
+    # the small term keeps directions finite that the image does not determine
     covariance = np.linalg.inv(j.T @ information @ j / inflation + 1e-3 * np.eye(6))
     return np.asarray(0.5 * (covariance + covariance.T))
 
 
 def _process_noise(dt: float, settings: MotionModelSettings) -> Array:
+    """Covariance ``[12, 12]`` that an acceleration, constant for `dt` seconds, adds to a `MotionState`."""
     variance = np.repeat([settings.acceleration**2, settings.angular_acceleration**2], 3)
     noise = np.zeros((12, 12))
     pose = np.arange(6)
@@ -137,7 +140,7 @@ class MotionState:
         )
 
     def transformed(self, rotation: Array, scale: float) -> MotionState:
-        """The same motion after the world was rotated by ``[3, 3]`` and its lengths were multiplied."""
+        """The state after the world was rotated by ``[3, 3]`` and its lengths were multiplied by `scale`."""
         by = np.eye(12)
         by[:3, :3] = by[6:9, 6:9] = scale * rotation
         return MotionState(
@@ -149,6 +152,7 @@ class MotionState:
 
     def predicted(self, dt: float, settings: MotionModelSettings) -> MotionState:
         """The state `dt` seconds later."""
+        # constant velocity; accelerations are noise
         f = np.eye(12) + dt * np.eye(12, k=6)
         covariance = f @ self.covariance @ f.T + _process_noise(dt, settings)
         return self.moved(np.append(self.speed * dt, np.zeros(6)), covariance)
@@ -163,13 +167,15 @@ class MotionState:
 
     def updated(self, T_cam_world: Array, covariance: Array) -> MotionState:
         """The state after a measured pose; one beyond the chi-square limit inflates the predicted covariance."""
+        # chi-square of the innovation; an unlikely one means that the motion was predicted too confidently
         p = self.covariance
         innovation = self.difference(T_cam_world)
-        surprise = (
-            float(innovation @ np.linalg.solve(p[:6, :6] + covariance, innovation)) / CHI2_POSE
-        )
-        if surprise > 1.0:
-            p = p * surprise
+        chi2 = float(innovation @ np.linalg.solve(p[:6, :6] + covariance, innovation))
+        excess = chi2 / CHI2_POSE
+        if excess > 1.0:
+            p = p * excess
+
+        # Kalman gain and update
         gain = np.linalg.solve(p[:6, :6] + covariance, p[:6]).T
         reduced = p - gain @ p[:6]
         return self.moved(gain @ innovation, 0.5 * (reduced + reduced.T))
@@ -183,7 +189,7 @@ def smooth(
     Args:
         stamps: Seconds ``[N]``, ascending.
         T_cam_world: Measured poses ``[N, 4, 4]``.
-        covariances: Of `pose_covariance` ``[N, 6, 6]``.
+        covariances: Covariances of the poses ``[N, 6, 6]``, see `pose_covariance`.
         settings: Accelerations.
 
     Returns:
@@ -200,14 +206,19 @@ def smooth(
 def _smooth_part(
     stamps: Array, poses: Array, covariances: Array, settings: MotionModelSettings
 ) -> Array:
-    later = MotionState.at(poses[0], covariances[0])
-    filtered = [later]
-    predicted = [later]
+    """`smooth` within a part without gaps."""
+    # forwards: filter, and keep each prediction
+    state = MotionState.at(poses[0], covariances[0])
+    filtered = [state]
+    predicted = [state]
     steps = np.diff(stamps)
     for k in range(1, len(stamps)):
-        predicted.append(later.predicted(float(steps[k - 1]), settings))
-        later = predicted[k].updated(poses[k], covariances[k])
-        filtered.append(later)
+        predicted.append(state.predicted(float(steps[k - 1]), settings))
+        state = predicted[k].updated(poses[k], covariances[k])
+        filtered.append(state)
+
+    # backwards: correct each filtered state by how the smoothed next one differs from its prediction
+    later = state
     out = np.empty_like(poses)
     out[-1] = later.T_cam_world
     for k in range(len(stamps) - 2, -1, -1):
@@ -238,14 +249,18 @@ class CameraMotion:
         self.state: MotionState | None = None
         self.intervals: deque[float] = deque(maxlen=INTERVALS)
 
-    def relocated(self, T_cam_world: Array) -> None:
-        """The same motion at another pose, as after bundle adjustment."""
+    def relocate(self, T_cam_world: Array) -> None:
+        """Move to another pose with the motion unchanged, as after bundle adjustment.
+
+        Args:
+            T_cam_world: The new world-to-camera pose ``[4, 4]``.
+        """
         if self.state is not None:
             r = T_cam_world[:3, :3]
             self.state = replace(self.state, position=-r.T @ T_cam_world[:3, 3], rotation=r.copy())
 
-    def transformed(self, T_cam_before: Array, T_cam_now: Array, scale: float) -> None:
-        """The same motion after a loop was closed.
+    def transform(self, T_cam_before: Array, T_cam_now: Array, scale: float) -> None:
+        """Move the motion with the world around the camera, as after a loop was closed.
 
         Args:
             T_cam_before: World-to-camera pose of a keyframe nearby as it was before.
@@ -276,7 +291,7 @@ class CameraMotion:
         covariance = self.state.motion_covariance(dt, self._settings)
         return self.state.predicted(dt, self._settings).T_cam_world, covariance
 
-    def filtered(
+    def update(
         self, last: TrackedFrame, timestamp: float, measured: Array, information: Array
     ) -> Array:
         """Weigh the image's pose against the motion model, and remember the motion.
@@ -301,8 +316,7 @@ class CameraMotion:
         return self.state.T_cam_world
 
 
-# ---------------------------------------------------------------------- rolling-shutter
-# compensation
+# ---------------------------------------------------------------------- rolling shutter
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,11 +333,16 @@ class CameraVelocity:
 
     @classmethod
     def between(cls, before: Array, now: Array, seconds: float) -> CameraVelocity:
-        """From two world-to-camera poses ``[4, 4]`` so many seconds apart; in the camera frame of the later one."""
+        """The velocity between two world-to-camera poses ``[4, 4]``, in the camera frame of the later one.
+
+        Args:
+            before: The earlier pose.
+            now: The later pose.
+            seconds: The time between them.
+        """
         angular = se3.rotation_vectors(now[:3, :3] @ before[:3, :3].T) / seconds
-        return cls(
-            now[:3, :3] @ (se3.inverse(before)[:3, 3] - se3.inverse(now)[:3, 3]) / seconds, angular
-        )
+        moved_back = se3.inverse(before)[:3, 3] - se3.inverse(now)[:3, 3]
+        return cls(now[:3, :3] @ moved_back / seconds, angular)
 
 
 def compensate_rolling_shutter(
@@ -342,10 +361,18 @@ def compensate_rolling_shutter(
         New observations; a feature that such a motion would put behind the camera stays where it
         is.
     """
-    lens = camera.fx, camera.fy, camera.cx, camera.cy
+    # seconds of each row after the middle one
     late = ((observations.keypoints.xy[:, 1] + 0.5) / camera.height - 0.5) * camera.readout_s
     xy, z = _compensated(
-        observations.xy, observations.z, late, velocity.linear, velocity.angular, *lens
+        observations.xy,
+        observations.z,
+        late,
+        velocity.linear,
+        velocity.angular,
+        camera.fx,
+        camera.fy,
+        camera.cx,
+        camera.cy,
     )
     grid = CellGrid.of(xy, camera.width, camera.height)
     return replace(observations, xy=xy, z=z, right=right_coordinates(xy, z, camera), grid=grid)
@@ -369,6 +396,7 @@ def _compensated(
     speed = np.sqrt((angular**2).sum())
     ax, ay, az = angular / max(speed, 1e-12)
     for i in range(len(xy)):
+        # the point before it moved on; without depth it is a direction, which only the rotation changes
         has_depth = z[i] > 0
         depth = z[i] if has_depth else 1.0
         travelled = late[i] if has_depth else 0.0
@@ -440,13 +468,16 @@ class RollingShutter:
         dt = timestamp - last.timestamp
         if not 0 < dt <= MAX_GAP_S:
             return observations, fit, None
-        # a camera exposes at a regular rate, however its frames were stamped
+
+        # velocity from the last pose; a camera exposes at a regular rate, however its frames were stamped
         usual = float(np.median(self._intervals)) if self._intervals else dt
         regular = round(dt / usual) * usual
         exposed = regular if abs(dt - regular) <= STAMP_NOISE * usual else dt
         velocity = CameraVelocity.between(
             last.T_cam_world, pose, max(exposed, self._camera.readout_s)
         )
+
+        # compensate by it and fit again
         compensated = compensate_rolling_shutter(raw, self._camera, velocity)
         refit = fit_pose(self._camera, compensated, fit.matches, pose, fit.in_view)
         if refit.count < MIN_AGREEING * fit.count and not force:
@@ -475,10 +506,16 @@ class FramePose:
 
 
 def rescale(history: Sequence[FramePose], scales: Mapping[int, float]) -> None:
-    """Lengths around keyframes, by their slots, were multiplied by scales: so are those of their frames."""
+    """Rescale the frames of keyframes around which lengths were multiplied.
+
+    Args:
+        history: Changed in place.
+        scales: What lengths were multiplied by, by slot of the keyframe.
+    """
     for frame in history:
         scale = scales.get(frame.reference, 1.0)
         frame.T_cam_ref[:3, 3] *= scale
+        # a derivative by a longer unit is smaller
         frame.information[:3] /= scale
         frame.information[:, :3] /= scale
 
@@ -491,18 +528,20 @@ def trajectory(
     Frames of unmerged submaps are left out: where they were taken in the root map's world is
     unknown.
     """
+    # frames of the root map, by stamp; of equal stamps the first
     frames = {
         frame.timestamp: frame for frame in reversed(history) if world.kf_map[frame.reference] == 0
     }
     stamps = np.array(sorted(frames), np.float64)
     ordered = [frames[stamp] for stamp in sorted(frames)]
-    poses = np.array(
-        [frame.T_cam_ref @ world.kf_pose[frame.reference] for frame in ordered]
-    ).reshape(-1, 4, 4)
+
+    # world-to-camera poses by the keyframes as they are now
+    absolute = [frame.T_cam_ref @ world.kf_pose[frame.reference] for frame in ordered]
+    poses = np.array(absolute).reshape(-1, 4, 4)
+
     if settings.smooth and len(poses) > 2:
-        covariances = [
-            pose_covariance(pose, f.information.astype(float))
-            for pose, f in zip(poses, ordered, strict=True)
-        ]
+        covariances: list[Array] = []
+        for pose, frame in zip(poses, ordered, strict=True):
+            covariances.append(pose_covariance(pose, frame.information.astype(float)))
         poses = smooth(stamps, poses, np.array(covariances), settings)
     return Trajectory(stamps, se3.inverse(poses))

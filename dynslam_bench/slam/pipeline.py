@@ -1,7 +1,7 @@
 """The frame pipeline of a visual SLAM system for dynamic scenes (paper, Figure 2), from top to bottom.
 
-Every published system runs this file; it differs only in its list of filters, its flow and its
-settings.
+`SlamPipeline.track` is the path of one frame. Every published system runs this file; systems differ
+only in their list of filters, their flow and their settings.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ from dynslam_bench.contracts import (
     FlowResult,
     Frame,
     FrameBundle,
+    Instances,
+    Keypoints,
     MapOutputs,
     MaskedExtractor,
     TrackResult,
@@ -43,6 +45,9 @@ from dynslam_bench.slam.backend import RgbdBackend
 
 if TYPE_CHECKING:
     from dynslam_bench.segmentation.schedule import MaskScheduler
+
+MIN_PREDICTED_DEPTH_M = 0.05
+"""Points nearer than this to the previous camera plane have no predicted flow."""
 
 RefinePrediction = Callable[[FrameBundle, FilterState], NDArray[np.float64] | None]
 """Called with a frame and what is known beside it, its flow among that; gives ``T_world_cam`` or None."""
@@ -177,61 +182,93 @@ class SlamPipeline:
             SequenceError: The frame does not fit the camera (see `check_frame`).
         """
         backend = self._started()
-        camera = self._camera
-        check_frame(frame, camera)
-        if not backend.uses_depth:
-            frame = replace(frame, depth=np.zeros((camera.height, camera.width), np.float32))
+        check_frame(frame, self._camera)
         clock = StageClock(self._cached)
+
+        # grey levels, and depth without missing values; a monocular system sees none
+        if not backend.uses_depth:
+            no_depth = np.zeros((self._camera.height, self._camera.width), np.float32)
+            frame = replace(frame, depth=no_depth)
         gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
         depth = frame.depth.astype(np.float32)
         depth[~np.isfinite(depth)] = 0
-        instances = mask = None
-        if self._masks is not None:
-            with clock("segmentation"):
-                instances = self._masks.masks_for(frame, gray, keyframe=self._keyframe_due)
-                if self._segmentation is not None and instances.class_names:
-                    mask = dynamic_mask(instances, self._segmentation, depth)
-        with clock("features"):
-            if (
-                mask is None
-                or self._segmentation is None
-                or not isinstance(self._extractor, MaskedExtractor)
-            ):
-                keypoints = self._extractor.extract(gray)
-            else:
-                keypoints = self._extractor.extract_masked(
-                    gray, mask, self._segmentation.outside_share
-                )
-            xy = camera.undistort_points(keypoints.xy)
-        column, row = np.rint(keypoints.xy).astype(np.intp).T
-        z = depth[row.clip(0, camera.height - 1), column.clip(0, camera.width - 1)].clip(min=0)
+
+        # objects that may move, and the mask of all of them
+        instances, mask = self._segment(frame, gray, depth, clock)
+
+        # keypoints, enough of them outside the mask; undistorted, with depth
+        keypoints, xy = self._extract(gray, mask, clock)
+        z = _depth_at(keypoints, depth)
         bundle = FrameBundle(
             frame.index, frame.timestamp, frame.rgb, gray, depth, keypoints, xy, z, instances, mask
         )
-        state = self._filter_state(bundle, camera)
-        # flow runs on demand, on what the masks leave
+
+        # what else filters may read: the previous frame, the predicted pose, the map
+        state = self._filter_state(bundle)
+
+        # static keypoints; flow runs on demand, on what the masks leave
         static, image = self._cull(bundle, state, clock)
-        result = backend.track(bundle, static.keep, static.weight)  # with mapping and loop closing
-        # the pose of a frame that is not tracked in the root map's world is unknown
+
+        # pose by the static keypoints, with mapping and loop closing
+        result = backend.track(bundle, static.keep, static.weight)
+
+        # remember the frame for the next one; its pose only if it is in the root map's world
         pose = result.T_world_cam if result.state == backend.state == "ok" else None
         self._previous = PreviousFrame(bundle, static.keep, image, pose)
         self._keyframe_due = result.state != "ok" or bool(result.stats["keyframe"])
+
+        # report; a detector in a thread of its own is not a part of the frame's time
         timings = clock.seconds | dict(result.timings)
         if self._masks is not None and self._masks.beside_s:
-            # in a thread of its own: not a part of the frame's time
             timings["detector"] = self._masks.beside_s
         stats = self._stats(bundle, state, static, result)
         return TrackResult(
             result.T_world_cam, result.state, stats, timings, static.mask, keypoints.xy, static.keep
         )
 
-    def _filter_state(self, frame: FrameBundle, camera: Camera) -> FilterState:
+    # ------------------------------------------------------------------ steps of a frame
+
+    def _segment(
+        self,
+        frame: Frame,
+        gray: NDArray[np.uint8],
+        depth: NDArray[np.float32],
+        clock: StageClock,
+    ) -> tuple[Instances | None, NDArray[np.bool_] | None]:
+        """The frame's instances and the mask ``[H, W]`` of the dynamic ones; None each where there are none."""
+        if self._masks is None:
+            return None, None
+        mask = None
+        with clock("segmentation"):
+            instances = self._masks.masks_for(frame, gray, keyframe=self._keyframe_due)
+            if self._segmentation is not None and instances.class_names:
+                mask = dynamic_mask(instances, self._segmentation, depth)
+        return instances, mask
+
+    def _extract(
+        self, gray: NDArray[np.uint8], mask: NDArray[np.bool_] | None, clock: StageClock
+    ) -> tuple[Keypoints, NDArray[np.float64]]:
+        """Keypoints, and their undistorted pixels ``[N, 2]``."""
+        extractor = self._extractor
+        with clock("features"):
+            if (
+                mask is not None
+                and self._segmentation is not None
+                and isinstance(extractor, MaskedExtractor)
+            ):
+                keypoints = extractor.extract_masked(gray, mask, self._segmentation.outside_share)
+            else:
+                keypoints = extractor.extract(gray)
+            xy = self._camera.undistort_points(keypoints.xy)
+        return keypoints, xy
+
+    def _filter_state(self, frame: FrameBundle) -> FilterState:
         """What filters may read beside the frame: the previous frame, the prediction and the map."""
         previous = self._previous
         T_world_pred, covariance = self._backend.predict(frame.timestamp)
         keyframes, map_points = self._backend.view()
         return FilterState(
-            camera=camera,
+            camera=self._camera,
             keep=np.ones(len(frame.xy), dtype=bool),
             previous=None if previous is None else previous.frame,
             previous_keep=None if previous is None else previous.keep,
@@ -254,8 +291,9 @@ class SlamPipeline:
             keypoints would be left. Beside it this frame's image as the flow prepared it, None if
             no flow ran.
         """
+        # each filter judges what the ones before have left
         image = None
-        verdicts = []
+        verdicts: list[FilterResult] = []
         stats: dict[str, float] = {}
         for dynamic_filter in self._filters:
             if "flow" in dynamic_filter.needs and image is None:
@@ -264,31 +302,46 @@ class SlamPipeline:
                 verdict = dynamic_filter.apply(frame, state)
             state.keep = state.keep & verdict.keep
             verdicts.append(verdict)
-            stats |= {f"{dynamic_filter.name}_{key}": value for key, value in verdict.stats.items()}
-        keep, undone = combine_verdicts(
-            [verdict.keep for verdict in verdicts], self._guard, len(frame.xy)
-        )
-        used = verdicts[: len(verdicts) - undone]
+            for key, value in verdict.stats.items():
+                stats[f"{dynamic_filter.name}_{key}"] = value
+
+        # the starvation guard sets the last filters aside while too few keypoints would be left
+        keeps = [verdict.keep for verdict in verdicts]
+        keep, undone = combine_verdicts(keeps, self._guard, len(frame.xy))
+        stats["guard_undone"] = float(undone)
+
+        # weights multiply and masks join, of the filters that count
+        counted = verdicts[: len(verdicts) - undone]
         weight = np.ones(len(frame.xy), np.float32)
-        for verdict in used:
+        for verdict in counted:
             weight *= verdict.weight
-        masks = [verdict.mask for verdict in used if verdict.mask is not None]
+        masks = [verdict.mask for verdict in counted if verdict.mask is not None]
         mask = np.logical_or.reduce(masks) if masks else None
-        return FilterResult(keep, weight, stats | {"guard_undone": float(undone)}, mask), image
+        return FilterResult(keep, weight, stats, mask), image
 
     def _run_flow(self, frame: FrameBundle, state: FilterState, clock: StageClock) -> Any:
-        """Put the flow to the previous image, and the pose that it predicts, into `state`; the prepared image."""
-        assert self._flow is not None  # checked in the constructor
+        """Compute the flow to the previous image and the pose that it predicts.
+
+        Args:
+            frame: The frame.
+            state: Takes the flow, if there is a previous frame, and the predicted pose.
+            clock: Times both.
+
+        Returns:
+            This frame's image as the flow prepared it.
+        """
+        # both are checked in the constructor
+        assert self._flow is not None
+        assert self._refine_prediction is not None
         with clock("flow"):
             image = self._flow.prepare(frame.gray)
-            if (previous := self._previous) is not None:
-                other = (
-                    self._flow.prepare(previous.frame.gray)
-                    if previous.image is None
-                    else previous.image
-                )
-                state.flow = flow_to_previous(self._flow, image, other, frame, state)
-        assert self._refine_prediction is not None  # checked in the constructor
+            previous = self._previous
+            if previous is not None:
+                # no flow ran on the previous frame: prepare its image now
+                previous_image = previous.image
+                if previous_image is None:
+                    previous_image = self._flow.prepare(previous.frame.gray)
+                state.flow = flow_to_previous(self._flow, image, previous_image, frame, state)
         with clock("ego_motion"):
             state.T_world_pred = self._refine_prediction(frame, state)
         return image
@@ -305,10 +358,8 @@ class SlamPipeline:
             **static.stats,
         }
         flow_stats = {} if state.flow is None else state.flow.stats
-        stats |= {
-            f"flow_{name}": flow_stats.get(name, 0.0)
-            for name in getattr(self._flow, "stats_names", ())
-        }
+        for name in getattr(self._flow, "stats_names", ()):
+            stats[f"flow_{name}"] = flow_stats.get(name, 0.0)
         if self._masks is not None:
             stats["segmented"] = float(self._masks.segmented)
         if self._cached:
@@ -326,7 +377,7 @@ class SlamPipeline:
         return self._started().finalize()
 
     def map_outputs(self) -> MapOutputs:
-        """Keyframes and map points, for ``keyframes.csv``, ``map.ply`` and the sheet.
+        """Keyframes and map points, for ``keyframes.csv``, ``map.ply`` and pictures.
 
         Raises:
             TrackerError: `reset` was never called.
@@ -364,30 +415,41 @@ class SlamPipeline:
     def _configurable_parts(
         self, settings: Settings
     ) -> Iterator[tuple[str, Callable[[Any], None]]]:
-        """Each group of the settings with every part that takes it."""
-        parts: list[tuple[str, Any]] = [
-            (group, part)
-            for part in self._filters
-            for group in getattr(part, "groups", (part.name,))
-        ]
-        parts += zip(
-            ("features", "segmentation", "flow", "backend"),
-            (self._extractor, self._masks, self._flow, self._backend),
-            strict=True,
-        )
+        """Each group of the settings with the function of every part that takes it."""
+        parts: list[tuple[str, Any]] = []
+        for dynamic_filter in self._filters:
+            for group in getattr(dynamic_filter, "groups", (dynamic_filter.name,)):
+                parts.append((group, dynamic_filter))
+        parts.append(("features", self._extractor))
+        parts.append(("segmentation", self._masks))
+        parts.append(("flow", self._flow))
+        parts.append(("backend", self._backend))
         for group, part in parts:
             if isinstance(part, Reconfigurable) and hasattr(settings, group):
                 yield group, part.configure
         if hasattr(settings, "guard"):
-            # a deep copy of it configures the copy, unlike a closure
+            # a deep copy of this function configures the copied pipeline, unlike a closure
             yield "guard", partial(setattr, self, "_guard")
         if self._segmentation is not None:
             yield "segmentation", partial(setattr, self, "_segmentation")
 
     def _started(self) -> RgbdBackend:
+        """The back end.
+
+        Raises:
+            TrackerError: `reset` was never called.
+        """
         if not hasattr(self, "_camera"):
             raise TrackerError("the tracker was used before reset()")
         return self._backend
+
+
+def _depth_at(keypoints: Keypoints, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Depth ``[N]`` in metres at the nearest pixel of each keypoint; 0 missing."""
+    height, width = depth.shape
+    column, row = np.rint(keypoints.xy).astype(np.intp).T
+    nearest = depth[row.clip(0, height - 1), column.clip(0, width - 1)]
+    return np.asarray(nearest.clip(min=0))
 
 
 def combine_verdicts(
@@ -453,12 +515,14 @@ def predicted_flow(frame: FrameBundle, state: FilterState) -> NDArray[np.float32
     has_depth = frame.z > 0
     if state.T_world_prev is None or state.T_world_pred is None or not has_depth.any():
         return guess
+    # the keypoints as points in the previous camera
     camera = state.camera
     T_prev_cur = se3.inverse(state.T_world_prev) @ state.T_world_pred
-    points = (
-        camera.unproject(frame.xy[has_depth], frame.z[has_depth]) @ T_prev_cur[:3, :3].T
-        + T_prev_cur[:3, 3]
-    )
-    ahead = points[:, 2] > 0.05
-    guess[np.flatnonzero(has_depth)[ahead]] = camera.distort_points(camera.project(points[ahead]))
+    current_points = camera.unproject(frame.xy[has_depth], frame.z[has_depth])
+    points = current_points @ T_prev_cur[:3, :3].T + T_prev_cur[:3, 3]
+
+    # their projections
+    ahead = points[:, 2] > MIN_PREDICTED_DEPTH_M
+    rows = np.flatnonzero(has_depth)[ahead]
+    guess[rows] = camera.distort_points(camera.project(points[ahead]))
     return guess

@@ -11,6 +11,7 @@ not would move the pose by centimetres.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,56 @@ LEAST_VARIANCE = 0.01
 """The residuals' variance is at least this share of the assumed one."""
 NEAR_M = 0.05
 """Points nearer than this to the camera plane are never inliers."""
+MIN_POINTS = 6
+"""Fewer points, or inliers after a round, give no pose."""
+DAMPING = 1e-6
+"""Levenberg-Marquardt's damping at the start of a round, relative to the diagonal."""
+LEAST_DAMPING = 1e-9
+"""Steps that reduce the cost lower the damping down to this."""
+MOST_DAMPING = 1e3
+"""A round ends when steps that do not reduce the cost raised the damping above this."""
+CONVERGED_GAIN = 1e-4
+"""A round ends when a step reduces the cost by less than this share."""
+
+
+class Intrinsics(NamedTuple):
+    """A pinhole camera with depth, as compiled loops take it.
+
+    Attributes:
+        fx: Focal length along x, pixels.
+        fy: Focal length along y, pixels.
+        cx: Principal point, pixels.
+        cy: Principal point, pixels.
+        bf: Stereo baseline times `fx`, metres times pixels: the right coordinate of a point at
+            depth z is ``u - bf / z``.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    bf: float
+
+
+class Measurements(NamedTuple):
+    """Where N points were observed, and how exactly.
+
+    Attributes:
+        uv: float64 ``[N, 2]``, undistorted pixels.
+        right: float64 ``[N]``, right coordinates; ignored where `info_right` is 0.
+        info: float64 ``[N]``, inverse variances of the pixels, 1/px^2.
+        info_right: float64 ``[N]``, inverse variances of the right coordinates, 0 without depth.
+    """
+
+    uv: Array
+    right: Array
+    info: Array
+    info_right: Array
+
+
+def intrinsics_of(camera: Camera) -> Intrinsics:
+    """The intrinsics of a camera for compiled loops."""
+    return Intrinsics(camera.fx, camera.fy, camera.cx, camera.cy, camera.fx * camera.baseline_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +111,10 @@ class PoseEstimate:
 
 @kernel
 def cauchy_width(chi2: Array) -> float:
-    """Squared width of the kernel for observations with these chi-squares, by the median of those in front."""
+    """Squared width of Cauchy's kernel for observations with these chi-squares.
+
+    Their variance over the assumed one is estimated by the median of those in front of the camera.
+    """
     finite = chi2[np.isfinite(chi2)]
     return CAUCHY * (max(np.median(finite) / MEDIAN_CHI2, LEAST_VARIANCE) if len(finite) else 1.0)
 
@@ -69,21 +123,14 @@ def cauchy_width(chi2: Array) -> float:
 def _linearise(
     pose: Array,
     points: Array,
-    uv: Array,
-    right: Array,
-    info: Array,
-    info_right: Array,
+    measured: Measurements,
     active: NDArray[np.bool_],
     width: float,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    bf: float,
+    camera: Intrinsics,
     h: Array,
     g: Array,
 ) -> float:
-    """Fill the Gauss-Newton system; returns the cost.
+    """Fill the Gauss-Newton system ``h x = g`` ``[6, 6]``, ``[6]`` of the active points; returns the cost.
 
     The cost is that of Cauchy's kernel of a squared width, or of Huber's where that is 0.
     """
@@ -92,18 +139,25 @@ def _linearise(
     for i in range(points.shape[0]):
         if not active[i]:
             continue
+        # a point behind the camera costs as much as an outlier, and tells no direction
         x, y, z = transform_point(pose, points[i])
-        depth = info_right[i] > 0.0
+        depth = measured.info_right[i] > 0.0
         limit = CHI2_DEPTH if depth else CHI2_MONO
         if z < NEAR_M:
             cost += limit
             continue
+
+        # residuals of the pixel and of the right coordinate
         iz = 1.0 / z
-        u = fx * x * iz + cx
-        du = uv[i, 0] - u
-        dv = uv[i, 1] - (fy * y * iz + cy)
-        dr = right[i] - (u - bf * iz) if depth else 0.0
-        chi2 = info[i] * (du * du + dv * dv) + (info_right[i] * dr * dr if depth else 0.0)
+        u = camera.fx * x * iz + camera.cx
+        du = measured.uv[i, 0] - u
+        dv = measured.uv[i, 1] - (camera.fy * y * iz + camera.cy)
+        dr = measured.right[i] - (u - camera.bf * iz) if depth else 0.0
+        info = measured.info[i]
+        info_right = measured.info_right[i]
+        chi2 = info * (du * du + dv * dv) + (info_right * dr * dr if depth else 0.0)
+
+        # weight and cost by the robust kernel: Cauchy's, or Huber's
         w = 1.0
         if width > 0.0:
             w = 1.0 / (1.0 + chi2 / width)
@@ -113,21 +167,24 @@ def _linearise(
             cost += 2.0 * np.sqrt(limit * chi2) - limit
         else:
             cost += chi2
-        a = fx * iz
-        b = fy * iz
-        c = bf * iz * iz
+
+        # rows of the Jacobian by (translation, rotation): of u, of v, and of the right coordinate
+        a = camera.fx * iz
+        b = camera.fy * iz
+        c = camera.bf * iz * iz
         j2 = -a * x * iz
-        j3 = -fx * x * y * iz * iz
-        j4 = fx * (1.0 + x * x * iz * iz)
+        j3 = -camera.fx * x * y * iz * iz
+        j4 = camera.fx * (1.0 + x * x * iz * iz)
         j5 = -a * y
-        sums = add_normal_equation(sums, w * info[i], a, 0.0, j2, j3, j4, j5, du)
-        turned = -fy * (1.0 + y * y * iz * iz)
+        sums = add_normal_equation(sums, w * info, a, 0.0, j2, j3, j4, j5, du)
+        dv_about_x = -camera.fy * (1.0 + y * y * iz * iz)
+        dv_about_y = camera.fy * x * y * iz * iz
         sums = add_normal_equation(
-            sums, w * info[i], 0.0, b, -b * y * iz, turned, fy * x * y * iz * iz, b * x, dv
+            sums, w * info, 0.0, b, -b * y * iz, dv_about_x, dv_about_y, b * x, dv
         )
         if depth:
             sums = add_normal_equation(
-                sums, w * info_right[i], a, 0.0, j2 + c, j3 + c * y, j4 - c * x, j5, dr
+                sums, w * info_right, a, 0.0, j2 + c, j3 + c * y, j4 - c * x, j5, dr
             )
     store_normal_equations(sums, h, g)
     return cost
@@ -141,23 +198,19 @@ def observation_chi2(
     right: float,
     info: float,
     info_right: float,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    bf: float,
+    camera: Intrinsics,
 ) -> tuple[float, float]:
     """Chi-square of one observation by its pixel alone, and with its right coordinate; inf behind the camera."""
     x, y, z = transform_point(pose, point)
     if z < NEAR_M:
         return np.inf, np.inf
-    u = fx * x / z + cx
+    u = camera.fx * x / z + camera.cx
     du = uv[0] - u
-    dv = uv[1] - (fy * y / z + cy)
+    dv = uv[1] - (camera.fy * y / z + camera.cy)
     pixel = info * (du * du + dv * dv)
     if info_right <= 0.0:
         return pixel, pixel
-    dr = right - (u - bf / z)
+    dr = right - (u - camera.bf / z)
     return pixel, pixel + info_right * dr * dr
 
 
@@ -165,53 +218,47 @@ def observation_chi2(
 def _classify(
     pose: Array,
     points: Array,
-    uv: Array,
-    right: Array,
-    info: Array,
-    info_right: Array,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    bf: float,
+    measured: Measurements,
+    camera: Intrinsics,
     inlier: NDArray[np.bool_],
     error: Array,
 ) -> None:
+    """Fill which observations fit, ``[N]``, and their reprojection errors ``[N]`` in standard deviations."""
     for i in range(points.shape[0]):
         pixel, whole = observation_chi2(
-            pose, points[i], uv[i], right[i], info[i], info_right[i], fx, fy, cx, cy, bf
+            pose,
+            points[i],
+            measured.uv[i],
+            measured.right[i],
+            measured.info[i],
+            measured.info_right[i],
+            camera,
         )
         error[i] = np.sqrt(pixel)
-        inlier[i] = whole <= (CHI2_DEPTH if info_right[i] > 0.0 else CHI2_MONO)
+        inlier[i] = whole <= (CHI2_DEPTH if measured.info_right[i] > 0.0 else CHI2_MONO)
 
 
 @kernel
 def _optimise(
     pose: Array,
     points: Array,
-    uv: Array,
-    right: Array,
-    info: Array,
-    info_right: Array,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    bf: float,
+    measured: Measurements,
+    camera: Intrinsics,
     rounds: int,
     iterations: int,
 ) -> tuple[Array, NDArray[np.bool_], Array, Array]:
+    """Pose ``[4, 4]``, inliers ``[N]``, their errors ``[N]`` and the lower triangle of the information ``[6, 6]``."""
     inlier = np.ones(len(points), np.bool_)
     error = np.zeros(len(points))
     h = np.zeros((6, 6))
     g = np.zeros(6)
-    for turn in range(rounds):
-        width = cauchy_width(error[inlier] ** 2) if turn == rounds - 1 else 0.0
-        damping = 1e-6
-        cost = _linearise(
-            pose, points, uv, right, info, info_right, inlier, width, fx, fy, cx, cy, bf, h, g
-        )
+    for number in range(rounds):
+        # Huber's kernel, and in the last round Cauchy's, as wide as the inliers' residuals
+        width = cauchy_width(error[inlier] ** 2) if number == rounds - 1 else 0.0
+        damping = DAMPING
+        cost = _linearise(pose, points, measured, inlier, width, camera, h, g)
         for _ in range(iterations):
+            # damped step
             work = h.copy()
             for m in range(6):
                 work[m, m] += damping * h[m, m] + 1e-9
@@ -219,40 +266,27 @@ def _optimise(
             if not cholesky_solve(work, step):
                 break
             candidate = apply_twist(pose, step)
+
+            # take it if the cost does not grow, else damp more
             h2 = np.zeros((6, 6))
             g2 = np.zeros(6)
-            new = _linearise(
-                candidate,
-                points,
-                uv,
-                right,
-                info,
-                info_right,
-                inlier,
-                width,
-                fx,
-                fy,
-                cx,
-                cy,
-                bf,
-                h2,
-                g2,
-            )
+            new = _linearise(candidate, points, measured, inlier, width, camera, h2, g2)
             if new <= cost:
                 gain = cost - new
-                damping = max(damping * 0.1, 1e-9)
+                damping = max(damping * 0.1, LEAST_DAMPING)
                 pose = candidate
                 cost = new
                 h = h2
                 g = g2
-                if gain < 1e-4 * (cost + 1e-12):
+                if gain < CONVERGED_GAIN * (cost + 1e-12):
                     break
             else:
                 damping *= 100.0
-                if damping > 1e3:
+                if damping > MOST_DAMPING:
                     break
-        _classify(pose, points, uv, right, info, info_right, fx, fy, cx, cy, bf, inlier, error)
-        if inlier.sum() < 6:
+        # sort all points into inliers and outliers anew
+        _classify(pose, points, measured, camera, inlier, error)
+        if inlier.sum() < MIN_POINTS:
             break
     return pose, inlier, error, h
 
@@ -285,17 +319,19 @@ def optimise_pose(
     Returns:
         The pose; with fewer than six points the start pose and no inliers.
     """
-    if len(points) < 6:
+    if len(points) < MIN_POINTS:
         return PoseEstimate(T_cam_world, np.zeros(len(points), bool), 0, np.nan, np.zeros((6, 6)))
     start = np.ascontiguousarray(T_cam_world, np.float64)
-    points, uv, right, info, info_right = map(
-        np.ascontiguousarray, (points, uv, right, info, info_right)
-    )
-    lens = camera.fx, camera.fy, camera.cx, camera.cy, camera.fx * camera.baseline_m
+    measured = Measurements(*map(np.ascontiguousarray, (uv, right, info, info_right)))
     pose, inliers, error, h = _optimise(
-        start, points, uv, right, info, info_right, *lens, rounds, iterations
+        start,
+        np.ascontiguousarray(points),
+        measured,
+        intrinsics_of(camera),
+        rounds,
+        iterations,
     )
     residual_px = float(np.median(error[inliers])) if inliers.any() else np.nan
-    return PoseEstimate(
-        pose, inliers, int(np.count_nonzero(inliers)), residual_px, np.tril(h) + np.tril(h, -1).T
-    )
+    # the kernel fills the lower triangle only
+    information = np.tril(h) + np.tril(h, -1).T
+    return PoseEstimate(pose, inliers, int(np.count_nonzero(inliers)), residual_px, information)

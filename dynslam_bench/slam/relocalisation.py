@@ -29,12 +29,13 @@ from scipy.spatial.transform import Rotation
 
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.core.seeding import stream
-from dynslam_bench.features.matching import match_brute_force
+from dynslam_bench.features.matching import Words, match_brute_force
 from dynslam_bench.geometry import Camera, pixel_index, se3
 from dynslam_bench.slam.atlas import Atlas
 from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.motion_model import pose_covariance
 from dynslam_bench.slam.observations import Observations
+from dynslam_bench.slam.pose_optimisation import CHI2_MONO, NEAR_M
 from dynslam_bench.slam.settings import BackendSettings, TrackingSettings
 from dynslam_bench.slam.tracking import (
     MIN_MATCHES,
@@ -46,21 +47,28 @@ from dynslam_bench.slam.tracking import (
 )
 
 VALUES = 1 << 16
-"""Values of a substring."""
+"""Values that a substring of 16 bits can have."""
 STRIDE = 4
 """Every fourth substring is used: the others change the ranking little and cost as much again."""
 CHANGED = 0.25
 """A keyframe is indexed again when it has gained or lost this share of its points."""
 
 MAX_DISTANCE = 60
+"""Largest Hamming distance of a match by descriptor alone."""
 RATIO = 0.85
-"""Largest Hamming distance of a match by descriptor alone, and over that of the second nearest."""
+"""Largest ratio of that distance to the second nearest one's."""
 RANSAC_ITERATIONS = 150
+"""RANSAC samples at most."""
 RANSAC_BATCH = 25
-"""RANSAC samples at most, and how many of them are evaluated together."""
+"""RANSAC samples that are evaluated together."""
+RANSAC_CHI2 = 2.0 * CHI2_MONO
+"""Largest chi-square of a RANSAC inlier, twice that of an optimised pose."""
+RANSAC_FAILURE = 0.001
+"""Probability that all samples contain an outlier at which RANSAC stops."""
 PNP_CANDIDATES = 5
 """Keyframes with the most descriptor matches that RANSAC is tried on."""
 MIN_PNP_INLIERS = 8
+"""Inliers of RANSAC without which a keyframe gives no pose, and matches that it needs before."""
 
 AROUND = 10
 """Keyframes around a place whose points are matched."""
@@ -76,8 +84,9 @@ MAX_DILUTION = 0.1
 MIN_SPREAD_MATCHES = 12
 """Matches at least: a half of fewer determines no pose."""
 SPLITS = 12
+"""Random halves of the matches that the pose is fitted to."""
 MAX_SPLIT_SPREAD = 0.01
-"""Random halves of the matches that the pose is fitted to, and the largest spread of these positions, median depths."""
+"""Largest spread of the positions by these halves, median depths."""
 
 ALIASING_CANDIDATES = 12
 """Best-ranked keyframes of each submap that are tested for aliasing."""
@@ -85,16 +94,18 @@ ALIASING_SHARE = 0.33
 """What a second place has to show, as a share of what the first one does. Without repetition it is 0.15 at most, with
 repeated walls 0.4 to 1 (rendered buildings)."""
 SAME_PLACE_DEPTHS = 0.3
+"""Poses farther apart, in median depths of what is seen, are two places."""
 SAME_PLACE_ANGLE = np.radians(15.0)
-"""Poses farther apart, in median depths of what is seen, or rotated by more, are two places."""
+"""Poses that are rotated by more, radians, are two places."""
 MIN_ALIASING_MATCHES = 30
 """Matches that make a second place."""
 
 CANDIDATES = 10
 """Best-ranked keyframes that are matched feature by feature; bounds the time of a frame."""
 MANY_POINTS = 60
+"""Matches at a place that are many."""
 MANY_POINTS_SHARE = 0.75
-"""With so many matches at a place this factor of the required share suffices."""
+"""Factor on the share that must be seen, where there are many matches."""
 
 SLACK_M = 0.5
 """Distance that the camera may have moved in no time, metres."""
@@ -102,15 +113,16 @@ KIDNAP_POINTS = 60
 """A frame that shows so many map points, as many as a map begins with, followed by one that shows none of them and is
 not connected with it: the camera was kidnapped."""
 CONNECTED = 20
+"""Matches that must fit one homography to connect two images."""
 CONNECTED_SHARE = 0.4
-"""Matches that fit one homography, and their share of all, that connect two images."""
+"""Their share of all matches, at least."""
 HOMOGRAPHY_PX = 4.0
 """Largest error of these matches, pixels."""
 ROTATION_SLACK = np.radians(20.0)
+"""Largest error of the rotation is this angle, radians, plus `ROTATION_SLACK_SHARE`."""
 ROTATION_SLACK_SHARE = 0.75
-"""Largest error of the rotation: an angle, and a share of all rotations between images. A camera that moves sideways
-seems to rotate. On four rendered laps none of 4,000 sections of 3 to 30 steps exceeded the share
-and half the angle."""
+"""Share of all rotations between images that is added: a camera that moves sideways seems to rotate. On four rendered
+laps none of 4,000 sections of 3 to 30 steps exceeded the share and half the angle."""
 
 
 # ---------------------------------------------------------------------- rank
@@ -133,9 +145,8 @@ def top_candidates(
     """
     if len(keyframes) <= count or not len(observations):
         return list(map(int, keyframes[:count]))
-    order = np.lexsort(
-        (-world.kf_id[keyframes], -recognition_scores(world, keyframes, observations))
-    )
+    scores = recognition_scores(world, keyframes, observations)
+    order = np.lexsort((-world.kf_id[keyframes], -scores))
     return list(map(int, keyframes[order[:count]]))
 
 
@@ -147,16 +158,28 @@ def recognition_scores(world: Map, keyframes: Slots, observations: Observations)
     rarer a substring is than all of the frame's together.
     """
     _index_substrings(world)
-    query = np.ascontiguousarray(observations.words).view(np.uint16)[:, ::STRIDE].T
+
+    # table of the frame's substrings by position and value: 0 if the frame has it, else -1
+    query = _substrings(observations.words)
     counts = np.full((len(query), VALUES), -1, np.int64)
     np.put_along_axis(counts, query.astype(np.int64), 0, axis=1)
+
+    # how often all keyframes together have each of them
     indexed = [world.substrings[slot][1] for slot in keyframes.tolist()]
     for substrings in indexed:
         _count_shared(substrings, counts)
+
+    # rare ones weigh more
     total = np.maximum(counts, 0).sum()
     weight = np.where(counts > 0, np.log(max(total, 1) / np.maximum(counts, 1)), 0.0)
     scores = np.array([_sum_weights(substrings, weight) for substrings in indexed])
-    return np.asarray(scores / np.sqrt([max(substrings.shape[1], 1) for substrings in indexed]))
+    points = [max(substrings.shape[1], 1) for substrings in indexed]
+    return np.asarray(scores / np.sqrt(points))
+
+
+def _substrings(words: Words) -> NDArray[np.uint16]:
+    """Every `STRIDE`-th substring of descriptors ``[N, W]``, by position ``[P, N]``."""
+    return np.ascontiguousarray(words).view(np.uint16)[:, ::STRIDE].T
 
 
 def _index_substrings(world: Map) -> None:
@@ -167,8 +190,9 @@ def _index_substrings(world: Map) -> None:
         new = keyframe != world.kf_id[slot]
         count = substrings.shape[1]
         if new or abs(observed[slot] - count) > CHANGED * count:
-            columns = world.kf_words[slot, world.kf_point[slot] >= 0].view(np.uint16)[:, ::STRIDE].T
-            world.substrings[slot] = int(world.kf_id[slot]), np.sort(np.ascontiguousarray(columns))
+            words = world.kf_words[slot, world.kf_point[slot] >= 0]
+            columns = np.ascontiguousarray(_substrings(words))
+            world.substrings[slot] = int(world.kf_id[slot]), np.sort(columns)
 
 
 @kernel
@@ -182,6 +206,7 @@ def _count_shared(substrings: NDArray[np.uint16], counts: NDArray[np.int64]) -> 
 
 @kernel
 def _sum_weights(substrings: NDArray[np.uint16], weight: NDArray[np.float64]) -> float:
+    """Sum of the weights ``[P, VALUES]`` of a keyframe's substrings ``[P, F]``."""
     score = 0.0
     for position in range(substrings.shape[0]):
         for value in substrings[position]:
@@ -225,26 +250,34 @@ def ransac_pose(
     needed = RANSAC_ITERATIONS
     drawn = 0
     while drawn < min(needed, RANSAC_ITERATIONS):
+        # all poses that fit any of a batch of samples
         samples = _triples(n, min(RANSAC_BATCH, RANSAC_ITERATIONS - drawn), rng)
         drawn += len(samples)
         poses = _three_point_poses(position[samples], xy[samples], camera)
         if not len(poses):
             continue
+
+        # inliers ``[H, N]`` of each, by the reprojection error
         local = np.swapaxes(poses[:, :3, :3] @ position.T + poses[:, :3, 3:], 1, 2)
         chi2 = info * np.square(camera.project(local) - xy).sum(axis=-1)
-        inliers = (local[..., 2] > 0.05) & (chi2 < 2.0 * 5.991)
+        inliers = (local[..., 2] > NEAR_M) & (chi2 < RANSAC_CHI2)
         count = np.count_nonzero(inliers, axis=1)
         most = int(count.argmax())
         if count[most] > best_count:
             best = (poses[most], inliers[most])
             best_count = int(count[most])
-            needed = int(np.ceil(np.log(0.001) / np.log1p(-(min(best_count / n, 0.999) ** 3)))) + 1
+            # samples until one of three inliers was drawn almost surely
+            all_inliers = min(best_count / n, 0.999) ** 3
+            needed = int(np.ceil(np.log(RANSAC_FAILURE) / np.log1p(-all_inliers))) + 1
     return best
 
 
 def _triples(n: int, count: int, rng: np.random.Generator) -> Slots:
     """So many samples ``[count, 3]`` of three different indices below `n`, all equally likely."""
-    a, b, c = (rng.integers(n - k, size=count) for k in range(3))
+    a = rng.integers(n, size=count)
+    b = rng.integers(n - 1, size=count)
+    c = rng.integers(n - 2, size=count)
+    # skip the indices that are taken
     b += b >= a
     for other in (np.minimum(a, b), np.maximum(a, b)):
         c += c >= other
@@ -259,11 +292,11 @@ def _three_point_poses(position: Array, xy: Array, camera: Camera) -> Array:
             _, rotations, translations = cv2.solveP3P(
                 points, pixels, camera.matrix, None, flags=cv2.SOLVEPNP_AP3P
             )
-        except cv2.error:  # a degenerate sample, e.g. collinear points
+        except cv2.error:
+            # a degenerate sample, e.g. collinear points
             continue
-        solutions.append(
-            np.hstack([np.reshape(rotations, (-1, 3)), np.reshape(translations, (-1, 3))])
-        )
+        vectors = np.reshape(rotations, (-1, 3))
+        solutions.append(np.hstack([vectors, np.reshape(translations, (-1, 3))]))
     flat = np.concatenate(solutions)
     flat = flat[np.isfinite(flat).all(axis=1)]
     poses = np.tile(np.eye(4), (len(flat), 1, 1))
@@ -285,9 +318,12 @@ def _ransac_place(
     ransac = ransac_pose(
         matches.position, observations.xy[f], observations.info[f], world.camera, rng
     )
-    if ransac is None or np.count_nonzero(ransac[1]) < min_inliers:
+    if ransac is None:
         return None
-    return InitialPose(ransac[0], matches.select(ransac[1]), keyframe)
+    T_cam_world, inliers = ransac
+    if np.count_nonzero(inliers) < min_inliers:
+        return None
+    return InitialPose(T_cam_world, matches.select(inliers), keyframe)
 
 
 def pnp_poses(
@@ -308,19 +344,22 @@ def pnp_poses(
     """
     if len(observations) < min_inliers:
         return
+
+    # keyframes with the most descriptor matches first, of equal ones the newer
     matched = [(match_keyframe(world, keyframe, observations), keyframe) for keyframe in keyframes]
     matched.sort(key=lambda pair: (-len(pair[0]), -int(world.kf_id[pair[1]])))
     others: list[InitialPose] = []
     for matches, keyframe in matched[:PNP_CANDIDATES]:
         if len(matches) < max(MIN_PNP_INLIERS, min_inliers // 3):
             break
+
+        # a pose by RANSAC, fitted to its inliers
         place = _ransac_place(world, keyframe, observations, matches, rng, MIN_PNP_INLIERS)
         if place is None:
             continue
         estimate = solve(world.camera, observations, place.matches, place.T_cam_world)
-        candidate = InitialPose(
-            estimate.T_cam_world, place.matches.select(estimate.inliers), keyframe
-        )
+        inliers = place.matches.select(estimate.inliers)
+        candidate = InitialPose(estimate.T_cam_world, inliers, keyframe)
         if estimate.count >= 2 * min_inliers:
             yield candidate
         else:
@@ -344,6 +383,8 @@ def verify_place(
     """
     keyframe = candidate.keyframe
     matches = candidate.matches
+
+    # match the points around and fit the pose, while that gives more inliers
     points = world.points_of(around(world, keyframe))
     estimate = solve(world.camera, observations, matches, candidate.T_cam_world)
     for _ in range(ROUNDS):
@@ -356,17 +397,21 @@ def verify_place(
         matches = joined.select(estimate.inliers)
         if len(matches) <= before:
             break
+    T_cam_world = estimate.T_cam_world
+
+    # share of the keyframe's own points in view, and behind no mask, that is matched
     own = world.kf_point[keyframe]
-    in_view, uv, *_ = world.project(estimate.T_cam_world, own[own >= 0].astype(np.int64))
-    if observations.mask is not None:  # the distortion is less than what masks are dilated by
-        in_view = in_view[~observations.mask[pixel_index(uv, observations.mask.shape)[0]]]
+    in_view, uv, *_ = world.project(T_cam_world, own[own >= 0].astype(np.int64))
+    if observations.mask is not None:
+        # the distortion is less than what masks are dilated by
+        pixels, _ = pixel_index(uv, observations.mask.shape)
+        in_view = in_view[~observations.mask[pixels]]
     share = float(np.isin(in_view, matches.point).mean()) if len(in_view) else 0.0
-    depth = (
-        float(np.median(se3.transform(estimate.T_cam_world, matches.position)[:, 2]))
-        if len(matches)
-        else np.nan
-    )
-    return InitialPose(estimate.T_cam_world, matches, keyframe, share, depth)
+
+    depth = np.nan
+    if len(matches):
+        depth = float(np.median(se3.transform(T_cam_world, matches.position)[:, 2]))
+    return InitialPose(T_cam_world, matches, keyframe, share, depth)
 
 
 def recognise_place(
@@ -378,7 +423,17 @@ def recognise_place(
     min_matches: int,
     min_inliers: int,
 ) -> InitialPose | None:
-    """The verified pose at a keyframe's place; None with too few matches by descriptor or inliers of RANSAC."""
+    """The verified pose at a keyframe's place; None with too few matches by descriptor or inliers of RANSAC.
+
+    Args:
+        world: The map.
+        keyframe: Slot of the keyframe.
+        observations: The frame's features.
+        settings: Radius and descriptor distances.
+        rng: Draws RANSAC's samples.
+        min_matches: Matches by descriptor that are needed.
+        min_inliers: Inliers of RANSAC that are needed.
+    """
     matches = match_keyframe(world, keyframe, observations)
     if len(matches) < min_matches:
         return None
@@ -407,23 +462,24 @@ def pose_uncertainty(
     count = len(matches)
     if count < MIN_SPREAD_MATCHES:
         return np.inf
-    off = np.abs(xy - np.median(xy, axis=0)).max(axis=1)
-    inner = solve(
-        world.camera,
-        observations,
-        matches.select(off <= np.quantile(off, INNER_SHARE)),
-        T_cam_world,
-    )
+
+    # dilution of precision: position's uncertainty by the inner matches, with the information of one
+    off_centre = np.abs(xy - np.median(xy, axis=0)).max(axis=1)
+    inner_matches = matches.select(off_centre <= np.quantile(off_centre, INNER_SHARE))
+    inner = solve(world.camera, observations, inner_matches, T_cam_world)
     if inner.count < MIN_SPREAD_MATCHES // 2:
         return np.inf
     covariance = pose_covariance(inner.T_cam_world, inner.information, inner.count)
     dilution = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
+
+    # spread of the positions by random halves of the matches
     halves = [matches.select(rng.permutation(count) < count // 2) for _ in range(SPLITS)]
     poses = np.array(
         [solve(world.camera, observations, half, T_cam_world).T_cam_world for half in halves]
     )
     centres = se3.inverse(poses)[:, :3, 3]
     spread = np.sqrt(np.square(centres - np.median(centres, axis=0)).sum(axis=1).mean())
+
     worst = float(max(dilution / MAX_DILUTION, spread / MAX_SPLIT_SPREAD) / place.depth)
     return worst if np.isfinite(worst) else np.inf
 
@@ -460,8 +516,8 @@ def is_aliased(
         observations: The features.
         hypotheses: The frame's pose by submap, as far as it is known.
         keyframes: Slots of the keyframes whose places may be others.
-        settings: Of tracking.
-        seed: Founds RANSAC's draws.
+        settings: Settings of tracking.
+        seed: Seed of RANSAC's draws.
         possible: Whether the frame can have been taken in a submap at a world-to-camera pose.
     """
     min_share = ALIASING_SHARE * max(place.share for place in hypotheses.values())
@@ -469,9 +525,16 @@ def is_aliased(
         places = [hypotheses[submap]] if submap in hypotheses else []
         slots = keyframes[world.kf_map[keyframes] == submap]
         for slot in top_candidates(world, slots, observations, ALIASING_CANDIDATES):
-            rng = stream(seed, "lookalikes", int(world.kf_id[slot]))
-            least = MIN_ALIASING_MATCHES // 2, MIN_ALIASING_MATCHES // 3
-            other = recognise_place(world, slot, observations, settings, rng, *least)
+            # another place counts if it shows as much, and the camera can be there
+            other = recognise_place(
+                world,
+                slot,
+                observations,
+                settings,
+                stream(seed, "lookalikes", int(world.kf_id[slot])),
+                min_matches=MIN_ALIASING_MATCHES // 2,
+                min_inliers=MIN_ALIASING_MATCHES // 3,
+            )
             if (
                 other is None
                 or len(other.matches) < MIN_ALIASING_MATCHES
@@ -479,6 +542,8 @@ def is_aliased(
                 or not possible(submap, other.T_cam_world)
             ):
                 continue
+
+            # the same place seen from another keyframe does not contradict
             if any(contradict(place, other) for place in places):
                 return True
             places.append(other)
@@ -509,6 +574,7 @@ class RotationEstimate:
             observations: Its features.
             camera: Intrinsics without distortion.
         """
+        # match the two images, and keep what fits one homography
         before, now = match_brute_force(
             self.observations.words, observations.words, max_distance=MAX_DISTANCE, ratio=RATIO
         )
@@ -520,9 +586,11 @@ class RotationEstimate:
         fits = np.zeros(len(before), bool) if homography is None else mask.ravel() > 0
         if np.count_nonzero(fits) < max(CONNECTED, CONNECTED_SHARE * len(before)):
             return None
-        step, _ = Rotation.align_vectors(
-            _bearings(xy_now[fits], camera), _bearings(xy_before[fits], camera)
-        )
+
+        # the rotation that aligns their bearings best
+        bearings_now = _bearings(xy_now[fits], camera)
+        bearings_before = _bearings(xy_before[fits], camera)
+        step, _ = Rotation.align_vectors(bearings_now, bearings_before)
         return RotationEstimate(
             observations,
             step.as_matrix() @ self.R_now_last,
@@ -548,13 +616,12 @@ class RotationEstimate:
             T_now_world: That of now.
             more: How far the two worlds may be rotated against each other, radians.
         """
-        return bool(
-            se3.rotation_angle(T_now_world @ se3.inverse(self.applied(T_last_world)))
-            <= self.slack + more
-        )
+        difference = T_now_world @ se3.inverse(self.applied(T_last_world))
+        return bool(se3.rotation_angle(difference) <= self.slack + more)
 
 
 def _bearings(xy: Array, camera: Camera) -> Array:
+    """Unit vectors ``[N, 3]`` in the camera frame towards pixels ``[N, 2]``."""
     rays = camera.unproject(xy, np.ones(len(xy)))
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
@@ -582,8 +649,9 @@ class MotionBound:
             self.T_last_world, T_cam_world, slack
         ):
             return False
-        last, now = (se3.inverse(pose)[:3, 3] for pose in (self.T_last_world, T_cam_world))
-        return self.atlas.reachable(self.atlas.active, submap, last, now, self.distance_m)
+        last_centre = se3.inverse(self.T_last_world)[:3, 3]
+        centre = se3.inverse(T_cam_world)[:3, 3]
+        return self.atlas.reachable(self.atlas.active, submap, last_centre, centre, self.distance_m)
 
 
 class RelocalisationGate:
@@ -605,7 +673,7 @@ class RelocalisationGate:
         self.rotation: RotationEstimate | None = None
 
     def lose(self, last: TrackedFrame, observations: Observations, *, textured: bool) -> None:
-        """The first frame that is not tracked any more.
+        """Begin to follow the rotation of a camera that was lost: in the first frame that is not tracked any more.
 
         Args:
             last: The last tracked frame.
@@ -614,12 +682,15 @@ class RelocalisationGate:
         """
         self.start(last)
         self._advance(observations)
-        self._kidnapped = (
-            self.rotation is None and textured and int((last.point >= 0).sum()) >= KIDNAP_POINTS
-        )
+        points = int((last.point >= 0).sum())
+        self._kidnapped = self.rotation is None and textured and points >= KIDNAP_POINTS
 
     def start(self, last: TrackedFrame) -> None:
-        """The camera counts as lost from the next frame on; `last` is the last tracked one."""
+        """Begin to follow the rotation of a camera that counts as lost from the next frame on.
+
+        Args:
+            last: The last tracked frame.
+        """
         self.rotation = RotationEstimate(last.observations, np.eye(3))
         self._kidnapped = False
 
@@ -640,9 +711,8 @@ class RelocalisationGate:
         A camera that moves fast, as on a car, may go on as the motion model has it: world-to-camera
         `prediction`.
         """
-        rotation = RotationEstimate(last.observations, np.eye(3)).advanced(
-            observations, self._atlas.world.camera
-        )
+        unrotated = RotationEstimate(last.observations, np.eye(3))
+        rotation = unrotated.advanced(observations, self._atlas.world.camera)
         centres = se3.inverse(np.stack([last.T_cam_world, prediction]))[:, :3, 3]
         step = float(np.linalg.norm(centres[1] - centres[0]))
         return MotionBound(
@@ -650,6 +720,7 @@ class RelocalisationGate:
         )
 
     def _advance(self, observations: Observations) -> None:
+        """Follow the rotation to the next image, until two images are not connected."""
         if self.rotation is not None:
             self.rotation = self.rotation.advanced(observations, self._atlas.world.camera)
 
@@ -660,15 +731,16 @@ class RelocalisationGate:
 
     def rotated(self, last: TrackedFrame) -> Array:
         """World-to-camera pose ``[4, 4]`` of a camera that has rotated but has not moved."""
-        return (
-            last.T_cam_world if self.rotation is None else self.rotation.applied(last.T_cam_world)
-        )
+        if self.rotation is None:
+            return last.T_cam_world
+        return self.rotation.applied(last.T_cam_world)
 
     def distance_m(self, last: TrackedFrame, timestamp: float) -> float:
         """Largest distance until a time, metres; infinite for a kidnapped camera."""
         return np.inf if self._kidnapped else self._distance(last, timestamp)
 
     def _distance(self, last: TrackedFrame, timestamp: float) -> float:
+        """Largest distance until a time of a camera that was not kidnapped, metres."""
         return SLACK_M + self._max_speed * max(timestamp - last.timestamp, 0.0)
 
 
@@ -685,8 +757,8 @@ class PoseSearch:
         keyframes: Slots of the candidate keyframes.
         lost: Whether the camera was lost since then; else it was tracked in the frame before.
         bound: Where the camera can be.
-        settings: Of the back end.
-        seed: Of the sequence's random draws.
+        settings: Settings of the back end.
+        seed: Seed of the sequence's random draws.
         frame: Index of the frame.
     """
 
@@ -713,53 +785,75 @@ class PoseSearch:
             return self._relocalise(MIN_MATCHES)
         if self.lost:
             return self._verified(weak) or self._relocalise(MIN_MATCHES)
+        # a pose from keyframes has to be better
         pose = self._relocalise(len(weak.matches) + 1)
-        return weak if pose is None and self._within_bound(weak) else pose
+        if pose is None and self._within_bound(weak):
+            return weak
+        return pose
 
     def in_root_map(self) -> InitialPose | None:
         """The pose in the root map of a camera that is tracked in a submap, as strict as for a lost one."""
-        pose = replace(self, keyframes=self.bound.atlas.world.submap(0), lost=True)._relocalise(
-            MIN_MATCHES
-        )
-        return (
-            pose if pose and len(pose.matches) >= self.settings.relocalisation.min_inliers else None
-        )
+        root_map = self.bound.atlas.world.submap(0)
+        pose = replace(self, keyframes=root_map, lost=True)._relocalise(MIN_MATCHES)
+        if pose is None or len(pose.matches) < self.settings.relocalisation.min_inliers:
+            return None
+        return pose
 
     def _relocalise(self, min_inliers: int) -> InitialPose | None:
         """A pose by descriptors: from the reference keyframe, else from the best-ranked candidates."""
         rng = stream(self.seed, "relocalisation", self.frame)
         world = self.bound.atlas.world
         least = self.settings.tracking.min_inliers
+
+        # the camera was tracked in the frame before: it is near the reference keyframe
         if not self.lost:
             for candidate in pnp_poses(world, [self.reference], self.observations, rng, least):
                 if len(candidate.matches) >= min_inliers and self._within_bound(candidate):
                     return candidate
+
+        # the first of the best-ranked keyframes whose place is verified
         keyframes = top_candidates(world, self.keyframes, self.observations, CANDIDATES)
-        candidates = pnp_poses(world, keyframes, self.observations, rng, least)
-        verified = (self._verified(one) for one in candidates if len(one.matches) >= min_inliers)
-        return next((pose for pose in verified if pose is not None), None)
+        for candidate in pnp_poses(world, keyframes, self.observations, rng, least):
+            if len(candidate.matches) >= min_inliers:
+                pose = self._verified(candidate)
+                if pose is not None:
+                    return pose
+        return None
 
     def _verified(self, candidate: InitialPose) -> InitialPose | None:
         """The pose at a candidate's place, if it is within the motion bound and the place is verified."""
         world = self.bound.atlas.world
         observations = self.observations
-        s = self.settings
+        settings = self.settings
+
+        # within the motion bound
         submap = int(world.kf_map[candidate.keyframe])
-        admits = self.bound.admits
-        if not admits(submap, candidate.T_cam_world):
+        if not self.bound.admits(submap, candidate.T_cam_world):
             return None
-        place = verify_place(world, candidate, observations, s.tracking)
+
+        # most of what should be in view is seen
+        place = verify_place(world, candidate, observations, settings.tracking)
         factor = MANY_POINTS_SHARE if len(place.matches) >= MANY_POINTS else 1.0
-        if place.share < factor * s.relocalisation.min_share:
+        if place.share < factor * settings.relocalisation.min_share:
             return None
         if not self.lost:
             return replace(place, uncertainty=0.0)
-        uncertainty = pose_uncertainty(
-            world, observations, place, stream(self.seed, "halves", self.frame)
-        )
-        candidates = {submap: place}, self.keyframes
-        aliased = uncertainty > 1 or is_aliased(
-            world, observations, *candidates, s.tracking, self.seed, admits
+
+        # the matches determine the pose well
+        rng = stream(self.seed, "halves", self.frame)
+        uncertainty = pose_uncertainty(world, observations, place, rng)
+        if uncertainty > 1:
+            return None
+
+        # the features fit no second place
+        aliased = is_aliased(
+            world,
+            observations,
+            {submap: place},
+            self.keyframes,
+            settings.tracking,
+            self.seed,
+            self.bound.admits,
         )
         return None if aliased else replace(place, uncertainty=uncertainty)
 

@@ -1,11 +1,14 @@
 """Tracking: a frame's features, their matches with the last frame and the local map, and the pose that follows.
 
-All functions are pure: they read the map and never change it.
+`pose_from_last_frame` gives an initial pose, `track_local_map` refines it with the local map
+(ORB-SLAM2's ``TrackWithMotionModel`` and ``TrackLocalMap``). All functions are pure: they read the
+map and never change it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +25,13 @@ CLOSE_BASELINES = 40.0
 MARGIN_PX = 8.0
 """Points of the last frame are matched up to this distance outside the image."""
 LAST_FRAME_RATIO = 0.9
+"""Largest ratio of nearest to second nearest descriptor distance in the search of the last frame's points."""
 MAP_RATIO = 0.85
-"""Nearest over second nearest descriptor distance allowed in the two searches."""
+"""Largest such ratio in the search of the local map's points."""
+FRONTAL_COSINE = 0.998
+"""Points seen within this cosine of their mean viewing direction have the narrow search window (ORB-SLAM2)."""
+OBLIQUE_FACTOR = 1.6
+"""Factor on the search window of all other points (ORB-SLAM2: 4.0 instead of 2.5)."""
 MIN_KEYFRAME_GAP = 20
 """Keyframes at least between one and another that a loop is closed to."""
 STRONG_COVISIBILITY = 15
@@ -37,8 +45,11 @@ MIN_MATCHES = 10
 WIDEN = 2.5
 """Factor on the search window where the narrow one gave no trusted pose."""
 TRUSTED_INLIERS = 50
+"""Inliers that a pose from the last frame needs to be trusted by itself."""
 TRUSTED_SHARE = 0.5
-"""Inliers, and their share of the matches, that make a pose from the last frame trusted by itself."""
+"""Share of the matches that must be inliers as well."""
+LAST_FRAME_ROUNDS = 3
+"""Rounds of the pose optimisation from the last frame; the local map's has one more."""
 
 
 @dataclass(eq=False)
@@ -96,7 +107,9 @@ class Matches:
     def joined(self, other: Matches) -> Matches:
         """These matches, then the others."""
         return Matches(
-            *map(np.concatenate, zip(vars(self).values(), vars(other).values(), strict=True))
+            np.concatenate([self.feature, other.feature]),
+            np.concatenate([self.point, other.point]),
+            np.concatenate([self.position, other.position]),
         )
 
 
@@ -114,6 +127,7 @@ class InitialPose:
         depth: Median depth of the matches' points; NaN if not verified.
         uncertainty: `relocalisation.pose_uncertainty`; NaN if not verified.
         relocalised: Whether it comes from a keyframe, or the camera was lost before.
+        trusted: Whether so many matches with the last frame agree that keyframes need not be searched.
     """
 
     T_cam_world: Array
@@ -123,6 +137,29 @@ class InitialPose:
     depth: float = np.nan
     uncertainty: float = np.nan
     relocalised: bool = True
+    trusted: bool = False
+
+
+class LastFrameSearch(NamedTuple):
+    """How the last frame's points are searched in the new frame.
+
+    Attributes:
+        widen: Factor on the search window.
+        uses_depth: Whether points are used that only the last frame's depth gives.
+        min_matches: Matches without which no pose is computed.
+    """
+
+    widen: float
+    uses_depth: bool
+    min_matches: int
+
+
+LAST_FRAME_SEARCHES = (
+    LastFrameSearch(1.0, uses_depth=False, min_matches=ENOUGH_MAPPED),
+    LastFrameSearch(1.0, uses_depth=True, min_matches=ENOUGH_MATCHES),
+    LastFrameSearch(WIDEN, uses_depth=True, min_matches=ENOUGH_MATCHES),
+)
+"""Searches in turn, until one gives a trusted pose."""
 
 
 def pose_from_last_frame(
@@ -132,8 +169,8 @@ def pose_from_last_frame(
     prediction: Array,
     reference: int,
     settings: TrackingSettings,
-) -> tuple[InitialPose | None, bool]:
-    """The best pose from the last frame, and whether it is trusted; each search is wider than the one before.
+) -> InitialPose | None:
+    """The best pose from the last frame; each search is wider than the one before, until a pose is trusted.
 
     Args:
         world: The map.
@@ -143,29 +180,32 @@ def pose_from_last_frame(
         reference: Slot of the keyframe that shares most points with the last frame.
         settings: Radius and descriptor distance.
     """
-    close_m = CLOSE_BASELINES * world.camera.baseline_m
     best: InitialPose | None = None
-    for widen, depth_m, enough in (
-        (1.0, 0.0, ENOUGH_MAPPED),
-        (1.0, close_m, ENOUGH_MATCHES),
-        (WIDEN, close_m, ENOUGH_MATCHES),
-    ):
-        radius = widen * settings.radius_px
+    for search in LAST_FRAME_SEARCHES:
+        # match around the predicted projections
         matches = match_last_frame(
-            world, last, observations, prediction, radius, depth_m, settings.max_distance
+            world,
+            last,
+            observations,
+            prediction,
+            search.widen * settings.radius_px,
+            CLOSE_BASELINES * world.camera.baseline_m if search.uses_depth else 0.0,
+            settings.max_distance,
         )
-        if len(matches) < enough:
+        if len(matches) < search.min_matches:
             continue
-        estimate = solve(world.camera, observations, matches, prediction, rounds=3)
+
+        # fit the pose; the one with the most inliers is kept
+        estimate = solve(world.camera, observations, matches, prediction, rounds=LAST_FRAME_ROUNDS)
         if estimate.count >= MIN_MATCHES and (best is None or estimate.count > len(best.matches)):
-            best = InitialPose(
-                estimate.T_cam_world, matches.select(estimate.inliers), reference, relocalised=False
-            )
-        if best is not None and estimate.count >= max(
-            TRUSTED_INLIERS, TRUSTED_SHARE * len(matches)
-        ):
-            return best, True
-    return best, False
+            inliers = matches.select(estimate.inliers)
+            best = InitialPose(estimate.T_cam_world, inliers, reference, relocalised=False)
+
+        # enough agree: no wider search
+        trusted_count = max(TRUSTED_INLIERS, TRUSTED_SHARE * len(matches))
+        if best is not None and estimate.count >= trusted_count:
+            return replace(best, trusted=True)
+    return best
 
 
 def match_last_frame(
@@ -193,36 +233,43 @@ def match_last_frame(
         max_distance: Largest Hamming distance.
     """
     camera = world.camera
-    from_map = last.point >= 0
-    rows = np.flatnonzero(from_map | (last.observations.z > 0) & (last.observations.z < close_m))
+    seen = last.observations
+
+    # the points' positions in the world: of the map, or from the last frame's depth
+    mapped = last.point >= 0
+    rows = np.flatnonzero(mapped | (seen.z > 0) & (seen.z < close_m))
     position = world.position[last.point[rows]]
-    unmapped = ~from_map[rows]
-    local = camera.unproject(
-        last.observations.xy[rows[unmapped]], last.observations.z[rows[unmapped]]
-    )
-    position[unmapped] = se3.transform(se3.inverse(last.T_cam_world), local)
+    unmapped = ~mapped[rows]
+    in_last_camera = camera.unproject(seen.xy[rows[unmapped]], seen.z[rows[unmapped]])
+    position[unmapped] = se3.transform(se3.inverse(last.T_cam_world), in_last_camera)
+
+    # their projections into the new frame
     local = position @ T_cam_world[:3, :3].T + T_cam_world[:3, 3]
     uv, inside = camera.view(local, MARGIN_PX)
     rows = rows[inside]
     position = position[inside]
     uv = uv[inside]
     depth = local[inside, 2]
-    octave = last.observations.octave[rows]
+    octave = seen.octave[rows]
     right = uv[:, 0] - camera.fx * camera.baseline_m / depth
+
+    # match by descriptor in a window around each
     feature = search_in_radius(
         observations,
         np.ones(len(observations.xy), bool),
         (uv, right, radius_px * world.scales[octave]),
         octave,
-        last.observations.words[rows],
+        seen.words[rows],
         max_distance=max_distance,
         ratio=LAST_FRAME_RATIO,
     )
-    hit = feature >= 0
-    matches = Matches(feature[hit], last.point[rows[hit]], position[hit])
-    return matches.select(
-        rotation_consistent(last.observations.angle[rows[hit]], observations.angle[matches.feature])
-    )
+    matched = feature >= 0
+    matches = Matches(feature[matched], last.point[rows[matched]], position[matched])
+
+    # drop matches whose features are rotated in the image unlike the others
+    angles_before = seen.angle[rows[matched]]
+    angles_now = observations.angle[matches.feature]
+    return matches.select(rotation_consistent(angles_before, angles_now))
 
 
 def match_map(
@@ -248,14 +295,16 @@ def match_map(
     Returns:
         New matches, and the slots of all candidates in view (matched or not).
     """
+    # points that should be in view and have no match yet, features that have none
     points, uv, right, octave, cosine = world.project(T_cam_world, candidates)
+    rest = ~np.isin(points, matches.point)
+    wanted = points[rest]
     free = np.ones(len(observations.xy), bool)
     free[matches.feature] = False
-    rest = ~np.isin(points, matches.point)
-    radius = (
-        settings.map_radius_px * widen * np.where(cosine > 0.998, 1.0, 1.6) * world.scales[octave]
-    )
-    wanted = points[rest]
+
+    # match by descriptor; the window grows with the octave, and away from the usual viewing direction
+    view_factor = np.where(cosine > FRONTAL_COSINE, 1.0, OBLIQUE_FACTOR)
+    radius = settings.map_radius_px * widen * view_factor * world.scales[octave]
     feature = search_in_radius(
         observations,
         free,
@@ -265,8 +314,9 @@ def match_map(
         max_distance=settings.max_distance,
         ratio=MAP_RATIO,
     )
-    hit = feature >= 0
-    return Matches(feature[hit], wanted[hit], world.position[wanted[hit]]), points
+    matched = feature >= 0
+    matched_points = wanted[matched]
+    return Matches(feature[matched], matched_points, world.position[matched_points]), points
 
 
 def solve(
@@ -277,15 +327,18 @@ def solve(
     *,
     rounds: int = 4,
 ) -> PoseEstimate:
-    """The pose that fits the matches, starting from a given one."""
+    """The world-to-camera pose ``[4, 4]`` that fits the matches, starting from a given one."""
     f = matches.feature
-    measured = (
+    return optimise_pose(
+        T_cam_world,
+        matches.position,
         observations.xy[f],
         observations.right[f],
         observations.info[f],
         observations.info_right[f],
+        camera,
+        rounds=rounds,
     )
-    return optimise_pose(T_cam_world, matches.position, *measured, camera, rounds=rounds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,6 +391,8 @@ def track_local_map(
     """
     more, in_view = match_map(world, observations, T_cam_world, matches, candidates, settings)
     matches = matches.joined(more)
+
+    # enough map points: leave out what only the last frame's depth gives
     mapped = matches.point >= 0
     if np.count_nonzero(mapped) >= 2 * settings.min_inliers:
         matches = matches.select(mapped)
@@ -371,6 +426,7 @@ class LocalMap:
             self._computed_for = reference, world.next_keyframe
             self._keyframes = world.keyframes
             self._points = world.points
+            # with loop closing, what the covisibility graph does not reach is left to the loop closer
             distant = unconnected(world, reference) if self._connected_only else ()
             if len(distant):
                 self._keyframes = self._keyframes[~np.isin(self._keyframes, distant)]
@@ -397,13 +453,15 @@ def weakly_connected(world: Map, keyframe: int, gap: int = MIN_KEYFRAME_GAP) -> 
     """
     near, shared = world.covisible(keyframe)
     near = near[shared >= STRONG_COVISIBILITY]
-    further = [
-        other[count >= STRONG_COVISIBILITY] for other, count in map(world.covisible, near.tolist())
-    ]
+    further = []
+    for neighbour in near.tolist():
+        second, second_shared = world.covisible(neighbour)
+        further.append(second[second_shared >= STRONG_COVISIBILITY])
     return _long_ago(world, keyframe, gap, np.concatenate([near, *further]))
 
 
 def _long_ago(world: Map, keyframe: int, gap: int, connected: Slots) -> Slots:
+    """Slots of the keyframes made `gap` before or after one, or longer, without the connected; all of other submaps."""
     long_ago = np.abs(world.kf_id - world.kf_id[keyframe]) >= gap
     long_ago[connected] = False
     return np.flatnonzero(world.kf_alive & (long_ago | (world.kf_map != world.kf_map[keyframe])))

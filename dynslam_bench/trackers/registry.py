@@ -79,15 +79,18 @@ def _bind(spec: TrackerSpec, value: str) -> TrackerSpec:
         raise PluginError(
             f"'{spec.id}:' lacks its {spec.parameter}", f"write {spec.id}:{spec.parameter.upper()}"
         )
+    # a file's content is a part of the version
     path = Path(value).expanduser()
     content = f"+{sha256(path.read_bytes()).hexdigest()[:12]}" if path.is_file() else ""
     described = load_object(spec.describe)(path) if spec.describe else {}
-    named = {
-        "label": f"{spec.label}: {path.name if content else value}",
-        "version": spec.version,
-    } | described
-    named |= {"id": f"{spec.id}:{value}", "version": named["version"] + content, "parameter": ""}
-    return replace(spec, **named, bound={**spec.bound, spec.parameter: value})
+
+    # what the file says of itself replaces label, version and other fields
+    label = f"{spec.label}: {path.name if content else value}"
+    fields = {"label": label, "version": spec.version} | described
+    fields["id"] = f"{spec.id}:{value}"
+    fields["version"] += content
+    fields["parameter"] = ""
+    return replace(spec, **fields, bound={**spec.bound, spec.parameter: value})
 
 
 TRACKERS: Registry[TrackerSpec] = TrackerRegistry("trackers", TrackerSpec, all_specs)
@@ -132,11 +135,9 @@ def build_tracker(
         )
 
     def construct(build: Callable[..., object]) -> object:
-        takes_context = "context" in inspect.signature(build).parameters
-        return (
-            build(settings, context=context or TrackerContext())
-            if takes_context
-            else build(settings)
-        )
+        """Call the factory, with the context if it takes one."""
+        if "context" in inspect.signature(build).parameters:
+            return build(settings, context=context or TrackerContext())
+        return build(settings)
 
     return build_plugin("tracker", spec, Tracker, TrackerError, construct)  # type: ignore[type-abstract]

@@ -29,8 +29,11 @@ from dynslam_bench.trackers.adapters.specs import BatchProgram, BatchSettings, O
 from dynslam_bench.trackers.adapters.subprocess_tracker import LOGGER, end_with_parent, write_images
 
 _POLL_S = 0.1
+"""Interval at which memory is measured, and the end of the program is looked for."""
 _COLOUR = re.compile(r"\x1b\[[\d;]*m")
+"""Escape sequences that colour a terminal's text."""
 WRITE_THERE = "let the command write to {output}, a new file in its working folder"
+"""What to do where the trajectory is not of this run."""
 LONGEST_TAIL = 1 << 16
 """Bytes of a program's output of which the end is kept."""
 
@@ -100,67 +103,76 @@ class BatchTracker:
                 not of this run; with its last words.
             TrackerTimeoutError: It did not end in time.
         """
+        # run it on the sequence's folder, in a new working folder
         folder = self._open()
         program = self._program
-        work = folder / "work"
-        if work.exists():  # of an earlier call
-            shutil.rmtree(work)
-        work.mkdir()
-        output = work / program.output
-        settings = folder / "camera.yaml"
-        places = {
-            "sequence": folder / "sequence",
-            "associations": folder / "sequence" / "associations.txt",
-            "camera": settings,
-            "output": output,
-            "folder": folder,
-            "threads": self._context.threads,
-        }
-        self._write_lists(folder / "sequence")
-        settings.write_text(camera_yaml(self._camera, self._context.fps))
-        words = program.words(self._place, **{name: str(place) for name, place in places.items()})
-        code = self._run(words, folder)
-        said = _tail(folder / "log.txt")
-        LOGGER.info("[%s] %s", program.name, said)
-        last = next(
-            (line.strip()[:300] for line in reversed(said.splitlines()) if line.strip()), ""
-        )
-        words_said = f"its last words: '{last}'" if last else "it wrote no message"
-        display = re.search("display|x11|glx|opengl", said, re.IGNORECASE)
-        hint = (
-            "does it need a display? switch its viewer off, or put xvfb-run before it"
-            if display
-            else ""
-        )
+        output = self._new_working_folder(folder) / program.output
+        code = self._run(self._command(folder, output), folder)
+        log = _tail(folder / "log.txt")
+        LOGGER.info("[%s] %s", program.name, log)
+
+        # it was killed, failed, or wrote nothing
+        last_words = _last_words(log)
+        hint = _display_hint(log)
         if code is None:
             raise TrackerTimeoutError(
-                f"{program.name}: not done within {self._limit_s:g} s, killed; {words_said}", hint
+                f"{program.name}: not done within {self._limit_s:g} s, killed; {last_words}", hint
             )
-        ended = (
-            f"killed by signal {-code} ({signal.strsignal(-code)})"
-            if code < 0
-            else f"ended with exit code {code}"
-        )
+        if code < 0:
+            ended = f"killed by signal {-code} ({signal.strsignal(-code)})"
+        else:
+            ended = f"ended with exit code {code}"
         missing = "" if output.is_file() else f", and wrote no {program.output}"
         if code not in program.exit_codes:
             fine = f"if that is no failure: exit_codes = {[*program.exit_codes, code]} in {self._file.name}"
-            raise TrackerError(f"{program.name}: {ended}{missing}; {words_said}", hint or fine)
+            raise TrackerError(f"{program.name}: {ended}{missing}; {last_words}", hint or fine)
         if missing:
             raise TrackerError(
-                f"{program.name}: {ended}{missing}; {words_said}", hint or WRITE_THERE
+                f"{program.name}: {ended}{missing}; {last_words}", hint or WRITE_THERE
             )
+
+        # read the trajectory, if it is of this run
         self._check_own(output)
         try:
             trajectory, read_notes = self._read(output)
         except TrajectoryError as error:
             text = str(error.args[0]).replace(str(output), program.output)
             raise TrackerError(
-                f"{program.name}: {text}; it {ended}; {words_said}", error.hint
+                f"{program.name}: {text}; it {ended}; {last_words}", error.hint
             ) from None
-        odd = code or len(trajectory) < len(self._stamps)
-        self.measured["notes"] = [f"the program {ended}; {words_said}"] if odd else []
-        self.measured["notes"] += [f"{program.output}: {note}" for note in read_notes]
+
+        # note what is not as usual
+        notes: list[str] = []
+        if code or len(trajectory) < len(self._stamps):
+            notes.append(f"the program {ended}; {last_words}")
+        notes += [f"{program.output}: {note}" for note in read_notes]
+        self.measured["notes"] = notes
         return trajectory
+
+    def _new_working_folder(self, folder: Path) -> Path:
+        """An empty folder for the program to work in."""
+        work = folder / "work"
+        # of an earlier call
+        if work.exists():
+            shutil.rmtree(work)
+        work.mkdir()
+        return work
+
+    def _command(self, folder: Path, output: Path) -> list[str]:
+        """The program's words, with the paths of the files that are written for it here."""
+        sequence = folder / "sequence"
+        camera = folder / "camera.yaml"
+        self._write_lists(sequence)
+        camera.write_text(camera_yaml(self._camera, self._context.fps))
+        return self._program.words(
+            self._place,
+            sequence=str(sequence),
+            associations=str(sequence / "associations.txt"),
+            camera=str(camera),
+            output=str(output),
+            folder=str(folder),
+            threads=str(self._context.threads),
+        )
 
     def close(self) -> None:
         """Remove the folder; may be called more than once."""
@@ -190,19 +202,27 @@ class BatchTracker:
             )
 
     def _open(self) -> Path:
+        """The folder of this run.
+
+        Raises:
+            TrackerError: `reset` was not called, or `close` was.
+        """
         if self._folder is None:
             raise TrackerError(f"{self._program.name} was used before reset() or after close()")
         return self._folder.path
 
     def _write_lists(self, folder: Path) -> None:
+        """Write ``rgb.txt``, ``depth.txt`` and ``associations.txt``, as TUM's sequences have them."""
         kinds = ("rgb",) if self._program.sensors == "rgb" else ("rgb", "depth")
         rows = [[f"{stamp:.6f} {kind}/{stamp:.6f}.png" for kind in kinds] for stamp in self._stamps]
-        for at, kind in enumerate(kinds):
-            (folder / f"{kind}.txt").write_text("".join(f"{row[at]}\n" for row in rows))
+        for column, kind in enumerate(kinds):
+            (folder / f"{kind}.txt").write_text("".join(f"{row[column]}\n" for row in rows))
         (folder / "associations.txt").write_text("".join(f"{' '.join(row)}\n" for row in rows))
 
     def _run(self, words: list[str], folder: Path) -> int | None:
         """Run the program to its end; its exit code, or None if it had to be killed."""
+        environment = program_environment(self._program.environment)
+        environment |= {"OMP_NUM_THREADS": str(self._context.threads)}
         began = time.perf_counter()
         log = folder / "log.txt"
         with (
@@ -216,11 +236,12 @@ class BatchTracker:
                 stdout=out,
                 stderr=subprocess.STDOUT,
                 cwd=folder / "work",
-                env=program_environment(self._program.environment)
-                | {"OMP_NUM_THREADS": str(self._context.threads)},
+                env=environment,
                 start_new_session=True,
                 preexec_fn=end_with_parent(),
             )
+
+        # wait, and measure the memory meanwhile
         code = None
         peak = 0
         try:
@@ -229,8 +250,9 @@ class BatchTracker:
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     code = process.wait(_POLL_S)
         finally:
+            # with what it started
             with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.killpg(process.pid, signal.SIGKILL)  # with what it started
+                os.killpg(process.pid, signal.SIGKILL)
             process.wait()
         self.measured["program_s"] = time.perf_counter() - began
         self.measured["program_memory_mb"] = peak / 1e6
@@ -242,6 +264,7 @@ class BatchTracker:
         Raises:
             TrajectoryError: It is damaged, or of other frames.
         """
+        # indices of frames
         stamps = np.array(self._stamps)
         if self._program.format == "indices":
             rows = read_table(output, 8, "index tx ty tz qx qy qz qw")
@@ -250,12 +273,16 @@ class BatchTracker:
                 raise TrajectoryError(
                     f"{output} does not hold indices of frames 0 to {len(stamps) - 1}"
                 )
+            notes: list[str] = []
             repeats = len(rows) - len(index)
-            repeated = [
-                f"{repeats} of {len(rows)} lines repeat an index, the first of each is taken"
-            ] * (repeats > 0)
+            if repeats > 0:
+                notes.append(
+                    f"{repeats} of {len(rows)} lines repeat an index, the first of each is taken"
+                )
             poses = se3.from_quaternion(rows[first, 1:4], rows[first, 4:])
-            return Trajectory(stamps[index.astype(int)], poses), repeated
+            return Trajectory(stamps[index.astype(int)], poses), notes
+
+        # stamps; at least one must be of a frame
         file = load_tum(output)
         trajectory = file.trajectory
         gap = nearest_gap(trajectory.timestamps, stamps)
@@ -272,16 +299,24 @@ class BatchTracker:
 
 def camera_yaml(camera: Camera, fps: float) -> str:
     """A settings file for ORB-SLAM3 (format 1.0) with the keys of ORB-SLAM2 beside them, for 16-bit depth images."""
-    names = ("fx", "fy", "cx", "cy"), ("k1", "k2", "p1", "p2", "k3")
-    values = {name: getattr(camera, name) for name in names[0]} | dict(
-        zip(names[1], camera.distortion, strict=True)
-    )
-    old = {f"Camera.{name}": value for name, value in values.items()}
     settings = OrbSlam3Settings()
-    old |= {"Camera.bf": camera.fx * camera.baseline_m, "ThDepth": settings.close_depth_baselines}
-    old |= {"DepthMapFactor": camera.written_depth_factor}
-    text = settings_yaml(camera, settings, fps, depth_factor=camera.written_depth_factor)
-    return text + "".join(f"{name}: {float(value)!r}\n" for name, value in old.items())
+    orbslam3 = settings_yaml(camera, settings, fps, depth_factor=camera.written_depth_factor)
+    k1, k2, p1, p2, k3 = camera.distortion
+    orbslam2 = {
+        "Camera.fx": camera.fx,
+        "Camera.fy": camera.fy,
+        "Camera.cx": camera.cx,
+        "Camera.cy": camera.cy,
+        "Camera.k1": k1,
+        "Camera.k2": k2,
+        "Camera.p1": p1,
+        "Camera.p2": p2,
+        "Camera.k3": k3,
+        "Camera.bf": camera.fx * camera.baseline_m,
+        "ThDepth": settings.close_depth_baselines,
+        "DepthMapFactor": camera.written_depth_factor,
+    }
+    return orbslam3 + "".join(f"{name}: {float(value)!r}\n" for name, value in orbslam2.items())
 
 
 def _resident(pid: int) -> int:
@@ -295,9 +330,25 @@ def _resident(pid: int) -> int:
 
 
 def _tail(log: Path) -> str:
+    """The end of a program's log, without colours."""
     with log.open("rb") as file:
         file.seek(max(0, log.stat().st_size - LONGEST_TAIL))
         return _COLOUR.sub("", file.read().decode(errors="replace"))
+
+
+def _last_words(log: str) -> str:
+    """The last line of a log, in words for a message."""
+    for line in reversed(log.splitlines()):
+        if line.strip():
+            return f"its last words: '{line.strip()[:300]}'"
+    return "it wrote no message"
+
+
+def _display_hint(log: str) -> str:
+    """What to do if a log speaks of a display; else an empty text."""
+    if re.search("display|x11|glx|opengl", log, re.IGNORECASE):
+        return "does it need a display? switch its viewer off, or put xvfb-run before it"
+    return ""
 
 
 def describe(path: Path) -> dict[str, Any]:
@@ -307,5 +358,10 @@ def describe(path: Path) -> dict[str, Any]:
         SettingsError: It is damaged.
     """
     program: BatchProgram = BatchSettings(program=str(path)).read()[0]
-    chosen = {"license": program.license, "citation": program.citation, "sensors": program.sensors}
-    return chosen | {"label": program.name, "version": program.version}
+    return {
+        "license": program.license,
+        "citation": program.citation,
+        "sensors": program.sensors,
+        "label": program.name,
+        "version": program.version,
+    }

@@ -13,8 +13,11 @@ from dynslam_bench.geometry import Camera, read_tum, se3
 from dynslam_bench.trackers.adapters.specs import ConstantVelocitySettings, ReplaySettings
 
 MAX_CORNERS = 400
+"""Corners that are tracked at most."""
 MIN_INLIERS = 12
+"""Points that must agree on a motion."""
 REPROJECTION_PX = 2.0
+"""Largest reprojection error of a point that agrees."""
 
 
 class NeverMove:
@@ -60,6 +63,8 @@ class ConstantVelocity:
         start = time.perf_counter()
         if self._count == 0:
             self._first_stamp = self._stamp = frame.timestamp
+
+        # one of the first frames: align it to its predecessor
         motion = None
         inliers = 0
         measured = self._count < self.settings.frames
@@ -68,6 +73,8 @@ class ConstantVelocity:
             if self._previous is not None:
                 motion, inliers = relative_motion(self._camera, *self._previous, grey)
             self._previous = grey, frame.depth
+
+        # else extrapolate
         if motion is None:
             motion = se3.exp(self._velocity * (frame.timestamp - self._stamp))
         self._pose = self._pose @ motion
@@ -88,7 +95,7 @@ def relative_motion(
     """Pose of camera b in the frame of camera a.
 
     Args:
-        camera: Of both images.
+        camera: The camera of both images.
         grey_a: First image ``[H, W]``.
         depth_a: Its depth ``[H, W]`` in metres, 0 where missing.
         grey_b: Second image ``[H, W]``.
@@ -97,25 +104,27 @@ def relative_motion(
         ``T_a_b`` ``[4, 4]`` and the number of inliers; None and their number if fewer than 12
         points agree.
     """
-    # None if there are none
+    # corners with depth; OpenCV gives None where there are none
     detected: object = cv2.goodFeaturesToTrack(grey_a, MAX_CORNERS, 0.01, 8)
-    corners = (
-        np.zeros((0, 2), np.float32)
-        if detected is None
-        else np.asarray(detected, np.float32).reshape(-1, 2)
-    )
+    corners = np.zeros((0, 2), np.float32)
+    if detected is not None:
+        corners = np.asarray(detected, np.float32).reshape(-1, 2)
     column, row = np.rint(corners).astype(np.intp).clip(0, np.array(depth_a.shape[::-1]) - 1).T
     depth = depth_a[row, column].astype(np.float64)
     corners = corners[depth > 0]
     depth = depth[depth > 0]
     if len(corners) < MIN_INLIERS:
         return None, 0
+
+    # track them by Lucas-Kanade
     tracked, status, _ = cv2.calcOpticalFlowPyrLK(
         grey_a, grey_b, corners[:, None], corners[:, None].copy()
     )
     good = status.reshape(-1) == 1
     if good.sum() < MIN_INLIERS:
         return None, 0
+
+    # P3P with RANSAC, then refined on the inliers
     points = camera.unproject(camera.undistort_points(corners[good]), depth[good])
     pixels = camera.undistort_points(tracked.reshape(-1, 2)[good])
     success, rotation, translation, agreeing = cv2.solvePnPRansac(
@@ -136,7 +145,9 @@ def relative_motion(
     )
     T_b_a = np.eye(4)
     T_b_a[:3] = np.column_stack([cv2.Rodrigues(rotation)[0], np.asarray(translation).reshape(3)])
-    return (se3.inverse(T_b_a), inliers) if se3.is_pose(T_b_a) else (None, inliers)
+    if not se3.is_pose(T_b_a):
+        return None, inliers
+    return se3.inverse(T_b_a), inliers
 
 
 class Replay:
@@ -165,7 +176,8 @@ class Replay:
         nearest = int(np.argmin(np.abs(stamps - frame.timestamp)))
         gap = float(abs(stamps[nearest] - frame.timestamp))
         stats = {"stamp_gap_s": gap}
-        if gap > self.settings.tolerance_s + 1e-9:  # rounding of the difference
+        # the small term is the rounding of the difference
+        if gap > self.settings.tolerance_s + 1e-9:
             return TrackResult(T_world_cam=None, state="lost", stats=stats)
         return TrackResult(
             T_world_cam=self._trajectory.T_world_cam[nearest].copy(), state="ok", stats=stats

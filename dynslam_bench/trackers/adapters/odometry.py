@@ -26,6 +26,7 @@ MAX_FAILURES = 5
 INSTALL = (
     "pip install 'opencv-python-headless>=5' (or, for OpenCV 4, opencv-contrib-python-headless)"
 )
+"""How to get an OpenCV with RGB-D odometry."""
 
 
 class FrameToFrame(ABC):
@@ -65,9 +66,13 @@ class FrameToFrame(ABC):
         start = time.perf_counter()
         rgb = frame.rgb
         depth = np.nan_to_num(frame.depth, nan=0.0, posinf=0.0, neginf=0.0)
+
+        # undistort; depth keeps its values
         if self._maps is not None:
             rgb = np.asarray(cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR), dtype=np.uint8)
             depth = np.asarray(cv2.remap(depth, *self._maps, cv2.INTER_NEAREST), dtype=np.float32)
+
+        # align to the last good frame
         valid = np.count_nonzero(depth > 0)
         state: TrackingState = "initialising" if self._reference is None else "lost"
         if valid >= LEAST_DEPTH_PIXELS:
@@ -90,11 +95,9 @@ class FrameToFrame(ABC):
 
 def unavailable() -> str:
     """How to get an OpenCV with RGB-D odometry; empty if this one has it."""
-    return (
-        ""
-        if hasattr(cv2, "Odometry") or hasattr(cv2, "rgbd")
-        else f"OpenCV {cv2.__version__} lacks it: {INSTALL}"
-    )
+    if hasattr(cv2, "Odometry") or hasattr(cv2, "rgbd"):
+        return ""
+    return f"OpenCV {cv2.__version__} lacks it: {INSTALL}"
 
 
 class OpenCvOdometry(FrameToFrame):
@@ -152,7 +155,8 @@ class OpenCvOdometry(FrameToFrame):
                 success, T_current_reference = self._odometry.compute(reference, current)
             else:
                 success, T_current_reference = self._odometry.compute(*reference, *current)
-        except cv2.error:  # too little texture or depth in one of them
+        except cv2.error:
+            # too little texture or depth in one of them
             return None
         pose = np.asarray(T_current_reference, dtype=np.float64)
         return se3.inverse(pose) if success and se3.is_pose(pose) else None
@@ -199,7 +203,8 @@ class Open3dOdometry(FrameToFrame):
                 result = self._o3d.t.pipelines.odometry.rgbd_odometry_multi_scale(
                     current, reference, *self._arguments
                 )
-        except RuntimeError:  # singular: too little texture or depth
+        except RuntimeError:
+            # singular: too little texture or depth
             return None
         return (
             np.asarray(result.transformation.numpy(), dtype=np.float64)

@@ -27,16 +27,18 @@ from dynslam_bench.trackers.adapters.subprocess_tracker import (
 )
 
 ENVIRONMENT_VARIABLE = "DYNSLAM_BENCH_ORB_VOCABULARY"
+"""Names the vocabulary where no setting does."""
 HINT = (
     f"name ORBvoc.txt of the ORB-SLAM3 repository or another ORB vocabulary in DBoW2's text format, .txt or .txt.xz, "
     f"with --set vocabulary=FILE or ${ENVIRONMENT_VARIABLE}"
 )
+"""How to name a vocabulary."""
 MAX_BYTES = 512 * MEGABYTE
-"""The vocabulary of ORB-SLAM3 has 145 MB."""
+"""Largest vocabulary that is read; that of ORB-SLAM3 has 145 MB."""
 MAX_MEMORY = 256 * MEGABYTE
 """Memory that its decompression may take."""
 TOKENS = 35
-"""Of a node: parent, whether it is a leaf, 32 bytes of the descriptor, weight."""
+"""Numbers on the line of a node: parent, whether it is a leaf, 32 bytes of the descriptor, weight."""
 
 
 def files(settings: OrbSlam3Settings) -> list[Path]:
@@ -71,10 +73,13 @@ def find_vocabulary(setting: str) -> Path:
 @lru_cache(maxsize=8)
 def _prepared(path: Path, size: int, modified_ns: int) -> Path:
     """Decompress if need be, check; once in a process as long as the file's size and time stay."""
+    # a text is used where it lies
     packed = read_bytes(path, limit=MAX_BYTES, kind=TrackerError)
     if path.suffix != ".xz":
         _check(packed, path)
         return path
+
+    # an archive is unpacked once, into a file that is named by its content
     target = vocabularies_folder() / f"{hashlib.sha256(packed).hexdigest()[:16]}.txt"
     if target.is_file():
         return _prepared(target, target.stat().st_size, target.stat().st_mtime_ns)
@@ -131,14 +136,13 @@ def _first_fault(nodes: Iterable[bytes]) -> str:
         childless.discard(parent)
         if tokens[1] == b"0":
             childless.add(node)
-    return (
-        f"{len(childless)} inner nodes have no children, as if its end were missing"
-        if childless
-        else ""
-    )
+    if childless:
+        return f"{len(childless)} inner nodes have no children, as if its end were missing"
+    return ""
 
 
 WORKER = "dynslam_bench.trackers.adapters.orbslam3_worker"
+"""The module that runs as a process of its own."""
 BORDER_PX = 16
 """ORB-SLAM3 extracts no corners so near to the edge of a pyramid level."""
 _VIEWER = (
@@ -212,11 +216,14 @@ def check_camera(camera: Camera, settings: OrbSlam3Settings) -> None:
         TrackerError: Another camera model, intrinsics that are none, or an image too small for the
             pyramid.
     """
+    # the model
     if type(camera) is not Camera or len(camera.distortion) != 5:
         raise TrackerError(
             f"orbslam3 cannot take a {type(camera).__name__} with {len(camera.distortion)} distortion coefficients",
             "its RGB-D mode knows the pinhole camera with k1 k2 p1 p2 k3 only; undistort the images",
         )
+
+    # the numbers
     values = (camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline_m, *camera.distortion)
     if (
         not all(math.isfinite(value) for value in values)
@@ -227,8 +234,11 @@ def check_camera(camera: Camera, settings: OrbSlam3Settings) -> None:
             f"baseline={camera.baseline_m:g} m distortion={camera.distortion}",
             "focal lengths and baseline must be positive, all values finite",
         )
+
+    # the pyramid: its smallest level must have pixels inside the border, and no extreme shape
     shrunk = settings.scale_factor ** (settings.levels - 1)
-    columns, rows = (round(side / shrunk) - 2 * BORDER_PX for side in (camera.width, camera.height))
+    columns = round(camera.width / shrunk) - 2 * BORDER_PX
+    rows = round(camera.height / shrunk) - 2 * BORDER_PX
     pyramid = f"{settings.levels} pyramid levels of {settings.scale_factor:g}"
     size = f"images of {camera.width}x{camera.height} with {pyramid}"
     if min(columns, rows) < 1:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dynslam_bench.trackers.adapters.serve import serve
 
 STATES = {"OK": "ok", "OK_KLT": "ok", "RECENTLY_LOST": "lost", "LOST": "lost"}
+"""Tracking states by ORB-SLAM3's; any other is ``initialising``."""
 
 
 class Worker:
@@ -50,11 +51,9 @@ class Worker:
             result = self._slam.track_rgbd(image, np.ascontiguousarray(depth), timestamp)
         seconds = time.perf_counter() - start
         state = STATES.get(result.state.name, "initialising")
-        pose = (
-            None
-            if result.pose_wc is None or state == "initialising"
-            else result.pose_wc.astype(float).tolist()
-        )
+        pose = None
+        if result.pose_wc is not None and state != "initialising":
+            pose = result.pose_wc.astype(float).tolist()
         if state == "ok" and pose is None:
             state = "lost"
         if state == "ok":
@@ -83,13 +82,16 @@ class Worker:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "final.txt"
             self._slam.save_trajectory_tum(str(path))
-            rows = [
-                [float(value) for value in line.split()] for line in path.read_text().splitlines()
-            ]
-        own = {f"{stamp:.6f}": stamp for stamp in self._tracked}  # the file rounds the stamps
-        # the first of a stamp counts
-        named = [(own.get(f"{stamp:.6f}"), pose) for stamp, *pose in reversed(rows)]
-        poses = {stamp: [stamp, *pose] for stamp, pose in named if stamp is not None}
+            lines = path.read_text().splitlines()
+
+        # poses of tracked frames; the file rounds the stamps, and the first of a stamp counts
+        tracked = {f"{stamp:.6f}": stamp for stamp in self._tracked}
+        poses: dict[float, list[float]] = {}
+        for line in lines:
+            rounded, *pose = (float(value) for value in line.split())
+            stamp = tracked.get(f"{rounded:.6f}")
+            if stamp is not None and stamp not in poses:
+                poses[stamp] = [stamp, *pose]
         self._final = [poses[stamp] for stamp in sorted(poses)]
         return self._final
 
@@ -98,4 +100,5 @@ if __name__ == "__main__":
     worker = Worker()
     serve(worker.reset, worker.track, worker.finalize)
     sys.stderr.flush()
-    os._exit(0)  # without ORB-SLAM3's destructors, which may wait for its threads for ever
+    # without ORB-SLAM3's destructors, which may wait for its threads for ever
+    os._exit(0)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Answer = dict[str, Any]
+"""Fields of an answer, which become one JSON object."""
 
 
 def serve(
@@ -33,6 +34,7 @@ def serve(
         finalize: Returns rows ``[timestamp, tx, ty, tz, qx, qy, qz, qw]``; None if there is no
             final trajectory.
     """
+    # answers go to the real standard output, everything else to standard error
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     sys.stdout.flush()
     os.dup2(2, 1)
@@ -58,7 +60,8 @@ def serve(
                 break
             else:
                 raise RuntimeError(f"unknown op {operation!r}")
-        except Exception as error:  # all of them belong to the other side
+        except Exception as error:
+            # every one is for the other side to report
             answer = {"error": f"{type(error).__name__}: {error}"}
         answers.write(json.dumps(answer) + "\n")
         answers.flush()
@@ -82,10 +85,8 @@ def map_images(request: dict[str, Any]) -> tuple[NDArray[np.uint8], NDArray[np.f
     start = int(images["rgb_offset"])
     depth_start = int(images["depth_offset"])
     rgb = memory[start : start + height * width * 3].reshape(height, width, 3)
-    depth = (
-        memory[depth_start : depth_start + height * width * 4].view("<f4").reshape(height, width)
-    )
-    return rgb, depth
+    depth = memory[depth_start : depth_start + height * width * 4].view("<f4")
+    return rgb, depth.reshape(height, width)
 
 
 def _end_with_parent() -> None:

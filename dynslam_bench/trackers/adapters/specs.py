@@ -61,7 +61,7 @@ class ReplaySettings(Settings):
 
 
 ExitCode = Annotated[int, Field(ge=-64, le=255)]
-"""Of a program; ``-N`` if signal N killed it."""
+"""Exit code of a program; ``-N`` if signal N killed it."""
 
 
 class ProgramSettings(Settings):
@@ -130,11 +130,10 @@ class SubprocessSettings(ProgramSettings):
         folder = self.working_folder
         if not folder.is_dir():
             raise SettingsError(f"subprocess: no folder {folder}")
-        program = (
-            command[0]
-            if os.sep not in command[0]
-            else str((folder / Path(command[0]).expanduser()).absolute())
-        )
+        # a path counts from the working folder, a bare name is searched in PATH
+        program = command[0]
+        if os.sep in program:
+            program = str((folder / Path(program).expanduser()).absolute())
         if shutil.which(program) is None:
             raise SettingsError(
                 f"subprocess: cannot start '{command[0]}': no such program",
@@ -191,13 +190,19 @@ class BatchProgram(Record):
         return output
 
     def words(self, here: Path, **places: str) -> list[str]:
-        """The command with these paths for its placeholders."""
-        words = [
-            str(here / word)
-            if re.search(r"[./]", word) and (here / word).is_file() and word != self.output
-            else word
-            for word in self.command
-        ]
+        """The command with paths for its placeholders.
+
+        Args:
+            here: The folder of the TOML file.
+            **places: Paths by name of the placeholder.
+        """
+        # names of files beside the TOML file
+        words: list[str] = []
+        for word in self.command:
+            looks_like_file = re.search(r"[./]", word) and word != self.output
+            words.append(str(here / word) if looks_like_file and (here / word).is_file() else word)
+
+        # placeholders
         for name, place in {"here": str(here), "python": sys.executable, **places}.items():
             words = [word.replace(f"{{{name}}}", place) for word in words]
         return words

@@ -43,14 +43,19 @@ from dynslam_bench.geometry import Camera, Trajectory, se3
 from dynslam_bench.trackers.adapters.specs import ProgramSettings, SubprocessSettings
 
 _SET_PARENT_DEATH_SIGNAL = 1
+"""Linux's number of the option of ``prctl`` (``PR_SET_PDEATHSIG``)."""
 LOGGER = logging.getLogger(__name__)
 """Gets, at level INFO, every line that a program writes beside its answers; a run keeps them in its log."""
 LONGEST_LINE = 1 << 26
 """Bytes of the longest line that is read from a program: a final trajectory of half a million poses."""
 FRAME_FILE = "frame.raw"
+"""Name of the file through which frames are exchanged."""
 PROTOCOL = 2
 """Version of the JSON lines."""
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""Environment variables by which libraries are told how many threads they may start."""
 CAMERA_FIELDS = ("width", "height", "fx", "fy", "cx", "cy", "baseline_m", "readout_s")
+"""Fields of `Camera` that a program is told, beside the distortion."""
 
 
 class Program:
@@ -101,17 +106,14 @@ class Program:
         self._kill = weakref.finalize(self, _kill_group, self._process)
         # None: standard output has ended
         self._answers: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-        # new: since the last request
-        self._old_lines, self._new_lines = dict[str, str](), dict[str, str]()
-        self._readers = [
-            threading.Thread(
-                target=_read,
-                args=(name, channel, stream, self._answers, self._new_lines),
-                daemon=True,
-            )
-            for channel, stream in (("out", self._process.stdout), ("err", self._process.stderr))
-        ]
-        for reader in self._readers:
+        # last lines by channel, before the last request and since then
+        self._old_lines: dict[str, str] = {}
+        self._new_lines: dict[str, str] = {}
+        self._readers: list[threading.Thread] = []
+        for channel, stream in (("out", self._process.stdout), ("err", self._process.stderr)):
+            arguments = (name, channel, stream, self._answers, self._new_lines)
+            reader = threading.Thread(target=_read, args=arguments, daemon=True)
+            self._readers.append(reader)
             reader.start()
 
     def ask(self, request: Mapping[str, Any], timeout_s: float, doing: str) -> dict[str, Any]:
@@ -126,12 +128,14 @@ class Program:
             TrackerError: It died, did not answer in time, answered no JSON object, or answered
                 ``{"error": ...}``.
         """
+        # send the request and wait
         self._old_lines.update(self._new_lines)
         self._new_lines.clear()
         try:
             self._write(request)
             text = self._answers.get(timeout=timeout_s)
-        except (OSError, ValueError):  # it has closed its input, or was killed before
+        except (OSError, ValueError):
+            # it has closed its input, or was killed before
             text = None
         except queue.Empty:
             line_shown = f"; its last line: '{self._last_line()}'" if self._last_line() else ""
@@ -141,6 +145,8 @@ class Program:
             ) from None
         if text is None:
             raise self._death(doing)
+
+        # one JSON object, which may state an error
         try:
             answer = parse_answer(text)
         except TrackerError as error:
@@ -149,9 +155,8 @@ class Program:
                 f"{self.name} {doing}: {error.args[0]}", "one JSON object a line"
             ) from None
         if answer.get("error"):
-            raise TrackerError(
-                f"{self.name} {doing}: {' '.join(str(answer['error']).split())[:400]}"
-            )
+            stated = " ".join(str(answer["error"]).split())
+            raise TrackerError(f"{self.name} {doing}: {stated[:400]}")
         return answer
 
     def close(self, timeout_s: float) -> int | None:
@@ -171,23 +176,23 @@ class Program:
 
     def ending(self, code: int) -> str:
         """How it ended, with its last line, in words."""
-        shown = (
-            f"its last line: '{self._last_line()}'" if self._last_line() else "it wrote no message"
-        )
-        ended = (
-            f"was killed by signal {-code} ({signal.strsignal(-code)})"
-            if code < 0
-            else f"ended with exit code {code}"
-        )
+        shown = "it wrote no message"
+        if self._last_line():
+            shown = f"its last line: '{self._last_line()}'"
+        ended = f"ended with exit code {code}"
+        if code < 0:
+            ended = f"was killed by signal {-code} ({signal.strsignal(-code)})"
         return f"the program {ended}; {shown}"
 
     def kill(self) -> None:
         """End it and everything it started, at once."""
         self._kill()
+        # a process in another session may hold the pipe open for ever
         for reader in self._readers:
-            reader.join(timeout=0.5)  # a process in another session may hold the pipe open for ever
+            reader.join(timeout=0.5)
 
     def _write(self, message: Mapping[str, Any]) -> None:
+        """Send a line of JSON."""
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps(message, allow_nan=False).encode() + b"\n")
         self._process.stdin.flush()
@@ -198,10 +203,14 @@ class Program:
         Lines since the last request count before earlier ones, and standard error before standard
         output, which often arrives late, when it is flushed at the end.
         """
-        lines = (self._new_lines.get("err"), self._new_lines.get("out"), self._old_lines.get("err"))
-        return next(filter(None, lines), self._old_lines.get("out", ""))
+        for lines in (self._new_lines, self._old_lines):
+            for channel in ("err", "out"):
+                if lines.get(channel):
+                    return lines[channel]
+        return ""
 
     def _death(self, doing: str) -> TrackerError:
+        """The error that says how it ended without an answer."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout=1.0)
         code = self._process.returncode
@@ -281,6 +290,7 @@ def read_track_answer(
     Raises:
         TrackerError: It is no valid result, see `faults`.
     """
+    # the pose
     value = answer.get("T_world_cam")
     fitting = (AttributeError, TypeError, ValueError, OverflowError)
     with translate_errors(
@@ -290,18 +300,23 @@ def read_track_answer(
         of=fitting,
     ):
         pose = None if value is None else np.asarray(value, dtype=np.float64).reshape(4, 4)
+
+    # stats and timings; what its timings leave of the time is the transfer
     with translate_errors(
         TrackerError, f"{who}: stats and timings are not objects of numbers", of=fitting
     ):
-        stats, timings = (
-            {str(key): float(number) for key, number in (answer.get(name) or {}).items()}
-            for name in ("stats", "timings")
-        )
+        stats = _numbers(answer, "stats")
+        timings = _numbers(answer, "timings")
     timings["transfer"] = max(0.0, elapsed_s() - sum(timings.values()))
     result = TrackResult(pose, cast(TrackingState, str(answer.get("state"))[:80]), stats, timings)
     for fault in faults(result, frame):
         raise TrackerError(f"{who}: answered {fault.found}", fault.cause)
     return result
+
+
+def _numbers(answer: Mapping[str, Any], field: str) -> dict[str, float]:
+    """An answer's object of numbers; an empty one where the field is missing."""
+    return {str(key): float(number) for key, number in (answer.get(field) or {}).items()}
 
 
 def read_final_answer(answer: Mapping[str, Any], who: str) -> Trajectory:
@@ -318,7 +333,8 @@ def read_final_answer(answer: Mapping[str, Any], who: str) -> Trajectory:
     ):
         rows = np.asarray(answer.get("trajectory"), dtype=np.float64).reshape(-1, 8)
     norms = np.linalg.norm(rows[:, 4:], axis=1)
-    if not (np.abs(norms - 1) < 1e-3).all():  # also catches NaN
+    # written so that NaN is caught as well
+    if not (np.abs(norms - 1) < 1e-3).all():
         raise TrackerError(f"{who}: a quaternion has norm {norms[np.abs(norms - 1).argmax()]:g}")
     try:
         return Trajectory(rows[:, 0], se3.from_quaternion(rows[:, 1:4], rows[:, 4:]))
@@ -337,7 +353,7 @@ class ImageExchange:
     are removed.
 
     Args:
-        camera: Of the frames.
+        camera: The camera of the frames.
         mode: ``raw`` or ``png``.
     """
 
@@ -350,11 +366,11 @@ class ImageExchange:
         self._temporary = _with_space(size) if mode == "raw" else TemporaryFolder()
         self.folder = self._temporary.path
         if mode == "raw":
+            # views of the file: colour, and depth from an offset that is a multiple of 16 bytes
             self._memory = np.memmap(self.folder / FRAME_FILE, np.uint8, "r+", shape=(size,))
             self._rgb = self._memory[:colour].reshape(camera.height, camera.width, 3)
-            self._depth = (
-                self._memory[self.depth_offset :].view("<f4").reshape(camera.height, camera.width)
-            )
+            depth = self._memory[self.depth_offset :].view("<f4")
+            self._depth = depth.reshape(camera.height, camera.width)
 
     def announce(self) -> dict[str, Any]:
         """The part ``images`` of the ``reset`` request."""
@@ -380,7 +396,8 @@ class ImageExchange:
             return {}
         for old in self.folder.glob("*.png"):
             old.unlink()
-        rgb, depth = (self.folder / f"{kind}-{frame.index:06d}.png" for kind in ("rgb", "depth"))
+        rgb = self.folder / f"rgb-{frame.index:06d}.png"
+        depth = self.folder / f"depth-{frame.index:06d}.png"
         write_images(frame, rgb, depth, self.camera.written_depth_factor)
         return {"rgb": str(rgb), "depth": str(depth)}
 
@@ -397,9 +414,8 @@ def write_images(frame: Frame, rgb: Path, depth: Path | None, depth_factor: floa
     """
     images = {rgb: cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR)}
     if depth is not None:
-        images[depth] = (
-            np.rint(np.nan_to_num(frame.depth) * depth_factor).clip(0, 65535).astype(np.uint16)
-        )
+        units = np.rint(np.nan_to_num(frame.depth) * depth_factor)
+        images[depth] = units.clip(0, 65535).astype(np.uint16)
     for path, image in images.items():
         if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
             raise TrackerError(f"cannot write {path}", "is the temporary folder full?")
@@ -455,7 +471,8 @@ class ProgramTracker:
     ) -> None:
         self._exit_codes = exit_codes
         self._variables = variables
-        self._failed = False  # whether a fault of the program was raised
+        # whether a fault of the program was raised
+        self._failed = False
         self._images: Literal["raw", "png"] = images
         self.name = name
         self.limits = settings
@@ -479,11 +496,10 @@ class ProgramTracker:
         Raises:
             TrackerError: It cannot be started, dies, refuses, or does not answer in time.
         """
+        # what the program gets: environment, images, request
         self._end()
-        names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-        environment = program_environment(self._variables) | dict.fromkeys(
-            names, str(self.context.threads)
-        )
+        environment = program_environment(self._variables)
+        environment |= dict.fromkeys(THREAD_VARIABLES, str(self.context.threads))
         self._exchange = ImageExchange(camera, self._images)
         request = {
             "op": "reset",
@@ -500,6 +516,8 @@ class ProgramTracker:
             "sequence": self.context.sequence_id,
             "options": self.options(camera, self._exchange.folder),
         }
+
+        # start it; one that refuses is ended
         self._failed = False
         self._program = Program(
             self.name, self._command, folder=self._folder, environment=environment
@@ -580,6 +598,7 @@ class ProgramTracker:
             raise
 
     def _ask(self, request: Mapping[str, Any], timeout_s: float, doing: str) -> dict[str, Any]:
+        """The program's answer to a request, see `Program.ask`."""
         if self._program is None:
             raise TrackerError(f"{self.name} was used before reset() or after close()")
         return self._program.ask(request, timeout_s, doing)

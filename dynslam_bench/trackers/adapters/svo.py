@@ -18,6 +18,7 @@ from dynslam_bench.trackers.adapters.specs import SvoSettings
 from dynslam_bench.trackers.adapters.subprocess_tracker import ProgramTracker
 
 STATES = {"DEFAULT_FRAME": "ok", "RELOCALIZING": "lost"}
+"""Tracking states by SVO's stages; any other is ``initialising``."""
 _VALUE = object.__basicsize__
 """Where an object of pybind11 keeps the address of its value: behind Python's own fields."""
 
@@ -92,22 +93,22 @@ def pose_of(T_cam_world: Any) -> NDArray[np.float64]:
     Raises:
         RuntimeError: What lies there is not the transformation.
     """
+    # where the object keeps it
     address = ctypes.c_void_p.from_address(id(T_cam_world) + _VALUE).value
     values = np.array((ctypes.c_double * 7).from_address(address or 0))
-    translation, centre = (np.ravel(T.translation()) for T in (T_cam_world, T_cam_world.inverse()))
-    norm = np.linalg.norm(values[:4])
-    inverse = (
-        se3.from_quaternion(values[None, 4:], values[None, :4])[0]
-        if abs(norm - 1) < 1e-6
-        else np.zeros((4, 4))
-    )
-    if not np.array_equal(values[4:], translation) or not np.allclose(
-        -inverse[:3, :3] @ centre, translation
-    ):
+    pose = np.zeros((4, 4))
+    if abs(np.linalg.norm(values[:4]) - 1) < 1e-6:
+        pose = se3.from_quaternion(values[None, 4:], values[None, :4])[0]
+
+    # check it against what the bindings hand out
+    translation = np.ravel(T_cam_world.translation())
+    centre = np.ravel(T_cam_world.inverse().translation())
+    same_translation = np.array_equal(values[4:], translation)
+    if not same_translation or not np.allclose(-pose[:3, :3] @ centre, translation):
         raise RuntimeError(
             "this build of svo-cpp keeps its poses in another way, and cannot hand out rotations"
         )
-    return se3.inverse(inverse)
+    return se3.inverse(pose)
 
 
 if __name__ == "__main__":

@@ -22,13 +22,17 @@ if TYPE_CHECKING:
 
 SOURCES = ", ".join(form for form in FORMS.split(", ") if form != "none")
 """Sources of masks, as `segmentation.source` names them."""
-_SECOND: dict[str, Any] = {"segmentation.schedule": "every_nth", "segmentation.n": 2}
-FAST_MASKS = {"fast": _SECOND | {"segmentation.crowded_share": 0.5}}
+_EVERY_SECOND_FRAME: dict[str, Any] = {
+    "segmentation.schedule": "every_nth",
+    "segmentation.n": 2,
+}
+"""Settings with which the network runs on every second frame."""
+FAST_MASKS = {"fast": _EVERY_SECOND_FRAME | {"segmentation.crowded_share": 0.5}}
 """Preset: the network runs on every second frame, and on every frame while masks cover half of the view.
 
 ``dynslam-bench report compare`` compares runs with a preset and without.
 """
-FAST_FLOW = {"fast": _SECOND | {"flow.budget": 24}}
+FAST_FLOW = {"fast": _EVERY_SECOND_FRAME | {"flow.budget": 24}}
 """Preset: the network runs on every second frame, and the flow searches for less than half as long."""
 
 
@@ -92,14 +96,22 @@ class MonocularSemanticSettings(SemanticSystemSettings):
     segmentation: UnrepairedSettings = UnrepairedSettings()
 
 
+# Parts that only some systems have. They are loaded by name, so that no other system depends on their
+# code.
 MASK_STAGE = "dynslam_bench.trackers.systems.mask_stage:build_mask_stage"
+"""Builds the segmentation stage."""
 FLOW = "dynslam_bench.flow.registry:build_flow"
+"""Builds the optical flow."""
 REFINE_PREDICTION = "dynslam_bench.culling.ego_motion:refine_prediction"
-"""Parts that only some systems have. They are loaded by name, so that no other system depends on their code."""
+"""Refines the predicted pose by the flow."""
 
 
 def parts_of(settings: UnfilteredSystemSettings) -> list[str]:
-    """The entry points of the parts that a system has beside the back end: filters in force, masks, flow."""
+    """The entry points of the parts that a system has beside the back end: filters in force, masks, flow.
+
+    Args:
+        settings: The system's settings.
+    """
     parts = [f"dynslam_bench.culling.{name}" for name, _ in _filters_in_force(settings)]
     if isinstance(settings, SemanticSystemSettings):
         parts.append(MASK_STAGE)
@@ -110,7 +122,7 @@ def parts_of(settings: UnfilteredSystemSettings) -> list[str]:
 
 def _filters_in_force(settings: UnfilteredSystemSettings) -> list[tuple[str, list[Any]]]:
     """The rules of a system that are not left out: ``module:Class``, and the groups of settings that it takes."""
-    in_force = []
+    in_force: list[tuple[str, list[Any]]] = []
     for name, *groups in settings.filters:
         arguments = [getattr(settings, group, None) for group in groups]
         if None not in arguments and getattr(arguments[0], "enabled", True):
@@ -253,12 +265,15 @@ def system(
         entry_point: Its factory, where it is none of the rules alone.
         **spec: Further fields of `TrackerSpec`.
     """
+    # the class of its settings; pickle looks it up in this module
     title = "".join(word.capitalize() for word in re.findall(r"\w+", name))
     fields: dict[str, Any] = {group: (type(default), default) for group, default in groups.items()}
     made = create_model(f"{title}Settings", __base__=base, __module__=__name__, **fields)
     settings = cast("type[UnfilteredSystemSettings]", made)
     settings.filters = tuple(filters)
-    globals()[settings.__name__] = settings  # pickle looks it up there
+    globals()[settings.__name__] = settings
+
+    # assumptions state the numbers of the default settings
     stated = sentences(settings())
     return TrackerSpec(
         id=name,
@@ -274,8 +289,8 @@ def sentences(settings: UnfilteredSystemSettings) -> dict[str, str]:
     """Sentences of specs by name, made from the settings, so that a spec states the numbers in force.
 
     ``masks``, ``boxes``: their source; ``dilation``: how far masks are grown, where the source is
-    silent; ``tracks``: how the flow is computed; ``matches``: the same, of a system that tests
-    matches; ``links``: the same, of one with a memory of features.
+    silent; ``tracks``: how the flow is computed; ``matches``: how a system that tests matches uses
+    it; ``links``: how a system with a memory of features uses it.
     """
     stated: dict[str, str] = {}
     if isinstance(settings, SemanticSystemSettings):
@@ -289,9 +304,12 @@ def sentences(settings: UnfilteredSystemSettings) -> dict[str, str]:
     flow = getattr(settings, "flow", None)
     if flow is not None:
         tracks = describe_tracks(flow)
-        unmatched: Unmatched = next(
-            (group.unmatched for _, group in settings if hasattr(group, "unmatched")), "keep"
-        )
+        # the first group that has the setting; without any, lost features stay
+        unmatched: Unmatched = "keep"
+        for _, group in settings:
+            if hasattr(group, "unmatched"):
+                unmatched = group.unmatched
+                break
         links = f"features are followed by {tracks}, not by descriptors; one without a past begins at 0.5"
         stated |= {
             "tracks": tracks,

@@ -29,16 +29,18 @@ from dynslam_bench.trackers.systems.composition import (
 from dynslam_bench.trackers.systems.published import SEMANTIC, UNGUARDED
 
 Groups = Mapping[str, Settings]
-
+"""Groups of settings, by name."""
 
 TESTS = (
     ("epipolar:EpipolarFilter", "epipolar"),
     ("ego_motion:RigidMotionFilter", "motion"),
     ("free_space:FreeSpaceFilter", "free_space"),
 )
+"""The rules of all systems here, in the order of application; each needs its group of settings."""
 EPIPOLAR: Groups = {"flow": FlowSettings(), "epipolar": EpipolarSettings()}
+"""The sparse flow and the guarded epipolar test."""
 OWN: Groups = {**EPIPOLAR, "motion": RigidMotionSettings(), "free_space": FreeSpaceSettings()}
-"""The tests of depth as well."""
+"""This project's own: `EPIPOLAR`, and the tests of depth."""
 VOTE: Groups = {"segmentation": ObjectSettings(), "epipolar": EpipolarSettings(mode="object")}
 """Without mask culling: the epipolar vote of its points decides on an object (`EpipolarFilter`)."""
 PAPER: Groups = {"flow": DenseFlowSettings(terms=3), "epipolar": UNGUARDED}
@@ -46,63 +48,77 @@ PAPER: Groups = {"flow": DenseFlowSettings(terms=3), "epipolar": UNGUARDED}
 
 
 def _assumptions(name: str, base: type[SystemSettings], groups: Groups) -> list[str]:
+    """Sentences on what is assumed or ours in a system, as its settings make them true."""
     masks = base is not SystemSettings
     monocular = base is MonocularSemanticSettings
     tested = "epipolar" in groups
     paper = name.startswith("emfoa-oft-paper")
     sparse = isinstance(groups.get("flow"), FlowSettings)
     guarded = tested and not paper
-    sentences: list[tuple[bool, str]] = [
-        (
-            name == "emfoa-oft",
+    sentences: list[str] = []
+    if name == "emfoa-oft":
+        sentences.append(
             "the paper's are the masks, the EMFOA-optimised DAISY Filter Flow and the epipolar test; "
             "ours are the flow at the points alone without aggregated costs, the conditions under "
-            "which the epipolar test may cull, and the tests of motion and free space in depth",
-        ),
-        (masks, "{masks}"),
-        (masks, CFPN),
-        (masks and "segmentation" not in groups, "{dilation}"),
-        (tested, "epipolar threshold 1 px and RANSAC (not stated in the paper)"),
-        (not monocular, "RGB-D back end (the paper says monocular, depth-based and RGB-D in turn)"),
-        (
-            sparse,
+            "which the epipolar test may cull, and the tests of motion and free space in depth"
+        )
+
+    # masks
+    if masks:
+        sentences.append("{masks}")
+        sentences.append(CFPN)
+    if masks and "segmentation" not in groups:
+        sentences.append("{dilation}")
+
+    if tested:
+        sentences.append("epipolar threshold 1 px and RANSAC (not stated in the paper)")
+    if not monocular:
+        sentences.append("RGB-D back end (the paper says monocular, depth-based and RGB-D in turn)")
+
+    # flow
+    if sparse:
+        sentences.append(
             "labels are searched at the points alone and by the descriptors' term of Eq. 1 alone; "
-            "no Eq. 2 and 3 (ours)",
-        ),
-        (
-            paper and not sparse,
+            "no Eq. 2 and 3 (ours)"
+        )
+    if paper and not sparse:
+        sentences.append(
             "weights and truncations of Eq. 1 (not stated): alpha 55, beta 190, 0.882 a histogram, "
-            "7 and 2 grey levels",
-        ),
-        (
-            paper and not sparse,
+            "7 and 2 grey levels"
+        )
+        sentences.append(
             "labels live on superpixels, pass between them, are refined by Lucas-Kanade and tried "
             "on every pixel of the region (as in DAISY Filter Flow; the refinement, the way back of 1.5 px and the "
-            "smoothing by regions are ours)",
-        ),
-        (
-            guarded,
-            "the epipolar test is skipped where F means nothing: too little parallax, one plane (ours)",
-        ),
-        (guarded and monocular, "a failing point goes only where its neighbours fail too (ours)"),
-        (
-            guarded and not monocular,
+            "smoothing by regions are ours)"
+        )
+
+    # the guard of the epipolar test, and tests beside it
+    if guarded:
+        sentences.append(
+            "the epipolar test is skipped where F means nothing: too little parallax, one plane (ours)"
+        )
+    if guarded and monocular:
+        sentences.append("a failing point goes only where its neighbours fail too (ours)")
+    if guarded and not monocular:
+        sentences.append(
             "a failing point goes only where its neighbours fail too, and an F that depth "
-            "contradicts is not used (ours)",
-        ),
-        (
-            "motion" in groups,
+            "contradicts is not used (ours)"
+        )
+    if "motion" in groups:
+        sentences.append(
             "rigid motion in depth and free space seen before are tested as well "
-            "(ours, no part of the paper)",
-        ),
-        (monocular, BACKEND),
-    ]
-    return [sentence for holds, sentence in sentences if holds]
+            "(ours, no part of the paper)"
+        )
+
+    if monocular:
+        sentences.append(BACKEND)
+    return sentences
 
 
 def _spec(
     name: str, label: str, base: type[SystemSettings], groups: Groups, summary: str, **more: Any
 ) -> TrackerSpec:
+    """The spec of one of these systems; `more` are further fields of `TrackerSpec`."""
     filters = TESTS if "masks=vote" in name else (SEMANTIC, *TESTS)
     return system(
         name,
@@ -185,7 +201,8 @@ SPECS = (
         provenance="faithful-paper",
         published_as=("EMFOA-OFT-SLAM",),
     ),
-    _spec(  # the paper calls itself monocular in half of its text
+    # the paper calls itself monocular in half of its text
+    _spec(
         "emfoa-oft-mono",
         "EMFOA-OFT, monocular (our back end)",
         MonocularSemanticSettings,

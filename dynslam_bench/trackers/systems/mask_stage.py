@@ -48,5 +48,9 @@ def build_mask_stage(
 
 def movable_classes(filters: Sequence[DynamicFilter]) -> frozenset[str]:
     """The classes that filters watch although they are not dynamic by themselves: their setting ``movable``."""
-    named = (getattr(getattr(block, "settings", None), "movable", "") for block in filters)
-    return frozenset().union(*(expand_classes(names) for names in named if names))
+    classes: frozenset[str] = frozenset()
+    for dynamic_filter in filters:
+        names = getattr(getattr(dynamic_filter, "settings", None), "movable", "")
+        if names:
+            classes |= expand_classes(names)
+    return classes

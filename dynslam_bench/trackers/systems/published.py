@@ -40,13 +40,18 @@ from dynslam_bench.trackers.systems.composition import (
     system,
 )
 
+# Rules and the groups of settings that they take, see `UnfilteredSystemSettings.filters`.
 SEMANTIC = ("semantic:SemanticFilter", "segmentation")
 BOX_EPIPOLAR = ("epipolar:BoxEpipolarFilter", "box_epipolar", "segmentation")
 CLASS_RULE = ("epipolar:ClassRuleFilter", "class_rule", "segmentation")
 PROBABILITY = ("moving_probability:ProbabilityFilter", "probability", "segmentation")
 MULTIVIEW = ("multiview_depth:MultiViewFilter", "multiview")
+
+# Settings and texts that several systems share.
 LUCAS_KANADE = PublishedFlowSettings()
+"""The flow of all published systems."""
 WHOLE_OBJECTS = ObjectSettings()
+"""Masks as they are, neither repaired nor grown."""
 BOTH_SIDES = BoxEpipolarSettings(inside_px=1.0, outside_px=1.0, fit="kept")
 """The epipolar test of Chen et al. and of MOR-SLAM."""
 UNGUARDED = EpipolarSettings(
@@ -58,14 +63,15 @@ UNGUARDED = EpipolarSettings(
 )
 """The epipolar test on every frame and for every feature, as papers state it."""
 REIMPLEMENTED = "MIT (re-implemented from the description)"
+"""License of a system without the authors' code."""
 
 
 def build_detect_slam(settings: SemanticSystemSettings, context: TrackerContext) -> Tracker:
     """Detect-SLAM: boxes on keyframes, in place of masks, feed the moving probability."""
     from dynslam_bench.culling.moving_probability import ProbabilityFilter
 
-    block = ProbabilityFilter(settings.probability, settings.segmentation, evidence="boxes")  # type: ignore[attr-defined]
-    return compose(settings, context, [block], settings.flow)  # type: ignore[attr-defined]
+    rule = ProbabilityFilter(settings.probability, settings.segmentation, evidence="boxes")  # type: ignore[attr-defined]
+    return compose(settings, context, [rule], settings.flow)  # type: ignore[attr-defined]
 
 
 ORB_SLAM2 = (
@@ -75,7 +81,7 @@ ORB_SLAM2 = (
     "residuals weigh by Cauchy's kernel, as wide as they are, where ORB-SLAM2 has Huber's",
     "the rolling shutter of a camera whose readout is known is undone, which ORB-SLAM2 does not do",
 )
-"""Deviations with depth and without."""
+"""Deviations of the shared back end from ORB-SLAM2, with depth and without."""
 ORB_SLAM2_LICENSE = "MIT (our code; ORB-SLAM2 itself is GPL-3.0 and not used)"
 ORB_SLAM2_REMARKS = "the identity filter on our own back end, not the ORB-SLAM2 program"
 CHEN: dict[str, Any] = {
@@ -261,20 +267,17 @@ SPECS = (
         citation="Dai et al., RGB-D SLAM in Dynamic Environments Using Point Correlations, TPAMI 2020",
         assumptions=(
             "the graph is over tracked features and their last frames; the paper's is over map points and their "
-            "keyframes, "
-            "with a second one over a window of keyframes",
+            "keyframes, with a second one over a window of keyframes",
             "features are followed by {tracks}; one that it loses is not judged",
             "each edge is tested against the oldest common observation of at most 8 frames ago; no Huber step",
             "components are those of points observed for 4 frames or more; younger points follow the settled ones "
-            "around "
-            "them; what has neither flow nor depth is never judged",
+            "around them; what has neither flow nor depth is never judged",
             "the static part is the component of the largest volume, as in the back end of the paper",
             "chi-square quantile of 0.95 and 1 px per keypoint (not stated)",
         ),
         remarks="within 8 frames people move less than depth noise shows, edges stay whole and one component holds "
-        "people and "
-        "room: 4 % of the features on people go on a rendered half sphere; its authors' name DSLAM also stands for "
-        "Decentralised SLAM elsewhere",
+        "people and room: 4 % of the features on people go on a rendered half sphere; its authors' name "
+        "DSLAM also stands for Decentralised SLAM elsewhere",
     ),
     # Detect-SLAM (Zhong et al. 2018): a moving probability for every feature, fed by boxes on
     # keyframes.
@@ -297,8 +300,8 @@ SPECS = (
             "{boxes}",
             "{links}",
             "rate 0.3 and threshold 0.75 (no readable source)",
-            "between keyframes boxes are carried by optical flow, and probabilities updated with them; a detection at "
-            "least on every tenth frame",
+            "between keyframes boxes are carried by optical flow, and probabilities updated with them; a detection "
+            "at least on every tenth frame",
             "GrabCut inside boxes is left out",
             "matching point expansion: nearest sure feature within 32 px, with a Gaussian of half that",
         ),
@@ -318,8 +321,7 @@ SPECS = (
         assumptions=(
             "{masks}",
             "the warp: every eighth pixel of the frame goes to the nearest one of the previous image by the motion "
-            "model's "
-            "prediction, before the frame's own pose is known",
+            "model's prediction, before the frame's own pose is known",
             "24 clusters that move with a prior of 0.9 (people) or 0.05, four times the residual where they do",
             "its classes of features with priority in tracking are left out",
             "segmentation on every frame instead of selected ones",
@@ -352,11 +354,11 @@ SPECS = (
         assumptions=(
             "{boxes}",
             "{matches}",
-            "the published code of SG-SLAM stands in for the epipolar half; that code judges a feature that the flow "
-            "loses "
-            "by the place where it was lost (`unmatched = judge`), and takes distances in the previous image",
-            "F is refitted to RANSAC's inliers; with fewer than 20 matches outside the boxes it is fitted to all kept "
-            "ones",
+            "the published code of SG-SLAM stands in for the epipolar half; that code judges a feature that the "
+            "flow loses by the place where it was lost (`unmatched = judge`), and takes distances in the previous "
+            "image",
+            "F is refitted to RANSAC's inliers; with fewer than 20 matches outside the boxes it is fitted to all "
+            "kept ones",
             "seeds of the multi-view test are grown by 15 px",
             "multi-view depth without growing regions; where fewer than a tenth of the features remain the guard "
             "undoes it first (SG-SLAM restores all)",
@@ -444,9 +446,8 @@ SPECS = (
         assumptions=(*DYNASLAM_GEOMETRY, *DYNASLAM_PAPER),
         remarks=(
             f"{NO_INPAINTING}; worse than a static camera where people fill the view from the start (Bonn from frames "
-            "80 "
-            "and 120: 0.074 and 0.044 m against 0.053 and 0.029), which nobody reports of the authors' program: hence "
-            "inspired"
+            "80 and 120: 0.074 and 0.044 m against 0.053 and 0.029), which nobody reports of the authors' program: "
+            "hence inspired"
         ),
     ),
     # DynaTM-SLAM (Zhong et al. 2024): template matching over a window inside boxes.
