@@ -93,6 +93,11 @@ def plan_room(scene: int, number: int | None = None) -> Plan:
     )
 
 
+def glare_window(plan: Plan) -> tuple[float, float, float]:
+    """The place beside the back wall where glare comes from, metres."""
+    return plan.left_x * 0.55, plan.back_y, 2.15
+
+
 # The office's furniture: desk with monitors and clutter, shelf, posters, cabinet with a plant,
 # office chairs.
 
