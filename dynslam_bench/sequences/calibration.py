@@ -56,7 +56,7 @@ DELAYS_TRIED = 21
 ROUNDS = 12
 """Gauss-Newton steps of all windows together, at most."""
 ROUGH_ROUNDS = 4
-"""Of these, the first ones, in which the noise is measured again."""
+"""In the first of these steps the noise is measured again."""
 LARGEST_STEP_S = 0.02
 """A step changes readout time and delay by no more."""
 CONVERGED_S = 1e-5

@@ -40,7 +40,7 @@ _EXPLAINED: tuple[tuple[int, float], ...] = ((5, 0.75), (8, 0.88))
 """Standard deviations, and the part of the errors that may remain, for one value to be at fault: 0.87 and more remain
 in healthy recordings, and no value above its limit is sure to 4."""
 _EXPLAINED_BY_LEVER: tuple[tuple[int, float], ...] = ((5, 0.62),)
-"""Likewise for the lever arm. People who walk past can feign one: 0.68 remained then."""
+"""These limits for the lever arm: people who walk past can feign one: 0.68 remained then."""
 _LEAST_DEPTH = 0.5
 """Part of the image that has depth, for a lever arm or a depth factor. With less, the corners may lie on moving people
 alone: of the errors that a lever arm explains 0.61 remained then, and lengths came out at 0.43 of

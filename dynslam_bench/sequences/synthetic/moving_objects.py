@@ -29,7 +29,7 @@ from dynslam_bench.sequences.synthetic.rooms import (
     printed_box,
     trolley,
 )
-from dynslam_bench.sequences.synthetic.scene import Body, Variant, World
+from dynslam_bench.sequences.synthetic.scene import Actor, Body, Variant, World
 
 PERIOD_S = 20.0
 """After this a motion begins again."""
@@ -56,11 +56,13 @@ def build_objects(variant: str, scene: int) -> World:
     room = build_room(scene, plan)
     if variant == "door":
         room += _doorway(plan)
-    bodies, keys = _SCRIPTS[variant](partial(pick, rng, scene), scene, plan)
-    person = replace(draw_person(scene, 0), instance=_CARRIER_ID)
-    actors = ((person, partial(posture, keys, PERIOD_S)),) if keys else ()
+    script = _SCRIPTS[variant](partial(pick, rng, scene), scene, plan)
+    actors: tuple[Actor, ...] = ()
+    if script.carrier:
+        person = replace(draw_person(scene, 0), instance=_CARRIER_ID)
+        actors = ((person, partial(posture, script.carrier, PERIOD_S)),)
     camera = partial(camera_poses, "xyz", "objects", scene)
-    return World(room, camera, glare_window(plan), bodies, actors)
+    return World(room, camera, glare_window(plan), script.bodies, actors)
 
 
 def _body(
