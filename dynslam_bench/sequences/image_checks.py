@@ -34,7 +34,7 @@ LEAST_SHIFT_PX = 14.0
 LEAST_DELAY = 2
 """In frames; the first Kinect's depth lags by nearly one."""
 CLEAR_PEAK = 7.0
-"""Height of a correlation's clear peak, in standard deviations over all shifts: what has nothing in common stays below 6."""
+"""Height of a clear correlation peak, in standard deviations over all shifts: unrelated maps stay below 6."""
 DEPTH_RANGE_M = (0.1, 60.0)
 """Median depths outside of this range are in another unit than metres."""
 USUAL_FACTORS = (1.0, 100.0, 1000.0, 5000.0)
