@@ -71,7 +71,7 @@ class Camera:
         return any(self.distortion)
 
     def undistorted(self) -> Camera:
-        """The same pinhole without distortion."""
+        """This camera's pinhole without distortion."""
         return replace(self, distortion=(0.0, 0.0, 0.0, 0.0, 0.0))
 
     def resized(self, width: int, height: int) -> Camera:

@@ -28,6 +28,7 @@ def cholesky_solve(a: Array, b: Array) -> bool:
     Only the lower triangle of `a` is read.
     """
     n = a.shape[0]
+    # Factor a = L L^T; L takes the place of the lower triangle.
     for j in range(n):
         for i in range(j, n):
             s = a[i, j]
@@ -39,11 +40,13 @@ def cholesky_solve(a: Array, b: Array) -> bool:
                 a[j, j] = np.sqrt(s)
             else:
                 a[i, j] = s / a[j, j]
+    # Forward substitution: L y = b.
     for i in range(n):
         s = b[i]
         for k in range(i):
             s -= a[i, k] * b[k]
         b[i] = s / a[i, i]
+    # Back substitution: L^T x = y.
     for i in range(n - 1, -1, -1):
         s = b[i]
         for k in range(i + 1, n):
@@ -55,6 +58,8 @@ def cholesky_solve(a: Array, b: Array) -> bool:
 @kernel
 def apply_twist(pose: Array, xi: Array) -> Array:
     """``exp(xi) @ pose`` for a twist (translation, rotation), re-orthonormalised."""
+    # Coefficients of exp: sin(theta) / theta, (1 - cos(theta)) / theta^2 and
+    # (theta - sin(theta)) / theta^3, by their series near 0.
     theta2 = xi[3] * xi[3] + xi[4] * xi[4] + xi[5] * xi[5]
     theta = np.sqrt(theta2)
     if theta < 1e-8:
@@ -65,6 +70,7 @@ def apply_twist(pose: Array, xi: Array) -> Array:
         a = np.sin(theta) / theta
         b = (1.0 - np.cos(theta)) / theta2
         c = (theta - np.sin(theta)) / (theta2 * theta)
+    # Cross-product matrix of the rotation vector, and its square.
     k = np.zeros((3, 3))
     k[0, 1], k[0, 2], k[1, 2] = -xi[5], xi[4], -xi[3]
     k[1, 0], k[2, 0], k[2, 1] = xi[5], -xi[4], xi[3]
@@ -73,12 +79,14 @@ def apply_twist(pose: Array, xi: Array) -> Array:
         for j in range(3):
             for m in range(3):
                 k2[i, j] += k[i, m] * k[m, j]
+    # exp(xi): rotation I + a k + b k^2, translation (I + b k + c k^2) v.
     step = np.eye(4)
     for i in range(3):
         for j in range(3):
             step[i, j] += a * k[i, j] + b * k2[i, j]
             step[i, 3] += (b * k[i, j] + c * k2[i, j]) * xi[j]
         step[i, 3] += xi[i]
+    # Applied to the pose from the left.
     out = np.eye(4)
     for i in range(3):
         for j in range(4):
@@ -105,6 +113,7 @@ def apply_twist(pose: Array, xi: Array) -> Array:
 @kernel
 def twist_of(pose: Array) -> Array:
     """The twist ``[6]`` (translation, rotation) whose exponential is the pose, rotated by less than half a turn."""
+    # The rotation's axis times the sine of its angle, then the angle.
     out = np.empty(6)
     out[3] = 0.5 * (pose[2, 1] - pose[1, 2])
     out[4] = 0.5 * (pose[0, 2] - pose[2, 0])
@@ -116,6 +125,7 @@ def twist_of(pose: Array) -> Array:
     else:
         out[3:] *= theta / sine
         factor = (1.0 - 0.5 * theta / np.tan(0.5 * theta)) / (theta * theta)
+    # The inverse of the left Jacobian, applied to the translation.
     phi = out[3:]
     t = pose[:3, 3]
     once = np.cross(phi, t)

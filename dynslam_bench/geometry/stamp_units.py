@@ -47,9 +47,11 @@ LATEST_S = 9e9
 SLOWEST_S = 5.0
 """Poses further apart by the median are no video and no motion capture."""
 FASTEST_FINE_S = 0.9e-3
+"""Shortest median step in a unit smaller than the second: a little more than 1000 Hz.
+
+At 200 Hz, a frequent rate of motion capture, this limit and `SLOWEST_FINE_S` leave one unit."""
 SLOWEST_FINE_S = 4.0
-"""The same for units smaller than the second: from a little more than 1000 Hz to 0.25 Hz. At 200 Hz, a frequent rate of
-motion capture, these limits leave one unit."""
+"""Longest median step in a unit smaller than the second: 0.25 Hz."""
 SPARSE_S = 60.0
 """Keyframes of a camera that hardly moves may be as far apart."""
 SHORTEST_S = 0.5

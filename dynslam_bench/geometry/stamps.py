@@ -147,7 +147,8 @@ def _associate(first: bytes, second: bytes, max_dt: float, strict: bool) -> tupl
         )
     candidate_a, candidate_b, dt = _candidates(a, b, max_dt, strict=strict)
     pairs = np.stack([candidate_a, candidate_b], axis=1)
-    if not (np.diff(pairs, axis=0) > 0).all():  # some stamp has several candidates
+    # Where a stamp has several candidates, the closest pairs are taken first.
+    if not (np.diff(pairs, axis=0) > 0).all():
         match_of: dict[int, int] = {}
         taken: set[int] = set()
         for i, j in pairs[np.lexsort((candidate_b, candidate_a, dt))].tolist():
@@ -157,21 +158,22 @@ def _associate(first: bytes, second: bytes, max_dt: float, strict: bool) -> tupl
         pairs = np.array(sorted(match_of.items()), dtype=np.intp).reshape(-1, 2)
     index_a = order_a[pairs[:, 0]]
     index_b = order_b[pairs[:, 1]]
-    index_a.flags.writeable = index_b.flags.writeable = False
+    index_a.flags.writeable = False
+    index_b.flags.writeable = False
     return index_a, index_b
 
 
 def nearest_gap(first: ArrayLike, second: ArrayLike) -> NDArray[np.float64]:
     """Distance in seconds ``[N]`` of every (finite) stamp of `first` to the nearest of `second`; inf without any."""
     a = np.asarray(first, dtype=np.float64).reshape(-1)
-    b = np.concatenate(
-        [[-np.inf], np.sort(np.asarray(second, dtype=np.float64).reshape(-1)), [np.inf]]
-    )
+    ordered = np.sort(np.asarray(second, dtype=np.float64).reshape(-1))
+    b = np.concatenate([[-np.inf], ordered, [np.inf]])
     after = np.searchsorted(b, a)
     return np.asarray(np.minimum(a - b[after - 1], b[after] - a))
 
 
 def _sorted_stamps(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], Index]:
+    """Stamps in ascending order, and the index of each in `values`."""
     if not np.isfinite(values).all():
         at = int(np.argmin(np.isfinite(values)))
         raise TrajectoryError(
@@ -185,13 +187,14 @@ def _candidates(
     a: NDArray[np.float64], b: NDArray[np.float64], max_dt: float, *, strict: bool
 ) -> tuple[Index, Index, NDArray[np.float64]]:
     """All pairs of indices within `max_dt` with their |dt|; both lists sorted."""
+    # Look a little farther than `max_dt`, as sums round; the differences decide.
     slack = 1e-9 + 4 * np.spacing(max(np.abs(a).max(initial=0.0), np.abs(b).max(initial=0.0)))
     low = np.searchsorted(b, a - max_dt - slack, side="left")
     count = np.searchsorted(b, a + max_dt + slack, side="right") - low
+    # Every stamp of `a` with each of its `count` candidates in `b`, from `low` on.
     index_a = np.repeat(np.arange(len(a)), count)
-    index_b = np.repeat(low, count) + (
-        np.arange(len(index_a)) - np.repeat(np.cumsum(count) - count, count)
-    )
+    number_of_candidate = np.arange(len(index_a)) - np.repeat(np.cumsum(count) - count, count)
+    index_b = np.repeat(low, count) + number_of_candidate
     dt = np.abs(a[index_a] - b[index_b])
     keep = dt < max_dt if strict else dt <= max_dt
     return index_a[keep], index_b[keep], dt[keep]

@@ -93,7 +93,7 @@ class Trajectory:
         return type(self)(self.timestamps, T_world_cam, self.exact_ns)
 
     def with_exact(self, exact: Mapping[float, int]) -> Trajectory:
-        """The same trajectory with the nanoseconds of those stamps that a table of seconds to nanoseconds holds."""
+        """This trajectory with the nanoseconds of those stamps that a table of seconds to nanoseconds holds."""
         stamps = self.timestamps.tolist()
         if exact.keys().isdisjoint(stamps):
             return self

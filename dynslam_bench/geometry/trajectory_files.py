@@ -28,10 +28,13 @@ from dynslam_bench.geometry.stamps import format_ns, parse_ns, refuse_close, to_
 from dynslam_bench.geometry.trajectory import RepeatedStamps, Trajectory
 
 _COLUMNS = "timestamp tx ty tz qx qy qz qw"
+"""What stands in a line of TUM's format."""
 MOST_LINES = 4_000_000
 """More than an hour at 1 kHz; a longer file is refused before it fills the memory."""
 _ZERO_NORM = 1e-8
+"""A quaternion of a smaller norm is all zero."""
 _UNIT_TOLERANCE = 0.01
+"""A quaternion whose norm is off by more is counted as normalised."""
 
 
 @dataclass(frozen=True)
@@ -64,11 +67,10 @@ class FileNotes:
         Args:
             repeats: Whether all lines with the same stamp were taken, not only the last.
         """
-        duplicates = (
-            "repeat the next line's stamp, all are taken"
-            if repeats
-            else "replaced by a later line with the same stamp"
-        )
+        if repeats:
+            duplicates = "repeat the next line's stamp, all are taken"
+        else:
+            duplicates = "replaced by a later line with the same stamp"
         of = f"of {self.lines} lines"
         phrases = [
             (self.not_finite, f"{self.not_finite} {of} skipped: not finite"),
@@ -80,7 +82,10 @@ class FileNotes:
                 f"{self.renormalised} {of} with a quaternion far from unit norm, normalised",
             ),
         ]
-        return [phrase for count, phrase in phrases if count] + [self.stamps] * bool(self.stamps)
+        described = [phrase for count, phrase in phrases if count]
+        if self.stamps:
+            described.append(self.stamps)
+        return described
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,8 +134,8 @@ def load_tum(path: str | Path) -> TumFile:
     table = _read_table(
         path, heading.columns, _COLUMNS, without=line_of_heading, stamp_column=heading.order[0]
     )
+    # Columns in TUM's order; lines without a pose are left out.
     values = table.values[:, list(heading.order)]
-    # lines without a pose are left out
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
     norm = np.linalg.norm(np.where(finite[:, None], values[:, 4:8], 0.0), axis=1)
     valid = finite & (norm >= _ZERO_NORM)
@@ -142,16 +147,15 @@ def load_tum(path: str | Path) -> TumFile:
     )
     if not valid.any():
         raise NoPoseError(f"{path} holds no valid pose", "; ".join(counted.describe()))
+    # Stamps, exactly as they are written.
     kept = values[valid]
-    # stamps, exactly as they are written
     texts = [table.texts[row] for row in np.flatnonzero(valid)]
     moved = (np.diff(kept[:, 1:], axis=0) != 0).any(axis=1)
     ns, unit_note = _stamps_of(texts, kept[:, 0], str(path), stated=heading.unit, moved=moved)
     line_of = dict(zip(ns.tolist(), np.array(table.numbers)[valid].tolist(), strict=True))
     refuse_close(np.sort(ns), str(path), TrajectoryError, line_of.get)
-    return ordered_file(
-        ns, se3.from_quaternion(kept[:, 1:4], kept[:, 4:8]), replace(counted, stamps=unit_note)
-    )
+    poses = se3.from_quaternion(kept[:, 1:4], kept[:, 4:8])
+    return ordered_file(ns, poses, replace(counted, stamps=unit_note))
 
 
 def _stamps_of(
@@ -176,6 +180,7 @@ def _stamps_of(
         TrajectoryError: Most stamps, or a third of them with other poses, repeat the one before;
             their unit is not known; or one lies beyond the range of 64 bits.
     """
+    # Stamps that lost their last digits repeat each other.
     repeated = np.diff(values) == 0
     repeats = np.flatnonzero(repeated)
     others = 0 if moved is None else int((repeated & moved).sum())
@@ -407,6 +412,7 @@ def is_number(text: str) -> bool:
 
 
 def _hint(parts: list[str]) -> str:
+    """Which other format a line of another length is of; empty where that is not known."""
     if len(parts) == 12:
         return "12 values a line are KITTI's format: `eval` and `import` take its stamps with --timestamps FILE"
     if len(parts) == 17:
@@ -466,13 +472,11 @@ def write_kitti(path: str | Path, trajectory: Trajectory, times: str | Path | No
         DynslamError: A file cannot be written.
     """
     rows = trajectory.T_world_cam[:, :3].reshape(-1, 12).tolist()
-    write_atomic(
-        Path(path), "".join(" ".join(f"{value:.9e}" for value in row) + "\n" for row in rows)
-    )
+    lines = [" ".join(f"{value:.9e}" for value in row) + "\n" for row in rows]
+    write_atomic(Path(path), "".join(lines))
     if times is not None:
-        write_atomic(
-            Path(times), "".join(f"{format_ns(ns)}\n" for ns in trajectory.timestamps_ns.tolist())
-        )
+        stamps = [f"{format_ns(ns)}\n" for ns in trajectory.timestamps_ns.tolist()]
+        write_atomic(Path(times), "".join(stamps))
 
 
 # Trajectory files of either format: TUM's, which carry their stamps, and KITTI's, whose stamps lie

@@ -22,13 +22,16 @@ from dynslam_bench.sequences.cameras import CAMERA_FILE, write_camera
 from dynslam_bench.sequences.catalogue import open_folder
 
 IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+"""Types of image messages."""
 INFO = "sensor_msgs/msg/CameraInfo"
+"""Type of a camera's calibration."""
 POSES = (
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
     "geometry_msgs/msg/TransformStamped",
     "nav_msgs/msg/Odometry",
 )
+"""Types of messages that hold a stamped pose."""
 
 
 @dataclass(frozen=True)
@@ -85,25 +88,22 @@ def unpack_bag(
         chosen_depth = topics.image("depth", depth)
         chosen_truth = topics.pose(truth)
         with atomic_folder(target) as work:
-            frames = {
-                kind: _write_images(reader, topics.connections[topic], work, name)
-                for kind, topic, name in (
-                    ("colour", chosen_colour, "rgb"),
-                    ("depth", chosen_depth, "depth"),
-                )
-            }
+            # The frames of reference that the images name show whether they are registered.
+            colour_frame = _write_images(reader, topics.connections[chosen_colour], work, "rgb")
+            depth_frame = _write_images(reader, topics.connections[chosen_depth], work, "depth")
             write_camera(work / CAMERA_FILE, topics.camera(chosen_colour))
             if chosen_truth:
                 poses = _read(reader, topics.connections[chosen_truth])
                 write_lines(work / "groundtruth.txt", map(pose_line, poses))
             count = len(open_folder(work))
-    apart = f"depth is in the frame '{frames['depth']}', colour in '{frames['colour']}': is {chosen_depth} registered?"
-    notes = {
-        apart: frames["colour"] != frames["depth"],
-        f"the poses of {chosen_truth} are taken for the colour camera's": bool(chosen_truth),
-    }
-    said = tuple(note for note, holds in notes.items() if holds)
-    return Unpacked(target, chosen_colour, chosen_depth, chosen_truth, count, said)
+    notes = []
+    if colour_frame != depth_frame:
+        notes.append(
+            f"depth is in the frame '{depth_frame}', colour in '{colour_frame}': is {chosen_depth} registered?"
+        )
+    if chosen_truth:
+        notes.append(f"the poses of {chosen_truth} are taken for the colour camera's")
+    return Unpacked(target, chosen_colour, chosen_depth, chosen_truth, count, tuple(notes))
 
 
 def read_bag_poses(
@@ -123,11 +123,16 @@ def read_bag_poses(
     with _opened(source) as reader:
         topics = _Topics(reader, source)
         chosen = topics.pose(topic, "--topic")
-        lines = [*map(pose_line, _read(reader, topics.connections[chosen]))] if chosen else []
-    table = np.array([line.split() for line in lines], dtype=np.float64).reshape(-1, 8)
+        lines = []
+        if chosen:
+            messages = _read(reader, topics.connections[chosen])
+            lines = [pose_line(message).split() for message in messages]
+    table = np.array(lines, dtype=np.float64).reshape(-1, 8)
     if not np.isfinite(table).all():
         raise SequenceError(f"{source} holds poses that are not finite")
-    return np.array([parse_ns(line.split()[0]) for line in lines], dtype=np.int64), table[:, 1:]
+    # Stamps are parsed from their text: floating point does not hold nanoseconds.
+    stamps_ns = np.array([parse_ns(line[0]) for line in lines], dtype=np.int64)
+    return stamps_ns, table[:, 1:]
 
 
 class _Topics:
@@ -141,6 +146,7 @@ class _Topics:
         }
 
     def of_types(self, types: Sequence[str]) -> list[str]:
+        """Names of all topics whose messages are of one of these types."""
         return sorted(
             topic
             for topic, connections in self.connections.items()
@@ -148,23 +154,25 @@ class _Topics:
         )
 
     def image(self, kind: str, wanted: str | None) -> str:
+        """The topic of ``colour`` or ``depth`` images: the wanted one, else the only one."""
         candidates = self.of_types(IMAGES)
         if wanted is None:
             candidates = [topic for topic in candidates if kind_of(self._first(topic)) == kind]
         return self._one(f"{kind} images", candidates, wanted, f"--{kind}")
 
     def pose(self, wanted: str | None, option: str = "--truth (or --truth none)") -> str:
+        """The topic of poses: the wanted one, else the only one; empty for none."""
         candidates = self.of_types(POSES)
         if wanted == "none" or (wanted is None and not candidates):
             return ""
         return self._one("poses", candidates, wanted, option)
 
-    def camera(self, colour: str) -> Any:
+    def camera(self, colour: str) -> Camera:
+        """The calibration beside the colour images' topic, else the only one."""
         namespace = colour.rpartition("/")[0]
         infos = self.of_types((INFO,))
-        beside = [
-            topic for topic in infos if namespace.startswith(topic.rpartition("/")[0])
-        ] or infos
+        beside = [topic for topic in infos if namespace.startswith(topic.rpartition("/")[0])]
+        beside = beside or infos
         if len(beside) != 1:
             raise SequenceError(
                 f"{self.source} has {len(beside)} topics of calibration for {colour}, expected 1"
@@ -172,11 +180,13 @@ class _Topics:
         return camera_of(self._first(beside[0]), f"{beside[0]} of {self.source}")
 
     def _first(self, topic: str) -> Any:
+        """The first message of a topic."""
         for message in _read(self.reader, self.connections[topic]):
             return message
         raise SequenceError(f"topic {topic} of {self.source} has no message")
 
     def _one(self, what: str, candidates: list[str], wanted: str | None, option: str) -> str:
+        """The wanted topic, else the only candidate; where there are several, `option` chooses one."""
         listed = ", ".join(candidates)[:300] or "none"
         if wanted is not None and wanted not in candidates:
             raise SequenceError(
@@ -261,13 +271,9 @@ def stamp_text(message: Any) -> str:
 def kind_of(message: Any) -> str:
     """``colour``, ``depth`` or empty, of an image message, compressed or not."""
     if hasattr(message, "encoding"):
-        return (
-            "depth"
-            if message.encoding in DEPTHS
-            else "colour"
-            if message.encoding in COLOURS
-            else ""
-        )
+        if message.encoding in DEPTHS:
+            return "depth"
+        return "colour" if message.encoding in COLOURS else ""
     return "" if "compressedDepth" in message.format else "colour"
 
 
@@ -286,9 +292,9 @@ def colour_file(message: Any, where: str) -> tuple[str, bytes]:
         )
     channels, code = COLOURS[message.encoding]
     pixels = _pixels(message, np.dtype(np.uint8), channels, where)
-    return ".png", cv2.imencode(".png", pixels if code is None else cv2.cvtColor(pixels, code))[
-        1
-    ].tobytes()
+    if code is not None:
+        pixels = cv2.cvtColor(pixels, code)
+    return ".png", cv2.imencode(".png", pixels)[1].tobytes()
 
 
 def depth_file(message: Any, where: str) -> tuple[str, bytes]:
@@ -304,14 +310,15 @@ def depth_file(message: Any, where: str) -> tuple[str, bytes]:
             "choose another topic with --depth",
         )
     depth = _pixels(message, kind, 1, where)
-    buffer = BytesIO()
     if kind == np.uint16:
         return ".png", cv2.imencode(".png", depth)[1].tobytes()
+    buffer = BytesIO()
     np.save(buffer, depth)
     return ".npy", buffer.getvalue()
 
 
 def _pixels(message: Any, kind: np.dtype[Any], channels: int, where: str) -> NDArray[Any]:
+    """The pixels ``[H, W]`` or ``[H, W, channels]`` of an uncompressed image in the machine's byte order."""
     height = int(message.height)
     width = int(message.width)
     step = int(message.step)
@@ -321,6 +328,7 @@ def _pixels(message: Any, kind: np.dtype[Any], channels: int, where: str) -> NDA
         raise SequenceError(
             f"{where} is {width}x{height} of {message.encoding} in {len(data)} bytes, {step} a row"
         )
+    # Rows may be padded.
     rows = np.ascontiguousarray(data.reshape(height, step)[:, :used])
     values = rows.view(kind.newbyteorder(">" if message.is_bigendian else "<")).astype(kind)
     return values.reshape(height, width, channels) if channels > 1 else values
@@ -333,15 +341,10 @@ def camera_of(message: Any, where: str) -> Camera:
         SequenceError: Its distortion is not the radial-tangential one of five coefficients, or it
             is none.
     """
-    k, d = (
-        np.asarray(getattr(message, name, getattr(message, name.upper(), ())), float).ravel()
-        for name in "kd"
-    )
-    if (
-        len(k) != 9
-        or not np.isfinite(k).all()
-        or min(k[0], k[4], message.width, message.height) <= 0
-    ):
+    k = _coefficients(message, "k")
+    d = _coefficients(message, "d")
+    valid = len(k) == 9 and np.isfinite(k).all()
+    if not valid or min(k[0], k[4], message.width, message.height) <= 0:
         raise SequenceError(
             f"{where} holds no calibration (K = {k.tolist()})", "the camera was not calibrated"
         )
@@ -349,15 +352,22 @@ def camera_of(message: Any, where: str) -> Camera:
         raise SequenceError(
             f"{where} has the distortion '{message.distortion_model}', only plumb_bob is read"
         )
-    coefficients = [*d[:5].tolist(), *[0.0] * 5][:5]
+    distortion = [*d[:5].tolist(), *[0.0] * 5][:5]
     size = int(message.width), int(message.height)
-    return Camera(*size, k[0], k[4], k[2], k[5], tuple(coefficients), MILLIMETRES)
+    return Camera(*size, k[0], k[4], k[2], k[5], tuple(distortion), MILLIMETRES)
+
+
+def _coefficients(message: Any, name: str) -> NDArray[np.float64]:
+    """A field of a ``CameraInfo``; ROS 1 writes its name in capitals."""
+    values = getattr(message, name, getattr(message, name.upper(), ()))
+    return np.asarray(values, float).ravel()
 
 
 def pose_line(message: Any) -> str:
     """A line ``timestamp tx ty tz qx qy qz qw`` of a stamped pose, transformation or odometry."""
     outer = getattr(message, "pose", None) or message.transform
-    inner = getattr(outer, "pose", outer)  # with covariance
+    # one with covariance holds the pose inside
+    inner = getattr(outer, "pose", outer)
     position = getattr(inner, "position", None) or inner.translation
     rotation = getattr(inner, "orientation", None) or inner.rotation
     values = (position.x, position.y, position.z, rotation.x, rotation.y, rotation.z, rotation.w)

@@ -26,10 +26,10 @@ _WILD_SLAM_DISTORTION = (
     0.0004771310486830771,
     -0.021717390045523643,
 )
-"""Of both of Wild-SLAM's cameras, as its authors' configurations state it."""
+"""Distortion of both of Wild-SLAM's cameras, as its authors' configurations state it."""
 
 PRIMESENSE_READOUT_S = 0.026
-"""Of the Kinect and the Xtion, whose colour cameras have rolling shutters; measured, not published with the sequences.
+"""Readout time of the Kinect and the Xtion, which have rolling shutters; measured, not published with the sequences.
 
 Of 0, 13, 20, 26 and 33 ms it has the least error, or within 2 % of it, on excerpts of fr1_xyz,
 fr1_rpy and Bonn crowd
@@ -445,7 +445,7 @@ _DEPTH_FACTORS = (1.0, 655_350.0)
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
 _BASELINES_M = (0.001, 10.0)
 _LONGEST_S = 1.0
-"""Of readout and delay of depth: slower than any camera."""
+"""Longest readout time and delay of depth: slower than any camera."""
 _MOST_FOLDED = 0.05
 """Share of the pixels that a distortion may send to a wrong place: calibrations are often poor in the corners."""
 _FOLDED_PX = 1.0

@@ -37,7 +37,8 @@ from dynslam_bench.sequences.tags import Tag
 from dynslam_bench.sequences.view import SequenceView
 
 Split = Literal["tune", "held-out", ""]
-_FILES = (  # of `published/`: a new TOML file there is named here
+# Files of `published/`: a new TOML file there is named here.
+_FILES = (
     "tum",
     "bonn",
     "wild_slam",
@@ -102,19 +103,16 @@ class CatalogueEntry(Settings):
         if not self.distinctive:
             return inside / self.folder, data_root / self.id
         places = (inside / self.folder, data_root / self.folder, data_root / self.id)
-        return (
-            (*places, data_root / self.folder.removeprefix("rgbd_"))
-            if data_root.name == self.dataset
-            else places
-        )
+        if data_root.name == self.dataset:
+            return (*places, data_root / self.folder.removeprefix("rgbd_"))
+        return places
 
     def find(self, data_root: Path) -> Path | None:
         """The folder in which the sequence lies, None if it does not."""
-        places = self.folders(data_root)
-        return next(
-            (folder for folder in places if layouts_of(folder, self.layout) or is_plain(folder)),
-            None,
-        )
+        for folder in self.folders(data_root):
+            if layouts_of(folder, self.layout) or is_plain(folder):
+                return folder
+        return None
 
     def how_to_get(self) -> str:
         """What a user does to have it, for the end of a message."""
@@ -132,9 +130,12 @@ class CatalogueEntry(Settings):
 @cache
 def catalogue() -> dict[str, CatalogueEntry]:
     """All public sequences by id, in the order of the data files."""
-    documents = [read_toml(Path(__file__).parent / "published" / f"{name}.toml") for name in _FILES]
-    rows = ({**document["common"], **row} for document in documents for row in document["sequence"])
-    return {row["id"]: build(CatalogueEntry, row) for row in rows}
+    entries = {}
+    for name in _FILES:
+        document = read_toml(Path(__file__).parent / "published" / f"{name}.toml")
+        for row in document["sequence"]:
+            entries[row["id"]] = build(CatalogueEntry, {**document["common"], **row})
+    return entries
 
 
 def entry_of(name: str) -> CatalogueEntry | None:
@@ -262,6 +263,7 @@ def open_folder(
 
     settings = settings or PreprocessingSettings()
     entry = entry or entry_of(folder.resolve().name)
+    # What the folder holds, by its layout, and the camera that was chosen or that it states.
     catalogued = entry.layout if entry else ""
     layout = find_layout(folder, catalogued)
     chosen = chosen_camera(folder, camera)
@@ -270,6 +272,7 @@ def open_folder(
     notes = layout_notes(folder, layout, catalogued)
     if camera is not None and (folder / CAMERA_FILE).exists():
         notes = (*notes, f"{CAMERA_FILE} of the folder is not used: another camera was chosen")
+    # What the catalogue says of it.
     about: dict[str, Any] = {"id": f"folder/{folder.resolve().name}"}
     if entry is not None:
         about = {
@@ -294,6 +297,7 @@ def open_folder(
 def _open_whole(
     name: str, data_root: Path, camera: str | Path | Camera | None, settings: PreprocessingSettings
 ) -> Sequence:
+    """Open a sequence with all of its frames, by its id, its published folder name or its path."""
     path = Path(name).expanduser()
     is_path = name.startswith((".", "/", "~", "\\"))
     entry = None if is_path else entry_of(name)
@@ -302,8 +306,11 @@ def _open_whole(
             f"'{name}' names the sequence '{entry.id}', which is not at {entry.folders(data_root)[0]}",
             f"for the folder of that name here write ./{name}",
         )
+    # One of the catalogue.
     if entry is not None:
         return open_public(entry.id, data_root=data_root, camera=camera, settings=settings)
+
+    # One of another data set, by the prefix of its id.
     prefix, separator, _ = name.partition("/")
     public = {entry.dataset for entry in catalogue().values()}
     if separator and not is_path and prefix not in public:
@@ -312,6 +319,8 @@ def _open_whole(
             raise SequenceError(f"sequence '{name}' brings its own camera", "leave out --camera")
         if dataset is not None:
             return cast("Sequence", load_object(dataset.entry_point)(name, data_root=data_root))
+
+    # A folder.
     if is_bag(path):
         raise SequenceError(
             f"{path} is a bag", f"unpack it first: dynslam-bench sequences unpack {path} FOLDER"
@@ -335,6 +344,7 @@ def parse_frames(frames: Iterable[int | None] | str | None) -> tuple[int, int | 
     """
     if frames is None:
         return 0, None
+    # A pair is written as text, and read like it.
     if not isinstance(frames, str):
         ends = frames if isinstance(frames, Iterable) else [frames]
         frames = ":".join("" if end is None else str(end) for end in ends)
@@ -389,38 +399,45 @@ def summaries(*, data_root: str | Path | None = None) -> list[dict[str, Any]]:
     rows = []
     for spec in (dataset.spec for dataset in DATASETS.all()):
         for name in spec.sequences:
+            row = _blank_summary(spec, name)
             entry = catalogue().get(name)
-            row: dict[str, Any] = {
-                "id": name,
-                "here": True,
-                "size": "",
-                "tags": (),
-                "split": "",
-                "ground_truth": True,
-                "license": spec.license,
-                "url": "",
-                "dataset": spec.summary or spec.id,
-                "layout": "",
-                "by_hand": "",
-                "checksum": None,
-            }
             if entry is not None:
-                row |= entry.model_dump(
-                    include={"tags", "split", "ground_truth", "license", "url", "by_hand"}
-                )
-                layout = "verified" if entry.verified else "not verified"
-                row |= {
-                    "here": entry.find(root) is not None,
-                    "size": entry.size_text(),
-                    "dataset": entry.title,
-                    "layout": layout,
-                    "checksum": entry.sha256 is not None,
-                }
+                row |= _public_summary(entry, root)
             elif spec.id == "synthetic":
                 parsed = parse_synthetic_id(name)
                 row |= {"size": "rendered", "tags": (parsed.variant.tag,), "split": parsed.split}
             rows.append(row)
     return rows
+
+
+def _blank_summary(spec: DatasetSpec, name: str) -> dict[str, Any]:
+    """The row of a sequence of which only the data set is known."""
+    return {
+        "id": name,
+        "here": True,
+        "size": "",
+        "tags": (),
+        "split": "",
+        "ground_truth": True,
+        "license": spec.license,
+        "url": "",
+        "dataset": spec.summary or spec.id,
+        "layout": "",
+        "by_hand": "",
+        "checksum": None,
+    }
+
+
+def _public_summary(entry: CatalogueEntry, data_root: Path) -> dict[str, Any]:
+    """What the catalogue says in the row of a public sequence."""
+    stated = {"tags", "split", "ground_truth", "license", "url", "by_hand"}
+    return entry.model_dump(include=stated) | {
+        "here": entry.find(data_root) is not None,
+        "size": entry.size_text(),
+        "dataset": entry.title,
+        "layout": "verified" if entry.verified else "not verified",
+        "checksum": entry.sha256 is not None,
+    }
 
 
 def describe(
@@ -440,26 +457,7 @@ def describe(
     entry = entry_of(name)
     facts: dict[str, Any] = {}
     if entry is not None:
-        facts = {
-            "id": entry.id,
-            "alias": entry.folder,
-            "url": entry.url,
-            "page": entry.page,
-            "size": entry.size_text(),
-            "size_bytes": entry.size_bytes,
-            "sha256": entry.sha256,
-            "license": entry.license,
-            "checksum": "known: another archive is refused"
-            if entry.sha256
-            else "not published: the first fetch takes it, every later one has to bring the same",
-            "citation": entry.citation,
-            "tags": list(entry.tags),
-            "split": entry.split,
-            "ground_truth": "public" if entry.ground_truth else "not public",
-            "camera": repr(CAMERAS.get(entry.camera, "as its files or its layout state")),
-            "layout": f"{entry.layout}: {'' if entry.verified else 'not '}verified on the publisher's files",
-            "remark": entry.remark,
-        }
+        facts = _public_facts(entry)
         if entry.find(root) is None:
             return facts | {"here": False, "fetch": entry.how_to_get()}
     sequence = open_sequence(name, data_root=data_root, camera=camera)
@@ -481,6 +479,33 @@ def describe(
         "citation": sequence.citation,
         "association": getattr(sequence, "dropped", None),
         "digest": sequence.digest(),
+    }
+
+
+def _public_facts(entry: CatalogueEntry) -> dict[str, Any]:
+    """What the catalogue says of a sequence, for people."""
+    if entry.sha256:
+        checksum = "known: another archive is refused"
+    else:
+        checksum = "not published: the first fetch takes it, every later one has to bring the same"
+    verified = "verified" if entry.verified else "not verified"
+    return {
+        "id": entry.id,
+        "alias": entry.folder,
+        "url": entry.url,
+        "page": entry.page,
+        "size": entry.size_text(),
+        "size_bytes": entry.size_bytes,
+        "sha256": entry.sha256,
+        "license": entry.license,
+        "checksum": checksum,
+        "citation": entry.citation,
+        "tags": list(entry.tags),
+        "split": entry.split,
+        "ground_truth": "public" if entry.ground_truth else "not public",
+        "camera": repr(CAMERAS.get(entry.camera, "as its files or its layout state")),
+        "layout": f"{entry.layout}: {verified} on the publisher's files",
+        "remark": entry.remark,
     }
 
 

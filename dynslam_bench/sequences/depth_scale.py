@@ -22,26 +22,35 @@ fr1_xyz and fr1_rpy."""
 LEVER_SIGMA_M = 0.02
 """Bonn's camera is 0.019 m from its markers."""
 TURN_SIGMA = np.radians(2.0)
+"""Standard deviation of the turn of the truth's axes."""
 SHIFT_SIGMA_S = 0.01
+"""Standard deviation of the truth's shift in time."""
 READOUT_S = 0.013
+"""Mean of a readout time that the camera does not state: from a global shutter to most of a frame."""
 READOUT_SIGMA_S = 0.013
-"""Mean and standard deviation of a readout that the camera does not state: from a global shutter to most of a frame."""
+"""Its standard deviation."""
 STATED_READOUT_SIGMA_S = 0.005
+"""Standard deviation of one that it states."""
 SYSTEMATIC = 0.03
 """Relative standard deviation of what all pairs share: Bonn's own calibration has a scale of 1.059."""
 CAUCHY = 2.5
 """Scale of the robust kernels in standard deviations."""
 LEAST_PAIRS = 8
+"""Pairs that are needed for an interval."""
 BLOCK = 2
 """Successive pairs that are left out together: they share an image, and often the same people."""
 _ROUNDS = 20
+"""Rounds of reweighted least squares, at most."""
 _READOUT_STEP_S = 0.03
+"""Step of the derivative by the readout time."""
 _RATE_S = 0.015
 """Half the time over which the truth's turning rate is taken."""
 _SHIFT_S = 0.01
+"""Step of the derivative by the shift in time."""
 _LEAST_PX = 0.3
 """Least standard deviation of a corner: below it the images' rounding counts."""
 _LEAST_Z_M = 0.05
+"""Smaller depths are taken as this one in projections."""
 
 
 @dataclass(frozen=True)
@@ -87,27 +96,33 @@ def depth_scale(
     if len(pairs) < LEAST_PAIRS:
         return None
     relative = truth.between(start, end)[1]
-    rates = _turning_rates(truth, start), _turning_rates(truth, end)
+    rates = list(zip(_turning_rates(truth, start), _turning_rates(truth, end), strict=True))
 
-    # Translations under a global shutter, and how they change with the readout time.
-    still, rolling = (
-        np.stack(
+    # Translations ``[N, 3]`` under a global shutter, and how they change with the readout time.
+    def translations(readout_s: float) -> Array:
+        return np.stack(
             [
-                translation_of(pair, T, (first, second), camera, readout_s, first_guess)
-                for pair, T, first, second in zip(pairs, relative, *rates, strict=True)
+                translation_of(pair, T, both_rates, camera, readout_s, first_guess)
+                for pair, T, both_rates in zip(pairs, relative, rates, strict=True)
             ]
         )
-        for readout_s in (0.0, _READOUT_STEP_S)
-    )
+
+    still = translations(0.0)
+    rolling = translations(_READOUT_STEP_S)
     by_readout = (rolling - still) / _READOUT_STEP_S
-    readout_s = camera.readout_s if camera.readout_s > 0 else READOUT_S
-    readout_sigma_s = STATED_READOUT_SIGMA_S if camera.readout_s > 0 else READOUT_SIGMA_S
+    if camera.readout_s > 0:
+        readout_s = camera.readout_s
+        readout_sigma_s = STATED_READOUT_SIGMA_S
+    else:
+        readout_s = READOUT_S
+        readout_sigma_s = READOUT_SIGMA_S
 
     # How the true translations change with a shift in time.
     later = truth.between(start + _SHIFT_S, end + _SHIFT_S)[1]
     earlier = truth.between(start - _SHIFT_S, end - _SHIFT_S)[1]
     by_shift = (later - earlier)[:, :3, 3] / (2 * _SHIFT_S)
 
+    # What the translations consist of ``[N, 3, 9]``, and the prior of each column's factor.
     true = relative[:, :3, 3]
     if not (np.linalg.norm(true, axis=1) > 0).any():
         return None
@@ -148,11 +163,13 @@ def translation_of(
         readout_s: Readout time that is taken into account.
         first_guess: Length of the translation at the beginning, as a multiple of the true one.
     """
+    # Points in the first camera and pixels in the second, as at the time of the middle rows.
     points = camera.unproject(pair.pixels_first, pair.depth_first)
     points = _at_middle_row(points, pair.pixels_first, rates[0], camera, readout_s)
     rays = camera.unproject(pair.pixels_second, np.ones(len(pair.pixels_second)))
     pixels = camera.project(_at_middle_row(rays, pair.pixels_second, rates[1], camera, readout_s))
     focal = np.array([camera.fx, camera.fy])
+    centre = (camera.cx, camera.cy)
     back = se3.inverse(T_true)
     R_true = back[:3, :3]
     R = R_true
@@ -161,7 +178,7 @@ def translation_of(
         turned = points @ R.T
         moved = turned + t
         z = np.maximum(moved[:, 2], _LEAST_Z_M)
-        errors = moved[:, :2] / z[:, None] * focal + (camera.cx, camera.cy) - pixels
+        errors = moved[:, :2] / z[:, None] * focal + centre - pixels
         # the slopes of the pixels by the moved points, then by rotation and translation
         by_point = np.zeros((len(points), 2, 3))
         by_point[:, 0, 0] = camera.fx / z
@@ -221,6 +238,7 @@ def _regression(columns: Array, measured: Array, scaled: Array, fixed: Array) ->
     weight = np.ones(len(measured))
     if not (np.isfinite(scale) and sigma > 0):
         return None
+    # Reweighted least squares with priors that grow with the scale.
     for _ in range(_ROUNDS):
         deviation = np.maximum(scaled * scale, fixed)
         prior = np.diag(np.where(deviation > 0, 1 / np.maximum(deviation, 1e-12) ** 2, 0.0))
@@ -228,28 +246,27 @@ def _regression(columns: Array, measured: Array, scaled: Array, fixed: Array) ->
         pulls = np.einsum("nki,n,nk->ni", columns, weight, measured) / sigma**2
         factors = np.linalg.solve(normals.sum(axis=0) + prior, pulls.sum(axis=0))
         scale = max(float(factors[0]), 1e-3)
-        off = np.linalg.norm(measured - columns @ factors, axis=1)
+        residual = np.linalg.norm(measured - columns @ factors, axis=1)
         # 1.54: median length of a normal vector in space
-        sigma = max(float(np.median(off)) / 1.54, 1e-4)
-        weight = 1 / (1 + (off / sigma / CAUCHY) ** 2)
+        sigma = max(float(np.median(residual)) / 1.54, 1e-4)
+        weight = 1 / (1 + (residual / sigma / CAUCHY) ** 2)
 
-    # The variance: of the scale without one block after the other, and of what the bounds leave
-    # open.
+    # The variance: by a jackknife over blocks, and what the bounds leave open.
     blocks = np.arange(len(measured)) // BLOCK
     count = int(blocks[-1]) + 1
-    parts = []
+    scales = []
     for block in range(count):
         kept = blocks != block
         part = np.linalg.solve(normals[kept].sum(axis=0) + prior, pulls[kept].sum(axis=0))
-        parts.append(float(part[0]))
-    without = np.array(parts)
-    inverse = np.linalg.inv(normals.sum(axis=0) + prior)
+        scales.append(float(part[0]))
+    without = np.array(scales)
     jackknife = (count - 1) / count * float(((without - without.mean()) ** 2).sum())
+    inverse = np.linalg.inv(normals.sum(axis=0) + prior)
     left_open = float((inverse @ prior @ inverse)[0, 0])
     variance = max(jackknife + left_open, float(inverse[0, 0]))
-    half = float(
-        np.hypot(student.ppf(0.975, count - 1) * np.sqrt(variance), 1.96 * SYSTEMATIC * factors[0])
-    )
-    return DepthScale(
-        float(factors[0]), max(float(factors[0]) - half, 0.0), max(float(factors[0]) + half, 0.0)
-    )
+
+    # Half of the 95 % interval, with what all pairs share.
+    value = float(factors[0])
+    statistical = student.ppf(0.975, count - 1) * np.sqrt(variance)
+    half = float(np.hypot(statistical, 1.96 * SYSTEMATIC * factors[0]))
+    return DepthScale(value, max(value - half, 0.0), max(value + half, 0.0))

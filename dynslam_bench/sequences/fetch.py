@@ -43,7 +43,9 @@ from dynslam_bench.sequences.catalogue import (
 from dynslam_bench.sequences.readers.layouts import layout_of
 
 RECEIPT = "fetched.json"
+"""What was fetched, as a `Receipt`, in the sequence's folder."""
 MANIFEST = "manifest.sha256"
+"""Checksums of its files, in the format of ``sha256sum``."""
 
 
 class Receipt(Record):
@@ -155,37 +157,45 @@ def fetch(
         raise SequenceError(
             f"'{entry.id}' cannot be fetched by this program: {entry.by_hand}", entry.how_to_get()
         )
+    # Download every archive; the catalogue knows the first one's checksum only.
     parts: list[Download] = []
     for address in (url or entry.url, *entry.more_urls):
-        # the catalogue knows the first archive's only
-        expected = entry.sha256 if checksum and not parts else None
-        own = address.partition("?")[0].rpartition("/")[2]
-        named = is_inside(own) and not own.startswith(".") and len(own) < 200
-        archive = root / ".downloads" / (own if named else f"{entry.folder}.archive")
-        most_bytes = (entry.size_bytes if checksum else None) or MOST_BYTES
+        archive = root / ".downloads" / _archive_name(address, entry)
         sha256 = download(
             address,
             archive,
-            sha256=expected,
-            most_bytes=most_bytes,
+            sha256=entry.sha256 if checksum and not parts else None,
+            most_bytes=(entry.size_bytes if checksum else None) or MOST_BYTES,
             attempts=attempts,
             wait_s=wait_s,
             timeout_s=timeout_s,
             progress=progress,
         )
         parts.append(Download(address, archive, sha256))
-    place = entry.folders(root)[0]
+
+    # The others have to be what their address gave before.
     unstated = parts if entry.sha256 is None else parts[1:]
-    for part in unstated if checksum else ():
-        _compare_checksum(root, part)
+    if checksum:
+        for part in unstated:
+            _compare_checksum(root, part)
+
+    place = entry.folders(root)[0]
     _install(entry, place, parts, checksum and entry.sha256 is not None, progress)
-    for part in unstated:  # only of archives whose sequence could be opened
-        write_atomic(
-            _checksum_file(root, part), f"{part.sha256}  {without_passwords(part.address)}\n"
-        )
-    for part in () if keep_archive else parts:
-        part.archive.unlink(missing_ok=True)
+    # Checksums are kept only of archives whose sequence could be opened.
+    for part in unstated:
+        line = f"{part.sha256}  {without_passwords(part.address)}\n"
+        write_atomic(_checksum_file(root, part), line)
+    if not keep_archive:
+        for part in parts:
+            part.archive.unlink(missing_ok=True)
     return place
+
+
+def _archive_name(address: str, entry: CatalogueEntry) -> str:
+    """The last part of an address where it can be a file's name, else a name by the sequence's folder."""
+    last = address.partition("?")[0].rpartition("/")[2]
+    usable = is_inside(last) and not last.startswith(".") and len(last) < 200
+    return last if usable else f"{entry.folder}.archive"
 
 
 def _install(
@@ -193,23 +203,13 @@ def _install(
 ) -> None:
     """Let the sequence appear if it can be opened; a faulty archive is deleted, so that the next call fetches it."""
     first = parts[0].archive
-    size = parts[0].archive.stat().st_size
+    size = first.stat().st_size
     fault = f"cannot extract {first.name} ({size / 1e9:.2f} GB) into {place.parent}"
     hint = "make room or check the permissions and run the same command again, the archive is kept"
     with translate_errors(SequenceError, fault, hint):
         try:
             with atomic_folder(place) as work:
-                unpacked = work / ".unpacked"
-                sums = _unpack(parts, unpacked, progress)
-                top = _top(unpacked, entry, first)
-                inner = "" if top == unpacked else f"{top.relative_to(unpacked).as_posix()}/"
-                files = {
-                    name.removeprefix(inner): value
-                    for name, value in sums.items()
-                    if name.startswith(inner)
-                }
-                shutil.copytree(top, work, copy_function=os.replace, dirs_exist_ok=True)
-                shutil.rmtree(unpacked)
+                files = _unpack_sequence(entry, parts, work, progress)
                 receipt = Receipt(
                     id=entry.id,
                     url=parts[0].address,
@@ -219,15 +219,28 @@ def _install(
                     files=len(files),
                 )
                 write_atomic(work / RECEIPT, receipt.to_json())
-                write_atomic(
-                    work / MANIFEST,
-                    "".join(f"{value}  {name}\n" for name, value in sorted(files.items())),
-                )
+                lines = [f"{value}  {name}\n" for name, value in sorted(files.items())]
+                write_atomic(work / MANIFEST, "".join(lines))
                 open_folder(work, entry=entry)
         except SequenceError:
             for part in parts:
                 part.archive.unlink(missing_ok=True)
             raise
+
+
+def _unpack_sequence(
+    entry: CatalogueEntry, parts: list[Download], work: Path, progress: Report
+) -> dict[str, str]:
+    """Unpack the folder of the archives that is the sequence into `work`; SHA-256 of each file by its path in it."""
+    unpacked = work / ".unpacked"
+    sums = _unpack(parts, unpacked, progress)
+    top = _top(unpacked, entry, parts[0].archive)
+    inner = "" if top == unpacked else f"{top.relative_to(unpacked).as_posix()}/"
+    shutil.copytree(top, work, copy_function=os.replace, dirs_exist_ok=True)
+    shutil.rmtree(unpacked)
+    return {
+        name.removeprefix(inner): value for name, value in sums.items() if name.startswith(inner)
+    }
 
 
 def _unpack(parts: list[Download], target: Path, progress: Report) -> dict[str, str]:
@@ -262,6 +275,7 @@ def verify(
     Raises:
         SequenceError: Unknown id, or the sequence is not here, or it needs a `camera` to be named.
     """
+    # Where it lies.
     entry = entry_of(name)
     folder = Path(name).expanduser() if entry is None else status(name, data_root=data_root)
     if folder is None or not folder.is_dir():
@@ -275,6 +289,7 @@ def verify(
         raise
     except DynslamError as error:
         return Verification(name, folder, 0, (str(error),), False, "")
+    # Decode every frame.
     faults = []
     for index in range(len(sequence)):
         try:
@@ -282,25 +297,28 @@ def verify(
         except SequenceError as error:
             faults.append(f"frame {index}: {error}")
         progress(index + 1, len(sequence))
+    # Compare every file with its checksum.
     manifest = folder / MANIFEST
-    try:
-        faults += compare_sums(folder, manifest, SequenceError) if manifest.is_file() else []
-    except SequenceError as error:
-        faults.append(str(error))
-    dropped = getattr(sequence, "dropped", "")
+    if manifest.is_file():
+        try:
+            faults += compare_sums(folder, manifest, SequenceError)
+        except SequenceError as error:
+            faults.append(str(error))
     return Verification(
-        sequence.id, folder, len(sequence), tuple(faults), manifest.is_file(), dropped
+        id=sequence.id,
+        folder=folder,
+        frames=len(sequence),
+        faults=tuple(faults),
+        manifest=manifest.is_file(),
+        dropped=getattr(sequence, "dropped", ""),
     )
 
 
 def _top(work: Path, entry: CatalogueEntry, archive: Path) -> Path:
     """The folder inside the extracted archive that is the sequence."""
     layout = layout_of(entry.layout)
-    for candidate in (
-        work / entry.folder,
-        work,
-        *sorted(path for path in work.iterdir() if path.is_dir()),
-    ):
+    folders = sorted(path for path in work.iterdir() if path.is_dir())
+    for candidate in (work / entry.folder, work, *folders):
         if layout.fits(candidate):
             return candidate
     hint = f"it is not a sequence in the layout {layout.name}"
@@ -308,6 +326,7 @@ def _top(work: Path, entry: CatalogueEntry, archive: Path) -> Path:
 
 
 def _known(name: str) -> CatalogueEntry:
+    """The catalogue's entry of a public sequence; says what is wrong where there is none."""
     entry = entry_of(name)
     if entry is None:
         if name.startswith("synthetic/"):
@@ -325,7 +344,8 @@ def _compare_checksum(root: Path, part: Download) -> None:
         return
     first = (read_text(path, kind=SequenceError).split() or ["none"])[0]
     if first != part.sha256:
-        part.archive.unlink(missing_ok=True)  # the next call fetches it again
+        # the next call fetches it again
+        part.archive.unlink(missing_ok=True)
         raise SequenceError(
             f"{without_passwords(part.address)} has the checksum {part.sha256}, but gave {first} before",
             f"the file has changed; --no-checksum takes it all the same, and {path} says what came first",
@@ -334,11 +354,8 @@ def _compare_checksum(root: Path, part: Download) -> None:
 
 def _checksum_file(root: Path, part: Download) -> Path:
     """One file an address, so that several processes may fetch at a time."""
-    return (
-        root
-        / ".downloads"
-        / f"{hashlib.sha256(without_passwords(part.address).encode()).hexdigest()[:16]}.sha256"
-    )
+    address = hashlib.sha256(without_passwords(part.address).encode()).hexdigest()
+    return root / ".downloads" / f"{address[:16]}.sha256"
 
 
 # Extraction of archives: nothing outside the target, no links, no devices, no bombs.
@@ -346,6 +363,7 @@ def _checksum_file(root: Path, part: Download) -> Path:
 MAX_RATIO = 200
 """Most bytes that a byte of the archive may unpack to; images unpack to about as many as they take."""
 MAX_SLACK = 100_000_000
+"""Bytes that may be unpacked beyond `MAX_RATIO`."""
 MAX_MEMBERS = 200_000
 """Most files and folders of an archive; the largest public sequence has fewer than 20,000."""
 MAX_HEADER = 1 << 20
@@ -388,9 +406,8 @@ def extract(archive: Path, target: Path, progress: Report = lambda state: None) 
     sums = dict[str, str]()
     done = 0
     try:
-        for name, stream in (_zip_members if zipfile.is_zipfile(archive) else _tar_members)(
-            archive
-        ):
+        members = _zip_members if zipfile.is_zipfile(archive) else _tar_members
+        for name, stream in members(archive):
             path = target / safe_name(archive, name)
             path.parent.mkdir(parents=True, exist_ok=True)
             checksum = hashlib.sha256()
@@ -406,8 +423,9 @@ def extract(archive: Path, target: Path, progress: Report = lambda state: None) 
             f"{archive.name} holds one name twice: {error.filename}, refused"
         ) from error
     except _DAMAGE as error:
+        # Faults of the target are not the archive's.
         if isinstance(error, OSError) and (error.filename is not None or error.errno in DISK_FULL):
-            raise  # of the target, not of the archive
+            raise
         size = archive.stat().st_size
         raise SequenceError(
             f"{archive.name} is damaged ({size} bytes): {error}", "fetch it again"
@@ -429,6 +447,7 @@ def safe_name(archive: Path, name: str) -> PurePosixPath:
 
 
 def _check(archive: Path, size: int, members: int = 0) -> None:
+    """Refuse an archive that unpacks to more bytes, or holds more members, than is allowed."""
     limit = archive.stat().st_size * MAX_RATIO + MAX_SLACK
     if size > limit:
         raise SequenceError(f"{archive.name} unpacks to more than {limit / 1e9:.1f} GB, refused")
@@ -442,6 +461,7 @@ def _zip_members(archive: Path) -> Iterator[tuple[str, IO[bytes]]]:
         entries = source.infolist()
         _check(archive, sum(entry.file_size for entry in entries), len(entries))
         for entry in entries:
+            # Unix's type of the file: not stated, a regular file or a folder.
             if (entry.external_attr >> 16) & 0o170000 not in (0, 0o100000, 0o040000):
                 raise SequenceError(
                     f"{archive.name} holds {entry.filename!r}, no regular file, refused"
@@ -458,6 +478,7 @@ def _zip_members(archive: Path) -> Iterator[tuple[str, IO[bytes]]]:
 
 
 def _tar_members(archive: Path) -> Iterator[tuple[str, IO[bytes]]]:
+    """Names and streams of all regular files, compressed or not, in the order of the archive."""
     with archive.open("rb") as start:
         compressed = start.read(2) == b"\x1f\x8b"
     with gzip.open(archive) if compressed else archive.open("rb") as file:
@@ -465,9 +486,11 @@ def _tar_members(archive: Path) -> Iterator[tuple[str, IO[bytes]]]:
         with tarfile.open(fileobj=cast("IO[bytes]", counted), mode="r|", tarinfo=_Header) as tar:
             for number, entry in enumerate(tar, 1):
                 _check(archive, 0, number)
-                tar.members = []  # type: ignore[attr-defined]  # it would keep the header of every file
+                # it would keep the header of every file
+                tar.members = []  # type: ignore[attr-defined]
                 if entry.isdir():
-                    if PurePosixPath(entry.name).parts:  # "." names the archive itself
+                    # "." names the archive itself
+                    if PurePosixPath(entry.name).parts:
                         safe_name(archive, entry.name)
                     continue
                 stream = tar.extractfile(entry) if entry.isreg() and not entry.issparse() else None

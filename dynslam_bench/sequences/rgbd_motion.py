@@ -18,15 +18,21 @@ from dynslam_bench.geometry import Array, Camera, Trajectory, se3
 Pixels = NDArray[np.float32]
 
 CORNERS = 300
+"""Corners that are detected in a frame, at most."""
 FAR_ENOUGH_PX = 25.0
 """Median displacement of the corners at which a pair of frames ends: far above the tracker's noise."""
 MOST_FRAMES_APART = 6
+"""A pair ends after so many frames, even if the corners have moved less."""
 INLIER_PX = 4.0
 """Reprojection error of an inlier: leaves room for a rolling shutter and for the depth sensor's noise."""
 LEAST_INLIERS = 25
+"""Corners that have to agree on a motion, and this share of those tracked: `LEAST_INLIER_SHARE`."""
 LEAST_INLIER_SHARE = 0.4
+"""See `LEAST_INLIERS`."""
 _BACK_AND_FORTH_PX = 0.7
+"""A corner that is tracked back ends at most so far from where it began."""
 _DEPTH_EDGE = 0.1
+"""Depths around a corner that differ by more, relative to the nearest, are the edge of a surface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,64 +76,77 @@ def rgbd_pairs(frames: Sequence[Frame], camera: Camera) -> Iterator[RgbdPair]:
         camera: Its intrinsics; the motion holds in their units.
     """
     start: Pixels = np.zeros((0, 2), np.float32)
-    key = frames[0]
-    last = np.zeros((0, 0), np.uint8)
+    first = frames[0]
+    last_gray = np.zeros((0, 0), np.uint8)
     points = start
     for frame in frames:
         gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
         due = True
+        # Track the corners from the last frame, and end the pair where they have moved far enough.
         if len(points):
-            tracked, good = follow_corners(last, gray, points, points, _BACK_AND_FORTH_PX)
+            tracked, good = follow_corners(last_gray, gray, points, points, _BACK_AND_FORTH_PX)
             start = start[good]
             points = tracked[good]
             moved = float(np.median(np.linalg.norm(points - start, axis=1))) if len(points) else 0.0
-            due = frame.index - key.index >= MOST_FRAMES_APART or moved >= FAR_ENOUGH_PX
+            due = frame.index - first.index >= MOST_FRAMES_APART or moved >= FAR_ENOUGH_PX
             if len(points) >= LEAST_INLIERS and due:
-                yield measure_pair(key, frame, start, points, camera)
+                yield measure_pair(first, frame, start, points, camera)
+        # Begin the next pair, also where too few corners are left.
         if len(points) < LEAST_INLIERS or due:
-            key = frame
+            first = frame
             start = _corners(gray, frame.depth)
             points = start
-        last = gray
-    if frames[-1].index - key.index > 1 and len(points) >= LEAST_INLIERS:
-        yield measure_pair(key, frames[-1], start, points, camera)
+        last_gray = gray
+    if frames[-1].index - first.index > 1 and len(points) >= LEAST_INLIERS:
+        yield measure_pair(first, frames[-1], start, points, camera)
 
 
 def measure_pair(
     first: Frame, second: Frame, start: Pixels, end: Pixels, camera: Camera
 ) -> RgbdPair:
     """The pair of two frames whose corners `start` ``[N, 2]`` were found again at `end` ``[N, 2]``, raw pixels."""
+    # Undistorted pixels in both frames, and points ``[N, 3]`` in the first camera.
     x, y = np.round(start).astype(int).T
     depth = np.asarray(first.depth[y, x], dtype=np.float64)
-    a = camera.undistort_points(start)
-    b = camera.undistort_points(end)
-    points = camera.unproject(a, depth)
-    inliers = np.zeros(len(a), bool)
+    pixels_first = camera.undistort_points(start)
+    pixels_second = camera.undistort_points(end)
+    points = camera.unproject(pixels_first, depth)
+
+    # PnP with RANSAC, refined on the inliers.
+    inliers = np.zeros(len(points), bool)
     pose = None
     cv2.setRNGSeed(0)
     success, rotation, translation, index = cv2.solvePnPRansac(
         points,
-        b,
+        pixels_second,
         camera.matrix,
         None,
         iterationsCount=200,
         reprojectionError=INLIER_PX,
         confidence=0.999,
     )
-    if (
-        success
-        and index is not None
-        and len(index) >= max(LEAST_INLIERS, LEAST_INLIER_SHARE * len(points))
-    ):
+    enough = max(LEAST_INLIERS, LEAST_INLIER_SHARE * len(points))
+    if success and index is not None and len(index) >= enough:
         inliers[np.asarray(index).reshape(-1)] = True
         rotation, translation = cv2.solvePnPRefineLM(
-            points[inliers], b[inliers], camera.matrix, None, rotation, translation
+            points[inliers], pixels_second[inliers], camera.matrix, None, rotation, translation
         )
-        pose = se3.inverse(se3.from_matrix(translation[:, 0], cv2.Rodrigues(rotation)[0]))
-    displacement = float(np.median(np.linalg.norm(b - a, axis=1)))
-    share = float(np.mean(first.depth[::4, ::4] > 0))
-    pose = pose if pose is not None and np.isfinite(pose).all() else None
-    return RgbdPair(first.index, second.index, a, depth, b, inliers, pose, displacement, share)
+        T_second_first = se3.from_matrix(translation[:, 0], cv2.Rodrigues(rotation)[0])
+        pose = se3.inverse(T_second_first)
+        if not np.isfinite(pose).all():
+            pose = None
+    displacements = np.linalg.norm(pixels_second - pixels_first, axis=1)
+    return RgbdPair(
+        first=first.index,
+        second=second.index,
+        pixels_first=pixels_first,
+        depth_first=depth,
+        pixels_second=pixels_second,
+        inliers=inliers,
+        T_first_second=pose,
+        displacement_px=float(np.median(displacements)),
+        depth_share=float(np.mean(first.depth[::4, ::4] > 0)),
+    )
 
 
 def _corners(gray: NDArray[np.uint8], depth: NDArray[np.float32]) -> Pixels:
@@ -137,11 +156,8 @@ def _corners(gray: NDArray[np.uint8], depth: NDArray[np.float32]) -> Pixels:
     far = cv2.dilate(depth, window)
     mask = ((near > 0) & (far - near < _DEPTH_EDGE * near)).astype(np.uint8)
     corners = cv2.goodFeaturesToTrack(gray, CORNERS, 0.01, max(6, gray.shape[1] // 60), mask=mask)
-    return (
-        np.zeros((0, 2), np.float32)
-        if corners is None
-        else np.asarray(corners, np.float32).reshape(-1, 2)
-    )
+    # OpenCV gives None where there is no corner.
+    return np.asarray([] if corners is None else corners, np.float32).reshape(-1, 2)
 
 
 def follow_corners(
@@ -161,13 +177,13 @@ def follow_corners(
     back, status_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, points.copy(), **options)
     good = (status.reshape(-1) == 1) & (status_back.reshape(-1) == 1)
     good &= np.linalg.norm(back - points, axis=1) < tolerance_px
-    good &= (there >= 0).all(axis=1) & (there <= (after.shape[1] - 1, after.shape[0] - 1)).all(
-        axis=1
-    )
+    height, width = after.shape
+    good &= (there >= 0).all(axis=1) & (there <= (width - 1, height - 1)).all(axis=1)
     return np.asarray(there, np.float32), np.asarray(good, np.bool_)
 
 
 _EXPLAINED_PX = 3.0
+"""A motion explains a corner that it carries to within this distance of where it is seen."""
 _LENGTHS = (0.2, 1.0, 5.0)
 """Factors of the translations that are tried: of depth in millimetres that is read as TUM's, and the reverse."""
 
@@ -187,25 +203,32 @@ def explained_share(pairs: Sequence[RgbdPair], relative: Array, camera: Camera) 
     Returns:
         The mean share, with the factor of the translations for which it is largest.
     """
-    shares = []
+    T_second_first = se3.inverse(relative)
+    means = []
     for length in _LENGTHS:
-        parts = []
-        for pair, back in zip(pairs, se3.inverse(relative), strict=True):
+        shares = []
+        for pair, T in zip(pairs, T_second_first, strict=True):
             points = camera.unproject(pair.pixels_first, pair.depth_first)
-            pixels = camera.project(points @ back[:3, :3].T + length * back[:3, 3])
-            off = np.linalg.norm(pixels - pair.pixels_second, axis=1)
-            parts.append(float((off < _EXPLAINED_PX).mean()))
-        shares.append(float(np.mean(parts)))
-    return max(shares)
+            pixels = camera.project(points @ T[:3, :3].T + length * T[:3, 3])
+            error = np.linalg.norm(pixels - pair.pixels_second, axis=1)
+            shares.append(float((error < _EXPLAINED_PX).mean()))
+        means.append(float(np.mean(shares)))
+    return max(means)
 
 
 # Motions of a ground truth, read in several conventions, compared with the measured ones.
 
 
 READINGS = ("as stored", "inverted", "w first", "w first, inverted", "rotations inverted")
+"""Conventions in which the poses of a file may be written."""
 ROTATION_NOISE = np.radians(0.25)
+"""Standard deviation of a measured rotation."""
 TRANSLATION_NOISE = 0.006
-"""Of a measured motion: as a part of the median depth."""
+"""Standard deviation of a measured translation, as a part of the median depth."""
+_FEWEST_MOTIONS = 5
+"""Motions that are needed to compare a truth with them."""
+_SLACK_S = 0.005
+"""So far beyond its ends a truth still has poses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,6 +271,7 @@ class TruthMotion:
     def __init__(self, truth: Trajectory, reading: str = READINGS[0]) -> None:
         self.poses = read_as(truth.T_world_cam, reading)
         self.stamps = truth.timestamps
+        # Rotation vectors from each pose to the next; a wider gap than some steps is a hole.
         steps = se3.inverse(self.poses[:-1]) @ self.poses[1:]
         gaps = np.diff(self.stamps)
         self._turns = se3.log(steps)[:, 3:] if len(steps) else np.zeros((0, 3))
@@ -257,27 +281,26 @@ class TruthMotion:
         """Poses ``[N, 4, 4]`` and whether the truth has them: not beyond its ends nor in its holes."""
         if len(self.stamps) < 2:
             return np.tile(np.eye(4), (len(stamps), 1, 1)), np.zeros(len(stamps), bool)
-        index = np.clip(
-            np.searchsorted(self.stamps, stamps, side="right") - 1, 0, len(self.stamps) - 2
-        )
+        # The poses before and after each stamp, and how far it lies between them.
+        after = np.searchsorted(self.stamps, stamps, side="right")
+        index = np.clip(after - 1, 0, len(self.stamps) - 2)
         low = self.stamps[index]
         high = self.stamps[index + 1]
         share = np.clip((stamps - low) / (high - low), 0, 1)[:, None]
+        # Interpolate rotations along the shortest turn, and positions along a line.
         turn = np.pad(share * self._turns[index], ((0, 0), (3, 0)))
-        slack = 0.005
-        poses = se3.with_rotation(
-            self.poses[index], self.poses[index, :3, :3] @ se3.exp(turn)[:, :3, :3]
-        )
+        R = self.poses[index, :3, :3] @ se3.exp(turn)[:, :3, :3]
+        poses = se3.with_rotation(self.poses[index], R)
         poses[:, :3, 3] += share * (self.poses[index + 1, :3, 3] - self.poses[index, :3, 3])
-        inside = (stamps >= self.stamps[0] - slack) & (stamps <= self.stamps[-1] + slack)
+        inside = (stamps >= self.stamps[0] - _SLACK_S) & (stamps <= self.stamps[-1] + _SLACK_S)
         return poses, inside & (high - low <= self._widest)
 
     def between(self, start: Array, end: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
         """Poses at `start`, relative poses from there to `end`, their rotation vectors, and which of them there are."""
-        (first, valid) = self.at(start)
-        (second, valid_too) = self.at(end)
+        first, first_valid = self.at(start)
+        second, second_valid = self.at(end)
         relative = se3.inverse(first) @ second
-        return first, relative, se3.log(relative)[:, 3:], valid & valid_too
+        return first, relative, se3.log(relative)[:, 3:], first_valid & second_valid
 
 
 def read_as(poses: Array, reading: str) -> Array:
@@ -286,7 +309,9 @@ def read_as(poses: Array, reading: str) -> Array:
         poses = se3.from_wxyz_read_as_xyzw(poses)
     if reading == "rotations inverted":
         poses = se3.with_rotation(poses, np.swapaxes(poses[:, :3, :3], 1, 2))
-    return se3.inverse(poses) if reading in ("inverted", "w first, inverted") else poses
+    if reading in ("inverted", "w first, inverted"):
+        return se3.inverse(poses)
+    return poses
 
 
 def agreement(measured: Array, true: Array, bounds: tuple[float, float] = (1e-6, 1e6)) -> float:
@@ -296,12 +321,13 @@ def agreement(measured: Array, true: Array, bounds: tuple[float, float] = (1e-6,
     """
     true = best_gain(measured, true, *bounds) * true
     size = np.linalg.norm(measured, axis=1) + np.linalg.norm(true, axis=1)
-    off = np.linalg.norm(measured - true, axis=1) / np.maximum(size, 1e-12)
-    order = np.argsort(off)
+    difference = np.linalg.norm(measured - true, axis=1) / np.maximum(size, 1e-12)
+    # The median of the differences, weighted by the vectors' size.
+    order = np.argsort(difference)
     total = np.cumsum(size[order])
     if not len(total) or total[-1] <= 0:
         return 0.0
-    return 1.0 - float(off[order][np.searchsorted(total, total[-1] / 2)])
+    return 1.0 - float(difference[order][np.searchsorted(total, total[-1] / 2)])
 
 
 ROTATION_GAIN = (0.4, 2.5)
@@ -321,11 +347,12 @@ def rotation_between(measured: Array, true: Array, *, proper: bool = True) -> Ar
     X = np.eye(3)
     gain = 1.0 / best_gain(measured, true)
     for _ in range(4):
+        # Orthogonal Procrustes, then weights by the distance of each vector.
         left, _, right = np.linalg.svd((true * weight[:, None]).T @ measured)
         sign = np.linalg.det(left @ right) if proper else 1.0
         X = left @ np.diag([1.0, 1.0, sign]) @ right
-        off = np.linalg.norm(true - gain * measured @ X.T, axis=1)
-        weight = 1.0 / (1.0 + (off / max(float(np.median(off)), 1e-12)) ** 2)
+        distance = np.linalg.norm(true - gain * measured @ X.T, axis=1)
+        weight = 1.0 / (1.0 + (distance / max(float(np.median(distance)), 1e-12)) ** 2)
     return X
 
 
@@ -358,7 +385,7 @@ class Match:
 
     @property
     def clearest(self) -> float:
-        """The same, or the rotations' agreement where it is better and they are clear: people spoil it least."""
+        """`total`, or the rotations' agreement where it is better and they are clear: people spoil it least."""
         return max(self.total, self.rotation) if self.weights[0] >= 0.5 else self.total
 
 
@@ -371,15 +398,27 @@ def match(motions: Motions, truth: TruthMotion, reading: str, shift_s: float) ->
     """Compare the motions with those of a truth under a shift in time."""
     _, relative, turns, valid = truth.between(motions.start + shift_s, motions.end + shift_s)
     share = float(valid.mean()) if len(valid) else 0.0
-    if valid.sum() < 5:
+    if valid.sum() < _FEWEST_MOTIONS:
         return Match(reading, shift_s, share)
     rotation = motions.rotation[valid]
     translation = motions.translation[valid]
-    true = relative[valid, :3, 3]
-    noise = ((rotation, ROTATION_NOISE), (translation, TRANSLATION_NOISE * motions.depth_m))
-    snr, snr_t = (
-        float(np.median(np.linalg.norm(vectors, axis=1))) / sigma for vectors, sigma in noise
+    true_rotation = turns[valid]
+    true_translation = relative[valid, :3, 3]
+    return Match(
+        reading=reading,
+        shift_s=shift_s,
+        share=share,
+        rotation=agreement(rotation, true_rotation, ROTATION_GAIN),
+        translation=agreement(translation, true_translation),
+        weights=(
+            _weight(rotation, ROTATION_NOISE),
+            _weight(translation, TRANSLATION_NOISE * motions.depth_m),
+        ),
+        gain=best_gain(translation, true_translation),
     )
-    weights = snr**2 / (4 + snr**2), snr_t**2 / (4 + snr_t**2)
-    alike = agreement(rotation, turns[valid], ROTATION_GAIN), agreement(translation, true)
-    return Match(reading, shift_s, share, *alike, weights, best_gain(translation, true))
+
+
+def _weight(vectors: Array, noise: float) -> float:
+    """Weight of vectors ``[N, 3]`` by their median length over the noise: near 0 below it, near 1 far above."""
+    snr = float(np.median(np.linalg.norm(vectors, axis=1))) / noise
+    return snr**2 / (4 + snr**2)

@@ -61,7 +61,7 @@ class SequenceView(Wrapped):
 
     @property
     def timestamps_ns(self) -> NDArray[np.int64]:
-        """The same in nanoseconds."""
+        """Stamps of the selected frames in nanoseconds."""
         return timestamps_ns(self.base)[self.range.start : self.range.stop : self.range.step]
 
     @property

@@ -27,12 +27,12 @@ from dynslam_bench.sequences import (
 )
 from dynslam_bench.sequences import compose as composing
 from dynslam_bench.sequences.calibration import calibrate
+from dynslam_bench.sequences.camera_checks import axes_text
 from dynslam_bench.sequences.cameras import read_camera, write_camera
 from dynslam_bench.sequences.compose import compose
 from dynslam_bench.sequences.doctor import (
     Diagnosis,
     Finding,
-    _turn,
     diagnose,
     examine,
     stretches,
@@ -249,7 +249,7 @@ def test_the_cure_of_turned_axes_is_their_inverse_and_a_rotation(diagnosed):
     cure = matrix_of(re.search(r"\[(.*)\]", finding.cure).group(1))
     np.testing.assert_allclose(BODY[:3, :3] @ cure, np.eye(3), atol=0.02)
     for angle in (30, 40, 50, 85):
-        cure = matrix_of(_turn(Rotation.from_euler("x", angle, degrees=True).as_matrix()))
+        cure = matrix_of(axes_text(Rotation.from_euler("x", angle, degrees=True).as_matrix()))
         np.testing.assert_allclose(cure @ cure.T, np.eye(3), atol=0.005)
 
 

@@ -145,27 +145,26 @@ def list_folder(folder: Path, name: str, fps: float | None) -> ImageList:
         )
     shown = sorted(path for path in images.iterdir() if not path.name.startswith("."))
     paths = [path for path in shown if path.suffix.lower() in _IMAGES]
-    rows: list[tuple[int | None, str]]
+    files = [f"{name}/{path.name}" for path in paths]
+    # Stamps by whole numbers, or each by its own name.
+    stamps: Sequence[int | None]
     missing = 0
     if paths and all(path.stem.isascii() and path.stem.isdigit() for path in paths):
-        numbers = [int(path.stem) for path in paths]
-        stamps, missing = stamps_of_numbers(
-            numbers, fps, [f"{name}/{path.name}" for path in paths], folder
-        )
-        rows = [(stamp, f"{name}/{path.name}") for stamp, path in zip(stamps, paths, strict=True)]
+        stamps, missing = stamps_of_numbers([int(path.stem) for path in paths], fps, files, folder)
     else:
         hint = f"write {name}.txt with lines 'timestamp {name}/FILE'"
-        rows = [(_number(path.stem, images, hint), f"{name}/{path.name}") for path in paths]
-    listed = make_image_list(
-        sorted(rows, key=lambda row: (row[0] or 0, row[1])), described=str(images)
-    )
+        stamps = [_number(path.stem, images, hint) for path in paths]
+    rows = sorted(zip(stamps, files, strict=True), key=lambda row: (row[0] or 0, row[1]))
+    listed = make_image_list(rows, described=str(images))
     more = Counter({"files that are no images": len(shown) - len(paths), LEFT_OUT: missing})
     return ImageList(listed.stamps_ns, listed.files, listed.irregular + more)
 
 
 def rate_of(images: ImageList) -> float | None:
     """Frames a second by the median of the stamps, to 6 decimals; None for one image."""
-    return round(float(1 / np.median(np.diff(images.stamps))), 6) if len(images) > 1 else None
+    if len(images) < 2:
+        return None
+    return round(float(1 / np.median(np.diff(images.stamps))), 6)
 
 
 # Images that are named by whole numbers: stamps, or frame numbers.
@@ -273,7 +272,8 @@ def make_image_list(rows: list[tuple[int | None, str]], *, described: str) -> Im
     """
     named = [(stamp, name) for stamp, name in rows if name]
     finite = [(stamp, name) for stamp, name in named if stamp is not None]
-    unique = dict(finite)  # the last of several equal stamps wins, as in TUM's associate.py
+    # The last of several equal stamps wins, as in TUM's associate.py.
+    unique = dict(finite)
     if not unique:
         raise SequenceError(
             f"{described} lists no image ({len(rows)} lines, {len(named) - len(finite)} without a stamp)"
@@ -311,6 +311,7 @@ def read_stamped_lines(path: Path) -> list[tuple[int | None, list[str]]]:
 
 
 def _number(text: str, where: object, hint: str = "") -> int | None:
+    """Nanoseconds of a stamp in seconds, None where it is not finite; says where it looks like another unit."""
     try:
         return parse_ns(text) if math.isfinite(float(text)) else None
     except ValueError:
@@ -415,10 +416,10 @@ def checked_camera(
         raise SequenceError(
             f"{where}: depth_factor is {depth_factor:g} raw units a metre, expected more than 0"
         )
-    (width, height) = size
-    (fx, fy) = focal
-    (cx, cy) = centre
-    (k1, k2, p1, p2, k3) = (*distortion, *[0.0] * 5)[:5]
+    width, height = size
+    fx, fy = focal
+    cx, cy = centre
+    k1, k2, p1, p2, k3 = (*distortion, *[0.0] * 5)[:5]
     return Camera(int(width), int(height), fx, fy, cx, cy, (k1, k2, p1, p2, k3), depth_factor)
 
 
@@ -522,11 +523,9 @@ def camera_on_body(sensor: Mapping[str, Any], where: str) -> Array:
     Raises:
         SequenceError: It is no rigid transformation.
     """
-    return (
-        np.eye(4)
-        if sensor.get("T_BS") is None
-        else rigid(numbers(sensor, "T_BS", 16, where), f"{where}: T_BS")
-    )
+    if sensor.get("T_BS") is None:
+        return np.eye(4)
+    return rigid(numbers(sensor, "T_BS", 16, where), f"{where}: T_BS")
 
 
 def camera_truth(
@@ -545,9 +544,8 @@ def camera_truth(
     if not keep.any():
         return None
     notes = FileNotes(lines=len(rows), zero_quaternions=int(np.count_nonzero(~keep)))
-    return ordered_file(
-        stamps[keep], se3.from_quaternion(rows[keep, :3], rows[keep, 3:]) @ T_body_cam, notes
-    )
+    T_world_body = se3.from_quaternion(rows[keep, :3], rows[keep, 3:])
+    return ordered_file(stamps[keep], T_world_body @ T_body_cam, notes)
 
 
 # Tables in CSV whose stamps are nanoseconds, as EuRoC and VSLAM-LAB write them.
@@ -624,9 +622,10 @@ def nanoseconds(texts: list[str], path: Path) -> NDArray[np.int64]:
     stamps = []
     for text in texts:
         try:
-            stamps.append(
-                int(text) if text.isdigit() and len(text) < 19 else parse_ns(f"{Decimal(text)}e-9")
-            )
+            if text.isdigit() and len(text) < 19:
+                stamps.append(int(text))
+            else:
+                stamps.append(parse_ns(f"{Decimal(text)}e-9"))
         except (ValueError, ArithmeticError):
             raise SequenceError(f"{path}: '{text[:40]}' is not a stamp in nanoseconds") from None
     return np.array(stamps, dtype=np.int64)

@@ -15,12 +15,13 @@ from dynslam_bench.core import SequenceError, inside, translate_errors
 from dynslam_bench.core.fingerprint import contents_digest
 from dynslam_bench.core.images import read_image
 from dynslam_bench.core.records import digest
-from dynslam_bench.geometry import Camera, associate, nearest_gap
+from dynslam_bench.geometry import Camera, Trajectory, associate, nearest_gap
 from dynslam_bench.geometry.rigs import in_camera_axes
 from dynslam_bench.sequences.readers.files import Contents, ImageList
 from dynslam_bench.sequences.view import Masks
 
 GROUND_TRUTH_DT_S = 0.02
+"""A frame has a true pose if there is one within this time."""
 SLOWEST_S = 5.0
 """Frames further apart by the median are no video: their stamps are in another unit than seconds."""
 FASTEST_S = 0.0005
@@ -97,59 +98,43 @@ class RecordedSequence:
         self.split = split
         self._any_depth_size = any_depth_size
         self._furthest_m = contents.furthest_m
-        delayed = contents.depth.stamps_ns + round(1e9 * camera.depth_delay_s)
-        colour = contents.colour
-        depth = replace(contents.depth, stamps_ns=delayed)
+
+        # The images that are there, the depth images' stamps as the camera delays them.
         people = contents.people
-        for file in (*colour.files, *depth.files, *(people.files if people else ())):
+        listed = [*contents.colour.files, *contents.depth.files]
+        if people is not None:
+            listed += people.files
+        for file in listed:
             inside(folder, file, where=f"a list of images in {folder}", kind=SequenceError)
+        delayed = contents.depth.stamps_ns + round(1e9 * camera.depth_delay_s)
         paired = contents.paired and not camera.depth_delay_s
         tolerated = 0.0 if paired else MISSING_TOLERATED
-        colour = _existing(folder, colour, "colour", tolerated)
+        colour = _existing(folder, contents.colour, "colour", tolerated)
+        depth = replace(contents.depth, stamps_ns=delayed)
         depth = _existing(folder, depth, "depth", tolerated)
-        every = np.arange(len(colour))
-        first, second = (
-            (every, every)
-            if paired
-            else associate(colour.stamps, depth.stamps, max_time_difference_s)
-        )
-        if not len(first):
-            gap = float(nearest_gap(colour.stamps, depth.stamps).min())
-            raise SequenceError(
-                f"none of the {len(colour)} colour images of {folder} has a depth image within "
-                f"{max_time_difference_s:g} s (closest: {gap:.3f} s)",
-                "do both lists use the same clock?",
-            )
+
+        # Pairs of a colour and a depth image.
+        if paired:
+            first = second = np.arange(len(colour))
+        else:
+            first, second = _associated(folder, colour, depth, max_time_difference_s)
         self.timestamps_ns = colour.stamps_ns[first]
         self.timestamps = colour.stamps[first]
-        self.timestamps_ns.flags.writeable = self.timestamps.flags.writeable = False
+        self.timestamps_ns.flags.writeable = False
+        self.timestamps.flags.writeable = False
         _check_unit(folder, self.timestamps)
         self.fps, rate_note = _frame_rate(fps, self.timestamps)
         self.depth_timestamps = depth.stamps[second]
         self._colour = [colour.files[i] for i in first]
         self._depth = [depth.files[i] for i in second]
+
+        # Masks of people, and the truth in the camera's axes.
         self._people: list[str] = []
         if people is not None:
-            people = _existing(folder, people, "mask", 0.0)
-            at = np.searchsorted(people.stamps_ns, self.timestamps_ns).clip(max=len(people) - 1)
-            unmasked = int(np.count_nonzero(people.stamps_ns[at] != self.timestamps_ns))
-            if unmasked:
-                raise SequenceError(
-                    f"{unmasked} of {len(self)} frames of {folder} have no mask of their stamp"
-                )
-            self._people = [people.files[i] for i in at]
+            self._people = self._mask_files(_existing(folder, people, "mask", 0.0))
         self.masks: MaskSource | None = Masks(self._masks_of) if self._people else None
-        self.ground_truth = contents.truth
-        R_body_cam = camera.R_body_cam
-        turned = ""
-        if (
-            contents.truth is not None
-            and R_body_cam is not None
-            and not np.array_equal(R_body_cam, np.eye(3))
-        ):
-            poses = in_camera_axes(contents.truth.T_world_cam, R_body_cam)
-            self.ground_truth = contents.truth.with_poses(poses)
-            turned = "ground truth: orientations of another body are turned into the camera's axes"
+        self.ground_truth, turned = _truth_of_camera(contents.truth, camera)
+
         counts = {
             "colour images without depth": len(colour) - len(self),
             "depth images unused": len(depth) - len(self),
@@ -168,7 +153,18 @@ class RecordedSequence:
             rate_note,
         ]
         self.dropped = "; ".join(part for part in parts if part)
+        # Most damage shows in the first frame.
         self[0]
+
+    def _mask_files(self, people: ImageList) -> list[str]:
+        """The mask of each frame; all have to have one of their stamp."""
+        at = np.searchsorted(people.stamps_ns, self.timestamps_ns).clip(max=len(people) - 1)
+        unmasked = int(np.count_nonzero(people.stamps_ns[at] != self.timestamps_ns))
+        if unmasked:
+            raise SequenceError(
+                f"{unmasked} of {len(self)} frames of {self.folder} have no mask of their stamp"
+            )
+        return [people.files[i] for i in at]
 
     def _count_poses(self) -> dict[str, int]:
         """How many poses the ground truth has, and how many frames have none."""
@@ -177,9 +173,9 @@ class RecordedSequence:
         if truth is None:
             return {}
         without = int(np.count_nonzero(nearest_gap(stamps, truth.timestamps) >= GROUND_TRUTH_DT_S))
-        within = truth.timestamps[
-            (truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])
-        ]
+        # The largest time without a pose, the first and the last frame included.
+        times = truth.timestamps
+        within = times[(times >= stamps[0]) & (times <= stamps[-1])]
         hole = float(np.diff(np.concatenate([stamps[:1], within, stamps[-1:]])).max(initial=0.0))
         gap = f"frames without ground truth within {GROUND_TRUTH_DT_S:g} s (largest hole {hole:.2f} s)"
         return {"ground-truth poses": len(truth), gap: without}
@@ -196,9 +192,9 @@ class RecordedSequence:
     @cached_property
     def _digest(self) -> str:
         truth = self.ground_truth
-        poses = (
-            None if truth is None else [truth.timestamps_ns.tolist(), truth.T_world_cam.tolist()]
-        )
+        poses = None
+        if truth is not None:
+            poses = [truth.timestamps_ns.tolist(), truth.T_world_cam.tolist()]
         try:
             # Text, not paths: joining those takes longer than asking for the files' times.
             files = (*self._colour, *self._depth, *self._people)
@@ -232,6 +228,7 @@ class RecordedSequence:
         return Frame(index, float(self.timestamps[index]), rgb, depth)
 
     def _masks_of(self, index: int) -> FrameMasks:
+        """The masks of a frame; 0 is the background, every other value is a person who moves."""
         path = self.folder / self._people[index]
         size = (self.camera.width, self.camera.height)
         people = read_image(path, size=size, mismatch="unlike its colour image", kind=SequenceError)
@@ -244,6 +241,30 @@ class RecordedSequence:
         return f"<{type(self).__name__} {self.id}: {len(self)} frames in {self.folder}>"
 
 
+def _associated(
+    folder: Path, colour: ImageList, depth: ImageList, max_time_difference_s: float
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Indices of the colour and the depth images that are paired by their stamps, one pair at least."""
+    first, second = associate(colour.stamps, depth.stamps, max_time_difference_s)
+    if not len(first):
+        gap = float(nearest_gap(colour.stamps, depth.stamps).min())
+        raise SequenceError(
+            f"none of the {len(colour)} colour images of {folder} has a depth image within "
+            f"{max_time_difference_s:g} s (closest: {gap:.3f} s)",
+            "do both lists use the same clock?",
+        )
+    return first, second
+
+
+def _truth_of_camera(truth: Trajectory | None, camera: Camera) -> tuple[Trajectory | None, str]:
+    """The truth with orientations in the camera's axes, and a phrase where they were another body's."""
+    R_body_cam = camera.R_body_cam
+    if truth is None or R_body_cam is None or np.array_equal(R_body_cam, np.eye(3)):
+        return truth, ""
+    turned = truth.with_poses(in_camera_axes(truth.T_world_cam, R_body_cam))
+    return turned, "ground truth: orientations of another body are turned into the camera's axes"
+
+
 def _frame_rate(stated: float | None, stamps: NDArray[np.float64]) -> tuple[float, str]:
     """The nominal frame rate in Hz, and a phrase where the stamps say another one than is stated."""
     if len(stamps) < 2:
@@ -254,8 +275,10 @@ def _frame_rate(stated: float | None, stamps: NDArray[np.float64]) -> tuple[floa
     factor = max(measured / stated, stated / measured)
     if factor < RATES_AGREE:
         return stated, ""
-    said = f"fps = {stated:g} is stated, the stamps say {measured:.4g}"
-    return (stated, said) if factor < RATES_CONTRADICT else (measured, f"{said}, which is taken")
+    note = f"fps = {stated:g} is stated, the stamps say {measured:.4g}"
+    if factor < RATES_CONTRADICT:
+        return stated, note
+    return measured, f"{note}, which is taken"
 
 
 def _check_unit(folder: Path, stamps: NDArray[np.float64]) -> None:
@@ -271,6 +294,7 @@ def _check_unit(folder: Path, stamps: NDArray[np.float64]) -> None:
         )
     if interval <= SLOWEST_S:
         return
+    # The units in which the stamps would be those of 1 to 1000 frames a second.
     units = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
     likely = [
         f"{name} ({per_s / interval:.3g} Hz)"
@@ -285,13 +309,14 @@ def _check_unit(folder: Path, stamps: NDArray[np.float64]) -> None:
 
 def _existing(folder: Path, images: ImageList, kind: str, tolerated: float) -> ImageList:
     """The images whose files are there; a share may be missing, as in some published sequences, and none empty."""
-    sizes = [
-        path.stat().st_size if path.is_file() else None
-        for path in (folder / file for file in images.files)
-    ]
-    for state, size_then, allowed in (("missing", None, tolerated), ("empty (0 bytes)", 0, 0.0)):
+    # Bytes of each file, None where it is missing.
+    sizes = []
+    for file in images.files:
+        path = folder / file
+        sizes.append(path.stat().st_size if path.is_file() else None)
+    for state, fault_size, allowed in (("missing", None, tolerated), ("empty (0 bytes)", 0, 0.0)):
         at_fault = [
-            file for file, size in zip(images.files, sizes, strict=True) if size == size_then
+            file for file, size in zip(images.files, sizes, strict=True) if size == fault_size
         ]
         if len(at_fault) > allowed * len(images):
             raise SequenceError(

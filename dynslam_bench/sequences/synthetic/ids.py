@@ -5,17 +5,17 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from dynslam_bench.core import SequenceError, did_you_mean
+from dynslam_bench.sequences.synthetic.buildings import LOOPS
 from dynslam_bench.sequences.synthetic.families import (
     CHANGING,
     CONDITIONS,
     CROWDS,
     FAST,
-    LOOPS,
-    OBJECTS,
     REPLICAS,
     SYNCHRONOUS,
     TRACKING,
 )
+from dynslam_bench.sequences.synthetic.moving_objects import OBJECTS
 from dynslam_bench.sequences.synthetic.scene import Variant
 from dynslam_bench.sequences.synthetic.settings import DEFAULT_FRAMES, HELD_OUT_SCENES, MAX_FRAMES
 

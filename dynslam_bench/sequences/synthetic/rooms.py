@@ -26,6 +26,10 @@ class Plan:
         right_x: Right wall.
         desk_y: Front edge of the main desk.
         desk_x: Middle of the main desk.
+        monitors: How many stand on a desk.
+        shelf_side: 1 puts the shelf to the right and the cabinet to the left, -1 the other way.
+        posters: How many hang on the back wall.
+        mirrored: Whether a desk's drawers are on its right.
         tints: Colours by thing.
     """
 
@@ -59,9 +63,11 @@ def pick_one(rng: np.random.Generator, scene: int, pool: list[int]) -> int:
 
 def plan_room(scene: int, number: int | None = None) -> Plan:
     """Draw the plan of a scene's room, or of one of its several rooms."""
-    rng = stream(scene, "synthetic", "room", *(() if number is None else (number,)))
+    one_of_several = () if number is None else (number,)
+    rng = stream(scene, "synthetic", "room", *one_of_several)
 
     def color(low: float, high: float, spread: float) -> Array:
+        """A grey within bounds, and a deviation of each channel from it."""
         base = pick(rng, scene, low, high)
         return np.clip(base + spread * (rng.random(3) - 0.5), 0.03, 1.0)
 
@@ -93,6 +99,11 @@ def plan_room(scene: int, number: int | None = None) -> Plan:
     )
 
 
+def glare_window(plan: Plan) -> tuple[float, float, float]:
+    """The place beside the back wall where glare comes from, metres."""
+    return plan.left_x * 0.55, plan.back_y, 2.15
+
+
 # The office's furniture: desk with monitors and clutter, shelf, posters, cabinet with a plant,
 # office chairs.
 
@@ -103,29 +114,32 @@ _EYE = np.eye(3)
 
 def desk(rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) -> Parts:
     """A desk (0.8 m deep, 0.74 m high) with drawers, monitors, keyboards, books, papers, mugs and a lamp."""
+    return [
+        *_table(plan, x, y, half),
+        *_monitors(rng, plan, x, y, half),
+        *_papers(rng, x, y, half),
+        *_book_piles(rng, x, y, half),
+        *_mugs(rng, x, y),
+        *_lamp(plan, x, y, half),
+    ]
+
+
+def _table(plan: Plan, x: float, y: float, half: float) -> Parts:
+    """The top of a desk, its sides and back, and a unit of three drawers."""
     tint = plan.tints
-    side = 1 if plan.mirrored else -1
-    leg = (TOP - 0.036) / 2
-    unit = np.array([x + side * (half - 0.3), y + 0.38, 0.3])
-    lamp = np.array([x + side * (0.55 - half), y + 0.62, TOP])
     wood: Style = {"texture": "wood", "tint": tint["desk"]}
-    parts = [
-        box(_EYE, (x, y + 0.4, TOP - 0.018), (half, 0.4, 0.018), repeat=(1.2, 1.6), **wood),
-        *(
-            box(
-                _EYE,
-                (x + end * (half - 0.04), y + 0.4, leg),
-                (0.02, 0.36, leg),
-                **wood | {"tint": tint["desk"] * 0.9},
-            )
-            for end in (-1, 1)
-        ),
-        box(
-            _EYE,
-            (x, y + 0.74, 0.45),
-            (half - 0.06, 0.01, 0.25),
-            **wood | {"tint": tint["desk"] * 0.85},
-        ),
+    darker: Style = wood | {"tint": tint["desk"] * 0.9}
+    darkest: Style = wood | {"tint": tint["desk"] * 0.85}
+    leg = (TOP - 0.036) / 2
+    side = 1 if plan.mirrored else -1
+    unit = np.array([x + side * (half - 0.3), y + 0.38, 0.3])
+    parts = [box(_EYE, (x, y + 0.4, TOP - 0.018), (half, 0.4, 0.018), repeat=(1.2, 1.6), **wood)]
+    for end in (-1, 1):
+        parts.append(
+            box(_EYE, (x + end * (half - 0.04), y + 0.4, leg), (0.02, 0.36, leg), **darker)
+        )
+    parts += [
+        box(_EYE, (x, y + 0.74, 0.45), (half - 0.06, 0.01, 0.25), **darkest),
         box(_EYE, unit, (0.21, 0.3, 0.29), tint=tint["cabinet"]),
     ]
     for k in range(3):
@@ -135,51 +149,63 @@ def desk(rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) 
             box(_EYE, front, (0.195, 0.008, 0.085), tint=tint["cabinet"] * 0.92),
             box(_EYE, handle, (0.05, 0.008, 0.008), tint=tint["metal"]),
         ]
-    parts += _monitors(rng, plan, x, y, half)
+    return parts
+
+
+def _papers(rng: np.random.Generator, x: float, y: float, half: float) -> Parts:
+    """Five sheets, each lying a little higher than the one before."""
+    parts: Parts = []
     for k in range(5):
         px = x + (rng.random() - 0.5) * 2 * (half - 0.15)
-        parts.append(
-            box(
-                rotation_about_z(rng.random() * 50 - 25),
-                (px, y + 0.1 + 0.2 * rng.random(), TOP + 0.002 + 0.001 * k),
-                (0.105, 0.148, 0.001),
-                texture=f"poster:{k % 4}",
-                fit=(5,),
-                tint=(0.95,) * 3,
-            )
-        )
-    for k in range(2):  # a pile of books at either end
+        turned = rotation_about_z(rng.random() * 50 - 25)
+        at = (px, y + 0.1 + 0.2 * rng.random(), TOP + 0.002 + 0.001 * k)
+        style: Style = {"texture": f"poster:{k % 4}", "fit": (5,), "tint": (0.95,) * 3}
+        parts.append(box(turned, at, (0.105, 0.148, 0.001), **style))
+    return parts
+
+
+def _book_piles(rng: np.random.Generator, x: float, y: float, half: float) -> Parts:
+    """A pile of books at either end."""
+    parts: Parts = []
+    for k in range(2):
         bx = x + (-1 if k else 1) * (half - 0.2 - 0.1 * rng.random())
         for level in range(int(rng.integers(2, 5))):
             shade = 0.25 + 0.7 * rng.random(3)
-            parts.append(
-                box(
-                    rotation_about_z(rng.random() * 30 - 15),
-                    (bx, y + 0.3 + 0.1 * k, TOP + 0.018 + 0.036 * level),
-                    (0.12, 0.085, 0.017),
-                    texture=(*["books"] * 4, "plain", f"poster:{level % 4}"),
-                    fit=(5,),
-                    tint=shade,
-                    repeat=(0.4, 3.0),
-                )
-            )
-    mugs = (
-        cone(
-            _EYE,
-            (x + (rng.random() - 0.5) * 1.4, y + 0.12 + 0.12 * rng.random(), TOP + 0.012),
-            (0.085, 0.04, 0.042),
-            texture="stripes" if k else "plain",
-            repeat=(1.0, 4.0),
-            tint=0.35 + 0.6 * rng.random(3),
-        )
-        for k in range(2)
-    )
+            turned = rotation_about_z(rng.random() * 30 - 15)
+            at = (bx, y + 0.3 + 0.1 * k, TOP + 0.018 + 0.036 * level)
+            style: Style = {
+                "texture": (*["books"] * 4, "plain", f"poster:{level % 4}"),
+                "fit": (5,),
+                "tint": shade,
+                "repeat": (0.4, 3.0),
+            }
+            parts.append(box(turned, at, (0.12, 0.085, 0.017), **style))
+    return parts
+
+
+def _mugs(rng: np.random.Generator, x: float, y: float) -> Parts:
+    """A plain mug and one with stripes."""
+    parts: Parts = []
+    for k in range(2):
+        at = (x + (rng.random() - 0.5) * 1.4, y + 0.12 + 0.12 * rng.random(), TOP + 0.012)
+        style: Style = {
+            "texture": "stripes" if k else "plain",
+            "repeat": (1.0, 4.0),
+            "tint": 0.35 + 0.6 * rng.random(3),
+        }
+        parts.append(cone(_EYE, at, (0.085, 0.04, 0.042), **style))
+    return parts
+
+
+def _lamp(plan: Plan, x: float, y: float, half: float) -> Parts:
+    """Foot, rod and shade of a lamp, at the end without drawers."""
+    tint = plan.tints
+    side = 1 if plan.mirrored else -1
+    foot = np.array([x + side * (0.55 - half), y + 0.62, TOP])
     return [
-        *parts,
-        *mugs,
-        cone(_EYE, lamp, (0.02, 0.07, 0.06), tint=tint["metal"], scale=(1, 1, 0.4)),
-        cone(_EYE, lamp, (0.42, 0.012, 0.012), tint=tint["metal"]),
-        cone(_EYE, lamp + np.array([0.0, -0.1, 0.4]), (0.08, 0.085, 0.035), tint=tint["bin"]),
+        cone(_EYE, foot, (0.02, 0.07, 0.06), tint=tint["metal"], scale=(1, 1, 0.4)),
+        cone(_EYE, foot, (0.42, 0.012, 0.012), tint=tint["metal"]),
+        cone(_EYE, foot + np.array([0.0, -0.1, 0.4]), (0.08, 0.085, 0.035), tint=tint["bin"]),
     ]
 
 
@@ -203,80 +229,57 @@ def _monitors(rng: np.random.Generator, plan: Plan, x: float, y: float, half: fl
         my = y + 0.52 + 0.08 * rng.random()
         middle = np.array([mx, my, TOP + 0.3])
         faces = ("plain", "plain", f"screen:{k}", "plain", "plain", "plain")
-        bars = [
-            (middle + product(facing, np.array([dx, -0.012, dz])), (hx, 0.024, hz))
-            for dx, dz, hx, hz in _FRAME
-        ]
-        keys = rotation_about_z(6 * (rng.random() - 0.5))
+        turned = rotation_about_z(6 * (rng.random() - 0.5))
+        # the screen and the bars around it
+        parts.append(box(facing, middle, (0.27, 0.02, 0.175), texture=faces, fit=(2,)))
+        for dx, dz, hx, hz in _FRAME:
+            bar = middle + product(facing, np.array([dx, -0.012, dz]))
+            parts.append(box(facing, bar, (hx, 0.024, hz), tint=plastic))
+        keys: Style = {"texture": "keyboard", "fit": (5,)}
+        mouse: Style = {"scale": (0.032, 0.055, 0.025), "tint": plastic}
         parts += [
-            box(facing, middle, (0.27, 0.02, 0.175), texture=faces, fit=(2,)),
-            *(box(facing, bar, extents, tint=plastic) for bar, extents in bars),
             box(facing, (mx, my + 0.03, TOP + 0.09), (0.03, 0.02, 0.09), tint=plastic),
             box(facing, (mx, my + 0.01, TOP + 0.008), (0.12, 0.09, 0.008), tint=plastic),
-            box(
-                keys,
-                (mx - 0.03, my - 0.3, TOP + 0.012),
-                (0.22, 0.075, 0.012),
-                texture="keyboard",
-                fit=(5,),
-            ),
-            cone(
-                rotation_about_z(20),
-                (mx + 0.27, my - 0.3, TOP + 0.005),
-                (0, 1, 1),
-                scale=(0.032, 0.055, 0.025),
-                tint=plastic,
-            ),
+            box(turned, (mx - 0.03, my - 0.3, TOP + 0.012), (0.22, 0.075, 0.012), **keys),
+            cone(rotation_about_z(20), (mx + 0.27, my - 0.3, TOP + 0.005), (0, 1, 1), **mouse),
         ]
     return parts
 
 
 def shelf(rng: np.random.Generator, plan: Plan, side: int) -> Parts:
     """A bookcase against the back wall with rows of books and boxes."""
-    tint = plan.tints["shelf"]
+    wood: Style = {"texture": "wood", "tint": plan.tints["shelf"]}
+    darker: Style = wood | {"tint": plan.tints["shelf"] * 0.8}
     x = (plan.right_x - 0.5 if side > 0 else plan.left_x + 0.5) - side * 0.25 * rng.random()
     y = plan.back_y - 0.17
     half = 0.42
     height = 1.95
+    # sides and back
     parts = [
-        box(_EYE, (x - half, y, height / 2), (0.015, 0.15, height / 2), texture="wood", tint=tint),
-        box(_EYE, (x + half, y, height / 2), (0.015, 0.15, height / 2), texture="wood", tint=tint),
-        box(
-            _EYE,
-            (x, y + 0.145, height / 2),
-            (half, 0.008, height / 2),
-            texture="wood",
-            tint=tint * 0.8,
-        ),
+        box(_EYE, (x - half, y, height / 2), (0.015, 0.15, height / 2), **wood),
+        box(_EYE, (x + half, y, height / 2), (0.015, 0.15, height / 2), **wood),
+        box(_EYE, (x, y + 0.145, height / 2), (half, 0.008, height / 2), **darker),
     ]
+    # Six boards, and on all but the top one a row of books and, where there is room, a box.
     for k in range(6):
         z = 0.06 + k * (height - 0.08) / 5
-        parts.append(box(_EYE, (x, y, z), (half, 0.15, 0.014), texture="wood", tint=tint))
+        parts.append(box(_EYE, (x, y, z), (half, 0.15, 0.014), **wood))
         if k == 5:
             break
         width = half * (0.45 + 0.5 * rng.random())
         tall = 0.12 + 0.03 * rng.random()
         offset = (half - width - 0.02) * (1 if rng.random() < 0.5 else -1)
-        parts.append(
-            box(
-                _EYE,
-                (x + offset, y - 0.01, z + 0.014 + tall),
-                (width, 0.1, tall),
-                texture="books",
-                repeat=(0.9, 0.5 / tall),
-                shift=(float(rng.random()), 0.5),
-                tint=(0.9,) * 3,
-            )
-        )
+        books: Style = {
+            "texture": "books",
+            "repeat": (0.9, 0.5 / tall),
+            "shift": (float(rng.random()), 0.5),
+            "tint": (0.9,) * 3,
+        }
+        at = (x + offset, y - 0.01, z + 0.014 + tall)
+        parts.append(box(_EYE, at, (width, 0.1, tall), **books))
         if width < half * 0.75:
-            parts.append(
-                box(
-                    _EYE,
-                    (x - offset * 1.9, y, z + 0.1),
-                    (0.1, 0.1, 0.085),
-                    tint=0.3 + 0.6 * rng.random(3),
-                )
-            )
+            at = (x - offset * 1.9, y, z + 0.1)
+            parts.append(box(_EYE, at, (0.1, 0.1, 0.085), tint=0.3 + 0.6 * rng.random(3)))
     return parts
 
 
@@ -298,43 +301,43 @@ def cabinet(rng: np.random.Generator, plan: Plan, side: int) -> Parts:
     y = plan.back_y - 0.25
     x = plan.right_x - 0.5 if side > 0 else plan.left_x + 0.5
     parts = [box(_EYE, (x, y, 0.42), (0.45, 0.22, 0.42), tint=tint["cabinet"])]
+    # doors and handles
     for dx in (-0.225, 0.225):
         parts += [
             box(_EYE, (x + dx, y - 0.226, 0.42), (0.215, 0.008, 0.39), tint=tint["cabinet"] * 0.9),
             box(_EYE, (x + dx * 0.3, y - 0.24, 0.6), (0.008, 0.01, 0.06), tint=tint["metal"]),
         ]
-    pot = np.array([x - 0.2 * side, y, 0.85])
-    parts.append(cone(_EYE, pot + np.array([0, 0, 0.06]), (0.1, 0.08, 0.1), tint=(0.7, 0.38, 0.25)))
-    for _ in range(9):
-        a = rotation_about_z(rng.random() * 360)
-        lean = 0.3 + 0.7 * rng.random()
-        tip = pot + product(
-            a, np.array([0.24 * lean, 0, 0.3 + 0.3 * (1 - lean) + 0.1 * rng.random()])
-        )
-        stem = pot + np.array([0, 0, 0.14])
-        length = norm(tip - stem)
-        green = np.array([0.2, 0.45, 0.16]) * (0.7 + 0.6 * rng.random())
-        z = (tip - stem) / length
-        u = np.cross(z, product(a, np.array([0.0, 1.0, 0.0])))
-        axes = np.stack([u / norm(u), np.cross(z, u / norm(u)), z], 1)
-        parts.append(
-            cone(axes, stem, (float(length), 0.012, 0.04), scale=(0.25, 1.0, 1.0), tint=green)
-        )
+    parts += _plant(rng, np.array([x - 0.2 * side, y, 0.85]))
+    # boxes on it
     for k in range(2):
         s = 0.1 + 0.05 * rng.random()
         faces = ("plain", "plain", f"poster:{k}", "plain", "plain", "plain")
-        parts.append(
-            box(
-                rotation_about_z(rng.random() * 30),
-                (x + side * (0.1 + 0.2 * k), y, 0.84 + s),
-                (s, s * 0.8, s),
-                texture=faces,
-                fit=(2,),
-                tint=(0.85, 0.72, 0.55),
-            )
-        )
+        style: Style = {"texture": faces, "fit": (2,), "tint": (0.85, 0.72, 0.55)}
+        turned = rotation_about_z(rng.random() * 30)
+        at = (x + side * (0.1 + 0.2 * k), y, 0.84 + s)
+        parts.append(box(turned, at, (s, s * 0.8, s), **style))
     bin_at = (plan.desk_x + side * 1.35, plan.desk_y + 0.2, 0.13)
     return [*parts, cone(_EYE, bin_at, (0.16, 0.12, 0.14), tint=tint["bin"])]
+
+
+def _plant(rng: np.random.Generator, pot: Array) -> Parts:
+    """A pot and nine leaves that lean outwards from its middle."""
+    parts = [cone(_EYE, pot + np.array([0, 0, 0.06]), (0.1, 0.08, 0.1), tint=(0.7, 0.38, 0.25))]
+    stem = pot + np.array([0, 0, 0.14])
+    for _ in range(9):
+        around = rotation_about_z(rng.random() * 360)
+        lean = 0.3 + 0.7 * rng.random()
+        outwards = np.array([0.24 * lean, 0, 0.3 + 0.3 * (1 - lean) + 0.1 * rng.random()])
+        tip = pot + product(around, outwards)
+        length = norm(tip - stem)
+        green = np.array([0.2, 0.45, 0.16]) * (0.7 + 0.6 * rng.random())
+        # The leaf's axes: z along it, x across its flat side.
+        z = (tip - stem) / length
+        u = np.cross(z, product(around, np.array([0.0, 1.0, 0.0])))
+        axes = np.stack([u / norm(u), np.cross(z, u / norm(u)), z], 1)
+        shape = (float(length), 0.012, 0.04)
+        parts.append(cone(axes, stem, shape, scale=(0.25, 1.0, 1.0), tint=green))
+    return parts
 
 
 def build_room(scene: int, plan: Plan) -> Parts:
@@ -356,43 +359,36 @@ def build_room(scene: int, plan: Plan) -> Parts:
         ((-1, 0, 0), mid_x, front, across, "wall"),
     )
     plaster: Style = {"texture": "plaster", "repeat": (0.5, 0.5)}
-    return [
-        *floor(
-            (plan.left_x, front),
-            (plan.right_x, back),
-            plan,
-            (float(rng.random()), float(rng.random())),
-        ),
-        *(
-            quad(wall(right, (0, 0, 1)), (x, y, HEIGHT_M / 2), half, tint=tint[name], **plaster)
-            for right, x, y, half, name in sides
-        ),
-        # skirting board
+    carpet_shift = (float(rng.random()), float(rng.random()))
+    parts = floor((plan.left_x, front), (plan.right_x, back), plan, carpet_shift)
+    for right, x, y, half, name in sides:
+        facing = wall(right, (0, 0, 1))
+        parts.append(quad(facing, (x, y, HEIGHT_M / 2), half, tint=tint[name], **plaster))
+    # skirting board, cable duct
+    parts += [
         box(_EYE, (mid_x, back - 0.01, 0.05), (half_x, 0.01, 0.05), tint=tint["shelf"]),
-        box(_EYE, (mid_x, back - 0.02, 0.95), (half_x, 0.02, 0.04), tint=(0.82,) * 3),  # cable duct
-        *desk(rng, plan, plan.desk_x, plan.desk_y, half=1.15),
-        *shelf(rng, plan, plan.shelf_side),
-        *posters(rng, plan),
-        *(
-            box(
-                rotation_about_z(90),
-                (x + sign * 0.006, 1.6 + 1.2 * rng.random(), 1.55),
-                (0.36, 0.006, 0.26),
-                texture=f"poster:{k}",
-                fit=(2, 3),
-            )
-            for x, sign, k in ((plan.left_x, 1.0, 2), (plan.right_x, -1.0, 3))
-        ),
-        *cabinet(rng, plan, -plan.shelf_side),
+        box(_EYE, (mid_x, back - 0.02, 0.95), (half_x, 0.02, 0.04), tint=(0.82,) * 3),
     ]
+    parts += desk(rng, plan, plan.desk_x, plan.desk_y, half=1.15)
+    parts += shelf(rng, plan, plan.shelf_side)
+    parts += posters(rng, plan)
+    # a poster on either side wall
+    for x, sign, k in ((plan.left_x, 1.0, 2), (plan.right_x, -1.0, 3)):
+        at = (x + sign * 0.006, 1.6 + 1.2 * rng.random(), 1.55)
+        style: Style = {"texture": f"poster:{k}", "fit": (2, 3)}
+        parts.append(box(rotation_about_z(90), at, (0.36, 0.006, 0.26), **style))
+    return parts + cabinet(rng, plan, -plan.shelf_side)
 
 
 # Larger interiors: floors, walls with doorways, furnished stretches of wall, and pieces that may be
 # moved.
 
 HEIGHT_M = 2.8
+"""Height of the rooms."""
 DOOR_M = 1.3
+"""Width of a doorway in a partition."""
 _LINTEL_M = 2.1
+"""Height of a doorway."""
 Point = tuple[float, float]
 
 
@@ -401,16 +397,11 @@ def floor(low: Point, high: Point, plan: Plan, shift: Point = (0.0, 0.0)) -> Par
     middle = (low[0] + high[0]) / 2, (low[1] + high[1]) / 2
     half = ((high[0] - low[0]) / 2, (high[1] - low[1]) / 2, 0.0)
     tint = plan.tints["floor"]
+    up = wall((1, 0, 0), (0, 1, 0))
+    down = wall((1, 0, 0), (0, -1, 0))
     return [
-        quad(
-            wall((1, 0, 0), (0, 1, 0)),
-            (*middle, 0.0),
-            half,
-            texture="carpet",
-            tint=tint,
-            shift=shift,
-        ),
-        quad(wall((1, 0, 0), (0, -1, 0)), (*middle, HEIGHT_M), half, tint=(0.95,) * 3),
+        quad(up, (*middle, 0.0), half, texture="carpet", tint=tint, shift=shift),
+        quad(down, (*middle, HEIGHT_M), half, tint=(0.95,) * 3),
     ]
 
 
@@ -428,22 +419,18 @@ def partition(start: Point, end: Point, plan: Plan, doors: tuple[float, ...] = (
     length = math.sqrt(dx * dx + dy * dy)
     facing = rotation_about_z(math.degrees(atan2(dy, dx)))
     direction = np.array([dx, dy, 0.0]) / length
+    # Pieces between the doorways, and above them: first and last metre, and lower edge.
     edges = [0.0, *(door + side * DOOR_M / 2 for door in doors for side in (-1, 1)), length]
     pieces = [(a, b, 0.0) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     pieces += [(door - DOOR_M / 2, door + DOOR_M / 2, _LINTEL_M) for door in doors]
-    return [
-        box(
-            facing,
-            np.array([*start, 0.0])
-            + (a + b) / 2 * direction
-            + np.array([0.0, 0.0, (HEIGHT_M + bottom) / 2]),
-            ((b - a) / 2, 0.05, (HEIGHT_M - bottom) / 2),
-            texture="plaster",
-            repeat=(0.5, 0.5),
-            tint=plan.tints["wall"],
-        )
-        for a, b, bottom in pieces
-    ]
+    style: Style = {"texture": "plaster", "repeat": (0.5, 0.5), "tint": plan.tints["wall"]}
+    parts = []
+    for a, b, bottom in pieces:
+        along = np.array([*start, 0.0]) + (a + b) / 2 * direction
+        middle = along + np.array([0.0, 0.0, (HEIGHT_M + bottom) / 2])
+        half = ((b - a) / 2, 0.05, (HEIGHT_M - bottom) / 2)
+        parts.append(box(facing, middle, half, **style))
+    return parts
 
 
 def _stretch(scene: int, number: int, half: float) -> tuple[Plan, np.random.Generator]:
@@ -481,16 +468,13 @@ def corridor_bay(scene: int, number: int) -> Parts:
             box(_EYE, (0.36, -0.09, 1.02), (0.05, 0.012, 0.012), tint=tint["metal"]),
             box(_EYE, (0.0, -0.062, 1.5), (0.12, 0.003, 0.16), texture="poster:1", fit=(2,)),
         ]
-    return [
-        box(
-            rotation_about_z(8 * rng.random() - 4),
-            (-0.6 + 0.6 * (k % 3), -0.006, 1.35 + 0.5 * (k // 3)),
-            (0.15, 0.005, 0.21),
-            texture=f"poster:{k % 4}",
-            fit=(2,),
-        )
-        for k in range(6)
-    ]
+    # a notice board: three sheets above three others
+    parts = []
+    for k in range(6):
+        turned = rotation_about_z(8 * rng.random() - 4)
+        at = (-0.6 + 0.6 * (k % 3), -0.006, 1.35 + 0.5 * (k // 3))
+        parts.append(box(turned, at, (0.15, 0.005, 0.21), texture=f"poster:{k % 4}", fit=(2,)))
+    return parts
 
 
 def notices(scene: int, number: int) -> Parts:
@@ -531,23 +515,21 @@ def office_chair(plan: Plan, instance: int, shade: float = 1.0) -> Parts:
         box(lean, (0, 0.255, 0.47), (0.035, 0.012, 0.1), **frame),
         cone(_EYE, (0, 0, 0.1), (0.32, 0.03, 0.028), **frame),
     ]
+    # the base's five points, each with its castor
     for k in range(5):
-        a = rotation_about_z(72 * k + 18)
-        tip = product(a, np.array([0.28, 0, 0.05]))
-        u = product(a, np.array([0.0, 1.0, 0.0]))
+        around = rotation_about_z(72 * k + 18)
+        tip = product(around, np.array([0.28, 0, 0.05]))
+        u = product(around, np.array([0.0, 1.0, 0.0]))
         z = (tip - hub) / norm(tip - hub)
         parts += [
             cone(np.stack([u, np.cross(z, u), z], 1), hub, (0.28, 0.024, 0.02), **frame),
             cone(_EYE, tip - (0, 0, 0.015), (0, 0.032, 0.032), **frame | {"tint": metal * 0.7}),
         ]
+    # the armrests
+    darker = frame | {"tint": metal * 0.8}
     for side in (-1, 1):
         parts += [
-            box(
-                _EYE,
-                (side * 0.27, 0.03, 0.66),
-                (0.025, 0.13, 0.015),
-                **frame | {"tint": metal * 0.8},
-            ),
+            box(_EYE, (side * 0.27, 0.03, 0.66), (0.025, 0.13, 0.015), **darker),
             box(_EYE, (side * 0.27, 0.05, 0.55), (0.015, 0.02, 0.1), **frame),
         ]
     return parts
@@ -582,11 +564,10 @@ def printed_box(id: int, half: tuple[float, float, float]) -> Parts:
 def balloon(id: int, radius: float) -> Parts:
     """A printed balloon with its knot; the origin is its middle."""
     skin: Style = {"texture": "print:balloon", "repeat": (2.0, 2.0), "scale": (1.0, 1.0, 1.15)}
+    knot = (0.0, 0.0, -1.2 * radius)
     return [
         cone(_EYE, np.zeros(3), (0.0, radius, radius), instance=id, **skin),
-        cone(
-            _EYE, (0.0, 0.0, -1.2 * radius), (0.05, 0.02, 0.01), instance=id, tint=(0.8, 0.3, 0.3)
-        ),
+        cone(_EYE, knot, (0.05, 0.02, 0.01), instance=id, tint=(0.8, 0.3, 0.3)),
     ]
 
 
@@ -596,15 +577,13 @@ def trolley(id: int, scene: int, plan: Plan) -> Parts:
     bottom = 0.18
     metal: Style = {"instance": id, "tint": plan.tints["metal"]}
     wheels = ((-0.38, -0.24), (-0.38, 0.24), (0.38, -0.24), (0.38, 0.24))
-    parts = [
-        box(_EYE, (0, 0, 0.16), (0.45, 0.3, 0.02), **metal),
-        *(
-            cone(_EYE, (x, y, 0.07), (0, 0.07, 0.07), instance=id, tint=(0.15,) * 3)
-            for x, y in wheels
-        ),
-        *(cone(_EYE, (-0.43, y, 0.16), (0.85, 0.015, 0.015), **metal) for y in (-0.26, 0.26)),
-        box(_EYE, (-0.43, 0, 1.01), (0.015, 0.27, 0.015), **metal),
-    ]
+    parts = [box(_EYE, (0, 0, 0.16), (0.45, 0.3, 0.02), **metal)]
+    for x, y in wheels:
+        parts.append(cone(_EYE, (x, y, 0.07), (0, 0.07, 0.07), instance=id, tint=(0.15,) * 3))
+    for y in (-0.26, 0.26):
+        parts.append(cone(_EYE, (-0.43, y, 0.16), (0.85, 0.015, 0.015), **metal))
+    parts.append(box(_EYE, (-0.43, 0, 1.01), (0.015, 0.27, 0.015), **metal))
+    # the cartons, one on another
     for _ in range(3):
         half = (0.26 + 0.12 * rng.random(), 0.2 + 0.08 * rng.random(), 0.15 + 0.06 * rng.random())
         parts.append(
@@ -616,32 +595,12 @@ def trolley(id: int, scene: int, plan: Plan) -> Parts:
 
 def door_leaf(id: int, plan: Plan, width: float) -> Parts:
     """A door leaf whose hinge stands at the origin and which runs along +x; posters on both sides."""
-    leaf = (width / 2, 0.02, 1.02)
-    places = ((0.3, 1.55), (0.7, 1.5), (0.3, 1.0), (0.68, 0.95))
-    faces = [
-        ("plain", "plain", f"poster:{k}", f"poster:{(k + 1) % 4}", "plain", "plain")
-        for k in range(4)
-    ]
-    return [
-        box(
-            _EYE, (width / 2, 0.0, 1.03), leaf, instance=id, texture="wood", tint=plan.tints["door"]
-        ),
-        *(
-            box(
-                _EYE,
-                (x * width, 0.0, z),
-                (0.15, 0.024, 0.2),
-                instance=id,
-                texture=names,
-                fit=(2, 3),
-            )
-            for (x, z), names in zip(places, faces, strict=True)
-        ),
-        box(
-            _EYE,
-            (width - 0.08, 0.0, 1.03),
-            (0.06, 0.05, 0.012),
-            instance=id,
-            tint=plan.tints["metal"],
-        ),
-    ]
+    wood: Style = {"instance": id, "texture": "wood", "tint": plan.tints["door"]}
+    metal: Style = {"instance": id, "tint": plan.tints["metal"]}
+    parts = [box(_EYE, (width / 2, 0.0, 1.03), (width / 2, 0.02, 1.02), **wood)]
+    for k, (x, z) in enumerate(((0.3, 1.55), (0.7, 1.5), (0.3, 1.0), (0.68, 0.95))):
+        faces = ("plain", "plain", f"poster:{k}", f"poster:{(k + 1) % 4}", "plain", "plain")
+        poster: Style = {"instance": id, "texture": faces, "fit": (2, 3)}
+        parts.append(box(_EYE, (x * width, 0.0, z), (0.15, 0.024, 0.2), **poster))
+    parts.append(box(_EYE, (width - 0.08, 0.0, 1.03), (0.06, 0.05, 0.012), **metal))
+    return parts
