@@ -1,34 +1,28 @@
 """Where a study is stored, a journal file by default, any SQL database, or Optuna's gRPC proxy; and its trials."""
 
 import fcntl
-import inspect
 import json
 import math
 import os
-import random
 import socket
 import sys
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
-from functools import cache, wraps
+from functools import cache
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, urlsplit
 
 import numpy as np
 import optuna
 import pandas as pd
 import psutil
-from optuna.exceptions import StorageInternalError, UpdateFinishedTrialError
-from optuna.storages import BaseStorage, RDBStorage, journal
+from optuna.storages import BaseStorage, journal
 from optuna.trial import FrozenTrial, TrialState, create_trial
-from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError, PendingRollbackError
 
 from dynslam_bench.core import (
-    HIDDEN,
     StudyError,
     call_periodically,
     read_json,
@@ -36,6 +30,7 @@ from dynslam_bench.core import (
     without_passwords,
 )
 from dynslam_bench.core.records import Record, validated
+from dynslam_bench.tuning.database import open_database, without_password
 from dynslam_bench.tuning.objectives import centre
 from dynslam_bench.tuning.study_file import StudySpec
 
@@ -214,8 +209,6 @@ def _shares(trials: Sequence[FrozenTrial]) -> dict[str, float]:
 SCHEMES = ("sqlite", "postgresql", "mysql", "mariadb", "oracle", "mssql", "grpc")
 """SQL databases (also with a driver: ``postgresql+psycopg``) and Optuna's gRPC proxy. They hold data, never code;
 Optuna unpickles what Redis holds."""
-_BEING_MADE = ("already exists", "duplicate", "unique constraint", "is locked")
-"""What drivers say where another worker makes the tables at the same time."""
 
 
 def study_folder(results: Path, spec: StudySpec) -> Path:
@@ -292,93 +285,6 @@ def load_study(results: Path, spec: StudySpec) -> optuna.Study:
         return optuna.load_study(study_name=spec.name, storage=open_storage(results, spec))
     except KeyError as error:
         raise absent from error
-
-
-def open_database(url: str) -> BaseStorage:
-    """Open a database, and make its tables if it is empty.
-
-    Workers may begin at the same time: one whose tables another worker makes meanwhile tries again.
-
-    Raises:
-        Exception: What the database's driver raises.
-    """
-    attempts = 0
-    while True:
-        try:  # a server takes few connections, e.g. 100
-            storage = PatientStorage(url, engine_kwargs={"pool_pre_ping": True, "pool_size": 1})
-            return optuna.storages.get_storage(storage)
-        except (DBAPIError, StorageInternalError) as error:
-            cause = str(error.__cause__ or error).lower()
-            attempts += 1
-            if attempts == ATTEMPTS or not any(words in cause for words in _BEING_MADE):
-                raise
-        time.sleep(random.uniform(0.05, 0.5))
-
-
-class PatientStorage(RDBStorage):
-    """Optuna's SQL storage, which waits up to `PATIENCE_S` for a database that does not answer, as while it restarts.
-
-    Raises:
-        StudyError: It does not answer for longer.
-    """
-
-
-ATTEMPTS = 10
-PATIENCE_S = 60.0
-_NO_ANSWER = (OperationalError, InterfaceError, PendingRollbackError)
-"""Errors of a database that is away; the last one where it went within a transaction."""
-
-
-def _patient(method: Callable[..., Any]) -> Callable[..., Any]:
-    @wraps(method)
-    def call(storage: PatientStorage, *arguments: Any, **named: Any) -> Any:
-        began = time.monotonic()
-        failed = False
-        while True:
-            try:
-                return method(storage, *arguments, **named)
-            except UpdateFinishedTrialError:
-                if not failed:
-                    raise
-                return True  # the call before had arrived, its answer had not
-            except (DBAPIError, StorageInternalError) as error:
-                if not isinstance(error, _NO_ANSWER) and not isinstance(
-                    error.__cause__, _NO_ANSWER
-                ):
-                    raise
-                if time.monotonic() - began > PATIENCE_S:
-                    line = str(error.__cause__ or error).splitlines()[0]
-                    text = without_password(
-                        f"the study's database does not answer: {line}", storage.url
-                    )
-                    raise StudyError(
-                        text, "finished trials are stored; the same command goes on from there"
-                    ) from error
-            failed = True
-            time.sleep(random.uniform(0.2, 2.0))
-
-    return call
-
-
-_CALLED_BY_CACHE = (
-    "_create_new_trial",
-    "_get_best_trial_id",
-    "_get_stale_trial_ids",
-    "_get_trials",
-    "_set_trial_param",
-)
-for _name, _method in inspect.getmembers(RDBStorage, inspect.isfunction):
-    if not _name.startswith("_") or _name in _CALLED_BY_CACHE:
-        setattr(PatientStorage, _name, _patient(_method))
-
-
-def without_password(text: str, address: str) -> str:
-    """A text, for example a driver's message, without the password that an address holds."""
-    with suppress(ValueError):  # no address
-        password = urlsplit(address).password or ""
-        for secret in {password, unquote(password)} - {""}:
-            text = text.replace(secret, HIDDEN)
-    return without_passwords(text)
 
 
 def worker_name() -> str:

@@ -35,6 +35,7 @@ from dynslam_bench.core.seeding import stream
 from dynslam_bench.core.settings import Scalar
 from dynslam_bench.runs import RunEvent, resolve, run_many
 from dynslam_bench.runs.record import program_of
+from dynslam_bench.tuning.database import without_password
 from dynslam_bench.tuning.objectives import (
     CancelledError,
     Configuration,
@@ -66,7 +67,6 @@ from dynslam_bench.tuning.storage import (
     read_stored,
     study_folder,
     trials_frame,
-    without_password,
     worker_name,
 )
 from dynslam_bench.tuning.study_file import (
