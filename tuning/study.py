@@ -23,10 +23,10 @@ from optuna.trial import FrozenTrial, TrialState, create_trial
 from dynslam_bench.core import (
     DynslamError,
     StudyError,
+    exclusive_lock,
     read_settings,
     storable,
     translate_errors,
-    turn,
     words_without_passwords,
     write_atomic,
 )
@@ -525,7 +525,7 @@ class Study(Plan):
             StudyError, f"cannot write {self.folder}", "check the permissions and the free space"
         ):
             self.folder.mkdir(parents=True, exist_ok=True)
-        return turn(self.folder / f".{what}")
+        return exclusive_lock(self.folder / f".{what}")
 
     def _await_names(self) -> None:
         """Wait until each running trial has its worker's name, or that worker is known to have been killed before.

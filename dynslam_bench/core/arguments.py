@@ -55,7 +55,8 @@ def _is_ours(error: Exception) -> bool:
         str(frame.f_globals.get("__name__")) for frame, _ in traceback.walk_tb(error.__traceback__)
     )
     packages = {module.partition(".")[0] for module in modules}
-    return packages <= {"dynslam_bench", "gymnasium", "numpy", *sys.stdlib_module_names}
+    this_package = __name__.partition(".")[0]
+    return packages <= {this_package, "gymnasium", "numpy", *sys.stdlib_module_names}
 
 
 def _wrong_argument(function: Callable[..., Any], given: dict[str, Any]) -> SettingsError | None:

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 from urllib.request import HTTPRedirectHandler, Request, build_opener
 
 from dynslam_bench.core.errors import DownloadError, DynslamError, translate_errors
-from dynslam_bench.core.files import claimed
+from dynslam_bench.core.files import try_lock
 from dynslam_bench.core.reading import file_sha256, read_json
 from dynslam_bench.core.sanitise import without_passwords
 
@@ -94,7 +94,7 @@ def download(
     with translate_errors(DownloadError, f"cannot write {target}", "name another folder"):
         target.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.ExitStack() as stack:
-            if not stack.enter_context(claimed(part.with_name(part.name + ".lock"))):
+            if not stack.enter_context(try_lock(part.with_name(part.name + ".lock"))):
                 raise DownloadError(
                     f"another process is downloading {url}",
                     "wait for it, then run the same command again",

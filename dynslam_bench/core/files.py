@@ -20,10 +20,13 @@ from pathlib import Path
 from dynslam_bench.core.errors import InfrastructureError, translate_errors
 
 _TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.tmp")
-_TURN_S = 0.1
+_POLL_S = 0.1
+"""Pause before a lock that another process holds is asked for again."""
 _CURE = "check the permissions and the free space"
 _AT_FDCWD = -100
+"""Stands for the working folder, from which relative paths are resolved (renameat2(2))."""
 _RENAME_EXCHANGE = 2
+"""Flag of renameat2(2): both names exist, and each gets what the other one was."""
 
 
 @contextmanager
@@ -198,14 +201,14 @@ def atomic_folder(target: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def claimed(path: Path) -> Iterator[bool]:
-    """Hold a name while the block lasts, if no other process does; its file is removed afterwards.
+def try_lock(path: Path) -> Iterator[bool]:
+    """Take a lock for as long as the block lasts, if no other process holds it; its file is removed afterwards.
 
     Args:
-        path: Of the lock's file; its folder exists.
+        path: The lock's file; its folder exists.
 
     Yields:
-        Whether it is held; always, where the file system knows no locks.
+        Whether this process holds the lock; always true where the file system knows no locks.
 
     Raises:
         InfrastructureError: The file cannot be made.
@@ -215,12 +218,12 @@ def claimed(path: Path) -> Iterator[bool]:
     ):
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     try:
-        # else its last holder has just removed it
-        mine = _lock(handle) is not False and _is_at(handle, path)
+        # a locked file without its name is one that the last holder has just removed
+        is_held = _lock(handle) is not False and _is_at(handle, path)
         try:
-            yield mine
+            yield is_held
         finally:
-            if mine:  # while it is locked, so that no process locks a file that is being removed
+            if is_held:  # while it is locked, so that no process locks a file that is being removed
                 with suppress(OSError):  # a file that stays does no damage
                     path.unlink()
     finally:
@@ -228,14 +231,14 @@ def claimed(path: Path) -> Iterator[bool]:
 
 
 @contextmanager
-def turn(path: Path) -> Iterator[None]:
-    """Hold a name while the block lasts, and wait for it as long as another process does (see `claimed`)."""
+def exclusive_lock(path: Path) -> Iterator[None]:
+    """Take a lock for as long as the block lasts, and wait while another process holds it (see `try_lock`)."""
     while True:
-        with claimed(path) as mine:
-            if mine:
+        with try_lock(path) as is_held:
+            if is_held:
                 yield
                 return
-        time.sleep(_TURN_S)
+        time.sleep(_POLL_S)
 
 
 def is_abandoned(path: Path) -> bool:

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import dynslam_bench
 from dynslam_bench.core.code_files import leads_back
 from dynslam_bench.core.errors import DynslamError, PluginError, translate_errors
 from dynslam_bench.core.files import write_atomic
@@ -29,7 +28,7 @@ from dynslam_bench.core.folders import digest_cache_folder
 from dynslam_bench.core.reading import file_sha256
 from dynslam_bench.core.records import Record, digest
 from dynslam_bench.core.settings import Settings, field_names, named
-from dynslam_bench.core.version import release
+from dynslam_bench.core.version import release, version
 
 OPENCV = (
     "opencv-python-headless",
@@ -297,7 +296,7 @@ def this_machine() -> Machine:
 @cache
 def versions() -> dict[str, str]:
     """Versions of Python, of this package and of those that a result depends on; missing ones are left out."""
-    environment = {"python": platform.python_version(), "dynslam-bench": dynslam_bench.__version__}
+    environment = {"python": platform.python_version(), "dynslam-bench": version()}
     environment |= {name: distribution_version(name) for name in PACKAGES} | {
         "opencv": opencv_version()
     }
@@ -307,7 +306,7 @@ def versions() -> dict[str, str]:
 @cache
 def git_revision() -> GitRevision | None:
     """The commit of the checkout that the package lies in; None for an installed package or without git."""
-    checkout = Path(dynslam_bench.__file__).resolve().parent.parent
+    checkout = Path(__file__).resolve().parents[2]
     if not (checkout / "pyproject.toml").is_file() or not (checkout / ".git").exists():
         return None
     git = ("git", "-C", str(checkout))

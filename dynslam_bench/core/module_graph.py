@@ -26,7 +26,8 @@ from dynslam_bench.core.errors import DynslamError, RunError
 from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.folders import digest_cache_folder
 
-PACKAGE = "dynslam_bench"
+PACKAGE = __name__.partition(".")[0]
+"""The top-level package that this module belongs to."""
 _PLUMBING = (
     *(
         "arguments",
