@@ -20,9 +20,11 @@ from pathlib import Path
 from dynslam_bench.core.errors import InfrastructureError, translate_errors
 
 _TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.tmp")
+"""Names that `_reserve` gives."""
 _POLL_S = 0.1
 """Pause before a lock that another process holds is asked for again."""
 _CURE = "check the permissions and the free space"
+"""Hint of errors about files that cannot be written."""
 _AT_FDCWD = -100
 """Stands for the working folder, from which relative paths are resolved (renameat2(2))."""
 _RENAME_EXCHANGE = 2
@@ -57,20 +59,21 @@ def write_atomic(path: Path, content: str | bytes | memoryview) -> None:
         InfrastructureError: The folder cannot be written (full disk, permissions); nothing is left
             behind.
     """
+    if isinstance(content, str):
+        content = content.encode(errors="backslashreplace")
     with (
         translate_errors(InfrastructureError, f"cannot write {path}", _CURE),
         replacing(path) as temporary,
     ):
-        temporary.write_bytes(
-            content.encode(errors="backslashreplace") if isinstance(content, str) else content
-        )
+        temporary.write_bytes(content)
 
 
 def write_lines(path: Path, lines: Iterable[str]) -> None:
-    """The same of lines that are never all held at once; each gets its newline here.
+    """Write lines as `write_atomic` does, without holding all of them at once; each gets its newline here.
 
     Raises:
-        InfrastructureError: As `write_atomic`.
+        InfrastructureError: The folder cannot be written (full disk, permissions); nothing is left
+            behind.
     """
     with (
         translate_errors(InfrastructureError, f"cannot write {path}", _CURE),
@@ -92,6 +95,7 @@ def replace_folder(work: Path, target: Path) -> None:
     """
     old = work.with_name(f"{work.name}.old")
     while True:
+        # where nothing lies at the target a rename is enough
         try:
             work.rename(target)
             break
@@ -100,9 +104,11 @@ def replace_folder(work: Path, target: Path) -> None:
                 with suppress(OSError):  # what was moved aside below, if anything was
                     old.rename(target)
                 raise
+        # else both exchange their names at once
         if _exchange(work, target):
             old = work
             break
+        # where the system cannot do so, the target is moved aside, and the rename tried again
         shutil.rmtree(old, ignore_errors=True)
         with suppress(FileNotFoundError):  # another process has just moved it away
             target.rename(old)
@@ -287,7 +293,9 @@ def _lock(handle: int) -> bool | None:
 # -- private temporary folders, which are removed with the process that made them, also when that is killed ---
 
 _PRIVATE = "dynslam-private"
+"""In the names of `TemporaryFolder`s."""
 SHARED_MEMORY = Path("/dev/shm")
+"""Linux's file system in main memory."""
 
 
 class TemporaryFolder:
@@ -319,6 +327,7 @@ def sweep() -> None:
 
 
 def _remove(path: Path, lock: int, owner: int) -> None:
+    """Remove a folder, if this process made it, and give up its lock."""
     if os.getpid() == owner:  # a fork of the owner does not own it
         shutil.rmtree(path, ignore_errors=True)
     os.close(lock)
