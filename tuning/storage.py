@@ -40,7 +40,7 @@ EARLIER = "earlier"
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """No warnings while the block lasts: Optuna calls much experimental, and has something to say of equal trials."""
+    """Suppress warnings while the block lasts: Optuna warns of experimental parts, and of equal trials."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
@@ -60,20 +60,26 @@ def best_trials(study: optuna.Study, count: int) -> list[FrozenTrial]:
     trials = [
         trial for trial in study.get_trials(deepcopy=False) if EARLIER not in trial.user_attrs
     ]
+
+    # complete trials by their sum of log ratios
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
     candidates = [trial for trial in complete if is_feasible(trial)] or complete
+    candidates.sort(key=lambda trial: sum(trial.values))
+
+    # pruned trials by the instances that they were run on, then by their ratio on these
     pruned = [
         trial
         for trial in trials
         if trial.state == TrialState.PRUNED and trial.user_attrs.get("scenes")
     ]
-    candidates.sort(key=lambda trial: sum(trial.values))
     pruned.sort(
         key=lambda trial: (
             -len(trial.user_attrs["instances"]),
             centre(trial.user_attrs["scenes"].values()),
         )
     )
+
+    # of trials with the same settings the best one
     distinct: dict[tuple[Any, ...], FrozenTrial] = {}
     for trial in [*candidates, *pruned]:
         distinct.setdefault(tuple(sorted(trial.params.items())), trial)
@@ -110,19 +116,25 @@ def trials_frame(spec: StudySpec, study: optuna.Study) -> pd.DataFrame:
         ``Float64``, ``Int64``, ``boolean`` or ``string``, missing where its condition did not hold.
     """
     trials = study.get_trials(deepcopy=False)
-    objectives = [f"value_{objective}" for objective in spec.objectives]
-    kinds = {
-        **{"trial": "Int64", "state": "string"},
-        **dict.fromkeys([*objectives, "ratio", "duration_s", "coverage", "fps"], "Float64"),
-        **{"runs": "Int64", "feasible": "boolean", "reason": "string", EARLIER: "string"},
-    }
-    frame = pd.DataFrame([_row(spec, trial) for trial in trials], columns=list(kinds)).astype(kinds)
-    for name in sorted({name for trial in trials for name in trial.params}):
+    numbers = [f"value_{objective}" for objective in spec.objectives]
+    numbers += ["ratio", "duration_s", "coverage", "fps"]
+    kinds = {"trial": "Int64", "state": "string"}
+    kinds |= dict.fromkeys(numbers, "Float64")
+    kinds |= {"runs": "Int64", "feasible": "boolean", "reason": "string", EARLIER: "string"}
+    rows = [_row(spec, trial) for trial in trials]
+    frame = pd.DataFrame(rows, columns=list(kinds)).astype(kinds)
+
+    # a column for each tuned setting
+    settings: set[str] = set()
+    for trial in trials:
+        settings |= set(trial.params)
+    for name in sorted(settings):
         frame[f"params.{name}"] = pd.array([trial.params.get(name) for trial in trials])
     return frame
 
 
 def _row(spec: StudySpec, trial: FrozenTrial) -> dict[str, Any]:
+    """One row of `trials_frame`, without the tuned settings; what is missing is None."""
     values = dict(zip(spec.objectives, trial.values or [], strict=False))
     accuracy = values.get("accuracy")
     return {
@@ -142,6 +154,7 @@ def _row(spec: StudySpec, trial: FrozenTrial) -> dict[str, Any]:
 FEWEST_TRIALS = 20
 """With fewer complete or pruned trials importances are luck."""
 _RESAMPLES = 50
+"""Bootstrap samples of the trials, from which the intervals of importances are taken."""
 
 
 class Importance(Record):
@@ -170,35 +183,38 @@ def importances(study: optuna.Study) -> dict[str, Importance]:
         Shares that add up to 1; empty below `FEWEST_TRIALS` complete or pruned trials, or where
         their values are equal.
     """
+    # trials of one objective: the mean of all
     trials = study.get_trials(deepcopy=False)
-    copies = [
-        create_trial(
-            params=trials[number].params,
-            distributions=trials[number].distributions,
-            value=centre(ratios.values()),
+    copies = []
+    for number, ratios in scene_ratios(study).items():
+        trial = trials[number]
+        copies.append(
+            create_trial(
+                params=trial.params,
+                distributions=trial.distributions,
+                value=centre(ratios.values()),
+            )
         )
-        for number, ratios in scene_ratios(study).items()
-    ]
     if len(copies) < FEWEST_TRIALS or len({copy.value for copy in copies}) < 2:
         return {}
+
+    # importances of all trials, and of bootstrap samples of them
+    shares = _shares(copies)
     rng = np.random.default_rng(0)
-    whole, *resampled = [
-        _shares([copies[index] for index in chosen])
-        for chosen in (
-            range(len(copies)),
-            *rng.integers(len(copies), size=(_RESAMPLES, len(copies))),
-        )
-    ]
-    table = pd.DataFrame(resampled).fillna(0.0).quantile([0.025, 0.975])
-    return {
-        name: Importance(
-            share=share, low=float(table[name].iloc[0]), high=float(table[name].iloc[1])
-        )
-        for name, share in whole.items()
-    }
+    samples = rng.integers(len(copies), size=(_RESAMPLES, len(copies)))
+    resampled = [_shares([copies[index] for index in sample]) for sample in samples]
+
+    # a setting that a sample does not hold has no importance in it
+    intervals = pd.DataFrame(resampled).fillna(0.0).quantile([0.025, 0.975])
+    importance = {}
+    for name, share in shares.items():
+        low, high = intervals[name]
+        importance[name] = Importance(share=share, low=float(low), high=float(high))
+    return importance
 
 
 def _shares(trials: Sequence[FrozenTrial]) -> dict[str, float]:
+    """Optuna's importance of each parameter over these trials."""
     study = optuna.create_study()
     study.add_trials(trials)
     with quiet():
@@ -212,7 +228,7 @@ Optuna unpickles what Redis holds."""
 
 
 def study_folder(results: Path, spec: StudySpec) -> Path:
-    """The folder of a study's files."""
+    """The folder of a study's files: ``studies/NAME`` of the results folder."""
     return results / "studies" / spec.name
 
 
@@ -248,6 +264,7 @@ def open_storage(results: Path, spec: StudySpec) -> BaseStorage:
 
 
 SPEC_FILE = "study.json"
+"""The file of a study's folder that holds its specification."""
 
 
 def read_stored(folder: Path) -> tuple[StudySpec, Path]:
@@ -261,9 +278,10 @@ def read_stored(folder: Path) -> tuple[StudySpec, Path]:
         raise StudyError(
             f"{folder} holds no study: it has no {SPEC_FILE}", "name results/studies/NAME"
         )
-    return validated(
-        StudySpec, read_json(stored, kind=StudyError), str(stored), StudyError
-    ), folder.absolute().parents[1]
+    spec = validated(StudySpec, read_json(stored, kind=StudyError), str(stored), StudyError)
+    # RESULTS/studies/NAME
+    results = folder.absolute().parents[1]
+    return spec, results
 
 
 def load_study(results: Path, spec: StudySpec) -> optuna.Study:
@@ -288,7 +306,7 @@ def load_study(results: Path, spec: StudySpec) -> optuna.Study:
 
 
 def worker_name() -> str:
-    """Names this process: host, boot and process namespace, process number, and when the process started.
+    """The name of this process as a worker: host, boot, process namespace, process number, and when it started.
 
     The number alone is not enough: the system gives that of a process which has ended to another
     one.
@@ -327,11 +345,13 @@ def _machine() -> str:
 
 
 HEARTBEAT_S = 20.0
+"""A worker counts up once in so many seconds."""
 GRACE_S = 120.0
-"""A worker counts up so often, and is dead elsewhere once it has not for so long."""
+"""A worker of another machine is dead once its count has stood still for so long."""
 NAMELESS_S = 5.0
-"""A trial gets its worker's name at once."""
+"""A running trial without a worker's name is abandoned after so long: it gets the name at once."""
 _ALIVE = "alive "
+"""Begins the study's attribute that holds a worker's count; its name follows."""
 
 
 class Heartbeats:
@@ -398,10 +418,15 @@ class Heartbeats:
             silent = {
                 name for name in silent if now.get(_ALIVE + name) == counts.get(_ALIVE + name)
             }
-        return {
-            number: f"{name}, {'silent' if name in silent else 'dead' if self._has_ended(name) else 'alive'}"
-            for number, name in workers.items()
-        }
+
+        states = {}
+        for number, name in workers.items():
+            if name in silent:
+                state = "silent"
+            else:
+                state = "dead" if self._has_ended(name) else "alive"
+            states[number] = f"{name}, {state}"
+        return states
 
     def beat(self) -> None:
         """Count up once."""
@@ -449,11 +474,11 @@ class JournalFile(journal.JournalFileBackend):
         Raises:
             StudyError: They cannot be written; then the file is as it was.
         """
-        rest = memoryview(
-            "".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs).encode()
-        )
+        lines = "".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs)
+        rest = memoryview(lines.encode())
         with _writing(self.path), self.path.open("r+b", buffering=0) as file:
             fcntl.flock(file, fcntl.LOCK_EX)
+            # what a killed process left unfinished is cut off
             end = file.readall().rfind(b"\n") + 1
             file.truncate(end)
             file.seek(end)
@@ -467,6 +492,7 @@ class JournalFile(journal.JournalFileBackend):
 
 
 def _writing(path: Path) -> AbstractContextManager[None]:
+    """Turns errors of the disk into one line that names the file."""
     return translate_errors(
         StudyError, f"cannot write {path}", "free some space, or check the folder; then go on"
     )
