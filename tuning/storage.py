@@ -1,34 +1,28 @@
 """Where a study is stored, a journal file by default, any SQL database, or Optuna's gRPC proxy; and its trials."""
 
 import fcntl
-import inspect
 import json
 import math
 import os
-import random
 import socket
 import sys
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
-from functools import cache, wraps
+from functools import cache
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, urlsplit
 
 import numpy as np
 import optuna
 import pandas as pd
 import psutil
-from optuna.exceptions import StorageInternalError, UpdateFinishedTrialError
-from optuna.storages import BaseStorage, RDBStorage, journal
+from optuna.storages import BaseStorage, journal
 from optuna.trial import FrozenTrial, TrialState, create_trial
-from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError, PendingRollbackError
 
 from dynslam_bench.core import (
-    HIDDEN,
     StudyError,
     call_periodically,
     read_json,
@@ -36,6 +30,7 @@ from dynslam_bench.core import (
     without_passwords,
 )
 from dynslam_bench.core.records import Record, validated
+from dynslam_bench.tuning.database import open_database, without_password
 from dynslam_bench.tuning.objectives import centre
 from dynslam_bench.tuning.study_file import StudySpec
 
@@ -45,7 +40,7 @@ EARLIER = "earlier"
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """No warnings while the block lasts: Optuna calls much experimental, and has something to say of equal trials."""
+    """Suppress warnings while the block lasts: Optuna warns of experimental parts, and of equal trials."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
@@ -65,20 +60,26 @@ def best_trials(study: optuna.Study, count: int) -> list[FrozenTrial]:
     trials = [
         trial for trial in study.get_trials(deepcopy=False) if EARLIER not in trial.user_attrs
     ]
+
+    # complete trials by their sum of log ratios
     complete = [trial for trial in trials if trial.state == TrialState.COMPLETE]
     candidates = [trial for trial in complete if is_feasible(trial)] or complete
+    candidates.sort(key=lambda trial: sum(trial.values))
+
+    # pruned trials by the instances that they were run on, then by their ratio on these
     pruned = [
         trial
         for trial in trials
         if trial.state == TrialState.PRUNED and trial.user_attrs.get("scenes")
     ]
-    candidates.sort(key=lambda trial: sum(trial.values))
     pruned.sort(
         key=lambda trial: (
             -len(trial.user_attrs["instances"]),
             centre(trial.user_attrs["scenes"].values()),
         )
     )
+
+    # of trials with the same settings the best one
     distinct: dict[tuple[Any, ...], FrozenTrial] = {}
     for trial in [*candidates, *pruned]:
         distinct.setdefault(tuple(sorted(trial.params.items())), trial)
@@ -115,19 +116,25 @@ def trials_frame(spec: StudySpec, study: optuna.Study) -> pd.DataFrame:
         ``Float64``, ``Int64``, ``boolean`` or ``string``, missing where its condition did not hold.
     """
     trials = study.get_trials(deepcopy=False)
-    objectives = [f"value_{objective}" for objective in spec.objectives]
-    kinds = {
-        **{"trial": "Int64", "state": "string"},
-        **dict.fromkeys([*objectives, "ratio", "duration_s", "coverage", "fps"], "Float64"),
-        **{"runs": "Int64", "feasible": "boolean", "reason": "string", EARLIER: "string"},
-    }
-    frame = pd.DataFrame([_row(spec, trial) for trial in trials], columns=list(kinds)).astype(kinds)
-    for name in sorted({name for trial in trials for name in trial.params}):
+    numbers = [f"value_{objective}" for objective in spec.objectives]
+    numbers += ["ratio", "duration_s", "coverage", "fps"]
+    kinds = {"trial": "Int64", "state": "string"}
+    kinds |= dict.fromkeys(numbers, "Float64")
+    kinds |= {"runs": "Int64", "feasible": "boolean", "reason": "string", EARLIER: "string"}
+    rows = [_row(spec, trial) for trial in trials]
+    frame = pd.DataFrame(rows, columns=list(kinds)).astype(kinds)
+
+    # a column for each tuned setting
+    settings: set[str] = set()
+    for trial in trials:
+        settings |= set(trial.params)
+    for name in sorted(settings):
         frame[f"params.{name}"] = pd.array([trial.params.get(name) for trial in trials])
     return frame
 
 
 def _row(spec: StudySpec, trial: FrozenTrial) -> dict[str, Any]:
+    """One row of `trials_frame`, without the tuned settings; what is missing is None."""
     values = dict(zip(spec.objectives, trial.values or [], strict=False))
     accuracy = values.get("accuracy")
     return {
@@ -147,6 +154,7 @@ def _row(spec: StudySpec, trial: FrozenTrial) -> dict[str, Any]:
 FEWEST_TRIALS = 20
 """With fewer complete or pruned trials importances are luck."""
 _RESAMPLES = 50
+"""Bootstrap samples of the trials, from which the intervals of importances are taken."""
 
 
 class Importance(Record):
@@ -175,35 +183,38 @@ def importances(study: optuna.Study) -> dict[str, Importance]:
         Shares that add up to 1; empty below `FEWEST_TRIALS` complete or pruned trials, or where
         their values are equal.
     """
+    # trials of one objective: the mean of all
     trials = study.get_trials(deepcopy=False)
-    copies = [
-        create_trial(
-            params=trials[number].params,
-            distributions=trials[number].distributions,
-            value=centre(ratios.values()),
+    copies = []
+    for number, ratios in scene_ratios(study).items():
+        trial = trials[number]
+        copies.append(
+            create_trial(
+                params=trial.params,
+                distributions=trial.distributions,
+                value=centre(ratios.values()),
+            )
         )
-        for number, ratios in scene_ratios(study).items()
-    ]
     if len(copies) < FEWEST_TRIALS or len({copy.value for copy in copies}) < 2:
         return {}
+
+    # importances of all trials, and of bootstrap samples of them
+    shares = _shares(copies)
     rng = np.random.default_rng(0)
-    whole, *resampled = [
-        _shares([copies[index] for index in chosen])
-        for chosen in (
-            range(len(copies)),
-            *rng.integers(len(copies), size=(_RESAMPLES, len(copies))),
-        )
-    ]
-    table = pd.DataFrame(resampled).fillna(0.0).quantile([0.025, 0.975])
-    return {
-        name: Importance(
-            share=share, low=float(table[name].iloc[0]), high=float(table[name].iloc[1])
-        )
-        for name, share in whole.items()
-    }
+    samples = rng.integers(len(copies), size=(_RESAMPLES, len(copies)))
+    resampled = [_shares([copies[index] for index in sample]) for sample in samples]
+
+    # a setting that a sample does not hold has no importance in it
+    intervals = pd.DataFrame(resampled).fillna(0.0).quantile([0.025, 0.975])
+    importance = {}
+    for name, share in shares.items():
+        low, high = intervals[name]
+        importance[name] = Importance(share=share, low=float(low), high=float(high))
+    return importance
 
 
 def _shares(trials: Sequence[FrozenTrial]) -> dict[str, float]:
+    """Optuna's importance of each parameter over these trials."""
     study = optuna.create_study()
     study.add_trials(trials)
     with quiet():
@@ -214,12 +225,10 @@ def _shares(trials: Sequence[FrozenTrial]) -> dict[str, float]:
 SCHEMES = ("sqlite", "postgresql", "mysql", "mariadb", "oracle", "mssql", "grpc")
 """SQL databases (also with a driver: ``postgresql+psycopg``) and Optuna's gRPC proxy. They hold data, never code;
 Optuna unpickles what Redis holds."""
-_BEING_MADE = ("already exists", "duplicate", "unique constraint", "is locked")
-"""What drivers say where another worker makes the tables at the same time."""
 
 
 def study_folder(results: Path, spec: StudySpec) -> Path:
-    """The folder of a study's files."""
+    """The folder of a study's files: ``studies/NAME`` of the results folder."""
     return results / "studies" / spec.name
 
 
@@ -255,6 +264,7 @@ def open_storage(results: Path, spec: StudySpec) -> BaseStorage:
 
 
 SPEC_FILE = "study.json"
+"""The file of a study's folder that holds its specification."""
 
 
 def read_stored(folder: Path) -> tuple[StudySpec, Path]:
@@ -268,9 +278,10 @@ def read_stored(folder: Path) -> tuple[StudySpec, Path]:
         raise StudyError(
             f"{folder} holds no study: it has no {SPEC_FILE}", "name results/studies/NAME"
         )
-    return validated(
-        StudySpec, read_json(stored, kind=StudyError), str(stored), StudyError
-    ), folder.absolute().parents[1]
+    spec = validated(StudySpec, read_json(stored, kind=StudyError), str(stored), StudyError)
+    # RESULTS/studies/NAME
+    results = folder.absolute().parents[1]
+    return spec, results
 
 
 def load_study(results: Path, spec: StudySpec) -> optuna.Study:
@@ -294,95 +305,8 @@ def load_study(results: Path, spec: StudySpec) -> optuna.Study:
         raise absent from error
 
 
-def open_database(url: str) -> BaseStorage:
-    """Open a database, and make its tables if it is empty.
-
-    Workers may begin at the same time: one whose tables another worker makes meanwhile tries again.
-
-    Raises:
-        Exception: What the database's driver raises.
-    """
-    attempts = 0
-    while True:
-        try:  # a server takes few connections, e.g. 100
-            storage = PatientStorage(url, engine_kwargs={"pool_pre_ping": True, "pool_size": 1})
-            return optuna.storages.get_storage(storage)
-        except (DBAPIError, StorageInternalError) as error:
-            cause = str(error.__cause__ or error).lower()
-            attempts += 1
-            if attempts == ATTEMPTS or not any(words in cause for words in _BEING_MADE):
-                raise
-        time.sleep(random.uniform(0.05, 0.5))
-
-
-class PatientStorage(RDBStorage):
-    """Optuna's SQL storage, which waits up to `PATIENCE_S` for a database that does not answer, as while it restarts.
-
-    Raises:
-        StudyError: It does not answer for longer.
-    """
-
-
-ATTEMPTS = 10
-PATIENCE_S = 60.0
-_NO_ANSWER = (OperationalError, InterfaceError, PendingRollbackError)
-"""Errors of a database that is away; the last one where it went within a transaction."""
-
-
-def _patient(method: Callable[..., Any]) -> Callable[..., Any]:
-    @wraps(method)
-    def call(storage: PatientStorage, *arguments: Any, **named: Any) -> Any:
-        began = time.monotonic()
-        failed = False
-        while True:
-            try:
-                return method(storage, *arguments, **named)
-            except UpdateFinishedTrialError:
-                if not failed:
-                    raise
-                return True  # the call before had arrived, its answer had not
-            except (DBAPIError, StorageInternalError) as error:
-                if not isinstance(error, _NO_ANSWER) and not isinstance(
-                    error.__cause__, _NO_ANSWER
-                ):
-                    raise
-                if time.monotonic() - began > PATIENCE_S:
-                    line = str(error.__cause__ or error).splitlines()[0]
-                    text = without_password(
-                        f"the study's database does not answer: {line}", storage.url
-                    )
-                    raise StudyError(
-                        text, "finished trials are stored; the same command goes on from there"
-                    ) from error
-            failed = True
-            time.sleep(random.uniform(0.2, 2.0))
-
-    return call
-
-
-_CALLED_BY_CACHE = (
-    "_create_new_trial",
-    "_get_best_trial_id",
-    "_get_stale_trial_ids",
-    "_get_trials",
-    "_set_trial_param",
-)
-for _name, _method in inspect.getmembers(RDBStorage, inspect.isfunction):
-    if not _name.startswith("_") or _name in _CALLED_BY_CACHE:
-        setattr(PatientStorage, _name, _patient(_method))
-
-
-def without_password(text: str, address: str) -> str:
-    """A text, for example a driver's message, without the password that an address holds."""
-    with suppress(ValueError):  # no address
-        password = urlsplit(address).password or ""
-        for secret in {password, unquote(password)} - {""}:
-            text = text.replace(secret, HIDDEN)
-    return without_passwords(text)
-
-
 def worker_name() -> str:
-    """Names this process: host, boot and process namespace, process number, and when the process started.
+    """The name of this process as a worker: host, boot, process namespace, process number, and when it started.
 
     The number alone is not enough: the system gives that of a process which has ended to another
     one.
@@ -421,11 +345,13 @@ def _machine() -> str:
 
 
 HEARTBEAT_S = 20.0
+"""A worker counts up once in so many seconds."""
 GRACE_S = 120.0
-"""A worker counts up so often, and is dead elsewhere once it has not for so long."""
+"""A worker of another machine is dead once its count has stood still for so long."""
 NAMELESS_S = 5.0
-"""A trial gets its worker's name at once."""
+"""A running trial without a worker's name is abandoned after so long: it gets the name at once."""
 _ALIVE = "alive "
+"""Begins the study's attribute that holds a worker's count; its name follows."""
 
 
 class Heartbeats:
@@ -492,10 +418,15 @@ class Heartbeats:
             silent = {
                 name for name in silent if now.get(_ALIVE + name) == counts.get(_ALIVE + name)
             }
-        return {
-            number: f"{name}, {'silent' if name in silent else 'dead' if self._has_ended(name) else 'alive'}"
-            for number, name in workers.items()
-        }
+
+        states = {}
+        for number, name in workers.items():
+            if name in silent:
+                state = "silent"
+            else:
+                state = "dead" if self._has_ended(name) else "alive"
+            states[number] = f"{name}, {state}"
+        return states
 
     def beat(self) -> None:
         """Count up once."""
@@ -543,11 +474,11 @@ class JournalFile(journal.JournalFileBackend):
         Raises:
             StudyError: They cannot be written; then the file is as it was.
         """
-        rest = memoryview(
-            "".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs).encode()
-        )
+        lines = "".join(json.dumps(log, separators=(",", ":")) + "\n" for log in logs)
+        rest = memoryview(lines.encode())
         with _writing(self.path), self.path.open("r+b", buffering=0) as file:
             fcntl.flock(file, fcntl.LOCK_EX)
+            # what a killed process left unfinished is cut off
             end = file.readall().rfind(b"\n") + 1
             file.truncate(end)
             file.seek(end)
@@ -561,6 +492,7 @@ class JournalFile(journal.JournalFileBackend):
 
 
 def _writing(path: Path) -> AbstractContextManager[None]:
+    """Turns errors of the disk into one line that names the file."""
     return translate_errors(
         StudyError, f"cannot write {path}", "free some space, or check the folder; then go on"
     )

@@ -23,10 +23,10 @@ from optuna.trial import FrozenTrial, TrialState, create_trial
 from dynslam_bench.core import (
     DynslamError,
     StudyError,
+    exclusive_lock,
     read_settings,
     storable,
     translate_errors,
-    turn,
     words_without_passwords,
     write_atomic,
 )
@@ -35,6 +35,7 @@ from dynslam_bench.core.seeding import stream
 from dynslam_bench.core.settings import Scalar
 from dynslam_bench.runs import RunEvent, resolve, run_many
 from dynslam_bench.runs.record import program_of
+from dynslam_bench.tuning.database import without_password
 from dynslam_bench.tuning.objectives import (
     CancelledError,
     Configuration,
@@ -66,7 +67,6 @@ from dynslam_bench.tuning.storage import (
     read_stored,
     study_folder,
     trials_frame,
-    without_password,
     worker_name,
 )
 from dynslam_bench.tuning.study_file import (
@@ -544,7 +544,7 @@ class Study(Plan):
             StudyError, f"cannot write {self.folder}", "check the permissions and the free space"
         ):
             self.folder.mkdir(parents=True, exist_ok=True)
-        return turn(self.folder / f".{what}")
+        return exclusive_lock(self.folder / f".{what}")
 
     def _await_names(self) -> None:
         """Wait until each running trial has its worker's name, or that worker is known to have been killed before.

@@ -1,7 +1,7 @@
 """The lowest layer: errors, annotated settings, plug-in discovery, seeding and atomic records.
 
-What is here by name loads nothing but the standard library; settings and records, which need
-pydantic, have modules.
+What is here by name loads nothing but the standard library. Settings and records, which need
+pydantic, are imported from their modules.
 """
 
 from dynslam_bench.core.errors import (
@@ -27,7 +27,7 @@ from dynslam_bench.core.files import (
     SHARED_MEMORY,
     TemporaryFolder,
     atomic_folder,
-    claimed,
+    exclusive_lock,
     is_abandoned,
     is_temporary,
     replace_folder,
@@ -35,7 +35,7 @@ from dynslam_bench.core.files import (
     sweep,
     sweep_temporary,
     temporary_folder,
-    turn,
+    try_lock,
     write_atomic,
     write_lines,
 )
@@ -105,9 +105,9 @@ __all__ = [
     "assignments",
     "atomic_folder",
     "call_periodically",
-    "claimed",
     "compare_sums",
     "did_you_mean",
+    "exclusive_lock",
     "file_sha256",
     "find_data_root",
     "inside",
@@ -136,7 +136,7 @@ __all__ = [
     "sweep_temporary",
     "temporary_folder",
     "translate_errors",
-    "turn",
+    "try_lock",
     "user_cache",
     "vocabularies_folder",
     "weights_folder",

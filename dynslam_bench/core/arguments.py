@@ -14,11 +14,11 @@ from pydantic import ConfigDict, ValidationError, create_model
 from dynslam_bench.core.errors import DynslamError, SettingsError
 from dynslam_bench.core.settings import shown
 
-C = TypeVar("C", bound=Callable[..., Any])
+Target = TypeVar("Target", bound=Callable[..., Any])
 
 
-def names_wrong_arguments(target: C) -> C:
-    """Decorates a function, or a class for its constructor: when it fails, arguments are compared with annotations.
+def names_wrong_arguments(target: Target) -> Target:
+    """Decorate a function, or a class for its constructor: when it fails, arguments are compared with annotations.
 
     Raises:
         SettingsError: The call failed and an argument is not of the annotated type. Other errors
@@ -36,30 +36,36 @@ def names_wrong_arguments(target: C) -> C:
             raise
         except Exception as error:
             wrong = None
-            # names that do not fit, or annotations that cannot be checked
+            # it fails for names that do not fit, and annotations that cannot be checked
             with suppress(Exception):
-                if _is_ours(error):
-                    wrong = _wrong_argument(
-                        target, inspect.signature(target).bind(*args, **kwargs).arguments
-                    )
+                if _is_of_this_package(error):
+                    arguments = inspect.signature(target).bind(*args, **kwargs).arguments
+                    wrong = _wrong_argument(target, arguments)
             if wrong is not None:
                 raise wrong from error
             raise
 
-    return cast("C", call)
+    return cast("Target", call)
 
 
-def _is_ours(error: Exception) -> bool:
+def _is_of_this_package(error: Exception) -> bool:
     """Whether an error passed through this package and its libraries alone: no plug-in, nor a user's callable."""
-    modules = (
-        str(frame.f_globals.get("__name__")) for frame, _ in traceback.walk_tb(error.__traceback__)
-    )
-    packages = {module.partition(".")[0] for module in modules}
-    return packages <= {"dynslam_bench", "gymnasium", "numpy", *sys.stdlib_module_names}
+    packages = set()
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        module = str(frame.f_globals.get("__name__"))
+        packages.add(module.partition(".")[0])
+    this_package = __name__.partition(".")[0]
+    return packages <= {this_package, "gymnasium", "numpy", *sys.stdlib_module_names}
 
 
 def _wrong_argument(function: Callable[..., Any], given: dict[str, Any]) -> SettingsError | None:
-    """The line on the first argument that is not of the annotated type; None if all are."""
+    """The line on the first argument that is not of the annotated type; None if all are.
+
+    Args:
+        function: The function.
+        given: The arguments of a call by name.
+    """
+    # pydantic compares: a model with one field for each argument
     hints = get_type_hints(function)
     fields: dict[str, Any] = {name: (hints[name], ...) for name in given if name in hints}
     model = create_model(
@@ -69,7 +75,8 @@ def _wrong_argument(function: Callable[..., Any], given: dict[str, Any]) -> Sett
         model.model_validate({name: given[name] for name in fields})
     except ValidationError as wrong:
         name = str(wrong.errors()[0]["loc"][0])
-        expected = inspect.formatannotation(inspect.signature(function).parameters[name].annotation)
+        annotation = inspect.signature(function).parameters[name].annotation
+        expected = inspect.formatannotation(annotation)
         expected = re.sub(r"\b(\w+\.)+", "", expected).strip("'")  # without the modules
         return SettingsError(f"{name} is {shown(given[name])}", f"give {expected}")
     return None

@@ -14,6 +14,7 @@ from pathlib import Path
 from dynslam_bench.core.module_graph import parsed
 
 CODE = (".py", ".so", ".pyd", ".dylib", ".dll")
+"""How the names of Python sources and native libraries end."""
 _TEXT = (
     ".py",
     ".sh",
@@ -37,11 +38,15 @@ _TEXT = (
     ".h",
     ".hpp",
 )
+"""How scripts, sources and configurations end, which may name other files."""
 _LARGEST_TEXT = 1 << 20
+"""Bytes of the largest text that is searched for names of files."""
 _WORD = re.compile(rb"[\w./~+\-]+")
+"""What could be a path, quoted or not."""
 _QUOTED = re.compile(rb"[\"']([\w.+\-]+)(?:/[^\"'\n]*)?[\"']")
 """A text in quotes that could be a path, of which the first part is taken."""
 _FORMAT = re.compile(rb"%[-+0-9.]*[a-zA-Z]")
+"""A placeholder of printf: what stands before and after it are words of their own."""
 _SYSTEM = (
     "/usr/",
     "/bin/",
@@ -54,8 +59,11 @@ _SYSTEM = (
     "/opt/local/",
     "/System/",
 )
+"""Where files of the operating system lie."""
 _STORE = ("index.sqlite", "sequences", "latest")
+"""A folder with ``runs/`` and one of these is a results folder."""
 _RECORDING = ("rgb.txt", "groundtruth.txt", "rgb.csv", "mav0", "color.txt", "associations.txt")
+"""A folder with one of these is a recording."""
 
 
 def is_code(file: Path) -> bool:
@@ -107,18 +115,21 @@ def program_files(folder: Path) -> list[Path]:
         OSError: The folder cannot be read.
     """
     everything = list(files_below(folder))
-    code = [file for file in everything if is_code(file)]
-    quoted = {
-        name.decode()
-        for file in filter(is_python, code)
-        for name in _QUOTED.findall(file.read_bytes())
-    }
-    sure = [
-        file
-        for file in everything
-        if file in set(code) or file.relative_to(folder).parts[0] in quoted
-    ]
-    return sure + _named(sure, [file for file in everything if file not in set(sure)])
+    code = {file for file in everything if is_code(file)}
+
+    # what Python sources quote may be the name of a folder, all of whose files count
+    quoted: set[str] = set()
+    for file in filter(is_python, code):
+        quoted |= {name.decode() for name in _QUOTED.findall(file.read_bytes())}
+
+    counted = []
+    others = []
+    for file in everything:
+        if file in code or file.relative_to(folder).parts[0] in quoted:
+            counted.append(file)
+        else:
+            others.append(file)
+    return counted + _named(counted, others)
 
 
 def imported_modules(files: Iterable[Path]) -> set[str]:
@@ -138,12 +149,12 @@ def imported_modules(files: Iterable[Path]) -> set[str]:
                 modules |= {alias.name for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and not node.level:
                 modules.add(node.module or "")
-            elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(
-                ("import_module", "__import__")
-            ):
-                modules |= {
-                    str(first.value) for first in node.args[:1] if isinstance(first, ast.Constant)
-                }
+            elif isinstance(node, ast.Call):
+                function = ast.unparse(node.func)
+                argument = node.args[0] if node.args else None
+                is_import = function.endswith(("import_module", "__import__"))
+                if is_import and isinstance(argument, ast.Constant):
+                    modules.add(str(argument.value))
     return {name.partition(".")[0].partition(" ")[0] for name in modules} - {""}
 
 
@@ -188,70 +199,79 @@ def files_of_command(command: Sequence[str], folder: Path | None = None) -> list
     if not command:
         return []
     base = Path() if folder is None else folder
-    first = (
-        str(base / Path(command[0]).expanduser())
-        if os.sep in command[0]
-        else shutil.which(command[0])
-    )
-    program = None if first is None else Path(first)
-    files = (
-        []
-        if program is None or not _is_file(program)
-        else [program, *_linked_libraries(program.resolve())]
-    )
+    program = _program_of(command[0], base)
+    files: list[Path] = []
+
+    # the program with its libraries, and what its arguments name
+    if program is not None and _is_file(program):
+        files += [program, *_linked_libraries(program.resolve())]
     for word in command[1:]:
-        for path in {
-            base / Path(text).expanduser() for text in (word, word.partition("=")[2]) if text
-        }:
-            files += files_below(path) if os.path.isdir(path) else [path] if _is_file(path) else []  # noqa: PTH112
+        files += _files_of_argument(word, base)
     if program is not None and program.name.startswith("python") and "-m" in command[:-1]:
         files += _module_files(command[command.index("-m") + 1], base)
+
+    # what scripts and configurations among them name, shell scripts also the files beside them
     named = _with_named_files(files, base)
-    shells = [
-        file
-        for file in named
-        if file.suffix in (".sh", ".bash") or (not file.suffix and _words(file))
-    ]
-    named += [
-        data_file for file in shells for data_file in _named([file], list(files_below(file.parent)))
-    ]
+    shell_scripts = [file for file in named if _is_shell_script(file)]
+    for script in shell_scripts:
+        named += _named([script], list(files_below(script.parent)))
+
+    # Python scripts: the code in their folders, and what they import from elsewhere
     scripts = [file for file in named if is_python(file) and not _is_of_system(file)]
-    own = [
-        file
-        for folder in sorted({script.parent for script in scripts})
-        for file in program_files(folder)
-    ]
-    modules = {name for script in scripts for name in foreign_modules(script)} - set(
-        sys.stdlib_module_names
-    )
-    own += [
-        file
-        for name in sorted(modules)
-        for file in _module_files(name, base)
-        if not is_installed(file)
-    ]
-    return list(dict.fromkeys(file.resolve() for file in (*named, *own)))
+    code: list[Path] = []
+    for script_folder in sorted({script.parent for script in scripts}):
+        code += program_files(script_folder)
+    modules: set[str] = set()
+    for script in scripts:
+        modules |= foreign_modules(script)
+    for module in sorted(modules - set(sys.stdlib_module_names)):
+        code += [file for file in _module_files(module, base) if not is_installed(file)]
+
+    return list(dict.fromkeys(file.resolve() for file in (*named, *code)))
+
+
+def _program_of(word: str, base: Path) -> Path | None:
+    """The file of a command's first word; None where a bare name is not on ``PATH``."""
+    if os.sep in word:
+        return base / Path(word).expanduser()
+    found = shutil.which(word)
+    return None if found is None else Path(found)
+
+
+def _files_of_argument(word: str, base: Path) -> list[Path]:
+    """The file, or the files of the folder, that an argument or its part behind ``=`` names."""
+    texts = [text for text in (word, word.partition("=")[2]) if text]
+    files: list[Path] = []
+    for path in {base / Path(text).expanduser() for text in texts}:
+        if os.path.isdir(path):  # noqa: PTH112 - it takes words that cannot be a path
+            files += files_below(path)
+        elif _is_file(path):
+            files.append(path)
+    return files
+
+
+def _is_shell_script(file: Path) -> bool:
+    if file.suffix:
+        return file.suffix in (".sh", ".bash")
+    return bool(_words(file))
 
 
 def _module_files(module: str, base: Path) -> list[Path]:
     """The code of a module in the working folder or on ``PYTHONPATH``, else as this interpreter finds it."""
     top = module.partition(".")[0]
-    for place in (
-        base,
-        *map(Path, filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))),
-    ):
+    search_path = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    for place in (base, *(Path(folder) for folder in search_path if folder)):
         if (place / top).is_dir():
             return program_files(place / top)
         if (place / f"{top}.py").is_file():
             return program_files(place)
     with suppress(ImportError, ValueError):
         folders = getattr(find_spec(top), "submodule_search_locations", None) or ()
-        return [
-            file
-            for place in map(Path, folders)
-            if not is_installed(place)
-            for file in files_below(place)
-        ]
+        files: list[Path] = []
+        for place in map(Path, folders):
+            if not is_installed(place):
+                files += files_below(place)
+        return files
     return []
 
 
@@ -280,7 +300,8 @@ def _with_named_files(files: Iterable[Path], base: Path) -> list[Path]:
         if file in reached:
             continue
         reached[file] = None
-        for word in sorted(word for word in _words(file) if "." in word or "/" in word):
+        path_like = sorted(word for word in _words(file) if "." in word or "/" in word)
+        for word in path_like:
             path = Path(word).expanduser() if word.startswith("~/") else Path(word)
             places = {file.parent / path, base / path}  # an absolute path stays as it is
             waiting += [place for place in places if not _is_of_system(place) and _is_file(place)]
@@ -292,7 +313,10 @@ def _named(code: list[Path], others: list[Path]) -> list[Path]:
     files: list[Path] = []
     waiting = list(code)
     while waiting and others:
-        words = {word.rpartition("/")[2] for file in waiting for word in _words(file)}
+        words: set[str] = set()
+        for file in waiting:
+            words |= {word.rpartition("/")[2] for word in _words(file)}
+        # f"{name}_v2.yaml" names every file that ends so
         ends = tuple(word for word in words if "." in word)
         waiting = [file for file in others if file.name in words or file.name.endswith(ends)]
         others = [file for file in others if file not in set(waiting)]
@@ -306,7 +330,9 @@ def _words(file: Path) -> set[str]:
         if file.stat().st_size > _LARGEST_TEXT:
             return set()
         with file.open("rb") as opened:
-            if file.suffix not in _TEXT and (file.suffix or opened.read(2) != b"#!"):
+            # without an ending it is a script where it names its interpreter
+            is_script = not file.suffix and opened.read(2) == b"#!"
+            if file.suffix not in _TEXT and not is_script:
                 return set()
         text = _FORMAT.sub(b" ", file.read_bytes())
         return {word.decode(errors="replace").rstrip(".") for word in _WORD.findall(text)}
@@ -324,7 +350,9 @@ def _is_file(path: Path) -> bool:
 
 def leads_back(entry: Path) -> bool:
     """Whether a folder is a link to one that it lies in: following it would never end."""
-    return entry.is_symlink() and entry.resolve() in (entry.parent.resolve() / entry.name).parents
+    if not entry.is_symlink():
+        return False
+    return entry.resolve() in (entry.parent.resolve() / entry.name).parents
 
 
 def _is_left_out(folder: Path) -> bool:

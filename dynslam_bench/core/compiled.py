@@ -45,6 +45,13 @@ def inlined(function: Function) -> Function:
 
 
 def _compiled(function: Function, *, error_model: str, **options: Any) -> Function:
+    """Numba's kernel of a function, compiled at its first call or loaded from disk.
+
+    Args:
+        function: The function.
+        error_model: ``python``: a division by zero raises; ``numpy``: it gives an infinity.
+        **options: Further options of `numba.njit`.
+    """
     # numba would give a kernel without an error model that of the kernel which calls it first
     compiled = numba.njit(
         nogil=True, pipeline_class=KernelCompiler, error_model=error_model, **options

@@ -15,15 +15,20 @@ from urllib.parse import urlsplit
 from urllib.request import HTTPRedirectHandler, Request, build_opener
 
 from dynslam_bench.core.errors import DownloadError, DynslamError, translate_errors
-from dynslam_bench.core.files import claimed
+from dynslam_bench.core.files import try_lock
 from dynslam_bench.core.reading import file_sha256, read_json
 from dynslam_bench.core.sanitise import without_passwords
 
 CHUNK = 1 << 18
+"""Bytes that are read and written at a time."""
 MOST_BYTES = 32 * 2**30
+"""A longer file is refused where nothing else is said."""
 _LONGEST_PAUSE_S = 30.0
+"""Bound of the pause between two attempts, which doubles each time."""
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS, errno.EIO)
+"""Faults of this machine's disk, which another attempt does not cure."""
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
+"""Names of this machine: plain http to it does not leave it."""
 _GO_ON = "run the same command again, it goes on from there"
 
 
@@ -46,10 +51,11 @@ Report = Callable[[Progress], None]
 Display = Callable[[str], contextlib.AbstractContextManager[Report]]
 """Shows the download of a file of that name as long as the context lasts."""
 _display: list[Display] = []
+"""What `show_downloads` was given, in a list of one; empty where nothing is shown."""
 
 
 def show_downloads(display: Display) -> None:
-    """Let this process show every download that is called without `progress`; the command line does so."""
+    """Set how this process shows every download that is called without `progress`; the command line does so."""
     _display[:] = [display]
 
 
@@ -94,19 +100,25 @@ def download(
     with translate_errors(DownloadError, f"cannot write {target}", "name another folder"):
         target.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.ExitStack() as stack:
-            if not stack.enter_context(claimed(part.with_name(part.name + ".lock"))):
+            if not stack.enter_context(try_lock(part.with_name(part.name + ".lock"))):
                 raise DownloadError(
                     f"another process is downloading {url}",
                     "wait for it, then run the same command again",
                 )
-            report = progress or (
-                stack.enter_context(_display[0](target.name)) if _display else lambda _: None
-            )
+            report = progress
+            if report is None and _display:
+                report = stack.enter_context(_display[0](target.name))
+            if report is None:
+                report = _report_nothing
+
+            # what is missing of the file
             partial = _Partial(url, part, report, timeout_s, most_bytes)
             if not target.is_file():
                 partial.complete(attempts, wait_s)
+
+            # a wrong file is removed, so that the next call begins again
             file = target if target.is_file() else part
-            checksum = file_sha256(file, lambda done, total: report(Progress("check", done, total)))
+            checksum = _checksum(file, report)
             if sha256 is not None and not checksum.startswith(sha256):
                 size = file.stat().st_size
                 file.unlink()
@@ -118,6 +130,15 @@ def download(
             file.replace(target)
             partial.forget()  # also what a process left that was killed between these two lines
             return checksum
+
+
+def _report_nothing(progress: Progress) -> None:
+    """Shows no progress."""
+
+
+def _checksum(file: Path, report: Report) -> str:
+    """SHA-256 of a file, whose progress is reported."""
+    return file_sha256(file, lambda done, total: report(Progress("check", done, total)))
 
 
 @dataclass(frozen=True)
@@ -133,8 +154,12 @@ class _Partial:
     def complete(self, attempts: int, wait_s: float) -> None:
         """Connect until the file is whole.
 
+        Args:
+            attempts: Connections in a row that may fail without bringing a single byte.
+            wait_s: Pause before the second attempt, doubled before each further one.
+
         Raises:
-            DownloadError: It does not become so.
+            DownloadError: The attempts are used up, or the server refuses.
         """
         fruitless = 0
         best = self._size()
@@ -143,28 +168,34 @@ class _Partial:
         while fruitless < attempts:
             try:
                 with self._connect() as response:
-                    total = self._total(response)
+                    total = self._begin_or_continue(response)
                     if self._receive(response, total):
                         return
                 reason = "the server closed the connection early"
             except HTTPError as error:
+                # 416: there is nothing after what was got before
                 if error.code == 416 and self._size():
-                    if error.headers.get("Content-Range", "").rpartition("/")[2] == str(
-                        self._size()
-                    ):
+                    length = error.headers.get("Content-Range", "").rpartition("/")[2]
+                    if length == str(self._size()):
                         return
                     # longer than the file on the server, or the server does not say: begin again
                     self.forget()
                 reason = f"the server answers {error.code} {error.reason}"
+                # time-out, range and too many requests may pass; so may faults of the server (5xx)
                 if error.code < 500 and error.code not in (408, 416, 429):
                     raise DownloadError(f"{reason} for {self.url}") from error
             # no route, time-out, TLS, odd redirect
             except (OSError, HTTPException, ValueError) as error:
                 reason = str(getattr(error, "reason", "") or error) or type(error).__name__
-            fruitless = 0 if self._size() > best else fruitless + 1
+            # a connection that brought bytes is followed by the next one at once
+            if self._size() > best:
+                fruitless = 0
+            else:
+                fruitless += 1
             best = max(best, self._size())
             if 0 < fruitless < attempts:
-                time.sleep(min(2 ** (fruitless - 1) * wait_s, _LONGEST_PAUSE_S))
+                pause_s = 2 ** (fruitless - 1) * wait_s
+                time.sleep(min(pause_s, _LONGEST_PAUSE_S))
         expected = f" of {total}" if total else ""
         raise DownloadError(
             f"download of {self.url} stopped at {self._size()}{expected} bytes: {reason}", _GO_ON
@@ -192,16 +223,27 @@ class _Partial:
                 request.add_header("If-Range", notes["version"])
         return build_opener(_Redirect).open(request, timeout=self.timeout_s)
 
-    def _total(self, response: Any) -> int | None:
-        """The length of the whole file, if the server says it; an answer that does not go on begins the file again."""
+    def _begin_or_continue(self, response: Any) -> int | None:
+        """Prepare the partial file for an answer's bytes.
+
+        The file is begun again where the answer is not its rest, and the server's name for this
+        version is noted.
+
+        Returns:
+            The length of the whole file in bytes; None where the server does not say.
+
+        Raises:
+            DownloadError: The file is too long, or does not fit on the disk.
+            ValueError: The answer is another range than was asked for.
+        """
         headers = response.headers
         is_rest = headers.get("Content-Range", "").startswith(f"bytes {self._size()}-")
         if response.status != 206 or not is_rest:
             self.forget()  # the server knows no ranges, or the file has changed
         if response.status == 206 and not is_rest:
             raise ValueError("the server sends another range than was asked for")
+        # a weak ETag (W/...) validates no range
         etag = headers.get("ETag") or "W/"
-        # a weak one validates no range
         version = headers.get("Last-Modified") if etag.startswith("W/") else etag
         # without notes the next call begins again, which is safe
         with contextlib.suppress(OSError):
@@ -212,7 +254,7 @@ class _Partial:
             return None
         missing = int(headers["Content-Length"])
         free = shutil.disk_usage(self.part.parent).free
-        self._check(self._size() + missing)
+        self._check_length(self._size() + missing)
         if missing > free:
             raise DownloadError(
                 f"{self.part.parent} has {free / 1e9:.2f} GB free, but {missing / 1e9:.2f} GB are still to download",
@@ -227,7 +269,7 @@ class _Partial:
             with self.part.open("ab") as file:
                 while block := response.read1(CHUNK):
                     done += len(block)
-                    self._check(done)
+                    self._check_length(done)
                     file.write(block)
                     self.report(Progress("download", done, total))
             return total is None or done == total
@@ -239,18 +281,24 @@ class _Partial:
                 f"make room and {_GO_ON}",
             ) from error
 
-    def _check(self, size: int) -> None:
-        """Refuse what is too long, and throw away what came of it."""
+    def _check_length(self, size: int) -> None:
+        """Refuse a file that is too long, and throw away what came of it.
+
+        Raises:
+            DownloadError: It has more than `most_bytes`.
+        """
         if size > self.most_bytes:
             self.forget()
             expected = f"the {self.most_bytes / 1e9:.2f} GB that are expected"
             raise DownloadError(f"{self.url} is longer than {expected}, refused")
 
     def _size(self) -> int:
+        """Bytes of the partial file."""
         return self.part.stat().st_size if self.part.exists() else 0
 
     @property
     def _notes(self) -> Path:
+        """The file beside it with the address, and the server's name for the version."""
         return self.part.with_name(self.part.name + ".json")
 
 

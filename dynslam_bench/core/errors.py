@@ -66,19 +66,27 @@ LONGEST = 1000
 
 
 _HIDDEN_FOLDERS: list[str] = []
+"""Beginnings of paths that messages leave out, see `hide_folder_in_messages`."""
 
 
 def hide_folder_in_messages(folder: Path) -> Path:
-    """A temporary folder whose path messages leave out: they name what lies below it, e.g. an unpacked archive."""
+    """Leave a temporary folder's path out of messages, which then name what lies below it, e.g. in an archive.
+
+    Returns:
+        The folder.
+    """
     _HIDDEN_FOLDERS.append(f"{folder}{os.sep}")
     return folder
 
 
 def _one_line(text: str) -> str:
+    """The text as one line without passwords; of a long one its beginning and its end."""
     text = without_passwords(" ".join(text.splitlines()))
     for folder in _HIDDEN_FOLDERS:
         text = text.replace(folder, "")
-    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} [...] {text[-LONGEST // 2 :]}"
+    if len(text) <= LONGEST:
+        return text
+    return f"{text[: LONGEST // 2]} [...] {text[-LONGEST // 2 :]}"
 
 
 class SettingsError(DynslamError):
@@ -168,11 +176,9 @@ def reason_of(error: BaseException) -> str:
     if isinstance(error, shutil.Error) and error.args and isinstance(error.args[0], list):
         source, _, reason = error.args[0][0]  # a folder could not be copied: the first of its files
         return f"{reason} ({source})"
-    return (
-        getattr(error, "strerror", None)
-        or " ".join(str(error).split())[:200]
-        or type(error).__name__
-    )
+    words_of_system = getattr(error, "strerror", None)
+    words_of_library = " ".join(str(error).split())[:200]
+    return words_of_system or words_of_library or type(error).__name__
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
@@ -186,14 +192,17 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
         For example ``"did you mean 'epipolar.threshold_px'?"``; empty if nothing is known.
     """
     names = sorted(set(known))
-    close = difflib.get_close_matches(
-        name.lower(), {candidate.lower() for candidate in names}, n=3, cutoff=0.5
-    )
-    if close:
-        meant = [
-            repr(candidate) for match in close for candidate in names if candidate.lower() == match
-        ]
+    if not names:
+        return ""
+
+    # upper and lower case do not count
+    spellings = {candidate.lower() for candidate in names}
+    meant: list[str] = []
+    for match in difflib.get_close_matches(name.lower(), spellings, n=3, cutoff=0.5):
+        meant += [repr(candidate) for candidate in names if candidate.lower() == match]
+
+    if meant:
         return f"did you mean {' or '.join(meant)}?"
-    if 0 < len(names) <= 16:
+    if len(names) <= 16:
         return "known: " + ", ".join(names)
-    return f"{len(names)} are known, none is close" if names else ""
+    return f"{len(names)} are known, none is close"

@@ -20,10 +20,15 @@ from pathlib import Path
 from dynslam_bench.core.errors import InfrastructureError, translate_errors
 
 _TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}\.tmp")
-_TURN_S = 0.1
+"""Names that `_reserve` gives."""
+_POLL_S = 0.1
+"""Pause before a lock that another process holds is asked for again."""
 _CURE = "check the permissions and the free space"
+"""Hint of errors about files that cannot be written."""
 _AT_FDCWD = -100
+"""Stands for the working folder, from which relative paths are resolved (renameat2(2))."""
 _RENAME_EXCHANGE = 2
+"""Flag of renameat2(2): both names exist, and each gets what the other one was."""
 
 
 @contextmanager
@@ -54,20 +59,21 @@ def write_atomic(path: Path, content: str | bytes | memoryview) -> None:
         InfrastructureError: The folder cannot be written (full disk, permissions); nothing is left
             behind.
     """
+    if isinstance(content, str):
+        content = content.encode(errors="backslashreplace")
     with (
         translate_errors(InfrastructureError, f"cannot write {path}", _CURE),
         replacing(path) as temporary,
     ):
-        temporary.write_bytes(
-            content.encode(errors="backslashreplace") if isinstance(content, str) else content
-        )
+        temporary.write_bytes(content)
 
 
 def write_lines(path: Path, lines: Iterable[str]) -> None:
-    """The same of lines that are never all held at once; each gets its newline here.
+    """Write lines as `write_atomic` does, without holding all of them at once; each gets its newline here.
 
     Raises:
-        InfrastructureError: As `write_atomic`.
+        InfrastructureError: The folder cannot be written (full disk, permissions); nothing is left
+            behind.
     """
     with (
         translate_errors(InfrastructureError, f"cannot write {path}", _CURE),
@@ -89,6 +95,7 @@ def replace_folder(work: Path, target: Path) -> None:
     """
     old = work.with_name(f"{work.name}.old")
     while True:
+        # where nothing lies at the target a rename is enough
         try:
             work.rename(target)
             break
@@ -97,9 +104,11 @@ def replace_folder(work: Path, target: Path) -> None:
                 with suppress(OSError):  # what was moved aside below, if anything was
                     old.rename(target)
                 raise
+        # else both exchange their names at once
         if _exchange(work, target):
             old = work
             break
+        # where the system cannot do so, the target is moved aside, and the rename tried again
         shutil.rmtree(old, ignore_errors=True)
         with suppress(FileNotFoundError):  # another process has just moved it away
             target.rename(old)
@@ -198,14 +207,14 @@ def atomic_folder(target: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def claimed(path: Path) -> Iterator[bool]:
-    """Hold a name while the block lasts, if no other process does; its file is removed afterwards.
+def try_lock(path: Path) -> Iterator[bool]:
+    """Take a lock for as long as the block lasts, if no other process holds it; its file is removed afterwards.
 
     Args:
-        path: Of the lock's file; its folder exists.
+        path: The lock's file; its folder exists.
 
     Yields:
-        Whether it is held; always, where the file system knows no locks.
+        Whether this process holds the lock; always true where the file system knows no locks.
 
     Raises:
         InfrastructureError: The file cannot be made.
@@ -215,12 +224,12 @@ def claimed(path: Path) -> Iterator[bool]:
     ):
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     try:
-        # else its last holder has just removed it
-        mine = _lock(handle) is not False and _is_at(handle, path)
+        # a locked file without its name is one that the last holder has just removed
+        is_held = _lock(handle) is not False and _is_at(handle, path)
         try:
-            yield mine
+            yield is_held
         finally:
-            if mine:  # while it is locked, so that no process locks a file that is being removed
+            if is_held:  # while it is locked, so that no process locks a file that is being removed
                 with suppress(OSError):  # a file that stays does no damage
                     path.unlink()
     finally:
@@ -228,14 +237,14 @@ def claimed(path: Path) -> Iterator[bool]:
 
 
 @contextmanager
-def turn(path: Path) -> Iterator[None]:
-    """Hold a name while the block lasts, and wait for it as long as another process does (see `claimed`)."""
+def exclusive_lock(path: Path) -> Iterator[None]:
+    """Take a lock for as long as the block lasts, and wait while another process holds it (see `try_lock`)."""
     while True:
-        with claimed(path) as mine:
-            if mine:
+        with try_lock(path) as is_held:
+            if is_held:
                 yield
                 return
-        time.sleep(_TURN_S)
+        time.sleep(_POLL_S)
 
 
 def is_abandoned(path: Path) -> bool:
@@ -284,7 +293,9 @@ def _lock(handle: int) -> bool | None:
 # -- private temporary folders, which are removed with the process that made them, also when that is killed ---
 
 _PRIVATE = "dynslam-private"
+"""In the names of `TemporaryFolder`s."""
 SHARED_MEMORY = Path("/dev/shm")
+"""Linux's file system in main memory."""
 
 
 class TemporaryFolder:
@@ -316,6 +327,7 @@ def sweep() -> None:
 
 
 def _remove(path: Path, lock: int, owner: int) -> None:
+    """Remove a folder, if this process made it, and give up its lock."""
     if os.getpid() == owner:  # a fork of the owner does not own it
         shutil.rmtree(path, ignore_errors=True)
     os.close(lock)

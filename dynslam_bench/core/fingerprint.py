@@ -1,7 +1,7 @@
 """What a result was made of: digests of code, weights, machine and content.
 
 Run ids and the stage cache's keys are made of these, of the code in `core.module_graph`, and of
-what plug-ins read (`core.reads`), so that what is another run is another entry.
+what plug-ins read (`core.reads`): where anything of it differs, so does the id.
 """
 
 import contextlib
@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import dynslam_bench
 from dynslam_bench.core.code_files import leads_back
 from dynslam_bench.core.errors import DynslamError, PluginError, translate_errors
 from dynslam_bench.core.files import write_atomic
@@ -29,7 +28,7 @@ from dynslam_bench.core.folders import digest_cache_folder
 from dynslam_bench.core.reading import file_sha256
 from dynslam_bench.core.records import Record, digest
 from dynslam_bench.core.settings import Settings, field_names, named
-from dynslam_bench.core.version import release
+from dynslam_bench.core.version import release, version
 
 OPENCV = (
     "opencv-python-headless",
@@ -41,6 +40,7 @@ OPENCV = (
 _STAGES_NEED = ("numpy", "torch", "numba")
 """Further distributions whose version may change a stage's result."""
 _FILE_PREFIXES = ("onnx", "weights", "recorded")
+"""Segmenters' ids that begin so, with a colon, name a file or folder."""
 
 
 # -- what settings name ----------------------------------------------------------------------------
@@ -58,12 +58,16 @@ def named_digests(settings: Settings) -> dict[str, str]:
     Raises:
         PluginError: One cannot be read.
     """
+    # declared names, also where nothing tells them from a word
     texts = {name: value for name, (kind, value) in named(settings).items() if kind == "file"}
+
+    # then what is written as a path, at any depth of a setting's value
     for name in field_names(type(settings)):
         for setting, value in _leaves_of(name, attrgetter(name)(settings)):
             text = _path_in(value)
             if text:
                 texts.setdefault(setting, text)
+
     digests = {}
     for name, text in texts.items():
         digest_now = _digest_at(text, name)
@@ -86,6 +90,7 @@ def named_digest(name: str, value: str | Path) -> str:
 
 
 def _digest_at(text: str, setting: str) -> str:
+    """Sixteen digits of the SHA-256 of what lies at a path, empty for nothing; ``~`` and ``$VARIABLE`` are replaced."""
     path = Path(os.path.expandvars(text)).expanduser()
     with translate_errors(PluginError, f"cannot read {path}, which the setting '{setting}' names"):
         return path_digest(path)[:16] if path.exists() else ""
@@ -129,7 +134,9 @@ def _leaves_of(name: str, value: object) -> Iterator[tuple[str, str | Path]]:
 def distribution_of_module(module: str) -> tuple[str, str]:
     """Name and version of the distribution that a module comes from; empty where it is not known."""
     names = _distributions().get(module.partition(".")[0], ())
-    return (names[0], distribution_version(names[0])) if names else ("", "")
+    if not names:
+        return "", ""
+    return names[0], distribution_version(names[0])
 
 
 _distributions = cache(importlib.metadata.packages_distributions)
@@ -141,9 +148,10 @@ _distributions = cache(importlib.metadata.packages_distributions)
 @cache
 def opencv_version() -> str:
     """Every installed distribution of OpenCV with its version; that of the module for a build of one's own."""
-    versions = [f"{name} {number}" for name in OPENCV if (number := distribution_version(name))]
-    if versions or find_spec("cv2") is None:
-        return ", ".join(versions)
+    numbers = {name: distribution_version(name) for name in OPENCV}
+    installed = [f"{name} {number}" for name, number in numbers.items() if number]
+    if installed or find_spec("cv2") is None:
+        return ", ".join(installed)
     import cv2
 
     return f"cv2 {cv2.__version__}"
@@ -166,7 +174,7 @@ def machine_digest() -> str:
 
 
 def content_digest(*arrays: NDArray[Any]) -> str:
-    """Digest of the bytes, shapes and types of arrays."""
+    """Digest of the bytes, shapes and types of arrays: sixteen bytes of BLAKE2b, in hexadecimal."""
     state = hashlib.blake2b(digest_size=16)
     for array in arrays:
         state.update(f"{array.dtype.str}{array.shape}".encode())
@@ -184,8 +192,9 @@ def contents_digest(files: Iterable[str | Path], root: Path | None = None) -> st
     """SHA-256 of the contents of files.
 
     Args:
-        files: The files; without a root their order counts and their names do not.
-        root: A folder; with one their names below it count and their order does not.
+        files: The files.
+        root: A folder above all of them: their names below it count, and their order does not. None:
+            their order counts, and their names do not.
 
     Raises:
         OSError: One cannot be read.
@@ -193,11 +202,11 @@ def contents_digest(files: Iterable[str | Path], root: Path | None = None) -> st
     ordered = list(files) if root is None else sorted(files)
 
     def compute() -> str:
-        whole = hashlib.sha256()
+        state = hashlib.sha256()
         for file in map(Path, ordered):
             name = "" if root is None else f"{file.relative_to(root).as_posix()}\0"
-            whole.update(f"{name}{file_sha256(file)}\n".encode(errors="surrogateescape"))
-        return whole.hexdigest()
+            state.update(f"{name}{file_sha256(file)}\n".encode(errors="surrogateescape"))
+        return state.hexdigest()
 
     return _remembered(f"bytes {root}", ordered, compute)
 
@@ -210,23 +219,36 @@ def path_digest(path: Path) -> str:
     """
     if path.is_file():
         return _remembered("file", [path], lambda: file_sha256(path))
-    files = []
+    files: list[Path] = []
     for place, folders, names in os.walk(path, followlinks=True):
+        # os.walk goes into the folders that are left in this list
         folders[:] = [name for name in folders if not leads_back(Path(place, name))]
-        files += [file for name in names if (file := Path(place, name)).is_file()]
+        entries = [Path(place, name) for name in names]
+        files += [entry for entry in entries if entry.is_file()]
     return contents_digest(files, path)
 
 
 def _remembered(kind: str, files: Sequence[str | Path], compute: Callable[[], str]) -> str:
-    state, newest = _files_state(files)
+    """A digest of files from the user's cache, or computed and stored there.
+
+    Args:
+        kind: What is computed.
+        files: The files; the stored digest holds while path, size, times and inode of each stay.
+        compute: Computes it: 64 hexadecimal digits.
+
+    Raises:
+        OSError: A file is not there, or cannot be read.
+    """
+    state, newest_ns = _files_state(files)
     key = hashlib.sha256(f"{kind}\0{state}".encode()).hexdigest()
     entry = digest_cache_folder() / key[:40]
     with contextlib.suppress(OSError):
         stored = entry.read_text(encoding="ascii", errors="replace")
-        if len(stored) == 64:
+        if len(stored) == 64:  # else it was cut off
             return stored
+
     value = compute()
-    if time.time_ns() - newest > _SETTLED_NS:
+    if time.time_ns() - newest_ns > _SETTLED_NS:
         with contextlib.suppress(DynslamError):  # a cache that cannot be written costs time only
             write_atomic(entry, value)
     return value
@@ -250,6 +272,7 @@ def _files_state(files: Sequence[str | Path]) -> tuple[str, int]:
 # -- where and with what a run was made ------------------------------------------------------------
 
 PACKAGES = ("numpy", "scipy", "torch", "numba", "gtsam", "gymnasium", "optuna")
+"""The packages whose versions a run's record states."""
 
 
 class Machine(Record):
@@ -285,11 +308,14 @@ class GitRevision(Record):
 @cache
 def this_machine() -> Machine:
     """This computer."""
+    # macOS has no affinity
     affinity = getattr(os, "sched_getaffinity", None)
+    cores = (os.cpu_count() or 1) if affinity is None else len(affinity(0))
+    memory_bytes = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return Machine(
         cpu=_cpu_model(),
-        cores=len(affinity(0)) if affinity is not None else os.cpu_count() or 1,
-        memory_gb=round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9, 1),
+        cores=cores,
+        memory_gb=round(memory_bytes / 1e9, 1),
         system=f"{platform.system()} {platform.release()} {platform.machine()}",
     )
 
@@ -297,17 +323,16 @@ def this_machine() -> Machine:
 @cache
 def versions() -> dict[str, str]:
     """Versions of Python, of this package and of those that a result depends on; missing ones are left out."""
-    environment = {"python": platform.python_version(), "dynslam-bench": dynslam_bench.__version__}
-    environment |= {name: distribution_version(name) for name in PACKAGES} | {
-        "opencv": opencv_version()
-    }
-    return {name: number for name, number in environment.items() if number}
+    numbers = {"python": platform.python_version(), "dynslam-bench": version()}
+    numbers |= {name: distribution_version(name) for name in PACKAGES}
+    numbers["opencv"] = opencv_version()
+    return {name: number for name, number in numbers.items() if number}
 
 
 @cache
 def git_revision() -> GitRevision | None:
     """The commit of the checkout that the package lies in; None for an installed package or without git."""
-    checkout = Path(dynslam_bench.__file__).resolve().parent.parent
+    checkout = Path(__file__).resolve().parents[2]
     if not (checkout / "pyproject.toml").is_file() or not (checkout / ".git").exists():
         return None
     git = ("git", "-C", str(checkout))
@@ -318,15 +343,22 @@ def git_revision() -> GitRevision | None:
 
 
 def _output_of(*command: str) -> str:
-    return subprocess.run(
-        command, check=True, capture_output=True, text=True, timeout=10
-    ).stdout.strip()
+    """What a command writes, without white space around it.
+
+    Raises:
+        OSError: It cannot be started.
+        subprocess.SubprocessError: It fails, or takes longer than ten seconds.
+    """
+    ended = subprocess.run(command, check=True, capture_output=True, text=True, timeout=10)
+    return ended.stdout.strip()
 
 
 def _cpu_model() -> str:
+    """The processor's name; that of the architecture where the system does not tell."""
     info = Path("/proc/cpuinfo")
-    for line in info.read_text(errors="replace").splitlines() if info.is_file() else ():
-        if line.lower().startswith(("model name", "hardware")):
+    lines = info.read_text(errors="replace").splitlines() if info.is_file() else []
+    for line in lines:
+        if line.lower().startswith(("model name", "hardware")):  # the latter on ARM
             return line.partition(":")[2].strip()
     with contextlib.suppress(OSError, subprocess.SubprocessError):  # macOS
         return _output_of("sysctl", "-n", "machdep.cpu.brand_string")

@@ -11,19 +11,24 @@ import sys
 from pathlib import Path
 
 DATA_VARIABLE = "DYNSLAM_BENCH_DATA"
+"""Names the folder of sequences."""
 STAGES_VARIABLE = "DYNSLAM_BENCH_CACHE"
+"""Names the folder that holds the stage cache, remembered digests and compiled kernels."""
 WEIGHTS_VARIABLE = "DYNSLAM_BENCH_WEIGHTS"
+"""Names the folder of downloaded weights."""
 
 
 def user_cache() -> Path:
-    """The user's cache folder of this package: ``XDG_CACHE_HOME``, ``~/Library/Caches`` on macOS, else ``~/.cache``."""
+    """The user's cache folder of this package: ``XDG_CACHE_HOME``, ``~/Library/Caches`` on macOS, else ``~/.cache``.
+
+    Raises:
+        RuntimeError: The user has no home folder.
+    """
     base = os.environ.get("XDG_CACHE_HOME")
     if base:
         return Path(base).expanduser() / "dynslam-bench"
-    home = Path.home()
-    return (
-        home / "Library" / "Caches" if sys.platform == "darwin" else home / ".cache"
-    ) / "dynslam-bench"
+    caches = "Library/Caches" if sys.platform == "darwin" else ".cache"
+    return Path.home() / caches / "dynslam-bench"
 
 
 def find_data_root(argument: str | Path | None = None) -> Path:
@@ -35,27 +40,27 @@ def find_data_root(argument: str | Path | None = None) -> Path:
     """
     if argument is not None:
         return Path(argument).expanduser().absolute()
-    return _named(DATA_VARIABLE, user_cache() / "data").absolute()
+    return _folder_in(DATA_VARIABLE, user_cache() / "data").absolute()
 
 
 def stage_cache_folder() -> Path:
     """The folder of the stage cache: ``stages/`` in ``DYNSLAM_BENCH_CACHE``, else in the user's cache folder."""
-    return _named(STAGES_VARIABLE, user_cache()) / "stages"
+    return _folder_in(STAGES_VARIABLE, user_cache()) / "stages"
 
 
 def digest_cache_folder() -> Path:
     """The folder of remembered digests: ``digests/`` in ``DYNSLAM_BENCH_CACHE``, else in the user's cache folder."""
-    return _named(STAGES_VARIABLE, user_cache()) / "digests"
+    return _folder_in(STAGES_VARIABLE, user_cache()) / "digests"
 
 
 def kernels_folder() -> Path:
     """The folder of compiled kernels: ``kernels/`` in ``DYNSLAM_BENCH_CACHE``, else in the user's cache folder."""
-    return _named(STAGES_VARIABLE, user_cache()) / "kernels"
+    return _folder_in(STAGES_VARIABLE, user_cache()) / "kernels"
 
 
 def weights_folder() -> Path:
     """The folder of downloaded weights: ``DYNSLAM_BENCH_WEIGHTS``, else in the user's cache folder."""
-    return _named(WEIGHTS_VARIABLE, user_cache() / "weights")
+    return _folder_in(WEIGHTS_VARIABLE, user_cache() / "weights")
 
 
 def vocabularies_folder() -> Path:
@@ -63,7 +68,8 @@ def vocabularies_folder() -> Path:
     return user_cache() / "vocabularies"
 
 
-def _named(variable: str, otherwise: Path) -> Path:
+def _folder_in(variable: str, otherwise: Path) -> Path:
+    """The folder that an environment variable names; another one where it is not set."""
     value = os.environ.get(variable)
     return Path(value).expanduser() if value else otherwise
 

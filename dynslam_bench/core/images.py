@@ -1,5 +1,6 @@
 """Decode image files; a file of a few bytes that claims to be huge is refused before any memory is taken for it."""
 
+import contextlib
 import io
 import struct
 import warnings
@@ -15,7 +16,9 @@ Image = NDArray[np.integer | np.floating]
 MOST_PIXELS = 1 << 26
 """Larger images (67 megapixels) are refused where nothing says which size to expect."""
 MOST_BYTES = 512 * MEGABYTE
+"""A larger file is not read."""
 _PNG_START = b"\x89PNG\r\n\x1a\n"
+"""The first bytes of a PNG file."""
 _TILE_SIZE = (322, 323)
 """TIFF tags of the width and height of a tile, for which OpenCV takes memory as well."""
 
@@ -33,8 +36,9 @@ def image_size(data: bytes) -> tuple[int, int] | None:
                 warnings.simplefilter("ignore")  # of damaged metadata
                 # not `PIL.Image.open`, which does not state a size that is too large
                 image = reader(io.BytesIO(data))
-            tile = [getattr(image, "tag_v2", {}).get(tag, 0) for tag in _TILE_SIZE]
-            return max(image.width, int(tile[0])), max(image.height, int(tile[1]))
+            tags = getattr(image, "tag_v2", {})
+            tile_width, tile_height = (int(tags.get(tag, 0)) for tag in _TILE_SIZE)
+            return max(image.width, tile_width), max(image.height, tile_height)
         except Exception:  # Pillow raises almost anything over damaged headers
             continue
     return None
@@ -73,19 +77,21 @@ def read_image(
         raise kind(f"image {path} is empty (0 bytes)", "fetch it again")
     if not _is_whole(data):
         raise kind(f"image {path} is truncated ({len(data)} bytes)", "fetch it again")
+
+    # the size that the header states, before any memory is taken for the pixels
     stated = image_size(data)
     if stated is not None and size is not None and stated != size:
         raise kind(f"image {path} is {stated[0]}x{stated[1]}, {mismatch}", hint)
     if stated is not None and stated[0] * stated[1] > MOST_PIXELS:
         most = f"at most {MOST_PIXELS >> 20} megapixels are decoded"
         raise kind(f"image {path} ({len(data)} bytes) claims to be {stated[0]}x{stated[1]}, {most}")
-    as_stored = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        image = stated and cv2.imdecode(
-            np.frombuffer(data, np.uint8), as_stored if flags is None else flags
-        )
-    except cv2.error:
-        image = None
+
+    if flags is None:
+        flags = cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION
+    image = None
+    if stated is not None:
+        with contextlib.suppress(cv2.error):
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if image is None or 0 in image.shape:
         raise kind(
             f"image {path} cannot be decoded ({len(data)} bytes)",
@@ -100,11 +106,12 @@ def _is_whole(data: bytes) -> bool:
     OpenCV fills what is missing of a JPEG, and some versions of it of a PNG; some take the memory
     that a chunk claims.
     """
-    # the end marker does not occur within the image data that it ends
+    # JPEG: the marker of its end (FFD9) does not occur within the image data (FFDA) that it ends
     if data.startswith(b"\xff\xd8\xff"):
         return data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda") > 0
     if not data.startswith(_PNG_START):
         return True
+    # PNG: chunks of length, kind, data and checksum, of which IEND is the last one
     position = len(_PNG_START)
     while position + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, position)

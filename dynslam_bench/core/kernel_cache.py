@@ -33,6 +33,7 @@ from dynslam_bench.core.kernel_code import (
 from dynslam_bench.core.module_graph import PACKAGE, module_graph
 
 SUFFIX = ".kernel"
+"""How the names of the files end."""
 UNUSED_S = 30 * 24 * 3600
 """Files that nobody has loaded for so long are removed: the kernels of one state of the sources take some 7 MB."""
 _DIGITS = 32
@@ -108,9 +109,9 @@ def kernel_file(
 
     Args:
         kernel: One of `KERNELS`.
-        arguments: See `signature_digest`; so are the other two.
-        return_type: Likewise.
-        flags: Likewise.
+        arguments: Numba's types of the arguments, see `signature_digest`.
+        return_type: Numba's type of the result, see `signature_digest`.
+        flags: Numba's flags of this compilation, see `signature_digest`.
     """
     prefix = _name_prefix(kernel)
     if not prefix:
@@ -126,8 +127,9 @@ def _name_prefix(kernel: Foreign) -> str:
     """How the names of a kernel's files begin; empty if it is compiled in memory only."""
     function = kernel.py_func
     name = f"{function.__module__}.{function.__qualname__}".removeprefix(f"{PACKAGE}.")
+    readable = re.sub("[^A-Za-z0-9_.]", "", name)[-100:]
     try:
-        return f"{re.sub('[^A-Za-z0-9_.]', '', name)[-100:]}-{kernel_digest(kernel)[:_DIGITS]}-"
+        return f"{readable}-{kernel_digest(kernel)[:_DIGITS]}-"
     except (NotDescribedError, *_NO_FOLDER):
         return ""
 
@@ -135,7 +137,7 @@ def _name_prefix(kernel: Foreign) -> str:
 # -- files -----------------------------------------------------------------------------------------
 
 
-class _Portable(CompileResultCacheImpl):
+class _Serializer(CompileResultCacheImpl):
     """Numba's conversion of compiled code to what can be written and back, without its choice of a folder."""
 
     def __init__(self) -> None:
@@ -156,6 +158,7 @@ def _read(file: Path) -> bytes | None:
 
 
 def _header(file: Path, content: bytes) -> bytes:
+    """The first line of a file: its name, and the SHA-256 of what follows."""
     return f"{file.name} {hashlib.sha256(content).hexdigest()}".encode()
 
 
@@ -165,7 +168,7 @@ def _load(kernel: Foreign, content: bytes) -> Foreign:
     pickle.load(stream)  # the types, which `load_kernels` reads
     context = kernel.targetctx
     context.refresh()
-    compiled = _Portable().rebuild(context, pickle.load(stream))
+    compiled = _Serializer().rebuild(context, pickle.load(stream))
     # kernels that are compiled later may call it
     context.insert_user_function(compiled.entry_point, compiled.fndesc, [compiled.library])
     return compiled
@@ -174,7 +177,7 @@ def _load(kernel: Foreign, content: bytes) -> Foreign:
 def _store(file: Path, arguments: tuple[Foreign, ...], compiled: Foreign) -> None:
     """Write compiled code; where that is not possible, the next process compiles it again."""
     remove_unused(file.parent, time.time())
-    content = dumps(arguments) + dumps(_Portable().reduce(compiled))
+    content = dumps(arguments) + dumps(_Serializer().reduce(compiled))
     with contextlib.suppress(DynslamError):
         write_atomic(file, _header(file, content) + b"\n" + content)
 

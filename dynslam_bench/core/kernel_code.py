@@ -26,7 +26,7 @@ Foreign: TypeAlias = Any
 """A kernel, type or flag of numba, which has no annotations."""
 
 Described: TypeAlias = dict[Any, int]
-"""Kernels and modules that are described already, by their `id`, in the order in which they were met."""
+"""Kernels and modules that are described already, by their `id`, with a running number in the order of description."""
 
 VERSIONED = {"numba", "llvmlite", "numpy", *sys.stdlib_module_names}
 """Packages whose versions are part of every digest: what they define is described by its name."""
@@ -42,6 +42,7 @@ NO_CODE = (
 )
 """How those settings of numba begin that do not change what is compiled."""
 _PLAIN = (bool, int, float, complex, str, bytes, type(None), type(...))
+"""Types of values that their `repr` tells completely."""
 
 
 class NotDescribedError(Exception):
@@ -74,16 +75,15 @@ def signature_digest(arguments: tuple[Foreign, ...], return_type: Foreign, flags
         NotDescribedError: One of the types cannot be described.
         OSError: A source cannot be read.
     """
-    words = [
-        str(return_type),
-        *(f"{name}={value}" for name, value in sorted(flags.values().items())),
-    ]
+    words = [str(return_type)]
+    words += [f"{name}={value}" for name, value in sorted(flags.values().items())]
     for kind in arguments:
         words += _type_words(kind)
     return _digest(words)
 
 
 def _digest(words: Iterable[str]) -> str:
+    """SHA-256 of words; each counts with its length, so that no two lists of words are the same text."""
     state = hashlib.sha256()
     for word in words:
         state.update(f"{len(word)} {word}\n".encode(errors="surrogatepass"))
@@ -105,13 +105,15 @@ def _kernel_words(kernel: Foreign, described: Described) -> Iterator[str]:
     """A kernel with its options and all that it uses; one that is met again is described by its number alone."""
     function = kernel.py_func
     is_described = id(function) in described
-    yield f"kernel {function.__module__}.{function.__qualname__} {described.setdefault(id(function), len(described))}"
+    number = described.setdefault(id(function), len(described))
+    yield f"kernel {function.__module__}.{function.__qualname__} {number}"
     if not is_described:
         yield repr(sorted(kernel.targetoptions.items()))
         yield from _function_words(function, described)
 
 
 def _function_words(function: FunctionType, described: Described) -> Iterator[str]:
+    """A function's bytecode, defaults, enclosed variables, and the globals that it names."""
     codes = list(_with_inner_code(function.__code__))
     for code in codes:
         yield from _code_words(code, function.__doc__)
@@ -202,14 +204,16 @@ def _value_words(value: Any, names: tuple[str, ...], described: Described) -> It
 def _module_words(
     module: ModuleType, names: tuple[str, ...], described: Described
 ) -> Iterator[str]:
+    """A module that a kernel uses, with those of its attributes that the kernel's code names."""
     yield f"module {module.__name__}"
     is_versioned = module.__name__.partition(".")[0] in VERSIONED
-    if not is_versioned and (id(module), names) not in described:
-        described[id(module), names] = len(described)
-        for name in names:
-            if hasattr(module, name):
-                yield name
-                yield from _value_words(getattr(module, name), names, described)
+    if is_versioned or (id(module), names) in described:
+        return
+    described[id(module), names] = len(described)
+    for name in names:
+        if hasattr(module, name):
+            yield name
+            yield from _value_words(getattr(module, name), names, described)
 
 
 def _tuple_words(kind: type, described: Described) -> Iterator[str]:
@@ -234,25 +238,26 @@ def _type_words(kind: Foreign) -> Iterator[str]:
 
 
 def _named_words(value: Any) -> Iterator[str]:
-    """Something that is described by where it is defined."""
+    """Something that is described by where it is defined.
+
+    Raises:
+        NotDescribedError: It has no name there, or is neither this package's nor a versioned one's.
+    """
     module = getattr(value, "__module__", None) or type(value).__module__
-    if _is_own(module):
+    top_level = module.partition(".")[0]
+    names: list[str] = []
+    if top_level == PACKAGE:
         # one inner function may make several instructions: they differ by the names that their
         # module gives them
         names = sorted(name for name, other in vars(sys.modules[module]).items() if other is value)
         yield source_digest(module)
-    elif module.partition(".")[0] in VERSIONED:
+    elif top_level in VERSIONED:
         name = str(getattr(value, "__qualname__", None) or getattr(value, "__name__", "<unknown>"))
-        names = [] if "<" in name else [name]
-    else:
-        names = []
+        if "<" not in name:  # <locals>, <lambda>, <unknown>
+            names = [name]
     if not names:
         raise NotDescribedError(f"{value!r} of {module}")
     yield f"{module} {names}"
-
-
-def _is_own(module: str) -> bool:
-    return module.partition(".")[0] == PACKAGE
 
 
 @cache

@@ -15,7 +15,7 @@ SEARCH_VARIABLES = ("LD_LIBRARY_PATH", "LD_PRELOAD", "DYLD_LIBRARY_PATH", "DYLD_
 def library_identity(module: str) -> str:
     """Version and files of the distribution that a module is imported from, or the digest of the files alone.
 
-    A module that lies before the installed one on the import path is another one.
+    A module that lies before the installed one on the import path hides it, and is the one that counts.
 
     Args:
         module: A top-level module; it is not imported.
@@ -30,13 +30,14 @@ def library_identity(module: str) -> str:
     distributions = imports.distributions_of(module, place)
     if distributions:
         return ", ".join(imports.distribution(name) for name in distributions)
+    # no distribution brings it: a file or folder on the import path
     path = Path(place)
     files = [path] if path.is_file() else list(files_below(path))
     return f"files {contents_digest(files, path.parent)[:12]}"
 
 
 def search_path() -> dict[str, str]:
-    """The variables of the linker that are set."""
+    """The folders or libraries that each variable of the linker names; variables that are not set are left out."""
     anchors = Anchors(plugin=None, work=Path.cwd())
     folders_by_name = {name: search_now(name, os.environ, anchors) for name in SEARCH_VARIABLES}
     return {name: folders for name, folders in folders_by_name.items() if folders}

@@ -26,29 +26,26 @@ from dynslam_bench.core.errors import DynslamError, RunError
 from dynslam_bench.core.files import write_atomic
 from dynslam_bench.core.folders import digest_cache_folder
 
-PACKAGE = "dynslam_bench"
+PACKAGE = __name__.partition(".")[0]
+"""The top-level package that this module belongs to."""
 _PLUMBING = (
-    *(
-        "arguments",
-        "code_files",
-        "download",
-        "errors",
-        "files",
-        "fingerprint",
-        "folders",
-        "kernel_cache",
-        "kernel_code",
-    ),
-    *(
-        "libraries",
-        "module_graph",
-        "plugins",
-        "programs",
-        "reads",
-        "records",
-        "sanitise",
-        "version",
-    ),
+    "arguments",
+    "code_files",
+    "download",
+    "errors",
+    "files",
+    "fingerprint",
+    "folders",
+    "kernel_cache",
+    "kernel_code",
+    "libraries",
+    "module_graph",
+    "plugins",
+    "programs",
+    "reads",
+    "records",
+    "sanitise",
+    "version",
 )
 PLUMBING = tuple(f"{PACKAGE}.core.{name}" for name in _PLUMBING)
 """Modules that name faults, find, fetch, store and digest files, and load plug-ins: no number passes through them."""
@@ -57,6 +54,7 @@ SETTLED_NS = 2_000_000_000
 _BYTE_CODE_HEADER = struct.Struct("<4sIII")
 """Python's magic number, flags, second of the source's modification and its size (PEP 552)."""
 _PARSING = threading.Lock()
+"""Held while a source is parsed, see `parsed`."""
 
 Reference = tuple[str, str]
 """A module of this package, and a name that is taken from it; the empty name stands for the module itself."""
@@ -104,10 +102,10 @@ class ModuleGraph:
             if module in reached or module in left_out:
                 continue
             reached.add(module)
-            defining = [
-                self.defining_module(*reference) for reference in self.modules[module].imports
-            ]
-            waiting += [source for source in defining if source is not None]
+            for source, name in self.modules[module].imports:
+                defining = self.defining_module(source, name)
+                if defining is not None:
+                    waiting.append(defining)
         return sorted(reached)
 
     def digest(self, roots: Iterable[str], without: Iterable[str] = ()) -> str:
@@ -131,10 +129,12 @@ class ModuleGraph:
         followed: set[Reference] = set()
         while (source, name) not in followed:  # two packages may pass a name on to each other
             followed.add((source, name))
+            # from package import module
             if name and f"{source}.{name}" in self.modules:
                 return f"{source}.{name}"
             if source not in self.modules:
                 return None
+            # a package's __init__ is looked through, a module defines what it passes on
             passed_on = self.modules[source].names.get(name)
             if passed_on is None or source not in self._packages:
                 return source
@@ -161,13 +161,13 @@ def read_module_graph() -> ModuleGraph:
     Raises:
         OSError: A source cannot be read.
     """
-    places = [str(place) for place in sys.modules[PACKAGE].__path__]
-    name_of_places = hashlib.sha256("\0".join(places).encode(errors="surrogateescape")).hexdigest()[
-        :16
-    ]
-    memory = digest_cache_folder() / f"modules-{name_of_places}.json"
+    # each checkout and installation has a file of its own
+    places = "\0".join(str(place) for place in sys.modules[PACKAGE].__path__)
+    places_digest = hashlib.sha256(places.encode(errors="surrogateescape")).hexdigest()
+    memory = digest_cache_folder() / f"modules-{places_digest[:16]}.json"
     remembered = _read_remembered(memory)
 
+    # read what is new or has changed
     modules = {}
     stamps = {}
     for name, file in module_files().items():
@@ -178,8 +178,10 @@ def read_module_graph() -> ModuleGraph:
         if code is None or old_stamp != stamp:
             code = read_module(name, file.read_bytes())
         modules[name] = code
-        stamps[name] = stamp if time.time_ns() - changed_ns > SETTLED_NS else ""
+        is_settled = time.time_ns() - changed_ns > SETTLED_NS
+        stamps[name] = stamp if is_settled else ""
 
+    # remember what has settled
     entries = {name: (stamps[name], code) for name, code in modules.items() if stamps[name]}
     if entries != remembered:
         _remember(memory, entries)
@@ -240,28 +242,22 @@ def _module_name(file: Path, place: Path) -> str:
 
 def _read_remembered(memory: Path) -> dict[str, tuple[str, ModuleCode]]:
     """Stamp and code of each module that was remembered; empty where nothing can be read."""
+    entries = {}
     try:
         stored = json.loads(memory.read_text(encoding="utf-8"))
-        return {
-            name: (
-                entry["stamp"],
-                ModuleCode(
-                    digest=entry["digest"],
-                    imports=[(source, imported) for source, imported in entry["imports"]],
-                    names={
-                        own: (source, imported)
-                        for own, (source, imported) in entry["names"].items()
-                    },
-                ),
-            )
-            for name, entry in stored.items()
-        }
+        for name, entry in stored.items():
+            # JSON has lists in place of pairs
+            imports = [(source, imported) for source, imported in entry["imports"]]
+            names = {own: (source, imported) for own, (source, imported) in entry["names"].items()}
+            entries[name] = (entry["stamp"], ModuleCode(entry["digest"], imports, names))
     # it is missing, cut off or of another version
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}
+    return entries
 
 
 def _remember(memory: Path, entries: Mapping[str, tuple[str, ModuleCode]]) -> None:
+    """Store stamp and code of each module, as `_read_remembered` reads them."""
     stored = {name: {"stamp": stamp, **asdict(code)} for name, (stamp, code) in entries.items()}
     try:
         write_atomic(memory, json.dumps(stored))
@@ -273,7 +269,7 @@ def _remember(memory: Path, entries: Mapping[str, tuple[str, ModuleCode]]) -> No
 
 
 def read_module(name: str, source: bytes) -> ModuleCode:
-    """The digest and the imports of a module's source; one that cannot be parsed imports nothing.
+    """Parse a module's source for its digest and its imports; one that cannot be parsed imports nothing.
 
     Args:
         name: The module.
@@ -283,15 +279,15 @@ def read_module(name: str, source: bytes) -> ModuleCode:
         tree = parsed(source)
     except (SyntaxError, ValueError, RecursionError):
         return ModuleCode(hashlib.sha256(source).hexdigest(), [], {})
-    imports = [
-        reference
-        for statement in _import_statements(tree)
-        for reference in _references(statement).values()
-    ]
+    imports: set[Reference] = set()
+    for statement in _import_statements(tree):
+        imports |= set(_references(statement).values())
+
+    # names that the module, or a package, passes on
     names: dict[str, Reference] = {}
     for statement in tree.body:
         names |= _references(statement)
-    return ModuleCode(syntax_digest(source), sorted(set(imports)), names)
+    return ModuleCode(syntax_digest(source), sorted(imports), names)
 
 
 def _import_statements(node: ast.AST) -> Iterator[ast.AST]:
@@ -308,28 +304,26 @@ def _import_statements(node: ast.AST) -> Iterator[ast.AST]:
 
 def _references(statement: ast.AST) -> dict[str, Reference]:
     """What a statement imports from this package, by the name that it gives to it."""
+    references: dict[str, Reference] = {}
     if isinstance(statement, ast.Import):
-        return {
-            alias.asname or alias.name: (alias.name, "")
-            for alias in statement.names
-            if alias.name.partition(".")[0] == PACKAGE
-        }
-    if (
-        isinstance(statement, ast.ImportFrom)
-        and (statement.module or "").partition(".")[0] == PACKAGE
-    ):
-        return {
-            alias.asname or alias.name: (str(statement.module), alias.name)
-            for alias in statement.names
-        }
-    return {}
+        for alias in statement.names:
+            if alias.name.partition(".")[0] == PACKAGE:
+                references[alias.asname or alias.name] = (alias.name, "")
+    elif isinstance(statement, ast.ImportFrom):
+        source = statement.module or ""
+        if source.partition(".")[0] == PACKAGE:
+            for alias in statement.names:
+                references[alias.asname or alias.name] = (source, alias.name)
+    return references
 
 
 def parsed(source: bytes) -> ast.Module:
     """`ast.parse`, one thread at a time: in Python 3.11 two at once can fail with a SystemError.
 
     Raises:
-        SyntaxError: It is no Python of this version; ValueError and RecursionError likewise.
+        SyntaxError: It is no Python of this version.
+        ValueError: It holds a null byte.
+        RecursionError: It is nested too deeply.
     """
     with _PARSING:
         return ast.parse(source)

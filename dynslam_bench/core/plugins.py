@@ -27,6 +27,7 @@ from typing import Any, Generic, Literal, Protocol, TypeVar
 from dynslam_bench.core.errors import DynslamError, PluginError, did_you_mean
 
 ENVIRONMENT_VARIABLE = "DYNSLAM_BENCH_PLUGINS"
+"""Lists plug-ins of the user, see `_environment_targets`."""
 Kind = Literal["trackers", "segmenters", "features", "flow", "filters", "sequences"]
 
 
@@ -55,7 +56,7 @@ class Failure:
 
 
 @dataclass(frozen=True)
-class Found(Generic[P]):
+class Discovered(Generic[P]):
     """A plug-in spec and where it came from: ``argument``, ``environment``, ``entry point (dist)``, ``built in``."""
 
     spec: P
@@ -96,10 +97,10 @@ class Registry(Generic[P]):
         self._spec_type = spec_type
         self._builtin_specs = builtin
         self._builtin: dict[str, P] | None = None
-        self._found: dict[str, Found[P]] | None = None
+        self._discovered: dict[str, Discovered[P]] | None = None
         self._failures: list[Failure] = []
 
-    def all(self) -> list[Found[P]]:
+    def all(self) -> list[Discovered[P]]:
         """Every available plug-in, sorted by id; imports all that are listed."""
         return [plugin for _, plugin in sorted(self._discover().items())]
 
@@ -134,15 +135,19 @@ class Registry(Generic[P]):
                     "give the plug-in another id",
                 )
             return spec
+        raise self._unknown(name)
+
+    def _unknown(self, name: str) -> PluginError:
+        """The error for an id that no plug-in has; its hint says which ones failed to load."""
         plugins = self._discover()
         broken = [
             f"{failure.source} failed to load: {failure.reason}" for failure in self._failures
         ]
-        named = [line for line in broken if name in line]
-        hints = named[:1] or [did_you_mean(name, plugins), *broken[:1]]
-        raise PluginError(
-            f"unknown {self.kind.rstrip('s')} '{name}'", "; ".join(filter(None, hints))
-        )
+        # one whose source holds the name is most likely the plug-in that was asked for
+        of_this_name = [line for line in broken if name in line]
+        hints = of_this_name[:1] or [did_you_mean(name, plugins), *broken[:1]]
+        hint = "; ".join(filter(None, hints))
+        return PluginError(f"unknown {self.kind.rstrip('s')} '{name}'", hint)
 
     def find(self, name: str) -> P | None:
         """The spec of an id, None where no plug-in has it; imports no other plug-in."""
@@ -161,9 +166,10 @@ class Registry(Generic[P]):
         is_file = name.rpartition(":")[0].endswith(".py")
         if name in self.builtin() or is_file:
             return None
-        called_so = [listed for listed in self.listed() if listed.name == name]
+        # entry points of that name first: by custom it is the id, and reading a spec takes a process
+        of_this_name = [listed for listed in self.listed() if listed.name == name]
         others = [listed for listed in self.listed() if listed.name != name]
-        for listed in (*called_so, *others):
+        for listed in (*of_this_name, *others):
             if described(listed.target).get("id") == name:
                 return listed.target
         return None
@@ -194,36 +200,42 @@ class Registry(Generic[P]):
 
     def refresh(self) -> None:
         """Forget what was discovered, e.g. after the environment variable changed."""
-        self._found = None
+        self._discovered = None
         self._failures = []
         _entry_points.cache_clear()
         described.cache_clear()
 
-    def _discover(self) -> dict[str, Found[P]]:
-        if self._found is None:
-            self._found = {}
+    def _discover(self) -> dict[str, Discovered[P]]:
+        """All plug-ins by id, imported once; the first one with an id wins."""
+        if self._discovered is None:
+            self._discovered = {}
             for spec in self.builtin().values():
                 self._add(spec, "built in")
             in_environment = [listed for listed in self.listed() if not listed.name]
             for listed in (*in_environment, *self._installed()):
                 self._add(listed.target, listed.source)
-        return self._found
+        return self._discovered
 
     def _add(self, plugin: P | str, source: str) -> None:
         """Take a spec, or the object that a target names; keep the reason if that is not possible."""
-        assert self._found is not None
+        assert self._discovered is not None
         try:
-            spec = self._check(load_object(plugin) if isinstance(plugin, str) else plugin, source)
-            if spec.id in self._found:
-                raise PluginError(
-                    f"id '{spec.id}' is already taken by {self._found[spec.id].source}"
-                )
+            value = load_object(plugin) if isinstance(plugin, str) else plugin
+            spec = self._check(value, source)
+            if spec.id in self._discovered:
+                holder = self._discovered[spec.id].source
+                raise PluginError(f"id '{spec.id}' is already taken by {holder}")
         except Exception as error:  # a foreign plug-in may raise anything
             self._failures.append(Failure(source, _reason(error)))
         else:
-            self._found[spec.id] = Found(spec, source)
+            self._discovered[spec.id] = Discovered(spec, source)
 
     def _check(self, value: object, source: str) -> P:
+        """The value, if it is a spec of this kind.
+
+        Raises:
+            PluginError: It is none.
+        """
         if isinstance(value, self._spec_type):
             return value
         raise PluginError(
@@ -244,11 +256,16 @@ def used(names: Iterable[tuple[Registry[Any], str]]) -> str:
 
 @cache
 def _entry_points(*_path: str) -> Any:
-    """Those of all distributions on the import path; reading them takes 12 ms."""
+    """The entry points of all distributions on an import path; reading them takes 12 ms.
+
+    Args:
+        *_path: The import path, so that another one is read anew.
+    """
     return entry_points()
 
 
 _IMPORTED_PLUGINS: set[str] = set()
+"""The modules and files of plug-ins that this process has imported."""
 
 
 def has_imported_plugins() -> bool:
@@ -275,7 +292,7 @@ def load_object(target: str) -> Any:
         module = import_module(location)
     except (Exception, SystemExit) as error:
         raise PluginError(f"cannot import {location}: {_reason(error)}") from error
-    if location.partition(".")[0] != __name__.partition(".")[0] or location.endswith(".py"):
+    if location.endswith(".py") or not _is_of_this_package(location):
         _IMPORTED_PLUGINS.add(location)
     try:
         return attrgetter(attribute)(module)
@@ -323,19 +340,26 @@ def build_plugin(
 
 
 def import_module(location: str) -> ModuleType:
-    """The module of a name, or of the path of a ``.py`` file; whatever the import raises."""
-    return (
-        _load_file(Path(location))
-        if location.endswith(".py")
-        else importlib.import_module(location)
-    )
+    """Import a module by its name, or by the path of a ``.py`` file.
+
+    Raises:
+        BaseException: Whatever the import raises.
+    """
+    if location.endswith(".py"):
+        return _load_file(Path(location))
+    return importlib.import_module(location)
 
 
 def _is_imported(location: str) -> bool:
     """Whether a module is there already, comes with this package, or does not exist as a file."""
     if not location.endswith(".py"):
-        return location in sys.modules or location.partition(".")[0] == __name__.partition(".")[0]
-    return _module_name(Path(location)) in sys.modules or not Path(location).expanduser().is_file()
+        return location in sys.modules or _is_of_this_package(location)
+    file = Path(location)
+    return _module_name(file) in sys.modules or not file.expanduser().is_file()
+
+
+def _is_of_this_package(module: str) -> bool:
+    return module.partition(".")[0] == __name__.partition(".")[0]
 
 
 def _module_name(path: Path) -> str:
@@ -346,6 +370,7 @@ def _module_name(path: Path) -> str:
 
 
 def _load_file(path: Path) -> ModuleType:
+    """Run a ``.py`` file as a module, once for each content."""
     resolved = path.expanduser().resolve()
     if not resolved.is_file():
         raise FileNotFoundError(f"no file {resolved}")
@@ -368,16 +393,25 @@ def _load_file(path: Path) -> ModuleType:
 
 def _environment_targets(kind: Kind) -> list[str]:
     """Targets of ``DYNSLAM_BENCH_PLUGINS="trackers=my.py:SPEC,flow=pkg.mod:SPEC"``; no ``kind=`` means a tracker."""
-    items = [item.strip() for item in os.environ.get(ENVIRONMENT_VARIABLE, "").split(",")]
-    pairs = [
-        item.partition("=") if "=" in item else ("trackers", "=", item) for item in items if item
-    ]
-    return [target for prefix, _, target in pairs if prefix == kind]
+    targets = []
+    for item in os.environ.get(ENVIRONMENT_VARIABLE, "").split(","):
+        text = item.strip()
+        if not text:
+            continue
+        prefix, separator, target = text.partition("=")
+        if not separator:
+            prefix = "trackers"
+            target = text
+        if prefix == kind:
+            targets.append(target)
+    return targets
 
 
 def _reason(error: BaseException) -> str:
+    """The last line of an error's text, behind its type if it is none of this package's."""
     name = "" if isinstance(error, DynslamError) else type(error).__name__
-    return ": ".join(filter(None, [name, *str(error).strip().splitlines()[-1:]]))
+    last_line = str(error).strip().splitlines()[-1:]
+    return ": ".join(filter(None, [name, *last_line]))
 
 
 # -- whether a module can be imported at all: tried in a process of its own, which that may end ----
@@ -385,7 +419,9 @@ def _reason(error: BaseException) -> str:
 ISOLATED_VARIABLE = "DYNSLAM_BENCH_ISOLATED"
 """Set in processes that may end by an import without harm: the children of runs, and the probes themselves."""
 LIMIT_S = 120
+"""Seconds that the import of a plug-in may take."""
 _IMPORTED = 113
+"""Exit code of a probe whose import came to an end."""
 _PROBE = """
 import json, os
 from dynslam_bench.core.plugins import import_module, load_object
@@ -412,7 +448,7 @@ def python_command(code: str) -> list[str]:
 
 
 def module_command(module: str) -> list[str]:
-    """As `python_command`, for a module that is run as a program."""
+    """The command of a Python process that runs a module as a program, see `python_command`."""
     return python_command(f"import runpy; runpy.run_module({module!r}, run_name='__main__')")
 
 
@@ -420,15 +456,15 @@ def module_command(module: str) -> list[str]:
 def check_import(location: str) -> None:
     """Import a plug-in's module in a process of its own, once for every location.
 
-    What the import raises is left to the caller's own import; here counts that it comes to an end
-    and that the process lives on: ``sys.exit``, ``os._exit``, a crash of a native library or an
-    endless loop would end, or hang, the importing process.
+    The import has to come to an end, and the process has to live on: ``sys.exit``, ``os._exit``, a
+    crash of a native library or an endless loop would end, or hang, the importing process. What the
+    import raises is left to the caller's own import.
 
     Args:
         location: Name of a module, or path of a ``.py`` file.
 
     Raises:
-        PluginError: It does not; with how it ended.
+        PluginError: The import hangs or ends the process.
     """
     if not os.environ.get(ISOLATED_VARIABLE):
         _probe(location, "")

@@ -17,105 +17,114 @@ import psutil
 
 RESULT_VARIABLES = (
     # where libraries and modules are searched
-    *(
-        "LD_LIBRARY_PATH",
-        "LD_PRELOAD",
-        "DYLD_LIBRARY_PATH",
-        "PYTHONPATH",
-        "PYTHONHOME",
-        "PYTHONHASHSEED",
-    ),
+    "LD_LIBRARY_PATH",
+    "LD_PRELOAD",
+    "DYLD_LIBRARY_PATH",
+    "PYTHONPATH",
+    "PYTHONHOME",
+    "PYTHONHASHSEED",
     # how numbers and times are read and written: a decimal comma cuts numbers short
-    *("LANG", "LANGUAGE", "LC_ALL", "LC_CTYPE", "LC_NUMERIC", "LC_TIME", "LC_COLLATE", "TZ"),
+    "LANG",
+    "LANGUAGE",
+    "LC_ALL",
+    "LC_CTYPE",
+    "LC_NUMERIC",
+    "LC_TIME",
+    "LC_COLLATE",
+    "TZ",
     # on what is computed, and in which order sums are made
-    *(
-        "CUDA_VISIBLE_DEVICES",
-        "CUDA_LAUNCH_BLOCKING",
-        "CUBLAS_WORKSPACE_CONFIG",
-        "NVIDIA_TF32_OVERRIDE",
-    ),
-    *(
-        "OMP_DYNAMIC",
-        "OMP_SCHEDULE",
-        "OPENBLAS_CORETYPE",
-        "MKL_CBWR",
-        "MKL_DYNAMIC",
-        "OPENCV_CPU_DISABLE",
-    ),
-    *("OPENCV_OPENCL_DEVICE", "OPENCV_OPENCL_RUNTIME", "LIBGL_ALWAYS_SOFTWARE"),
+    "CUDA_VISIBLE_DEVICES",
+    "CUDA_LAUNCH_BLOCKING",
+    "CUBLAS_WORKSPACE_CONFIG",
+    "NVIDIA_TF32_OVERRIDE",
+    "OMP_DYNAMIC",
+    "OMP_SCHEDULE",
+    "OPENBLAS_CORETYPE",
+    "MKL_CBWR",
+    "MKL_DYNAMIC",
+    "OPENCV_CPU_DISABLE",
+    "OPENCV_OPENCL_DEVICE",
+    "OPENCV_OPENCL_RUNTIME",
+    "LIBGL_ALWAYS_SOFTWARE",
 )
 """Programs get these variables, and their values count: each can change a result."""
 RUN_VARIABLES = (
-    *(
-        "OMP_NUM_THREADS",
-        "OPENBLAS_NUM_THREADS",
-        "MKL_NUM_THREADS",
-        "VECLIB_MAXIMUM_THREADS",
-        "BLIS_NUM_THREADS",
-    ),
-    *("NUMBA_NUM_THREADS", "NUMBA_CACHE_DIR", "TMPDIR"),
-    *(
-        "DYNSLAM_BENCH_ISOLATED",
-        "DYNSLAM_BENCH_CACHE",
-        "DYNSLAM_BENCH_DATA",
-        "DYNSLAM_BENCH_WEIGHTS",
-    ),
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+    "BLIS_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+    "NUMBA_CACHE_DIR",
+    "TMPDIR",
+    "DYNSLAM_BENCH_ISOLATED",
+    "DYNSLAM_BENCH_CACHE",
+    "DYNSLAM_BENCH_DATA",
+    "DYNSLAM_BENCH_WEIGHTS",
 )
 """Programs get these variables. A run sets them by its settings, or they name places of data that counts by itself."""
 PLACE_VARIABLES = (
     # found through these, programs and files count by their content
-    *("PATH", "HOME", "USER", "LOGNAME", "SHELL", "VIRTUAL_ENV", "CONDA_PREFIX"),
-    *(
-        "XDG_CACHE_HOME",
-        "XDG_CONFIG_HOME",
-        "XDG_DATA_HOME",
-        "XDG_DATA_DIRS",
-        "XDG_CONFIG_DIRS",
-        "XDG_RUNTIME_DIR",
-    ),
+    "PATH",
+    "HOME",
+    "USER",
+    "LOGNAME",
+    "SHELL",
+    "VIRTUAL_ENV",
+    "CONDA_PREFIX",
+    "XDG_CACHE_HOME",
+    "XDG_CONFIG_HOME",
+    "XDG_DATA_HOME",
+    "XDG_DATA_DIRS",
+    "XDG_CONFIG_DIRS",
+    "XDG_RUNTIME_DIR",
     # where windows are shown, without which viewers do not start
-    *("DISPLAY", "WAYLAND_DISPLAY", "XAUTHORITY", "QT_QPA_PLATFORM", "TERM"),
-    *("PYTHONUNBUFFERED", "PYTHONDONTWRITEBYTECODE", "PYTHONSAFEPATH"),
+    "DISPLAY",
+    "WAYLAND_DISPLAY",
+    "XAUTHORITY",
+    "QT_QPA_PLATFORM",
+    "TERM",
+    "PYTHONUNBUFFERED",
+    "PYTHONDONTWRITEBYTECODE",
+    "PYTHONSAFEPATH",
 )
 """Programs get these variables, and their values do not count."""
 SESSION_VARIABLES = (
-    *(
-        "_",
-        "PWD",
-        "OLDPWD",
-        "SHLVL",
-        "TEMP",
-        "TMP",
-        "COLORTERM",
-        "COLUMNS",
-        "LINES",
-        "LS_COLORS",
-        "WINDOWID",
-    ),
-    *(
-        "SSH_CLIENT",
-        "SSH_CONNECTION",
-        "SSH_TTY",
-        "SSH_AUTH_SOCK",
-        "DBUS_SESSION_BUS_ADDRESS",
-        "SESSION_MANAGER",
-    ),
-    *(
-        "XDG_SESSION_ID",
-        "XDG_VTNR",
-        "XDG_SEAT",
-        "TMUX",
-        "TMUX_PANE",
-        "STY",
-        "INVOCATION_ID",
-        "JOURNAL_STREAM",
-    ),
-    *("TERM_SESSION_ID", "VSCODE_IPC_HOOK_CLI", "PYTEST_CURRENT_TEST"),
+    "_",
+    "PWD",
+    "OLDPWD",
+    "SHLVL",
+    "TEMP",
+    "TMP",
+    "COLORTERM",
+    "COLUMNS",
+    "LINES",
+    "LS_COLORS",
+    "WINDOWID",
+    "SSH_CLIENT",
+    "SSH_CONNECTION",
+    "SSH_TTY",
+    "SSH_AUTH_SOCK",
+    "DBUS_SESSION_BUS_ADDRESS",
+    "SESSION_MANAGER",
+    "XDG_SESSION_ID",
+    "XDG_VTNR",
+    "XDG_SEAT",
+    "TMUX",
+    "TMUX_PANE",
+    "STY",
+    "INVOCATION_ID",
+    "JOURNAL_STREAM",
+    "TERM_SESSION_ID",
+    "VSCODE_IPC_HOOK_CLI",
+    "PYTEST_CURRENT_TEST",
 )
 """These name the terminal, the login or the moment. Programs do not get them, and their values do not count."""
 _UNCOUNTED = frozenset((*RUN_VARIABLES, *PLACE_VARIABLES, *SESSION_VARIABLES))
+"""The variables whose values do not count."""
 _LIBRARIES = "LD_LIBRARY_PATH"
 _OF_OPENCV = re.compile(r"/cv2/\.\./\.\./lib\w*/?$")
+"""The folders that ``import cv2`` adds to ``LD_LIBRARY_PATH``."""
 _NOT_FILES = ("/proc/", "/sys/", "/dev/", "/memfd:", "/SYSV", "[")
 """Beginnings of what is mapped, or named, and is no file on a disk."""
 
@@ -128,7 +137,9 @@ def is_counted(variable: str) -> bool:
 def program_environment(
     declared: Iterable[str] = (), environment: Mapping[str, str] | None = None
 ) -> dict[str, str]:
-    """The environment variables that a program gets; a result cannot depend on others without a word.
+    """The environment variables that a program gets: those that are listed above or declared, and no others.
+
+    A result cannot depend on a variable that is not declared.
 
     Args:
         declared: Names of further variables that the program's settings declare; their values
@@ -184,11 +195,16 @@ class Command:
             words: Only these of them; None for all.
         """
         arguments = self.words[1:] if words is None else words
-        texts = {text for word in arguments for text in (word, word.partition("=")[2]) if text}
-        paths = {
-            os.path.normpath(os.path.join(self.folder, os.path.expanduser(text))) for text in texts
-        }
-        return {path for path in paths if is_file_name(path) and _is_there(path)}
+        texts: set[str] = set()
+        for word in arguments:
+            texts |= {word, word.partition("=")[2]}  # --config=FILE
+
+        paths = set()
+        for text in texts - {""}:
+            path = os.path.normpath(os.path.join(self.folder, os.path.expanduser(text)))
+            if is_file_name(path) and _is_there(path):
+                paths.add(path)
+        return paths
 
 
 def is_file_name(path: str) -> bool:
@@ -199,7 +215,7 @@ def is_file_name(path: str) -> bool:
 def _is_there(path: str) -> bool:
     try:
         return os.path.exists(path)
-    except ValueError:
+    except ValueError:  # a null byte
         return False
 
 
@@ -233,7 +249,8 @@ def mapped_files(pid: int) -> set[str]:
     """The files that are mapped into a process's memory; empty where the system does not tell.
 
     Raises:
-        OSError: The process has ended or is another user's; psutil.Error likewise.
+        OSError: The process has ended or is another user's.
+        psutil.Error: Likewise, on systems without ``/proc``.
     """
     maps = Path(f"/proc/{pid}/maps")
     if maps.is_file():

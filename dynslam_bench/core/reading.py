@@ -34,7 +34,7 @@ _MOST_FILES = 1 << 16
 def read_bytes(
     path: Path, *, limit: int = RECORD_BYTES, kind: type[DynslamError] = DynslamError
 ) -> bytes:
-    """The content of a file of at most `limit` bytes.
+    """Read a file of at most `limit` bytes.
 
     Args:
         path: The file.
@@ -51,7 +51,8 @@ def read_bytes(
     ):
         # in two steps: taking memory for `limit` bytes costs as much as reading them
         data = file.read(min(_MOST_FILES, limit + 1))
-        data += file.read(limit + 1 - len(data)) if len(data) == _MOST_FILES else b""
+        if len(data) == _MOST_FILES:
+            data += file.read(limit + 1 - len(data))
     if len(data) > limit:
         raise kind(_too_large(path, limit))
     return data
@@ -60,7 +61,7 @@ def read_bytes(
 def read_text(
     path: Path, *, limit: int = RECORD_BYTES, kind: type[DynslamError] = DynslamError
 ) -> str:
-    """The content of a UTF-8 file of at most `limit` bytes; a byte order mark is left out.
+    """Read a UTF-8 file of at most `limit` bytes; a byte order mark is left out.
 
     Raises:
         DynslamError: Of the given kind: it cannot be read, is larger, or is no UTF-8.
@@ -72,7 +73,7 @@ def read_text(
 def read_lines(
     path: Path, *, limit: int = TABLE_BYTES, kind: type[DynslamError] = DynslamError
 ) -> Iterator[str]:
-    """The lines of a UTF-8 file, one after the other, so that a long file needs no memory of its own size.
+    """Read the lines of a UTF-8 file one after the other, so that a long file needs no memory of its own size.
 
     Raises:
         DynslamError: Of the given kind: it cannot be read, has more than `limit` bytes, or is no
@@ -94,7 +95,7 @@ def read_lines(
 def read_json(
     path: Path, *, limit: int = RECORD_BYTES, kind: type[DynslamError] = DynslamError
 ) -> Any:
-    """The value in a JSON file.
+    """Read the value in a JSON file.
 
     Raises:
         DynslamError: Of the given kind: it cannot be read, is larger than `limit` bytes, or is no
@@ -104,7 +105,7 @@ def read_json(
 
 
 def parse_json(text: str, where: str, *, kind: type[DynslamError] = DynslamError) -> Any:
-    """The value of a JSON text.
+    """Read the value of a JSON text.
 
     Args:
         text: The text.
@@ -120,7 +121,7 @@ def parse_json(text: str, where: str, *, kind: type[DynslamError] = DynslamError
 
 
 def read_npz(path: Path, *, kind: type[DynslamError] = DynslamError) -> dict[str, NDArray[Any]]:
-    """The arrays of an ``.npz`` file by name; nothing is unpickled.
+    """Read the arrays of an ``.npz`` file by name; nothing is unpickled.
 
     Args:
         path: The file.
@@ -138,10 +139,11 @@ def read_npz(path: Path, *, kind: type[DynslamError] = DynslamError) -> dict[str
         translate_errors(kind, f"{path} holds no arrays", of=Exception),
         np.load(io.BytesIO(data), allow_pickle=False) as archive,
     ):
-        claimed = sum(entry.file_size for entry in archive.zip.infolist())
-        if claimed > MOST_BYTES:
+        # a small archive may unpack to any size
+        stated_bytes = sum(entry.file_size for entry in archive.zip.infolist())
+        if stated_bytes > MOST_BYTES:
             raise ValueError(
-                f"it claims {claimed / 1e6:.0f} MB, at most {MOST_BYTES / 1e6:.0f} are read"
+                f"it claims {stated_bytes / 1e6:.0f} MB, at most {MOST_BYTES / 1e6:.0f} are read"
             )
         arrays = dict(archive)
     if not all(isinstance(array, np.ndarray) for array in arrays.values()):
@@ -167,7 +169,7 @@ def file_sha256(
 
 
 def compare_sums(folder: Path, sums: Path, kind: type[DynslamError] = DynslamError) -> list[str]:
-    """The files of a folder that are missing, or are not what a list of checksums says, one line each.
+    """Compare a folder with a list of checksums: one line for each file that is missing or differs.
 
     Args:
         folder: The folder.

@@ -27,19 +27,25 @@ from dynslam_bench.core.records import Record, digest
 ABSENT = ""
 """Stands for what was looked for and was not there."""
 UNREADABLE = "unreadable"
+"""Stands for what is there and cannot be read."""
 INSTALLED = "installed"
 """Where a module was found that lies beside its distribution's metadata; the distribution tells its content."""
 SEARCH_PATHS = ("PYTHONPATH", "LD_LIBRARY_PATH", "LD_PRELOAD")
+"""Environment variables whose folders count in their order (`Reads.search`)."""
 COMMAND = "command "
 """Begins, in `Reads.search`, the name of a command that was looked up on ``PATH``."""
 BYTE_CODE_FOLDER = "__pycache__"
+"""Python writes it beside every source that it imports; its content tells nothing that the sources do not."""
 _SETTLED_NS = 2_000_000_000
 """Digests of files that are younger are not kept: a change within the same tick of the clock would not show."""
 _METADATA = (".dist-info", ".egg-info")
+"""How the names of folders end that hold a distribution's metadata."""
 _NOT_CONTENT = ("..", ".pyc", ".dist-info")
 """Lines of a distribution's RECORD with these differ between installations of the same files."""
 _FIRST_PART = re.compile("^[^/,\\n]+", re.MULTILINE)
+"""The first folder, or the file itself, of each line of a RECORD."""
 _SUFFIXES = tuple(importlib.machinery.all_suffixes())
+"""How files end that Python imports as modules."""
 
 
 def _sorted(entries: dict[str, str]) -> dict[str, str]:
@@ -47,6 +53,7 @@ def _sorted(entries: dict[str, str]) -> dict[str, str]:
 
 
 Entries = Annotated[dict[str, str], AfterValidator(_sorted)]
+"""Name to digest, sorted by name: what was read in another order is the same record."""
 
 
 class Reads(Record):
@@ -104,15 +111,18 @@ class Anchors:
     def _folders(self) -> list[tuple[str, str]]:
         """Each label with its folder, as it is written and with its links followed; the first that fits counts."""
         home = Path.home()
-        folders = [] if self.plugin is None else [("plugin:", self.plugin)]
+        labelled: list[tuple[str, Path]] = []
+        if self.plugin is not None:
+            labelled.append(("plugin:", self.plugin))
         if not home.is_relative_to(self.work):
-            folders.append(("work:", self.work))
-        folders.append(("~", home))
-        return [
-            (label, spelling.rstrip(os.sep))
-            for label, folder in folders
-            for spelling in dict.fromkeys((os.path.abspath(folder), os.path.realpath(folder)))
-        ]
+            labelled.append(("work:", self.work))
+        labelled.append(("~", home))
+
+        folders = []
+        for label, folder in labelled:
+            spellings = dict.fromkeys((os.path.abspath(folder), os.path.realpath(folder)))
+            folders += [(label, spelling.rstrip(os.sep)) for spelling in spellings]
+        return folders
 
     def name(self, path: str) -> str:
         """The name of an absolute path."""
@@ -148,10 +158,12 @@ def remembered(kind: str, path: str, compute: Callable[[], str]) -> str:
     status = os.stat(path)
     key = (kind, path, status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino)
     value = _DIGESTS.get(key)
-    if value is None:
-        value = compute()
-        if time.time_ns() - max(status.st_mtime_ns, status.st_ctime_ns) > _SETTLED_NS:
-            _DIGESTS[key] = value
+    if value is not None:
+        return value
+    value = compute()
+    age_ns = time.time_ns() - max(status.st_mtime_ns, status.st_ctime_ns)
+    if age_ns > _SETTLED_NS:
+        _DIGESTS[key] = value
     return value
 
 
@@ -185,7 +197,7 @@ def digest_of_names(names: Sequence[str]) -> str:
 
 
 def folder_now(folder: str) -> str:
-    """Digest of the names in a folder; `ABSENT` where there is none."""
+    """Digest of the names in a folder; `ABSENT` where there is none, `UNREADABLE` where they cannot be listed."""
     try:
         return digest_of_names(names_in(folder))
     except (FileNotFoundError, NotADirectoryError):
@@ -206,7 +218,16 @@ def value_digest(value: str | None) -> str:
 
 
 def search_now(name: str, environment: Mapping[str, str], anchors: Anchors) -> str:
-    """A search path, or the file that a command is command to be."""
+    """What a search path holds, or which file a command is.
+
+    Args:
+        name: An environment variable that holds a search path; or `COMMAND` and the command's name.
+        environment: The environment variables.
+        anchors: Where names of files begin.
+
+    Returns:
+        The names of the folders, or of the file; `ABSENT` where there is none.
+    """
     if name.startswith(COMMAND):
         command = shutil.which(name[len(COMMAND) :], path=environment.get("PATH"))
         return ABSENT if command is None else anchors.name(os.path.abspath(command))
@@ -238,10 +259,11 @@ class ImportPath:
         metadata: dict[str, str] = {}
         for folder, names in self._names.items():
             for name in sorted(names):
-                if name.endswith(_METADATA):
-                    metadata.setdefault(
-                        _normalised(name.partition("-")[0]), os.path.join(folder, name)
-                    )
+                if not name.endswith(_METADATA):
+                    continue
+                # NAME-VERSION.dist-info
+                distribution = _normalised(name.partition("-")[0])
+                metadata.setdefault(distribution, os.path.join(folder, name))
         return metadata
 
     def distribution(self, name: str) -> str:
@@ -252,6 +274,7 @@ class ImportPath:
         metadata = self.distributions.get(name)
         if metadata is None:
             return ABSENT
+        # NAME-VERSION.dist-info
         version = os.path.basename(metadata).rpartition(".")[0].partition("-")[2]
         file = self.record_of(name)
         if os.path.isdir(file):
@@ -261,17 +284,20 @@ class ImportPath:
     def record_of(self, name: str) -> str:
         """The RECORD of a distribution that is installed, or the file that stands for it."""
         metadata = self.distributions[name]
-        files = [os.path.join(metadata, part) for part in ("RECORD", "METADATA", "PKG-INFO")]
-        return next(filter(os.path.isfile, files), metadata)
+        for part in ("RECORD", "METADATA", "PKG-INFO"):
+            file = os.path.join(metadata, part)
+            if os.path.isfile(file):
+                return file
+        return metadata
 
     @cached_property
-    def _of_module(self) -> dict[str, list[tuple[str, str]]]:
+    def _by_module(self) -> dict[str, list[tuple[str, str]]]:
         """The names of the distributions that bring each top-level module, with the beginning of its files' paths."""
         distributions: dict[str, list[tuple[str, str]]] = {}
         for name, metadata in self.distributions.items():
-            beginning = os.path.dirname(metadata) + os.sep
+            site_packages = os.path.dirname(metadata) + os.sep
             for top in _top_level_names(metadata):
-                distributions.setdefault(top, []).append((name, beginning))
+                distributions.setdefault(top, []).append((name, site_packages))
         return distributions
 
     def distributions_of(self, top: str, file: str) -> list[str]:
@@ -281,17 +307,19 @@ class ImportPath:
             top: Its top-level name.
             file: Its file.
         """
-        return [
-            name for name, beginning in self._of_module.get(top, ()) if file.startswith(beginning)
-        ]
+        candidates = self._by_module.get(top, ())
+        return [name for name, site_packages in candidates if file.startswith(site_packages)]
 
     def distributions_at(self, file: str) -> list[str]:
         """The names of the distributions that bring the module in which a file lies; empty where there is none."""
         for folder in self.folders:
-            if file.startswith(folder + os.sep):
-                top = file[len(folder) + 1 :].partition(os.sep)[0].partition(".")[0]
-                if names := self.distributions_of(top, file):
-                    return names
+            if not file.startswith(folder + os.sep):
+                continue
+            # package/module.py, or module.py itself
+            first_part = file[len(folder) + 1 :].partition(os.sep)[0]
+            names = self.distributions_of(first_part.partition(".")[0], file)
+            if names:
+                return names
         return []
 
     def read_all(self) -> None:
@@ -305,26 +333,29 @@ class ImportPath:
         namespace = ABSENT
         for folder, names in self._names.items():
             place = os.path.join(folder, top)
+            # a package wins over a module of its name in the same folder
             if top in names and os.path.isfile(os.path.join(place, "__init__.py")):
                 return place
             for suffix in _SUFFIXES:
                 if top + suffix in names:
                     return place + suffix
+            # a folder without __init__.py counts only where no later folder has the module
             if top in names and not namespace and os.path.isdir(place):
                 namespace = place
         return namespace
 
     def place(self, top: str, anchors: Anchors) -> str:
-        """Where a top-level module is module_file: `INSTALLED`, the name of its file or folder, or `ABSENT`."""
+        """Where a top-level module is found: `INSTALLED`, the name of its file or folder, or `ABSENT`."""
         module_file = self.find(top)
-        if module_file and any(
-            name.endswith(_METADATA) for name in self._names[os.path.dirname(module_file)]
-        ):
-            return INSTALLED
+        if module_file:
+            neighbours = self._names[os.path.dirname(module_file)]
+            if any(name.endswith(_METADATA) for name in neighbours):
+                return INSTALLED
         return anchors.name(module_file)
 
 
 def _normalised(distribution: str) -> str:
+    """The name of a distribution as PEP 503 normalises it."""
     return re.sub(r"[-_.]+", "-", distribution).lower()
 
 
@@ -343,21 +374,21 @@ def _record_digest(file: str) -> str:
 
 def _top_level_names(metadata: str) -> set[str]:
     """The top-level modules of a distribution, by its list of files or else by what its metadata say."""
-    listed = Path(metadata, "RECORD")
-    if not listed.is_file():
-        declared = Path(metadata, "top_level.txt")
-        return set(declared.read_text(encoding="utf-8").split()) if declared.is_file() else set()
-    text = remembered("modules", str(listed), lambda: "\n".join(sorted(_first_parts(listed))))
-    return set(text.split("\n"))
+    record = Path(metadata, "RECORD")
+    if record.is_file():
+        names = remembered("modules", str(record), lambda: "\n".join(sorted(_first_parts(record))))
+        return set(names.split("\n"))
+    declared = Path(metadata, "top_level.txt")
+    if declared.is_file():
+        return set(declared.read_text(encoding="utf-8").split())
+    return set()
 
 
 def _first_parts(record: Path) -> set[str]:
     """The names of the modules that lie where the files of a RECORD begin."""
     parts = set(_FIRST_PART.findall(record.read_text(encoding="utf-8", errors="replace")))
-    return {part.partition(".")[0] for part in parts if not part.endswith(_METADATA)} - {
-        "",
-        BYTE_CODE_FOLDER,
-    }
+    modules = {part.partition(".")[0] for part in parts if not part.endswith(_METADATA)}
+    return modules - {"", BYTE_CODE_FOLDER}
 
 
 # -- comparing -------------------------------------------------------------------------------------
@@ -395,13 +426,15 @@ class Verifier:
                 key = (section, name, anchors)
                 now = self._now.get(key)
                 if now is None:
-                    now = self._now[key] = self._look(section, name, anchors)
+                    now = self._look(section, name, anchors)
+                    self._now[key] = now
                 if now != before:
                     return _in_words(section, name, before)
             self._unchanged[section, anchors] = entries
         return ""
 
     def _look(self, section: str, name: str, anchors: Anchors) -> str:
+        """The digest that an entry of `Reads` would get now."""
         match section:
             case "search":
                 return search_now(name, self._environment, anchors)
@@ -449,9 +482,8 @@ def _in_words(section: str, name: str, before: str) -> str:
             return f"the names in the folder {short}"
         case "links":
             return f"the target of the link {short}"
-    what = (
-        f"the content of the folder {short.rstrip(os.sep)}"
-        if name.endswith(os.sep)
-        else f"the file {short}"
-    )
-    return f"{what} of a program" if section == "programs" else what
+    if name.endswith(os.sep):
+        content = f"the content of the folder {short.rstrip(os.sep)}"
+    else:
+        content = f"the file {short}"
+    return f"{content} of a program" if section == "programs" else content

@@ -12,8 +12,8 @@ from dynslam_bench.core.errors import DynslamError, did_you_mean
 from dynslam_bench.core.reading import RECORD_BYTES, read_text
 from dynslam_bench.core.sanitise import json_without_passwords, storable
 
-R = TypeVar("R", bound="Record")
-M = TypeVar("M", bound=BaseModel)
+AnyRecord = TypeVar("AnyRecord", bound="Record")
+Model = TypeVar("Model", bound=BaseModel)
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
 """Sixteen hexadecimal digits, as `digest` makes them: the name of a sequence's part."""
 RunId = Annotated[str, Field(pattern=r"^[0-9a-f]{16}([0-9a-f]{4})?$")]
@@ -21,7 +21,11 @@ RunId = Annotated[str, Field(pattern=r"^[0-9a-f]{16}([0-9a-f]{4})?$")]
 
 
 def schema(newest: int) -> Any:
-    """The field that says of which version a record is: one of those that this package reads."""
+    """A record's field that holds the version of its schema.
+
+    Args:
+        newest: The newest version; this package reads it and all before it.
+    """
     return Field(default=newest, ge=1, le=newest)
 
 
@@ -33,23 +37,24 @@ class Record(BaseModel):
     """A larger file is not read."""
 
     def to_json(self) -> str:
-        """The record as indented JSON with a final newline; no password, and nothing that UTF-8 cannot hold."""
+        """The record as indented JSON with a final newline, without passwords and without what UTF-8 cannot hold."""
         return self.to_line(2) + "\n"
 
     def to_line(self, indent: int | None = None) -> str:
-        """The same without its newline, as one line or indented."""
+        """The record as JSON without a final newline, without passwords and without what UTF-8 cannot hold.
+
+        Args:
+            indent: Spaces of each level; None for one line.
+        """
         try:
             text = self.model_dump_json(indent=indent)
         except ValueError:  # half characters, e.g. of a foreign command line
-            text = (
-                type(self)
-                .model_validate(storable(self.model_dump()))
-                .model_dump_json(indent=indent)
-            )
+            encodable = type(self).model_validate(storable(self.model_dump()))
+            text = encodable.model_dump_json(indent=indent)
         return json_without_passwords(text)
 
     @classmethod
-    def read(cls: type[R], path: Path) -> R:
+    def read(cls: type[AnyRecord], path: Path) -> AnyRecord:
         """Read and validate a record.
 
         Raises:
@@ -59,8 +64,12 @@ class Record(BaseModel):
         return cls.parse(read_text(path, limit=cls.most_bytes), str(path))
 
     @classmethod
-    def parse(cls: type[R], text: str, where: str) -> R:
-        """Validate a record's JSON; `where` says in messages what it is.
+    def parse(cls: type[AnyRecord], text: str, where: str) -> AnyRecord:
+        """Validate a record's JSON.
+
+        Args:
+            text: The JSON.
+            where: What it is, for messages.
 
         Raises:
             DynslamError: It is no JSON or does not fit the schema; names the first fault.
@@ -70,15 +79,15 @@ class Record(BaseModel):
         except ValidationError as error:
             first = error.errors()[0]
             place = ".".join(map(str, first["loc"])) or "file"
-            newer = place.endswith("schema_version") and first["type"] == "less_than_equal"
-            hint = "a newer dynslam-bench wrote it: upgrade" if newer else ""
+            is_newer = place.endswith("schema_version") and first["type"] == "less_than_equal"
+            hint = "a newer dynslam-bench wrote it: upgrade" if is_newer else ""
             raise DynslamError(
                 f"{where} is not a valid {cls.__name__}: {place}: {first['msg']}", hint
             ) from error
 
 
-def validated(cls: type[M], values: Any, where: str, kind: type[DynslamError]) -> M:
-    """A model of what a user wrote.
+def validated(cls: type[Model], values: Any, where: str, kind: type[DynslamError]) -> Model:
+    """Validate what a user wrote.
 
     Args:
         cls: The model.
@@ -97,8 +106,10 @@ def validated(cls: type[M], values: Any, where: str, kind: type[DynslamError]) -
         name = ".".join(map(str, first["loc"]))
         if first["type"] == "extra_forbidden":
             raise kind(f"{where}: unknown key '{name}'", did_you_mean(name, _keys(cls))) from None
+        # pydantic's prefix of errors that validators raise
         text = first["msg"].removeprefix("Value error, ")
-        raise kind(f"{where}: {name + ': ' if name else ''}{text[0].lower()}{text[1:]}") from None
+        field = f"{name}: " if name else ""
+        raise kind(f"{where}: {field}{text[0].lower()}{text[1:]}") from None
 
 
 def _keys(cls: type[BaseModel]) -> Iterator[str]:

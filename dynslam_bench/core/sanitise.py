@@ -14,6 +14,7 @@ _CONTROL = re.compile(
 )
 """Characters that a terminal acts upon (escape sequences, directions of writing) or that no encoding takes."""
 _SURROGATE = re.compile("[\ud800-\udfff]")
+"""Half of a character of UTF-16, which UTF-8 does not encode."""
 LONGEST_NAME = 255
 """Most bytes that file systems take of one part of a path."""
 
@@ -38,6 +39,7 @@ def storable(value: Any) -> Any:
 
 
 def _escaped(match: re.Match[str]) -> str:
+    r"""A character as Python's escape: ``\x1b`` or ``\u200e``."""
     code = ord(match[0])
     return f"\\x{code:02x}" if code < 256 else f"\\u{code:04x}"
 
@@ -45,14 +47,10 @@ def _escaped(match: re.Match[str]) -> str:
 def is_inside(name: str) -> bool:
     """Whether a relative path in foreign data stays below its folder, and can be a file's name at all."""
     path = PurePosixPath(name)
-    return (
-        bool(path.parts)
-        and not path.is_absolute()
-        and ".." not in path.parts
-        and "\\" not in name
-        and name.isprintable()
-        and all(len(part.encode()) <= LONGEST_NAME for part in path.parts)
-    )
+    stays_below = bool(path.parts) and not path.is_absolute() and ".." not in path.parts
+    if not stays_below or "\\" in name or not name.isprintable():
+        return False
+    return all(len(part.encode()) <= LONGEST_NAME for part in path.parts)
 
 
 def inside(folder: Path, name: str, *, where: str, kind: Callable[[str, str], Exception]) -> Path:
@@ -76,10 +74,13 @@ def inside(folder: Path, name: str, *, where: str, kind: Callable[[str, str], Ex
 
 
 _ADDRESS = re.compile(r"((?<![\w+.-])[A-Za-z][\w+.-]*://[^\s/?#:@\"']*):[^\s\"']{0,999}@")
+"""An address with a password: ``scheme://user:password@``."""
 _PARAMETER = re.compile(
     r"([?&;](?:password|passwd|pwd|token|secret|sslpassword)=)[^&;#\s\"']+", re.IGNORECASE
 )
+"""A parameter of an address that holds a secret: ``?token=...``."""
 HIDDEN = "***"
+"""Stands in the place of every secret."""
 _HINT = re.compile(
     r"passw|passp|pwd|token|secret|credential|(?:api|access|private)[-_]?key", re.IGNORECASE
 )
@@ -87,6 +88,7 @@ _HINT = re.compile(
 _NAME = (
     r"(?:password|passwd|passphrase|pwd|token|secret|credentials?|(?:api|access|private)[-_]?key)"
 )
+"""How the name of a secret ends."""
 _TEXT = r"(?:[^\"\\]|\\.)"
 """A character of a text in JSON."""
 _BARE = r"(?:[^\s\"'\\&;#]|\\[^\"'])+"
@@ -121,7 +123,10 @@ def without_passwords(text: str) -> str:
 
 
 def json_without_passwords(text: str) -> str:
-    """The same of a text in JSON, which stays JSON; an option and its value may be two texts of a list."""
+    """JSON without the passwords and secrets in its texts (`without_passwords`).
+
+    It stays JSON. An option and its value may be two texts of a list.
+    """
     if "://" in text:
         text = _PARAMETER.sub(rf"\1{HIDDEN}", _ADDRESS.sub(rf"\1:{HIDDEN}@", text))
     if _HINT.search(text):
@@ -131,5 +136,5 @@ def json_without_passwords(text: str) -> str:
 
 
 def words_without_passwords(words: Sequence[str]) -> list[str]:
-    """The same of the words of a command."""
+    """The words of a command without passwords and secrets (`without_passwords`)."""
     return list(json.loads(json_without_passwords(json.dumps(list(words), ensure_ascii=False))))

@@ -34,8 +34,10 @@ from dynslam_bench.core.errors import SettingsError, did_you_mean
 
 S = TypeVar("S", bound="Settings")
 Scalar = bool | int | float | str
-_KEY = "tunable"
+_TUNABLE = "tunable"
+"""Key in a field's JSON schema under which `tunable` stores range, scale, unit and whether it is online."""
 _NAMES = "names"
+"""Key in a field's JSON schema under which `names` stores what the field names."""
 
 
 class Settings(BaseModel):
@@ -49,26 +51,30 @@ class Settings(BaseModel):
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
         """Refuse a class with a default that lies outside its own range: studies and actions could not name it."""
         for name, field, default in _leaves(cls):
-            if _annotation(field) is None:
+            if _annotation(field, _TUNABLE) is None:
                 continue
-            p = _describe(name, field, default)
-            if (
-                p.low is not None
-                and p.high is not None
-                and default is not None
-                and not p.low <= default <= p.high
-            ):
+            parameter = _describe(name, field, default)
+            low = parameter.low
+            high = parameter.high
+            # booleans and categoricals have no range, optional fields may have no default
+            if low is None or high is None or default is None:
+                continue
+            if not low <= default <= high:
                 raise TypeError(
-                    f"{cls.__name__}: the default of '{name}' is {default!r}, outside its range {p.low:g} to {p.high:g}"
+                    f"{cls.__name__}: the default of '{name}' is {default!r}, outside its range {low:g} to {high:g}"
                 )
 
     @property
     def unused(self) -> Mapping[str, str]:
-        """Fields that have no effect as the fields that are not tunable stand, each with the reason."""
+        """Fields that have no effect with the present values of those that are not tunable, each with the reason."""
         return {}
 
     def verify(self) -> None:
-        """Raise `SettingsError` where values, each valid by itself, do not go together; asked before anything runs."""
+        """Check that values, each valid by itself, go together; called before anything runs.
+
+        Raises:
+            SettingsError: They do not.
+        """
 
 
 @dataclass(frozen=True)
@@ -140,7 +146,7 @@ def tunable(
     }
     least, most = (low, high) if limits is None else limits
     return Field(
-        default, description=meaning, json_schema_extra={_KEY: annotation}, ge=least, le=most
+        default, description=meaning, json_schema_extra={_TUNABLE: annotation}, ge=least, le=most
     )
 
 
@@ -165,15 +171,17 @@ def named(settings: Settings) -> dict[str, tuple[str, str]]:
 
     A field of type `Path` counts as a file, too.
     """
-    values: dict[str, tuple[str, str]] = {}
+    references: dict[str, tuple[str, str]] = {}
     for name, field, _ in _leaves(type(settings)):
-        note = _annotation(field, _NAMES)
+        annotation = _annotation(field, _NAMES)
         value = attrgetter(name)(settings)
-        if note is not None:
-            values[name] = (note["kind"], value or os.environ.get(note["otherwise"], ""))
+        if annotation is not None:
+            # an empty field leaves the choice to an environment variable
+            target = value or os.environ.get(annotation["otherwise"], "")
+            references[name] = (annotation["kind"], target)
         elif isinstance(value, Path):
-            values[name] = ("file", str(value))
-    return {name: pair for name, pair in values.items() if pair[1]}
+            references[name] = ("file", str(value))
+    return {name: (kind, target) for name, (kind, target) in references.items() if target}
 
 
 def build(cls: type[S], values: Mapping[str, Any] | None = None) -> S:
@@ -204,9 +212,12 @@ def apply_overrides(settings: S, overrides: Mapping[str, Any]) -> S:
     leaves = {name: field for name, field, _ in _leaves(type(settings))}
     for name, value in overrides.items():
         if name not in leaves:
-            if any(field.startswith(f"{name}.") for field in leaves):
+            is_group = any(field.startswith(f"{name}.") for field in leaves)
+            if is_group:
                 raise SettingsError(f"setting '{name}' is a group", f"set one of {name}.*")
             raise SettingsError(f"unknown setting '{name}'", did_you_mean(name, leaves))
+
+        # go down to the group that holds the field
         *groups, field_name = name.split(".")
         group = values
         for key in groups:
@@ -221,11 +232,13 @@ def parse_assignments(assignments: Iterable[str]) -> dict[str, str]:
     Raises:
         SettingsError: An assignment has no ``=`` or no name.
     """
-    split = [[text, *map(str.strip, text.partition("="))] for text in assignments]
-    for text, name, separator, _ in split:
-        if not separator or not name:
+    values = {}
+    for text in assignments:
+        name, separator, value = text.partition("=")
+        if not separator or not name.strip():
             raise SettingsError(f"'{text}' is not an assignment", "write it as --set name=value")
-    return {name: value for _, name, _, value in split}
+        values[name.strip()] = value.strip()
+    return values
 
 
 def flatten(settings: Settings) -> dict[str, Any]:
@@ -239,102 +252,135 @@ def field_names(cls: type[Settings]) -> list[str]:
 
 
 def parameters(cls: type[Settings], *, online_only: bool = False) -> list[Parameter]:
-    """The tunable fields of a settings class, or all online ones, in order of definition."""
-    return [
-        parameter
-        for parameter in _parameters(cls)
-        if (parameter.online if online_only else parameter.tunable)
-    ]
+    """The fields of a settings class that studies tune, in order of definition.
+
+    Args:
+        cls: The settings class.
+        online_only: The online fields instead, whether studies tune them or not.
+    """
+    described = _described_parameters(cls)
+    if online_only:
+        return [parameter for parameter in described if parameter.online]
+    return [parameter for parameter in described if parameter.tunable]
 
 
 @cache
-def _parameters(cls: type[Settings]) -> tuple[Parameter, ...]:
-    return tuple(_describe(*leaf) for leaf in _leaves(cls) if _annotation(leaf[1]) is not None)
+def _described_parameters(cls: type[Settings]) -> tuple[Parameter, ...]:
+    """Every field that `tunable` made, in order of definition."""
+    return tuple(
+        _describe(name, field, default)
+        for name, field, default in _leaves(cls)
+        if _annotation(field, _TUNABLE) is not None
+    )
 
 
 def settings_table(cls: type[Settings]) -> str:
     """Markdown table of every leaf field: name, default, range, unit, online, meaning."""
-    described = {parameter.name: parameter for parameter in _parameters(cls)}
+    described = {parameter.name: parameter for parameter in _described_parameters(cls)}
     rows = [
         "| setting | default | range | unit | online | meaning |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
     for name, field, default in _leaves(cls):
-        p = described.get(name)
-        more = f"{_span(p)} | {p.unit} | {'yes' if p.online else ''}" if p else " |  | "
-        rows.append(
-            f"| `{name}` | `{json.dumps(default, default=str)}` | {more} | {field.description or ''} |"
-        )
+        parameter = described.get(name)
+        if parameter is None:
+            search = " |  | "
+        else:
+            online = "yes" if parameter.online else ""
+            search = f"{_range_text(parameter)} | {parameter.unit} | {online}"
+        default_text = json.dumps(default, default=str)
+        rows.append(f"| `{name}` | `{default_text}` | {search} | {field.description or ''} |")
     return "\n".join(rows) + "\n"
 
 
-def _span(p: Parameter) -> str:
-    if p.kind == "categorical":
-        return ", ".join(f"`{choice}`" for choice in p.choices)
-    if p.kind == "bool":
+def _range_text(parameter: Parameter) -> str:
+    """The values that a study may choose, in Markdown: ``0.1 to 5 (log)``."""
+    if parameter.kind == "categorical":
+        return ", ".join(f"`{choice}`" for choice in parameter.choices)
+    if parameter.kind == "bool":
         return "`false`, `true`"
-    return f"{p.low:g} to {p.high:g}{' (log)' if p.scale == 'log' else ''}"
+    scale = " (log)" if parameter.scale == "log" else ""
+    return f"{parameter.low:g} to {parameter.high:g}{scale}"
 
 
 def _leaves(
     cls: type[Settings], prefix: str = "", defaults: Settings | None = None
 ) -> Iterator[tuple[str, FieldInfo, Any]]:
-    """Leaf fields: dotted name, field, and the default in `cls`, also where it gives a group other ones."""
+    """The leaf fields of a settings class, in order of definition.
+
+    Args:
+        cls: The class.
+        prefix: Begins every name; ends in a dot, or is empty.
+        defaults: The group's values where the class around it gives it other defaults than its own.
+
+    Yields:
+        Dotted name, field, and default.
+    """
     for key, field in cls.model_fields.items():
-        nested = _nested(field)
-        default = getattr(defaults, key) if defaults is not None else _default(field)
-        if nested is not None:
-            yield from _leaves(
-                nested, f"{prefix}{key}.", default if isinstance(default, Settings) else None
-            )
-        else:
+        group = _group_class(field)
+        default = _default(field) if defaults is None else getattr(defaults, key)
+        if group is None:
             yield f"{prefix}{key}", field, default
+            continue
+        group_defaults = default if isinstance(default, Settings) else None
+        yield from _leaves(group, f"{prefix}{key}.", group_defaults)
 
 
 def _default(field: FieldInfo) -> Any:
     """A field's default; pydantic's own way to ask copies whole groups, which cannot change."""
-    return (
-        field.default
-        if isinstance(field.default, Settings)
-        else field.get_default(call_default_factory=True)
-    )
+    if isinstance(field.default, Settings):
+        return field.default
+    return field.get_default(call_default_factory=True)
 
 
-def _nested(field: FieldInfo) -> type[Settings] | None:
+def _group_class(field: FieldInfo) -> type[Settings] | None:
+    """The settings class of a field that holds a group; None for a leaf."""
     kind = field.annotation
+    # Python 3.10 takes tuple[float, ...] for a class, too
     if typing.get_origin(kind) is None and isinstance(kind, type) and issubclass(kind, Settings):
-        return kind  # Python 3.10 takes tuple[float, ...] for a class, too
+        return kind
     return None
 
 
-def _annotation(field: FieldInfo, key: str = _KEY) -> dict[str, Any] | None:
-    """What `tunable` or `names` stored with a field."""
+def _annotation(field: FieldInfo, key: str) -> dict[str, Any] | None:
+    """What `tunable` or `names` stored with a field under a key; None where nothing is stored."""
     extra = field.json_schema_extra
-    return typing.cast("dict[str, Any] | None", extra.get(key)) if isinstance(extra, dict) else None
+    if not isinstance(extra, dict):
+        return None
+    return typing.cast("dict[str, Any] | None", extra.get(key))
 
 
 def _describe(name: str, field: FieldInfo, default: Any) -> Parameter:
-    note = _annotation(field)
-    assert note is not None
+    """The parameter that a tunable field is.
+
+    Raises:
+        TypeError: Its type has neither a range nor choices.
+    """
+    annotation = _annotation(field, _TUNABLE)
+    assert annotation is not None
+
+    # an optional field is searched over the values of its other type
     kinds = [kind for kind in _alternatives(field.annotation) if kind is not type(None)]
     base = kinds[0] if len(kinds) == 1 else field.annotation
-    choices = (
-        (False, True)
-        if base is bool
-        else typing.get_args(base)
-        if typing.get_origin(base) is Literal
-        else ()
-    )
-    if not choices and (base not in (int, float) or note["low"] is None or note["high"] is None):
+
+    choices: tuple[Scalar, ...] = ()
+    if base is bool:
+        choices = (False, True)
+    elif typing.get_origin(base) is Literal:
+        choices = typing.get_args(base)
+
+    has_range = annotation["low"] is not None and annotation["high"] is not None
+    if not choices and not (base in (int, float) and has_range):
         raise TypeError(
             f"tunable field '{name}' of type {base} needs low and high, or a bool or Literal type"
         )
     kind: Any = base.__name__ if base in (bool, int, float) else "categorical"
-    return Parameter(name, kind, default, choices=choices, meaning=field.description or "", **note)
+    meaning = field.description or ""
+    return Parameter(name, kind, default, choices=choices, meaning=meaning, **annotation)
 
 
 def _alternatives(annotation: Any) -> tuple[Any, ...]:
-    """The types that a union allows; another type alone."""
+    """The types that a union allows; a type that is no union by itself."""
     is_union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
     return typing.get_args(annotation) if is_union else (annotation,)
 
@@ -343,16 +389,16 @@ def _parse(value: Any, annotation: Any) -> Any:
     """A text becomes the JSON value that it spells, unless the field takes the text itself; all else stays as it is."""
     if not isinstance(value, str):
         return value
+
     kinds = _alternatives(annotation)
-    texts = [
-        choice
-        for kind in kinds
-        if typing.get_origin(kind) is Literal
-        for choice in typing.get_args(kind)
-    ]
-    if (str in kinds or Path in kinds or value in texts) and not (
-        value == "null" and type(None) in kinds
-    ):
+    literals: list[Any] = []
+    for kind in kinds:
+        if typing.get_origin(kind) is Literal:
+            literals += typing.get_args(kind)
+
+    takes_text = str in kinds or Path in kinds or value in literals
+    is_none = value == "null" and type(None) in kinds
+    if takes_text and not is_none:
         return value
     try:
         return json.loads(value)
@@ -361,6 +407,7 @@ def _parse(value: Any, annotation: Any) -> Any:
 
 
 def _explain(cls: type[Settings], error: ValidationError) -> SettingsError:
+    """One line on the first fault that pydantic found."""
     first = error.errors()[0]
     name = ".".join(map(str, first["loc"]))
     if first["type"] == "extra_forbidden":
@@ -402,18 +449,20 @@ def online_parameters(settings: Settings) -> list[Parameter]:
 
 def why_unused(settings: Settings, name: str) -> str:
     """Why a field has no effect with these settings, for a message; empty where it has one."""
-    node: Settings = settings
+    group: Settings = settings
+    # the field may be without effect at every level of its dotted name
     for part in name.split("."):
-        if reason := node.unused.get(part, ""):
+        reason = group.unused.get(part, "")
+        if reason:
             return reason
-        if part != "enabled" and not getattr(node, "enabled", True):
-            return f"{type(node).__name__} is not enabled"
-        node = getattr(node, part)
+        if part != "enabled" and not getattr(group, "enabled", True):
+            return f"{type(group).__name__} is not enabled"
+        group = getattr(group, part)
     return ""
 
 
 class OnlineSettings:
-    """Which part takes which group of a system's settings.
+    """Hands the groups of a system's settings to the parts of the system that take them.
 
     Args:
         settings: The complete settings that the system was built with.
@@ -426,7 +475,8 @@ class OnlineSettings:
     def __init__(
         self, settings: Settings, parts: Iterable[tuple[str, Callable[[Any], None]]]
     ) -> None:
-        self._built = self._in_force = settings
+        self._built = settings
+        self._in_force = settings
         self._parts = tuple(parts)
         for parameter in online_parameters(settings):
             group = parameter.name.split(".")[0]
@@ -440,8 +490,9 @@ class OnlineSettings:
     def configure(self, settings: Settings) -> None:
         """Hand the groups that differ from those in force to their parts."""
         for group, take in self._parts:
-            if (given := getattr(settings, group)) != getattr(self._in_force, group):
-                take(given)
+            wanted = getattr(settings, group)
+            if wanted != getattr(self._in_force, group):
+                take(wanted)
         self._in_force = settings
 
     def restore(self) -> None:

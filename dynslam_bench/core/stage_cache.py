@@ -3,7 +3,7 @@
 Entries are addressed by content: the key digests the stage, its code (a plug-in's too), its
 settings, the machine, the threads and the input itself (see `core.fingerprint`), so that nothing
 stale is ever returned. Each entry is one file that appears by atomic rename, so many processes may
-share a cache; the least recently used entries go when it grows over its bound.
+share a cache. When it grows over its bound, the least recently used entries are deleted.
 """
 
 import contextlib
@@ -28,17 +28,18 @@ from dynslam_bench.core.reading import read_npz
 ReadsSoFar = Callable[[], str]
 """Gives a digest of all that the plug-ins of this process have read so far."""
 _RECORDING: list[ReadsSoFar] = []
+"""What `record_reads` was given, in a list of one; empty where nothing records."""
 
 
 def record_reads(reads_so_far: ReadsSoFar) -> None:
-    """Say how this process records what plug-ins read; without it their stages are not cached."""
+    """Set how this process tells what plug-ins have read; without it their stages are not cached."""
     _RECORDING[:] = [reads_so_far]
 
 
 def stage_code(entry_point: str) -> ReadsSoFar | None:
-    """Gives the digest of the code of a stage, of a plug-in with all that it has read so far.
+    """A function that gives the digest of a stage's code; of a plug-in's with all that it has read so far.
 
-    It is asked before and after a stage computes: what a plug-in reads meanwhile, such as its
+    It is called before and after a stage computes: what a plug-in reads meanwhile, such as its
     weights at its first frame, makes the result one of an unknown state, which is not stored.
 
     Args:
@@ -55,9 +56,11 @@ def stage_code(entry_point: str) -> ReadsSoFar | None:
 
 
 DEFAULT_MAX_BYTES = 8 * 2**30
+"""Bound of a cache, in bytes."""
 _PRUNE_EVERY = 512
 """Writes between two looks at the cache's size."""
 _SHRINK_TO = 0.8
+"""Share of the bound that is left when the cache is pruned."""
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -79,8 +82,8 @@ class StageCache:
 
     Args:
         folder: Where; created when first written to.
-        max_bytes: Bound; when it is passed, the least recently used entries go until four fifths
-            are left.
+        max_bytes: Bound; when it is passed, the least recently used entries are deleted until four
+            fifths are left.
     """
 
     def __init__(self, folder: Path | None = None, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
@@ -96,7 +99,7 @@ class StageCache:
             entry = Entry(arrays, float(arrays.pop("cost_s")))
         except (DynslamError, KeyError):
             entry = None
-        # a cache that can only be read, or one that another process has evicted of
+        # it fails for a cache that can only be read, or where another process has just deleted the entry
         with contextlib.suppress(OSError):
             if entry is None:
                 path.unlink()
@@ -106,6 +109,12 @@ class StageCache:
 
     def put(self, stage: str, key: str, arrays: Mapping[str, NDArray[Any]], cost_s: float) -> None:
         """Store a result; another process may have stored the same meanwhile, which does not matter.
+
+        Args:
+            stage: The stage.
+            key: Digest of all that the result depends on.
+            arrays: The result.
+            cost_s: Seconds that computing it took.
 
         Raises:
             DynslamError: The folder cannot be written, e.g. a full disk; nothing is left behind.
@@ -120,7 +129,8 @@ class StageCache:
             replacing(path) as temporary,
             temporary.open("wb") as file,
         ):
-            np.savez(file, allow_pickle=False, **{**arrays, "cost_s": np.float64(cost_s)})  # type: ignore[arg-type]
+            contents = {**arrays, "cost_s": np.float64(cost_s)}
+            np.savez(file, allow_pickle=False, **contents)  # type: ignore[arg-type]
         self._writes += 1
         if self._writes % _PRUNE_EVERY == 1:
             self.prune()
@@ -149,20 +159,23 @@ class StageCache:
         return self._shrink(0)
 
     def _shrink(self, most_bytes: float) -> int:
+        """Delete the least recently used entries until at most so many bytes are left; returns the bytes freed."""
         entries = sorted(self._entries(), key=itemgetter(0))
-        # of an entry and all that were used later
-        left = np.cumsum([size for _, _, size in entries[::-1]])[::-1]
-        going = [
-            (path, size)
-            for (_, path, size), rest in zip(entries, left, strict=True)
-            if rest > most_bytes
-        ]
-        for path, _ in going:
+        total = sum(size for _, _, size in entries)
+        freed = 0
+        for _, path, size in entries:
+            if total - freed <= most_bytes:
+                break
             path.unlink(missing_ok=True)
-        return sum(size for _, size in going)
+            freed += size
+        return freed
 
     def path(self, stage: str, key: str, suffix: str = ".npz") -> Path:
-        """Where an entry lies; `get` and `put` take ``.npz``, other modules write ``.npy`` that count and go as all."""
+        """Where an entry lies.
+
+        `get` and `put` use ``.npz``. Other modules write ``.npy``, which count and are deleted as all
+        entries are.
+        """
         return self.folder / stage / key[:2] / f"{key}{suffix}"
 
     def _entries(self) -> list[tuple[float, Path, int]]:

@@ -17,11 +17,13 @@ else:
 
 
 _PREFIXED = re.compile(r"[a-z][a-z0-9_-]*:")
-_NETWORK = re.compile(r"\.(?:onnx|pt|pth)$")
+"""Begins an id that names a file behind a colon: ``onnx:/home/me/net.onnx``."""
+_NETWORK_SUFFIX = re.compile(r"\.(?:onnx|pt|pth)$")
+"""How files of networks end."""
 
 
 def read_toml(path: Path, *, kind: type[DynslamError] = SequenceError) -> dict[str, Any]:
-    """The file as nested dictionaries.
+    """Read a TOML file as nested dictionaries.
 
     Args:
         path: The file.
@@ -36,7 +38,7 @@ def read_toml(path: Path, *, kind: type[DynslamError] = SequenceError) -> dict[s
 def parse_toml(
     text: str, where: str, *, kind: type[DynslamError] = SequenceError
 ) -> dict[str, Any]:
-    """A TOML text as nested dictionaries.
+    """Read a TOML text as nested dictionaries.
 
     Args:
         text: The text.
@@ -54,7 +56,7 @@ def parse_toml(
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """Overrides of settings by dotted name, from a TOML file; a table ``[settings]`` holds them if there is one.
+    """Read overrides of settings by dotted name from a TOML file; a table ``[settings]`` holds them if there is one.
 
     Raises:
         SettingsError: The file cannot be read, or is no TOML.
@@ -79,11 +81,14 @@ def label_text(value: Any) -> str:
         ('onnx:yolov8n-seg', 'replay:run 3.txt', '0.5')
     """
     text = setting_text(value)
-    prefix, separator, path = text.partition(":") if _PREFIXED.match(text) else ("", "", text)
+    prefix = ""
+    path = text
+    if _PREFIXED.match(text):
+        prefix, _, path = text.partition(":")
     if not path.startswith(("/", "~", "./", "../")):
         return text
     name = path.rstrip("/").rpartition("/")[2]
-    return f"{prefix}{separator}{_NETWORK.sub('', name) if prefix else name}"
+    return f"{prefix}:{_NETWORK_SUFFIX.sub('', name)}" if prefix else name
 
 
 def assignments(values: Mapping[str, Any]) -> list[str]:
@@ -92,11 +97,11 @@ def assignments(values: Mapping[str, Any]) -> list[str]:
 
 
 def _flatten(values: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    """Dotted name and value of everything in nested tables."""
     items: list[tuple[str, Any]] = []
     for key, value in values.items():
-        items += (
-            _flatten(value, f"{prefix}{key}.")
-            if isinstance(value, dict)
-            else [(f"{prefix}{key}", value)]
-        )
+        if isinstance(value, dict):
+            items += _flatten(value, f"{prefix}{key}.")
+        else:
+            items.append((f"{prefix}{key}", value))
     return items

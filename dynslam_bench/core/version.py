@@ -5,7 +5,7 @@ from functools import cache
 from importlib import metadata
 
 UNKNOWN = "0+unknown"
-"""What a checkout that is not installed is; see `core.fingerprint.git_revision`."""
+"""The version of a checkout that is not installed; see `core.fingerprint.git_revision`."""
 
 
 @cache
@@ -18,7 +18,7 @@ def version() -> str:
 
 
 def install_hint(extra: str) -> str:
-    """How to install one of this package's extras: from the checkout, since it is on no index yet."""
+    """The command that installs one of this package's extras: from the checkout, since it is on no index yet."""
     return f"pip install '.[{extra}]' in the checkout of dynslam-bench"
 
 
@@ -28,5 +28,6 @@ def release() -> str:
     Runs and cached stages are identified by it and by the code itself, not by the number of
     commits.
     """
-    numbers = re.match(r"\d+(?:\.\d+)*", version())
-    return ".".join([*(numbers[0].split(".") if numbers else []), "0", "0", "0"][:3])
+    match = re.match(r"\d+(?:\.\d+)*", version())
+    numbers = match[0].split(".") if match else []
+    return ".".join([*numbers, "0", "0", "0"][:3])

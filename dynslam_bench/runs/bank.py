@@ -25,13 +25,13 @@ from dynslam_bench.core import (
     RunError,
     TemporaryFolder,
     compare_sums,
+    exclusive_lock,
     file_sha256,
     is_temporary,
     read_lines,
     read_toml,
     replace_folder,
     translate_errors,
-    turn,
     write_atomic,
 )
 from dynslam_bench.core.download import download
@@ -361,7 +361,7 @@ def _merge(sources: Sequence[RunStore], bank: str | Path) -> Merged:
     mark = store.root / UNFINISHED
     with translate_errors(InfrastructureError, f"cannot write {store.root}", "name another folder"):
         store.root.mkdir(parents=True, exist_ok=True)
-    with turn(store.root / ".merging"):
+    with exclusive_lock(store.root / ".merging"):
         if mark.exists():
             _refuse(store.root, _faults(store, unfinished=True))
         elif (store.root / SUMS).exists() or store.files():

@@ -28,7 +28,6 @@ from dynslam_bench.core import (
     RunError,
     TemporaryFolder,
     assignments,
-    claimed,
     did_you_mean,
     file_sha256,
     read_lines,
@@ -36,6 +35,7 @@ from dynslam_bench.core import (
     sweep_temporary,
     temporary_folder,
     translate_errors,
+    try_lock,
     write_atomic,
 )
 from dynslam_bench.core.errors import hide_folder_in_messages
@@ -316,7 +316,7 @@ class RunStore:
         for pattern in (".*", "runs/.*", "sequences/*/.*", "studies/*/**/.*"):
             sweep_temporary(self.root, pattern)
         for left in self.runs.glob(".*.claim"):
-            with claimed(left):  # if no process holds it, it is removed
+            with try_lock(left):  # if no process holds it, it is removed
                 pass
         self._unlink_dangling()
 
@@ -334,7 +334,7 @@ class RunStore:
         Raises:
             DynslamError: The store cannot be written.
         """
-        return claimed(self.runs / f".{run_id}.claim")
+        return try_lock(self.runs / f".{run_id}.claim")
 
     def publish(self, work: Path, record: RunRecord) -> RunRecord:
         """Write the record, ``run.json``, into its work folder, rename that to the run's; replaces a run of the id.

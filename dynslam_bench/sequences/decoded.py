@@ -13,9 +13,9 @@ from dynslam_bench.core import (
     STAGES_VARIABLE,
     DynslamError,
     SequenceError,
+    exclusive_lock,
     replacing,
     translate_errors,
-    turn,
 )
 from dynslam_bench.core.fingerprint import opencv_version
 from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, module_graph
@@ -71,7 +71,7 @@ def _mapped(sequence: Sequence) -> NDArray[np.void]:
             DynslamError, f"cannot write the stage cache {cache.folder}", f"set {STAGES_VARIABLE}"
         ):
             path.parent.mkdir(parents=True, exist_ok=True)
-        with turn(path.with_suffix(".lock")):
+        with exclusive_lock(path.with_suffix(".lock")):
             if (frames := _read(path)) is None:
                 _write(sequence, path, cache.max_bytes)
                 cache.prune()

@@ -24,7 +24,6 @@ from dynslam_bench.core import (
     RunError,
     TemporaryFolder,
     atomic_folder,
-    claimed,
     files,
     inside,
     is_abandoned,
@@ -38,6 +37,7 @@ from dynslam_bench.core import (
     storable,
     sweep,
     sweep_temporary,
+    try_lock,
     without_passwords,
     words_without_passwords,
     write_atomic,
@@ -242,12 +242,12 @@ def test_what_is_swept_before_it_is_locked_is_made_again(tmp_path: Path) -> None
     assert len(made) == 4
 
 
-def test_a_name_is_claimed_once(tmp_path: Path) -> None:
-    with claimed(tmp_path / "x") as first, claimed(tmp_path / "x") as second:
+def test_a_lock_is_held_once(tmp_path: Path) -> None:
+    with try_lock(tmp_path / "x") as first, try_lock(tmp_path / "x") as second:
         assert first
         assert not second
     assert not list(tmp_path.iterdir())
-    with claimed(tmp_path / "x") as again:
+    with try_lock(tmp_path / "x") as again:
         assert again
 
 

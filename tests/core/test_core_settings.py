@@ -378,7 +378,7 @@ VARIABLES = {
 def home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     for variable in (*VARIABLES.values(), "XDG_CACHE_HOME"):
         monkeypatch.delenv(variable, raising=False)
-    monkeypatch.setattr(Path, "home", lambda: tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
     return tmp_path
 
 
@@ -390,6 +390,8 @@ def test_everything_lies_in_one_cache_folder(
     monkeypatch.setattr(sys, "platform", platform)
     assert FOLDERS[name]() == home / cache / "dynslam-bench" / name
     monkeypatch.setenv("XDG_CACHE_HOME", str(home / "elsewhere"))
+    assert FOLDERS[name]() == home / "elsewhere" / "dynslam-bench" / name
+    monkeypatch.setenv("XDG_CACHE_HOME", "~/elsewhere")
     assert FOLDERS[name]() == home / "elsewhere" / "dynslam-bench" / name
 
 

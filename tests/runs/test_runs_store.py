@@ -20,7 +20,7 @@ from envs_toys import TARGET
 from reports_fake_store import add_run
 
 from dynslam_bench.contracts import TrackResult
-from dynslam_bench.core import DynslamError, ReportError, RunError, StudyError, claimed
+from dynslam_bench.core import DynslamError, ReportError, RunError, StudyError, try_lock
 from dynslam_bench.envs import FrameOutcome
 from dynslam_bench.evaluation import OnlineSample, get_protocol
 from dynslam_bench.reports import build_report
@@ -776,7 +776,7 @@ def test_nothing_is_written_through_links(
     store, run = one_run
     claim = store.runs / f".{run}.claim"
     claim.symlink_to(tmp_path / "new")
-    with pytest.raises(DynslamError, match="cannot write"), claimed(claim):
+    with pytest.raises(DynslamError, match="cannot write"), try_lock(claim):
         raise AssertionError("it is held")
     assert not (tmp_path / "new").exists()
     journal = tmp_path / "journal.log"

@@ -26,6 +26,7 @@ import pytest
 import toy_tracker
 from faults import in_a_small_process, survey
 from hostile import until
+from optuna.storages import RDBStorage
 from optuna.trial import FrozenTrial, TrialState
 from simulated import (
     HELD_OUT,
@@ -51,6 +52,7 @@ from dynslam_bench.tuning import (
     Study,
     StudySpec,
     Verdict,
+    database,
     distributions,
     finish,
     parse_instances,
@@ -61,12 +63,11 @@ from dynslam_bench.tuning import (
     storage,
     write_page,
 )
+from dynslam_bench.tuning.database import open_database
 from dynslam_bench.tuning.objectives import ACCURACY
 from dynslam_bench.tuning.storage import (
     Heartbeats,
     JournalFile,
-    PatientStorage,
-    open_database,
     open_storage,
     worker_name,
 )
@@ -590,19 +591,19 @@ def test_a_database_that_does_not_answer_is_waited_for(
 ) -> None:
     calls = iter(range(1000))
 
-    def fails(database: object) -> list[object]:
+    def fails(_: object) -> list[object]:
         if answers_after is None or next(calls) < answers_after:
             raise OperationalError("SELECT", {}, Exception("connection refused"))
         return []
 
-    monkeypatch.setattr(storage, "PATIENCE_S", 60.0 if answers_after else 0.0)
-    monkeypatch.setattr(PatientStorage, "get_all_studies", storage._patient(fails))
-    database = open_database(f"sqlite:///{tmp_path}/study.db")
+    monkeypatch.setattr(database, "MAX_RETRY_S", 60.0 if answers_after else 0.0)
+    monkeypatch.setattr(RDBStorage, "get_all_studies", fails)
+    opened = open_database(f"sqlite:///{tmp_path}/study.db")
     refused = pytest.raises(
         StudyError, match=r"^the study's database does not answer: .*connection refused"
     )
     with nullcontext() if answers_after else refused:
-        assert database.get_all_studies() == []
+        assert opened.get_all_studies() == []
 
 
 class Postgres:
