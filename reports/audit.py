@@ -12,7 +12,12 @@ from typing import Any
 from dynslam_bench.evaluation import RPESpec, static_camera
 from dynslam_bench.evaluation.rpe import select_pairs
 from dynslam_bench.geometry import Trajectory
-from dynslam_bench.reports.model.published import claimed, lines_of, published, static_camera_errors
+from dynslam_bench.reports.model.published import (
+    claimed_results,
+    lines_of,
+    published,
+    static_camera_errors,
+)
 from dynslam_bench.reports.tables.table import Table, TableCell, number, numbers, texts, to_markdown
 
 OURS = "EMFOA-OFT-SLAM"
@@ -148,7 +153,7 @@ def audit_paper(ground_truth: Mapping[str, Trajectory] | None = None) -> AuditRe
     """
     values = {
         (c.table, c.system, c.sequence, c.quantity): c
-        for c in lines_of(claimed().query("kind == 'value'"))
+        for c in lines_of(claimed_results().query("kind == 'value'"))
     }
     static = static_camera_errors() | _computed_static_camera(ground_truth or {})
     findings = [
@@ -166,7 +171,7 @@ def audit_paper(ground_truth: Mapping[str, Trajectory] | None = None) -> AuditRe
 Key = tuple[int, str, str, str]
 """Table, system, sequence and quantity of a printed number."""
 Values = Mapping[Key, Any]
-"""Printed numbers as lines of `claimed`."""
+"""Printed numbers as lines of `claimed_results`."""
 
 
 def _checks(
@@ -223,7 +228,7 @@ def _checks(
 
 
 def _improvements(values: Values) -> Iterator[Finding]:
-    printed = claimed().query("kind == 'improvement_percent'")
+    printed = claimed_results().query("kind == 'improvement_percent'")
     for row in lines_of(printed):
         baseline, ours = (
             values[row.table, system, row.sequence, row.quantity].value

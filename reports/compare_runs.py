@@ -10,7 +10,7 @@ import numpy as np
 
 from dynslam_bench.core import ReportError, setting_text, sweep_temporary, write_atomic
 from dynslam_bench.evaluation import Protocol, get_protocol
-from dynslam_bench.reports.html.board_page import cell_content, ratio_numbers, settings_content
+from dynslam_bench.reports.html.board_page import cell_data, ratio_numbers, settings_data
 from dynslam_bench.reports.html.page import render, write_assets, write_side
 from dynslam_bench.reports.html.run_pages import RUN_PAGE, write_run_pages
 from dynslam_bench.reports.model.board import Cell, group_of, group_weights, make_cell, mean_of
@@ -167,7 +167,7 @@ def _write_page(
         for name, cell in some.items():
             metric = {"key": "ate_rmse_m", "which": cell.rows[0].trajectory}
             run = cell.typical
-            contents.append(cell_content(cell, at, names.index(name), [metric], rank_seen=True))
+            contents.append(cell_data(cell, at, names.index(name), [metric], rank_seen=True))
             runs.append(
                 [
                     run.run_id,
@@ -183,7 +183,7 @@ def _write_page(
         "pageless": "",
         "unlisted": 0,
         "trackers": [
-            {"label": label, "settings": settings_content(next(iter(some.values())).rows[0])}
+            {"label": label, "settings": settings_data(next(iter(some.values())).rows[0])}
             for label, some in cells.items()
         ],
         "sequences": [{"name": name, "short": name, "tags": []} for name in names],

@@ -142,7 +142,7 @@ def spans(lines: pd.DataFrame) -> pd.DataFrame:
 
 
 @cache
-def claimed() -> pd.DataFrame:
+def claimed_results() -> pd.DataFrame:
     """Tables 1 to 3 of the paper that this project implements, as printed: claimed, not reproduced.
 
     Columns: table, system (as named there), sequence (its id), quantity (``ape_rmse``,
@@ -219,7 +219,7 @@ def reported_for(sequences: Sequence[str], protocol: Protocol) -> list[ReportedC
     ]
     if scored_as("SE(3) or not stated", "", protocol):
         remark = "contradicts itself and what the systems' authors published; see the audit"
-        frame = claimed().query(
+        frame = claimed_results().query(
             "kind == 'value' and quantity == 'ape_rmse' and sequence in @sequences"
         )
         cells += [
