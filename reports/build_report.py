@@ -49,7 +49,6 @@ from dynslam_bench.reports.model.load import (
     open_stores,
     trial_words,
     without_scale_words,
-    worker_pool,
 )
 from dynslam_bench.reports.model.published import (
     is_excerpt,
@@ -61,6 +60,7 @@ from dynslam_bench.reports.model.published import (
 )
 from dynslam_bench.reports.model.row import REPORT_FILE, ReportData, RunRow, command_line, grouped
 from dynslam_bench.reports.model.summary import explanation, headline, mean_rank_note, reservations
+from dynslam_bench.reports.model.workers import worker_pool
 from dynslam_bench.reports.tables import leaderboard as tables
 from dynslam_bench.reports.tables.published import published_table, span_table
 from dynslam_bench.reports.tables.table import Table, csv_text, prose, to_latex, to_markdown
@@ -673,7 +673,10 @@ def masks_section(board: Board) -> Section:
     """Quality of the masks, and the pose error against it."""
     caption = "One point a run."
     if any(len(board.runs(key)) > figures.MOST_POINTS for key in board.trackers):
-        caption += f" Of trackers with more than {figures.MOST_POINTS} runs fewer are drawn, from the best to the worst."
+        most = figures.MOST_POINTS
+        caption += (
+            f" Of trackers with more than {most} runs fewer are drawn, from the best to the worst."
+        )
     blocks = figure_blocks(figures.mask_figure(board), caption)
     blocks += table_blocks(tables.mask_quality(board))
     return Section("masks", "Mask quality and pose error", blocks=blocks)

@@ -6,7 +6,6 @@ import io
 import os
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
-from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,9 +23,9 @@ from dynslam_bench.evaluation import Protocol, RPESpec, pose_errors
 from dynslam_bench.geometry import Trajectory
 from dynslam_bench.reports.figures import COLOURS, NEUTRAL, packed, significant
 from dynslam_bench.reports.html.page import read_remark, write_changed, write_side
-from dynslam_bench.reports.model.load import run_jobs
 from dynslam_bench.reports.model.row import RunRow, command_line, grouped, run_command
 from dynslam_bench.reports.model.summary import reservations
+from dynslam_bench.reports.model.workers import WorkerPool, run_jobs
 from dynslam_bench.reports.tables.table import mm, significant_text
 from dynslam_bench.runs.artifacts import VIDEO_FILE
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE
@@ -74,7 +73,7 @@ def write_run_pages(
     pictured: Collection[str],
     protocol: Protocol,
     output: Path,
-    pool: Executor | None = None,
+    pool: WorkerPool | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[RunPage]:
     """Write what the pages of some runs show: ``data/run-<id>.js``, and their pictures.
