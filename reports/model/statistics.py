@@ -86,20 +86,25 @@ def standings(
     Returns:
         The ranked trackers from the best to the worst, then the others by their ratio.
     """
+    # logarithms of the median errors [S] of the reference and of every tracker
     names = list(reference)
     base = log_medians(reference, names)
     share = np.array([1.0 if weights is None else weights[name] for name in names])
     logs = {key: log_medians(cell, names) for key, cell in cells.items()}
     ranked_logs = {key: logs[key] for key in ranked}
-    verdicts = verdicts_against(ranked_logs, base, share)
+
+    # ranks by the mean; equal up to rounding, they share the better one
     means = [round(float(np.average(log, weights=share)), 12) for log in ranked_logs.values()]
-    ranks = dict(
-        zip(ranked, scipy.stats.rankdata(means, method="min").astype(int).tolist(), strict=True)
-    )
-    by_sequence = scipy.stats.rankdata(
-        np.reshape([*ranked_logs.values()], (len(ranked), len(names))), axis=0
-    )
-    mean_ranks = dict(zip(ranked, by_sequence.mean(axis=1).tolist(), strict=True))
+    ranks_of_means = scipy.stats.rankdata(means, method="min").astype(int)
+    ranks = dict(zip(ranked, ranks_of_means.tolist(), strict=True))
+
+    # mean over sequences of the ranks [K, S] there
+    errors = np.reshape([*ranked_logs.values()], (len(ranked), len(names)))
+    ranks_by_sequence = scipy.stats.rankdata(errors, axis=0)
+    mean_ranks = dict(zip(ranked, ranks_by_sequence.mean(axis=1).tolist(), strict=True))
+
+    # verdicts against the reference, and ranks that the data leave open
+    verdicts = verdicts_against(ranked_logs, base, share)
     groups = rank_groups(ranked_logs, share)
     unordered = [
         Standing(
@@ -150,7 +155,8 @@ def p_values(differences: Array, weights: Array) -> Array:
     if not len(differences) or differences.shape[1] < FEWEST:
         return np.ones(len(differences))
     means, errors, freedom = _weighted_mean(differences, weights)
-    constant = np.ptp(differences, axis=1) == 0  # the same ratio on every sequence
+    # the same ratio on every sequence: certain, without a spread to divide by
+    constant = np.ptp(differences, axis=1) == 0
     with np.errstate(divide="ignore", invalid="ignore"):
         p = 2.0 * scipy.stats.t.sf(np.abs(means / errors), freedom)
     return np.where(constant, np.where(differences[:, 0] == 0, 1.0, 0.0), p)
@@ -173,14 +179,17 @@ def verdicts_against(
         Verdict and corrected p value of every tracker.
     """
     verdicts: dict[str, tuple[Verdict, float | None]] = dict.fromkeys(logs, ("cannot tell", None))
-    # not the reference itself
+    # all but the reference itself
     others = [key for key, log in logs.items() if not np.array_equal(log, base)]
-    corrected = holm(
-        p_values(np.reshape([logs[key] - base for key in others], (-1, len(base))), weights)
-    )
+    differences = np.reshape([logs[key] - base for key in others], (-1, len(base)))
+    corrected = holm(p_values(differences, weights))
     for key, p in zip(others, corrected.tolist(), strict=True):
-        smaller = np.average(logs[key] - base, weights=weights) < 0
-        verdicts[key] = ("cannot tell" if p > FAMILY_ERROR else "better" if smaller else "worse"), p
+        if p > FAMILY_ERROR:
+            verdicts[key] = ("cannot tell", p)
+        elif np.average(logs[key] - base, weights=weights) < 0:
+            verdicts[key] = ("better", p)
+        else:
+            verdicts[key] = ("worse", p)
     return verdicts
 
 
@@ -208,7 +217,11 @@ def separable(
 
 
 def rank_groups(logs: Mapping[str, Array], weights: Array) -> dict[str, tuple[int, int]]:
-    """First and last rank that the data leave open to every tracker; arguments as in `separable`."""
+    """First and last rank that the data leave open to every tracker; arguments as in `separable`.
+
+    As many trackers as are shown to be better come before it, as many as are shown to be worse
+    behind it.
+    """
     better = dict.fromkeys(logs, 0)
     worse = dict.fromkeys(logs, 0)
     means = {key: np.average(log, weights=weights) for key, log in logs.items()}
@@ -241,6 +254,7 @@ def mean_rank_test(logs: Mapping[str, Array]) -> tuple[float, float] | None:
 
 def holm(p_values: Sequence[float] | Array) -> Array:
     """Holm's step-down correction of several p values ``[K]``."""
+    # the smallest of K times K, the next times K - 1, and so on; never below an earlier one
     order = np.argsort(p_values, kind="stable")
     steps = np.minimum(1.0, np.asarray(p_values)[order] * np.arange(len(order), 0, -1))
     return np.asarray(np.maximum.accumulate(steps)[np.argsort(order)])
