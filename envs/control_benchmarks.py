@@ -73,8 +73,13 @@ class ControlBenchmark:
             raise SettingsError(
                 f"'{self.id}' has no split '{split}'", f"choose {', '.join(splits)}"
             )
+
+        # the chosen sequences: all, several, or one
         every = range(len(splits[split]))
-        chosen = list(every if index is None else index if isinstance(index, Iterable) else [index])
+        if index is None:
+            chosen = list(every)
+        else:
+            chosen = list(index) if isinstance(index, Iterable) else [index]
         if not chosen or not all(number in every for number in chosen):
             raise SettingsError(
                 f"the split {split} of '{self.id}' has no sequence {index!r}",
@@ -88,7 +93,7 @@ class ControlBenchmark:
             "frames": self.frames,
             "stride": self.stride,
             "device": "cpu",
-            # keypoints under ever other settings are not found again
+            # under changing settings of features the cache would find no keypoints again
             "cache": self.reward.cost == "network_calls",
             "memory_map": True,
         }
@@ -106,6 +111,7 @@ def _scenes(names: Sequence[str], numbers: range) -> tuple[str, ...]:
 _SMALL = {"preprocessing.width": 320, "preprocessing.height": 240, "features.n_features": 500}
 """Images of a camera on a small computer, which keep a step cheap."""
 _NEVER = 1_000_000
+"""Every so many frames: more than an episode has."""
 
 _BENCHMARKS = (
     ControlBenchmark(
@@ -138,11 +144,9 @@ _BENCHMARKS = (
         tracker="orb-slam2",
         settings=MappingProxyType(_SMALL),
         control=(
-            *(
-                "features.n_features",
-                "backend.tracking.radius_px",
-                "backend.tracking.map_radius_px",
-            ),
+            "features.n_features",
+            "backend.tracking.radius_px",
+            "backend.tracking.map_radius_px",
             "backend.keyframes.tracked_share",
         ),
         actions=(),
@@ -151,14 +155,14 @@ _BENCHMARKS = (
         stride=2,
     ),
 )
-_FALLING = replace(
+_BUDGET = replace(
     _BENCHMARKS[1],
     id="budget-v0",
     summary=f"{_BENCHMARKS[1].summary}, and keypoints cost five times as much at the end",
     reward=AccuracyMinusCost(weight=0.001, cost="keypoints", growth=4 / 119),
 )
 CONTROL_BENCHMARKS: Mapping[str, ControlBenchmark] = MappingProxyType(
-    {b.id: b for b in (*_BENCHMARKS, _FALLING)}
+    {benchmark.id: benchmark for benchmark in (*_BENCHMARKS, _BUDGET)}
 )
 """The benchmarks by id."""
 

@@ -84,9 +84,10 @@ class Episode:
 
     def trajectory(self) -> Trajectory:
         """The online trajectory: the poses of the frames with state ``ok``, each as it was when the frame came."""
-        tracked = [(o.timestamp, o.T_world_cam) for o in self.outcomes if o.T_world_cam is not None]
-        stamps = np.array([stamp for stamp, _ in tracked], dtype=np.float64)
-        poses = np.array([pose for _, pose in tracked], dtype=np.float64).reshape(-1, 4, 4)
+        tracked = [outcome for outcome in self.outcomes if outcome.T_world_cam is not None]
+        stamps = np.array([outcome.timestamp for outcome in tracked], dtype=np.float64)
+        poses = np.array([outcome.T_world_cam for outcome in tracked], dtype=np.float64)
+        poses = poses.reshape(-1, 4, 4)
         return Trajectory(stamps, poses)
 
 
@@ -120,7 +121,7 @@ def frame_info(outcome: FrameOutcome) -> dict[str, Any]:
 
 
 def fixed_info(info: Mapping[str, Any], protocol: Protocol) -> dict[str, Any]:
-    """The same with every key that may be missing: 0 with a flag ``has_<key>`` that is False.
+    """The ``info`` of a step with every key that may be missing: 0 with a flag ``has_<key>`` that is False.
 
     Args:
         info: Of a step.
@@ -132,6 +133,7 @@ def fixed_info(info: Mapping[str, Any], protocol: Protocol) -> dict[str, Any]:
 
 
 def _flagged(given: Mapping[str, Any], missing: Mapping[str, Any]) -> dict[str, Any]:
+    """Values by name, those of `missing` where none is given, with a flag ``has_<name>`` for each."""
     values = {name: given.get(name, nothing) for name, nothing in missing.items()}
     return values | {f"has_{name}": name in given for name in missing}
 
@@ -139,11 +141,11 @@ def _flagged(given: Mapping[str, Any], missing: Mapping[str, Any]) -> dict[str, 
 @cache
 def metric_names(protocol: Protocol) -> tuple[str, ...]:
     """The metrics that an episode may have: those of a long path and of a camera that stands still."""
+    # twists [2000, 6] of a long path at 30 Hz: translations along a helix, and turns
     stamps = np.arange(2000) / 30.0
+    helix = np.stack([np.cos(stamps), np.sin(stamps), stamps], axis=1) * 40.0
     turns = np.stack([0.0 * stamps, 0.1 * np.sin(stamps), 0.0 * stamps], axis=1)
-    moving = np.concatenate(
-        [np.stack([np.cos(stamps), np.sin(stamps), stamps], axis=1) * 40.0, turns], axis=1
-    )
+    moving = np.concatenate([helix, turns], axis=1)
     names = ["coverage", "frames", "tracked_frames"]
     for twists in (moving, np.zeros_like(moving)):
         path = Trajectory(stamps, se3.exp(twists))
@@ -155,6 +157,7 @@ def metric_names(protocol: Protocol) -> tuple[str, ...]:
 # Rewards: what the newest frame of an episode earns.
 
 Reward = Callable[[Episode], float]
+"""What the newest frame of an episode earns, in metres."""
 Cost = Literal["network_calls", "keypoints", "processor_s"]
 RewardKind = Literal["neg_rpe", "neg_pose_error", "neg_window_error", "accuracy_minus_cost"]
 

@@ -15,9 +15,12 @@ from dynslam_bench.geometry import Array, se3
 Image = NDArray[np.uint8]
 
 HEIGHT = 480
+"""Height of the image, and size of the plot beside it, in pixels."""
 STRIP = 64
+"""Height of the line of numbers below, in pixels."""
 ALIGN_FROM = 30
 """Tracked frames with ground truth from which on the estimate is drawn aligned."""
+# Colours, red first: features, mask and trajectories, then text, ground and states.
 KEPT = (86, 180, 233)
 CULLED = (213, 94, 0)
 MASK = (240, 228, 66)
@@ -53,6 +56,8 @@ class Canvas:
         self._width = 2 * round(sequence.camera.width * self._scale / 2)
         self._title = f"{label}  |  {sequence.id}"
         self._frames = len(sequence)
+
+        # true poses by frame, in the first camera's frame, and the view in which they spread most
         truth = truths_at(sequence.ground_truth, sequence.timestamps)
         origin = se3.inverse(next(iter(truth.values()), np.eye(4)))
         self._truth = {index: origin @ pose for index, pose in truth.items()}
@@ -73,6 +78,7 @@ class Canvas:
 
     def _plot(self, estimate: Array, pieces: list[slice], now: int) -> Image:
         """A square plot of the estimated centres ``[N, 2]`` over the ground truth up to frame `now` and ahead."""
+        # scale: all paths and the origin fit, with a margin of 60 pixels
         plot = np.full((HEIGHT, HEIGHT, 3), _PAPER, np.uint8)
         points = np.concatenate([self._truth_path, estimate, np.zeros((1, 2))])
         low = points.min(axis=0)
@@ -84,16 +90,21 @@ class Canvas:
             offset = (points - centre) / metres_a_pixel
             return np.stack([HEIGHT / 2 + offset[:, 0], HEIGHT / 2 - offset[:, 1]], axis=1)
 
+        # the true path, that of the frames so far darker
         _grid(plot, centre, metres_a_pixel)
         passed = self._truth_path[: sum(index <= now for index in self._truth)]
         for path, colour, thickness in ((self._truth_path, TRUTH_AHEAD, 1), (passed, TRUTH, 2)):
             if len(path) > 1:
                 _polyline(plot, to_pixels(path), colour, thickness)
+
+        # the estimate in its pieces, and the camera now
         for piece in pieces:
             _polyline(plot, to_pixels(estimate[piece]), ESTIMATE, 2)
         if len(estimate):
             x, y = to_pixels(estimate[-1:])[0].round().astype(int).tolist()
             cv2.circle(plot, (x, y), 5, ESTIMATE, -1, cv2.LINE_AA)
+
+        # scale, name of the view, frame
         _scale_bar(plot, metres_a_pixel)
         _text(plot, self._view, (HEIGHT - 215, HEIGHT - 13), (120, 120, 120), 0.42)
         cv2.rectangle(plot, (0, 0), (HEIGHT - 1, HEIGHT - 1), (200, 200, 200), 1)
@@ -102,11 +113,27 @@ class Canvas:
     def _strip(
         self, result: TrackResult, episode: Episode, ate_m: float | None, width: int
     ) -> Image:
+        """Title, state, numbers and legend below the picture, uint8 ``[64, width, 3]``."""
         strip = np.full((STRIP, width, 3), 235, np.uint8)
         last = episode.outcomes[-1]
         _text(strip, self._title, (10, 24), _INK, 0.5)
         _text(strip, last.state, (10, 50), _STATE_COLOUR[last.state], 0.5, 2)
-        parts = [
+        numbers = self._numbers(result, episode, ate_m)
+        _text(strip, "   ".join(numbers), (130, 50), _INK, 0.45)
+
+        # legend: circles for features and mask, lines for trajectories
+        for x, name, colour in ((470, "kept", KEPT), (395, "culled", CULLED), (320, "mask", MASK)):
+            cv2.circle(strip, (width - x, 19), 5, colour, -1, cv2.LINE_AA)
+            _text(strip, name, (width - x + 10, 24), _INK, 0.45)
+        for x, name, colour in ((245, "estimate", ESTIMATE), (135, "ground truth", TRUTH)):
+            cv2.line(strip, (width - x, 19), (width - x + 20, 19), colour, 3, cv2.LINE_AA)
+            _text(strip, name, (width - x + 26, 24), _INK, 0.45)
+        return strip
+
+    def _numbers(self, result: TrackResult, episode: Episode, ate_m: float | None) -> list[str]:
+        """Frame, time, counts and errors in words."""
+        last = episode.outcomes[-1]
+        numbers = [
             f"frame {last.index + 1}/{self._frames}",
             f"t {last.timestamp - episode.outcomes[0].timestamp:.2f} s",
         ]
@@ -116,27 +143,20 @@ class Canvas:
             "inliers": "inliers",
             "keyframes": "kf",
         }
-        parts += [
-            f"{name} {result.stats[key]:.0f}" for key, name in names.items() if key in result.stats
-        ]
-        if last.error is None:
-            parts.append("no ground truth here")
+        for key, name in names.items():
+            if key in result.stats:
+                numbers.append(f"{name} {result.stats[key]:.0f}")
+
+        error = last.error
+        if error is None:
+            numbers.append("no ground truth here")
         else:
-            parts.append(
-                f"pose error {100 * last.error.trans_m:.1f} cm, {last.error.rot_deg:.2f} deg"
-            )
-            if last.error.frame_trans_m is not None:
-                parts.append(f"frame error {1000 * last.error.frame_trans_m:.1f} mm")
+            numbers.append(f"pose error {100 * error.trans_m:.1f} cm, {error.rot_deg:.2f} deg")
+            if error.frame_trans_m is not None:
+                numbers.append(f"frame error {1000 * error.frame_trans_m:.1f} mm")
         if ate_m is not None:
-            parts.append(f"ATE so far {1000 * ate_m:.1f} mm")
-        _text(strip, "   ".join(parts), (130, 50), _INK, 0.45)
-        for x, name, colour in ((470, "kept", KEPT), (395, "culled", CULLED), (320, "mask", MASK)):
-            cv2.circle(strip, (width - x, 19), 5, colour, -1, cv2.LINE_AA)
-            _text(strip, name, (width - x + 10, 24), _INK, 0.45)
-        for x, name, colour in ((245, "estimate", ESTIMATE), (135, "ground truth", TRUTH)):
-            cv2.line(strip, (width - x, 19), (width - x + 20, 19), colour, 3, cv2.LINE_AA)
-            _text(strip, name, (width - x + 26, 24), _INK, 0.45)
-        return strip
+            numbers.append(f"ATE so far {1000 * ate_m:.1f} mm")
+        return numbers
 
 
 def annotated(rgb: Image, result: TrackResult, width: int) -> Image:
@@ -147,6 +167,7 @@ def annotated(rgb: Image, result: TrackResult, width: int) -> Image:
         result: What the tracker said of it.
         width: Of the result, whose pixels are square as the image's.
     """
+    # the dynamic mask, blended and outlined
     image = np.array(rgb, dtype=np.uint8)
     scale = width / image.shape[1]
     if result.dynamic_mask is not None and result.dynamic_mask.any():
@@ -156,31 +177,26 @@ def annotated(rgb: Image, result: TrackResult, width: int) -> Image:
             mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE
         )
         cv2.drawContours(image, outlines, -1, MASK, 1, cv2.LINE_AA)
+
+    # scale
     size = (width, round(image.shape[0] * scale))
-    radius = max(round(width / 320), 1)
     image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    if result.keypoints_xy is not None:
-        points = np.asarray(result.keypoints_xy, dtype=np.float64).reshape(-1, 2)
-        kept = (
-            np.ones(len(points), bool)
-            if result.keypoints_keep is None
-            else np.asarray(result.keypoints_keep, bool)
-        )
-        for (x, y), static in zip(
-            (points * scale).round().astype(int).tolist(), kept.tolist(), strict=True
-        ):
-            if static:
-                cv2.circle(image, (x, y), radius, KEPT, -1, cv2.LINE_AA)
-            else:
-                cv2.drawMarker(
-                    image,
-                    (x, y),
-                    CULLED,
-                    cv2.MARKER_TILTED_CROSS,
-                    2 * radius + 3,
-                    radius,
-                    cv2.LINE_AA,
-                )
+    if result.keypoints_xy is None:
+        return image
+
+    # features, static ones as circles and dynamic ones as crosses
+    points = np.asarray(result.keypoints_xy, dtype=np.float64).reshape(-1, 2)
+    is_static = np.ones(len(points), bool)
+    if result.keypoints_keep is not None:
+        is_static = np.asarray(result.keypoints_keep, bool)
+    radius = max(round(width / 320), 1)
+    cross = (cv2.MARKER_TILTED_CROSS, 2 * radius + 3, radius, cv2.LINE_AA)
+    pixels = (points * scale).round().astype(int).tolist()
+    for (x, y), static in zip(pixels, is_static.tolist(), strict=True):
+        if static:
+            cv2.circle(image, (x, y), radius, KEPT, -1, cv2.LINE_AA)
+        else:
+            cv2.drawMarker(image, (x, y), CULLED, *cross)
     return image
 
 
@@ -213,25 +229,31 @@ def align_to_truth(
     tracked = [(o.index, o.T_world_cam) for o in episode.outcomes if o.T_world_cam is not None]
     if not tracked:
         return np.zeros((0, 3)), [], None
+
+    # estimated poses [N, 4, 4], and of those with ground truth rows and true poses
     poses = np.array([pose for _, pose in tracked])
     both = [row for row, (index, _) in enumerate(tracked) if index in truth]
     true = np.array([truth[tracked[row][0]] for row in both])
+
+    # align by least squares, by the first pose with ground truth, or to the first camera
     ate_m = None
     if len(both) >= ALIGN_FROM:
-        placed = align(poses[both], true, "se3").apply(poses)
-        ate_m = float(
-            np.sqrt(np.square(placed[both][:, :3, 3] - true[:, :3, 3]).sum(axis=1).mean())
-        )
+        aligned = align(poses[both], true, "se3").apply(poses)
+        errors_m = aligned[both][:, :3, 3] - true[:, :3, 3]
+        ate_m = float(np.sqrt(np.square(errors_m).sum(axis=1).mean()))
     elif both:
-        placed = true[0] @ se3.inverse(poses[both[0]]) @ poses
+        aligned = true[0] @ se3.inverse(poses[both[0]]) @ poses
     else:
-        placed = se3.inverse(poses[0]) @ poses
+        aligned = se3.inverse(poses[0]) @ poses
+
+    # pieces of frames that follow each other
     breaks = np.flatnonzero(np.diff([index for index, _ in tracked]) > 1) + 1
-    bounds = [0, *breaks.tolist(), len(placed)]
-    return placed[:, :3, 3], [slice(a, b) for a, b in pairwise(bounds)], ate_m
+    bounds = [0, *breaks.tolist(), len(aligned)]
+    return aligned[:, :3, 3], [slice(a, b) for a, b in pairwise(bounds)], ate_m
 
 
 def _polyline(image: Image, points: Array, colour: tuple[int, int, int], thickness: int) -> None:
+    """Draw a path through points ``[N, 2]`` in pixels; OpenCV takes them in sixteenths (4 bits)."""
     fixed = np.clip(points * 16, -(2**20), 2**20).round().astype(np.int32).reshape(-1, 1, 2)
     cv2.polylines(image, [fixed], False, colour, thickness, cv2.LINE_AA, 4)
 
@@ -243,6 +265,7 @@ def _nice_length(metres: float) -> float:
 
 
 def _grid(plot: Image, centre: Array, metres_a_pixel: float) -> None:
+    """Draw lines at round coordinates, some four of them in each direction."""
     step = _nice_length(metres_a_pixel * HEIGHT / 4)
     half = HEIGHT / 2 * metres_a_pixel
     for axis, sign in ((0, 1), (1, -1)):
@@ -254,15 +277,15 @@ def _grid(plot: Image, centre: Array, metres_a_pixel: float) -> None:
 
 
 def _scale_bar(plot: Image, metres_a_pixel: float) -> None:
+    """Draw a bar of a round length, at most 140 pixels, with that length."""
     length = _nice_length(metres_a_pixel * 140)
     pixels = round(length / metres_a_pixel)
     y = HEIGHT - 18
     cv2.line(plot, (16, y), (16 + pixels, y), _INK, 2)
     for x in (16, 16 + pixels):
         cv2.line(plot, (x, y - 4), (x, y + 4), _INK, 2)
-    _text(
-        plot, f"{length:g} m" if length >= 1 else f"{100 * length:g} cm", (16, y - 10), _INK, 0.45
-    )
+    words = f"{length:g} m" if length >= 1 else f"{100 * length:g} cm"
+    _text(plot, words, (16, y - 10), _INK, 0.45)
 
 
 def _text(
@@ -273,4 +296,5 @@ def _text(
     scale: float,
     thickness: int = 1,
 ) -> None:
+    """Write text from its lower left corner on, in pixels."""
     cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, thickness, cv2.LINE_AA)

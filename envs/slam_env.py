@@ -75,23 +75,33 @@ from dynslam_bench.sequences.catalogue import parse_frames
 from dynslam_bench.trackers.registry import TRACKERS, build_tracker, resolve_settings
 
 FrameTransform = Callable[[Frame], Frame]
+"""Changes a frame before the tracker sees it."""
 Frames = Sequence[int | None] | str | None
 """Part of a sequence: ``(start, stop)``, ``"start:stop"`` with either end open, or None for all."""
-_OF_AN_EPISODE = (
-    *(
-        "_tracker",
-        "_errors",
-        "episode",
-        "frame",
-        "result",
-        "_final",
-        "settings",
-        "_actions",
-        "window",
-    ),
-    *("_np_random", "_np_random_seed"),
+_EPISODE_ATTRIBUTES = (
+    "_tracker",
+    "_errors",
+    "episode",
+    "frame",
+    "result",
+    "_final",
+    "settings",
+    "_actions",
+    "window",
+    "_np_random",
+    "_np_random_seed",
 )
-"""What of an environment belongs to its episode."""
+"""Attributes of an environment that belong to its episode: what `SlamEnv.clone_state` copies."""
+_OPTION_ATTRIBUTES = (
+    "settings",
+    "_actions",
+    "sequence",
+    "_whole",
+    "window",
+    "_source",
+    "metadata",
+)
+"""Attributes that the options of `SlamEnv.reset` change: what it restores where it fails."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,13 +231,11 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             raise SettingsError(
                 f"unknown reward '{reward}'", f"choose {' or '.join(REWARDS)}, or give a callable"
             )
-        for title, number, least in (
-            ("lost_after", lost_after, 1),
-            ("threads", threads, 1),
-            ("window", window, 2),
-        ):
-            if number is not None and operator.index(number) < least:
-                raise SettingsError(f"{title} is {number}", f"give a number >= {least}")
+        _check_least("lost_after", lost_after, 1)
+        _check_least("threads", threads, 1)
+        _check_least("window", window, 2)
+
+        # what stays for all episodes
         self.render_mode = render_mode
         self.protocol = get_protocol(protocol)
         self.tracker_spec = TRACKERS.get(tracker) if isinstance(tracker, str) else tracker
@@ -252,11 +260,15 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         )
         self._control = tuple(control) if not isinstance(control, str) else control
         self._tracker: Tracker | None = None
+
+        # what options of `reset` replace, and the spaces that follow from it
         self._use_settings(settings)
         self._use_sequence(sequence)
         segmentation_source(self.settings, self.sequence, fetch=False)
         self.action_space = self._actions.space()
         self.observation_space = observation_space(observation, self.sequence.camera)
+
+        # the episode
         self.episode = Episode()
         self._final: Trajectory | None = None
         self._canvas: Canvas | None = None
@@ -350,32 +362,24 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         super().reset(seed=seed)
         self.episode = Episode()
         self._final = None
-        before = {
-            name: vars(self)[name]
-            for name in (
-                "settings",
-                "_actions",
-                "sequence",
-                "_whole",
-                "window",
-                "_source",
-                "metadata",
-            )
-        }
+
+        # take the options and reset the tracker; where that fails, nothing has changed
+        before = {name: vars(self)[name] for name in _OPTION_ATTRIBUTES}
         try:
             self._apply_options(options or {})
-            tracker = self._ready_tracker()
+            tracker = self._build_or_reuse_tracker()
             with tracker_code():
                 # before the reset: whatever that copies is then the episode's own
                 if self._actions.parameters:
                     tracker.configure(self.settings)  # type: ignore[attr-defined]
-                tracker.reset(
-                    self.sequence.camera, rng=np.random.default_rng(derive_seed(self.np_random))
-                )
+                rng = np.random.default_rng(derive_seed(self.np_random))
+                tracker.reset(self.sequence.camera, rng=rng)
         except Exception:
             vars(self).update(before)
             self.close()
             raise
+
+        # track frame 0; the poses of a monocular tracker have no causal errors
         self._errors = OnlineError(
             self.sequence.ground_truth if self.tracker_spec.metric else None, self.protocol.max_dt
         )
@@ -391,17 +395,23 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             SettingsError: The action does not fit the action space.
             TrackerError: The tracker broke its contract.
         """
+        # apply the action
         tracker = self._running_tracker()
         settings = self._actions.settings(action)
         if self._actions.parameters:
             with tracker_code():
                 tracker.configure(settings)  # type: ignore[attr-defined]
+
+        # track the frame
         self._track_next(tracker)
         outcomes = self.episode.outcomes
         reward = outcomes[-1].reward
+
+        # end the episode: lost for too long, or no frame is left
         terminated = self._lost_after is not None and self.episode.lost_streak >= self._lost_after
-        truncated = len(outcomes) == self._count
+        truncated = len(outcomes) == self._n_frames
         if terminated:
+            # all remaining frames cost what lost ones do, without being part of the episode
             rest = Episode(list(outcomes))
             reward += sum(
                 self._add_untracked(rest, "lost") for _ in self.sequence.timestamps[len(outcomes) :]
@@ -422,7 +432,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             DynslamError: The episode is not running, or fewer frames are left.
         """
         self._running_tracker()
-        left = self._count - 1 - self.episode.next_index
+        left = self._n_frames - 1 - self.episode.next_index
         if not 0 <= count <= left:
             raise DynslamError(f"cannot drop {count} frames, {left} are left before the last one")
         return sum(self._add_untracked(self.episode, "dropped") for _ in range(count))
@@ -438,7 +448,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         """
         if self._tracker is None or not self.episode.outcomes:
             raise DynslamError("clone_state() was called before reset()")
-        parts = {name: vars(self)[name] for name in _OF_AN_EPISODE}
+        parts = {name: vars(self)[name] for name in _EPISODE_ATTRIBUTES}
         return EpisodeState(self._origin(), self._copied(parts, {}))
 
     @names_wrong_arguments
@@ -463,6 +473,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self.sequence = _part(self._whole, self.window)
 
     def _origin(self) -> dict[str, str]:
+        """What an episode's state depends on, in words; equal where it can be restored."""
         whole = self._whole
         frames = digest([whole.digest(), content_digest(whole.timestamps)])
         return {
@@ -482,13 +493,14 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         ``coverage``, ``frames`` and ``tracked_frames`` of the scored trajectory, and the metrics of
         `evaluate` where there is ground truth and the protocol finds something to evaluate.
         """
+        # the trajectory that the protocol asks for; without a final one the online one
         final = self.final_trajectory() if self.protocol.trajectory == "final" else None
         trajectory = self.online_trajectory() if final is None else final
-        due = (
-            self.sequence.timestamps
-            if self.episode.over
-            else self.sequence.timestamps[: self.episode.next_index]
-        )
+
+        # stamps of the frames so far; after the end of all, tracked or not
+        due = self.sequence.timestamps
+        if not self.episode.over:
+            due = due[: self.episode.next_index]
         tracked = 0
         with suppress(EvaluationError):  # a final trajectory whose stamps are of no frame
             tracked = int(tracked_frames(trajectory, due).sum())
@@ -497,6 +509,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             "frames": float(len(due)),
             "tracked_frames": float(tracked),
         }
+
+        # errors; of a monocular tracker only where the alignment finds the scale
         truth = self.sequence.ground_truth
         if truth is None or not (self.tracker_spec.metric or self.protocol.finds_scale):
             return counts
@@ -553,6 +567,8 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             self.settings,
         )
         memo |= {id(value): value for value in (*shared, self.sequence.ground_truth)}
+
+        # the tracker first: only that may refuse
         try:
             deepcopy(parts["_tracker"], memo)
         except Exception as error:
@@ -566,13 +582,12 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
     def _use_settings(
         self, settings: Mapping[str, Any] | Settings | None, before: Settings | None = None
     ) -> None:
+        """Take settings, complete or as overrides: of the tracker's defaults, or of those before."""
         if not isinstance(settings, Settings):
-            spec = self.tracker_spec
-            settings = (
-                resolve_settings(spec, settings)
-                if before is None
-                else apply_overrides(before, settings or {})
-            )
+            if before is None:
+                settings = resolve_settings(self.tracker_spec, settings)
+            else:
+                settings = apply_overrides(before, settings or {})
         if not isinstance(settings, self.tracker_spec.settings):
             raise SettingsError(
                 f"tracker '{self.tracker_spec.id}' takes {self.tracker_spec.settings.__name__}, "
@@ -584,6 +599,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     @names_wrong_arguments
     def _use_sequence(self, sequence: str | FrameSequence) -> None:
+        """Open a sequence and check that tracker, protocol and window fit it."""
         opened = self._open(sequence, preprocessing=preprocessing_of(self.settings))
         check_frames(opened)
         self.protocol.check_sequence(opened.id)
@@ -599,25 +615,33 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         self._source = sequence
 
     def _apply_options(self, options: Mapping[str, Any]) -> None:
+        """Take the options of `reset`: settings, sequence and window."""
         for unknown in sorted(set(options) - {"sequence", "settings", "window"}):
             raise SettingsError(
                 f"unknown reset option '{unknown}'", "known: sequence, settings, window"
             )
         if {"sequence", "settings"} & set(options):
             self.close()  # the next tracker is built for other settings or another sequence
+
+        # settings; other preprocessing needs the sequence opened again
         preprocessing = preprocessing_of(self.settings)
         camera = self.sequence.camera
         if "settings" in options:
             self._use_settings(options["settings"], self.settings)
             if preprocessing_of(self.settings) != preprocessing:
                 options = {"sequence": self._source, **options}
+
+        # sequence
         if "sequence" in options:
             self._use_sequence(options["sequence"])
-            size, new_size = ((c.width, c.height) for c in (camera, self.sequence.camera))
+            size = (camera.width, camera.height)
+            new_size = (self.sequence.camera.width, self.sequence.camera.height)
             if {"rgb", "depth"} & set(self._parts) and size != new_size:
                 raise SequenceError(
                     f"images of {new_size} pixels do not fit the observation space of {size}"
                 )
+
+        # window: the one asked for, a random one of the window's length, or all frames
         window = (0, len(self._whole))
         if options.get("window") is not None:
             window = parse_window(options["window"], self._whole)
@@ -631,8 +655,12 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             self.sequence = _part(self._whole, window)
             self.window = window
 
-    def _ready_tracker(self) -> Tracker:
-        """The tracker for the current settings and sequence."""
+    def _build_or_reuse_tracker(self) -> Tracker:
+        """The tracker for the current settings and sequence; it is built where there is none.
+
+        Raises:
+            TrackerError: It cannot be built, or cannot change settings although `control` asks for it.
+        """
         if self._tracker is None:
             masks = self.sequence.masks
             context = TrackerContext(
@@ -653,6 +681,11 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
         return self._tracker
 
     def _running_tracker(self) -> Tracker:
+        """The tracker of an episode that runs.
+
+        Raises:
+            DynslamError: `reset` was not called, or the episode is over.
+        """
         if self._tracker is None or not self.episode.outcomes:
             raise DynslamError("step() was called before reset()")
         if self.episode.over:
@@ -668,68 +701,74 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             SequenceError: The frame cannot be read, or does not fit the sequence's camera.
             TrackerContractError: The tracker broke its contract.
         """
+        # read
         index = self.episode.next_index
-        began = time.perf_counter()
+        read_start = time.perf_counter()
         self._final = None
         frame = _read_frame(self.sequence, index)
         for transform in self.frame_transforms:
             frame = transform(frame)
         frame = read_only(frame)
-        read = time.perf_counter()
-        processor_began = time.process_time()
+
+        # track
+        track_start = time.perf_counter()
+        processor_start = time.process_time()
         with tracker_code():
             result = tracker.track(frame)
-        total = time.perf_counter() - read
-        processor = time.process_time() - processor_began
+        total = time.perf_counter() - track_start
+        processor = time.process_time() - processor_start
         result = check_result(result, frame, self.tracker_spec.id)
-        if result.stats.get("cached_stages"):  # the stages report their times without the cache
-            # which works beside
+
+        # times in seconds; cached stages report what they take without the cache, so the total grows
+        # with them. The detector works beside the others
+        if result.stats.get("cached_stages"):
             inside = (seconds for stage, seconds in result.timings.items() if stage != "detector")
             uncached = max(total, sum(inside))
             processor = processor + uncached - total
             total = uncached
-        timings = {"read": read - began, "total": total, "processor": processor}
-        timings |= {
-            stage: float(seconds)
-            for stage, seconds in result.timings.items()
-            if stage not in timings
-        }
+        timings = {"read": track_start - read_start, "total": total, "processor": processor}
+        for stage, seconds in result.timings.items():
+            if stage not in timings:
+                timings[stage] = float(seconds)
+
+        # errors and reward
         self.frame = frame
         self.result = result
         pose = np.array(result.T_world_cam, dtype=np.float64) if result.state == "ok" else None
         error = self._errors.update(frame.timestamp, pose)
-        self._add(
-            self.episode,
-            FrameOutcome(index, frame.timestamp, result.state, pose, result.stats, timings, error),
+        outcome = FrameOutcome(
+            index, frame.timestamp, result.state, pose, result.stats, timings, error
         )
+        self._add_with_reward(self.episode, outcome)
 
-    def _add(self, episode: Episode, outcome: FrameOutcome) -> float:
-        """Append a frame's outcome with what it earns, which is returned."""
+    def _add_with_reward(self, episode: Episode, outcome: FrameOutcome) -> float:
+        """Append a frame's outcome with its reward; returns the reward in metres."""
         episode.add(outcome)
         reward = float(self._reward(episode))
         episode.outcomes[-1] = replace(outcome, reward=reward)
         return reward
 
     def _add_untracked(self, episode: Episode, state: FrameState) -> float:
-        """Append the next frame as one without a pose; returns what it earns."""
+        """Append the next frame as one without a pose; returns its reward in metres."""
         index = episode.next_index
         stamp = float(self.sequence.timestamps[index])
-        return self._add(
-            episode,
-            FrameOutcome(index, stamp, state, None, {}, {}, self._errors.update(stamp, None)),
-        )
+        error = self._errors.update(stamp, None)
+        outcome = FrameOutcome(index, stamp, state, None, {}, {}, error)
+        return self._add_with_reward(episode, outcome)
 
     @property
-    def _count(self) -> int:
+    def _n_frames(self) -> int:
         """Frames of the episode."""
         return self.window[1] - self.window[0]
 
     def _observe(self) -> Any:
-        progress = self.episode.outcomes[-1].index / max(self._count - 1, 1)
+        """The observation of the last tracked frame: the vector for ``stats``, else a dict of parts."""
+        progress = self.episode.outcomes[-1].index / max(self._n_frames - 1, 1)
         observed = observe(self._parts, self.frame, self.result, self.episode, progress)
         return observed["stats"] if self._observation == "stats" else observed
 
     def _info(self) -> dict[str, Any]:
+        """The ``info`` of the last frame, at the end with the metrics of the episode."""
         info = frame_info(self.episode.outcomes[-1]) | {"window": np.array(self.window)}
         if self.episode.over:
             info |= {"episode_metrics": self.episode_metrics(), "protocol": self.protocol.id}
@@ -738,9 +777,19 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
 def _part(whole: FrameSequence, window: tuple[int, int]) -> FrameSequence:
     """The frames of a window."""
-    return (
-        whole if window == (0, len(whole)) else cast("FrameSequence", SequenceView(whole, *window))
-    )
+    if window == (0, len(whole)):
+        return whole
+    return cast("FrameSequence", SequenceView(whole, *window))
+
+
+def _check_least(name: str, number: int | None, least: int) -> None:
+    """Refuse a number that is too small; None is no limit.
+
+    Raises:
+        SettingsError: It is smaller than `least`.
+    """
+    if number is not None and operator.index(number) < least:
+        raise SettingsError(f"{name} is {number}", f"give a number >= {least}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -765,7 +814,8 @@ def _read_frame(sequence: FrameSequence, index: int) -> Frame:
         check_frame(frame, sequence.camera)
     except MemoryError:
         raise
-    except Exception as error:  # a data set of the user's may raise anything
+    # a data set of the user's may raise anything
+    except Exception as error:
         ours = isinstance(error, DynslamError)
         fault = error.args[0] if ours else f"{type(error).__name__}: {error}".rstrip(": ")
         hint = getattr(error, "hint", "") if ours else ""
@@ -853,6 +903,8 @@ def check_frames(sequence: FrameSequence) -> None:
         raise SequenceError(
             f"the frame rate of '{sequence.id}' is {sequence.fps} Hz", "it is a number above 0"
         )
+
+    # stamps increase, and are 1 us apart at least
     stamps = np.asarray(sequence.timestamps, dtype=np.float64)
     wrong = np.flatnonzero(~(np.diff(stamps) > 0))
     if len(wrong):
@@ -889,6 +941,8 @@ def resolve_device(device: str = "auto") -> str:
         return "cpu"
     if device != "auto" and not re.fullmatch(r"cuda(:\d+)?", device):
         raise SettingsError(f"unknown device '{device}'", "write auto, cpu, cuda or cuda:N")
+
+    # without the device of a driver (NVIDIA, WSL, AMD) there is no need to import torch
     count = 0
     if any(Path(node).exists() for node in ("/dev/nvidiactl", "/dev/dxg", "/dev/kfd")):
         import torch

@@ -108,13 +108,14 @@ class ActionMap:
             )
         if np.isnan(vector).any():
             raise SettingsError(f"the action holds NaN: {vector.tolist()}")
+        # shares u of the axes [k], from 0 to 1; neutral coordinates leave the settings' own values
         shares = (np.clip(vector, -1.0, 1.0) + 1.0) / 2.0
-        asked = zip(
-            self.parameters, shares, vector.astype(np.float32) == self._neutral, strict=True
-        )
-        return {
-            p.name: self._values[p.name] if same else _decode(p, float(u)) for p, u, same in asked
-        }
+        is_neutral = vector.astype(np.float32) == self._neutral
+        values = {}
+        for parameter, share, keep in zip(self.parameters, shares, is_neutral, strict=True):
+            name = parameter.name
+            values[name] = self._values[name] if keep else _decode(parameter, float(share))
+        return values
 
     def of(self, values: Mapping[str, Any]) -> NDArray[np.float32]:
         """The action ``[k]`` that asks for values of controlled settings; see `SlamEnv.action_of`."""
@@ -125,21 +126,20 @@ class ActionMap:
                 )
         settings = apply_overrides(self.base, values)
         for parameter in self.parameters:
-            _check_range(
-                parameter, attrgetter(parameter.name)(settings), f"setting '{parameter.name}'"
-            )
+            value = attrgetter(parameter.name)(settings)
+            _check_range(parameter, value, f"setting '{parameter.name}'")
         return self.encode(settings)
 
     def encode(self, settings: Settings) -> NDArray[np.float32]:
         """The action ``[k]`` that asks for given settings; values beyond the search range are clipped to its ends."""
         flat = flatten(settings)
-        shares = [_encode(p, flat[p.name]) for p in self.parameters]
-        return np.asarray(
-            np.clip(2.0 * np.array(shares, dtype=np.float64) - 1.0, -1.0, 1.0), dtype=np.float32
-        )
+        shares = [_encode(parameter, flat[parameter.name]) for parameter in self.parameters]
+        action = 2.0 * np.array(shares, dtype=np.float64) - 1.0
+        return np.asarray(np.clip(action, -1.0, 1.0), dtype=np.float32)
 
 
 def _select(settings: Settings, control: Sequence[str]) -> tuple[Parameter, ...]:
+    """The parameters of the settings that actions change, in the order of `control`; see `ActionMap`."""
     if isinstance(control, str):
         raise SettingsError(f"control is the string '{control}'", "give a list of setting names")
     online = {
@@ -148,11 +148,11 @@ def _select(settings: Settings, control: Sequence[str]) -> tuple[Parameter, ...]
     chosen = []
     for name in control:
         if name not in online:
-            fixed = f"setting '{name}' may not change in mid-episode"
-            fault = fixed if name in flatten(settings) else f"unknown setting '{name}' in control"
-            raise SettingsError(
-                fault, did_you_mean(name, online) or "this tracker has no online settings"
-            )
+            fault = f"unknown setting '{name}' in control"
+            if name in flatten(settings):
+                fault = f"setting '{name}' may not change in mid-episode"
+            hint = did_you_mean(name, online) or "this tracker has no online settings"
+            raise SettingsError(fault, hint)
         parameter = online[name]
         if parameter in chosen:
             raise SettingsError(f"setting '{name}' is given twice in control")
@@ -166,11 +166,14 @@ def _select(settings: Settings, control: Sequence[str]) -> tuple[Parameter, ...]
 
 
 def _check_range(parameter: Parameter, value: Any, title: str) -> None:
-    if (
-        parameter.low is not None
-        and parameter.high is not None
-        and not parameter.low <= value <= parameter.high
-    ):
+    """Refuse a number that lies outside of what actions span.
+
+    Raises:
+        SettingsError: It does.
+    """
+    if parameter.low is None or parameter.high is None:
+        return
+    if not parameter.low <= value <= parameter.high:
         raise SettingsError(
             f"{title} is {value:g}, actions span {parameter.low:g} to {parameter.high:g}",
             "set it within, or leave it out of control",
@@ -178,18 +181,23 @@ def _check_range(parameter: Parameter, value: Any, title: str) -> None:
 
 
 def _decode(parameter: Parameter, share: float) -> Scalar:
+    """The value of a setting at a share ``u``, 0 to 1, of its axis; see `ActionMap`."""
     if parameter.low is None or parameter.high is None:
-        return parameter.choices[
-            min(int(share * len(parameter.choices)), len(parameter.choices) - 1)
-        ]
+        n = len(parameter.choices)
+        return parameter.choices[min(int(share * n), n - 1)]
     low = float(parameter.low)
     high = float(parameter.high)
-    value = low * (high / low) ** share if parameter.scale == "log" else low + share * (high - low)
-    value = min(max(value, low), high)  # rounding may put a power slightly beyond its end
+    if parameter.scale == "log":
+        value = low * (high / low) ** share
+    else:
+        value = low + share * (high - low)
+    # rounding may put a power slightly beyond its end
+    value = min(max(value, low), high)
     return round(value) if parameter.kind == "int" else value
 
 
 def _encode(parameter: Parameter, value: Scalar) -> float:
+    """The share ``u`` of a setting's axis at which a value lies: the inverse of `_decode`."""
     if parameter.low is None or parameter.high is None:
         return (parameter.choices.index(value) + 0.5) / len(parameter.choices)
     low = float(parameter.low)
@@ -264,6 +272,7 @@ STATS_LAYOUT: tuple[tuple[str, str], ...] = (
 """Name and meaning of every entry of the ``stats`` observation, in order. What a tracker does not report is 0."""
 
 _SIGNED = np.array([name.startswith("motion_") for name, _ in STATS_LAYOUT])
+"""Which entries of ``stats`` may be negative, bool ``[24]``."""
 
 
 def stats_space() -> spaces.Box:
@@ -329,9 +338,8 @@ def observe(
                 observed[part] = np.clip(depth, 0.0, MAX_DEPTH_M).astype(np.float32)
             case "gray":
                 gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
-                observed[part] = cv2.resize(gray, GRAY_SIZE[::-1], interpolation=cv2.INTER_AREA)[
-                    ..., None
-                ]
+                small = cv2.resize(gray, GRAY_SIZE[::-1], interpolation=cv2.INTER_AREA)
+                observed[part] = small[..., None]
             case "keypoints":
                 observed[part], observed["keypoints_mask"] = keypoint_tokens(frame, result)
             case "privileged":
@@ -344,7 +352,9 @@ def _estimated_motion(episode: Episode) -> NDArray[np.float64]:
     poses = [
         outcome.T_world_cam for outcome in episode.outcomes[-2:] if outcome.T_world_cam is not None
     ]
-    return se3.log(se3.inverse(poses[0]) @ poses[1]) if len(poses) == 2 else np.zeros(6)
+    if len(poses) < 2:
+        return np.zeros(6)
+    return se3.log(se3.inverse(poses[0]) @ poses[1])
 
 
 def keypoint_tokens(
@@ -357,23 +367,26 @@ def keypoint_tokens(
         where there is one.
     """
     tokens = np.zeros((MOST_KEYPOINTS, len(KEYPOINT_LAYOUT)), np.float32)
-    mask = np.zeros(MOST_KEYPOINTS, np.int8)
+    is_keypoint = np.zeros(MOST_KEYPOINTS, np.int8)
+
+    # choose keypoints
     xy = np.zeros((0, 2)) if result.keypoints_xy is None else np.asarray(result.keypoints_xy)
     keep = np.ones(len(xy)) if result.keypoints_keep is None else np.asarray(result.keypoints_keep)
     rows = np.linspace(0, len(xy) - 1, min(len(xy), MOST_KEYPOINTS)).astype(np.intp)
+
+    # depth and dynamic mask at the nearest pixels
     height, width = frame.depth.shape
     x, y = xy[rows].T
-    at = (
-        np.rint(y).astype(np.intp).clip(0, height - 1),
-        np.rint(x).astype(np.intp).clip(0, width - 1),
-    )
-    z = np.nan_to_num(frame.depth[at], nan=0.0, posinf=MAX_DEPTH_M).clip(0, MAX_DEPTH_M)
-    masked = np.zeros(len(rows)) if result.dynamic_mask is None else result.dynamic_mask[at]
-    tokens[: len(rows)] = np.stack(
-        [x / width, y / height, z / (z + 3.0), keep[rows], masked], axis=1
-    ).clip(0, 1)
-    mask[: len(rows)] = 1
-    return tokens, mask
+    nearest_row = np.rint(y).astype(np.intp).clip(0, height - 1)
+    nearest_column = np.rint(x).astype(np.intp).clip(0, width - 1)
+    pixels = (nearest_row, nearest_column)
+    z = np.nan_to_num(frame.depth[pixels], nan=0.0, posinf=MAX_DEPTH_M).clip(0, MAX_DEPTH_M)
+    masked = np.zeros(len(rows)) if result.dynamic_mask is None else result.dynamic_mask[pixels]
+
+    columns = [x / width, y / height, z / (z + 3.0), keep[rows], masked]
+    tokens[: len(rows)] = np.stack(columns, axis=1).clip(0, 1)
+    is_keypoint[: len(rows)] = 1
+    return tokens, is_keypoint
 
 
 def privileged_observation(episode: Episode) -> NDArray[np.float32]:
@@ -382,10 +395,16 @@ def privileged_observation(episode: Episode) -> NDArray[np.float32]:
     now = episode.outcomes[-1].error
     before = episode.outcomes[-2].error if len(episode.outcomes) > 1 else None
     if now is not None:
-        values[:3] = 1.0, now.trans_m / (now.trans_m + 1.0), now.rot_deg / 180.0
-        values[3:5] = np.tanh((now.frame_trans_m or 0.0) / 0.1), (now.frame_rot_deg or 0.0) / 180.0
+        # errors of the pose, and of the motion since the previous frame
+        values[0] = 1.0
+        values[1] = now.trans_m / (now.trans_m + 1.0)
+        values[2] = now.rot_deg / 180.0
+        values[3] = np.tanh((now.frame_trans_m or 0.0) / 0.1)
+        values[4] = (now.frame_rot_deg or 0.0) / 180.0
     if now is not None and before is not None:
-        values[5:] = np.tanh(se3.log(se3.inverse(before.T_world_true) @ now.T_world_true) / 0.1)
+        # the true motion, a twist [6]
+        true_motion = se3.log(se3.inverse(before.T_world_true) @ now.T_world_true)
+        values[5:] = np.tanh(true_motion / 0.1)
     return values.astype(np.float32)
 
 
@@ -407,11 +426,13 @@ def stats_observation(
         motion: Twist ``[6]`` of the estimated motion since the previous frame; 0 if either frame
             has no pose.
     """
-    stats = defaultdict(
-        float, {name: float(value) for name, value in result.stats.items() if np.isfinite(value)}
-    )
+    # what the tracker reports; 0 for what it does not
+    finite = {name: float(value) for name, value in result.stats.items() if np.isfinite(value)}
+    stats = defaultdict(float, finite)
     keypoints = stats["keypoints"]
     matches = stats["matches"]
+
+    # image and depth, every fourth row and column
     gray = frame.rgb[::4, ::4].mean(axis=2, dtype=np.float32)
     depth = frame.depth[::4, ::4]
     valid = depth[(depth > 0) & np.isfinite(depth)]
@@ -436,14 +457,15 @@ def stats_observation(
         valid.size / max(depth.size, 1),
         _saturate(float(np.median(valid)), 3.0) if valid.size else 0.0,
     ]
-    return np.clip(np.asarray(values, dtype=np.float32), np.where(_SIGNED, -1.0, 0.0), 1.0).astype(
-        np.float32
-    )
+    lowest = np.where(_SIGNED, -1.0, 0.0)
+    return np.clip(np.asarray(values, dtype=np.float32), lowest, 1.0).astype(np.float32)
 
 
 def _saturate(value: float, scale: float) -> float:
+    """A number from 0 on in [0, 1); `scale` becomes 0.5."""
     return max(value, 0.0) / (max(value, 0.0) + scale)
 
 
 def _ratio(part: float, whole: float) -> float:
+    """A share in [0, 1]; 0 of nothing."""
     return min(max(part / whole, 0.0), 1.0) if whole > 0 else 0.0

@@ -65,22 +65,17 @@ class RecordTimings(SlamWrapper):
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Step, with the frame's times in ``info``."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        return (
-            observation,
-            reward,
-            terminated,
-            truncated,
-            info | {"timings": self._base.timings[-1]},
-        )
+        timed = info | {"timings": self._base.timings[-1]}
+        return observation, reward, terminated, truncated, timed
 
     def summary(self) -> dict[str, dict[str, float]]:
         """``median`` and ``p95`` of every stage over the episode so far, seconds (0 where a stage did not run)."""
-        return {
-            stage: {"median": float(np.median(seconds)), "p95": float(np.percentile(seconds, 95))}
-            for stage, seconds in stage_seconds(
-                [frame for frame in self._base.timings if frame]
-            ).items()
-        }
+        tracked = [frame for frame in self._base.timings if frame]
+        summary = {}
+        for stage, seconds in stage_seconds(tracked).items():
+            p95 = float(np.percentile(seconds, 95))
+            summary[stage] = {"median": float(np.median(seconds)), "p95": p95}
+        return summary
 
 
 class RecordTrajectory(SlamWrapper):
@@ -112,13 +107,13 @@ class RecordTrajectory(SlamWrapper):
         Raises:
             DynslamError: The file cannot be written.
         """
-        outcome = self.env.step(action)
-        if outcome[2] or outcome[3]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if terminated or truncated:
             path = Path(self._pattern.replace("{episode}", str(self._episode)))
             comment = f"{self._base.tracker_spec.id} on {self._base.sequence.id}, online"
             write_tum(path, self._base.online_trajectory(), comment=comment)
             self.written.append(path)
-        return outcome
+        return observation, reward, terminated, truncated, info
 
 
 @names_wrong_arguments
@@ -161,11 +156,13 @@ class SequenceSampler(SlamWrapper):
         """
         if seed is not None:
             self._next = seed
-            self._rng = stream(seed, "sequences")  # apart from the environment's own numbers
+            # apart from the environment's own numbers
+            self._rng = stream(seed, "sequences")
         count = len(self._sequences)
-        number = (
-            self._next % count if self._mode == "round_robin" else int(self._rng.integers(count))
-        )
+        if self._mode == "round_robin":
+            number = self._next % count
+        else:
+            number = int(self._rng.integers(count))
         self._next += 1
         options = {"sequence": self._sequences[number]} | (options or {})
         self._shown = str(options["sequence"])
@@ -226,7 +223,7 @@ class SmallImages(SlamWrapper, gym.ObservationWrapper[Any, Any, Any]):
     Args:
         env: A `SlamEnv`, wrapped or not, made with ``observation="rgbd"``.
         width: Of the images, pixels; stable-baselines3's convolutions need 36 at least.
-        height: Likewise.
+        height: Of the images, pixels, 36 at least for these convolutions.
 
     Raises:
         SettingsError: The environment shows no images, or an image would have no pixels.
@@ -317,6 +314,7 @@ class Degradation:
 
     def __call__(self, frame: Frame) -> Frame:
         """The degraded copy of a frame."""
+        # light: colour balance, shadow and glare
         image = frame.rgb.astype(np.float32)
         if self.lighting:
             image *= self._gain(frame.index)
@@ -324,6 +322,8 @@ class Degradation:
             image *= self._shade(frame.index, *image.shape[:2])[..., None]
         if self.glare:
             image += self._blob(frame.index, *image.shape[:2])[..., None]
+
+        # motion blur and noise, in this order of draws
         rng = stream(self.seed, "degrade", frame.index)
         if self.blur:
             kernel = _motion_kernel(25.0 * self.blur, rng)
@@ -331,14 +331,15 @@ class Degradation:
         if self.noise:
             image = image + rng.normal(0.0, 40.0 * self.noise, image.shape).astype(np.float32)
         depth = self._noisy_depth(frame.depth, rng) if self.depth_noise else frame.depth
-        return dataclasses.replace(
-            frame, rgb=np.clip(np.rint(image), 0, 255).astype(np.uint8), depth=depth
-        )
+        rgb = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+        return dataclasses.replace(frame, rgb=rgb, depth=depth)
 
     def _phase(self, name: str, count: int) -> NDArray[np.float64]:
+        """Phases of the waves of one degradation, radians ``[count]``; the same for all frames."""
         return stream(self.seed, "degrade", name).uniform(0.0, 2.0 * math.pi, count)
 
     def _gain(self, index: int) -> NDArray[np.float32]:
+        """Gain of red, green and blue ``[3]``: a drift over 90 frames with a flicker, and a tint over 150 frames."""
         slow, colour, flicker = self._phase("lighting", 3)
         level = (
             0.5
@@ -350,38 +351,33 @@ class Degradation:
         return np.array([gain * (1 + tint), gain, gain * (1 - tint)], np.float32)
 
     def _shade(self, index: int, height: int, width: int) -> NDArray[np.float32]:
+        """Gain of every pixel ``[H, W]``: a half plane that turns over 400 frames and sweeps over 120 is darker."""
         sweep, turn = self._phase("shadow", 2)
         angle = turn + 2 * math.pi * index / 400.0
         offset = 0.35 * math.sin(2 * math.pi * index / 120.0 + sweep) * width
         y, x = np.mgrid[0:height, 0:width].astype(np.float32)
-        side = (x - width / 2) * math.cos(angle) + (y - height / 2) * math.sin(angle) - offset
-        dark = 1.0 / (1.0 + np.exp(np.clip(-side / (0.02 * width), -30, 30)))
+        # signed distance from the edge in pixels; the edge is a sigmoid of it
+        distance = (x - width / 2) * math.cos(angle) + (y - height / 2) * math.sin(angle) - offset
+        dark = 1.0 / (1.0 + np.exp(np.clip(-distance / (0.02 * width), -30, 30)))
         return np.asarray(1.0 - 0.85 * self.shadow * dark, dtype=np.float32)
 
     def _blob(self, index: int, height: int, width: int) -> NDArray[np.float32]:
+        """Grey levels ``[H, W]`` to add: a Gaussian blob that wanders and pulses."""
         along, up, pulse = self._phase("glare", 3)
         centre_x = width * (0.5 + 0.4 * math.sin(2 * math.pi * index / 140.0 + along))
         centre_y = height * (0.5 + 0.35 * math.sin(2 * math.pi * index / 100.0 + up))
-        radius = (
-            0.45
-            * self.glare
-            * width
-            * (0.75 + 0.25 * math.sin(2 * math.pi * index / 60.0 + pulse))
-            / 2
-        )
+        pulse_factor = 0.75 + 0.25 * math.sin(2 * math.pi * index / 60.0 + pulse)
+        radius = 0.45 * self.glare * width * pulse_factor / 2
         y, x = np.mgrid[0:height, 0:width].astype(np.float32)
-        distance = ((x - centre_x) ** 2 + (y - centre_y) ** 2) / max(radius, 1.0) ** 2
-        return np.asarray(510.0 * np.exp(-distance), dtype=np.float32)
+        squared = ((x - centre_x) ** 2 + (y - centre_y) ** 2) / max(radius, 1.0) ** 2
+        return np.asarray(510.0 * np.exp(-squared), dtype=np.float32)
 
     def _noisy_depth(
         self, depth: NDArray[np.float32], rng: np.random.Generator
     ) -> NDArray[np.float32]:
-        noisy = (
-            depth
-            + rng.normal(size=depth.shape)
-            * (0.02 * self.depth_noise)
-            * depth.astype(np.float64) ** 2
-        )
+        """Depth ``[H, W]`` in metres with noise that grows with its square, and with gaps."""
+        draws = rng.normal(size=depth.shape)
+        noisy = depth + draws * (0.02 * self.depth_noise) * depth.astype(np.float64) ** 2
         lost = (rng.random(depth.shape) < 0.3 * self.depth_noise) | (depth <= 0)
         return np.where(lost, 0.0, np.maximum(noisy, 1e-3)).astype(np.float32)
 
@@ -437,18 +433,12 @@ class DropFrames(SlamWrapper):
         seed: int = 0,
     ) -> None:
         super().__init__(env, speed=speed, frame_time_s=frame_time_s, share=share, seed=seed)
-        for name, value, fits, expected in (
-            ("speed", speed, speed > 0, "a number > 0"),
-            (
-                "frame_time_s",
-                frame_time_s,
-                frame_time_s is None or frame_time_s >= 0,
-                "seconds >= 0",
-            ),
-            ("share", share, share is None or 0 <= share < 1, "a probability in [0, 1)"),
-        ):
-            if not fits:
-                raise SettingsError(f"{name} is {value}, expected {expected}")
+        if not speed > 0:
+            raise SettingsError(f"speed is {speed}, expected a number > 0")
+        if frame_time_s is not None and not frame_time_s >= 0:
+            raise SettingsError(f"frame_time_s is {frame_time_s}, expected seconds >= 0")
+        if share is not None and not 0 <= share < 1:
+            raise SettingsError(f"share is {share}, expected a probability in [0, 1)")
         self._speed = speed
         self._frame_time_s = frame_time_s
         self._share = share
@@ -469,6 +459,7 @@ class DropFrames(SlamWrapper):
         """Begin an episode; the clock starts when frame 0 arrives, and the tracker is warm then."""
         base = self._base
         if not self._warm:
+            # track some frames off the clock
             numbers = base.np_random
             base.reset(seed=0, options=options)
             while not base.episode.over and base.episode.next_index < WARM_UP_FRAMES:
@@ -476,18 +467,23 @@ class DropFrames(SlamWrapper):
             # the random numbers go on from where they were
             base.np_random = numbers
             self._warm = True
-        outcome = self.env.reset(seed=seed, options=options)
+        observation, info = self.env.reset(seed=seed, options=options)
         base.episode.free_at = self._arrivals()[0] + self._busy_s()
-        return outcome
+        return observation, info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Drop what the tracker missed, then track the next frame."""
+        # drop the frames that passed
         episode = self._base.episode
         target = self._next_frame(episode.next_index)
         charged = self._base.drop_frames(target - episode.next_index)
+
+        # wait for the frame, less the time that the last step took outside of tracking
         idle_s = max(self._arrivals()[target] - episode.free_at, 0.0)
         if self._live:
             time.sleep(max(idle_s - self._overhead_s, 0.0))
+
+        # track it, and move the clock on
         start = time.perf_counter()
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._overhead_s = time.perf_counter() - start - self._busy_s()
@@ -495,21 +491,26 @@ class DropFrames(SlamWrapper):
         return observation, float(reward) + charged, terminated, truncated, info
 
     def _next_frame(self, index: int) -> int:
+        """Index of the frame that is tracked next, `index` or a later one."""
         last = len(self._base.sequence) - 1
-        share = self._share
-        if share is not None:
-            return next(
-                (i for i in range(index, last) if stream(self._seed, "drop", i).random() >= share),
-                last,
-            )
-        newest = (
-            int(np.searchsorted(self._arrivals(), self._base.episode.free_at, side="right")) - 1
-        )
+
+        # at random: the first frame that is not dropped
+        if self._share is not None:
+            for later in range(index, last):
+                if stream(self._seed, "drop", later).random() >= self._share:
+                    return later
+            return last
+
+        # in real time: the newest that has arrived when the tracker is done
+        free_at = self._base.episode.free_at
+        newest = int(np.searchsorted(self._arrivals(), free_at, side="right")) - 1
         return min(max(newest, index), last)
 
     def _arrivals(self) -> Any:
+        """When each frame arrives, seconds ``[N]``."""
         return self._base.sequence.timestamps / self._speed
 
     def _busy_s(self) -> float:
+        """How long the tracker was busy with the last frame, seconds."""
         measured_s = self._base.episode.outcomes[-1].timings["total"]
         return measured_s if self._frame_time_s is None else self._frame_time_s

@@ -3,10 +3,9 @@
 import re
 import shlex
 import shutil
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -15,7 +14,7 @@ import dynslam_bench
 from dynslam_bench.core import ReportError, read_json, sweep_temporary, write_atomic
 from dynslam_bench.evaluation import Protocol, get_protocol
 from dynslam_bench.reports import figures
-from dynslam_bench.reports.html.board_page import MEANINGS, entries_of, ratios_content, side_content
+from dynslam_bench.reports.html.board_page import MEANINGS, board_data, ranking_entries, ratios_data
 from dynslam_bench.reports.html.page import (
     ASSETS,
     Block,
@@ -50,7 +49,6 @@ from dynslam_bench.reports.model.load import (
     open_stores,
     trial_words,
     without_scale_words,
-    worker_pool,
 )
 from dynslam_bench.reports.model.published import (
     is_excerpt,
@@ -62,12 +60,14 @@ from dynslam_bench.reports.model.published import (
 )
 from dynslam_bench.reports.model.row import REPORT_FILE, ReportData, RunRow, command_line, grouped
 from dynslam_bench.reports.model.summary import explanation, headline, mean_rank_note, reservations
+from dynslam_bench.reports.model.workers import worker_pool
 from dynslam_bench.reports.tables import leaderboard as tables
 from dynslam_bench.reports.tables.published import published_table, span_table
 from dynslam_bench.reports.tables.table import Table, csv_text, prose, to_latex, to_markdown
 from dynslam_bench.runs.store import RunStore, part_words
 
 COMPARE_PAGE = "compare.html"
+"""The page that shows two trackers side by side."""
 LINKS = (
     ("index.html", "Board"),
     ("errors.html", "Errors by sequence"),
@@ -111,8 +111,49 @@ class ReportPaths:
 
 
 _NOT_IN_LATEX = ("machines", "failures")
+"""Ids of tables that no paper would show."""
 Fact = tuple[str, str, list[str]]
 """A number, what it counts, and its details."""
+
+
+@dataclass(frozen=True)
+class _Content:
+    """What a report shows, before it is written.
+
+    Attributes:
+        title: Heading.
+        protocol: How errors were computed.
+        board: The board of all sequences.
+        boards: Category to its board, see `category_boards`.
+        notes: What a reader has to know about the ranking, in sentences.
+        sections: File name of a page to its sections.
+        trials: How many runs were left out since they are trials of studies.
+        paged: Ids of the runs that have a page of their own.
+    """
+
+    title: str
+    protocol: Protocol
+    board: Board
+    boards: Mapping[str, Board]
+    notes: list[str]
+    sections: Mapping[str, list[Section]]
+    trials: int
+    paged: Collection[str]
+
+    @property
+    def all_sections(self) -> list[Section]:
+        """The sections of all pages, in their order."""
+        return [section for sections in self.sections.values() for section in sections]
+
+    @property
+    def all_tables(self) -> dict[str, Table]:
+        """Id of every table to the table, the leaderboard first."""
+        tables_by_id = {"leaderboard": tables.leaderboard(self.board, self.protocol)}
+        for section in self.all_sections:
+            for block in section.blocks:
+                if block.table is not None:
+                    tables_by_id[block.table.id] = block.table
+        return tables_by_id
 
 
 def build_report(
@@ -160,50 +201,61 @@ def build_report(
     output = Path(output).expanduser().absolute()
     sweep_temporary(output, "**/.*")
     stores = open_stores(runs)
+
+    def on_page(done: int, total: int) -> None:
+        on_progress(done, total, "writing the pages of the runs")
+
     with worker_pool(sum(len(store.ids()) for store in stores)) as pool:
+        # score the runs and rank the trackers
         loaded = load_runs(stores, protocol, on_progress, pool, trials=trials)
         board = make_board(loaded.rows, reference, on, rank_seen=rank_seen)
+
+        # write the pages of runs; only failures and typical runs have pictures
         typical = board.typical
-        paged = _paged(board, typical, most_pages)
+        paged = _choose_paged(board, typical, most_pages)
+        paged_ids = {row.run_id for row in paged}
         pictured = {row.run_id for row in paged if row.failed or row.run_id in typical}
-        pages = write_run_pages(
-            paged,
-            pictured,
-            protocol,
-            output,
-            pool,
-            lambda done, total: on_progress(done, total, "writing the pages of the runs"),
-        )
+        run_pages = write_run_pages(paged, pictured, protocol, output, pool, on_page)
+
+    # put the tables and figures together
     on_progress(0, None, "putting the tables and figures together")
-    pageless = _pageless(len(paged), len(board.rows))
-    again = command or _command(
-        [store.source for store in stores], output, board, most_pages, trials=trials
-    )
-    none_failed = [Block(entries=[f"None of {len(board.rows)} runs failed."])]
+    pageless = _pageless_note(len(paged), len(board.rows))
+    if not command:
+        sources = [store.source for store in stores]
+        command = _derived_command(sources, output, board, most_pages, trials=trials)
     boards = category_boards(board)
-    sections = {
-        "errors.html": [errors_section(board, protocol), categories_section(boards, protocol)],
-        "paper.html": [paper_section(board, protocol)],
-        "diagnostics.html": [
-            Section(
-                "failures", "Failures", blocks=table_blocks(tables.failures(board)) or none_failed
-            ),
-            Section(
-                "repeatability", "Repeatability", blocks=table_blocks(tables.repeatability(board))
-            ),
-            masks_section(board),
-            share_section(board, pages),
-        ],
-        "reproduce.html": [provenance_section(board, loaded, again)],
-    }
-    on_progress(0, None, "writing")
-    paged_ids = {row.run_id for row in paged}
-    write_side(
-        output, "board", side_content(board, boards, protocol, paged_ids, pictured, pageless)
+    content = _Content(
+        title=title,
+        protocol=protocol,
+        board=board,
+        boards=boards,
+        notes=_notes(board, protocol, loaded, pageless),
+        sections={
+            "errors.html": [errors_section(board, protocol), categories_section(boards, protocol)],
+            "paper.html": [paper_section(board, protocol)],
+            "diagnostics.html": [
+                failures_section(board),
+                Section(
+                    "repeatability",
+                    "Repeatability",
+                    blocks=table_blocks(tables.repeatability(board)),
+                ),
+                masks_section(board),
+                share_section(board, run_pages),
+            ],
+            "reproduce.html": [provenance_section(board, loaded, command)],
+        },
+        trials=loaded.trials,
+        paged=paged_ids,
     )
-    write_side(output, "ratios", ratios_content(board))
-    notes = _notes(board, protocol, loaded, pageless)
-    return _write(sections, board, boards, protocol, output, title, notes, loaded.trials, paged_ids)
+
+    on_progress(0, None, "writing")
+    write_side(output, "board", board_data(board, boards, protocol, paged_ids, pictured, pageless))
+    write_side(output, "ratios", ratios_data(board))
+    return _write(content, output)
+
+
+# -- which runs have a page
 
 
 def pages_for(runs: int, typical: int) -> int:
@@ -216,25 +268,35 @@ def pages_for(runs: int, typical: int) -> int:
     return runs if runs <= MOST_PAGES else min(max(FEWER_PAGES, typical), MOST_PAGES)
 
 
-def _paged(board: Board, typical: set[str], most: int | None) -> list[RunRow]:
-    """The runs that have a page: the typical one of every cell, trackers in turn, failures first; then repeats."""
-    most = pages_for(len(board.rows), len(typical)) if most is None else most
+def _choose_paged(board: Board, typical: set[str], most: int | None) -> list[RunRow]:
+    """The runs that have a page.
+
+    First come the typical runs of all cells, then the first run of every cell, then the second, and
+    so on. Among those all trackers have equally many, and failures come before other runs.
+    """
+    if most is None:
+        most = pages_for(len(board.rows), len(typical))
     if len(board.rows) <= most:
         return board.rows
-    cells = [cell.rows for cells in board.cells.values() for cell in cells.values()]
-    turn = {row.run_id: at for rows in cells for at, row in enumerate(rows)} | dict.fromkeys(
-        typical, -1
-    )
-    rows = sorted(board.rows, key=lambda row: (turn[row.run_id], not row.failed))
-    place = {
-        row.run_id: at
-        for some in grouped(rows, lambda row: row.variant_key).values()
-        for at, row in enumerate(some)
-    }
-    return sorted(rows, key=lambda row: (turn[row.run_id], place[row.run_id]))[:most]
+
+    # a run's position among the repeats of its cell, before all others for the typical one
+    repeat_of = {}
+    for cells in board.cells.values():
+        for cell in cells.values():
+            for repeat, row in enumerate(cell.rows):
+                repeat_of[row.run_id] = repeat
+    repeat_of |= dict.fromkeys(typical, -1)
+    rows = sorted(board.rows, key=lambda row: (repeat_of[row.run_id], not row.failed))
+
+    # a run's position among those of its tracker, so that trackers take turns
+    position_of = {}
+    for of_tracker in grouped(rows, lambda row: row.variant_key).values():
+        for position, row in enumerate(of_tracker):
+            position_of[row.run_id] = position
+    return sorted(rows, key=lambda row: (repeat_of[row.run_id], position_of[row.run_id]))[:most]
 
 
-def _pageless(pages: int, runs: int) -> str:
+def _pageless_note(pages: int, runs: int) -> str:
     """Which runs have no page, in words; empty if all have one."""
     if pages == runs:
         return ""
@@ -244,143 +306,162 @@ def _pageless(pages: int, runs: int) -> str:
     )
 
 
-def _command(
-    roots: Sequence[Path], output: Path, board: Board, most_pages: int | None, *, trials: bool
+def _derived_command(
+    sources: Sequence[Path], output: Path, board: Board, most_pages: int | None, *, trials: bool
 ) -> str:
-    """The command that makes the report again."""
+    """The command that makes the report again; paths below the working directory are relative to it."""
     folder = Path.cwd()
-    paths = [
-        path.relative_to(folder) if path.is_relative_to(folder) else path
-        for path in (*roots, output)
-    ]
-    words = ["dynslam-bench", "report", *map(str, paths[:-1]), "-o", str(paths[-1])]
-    words += ["--on", board.on] if board.on != "common" else []
-    words += ["--reference", board.asked_reference] if board.asked_reference else []
-    words += ["--most-pages", str(most_pages)] if most_pages is not None else []
-    return shlex.join(words + ["--rank-seen"] * board.rank_seen + ["--trials"] * trials)
+    *results, target = (
+        str(path.relative_to(folder) if path.is_relative_to(folder) else path)
+        for path in (*sources, output)
+    )
+    words = ["dynslam-bench", "report", *results, "-o", target]
+    if board.on != "common":
+        words += ["--on", board.on]
+    if board.asked_reference:
+        words += ["--reference", board.asked_reference]
+    if most_pages is not None:
+        words += ["--most-pages", str(most_pages)]
+    if board.rank_seen:
+        words.append("--rank-seen")
+    if trials:
+        words.append("--trials")
+    return shlex.join(words)
 
 
-def _write(
-    pages: dict[str, list[Section]],
-    board: Board,
-    boards: dict[str, Board],
-    protocol: Protocol,
-    output: Path,
-    title: str,
-    notes: list[str],
-    trials: int,
-    paged: Collection[str],
-) -> ReportPaths:
+# -- the files of a report
+
+
+def _write(content: _Content, output: Path) -> ReportPaths:
     """Write the pages, and the tables in all formats."""
-    now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
-    footer = f"Made by dynslam-bench {dynslam_bench.__version__} on {now}. These pages work without a network."
-    blocks = [
-        block for sections in pages.values() for section in sections for block in section.blocks
-    ]
-    shown = {
-        t.id: t
-        for t in (tables.leaderboard(board, protocol), *(block.table for block in blocks))
-        if t is not None
-    }
+    tables_by_id = content.all_tables
     paths = ReportPaths(
         html=output / "index.html",
         run=output / RUN_PAGE,
         markdown=output / "report.md",
         latex=output / "report.tex",
-        csv={name: output / "csv" / f"{name}.csv" for name in (*shown, "runs")},
+        csv={name: output / "csv" / f"{name}.csv" for name in (*tables_by_id, "runs")},
         data=output / REPORT_FILE,
-        leaderboard=shown["leaderboard"],
-        headline=headline(board),
-        trials=trials,
+        leaderboard=tables_by_id["leaderboard"],
+        headline=headline(content.board),
+        trials=content.trials,
     )
-    for name, table in shown.items():
+    now = datetime.now(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+    footer = f"Made by dynslam-bench {dynslam_bench.__version__} on {now}. These pages work without a network."
+    facts = facts_of(content.board, content.protocol)
+
+    # the tables as CSV, Markdown and LaTeX, and the rows for `compare`
+    for name, table in tables_by_id.items():
         write_atomic(paths.csv[name], csv_text(table.frame()))
-    write_atomic(paths.csv["runs"], csv_text(board.frame()))
-    facts = facts_of(board, protocol)
-    counted = ", ".join(f"{value} {name}" for value, name, _ in facts)
-    all_notes = [
-        *notes,
-        *(note for sections in pages.values() for section in sections for note in section.notes),
+    write_atomic(paths.csv["runs"], csv_text(content.board.frame()))
+    write_atomic(paths.markdown, _markdown(content, tables_by_id.values(), facts, footer))
+    latex_tables = [
+        to_latex(table, content.protocol.id)
+        for name, table in tables_by_id.items()
+        if name not in _NOT_IN_LATEX
     ]
-    notes_text = "".join(f"> {prose(note)}\n\n" for note in [how_to_read(board), *all_notes])
-    texts = "\n".join(map(to_markdown, shown.values()))
-    head = f"# {prose(title)}\n\n{prose(headline(board))}\n\n{protocol.describe()}\n\n{counted}\n\n"
-    write_atomic(paths.markdown, f"{head}{notes_text}{texts}\n{footer}\n")
-    write_atomic(
-        paths.latex,
-        "% needs \\usepackage{booktabs}\n"
-        + "\n".join(
-            [
-                to_latex(table, protocol.id)
-                for name, table in shown.items()
-                if name not in _NOT_IN_LATEX
-            ]
-        ),
-    )
+    write_atomic(paths.latex, "% needs \\usepackage{booktabs}\n" + "\n".join(latex_tables))
     ReportData(
-        title=title,
-        protocol=protocol.describe(),
-        reference=board.reference_name,
+        title=content.title,
+        protocol=content.protocol.describe(),
+        reference=content.board.reference_name,
         version=dynslam_bench.__version__,
-        rows=board.rows,
+        rows=content.board.rows,
     ).write(paths.data)
+
+    # the pages
     write_assets(output)
-    speed = figures.speed_figure(board)
-    caption = (
-        f"{'All categories. ' * (len(boards) > 1)}Lower right is better. The dotted line joins ranked trackers that no "
-        "other beats in both; open ones are not ranked. Frame times hold for "
-        f"{tables.computer_words(board.timing_computer)}."
-        + f" {tables.COMPUTER_MARK} Timed on another computer, and not on the dotted line, or on several."
-        * bool(tables.computer_note(board))
-        + f" {tables.CACHED_NOTE}" * any(row.cached for row in board.rows)
+    write_atomic(paths.html, _first_page(content, facts, footer))
+    for page in content.sections:
+        write_atomic(output / page, _page_of_sections(content, page, footer))
+    run_page = render(
+        "run.html.j2", title=content.title, links=LINKS, footer=footer, scripts=["run.js"]
     )
-    first_page = render(
+    write_atomic(paths.run, run_page)
+    compare_page = render(
+        "compare.html.j2",
+        scripts=["run.js", "compare.js"],
+        title="Two trackers side by side",
+        links=LINKS,
+        here=COMPARE_PAGE,
+        footer=footer,
+    )
+    write_atomic(output / COMPARE_PAGE, compare_page)
+    return paths
+
+
+def _markdown(content: _Content, shown: Iterable[Table], facts: Sequence[Fact], footer: str) -> str:
+    """Headline, facts, notes and tables as Markdown."""
+    board = content.board
+    counts = ", ".join(f"{value} {name}" for value, name, _ in facts)
+    notes = [how_to_read(board), *content.notes]
+    for section in content.all_sections:
+        notes += section.notes
+    head = f"# {prose(content.title)}\n\n{prose(headline(board))}\n\n{content.protocol.describe()}\n\n{counts}\n\n"
+    quoted = "".join(f"> {prose(note)}\n\n" for note in notes)
+    return head + quoted + "\n".join(map(to_markdown, shown)) + f"\n{footer}\n"
+
+
+def _first_page(content: _Content, facts: Sequence[Fact], footer: str) -> str:
+    """The page that a report begins with: the ranking by category, and accuracy against speed."""
+    board = content.board
+    speed = figures.speed_figure(board)
+    rankings = {
+        category: ranking_entries(part, board, content.boards, content.paged)
+        for category, part in content.boards.items()
+    }
+    return render(
         "board.html.j2",
-        title=title,
+        title=content.title,
         links=LINKS,
         here="index.html",
         footer=footer,
         scripts=["board.js"],
         sentence=headline(board),
-        sentences={name: headline(some) for name, some in boards.items()},
+        sentences={category: headline(part) for category, part in content.boards.items()},
         facts=facts,
-        categories={name: entries_of(some, board, boards, paged) for name, some in boards.items()},
+        categories=rankings,
         meanings=MEANINGS,
         reference=board.reference_name,
         explanation=how_to_read(board),
-        notes=notes,
-        caption=caption,
+        notes=content.notes,
+        caption=_speed_caption(content),
         figures={} if speed is None else {"speed": speed},
     )
-    write_atomic(paths.html, first_page)
-    for page, sections in pages.items():
-        name = dict(LINKS)[page]
-        text = sections_page(
-            sections,
-            title=f"{title}: {name}",
-            links=LINKS,
-            here=page,
-            footer=footer,
-            protocol=protocol.describe(),
-            errors_table=page == "errors.html",
-            scripts=["errors.js"] if page == "errors.html" else [],
+
+
+def _speed_caption(content: _Content) -> str:
+    """How to read the figure of accuracy against speed."""
+    board = content.board
+    sentences = []
+    if len(content.boards) > 1:
+        sentences.append("All categories.")
+    sentences.append(
+        "Lower right is better. The dotted line joins ranked trackers that no other beats in both; open ones are not "
+        f"ranked. Frame times hold for {tables.computer_words(board.timing_computer)}."
+    )
+    if tables.computer_note(board):
+        sentences.append(
+            f"{tables.COMPUTER_MARK} Timed on another computer, and not on the dotted line, or on several."
         )
-        write_atomic(output / page, text)
-    write_atomic(
-        paths.run,
-        render("run.html.j2", title=title, links=LINKS, footer=footer, scripts=["run.js"]),
+    if any(row.cached for row in board.rows):
+        sentences.append(tables.CACHED_NOTE)
+    return " ".join(sentences)
+
+
+def _page_of_sections(content: _Content, page: str, footer: str) -> str:
+    """The text of one of the further pages; that of the errors has a script of its own."""
+    is_errors = page == "errors.html"
+    return sections_page(
+        content.sections[page],
+        title=f"{content.title}: {dict(LINKS)[page]}",
+        links=LINKS,
+        here=page,
+        footer=footer,
+        protocol=content.protocol.describe(),
+        errors_table=is_errors,
+        scripts=["errors.js"] if is_errors else [],
     )
-    compare = {
-        "title": "Two trackers side by side",
-        "links": LINKS,
-        "here": COMPARE_PAGE,
-        "footer": footer,
-    }
-    write_atomic(
-        output / COMPARE_PAGE,
-        render("compare.html.j2", scripts=["run.js", "compare.js"], **compare),
-    )
-    return paths
 
 
 def how_to_read(board: Board) -> str:
@@ -391,103 +472,125 @@ def how_to_read(board: Board) -> str:
 def sections_page(sections: Sequence[Section], **values: Any) -> str:
     """A page of sections; `values` are what `sections.html.j2` shows beside them."""
     shown = [section for section in sections if section.blocks or section.notes]
-    charts = {
-        f"{section.id}-{at}": block.figure
-        for section in shown
-        for at, block in enumerate(section.blocks, 1)
-        if block.figure is not None
-    }
+    charts = {}
+    for section in shown:
+        for number, block in enumerate(section.blocks, 1):
+            if block.figure is not None:
+                charts[f"{section.id}-{number}"] = block.figure
     return render("sections.html.j2", sections=shown, figures=charts, **values)
 
 
 def facts_of(board: Board, protocol: Protocol) -> list[Fact]:
-    """What the board stands on."""
+    """What the board is made of: sequences, trackers, runs, failures, reservations and the protocol."""
+    # sequences by group
     names = [*board.sequences, *board.unscored]
     by_group = grouped(names, lambda name: board.groups[name])
-    sequences = [
-        f"{group}: {', '.join(some)}" if group else ", ".join(some)
-        for group, some in by_group.items()
-    ]
+    sequences = []
+    for group, members in by_group.items():
+        listed = ", ".join(members)
+        sequences.append(f"{group}: {listed}" if group else listed)
+
+    # how many runs a cell has, from the fewest to the most
     repeats = sorted({len(cell.rows) for cells in board.cells.values() for cell in cells.values()})
+    repeats_text = f"{repeats[0]}–{repeats[-1]}" if len(repeats) > 1 else str(repeats[0])
+
     failed = [row for row in board.rows if row.failed]
     endings = [
         f"{board.labels[row.variant_key]} on {board.sequence(row)}: {row.ending}" for row in failed
     ]
     doubts = reservations(board.rows)
     quoting = [f"Name the protocol, {protocol.id}{', and say:' if doubts else '.'}", *doubts]
-    several = f"{repeats[0]}–{repeats[-1]}" if len(repeats) > 1 else str(repeats[0])
     return [
-        (str(len(names)), "sequence" + "s" * (len(names) != 1), sequences),
-        (str(len(board.labels)), "tracker" + "s" * (len(board.labels) != 1), []),
-        (several, "run a cell" if several == "1" else "runs a cell", []),
-        (str(len(board.rows)), "run" + "s" * (len(board.rows) != 1), []),
+        (str(len(names)), _plural("sequence", len(names)), sequences),
+        (str(len(board.labels)), _plural("tracker", len(board.labels)), []),
+        (repeats_text, "run a cell" if repeats_text == "1" else "runs a cell", []),
+        (str(len(board.rows)), _plural("run", len(board.rows)), []),
         (
             str(len(failed)),
             "failed",
             first_of(endings, _MOST_NOTES, "and {} more, see Diagnostics"),
         ),
-        (
-            str(len(doubts)),
-            "reservation" + "s" * (len(doubts) != 1) + " when quoting",
-            quoting,
-        ),
+        (str(len(doubts)), _plural("reservation", len(doubts)) + " when quoting", quoting),
         (protocol.id, "protocol", [protocol.describe()]),
     ]
+
+
+def _plural(word: str, count: int) -> str:
+    """A word as it stands behind a count."""
+    return word if count == 1 else f"{word}s"
 
 
 # -- the sections: what they show, in which order, below which words
 
 _MOST_NOTES = 60
+"""Entries of a list that are shown one by one."""
 _MOST_COMMANDS = 200
+"""Commands that are shown."""
 
 
 def _notes(board: Board, protocol: Protocol, loaded: Loaded, pageless: str) -> list[str]:
-    conflicts = "; ".join(first_of(loaded.conflicts, _MOST_NOTES, "and {} more"))
-    final_only = ", ".join(board.labels[key] for key in board.final_only)
-    others = sorted({board.labels[row.variant_key] for row in board.rows if not row.is_current})
-    in_future = [
-        f"{row.label} on {row.sequence.id}, {row.repeat} ({row.started[:10]}, run {row.run_id})"
-        for row in loaded.in_future
-    ]
-    absent = [f"{board.labels[key]} ({changed})" for key, changed in loaded.not_installed.items()]
+    """What a reader has to know about the ranking: contradictions, gaps, and what is left out or not ranked."""
+    notes = []
+    if loaded.conflicts:
+        conflicts = "; ".join(first_of(loaded.conflicts, _MOST_NOTES, "and {} more"))
+        notes.append(
+            f"Runs with one id must be equal, but these have different results: {conflicts}."
+        )
+    notes.append(missing_note(board))
+    if board.final_only:
+        final_only = ", ".join(board.labels[key] for key in board.final_only)
+        notes.append(
+            f"Only in the table of final trajectories, as nothing else is known of them: {final_only}."
+        )
+    if board.unscored:
+        notes.append(
+            f"Without ground truth, and so in no table of errors: {', '.join(board.unscored)}."
+        )
+    notes += [_left_out_note(loaded), *_program_notes(board, loaded), tables.computer_note(board)]
+    if loaded.without_scale:
+        notes.append(f"Left out: {without_scale_words(loaded.without_scale, protocol)}.")
+    if loaded.trials:
+        notes.append(f"Left out: {trial_words(loaded.trials)}.")
+    notes.append(pageless)
+    return [note for note in notes if note]
+
+
+def _left_out_note(loaded: Loaded) -> str:
+    """How many runs are in no table, by reason; empty for none."""
     left_out = {
         "further runs of the same tracker, settings, frames and repeat": loaded.superseded,
         "runs that were stopped on request": loaded.stopped,
         "folders without a valid record": len(loaded.unreadable),
     }
     counts = ", ".join(f"{count} {words}" for words, count in left_out.items() if count)
-    notes = [
-        f"Runs with one id must be equal, but these have different results: {conflicts}."
-        if conflicts
-        else "",
-        missing_note(board),
-        f"Only in the table of final trajectories, as nothing else is known of them: {final_only}."
-        if final_only
-        else "",
-        f"Without ground truth, and so in no table of errors: {', '.join(board.unscored)}."
-        if board.unscored
-        else "",
-        f"Left out: {counts}." if counts else "",
-        "Not ranked, as another program of the same tracker and settings ranks, or as the runs' ids are "
-        f"unverified: {', '.join(others)}."
-        if others
-        else "",
-        "Ranked by the program of their newest run, as none of several is the one installed here: "
-        f"{', '.join(first_of(absent, _MOST_NOTES, 'and {} more'))}."
-        if absent
-        else "",
-        "Dated in the future, and so counted as the oldest: "
-        f"{'; '.join(first_of(in_future, _MOST_NOTES, 'and {} more'))}."
-        if in_future
-        else "",
-        tables.computer_note(board),
-        f"Left out: {without_scale_words(loaded.without_scale, protocol)}."
-        if loaded.without_scale
-        else "",
-        f"Left out: {trial_words(loaded.trials)}." if loaded.trials else "",
-        pageless,
+    return f"Left out: {counts}." if counts else ""
+
+
+def _program_notes(board: Board, loaded: Loaded) -> list[str]:
+    """What is to be said where several programs made runs of one tracker."""
+    notes = []
+    others = sorted({board.labels[row.variant_key] for row in board.rows if not row.is_current})
+    if others:
+        notes.append(
+            "Not ranked, as another program of the same tracker and settings ranks, or as the runs' ids are "
+            f"unverified: {', '.join(others)}."
+        )
+    absent = [f"{board.labels[key]} ({changed})" for key, changed in loaded.not_installed.items()]
+    if absent:
+        notes.append(
+            "Ranked by the program of their newest run, as none of several is the one installed here: "
+            f"{', '.join(first_of(absent, _MOST_NOTES, 'and {} more'))}."
+        )
+    in_future = [
+        f"{row.label} on {row.sequence.id}, {row.repeat} ({row.started[:10]}, run {row.run_id})"
+        for row in loaded.in_future
     ]
-    return [note for note in notes if note]
+    if in_future:
+        notes.append(
+            "Dated in the future, and so counted as the oldest: "
+            f"{'; '.join(first_of(in_future, _MOST_NOTES, 'and {} more'))}."
+        )
+    return notes
 
 
 def categories_section(boards: Mapping[str, Board], protocol: Protocol) -> Section:
@@ -506,38 +609,35 @@ def errors_section(board: Board, protocol: Protocol) -> Section:
     """Errors by sequence, absolute and relative, with what they owe to lost frames and failures."""
     if not board.sequences:
         return Section("errors", "Tables")
-    excerpts = {
-        board.sequence(row)
-        for row in board.rows
-        if is_excerpt(row.sequence.id, row.sequence.duration_s)
-    }
-    shortened = {
-        board.sequence(r)
-        for r in board.rows
-        if part_words(r) and not r.sequence.id.startswith("synthetic/")
-    }
-    parts = sorted(excerpts | shortened)
-    whole = [name for name in board.sequences if name not in parts]
+
+    # published numbers hold for whole recordings only
+    partial = _partial_sequences(board)
+    whole = [name for name in board.sequences if name not in partial]
     lines = published_for(whole, protocol)
     published = reported_for(whole, protocol) + records_for(whole, protocol)
-    beside = {cell.sequence for cell in published}
-    unsure = sorted(
-        {
-            r.sequence.id
-            for r in board.rows
-            if board.sequence(r) in beside and not least_length_s(r.sequence.id)
-        }
-    )
-    notes = {
-        f"Parts of recordings, beside which no published number stands: {', '.join(parts)}.": parts,
-        f"Published numbers stand beside {', '.join(unsure)}, whose full length is not known here: that the runs "
-        "are of the whole recordings is not checked.": unsure,
-    }
-    lost = any(row.incomplete and not row.failed for row in board.rows)
+
+    notes = []
+    if partial:
+        notes.append(
+            f"Parts of recordings, beside which no published number stands: {', '.join(partial)}."
+        )
+    sequences_with_published = {cell.sequence for cell in published}
+    unsure = set()
+    for row in board.rows:
+        is_beside = board.sequence(row) in sequences_with_published
+        if is_beside and not least_length_s(row.sequence.id):
+            unsure.add(row.sequence.id)
+    if unsure:
+        notes.append(
+            f"Published numbers stand beside {', '.join(sorted(unsure))}, whose full length is not known here: that "
+            "the runs are of the whole recordings is not checked."
+        )
+
+    has_lost_frames = any(row.incomplete and not row.failed for row in board.rows)
     blocks = table_blocks(
         tables.per_sequence(board, protocol, published),
         tables.final_errors(board, protocol) if protocol.trajectory == "online" else None,
-        tables.tracked_errors(board, protocol) if lost else None,
+        tables.tracked_errors(board, protocol) if has_lost_frames else None,
         tables.failure_rule_table(board),
         *tables.relative_errors(board, protocol),
         tables.rotation_errors(board, protocol),
@@ -546,31 +646,49 @@ def errors_section(board: Board, protocol: Protocol) -> Section:
         span_table(spans(lines)),
         folded=True,
     )
-    return Section("errors", "Tables", [note for note, holds in notes.items() if holds], blocks)
+    return Section("errors", "Tables", notes, blocks)
+
+
+def _partial_sequences(board: Board) -> list[str]:
+    """Sequences with runs on a part of a recording: on an excerpt, or on some of its frames."""
+    names = set()
+    for row in board.rows:
+        is_recorded = not row.sequence.id.startswith("synthetic/")
+        if is_excerpt(row.sequence.id, row.sequence.duration_s) or (
+            is_recorded and part_words(row)
+        ):
+            names.add(board.sequence(row))
+    return sorted(names)
+
+
+def failures_section(board: Board) -> Section:
+    """The runs that failed, and how they ended."""
+    blocks = table_blocks(tables.failures(board))
+    if not blocks:
+        blocks = [Block(entries=[f"None of {len(board.rows)} runs failed."])]
+    return Section("failures", "Failures", blocks=blocks)
 
 
 def masks_section(board: Board) -> Section:
     """Quality of the masks, and the pose error against it."""
-    thinned = any(len(board.runs(key)) > figures.MOST_POINTS for key in board.trackers)
-    fewer = f" Of trackers with more than {figures.MOST_POINTS} runs fewer are drawn, from the best to the worst."
-    caption = "One point a run." + fewer * thinned
-    blocks = figure_blocks(figures.mask_figure(board), caption) + table_blocks(
-        tables.mask_quality(board)
-    )
+    caption = "One point a run."
+    if any(len(board.runs(key)) > figures.MOST_POINTS for key in board.trackers):
+        most = figures.MOST_POINTS
+        caption += (
+            f" Of trackers with more than {most} runs fewer are drawn, from the best to the worst."
+        )
+    blocks = figure_blocks(figures.mask_figure(board), caption)
+    blocks += table_blocks(tables.mask_quality(board))
     return Section("masks", "Mask quality and pose error", blocks=blocks)
 
 
 def share_section(board: Board, pages: Sequence[RunPage]) -> Section:
     """Frame-to-frame error against the share of people."""
-    bins = {
-        key: error_by_share(some)
-        for key, some in grouped(pages, lambda page: page.variant_key).items()
-    }
-    which = (
-        "all successful runs"
-        if len(pages) == len(board.rows)
-        else f"the {len(pages)} runs with pictures here"
-    )
+    pages_by_tracker = grouped(pages, lambda page: page.variant_key)
+    bins = {key: error_by_share(of_tracker) for key, of_tracker in pages_by_tracker.items()}
+    which = f"the {len(pages)} runs with pictures here"
+    if len(pages) == len(board.rows):
+        which = "all successful runs"
     caption = (
         f"Frame-to-frame error (translation, RMSE) over the frames of {which}, by the share of the image that shows "
         "people (exact masks)."
@@ -580,47 +698,59 @@ def share_section(board: Board, pages: Sequence[RunPage]) -> Section:
 
 
 def provenance_section(board: Board, loaded: Loaded, again: str) -> Section:
-    """Machines, versions, the commands that reproduce it, and the diagnostics of the runs."""
+    """Machines, versions, the commands that reproduce it, and the diagnostics of the runs.
+
+    Args:
+        board: The board.
+        loaded: What was read from the stores.
+        again: The command that makes this report again.
+    """
+    # commands
     commands = list(dict.fromkeys(command_line(row.command) for row in board.rows if row.command))
     commands = first_of(commands, _MOST_COMMANDS, "# ... and {} more, which report.json names")
     codes = {
         "The commands that reproduce it": [*commands, again],
         "The commands that fill the gaps": missing_commands(board),
     }
-    places = grouped(((text, row) for row in board.rows for text in row.notes), itemgetter(0))
-    names = {
-        text: [
-            f"{board.labels[row.variant_key]} on {board.sequence(row)}, {row.repeat}"
-            for _, row in runs
-        ]
-        for text, runs in places.items()
-    }
-    notes = [
-        f"{text}: {'; '.join(first_of(runs, 2, 'and {} more'))}" for text, runs in names.items()
-    ]
+
+    # lists, folded: a title, the entries, and what stands for those that are not shown
     lists = (
         (
             "Left out: no valid record",
             loaded.unreadable,
             "... and {} more, which `runs list` names",
         ),
-        ("Diagnostics", notes, "... and {} more on the pages of the runs"),
+        ("Diagnostics", _diagnostics(board), "... and {} more on the pages of the runs"),
     )
     blocks = table_blocks(tables.machines(board))
-    blocks += [Block(title, text="\n".join(lines)) for title, lines in codes.items() if lines]
-    blocks += [
-        Block(title, entries=first_of(entries, _MOST_NOTES, others), folded=True)
-        for title, entries, others in lists
-        if entries
-    ]
+    for title, lines in codes.items():
+        if lines:
+            blocks.append(Block(title, text="\n".join(lines)))
+    for title, entries, others in lists:
+        if entries:
+            shown = first_of(entries, _MOST_NOTES, others)
+            blocks.append(Block(title, entries=shown, folded=True))
     return Section("provenance", "Machines, versions, commands", blocks=blocks)
 
 
+def _diagnostics(board: Board) -> list[str]:
+    """Every note of a run once, with the first two runs that have it."""
+    runs_by_note: dict[str, list[str]] = {}
+    for row in board.rows:
+        run = f"{board.labels[row.variant_key]} on {board.sequence(row)}, {row.repeat}"
+        for note in row.notes:
+            runs_by_note.setdefault(note, []).append(run)
+    return [
+        f"{note}: {'; '.join(first_of(runs, 2, 'and {} more'))}"
+        for note, runs in runs_by_note.items()
+    ]
+
+
 def first_of(entries: list[str], most: int, others: str) -> list[str]:
-    """The first entries; how many others there are stands behind them."""
-    return (
-        entries if len(entries) <= most else [*entries[:most], others.format(len(entries) - most)]
-    )
+    """The first entries; behind them `others`, with the number of those that are left out in place of ``{}``."""
+    if len(entries) <= most:
+        return entries
+    return [*entries[:most], others.format(len(entries) - most)]
 
 
 def paper_section(board: Board, protocol: Protocol) -> Section:
@@ -633,11 +763,12 @@ def paper_section(board: Board, protocol: Protocol) -> Section:
     )
     for statistic, number in figures.FIGURES.items():
         figure = figures.bar_figure(board, statistic)
-        lost = figure is not None and any(tables.LOST_MARK in trace.text for trace in figure.data)
         caption = (
             f"As the paper's Figure {number}: {tables.STATISTICS[statistic]} of the absolute pose error, median over "
-            "the runs that succeeded; pale bars are not ranked." + f" {tables.LOST_NOTE}" * lost
+            "the runs that succeeded; pale bars are not ranked."
         )
+        if figure is not None and any(tables.LOST_MARK in trace.text for trace in figure.data):
+            caption += f" {tables.LOST_NOTE}"
         blocks += figure_blocks(figure, caption)
     return Section("paper", "Four statistics of the errors, and time", blocks=blocks)
 
@@ -645,10 +776,13 @@ def paper_section(board: Board, protocol: Protocol) -> Section:
 # -- the site that is published
 
 STUDY_PAGE = "index.html"
+"""The page of a study's folder."""
 README = "README.md"
 """What hosts of repositories show of a folder: they show the source of HTML."""
 _PUBLISHED = ("*.html", "*.csv", "*.toml", "csv/*.csv", "data/*")
 """What of a study's folder is published; its runs and its journal are not."""
+_LISTS_OF_FILES = r'"(pictures|files)":\[(?:[^\[\]]|\[[^\[\]]*\])*\]'
+"""The lists of pictures and files in what the page of a run shows; entries may be lists themselves."""
 
 
 @dataclass(frozen=True)
@@ -703,6 +837,8 @@ def publish(
             raise ReportError(
                 f"{study} holds no {STUDY_PAGE}", "make it with: dynslam-bench tune run STUDY.toml"
             )
+
+    # the report in place of an earlier one
     for part in ("leaderboard/data", "leaderboard/csv", "leaderboard/frames", "study"):
         shutil.rmtree(output / part, ignore_errors=True)
     report = build_report(
@@ -714,11 +850,16 @@ def publish(
         most_pages=most_pages,
         on_progress=on_progress,
     )
-    for path in (report.data, report.latex):  # for work with the results, not for looking at them
+    # those are for work with the results, not for looking at them
+    for path in (report.data, report.latex):
         path.unlink()
     report.markdown.replace(output / "leaderboard" / README)
+
+    # the studies: address of the page, its name, and what it says
     pages = [("leaderboard/index.html", "Leaderboard", report.headline)]
     pages += [_publish_study(study, output) for study in studies]
+
+    # the first page, as HTML and as Markdown
     made = f"Made by dynslam-bench report publish, version {dynslam_bench.__version__}."
     site = sections_page([], title=title, pages=pages, protocol=note, footer=made)
     write_atomic(output / "index.html", site.replace(f'="{ASSETS}/', f'="leaderboard/{ASSETS}/'))
@@ -729,6 +870,7 @@ def publish(
     how = "The pages are HTML: get the repository, and open `index.html` in a browser."
     text = [f"# {prose(title)}", prose(note), *lines, how, made]
     write_atomic(output / README, "\n\n".join(filter(None, text)) + "\n")
+    # GitHub Pages then shows the files as they are
     write_atomic(output / ".nojekyll", "")
     sizes = [path.stat().st_size for path in output.rglob("*") if path.is_file()]
     return Site(output / "index.html", len(sizes), sum(sizes) / 1e6)
@@ -737,23 +879,26 @@ def publish(
 def _publish_study(study: Path, output: Path) -> tuple[str, str, str]:
     """Copy the pages of a study into a site; returns the address of the first one, its name, and its verdict."""
     folder = output / "study" / study.name
+
+    # copy what is published; nothing that a link leads to elsewhere
     inside = study.resolve()
     sources = {path for pattern in _PUBLISHED for path in study.glob(pattern) if path.is_file()}
-    # no link to elsewhere
     for source in sorted(path for path in sources if path.resolve().is_relative_to(inside)):
         target = folder / source.relative_to(study)
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(source, target)
+
+    # pages take styles and scripts from the leaderboard's folder
+    shared = f'="../../leaderboard/{ASSETS}/'
     for page in folder.glob("*.html"):
-        shared = f'="../../leaderboard/{ASSETS}/'
-        page.write_text(
-            page.read_text(encoding="utf-8").replace(f'="{ASSETS}/', shared), encoding="utf-8"
-        )
-    lists = r'"(pictures|files)":\[(?:[^\[\]]|\[[^\[\]]*\])*\]'
-    for path in folder.glob("data/run-*.js"):  # pictures and files of runs are not published
-        path.write_text(
-            re.sub(lists, r'"\1":[]', path.read_text(encoding="utf-8")), encoding="utf-8"
-        )
+        html = page.read_text(encoding="utf-8")
+        page.write_text(html.replace(f'="{ASSETS}/', shared), encoding="utf-8")
+
+    # pictures and files of runs are not published
+    for path in folder.glob("data/run-*.js"):
+        script = path.read_text(encoding="utf-8")
+        path.write_text(re.sub(_LISTS_OF_FILES, r'"\1":[]', script), encoding="utf-8")
+
     summary = study / "summary.json"
     words = read_json(summary)["conclusion"] if summary.is_file() else ""
     return f"study/{study.name}/{STUDY_PAGE}", f"Study {study.name}", words

@@ -1,16 +1,17 @@
 """Two sets of results against each other: before and after a change of the code, or of the settings."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from operator import itemgetter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from dynslam_bench.core import ReportError, setting_text, sweep_temporary, write_atomic
 from dynslam_bench.evaluation import Protocol, get_protocol
-from dynslam_bench.reports.html.board_page import cell_content, ratio_numbers, settings_content
+from dynslam_bench.reports.html.board_page import cell_data, ratio_numbers, settings_data
 from dynslam_bench.reports.html.page import render, write_assets, write_side
 from dynslam_bench.reports.html.run_pages import RUN_PAGE, write_run_pages
 from dynslam_bench.reports.model.board import Cell, group_of, group_weights, make_cell, mean_of
@@ -24,7 +25,9 @@ from dynslam_bench.runs.record import coverage_text
 from dynslam_bench.runs.store import RunStore
 
 Paired = tuple[str, Cell, Cell]
-"""A sequence, with `SEEN` behind it if a side's network was trained on it, and one tracker's runs on both sides."""
+"""A sequence, with `SEEN` behind it if a side's network was trained on it, and one tracker's runs in A and in B."""
+Variants = Mapping[str, list[RunRow]]
+"""Variant key of a tracker to its rows."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,7 @@ def compare(
 
     Args:
         a: Results folder, store, or folder of a report (``report.json``).
-        b: Likewise.
+        b: The other results folder, store, or folder of a report.
         protocol: How results folders are evaluated; a report brings its own.
         output: Folder of a page that shows it; None for none.
 
@@ -73,17 +76,18 @@ def compare(
         ReportError: One holds no runs, nothing is in both, or their numbers stem from different
             protocols.
     """
+    # read both sides
     protocol = get_protocol(protocol)
     (rows_a, evaluated) = _read(a, protocol)
     (rows_b, _) = _read(b, protocol)
     check_one_protocol([*rows_a, *rows_b])
-    variants_a, variants_b = (
-        grouped(rows, lambda row: row.variant_key) for rows in (rows_a, rows_b)
-    )
+    name_a = _source_name(a)
+    name_b = _source_name(b)
+
+    # pair the variants of trackers
+    variants_a = grouped(rows_a, lambda row: row.variant_key)
+    variants_b = grouped(rows_b, lambda row: row.variant_key)
     pairs = pair_variants(variants_a, variants_b)
-    name_a, name_b = (
-        str(source.root if isinstance(source, RunStore) else source) for source in (a, b)
-    )
     if not pairs:
         raise ReportError(
             f"{name_a} ({len(rows_a)} runs) and {name_b} ({len(rows_b)} runs) have no tracker and sequence in common",
@@ -93,51 +97,72 @@ def compare(
     labels = make_labels(
         [row for one, other in pairs for row in (*variants_a[one], *variants_b[other])]
     )
+
+    # pair the runs of each on the sequences that both have
     compared: dict[str, list[Paired]] = {}
     differences: dict[str, list[str]] = {}
     only_a = len(rows_a)
     only_b = len(rows_b)
     for one, other in pairs:
         name = labels[one] if one == other else f"{labels[one]} → {labels[other]}"
-        by_column_a = _by_column(variants_a[one])
-        by_column_b = _by_column(variants_b[other])
-        shared = by_column_a.keys() & by_column_b.keys()
-        only_a -= sum(len(by_column_a[column]) for column in shared)
-        only_b -= sum(len(by_column_b[column]) for column in shared)
-        paired = []
-        for column in shared:
-            sides = by_column_a[column], by_column_b[column]
-            repeats = {row.repeat_key for row in sides[0]} & {row.repeat_key for row in sides[1]}
-            a_cell, b_cell = (
-                make_cell([row for row in side if row.repeat_key in repeats] or side)
-                for side in sides
-            )
-            if a_cell.scores and b_cell.scores:
-                mark = f" {SEEN}" * (a_cell.in_training or b_cell.in_training)
-                paired.append((columns[column] + mark, a_cell, b_cell))
+        columns_a = _by_column(variants_a[one])
+        columns_b = _by_column(variants_b[other])
+        for column in columns_a.keys() & columns_b.keys():
+            only_a -= len(columns_a[column])
+            only_b -= len(columns_b[column])
+        paired = _pair_cells(columns_a, columns_b, columns)
         if paired:
-            compared[name] = sorted(paired, key=itemgetter(0))
+            compared[name] = paired
             differences[name] = _differences(variants_a[one][0], variants_b[other][0])
     if not compared:
         raise ReportError("none of the runs in common has ground truth", "nothing can be compared")
+
+    # the ratios over all sequences, as a table and as a page
     overall = {name: overall_ratio(paired) for name, paired in compared.items()}
+    page = None
+    if output is not None:
+        page = _write_page(Path(output), protocol, evaluated, compared, overall)
+    title = f"{name_a} (A) against {name_b} (B)"
+    table = _table(title, _caption(evaluated, differences), compared, overall)
+    return Comparison(overall, table, only_a, only_b, differences, page)
+
+
+def _source_name(source: Path | str | RunStore) -> str:
+    """The folder of results or of a report."""
+    return str(source.root if isinstance(source, RunStore) else source)
+
+
+def _pair_cells(a: Variants, b: Variants, columns: Mapping[str, str]) -> list[Paired]:
+    """The runs of one tracker in A and in B on the sequences on which both have errors, sorted by sequence.
+
+    Args:
+        a: Column id to the runs in A.
+        b: Column id to the runs in B.
+        columns: Column id to the name of its sequence.
+    """
+    paired = []
+    for column in a.keys() & b.keys():
+        # the repeats that both have, or all where they share none
+        repeats = {row.repeat_key for row in a[column]} & {row.repeat_key for row in b[column]}
+        cell_a = make_cell([row for row in a[column] if row.repeat_key in repeats] or a[column])
+        cell_b = make_cell([row for row in b[column] if row.repeat_key in repeats] or b[column])
+        if cell_a.scores and cell_b.scores:
+            mark = f" {SEEN}" if cell_a.in_training or cell_b.in_training else ""
+            paired.append((columns[column] + mark, cell_a, cell_b))
+    return sorted(paired, key=itemgetter(0))
+
+
+def _caption(evaluated: str, differences: Mapping[str, list[str]]) -> str:
+    """How to read the table, and in which settings the trackers differ."""
     changed = "; ".join(
         f"{name}: {', '.join(words)}" for name, words in differences.items() if words
     )
-    caption = (
+    what_differs = f"What differs: {changed}." if changed else "The settings are the same."
+    return (
         f"{evaluated}. Median ATE (millimetres), lost frames held, over the repeats that both have, or all where they "
         "share none; failures count as a static camera, or worse. B / A below 1: B is better; all categories weigh the "
-        "same. Brackets: "
-        f"Student's 95 % interval over sequences, from {FEWEST} of them on. "
-        + (f"What differs: {changed}." if changed else "The settings are the same.")
+        f"same. Brackets: Student's 95 % interval over sequences, from {FEWEST} of them on. {what_differs}"
     )
-    page = (
-        None
-        if output is None
-        else _write_page(Path(output), protocol, evaluated, compared, overall)
-    )
-    table = _table(f"{name_a} (A) against {name_b} (B)", caption, compared, overall)
-    return Comparison(overall, table, only_a, only_b, differences, page)
 
 
 def _write_page(
@@ -149,55 +174,32 @@ def _write_page(
 ) -> Path:
     """Write the page: both sides of every tracker, with the pages of the runs that stand for a cell."""
     output = output.expanduser().absolute()
-    cells = {
-        f"{side}: {name}": {sequence: sides[at] for sequence, *sides in pairs}
-        for name, pairs in compared.items()
-        for at, side in enumerate("AB")
-    }
-    typical = {
-        cell.typical.run_id: cell.typical for some in cells.values() for cell in some.values()
-    }
-    # a report alone brings no files
-    paged = {run_id: row for run_id, row in typical.items() if row.folder.is_dir()}
+
+    # label to sequence to cell; every tracker is listed twice, first in A and then in B
+    cells: dict[str, dict[str, Cell]] = {}
+    for name, pairs in compared.items():
+        cells[f"A: {name}"] = {sequence: cell_a for sequence, cell_a, _ in pairs}
+        cells[f"B: {name}"] = {sequence: cell_b for sequence, _, cell_b in pairs}
+
+    # the pages of the typical runs, as far as there are files: a report alone brings none
+    paged = {}
+    for by_sequence in cells.values():
+        for cell in by_sequence.values():
+            if cell.typical.folder.is_dir():
+                paged[cell.typical.run_id] = cell.typical
     write_run_pages(list(paged.values()), paged, protocol, output)
-    names = sorted({name for some in cells.values() for name in some})
-    contents = []
-    runs = []
-    for at, some in enumerate(cells.values()):
-        for name, cell in some.items():
-            metric = {"key": "ate_rmse_m", "which": cell.rows[0].trajectory}
-            run = cell.typical
-            contents.append(cell_content(cell, at, names.index(name), [metric], rank_seen=True))
-            runs.append(
-                [
-                    run.run_id,
-                    at,
-                    names.index(name),
-                    run.repeat,
-                    run.ending,
-                    3 * (run.run_id in paged),
-                ]
-            )
-    board = {
-        "protocol": evaluated,
-        "pageless": "",
-        "unlisted": 0,
-        "trackers": [
-            {"label": label, "settings": settings_content(next(iter(some.values())).rows[0])}
-            for label, some in cells.items()
-        ],
-        "sequences": [{"name": name, "short": name, "tags": []} for name in names],
-        "cells": contents,
-        "runs": runs,
-        "pairs": [[2 * at, 2 * at + 1] for at in range(len(compared))],
-    }
+
+    # what the page reads; trackers come in pairs
     sweep_temporary(output, "**/.*")
+    board = _board_data(cells, evaluated, paged)
     write_side(output, "board", board)
     ratios = [
         [2 * at, 2 * at + 1, *ratio_numbers(overall[name]), len(pairs), ""]
         for at, (name, pairs) in enumerate(compared.items())
     ]
     write_side(output, "ratios", ratios)
+
+    # the page, and that of a run
     write_assets(output)
     shown = {"links": [("index.html", "Comparison")], "scripts": ["run.js"]}
     write_atomic(output / RUN_PAGE, render("run.html.j2", title="Run", **shown))
@@ -208,6 +210,44 @@ def _write_page(
     }
     write_atomic(output / "index.html", render("compare.html.j2", **(shown | compare_page)))
     return output / "index.html"
+
+
+def _board_data(
+    cells: Mapping[str, Mapping[str, Cell]], evaluated: str, paged: Collection[str]
+) -> dict[str, Any]:
+    """What ``data/board.js`` holds, see `html.board_page.board_data`; of every cell the typical run is listed.
+
+    Args:
+        cells: Label to sequence to cell, A and B of each tracker after each other.
+        evaluated: How errors were computed, in words.
+        paged: Ids of the runs that have a page and pictures.
+    """
+    names = sorted({name for by_sequence in cells.values() for name in by_sequence})
+    cells_data = []
+    runs = []
+    for tracker, by_sequence in enumerate(cells.values()):
+        for name, cell in by_sequence.items():
+            sequence = names.index(name)
+            metric = {"key": "ate_rmse_m", "which": cell.rows[0].trajectory}
+            cells_data.append(cell_data(cell, tracker, sequence, [metric], rank_seen=True))
+            run = cell.typical
+            has_page_and_pictures = 3 * (run.run_id in paged)
+            place = (tracker, sequence)
+            runs.append([run.run_id, *place, run.repeat, run.ending, has_page_and_pictures])
+    trackers = []
+    for label, by_sequence in cells.items():
+        first = next(iter(by_sequence.values())).rows[0]
+        trackers.append({"label": label, "settings": settings_data(first)})
+    return {
+        "protocol": evaluated,
+        "pageless": "",
+        "unlisted": 0,
+        "trackers": trackers,
+        "sequences": [{"name": name, "short": name, "tags": []} for name in names],
+        "cells": cells_data,
+        "runs": runs,
+        "pairs": [[at, at + 1] for at in range(0, len(cells), 2)],
+    }
 
 
 def _read(source: Path | str | RunStore, protocol: Protocol) -> tuple[list[RunRow], str]:
@@ -222,28 +262,27 @@ def _read(source: Path | str | RunStore, protocol: Protocol) -> tuple[list[RunRo
 
 
 def _by_column(rows: Sequence[RunRow]) -> dict[str, list[RunRow]]:
+    """Column id to the rows of it."""
     return grouped(rows, lambda row: row.column_id)
 
 
-def pair_variants(
-    a: Mapping[str, list[RunRow]], b: Mapping[str, list[RunRow]]
-) -> list[tuple[str, str]]:
+def pair_variants(a: Variants, b: Variants) -> list[tuple[str, str]]:
     """Variants of A and B that share a column: equal ones, then those that differ least, each at most once.
 
     Of several programs those that rank come first.
     """
-    candidates = [
-        (
-            one != other,
-            len(_differences(a[one][0], b[other][0])),
-            _not_current(a[one][0], b[other][0]),
-            one,
-            other,
-        )
-        for one, other in product(a, b)
-        if (a[one][0].tracker.id, a[one][0].kind) == (b[other][0].tracker.id, b[other][0].kind)
-        and (one == other or (one not in b and other not in a))
-    ]
+    # runs of one tracker, with the same settings or with settings that the other side has not
+    candidates = []
+    for one, other in product(a, b):
+        first = a[one][0]
+        second = b[other][0]
+        is_one_tracker = (first.tracker.id, first.kind) == (second.tracker.id, second.kind)
+        if is_one_tracker and (one == other or (one not in b and other not in a)):
+            n_differences = len(_differences(first, second))
+            order = (one != other, n_differences, _not_current(first, second))
+            candidates.append((*order, one, other))
+
+    # the best first, as long as both are unused
     pairs: list[tuple[str, str]] = []
     for *_, one, other in sorted(candidates, key=itemgetter(0, 1, 2)):
         unused = all(one != pair[0] and other != pair[1] for pair in pairs)
@@ -264,11 +303,12 @@ def _differences(first: RunRow, second: RunRow) -> list[str]:
         for name in {*first.variant, *second.variant}
         if first.variant.get(name) != second.variant.get(name)
     )
-    sides = [
-        {name: setting_text(row.variant.get(name, "default")) for name in names}
-        for row in (first, second)
-    ]
-    return [f"{name}: {sides[0][name]} in A, {sides[1][name]} in B" for name in names]
+    words = []
+    for name in names:
+        in_a = setting_text(first.variant.get(name, "default"))
+        in_b = setting_text(second.variant.get(name, "default"))
+        words.append(f"{name}: {in_a} in A, {in_b} in B")
+    return words
 
 
 def ratio_of(_: str, a: Cell, b: Cell) -> float:
@@ -293,19 +333,24 @@ def _table(
     separators = set()
     for name, paired in compared.items():
         separators.add(len(rows))
-        for sequence, *sides in paired:
-            coverages = [mean_of(row.coverage for row in cell.rows) for cell in sides]
+
+        # a line for every sequence
+        for sequence, cell_a, cell_b in paired:
             rows.append(
                 [
                     TableCell(name),
                     TableCell(sequence),
-                    *(TableCell(mm(cell.median or 0.0), value=cell.median) for cell in sides),
-                    number(ratio_of(sequence, *sides), ".3f"),
+                    _error_cell(cell_a),
+                    _error_cell(cell_b),
+                    number(ratio_of(sequence, cell_a, cell_b), ".3f"),
                     TableCell(),
-                    *(TableCell(coverage_text(coverage), value=coverage) for coverage in coverages),
-                    TableCell(" + ".join(str(len(cell.scores)) for cell in sides)),
+                    _coverage_cell(cell_a),
+                    _coverage_cell(cell_b),
+                    TableCell(f"{len(cell_a.scores)} + {len(cell_b.scores)}"),
                 ]
             )
+
+        # a line over all sequences
         wins = sum(ratio_of(*pair) < 1 for pair in paired)
         ratio = interval_cell(overall[name], ".3f", "best")
         verdict = TableCell(_verdict(overall[name], wins, len(paired)))
@@ -320,9 +365,23 @@ def _table(
     return Table("paired", title, caption, columns, rows, separators=separators - {0})
 
 
+def _error_cell(cell: Cell) -> TableCell:
+    """The median error of runs, in millimetres."""
+    return TableCell(mm(cell.median or 0.0), value=cell.median)
+
+
+def _coverage_cell(cell: Cell) -> TableCell:
+    """The mean coverage of runs."""
+    coverage = mean_of(row.coverage for row in cell.rows)
+    return TableCell(coverage_text(coverage), value=coverage)
+
+
 def _verdict(ratio: Interval, wins: int, sequences: int) -> str:
+    """Whether B is better than A; below `FEWEST` sequences on how many it is."""
     if sequences < FEWEST:
-        return (
-            "equal" if ratio.value == 1 else f"B better on {wins} of {sequences}, too few to tell"
-        )
-    return "better" if ratio.high < 1 else "worse" if ratio.low > 1 else "no difference shown"
+        if ratio.value == 1:
+            return "equal"
+        return f"B better on {wins} of {sequences}, too few to tell"
+    if ratio.high < 1:
+        return "better"
+    return "worse" if ratio.low > 1 else "no difference shown"

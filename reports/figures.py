@@ -3,7 +3,7 @@
 import base64
 import html
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -36,13 +36,17 @@ SYMBOLS = (
     "hexagon",
     "bowtie",
 )
+"""Symbols of trackers in figures of points."""
 DASHES = ("solid", "dash", "dot", "dashdot")
+"""Styles of trackers' lines."""
 NEUTRAL = "#8a8a8a"
+"""Colour of axes, guides and true paths."""
 MOST_POINTS = 400
 """Points of one tracker in the figure of masks; of more runs as many, from the best to the worst."""
 
 
 def _theme(ink: str, grid: str, paper: str) -> dict[str, Any]:
+    """A template of plotly with these colours of text, grid and labels."""
     line = {"gridcolor": grid, "linecolor": NEUTRAL, "zerolinecolor": grid, "automargin": True}
     walls = line | {"showbackground": False}
     return {
@@ -103,7 +107,7 @@ def rounded(values: Sequence[float]) -> list[float | None]:
 
 
 def safe(text: str) -> str:
-    """Names come from plug-ins; figures read labels as markup."""
+    """A text without markup: names come from plug-ins, and figures read labels as markup."""
     return html.escape(text, quote=False)
 
 
@@ -136,36 +140,40 @@ def speed_figure(board: Board) -> go.Figure | None:
     The Pareto front is drawn through the ranked trackers that were timed on the board's
     `timing_computer`.
     """
+    # tracker, median of the real-time factor, ATE ratio, and marks behind the name
     look = looks(board)
     placed = board.standing_by_key
     points = []
-    comparable: set[str] = set()
+    ranked = set()
     for key in board.trackers:
         ended = [row for row in board.runs(key) if row.real_time_factor and not row.failed]
         rows = timed_on_one(ended, board.timing_computer)
         factors = [row.real_time_factor for row in rows if row.real_time_factor]
-        if key in placed and factors and np.isfinite(placed[key].ratio.value):
-            marks, _ = time_marks(board, ended)
-            points.append(
-                (key, float(np.median(factors)), placed[key].ratio, f" {marks}" * bool(marks))
-            )
-            if rows[0].computer == board.timing_computer:
-                comparable.add(key)
+        if key not in placed or not factors or not np.isfinite(placed[key].ratio.value):
+            continue
+        marks, _ = time_marks(board, ended)
+        speed = float(np.median(factors))
+        ratio = placed[key].ratio
+        points.append((key, speed, ratio, f" {marks}" if marks else ""))
+        if key in board.ranked and rows[0].computer == board.timing_computer:
+            ranked.add((speed, ratio.value))
+
+    # the Pareto front
     traces: list[Any] = []
-    ranked = {
-        (speed, ratio.value)
-        for key, speed, ratio, _ in points
-        if key in board.ranked and key in comparable
-    }
-    front = sorted(
-        p for p in ranked if not any(q != p and q[0] >= p[0] and q[1] <= p[1] for q in ranked)
-    )
+    front = _pareto_front(ranked)
     if len(front) > 1:
-        x, y = (rounded(values) for values in zip(*front, strict=True))
-        line = {"color": NEUTRAL, "width": 1.5, "dash": "dot"}
         traces.append(
-            go.Scatter(x=x, y=y, mode="lines", line=line, name="Pareto front", hoverinfo="skip")
+            go.Scatter(
+                x=rounded([speed for speed, _ in front]),
+                y=rounded([ratio for _, ratio in front]),
+                mode="lines",
+                line={"color": NEUTRAL, "width": 1.5, "dash": "dot"},
+                name="Pareto front",
+                hoverinfo="skip",
+            )
         )
+
+    # a point for every tracker, with the interval of its ratio; open ones are not ranked
     for key, speed, ratio, mark in points:
         symbol = look[key]["symbol"] + "-open" * (key not in board.ranked)
         above = rounded([ratio.high - ratio.value])
@@ -194,6 +202,16 @@ def speed_figure(board: Board) -> go.Figure | None:
     return figure
 
 
+def _pareto_front(points: Collection[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Those of some speeds and ratios that no other beats in both, the slowest first."""
+    front = []
+    for speed, ratio in points:
+        others = [point for point in points if point != (speed, ratio)]
+        if not any(other >= speed and better <= ratio for other, better in others):
+            front.append((speed, ratio))
+    return sorted(front)
+
+
 def mask_figure(board: Board) -> go.Figure | None:
     """Quality of the masks against the pose error, one point a run; None where no run has it."""
     look = looks(board)
@@ -208,6 +226,7 @@ def mask_figure(board: Board) -> go.Figure | None:
             for row in board.runs(key)
             if row.mask_iou is not None and row.score_m is not None and not row.failed
         ]
+        # of many every so many, from the best to the worst
         if len(points) > MOST_POINTS:
             points = sorted(points)[:: -(-len(points) // MOST_POINTS)]
         if points:

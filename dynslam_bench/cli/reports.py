@@ -192,11 +192,11 @@ def audit_paper(
     """Hold the numbers that the paper prints against arithmetic, and against a static camera."""
     from dynslam_bench.geometry import read_tum
     from dynslam_bench.reports.audit import audit_paper as audit
-    from dynslam_bench.reports.model.published import claimed
+    from dynslam_bench.reports.model.published import claimed_results
     from dynslam_bench.sequences.catalogue import entry_of
 
     truth = {}
-    for name in sorted(set(claimed()["sequence"])):
+    for name in sorted(set(claimed_results()["sequence"])):
         entry = entry_of(name)
         folder = None if entry is None else entry.find(find_data_root(data_root))
         if folder is not None and (folder / "groundtruth.txt").is_file():

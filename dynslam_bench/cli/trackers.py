@@ -148,7 +148,7 @@ def range_text(parameter: Parameter) -> str:
 
 def _published(spec: TrackerSpec) -> list[dict[str, Any]]:
     """The reported numbers of a system: those of its spec, of publications, and the claims of the paper."""
-    from dynslam_bench.reports.model.published import CLAIMED, claimed, published
+    from dynslam_bench.reports.model.published import CLAIMED, claimed_results, published
 
     stated = [
         (name, metric, value, "its spec", "")
@@ -174,7 +174,7 @@ def _published(spec: TrackerSpec) -> list[dict[str, Any]]:
             f"EMFOA-OFT-SLAM, table {c.table}",
             f"{CLAIMED}: see 'report audit-paper'",
         )
-        for c in claimed().itertuples()
+        for c in claimed_results().itertuples()
         if c.system in spec.published_as and c.kind == "value"
     ]
     names = ("sequence", "metric", "value", "source", "remarks")

@@ -28,10 +28,9 @@ _OPPOSITE: dict[Verdict, Verdict] = {
     "worse": "better",
     "cannot tell": "cannot tell",
 }
+"""Verdict of one tracker against another to that of the other against the one."""
 MOST_LISTED = 5000
 """Runs that are listed one by one; of more, those that have a page, and the first of every cell."""
-
-
 MEANINGS = {
     "static": "nothing moves",
     "low dynamic": "people sit",
@@ -42,7 +41,7 @@ MEANINGS = {
 """Categories in everyday words."""
 
 
-def entries_of(
+def ranking_entries(
     board: Board, whole: Board, boards: Mapping[str, Board], paged: Collection[str] = ()
 ) -> list[dict[str, Any]]:
     """The rows of one category, cells by the names that `board.html.j2` calls them by.
@@ -58,48 +57,91 @@ def entries_of(
         paged: Ids of the runs that have a page.
     """
     keys = [*whole.trackers, *whole.final_only]
-    limits = _limits([s.ratio for s in board.standings])
+    limits = _axis_limits([standing.ratio for standing in board.standings])
     entries = []
     for key in board.trackers:
-        standing = board.standing_by_key.get(key)
+        entry = {"at": keys.index(key), "group": _entry_group(board, key)}
         cells = leaderboard_cells(board, key)
-        runs = board.cells[key]
-        first = board.first(key)
-        typical = [runs[name].typical for name in board.sequences if name in runs] or [first]
-        start = next((run for run in typical if run.run_id in paged), typical[0])
-        ended = [run for run in board.runs(key) if not run.failed]
-        marks = cells["tracker"].text.removeprefix(board.labels[key])
-        failure = next((run for run in board.runs(key) if run.failed), None)
-        if failure is not None:
-            tip = f"{board.sequence(failure)}: {failure.ending}"
-            cells["success"] = replace(cells["success"], link=run_link(failure), tip=tip)
-        entries.append(
-            {
-                "at": keys.index(key),
-                "group": 2
-                if first.tracker.provenance == "control"
-                else int(key not in board.ranked),
-                "name": replace(
-                    cells["tracker"], text=board.names[key] + marks, link=run_link(start)
-                ),
-                "kind": TableCell("imported") if first.imported else cells["provenance"],
-                "remark": first.program_remark,
-                "rank": TableCell("–") if standing is None else rank_cell(standing),
-                "ratio": cells["ATE ratio"]
-                if standing is None
-                else _ratio_cell(board, standing, cells["ATE ratio"]),
-                "bar": {} if standing is None else _bar(standing.ratio, limits),
-                "verdict": TableCell("not ranked", why)
-                if (why := board.unranked_why(key))
-                else cells["better?"],
-                "success": cells["success"],
-                "coverage": cells["coverage"],
-                "time": frame_time_cell(board, ended),
-                "memory": cells["MB"],
-                "by_category": _by_category(key, boards),
-            }
-        )
+        entry |= _run_cells(board, key, cells, paged)
+        entry |= _standing_cells(board, key, cells, limits)
+        entry["by_category"] = _by_category(key, boards)
+        entries.append(entry)
     return sorted(entries, key=itemgetter("group"))
+
+
+def _entry_group(board: Board, key: str) -> int:
+    """0 for a ranked tracker, 1 for another one, 2 for a control."""
+    if board.first(key).tracker.provenance == "control":
+        return 2
+    return int(key not in board.ranked)
+
+
+def _run_cells(
+    board: Board, key: str, cells: Mapping[str, TableCell], paged: Collection[str]
+) -> dict[str, Any]:
+    """What follows from a tracker's runs alone: name and origin, success, coverage, time and memory.
+
+    Args:
+        board: The board.
+        key: Variant key of the tracker.
+        cells: Its cells, see `leaderboard_cells`.
+        paged: Ids of the runs that have a page.
+    """
+    runs = board.runs(key)
+    first = board.first(key)
+
+    # the name, with its marks, leads to the first typical run that has a page
+    of_sequence = board.cells[key]
+    typical = [of_sequence[name].typical for name in board.sequences if name in of_sequence]
+    typical = typical or [first]
+    linked = next((run for run in typical if run.run_id in paged), typical[0])
+    marks = cells["tracker"].text.removeprefix(board.labels[key])
+    name = replace(cells["tracker"], text=board.names[key] + marks, link=run_link(linked))
+
+    # the successes lead to the first failure
+    success = cells["success"]
+    failure = next((run for run in runs if run.failed), None)
+    if failure is not None:
+        tip = f"{board.sequence(failure)}: {failure.ending}"
+        success = replace(success, link=run_link(failure), tip=tip)
+    return {
+        "name": name,
+        "kind": TableCell("imported") if first.imported else cells["provenance"],
+        "remark": first.program_remark,
+        "success": success,
+        "coverage": cells["coverage"],
+        "time": frame_time_cell(board, [run for run in runs if not run.failed]),
+        "memory": cells["MB"],
+    }
+
+
+def _standing_cells(
+    board: Board, key: str, cells: Mapping[str, TableCell], limits: tuple[float, float]
+) -> dict[str, Any]:
+    """Rank, ratio with its bar, and verdict of a tracker, or why it has none.
+
+    Args:
+        board: The board.
+        key: Variant key of the tracker.
+        cells: Its cells, see `leaderboard_cells`.
+        limits: Ends of the bars' axis, see `_axis_limits`.
+    """
+    standing = board.standing_by_key.get(key)
+    why_unranked = board.unranked_why(key)
+    verdict = TableCell("not ranked", why_unranked) if why_unranked else cells["better?"]
+    if standing is None:
+        return {
+            "rank": TableCell("–"),
+            "ratio": cells["ATE ratio"],
+            "bar": {},
+            "verdict": verdict,
+        }
+    return {
+        "rank": rank_cell(standing),
+        "ratio": _ratio_cell(board, standing, cells["ATE ratio"]),
+        "bar": _interval_bar(standing.ratio, limits),
+        "verdict": verdict,
+    }
 
 
 def _ratio_cell(board: Board, standing: Standing, cell: TableCell) -> TableCell:
@@ -108,52 +150,55 @@ def _ratio_cell(board: Board, standing: Standing, cell: TableCell) -> TableCell:
         return cell
     low = standing.ratio.low
     high = standing.ratio.high
-    some = standing.sequences < len(board.common)
     tip = f"95 % interval {low:.2f} to {high:.2f}" if math.isfinite(low) else ""
-    small = f"{standing.sequences} of {len(board.common)} sequences" if some else ""
+    small = ""
+    if standing.sequences < len(board.common):
+        small = f"{standing.sequences} of {len(board.common)} sequences"
     return replace(cell, small=small, emphasis="", tip=tip)
 
 
-def _limits(ratios: Sequence[Interval]) -> tuple[float, float]:
+def _axis_limits(ratios: Sequence[Interval]) -> tuple[float, float]:
     """Ends of the axis of interval bars, in logarithms; 1 lies between them."""
-    ends = [
-        end
-        for ratio in ratios
-        for end in (ratio.value, ratio.low, ratio.high)
-        if math.isfinite(end) and end > 0
-    ]
-    return math.log(max(min([0.8, *ends]), 0.02)), math.log(min(max([1.25, *ends]), 20.0))
+    ends = []
+    for ratio in ratios:
+        for end in (ratio.value, ratio.low, ratio.high):
+            if math.isfinite(end) and end > 0:
+                ends.append(end)
+    # at least from 0.8 to 1.25, at most from 0.02 to 20
+    lowest = max(min([0.8, *ends]), 0.02)
+    highest = min(max([1.25, *ends]), 20.0)
+    return math.log(lowest), math.log(highest)
 
 
-def _bar(ratio: Interval, limits: tuple[float, float]) -> dict[str, float]:
+def _interval_bar(ratio: Interval, limits: tuple[float, float]) -> dict[str, float]:
     """Places of a ratio, of the ends of its interval and of 1 on a logarithmic axis, in pixels; none of what is nan."""
     values = {"at": ratio.value, "low": ratio.low, "high": ratio.high, "one": 1.0}
-    shares = {
-        name: (math.log(max(value, FLOOR_M)) - limits[0]) / (limits[1] - limits[0])
-        for name, value in values.items()
-        if math.isfinite(value)
-    }
-    return {name: 4 + 112 * min(max(share, 0.0), 1.0) for name, share in shares.items()}
+    places_px = {}
+    for name, value in values.items():
+        if math.isfinite(value):
+            share = (math.log(max(value, FLOOR_M)) - limits[0]) / (limits[1] - limits[0])
+            places_px[name] = 4 + 112 * min(max(share, 0.0), 1.0)
+    return places_px
 
 
 def _by_category(key: str, boards: Mapping[str, Board]) -> list[tuple[str, float, float]]:
     """A dot a category: its name, the ratio there, and the height of a ratio from 1/8 to 8 in pixels from above."""
-    ratios = {
-        name: board.standing_by_key[key].ratio.value
-        for name, board in boards.items()
-        if key in board.standing_by_key
-    }
-    return [
-        (name, ratio, 12 - 8 * min(max(math.log(max(ratio, FLOOR_M)) / math.log(8), -1.0), 1.0))
-        for name, ratio in ratios.items()
-        if math.isfinite(ratio) and name != OVERALL
-    ]
+    dots = []
+    for name, board in boards.items():
+        standing = board.standing_by_key.get(key)
+        if name == OVERALL or standing is None or not math.isfinite(standing.ratio.value):
+            continue
+        ratio = standing.ratio.value
+        # -1 for a ratio of 1/8, 1 for one of 8
+        share = min(max(math.log(max(ratio, FLOOR_M)) / math.log(8), -1.0), 1.0)
+        dots.append((name, ratio, 12 - 8 * share))
+    return dots
 
 
 # -- what the pages of errors, runs and comparisons read
 
 
-def side_content(
+def board_data(
     board: Board,
     boards: Mapping[str, Board],
     protocol: Protocol,
@@ -163,6 +208,8 @@ def side_content(
 ) -> dict[str, Any]:
     """What ``data/board.js`` holds: trackers, sequences, cells and runs.
 
+    Cells and runs name trackers and sequences by their positions in these lists.
+
     Args:
         board: The board.
         boards: Of its categories.
@@ -171,86 +218,102 @@ def side_content(
         pictured: Ids of those whose pictures lie beside it.
         pageless: Which runs have no page, in words.
     """
+    # positions of trackers and sequences
     keys = [*board.trackers, *board.final_only]
     names = [*board.sequences, *board.unscored]
-    place, column = ({name: at for at, name in enumerate(items)} for items in (keys, names))
+    tracker_at = {key: at for at, key in enumerate(keys)}
+    sequence_at = {name: at for at, name in enumerate(names)}
+
     metrics = _metrics(protocol)
-    first = {cell.rows[0].run_id for cells in board.cells.values() for cell in cells.values()}
-    all_listed = len(board.rows) <= MOST_LISTED  # a page of a hundred thousand would open slowly
-    listed = [row for row in board.rows if all_listed or row.run_id in paged or row.run_id in first]
-    ordered = sorted(
-        listed,
-        key=lambda row: (place[row.variant_key], column[board.sequence(row)], row.repeat_key),
+    cells = [
+        cell_data(cell, tracker_at[key], sequence_at[name], metrics, rank_seen=board.rank_seen)
+        for key in keys
+        for name, cell in board.cells[key].items()
+    ]
+
+    # runs, by tracker, sequence and repeat
+    listed = _listed_runs(board, paged)
+    listed.sort(
+        key=lambda row: (
+            tracker_at[row.variant_key],
+            sequence_at[board.sequence(row)],
+            row.repeat_key,
+        )
     )
-    tags = {
-        name: {tag for row in rows for tag in row.sequence.tags}
-        for name, rows in grouped(board.rows, board.sequence).items()
-    }
+    runs = []
+    for row in listed:
+        at = (tracker_at[row.variant_key], sequence_at[board.sequence(row)])
+        has_page_and_pictures = (row.run_id in paged) + 2 * (row.run_id in pictured)
+        runs.append([row.run_id, *at, row.repeat, row.ending, has_page_and_pictures])
+
     categories = {
-        category: {column[name] for name in some.sequences}
-        for category, some in list(boards.items())[1:]
+        category: sorted({sequence_at[name] for name in part.sequences})
+        for category, part in boards.items()
+        if part is not board
     }
     return {
         "protocol": protocol.describe(),
         "seen": SEEN,
         "pageless": pageless,
         "reference": board.reference_name,
-        "referenceAt": None if board.reference is None else place[board.reference],
+        "referenceAt": None if board.reference is None else tracker_at[board.reference],
         "metrics": metrics,
         "trackers": [
             {
                 "label": board.names[key],
                 "ranked": key in board.ranked,
-                "settings": settings_content(board.first(key)),
+                "settings": settings_data(board.first(key)),
             }
             for key in keys
         ],
-        "sequences": [
-            {
-                "name": name,
-                "short": board.short.get(name, name),
-                "tags": sorted(tags[name]),
-                "static": significant(board.static_camera.get(name)),
-            }
-            for name in names
-        ],
-        "categories": {category: sorted(members) for category, members in categories.items()},
-        "cells": [
-            cell_content(cell, place[key], column[name], metrics, rank_seen=board.rank_seen)
-            for key in keys
-            for name, cell in board.cells[key].items()
-        ],
-        "runs": [
-            [
-                row.run_id,
-                place[row.variant_key],
-                column[board.sequence(row)],
-                row.repeat,
-                row.ending,
-                (row.run_id in paged) + 2 * (row.run_id in pictured),
-            ]
-            for row in ordered
-        ],
+        "sequences": _sequences_data(board, names),
+        "categories": categories,
+        "cells": cells,
+        "runs": runs,
         "unlisted": len(board.rows) - len(listed),
     }
 
 
-def ratios_content(board: Board) -> list[list[Any]]:
+def _listed_runs(board: Board, paged: set[str]) -> list[RunRow]:
+    """The runs that are listed one by one; a page of a hundred thousand would open slowly."""
+    if len(board.rows) <= MOST_LISTED:
+        return list(board.rows)
+    first = {cell.rows[0].run_id for cells in board.cells.values() for cell in cells.values()}
+    return [row for row in board.rows if row.run_id in paged or row.run_id in first]
+
+
+def _sequences_data(board: Board, names: Sequence[str]) -> list[dict[str, Any]]:
+    """Name, short name, tags and error of a static camera of every sequence."""
+    rows_by_sequence = grouped(board.rows, board.sequence)
+    return [
+        {
+            "name": name,
+            "short": board.short.get(name, name),
+            "tags": sorted({tag for row in rows_by_sequence[name] for tag in row.sequence.tags}),
+            "static": significant(board.static_camera.get(name)),
+        }
+        for name in names
+    ]
+
+
+def ratios_data(board: Board) -> list[list[Any]]:
     """What ``data/ratios.js`` holds of every two trackers: their numbers, and the second against the first."""
     keys = [*board.trackers, *board.final_only]
-    place = {key: at for at, key in enumerate(keys)}
+    tracker_at = {key: at for at, key in enumerate(keys)}
     verdicts = {standing.key: standing.verdict for standing in board.standings}
     ratios = []
-    for pair in compare_pairs(board, keys[::-1]):  # of the later one over the earlier one
+    # reversed: of the later tracker over the earlier one
+    for pair in compare_pairs(board, keys[::-1]):
+        # against the reference the verdict is the board's, which asks it of fewer pairs
         verdict = pair.verdict
-        if pair.other == board.reference:  # as on the board, which asks it of fewer pairs
+        if pair.other == board.reference:
             verdict = verdicts.get(pair.one, "")
         elif pair.one == board.reference:
             verdict = _OPPOSITE.get(verdicts.get(pair.other, ""), verdict)
         ratios.append(
             [
-                place[pair.other],
-                place[pair.one],
+                tracker_at[pair.other],
+                tracker_at[pair.one],
                 *ratio_numbers(pair.ratio),
                 pair.sequences,
                 verdict,
@@ -264,7 +327,7 @@ def ratio_numbers(ratio: Interval) -> list[float | None]:
     return [significant(value) for value in (ratio.value, ratio.low, ratio.high)]
 
 
-def cell_content(
+def cell_data(
     cell: Cell,
     tracker: int,
     sequence: int,
@@ -272,35 +335,53 @@ def cell_content(
     *,
     rank_seen: bool,
 ) -> list[Any]:
-    """Place, runs, failures, what speaks against it, the median of every number, typical run, the error's quartiles."""
-    doubt = any(not row.rotation_reliable for row in cell.rows) + 2 * (
-        cell.in_training and not rank_seen
-    )
+    """A cell as the scripts of the pages read it.
+
+    Args:
+        cell: The cell.
+        tracker: Position of its tracker.
+        sequence: Position of its sequence.
+        metrics: The numbers to choose from, see `_metrics`.
+        rank_seen: Whether masks of a network that was trained on the scene are no reservation.
+
+    Returns:
+        Positions of tracker and sequence, number of runs, number of failures, reservations (1: the
+        rotation is not reliable; 2: seen in training; 3: both), the median of every number, id of
+        the typical run, and the quartiles of the error, none for a single run.
+    """
+    unreliable_rotation = any(not row.rotation_reliable for row in cell.rows)
+    reservations = unreliable_rotation + 2 * (cell.in_training and not rank_seen)
     medians = [
         significant(median_of(_value(row, metric) for row in cell.kept)) for metric in metrics
     ]
     quartiles = np.percentile(cell.scores, [25, 75]).tolist() if len(cell.scores) > 1 else []
-    place = [tracker, sequence, len(cell.rows), cell.failed, doubt]
-    return [*place, medians, cell.typical.run_id, [significant(value) for value in quartiles]]
+    return [
+        tracker,
+        sequence,
+        len(cell.rows),
+        cell.failed,
+        reservations,
+        medians,
+        cell.typical.run_id,
+        [significant(value) for value in quartiles],
+    ]
 
 
-def settings_content(row: RunRow) -> dict[str, str]:
+def settings_data(row: RunRow) -> dict[str, str]:
     """What sets a run's tracker apart from other variants of it."""
     return {name: setting_text(value) for name, value in row.variant.items()}
 
 
 def _metrics(protocol: Protocol) -> list[dict[str, str]]:
-    """The numbers to choose from, the one that ranks first."""
-    parts = (("", "m", "trans"), (", rotation", "deg", "rot"))
-    numbers = [
-        ("ATE", "m", "ate_rmse_m"),
-        *(
-            (f"RPE over {spec.describe()}{words}", f"{unit}{'/s' * spec.rate}", spec.metric(part))
-            for words, unit, part in parts
-            for spec in protocol.rpe
-        ),
-        ("absolute rotation", "deg", "ape_rot_rmse_deg"),
-    ]
+    """The numbers to choose from, the one that ranks first; all of them of the final trajectory, too."""
+    # name, unit and key
+    numbers = [("ATE", "m", "ate_rmse_m")]
+    for words, unit, part in (("", "m", "trans"), (", rotation", "deg", "rot")):
+        for spec in protocol.rpe:
+            per_second = "/s" if spec.rate else ""
+            name = f"RPE over {spec.describe()}{words}"
+            numbers.append((name, unit + per_second, spec.metric(part)))
+    numbers.append(("absolute rotation", "deg", "ape_rot_rmse_deg"))
     return [
         {"name": name, "unit": unit, "key": key, "which": which}
         for which in dict.fromkeys([protocol.trajectory, "final"])
@@ -310,12 +391,10 @@ def _metrics(protocol: Protocol) -> list[dict[str, str]]:
 
 def _value(row: RunRow, metric: Mapping[str, str]) -> float | None:
     """A run's number; only the ATE that ranks counts failures."""
-    if metric["which"] != row.trajectory:
-        return (
-            None
-            if row.failed or metric["which"] == "online"
-            else row.final_metrics.get(metric["key"])
-        )
-    if metric["key"] == "ate_rmse_m":
-        return row.score_m
-    return None if row.failed else row.metrics.get(metric["key"])
+    if metric["which"] == row.trajectory:
+        if metric["key"] == "ate_rmse_m":
+            return row.score_m
+        return None if row.failed else row.metrics.get(metric["key"])
+    if row.failed or metric["which"] == "online":
+        return None
+    return row.final_metrics.get(metric["key"])

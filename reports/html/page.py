@@ -19,7 +19,9 @@ from dynslam_bench.reports.figures import THEMES
 from dynslam_bench.reports.tables.table import Table
 
 ASSETS = "assets"
+"""Folder of what all pages share."""
 FOLDER = "data"
+"""Folder of what pages load on demand."""
 _SCRIPTS = ("page.js", "board.js", "errors.js", "run.js", "compare.js")
 
 
@@ -158,7 +160,7 @@ def write_side(output: Path, name: str, value: Any, remark: Any = None) -> None:
         output: Folder of the page.
         name: What the page asks for.
         value: Anything that JSON can hold; no NaN.
-        remark: Likewise; stands before it, for `read_remark`.
+        remark: Anything that JSON can hold, too; stands before the value, for `read_remark`.
 
     Raises:
         DynslamError: It cannot be written.

@@ -6,7 +6,6 @@ import io
 import os
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
-from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,9 +23,9 @@ from dynslam_bench.evaluation import Protocol, RPESpec, pose_errors
 from dynslam_bench.geometry import Trajectory
 from dynslam_bench.reports.figures import COLOURS, NEUTRAL, packed, significant
 from dynslam_bench.reports.html.page import read_remark, write_changed, write_side
-from dynslam_bench.reports.model.load import run_jobs
 from dynslam_bench.reports.model.row import RunRow, command_line, grouped, run_command
 from dynslam_bench.reports.model.summary import reservations
+from dynslam_bench.reports.model.workers import WorkerPool, run_jobs
 from dynslam_bench.reports.tables.table import mm, significant_text
 from dynslam_bench.runs.artifacts import VIDEO_FILE
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE
@@ -37,6 +36,7 @@ from dynslam_bench.runs.store import file_stamp, part_words
 Array = NDArray[np.float64]
 
 RUN_PAGE = "run.html"
+"""The page that shows one run."""
 SHARE_EDGES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.6, 1.0)
 """Bins of the share of dynamic pixels."""
 FEWEST_FRAMES = 5
@@ -48,8 +48,8 @@ WORST = 6
 _APART = 15
 """Frames between two of these at least."""
 _LOG_BYTES = 20_000
-"""Packages whose code makes a page."""
-_WHOLE = ("total_s", "processor_s", "read_s")
+"""How much of the end of a log a page shows."""
+_NO_STAGES = ("total_s", "processor_s", "read_s")
 """Times of a frame that are no stage of it: the figure stacks stages."""
 
 
@@ -74,7 +74,7 @@ def write_run_pages(
     pictured: Collection[str],
     protocol: Protocol,
     output: Path,
-    pool: Executor | None = None,
+    pool: WorkerPool | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[RunPage]:
     """Write what the pages of some runs show: ``data/run-<id>.js``, and their pictures.
@@ -90,18 +90,18 @@ def write_run_pages(
     Raises:
         DynslamError: The folder cannot be written, or a run's files are damaged.
     """
-    newest = sorted(
-        sorted(rows, key=lambda row: row.started, reverse=True), key=lambda row: row.offset
-    )
-    shares = {
-        column: exact_shares(runs)
-        for column, runs in grouped(newest, lambda row: row.column_id).items()
-    }
-    jobs = [
-        (row, row.run_id in pictured, shares[column], protocol, output)
-        for column, runs in grouped(rows, lambda row: row.column_id).items()
-        for row in runs
-    ]
+    # exact shares of dynamic pixels by column: from runs without offset, of these from the newest
+    newest = sorted(rows, key=lambda row: row.started, reverse=True)
+    newest.sort(key=lambda row: row.offset)
+    shares = {}
+    for column, runs in grouped(newest, lambda row: row.column_id).items():
+        shares[column] = exact_shares(runs)
+
+    # write the pages, those of one column after each other
+    jobs = []
+    for column, runs in grouped(rows, lambda row: row.column_id).items():
+        for row in runs:
+            jobs.append((row, row.run_id in pictured, shares[column], protocol, output))
     pages: list[RunPage] = []
     for page in run_jobs(pool, _write_page, jobs):
         pages.append(page)
@@ -116,6 +116,7 @@ def _write_page(
 
     A page whose inputs are as they were stays as it is.
     """
+    # a page that was made of the same code, protocol, files and state stays
     name = f"run-{row.run_id}"
     files = _files(row, output)
     stamps = [file_stamp(row.folder / file) for file in (CSV_FILE, "log.txt")]
@@ -125,15 +126,18 @@ def _write_page(
     earlier = read_remark(output, name)
     if earlier and earlier[0] == made_of:
         return RunPage(row.variant_key, *earlier[1:])
+
+    # what the page shows
     record = row.store.read_whole(row.run_id)
     frames = read_frames(row, share)
-    content = run_content(
-        row, record, frames, protocol, _copy_pictures(row, output) if pictured else []
-    )
+    pictures = _copy_pictures(row, output) if pictured else []
+    data = run_data(row, record, frames, protocol, pictures)
+
+    # squared errors by the share of people, of the frames of a successful run with exact masks
     has_exact = (frames.share_source == EXACT) & (not row.failed)
     exact = np.isfinite(frames.errors_m) & np.isfinite(frames.share) & has_exact
     sums = share_sums(frames.share[exact], frames.errors_m[exact])
-    write_side(output, name, content | {"files": files}, remark=[made_of, *sums])
+    write_side(output, name, data | {"files": files}, remark=[made_of, *sums])
     return RunPage(row.variant_key, *sums)
 
 
@@ -150,7 +154,7 @@ def _files(row: RunRow, output: Path) -> list[tuple[str, str]]:
     """Name and relative path of the run's files, where the report lies in the results folder of the run."""
     if not output.resolve().is_relative_to(row.store.root.resolve()):
         return []
-    names = {
+    files = {
         "trajectory": f"trajectory_{row.trajectory}.txt",
         "video": VIDEO_FILE,
         "rerun recording": RECORDING_FILE,
@@ -158,15 +162,14 @@ def _files(row: RunRow, output: Path) -> list[tuple[str, str]]:
     }
     folder = Path(os.path.relpath(row.folder.resolve(), output.resolve())).as_posix()
     return [
-        (name, f"{folder}/{file}") for name, file in names.items() if (row.folder / file).is_file()
+        (name, f"{folder}/{file}") for name, file in files.items() if (row.folder / file).is_file()
     ]
 
 
 def share_sums(share: Array, errors_m: Array) -> tuple[list[float], list[int]]:
     """Sums of the squared errors ``[N]``, and numbers of frames, in every bin of `SHARE_EDGES`."""
-    squares, counts = (
-        np.histogram(share, SHARE_EDGES, weights=weights)[0] for weights in (errors_m**2, None)
-    )
+    squares, _ = np.histogram(share, SHARE_EDGES, weights=errors_m**2)
+    counts, _ = np.histogram(share, SHARE_EDGES)
     return squares.tolist(), counts.tolist()
 
 
@@ -176,9 +179,9 @@ def error_by_share(pages: Sequence[RunPage]) -> list[list[float | None]]:
     Not the median: a tracker that follows people errs grossly on few frames, and best of all on
     most.
     """
-    squares, counts = (
-        np.sum(sums, axis=0) for sums in ([p.squares for p in pages], [p.frames for p in pages])
-    )
+    # sums over the runs, in every bin
+    squares = np.sum([page.squares for page in pages], axis=0)
+    counts = np.sum([page.frames for page in pages], axis=0)
     if not counts.any():
         return []
     rmse_mm = 1000 * np.sqrt(squares / np.maximum(counts, 1))
@@ -191,7 +194,7 @@ def error_by_share(pages: Sequence[RunPage]) -> list[list[float | None]]:
 # -- what the page of a run shows
 
 
-def run_content(
+def run_data(
     row: RunRow,
     record: RunRecord,
     frames: RunFrames,
@@ -209,22 +212,21 @@ def run_content(
         protocol: How its errors are computed.
         pictures: Frames that have a picture.
     """
+    # series of numbers over the frames and along the track, and the figures that name them
     series, lost = _series(frames, pictures)
-    track, fault = _track(
-        row, protocol, float(frames.columns["timestamp"][0]) if frames.columns else None
-    )
-    level, verdict = verdict_of(row, frames)
-    settings = {
-        name: value if isinstance(value, str | int | bool) else str(value)
-        for name, value in record.settings.items()
-    }
-    changed = [name for name in settings if name in record.overrides]
+    start = float(frames.columns["timestamp"][0]) if frames.columns else None
+    track, fault = _track(row, protocol, start)
     figures = {
         "time": _time_figure(row, frames, series, track, lost),
         "track": _track_figure(track),
         "poses": _poses_figure(row, track),
         "stages": _stages_figure(series),
     }
+    packed_series = {}
+    for name, values in (series | track).items():
+        packed_series[name] = packed(values, "i4" if name == "index" else "f4")
+
+    level, verdict = verdict_of(row, frames)
     return {
         "id": row.run_id,
         "level": level,
@@ -232,16 +234,8 @@ def run_content(
         "numbers": _numbers(row, protocol.rpe),
         "quote": _quote(row, protocol),
         "more": _more_numbers(row, record),
-        "settings": [
-            [name, settings[name], name in changed] for name in dict.fromkeys([*changed, *settings])
-        ],
-        "stages": [
-            [
-                name,
-                *(significant(1000 * value) for value in (time.median_s, time.p95_s, time.mean_s)),
-            ]
-            for name, time in record.timings.items()
-        ],
+        "settings": _settings_data(record),
+        "stages": _stages_data(record),
         "protocol": protocol.describe(),
         "started": row.started,
         "machine": row.machine_words,
@@ -251,12 +245,27 @@ def run_content(
         "log": _log(row),
         "pictures": list(pictures),
         "worst": _worst(frames),
-        "series": {
-            name: packed(values, "i4" if name == "index" else "f4")
-            for name, values in (series | track).items()
-        },
+        "series": packed_series,
         "figures": {name: figure for name, figure in figures.items() if figure},
     }
+
+
+def _settings_data(record: RunRecord) -> list[list[Any]]:
+    """Name and value of every setting, and whether it was asked for; those that were come first."""
+    lines: list[list[Any]] = []
+    for name, value in record.settings.items():
+        text = value if isinstance(value, str | int | bool) else str(value)
+        lines.append([name, text, name in record.overrides])
+    return sorted(lines, key=lambda line: not line[2])
+
+
+def _stages_data(record: RunRecord) -> list[list[Any]]:
+    """Name of every stage, and the median, the 95th percentile and the mean of its time in milliseconds."""
+    lines: list[list[Any]] = []
+    for name, time in record.timings.items():
+        times_s = (time.median_s, time.p95_s, time.mean_s)
+        lines.append([name, *(significant(1000 * time_s) for time_s in times_s)])
+    return lines
 
 
 Level = Literal["red", "amber", "green"]
@@ -264,104 +273,115 @@ Level = Literal["red", "amber", "green"]
 
 def verdict_of(row: RunRow, frames: RunFrames) -> tuple[Level, str]:
     """How a run ended, and why, in one sentence, with its level: failed, something to know, or nothing."""
-    length = f"{row.sequence.duration_s:.1f} s"
     if row.failed:
-        reason = f": {row.reason}" if row.reason else ""
-        if not row.n_tracked and row.status == "lost":
-            return "red", f"Never tracked: not one of {row.n_frames} frames"
-        if row.status == "lost":
-            why = row.reason or row.ending
-            return "red", f"{_loss(frames, length) or 'Lost'}. {why[0].upper()}{why[1:]}"
-        return (
-            "red",
-            f"{row.ending.capitalize()} frames{reason}"
-            if row.status != "ok"
-            else f"Not evaluated{reason}",
-        )
-    score = row.score_m
-    static = row.static_camera_ate_rmse_m
-    error = "No ground truth" if score is None else f"ATE {mm(score)} mm"
-    if score is not None and static:
-        error += f", {significant_text(100 * score / static, 2)} % of a static camera's"
-    if score is not None and static and score >= static and not row.fixed_camera:
-        return "amber", f"No better than a static camera: {error}"
+        return "red", _failure_words(row, frames)
+
+    # the error, in metres and of a static camera's
+    score_m = row.score_m
+    static_m = row.static_camera_ate_rmse_m
+    error = "No ground truth" if score_m is None else f"ATE {mm(score_m)} mm"
+    if score_m is not None and static_m:
+        error += f", {significant_text(100 * score_m / static_m, 2)} % of a static camera's"
+        if score_m >= static_m and not row.fixed_camera:
+            return "amber", f"No better than a static camera: {error}"
+
     if row.incomplete:
-        loss = _loss(frames, length)
-        return (
-            "amber",
-            f"Tracked {row.n_tracked} of {row.n_frames} frames: {error}" + f". {loss}" * bool(loss),
-        )
+        words = f"Tracked {row.n_tracked} of {row.n_frames} frames: {error}"
+        loss = _loss_words(row, frames)
+        return "amber", f"{words}. {loss}" if loss else words
     if row.hints:
         return "amber", f"{error}, but the trajectory is probably faulty: {row.hints[0]}"
     tracked = "Tracked" if row.n_tracked < row.n_frames else f"All {row.n_frames} frames tracked"
     return "green", f"{tracked}: {error}"
 
 
-def _loss(frames: RunFrames, length: str) -> str:
+def _failure_words(row: RunRow, frames: RunFrames) -> str:
+    """How a failed run ended, and why."""
+    reason = f": {row.reason}" if row.reason else ""
+    if row.status == "ok":
+        return f"Not evaluated{reason}"
+    if row.status != "lost":
+        return f"{row.ending.capitalize()} frames{reason}"
+    if not row.n_tracked:
+        return f"Never tracked: not one of {row.n_frames} frames"
+    why = row.reason or row.ending
+    return f"{_loss_words(row, frames) or 'Lost'}. {why[0].upper()}{why[1:]}"
+
+
+def _loss_words(row: RunRow, frames: RunFrames) -> str:
     """When tracking was lost first, and what the frame showed; empty where it was not."""
     lost = np.flatnonzero(frames.columns.get("state", np.array([], str)) == "lost")
     if not len(lost):
         return ""
     at = int(lost[0])
     seconds = frames.columns["timestamp"][at] - frames.columns["timestamp"][0]
+    facts = []
     inliers = frames.columns.get("stat_inliers", np.full(at + 1, np.nan))[at]
-    who = "people fill" if frames.share_source == EXACT else "its masks cover"
-    values = {
-        f"{inliers:.0f} inliers": inliers,
-        f"{who} {100 * frames.share[at]:.0f} %": frames.share[at],
-    }
-    facts = " while ".join(words for words, value in values.items() if np.isfinite(value))
-    return f"Lost after {seconds:.1f} s of {length}" + f": {facts}" * bool(facts)
+    if np.isfinite(inliers):
+        facts.append(f"{inliers:.0f} inliers")
+    share = frames.share[at]
+    if np.isfinite(share):
+        who = "people fill" if frames.share_source == EXACT else "its masks cover"
+        facts.append(f"{who} {100 * share:.0f} %")
+    words = f"Lost after {seconds:.1f} s of {row.sequence.duration_s:.1f} s"
+    return f"{words}: {' while '.join(facts)}" if facts else words
 
 
 def _numbers(row: RunRow, rpe: Sequence[RPESpec]) -> list[list[str]]:
-    """The six numbers of a run: name and text."""
-    score = row.score_m
-    static = row.static_camera_ate_rmse_m
-    relative = next(
-        (
-            (spec, row.metrics[spec.metric("trans")])
-            for spec in rpe
-            if spec.metric("trans") in row.metrics
-        ),
-        None,
-    )
-    numbers = {
-        "ATE, as it counts" if row.failed else "ATE, lost frames held": ""
-        if score is None
-        else f"{mm(score)} mm",
-        "of a static camera's": ""
-        if score is None or not static
-        else f"{significant_text(100 * score / static)} %",
-        f"RPE over {relative[0].describe()}" if relative else "RPE": (
-            "" if relative is None else f"{mm(relative[1])} mm{'/s' * relative[0].rate}"
-        ),
-        "coverage": coverage_text(row.coverage),
-        "time of a frame": "" if row.frame_ms is None else f"{significant_text(row.frame_ms)} ms",
-        "memory": "" if row.peak_memory_mb is None else f"{row.peak_memory_mb:.0f} MB",
-    }
-    return [[name, text or "–"] for name, text in numbers.items()]
+    """The six numbers of a run: name and text, a dash for what is not known."""
+    # absolute error, in millimetres and in percent of a static camera's
+    score_m = row.score_m
+    static_m = row.static_camera_ate_rmse_m
+    ate_name = "ATE, as it counts" if row.failed else "ATE, lost frames held"
+    ate = ""
+    of_static = ""
+    if score_m is not None:
+        ate = f"{mm(score_m)} mm"
+        if static_m:
+            of_static = f"{significant_text(100 * score_m / static_m)} %"
+
+    # the first relative error of the protocol that the run has
+    rpe_name = "RPE"
+    rpe_text = ""
+    measured = [spec for spec in rpe if spec.metric("trans") in row.metrics]
+    if measured:
+        spec = measured[0]
+        per_second = "/s" if spec.rate else ""
+        rpe_name = f"RPE over {spec.describe()}"
+        rpe_text = f"{mm(row.metrics[spec.metric('trans')])} mm{per_second}"
+
+    time = "" if row.frame_ms is None else f"{significant_text(row.frame_ms)} ms"
+    memory = "" if row.peak_memory_mb is None else f"{row.peak_memory_mb:.0f} MB"
+    numbers = [
+        (ate_name, ate),
+        ("of a static camera's", of_static),
+        (rpe_name, rpe_text),
+        ("coverage", coverage_text(row.coverage)),
+        ("time of a frame", time),
+        ("memory", memory),
+    ]
+    return [[name, text or "–"] for name, text in numbers]
 
 
 def _quote(row: RunRow, protocol: Protocol) -> list[str]:
     """The error with everything that it depends on, then what speaks against quoting it."""
     if row.score_m is None:
         return []
-    part = part_words(row)
+    part = f" [{part_words(row)}]" if part_words(row) else ""
     words = [
-        f"{row.label} on {row.sequence.id}{part and f' [{part}]'}, {row.repeat}: ATE (RMSE) {mm(row.score_m)} mm"
-    ]
-    words += [
+        f"{row.label} on {row.sequence.id}{part}, {row.repeat}: ATE (RMSE) {mm(row.score_m)} mm",
         "lost frames held at the last pose",
         f"coverage {coverage_text(row.coverage)}",
         protocol.describe(),
     ]
-    words += [f"revision {row.git.revision[:10]}"] if row.git else []
+    if row.git:
+        words.append(f"revision {row.git.revision[:10]}")
     return [f"{', '.join(words)}.", *reservations([row])]
 
 
 def _more_numbers(row: RunRow, record: RunRecord) -> list[list[str]]:
-    """What else is known of a run."""
+    """What else is known of a run: name and text."""
+    # name, value, factor to the unit that is shown, unit
     numbers = [
         ("ATE of the tracked frames", row.metrics.get("ate_rmse_m"), 1000, " mm"),
         ("ATE of the final trajectory", row.final_ate_m, 1000, " mm"),
@@ -378,6 +398,7 @@ def _more_numbers(row: RunRow, record: RunRecord) -> list[list[str]]:
 
 
 def _log(row: RunRow) -> str:
+    """The end of a run's log; empty for none."""
     path = row.folder / "log.txt"
     if not path.is_file():
         return ""
@@ -391,29 +412,29 @@ def _log(row: RunRow) -> str:
 def _worst(frames: RunFrames) -> list[list[float | None]]:
     """Index and error in mm of the frames with the largest frame-to-frame error."""
     worst: list[list[float | None]] = []
-    errors = frames.errors_m.copy()
-    while len(worst) < WORST and np.isfinite(errors).any():
-        at = int(np.nanargmax(errors))
-        worst.append([int(frames.columns["index"][at]), significant(1000 * errors[at], 3)])
-        errors[max(at - _APART, 0) : at + _APART + 1] = np.nan
+    errors_m = frames.errors_m.copy()
+    while len(worst) < WORST and np.isfinite(errors_m).any():
+        at = int(np.nanargmax(errors_m))
+        worst.append([int(frames.columns["index"][at]), significant(1000 * errors_m[at], 3)])
+        # its neighbours would show the same moment
+        errors_m[max(at - _APART, 0) : at + _APART + 1] = np.nan
     return worst
 
 
 def _rotation_doubt(row: RunRow) -> str:
     """Why no angles are drawn; empty where they are."""
+    if row.rotation_reliable:
+        return ""
     return (
-        ""
-        if row.rotation_reliable
-        else (
-            "No angles are drawn: the path hardly determines the alignment's rotation (standard error "
-            f"{row.rotation_uncertainty_deg:.0f}°). Positions are not affected."
-        )
+        "No angles are drawn: the path hardly determines the alignment's rotation (standard error "
+        f"{row.rotation_uncertainty_deg:.0f}°). Positions are not affected."
     )
 
 
 # -- series and figures of a run
 
 Series = dict[str, Any]
+"""Name to numbers ``[N]``."""
 
 
 def _series(frames: RunFrames, pictures: Sequence[int]) -> tuple[Series, list[tuple[float, float]]]:
@@ -422,24 +443,32 @@ def _series(frames: RunFrames, pictures: Sequence[int]) -> tuple[Series, list[tu
     if not columns:
         return {}, []
     index = columns["index"]
-    stamps = columns["timestamp"] - columns["timestamp"][0]
+    seconds = columns["timestamp"] - columns["timestamp"][0]
     tracked = columns["state"] == "ok"
-    keep = (np.arange(len(index)) % -(-len(index) // MOST_FRAMES) == 0) | np.isin(index, pictures)
+
+    # every so many frames, and those with a picture
+    step = -(-len(index) // MOST_FRAMES)
+    keep = (np.arange(len(index)) % step == 0) | np.isin(index, pictures)
+
+    # errors, share of people, counts of features, and times of stages that took any
     series = {
         "index": index,
-        "t": stamps,
+        "t": seconds,
         "frame_error": np.where(tracked, 1000 * frames.errors_m, np.nan),
         "share": 100 * frames.share,
     }
     series |= {name: columns[f"stat_{name}"] for name in COUNTS if f"stat_{name}" in columns}
-    stages = [name for name in columns if name.endswith("_s") and name not in _WHOLE]
+    stages = [name for name in columns if name.endswith("_s") and name not in _NO_STAGES]
     series |= {
         name: 1000 * columns[name] for name in stages if np.nanmax(columns[name], initial=0.0) > 0
     }
-    lost = np.flatnonzero(np.diff(np.concatenate([[0], columns["state"] != "ok", [0]])))
-    ends = np.append(stamps, stamps[-1])
+
+    # spans without tracking: from the first frame of each to the first behind it, or to the end
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], columns["state"] != "ok", [0]])))
+    ends = np.append(seconds, seconds[-1])
     spans = [
-        (float(stamps[first]), float(ends[last])) for first, last in lost.reshape(-1, 2).tolist()
+        (float(seconds[first]), float(ends[behind]))
+        for first, behind in edges.reshape(-1, 2).tolist()
     ]
     return {name: values[keep] for name, values in series.items()}, spans
 
@@ -452,12 +481,19 @@ def _track(row: RunRow, protocol: Protocol, start: float | None) -> tuple[Series
     """
     truth = row.ground_truth()
     estimate = row.estimate(row.trajectory)
-    longest = truth or estimate
-    first = start if start is not None else 0.0 if longest is None else float(longest.timestamps[0])
+
+    # without frames, time begins with the first known pose
+    if start is None:
+        whole = truth or estimate
+        start = 0.0 if whole is None else float(whole.timestamps[0])
+
+    # the true path
     series: Series = {}
     if truth is not None and len(truth) > 1:
         drawn = _of_part(row, truth)
-        series = _along("true", drawn.timestamps - first, [drawn.positions, _angles(drawn, truth)])
+        series = _along("true", drawn.timestamps - start, [drawn.positions, _angles(drawn, truth)])
+
+    # the estimate: aligned and with its errors, where there is ground truth
     if estimate is None or len(estimate) < 2:
         return series, ""
     error_mm = np.full(len(estimate), np.nan)
@@ -468,7 +504,7 @@ def _track(row: RunRow, protocol: Protocol, start: float | None) -> tuple[Series
             return series, str(error)
         error_mm = 1000 * errors["trans_m"]
     columns = [estimate.positions, _angles(estimate, truth or estimate), error_mm]
-    return series | _along("track", estimate.timestamps - first, columns), ""
+    return series | _along("track", estimate.timestamps - start, columns), ""
 
 
 def _of_part(row: RunRow, truth: Trajectory) -> Trajectory:
@@ -477,9 +513,8 @@ def _of_part(row: RunRow, truth: Trajectory) -> Trajectory:
         stamps = row.store.timestamps(row.sequence.part)
         if len(stamps) > 1:
             margin = float(np.median(np.diff(stamps)))
-            inside = (truth.timestamps >= stamps[0] - margin) & (
-                truth.timestamps <= stamps[-1] + margin
-            )
+            is_begun = truth.timestamps >= stamps[0] - margin
+            inside = is_begun & (truth.timestamps <= stamps[-1] + margin)
             return truth.select(inside) if np.count_nonzero(inside) > 1 else truth
     return truth
 
@@ -488,19 +523,35 @@ def _along(name: str, stamps: Array, columns: Sequence[Array]) -> Series:
     """Time, position, angles and error along a track, thinned and broken at gaps."""
     stamps, values = broken(stamps, np.column_stack(columns), MOST_FRAMES)
     names = ("x", "y", "z", "yaw", "pitch", "roll", "error")[: values.shape[1]]
-    return {f"{name}_t": stamps} | {
-        f"{name}_{part}": values[:, at] for at, part in enumerate(names)
-    }
+    series = {f"{name}_t": stamps}
+    for column, part in enumerate(names):
+        series[f"{name}_{part}"] = values[:, column]
+    return series
 
 
 def _line(name: str, x: str, y: str, colour: str, axis: int, **more: Any) -> dict[str, Any]:
-    line = {"color": colour, "width": 1.8} | more.pop("line", {})
-    place = {"xaxis": "x", "yaxis": f"y{axis if axis > 1 else ''}"}
-    return (
-        {"type": "scatter", "mode": "lines", "name": name, "x": f"@{x}", "y": f"@{y}", "line": line}
-        | place
-        | more
-    )
+    """A line of a figure.
+
+    Args:
+        name: What the legend calls it.
+        x: Name of the series along the axis.
+        y: Name of the series that is drawn.
+        colour: Its colour.
+        axis: Number of the panel, from 1 on.
+        **more: Further properties of plotly's trace; ``line`` adds to colour and width.
+    """
+    style = {"color": colour, "width": 1.8} | more.pop("line", {})
+    trace = {
+        "type": "scatter",
+        "mode": "lines",
+        "name": name,
+        "x": f"@{x}",
+        "y": f"@{y}",
+        "line": style,
+        "xaxis": "x",
+        "yaxis": f"y{axis if axis > 1 else ''}",
+    }
+    return trace | more
 
 
 def _time_figure(
@@ -511,62 +562,45 @@ def _time_figure(
     lost: Sequence[tuple[float, float]],
 ) -> dict[str, Any]:
     """Error, inliers and people's share on one time axis, lost spans shaded."""
-    unit = {"hovertemplate": "%{y:.3g} at %{x:.2f} s<extra>%{fullData.name}</extra>"}
-    panels: list[tuple[str, list[tuple[str, str, str, str, dict[str, Any]]]]] = [
-        (
-            "error (mm)",
-            [
-                ("absolute error", "track_t", "track_error", COLOURS[1], {}),
-                ("frame-to-frame error", "t", "frame_error", COLOURS[0], {"line": {"dash": "dot"}}),
-            ],
-        ),
-        (
-            "features",
-            [
-                ("inliers", "t", "inliers", COLOURS[2], {}),
-                ("dynamic (culled)", "t", "culled", COLOURS[1], {"line": {"dash": "dash"}}),
-            ],
-        ),
-        (
-            "people (%)",
-            [
-                (
-                    f"share of people: {frames.share_source}",
-                    "t",
-                    "share",
-                    COLOURS[4],
-                    {"fill": "tozeroy"},
-                )
-            ],
-        ),
+    # panel, line, its time, its series, colour, and further properties
+    share_name = f"share of people: {frames.share_source}"
+    dotted = {"line": {"dash": "dot"}}
+    dashed = {"line": {"dash": "dash"}}
+    filled = {"fill": "tozeroy"}
+    lines: list[tuple[str, str, str, str, str, dict[str, Any]]] = [
+        ("error (mm)", "absolute error", "track_t", "track_error", COLOURS[1], {}),
+        ("error (mm)", "frame-to-frame error", "t", "frame_error", COLOURS[0], dotted),
+        ("features", "inliers", "t", "inliers", COLOURS[2], {}),
+        ("features", "dynamic (culled)", "t", "culled", COLOURS[1], dashed),
+        ("people (%)", share_name, "t", "share", COLOURS[4], filled),
     ]
+
+    # draw what has a number; panels without a line are left out
     columns = series | track
-    measured = {
-        title: [
-            line for line in lines if line[2] in columns and np.isfinite(columns[line[2]]).any()
-        ]
-        for title, lines in panels
-    }
-    shown = {title: lines for title, lines in measured.items() if lines}
-    if not shown:
+    hover = "%{y:.3g} at %{x:.2f} s<extra>%{fullData.name}</extra>"
+    panels: list[str] = []
+    traces = []
+    for panel, name, x, y, colour, more in lines:
+        if y not in columns or not np.isfinite(columns[y]).any():
+            continue
+        if panel not in panels:
+            panels.append(panel)
+        traces.append(_line(name, x, y, colour, len(panels), **more, hovertemplate=hover))
+    if not traces:
         return {}
-    traces = [
-        _line(name, x, y, colour, axis, **more, **unit)
-        for axis, lines in enumerate(shown.values(), 1)
-        for name, x, y, colour, more in lines
-    ]
+
+    # shade where tracking was lost, and what a failed run never saw
     spans = list(lost)
     times = columns.get("t", columns.get("track_t"))
-    # the rest was never seen
     if row.failed and times is not None and row.n_processed < row.n_frames:
         spans.append((float(times[-1]), row.sequence.duration_s))
     layout = {
-        "height": 60 + 150 * len(shown),
+        "height": 60 + 150 * len(panels),
         "hovermode": "x",
         "legend": {"orientation": "h", "y": 1.02, "yanchor": "bottom"},
         "shapes": [_shade(*span) for span in spans],
     }
-    return {"data": traces, "layout": layout | _axes([*shown], 0.02, rangemode="tozero")}
+    return {"data": traces, "layout": layout | _axes(panels, 0.02, rangemode="tozero")}
 
 
 def _axes(titles: Sequence[str], gap: float, **more: Any) -> dict[str, Any]:
@@ -575,6 +609,7 @@ def _axes(titles: Sequence[str], gap: float, **more: Any) -> dict[str, Any]:
     count = len(titles)
     axes: dict[str, Any] = {"xaxis": {"title": {"text": "time (s)"}, "anchor": f"y{last}"}}
     for at, title in enumerate(titles):
+        # from the top down, as shares of the figure's height
         domain = [1 - (at + 1) / count + gap, 1 - at / count - gap]
         axes[f"yaxis{at + 1 if at else ''}"] = {"title": {"text": title}, "domain": domain} | more
     return axes
@@ -609,8 +644,11 @@ HEAT = {
 
 def _track_figure(track: Series) -> dict[str, Any]:
     """The track in space, coloured by its error, beside the true path."""
-    data = [_path("true path", "true", {"color": NEUTRAL, "width": 3})] if "true_t" in track else []
+    data = []
+    if "true_t" in track:
+        data.append(_path("true path", "true", {"color": NEUTRAL, "width": 3}))
     if "track_t" in track:
+        # colour by the logarithm of the error, where there is one
         track["track_heat"] = np.log10(np.maximum(track["track_error"], 1e-3))
         measured = bool(np.isfinite(track["track_error"]).any())
         line: dict[str, Any] = (
@@ -620,6 +658,8 @@ def _track_figure(track: Series) -> dict[str, Any]:
             "estimate", "track", line | {"width": 6}, "%{customdata:.3g} mm<extra></extra>"
         )
         data.append(path | {"customdata": "@track_error", "showlegend": not measured})
+
+    # seen from above and behind: the camera's y points down, its z ahead
     axes = {f"{name}axis": {"title": {"text": f"{name} (m)"}} for name in "xyz"}
     view = {"up": {"x": 0, "y": -1, "z": 0}, "eye": {"x": 0.7, "y": -1.4, "z": -1.8}}
     scene = axes | {"aspectmode": "data", "camera": view}
@@ -634,31 +674,39 @@ def _track_figure(track: Series) -> dict[str, Any]:
 
 
 def _path(name: str, part: str, line: dict[str, Any], hover: str = "") -> dict[str, Any]:
-    place = {axis: f"@{part}_{axis}" for axis in "xyz"}
-    place |= {"hovertemplate": hover} if hover else {"hoverinfo": "skip"}
-    return {"type": "scatter3d", "mode": "lines", "name": name, "line": line} | place
+    """A path in space.
+
+    Args:
+        name: What the legend calls it.
+        part: First part of the names of its series: ``true`` or ``track``.
+        line: Its style.
+        hover: What is shown where the pointer rests; empty for nothing.
+    """
+    positions = {axis: f"@{part}_{axis}" for axis in "xyz"}
+    on_hover = {"hovertemplate": hover} if hover else {"hoverinfo": "skip"}
+    trace = {"type": "scatter3d", "mode": "lines", "name": name, "line": line}
+    return trace | positions | on_hover
 
 
 def _poses_figure(row: RunRow, track: Series) -> dict[str, Any]:
     """Position and angles over time, beside the true ones; angles only where the alignment determines them."""
     if "track_t" not in track:
         return {}
+    # a panel for each
     parts = {"x": "x (m)", "y": "y (m)", "z": "z (m)"}
-    parts |= (
-        {"yaw": "yaw (°)", "pitch": "pitch (°)", "roll": "roll (°)"}
-        if row.rotation_reliable
-        else {}
-    )
-    kinds = [
+    if row.rotation_reliable:
+        parts |= {"yaw": "yaw (°)", "pitch": "pitch (°)", "roll": "roll (°)"}
+
+    # name, first part of the series' names, colour, and further properties
+    lines: list[tuple[str, str, str, dict[str, Any]]] = [
         ("truth", "true", NEUTRAL, {"line": {"dash": "dash"}}),
         ("estimate", "track", COLOURS[0], {}),
     ]
-    data = [
-        _line(name, f"{of}_t", f"{of}_{part}", colour, at, **more)
-        for at, part in enumerate(parts, 1)
-        for name, of, colour, more in kinds
-        if f"{of}_t" in track
-    ]
+    data = []
+    for panel, part in enumerate(parts, 1):
+        for name, source, colour, more in lines:
+            if f"{source}_t" in track:
+                data.append(_line(name, f"{source}_t", f"{source}_{part}", colour, panel, **more))
     layout = {"height": 130 * len(parts), "showlegend": False} | _axes([*parts.values()], 0.01)
     return {"data": data, "layout": layout}
 
@@ -668,18 +716,15 @@ def _stages_figure(series: Series) -> dict[str, Any]:
     stages = [name for name in series if name.endswith("_s")]
     if not stages:
         return {}
-    data = [
-        _line(
-            name.removesuffix("_s"),
-            "t",
-            name,
-            COLOURS[at % len(COLOURS)],
-            1,
-            stackgroup="stages",
-            line={"width": 0.5},
+    data = []
+    for at, name in enumerate(stages):
+        colour = COLOURS[at % len(COLOURS)]
+        style = {"width": 0.5}
+        data.append(
+            _line(name.removesuffix("_s"), "t", name, colour, 1, stackgroup="stages", line=style)
         )
-        for at, name in enumerate(stages)
-    ]
+
+    # a few slow frames do not set the scale: the axis ends at 2.5 times the 80th percentile
     total = np.nansum([series[name] for name in stages], axis=0)
     top = min(float(total.max()), 2.5 * float(np.quantile(total, 0.8))) or 1.0
     axes = {
@@ -702,12 +747,18 @@ def broken(stamps: Array, values: Array, most: int) -> tuple[Array, Array]:
     """
     if len(stamps) < 3:
         return stamps, values
+    # number the pieces between gaps [N]
     intervals = np.diff(stamps)
     piece = np.concatenate([[0], np.cumsum(intervals > 2 * np.median(intervals))])
-    keep = np.arange(len(stamps)) % max(1, -(-len(stamps) // most)) == 0
+
+    # keep every so many poses, and the ends of every piece
+    step = max(1, -(-len(stamps) // most))
+    keep = np.arange(len(stamps)) % step == 0
     edge = np.diff(piece) > 0
-    keep |= np.append(edge, True) | np.append(True, edge)  # the ends of every piece stay
+    keep |= np.append(edge, True) | np.append(True, edge)
     kept = np.flatnonzero(keep)
+
+    # a row of NaN in the middle of every gap
     breaks = np.flatnonzero(np.diff(piece[kept]) > 0) + 1
     middle = (stamps[kept][breaks - 1] + stamps[kept][breaks]) / 2
     return (
@@ -718,18 +769,24 @@ def broken(stamps: Array, values: Array, most: int) -> tuple[Array, Array]:
 
 def _angles(track: Trajectory, true: Trajectory) -> Array:
     """Yaw, pitch and roll (about the camera's y, x and z) from the first true pose, in degrees ``[N, 3]``."""
-    turned = true.T_world_cam[0, :3, :3].T @ track.T_world_cam[:, :3, :3]
-    return np.asarray(np.degrees(np.unwrap(Rotation.from_matrix(turned).as_euler("YXZ"), axis=0)))
+    R_first_cam = true.T_world_cam[0, :3, :3].T @ track.T_world_cam[:, :3, :3]
+    angles = Rotation.from_matrix(R_first_cam).as_euler("YXZ")
+    return np.asarray(np.degrees(np.unwrap(angles, axis=0)))
 
 
 # -- the frames of a run, from its ``frames.csv``
 
 Columns = dict[str, NDArray[Any]]
+"""Name of a column to its values ``[N]``."""
 
 COUNTS = ("culled", "inliers")
+"""Counts of features that the page shows over time."""
 _STATS = {f"stat_{name}" for name in (*COUNTS, "mask_fraction")}
+"""Columns of statistics that the page shows."""
 _NEEDED = {"index", "timestamp", "state", "frame_error_trans_m"}
+"""Columns without which a table holds no frames."""
 EXACT = "exact masks"
+"""Source of the share of people where it comes from exact masks."""
 _ASKED = 5
 """Runs of a column that are asked for the exact shares of its frames."""
 
@@ -767,12 +824,14 @@ def read_frames(row: RunRow, exact: Mapping[int, float]) -> RunFrames:
         return RunFrames({}, np.zeros(0), np.zeros(0), fault=str(error))
     if columns is None:
         return RunFrames({}, np.zeros(0), np.zeros(0))
+
+    # exact shares, else those of the tracker's masks; a tracker without masks has zeros
     share = columns.get("stat_mask_fraction", np.zeros(0))
     source = "the tracker's own masks"
     if exact:
         share = np.array([exact.get(at + row.offset, np.nan) for at in columns["index"].tolist()])
         source = EXACT
-    elif not share.any():  # it may have no masks
+    elif not share.any():
         share = np.full(len(columns["index"]), np.nan)
         source = ""
     return RunFrames(columns, columns["frame_error_trans_m"], share, source)
@@ -799,16 +858,12 @@ def read_table(path: Path, wanted: Callable[[str], bool]) -> Columns | None:
     Raises:
         RunError: It holds no frames, or something else than numbers.
     """
-    kinds: dict[str, Any] = defaultdict(lambda: np.float64, index=np.int64, state=str)
+    types: dict[str, Any] = defaultdict(lambda: np.float64, index=np.int64, state=str)
     try:
         if not path.is_file() or not path.stat().st_size:
             return None
-        table = pd.read_csv(
-            io.BytesIO(read_bytes(path, limit=TABLE_BYTES)),
-            usecols=wanted,
-            dtype=kinds,
-            low_memory=False,
-        )
+        content = io.BytesIO(read_bytes(path, limit=TABLE_BYTES))
+        table = pd.read_csv(content, usecols=wanted, dtype=types, low_memory=False)
     except (DynslamError, ValueError, OverflowError, OSError) as error:
         raise RunError(f"{CSV_FILE} is damaged: {error}") from error
     if not isinstance(table.index, pd.RangeIndex):
@@ -822,6 +877,5 @@ def read_table(path: Path, wanted: Callable[[str], bool]) -> Columns | None:
 
 def _is_shown(name: str) -> bool:
     """Whether the page shows a column of ``frames.csv``."""
-    return (
-        name in _NEEDED or name in _STATS or (name.endswith("_s") and not name.startswith("stat_"))
-    )
+    is_time = name.endswith("_s") and not name.startswith("stat_")
+    return is_time or name in _NEEDED or name in _STATS

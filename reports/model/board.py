@@ -41,13 +41,17 @@ from dynslam_bench.runs.store import RunStore, part_words
 from dynslam_bench.sequences.tags import FIXED_CAMERA
 
 STATIC_CAMERA = "static camera (from ground truth)"
+"""What captions call the reference where it is a static camera."""
 DEFAULT_REFERENCE = "orb-slam2"
+"""Tracker that errors are divided by where no other is asked for."""
 On = Literal["common", "all"]
 """Rank on the sequences that all ranked trackers have, or only trackers that have all sequences."""
 OVERALL = "overall"
+"""The category of all sequences."""
 EXACT_MASKS = "oracle"
 """Source of masks that no tracker could have: a bound, which never ranks beside others."""
 _FIXED = "fixed camera"
+"""Group of sequences on which the true camera stands still: a static camera has no error there."""
 _GROUPS = {
     FIXED_CAMERA: _FIXED,
     "unknown-objects": "unknown objects",
@@ -59,6 +63,9 @@ _GROUPS = {
 _FURTHER = {"fast": "fast", "loop": "loops", "recorded": "recorded", "rendered": "rendered"}
 """Tag of a sequence to a category that it has beside its group."""
 _OTHER = "other"
+"""Group of sequences without any of these tags."""
+_GROUP_ORDER = ("static", "low dynamic", "high dynamic", "unknown objects", _FIXED, _OTHER, "")
+"""Order of the groups in tables."""
 _MOST_MISSING = 8
 """Trackers whose missing cells are named."""
 
@@ -136,10 +143,11 @@ class Board:
             for key, label in self.labels.items()
         }
         counts = Counter(short.values())
-        return {
-            key: label if counts[short[key]] > 1 else short[key]
-            for key, label in self.labels.items()
-        }
+        names = {}
+        for key, label in self.labels.items():
+            is_unique = counts[short[key]] == 1
+            names[key] = short[key] if is_unique else label
+        return names
 
     @property
     def categories(self) -> dict[str, list[str]]:
@@ -156,11 +164,9 @@ class Board:
     @property
     def weights(self) -> dict[str, float]:
         """Weights of the common sequences: on an overall board all groups weigh the same, elsewhere all sequences."""
-        groups = (
-            [self.groups[name] for name in self.common]
-            if self.category == OVERALL
-            else [""] * len(self.common)
-        )
+        groups = [""] * len(self.common)
+        if self.category == OVERALL:
+            groups = [self.groups[name] for name in self.common]
         return dict(zip(self.common, group_weights(groups).tolist(), strict=True))
 
     @property
@@ -171,16 +177,19 @@ class Board:
     @cached_property
     def timing_computer(self) -> str:
         """The computer whose times are shown where runs were made on several: the one with most timed runs."""
-        counts = Counter(
-            row.computer for row in timed([row for row in self.rows if not row.failed])
-        )
+        ended = [row for row in self.rows if not row.failed]
+        counts = Counter(row.computer for row in timed(ended))
         return min(counts, key=lambda computer: (-counts[computer], computer), default="")
 
     @property
     def emphasised(self) -> set[str]:
         """Variant keys of those that may be first, unless that is most of them: then it would say nothing."""
-        first = {s.key for s in self.standings if s.group is not None and s.group[0] == 1}
-        return first if 2 * len(first) <= len(self.ranked) else set()
+        may_be_first = {
+            standing.key
+            for standing in self.standings
+            if standing.group is not None and standing.group[0] == 1
+        }
+        return may_be_first if 2 * len(may_be_first) <= len(self.ranked) else set()
 
     def sequence(self, row: RunRow) -> str:
         """Name of the sequence of a row."""
@@ -201,37 +210,37 @@ class Board:
 
     def unranked_why(self, key: str) -> str:
         """Why a tracker is not ranked, in a few words; empty for one that is, and where nothing is known of it."""
+        if key in self.ranked:
+            return ""
+        if key in self.no_better:
+            return "no better than a static camera"
+        if key in self.never_succeeded:
+            return "nothing succeeded"
+        if key in self.incomplete:
+            return "lacks sequences"
         row = self.first(key)
-        reasons = {
-            "no better than a static camera": key in self.no_better,
-            "nothing succeeded": key in self.never_succeeded,
-            "lacks sequences": key in self.incomplete,
-            "in real time": row.realtime,
-            "exact masks: a bound": row.segmentation == EXACT_MASKS,
-            "by another program": not row.is_current,
-            "ablation"
-            if row.tracker.provenance == "own"
-            else row.tracker.provenance: not self.is_rankable(key),
-        }
-        return (
-            ""
-            if key in self.ranked
-            else next((words for words, holds in reasons.items() if holds), "")
-        )
+        if row.realtime:
+            return "in real time"
+        if row.segmentation == EXACT_MASKS:
+            return "exact masks: a bound"
+        if not row.is_current:
+            return "by another program"
+        if self.is_rankable(key):
+            return ""
+        # a composition of this project that does not rank is an ablation
+        return "ablation" if row.tracker.provenance == "own" else row.tracker.provenance
 
     def no_better_than_static(self, key: str, sequence: str) -> bool:
         """Whether a tracker's runs that ended well have, by their median, a static camera's error or more.
 
         Controls make no claim: never. Nor does it count before a fixed camera.
         """
+        is_control = self.first(key).tracker.provenance == "control"
+        if is_control or self.groups[sequence] == _FIXED:
+            return False
         cell = self.cells[key].get(sequence)
-        static_m = None if self.groups[sequence] == _FIXED else self.static_camera.get(sequence)
-        if (
-            cell is None
-            or static_m is None
-            or not cell.succeeded
-            or self.first(key).tracker.provenance == "control"
-        ):
+        static_m = self.static_camera.get(sequence)
+        if cell is None or static_m is None or not cell.succeeded:
             return False
         return median(row.score_m or 0.0 for row in cell.succeeded) >= (1 - 1e-9) * static_m
 
@@ -240,9 +249,11 @@ class Board:
 
         Sequences of a fixed camera do not count; 0 if there are no others.
         """
-        names = [name for name in self.common if self.groups[name] != _FIXED]
-        pairs = [(self.cells[key][name].median or 0.0, self.static_camera[name]) for name in names]
-        ratios = [max(error, FLOOR_M) / max(static, FLOOR_M) for error, static in pairs]
+        ratios = []
+        for name in self.common:
+            if self.groups[name] != _FIXED:
+                error_m = max(self.cells[key][name].median or 0.0, FLOOR_M)
+                ratios.append(error_m / max(self.static_camera[name], FLOOR_M))
         return geometric_mean(ratios) if ratios else 0.0
 
     def scored(self, key: str) -> list[str]:
@@ -285,16 +296,20 @@ class Board:
             own name, the unit at its end (``ate_rmse_m``, ``rpe_1s_rot_rmse_deg``; see
             `Evaluation`).
         """
+        # column to its type: those that all frames have, then the metrics
         metrics = sorted(
             {name for row in self.rows for name in row.metrics} - set(_COLUMNS["Float64"])
         )
-        kinds = {name: kind for kind, names in _COLUMNS.items() for name in names} | dict.fromkeys(
-            metrics, "Float64"
+        types = {name: type_ for type_, names in _COLUMNS.items() for name in names}
+        types |= dict.fromkeys(metrics, "Float64")
+
+        ordered = sorted(
+            self.rows,
+            key=lambda row: (self.labels[row.variant_key], self.sequence(row), row.repeat_key),
         )
         lines = []
-        for row in sorted(
-            self.rows, key=lambda r: (self.labels[r.variant_key], self.sequence(r), r.repeat_key)
-        ):
+        for row in ordered:
+            # what is not an attribute of the row under the column's name
             values: dict[str, Any] = {
                 "kind": row.origin,
                 "tracker": row.tracker.id,
@@ -310,8 +325,8 @@ class Board:
                 "program_remark": row.program_remark or None,
             }
             values |= {name: row.metrics.get(name) for name in metrics}
-            lines.append([values[name] if name in values else getattr(row, name) for name in kinds])
-        return pd.DataFrame(lines, columns=list(kinds), dtype=object).astype(kinds)
+            lines.append([values[name] if name in values else getattr(row, name) for name in types])
+        return pd.DataFrame(lines, columns=list(types), dtype=object).astype(types)
 
     def competes(self, key: str, name: str) -> bool:
         """Whether a tracker's number on a sequence may rank: no network that it uses was trained there."""
@@ -372,7 +387,7 @@ def make_board(
         labels=make_labels(rows),
         asked_reference=reference or "",
     )
-    return _completed(board)
+    return _fill_board(board)
 
 
 def category_boards(board: Board) -> dict[str, Board]:
@@ -382,44 +397,38 @@ def category_boards(board: Board) -> dict[str, Board]:
         rows = [row for row in board.rows if board.sequence(row) in names]
         keys = {row.variant_key for row in rows}
         labels = {key: label for key, label in board.labels.items() if key in keys}
-        boards[category] = _completed(
-            Board(
-                rows,
-                board.on,
-                board.rank_seen,
-                board.columns,
-                labels=labels,
-                category=category,
-                asked_reference=board.asked_reference,
-            )
+        part = Board(
+            rows,
+            board.on,
+            board.rank_seen,
+            board.columns,
+            labels=labels,
+            category=category,
+            asked_reference=board.asked_reference,
         )
+        boards[category] = _fill_board(part)
     return boards
 
 
-def _completed(board: Board) -> Board:
-    """The board of rows with labels, ordered and ranked."""
+def _fill_board(board: Board) -> Board:
+    """Fill a board that has rows and labels: sequences, cells, ranking, reference, standings and order."""
+    # cells
     _order_sequences(board)
     by_tracker = {key: grouped(board.runs(key), board.sequence) for key in board.labels}
     board.cells = {
         key: {name: make_cell(runs) for name, runs in by_name.items()}
         for key, by_name in by_tracker.items()
     }
-    board.final_only = [
-        key
-        # imports and batch programs without the trajectory that the protocol asks for
-        for key in board.labels
-        if all(
-            (row.imported or not row.tracker.online)
-            and not row.metrics
-            and row.final_ate_m is not None
-            for row in board.runs(key)
-        )
-    ]
+    board.final_only = [key for key in board.labels if all(map(_has_final_only, board.runs(key)))]
+
+    # ranking
     shown = [key for key in board.labels if key not in board.final_only]
     scored = [key for key in shown if board.scored(key)]
     _choose_ranked(board, scored)
     _choose_reference(board, scored, board.asked_reference or DEFAULT_REFERENCE)
     board.standings = rank(board, scored, board.ranked)
+
+    # order: by standing, then the others by label; those that never succeeded come last
     others = sorted(set(shown) - board.standing_by_key.keys(), key=board.labels.__getitem__)
     board.trackers = sorted(
         [*board.standing_by_key, *others], key=lambda key: key in board.never_succeeded
@@ -428,15 +437,27 @@ def _completed(board: Board) -> Board:
     return board
 
 
+def _has_final_only(row: RunRow) -> bool:
+    """Whether a run is an import, or by a batch program, without the trajectory that the protocol asks for."""
+    may_lack_online = row.imported or not row.tracker.online
+    return may_lack_online and not row.metrics and row.final_ate_m is not None
+
+
 def _choose_reference(board: Board, scored: Sequence[str], tracker: str) -> None:
-    """The plainest variant of a tracker that was run on all common sequences, if there is one."""
-    everywhere = [board.first(key) for key in scored if set(board.common) <= set(board.scored(key))]
-    rows = [
-        row
-        for row in everywhere
-        if row.tracker.id == tracker and row.is_current and not row.imported
-    ]
-    candidates = [row.variant_key for row in rows if not row.realtime and "map" not in row.variant]
+    """Set the reference: the variant of a tracker with the fewest settings that was run on all common sequences.
+
+    Imports, real-time runs, runs that begin in a map and runs by another program are never it.
+    Without such a variant a static camera stays the reference.
+    """
+    candidates = []
+    for key in scored:
+        row = board.first(key)
+        if row.tracker.id != tracker or not row.is_current or row.imported:
+            continue
+        if row.realtime or "map" in row.variant:
+            continue
+        if set(board.common) <= set(board.scored(key)):
+            candidates.append(key)
     if candidates and board.common:
         board.reference = min(candidates, key=lambda key: len(board.first(key).variant))
         board.reference_name = board.names[board.reference]
@@ -456,30 +477,38 @@ def rank(
         ranked: Those of them that are ranked.
         score: Error of a run in metres, or None to leave it out.
     """
-    cells: dict[str, dict[str, list[float]]] = {}
-    for key in {*scored} if board.reference is None else {*scored, board.reference}:
-        rows = {
-            name: board.cells[key][name].kept for name in board.common if name in board.cells[key]
-        }
-        cells[key] = {
-            name: [error for error in map(score, kept) if error is not None]
-            for name, kept in rows.items()
-        }
-    static = {
-        name: [board.static_camera[name]] for name in board.common if board.groups[name] != _FIXED
-    }
-    reference = static if board.reference is None else cells[board.reference]
-    shared = {name: errors for name, errors in reference.items() if errors}
-    if not shared:
+    # errors in metres of every tracker, by sequence
+    keys = {*scored} if board.reference is None else {*scored, board.reference}
+    errors: dict[str, dict[str, list[float]]] = {}
+    for key in keys:
+        errors[key] = {}
+        for name in board.common:
+            if name in board.cells[key]:
+                scores = map(score, board.cells[key][name].kept)
+                errors[key][name] = [error for error in scores if error is not None]
+
+    # those of the reference; a static camera has none before a fixed camera
+    if board.reference is None:
+        static = board.static_camera
+        reference = {name: [static[name]] for name in board.common if board.groups[name] != _FIXED}
+    else:
+        reference = {name: values for name, values in errors[board.reference].items() if values}
+    if not reference:
         return []
-    placed = [key for key in scored if any(cells[key].get(name) for name in shared)]
-    full = [key for key in ranked if key in placed and all(cells[key].get(name) for name in shared)]
-    placed_cells = {key: cells[key] for key in placed}
+
+    # trackers with an error on one of these sequences are placed; of all sequences, ranked
+    placed = {
+        key: errors[key] for key in scored if any(errors[key].get(name) for name in reference)
+    }
+    complete = [
+        key for key in ranked if key in placed and all(errors[key].get(name) for name in reference)
+    ]
+    placings = standings(placed, reference, complete, board.weights)
     return [
         replace(standing, verdict="reference")
         if standing.key == board.reference and standing.verdict
         else standing
-        for standing in standings(placed_cells, shared, full, board.weights)
+        for standing in placings
     ]
 
 
@@ -530,93 +559,105 @@ class Pair(NamedTuple):
 def compare_pairs(board: Board, keys: Sequence[str]) -> list[Pair]:
     """Compare every two of some trackers that have a common sequence in common, in their order."""
     logs, weights = common_logs(board, keys)
-    tests = (
-        separable({key: logs[key] for key in keys if key in board.ranked}, weights)
-        if board.common
-        else {}
-    )
+    tests = {}
+    if board.common:
+        tests = separable({key: logs[key] for key in keys if key in board.ranked}, weights)
     pairs = []
-    for a, b in combinations(keys, 2):
-        differences = logs[a] - logs[b]
-        if not np.isfinite(differences).any():
+    for one, other in combinations(keys, 2):
+        # log ratios [S], nan where one of the two has no run
+        differences = logs[one] - logs[other]
+        n_sequences = int(np.isfinite(differences).sum())
+        if not n_sequences:
             continue
         ratio = ratio_interval(differences, weights)
-        (apart, p_value) = tests.get((a, b), (False, None))
+        (differ, p_value) = tests.get((one, other), (False, None))
         verdict: Verdict = "" if p_value is None else "cannot tell"
-        if apart:
+        if differ:
             verdict = "better" if ratio.value < 1 else "worse"
-        pairs.append(Pair(a, b, ratio, int(np.isfinite(differences).sum()), p_value, verdict))
+        pairs.append(Pair(one, other, ratio, n_sequences, p_value, verdict))
     return pairs
 
 
 def _order_sequences(board: Board) -> None:
     """Name the sequences and their groups, static ones first; note what a static camera scores on each."""
-    by_name = grouped(board.rows, board.sequence)
-    errors = {
-        name: [
-            row.static_camera_ate_rmse_m for row in rows if row.static_camera_ate_rmse_m is not None
-        ]
-        for name, rows in by_name.items()
-    }
-    board.static_camera = {name: median(values) for name, values in errors.items() if values}
-    board.unscored = [name for name, values in errors.items() if not values]
-    for name, rows in by_name.items():
+    for name, rows in grouped(board.rows, board.sequence).items():
+        # the error of a static camera; without one there is no ground truth
+        static_m = [row.static_camera_ate_rmse_m for row in rows]
+        known_m = [error for error in static_m if error is not None]
+        if known_m:
+            board.static_camera[name] = median(known_m)
+        else:
+            board.unscored.append(name)
+
+        # tags and group
         place = "rendered" if rows[0].sequence.id.startswith("synthetic/") else "recorded"
         board.tags[name] = {place, *(tag for row in rows for tag in row.sequence.tags)}
         board.groups[name] = group_of(board.tags[name])
+
+    # a single group without a meaning gets no heading
     if set(board.groups.values()) == {_OTHER}:
         board.groups = dict.fromkeys(board.groups, "")
-    order = ["static", "low dynamic", "high dynamic", "unknown objects", _FIXED, _OTHER, ""]
     board.sequences = sorted(
-        board.static_camera, key=lambda name: (order.index(board.groups[name]), name)
+        board.static_camera, key=lambda name: (_GROUP_ORDER.index(board.groups[name]), name)
     )
     board.short = shortened(board.sequences)
 
 
 def _choose_ranked(board: Board, scored: Sequence[str]) -> None:
-    """Who is ranked on which sequences: on those that all ranked trackers have.
+    """Set which trackers are ranked, on the sequences that all of them have.
 
     Trackers with few sequences are left out where that leaves more cells to rank (trackers times
     sequences), so that neither one more sequence of one tracker nor one run of another takes the
     ranking away from the rest. A tracker without any success is not ranked, nor is one that is no
     better than a static camera, nor one where its network was trained (`Board.competes`).
     """
+    # trackers that may rank; real-time runs and exact masks only among themselves
     rankable = [key for key in scored if board.is_rankable(key)]
-    # never beside real-time runs
     rankable = [key for key in rankable if not board.first(key).realtime] or rankable
-    # a bound
     rankable = [key for key in rankable if board.first(key).segmentation != EXACT_MASKS] or rankable
-    has = {
+
+    # the sequences of each, and a success on any of all
+    sequences_of = {
         key: {name for name in board.scored(key) if board.competes(key, name)} for key in rankable
     }
     rankable = [
         key
         for key in rankable
-        if has[key] and any(cell.success for cell in board.cells[key].values())
+        if sequences_of[key] and any(cell.success for cell in board.cells[key].values())
     ]
-    competing = sorted(rankable, key=lambda key: (-len(has[key]), key))
+
+    # those that compete, and the sequences that all of them have
+    competing = sorted(rankable, key=lambda key: (-len(sequences_of[key]), key))
     if board.on == "all":
-        competing = [key for key in competing if has[key] == set(board.sequences)]
-    sizes = {
-        n: n * len(set.intersection(*(has[key] for key in competing[:n])))
-        for n in range(1, len(competing) + 1)
-    }
-    several = {n: cells for n, cells in sizes.items() if n > 1 and cells} or sizes
-    competing = competing[: max(several, key=lambda n: (several[n], n), default=0)]
-    shared = (
-        set.intersection(*(has[key] for key in competing)) if competing else set(board.sequences)
-    )
+        competing = [key for key in competing if sequences_of[key] == set(board.sequences)]
+    competing = competing[: _most_cells([sequences_of[key] for key in competing])]
+    shared = set(board.sequences)
+    if competing:
+        shared = set.intersection(*(sequences_of[key] for key in competing))
     board.common = [name for name in board.sequences if name in shared]
+
+    # ranked, or why not
     board.incomplete = [key for key in rankable if key not in competing]
     for key in scored:
         cells = board.cells[key]
-        judged = [name for name in board.common if name in cells] or list(cells)
-        if not any(cells[name].success for name in judged):
+        considered = [name for name in board.common if name in cells] or list(cells)
+        if not any(cells[name].success for name in considered):
             board.never_succeeded.append(key)
         elif key in competing and board.static_ratio(key) >= 1 - 1e-9:
             board.no_better.append(key)
         elif key in competing:
             board.ranked.append(key)
+
+
+def _most_cells(sequences: Sequence[set[str]]) -> int:
+    """How many trackers to rank so that trackers times common sequences is largest: several, where that is possible.
+
+    Args:
+        sequences: The sequences of each tracker, most first.
+    """
+    n_cells = {n: n * len(set.intersection(*sequences[:n])) for n in range(1, len(sequences) + 1)}
+    several = {n: cells for n, cells in n_cells.items() if n > 1 and cells} or n_cells
+    return max(several, key=lambda n: (several[n], n), default=0)
 
 
 @dataclass(frozen=True)
@@ -676,35 +717,26 @@ class Cell:
     def ending(self) -> str:
         """How the runs failed, e.g. ``crashed at 20/60``; several that ended differently are counted."""
         endings = list(dict.fromkeys(row.ending for row in self.rows if row.failed))
-        return (
-            endings[0]
-            if len(endings) == 1
-            else f"{self.failed} failed: {'; '.join(endings)}"
-            if endings
-            else ""
-        )
+        if len(endings) > 1:
+            return f"{self.failed} failed: {'; '.join(endings)}"
+        return endings[0] if endings else ""
 
 
 def make_cell(rows: Sequence[RunRow]) -> Cell:
-    """Order the runs of a cell and find the copies among them."""
+    """Order the runs of a cell and find the copies among them: other seeds with equal results."""
     ordered = sorted(rows, key=lambda row: row.repeat_key)
+    by_input = grouped(ordered, lambda row: (row.offset, row.sequence.noise, row.imported))
     kept: list[RunRow] = []
-    for group in grouped(
-        ordered, lambda row: (row.offset, row.sequence.noise, row.imported)
-    ).values():
-        results = {
-            (
-                row.status,
-                row.n_processed,
-                row.coverage,
-                row.score_m,
-                row.final_ate_m,
-                *sorted(row.metrics.items()),
-            )
-            for row in group
-        }
-        kept += group[:1] if len(results) == 1 else group
+    for of_seeds in by_input.values():
+        n_results = len({_result_of(row) for row in of_seeds})
+        kept += of_seeds[:1] if n_results == 1 else of_seeds
     return Cell(tuple(ordered), tuple(kept))
+
+
+def _result_of(row: RunRow) -> tuple[object, ...]:
+    """How a run ended, and all its errors; equal for copies."""
+    errors = (row.score_m, row.final_ate_m, *sorted(row.metrics.items()))
+    return (row.status, row.n_processed, row.coverage, *errors)
 
 
 def timed(runs: Sequence[RunRow]) -> list[RunRow]:
@@ -749,47 +781,56 @@ def missing_note(board: Board) -> str:
     missing = missing_cells(board)
     if not missing:
         return ""
-    common = len(board.common)
-    total = len(board.sequences)
-    left = ", ".join(board.labels[key] for key in board.incomplete)
-    why = "lack sequences" if board.on == "all" else "lack too many of the others' sequences"
+    sentences = []
+
+    # what the ranking stands on, and who is not in it
+    n_common = len(board.common)
+    n_sequences = len(board.sequences)
+    if board.on == "common" and board.ranked and n_common < n_sequences:
+        sentences.append(
+            f"The ranking stands on the {n_common} of {n_sequences} sequences that all ranked trackers have."
+        )
+    if board.incomplete:
+        incomplete = ", ".join(board.labels[key] for key in board.incomplete)
+        why = "lack sequences" if board.on == "all" else "lack too many of the others' sequences"
+        sentences.append(f"Not ranked, since they {why}: {incomplete}.")
+
+    # the missing cells
     cells = []
     for key, names in list(missing.items())[:_MOST_MISSING]:
         others = f" and {len(names) - 4} more" if len(names) > 4 else ""
         cells.append(f"{board.labels[key]} on {', '.join(names[:4])}{others}")
     if len(missing) > _MOST_MISSING:
         cells.append(f"and {len(missing) - _MOST_MISSING} more trackers")
-    sentences = {
-        f"The ranking stands on the {common} of {total} sequences that all ranked trackers have.": (
-            board.on == "common" and board.ranked and common < total
-        ),
-        f"Not ranked, since they {why}: {left}.": left,
-        f"Missing cells: {'; '.join(cells)}. The page Reproduce has the commands that fill them.": True,
-    }
-    return " ".join(sentence for sentence, holds in sentences.items() if holds)
+    sentences.append(
+        f"Missing cells: {'; '.join(cells)}. The page Reproduce has the commands that fill them."
+    )
+    return " ".join(sentences)
 
 
 def missing_commands(board: Board) -> list[str]:
     """Commands that make the runs of the missing cells of all that can be run here."""
-    commands: list[str] = []
+    # one run for every sequence, which names it: if possible without noise and offset
     plainest = sorted(board.rows, key=lambda row: (row.sequence.noise is not None, row.offset))
     by_sequence = grouped(plainest, board.sequence)
+    commands = []
     for key, names in missing_cells(board).items():
-        if board.first(key).imported:
+        tracker = board.first(key)
+        if tracker.imported:
             continue
+
+        # the seeds and offsets that the tracker has elsewhere
         repeats: list[str] = []
         for name in ("seed", "offset"):
             values = sorted({getattr(run, name) for run in board.runs(key)})
-            repeats += [f"--{name}", *map(str, values)] if values != [0] else []
-        others = grouped(
-            (by_sequence[name][0] for name in names), lambda row: tuple(part_options(row))
-        )
-        commands += [
-            command_with(
-                board.first(key), [*[row.place or row.sequence.id for row in rows], *part, *repeats]
-            )
-            for part, rows in others.items()
-        ]
+            if values != [0]:
+                repeats += [f"--{name}", *map(str, values)]
+
+        # one command for all sequences of which the same part is run
+        missing = [by_sequence[name][0] for name in names]
+        for part, rows in grouped(missing, lambda row: tuple(part_options(row))).items():
+            places = [row.place or row.sequence.id for row in rows]
+            commands.append(command_with(tracker, [*places, *part, *repeats]))
     return commands
 
 
@@ -797,48 +838,53 @@ def missing_commands(board: Board) -> list[str]:
 
 _COLUMNS = {
     "string": (
-        *(
-            "run_id",
-            "kind",
-            "tracker",
-            "label",
-            "settings",
-            "provenance",
-            "sequence",
-            "column_id",
-            "frames",
-            "split",
-        ),
-        *(
-            "repeat",
-            "status",
-            "ending",
-            "study",
-            "protocol_id",
-            "protocol_digest",
-            "trajectory",
-            "segmentation",
-        ),
-        *("computer", "program_remark"),
+        "run_id",
+        "kind",
+        "tracker",
+        "label",
+        "settings",
+        "provenance",
+        "sequence",
+        "column_id",
+        "frames",
+        "split",
+        "repeat",
+        "status",
+        "ending",
+        "study",
+        "protocol_id",
+        "protocol_digest",
+        "trajectory",
+        "segmentation",
+        "computer",
+        "program_remark",
     ),
-    "Int64": ("seed", "offset", "n_frames", "n_processed", "n_tracked", "noise"),
-    "boolean": ("ranked", "failed", "cached", "seen_in_training"),
+    "Int64": (
+        "seed",
+        "offset",
+        "n_frames",
+        "n_processed",
+        "n_tracked",
+        "noise",
+    ),
+    "boolean": (
+        "ranked",
+        "failed",
+        "cached",
+        "seen_in_training",
+    ),
     "Float64": (
-        *(
-            "coverage",
-            "score_m",
-            "hold_last_pose_ate_m",
-            "final_ate_m",
-            "static_camera_ate_rmse_m",
-            "frame_ms",
-        ),
-        *(
-            "real_time_factor",
-            "peak_memory_mb",
-            "mask_iou",
-            "epipolar_skipped",
-            "rotation_uncertainty_deg",
-        ),
+        "coverage",
+        "score_m",
+        "hold_last_pose_ate_m",
+        "final_ate_m",
+        "static_camera_ate_rmse_m",
+        "frame_ms",
+        "real_time_factor",
+        "peak_memory_mb",
+        "mask_iou",
+        "epipolar_skipped",
+        "rotation_uncertainty_deg",
     ),
 }
 """Type of a column of `Board.frame` to the names."""

@@ -1,123 +1,33 @@
 """From results folders to rows: which runs count, scored under one protocol.
 
 Rows of unchanged runs are taken from the store's SQLite index. Many runs are scored by several
-processes.
+processes, see `model.workers`.
 """
 
-import os
-import signal
-import sys
-import threading
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from itertools import starmap
-from multiprocessing import get_context, parent_process
 from pathlib import Path
-from types import ModuleType
-from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
-from dynslam_bench.core import DynslamError, InfrastructureError, ReportError, translate_errors
+from dynslam_bench.core import DynslamError, ReportError
 from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, module_graph
 from dynslam_bench.evaluation.protocol import MONOCULAR, Protocol
 from dynslam_bench.reports.model.programs import choose_runs
 from dynslam_bench.reports.model.row import RunRow, grouped, make_row
+from dynslam_bench.reports.model.workers import WorkerPool, run_jobs
 from dynslam_bench.runs.store import RunStore, open_store, warn_of_unreadable
 
-T = TypeVar("T")
 OnProgress = Callable[[float, float | None, str], None]
 """Called as ``on_progress(done, total, what)``; the total is None where it is not known."""
-MANY = 250
-"""Runs from which on worker processes save more time than they need to start."""
-MOST_WORKERS = 8
-_AT_ONCE = 40
-"""Jobs that a worker takes at once."""
 _ROW_CODE = (f"{PACKAGE}.reports.model.row",)
 """What rows are computed by, with all that it uses."""
 
 
 def no_progress(done: float, total: float | None, what: str) -> None:
     """Ignore progress."""
-
-
-# -- worker processes
-
-
-@contextmanager
-def worker_pool(runs: int) -> Iterator[Executor | None]:
-    """As many worker processes as so many runs are worth on this machine; None where they are worth none."""
-    cores = (
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    )
-    if runs < MANY or cores == 1:
-        yield None
-        return
-    context = get_context("spawn")  # a library cannot know which threads its caller has: no fork
-    with ProcessPoolExecutor(min(cores, MOST_WORKERS), context, _start_worker) as pool:
-        yield pool
-
-
-def _start_worker() -> None:
-    """Leave Ctrl-C to the parent process, and end with it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    parent = parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
-
-
-def run_jobs(
-    pool: Executor | None, function: Callable[..., T], jobs: Sequence[tuple[Any, ...]]
-) -> Iterator[T]:
-    """Call a function once a job, in worker processes or here.
-
-    Args:
-        pool: The workers; None to call it here.
-        function: A function of a module.
-        jobs: Its arguments.
-
-    Yields:
-        The answers in the order of the jobs, each as soon as it is there.
-
-    Raises:
-        DynslamError: A job cannot be done.
-        InfrastructureError: A worker has died.
-    """
-    if pool is None:
-        yield from starmap(function, jobs)
-        return
-    with _without_main():
-        answers = pool.map(function, *zip(*jobs, strict=True), chunksize=_AT_ONCE)
-    with translate_errors(
-        InfrastructureError, "a worker process of the report ended early", of=BrokenProcessPool
-    ):
-        yield from answers
-
-
-@contextmanager
-def _without_main() -> Iterator[None]:
-    """Let workers start without the caller's script, which need not guard what it does at import.
-
-    A worker that is spawned imports the parent's ``__main__`` before it does anything: a script without
-    ``if __name__ == "__main__"`` would run again in every worker. The spawn and the forkserver contexts
-    both do so, and neither has an option against it. They look the module up in `sys.modules` when a
-    worker starts, so an empty one stands there meanwhile.
-    """
-    main = sys.modules["__main__"]
-    sys.modules["__main__"] = ModuleType("__main__")
-    try:
-        yield
-    finally:
-        sys.modules["__main__"] = main
 
 
 # -- rows of unchanged runs
@@ -198,7 +108,7 @@ def load_runs(
     stores: Sequence[RunStore],
     protocol: Protocol,
     on_progress: OnProgress = no_progress,
-    pool: Executor | None = None,
+    pool: WorkerPool | None = None,
     *,
     trials: bool = False,
 ) -> Loaded:
@@ -214,6 +124,7 @@ def load_runs(
     Raises:
         ReportError: There is no run at all.
     """
+    # read every store: unchanged rows from its index, the others from the runs' files
     on_progress(0, None, "looking for what has changed")
     loaded = Loaded()
     everything = []
@@ -221,27 +132,22 @@ def load_runs(
         run_ids = store.ids()
         unchanged = _unchanged_rows(store, protocol, run_ids)
         unread = [run_id for run_id in run_ids if run_id not in unchanged]
-        scored: list[tuple[RunRow, str]] = []
-        for done, answer in enumerate(
-            run_jobs(pool, _score_run, [(store, protocol, run_id) for run_id in unread]), 1
-        ):
-            if isinstance(answer, str):
-                loaded.unreadable.append(answer)
-                on_progress(done, len(unread), "")
-            else:
-                scored.append(answer)
-                on_progress(
-                    done, len(unread), f"scoring {answer[0].tracker.id} on {answer[0].sequence.id}"
-                )
+        scored, unreadable = _score_runs(store, protocol, unread, on_progress, pool)
         _keep_rows(store, protocol, scored)
         everything += [*unchanged.values(), *(row for row, _ in scored)]
+        loaded.unreadable += unreadable
     warn_of_unreadable(loaded.unreadable)
+
+    # leave out stopped runs, runs of unknown scale, and trials of studies
     ended = [row for row in everything if row.status != "stopped"]
     scaled = [row for row in ended if protocol.finds_scale or row.tracker.sensors != "rgb"]
     rows = [row for row in scaled if trials or not row.trial_of]
     loaded.stopped = len(everything) - len(ended)
-    loaded.without_scale, loaded.trials = len(ended) - len(scaled), len(scaled) - len(rows)
-    loaded.conflicts = _two_results(rows)
+    loaded.without_scale = len(ended) - len(scaled)
+    loaded.trials = len(scaled) - len(rows)
+
+    # of several runs of one request take one
+    loaded.conflicts = _conflicting_results(rows)
     chosen = choose_runs(rows)
     loaded.rows = chosen.rows
     loaded.superseded = len(rows) - len(chosen.rows)
@@ -249,6 +155,8 @@ def load_runs(
     loaded.not_installed = chosen.not_installed
     if loaded.rows:
         return loaded
+
+    # no run is left: say why
     if loaded.without_scale:
         raise ReportError(f"all {without_scale_words(loaded.without_scale, protocol)}")
     if loaded.trials:
@@ -257,6 +165,33 @@ def load_runs(
     raise ReportError(
         f"there are no runs in {places}", next(iter(loaded.unreadable), "make some with 'run'")
     )
+
+
+def _score_runs(
+    store: RunStore,
+    protocol: Protocol,
+    run_ids: Sequence[str],
+    on_progress: OnProgress,
+    pool: WorkerPool | None,
+) -> tuple[list[tuple[RunRow, str]], list[str]]:
+    """Score runs of a store.
+
+    Returns:
+        The rows with the states of their runs' files, and the folders without a valid record, with
+        reasons.
+    """
+    scored = []
+    unreadable = []
+    jobs = [(store, protocol, run_id) for run_id in run_ids]
+    for done, answer in enumerate(run_jobs(pool, _score_run, jobs), 1):
+        if isinstance(answer, str):
+            unreadable.append(answer)
+            on_progress(done, len(jobs), "")
+        else:
+            row, _ = answer
+            scored.append(answer)
+            on_progress(done, len(jobs), f"scoring {row.tracker.id} on {row.sequence.id}")
+    return scored, unreadable
 
 
 def without_scale_words(count: int, protocol: Protocol) -> str:
@@ -275,15 +210,15 @@ def trial_words(count: int) -> str:
     )
 
 
-def _two_results(rows: Iterable[RunRow]) -> list[str]:
+def _conflicting_results(rows: Iterable[RunRow]) -> list[str]:
     """Which runs of one id from several stores have different results although they should be equal, in words."""
     conflicts = []
-    for first, *others in grouped(rows, lambda row: row.run_id).values():
-        errors = sorted(
-            {row.metrics["ate_rmse_m"] for row in (first, *others) if "ate_rmse_m" in row.metrics}
-        )
-        if len(errors) > 1 and first.tracker.deterministic and not first.realtime:
-            results = ", ".join(f"{1000 * error:.3f}" for error in errors)
+    for same_run in grouped(rows, lambda row: row.run_id).values():
+        first = same_run[0]
+        is_deterministic = first.tracker.deterministic and not first.realtime
+        errors_m = {row.metrics["ate_rmse_m"] for row in same_run if "ate_rmse_m" in row.metrics}
+        if len(errors_m) > 1 and is_deterministic:
+            results = ", ".join(f"{1000 * error:.3f}" for error in sorted(errors_m))
             conflicts.append(
                 f"{first.label} on {first.sequence.id} (run {first.run_id}): ATE {results} mm"
             )
@@ -316,7 +251,9 @@ def open_stores(runs: Sequence[Path] | Sequence[str] | RunStore | Path | str) ->
     if isinstance(runs, RunStore):
         return [runs]
     roots = [Path(runs)] if isinstance(runs, str | Path) else map(Path, runs)
-    return [
-        open_store(root.parent if root.name == "runs" and not (root / "runs").is_dir() else root)
-        for root in roots
-    ]
+    stores = []
+    for root in roots:
+        # the folder ``runs`` of a results folder stands for that
+        is_inner = root.name == "runs" and not (root / "runs").is_dir()
+        stores.append(open_store(root.parent if is_inner else root))
+    return stores

@@ -14,6 +14,7 @@ import pandas as pd
 from dynslam_bench.evaluation import PROTOCOLS, Protocol
 
 CLAIMED = "claimed by the paper"
+"""Tag of what the implemented paper claims."""
 _LEAST_FRAMES = {
     "tum/fr3/sitting_static": 680,
     "tum/fr3/sitting_xyz": 1219,
@@ -27,8 +28,7 @@ _LEAST_FRAMES = {
 }
 """Least number of frames of a recording, at 30 Hz. TUM: the pairs of colour and depth in the association files that are
 published with the code of DynaSLAM (walking_xyz: of DANI-SLAM). Bonn: the last frame of an excerpt
-that is numbered as
-in the whole, counted from 0. Of others no source was read."""
+that is numbered as in the whole, counted from 0. Of others no source was read."""
 METRICS = (
     "ate_rmse_m",
     "ate_mean_m",
@@ -40,17 +40,21 @@ METRICS = (
 )
 """What was published of a sequence, the error that is always sought first."""
 NOT_STATED = "not stated"
+"""In place of what a source does not say."""
 RECORD = "record"
+"""Tag of the lowest published errors."""
 KINDS = {
     "best": "lowest error found in print",
     "cpu": "lowest error found in print, real time on a CPU",
     "masks": "ORB-SLAM2 with person masks, in print",
 }
+"""Kind of a record to its words."""
 HOW = {
     "R": "read in its source",
     "S": "second-hand: another paper's table or notes",
     "I": "inferred",
 }
+"""How a record is known, to its words."""
 
 
 @dataclass(frozen=True)
@@ -98,22 +102,24 @@ def published_for(sequences: Sequence[str], protocol: Protocol | None = None) ->
 
     Returns:
         Columns: sequence, system, source, by, year, alignment, hardware and remarks as in
-            `published`, then one for
-        every metric (``Float64``).
+        `published`, then one for every metric (``Float64``).
     """
     frame = published()
     frame = frame[frame["sequence"].isin(sequences)]
+
+    # one line for every sequence, system and source, with the facts of its first metric
     key = ["sequence", "system", "source"]
-    facts = frame.sort_values("metric").drop_duplicates(key)[
-        [*key, "by", "year", "alignment", "hardware", "remarks"]
-    ]
+    first = frame.sort_values("metric").drop_duplicates(key)
+    facts = first[[*key, "by", "year", "alignment", "hardware", "remarks"]]
+
+    # a column for every metric
     values = frame.pivot(index=key, columns="metric", values="value").astype("Float64")
-    lines = facts.join(values.reindex(columns=METRICS), on=key).sort_values(
-        ["sequence", METRICS[0], "system"]
-    )
-    return lines.loc[
-        [protocol is None or scored_as(p.alignment, p.sequence, protocol) for p in lines_of(lines)]
-    ]
+    lines = facts.join(values.reindex(columns=METRICS), on=key)
+    lines = lines.sort_values(["sequence", METRICS[0], "system"])
+    if protocol is None:
+        return lines
+    is_alike = [scored_as(line.alignment, line.sequence, protocol) for line in lines_of(lines)]
+    return lines.loc[is_alike]
 
 
 def spans(lines: pd.DataFrame) -> pd.DataFrame:
@@ -126,10 +132,12 @@ def spans(lines: pd.DataFrame) -> pd.DataFrame:
         One line where there are several. Columns: sequence, system, alignment, numbers, ratio,
         lowest_m, highest_m, authors_m (the lowest by its authors, missing where none was read).
     """
-    # what others call by its short name
-    whole = lines["system"].replace("DynaSLAM N+G", "DynaSLAM")
-    own = lines[METRICS[0]].where(lines["by"] == "authors")
-    errors = lines.assign(system=whole, own=own).dropna(subset=METRICS[0])
+    # others call DynaSLAM by its short name
+    systems = lines["system"].replace("DynaSLAM N+G", "DynaSLAM")
+    by_authors = lines[METRICS[0]].where(lines["by"] == "authors")
+    errors = lines.assign(system=systems, own=by_authors).dropna(subset=METRICS[0])
+
+    # the lowest and the highest of each system, sequence and alignment
     groups = errors.groupby(["sequence", "system", "alignment"])
     frame = groups.agg(
         numbers=(METRICS[0], "size"),
@@ -142,7 +150,7 @@ def spans(lines: pd.DataFrame) -> pd.DataFrame:
 
 
 @cache
-def claimed() -> pd.DataFrame:
+def claimed_results() -> pd.DataFrame:
     """Tables 1 to 3 of the paper that this project implements, as printed: claimed, not reproduced.
 
     Columns: table, system (as named there), sequence (its id), quantity (``ape_rmse``,
@@ -151,9 +159,8 @@ def claimed() -> pd.DataFrame:
     (decimals as printed).
     """
     frame = _read("claimed.csv")
-    return frame.astype({"table": int, "value": float}).assign(
-        digits=frame["value"].str.partition(".")[2].str.len()
-    )
+    digits = frame["value"].str.partition(".")[2].str.len()
+    return frame.astype({"table": int, "value": float}).assign(digits=digits)
 
 
 @cache
@@ -172,9 +179,8 @@ def records() -> pd.DataFrame:
 def static_camera_errors() -> dict[tuple[str, str], float]:
     """Errors of a static camera by sequence and metric, from the published ground truth."""
     frame = _read("never_move.csv").astype({"value": float})
-    return dict(
-        zip(zip(frame["sequence"], frame["metric"], strict=True), frame["value"], strict=True)
-    )
+    keys = zip(frame["sequence"], frame["metric"], strict=True)
+    return dict(zip(keys, frame["value"], strict=True))
 
 
 def least_length_s(sequence: str) -> float | None:
@@ -203,28 +209,22 @@ def reported_for(sequences: Sequence[str], protocol: Protocol) -> list[ReportedC
         One cell for every system, source and sequence, and those that the implemented paper claims,
         tagged so.
     """
-    cells = [
-        ReportedCell(
-            f"{p.system} ({p.by or NOT_STATED}: {p.source})",
-            p.sequence,
-            p.ate_rmse_m,
-            "; ".join(
-                filter(
-                    None,
-                    (p.alignment, p.hardware, "" if pd.isna(p.year) else str(p.year), p.remarks),
-                )
-            ),
-        )
-        for p in lines_of(published_for(sequences, protocol).dropna(subset=METRICS[0]))
-    ]
+    # what systems' authors and others published
+    cells = []
+    for line in lines_of(published_for(sequences, protocol).dropna(subset=METRICS[0])):
+        year = "" if pd.isna(line.year) else str(line.year)
+        remarks = filter(None, (line.alignment, line.hardware, year, line.remarks))
+        system = f"{line.system} ({line.by or NOT_STATED}: {line.source})"
+        cells.append(ReportedCell(system, line.sequence, line.ate_rmse_m, "; ".join(remarks)))
+
+    # what the implemented paper claims
     if scored_as("SE(3) or not stated", "", protocol):
         remark = "contradicts itself and what the systems' authors published; see the audit"
-        frame = claimed().query(
+        frame = claimed_results().query(
             "kind == 'value' and quantity == 'ape_rmse' and sequence in @sequences"
         )
-        cells += [
-            ReportedCell(c.system, c.sequence, c.value, remark, CLAIMED) for c in lines_of(frame)
-        ]
+        for line in lines_of(frame):
+            cells.append(ReportedCell(line.system, line.sequence, line.value, remark, CLAIMED))
     return cells
 
 
@@ -235,11 +235,9 @@ def scored_as(alignment: str, sequence: str, protocol: Protocol) -> bool:
     Sim(3) is from tables of WildGS-SLAM's evaluation, which corrects Bonn's truth.
     """
     truth = "bonn-droid-w" if alignment == "Sim(3)" and sequence.startswith("bonn/") else "as-is"
-    return (
-        not protocol.thins
-        and truth == protocol.truth
-        and protocol.alignment == {"Sim(3)": "sim3", "SE(3) or not stated": "se3"}.get(alignment)
-    )
+    if protocol.thins or truth != protocol.truth:
+        return False
+    return protocol.alignment == {"Sim(3)": "sim3", "SE(3) or not stated": "se3"}.get(alignment)
 
 
 def records_for(sequences: Sequence[str], protocol: Protocol) -> list[ReportedCell]:
@@ -249,19 +247,16 @@ def records_for(sequences: Sequence[str], protocol: Protocol) -> list[ReportedCe
         sequences: Names of a report's whole sequences.
         protocol: The report's protocol.
     """
+    # names of protocols that score as this one
     alike = [name for name, other in PROTOCOLS.items() if other.digest() == protocol.digest()]
     frame = records()
     frame = frame[frame["sequence"].isin(sequences) & frame["protocol"].isin(alike)]
-    return [
-        ReportedCell(
-            KINDS[r.kind],
-            r.sequence,
-            r.value,
-            "; ".join((r.system, r.input, r.alignment, r.hardware, r.source, HOW[r.how])),
-            RECORD,
-        )
-        for r in lines_of(frame)
-    ]
+    cells = []
+    for line in lines_of(frame):
+        facts = (line.system, line.input, line.alignment, line.hardware, line.source)
+        source = "; ".join((*facts, HOW[line.how]))
+        cells.append(ReportedCell(KINDS[line.kind], line.sequence, line.value, source, RECORD))
+    return cells
 
 
 def lines_of(frame: pd.DataFrame) -> Iterator[Any]:

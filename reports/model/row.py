@@ -2,7 +2,7 @@
 
 import json
 import shlex
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from functools import cached_property
 from itertools import chain, zip_longest
@@ -29,7 +29,9 @@ SEEN = "§"
 HINTED = "‡"
 """Behind trackers with runs whose trajectories are probably faulty."""
 REPORT_FILE = "report.json"
+"""File of a report's folder that holds `ReportData`."""
 SCHEMA_VERSION = 1
+"""Version of `ReportData`."""
 
 
 class RunRow(RunRecord):
@@ -136,31 +138,39 @@ class RunRow(RunRecord):
 
     @property
     def repeat(self) -> str:
-        """The same in words, e.g. ``seed 0, offset 2``; of an import the end of its id, which tells files apart."""
+        """Which repeat it is, in words, e.g. ``seed 0, offset 2``.
+
+        Of an import it is the end of its id, which tells files apart.
+        """
         return f"import {self.run_id[-6:]}" if self.imported else super().repeat
 
     @cached_property
     def variant(self) -> dict[str, Any]:
         """What sets runs of one tracker apart besides sequence and repeat: settings, device, threads, mode."""
         variant: dict[str, Any] = dict(sorted(self.asked.items()))
-        machine = f"{self.machine.cpu}, {self.machine.cores} cores" if self.machine else True
-        variant |= {} if self.imported else {"device": self.device, "threads": self.threads}
-        variant |= {"realtime": machine} if self.realtime else {}
-        variant |= {"drop_share": self.drop_share} if self.drop_share else {}
-        return variant | {f"degrade.{name}": value for name, value in sorted(self.degrade.items())}
+        if not self.imported:
+            variant |= {"device": self.device, "threads": self.threads}
+        if self.realtime:
+            machine = self.machine
+            variant["realtime"] = f"{machine.cpu}, {machine.cores} cores" if machine else True
+        if self.drop_share:
+            variant["drop_share"] = self.drop_share
+        for name, value in sorted(self.degrade.items()):
+            variant[f"degrade.{name}"] = value
+        return variant
 
     @cached_property
     def settings_key(self) -> str:
         """Tracker and settings, whatever program made the run."""
-        return (
-            f"{self.tracker.id}|{self.kind}|{json.dumps(self.variant, sort_keys=True, default=str)}"
-        )
+        variant = json.dumps(self.variant, sort_keys=True, default=str)
+        return f"{self.tracker.id}|{self.kind}|{variant}"
 
     @property
     def variant_key(self) -> str:
         """Tracker, settings and program: everything that sets its runs apart besides sequence and repeat."""
-        split = json.dumps(self.split_by, sort_keys=True) if self.split_by else ""
-        return f"{self.settings_key}|{split}" if split else self.settings_key
+        if not self.split_by:
+            return self.settings_key
+        return f"{self.settings_key}|{json.dumps(self.split_by, sort_keys=True)}"
 
     @property
     def failed(self) -> bool:
@@ -184,14 +194,13 @@ class RunRow(RunRecord):
         A failure whose held trajectory is even further off than a static camera keeps that error.
         Before a fixed camera a failure has no error: a static camera has none there.
         """
-        if self.failed:
-            static_m = None if self.fixed_camera else self.static_camera_ate_rmse_m
-            return None if static_m is None else max(static_m, self.hold_last_pose_ate_m or 0.0)
-        return (
-            self.hold_last_pose_ate_m
-            if self.hold_last_pose_ate_m is not None
-            else self.metrics.get("ate_rmse_m")
-        )
+        if not self.failed:
+            held_m = self.hold_last_pose_ate_m
+            return held_m if held_m is not None else self.metrics.get("ate_rmse_m")
+        static_m = None if self.fixed_camera else self.static_camera_ate_rmse_m
+        if static_m is None:
+            return None
+        return max(static_m, self.hold_last_pose_ate_m or 0.0)
 
     @property
     def frame_ms(self) -> float | None:
@@ -202,17 +211,14 @@ class RunRow(RunRecord):
     def cached(self) -> bool:
         """Whether stage times come from the stage cache and were not taken in this run."""
         # controls and external systems have no such stage
-        return bool(self.identity.get("cache")) and self.tracker.provenance not in (
-            "control",
-            "external",
-        )
+        has_stages = self.tracker.provenance not in ("control", "external")
+        return bool(self.identity.get("cache")) and has_stages
 
     @property
     def rotation_reliable(self) -> bool:
         """Whether the metrics ``ape_rot_*`` are errors of the estimate rather than of its alignment."""
-        return (
-            self.rotation_uncertainty_deg is None or self.rotation_uncertainty_deg <= RELIABLE_DEG
-        )
+        uncertainty_deg = self.rotation_uncertainty_deg
+        return uncertainty_deg is None or uncertainty_deg <= RELIABLE_DEG
 
     @property
     def ending(self) -> str:
@@ -221,11 +227,9 @@ class RunRow(RunRecord):
             return ""
         if self.status == "lost":
             return f"lost, {self.n_tracked}/{self.n_frames} tracked"
-        return (
-            "not evaluated"
-            if self.status == "ok"
-            else f"{self.status} at {self.n_processed}/{self.n_frames}"
-        )
+        if self.status == "ok":
+            return "not evaluated"
+        return f"{self.status} at {self.n_processed}/{self.n_frames}"
 
     @property
     def computer(self) -> str:
@@ -250,16 +254,15 @@ class RunRow(RunRecord):
         # a checkout is older than its code: git's revision holds
         if git is not None and "dynslam-bench" in versions:
             versions["dynslam-bench"] = versions["dynslam-bench"].partition("+")[0]
-        parts = [
-            self.computer,
-            *(f"{name} {version}" for name, version in versions.items()),
-            f"git {git.revision[:10]}{' (changed)' if git.dirty else ''}" if git else "",
-        ]
+        parts = [self.computer, *(f"{name} {version}" for name, version in versions.items())]
+        if git:
+            changed = " (changed)" if git.dirty else ""
+            parts.append(f"git {git.revision[:10]}{changed}")
         return "; ".join(filter(None, parts))
 
 
 def grouped(rows: Iterable[V], key: Callable[[V], K]) -> dict[K, list[V]]:
-    """Rows, or other things, by a key, in their order."""
+    """Group rows, or other things, by a key; groups and members stay in their order."""
     groups: dict[K, list[V]] = {}
     for row in rows:
         groups.setdefault(key(row), []).append(row)
@@ -296,10 +299,13 @@ class ReportData(Record):
             DynslamError: The folder cannot be written.
         """
         head = self.model_copy(update={"rows": []}).to_line().removesuffix("]}")
-        rows = (
-            _without_reads(row).to_line() + "," * (row is not self.rows[-1]) for row in self.rows
-        )
-        write_lines(path, chain([head], rows, ["]}"]))
+        write_lines(path, chain([head], self._row_lines(), ["]}"]))
+
+    def _row_lines(self) -> Iterator[str]:
+        """The rows as JSON, one a line, with commas between them."""
+        for row in self.rows:
+            is_last = row is self.rows[-1]
+            yield _without_reads(row).to_line() + ("" if is_last else ",")
 
 
 def _without_reads(row: RunRow) -> RunRow:
@@ -312,19 +318,21 @@ def _without_reads(row: RunRow) -> RunRow:
 
 def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
     """The row of one stored run, scored under a protocol."""
+    # evaluate the trajectory that the protocol asks for
     scored = score(store, record, protocol)
     evaluation = scored.online if protocol.trajectory == "online" else scored.final
-    static_m = _static_camera_error(store, record, protocol, evaluation)
-    trial = [f"trial of the study '{record.trial_of}'"] if record.trial_of else []
-    diagnostics = [] if evaluation is None else evaluation.diagnostics
-    warnings = [] if evaluation is None else [f"warning: {line}" for line in evaluation.warnings]
     alignment = None if evaluation is None else evaluation.alignment
-    scores: dict[str, Any] = dict(
+    static_m = _static_camera_error(store, record, protocol, evaluation)
+
+    # of the record keep what tables show: not the settings nobody asked for, not the stages' times
+    kept: dict[str, Any] = dict(
         settings={
             name: record.settings[name] for name in record.overrides if name in record.settings
         },
         identity={name: value for name, value in record.identity.items() if name != "settings"},
         timings={name: time for name, time in record.timings.items() if name == "total"},
+    )
+    scores: dict[str, Any] = dict(
         protocol_id=scored.protocol_id,
         protocol_digest=scored.protocol_digest,
         trajectory=protocol.trajectory,
@@ -335,31 +343,45 @@ def make_row(store: RunStore, record: RunRecord, protocol: Protocol) -> RunRow:
         hold_last_pose_ate_m=_hold_last_pose_error(store, record, protocol, evaluation, static_m),
         static_camera_ate_rmse_m=static_m,
         seen_in_training=seen_in_training(record.segmentation, record.sequence.id),
-        notes=[
-            *(f"hint: {hint}" for hint in scored.hints),
-            *warnings,
-            *trial,
-            *record.notes,
-            *diagnostics,
-        ],
+        notes=_notes_of(record, scored, evaluation),
         hints=scored.hints,
         store=store,
     )
-    return RunRow(**(dict(record) | scores | _outcome(record, scored, protocol, evaluation)))
+    outcome = _outcome(record, scored, protocol, evaluation)
+    return RunRow(**(dict(record) | kept | scores | outcome))
+
+
+def _notes_of(record: RunRecord, scored: MetricRecord, evaluation: Evaluation | None) -> list[str]:
+    """Hints, warnings, the study that a run is a trial of, the record's notes, and diagnostics."""
+    notes = [f"hint: {hint}" for hint in scored.hints]
+    if evaluation is not None:
+        notes += [f"warning: {line}" for line in evaluation.warnings]
+    if record.trial_of:
+        notes.append(f"trial of the study '{record.trial_of}'")
+    notes += record.notes
+    if evaluation is not None:
+        notes += evaluation.diagnostics
+    return notes
 
 
 def _outcome(
     record: RunRecord, scored: MetricRecord, protocol: Protocol, evaluation: Evaluation | None
 ) -> dict[str, Any]:
     """Fields of a row that differ from the record's: which trajectory is scored, how the run ended, its coverage."""
-    final_only = record.kind == "imported" or not record.tracker.online
-    if final_only and not record.failed and scored.online is None and scored.final is not None:
+    # imports and batch programs may have a final trajectory only
+    may_lack_online = record.kind == "imported" or not record.tracker.online
+    has_final_only = scored.online is None and scored.final is not None
+    if may_lack_online and has_final_only and not record.failed:
         return {"trajectory": "final"}
+
+    # no evaluation although there is ground truth counts as a failure
     if evaluation is None:
         if record.failed or record.status == "lost" or not record.sequence.ground_truth:
             return {}
         reason = record.reason or scored.reasons.get(protocol.trajectory, "it cannot be evaluated")
         return {"not_evaluated": True, "reason": reason}
+
+    # of the final trajectory of a run here, count the frames with a pose anew
     n_tracked = evaluation.n_tracked
     frames_due = record.n_frames - record.n_dropped
     if record.kind == "imported" or protocol.trajectory == "online" or n_tracked is None:
@@ -367,7 +389,8 @@ def _outcome(
     outcome: dict[str, Any] = {"n_tracked": n_tracked, "coverage": evaluation.coverage}
     if not n_tracked or record.failed or LOST_COVERAGE * frames_due <= n_tracked < frames_due:
         return outcome
-    if n_tracked >= frames_due:  # frames lost online were found later
+    # frames that were lost online have a pose in the final trajectory
+    if n_tracked >= frames_due:
         return outcome | {"status": "ok", "reason": ""}
     return outcome | {
         "status": "lost",
@@ -417,30 +440,32 @@ def _hold_last_pose_error(
 
 def command_line(command: list[str]) -> str:
     """The command line as one would type it; a results folder named by its absolute path is ``RESULTS``."""
-    place = _option(command, "--results")
-    words = (
-        [word.replace(place, "RESULTS") for word in command]
-        if place and Path(place).is_absolute()
-        else command
-    )
-    heads = [
-        "dynslam-bench" if Path(head).name in ("__main__.py", "dynslam-bench") else head
-        for head in command[:1]
-    ]
-    return shlex.join([*heads, *words[1:]])
+    if not command:
+        return ""
+    program, *words = command
+    results = _option(command, "--results")
+    if results and Path(results).is_absolute():
+        words = [word.replace(results, "RESULTS") for word in words]
+    if Path(program).name in ("__main__.py", "dynslam-bench"):
+        program = "dynslam-bench"
+    return shlex.join([program, *words])
 
 
 def run_command(row: RunRow) -> str:
     """The command that makes a run again; empty for an imported trajectory."""
     if row.imported:
         return ""
-    repeats = {"--seed": row.seed, "--offset": row.offset}
-    words = [word for name, value in repeats.items() if value for word in (name, str(value))]
-    return command_with(row, [row.place or row.sequence.id, *part_options(row), *words])
+    words = [row.place or row.sequence.id, *part_options(row)]
+    if row.seed:
+        words += ["--seed", str(row.seed)]
+    if row.offset:
+        words += ["--offset", str(row.offset)]
+    return command_with(row, words)
 
 
 def command_with(row: RunRow, words: Iterable[str]) -> str:
     """The command ``run`` with the tracker and the settings of a run; `words` name sequences, part and repeats."""
+    # options that are no settings; defaults are not named
     options: dict[str, list[str]] = {
         "threads": ["--threads", str(row.threads)] if row.threads != 1 else [],
         "device": ["--device", row.device] if row.device not in ("cpu", "") else [],
@@ -454,25 +479,22 @@ def command_with(row: RunRow, words: Iterable[str]) -> str:
             settings += ["--degrade", f"{name.removeprefix('degrade.')}={value}"]
         else:
             settings += options.get(name, ["--set", f"{name}={setting_text(value)}"])
-    return shlex.join(
-        ["dynslam-bench", "run", row.tracker.given or row.tracker.id, *words, *settings]
-    )
+    tracker = row.tracker.given or row.tracker.id
+    return shlex.join(["dynslam-bench", "run", tracker, *words, *settings])
 
 
 def part_options(row: RunRow) -> list[str]:
     """Its part of the sequence, and the camera that its command named, as options of the command line."""
-    frames = (
-        ""
-        if row.frames is None
-        else ":".join("" if end is None else str(end) for end in row.frames)
-    )
+    words = []
+    if row.frames is not None:
+        frames = ":".join("" if end is None else str(end) for end in row.frames)
+        words += ["--frames", frames]
     camera = _option(row.command, "--camera") if row.place else None
-    options = {
-        "--frames": frames,
-        "--camera": camera,
-        "--stride": "" if row.stride == 1 else str(row.stride),
-    }
-    return [word for name, value in options.items() if value for word in (name, value)]
+    if camera:
+        words += ["--camera", camera]
+    if row.stride != 1:
+        words += ["--stride", str(row.stride)]
+    return words
 
 
 def _option(command: Sequence[str], name: str) -> str | None:

@@ -17,6 +17,7 @@ from dynslam_bench.core import printable
 from dynslam_bench.reports.model.names import OUR_BACK_END
 
 Emphasis = Literal["", "best", "second", "muted", "failed"]
+"""How a cell is set, see `TableCell`."""
 MOST_ROWS = 1000
 """Rows that pages and Markdown show; CSV has all."""
 
@@ -132,11 +133,10 @@ class Table:
         Columns in which nothing is written are left out, and rows behind `MOST_ROWS`, which the
         caption says.
         """
-        kept = [
-            at
-            for at in range(len(self.columns))
-            if not self.rows or any(_words(row[at]) for row in self.rows)
-        ]
+        kept = []
+        for at in range(len(self.columns)):
+            if not self.rows or any(_words(row[at]) for row in self.rows):
+                kept.append(at)
         caption = self.caption
         if len(self.rows) > MOST_ROWS:
             caption += f" These are the first {MOST_ROWS} of {len(self.rows)} rows; all stand in csv/{self.id}.csv."
@@ -149,6 +149,7 @@ class Table:
         )
 
     def _with_columns(self, kept: Sequence[int]) -> Table:
+        """The table with the columns at these positions."""
         rows = [[row[at] for at in kept] for row in self.rows]
         return replace(self, columns=[self.columns[at] for at in kept], rows=rows)
 
@@ -202,10 +203,12 @@ def prose(text: str) -> str:
 
 
 def _escape_markdown(text: str) -> str:
+    """Text for a cell of Markdown, without markup."""
     return re.sub(r"[*_\[]", r"\\\g<0>", prose(re.sub(r"[\\|]", r"\\\g<0>", text)))
 
 
 def _markdown_cell(cell: TableCell) -> str:
+    """A cell: bold for the best, italic for the second, with small text and tag."""
     mark = {"best": "**", "second": "*"}.get(cell.emphasis, "") if cell.text else ""
     parts = [
         mark + _escape_markdown(cell.text) + mark,
@@ -216,6 +219,7 @@ def _markdown_cell(cell: TableCell) -> str:
 
 
 def _words(cell: TableCell) -> str:
+    """Everything that is written in a cell."""
     return " ".join(filter(None, (cell.text, cell.small, cell.tag)))
 
 
@@ -244,13 +248,15 @@ def significant_text(value: float, digits: int = 3) -> str:
 def percent(share: float) -> str:
     """A share as whole percents, but nothing short of all is 100 % and nothing above none 0 %."""
     rounded = round(100 * share)
-    if (rounded == 100 and share < 1) or (rounded == 0 and share > 0):
-        return (
-            f"{100 * share:.1f} %"
-            if 0.0005 <= share < 0.9995
-            else ("< 0.1 %" if share < 0.5 else "> 99.9 %")
-        )
-    return f"{rounded} %"
+    is_exact = not (rounded == 100 and share < 1) and not (rounded == 0 and share > 0)
+    if is_exact:
+        return f"{rounded} %"
+    if 0.0005 <= share < 0.9995:
+        return f"{100 * share:.1f} %"
+    return "< 0.1 %" if share < 0.5 else "> 99.9 %"
+
+
+# -- LaTeX: columns and rows that do not fit a column of a page stand in further tabulars and floats
 
 
 COLUMN_PT = 229.0
@@ -258,11 +264,17 @@ COLUMN_PT = 229.0
 MOST_LINES = 48
 """Lines of a table in this size that stand in a column of a page."""
 _GAP_PT = 6.0
+"""Between two columns: twice LaTeX's ``tabcolsep``."""
 _DIGIT_PT = 4.3
+"""About the width of a digit in this size."""
 _LETTER_PT = 4.6
+"""About the width of another character."""
 _NAMES_PT = 92.0
+"""Width of the column of names at most; longer names are broken into lines."""
 _HEADING = 11
+"""Characters of a line of a heading at most, unless a word is longer."""
 _STAR = r"\rlap{$^*$}"
+"""Behind the names of trackers with this project's back end."""
 _LATEX = {
     **{character: f"\\{character}" for character in "&%$#_{}"},
     **{
@@ -296,6 +308,7 @@ _LATEX = {
     "§": r"\S{}",
     "¶": r"\P{}",
 }
+"""Character to what LaTeX writes for it."""
 
 
 def to_latex(table: Table, protocol: str = "") -> str:
@@ -310,16 +323,17 @@ def to_latex(table: Table, protocol: str = "") -> str:
         protocol: Name of the protocol that its numbers were taken under, for the caption.
     """
     table = table.displayed()
+
+    # fill floats with tabulars, a new one where the next tabular would not fit
     floats: list[list[str]] = []
     used = MOST_LINES
-    for text, lines in (
-        tabular for columns in _blocks(table) for tabular in _tabulars(table, columns)
-    ):
-        if used + lines > MOST_LINES:
-            floats.append([])
-            used = 0
-        floats[-1].append(text)
-        used += lines
+    for columns in _blocks(table):
+        for text, lines in _tabulars(table, columns):
+            if used + lines > MOST_LINES:
+                floats.append([])
+                used = 0
+            floats[-1].append(text)
+            used += lines
     return "\n".join(
         _float(table, tabulars, number, protocol) for number, tabulars in enumerate(floats)
     )
@@ -335,32 +349,33 @@ def escape_latex(text: str) -> str:
 
 
 def _character(character: str) -> str:
+    """A character as LaTeX writes it; without a glyph as its plain letters or its code point."""
     if character in _LATEX or ("\u00c0" <= character <= "\u017e" and character != "÷"):
         return _LATEX.get(character, character)
     if character.isascii():
         return character if character.isprintable() else " "
     plain = unicodedata.normalize("NFKD", character).encode("ascii", "ignore").decode()
-    return (
-        "".join(_LATEX.get(letter, letter) for letter in plain)
-        if plain
-        else f"[U+{ord(character):04X}]"
-    )
+    if not plain:
+        return f"[U+{ord(character):04X}]"
+    return "".join(_LATEX.get(letter, letter) for letter in plain)
 
 
-def _float(table: Table, blocks: Sequence[str], number: int, protocol: str) -> str:
-    words = (
-        [table.brief or table.title]
-        + [f"protocol {protocol}"] * bool(protocol)
-        + ["continued"] * bool(number)
-    )
-    note = " $^*$\\,our back end." if any(_STAR in block for block in blocks) else ""
+def _float(table: Table, tabulars: Sequence[str], number: int, protocol: str) -> str:
+    """A float with some tabulars below each other; further ones of a table are numbered and say that they continue."""
+    words = [table.brief or table.title]
+    if protocol:
+        words.append(f"protocol {protocol}")
+    if number:
+        words.append("continued")
+    note = " $^*$\\,our back end." if any(_STAR in tabular for tabular in tabulars) else ""
+    label = f"{table.id}-{number + 1}" if number else table.id
     return "\n".join(
         [
             "\\begin{table}[htbp]",
             "\\centering\\footnotesize\\setlength{\\tabcolsep}{3pt}",
             f"\\caption{{{escape_latex(', '.join(words))}.{note}}}",
-            f"\\label{{tab:{table.id}{f'-{number + 1}' if number else ''}}}",
-            "\n\\par\\medskip\n".join(blocks),
+            f"\\label{{tab:{label}}}",
+            "\n\\par\\medskip\n".join(tabulars),
             "\\end{table}\n",
         ]
     )
@@ -368,20 +383,24 @@ def _float(table: Table, blocks: Sequence[str], number: int, protocol: str) -> s
 
 def _blocks(table: Table) -> list[list[int]]:
     """Which columns stand side by side; the names of the rows stand in every block."""
+    # the first column of texts holds the names of the rows
     shown = [at for at, column in enumerate(table.columns) if column.latex]
     names = next((at for at in shown if not table.columns[at].numeric), 0)
-    widths = {at: _width_pt(table, at) for at in shown}
-    available = COLUMN_PT - min(widths.get(names, 0.0), _NAMES_PT)
+    widths_pt = {at: _width_pt(table, at) for at in shown}
+    available_pt = COLUMN_PT - min(widths_pt.get(names, 0.0), _NAMES_PT)
+
+    # fill blocks from the left, a new one where the next column would not fit
     blocks: list[list[int]] = [[]]
-    for at in (at for at in shown if at != names):
-        by_group = groupby([*blocks[-1], at], key=lambda other: table.columns[other].group)
-        groups = [
-            (name, sum(widths[other] + _GAP_PT for other in group)) for name, group in by_group
-        ]
-        if (
-            blocks[-1]
-            and sum(max(width, _text_pt(name) + _GAP_PT) for name, width in groups) > available
+    for at in shown:
+        if at == names:
+            continue
+        needed_pt = 0.0
+        for group, members in groupby(
+            [*blocks[-1], at], key=lambda other: table.columns[other].group
         ):
+            columns_pt = sum(widths_pt[member] + _GAP_PT for member in members)
+            needed_pt += max(columns_pt, _text_pt(group) + _GAP_PT)
+        if blocks[-1] and needed_pt > available_pt:
             blocks.append([])
         blocks[-1].append(at)
     return [[names, *columns] for columns in blocks]
@@ -389,12 +408,12 @@ def _blocks(table: Table) -> list[list[int]]:
 
 def _width_pt(table: Table, at: int) -> float:
     """About how wide a column is, in points."""
-    return max(
-        map(_text_pt, [*(_plain(row[at]) for row in table.rows), *_heading(table.columns[at].name)])
-    )
+    cells = [_plain(row[at]) for row in table.rows]
+    return max(map(_text_pt, [*cells, *_heading(table.columns[at].name)]))
 
 
 def _text_pt(text: str) -> float:
+    """About how wide a text is, in points."""
     return sum(_DIGIT_PT if character.isdigit() else _LETTER_PT for character in text)
 
 
@@ -418,15 +437,19 @@ def _plain(cell: TableCell) -> str:
 
 def _tabulars(table: Table, columns: Sequence[int]) -> list[tuple[str, int]]:
     """Columns as one tabular, or as several where they have too many rows; each with its height in lines."""
+    # alignment of the columns; long names are set in lines of a fixed width
     chosen = [table.columns[at] for at in columns]
     wide = _width_pt(table, columns[0]) > _NAMES_PT
-    kinds = (f"p{{{_NAMES_PT:.0f}pt}}" if wide else "l") + "".join(
-        "r" if c.numeric else "l" for c in chosen[1:]
-    )
+    alignment = f"p{{{_NAMES_PT:.0f}pt}}" if wide else "l"
+    alignment += "".join("r" if column.numeric else "l" for column in chosen[1:])
+
+    # headings, with those of the groups above them
     groups = replace(table, columns=chosen).groups()
     head = [_groups(groups)] if any(name for name, _ in groups) else []
     head.append(" & ".join(_stacked(column.name) for column in chosen) + " \\\\")
     head_lines = len(head) + max(len(_heading(column.name)) for column in chosen) + 1
+
+    # lines of every row, and how many rows fit a column of a page
     names = [_plain(row[columns[0]]) for row in table.rows]
     lines = [ceil(1.2 * _text_pt(name) / _NAMES_PT) if wide else 1 for name in names]
     fitting = (MOST_LINES - head_lines) // max(lines, default=1)
@@ -436,45 +459,47 @@ def _tabulars(table: Table, columns: Sequence[int]) -> list[tuple[str, int]]:
         for position, row in enumerate(table.rows[first : first + fitting], first):
             if position in table.separators and body:
                 body.append("\\midrule")
-            name, *others = (_cell(row[at]) for at in columns)
+            name, *others = (_latex_cell(row[at]) for at in columns)
             body.append(" & ".join([f"\\raggedright {name}" if wide else name, *others]) + " \\\\")
         height = head_lines + sum(lines[first : first + fitting])
-        begin = [f"\\begin{{tabular}}{{@{{}}{kinds}@{{}}}}", "\\toprule", *head, "\\midrule"]
+        begin = [f"\\begin{{tabular}}{{@{{}}{alignment}@{{}}}}", "\\toprule", *head, "\\midrule"]
         parts.append(("\n".join([*begin, *body, "\\bottomrule", "\\end{tabular}"]), height))
     return parts
 
 
 def _stacked(name: str) -> str:
+    """A heading whose lines stand above each other."""
     lines = [escape_latex(line) for line in _heading(name)]
-    return lines[0] if len(lines) == 1 else "\\shortstack{" + " \\\\ ".join(lines) + "}"
+    if len(lines) == 1:
+        return lines[0]
+    return "\\shortstack{" + " \\\\ ".join(lines) + "}"
 
 
-def _cell(cell: TableCell) -> str:
+def _latex_cell(cell: TableCell) -> str:
+    """A cell: bold for the best, italic for the second, with its interval in small type."""
     if cell.emphasis == "failed":
         return "failed"
     text = escape_latex(cell.text.replace(OUR_BACK_END, ""))
     font = {"best": "bf", "second": "it"}.get(cell.emphasis)
-    text = (f"\\text{font}{{{text}}}" if text and font else text) + _STAR * (
-        OUR_BACK_END in cell.text
-    )
-    return (
-        f"{text}~{{\\scriptsize {escape_latex(cell.small)}}}"
-        if cell.small.startswith("[")
-        else text
-    )
+    if text and font:
+        text = f"\\text{font}{{{text}}}"
+    if OUR_BACK_END in cell.text:
+        text += _STAR
+    if cell.small.startswith("["):
+        text += f"~{{\\scriptsize {escape_latex(cell.small)}}}"
+    return text
 
 
 def _groups(groups: Sequence[tuple[str, int]]) -> str:
     """The line of headings above the columns' own, with a rule below each."""
     cells = []
     rules = []
-    at = 1
+    first = 1
     for name, width in groups:
-        cells.append(
-            f"\\multicolumn{{{width}}}{{c}}{{{escape_latex(name)}}}"
-            if name
-            else " & ".join([""] * width)
-        )
-        rules += [f"\\cmidrule(lr){{{at}-{at + width - 1}}}"] if name else []
-        at += width
+        if name:
+            cells.append(f"\\multicolumn{{{width}}}{{c}}{{{escape_latex(name)}}}")
+            rules.append(f"\\cmidrule(lr){{{first}-{first + width - 1}}}")
+        else:
+            cells.append(" & ".join([""] * width))
+        first += width
     return " & ".join(cells) + " \\\\ " + " ".join(rules)

@@ -34,7 +34,7 @@ from dynslam_bench.reports import ReportData, build_report, compare, figures, ma
 from dynslam_bench.reports.build_report import FEWER_PAGES, MOST_PAGES, masks_section, pages_for
 from dynslam_bench.reports.html import board_page
 from dynslam_bench.reports.html.run_pages import broken, exact_shares
-from dynslam_bench.reports.model import load
+from dynslam_bench.reports.model import workers
 from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.tables import table as tables
 from dynslam_bench.reports.tables.leaderboard import repeatability
@@ -298,8 +298,8 @@ def refuse(kind):
 
 @pytest.fixture
 def two_cores(monkeypatch):
-    monkeypatch.setattr(load, "MANY", 1)
-    monkeypatch.setattr(load.os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
+    monkeypatch.setattr(workers, "MANY", 1)
+    monkeypatch.setattr(workers.os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
 
 
 def test_workers_make_the_same_report(tmp_path, two_cores, monkeypatch):
@@ -310,7 +310,7 @@ def test_workers_make_the_same_report(tmp_path, two_cores, monkeypatch):
         store, tmp_path / "helped", command="c", on_progress=lambda *event: events.append(event)
     )
     (store.root / "index.sqlite").unlink()  # or there would be nothing left to read
-    monkeypatch.setattr(load, "MANY", 1000)
+    monkeypatch.setattr(workers, "MANY", 1000)
     build_report(store, tmp_path / "alone", command="c")
     alone = contents(tmp_path / "alone")
     helped = contents(tmp_path / "helped")
@@ -332,17 +332,17 @@ def test_workers_run_no_script_of_the_caller_and_their_errors_and_deaths_are_nam
     (tmp_path / "script.py").write_text(
         "raise SystemExit('a script need not guard what it does at import')"
     )
-    with load.worker_pool(1) as pool:
-        assert list(load.run_jobs(pool, abs, [(-2,), (3,)])) == [2, 3]
+    with workers.worker_pool(1) as pool:
+        assert list(workers.run_jobs(pool, abs, [(-2,), (3,)])) == [2, 3]
         for kind, error in (("raise", ReportError), ("die", InfrastructureError)):
             with pytest.raises(error):
-                list(load.run_jobs(pool, refuse, [(kind,)] * 3))
+                list(workers.run_jobs(pool, refuse, [(kind,)] * 3))
 
 
-@pytest.mark.parametrize(("runs", "cores"), [(load.MANY - 1, 8), (10_000, 1)])
+@pytest.mark.parametrize(("runs", "cores"), [(workers.MANY - 1, 8), (10_000, 1)])
 def test_few_runs_and_one_core_need_no_workers(runs, cores, monkeypatch):
-    monkeypatch.setattr(load.os, "sched_getaffinity", lambda _: set(range(cores)), raising=False)
-    with load.worker_pool(runs) as pool:
+    monkeypatch.setattr(workers.os, "sched_getaffinity", lambda _: set(range(cores)), raising=False)
+    with workers.worker_pool(runs) as pool:
         assert pool is None
 
 

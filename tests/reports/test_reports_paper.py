@@ -19,7 +19,7 @@ from dynslam_bench.reports.figures import FIGURES, bar_figure
 from dynslam_bench.reports.model.published import (
     HOW,
     KINDS,
-    claimed,
+    claimed_results,
     published,
     published_for,
     records,
@@ -240,7 +240,9 @@ def test_a_table_that_is_right_passes(monkeypatch):
         if name == "A":
             rows.append((table, "A", sequence, quantity, "improvement_percent", round(gain, 4), 4))
     monkeypatch.setattr(
-        audit_module, "claimed", lambda: pd.DataFrame(rows, columns=claimed().columns)
+        audit_module,
+        "claimed_results",
+        lambda: pd.DataFrame(rows, columns=claimed_results().columns),
     )
     audited = audit_paper()
     for check in ("rmse-identity", "rmse-at-least-mean", "improvement", "better-than-not-moving"):

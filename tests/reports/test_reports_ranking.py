@@ -12,7 +12,7 @@ from scipy import stats
 from dynslam_bench.cli.output import report_table
 from dynslam_bench.core.errors import ReportError
 from dynslam_bench.evaluation.protocol import MONOCULAR, get_protocol
-from dynslam_bench.reports.html.board_page import ratios_content
+from dynslam_bench.reports.html.board_page import ratios_data
 from dynslam_bench.reports.model.board import OVERALL, category_boards, compare_pairs, make_board
 from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.model.statistics import (
@@ -285,7 +285,7 @@ def test_two_trackers_side_by_side_have_the_numbers_of_the_board(boards):
     board = boards[OVERALL]
     assert len(set(board.weights.values())) == 2, "the categories have unequal sizes"
     reference = board.trackers.index(board.reference)
-    shown = ratios_content(board)
+    shown = ratios_data(board)
     assert len(shown) == len(board.trackers) * (len(board.trackers) - 1) // 2
     for a, b, *ratio, sequences, verdict in (line for line in shown if reference in line[:2]):
         standing = board.standing_by_key[board.trackers[b if a == reference else a]]
