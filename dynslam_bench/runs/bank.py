@@ -37,19 +37,11 @@ from dynslam_bench.core import (
 from dynslam_bench.core.download import download
 from dynslam_bench.core.errors import hide_folder_in_messages
 from dynslam_bench.core.records import Record, digest, validated
+from dynslam_bench.runs.copying import merge
 from dynslam_bench.runs.exchange.transfer import import_trajectory
+from dynslam_bench.runs.layout import FINAL, ONLINE, RUN_FILE, Unreadable, Which
 from dynslam_bench.runs.record import RunRecord, run_id_of
-from dynslam_bench.runs.store import (
-    FINAL,
-    ONLINE,
-    RUN_FILE,
-    Merged,
-    RunStore,
-    Unreadable,
-    Which,
-    merge,
-    open_store,
-)
+from dynslam_bench.runs.store import Merged, RunStore, open_store
 
 SUMS = "SHA256SUMS"
 UNFINISHED = ".unfinished"

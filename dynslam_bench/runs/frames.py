@@ -18,8 +18,9 @@ from pydantic.dataclasses import dataclass as validated
 from dynslam_bench.contracts import stage_seconds
 from dynslam_bench.core import DynslamError, RunError, read_lines, reason_of, storable
 from dynslam_bench.geometry import Trajectory, format_ns, ns_of, se3, write_tum
+from dynslam_bench.runs.layout import ONLINE
 from dynslam_bench.runs.record import RunRecord, StageTime
-from dynslam_bench.runs.store import ONLINE, RunStore
+from dynslam_bench.runs.store import RunStore
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -41,7 +41,8 @@ from dynslam_bench.geometry import Camera, load_tum, read_kitti
 from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.runs import RunRecord, RunStore, artifacts, bank, frames, running
 from dynslam_bench.runs.exchange import formats, transfer
-from dynslam_bench.runs.store import INDEX_FILE, list_runs
+from dynslam_bench.runs.layout import INDEX_FILE
+from dynslam_bench.runs.listing import list_runs
 from dynslam_bench.segmentation import recorded
 from dynslam_bench.segmentation.networks import loading, onnx_header, onnx_layout
 from dynslam_bench.segmentation.networks.backbone import NetworkConfig

@@ -33,10 +33,11 @@ from dynslam_bench.runs.exchange.formats import (
     write_pose_table,
 )
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE, write_stored
+from dynslam_bench.runs.layout import Which
 from dynslam_bench.runs.record import RunRecord, SequenceInfo, TrackerInfo, run_id_of
 from dynslam_bench.runs.running import judge_coverage, part_digest, sequence_info
 from dynslam_bench.runs.spec import place_of
-from dynslam_bench.runs.store import RunStore, Which, open_store
+from dynslam_bench.runs.store import RunStore, open_store
 from dynslam_bench.sequences.catalogue import entry_of, parse_frames
 from dynslam_bench.sequences.tags import motion_tags
 from dynslam_bench.sequences.view import Part, part_of
