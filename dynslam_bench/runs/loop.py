@@ -31,9 +31,9 @@ from dynslam_bench.runs.exchange.recording import (
     write_recording,
 )
 from dynslam_bench.runs.frames import FRAMES_FILE, FrameRow
-from dynslam_bench.runs.process.child import at
+from dynslam_bench.runs.layout import FINAL
+from dynslam_bench.runs.process.failures import at
 from dynslam_bench.runs.spec import RunSpec
-from dynslam_bench.runs.store import FINAL
 
 _BEAT_S = 5.0
 Send = Callable[[dict[str, Any]], None]

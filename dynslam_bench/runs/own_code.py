@@ -30,30 +30,31 @@ DEGRADED_FRAMES = "envs.wrappers"
 FINDERS = ("trackers.registry", "sequences.catalogue", "sequences.synthetic")
 """They look up what a name stands for; what they find is part of the identity by itself."""
 BESIDE_THE_LOOP = (
-    *(
-        "envs.rendering",
-        "runs.artifacts",
-        "runs.exchange.recording",
-        "runs.process.child",
-        "runs.record",
-        "runs.store",
-    ),
-    *("envs.wrappers", "segmentation.build_segmenter", "sequences.decoded"),
+    "envs.rendering",
+    "envs.wrappers",
+    "runs.artifacts",
+    "runs.exchange.recording",
+    "runs.layout",
+    "runs.process.failures",
+    "runs.record",
+    "runs.store",
+    "segmentation.build_segmenter",
+    "sequences.decoded",
 )
 """What the environment and the loop use to draw and to store; masks count with the systems that have them."""
 WITH_PLUGINS = (
-    *(
-        "contracts",
-        "core",
-        "culling",
-        "envs",
-        "evaluation",
-        "features",
-        "flow",
-        "geometry",
-        "segmentation",
-    ),
-    *("sequences", "slam", "trackers"),
+    "contracts",
+    "core",
+    "culling",
+    "envs",
+    "evaluation",
+    "features",
+    "flow",
+    "geometry",
+    "segmentation",
+    "sequences",
+    "slam",
+    "trackers",
 )
 """The packages that a plug-in may use: what it imports of this package is known only while it runs."""
 

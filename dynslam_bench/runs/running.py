@@ -50,8 +50,8 @@ from dynslam_bench.runs.frames import FRAMES_FILE, FrameLog
 from dynslam_bench.runs.identity import ResolvedRun, Resolver, check_unchanged, resolve
 from dynslam_bench.runs.lookup import LookUp
 from dynslam_bench.runs.own_code import is_file, module_of, plugins_of_run
-from dynslam_bench.runs.process.child import LOG_FILE, READS_FILE
-from dynslam_bench.runs.process.fork_server import Child, ForkServer, make_job
+from dynslam_bench.runs.process.fork_server import Child, ForkServer
+from dynslam_bench.runs.process.jobs import LOG_FILE, READS_FILE, make_job
 from dynslam_bench.runs.process.supervisor import (
     LONGEST_LOG,
     LONGEST_YET,

@@ -17,7 +17,6 @@ main script and may not be used in daemonic processes, see ``docs/decisions/fork
 
 import atexit
 import contextlib
-import ctypes
 import importlib
 import json
 import os
@@ -27,9 +26,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Collection, Iterable
 from multiprocessing.connection import Connection, Pipe, wait
-from pathlib import Path
 from typing import Any
 
 import psutil
@@ -38,31 +35,38 @@ from dynslam_bench.core import InfrastructureError, sweep
 from dynslam_bench.core.module_graph import module_graph
 from dynslam_bench.core.plugins import module_command
 from dynslam_bench.core.reads import ImportPath
+from dynslam_bench.runs.process.child import main as make_run
+from dynslam_bench.runs.process.jobs import THREAD_VARIABLES
+from dynslam_bench.runs.process.jobs import make_job as make_job
+from dynslam_bench.runs.process.process_trees import (
+    adopt_orphans,
+    end_children,
+    end_processes,
+    end_tree,
+)
 
 _CHILD = "dynslam_bench.runs.process.child"
 PRELOADED = (
-    *("numpy", "scipy.spatial.transform", "cv2", "torch", "numba", "gymnasium"),
-    *("dynslam_bench.envs", "dynslam_bench.evaluation.evaluate"),
-    *("dynslam_bench.slam.pipeline", "dynslam_bench.slam.backend", "dynslam_bench.features.orb"),
-    *("dynslam_bench.flow.moth_flame", "dynslam_bench.segmentation.schedule", _CHILD),
-    *(
-        "dynslam_bench.runs.loop",
-        "dynslam_bench.trackers.registry",
-        "dynslam_bench.sequences.synthetic.sequence",
-    ),
+    "numpy",
+    "scipy.spatial.transform",
+    "cv2",
+    "torch",
+    "numba",
+    "gymnasium",
+    "dynslam_bench.envs",
+    "dynslam_bench.evaluation.evaluate",
+    "dynslam_bench.slam.pipeline",
+    "dynslam_bench.slam.backend",
+    "dynslam_bench.features.orb",
+    "dynslam_bench.flow.moth_flame",
+    "dynslam_bench.segmentation.schedule",
+    "dynslam_bench.runs.loop",
+    "dynslam_bench.trackers.registry",
+    "dynslam_bench.sequences.synthetic.sequence",
 )
-THREAD_VARIABLES = (
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-    "BLIS_NUM_THREADS",
-)
-"""Set to 1 before anything is imported: BLAS must not spin up threads of its own beside the run's."""
+"""What the server imports before it forks."""
 START_VARIABLE = "DYNSLAM_BENCH_START"
 """``fork`` or ``fresh``: how children start. Forking is the default on Linux; macOS' libraries do not survive it."""
-_SET_PARENT_DEATH_SIGNAL = 1
-_SET_CHILD_SUBREAPER = 36
-_END_S = 5.0
 _REAP_S = 10.0
 """How long `Child.close` waits for the report of the child's end."""
 
@@ -224,28 +228,6 @@ class Child:
             sweep()
 
 
-def make_job(work: str, folder: Path | str, **details: Any) -> dict[str, Any]:
-    """A job for a child, as JSON takes it.
-
-    Args:
-        work: ``module:function`` that does it; called with the job, a function that tells the
-            parent something, and one that says whether the parent wants an early end.
-        folder: Where the child's log and what it finds go.
-        details: What `work` wants to know; ``spec`` with the ``threads`` of the run among it.
-
-    Returns:
-        The job; the child does it in this process's working folder, with its environment and import
-        path.
-    """
-    environment = {name: text for name, text in os.environ.items() if name not in THREAD_VARIABLES}
-    context = {
-        "environment": environment,
-        "working_folder": str(Path.cwd()),
-        "path": list(sys.path),
-    }
-    return {"work": work, "folder": str(folder), **context, **details}
-
-
 class _Server:
     """The server's loop: it waits for requests of the parent and for ends of children; SIGTERM ends it."""
 
@@ -309,9 +291,7 @@ class _Server:
             self.control.close()
             for inherited in (status_fd, *self.wake_fds, *self.runs.values()):
                 os.close(inherited)
-            from dynslam_bench.runs.process.child import main
-
-            code = main(Connection(connection_fd))
+            code = make_run(Connection(connection_fd))
         finally:
             os._exit(code)
 
@@ -364,59 +344,6 @@ def serve(fd: int, start: str) -> None:
             ImportPath(sys.path).read_all()
     adopt_orphans()
     _Server(control, start).run()
-
-
-# -- process trees ---------------------------------------------------------------------------------
-
-
-def adopt_orphans(*, die_with_parent: bool = False) -> None:
-    """On Linux become the parent of every descendant whose own parent ends.
-
-    Args:
-        die_with_parent: Whether this process is killed when the thread that forked it ends;
-            elsewhere than on Linux the closed connection has to do.
-    """
-    if sys.platform == "linux":
-        prctl = ctypes.CDLL(None).prctl
-        prctl(_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
-        if die_with_parent:
-            prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
-
-
-def process_tree(pid: int) -> list[psutil.Process]:
-    """A process, first, and all its descendants; empty if it has ended."""
-    try:
-        top = psutil.Process(pid)
-        return [top, *top.children(recursive=True)]
-    except psutil.Error:
-        return []
-
-
-def end_processes(processes: Iterable[psutil.Process]) -> None:
-    """Kill those that still run; a process that has taken the number of one that ended is left alone."""
-    for process in processes:
-        with contextlib.suppress(psutil.Error):
-            process.kill()
-
-
-def end_tree(pid: int) -> None:
-    """Kill a process with its process group and all its descendants, whatever their groups."""
-    members = process_tree(pid)
-    with contextlib.suppress(ProcessLookupError, PermissionError):
-        os.killpg(pid, signal.SIGKILL)
-    end_processes(members)
-
-
-def end_children(keep: Collection[int] = ()) -> None:
-    """Kill and reap all descendants of this process but the children in `keep` and their descendants."""
-    deadline = time.monotonic() + _END_S
-    while time.monotonic() < deadline:
-        ending = [child for child in psutil.Process().children() if child.pid not in keep]
-        if not ending:
-            return
-        for child in ending:
-            end_processes(process_tree(child.pid))
-        psutil.wait_procs(ending, timeout=0.1)
 
 
 if __name__ == "__main__":

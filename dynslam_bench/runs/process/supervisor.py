@@ -14,7 +14,8 @@ from typing import Any
 import psutil
 
 from dynslam_bench.core import InfrastructureError
-from dynslam_bench.runs.process.fork_server import Child, process_tree
+from dynslam_bench.runs.process.fork_server import Child
+from dynslam_bench.runs.process.process_trees import process_tree
 from dynslam_bench.runs.record import Status
 from dynslam_bench.runs.spec import Limits
 
