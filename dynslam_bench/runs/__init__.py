@@ -14,9 +14,10 @@ if TYPE_CHECKING:
     from dynslam_bench.runs.frames import load_frames
     from dynslam_bench.runs.identity import ResolvedRun, resolve
     from dynslam_bench.runs.listing import list_runs, rescore
+    from dynslam_bench.runs.many import Plan, RunEvent, pictures_asked, run_many
     from dynslam_bench.runs.record import FAILED, MetricRecord, RunRecord
     from dynslam_bench.runs.rows import part_words, run_row
-    from dynslam_bench.runs.running import Plan, RunEvent, pictures_asked, run_many, run_one
+    from dynslam_bench.runs.running import run_one
     from dynslam_bench.runs.spec import Limits, RunSpec
     from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RunStore, open_store, score
 
@@ -33,17 +34,17 @@ _DEFINED_IN = {
     "MetricRecord": "record",
     "open_store": "store",
     "part_words": "rows",
-    "pictures_asked": "running",
+    "pictures_asked": "many",
     "read_trajectory": "exchange.formats",
     "rescore": "listing",
     "resolve": "identity",
-    "Plan": "running",
+    "Plan": "many",
     "ResolvedRun": "identity",
-    "run_many": "running",
+    "run_many": "many",
     "run_one": "running",
     "run_row": "rows",
     "score": "store",
-    "RunEvent": "running",
+    "RunEvent": "many",
     "RunRecord": "record",
     "RunSpec": "spec",
     "RunStore": "store",

@@ -34,8 +34,8 @@ from dynslam_bench.runs.exchange.formats import (
 )
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE, write_stored
 from dynslam_bench.runs.layout import Which
+from dynslam_bench.runs.make_record import judge_coverage, part_digest, sequence_info
 from dynslam_bench.runs.record import RunRecord, SequenceInfo, TrackerInfo, run_id_of
-from dynslam_bench.runs.running import judge_coverage, part_digest, sequence_info
 from dynslam_bench.runs.spec import place_of
 from dynslam_bench.runs.store import RunStore, open_store
 from dynslam_bench.sequences.catalogue import entry_of, parse_frames
