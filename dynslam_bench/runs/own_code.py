@@ -11,7 +11,8 @@ from typing import Any
 
 from dynslam_bench.contracts import Sequence, TrackerSpec
 from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, ModuleGraph, module_graph
-from dynslam_bench.core.plugins import Registry, used
+from dynslam_bench.core.plugins import Registry
+from dynslam_bench.core.plugins import used as used_plugins
 from dynslam_bench.core.reads import Anchors
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.features.registry import FEATURES
@@ -112,9 +113,10 @@ def modules_by_part(graph: ModuleGraph, parts: Collection[str]) -> dict[str, lis
 
 def modules_of_run(graph: ModuleGraph, parts: Collection[str]) -> list[str]:
     """The modules of this package that decide a run's result, sorted; see `modules_by_part`."""
-    return sorted(
-        {module for modules in modules_by_part(graph, parts).values() for module in modules}
-    )
+    used: set[str] = set()
+    for modules in modules_by_part(graph, parts).values():
+        used.update(modules)
+    return sorted(used)
 
 
 def modules_for_plugins(graph: ModuleGraph) -> list[str]:
@@ -149,7 +151,7 @@ def plugins_of_run(tracker: str, settings: Settings, source: str, sequence: str)
             names.append((FLOWS, group.plugin or group.method))
     if source not in ("", "none"):
         names.append((SEGMENTERS, segmenter_of(source)))
-    return used(names)
+    return used_plugins(names)
 
 
 def module_of(part: str) -> str:
@@ -195,9 +197,10 @@ def anchors_of(tracker: TrackerSpec, parts: Iterable[str]) -> Anchors:
         tracker: The tracker.
         parts: See `parts_of_run`.
     """
-    files = [Path(module_of(part)).absolute() for part in parts if is_file(part)]
     if is_file(tracker.entry_point):
         files = [Path(module_of(tracker.entry_point)).absolute()]
+    else:
+        files = [Path(module_of(part)).absolute() for part in parts if is_file(part)]
     if not files:
         return Anchors(plugin=None, work=Path.cwd())
     first = min(files, key=lambda file: (file.name, file))
