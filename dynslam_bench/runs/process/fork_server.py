@@ -46,6 +46,7 @@ from dynslam_bench.runs.process.process_trees import (
 )
 
 _CHILD = "dynslam_bench.runs.process.child"
+"""The module that a fresh interpreter runs."""
 PRELOADED = (
     "numpy",
     "scipy.spatial.transform",
@@ -67,7 +68,7 @@ PRELOADED = (
 """What the server imports before it forks."""
 START_VARIABLE = "DYNSLAM_BENCH_START"
 """``fork`` or ``fresh``: how children start. Forking is the default on Linux; macOS' libraries do not survive it."""
-_REAP_S = 10.0
+_CLOSE_S = 10.0
 """How long `Child.close` waits for the report of the child's end."""
 
 
@@ -97,13 +98,14 @@ class ForkServer:
             InfrastructureError: The server cannot be started.
         """
         read_fd, write_fd = os.pipe()
+        request = ([b"c"], [child_fd, write_fd])
         try:
             with self._lock:
                 try:
-                    socket.send_fds(self._connected(), [b"c"], [child_fd, write_fd])
+                    socket.send_fds(self._connected(), *request)
                 except OSError:  # it has just died
                     self._close()
-                    socket.send_fds(self._connected(), [b"c"], [child_fd, write_fd])
+                    socket.send_fds(self._connected(), *request)
             return read_fd
         except OSError as error:
             os.close(read_fd)
@@ -119,6 +121,7 @@ class ForkServer:
             self._close()
 
     def _connected(self) -> socket.socket:
+        """The socket to a server that runs; starts one where there is none."""
         is_ours = self._owner == os.getpid()  # after a fork the parent's server is not
         if self._running is not None and is_ours and self._running[1].poll() is None:
             return self._running[0]
@@ -136,6 +139,7 @@ class ForkServer:
         return ours
 
     def _close(self) -> None:
+        """Stop the server; that of the process that this one was forked from is left alone."""
         if self._running is not None and self._owner == os.getpid():
             control, process = self._running
             control.close()
@@ -202,6 +206,7 @@ class Child:
                 self.server_died = not self.lost
                 self.lost = self.lost or "the fork server was ended from outside"
                 break
+            # a line may come in two parts
             *lines, self._buffer = (self._buffer + data).split(b"\n")
             for message in map(json.loads, lines):
                 self.pid = message.get("pid", self.pid)
@@ -219,7 +224,7 @@ class Child:
         """Kill it if it still runs, wait until it and all that it started have ended, and release the pipes."""
         self.kill()
         self.connection.close()
-        deadline = time.monotonic() + _REAP_S
+        deadline = time.monotonic() + _CLOSE_S
         while self.poll() is None and time.monotonic() < deadline:
             wait([self.status_fd], 0.1)
         os.close(self.status_fd)
@@ -229,36 +234,47 @@ class Child:
 
 
 class _Server:
-    """The server's loop: it waits for requests of the parent and for ends of children; SIGTERM ends it."""
+    """The server's loop: it waits for requests of the parent and for ends of children; SIGTERM ends it.
+
+    Args:
+        control: The server's end of the socket to the parent.
+        start: ``fork`` or ``fresh``.
+    """
 
     def __init__(self, control: socket.socket, start: str) -> None:
-        self.control = control
-        self.start = start
-        # helpers of libraries
-        self.own = frozenset(child.pid for child in psutil.Process().children())
-        self.runs: dict[int, int] = {}
-        self.wake_fds = os.pipe()
-        for end in self.wake_fds:
+        self._control = control
+        self._start = start
+        # processes that libraries have started when they were imported
+        self._helpers = frozenset(child.pid for child in psutil.Process().children())
+        # write ends of the status pipes, by the process id of each run
+        self._status_fds: dict[int, int] = {}
+        # signals write into a pipe, which wakes the loop
+        self._wake_fds = os.pipe()
+        for end in self._wake_fds:
             os.set_blocking(end, False)
-        signal.set_wakeup_fd(self.wake_fds[1], warn_on_full_buffer=False)
-        signal.signal(signal.SIGCHLD, lambda *_: None)  # it wakes the loop
+        signal.set_wakeup_fd(self._wake_fds[1], warn_on_full_buffer=False)
+        signal.signal(signal.SIGCHLD, lambda *_: None)
         signal.signal(signal.SIGTERM, lambda *_: sys.exit())
 
     def run(self) -> None:
+        """Serve until the parent closes the socket or SIGTERM comes; end all children then."""
         with contextlib.suppress(SystemExit):
-            while self.control not in wait([self.control, self.wake_fds[0]]) or self._accept():
+            while True:
+                ready = wait([self._control, self._wake_fds[0]])
+                if self._control in ready and not self._accept():
+                    break
                 with contextlib.suppress(BlockingIOError):
-                    os.read(self.wake_fds[0], 4096)
+                    os.read(self._wake_fds[0], 4096)
                 self._reap()
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # what follows ends by itself
-        for pid in self.runs:
+        for pid in self._status_fds:
             end_tree(pid)
         end_children()
         sweep()
 
     def _accept(self) -> bool:
         """Start the child that is asked for; False if the parent has closed the socket."""
-        message, fds, _, _ = socket.recv_fds(self.control, 1, 2)
+        message, fds, _, _ = socket.recv_fds(self._control, 1, 2)
         if not message:
             return False
         connection_fd, status_fd = fds
@@ -266,7 +282,7 @@ class _Server:
         try:
             pid = (
                 self._fork(connection_fd, status_fd)
-                if self.start == "fork"
+                if self._start == "fork"
                 else _spawn(connection_fd)
             )
         except OSError as error:
@@ -274,7 +290,7 @@ class _Server:
             os.close(status_fd)
         else:
             _tell(status_fd, {"pid": pid})
-            self.runs[pid] = status_fd
+            self._status_fds[pid] = status_fd
         os.close(connection_fd)
         return True
 
@@ -288,8 +304,8 @@ class _Server:
             signal.set_wakeup_fd(-1)
             for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM, signal.SIGCHLD):
                 signal.signal(number, signal.SIG_DFL)
-            self.control.close()
-            for inherited in (status_fd, *self.wake_fds, *self.runs.values()):
+            self._control.close()
+            for inherited in (status_fd, *self._wake_fds, *self._status_fds.values()):
                 os.close(inherited)
             code = make_run(Connection(connection_fd))
         finally:
@@ -297,13 +313,14 @@ class _Server:
 
     def _reap(self) -> None:
         """Reap the runs that have ended, end what they have left behind, then report them."""
-        waited = [os.waitpid(pid, os.WNOHANG) for pid in self.runs]
-        ended = [(self.runs.pop(pid), status) for pid, status in waited if pid]
+        waited = [os.waitpid(pid, os.WNOHANG) for pid in self._status_fds]
+        # status pipe and exit status of each run that has ended
+        ended = [(self._status_fds.pop(pid), status) for pid, status in waited if pid]
         # at once: the system may give the number to another process, which is not to be killed
         for status_fd, _ in ended:
             _tell(status_fd, {"pid": 0})
         if ended:
-            end_children({*self.runs, *self.own})
+            end_children({*self._status_fds, *self._helpers})
             sweep()
         for status_fd, status in ended:
             _tell(status_fd, {"exit": os.waitstatus_to_exitcode(status)})
@@ -320,6 +337,7 @@ def _spawn(connection_fd: int) -> int:
 
 
 def _tell(fd: int, message: dict[str, Any]) -> None:
+    """Write a line of JSON into the status pipe of a run."""
     with contextlib.suppress(OSError):  # the parent may have closed its end
         os.write(fd, json.dumps(message).encode() + b"\n")
 
@@ -329,21 +347,25 @@ def serve(fd: int, start: str) -> None:
     control = socket.socket(fileno=fd)
     for ignored in (signal.SIGINT, signal.SIGHUP):
         signal.signal(ignored, signal.SIG_IGN)
-    for name in PRELOADED if start == "fork" else ():
-        with contextlib.suppress(Exception):  # the child meets it again and says what is wrong
-            importlib.import_module(name)
     if start == "fork":
-        with contextlib.suppress(Exception):  # what is not loaded here each child loads itself
-            importlib.import_module("dynslam_bench.core.kernel_cache").load_kernels()
-            # remembered: the keys of the children's stage caches are of the code that is loaded
-            # here
-            module_graph()
-            # it dates what was loaded here; children that record what plug-ins read find the
-            # distributions read already
-            importlib.import_module("dynslam_bench.runs.process.recorder")
-            ImportPath(sys.path).read_all()
+        _preload()
     adopt_orphans()
     _Server(control, start).run()
+
+
+def _preload() -> None:
+    """Load what the children need, so that a forked one has it at once."""
+    for name in PRELOADED:
+        with contextlib.suppress(Exception):  # the child meets it again and says what is wrong
+            importlib.import_module(name)
+    with contextlib.suppress(Exception):  # what is not loaded here each child loads itself
+        importlib.import_module("dynslam_bench.core.kernel_cache").load_kernels()
+        # remembered: the keys of the children's stage caches are of the code that is loaded here
+        module_graph()
+        # it dates what was loaded here; children that record what plug-ins read find the
+        # distributions read already
+        importlib.import_module("dynslam_bench.runs.process.recorder")
+        ImportPath(sys.path).read_all()
 
 
 if __name__ == "__main__":
