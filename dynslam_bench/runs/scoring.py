@@ -25,7 +25,7 @@ _WORK = f"{__name__}:score_job"
 def score_apart(
     store: RunStore, run_id: str, protocol: Protocol, *, again: bool = False
 ) -> MetricRecord:
-    """What `RunStore.score` gives, computed in a process of its own.
+    """The metrics of a stored run under a protocol, computed in a process of its own; see `RunStore.score`.
 
     Raises:
         InfrastructureError: The process could not do it.
