@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from dynslam_bench.evaluation import Protocol
     from dynslam_bench.reports import ReportPaths
     from dynslam_bench.runs import Plan, RunEvent
-    from dynslam_bench.runs.running import OnFault
+    from dynslam_bench.runs.many import OnFault
     from dynslam_bench.tuning import Study, StudySpec, StudySummary
 
 R = TypeVar("R", bound=Record)

@@ -8,49 +8,43 @@ from elsewhere beside them, and `export_run` writes them in the formats of other
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from dynslam_bench.runs.copying import merge
     from dynslam_bench.runs.exchange.formats import read_trajectory
     from dynslam_bench.runs.exchange.transfer import Exported, export_run, import_trajectory
     from dynslam_bench.runs.frames import load_frames
     from dynslam_bench.runs.identity import ResolvedRun, resolve
+    from dynslam_bench.runs.listing import list_runs, rescore
+    from dynslam_bench.runs.many import Plan, RunEvent, pictures_asked, run_many
     from dynslam_bench.runs.record import FAILED, MetricRecord, RunRecord
-    from dynslam_bench.runs.running import Plan, RunEvent, pictures_asked, run_many, run_one
+    from dynslam_bench.runs.rows import part_words, run_row
+    from dynslam_bench.runs.running import run_one
     from dynslam_bench.runs.spec import Limits, RunSpec
-    from dynslam_bench.runs.store import (
-        DEFAULT_PROTOCOL,
-        RunStore,
-        list_runs,
-        merge,
-        open_store,
-        part_words,
-        rescore,
-        run_row,
-        score,
-    )
+    from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RunStore, open_store, score
 
-_HOMES = {
+_DEFINED_IN = {
     "DEFAULT_PROTOCOL": "store",
     "export_run": "exchange.transfer",
     "Exported": "exchange.transfer",
     "FAILED": "record",
     "import_trajectory": "exchange.transfer",
     "Limits": "spec",
-    "list_runs": "store",
+    "list_runs": "listing",
     "load_frames": "frames",
-    "merge": "store",
+    "merge": "copying",
     "MetricRecord": "record",
     "open_store": "store",
-    "part_words": "store",
-    "pictures_asked": "running",
+    "part_words": "rows",
+    "pictures_asked": "many",
     "read_trajectory": "exchange.formats",
-    "rescore": "store",
+    "rescore": "listing",
     "resolve": "identity",
-    "Plan": "running",
+    "Plan": "many",
     "ResolvedRun": "identity",
-    "run_many": "running",
+    "run_many": "many",
     "run_one": "running",
-    "run_row": "store",
+    "run_row": "rows",
     "score": "store",
-    "RunEvent": "running",
+    "RunEvent": "many",
     "RunRecord": "record",
     "RunSpec": "spec",
     "RunStore": "store",
@@ -88,8 +82,8 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """Load what is asked for: the child, the store and the records need little, the environments much."""
-    if name not in _HOMES:
+    if name not in _DEFINED_IN:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    return getattr(import_module(f"{__name__}.{_DEFINED_IN[name]}"), name)

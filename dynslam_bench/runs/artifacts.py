@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -22,16 +23,18 @@ from dynslam_bench.slam.map_files import MAP_FILE, write_keyframes_csv, write_pl
 from dynslam_bench.slam.run_figure import write_run_figure
 
 SNAPSHOTS_FILE = "snapshots.npz"
+"""Holds the snapshots of a run."""
 SPREAD = 24
 """Frames that are kept evenly spread over a run."""
 MOST_FRAMES = 1000
-"""Of a file that is read."""
+"""A file with more snapshots is damaged."""
 WORST = 6
 """Frames that are kept besides: those with the largest frame-to-frame error, and as many on which tracking was lost."""
 PICTURE = "frame_{:06d}.webp"
 """Name of the picture of a frame, as its tracker saw it, in the folder of its run."""
 _PICTURE_WIDTH = 400
 _PICTURE_QUALITY = 55
+"""Of the WebP files, 1 to 100."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,18 +59,31 @@ class Snapshot:
     @property
     def mask(self) -> NDArray[np.bool_] | None:
         """Pixels held for dynamic, bool ``[H, W]``; None where the tracker gave no mask."""
-        return (
-            None
-            if self.packed is None
-            else np.unpackbits(self.packed, axis=1, count=self.width).view(np.bool_)
-        )
+        if self.packed is None:
+            return None
+        return np.unpackbits(self.packed, axis=1, count=self.width).view(np.bool_)
 
 
 def spread(frames: int, count: int = SPREAD) -> list[int]:
     """At most `count` frames evenly spread over so many, the first and the last among them."""
-    return sorted(
-        {int(index) for index in np.linspace(0, max(frames - 1, 0), min(count, frames)).round()}
-    )
+    indices = np.linspace(0, max(frames - 1, 0), min(count, frames)).round()
+    return sorted({int(index) for index in indices})
+
+
+class _WorstFrame(NamedTuple):
+    """A frame with a large frame-to-frame error.
+
+    Attributes:
+        error_m: The translational error in metres.
+        shot: Its snapshot; None if its tracker shows neither features nor a mask.
+        index: Its index in the run's part of the sequence.
+        picture: Its picture.
+    """
+
+    error_m: float
+    shot: Snapshot | None
+    index: int
+    picture: Image
 
 
 class SnapshotWriter:
@@ -85,30 +101,33 @@ class SnapshotWriter:
         self._spread = set(spread(frames))
         self._folder = folder
         self._even: list[Snapshot] = []
-        self._worst: list[tuple[float, Snapshot | None, int, Image]] = []
-        self._size = (0, 0)
+        self._worst: list[_WorstFrame] = []  # with the largest error first
+        self._size = (0, 0)  # height and width
         self._state = ""
         self._losses = 0
 
     def add(self, outcome: FrameOutcome, rgb: Image, result: TrackResult) -> None:
         """Keep the frame if it is one of those spread over the run, of the worst so far, or the first of a loss."""
-        error = None if outcome.error is None else outcome.error.frame_trans_m
-        lost = outcome.state == "lost" and self._state == "ok"
+        error_m = None if outcome.error is None else outcome.error.frame_trans_m
+        is_loss = outcome.state == "lost" and self._state == "ok"
         self._state = outcome.state
-        self._losses += lost
-        kept = outcome.index in self._spread or (lost and self._losses <= WORST)
-        bad = error is not None and (len(self._worst) < WORST or error > self._worst[-1][0])
-        if not kept and not bad:
+        self._losses += is_loss
+        is_kept = outcome.index in self._spread or (is_loss and self._losses <= WORST)
+        is_among_worst = error_m is not None and (
+            len(self._worst) < WORST or error_m > self._worst[-1].error_m
+        )
+        if not is_kept and not is_among_worst:
             return
         shot = snapshot_of(outcome.index, result)
         self._size = (rgb.shape[0], rgb.shape[1])
         picture = annotated(rgb, result, _PICTURE_WIDTH)
-        if kept:
-            self._even += [] if shot is None else [shot]
+        if is_kept:
+            if shot is not None:
+                self._even.append(shot)
             self._write_picture(outcome.index, picture)
-        elif error is not None:
-            self._worst.append((error, shot, outcome.index, picture))
-            self._worst = sorted(self._worst, key=lambda entry: -entry[0])[:WORST]
+        elif error_m is not None:
+            self._worst.append(_WorstFrame(error_m, shot, outcome.index, picture))
+            self._worst = sorted(self._worst, key=lambda entry: -entry.error_m)[:WORST]
 
     def _write_picture(self, index: int, picture: Image) -> None:
         options = (cv2.IMWRITE_WEBP_QUALITY, _PICTURE_QUALITY)
@@ -117,13 +136,13 @@ class SnapshotWriter:
 
     def write(self) -> None:
         """Write what was kept."""
-        for _, _, index, picture in self._worst:
-            self._write_picture(index, picture)
-        worst = [shot for _, shot, *_ in self._worst if shot is not None]
+        for frame in self._worst:
+            self._write_picture(frame.index, frame.picture)
+        worst = [frame.shot for frame in self._worst if frame.shot is not None]
         shots = sorted([*self._even, *worst], key=lambda shot: shot.index)
         if not shots:
             return
-        empty = np.zeros((self._size[0], -(-self._size[1] // 8)), np.uint8)
+        empty = np.zeros((self._size[0], _packed_width(self._size[1])), np.uint8)
         np.savez_compressed(
             self._folder / SNAPSHOTS_FILE,
             index=np.array([shot.index for shot in shots], np.int32),
@@ -140,20 +159,24 @@ def snapshot_of(index: int, result: TrackResult) -> Snapshot | None:
     """The snapshot of a frame that was tracked; None if its tracker shows neither features nor a mask."""
     if result.keypoints_xy is None and result.dynamic_mask is None:
         return None
-    points = (
-        np.zeros((0, 2))
-        if result.keypoints_xy is None
-        else np.asarray(result.keypoints_xy).reshape(-1, 2)
-    )
+    if result.keypoints_xy is None:
+        points = np.zeros((0, 2))
+    else:
+        points = np.asarray(result.keypoints_xy).reshape(-1, 2)
     kept = result.keypoints_keep
     mask = result.dynamic_mask
     return Snapshot(
-        index,
-        np.clip(points.round(), -(2**15), 2**15 - 1).astype(np.int16),
-        np.ones(len(points), bool) if kept is None else np.array(kept, dtype=bool),
-        None if mask is None else np.packbits(np.asarray(mask, dtype=bool), axis=1),
-        0 if mask is None else mask.shape[1],
+        index=index,
+        points=np.clip(points.round(), -(2**15), 2**15 - 1).astype(np.int16),
+        kept=np.ones(len(points), bool) if kept is None else np.array(kept, dtype=bool),
+        packed=None if mask is None else np.packbits(np.asarray(mask, dtype=bool), axis=1),
+        width=0 if mask is None else mask.shape[1],
     )
+
+
+def _packed_width(width: int) -> int:
+    """Bytes of a line of a mask, eight pixels a byte."""
+    return -(-width // 8)
 
 
 def read_snapshots(folder: Path) -> tuple[tuple[int, int], list[Snapshot]]:
@@ -179,31 +202,53 @@ def read_snapshots(folder: Path) -> tuple[tuple[int, int], list[Snapshot]]:
         of=(LookupError, ValueError, TypeError, ArithmeticError),
     ):
         height, width = map(int, arrays["size"])
-        index = arrays["index"]
-        count = arrays["count"]
-        points = arrays["points"]
-        kept = arrays["kept"]
-        masks = arrays["masks"]
-        masked = arrays["masked"]
-        if not (
-            masks.dtype == np.uint8
-            and masks.shape[1:] == (height, -(-width // 8))
-            and len(index) == len(count) == len(masks) == len(masked) <= MOST_FRAMES
-            and (count >= 0).all()
-            and points.shape == (count.sum(), 2)
-            and kept.shape == points.shape[:1]
-            and points.dtype == np.int16
-            and kept.dtype == masked.dtype == np.bool_
-        ):
-            raise ValueError(f"its arrays do not fit each other and {width} x {height} pixels")
-        parts = zip(
-            *(np.split(array, np.cumsum(count)[:-1]) for array in (points, kept)), strict=True
-        )
-        shots = [
-            Snapshot(int(index[at]), place, keep, masks[at] if masked[at] else None, width)
-            for at, (place, keep) in enumerate(parts)
-        ]
+        shots = _unpacked(arrays, height, width)
     return (height, width), shots
+
+
+def _unpacked(arrays: Mapping[str, NDArray[Any]], height: int, width: int) -> list[Snapshot]:
+    """The snapshots of a file's arrays.
+
+    Args:
+        arrays: ``index``, ``count`` (features of each frame), ``points`` ``[sum(count), 2]`` and
+            ``kept`` of all frames, ``masked`` (whether there is a mask) and ``masks``
+            ``[frames, height, ceil(width / 8)]``.
+        height: Of the images in pixels.
+        width: Of the images in pixels.
+
+    Raises:
+        LookupError: An array is missing.
+        ValueError: They do not fit each other.
+    """
+    index = arrays["index"]
+    count = arrays["count"]
+    points = arrays["points"]
+    kept = arrays["kept"]
+    masks = arrays["masks"]
+    masked = arrays["masked"]
+    if not (
+        masks.dtype == np.uint8
+        and masks.shape[1:] == (height, _packed_width(width))
+        and len(index) == len(count) == len(masks) == len(masked) <= MOST_FRAMES
+        and (count >= 0).all()
+        and points.shape == (count.sum(), 2)
+        and kept.shape == points.shape[:1]
+        and points.dtype == np.int16
+        and kept.dtype == masked.dtype == np.bool_
+    ):
+        raise ValueError(f"its arrays do not fit each other and {width} x {height} pixels")
+    ends = np.cumsum(count)[:-1]
+    features = zip(np.split(points, ends), np.split(kept, ends), strict=True)
+    return [
+        Snapshot(
+            index=int(index[row]),
+            points=points_of_frame,
+            kept=kept_of_frame,
+            packed=masks[row] if masked[row] else None,
+            width=width,
+        )
+        for row, (points_of_frame, kept_of_frame) in enumerate(features)
+    ]
 
 
 def keep_map(
@@ -252,14 +297,19 @@ def _origin_of_map(env: SlamEnv, spec: RunSpec) -> str:
         f"{env.tracker_spec.id} on {env.sequence.id}",
         f"frames {start}:{'' if stop is None else stop}",
     ]
-    words += [f"stride {spec.stride}"] * (spec.stride != 1) + [f"seed {spec.seed}"]
-    return ", ".join([*words, *(f"{name}={value}" for name, value in asked.items())])
+    if spec.stride != 1:
+        words.append(f"stride {spec.stride}")
+    words.append(f"seed {spec.seed}")
+    words += [f"{name}={value}" for name, value in asked.items()]
+    return ", ".join(words)
 
 
 SHOWN = 9
 """Frames, and keyframes, on a sheet."""
 SHEET_FILE = "sheet.png"
+"""The picture that ``--sheet`` asks for."""
 FEATURES = (("kept", KEPT), ("culled", CULLED), ("mask", MASK))
+"""Legend of a sheet: what is drawn over its frames, and its colour."""
 
 
 class SheetWriter:
@@ -290,9 +340,9 @@ class SheetWriter:
             track: The run's final trajectory, or the online one.
         """
         sequence = self._env.sequence
-        # others are of an earlier run
-        own = [record.frame for record in outputs.keyframes if record.frame >= 0]
-        shown = [own[row] for row in spread(len(own), SHOWN)]
+        # keyframes without a frame came with the map of an earlier run
+        frames_of_run = [record.frame for record in outputs.keyframes if record.frame >= 0]
+        shown = [frames_of_run[row] for row in spread(len(frames_of_run), SHOWN)]
         title = f"{self._env.tracker_spec.label}  |  {sequence.id}"
         keyframes = [sequence[index].rgb for index in shown]
         truth, ate_m = aligned_truth(sequence.ground_truth, track)
@@ -311,6 +361,7 @@ class SheetWriter:
 
 
 VIDEO_FILE = "video.webm"
+"""The video that ``--video`` asks for."""
 
 
 class VideoWriter:
@@ -358,16 +409,16 @@ def aligned_truth(
 
     Both are None without enough of it.
     """
-    by_row = truths_at(truth, track.timestamps)
-    if len(by_row) < 3:
+    truth_by_row = truths_at(truth, track.timestamps)
+    if len(truth_by_row) < 3:
         return None, None
-    rows = list(by_row)
-    true = np.array(list(by_row.values()))
-    fit = align(track.T_world_cam[rows], true, "se3")
-    move = np.eye(4)
-    move[:3, :3] = fit.rotation
-    move[:3, 3] = fit.translation
-    moved = Trajectory(track.timestamps[rows], se3.inverse(move) @ true)
-    return moved, float(
-        np.sqrt(np.square(moved.positions - track.positions[rows]).sum(axis=1).mean())
-    )
+    rows = list(truth_by_row)
+    true_poses = np.array(list(truth_by_row.values()))
+    # the rigid motion of the track onto the truth, and its inverse on the truth
+    fit = align(track.T_world_cam[rows], true_poses, "se3")
+    T_truth_track = np.eye(4)
+    T_truth_track[:3, :3] = fit.rotation
+    T_truth_track[:3, 3] = fit.translation
+    moved = Trajectory(track.timestamps[rows], se3.inverse(T_truth_track) @ true_poses)
+    squared_errors = np.square(moved.positions - track.positions[rows]).sum(axis=1)
+    return moved, float(np.sqrt(squared_errors.mean()))

@@ -13,7 +13,7 @@ one that adds goes on from there.
 import re
 import shutil
 import subprocess
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
@@ -37,25 +37,22 @@ from dynslam_bench.core import (
 from dynslam_bench.core.download import download
 from dynslam_bench.core.errors import hide_folder_in_messages
 from dynslam_bench.core.records import Record, digest, validated
+from dynslam_bench.runs.copying import merge
 from dynslam_bench.runs.exchange.transfer import import_trajectory
+from dynslam_bench.runs.layout import FINAL, ONLINE, RUN_FILE, STAMPS, Unreadable, Which
 from dynslam_bench.runs.record import RunRecord, run_id_of
-from dynslam_bench.runs.store import (
-    FINAL,
-    ONLINE,
-    RUN_FILE,
-    Merged,
-    RunStore,
-    Unreadable,
-    Which,
-    merge,
-    open_store,
-)
+from dynslam_bench.runs.store import Merged, RunStore, open_store
 
 SUMS = "SHA256SUMS"
+"""The list of checksums, in the format of ``sha256sum -c``."""
 UNFINISHED = ".unfinished"
-_PARTS = ("runs", "sequences")
+"""An empty file that is there while runs are added."""
+_CONTENT_FOLDERS = ("runs", "sequences")
+"""Folders whose files are listed with their checksums."""
 _ARCHIVE = re.compile(r"https?://.*\.(?:zip|tgz|tar|tar\.gz)(?:\?.*)?")
+"""The address of an archive, which is downloaded."""
 _ADDRESS = re.compile(r"[a-z+]+://.*|(?:[\w.-]+@)?[\w.-]+:.+")
+"""An address: a URL, or a place on another machine as ssh and git name it."""
 
 
 class Bank(RunStore):
@@ -71,9 +68,10 @@ class Bank(RunStore):
         self.copy_part(other, record)
         with self.work_folder(record.run_id) as work:
             with self.copying(other, record):
-                for file in (other.folder(record.run_id) / name for name in (ONLINE, FINAL)):
+                for name in (ONLINE, FINAL):
+                    file = other.folder(record.run_id) / name
                     if file.is_file():
-                        shutil.copyfile(file, work / file.name)
+                        shutil.copyfile(file, work / name)
                 (work / RUN_FILE).write_text(record.public().to_json(), encoding="utf-8")
             self.check_copy(work, record)
             with translate_errors(
@@ -93,11 +91,12 @@ class Bank(RunStore):
         What a killed process left unfinished is not among them.
         """
         names = []
-        for path in (path for part in _PARTS for path in (self.root / part).rglob("*")):
-            inside = path.relative_to(self.root)
-            is_unfinished = any(is_temporary(Path(name)) for name in inside.parts)
-            if not is_unfinished and (path.is_symlink() or path.is_file()):
-                names.append(inside.as_posix())
+        for folder in _CONTENT_FOLDERS:
+            for path in (self.root / folder).rglob("*"):
+                inside = path.relative_to(self.root)
+                is_unfinished = any(is_temporary(Path(name)) for name in inside.parts)
+                if not is_unfinished and (path.is_symlink() or path.is_file()):
+                    names.append(inside.as_posix())
         return sorted(names)
 
 
@@ -153,11 +152,13 @@ def add(sources: Iterable[str | Path], bank: str | Path) -> Merged:
     """
     with ExitStack() as stack:
         stores = []
-        left_out = list[Unreadable]()
+        left_out: list[Unreadable] = []
         for source in map(Path, sources):
             if source.suffix.lower() == ".toml":
-                stores.append(RunStore(stack.enter_context(closing(TemporaryFolder())).path))
-                left_out += _import(source, stores[-1])
+                temporary = stack.enter_context(closing(TemporaryFolder()))
+                store = RunStore(temporary.path)
+                left_out += _import(source, store)
+                stores.append(store)
             else:
                 stores.append(open_store(source))
         merged = _merge(stores, bank)
@@ -179,11 +180,9 @@ def _import(manifest: Path, store: RunStore) -> Iterator[Unreadable]:
         for entry in read_manifest(manifest):
             try:
                 file = _fetched(entry.file, entry.sha256, manifest.parent, folder.path)
-                truth = (
-                    _fetched(entry.truth, entry.truth_sha256, manifest.parent, folder.path)
-                    if entry.truth
-                    else None
-                )
+                truth = None
+                if entry.truth:
+                    truth = _fetched(entry.truth, entry.truth_sha256, manifest.parent, folder.path)
                 import_trajectory(
                     file,
                     entry.tracker,
@@ -201,7 +200,17 @@ def _import(manifest: Path, store: RunStore) -> Iterator[Unreadable]:
 
 
 def _fetched(place: str, sha256: str, base: Path, folder: Path) -> Path:
-    """A file of a manifest with this checksum; an empty one is not known."""
+    """A file that a manifest names, checked.
+
+    Args:
+        place: Its address, or its path from the manifest's folder.
+        sha256: Its checksum; empty where it is not known.
+        base: The manifest's folder.
+        folder: Where a downloaded file goes.
+
+    Raises:
+        DynslamError: It cannot be read or downloaded, or has another checksum.
+    """
     if _ADDRESS.fullmatch(place):
         target = folder / f"{digest(place)}.txt"
         download(place, target, sha256=sha256 or None)
@@ -235,52 +244,73 @@ def verify(bank: str | Path) -> list[str]:
 
 
 def _faults(store: Bank, *, unfinished: bool = False) -> list[str]:
-    """See `verify`; in a bank to which runs are still to be added, files may be without a checksum."""
+    """Every fault of a bank, one line each.
+
+    Args:
+        store: The bank.
+        unfinished: Whether runs are still to be added to it: files may be without a checksum then.
+    """
     sums = store.root / SUMS
-    faults = list[str]()
-    listed = set[str]()
-    if sums.is_file() or not unfinished:
-        faults = compare_sums(store.root, sums, RunError)
-        listed = {line.rstrip("\n").partition("  ")[2] for line in read_lines(sums, kind=RunError)}
     names = store.files()
-    faults += [
-        f"{name} is a link" for name in (*_PARTS, *names) if (store.root / name).is_symlink()
-    ]
+
+    # files that are missing or changed, by their checksums
+    faults: list[str] = []
+    listed: set[str] = set()
+    if sums.is_file() or not unfinished:
+        faults += compare_sums(store.root, sums, RunError)
+        listed = {line.rstrip("\n").partition("  ")[2] for line in read_lines(sums, kind=RunError)}
+
+    # files that do not belong there
+    links = [name for name in (*_CONTENT_FOLDERS, *names) if (store.root / name).is_symlink()]
+    faults += [f"{name} is a link" for name in links]
     if unfinished:
         listed.update(names)
     faults += [f"{name} is not listed in {SUMS}" for name in names if name not in listed]
+
+    # records that are damaged or do not fit
     records, unreadable = store.all()
     faults += [f"{entry.path}: {entry.reason}" for entry in unreadable]
     for record in records:
-        # the second of older runs
-        if record.run_id not in (run_id_of(record.identity), digest(record.identity, 16)):
-            faults.append(f"runs/{record.run_id}: its id is not that of what it says of itself")
         faults += [
-            f"runs/{record.run_id}: its {name} is not that of its identity"
-            for name in _contradicted(record)
+            f"runs/{record.run_id}: {fault}" for fault in _faults_of_run(store, record, listed)
         ]
-        if f"sequences/{record.sequence.part}/timestamps.txt" not in listed:
-            faults.append(f"runs/{record.run_id}: the stamps of its sequence are missing")
-            continue
-        try:
-            store.check(record)
-        except DynslamError as error:
-            faults.append(f"runs/{record.run_id}: {error}")
+    return faults
+
+
+def _faults_of_run(store: Bank, record: RunRecord, listed: Collection[str]) -> list[str]:
+    """What is wrong with a run whose record can be read.
+
+    Args:
+        store: The bank.
+        record: The run's.
+        listed: Names of the files with checksums.
+    """
+    faults = []
+    # the second is the id of older runs
+    if record.run_id not in (run_id_of(record.identity), digest(record.identity, 16)):
+        faults.append("its id is not that of what it says of itself")
+    faults += [f"its {name} is not that of its identity" for name in _contradicted(record)]
+    if f"sequences/{record.sequence.part}/{STAMPS}" not in listed:
+        return [*faults, "the stamps of its sequence are missing"]
+    try:
+        store.check(record)
+    except DynslamError as error:
+        faults.append(str(error))
     return faults
 
 
 def _contradicted(record: RunRecord) -> list[str]:
     """Fields of a record that are part of its identity, and differ from it."""
     stated = {
-        name: getattr(record, name)
-        for name in ("offset", "stride", "seed", "device", "threads", "realtime")
-    }
-    stated |= {
+        "offset": record.offset,
+        "stride": record.stride,
+        "seed": record.seed,
+        "device": record.device,
+        "threads": record.threads,
+        "realtime": record.realtime,
         "tracker": record.tracker.id,
         "tracker_version": record.tracker.version,
         "drop_share": record.drop_share,
-    }
-    stated |= {
         "sequence": record.sequence.id,
         "content": record.sequence.content,
         "degrade": record.degrade,
@@ -303,15 +333,13 @@ def pull(source: str, bank: str | Path) -> Merged:
     with ExitStack() as stack:
         store = RunStore(source)
         if _ARCHIVE.fullmatch(source):
-            archive = (
-                stack.enter_context(closing(TemporaryFolder())).path
-                / Path(source.partition("?")[0]).name
-            )
+            temporary = stack.enter_context(closing(TemporaryFolder()))
+            archive = temporary.path / Path(source.partition("?")[0]).name
             download(source, archive)
             store = open_store(archive)
         elif _is_repository(source):
             store = RunStore(stack.enter_context(_cloned(source)))
-        # an address's end
+        # messages name the folder, or the end of an address
         store.source = Path(source) if Path(source).exists() else Path(Path(source).name)
         if not (store.root / SUMS).is_file():
             raise RunError(f"{source} is no bank: it has no {SUMS}")
@@ -346,7 +374,7 @@ def push(bank: str | Path, target: str) -> Merged:
             )
         merged = _merge([RunStore(bank)], clone)
         if merged.added:
-            _git(clone, "add", "--force", "--", SUMS, *_PARTS)
+            _git(clone, "add", "--force", "--", SUMS, *_CONTENT_FOLDERS)
             _git(clone, "commit", "--quiet", "--message", f"Add runs: {len(merged.added)}")
             _git(clone, "push", "--quiet", "origin", "HEAD")
     return merged
@@ -358,23 +386,23 @@ def _merge(sources: Sequence[RunStore], bank: str | Path) -> Merged:
     It goes on where a process was killed that did the same.
     """
     store = Bank(bank)
-    mark = store.root / UNFINISHED
+    unfinished = store.root / UNFINISHED
     with translate_errors(InfrastructureError, f"cannot write {store.root}", "name another folder"):
         store.root.mkdir(parents=True, exist_ok=True)
     with exclusive_lock(store.root / ".merging"):
-        if mark.exists():
+        if unfinished.exists():
             _refuse(store.root, _faults(store, unfinished=True))
         elif (store.root / SUMS).exists() or store.files():
             _check(store.root)
-        write_atomic(mark, "")
+        write_atomic(unfinished, "")
         try:
             return merge(sources, store, trials=False)
         finally:  # what was copied before a fault is whole
             _write_sums(store)
             with translate_errors(
-                InfrastructureError, f"cannot remove {mark}", "repeat the command"
+                InfrastructureError, f"cannot remove {unfinished}", "repeat the command"
             ):
-                mark.unlink(missing_ok=True)
+                unfinished.unlink(missing_ok=True)
 
 
 def _write_sums(store: Bank) -> None:
@@ -393,10 +421,16 @@ def _write_sums(store: Bank) -> None:
 
 
 def _check(bank: str | Path) -> None:
+    """Refuse a bank that has faults.
+
+    Raises:
+        RunError: It has some, or is no bank.
+    """
     _refuse(bank, verify(bank))
 
 
 def _refuse(bank: str | Path, faults: Sequence[str]) -> None:
+    """Raise the first of the faults of a bank, if there are any."""
     if faults:
         raise RunError(
             f"{bank} has faults, of {len(faults)} the first: {faults[0]}", "bank verify lists all"
@@ -412,21 +446,18 @@ def _is_repository(place: str) -> bool:
 
 @contextmanager
 def _cloned(repository: str) -> Iterator[Path]:
+    """A clone of a git repository, in a temporary folder that is removed afterwards.
+
+    Raises:
+        RunError: git is not installed, or refuses.
+    """
     with closing(TemporaryFolder()) as folder:
         origin = repository if _ADDRESS.fullmatch(repository) else str(Path(repository).absolute())
-        clone = hide_folder_in_messages(folder.path) / (
-            re.sub(r"[^\w.-]", "-", Path(origin).resolve().name) or "bank"
-        )
-        _git(
-            folder.path,
-            "clone",
-            "--quiet",
-            "--config",
-            "core.autocrlf=false",
-            "--",
-            origin,
-            str(clone),
-        )
+        name = re.sub(r"[^\w.-]", "-", Path(origin).resolve().name) or "bank"
+        clone = hide_folder_in_messages(folder.path) / name
+        # checksums are of the bytes: git is not to change ends of lines
+        options = ("--quiet", "--config", "core.autocrlf=false")
+        _git(folder.path, "clone", *options, "--", origin, str(clone))
         yield clone
 
 

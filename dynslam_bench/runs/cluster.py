@@ -19,7 +19,7 @@ from dynslam_bench.runs.own_code import package_code
 from dynslam_bench.segmentation.networks.checkpoints import COCO, cached_checkpoint
 from dynslam_bench.sequences.catalogue import entry_of
 
-_KIND = (
+_FIELDS_OF_KIND = (
     "tracker",
     "settings",
     "sequence",
@@ -30,8 +30,9 @@ _KIND = (
     "offset",
     "stride",
 )
-"""What decides whether a host can make a run."""
-_LOOK_EVERY_S = 5.0
+"""What of a `RunSpec` decides whether a host can make it: runs that are equal in these are of one kind."""
+_COUNT_SLOTS_EVERY_S = 5.0
+"""Seconds between two looks at the workers that there are."""
 
 
 class DaskWorkers(Executor):
@@ -61,8 +62,12 @@ class DaskWorkers(Executor):
         ):
             self._client = Client(address, timeout="10s")
         self._executor = self._client.get_executor(pure=False)
-        self._slots, self._look_again = Counter[str](), float("-inf")
+        # runs at a time of each host, and when they are counted again
+        self._slots = Counter[str]()
+        self._next_count = float("-inf")
+        # by kind of run the hosts that cannot make it, with reasons
         self._refused: dict[str, dict[str, RunError]] = defaultdict(dict)
+        # hosts that do not know this package
         self._strangers: set[str] = set()
 
     def describe(
@@ -74,58 +79,65 @@ class DaskWorkers(Executor):
             sequences: Ids or folders that runs will need.
             data_root: Folder of the recorded sequences.
         """
-        own = _facts(sequences, data_root)
+        here = _facts(sequences, data_root)
         workers = self._workers()
         answers = self._client.run(_facts, sequences, data_root, on_error="ignore")
         self._strangers = {_host(address) for address in workers.keys() - answers.keys()}
         unknown = {"code": "", "packages": set(), "device": "", "lacking": set()}
-        return [
-            {
-                "worker": address,
-                "code": "the same"
-                if facts["code"] == own["code"]
-                else "other"
-                if facts["code"]
-                else "none",
-                "other packages": [
-                    " ".join(pair) for pair in sorted(facts["packages"] - own["packages"])
-                ],
-                "device": facts["device"],
-                "runs at a time": worker["nthreads"],
-                "memory (GB)": (worker["memory_limit"] or 0) / 1e9,
-                "lacks": sorted(facts["lacking"] - own["lacking"]),
-            }
-            for address, worker in workers.items()
-            for facts in [answers.get(address, unknown)]
-        ]
+        rows: list[dict[str, object]] = []
+        for address, worker in workers.items():
+            facts = answers.get(address, unknown)
+            rows.append(
+                {
+                    "worker": address,
+                    "code": _compare_code(facts["code"], here["code"]),
+                    "other packages": [
+                        " ".join(pair) for pair in sorted(facts["packages"] - here["packages"])
+                    ],
+                    "device": facts["device"],
+                    "runs at a time": worker["nthreads"],
+                    "memory (GB)": (worker["memory_limit"] or 0) / 1e9,
+                    "lacks": sorted(facts["lacking"] - here["lacking"]),
+                }
+            )
+        return rows
 
     def _workers(self) -> dict[str, dict[str, Any]]:
+        """What the scheduler knows of each worker, by its address."""
         return self._client.scheduler_info(n_workers=-1)["workers"]  # type: ignore[no-any-return]
 
     def submit(self, make: Callable[..., bytes], spec: str, *arguments: str) -> Future[bytes]:  # type: ignore[override]
         """Have a run made, as `run_packed` does."""
-        if time.monotonic() > self._look_again:
-            self._look_again, self._slots = time.monotonic() + _LOOK_EVERY_S, Counter()
+        now = time.monotonic()
+        if now > self._next_count:
+            self._next_count = now + _COUNT_SLOTS_EVERY_S
+            self._slots = Counter()
             for address, worker in self._workers().items():
                 self._slots[_host(address)] += worker["nthreads"]
-        named = json.loads(spec)
+        fields = json.loads(spec)
+        kind = json.dumps([fields[name] for name in _FIELDS_OF_KIND])
         outcome = Future[bytes]()
-        self._send(
-            outcome, json.dumps([named[name] for name in _KIND]), set(), make, spec, *arguments
-        )
+        self._send(outcome, kind, set(), make, spec, *arguments)
         return outcome
 
     def _send(self, outcome: Future[bytes], kind: str, refusers: set[str], *call: Any) -> None:
-        """Send a run, which `refusers` have refused, to hosts that have refused none of its kind."""
+        """Send a run to hosts that have refused none of its kind.
+
+        Args:
+            outcome: Gets the run, or why it was not made.
+            kind: The kind of the run.
+            refusers: Hosts that have refused this run.
+            *call: The function that makes it, and its arguments.
+        """
         refused = self._refused[kind]
         able = sorted(self._slots.keys() - refused.keys() - self._strangers)
         if refused and not able:
             outcome.set_exception(next(iter(refused.values())))
             return
         at_a_time = max(self._slots.values(), default=1)
-        sent = self._executor.submit(
-            _answer, at_a_time, *call, **({"workers": able} if refused or self._strangers else {})
-        )
+        # without a reason to choose, the scheduler does
+        choice = {"workers": able} if refused or self._strangers else {}
+        sent = self._executor.submit(_answer, at_a_time, *call, **choice)
         outcome.add_done_callback(lambda outcome: sent.cancel() if outcome.cancelled() else None)
         sent.add_done_callback(partial(self._take, outcome, kind, refusers, call))
 
@@ -137,25 +149,39 @@ class DaskWorkers(Executor):
         call: tuple[Any, ...],
         sent: Future[Any],
     ) -> None:
-        if error := CancelledError() if sent.cancelled() else sent.exception():
+        """Take the answer to a run that was sent, see `_send`; one that a host has refused is sent to others."""
+        error = CancelledError() if sent.cancelled() else sent.exception()
+        if error is not None:
             died = RunError(
                 f"every worker that was given the run died: {error}", "see the workers' logs"
             )
             outcome.set_exception(died if type(error).__name__ == "KilledWorker" else error)
-        elif isinstance(answer := sent.result(), bytes):
+            return
+        answer = sent.result()
+        if isinstance(answer, bytes):
             outcome.set_result(answer)
-        elif answer[0] in refusers:
-            outcome.set_exception(answer[1])
-        else:
-            self._refused[kind][answer[0]] = answer[1]
-            self._send(outcome, kind, refusers | {answer[0]}, *call)
+            return
+        host, refusal = answer
+        if host in refusers:
+            outcome.set_exception(refusal)
+            return
+        self._refused[kind][host] = refusal
+        self._send(outcome, kind, refusers | {host}, *call)
 
     def shutdown(self, *_: object, **__: object) -> None:
         """Leave the scheduler."""
         self._client.close()
 
 
+def _compare_code(code: str, here: str) -> str:
+    """The code of a worker in words, by its digest and that of this machine."""
+    if code == here:
+        return "the same"
+    return "other" if code else "none"
+
+
 def _host(address: str) -> str:
+    """The host of a worker's address."""
     return urlsplit(address).hostname or ""
 
 
@@ -172,13 +198,15 @@ def _answer(
 
 
 def _facts(sequences: Sequence[str], data_root: str | None) -> dict[str, Any]:
-    """What this machine has."""
+    """What this machine has: code, packages and device, and which sequences and networks it lacks."""
     lacking = {name for name in sequences if not _is_here(name, data_root)}
+    if not cached_checkpoint(COCO):
+        lacking.add(f"network {COCO.id}")
     return {
         "code": package_code(),
         "packages": set(versions().items()),
         "device": resolve_device(),
-        "lacking": lacking | (set() if cached_checkpoint(COCO) else {f"network {COCO.id}"}),
+        "lacking": lacking,
     }
 
 

@@ -18,8 +18,9 @@ from pydantic.dataclasses import dataclass as validated
 from dynslam_bench.contracts import stage_seconds
 from dynslam_bench.core import DynslamError, RunError, read_lines, reason_of, storable
 from dynslam_bench.geometry import Trajectory, format_ns, ns_of, se3, write_tum
+from dynslam_bench.runs.layout import ONLINE
 from dynslam_bench.runs.record import RunRecord, StageTime
-from dynslam_bench.runs.store import ONLINE, RunStore
+from dynslam_bench.runs.store import RunStore
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,17 +32,25 @@ FRAMES_FILE = "frames.jsonl"
 CSV_FILE = "frames.csv"
 """The stored table: one row a frame."""
 FIXED = (
-    *("index", "timestamp", "state"),
-    *("frame_error_trans_m", "frame_error_rot_deg", "pose_error_trans_m", "pose_error_rot_deg"),
-    *("reward_m", "mask_iou"),
+    "index",
+    "timestamp",
+    "state",
+    "frame_error_trans_m",
+    "frame_error_rot_deg",
+    "pose_error_trans_m",
+    "pose_error_rot_deg",
+    "reward_m",
+    "mask_iou",
 )
 """Columns of every ``frames.csv``; after them come ``<stage>_s``, seconds of every stage, and ``stat_<name>``."""
 MOST_FRAMES = 1 << 31
 """No run has as many."""
-_SHARE = "dynamic_share"
+_DYNAMIC_SHARE = "dynamic_share"
 """A column of sequences with exact masks only."""
-_STAT = "stat_"
-_SECONDS = "_s"
+_STAT_PREFIX = "stat_"
+"""Begins the column of a diagnostic of the tracker."""
+_TIME_SUFFIX = "_s"
+"""Ends the column of a stage's time, in seconds."""
 
 
 @validated(frozen=True, config=ConfigDict(extra="forbid"))
@@ -55,10 +64,11 @@ class FrameRow:
             tracker.
         frame_error_trans_m: Frame-to-frame translational error in metres; None without ground truth
             at both frames.
-        frame_error_rot_deg: Frame-to-frame rotational error in degrees, likewise.
+        frame_error_rot_deg: Frame-to-frame rotational error in degrees; None without ground truth
+            at both frames.
         pose_error_trans_m: Cumulative translational error in metres, see `OnlineError`; None
             without ground truth.
-        pose_error_rot_deg: Cumulative rotational error in degrees, likewise.
+        pose_error_rot_deg: Cumulative rotational error in degrees; None without ground truth.
         reward_m: What the frame earned.
         mask_iou: Overlap of the dynamic mask with the exact masks of people, 0 to 1; None where
             either is missing or neither has a pixel.
@@ -121,9 +131,9 @@ class FrameRow:
 
     def cells(self) -> dict[str, Any]:
         """The row by the columns of ``frames.csv``: `FIXED`, the dynamic share, ``<stage>_s`` and ``stat_<name>``."""
-        share = {} if self.dynamic_share is None else {_SHARE: self.dynamic_share}
-        times = {stage + _SECONDS: value for stage, value in self.timings.items()}
-        stats = {_STAT + name: value for name, value in self.stats.items()}
+        share = {} if self.dynamic_share is None else {_DYNAMIC_SHARE: self.dynamic_share}
+        times = {stage + _TIME_SUFFIX: value for stage, value in self.timings.items()}
+        stats = {_STAT_PREFIX + name: value for name, value in self.stats.items()}
         return {name: getattr(self, name) for name in FIXED} | share | times | stats
 
     def to_json(self) -> str:
@@ -138,7 +148,7 @@ def column_names(rows: Iterable[FrameRow]) -> list[str]:
     """The columns of a table of frames: `FIXED`, the stages' times, the stats, in the order they appeared in."""
     names = dict.fromkeys(name for row in rows for name in row.cells())
     others = [name for name in names if name not in FIXED]
-    return [*FIXED, *sorted(others, key=lambda name: name.startswith(_STAT))]
+    return [*FIXED, *sorted(others, key=lambda name: name.startswith(_STAT_PREFIX))]
 
 
 def write_csv(
@@ -171,20 +181,25 @@ def read_csv(path: Path) -> list[FrameRow]:
 
 
 def _parse(line: dict[str, str]) -> FrameRow:
+    """The row of a line of ``frames.csv``, by its columns.
+
+    Raises:
+        ValueError: It does not fit the heading, or a cell holds another kind of value.
+    """
     if None in line or None in line.values():
         raise ValueError("another number of cells than the heading has")
     cells = {name: text for name, text in line.items() if text}
-    fixed: dict[str, Any] = {name: cells.pop(name) for name in (*FIXED, _SHARE) if name in cells}
-    stats = {
-        name.removeprefix(_STAT): text for name, text in cells.items() if name.startswith(_STAT)
+    values: dict[str, Any] = {
+        name: cells.pop(name) for name in (*FIXED, _DYNAMIC_SHARE) if name in cells
     }
-    times = {
-        name: text
-        for name, text in cells.items()
-        if name.endswith(_SECONDS) and not name.startswith(_STAT)
-    }
-    timings = {name.removesuffix(_SECONDS): text for name, text in times.items()}
-    return _LINE.validate_python(fixed | {"stats": stats, "timings": timings})
+    stats = {}
+    timings = {}
+    for name, text in cells.items():
+        if name.startswith(_STAT_PREFIX):
+            stats[name.removeprefix(_STAT_PREFIX)] = text
+        elif name.endswith(_TIME_SUFFIX):
+            timings[name.removesuffix(_TIME_SUFFIX)] = text
+    return _LINE.validate_python(values | {"stats": stats, "timings": timings})
 
 
 @dataclass
@@ -223,25 +238,23 @@ class FrameLog:
     def trajectory(self) -> Trajectory:
         """The online trajectory."""
         tracked = [(row.timestamp, row.pose) for row in self.rows if row.pose is not None]
+        if not tracked:
+            return Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
         stamps = np.array([stamp for stamp, _ in tracked], dtype=np.float64)
-        poses = np.array([pose for _, pose in tracked], dtype=np.float64).reshape(-1, 7)
-        return Trajectory(
-            stamps,
-            se3.from_quaternion(poses[:, :3], poses[:, 3:]) if tracked else np.zeros((0, 4, 4)),
-        )
+        poses = np.array([pose for _, pose in tracked], dtype=np.float64)  # position, quaternion
+        return Trajectory(stamps, se3.from_quaternion(poses[:, :3], poses[:, 3:]))
 
     def timings(self) -> dict[str, StageTime]:
         """Median, p95 and mean of every stage over the frames that reached the tracker."""
-        return {
-            stage: StageTime(
+        timings = {}
+        seconds = stage_seconds([row.timings for row in self.rows if row.timings])
+        for stage, values in seconds.items():  # float64, one a frame
+            timings[stage] = StageTime(
                 median_s=float(np.median(values)),
                 p95_s=float(np.percentile(values, 95)),
                 mean_s=float(values.mean()),
             )
-            for stage, values in stage_seconds(
-                [row.timings for row in self.rows if row.timings]
-            ).items()
-        }
+        return timings
 
     def mask_iou(self) -> float | None:
         """Mean overlap of the dynamic mask with the exact masks of people over the frames where either has pixels."""
@@ -254,15 +267,17 @@ class FrameLog:
         Asks the stats ``*_f_asked`` and ``*_f_judged`` of the filters; None for systems without
         such a filter.
         """
-        tracked = [row.stats for row in self.rows if row.state == "ok"]
-        asked, judged = (
-            sum(
-                any(value for name, value in stats.items() if name.endswith(ending))
-                for stats in tracked
-            )
-            for ending in ("_f_asked", "_f_judged")
-        )
-        return 1 - judged / asked if asked else None
+        n_asked = self._tracked_with_stat("_f_asked")
+        n_judged = self._tracked_with_stat("_f_judged")
+        return 1 - n_judged / n_asked if n_asked else None
+
+    def _tracked_with_stat(self, ending: str) -> int:
+        """On how many tracked frames a diagnostic is not 0 whose name ends so."""
+        count = 0
+        for row in self.rows:
+            if row.state == "ok":
+                count += any(value for name, value in row.stats.items() if name.endswith(ending))
+        return count
 
     def write(self, folder: Path, comment: str, exact: Mapping[float, int] | None = None) -> None:
         """Write `frames.csv` and `trajectory_online.txt`.
@@ -277,7 +292,7 @@ class FrameLog:
         write_csv(folder / CSV_FILE, self.rows, exact)
 
 
-_KINDS = {"index": "int64", "timestamp": "float64", "state": "string", "reward_m": "float64"}
+_COLUMN_TYPES = {"index": "int64", "timestamp": "float64", "state": "string", "reward_m": "float64"}
 """Columns that are never missing; all others are ``Float64``."""
 
 
@@ -310,10 +325,11 @@ def load_frames(
     rows = read_csv(_file(run, results))
     columns = column_names(rows)
     frame = pd.DataFrame([row.cells() for row in rows], columns=columns, dtype=object)
-    return frame.astype({name: _KINDS.get(name, "Float64") for name in columns})
+    return frame.astype({name: _COLUMN_TYPES.get(name, "Float64") for name in columns})
 
 
 def _file(run: RunRecord | Path | str, results: RunStore | Path | str) -> Path:
+    """The table of frames of a run, see `load_frames`."""
     path = Path(run.run_id if isinstance(run, RunRecord) else run).expanduser()
     if isinstance(run, RunRecord) or (isinstance(run, str) and not path.exists()):
         store = results if isinstance(results, RunStore) else RunStore(results)

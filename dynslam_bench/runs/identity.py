@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from dynslam_bench.contracts import Sequence, TrackerSpec
 from dynslam_bench.contracts.checks import check_sensors
@@ -124,6 +124,22 @@ class ResolvedRun:
         return " ".join(distribution_of_module(top)).strip()
 
 
+class _Configuration(NamedTuple):
+    """A tracker with its settings.
+
+    Attributes:
+        key: Name and overrides as text: equal texts stand for equal configurations.
+        tracker: The tracker's spec.
+        settings: Its complete settings.
+        flat: These by dotted name.
+    """
+
+    key: str
+    tracker: TrackerSpec
+    settings: Settings
+    flat: dict[str, Any]
+
+
 def resolve(spec: RunSpec) -> ResolvedRun:
     """Look up everything that a run names, before anything runs.
 
@@ -137,7 +153,7 @@ def resolve(spec: RunSpec) -> ResolvedRun:
 
 
 class Resolver:
-    """Looks up many runs as `resolve` does, but each sequence, tracker with settings, and device once.
+    """Looks up many runs, each sequence, tracker with settings, and device once; see `resolve`.
 
     What they name must not change meanwhile.
     """
@@ -147,51 +163,35 @@ class Resolver:
         self._part = lru_cache(maxsize=None)(self._open_part)
         self._device = lru_cache(maxsize=None)(resolve_device)
         self._libraries = lru_cache(maxsize=None)(libraries)
-        self._configured: dict[str, tuple[TrackerSpec, Settings, dict[str, Any]]] = {}
+        self._configurations: dict[str, _Configuration] = {}
         self._files: dict[tuple[str, str], tuple[dict[str, Any], tuple[Path, ...]]] = {}
 
     def __call__(self, spec: RunSpec) -> ResolvedRun:
         """Look up a run; see `resolve`."""
         spec = spec.absolute()
-        configuration = json.dumps([spec.tracker, spec.settings], sort_keys=True, default=str)
-        if configuration not in self._configured:
-            self._configured[configuration] = _configured(spec)
-        tracker, settings, flat = self._configured[configuration]
+        configured = self._configuration(spec)
+        tracker = configured.tracker
+        settings = configured.settings
+
+        # the frames
         where = (spec.sequence, spec.data_root, spec.camera, preprocessing_of(settings))
         sequence, part = self._part(where, spec.frames_seen, spec.stride, spec.offset)
         check_sensors(tracker, sequence)
         check_degradation(spec.degrade)
         device = self._device(spec.device)
+
+        # weights, the files of the tracker's program, and the map to begin in
         source = segmentation_source(settings, sequence)
-        if (configuration, source) not in self._files:
-            self._files[configuration, source] = _files_of(tracker, settings, source)
-        named, files = self._files[configuration, source]
+        named, files = self._named_files(configured, source)
         start_map = start_map_of(settings, sequence.camera, tracker.sensors, named["weights"])
 
-        asked = {
-            "scheme": IDENTITY_SCHEME,
-            "tracker": tracker.id,
-            # its digest is among the weights
-            "settings": flat if start_map is None else flat | {MAP_SETTING: ""},
-            "sequence": part.id,
-            "frames": [part.start, part.stop],
-            "offset": spec.offset,
-            "stride": part.stride,
-            "seed": spec.seed,
-            "device": device,
-            "threads": spec.threads,
-            **({"cache": True} if spec.cache else {}),
-            "realtime": spec.realtime,
-            "drop_share": spec.drop_share,
-            "degrade": {name: value for name, value in sorted(spec.degrade.items()) if value},
-        }
+        asked = _asked(spec, configured, part, device, start_map)
         changes_frames = bool(asked["degrade"]) or spec.realtime or bool(spec.drop_share)
         entry_points = parts_of_run(
             tracker, settings, source, sequence, changes_frames=changes_frames
         )
         anchors = anchors_of(tracker, entry_points)
         parts = sorted(named_part(part, anchors) for part in entry_points)
-        foreign = any(map(is_foreign, parts)) or bool(tracker.files)
         read = {
             "tracker_version": tracker.version,
             "parts": parts,
@@ -202,21 +202,38 @@ class Resolver:
             "segmentation": source,
             "content": part.content,
             "camera": part.camera,
-            **({"machine": this_machine().model_dump()} if spec.realtime else {}),
         }
+        if spec.realtime:  # which frames are dropped depends on the machine's speed
+            read["machine"] = this_machine().model_dump()
         return ResolvedRun(
-            spec,
-            tracker,
-            settings,
-            sequence,
-            device,
-            source,
-            asked | read,
-            anchors,
-            foreign,
-            start_map,
-            files,
+            spec=spec,
+            tracker=tracker,
+            settings=settings,
+            sequence=sequence,
+            device=device,
+            segmentation=source,
+            identity=asked | read,
+            anchors=anchors,
+            foreign=any(map(is_foreign, parts)) or bool(tracker.files),
+            start_map=start_map,
+            files=files,
         )
+
+    def _configuration(self, spec: RunSpec) -> _Configuration:
+        """The tracker of a run with its settings, looked up once."""
+        key = json.dumps([spec.tracker, spec.settings], sort_keys=True, default=str)
+        if key not in self._configurations:
+            self._configurations[key] = _configure(spec, key)
+        return self._configurations[key]
+
+    def _named_files(
+        self, configured: _Configuration, source: str
+    ) -> tuple[dict[str, Any], tuple[Path, ...]]:
+        """What `_files_of` gives, looked up once for a tracker with its settings and a source of masks."""
+        key = (configured.key, source)
+        if key not in self._files:
+            self._files[key] = _files_of(configured.tracker, configured.settings, source)
+        return self._files[key]
 
     def _open_part(
         self,
@@ -246,21 +263,65 @@ def check_degradation(strengths: Mapping[str, float]) -> None:
     Degradation(seed=0, **strengths)
 
 
-def _configured(spec: RunSpec) -> tuple[TrackerSpec, Settings, dict[str, Any]]:
-    """The tracker of a run, its complete settings, and these by dotted name."""
+def _configure(spec: RunSpec, key: str) -> _Configuration:
+    """Look up the tracker of a run and its settings.
+
+    Raises:
+        DynslamError: One is unknown, does not fit, or a package that the tracker needs is missing.
+    """
     tracker = TRACKERS.get(spec.tracker)
     if missing := tracker.missing():
         raise RunError(
             f"tracker '{tracker.id}' needs a package that is not installed", "; ".join(missing)
         )
     settings = resolve_settings(tracker, spec.settings)
-    return tracker, settings, flatten(settings)
+    return _Configuration(key, tracker, settings, flatten(settings))
+
+
+def _asked(
+    spec: RunSpec,
+    configured: _Configuration,
+    part: Part,
+    device: str,
+    start_map: StartMap | None,
+) -> dict[str, Any]:
+    """What of a run's identity was asked for: the entries `record.ASKED`."""
+    settings = configured.flat
+    if start_map is not None:  # its digest is among the weights
+        settings = settings | {MAP_SETTING: ""}
+    asked: dict[str, Any] = {
+        "scheme": IDENTITY_SCHEME,
+        "tracker": configured.tracker.id,
+        "settings": settings,
+        "sequence": part.id,
+        "frames": [part.start, part.stop],
+        "offset": spec.offset,
+        "stride": part.stride,
+        "seed": spec.seed,
+        "device": device,
+        "threads": spec.threads,
+    }
+    if spec.cache:
+        asked["cache"] = True
+    degrade = {name: value for name, value in sorted(spec.degrade.items()) if value}
+    return asked | {
+        "realtime": spec.realtime,
+        "drop_share": spec.drop_share,
+        "degrade": degrade,
+    }
 
 
 def _files_of(
     tracker: TrackerSpec, settings: Settings, source: str
 ) -> tuple[dict[str, Any], tuple[Path, ...]]:
-    """What of a run's identity says by which weights and files it is made; and the files of its program."""
+    """The weights and files by which a run is made.
+
+    Returns:
+        The entries ``weights`` and ``files`` of its identity, and the files of its program.
+
+    Raises:
+        DynslamError: One cannot be read.
+    """
     weights = named_digests(settings)
     group = getattr(settings, "segmentation", None)
     if source in ("embedded", "coco") and isinstance(group, SegmentationSettings):
@@ -294,6 +355,7 @@ def source_digests(parts: Iterable[str]) -> dict[str, str]:
 
 @lru_cache(maxsize=1024)
 def _code_digests(graph: ModuleGraph, parts: tuple[str, ...]) -> Mapping[str, str]:
+    """The digests that `source_digests` gives, for the modules of one graph."""
     return {
         part: graph.code_digest(modules)[:16]
         for part, modules in modules_by_part(graph, parts).items()
@@ -301,7 +363,7 @@ def _code_digests(graph: ModuleGraph, parts: tuple[str, ...]) -> Mapping[str, st
 
 
 def check_unchanged(run: ResolvedRun, *, begun: bool = False) -> None:
-    """What a run is made of is what was looked up for it: data, code, files, weights, map.
+    """Check that what a run is made of is what was looked up for it: data, code, files, weights, map.
 
     Args:
         run: The run.
@@ -317,10 +379,12 @@ def check_unchanged(run: ResolvedRun, *, begun: bool = False) -> None:
         )
     before = run.identity
     now = resolve(run.spec).identity
-    with translate_errors(PluginError, f"cannot read a file of tracker '{run.tracker.id}'"):
-        now |= {
-            "files": contents_digest(run.files) if run.files and not begun else before.get("files")
-        }
+    # what a program's command names may be its output once it has begun
+    now["files"] = before.get("files")
+    if run.files and not begun:
+        with translate_errors(PluginError, f"cannot read a file of tracker '{run.tracker.id}'"):
+            now["files"] = contents_digest(run.files)
+    # weights that had no digest before do not count
     now["weights"] = {
         name: now["weights"].get(name) if value else value
         for name, value in before["weights"].items()

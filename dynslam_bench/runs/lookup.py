@@ -26,25 +26,17 @@ class LookUp:
 
         Of several the newest is taken: a file may have been changed and put back.
         """
+        # a run of built-in parts is found by its id alone
         if not run.foreign:
             record = self._store.get(run.run_id)
             if record is not None and record.identity == run.stated:
                 return record
-        candidates = [
-            record
-            for record in map(self._store.get, self._store.ids_of(run.asked))
-            if record is not None
-        ]
-        valid = [record for record in candidates if self._holds(record, run)]
-        return max(valid, key=lambda record: record.started, default=None)
+        matching = [record for record in self._candidates(run) if self._is_current(record, run)]
+        return max(matching, key=lambda record: record.started, default=None)
 
     def changed(self, run: ResolvedRun) -> str:
         """Why none of the stored runs of a request can be taken; empty where one can, or none is stored."""
-        candidates = [
-            record
-            for record in map(self._store.get, self._store.ids_of(run.asked))
-            if record is not None
-        ]
+        candidates = self._candidates(run)
         if not candidates or self.find(run) is not None:
             return ""
         newest = max(candidates, key=lambda record: record.started)
@@ -55,7 +47,12 @@ class LookUp:
             return ", ".join(differing)
         return "" if newest.reads is None else self._verifier.changed(newest.reads, run.anchors)
 
-    def _holds(self, record: RunRecord, run: ResolvedRun) -> bool:
+    def _candidates(self, run: ResolvedRun) -> list[RunRecord]:
+        """The stored runs of a request, whatever they have read."""
+        records = map(self._store.get, self._store.ids_of(run.asked))
+        return [record for record in records if record is not None]
+
+    def _is_current(self, record: RunRecord, run: ResolvedRun) -> bool:
         """Whether a stored run is what is asked for, and nothing that it read has changed."""
         known_before = {
             name: value for name, value in record.identity.items() if name in run.stated

@@ -9,11 +9,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from dynslam_bench.contracts import MapOutputs
 from dynslam_bench.core import call_periodically
 from dynslam_bench.envs import DegradeFrames, DropFrames, SlamEnv
 from dynslam_bench.evaluation import Protocol, compare_masks
 from dynslam_bench.evaluation.comparison import tracked_frames
-from dynslam_bench.geometry import write_tum
+from dynslam_bench.geometry import Trajectory, write_tum
 from dynslam_bench.runs.artifacts import (
     SHEET_FILE,
     SheetWriter,
@@ -31,11 +32,12 @@ from dynslam_bench.runs.exchange.recording import (
     write_recording,
 )
 from dynslam_bench.runs.frames import FRAMES_FILE, FrameRow
-from dynslam_bench.runs.process.child import at
+from dynslam_bench.runs.layout import FINAL
+from dynslam_bench.runs.process.failures import at
 from dynslam_bench.runs.spec import RunSpec
-from dynslam_bench.runs.store import FINAL
 
-_BEAT_S = 5.0
+_SIGN_OF_LIFE_S = 5.0
+"""Seconds between two signs of life of a batch program, which reports no frames."""
 Send = Callable[[dict[str, Any]], None]
 
 
@@ -54,7 +56,57 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
         DynslamError: The environment cannot be made, or the tracker broke its contract.
     """
     spec = RunSpec.model_validate(job["spec"])
-    base = SlamEnv(
+    slam = _slam_env(spec, Protocol.model_validate(job["protocol"]))
+    env = _with_changed_frames(slam, spec)
+    total = len(slam.sequence)
+
+    def position() -> str:
+        return f"frame {slam.episode.next_index} of {total}"
+
+    def last_position() -> str:
+        return f"frame {slam.episode.next_index - 1} of {total}"
+
+    send({"type": "started", "frames": total})
+    recorder = _Recorder(slam, spec, Path(job["folder"]))
+    with contextlib.closing(recorder):
+        with at(position):
+            env.reset(seed=spec.seed)  # it tracks the first frame
+        is_over = False
+        n_reported = 0
+        while True:
+            # keep the frame that was just tracked, and report it
+            n_done = slam.episode.next_index
+            with at(last_position):
+                recorder.add()
+            send({"type": "frame", "index": n_done - 1})
+            if n_done - n_reported >= job["progress_every"] or is_over:
+                n_reported = n_done
+                send({"type": "progress", **_partial(slam)})
+            if is_over:
+                break
+            if stopping():
+                env.close()
+                return {"type": "stopped", "frames": n_done}
+            # track the next frame
+            with at(position):
+                _, _, terminated, truncated, _ = env.step(0)
+            is_over = terminated or truncated
+
+        signs_of_life: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
+        # a batch program, which has a time limit of its own, is at work
+        if not slam.tracker_spec.online:
+            signs_of_life = call_periodically(
+                _SIGN_OF_LIFE_S, lambda: send({"type": "frame", "index": total - 1})
+            )
+        with at(lambda: "after the last frame"), signs_of_life:
+            outcome = recorder.finish()
+            env.close()
+    return {"type": "done", **outcome}
+
+
+def _slam_env(spec: RunSpec, protocol: Protocol) -> SlamEnv:
+    """The environment of a run; the protocol is that of the partial metrics."""
+    return SlamEnv(
         spec.sequence,
         spec.tracker,
         settings=spec.settings,
@@ -65,50 +117,19 @@ def run_loop(job: dict[str, Any], send: Send, stopping: Callable[[], bool]) -> d
         cache=spec.cache,
         data_root=spec.data_root,
         camera=spec.camera,
-        protocol=Protocol.model_validate(job["protocol"]),
+        protocol=protocol,
         render_mode="rgb_array" if spec.video else None,
     )
-    env: gym.Env[Any, Any] = base
+
+
+def _with_changed_frames(slam: SlamEnv, spec: RunSpec) -> gym.Env[Any, Any]:
+    """The environment, with its frames degraded or dropped as a run asks for."""
+    env: gym.Env[Any, Any] = slam
     if any(spec.degrade.values()):
         env = DegradeFrames(env, seed=0, **spec.degrade)
     if spec.realtime or spec.drop_share:
         env = DropFrames(env, share=None if spec.realtime else spec.drop_share, seed=spec.seed)
-    total = len(base.sequence)
-
-    def position() -> str:
-        return f"frame {base.episode.next_index} of {total}"
-
-    send({"type": "started", "frames": total})
-    recorder = _Recorder(base, spec, Path(job["folder"]))
-    with contextlib.closing(recorder):
-        with at(position):
-            env.reset(seed=spec.seed)
-        over = False
-        reported = 0
-        while True:
-            done = base.episode.next_index
-            with at(lambda: f"frame {base.episode.next_index - 1} of {total}"):
-                recorder.add()
-            send({"type": "frame", "index": done - 1})
-            if done - reported >= job["progress_every"] or over:
-                reported = done
-                send({"type": "progress", **_partial(base)})
-            if over:
-                break
-            if stopping():
-                env.close()
-                return {"type": "stopped", "frames": done}
-            with at(position):
-                _, _, terminated, truncated, _ = env.step(0)
-            over = terminated or truncated
-        signs: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
-        # a batch program, which has a time limit of its own, is at work
-        if not base.tracker_spec.online:
-            signs = call_periodically(_BEAT_S, lambda: send({"type": "frame", "index": total - 1}))
-        with at(lambda: "after the last frame"), signs:
-            outcome = recorder.finish()
-            env.close()
-    return {"type": "done", **outcome}
+    return env
 
 
 def _partial(env: SlamEnv) -> dict[str, Any]:
@@ -161,51 +182,73 @@ class _Recorder:
         if self._sheet is not None:
             self._sheet.add()
         if self._spec.rrd:
-            shot = snapshot_of(outcome.index, result)
-            error_m = None if outcome.error is None else outcome.error.trans_m
-            image = encode(env.frame.rgb)
-            pose = outcome.T_world_cam
             self._recorded.append(
                 RecordedFrame(
-                    outcome.index, outcome.timestamp, image, pose, shot, outcome.state, error_m
+                    index=outcome.index,
+                    stamp=outcome.timestamp,
+                    jpeg=encode(env.frame.rgb),
+                    pose=outcome.T_world_cam,
+                    shot=snapshot_of(outcome.index, result),
+                    state=outcome.state,
+                    error_m=None if outcome.error is None else outcome.error.trans_m,
                 )
             )
 
     def finish(self) -> dict[str, Any]:
         """Write what is known at the end, and return what goes into the record."""
         env = self._env
-        folder = self._folder
+        outcome: dict[str, Any] = {}
+
+        # the final optimisation, and the map
         began = time.perf_counter()
         final = env.final_trajectory()
-        outcome: dict[str, Any] = {}
         if final is not None:
             outcome["finalize_s"] = time.perf_counter() - began
-            write_tum(folder / FINAL, final)
-        outputs, counts, notes = keep_map(env, folder, self._spec)
+            write_tum(self._folder / FINAL, final)
+        outputs, counts, notes = keep_map(env, self._folder, self._spec)
         if not env.tracker_spec.online and final is not None:
             measured = env.measured
-            tracked = tracked_frames(final, env.sequence.timestamps)
             notes += measured.pop("notes")
-            outcome |= measured | {
-                "tracked": int(tracked.sum()),
-                "lost_at_end": int(tracked[::-1].argmax()),
-            }
+            outcome |= measured | self._coverage_of_batch(final)
+
+        # the pictures that were asked for
         track = env.online_trajectory() if final is None else final
         if self._sheet is not None and outputs is not None:
             self._sheet.write(outputs, track)
         elif self._sheet is not None:
             notes.append(f"no {SHEET_FILE}: the tracker offers neither keyframes nor a map")
         if self._spec.rrd:
-            truth = aligned_truth(env.sequence.ground_truth, track)[0] if len(track) else None
-            path = folder / RECORDING_FILE
-            camera = env.sequence.camera
-            write_recording(path, camera, self._title, self._recorded, (track, truth), outputs)
+            self._write_recording(track, outputs)
+
         if env.device.startswith("cuda"):
             import torch
 
             outcome["gpu_memory_mb"] = torch.cuda.max_memory_allocated(env.device) / 1e6
             outcome["gpu"] = torch.cuda.get_device_name(env.device)
         return outcome | counts | {"notes": notes}
+
+    def _coverage_of_batch(self, final: Trajectory) -> dict[str, int]:
+        """How many frames a batch program has tracked, and how many have no pose at the end."""
+        tracked = tracked_frames(final, self._env.sequence.timestamps)  # bool, one a frame
+        return {"tracked": int(tracked.sum()), "lost_at_end": int(tracked[::-1].argmax())}
+
+    def _write_recording(self, track: Trajectory, outputs: MapOutputs | None) -> None:
+        """Write the recording for rerun's viewer.
+
+        Args:
+            track: The run's final trajectory, or the online one.
+            outputs: Keyframes and map points; None where the tracker offers none.
+        """
+        sequence = self._env.sequence
+        truth = aligned_truth(sequence.ground_truth, track)[0] if len(track) else None
+        write_recording(
+            self._folder / RECORDING_FILE,
+            sequence.camera,
+            self._title,
+            self._recorded,
+            (track, truth),
+            outputs,
+        )
 
     def close(self) -> None:
         """Finish the files, also those of a run that ends early."""
@@ -216,9 +259,11 @@ class _Recorder:
             self._video.close()
 
     def _compare_masks(self, index: int) -> tuple[float | None, float | None]:
-        """Overlap of the tracker's mask with the exact one of people, and the share of the image that shows people.
+        """The tracker's mask against the exact one of people.
 
-        None where a mask is missing; the overlap also where both are empty.
+        Returns:
+            Overlap of the two masks, 0 to 1; None where one is missing, or both are empty. Share of
+            the image that shows people, 0 to 1; None without exact masks.
         """
         masks = self._env.sequence.masks
         if masks is None:
@@ -226,10 +271,9 @@ class _Recorder:
         truth = masks[index]
         people = [number for number, name in truth.class_names.items() if name == "person"]
         exact = np.isin(truth.instances, people)
+        people_share = float(exact.mean())
         predicted = self._env.result.dynamic_mask
-        overlap = (
-            None
-            if predicted is None
-            else compare_masks(np.asarray(predicted, dtype=bool), exact).iou
-        )
-        return overlap, float(exact.mean())
+        if predicted is None:
+            return None, people_share
+        overlap = compare_masks(np.asarray(predicted, dtype=bool), exact).iou
+        return overlap, people_share

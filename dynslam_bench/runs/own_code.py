@@ -11,7 +11,8 @@ from typing import Any
 
 from dynslam_bench.contracts import Sequence, TrackerSpec
 from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, ModuleGraph, module_graph
-from dynslam_bench.core.plugins import Registry, used
+from dynslam_bench.core.plugins import Registry
+from dynslam_bench.core.plugins import used as used_plugins
 from dynslam_bench.core.reads import Anchors
 from dynslam_bench.core.settings import Settings
 from dynslam_bench.features.registry import FEATURES
@@ -30,30 +31,31 @@ DEGRADED_FRAMES = "envs.wrappers"
 FINDERS = ("trackers.registry", "sequences.catalogue", "sequences.synthetic")
 """They look up what a name stands for; what they find is part of the identity by itself."""
 BESIDE_THE_LOOP = (
-    *(
-        "envs.rendering",
-        "runs.artifacts",
-        "runs.exchange.recording",
-        "runs.process.child",
-        "runs.record",
-        "runs.store",
-    ),
-    *("envs.wrappers", "segmentation.build_segmenter", "sequences.decoded"),
+    "envs.rendering",
+    "envs.wrappers",
+    "runs.artifacts",
+    "runs.exchange.recording",
+    "runs.layout",
+    "runs.process.failures",
+    "runs.record",
+    "runs.store",
+    "segmentation.build_segmenter",
+    "sequences.decoded",
 )
 """What the environment and the loop use to draw and to store; masks count with the systems that have them."""
 WITH_PLUGINS = (
-    *(
-        "contracts",
-        "core",
-        "culling",
-        "envs",
-        "evaluation",
-        "features",
-        "flow",
-        "geometry",
-        "segmentation",
-    ),
-    *("sequences", "slam", "trackers"),
+    "contracts",
+    "core",
+    "culling",
+    "envs",
+    "evaluation",
+    "features",
+    "flow",
+    "geometry",
+    "segmentation",
+    "sequences",
+    "slam",
+    "trackers",
 )
 """The packages that a plug-in may use: what it imports of this package is known only while it runs."""
 
@@ -111,9 +113,10 @@ def modules_by_part(graph: ModuleGraph, parts: Collection[str]) -> dict[str, lis
 
 def modules_of_run(graph: ModuleGraph, parts: Collection[str]) -> list[str]:
     """The modules of this package that decide a run's result, sorted; see `modules_by_part`."""
-    return sorted(
-        {module for modules in modules_by_part(graph, parts).values() for module in modules}
-    )
+    used: set[str] = set()
+    for modules in modules_by_part(graph, parts).values():
+        used.update(modules)
+    return sorted(used)
 
 
 def modules_for_plugins(graph: ModuleGraph) -> list[str]:
@@ -148,7 +151,7 @@ def plugins_of_run(tracker: str, settings: Settings, source: str, sequence: str)
             names.append((FLOWS, group.plugin or group.method))
     if source not in ("", "none"):
         names.append((SEGMENTERS, segmenter_of(source)))
-    return used(names)
+    return used_plugins(names)
 
 
 def module_of(part: str) -> str:
@@ -194,9 +197,10 @@ def anchors_of(tracker: TrackerSpec, parts: Iterable[str]) -> Anchors:
         tracker: The tracker.
         parts: See `parts_of_run`.
     """
-    files = [Path(module_of(part)).absolute() for part in parts if is_file(part)]
     if is_file(tracker.entry_point):
         files = [Path(module_of(tracker.entry_point)).absolute()]
+    else:
+        files = [Path(module_of(part)).absolute() for part in parts if is_file(part)]
     if not files:
         return Anchors(plugin=None, work=Path.cwd())
     first = min(files, key=lambda file: (file.name, file))

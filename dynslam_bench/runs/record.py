@@ -14,30 +14,34 @@ from dynslam_bench.core.records import Digest, Record, RunId, digest, schema
 from dynslam_bench.evaluation import Evaluation
 
 RUN_SCHEMA = 1
+"""Version of the fields of `RunRecord`."""
 METRIC_SCHEMA = 1
+"""Version of the fields of `MetricRecord`."""
 
 Status = Literal["ok", "lost", "crashed", "timeout", "out-of-memory", "invalid", "stopped"]
+"""How a run ended, see `RunRecord`."""
 IDENTITY_SCHEME = 2
 """Raised when run ids are made of other things. Stored runs of another scheme are shown as unverified."""
 ASKED = (
-    *(
-        "scheme",
-        "tracker",
-        "settings",
-        "sequence",
-        "frames",
-        "offset",
-        "stride",
-        "seed",
-        "device",
-        "threads",
-        "cache",
-    ),
-    *("realtime", "drop_share", "degrade"),
+    "scheme",
+    "tracker",
+    "settings",
+    "sequence",
+    "frames",
+    "offset",
+    "stride",
+    "seed",
+    "device",
+    "threads",
+    "cache",
+    "realtime",
+    "drop_share",
+    "degrade",
 )
 """What of an identity was asked for; all else was read for it: code, data, weights, libraries, files."""
-_CODE = ("tracker_version", "source", "requires", "files", "reads")
-PROGRAM = ("parts", *_CODE, "libraries", "weights")
+_CODE_ENTRIES = ("tracker_version", "source", "requires", "files", "reads")
+"""What of an identity says by which code the run was made."""
+PROGRAM = ("parts", *_CODE_ENTRIES, "libraries", "weights")
 """What of an identity says by which program the run was made: its code, libraries and weights."""
 FAILED: tuple[Status, ...] = ("crashed", "timeout", "out-of-memory", "invalid")
 """Statuses of runs that did not come to their end."""
@@ -63,7 +67,7 @@ def coverage_text(coverage: float | None) -> str:
 
 def program_of(identity: Mapping[str, Any]) -> dict[str, str]:
     """Code, weights and library versions in a run's identity, by name, as short texts."""
-    code = digest([identity.get(name) for name in _CODE], 8)
+    code = digest([identity.get(name) for name in _CODE_ENTRIES], 8)
     libraries = {name: str(value) for name, value in identity.get("libraries", {}).items()}
     weights = {
         f"weights of {name}": str(value)[:8] for name, value in identity.get("weights", {}).items()
@@ -160,13 +164,10 @@ class StartMap(Record):
 
     def describe(self) -> str:
         """One line: which map, of which run, and whether it stayed as it was."""
-        what = (
-            f"begun in the map {self.digest[:8]} ({self.keyframes} keyframes, {self.points} points)"
-        )
-        of = f" of {self.made_by}" if self.made_by else ""
-        return (
-            what + of + (", localisation only" if self.localisation_only else "") + f": {self.file}"
-        )
+        size = f"{self.keyframes} keyframes, {self.points} points"
+        origin = f" of {self.made_by}" if self.made_by else ""
+        mode = ", localisation only" if self.localisation_only else ""
+        return f"begun in the map {self.digest[:8]} ({size}){origin}{mode}: {self.file}"
 
 
 class RunRecord(Record):
@@ -335,11 +336,13 @@ class RunRecord(Record):
         asked = {name: self.settings.get(name, value) for name, value in self.overrides.items()}
         if self.start_map is None:
             return asked
-        named = {
+        others = {
             name: value for name, value in asked.items() if not name.startswith("backend.map.")
         }
-        alone = {"backend.map.localisation_only": True} if self.start_map.localisation_only else {}
-        return named | {"map": self.start_map.digest[:8]} | alone
+        others["map"] = self.start_map.digest[:8]
+        if self.start_map.localisation_only:
+            others["backend.map.localisation_only"] = True
+        return others
 
     @property
     def trial_of(self) -> str:
@@ -350,13 +353,15 @@ class RunRecord(Record):
     def repeat(self) -> str:
         """Which repeat of its block the run is, in words, e.g. ``seed 0, offset 2``."""
         words = [f"seed {self.seed}"]
-        words += [f"offset {self.offset}"] * bool(self.offset)
-        words += [] if self.sequence.noise is None else [f"noise {self.sequence.noise}"]
+        if self.offset:
+            words.append(f"offset {self.offset}")
+        if self.sequence.noise is not None:
+            words.append(f"noise {self.sequence.noise}")
         return ", ".join(words)
 
     @property
     def frame_time_s(self) -> float | None:
-        """Median time a frame, segmentation included, decoding excluded."""
+        """Median time a frame in seconds, segmentation included, decoding excluded."""
         total = self.timings.get("total")
         return None if total is None else total.median_s
 
@@ -364,9 +369,9 @@ class RunRecord(Record):
     def real_time_factor(self) -> float | None:
         """Sensor's frame interval over the mean frame time: above 1 the tracker keeps up."""
         total = self.timings.get("total")
-        return (
-            None if total is None or total.mean_s <= 0 else 1.0 / (self.sequence.fps * total.mean_s)
-        )
+        if total is None or total.mean_s <= 0:
+            return None
+        return 1.0 / (self.sequence.fps * total.mean_s)
 
     def describe(self) -> str:
         """One line: tracker, sequence, seed, status, coverage, frame time."""

@@ -12,7 +12,8 @@ from typing import Any
 from dynslam_bench.core import InfrastructureError, TemporaryFolder
 from dynslam_bench.core.errors import hide_folder_in_messages
 from dynslam_bench.evaluation import Protocol
-from dynslam_bench.runs.process.fork_server import Child, make_job
+from dynslam_bench.runs.process.fork_server import Child
+from dynslam_bench.runs.process.jobs import make_job
 from dynslam_bench.runs.process.supervisor import supervise
 from dynslam_bench.runs.record import MetricRecord
 from dynslam_bench.runs.spec import Limits
@@ -24,7 +25,7 @@ _WORK = f"{__name__}:score_job"
 def score_apart(
     store: RunStore, run_id: str, protocol: Protocol, *, again: bool = False
 ) -> MetricRecord:
-    """What `RunStore.score` gives, computed in a process of its own.
+    """The metrics of a stored run under a protocol, computed in a process of its own; see `RunStore.score`.
 
     Raises:
         InfrastructureError: The process could not do it.

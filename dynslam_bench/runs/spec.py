@@ -25,7 +25,7 @@ class Limits(Record):
             kernels.
         frame_s: Time for any later frame, and for the final optimisation.
         memory_mb: Memory of the run's process and its children, shared pages counted once; None for
-            the default, a share of the machine's memory (see `memory.memory_limit`), 0 for no
+            the default, a share of the machine's memory (see `supervisor.memory_limit`), 0 for no
             limit.
     """
 
@@ -119,24 +119,27 @@ class RunSpec(Record):
         return (start + self.offset, stop) if self.offset else self.frames
 
     def absolute(self) -> RunSpec:
-        """The same run, named independently of the working folder."""
-        camera = None if self.camera is None else Path(self.camera).expanduser()
+        """This run, named independently of the working folder."""
         settings = self.settings
         # with its links followed: ``latest`` is another run's folder soon
         if settings.get(MAP_SETTING):
-            settings = settings | {
-                MAP_SETTING: str(Path(settings[MAP_SETTING]).expanduser().resolve())
-            }
+            map_file = Path(settings[MAP_SETTING]).expanduser().resolve()
+            settings = settings | {MAP_SETTING: str(map_file)}
+
+        data_root = self.data_root
+        if data_root is not None:
+            data_root = str(Path(data_root).expanduser().absolute())
+
+        camera = self.camera
+        if camera is not None and Path(camera).expanduser().is_file():
+            camera = str(Path(camera).expanduser().absolute())
+
         return self.model_copy(
             update={
                 "tracker": absolute_target(self.tracker),
                 "sequence": _absolute_folder(self.sequence),
-                "data_root": None
-                if self.data_root is None
-                else str(Path(self.data_root).expanduser().absolute()),
-                "camera": str(camera.absolute())
-                if camera is not None and camera.is_file()
-                else self.camera,
+                "data_root": data_root,
+                "camera": camera,
                 "settings": settings,
             }
         )
@@ -153,15 +156,16 @@ def absolute_target(tracker: str) -> str:
 
 
 def _absolute_folder(sequence: str) -> str:
+    """The absolute path of a sequence that is named by its folder; an id as it is."""
     if sequence.startswith((".", "~", os.sep)):
         return str(Path(sequence).expanduser().absolute())
-    catalogued = sequence.startswith("synthetic/") or entry_of(sequence) is not None
-    return (
-        str(Path(sequence).absolute()) if not catalogued and Path(sequence).is_dir() else sequence
-    )
+    is_id = sequence.startswith("synthetic/") or entry_of(sequence) is not None
+    if is_id or not Path(sequence).is_dir():
+        return sequence
+    return str(Path(sequence).absolute())
 
 
 def place_of(sequence: str) -> str:
     """Absolute folder of a sequence that is named by its path; empty for an id."""
-    named = _absolute_folder(sequence)
-    return named if Path(named).is_absolute() else ""
+    name = _absolute_folder(sequence)
+    return name if Path(name).is_absolute() else ""

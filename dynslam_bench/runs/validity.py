@@ -59,11 +59,9 @@ class Installation:
         if tracker.folder:
             return Path(tracker.folder)
         target = TRACKERS.target_of(tracker.id)
-        return (
-            Path(module_of(target)).absolute().parent
-            if target is not None and is_file(target)
-            else None
-        )
+        if target is None or not is_file(target):
+            return None
+        return Path(module_of(target)).absolute().parent
 
     def _compare(
         self, program: Mapping[str, Any], named: Mapping[str, Any], plugin: Path | None
@@ -125,7 +123,10 @@ def _table(value: object) -> dict[str, Any]:
 
 
 def _package_now(module: str) -> str:
-    """As `library_identity`; empty for what is no top-level module, which could not be looked up without an import."""
+    """The identity of an installed library; empty for what is no top-level module.
+
+    Any other module could not be looked up without an import.
+    """
     return library_identity(module) if module.isidentifier() else ""
 
 

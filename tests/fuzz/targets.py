@@ -39,9 +39,10 @@ from dynslam_bench.core.stage_cache import StageCache  # what of the cache reads
 from dynslam_bench.evaluation import get_protocol
 from dynslam_bench.geometry import Camera, load_tum, read_kitti
 from dynslam_bench.reports.model.load import load_runs
-from dynslam_bench.runs import RunRecord, RunStore, artifacts, bank, frames, running
+from dynslam_bench.runs import RunRecord, RunStore, artifacts, bank, frames, packing
 from dynslam_bench.runs.exchange import formats, transfer
-from dynslam_bench.runs.store import INDEX_FILE, list_runs
+from dynslam_bench.runs.layout import INDEX_FILE
+from dynslam_bench.runs.listing import list_runs
 from dynslam_bench.segmentation import recorded
 from dynslam_bench.segmentation.networks import loading, onnx_header, onnx_layout
 from dynslam_bench.segmentation.networks.backbone import NetworkConfig
@@ -202,7 +203,7 @@ def _log_seeds() -> list[bytes]:
 
 def _packed_seeds() -> list[bytes]:
     store = RunStore(FIXTURE)
-    packed = running.pack(store, store.read(RUN))
+    packed = packing.pack(store, store.read(RUN))
     lying = bytearray(packed)
     start = lying.index(b"PK\x01\x02") + 24  # the size that the first file claims
     lying[start : start + 4] = b"\xfe\xff\xff\xff"
@@ -322,7 +323,7 @@ RECORDS = [
     ),
     Target(
         "packed run",
-        lambda data, folder: running.unpack(data or b"", RunStore(folder)),
+        lambda data, folder: packing.unpack(data or b"", RunStore(folder)),
         _packed_seeds,
         mutate_zip,
     ),

@@ -26,8 +26,8 @@ from dynslam_bench.runs.process.fork_server import (
     START_VARIABLE,
     Child,
     ForkServer,
-    process_tree,
 )
+from dynslam_bench.runs.process.process_trees import process_tree
 from dynslam_bench.runs.process.supervisor import ServerDiedError, supervise
 
 linux = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux' subreapers and /proc")

@@ -51,7 +51,7 @@ from dynslam_bench.runs import (
 )
 from dynslam_bench.runs.cluster import DaskWorkers
 from dynslam_bench.runs.identity import Resolver
-from dynslam_bench.runs.running import pack, unpack
+from dynslam_bench.runs.packing import pack, unpack
 from dynslam_bench.sequences.catalogue import entry_of, sequence_ids
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
 from dynslam_bench.suites import load_suite, suite_names
@@ -232,7 +232,7 @@ def test_packed_runs_that_are_none(store: RunStore, toy_folder: str, tmp_path: P
 
 @pytest.mark.parametrize(
     "writes",
-    ["dynslam_bench.runs.running.TemporaryFolder", "zipfile.ZipFile.extractall"],
+    ["dynslam_bench.runs.packing.TemporaryFolder", "zipfile.ZipFile.extractall"],
     ids=["worker", "head"],
 )
 def test_a_full_disk_of_a_worker_or_of_the_head_is_one_clear_line(

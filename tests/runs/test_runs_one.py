@@ -33,7 +33,7 @@ from dynslam_bench.runs import (
 from dynslam_bench.runs.artifacts import keep_map
 from dynslam_bench.runs.frames import FrameLog, FrameRow, read_csv
 from dynslam_bench.runs.identity import check_unchanged, start_map_of
-from dynslam_bench.runs.store import runs_frame
+from dynslam_bench.runs.rows import runs_frame
 from dynslam_bench.slam.map_files import MAP_FILE, SavedMap, read_map, write_map
 from dynslam_bench.slam.settings import BackendSettings, StartMapSettings
 

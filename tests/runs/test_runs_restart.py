@@ -15,9 +15,9 @@ from faults import in_a_small_process, survey, tree
 from dynslam_bench.core import InfrastructureError, RunError
 from dynslam_bench.geometry import Trajectory, write_tum
 from dynslam_bench.runs import RunRecord, RunStore, bank, list_runs, rescore
-from dynslam_bench.runs import store as store_module
+from dynslam_bench.runs import index as index_module
+from dynslam_bench.runs.copying import merge
 from dynslam_bench.runs.exchange.transfer import import_trajectory
-from dynslam_bench.runs.store import merge
 
 
 def walk(path: Path, drift: float) -> Path:
@@ -216,7 +216,7 @@ def test_a_full_disk_is_no_fault_of_a_manifest(
 def locked(three: RunStore, monkeypatch: pytest.MonkeyPatch) -> Iterator[sqlite3.Connection]:
     """Another connection that keeps the index of the three runs locked."""
     list_runs(three)
-    monkeypatch.setattr(store_module, "_LOCKED_S", 0.05)
+    monkeypatch.setattr(index_module, "_LOCKED_S", 0.05)
     with closing(sqlite3.connect(three.index.path, isolation_level=None)) as connection:
         connection.execute("BEGIN EXCLUSIVE")
         yield connection

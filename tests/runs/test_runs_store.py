@@ -36,6 +36,7 @@ from dynslam_bench.runs import (
     run_row,
     score,
 )
+from dynslam_bench.runs import listing as listing_module
 from dynslam_bench.runs import store as store_module
 from dynslam_bench.runs.artifacts import (
     PICTURE,
@@ -47,7 +48,7 @@ from dynslam_bench.runs.artifacts import (
     spread,
 )
 from dynslam_bench.runs.frames import FrameLog, FrameRow, read_csv, write_csv
-from dynslam_bench.runs.store import FIELDS
+from dynslam_bench.runs.rows import FIELDS
 from dynslam_bench.tuning.storage import JournalFile
 
 
@@ -277,7 +278,8 @@ def test_metrics_hold_for_one_version_of_the_code(filled, monkeypatch: pytest.Mo
     assert store.score(record).code == "newer"
     monkeypatch.undo()
     rows, _ = list_runs(store)
-    monkeypatch.setattr(store_module, "module_graph", lambda: Mock(digest=lambda *_: "another"))
+    for module in (listing_module, store_module):
+        monkeypatch.setattr(module, "module_graph", lambda: Mock(digest=lambda *_: "another"))
     (store.folder(ids[1]) / "log.txt").write_text("no part of a row")
     assert list_runs(store) == (rows, [])
 

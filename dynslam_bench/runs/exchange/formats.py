@@ -76,8 +76,10 @@ POSE_TABLES = {
     ),
     "vslam-lab": ("00000_KeyFrameTrajectory.csv", ",".join(POSE), [0, 1, 2, 3, 4, 5, 6]),
 }
-"""Tables of poses as EuRoC's ground truth and VSLAM-LAB's systems write them: their file, their heading, and their
-columns behind the stamp, of ``tx ty tz qx qy qz qw``."""
+"""Tables of poses as EuRoC's ground truth and VSLAM-LAB's systems write them.
+
+For each its file, its heading, and its columns behind the stamp: places in ``tx ty tz qx qy qz qw``.
+"""
 
 
 def write_pose_table(folder: Path, form: str, trajectory: Trajectory) -> None:
@@ -96,6 +98,7 @@ def write_pose_table(folder: Path, form: str, trajectory: Trajectory) -> None:
 
 
 IMAGES = "images.txt"
+"""COLMAP's file of the images and their poses."""
 
 
 def write_colmap(
@@ -118,27 +121,24 @@ def write_colmap(
     Raises:
         DynslamError: A file cannot be written.
     """
-    # the corner of the first pixel is at 0
-    values = [camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5]
-    k1, k2, p1, p2, k3 = camera.distortion
-    model = ("FULL_OPENCV" if k3 else "OPENCV") if camera.is_distorted else "PINHOLE"
-    values += {
-        "PINHOLE": [],
-        "OPENCV": [k1, k2, p1, p2],
-        "FULL_OPENCV": [k1, k2, p1, p2, k3, 0, 0, 0],
-    }[model]
-    numbers = " ".join(f"{value:.12g}" for value in values)
+    # the camera
+    model, parameters = _colmap_camera(camera)
+    numbers = " ".join(f"{value:.12g}" for value in parameters)
     write_atomic(
         folder / "cameras.txt",
         f"# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n1 {model} {camera.width} "
         f"{camera.height} {numbers}\n",
     )
+
+    # the images with their poses, world to camera
     position, quaternion = se3.to_quaternion(se3.inverse(trajectory.T_world_cam))
     lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then POINTS2D[] (none)"]
     for number, (t, q, name) in enumerate(zip(position, quaternion, names, strict=True), start=1):
         pose = " ".join(f"{value:.12f}" for value in (q[3], *q[:3], *t))
         lines += [f"{number} {pose} 1 {name}", ""]
     write_atomic(folder / IMAGES, "\n".join(lines) + "\n")
+
+    # the map points
     points = ["# POINT3D_ID X Y Z R G B ERROR TRACK[]"]
     if cloud is not None:
         rows = zip(cloud.positions.tolist(), cloud.colours.tolist(), strict=True)
@@ -147,6 +147,18 @@ def write_colmap(
             for i, ((x, y, z), (r, g, b)) in enumerate(rows, 1)
         ]
     write_atomic(folder / "points3D.txt", "\n".join(points) + "\n")
+
+
+def _colmap_camera(camera: Camera) -> tuple[str, list[float]]:
+    """COLMAP's model of a camera, and its parameters."""
+    # the corner of the first pixel is at 0
+    values = [camera.fx, camera.fy, camera.cx + 0.5, camera.cy + 0.5]
+    if not camera.is_distorted:
+        return "PINHOLE", values
+    k1, k2, p1, p2, k3 = camera.distortion
+    if not k3:
+        return "OPENCV", [*values, k1, k2, p1, p2]
+    return "FULL_OPENCV", [*values, k1, k2, p1, p2, k3, 0, 0, 0]
 
 
 def read_colmap(folder: Path, stamps: Mapping[str, float] | None = None) -> Trajectory:
@@ -161,7 +173,7 @@ def read_colmap(folder: Path, stamps: Mapping[str, float] | None = None) -> Traj
             is no image.
     """
     path = folder / IMAGES if folder.is_dir() else folder
-    poses_by_stamp: dict[float, Array] = {}
+    poses_by_stamp: dict[float, Array] = {}  # world to camera, [4, 4]
     numbered = enumerate(read_lines(path, kind=TrajectoryError), start=1)
     lines = ((number, line) for number, line in numbered if not line.startswith("#"))
     for number, line in lines:
@@ -184,13 +196,22 @@ def read_colmap(folder: Path, stamps: Mapping[str, float] | None = None) -> Traj
         poses_by_stamp[stamp] = se3.from_quaternion(values[4:], values[[1, 2, 3, 0]])
     if not poses_by_stamp:
         raise TrajectoryError(f"{path} names no image")
-    order = sorted(poses_by_stamp)
-    return Trajectory(
-        np.array(order), se3.inverse(np.array([poses_by_stamp[stamp] for stamp in order]))
-    )
+    stamps_in_order = sorted(poses_by_stamp)
+    poses = np.array([poses_by_stamp[stamp] for stamp in stamps_in_order])
+    return Trajectory(np.array(stamps_in_order), se3.inverse(poses))
 
 
 def _stamp(name: str, stamps: Mapping[str, float] | None, path: Path) -> float:
+    """The stamp of an image in seconds.
+
+    Args:
+        name: The image as the reconstruction names it.
+        stamps: Stamps by name; None where the names are the stamps.
+        path: The file that names it.
+
+    Raises:
+        TrajectoryError: It has none.
+    """
     if stamps is not None:
         stamp = stamps.get(name, stamps.get(Path(name).name))
         if stamp is None:
@@ -208,7 +229,9 @@ def _stamp(name: str, stamps: Mapping[str, float] | None, path: Path) -> float:
 
 
 POSE_MESSAGE = "geometry_msgs/msg/PoseStamped"
-PATH = "nav_msgs/msg/Path"
+"""Type of the messages on a topic of poses."""
+PATH_MESSAGE = "nav_msgs/msg/Path"
+"""Type of the message that holds a whole trajectory."""
 
 
 def read_bag_trajectory(path: Path, topic: str | None = None) -> TumFile:
@@ -260,6 +283,14 @@ def write_bag(folder: Path, trajectories: Mapping[str, Trajectory]) -> None:
 
 
 def _write_messages(writer: Any, store: Any, name: str, trajectory: Trajectory) -> None:
+    """Write a trajectory: each pose at its stamp, and all of them as a path at the first one.
+
+    Args:
+        writer: Of the bag.
+        store: The types of the messages.
+        name: Of the trajectory.
+        trajectory: Camera-to-world poses.
+    """
     types = store.types
     poses = []
     topic = writer.add_connection(f"/{name}/pose", POSE_MESSAGE, typestore=store)
@@ -270,13 +301,13 @@ def _write_messages(writer: Any, store: Any, name: str, trajectory: Trajectory) 
         position = types["geometry_msgs/msg/Point"](*row[:3])
         orientation = types["geometry_msgs/msg/Quaternion"](*row[3:])
         pose = types["geometry_msgs/msg/Pose"](position=position, orientation=orientation)
-        poses.append(
-            types[POSE_MESSAGE](
-                header=types["std_msgs/msg/Header"](stamp=time, frame_id="world"), pose=pose
-            )
-        )
-        writer.write(topic, ns, store.serialize_cdr(poses[-1], POSE_MESSAGE))
+        header = types["std_msgs/msg/Header"](stamp=time, frame_id="world")
+        message = types[POSE_MESSAGE](header=header, pose=pose)
+        poses.append(message)
+        writer.write(topic, ns, store.serialize_cdr(message, POSE_MESSAGE))
     if poses:
-        whole = types[PATH](header=poses[0].header, poses=poses)
-        topic = writer.add_connection(f"/{name}/path", PATH, typestore=store)
-        writer.write(topic, int(trajectory.timestamps_ns[0]), store.serialize_cdr(whole, PATH))
+        whole = types[PATH_MESSAGE](header=poses[0].header, poses=poses)
+        topic = writer.add_connection(f"/{name}/path", PATH_MESSAGE, typestore=store)
+        writer.write(
+            topic, int(trajectory.timestamps_ns[0]), store.serialize_cdr(whole, PATH_MESSAGE)
+        )

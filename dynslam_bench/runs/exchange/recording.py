@@ -33,9 +33,12 @@ from dynslam_bench.slam.map_files import read_ply
 
 RECORDING_FILE = "recording.rrd"
 IMAGE = "world/camera/image"
+"""Where the images are in the recording."""
 LAYERS = {"mask": f"{IMAGE}/mask", "kept": f"{IMAGE}/kept", "culled": f"{IMAGE}/culled"}
-_QUALITY = 80
-_TOLERANCE_S = 1e-5
+"""What is drawn over the images, and where it is in the recording."""
+_JPEG_QUALITY = 80
+_STAMP_TOLERANCE_S = 1e-5
+"""Poses and frames whose stamps differ by less belong to each other."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +70,7 @@ def encode(rgb: NDArray[np.uint8]) -> bytes:
     """An image, uint8 ``[H, W, 3]``, red first, as a JPEG file of half its size."""
     size = (max(rgb.shape[1] // 2, 1), max(rgb.shape[0] // 2, 1))
     small = cv2.cvtColor(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2BGR)
-    return bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1])
+    return bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1])
 
 
 def check_rerun() -> None:
@@ -117,74 +120,113 @@ def write_recording(
         stream.save(str(path), default_blueprint=_blueprint())
     stream.send_recording_name(name)
     _log_frames(rr, stream, camera, frames)
-    for track_name, track, colour in zip(
-        ("estimate", "truth"), tracks, (ESTIMATE, TRUTH), strict=True
-    ):
-        if track is not None and len(track):
-            stream.log(
-                f"world/{track_name}",
-                rr.LineStrips3D([track.positions], colors=[colour]),
-                static=True,
-            )
-    if cloud is not None and len(cloud.positions):
-        stream.log(
-            "world/map",
-            rr.Points3D(cloud.positions, colors=cloud.colours, radii=0.005),
-            static=True,
-        )
+    _log_scene(rr, stream, tracks, cloud)
     stream.disconnect()
 
 
+def _log_scene(
+    rr: Any, stream: Any, tracks: tuple[Trajectory, Trajectory | None], cloud: Any
+) -> None:
+    """Log what is there without time: the trajectories and the map."""
+    estimate, truth = tracks
+    for name, track, colour in (("estimate", estimate, ESTIMATE), ("truth", truth, TRUTH)):
+        if track is not None and len(track):
+            line = rr.LineStrips3D([track.positions], colors=[colour])
+            stream.log(f"world/{name}", line, static=True)
+    if cloud is not None and len(cloud.positions):
+        points = rr.Points3D(cloud.positions, colors=cloud.colours, radii=0.005)
+        stream.log("world/map", points, static=True)
+
+
 def _log_frames(rr: Any, stream: Any, camera: Camera, frames: Iterable[RecordedFrame]) -> None:
-    width, height = size = (max(camera.width // 2, 1), max(camera.height // 2, 1))
-    scale = np.array([width / camera.width, height / camera.height])
+    """Log the frames in order.
+
+    Args:
+        rr: The library.
+        stream: The recording.
+        camera: Of the images at full size.
+        frames: The frames.
+    """
+    # width and height of the images in the recording, and what they are of those at full size
+    size = (max(camera.width // 2, 1), max(camera.height // 2, 1))
+    scale = np.array([size[0] / camera.width, size[1] / camera.height])
+    _log_camera(rr, stream, camera, size, scale)
+    first_stamp: float | None = None
+    shown_layers: set[str] = set()
+    state = ""
+    for frame in frames:
+        first_stamp = frame.stamp if first_stamp is None else first_stamp
+        stream.set_time("frame", sequence=frame.index)
+        stream.set_time("time", duration=frame.stamp - first_stamp)
+
+        # the image, the camera's pose, and the numbers of the frame
+        stream.log(IMAGE, rr.EncodedImage(contents=frame.jpeg, media_type="image/jpeg"))
+        if frame.pose is not None:
+            position, quaternion = se3.to_quaternion(frame.pose)
+            pose = rr.Transform3D.from_fields(translation=position, quaternion=quaternion)
+            stream.log("world/camera", pose)
+        if frame.error_m is not None:
+            stream.log("error/trans_m", rr.Scalars(frame.error_m))
+        if frame.state != state:
+            stream.log("state", rr.TextLog(frame.state))
+
+        # features and mask; the viewer would show on those that this frame does not have
+        layers = {} if frame.shot is None else _layers(rr, stream, frame.shot, size, scale)
+        for layer in shown_layers - layers.keys():
+            stream.log(LAYERS[layer], rr.Clear(recursive=False))
+        for layer, picture in layers.items():
+            stream.log(LAYERS[layer], picture)
+        shown_layers = set(layers)
+        state = frame.state
+
+
+def _log_camera(
+    rr: Any, stream: Any, camera: Camera, size: tuple[int, int], scale: NDArray[np.float64]
+) -> None:
+    """Log the camera, and how features and masks are drawn.
+
+    Args:
+        rr: The library.
+        stream: The recording.
+        camera: Of the images at full size.
+        size: Width and height of the images in the recording.
+        scale: What these are of those at full size.
+    """
     matrix = camera.matrix * np.array([*scale, 1.0])[:, None]
     matrix[:2, 2] += 0.5 * scale  # rerun puts the corner of the top-left pixel at 0, we its centre
     pinhole = rr.Pinhole(
-        image_from_camera=matrix, width=width, height=height, camera_xyz=rr.ViewCoordinates.RDF
+        image_from_camera=matrix, width=size[0], height=size[1], camera_xyz=rr.ViewCoordinates.RDF
     )
     classes = rr.AnnotationContext([(0, "static", (0, 0, 0, 0)), (1, "dynamic", (*MASK, 110))])
     stream.log("world", rr.ViewCoordinates.RDF, static=True)
     stream.log(IMAGE, pinhole, classes, static=True)
     for layer, colour in (("kept", KEPT), ("culled", CULLED)):
-        stream.log(
-            LAYERS[layer], rr.Points2D.from_fields(colors=[colour], radii=[1.0]), static=True
-        )
-    first: float | None = None
-    shown = set[str]()
-    state = ""
-    for frame in frames:
-        first = frame.stamp if first is None else first
-        stream.set_time("frame", sequence=frame.index)
-        stream.set_time("time", duration=frame.stamp - first)
-        stream.log(IMAGE, rr.EncodedImage(contents=frame.jpeg, media_type="image/jpeg"))
-        if frame.pose is not None:
-            position, quaternion = se3.to_quaternion(frame.pose)
-            stream.log(
-                "world/camera",
-                rr.Transform3D.from_fields(translation=position, quaternion=quaternion),
-            )
-        if frame.error_m is not None:
-            stream.log("error/trans_m", rr.Scalars(frame.error_m))
-        if frame.state != state:
-            stream.log("state", rr.TextLog(frame.state))
-        layers: dict[str, Any] = {}
-        if frame.shot is not None:
-            points = ((frame.shot.points + 0.5) * scale).astype(np.float32)
-            kept = frame.shot.kept
-            mask = frame.shot.mask
-            for layer, chosen in (("kept", points[kept]), ("culled", points[~kept])):
-                layers[layer] = rr.Points2D.from_fields(positions=chosen)
-                stream.log(f"features/{layer}", rr.Scalars(float(len(chosen))))
-            if mask is not None:
-                small = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-                layers["mask"] = rr.SegmentationImage(small)
-        for layer in shown - layers.keys():  # the viewer would show them on
-            stream.log(LAYERS[layer], rr.Clear(recursive=False))
-        for layer, picture in layers.items():
-            stream.log(LAYERS[layer], picture)
-        shown = set(layers)
-        state = frame.state
+        points = rr.Points2D.from_fields(colors=[colour], radii=[1.0])
+        stream.log(LAYERS[layer], points, static=True)
+
+
+def _layers(
+    rr: Any, stream: Any, shot: Snapshot, size: tuple[int, int], scale: NDArray[np.float64]
+) -> dict[str, Any]:
+    """The features and the mask of a frame by their layers; logs how many features there are.
+
+    Args:
+        rr: The library.
+        stream: The recording.
+        shot: Features in pixels of the image at full size, and the mask.
+        size: Width and height of the images in the recording.
+        scale: What these are of those at full size.
+    """
+    layers: dict[str, Any] = {}
+    points = ((shot.points + 0.5) * scale).astype(np.float32)
+    for layer, chosen in (("kept", points[shot.kept]), ("culled", points[~shot.kept])):
+        layers[layer] = rr.Points2D.from_fields(positions=chosen)
+        stream.log(f"features/{layer}", rr.Scalars(float(len(chosen))))
+    mask = shot.mask
+    if mask is not None:
+        small = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+        layers["mask"] = rr.SegmentationImage(small)
+    return layers
 
 
 def _blueprint() -> Any:
@@ -219,39 +261,27 @@ def write_stored(
         SequenceError: An image cannot be read.
     """
     folder = store.folder(record.run_id)
-    (height, width), snapshots = read_snapshots(folder)
-    scale = np.array(
-        [sequence.camera.width / max(width, 1), sequence.camera.height / max(height, 1)]
-    )
-    # in pixels of the sequence's images, which the tracker's preprocessing may have resized
-    scaled = [((shot.points + 0.5) * scale - 0.5).round().astype(np.int16) for shot in snapshots]
-    shots = {
-        shot.index: replace(shot, points=points)
-        for shot, points in zip(snapshots, scaled, strict=True)
-    }
+    shots = _snapshots(folder, sequence.camera)
     online = store.trajectory(record.run_id, "online") or trajectory
     tracked, rows_of_poses = associate(
-        sequence.timestamps, online.timestamps, _TOLERANCE_S, strict=False
+        sequence.timestamps, online.timestamps, _STAMP_TOLERANCE_S, strict=False
     )
     poses = dict(zip(tracked.tolist(), online.T_world_cam[rows_of_poses], strict=True))
-    rows = (
-        {row.index: row for row in read_csv(folder / CSV_FILE)}
-        if (folder / CSV_FILE).is_file()
-        else {}
-    )
+    table = folder / CSV_FILE
+    rows = {row.index: row for row in read_csv(table)} if table.is_file() else {}
 
     def frames() -> Iterator[RecordedFrame]:
         for index in range(len(sequence)):
             row = rows.get(index)
             frame = sequence[index]
-            state = ("", None) if row is None else (str(row.state), row.pose_error_trans_m)
             yield RecordedFrame(
-                index,
-                frame.timestamp,
-                encode(frame.rgb),
-                poses.get(index),
-                shots.get(index),
-                *state,
+                index=index,
+                stamp=frame.timestamp,
+                jpeg=encode(frame.rgb),
+                pose=poses.get(index),
+                shot=shots.get(index),
+                state="" if row is None else str(row.state),
+                error_m=None if row is None else row.pose_error_trans_m,
             )
 
     cloud = read_ply(folder / "map.ply") if (folder / "map.ply").is_file() else None
@@ -263,3 +293,21 @@ def write_stored(
     return [
         f"features and masks are known of {len(shots)} of {len(sequence)} frames; `run --rrd` records all"
     ]
+
+
+def _snapshots(folder: Path, camera: Camera) -> dict[int, Snapshot]:
+    """The snapshots of a stored run by the index of their frame.
+
+    Args:
+        folder: The run's.
+        camera: Of the sequence's images, in pixels of which the features are given: the tracker's
+            preprocessing may have resized them.
+    """
+    (height, width), snapshots = read_snapshots(folder)
+    scale = np.array([camera.width / max(width, 1), camera.height / max(height, 1)])
+    shots = {}
+    for shot in snapshots:
+        # the centre of the top-left pixel is at 0 in both
+        points = ((shot.points + 0.5) * scale - 0.5).round().astype(np.int16)
+        shots[shot.index] = replace(shot, points=points)
+    return shots

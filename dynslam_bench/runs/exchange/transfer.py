@@ -1,5 +1,7 @@
 """Stored runs as files of other tools with ``provenance.json`` beside them, and their trajectories as stored runs."""
 
+from __future__ import annotations
+
 import contextlib
 import shutil
 from collections.abc import Callable
@@ -7,8 +9,10 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 from hashlib import sha256
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Sequence, timestamps_ns
 from dynslam_bench.core import DynslamError, RunError, atomic_folder, did_you_mean, write_atomic
@@ -20,6 +24,7 @@ from dynslam_bench.evaluation.comparison import STAMP_TOLERANCE, clock_hint
 from dynslam_bench.geometry import (
     Array,
     Trajectory,
+    TumFile,
     associate,
     nearest_gap,
     to_seconds,
@@ -33,17 +38,24 @@ from dynslam_bench.runs.exchange.formats import (
     write_pose_table,
 )
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE, write_stored
+from dynslam_bench.runs.layout import Which
+from dynslam_bench.runs.make_record import judge_coverage, part_digest, sequence_info
 from dynslam_bench.runs.record import RunRecord, SequenceInfo, TrackerInfo, run_id_of
-from dynslam_bench.runs.running import judge_coverage, part_digest, sequence_info
 from dynslam_bench.runs.spec import place_of
-from dynslam_bench.runs.store import RunStore, Which, open_store
+from dynslam_bench.runs.store import RunStore, open_store
 from dynslam_bench.sequences.catalogue import entry_of, parse_frames
 from dynslam_bench.sequences.tags import motion_tags
 from dynslam_bench.sequences.view import Part, part_of
 from dynslam_bench.slam.map_files import read_ply
 
 _STAMP_TOLERANCE_S = 1e-5
+"""Poses and images of one run whose stamps differ by less belong to each other."""
 _IMPORT_TOLERANCE_S = 0.02
+"""An imported pose covers a frame whose stamp differs by less."""
+FORMATS = ("tum", "kitti", "euroc", "vslam-lab", "colmap", "mcap", "rrd")
+"""Names of the formats."""
+PROVENANCE_FILE = "provenance.json"
+"""Lies beside an export, see `Provenance`."""
 
 
 @dataclass(frozen=True)
@@ -98,16 +110,11 @@ def export_run(
     store = results if isinstance(results, RunStore) else open_store(results)
     record = store.read(run) if isinstance(run, str) else run
     chosen, trajectory = _trajectory(store, record, which)
-    target = (
-        store.root / "exports" / record.run_id / form
-        if folder is None
-        else Path(folder).expanduser().absolute()
-    )
-    is_free = target.is_dir() and (
-        not any(target.iterdir()) or (target / PROVENANCE_FILE).is_file()
-    )
-    # only a folder that an export made, or an empty one, is replaced
-    if target.exists() and not is_free:
+    if folder is None:
+        target = store.root / "exports" / record.run_id / form
+    else:
+        target = Path(folder).expanduser().absolute()
+    if target.exists() and not _is_replaceable(target):
         raise RunError(
             f"{target} exists and is no export", "name a folder that does not exist, with -o"
         )
@@ -129,9 +136,21 @@ def export_run(
     return Exported(target, (*digests, PROVENANCE_FILE), chosen, tuple(notes))
 
 
+def _is_replaceable(folder: Path) -> bool:
+    """Whether an export may take the place of what is there: an empty folder, or one that an export made."""
+    if not folder.is_dir():
+        return False
+    return not any(folder.iterdir()) or (folder / PROVENANCE_FILE).is_file()
+
+
 def _trajectory(
     store: RunStore, record: RunRecord, which: Which | None
 ) -> tuple[Which, Trajectory]:
+    """The trajectory of a run that is exported, and which it is; by default the final one, else the online one.
+
+    Raises:
+        RunError: The run has no such trajectory.
+    """
     wanted: tuple[Which, ...] = ("final", "online") if which is None else (which,)
     for kind in wanted:
         if trajectory := store.trajectory(record.run_id, kind):
@@ -139,10 +158,6 @@ def _trajectory(
     raise RunError(
         f"run {record.run_id} has no {' and no '.join(wanted)} trajectory", record.describe()
     )
-
-
-FORMATS = ("tum", "kitti", "euroc", "vslam-lab", "colmap", "mcap", "rrd")
-"""Names of the formats."""
 
 
 def _write(
@@ -154,7 +169,20 @@ def _write(
     trajectory: Trajectory,
     reopened: Callable[[], Sequence],
 ) -> list[str]:
-    """Write the files of a format into a folder, and give notes; `reopened` gives the frames of the run."""
+    """Write the files of a format into a folder.
+
+    Args:
+        form: Name of the format.
+        work: The folder.
+        store: The run's.
+        record: The run.
+        which: Which of its trajectories.
+        trajectory: That trajectory.
+        reopened: Opens the frames of the run, for formats that need images or the camera.
+
+    Returns:
+        What a user should know, one line each.
+    """
     match form:
         case "tum":
             comment = f"{record.tracker.id} on {record.sequence.id}, {which}, run {record.run_id}"
@@ -172,9 +200,10 @@ def _write(
             write_pose_table(work, form, trajectory)
         case "mcap":
             truth = store.ground_truth(record.sequence.part)
-            write_bag(
-                work, {"estimate": trajectory} | ({} if truth is None else {"ground_truth": truth})
-            )
+            trajectories = {"estimate": trajectory}
+            if truth is not None:
+                trajectories["ground_truth"] = truth
+            write_bag(work, trajectories)
             if truth is not None:
                 return ["estimate and ground_truth are each in a world of their own, not aligned"]
         case "colmap":
@@ -191,20 +220,37 @@ def _write(
 
 
 def _write_colmap(work: Path, sequence: Sequence, trajectory: Trajectory, cloud: Path) -> list[str]:
-    at, poses = associate(sequence.timestamps, trajectory.timestamps, _STAMP_TOLERANCE_S)
+    """Write a reconstruction of the frames that have poses.
+
+    Args:
+        work: The folder.
+        sequence: The frames of the run.
+        trajectory: Its poses.
+        cloud: Its map points, a PLY file that may be missing.
+
+    Returns:
+        What a user should know, one line each.
+    """
+    rows_of_frames, rows_of_poses = associate(
+        sequence.timestamps, trajectory.timestamps, _STAMP_TOLERANCE_S
+    )
     # without files they are named as TUM names them
     files: dict[float, str] = getattr(sequence, "colour_files", {})
-    names = [files.get(stamp, f"rgb/{stamp:.6f}.png") for stamp in sequence.timestamps[at].tolist()]
+    stamps = sequence.timestamps[rows_of_frames].tolist()
+    names = [files.get(stamp, f"rgb/{stamp:.6f}.png") for stamp in stamps]
     points = read_ply(cloud) if cloud.is_file() else None
-    write_colmap(work, trajectory.select(np.asarray(poses)), sequence.camera, names, points)
-    odd = len(trajectory) - len(poses)
-    notes = [
-        "the points have no tracks: a map of this package keeps positions, colours and counts"
-    ] * cloud.is_file()
-    return notes + [f"{odd} poses carry stamps of no image and were left out"] * (odd > 0)
+    poses = trajectory.select(np.asarray(rows_of_poses))
+    write_colmap(work, poses, sequence.camera, names, points)
 
-
-PROVENANCE_FILE = "provenance.json"
+    notes = []
+    if points is not None:
+        notes.append(
+            "the points have no tracks: a map of this package keeps positions, colours and counts"
+        )
+    n_without_image = len(trajectory) - len(rows_of_poses)
+    if n_without_image > 0:
+        notes.append(f"{n_without_image} poses carry stamps of no image and were left out")
+    return notes
 
 
 class Provenance(Record):
@@ -245,13 +291,14 @@ def stated_provenance(file: Path) -> str:
     """
     # ValueError: a name with a null byte
     with contextlib.suppress(DynslamError, OSError, ValueError):
-        provenance = Provenance.read((file if file.is_dir() else file.parent) / PROVENANCE_FILE)
-        files = (
-            [file]
-            if file.is_file()
-            else [file / name for name in provenance.files if Path(name).name == name]
-        )
-        if files and all(provenance.files.get(path.name) == digest_of(path) for path in files):
+        folder = file if file.is_dir() else file.parent
+        provenance = Provenance.read(folder / PROVENANCE_FILE)
+        if file.is_file():
+            files = [file]
+        else:  # names that lead out of the folder are left out
+            files = [file / name for name in provenance.files if Path(name).name == name]
+        is_unchanged = all(provenance.files.get(path.name) == digest_of(path) for path in files)
+        if files and is_unchanged:
             return provenance.describe()
     return ""
 
@@ -279,7 +326,7 @@ def open_stored(
     Raises:
         DynslamError: It is not here, or not the one that was run on.
     """
-    # else a record could name any folder of images, and a page or a file show them
+    # without that a record could name any folder of images, and a page or a file show them
     if not record.sequence.content:
         raise RunError(f"the record does not say what {record.sequence.id} held")
     start, stop = record.frames or (0, None)
@@ -345,39 +392,35 @@ def import_trajectory(
         raise RunError("an imported trajectory needs the name of its tracker")
     file = Path(path).expanduser()
     loaded = read_trajectory(file, timestamps, topic)
+    trajectory = loaded.trajectory
     notes = loaded.notes.describe()
-    opened = None
-    stated = None
+
+    # the sequence, by its images or by a ground truth alone
     if truth is None:
-        opened = open_frames(sequence, data_root, camera, frames, stride)
-        part = part_of(opened)
-        stamps = timestamps_ns(opened)
-        poses = opened.ground_truth
+        reference = _reference_by_images(open_frames(sequence, data_root, camera, frames, stride))
     else:
-        file_of_truth = read_trajectory(Path(truth).expanduser(), timestamps)
-        notes += [
-            f"ground truth: {phrase}" for phrase in file_of_truth.notes.describe(repeats=True)
-        ]
-        stated = file_of_truth.trajectory
-        poses = file_of_truth.poses(repeats=True)
-        part = _part_by_truth(sequence, poses)
-        stamps = stated.timestamps_ns
-    covered, odd, last = _join(
-        loaded.trajectory, to_seconds(stamps), f"{file} shares", f"'{part.id}'"
-    )
-    total = len(stamps)
-    if opened is None:
-        covered = len(loaded.trajectory)
-        total = len(loaded.trajectory)
-        last = len(loaded.trajectory) - 1
+        truth_file = read_trajectory(Path(truth).expanduser(), timestamps)
+        phrases = truth_file.notes.describe(repeats=True)
+        notes += [f"ground truth: {phrase}" for phrase in phrases]
+        reference = _reference_by_truth(sequence, truth_file)
+    part = reference.part
+
+    # which of its frames the trajectory covers
+    stamps_s = to_seconds(reference.timestamps_ns)
+    coverage = _match_frames(trajectory, stamps_s, f"{file} shares", f"'{part.id}'")
+    if not reference.knows_frames:
+        coverage = _Coverage.of_all(len(trajectory), coverage.n_without_frame)
         notes.append(
             "coverage is unknown: the images of the sequence were not here, and so its frames are not known"
         )
-    elif odd:
+    elif coverage.n_without_frame:
         notes.append(
-            f"{odd} of {len(loaded.trajectory)} poses carry stamps that are no input frame's"
+            f"{coverage.n_without_frame} of {len(trajectory)} poses carry stamps that are no input frame's"
         )
-    status, reason = judge_coverage(covered, total, total - 1 - last, total)
+    total = coverage.total
+    covered = coverage.covered
+    status, reason = judge_coverage(covered, total, total - 1 - coverage.last, total)
+
     identity = {
         "kind": "imported",
         "tracker": tracker,
@@ -388,15 +431,11 @@ def import_trajectory(
         "frames": [part.start, part.stop],
         "offset": 0,
         "stride": part.stride,
-        **({} if timestamps is None else {"timestamps": digest_of(Path(timestamps).expanduser())}),
-        **({} if topic is None else {"topic": topic}),
     }
-    named = part_digest(identity)
-    info = (
-        sequence_info(opened, part.content, named)
-        if stated is None
-        else _info_by_truth(part, stated, named)
-    )
+    if timestamps is not None:
+        identity["timestamps"] = digest_of(Path(timestamps).expanduser())
+    if topic is not None:
+        identity["topic"] = topic
     record = RunRecord(
         kind="imported",
         run_id=run_id_of(identity),
@@ -405,32 +444,74 @@ def import_trajectory(
         tracker=TrackerInfo(
             id=tracker, label=label or f"{tracker} (imported)", provenance="external"
         ),
-        sequence=info,
+        sequence=reference.info(part_digest(identity)),
         frames=None if frames is None else parse_frames(frames),
         stride=stride,
         n_frames=total,
         n_tracked=covered,
         n_lost=total - covered,
-        coverage=None if opened is None else covered / total,
+        coverage=covered / total if reference.knows_frames else None,
         started=datetime.now(timezone.utc).isoformat(timespec="milliseconds"),
         versions=versions(),
         identity=identity,
         provenance=provenance or stated_provenance(file) or str(file),
-        place="" if opened is None else place_of(sequence),
-        stamps_match=not odd and opened is not None,
+        place=place_of(sequence) if reference.knows_frames else "",
+        stamps_match=reference.knows_frames and not coverage.n_without_frame,
         notes=notes,
     ).normalised()
+
     store = results if isinstance(results, RunStore) else RunStore(results)
     store.prepare()
     with store.work_folder(record.run_id) as work:
-        write_tum(
-            work / f"trajectory_{which}.txt",
-            loaded.trajectory,
-            comment=f"imported: {tracker} on {part.id}",
-        )
-        store.add_sequence(record.sequence.part, stamps, poses)
+        comment = f"imported: {tracker} on {part.id}"
+        write_tum(work / f"trajectory_{which}.txt", trajectory, comment=comment)
+        store.add_sequence(record.sequence.part, reference.timestamps_ns, reference.ground_truth)
         store.publish(work, record)
     return record
+
+
+@dataclass(frozen=True, eq=False)
+class _Reference:
+    """What an imported trajectory is compared with.
+
+    Attributes:
+        part: The part of the sequence.
+        timestamps_ns: Stamps of its frames, or of its ground truth where the frames are not known.
+        ground_truth: Its ground truth, with all poses of a repeated stamp; None if it has none.
+        info: What the record keeps of the sequence, by the name of its part.
+        knows_frames: Whether its images are here.
+    """
+
+    part: Part
+    timestamps_ns: NDArray[np.int64]
+    ground_truth: Trajectory | None
+    info: Callable[[str], SequenceInfo]
+    knows_frames: bool
+
+
+def _reference_by_images(opened: Sequence) -> _Reference:
+    """A sequence whose images are here."""
+    part = part_of(opened)
+    return _Reference(
+        part=part,
+        timestamps_ns=timestamps_ns(opened),
+        ground_truth=opened.ground_truth,
+        info=lambda name: sequence_info(opened, part.content, name),
+        knows_frames=True,
+    )
+
+
+def _reference_by_truth(sequence: str, truth: TumFile) -> _Reference:
+    """A sequence of which only the ground truth is here."""
+    poses = truth.poses(repeats=True)
+    part = _part_by_truth(sequence, poses)
+    return _Reference(
+        part=part,
+        timestamps_ns=truth.trajectory.timestamps_ns,
+        ground_truth=poses,
+        info=lambda name: _info_by_truth(part, truth.trajectory, name),
+        knows_frames=False,
+    )
 
 
 def _part_by_truth(sequence: str, truth: Trajectory) -> Part:
@@ -442,32 +523,63 @@ def _part_by_truth(sequence: str, truth: Trajectory) -> Part:
     )
 
 
-def _info_by_truth(part: Part, truth: Trajectory, named: str) -> SequenceInfo:
-    """What is known of it: the catalogue's entry and the camera's motion."""
+def _info_by_truth(part: Part, truth: Trajectory, name: str) -> SequenceInfo:
+    """What is known of a sequence without its images: the catalogue's entry and the camera's motion.
+
+    Args:
+        part: The whole sequence.
+        truth: Its ground truth.
+        name: The name of the part in a store.
+    """
     entry = entry_of(part.id)
-    stated = (
-        {}
-        if entry is None
-        else {name: getattr(entry, name) for name in ("fps", "license", "citation", "split")}
-    )
     return SequenceInfo(
         id=part.id,
         content=part.content,
-        part=named,
+        part=name,
         block=part.block,
         frames=len(truth),
         duration_s=float(truth.timestamps[-1] - truth.timestamps[0]),
         ground_truth=True,
         tags=sorted({*(entry.tags if entry else ()), *motion_tags(truth)}),
-        **({"fps": 0.0} | stated),
+        fps=0.0 if entry is None else entry.fps,
+        license="" if entry is None else entry.license,
+        citation="" if entry is None else entry.citation,
+        split="" if entry is None else entry.split,
     )
 
 
-def _join(trajectory: Trajectory, stamps: Array, shares: str, name: str) -> tuple[int, int, int]:
-    """How many frames a trajectory covers, how many of its poses carry no frame's stamp, and the last frame it covers.
+class _Coverage(NamedTuple):
+    """Which frames of a sequence a trajectory covers.
+
+    Attributes:
+        total: Frames of the sequence.
+        covered: Frames with a pose.
+        n_without_frame: Poses that carry no frame's stamp.
+        last: The last frame with a pose.
+    """
+
+    total: int
+    covered: int
+    n_without_frame: int
+    last: int
+
+    @classmethod
+    def of_all(cls, poses: int, n_without_frame: int) -> _Coverage:
+        """Each pose counts as a frame: the frames are not known."""
+        return cls(poses, poses, n_without_frame, poses - 1)
+
+
+def _match_frames(trajectory: Trajectory, stamps: Array, shares: str, name: str) -> _Coverage:
+    """Match the poses of a trajectory with the frames of a sequence by their stamps.
+
+    Args:
+        trajectory: The trajectory.
+        stamps: Stamps of the frames in seconds.
+        shares: The beginning of an error: whose poses these are.
+        name: The sequence as the error names it.
 
     Raises:
-        RunError: Fewer than two of them are near a frame; `shares` and `name` say whose they are.
+        RunError: Fewer than two poses are near a frame.
     """
     exact, _ = associate(stamps, trajectory.timestamps, STAMP_TOLERANCE, strict=False)
     near, _ = associate(stamps, trajectory.timestamps, _IMPORT_TOLERANCE_S)
@@ -479,5 +591,6 @@ def _join(trajectory: Trajectory, stamps: Array, shares: str, name: str) -> tupl
             f"{stamps[0]:.6f} to {stamps[-1]:.6f}",
             clock_hint(trajectory.timestamps, stamps),
         )
-    odd = len(trajectory) - len(exact)
-    return (len(near) if odd else len(exact)), odd, int(near[-1])
+    n_without_frame = len(trajectory) - len(exact)
+    covered = len(near) if n_without_frame else len(exact)
+    return _Coverage(len(stamps), covered, n_without_frame, int(near[-1]))

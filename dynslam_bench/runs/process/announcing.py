@@ -23,8 +23,9 @@ Listener = Callable[[FrameType, str, tuple[Any, ...]], None]
 _listener: Listener | None = None
 _events: frozenset[str] = frozenset()
 _after_fork: Callable[[], None] | None = None
-_is_installed = False
+_is_hook_installed = False
 _Environment: Any = type(os.environ)
+"""The class of ``os.environ``."""
 
 
 def listen(
@@ -39,11 +40,11 @@ def listen(
         events: What it hears.
         after_fork: Called in each process that is forked from this one.
     """
-    global _listener, _events, _after_fork, _is_installed
-    if listener is not None and not _is_installed:  # a hook stays for the life of the process
+    global _listener, _events, _after_fork, _is_hook_installed
+    if listener is not None and not _is_hook_installed:  # a hook stays for the life of the process
         sys.addaudithook(_announce)
         os.register_at_fork(after_in_child=_tell_of_fork)
-        _is_installed = True
+        _is_hook_installed = True
     _listener = listener
     _events = frozenset(events)
     _after_fork = after_fork

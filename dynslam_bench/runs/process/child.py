@@ -14,11 +14,9 @@ import faulthandler
 import json
 import logging
 import os
-import re
 import resource
 import signal
 import sys
-import sysconfig
 import tempfile
 import threading
 import traceback
@@ -30,31 +28,15 @@ from typing import Any
 
 import psutil
 
-from dynslam_bench.core import (
-    DynslamError,
-    InfrastructureError,
-    PluginError,
-    RunError,
-    SegmentationError,
-    SequenceError,
-    SettingsError,
-    TemporaryFolder,
-    TrackerTimeoutError,
-    TrajectoryError,
-)
+from dynslam_bench.core import RunError, TemporaryFolder
 from dynslam_bench.core.plugins import ISOLATED_VARIABLE, load_object
-from dynslam_bench.runs.process.fork_server import THREAD_VARIABLES, adopt_orphans
+from dynslam_bench.runs.process.failures import describe_failure
+from dynslam_bench.runs.process.jobs import LOG_FILE as LOG_FILE  # `testing` takes it from here
+from dynslam_bench.runs.process.jobs import READS_FILE, THREAD_VARIABLES
+from dynslam_bench.runs.process.process_trees import adopt_orphans
 
-LOG_FILE = "log.txt"
-READS_FILE = "reads.json"
-"""Where the child puts what plug-ins and programs have read."""
-_LONGEST = 400
-_REFUSALS = (SettingsError, PluginError, TrajectoryError)
-"""Raised before the first frame is tracked, these say that what was asked for cannot be."""
-_DATA_FAULTS = (SequenceError, SegmentationError)
-"""These say, whenever they are raised, that an image, a mask or a network's weights are at fault."""
-_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.ESTALE)
-"""Errors of a disk that is full, read-only, damaged or gone: no tracker is at fault."""
+_CHECKPOINTS = ("started", "progress")
+"""Messages before which the reads so far are written: a run that is killed later has read this much at least."""
 
 
 def main(connection: Connection) -> int:
@@ -73,25 +55,14 @@ def main(connection: Connection) -> int:
     spare_ancestors()
     try:
         job = json.loads(connection.recv_bytes())
-    except EOFError:
+    except EOFError:  # the parent wants no run any more
         return 0
     _send(connection, {"type": "ready"})
     _redirect(Path(job["folder"]) / LOG_FILE)
     stop = threading.Event()
     threading.Thread(target=_listen, args=(connection, stop), daemon=True).start()
     try:
-        with contextlib.closing(TemporaryFolder()) as temporary:
-            os.environ["TMPDIR"] = tempfile.tempdir = str(temporary.path)
-            _prepare(job)
-            work = load_object(job["work"])
-            with recording_reads(job, temporary.path) as keep_reads:
-
-                def send(message: dict[str, Any]) -> None:
-                    if message["type"] in ("started", "progress") or message.get("index") == 0:
-                        keep_reads()  # a run that is killed later has read this much at least
-                    _send(connection, message)
-
-                message = work(job, send, stop.is_set)
+        message = _do(job, connection, stop)
     except BaseException as error:
         traceback.print_exc()
         message = describe_failure(error)
@@ -101,6 +72,24 @@ def main(connection: Connection) -> int:
     sys.stdout.flush()
     sys.stderr.flush()
     return 0
+
+
+def _do(job: dict[str, Any], connection: Connection, stop: threading.Event) -> dict[str, Any]:
+    """Do the job in a private folder for temporary files, and give its last message."""
+    with contextlib.closing(TemporaryFolder()) as temporary:
+        tempfile.tempdir = str(temporary.path)
+        os.environ["TMPDIR"] = tempfile.tempdir
+        _prepare(job)
+        work = load_object(job["work"])
+        with recording_reads(job, temporary.path) as write_reads:
+
+            def send(message: dict[str, Any]) -> None:
+                if message["type"] in _CHECKPOINTS or message.get("index") == 0:
+                    write_reads()
+                _send(connection, message)
+
+            last: dict[str, Any] = work(job, send, stop.is_set)
+            return last
 
 
 @contextmanager
@@ -126,25 +115,25 @@ def recording_reads(job: dict[str, Any], temporary: Path) -> Iterator[Callable[[
     from dynslam_bench.core.stage_cache import record_reads
     from dynslam_bench.runs.process.recorder import ReadRecorder
 
-    about = job["recorded"]
-    plugin = None if about["plugin"] is None else Path(about["plugin"])
+    recorded = job["recorded"]
+    plugin = None if recorded["plugin"] is None else Path(recorded["plugin"])
     folder = Path(job["folder"])
-    anchors = Anchors(plugin=plugin, work=Path(about["work"]))
-    recorder = ReadRecorder(anchors, private=[temporary, folder], plugins=about["packages"])
+    anchors = Anchors(plugin=plugin, work=Path(recorded["work"]))
+    recorder = ReadRecorder(anchors, private=[temporary, folder], plugins=recorded["packages"])
 
-    def keep(reads: Reads) -> None:
+    def write(reads: Reads) -> None:
         (folder / READS_FILE).write_text(reads.to_json(), encoding="utf-8")
 
     recorder.start()
     record_reads(recorder.snapshot)
     try:
-        yield lambda: keep(recorder.so_far())
+        yield lambda: write(recorder.so_far())
     except BaseException:
         with contextlib.suppress(RunError):
             # the run's own error is the one to tell; what changed meanwhile shows at the look-up
-            keep(recorder.finish())
+            write(recorder.finish())
         raise
-    keep(recorder.finish())
+    write(recorder.finish())
 
 
 def spare_ancestors() -> None:
@@ -155,7 +144,7 @@ def spare_ancestors() -> None:
     `run_one` finds out.
     """
     ancestors = {process.pid for process in psutil.Process().parents()}
-    groups = {1}  # it stands for all processes
+    groups = {1}  # -1 as a target of os.kill stands for all processes
     for pid in ancestors:
         with contextlib.suppress(OSError):  # it has just ended
             groups.add(os.getpgid(pid))
@@ -165,10 +154,12 @@ def spare_ancestors() -> None:
     def refuse(event: str, arguments: tuple[Any, ...]) -> None:
         if event not in ("os.kill", "os.killpg"):
             return
-        target, number = arguments
-        is_process = event == "os.kill" and target in ancestors
-        is_group = (target if event == "os.killpg" else -target) in groups
-        if number and (is_process or is_group):  # number 0 asks whether the process is there
+        target, signal_number = arguments
+        # os.kill takes a group as a negative number
+        group = target if event == "os.killpg" else -target
+        is_ancestor = event == "os.kill" and target in ancestors
+        is_probe = not signal_number  # signal 0 asks whether the process is there
+        if not is_probe and (is_ancestor or group in groups):
             raise PermissionError(
                 errno.EPERM, f"a run may not signal process {target}, which it was started by"
             )
@@ -177,10 +168,9 @@ def spare_ancestors() -> None:
 
 
 def peak_memory_mb() -> float:
-    """Largest resident memory of this process so far."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (
-        1e6 if sys.platform == "darwin" else 1e3
-    )
+    """Largest resident memory of this process so far, in MB."""
+    units_per_mb = 1e6 if sys.platform == "darwin" else 1e3  # macOS counts bytes, Linux kilobytes
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / units_per_mb
 
 
 def _listen(connection: Connection, stop: threading.Event) -> None:
@@ -192,6 +182,7 @@ def _listen(connection: Connection, stop: threading.Event) -> None:
 
 
 def _send(connection: Connection, message: dict[str, Any]) -> None:
+    """Send a message; when the parent has closed the connection, this process ends with its group."""
     try:
         connection.send_bytes(json.dumps(message).encode())
     except OSError:
@@ -214,11 +205,11 @@ def _redirect(log: Path) -> None:
 
 def _prepare(job: dict[str, Any]) -> None:
     """Take over the parent's environment, working folder and import path, and limit the threads."""
-    wanted = {name: text for name, text in job["environment"].items() if name != "TMPDIR"}
+    variables = {name: text for name, text in job["environment"].items() if name != "TMPDIR"}
     # the fork server still has what its parent has removed since
-    for name in os.environ.keys() - wanted.keys() - {"TMPDIR", *THREAD_VARIABLES}:
+    for name in os.environ.keys() - variables.keys() - {"TMPDIR", *THREAD_VARIABLES}:
         del os.environ[name]
-    os.environ.update(wanted | {ISOLATED_VARIABLE: "1"})
+    os.environ.update(variables | {ISOLATED_VARIABLE: "1"})
     with contextlib.suppress(OSError):
         os.chdir(job["working_folder"])
     sys.path[:] = job["path"]
@@ -226,7 +217,7 @@ def _prepare(job: dict[str, Any]) -> None:
 
 
 def limit_threads(threads: int) -> None:
-    """Give OpenCV, torch and numba that many threads; BLAS has one (see `fork_server.THREAD_VARIABLES`)."""
+    """Give OpenCV, torch and numba that many threads; BLAS has one (see `jobs.THREAD_VARIABLES`)."""
     import cv2
 
     cv2.setNumThreads(threads)
@@ -242,100 +233,6 @@ def limit_threads(threads: int) -> None:
         numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
 
 
-class FailedAt(Exception):
-    """Where a run was when its cause was raised."""
-
-
-@contextmanager
-def at(where: Callable[[], str]) -> Iterator[None]:
-    """Note where the run was for what is raised inside; `where` is asked only then."""
-    try:
-        yield
-    except (Exception, SystemExit) as error:
-        raise FailedAt(where()) from error
-
-
-def describe_failure(error: BaseException) -> dict[str, Any]:
-    """The last message of a run that an exception ended: ``status``, ``reason`` and ``refused``.
-
-    The key ``infrastructure`` says what broke beside the run. The key ``data`` says that something
-    other than the tracker's own code raised, or that its input cannot be read: the run says nothing
-    about the tracker.
-
-    The reason reads ``frame 20 of 60: ValueError: too few points (my_tracker.py:31)``.
-    """
-    from dynslam_bench.contracts.checks import TrackerContractError, raised_by_tracker
-
-    where = ""
-    cause = error
-    if isinstance(error, FailedAt) and error.__cause__ is not None:
-        where = str(error)
-        cause = error.__cause__
-    text = _one_line(cause)
-    kind = type(cause).__name__
-
-    def message(status: str, what: str, *, line: bool = False, **more: Any) -> dict[str, Any]:
-        before = "" if not where or re.search(r"\bframe \d+", what) else f"{where}: "
-        after = f" ({source})" if line and (source := source_line(cause)) else ""
-        return {"type": "failed", "status": status, "reason": before + what + after, **more}
-
-    broken = _broken_infrastructure(error)
-    if broken:
-        return message("crashed", broken, infrastructure=broken)
-    if isinstance(cause, TrackerContractError):
-        return message("invalid", text)
-    named = (
-        f"sys.exit({cause.code!r}) was called"
-        if isinstance(cause, SystemExit)
-        else f"{kind}: {text}".rstrip(": ")
-    )
-    if (
-        isinstance(cause, MemoryError)
-        or "out of memory" in text.lower()
-        or kind == "OutOfMemoryError"
-    ):
-        return message("out-of-memory", named, line=True)
-    data = (
-        {} if raised_by_tracker(cause) and not isinstance(cause, _DATA_FAULTS) else {"data": True}
-    )
-    if isinstance(cause, TrackerTimeoutError):
-        return message("timeout", text)
-    if isinstance(cause, DynslamError):
-        return message("crashed", text, refused=isinstance(cause, _REFUSALS), **data)
-    return message("crashed", named, line=True, **data)
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:_LONGEST]
-
-
-def _broken_infrastructure(error: BaseException | None) -> str:
-    """What of the infrastructure broke, by an exception or one of its causes; empty if nothing did."""
-    while error is not None:
-        if isinstance(error, InfrastructureError) or (
-            isinstance(error, OSError) and error.errno in _DISK_ERRORS
-        ):
-            return _one_line(error)
-        error = error.__cause__ or error.__context__
-    return ""
-
-
-def source_line(error: BaseException) -> str:
-    """``file.py:31``: the innermost line of an exception's traceback outside of libraries, else the innermost."""
-    lines = traceback.extract_tb(error.__traceback__)
-    folders = map(sysconfig.get_path, ("stdlib", "platstdlib", "purelib", "platlib"))
-    libraries = (*folders, "<", sys.base_prefix, __file__)
-    outside = [
-        line
-        for line in lines
-        if "site-packages" not in line.filename and not line.filename.startswith(libraries)
-    ]
-    return "".join(f"{Path(line.filename).name}:{line.lineno}" for line in (outside or lines)[-1:])
-
-
 if __name__ == "__main__":
-    # from the module, not from here: the loop raises the module's `FailedAt`
-    from dynslam_bench.runs.process.child import main as make_run
-
     # threads that a tracker left running must not hold it up
-    os._exit(make_run(Connection(int(sys.argv[1]))))
+    os._exit(main(Connection(int(sys.argv[1]))))

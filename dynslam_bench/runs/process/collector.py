@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 from dynslam_bench.core.code_files import files_of_command
 from dynslam_bench.core.programs import (
@@ -39,57 +40,58 @@ _LOADED_NS = time.time_ns()
 _LONGEST_TEXT = 1 << 16
 """Text files of up to so many bytes are searched for names of files; longer ones are data."""
 _LONGEST_SOURCE = 1 << 20
+"""Python sources of up to so many bytes are searched, and files of programs for names of variables."""
 _MANY_FILES = 10_000
 """A folder with more files is not read whole where a program's arguments name it."""
-_TEXT = (".yaml", ".yml", ".toml", ".json", ".cfg", ".ini", ".conf", ".txt", ".xml")
-_READ_IN_MACHINE_CODE = (
-    *(
-        ".png",
-        ".jpg",
-        ".jpeg",
-        ".bmp",
-        ".tif",
-        ".tiff",
-        ".exr",
-        ".pgm",
-        ".ppm",
-        ".webp",
-        ".mp4",
-        ".avi",
-        ".mkv",
-    ),
-    *(
-        ".onnx",
-        ".pb",
-        ".tflite",
-        ".pt",
-        ".pth",
-        ".caffemodel",
-        ".weights",
-        ".engine",
-        ".safetensors",
-        ".h5",
-        ".hdf5",
-        ".ply",
-        ".pcd",
-    ),
+_TEXT_SUFFIXES = (".yaml", ".yml", ".toml", ".json", ".cfg", ".ini", ".conf", ".txt", ".xml")
+_IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".exr", ".pgm", ".ppm", ".webp")
+_VIDEOS = (".mp4", ".avi", ".mkv")
+_NETWORKS = (
+    ".onnx",
+    ".pb",
+    ".tflite",
+    ".pt",
+    ".pth",
+    ".caffemodel",
+    ".weights",
+    ".engine",
+    ".safetensors",
 )
+_ARRAYS_AND_CLOUDS = (".h5", ".hdf5", ".ply", ".pcd")
+_READ_IN_MACHINE_CODE = (*_IMAGES, *_VIDEOS, *_NETWORKS, *_ARRAYS_AND_CLOUDS)
 """Images, networks, arrays and clouds: OpenCV, onnxruntime, torch and others open them without a word."""
 _WORD = re.compile(r"[\w./~+\-]*[A-Za-z][\w./~+\-]*")
+"""A word of a text file that can be the name of a file."""
 _QUOTED = re.compile(r"[\"']([^\"'\n]{1,200})[\"']")
+"""A text in a Python source."""
 _VARIABLE = re.compile(r"[A-Z][A-Z0-9_]{2,}")
 """A word in a text that can be the name of an environment variable."""
 _FILE_NAME = re.compile(r"[\w./~+\-]*\w\.[A-Za-z]\w{0,9}")
 """A text that can be the name of a file: it has a suffix."""
-_OF_PYTHON = re.compile(
+_SYSTEM_LIBRARY = re.compile(
     r"lib(?:c|m|dl|rt|util|pthread|resolv|nss_\w+|gcc_s|stdc\+\+|ssl|crypto|sqlite3|z|bz2|lzma|ffi|readline|ncursesw?|"
     r"tinfow?|panelw?|uuid|expat|mpdec|gdbm\w*|db|nsl|tirpc)[-.].*"
 )
 """Libraries of the operating system that Python itself is linked with: they are updated often, and change no result."""
 _OWN_DISTRIBUTION = "dynslam-bench"
 
-Stamp = tuple[int, int, int, int, int]
-"""Device, inode, size, time of modification and time of change of a file: as long as they stay, it is the same."""
+
+class Stamp(NamedTuple):
+    """What tells that a file is the same as before: its place on the disk, its size and its times.
+
+    Attributes:
+        device: The device.
+        inode: The inode.
+        size: Size in bytes.
+        modified_ns: Time of modification in nanoseconds.
+        changed_ns: Time of change in nanoseconds, of the content or the inode.
+    """
+
+    device: int
+    inode: int
+    size: int
+    modified_ns: int
+    changed_ns: int
 
 
 def stamp_of(path: str) -> Stamp | None:
@@ -98,7 +100,9 @@ def stamp_of(path: str) -> Stamp | None:
         status = os.stat(path)
     except (OSError, ValueError):
         return None
-    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+    return Stamp(
+        status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
+    )
 
 
 def is_code(path: str) -> bool:
@@ -121,7 +125,7 @@ class FileNote:
 
 @dataclass
 class Notes:
-    """What a recorder has noted.
+    """What a recorder has noted so far.
 
     Attributes:
         files: Each file that was opened to be read.
@@ -153,7 +157,8 @@ class Modules:
         places: Where each top-level module is found.
         distributions: Names of distributions, and whether they were loaded before the recorder was
             started.
-        files: The same of the files of modules that belong to no distribution.
+        files: Files of modules that belong to no distribution, and whether they were loaded before
+            the recorder was started.
     """
 
     imports: ImportPath
@@ -195,25 +200,28 @@ class Collector:
         imports = modules.imports
         programs, distributions = self._programs(imports)
 
-        # what was noted counts as it was then, what was not noted as it is now
+        # files that were seen opened count as they were then; a library's count by its distribution
         opened = {
             path: note.digest or self._content(path, note)
             for path, note in dict(self.notes.files).items()
             if path in modules.files or not is_code(path) or not imports.distributions_at(path)
         }
+        # files that were opened unseen count as they are now
         unseen = self._libraries() | self._unseen_files(opened) | set(modules.files)
         files = opened | {path: content_now(path) for path in unseen - opened.keys()}
+        # so do files that these name
         named, missing = self._named_files(files)
         files |= {path: content_now(path) for path in named - files.keys()}
         files |= dict.fromkeys(missing - files.keys(), ABSENT)
+
         folders = {
             path: self._folder(path, names) for path, names in dict(self.notes.folders).items()
         }
-
+        links = {path: link_now(path, self._anchors) for path in (*files, *folders, *programs)}
         variables = self.notes.variables.union(*map(self._variables_of, dict(self.notes.commands)))
+        used_distributions = modules.distributions.keys() | distributions
 
         name = self._anchors.name
-        links = {path: link_now(path, self._anchors) for path in (*files, *folders, *programs)}
         return Reads(
             files={name(path): digest for path, digest in files.items()},
             folders={name(path): digest for path, digest in folders.items()},
@@ -221,10 +229,7 @@ class Collector:
             environment={f"${key}": value_digest(self.environment.get(key)) for key in variables},
             search=self._search(),
             modules=modules.places,
-            distributions={
-                key: imports.distribution(key)
-                for key in modules.distributions.keys() | distributions
-            },
+            distributions={key: imports.distribution(key) for key in used_distributions},
             programs={self._name(path): content_now(path) for path in programs},
         )
 
@@ -236,18 +241,19 @@ class Collector:
             (*self._private, *self.notes.made_folders)
         )
 
-    def is_of_program(self, stamp: Stamp | None) -> bool:
+    def is_made_by_program(self, stamp: Stamp | None) -> bool:
         """Whether a file was written after a program was started."""
-        return stamp is not None and stamp[3] >= min(
-            self.notes.commands.values(), default=sys.maxsize
-        )
+        if stamp is None:
+            return False
+        first_start_ns = min(self.notes.commands.values(), default=sys.maxsize)
+        return stamp.modified_ns >= first_start_ns
 
     def _is_input(self, path: str) -> bool:
         """Whether something lies at a path that was there before the run."""
         if not is_file_name(path) or self.is_output(path):
             return False
         stamp = stamp_of(path)
-        return stamp is not None and not self.is_of_program(stamp)
+        return stamp is not None and not self.is_made_by_program(stamp)
 
     def _name(self, path: str) -> str:
         """The name of a file, or of a folder whose whole content counts."""
@@ -259,9 +265,10 @@ class Collector:
         return ABSENT if note.stamp is None and content != UNREADABLE else content
 
     def _folder(self, path: str, names: list[str] | None) -> str:
-        """Digest of the names in a folder as it was listed, but with the files that the run itself has made or removed.
+        """Digest of the names in a folder as it was listed.
 
-        Else the run would change what it has read.
+        Files that the run itself has made or removed count as they are now: else the run would
+        change what it has read.
         """
         if names is None:
             return ABSENT
@@ -274,14 +281,15 @@ class Collector:
 
     def _unseen_files(self, opened: Mapping[str, str]) -> set[str]:
         """The images and networks in listed folders that nobody was seen to open: libraries open them unannounced."""
-        return {
-            path
-            for folder, names in dict(self.notes.folders).items()
-            for name in names or ()
-            if name.lower().endswith(_READ_IN_MACHINE_CODE)
-            and (path := os.path.join(folder, name)) not in opened
-            and self._is_input(path)
-        }
+        unseen = set()
+        for folder, names in dict(self.notes.folders).items():
+            for name in names or ():
+                if not name.lower().endswith(_READ_IN_MACHINE_CODE):
+                    continue
+                path = os.path.join(folder, name)
+                if path not in opened and self._is_input(path):
+                    unseen.add(path)
+        return unseen
 
     def _search(self) -> dict[str, str]:
         """The search paths, and where commands were found that were named without a folder."""
@@ -311,10 +319,16 @@ class Collector:
         return ""
 
     def compare(self, path: str, note: FileNote, stamp: Stamp | None) -> None:
-        """Take it down where a file is another than when it was opened first."""
+        """Note a file that is another than when it was opened first.
+
+        Args:
+            path: The file.
+            note: What it was then.
+            stamp: Its stamp now.
+        """
         if stamp == note.stamp or path in self.notes.made:
             return
-        if note.stamp is None and self.is_of_program(stamp):
+        if note.stamp is None and self.is_made_by_program(stamp):
             return
         if note.digest and content_now(path) == note.digest:
             note.stamp = stamp  # it was written again with the same content
@@ -325,7 +339,7 @@ class Collector:
         """Whether an input has changed since the recorder was started, or since this process loaded its libraries."""
         stamp = stamp_of(path)
         since_ns = _LOADED_NS if was_loaded else self.began_ns
-        return stamp is not None and stamp[4] > since_ns and self._is_input(path)
+        return stamp is not None and stamp.changed_ns > since_ns and self._is_input(path)
 
     # -- modules and libraries ---------------------------------------------------------------------
 
@@ -333,14 +347,12 @@ class Collector:
         """Look at the modules that are loaded now."""
         imports = ImportPath(self._path)
         modules = Modules(imports)
-        files_of: dict[str, str] = {}
+        file_of_top: dict[str, str] = {}
         for name, module in list(sys.modules.items()):
             file = vars(module).get("__file__") if hasattr(module, "__dict__") else None
-            if (
-                not isinstance(file, str)
-                or name == "__main__"
-                or self._origins.of_file(file) in ("own", "python")
-            ):
+            if not isinstance(file, str) or name == "__main__":
+                continue
+            if self._origins.of_file(file) in ("own", "python"):
                 continue
             top = name.partition(".")[0]
             was_loaded = top in self._loaded
@@ -350,16 +362,20 @@ class Collector:
             modules.distributions |= dict.fromkeys(distributions, was_loaded)
             if not distributions or self._origins.is_plugin(name):
                 modules.files[_on_disk(file)] = was_loaded
-            files_of.setdefault(top, file)
-        for top, file in files_of.items():
+            file_of_top.setdefault(top, file)
+
+        # where each is found on the import path
+        for top, file in file_of_top.items():
             module_file = imports.find(top)
             if module_file and file.startswith(module_file):  # else a plug-in has changed the path
                 modules.places[top] = imports.place(top, self._anchors)
+
+        # modules that were asked for and are not loaded
         for top in set(self.notes.modules) - sys.modules.keys():
             modules.places[top] = imports.place(top, self._anchors)
-            modules.distributions |= dict.fromkeys(
-                imports.distributions_of(top, imports.find(top)), False
-            )
+            distributions = imports.distributions_of(top, imports.find(top))
+            modules.distributions |= dict.fromkeys(distributions, False)
+
         modules.files = {
             path: loaded for path, loaded in modules.files.items() if self._is_input(path)
         }
@@ -368,12 +384,14 @@ class Collector:
     def _libraries(self) -> set[str]:
         """The files that were mapped into memory since the start, or because a search path named them."""
         mapped = mapped_files(os.getpid())
+        # those that a search path of the loader names
         preloaded = set(re.split("[: ]", self.environment.get("LD_PRELOAD", "")))
         folders = folders_of(self.environment.get("LD_LIBRARY_PATH", ""))
         beginnings = tuple(f"{os.path.realpath(folder)}{os.sep}" for folder in folders)
         named = {path for path in mapped if path in preloaded or path.startswith(beginnings)}
+        # those that are new
         new = {path for path in mapped - self._mapped if self._origins.of_file(path) == "foreign"}
-        new = {path for path in new if not _OF_PYTHON.fullmatch(os.path.basename(path))}
+        new = {path for path in new if not _SYSTEM_LIBRARY.fullmatch(os.path.basename(path))}
         return set(filter(self._is_input, named | new))
 
     # -- programs ----------------------------------------------------------------------------------
@@ -385,8 +403,8 @@ class Collector:
             if command not in self._commands:
                 self._commands[command] = self._files_of(command)
             files |= self._commands[command]
-        inputs = set[str]()
-        distributions = set[str]()
+        inputs: set[str] = set()
+        distributions: set[str] = set()
         for file in files:
             origin = self._origins.of_file(file)
             names = imports.distributions_at(file) if origin == "library" else []
@@ -398,6 +416,7 @@ class Collector:
     def _files_of(self, command: Command) -> set[str]:
         """The executable of a command, the files and folders that it names, and what these name or import."""
         executable = command.executable(self.environment.get("PATH"))
+        # code is looked for in files, not in folders that an argument names
         arguments = [
             word for word in command.words[1:] if not any(map(os.path.isdir, command.named([word])))
         ]
@@ -433,9 +452,8 @@ class Collector:
             sys.prefix,
             *self._path,
         ]
-        if any(
-            place == folder or place.startswith(folder.rstrip(os.sep) + os.sep) for place in places
-        ):
+        inside = folder.rstrip(os.sep) + os.sep
+        if any(place == folder or place.startswith(inside) for place in places):
             return True
         count = 0
         for _, _, names in os.walk(folder):
@@ -460,8 +478,8 @@ class Collector:
         A name is looked for in the folder of the text, in that of the plug-in and in the working
         folder.
         """
-        named = set[str]()
-        missing = set[str]()
+        named: set[str] = set()
+        missing: set[str] = set()
         for text in texts:
             for word in self._words(text):
                 places = self._places_of(word, text)
@@ -469,22 +487,25 @@ class Collector:
                 named |= there
                 if not there and text.endswith(".py") and _can_be_missing(word):
                     missing |= places
-        return set(filter(self._is_input, named)), {
-            path for path in missing if not self.is_output(path)
-        }
+        missing = {path for path in missing if not self.is_output(path)}
+        return set(filter(self._is_input, named)), missing
 
     def _words(self, text: str) -> set[str]:
         """The words of a text file that could be names of files; none of a file that is no such text."""
         is_source = text.endswith(".py") and self._origins.of_file(text) == "foreign"
-        stamp = stamp_of(text) if is_source or text.endswith(_TEXT) else None
-        if stamp is None or stamp[2] > (_LONGEST_SOURCE if is_source else _LONGEST_TEXT):
+        if not is_source and not text.endswith(_TEXT_SUFFIXES):
+            return set()
+        stamp = stamp_of(text)
+        longest = _LONGEST_SOURCE if is_source else _LONGEST_TEXT
+        if stamp is None or stamp.size > longest:
             return set()
         if (text, stamp) not in self._texts:
             content = Path(text).read_text(encoding="utf-8", errors="replace")
-            words = set(_QUOTED.findall(content)) if is_source else set(_WORD.findall(content))
-            self._texts[text, stamp] = {
-                word for word in words if is_source or "." in word or os.sep in word
-            }
+            if is_source:
+                words = set(_QUOTED.findall(content))
+            else:
+                words = {word for word in _WORD.findall(content) if "." in word or os.sep in word}
+            self._texts[text, stamp] = words
         return self._texts[text, stamp]
 
     def _places_of(self, word: str, text: str) -> set[str]:

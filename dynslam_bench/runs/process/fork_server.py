@@ -17,7 +17,6 @@ main script and may not be used in daemonic processes, see ``docs/decisions/fork
 
 import atexit
 import contextlib
-import ctypes
 import importlib
 import json
 import os
@@ -27,9 +26,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Collection, Iterable
 from multiprocessing.connection import Connection, Pipe, wait
-from pathlib import Path
 from typing import Any
 
 import psutil
@@ -38,32 +35,40 @@ from dynslam_bench.core import InfrastructureError, sweep
 from dynslam_bench.core.module_graph import module_graph
 from dynslam_bench.core.plugins import module_command
 from dynslam_bench.core.reads import ImportPath
+from dynslam_bench.runs.process.child import main as make_run
+from dynslam_bench.runs.process.jobs import THREAD_VARIABLES
+from dynslam_bench.runs.process.jobs import make_job as make_job
+from dynslam_bench.runs.process.process_trees import (
+    adopt_orphans,
+    end_children,
+    end_processes,
+    end_tree,
+)
 
 _CHILD = "dynslam_bench.runs.process.child"
+"""The module that a fresh interpreter runs."""
 PRELOADED = (
-    *("numpy", "scipy.spatial.transform", "cv2", "torch", "numba", "gymnasium"),
-    *("dynslam_bench.envs", "dynslam_bench.evaluation.evaluate"),
-    *("dynslam_bench.slam.pipeline", "dynslam_bench.slam.backend", "dynslam_bench.features.orb"),
-    *("dynslam_bench.flow.moth_flame", "dynslam_bench.segmentation.schedule", _CHILD),
-    *(
-        "dynslam_bench.runs.loop",
-        "dynslam_bench.trackers.registry",
-        "dynslam_bench.sequences.synthetic.sequence",
-    ),
+    "numpy",
+    "scipy.spatial.transform",
+    "cv2",
+    "torch",
+    "numba",
+    "gymnasium",
+    "dynslam_bench.envs",
+    "dynslam_bench.evaluation.evaluate",
+    "dynslam_bench.slam.pipeline",
+    "dynslam_bench.slam.backend",
+    "dynslam_bench.features.orb",
+    "dynslam_bench.flow.moth_flame",
+    "dynslam_bench.segmentation.schedule",
+    "dynslam_bench.runs.loop",
+    "dynslam_bench.trackers.registry",
+    "dynslam_bench.sequences.synthetic.sequence",
 )
-THREAD_VARIABLES = (
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-    "BLIS_NUM_THREADS",
-)
-"""Set to 1 before anything is imported: BLAS must not spin up threads of its own beside the run's."""
+"""What the server imports before it forks."""
 START_VARIABLE = "DYNSLAM_BENCH_START"
 """``fork`` or ``fresh``: how children start. Forking is the default on Linux; macOS' libraries do not survive it."""
-_SET_PARENT_DEATH_SIGNAL = 1
-_SET_CHILD_SUBREAPER = 36
-_END_S = 5.0
-_REAP_S = 10.0
+_CLOSE_S = 10.0
 """How long `Child.close` waits for the report of the child's end."""
 
 
@@ -93,13 +98,14 @@ class ForkServer:
             InfrastructureError: The server cannot be started.
         """
         read_fd, write_fd = os.pipe()
+        request = ([b"c"], [child_fd, write_fd])
         try:
             with self._lock:
                 try:
-                    socket.send_fds(self._connected(), [b"c"], [child_fd, write_fd])
+                    socket.send_fds(self._connected(), *request)
                 except OSError:  # it has just died
                     self._close()
-                    socket.send_fds(self._connected(), [b"c"], [child_fd, write_fd])
+                    socket.send_fds(self._connected(), *request)
             return read_fd
         except OSError as error:
             os.close(read_fd)
@@ -115,6 +121,7 @@ class ForkServer:
             self._close()
 
     def _connected(self) -> socket.socket:
+        """The socket to a server that runs; starts one where there is none."""
         is_ours = self._owner == os.getpid()  # after a fork the parent's server is not
         if self._running is not None and is_ours and self._running[1].poll() is None:
             return self._running[0]
@@ -132,6 +139,7 @@ class ForkServer:
         return ours
 
     def _close(self) -> None:
+        """Stop the server; that of the process that this one was forked from is left alone."""
         if self._running is not None and self._owner == os.getpid():
             control, process = self._running
             control.close()
@@ -198,6 +206,7 @@ class Child:
                 self.server_died = not self.lost
                 self.lost = self.lost or "the fork server was ended from outside"
                 break
+            # a line may come in two parts
             *lines, self._buffer = (self._buffer + data).split(b"\n")
             for message in map(json.loads, lines):
                 self.pid = message.get("pid", self.pid)
@@ -215,7 +224,7 @@ class Child:
         """Kill it if it still runs, wait until it and all that it started have ended, and release the pipes."""
         self.kill()
         self.connection.close()
-        deadline = time.monotonic() + _REAP_S
+        deadline = time.monotonic() + _CLOSE_S
         while self.poll() is None and time.monotonic() < deadline:
             wait([self.status_fd], 0.1)
         os.close(self.status_fd)
@@ -224,59 +233,48 @@ class Child:
             sweep()
 
 
-def make_job(work: str, folder: Path | str, **details: Any) -> dict[str, Any]:
-    """A job for a child, as JSON takes it.
+class _Server:
+    """The server's loop: it waits for requests of the parent and for ends of children; SIGTERM ends it.
 
     Args:
-        work: ``module:function`` that does it; called with the job, a function that tells the
-            parent something, and one that says whether the parent wants an early end.
-        folder: Where the child's log and what it finds go.
-        details: What `work` wants to know; ``spec`` with the ``threads`` of the run among it.
-
-    Returns:
-        The job; the child does it in this process's working folder, with its environment and import
-        path.
+        control: The server's end of the socket to the parent.
+        start: ``fork`` or ``fresh``.
     """
-    environment = {name: text for name, text in os.environ.items() if name not in THREAD_VARIABLES}
-    context = {
-        "environment": environment,
-        "working_folder": str(Path.cwd()),
-        "path": list(sys.path),
-    }
-    return {"work": work, "folder": str(folder), **context, **details}
-
-
-class _Server:
-    """The server's loop: it waits for requests of the parent and for ends of children; SIGTERM ends it."""
 
     def __init__(self, control: socket.socket, start: str) -> None:
-        self.control = control
-        self.start = start
-        # helpers of libraries
-        self.own = frozenset(child.pid for child in psutil.Process().children())
-        self.runs: dict[int, int] = {}
-        self.wake_fds = os.pipe()
-        for end in self.wake_fds:
+        self._control = control
+        self._start = start
+        # processes that libraries have started when they were imported
+        self._helpers = frozenset(child.pid for child in psutil.Process().children())
+        # write ends of the status pipes, by the process id of each run
+        self._status_fds: dict[int, int] = {}
+        # signals write into a pipe, which wakes the loop
+        self._wake_fds = os.pipe()
+        for end in self._wake_fds:
             os.set_blocking(end, False)
-        signal.set_wakeup_fd(self.wake_fds[1], warn_on_full_buffer=False)
-        signal.signal(signal.SIGCHLD, lambda *_: None)  # it wakes the loop
+        signal.set_wakeup_fd(self._wake_fds[1], warn_on_full_buffer=False)
+        signal.signal(signal.SIGCHLD, lambda *_: None)
         signal.signal(signal.SIGTERM, lambda *_: sys.exit())
 
     def run(self) -> None:
+        """Serve until the parent closes the socket or SIGTERM comes; end all children then."""
         with contextlib.suppress(SystemExit):
-            while self.control not in wait([self.control, self.wake_fds[0]]) or self._accept():
+            while True:
+                ready = wait([self._control, self._wake_fds[0]])
+                if self._control in ready and not self._accept():
+                    break
                 with contextlib.suppress(BlockingIOError):
-                    os.read(self.wake_fds[0], 4096)
+                    os.read(self._wake_fds[0], 4096)
                 self._reap()
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # what follows ends by itself
-        for pid in self.runs:
+        for pid in self._status_fds:
             end_tree(pid)
         end_children()
         sweep()
 
     def _accept(self) -> bool:
         """Start the child that is asked for; False if the parent has closed the socket."""
-        message, fds, _, _ = socket.recv_fds(self.control, 1, 2)
+        message, fds, _, _ = socket.recv_fds(self._control, 1, 2)
         if not message:
             return False
         connection_fd, status_fd = fds
@@ -284,7 +282,7 @@ class _Server:
         try:
             pid = (
                 self._fork(connection_fd, status_fd)
-                if self.start == "fork"
+                if self._start == "fork"
                 else _spawn(connection_fd)
             )
         except OSError as error:
@@ -292,7 +290,7 @@ class _Server:
             os.close(status_fd)
         else:
             _tell(status_fd, {"pid": pid})
-            self.runs[pid] = status_fd
+            self._status_fds[pid] = status_fd
         os.close(connection_fd)
         return True
 
@@ -306,24 +304,23 @@ class _Server:
             signal.set_wakeup_fd(-1)
             for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM, signal.SIGCHLD):
                 signal.signal(number, signal.SIG_DFL)
-            self.control.close()
-            for inherited in (status_fd, *self.wake_fds, *self.runs.values()):
+            self._control.close()
+            for inherited in (status_fd, *self._wake_fds, *self._status_fds.values()):
                 os.close(inherited)
-            from dynslam_bench.runs.process.child import main
-
-            code = main(Connection(connection_fd))
+            code = make_run(Connection(connection_fd))
         finally:
             os._exit(code)
 
     def _reap(self) -> None:
         """Reap the runs that have ended, end what they have left behind, then report them."""
-        waited = [os.waitpid(pid, os.WNOHANG) for pid in self.runs]
-        ended = [(self.runs.pop(pid), status) for pid, status in waited if pid]
+        waited = [os.waitpid(pid, os.WNOHANG) for pid in self._status_fds]
+        # status pipe and exit status of each run that has ended
+        ended = [(self._status_fds.pop(pid), status) for pid, status in waited if pid]
         # at once: the system may give the number to another process, which is not to be killed
         for status_fd, _ in ended:
             _tell(status_fd, {"pid": 0})
         if ended:
-            end_children({*self.runs, *self.own})
+            end_children({*self._status_fds, *self._helpers})
             sweep()
         for status_fd, status in ended:
             _tell(status_fd, {"exit": os.waitstatus_to_exitcode(status)})
@@ -340,6 +337,7 @@ def _spawn(connection_fd: int) -> int:
 
 
 def _tell(fd: int, message: dict[str, Any]) -> None:
+    """Write a line of JSON into the status pipe of a run."""
     with contextlib.suppress(OSError):  # the parent may have closed its end
         os.write(fd, json.dumps(message).encode() + b"\n")
 
@@ -349,74 +347,25 @@ def serve(fd: int, start: str) -> None:
     control = socket.socket(fileno=fd)
     for ignored in (signal.SIGINT, signal.SIGHUP):
         signal.signal(ignored, signal.SIG_IGN)
-    for name in PRELOADED if start == "fork" else ():
-        with contextlib.suppress(Exception):  # the child meets it again and says what is wrong
-            importlib.import_module(name)
     if start == "fork":
-        with contextlib.suppress(Exception):  # what is not loaded here each child loads itself
-            importlib.import_module("dynslam_bench.core.kernel_cache").load_kernels()
-            # remembered: the keys of the children's stage caches are of the code that is loaded
-            # here
-            module_graph()
-            # it dates what was loaded here; children that record what plug-ins read find the
-            # distributions read already
-            importlib.import_module("dynslam_bench.runs.process.recorder")
-            ImportPath(sys.path).read_all()
+        _preload()
     adopt_orphans()
     _Server(control, start).run()
 
 
-# -- process trees ---------------------------------------------------------------------------------
-
-
-def adopt_orphans(*, die_with_parent: bool = False) -> None:
-    """On Linux become the parent of every descendant whose own parent ends.
-
-    Args:
-        die_with_parent: Whether this process is killed when the thread that forked it ends;
-            elsewhere than on Linux the closed connection has to do.
-    """
-    if sys.platform == "linux":
-        prctl = ctypes.CDLL(None).prctl
-        prctl(_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
-        if die_with_parent:
-            prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL, 0, 0, 0)
-
-
-def process_tree(pid: int) -> list[psutil.Process]:
-    """A process, first, and all its descendants; empty if it has ended."""
-    try:
-        top = psutil.Process(pid)
-        return [top, *top.children(recursive=True)]
-    except psutil.Error:
-        return []
-
-
-def end_processes(processes: Iterable[psutil.Process]) -> None:
-    """Kill those that still run; a process that has taken the number of one that ended is left alone."""
-    for process in processes:
-        with contextlib.suppress(psutil.Error):
-            process.kill()
-
-
-def end_tree(pid: int) -> None:
-    """Kill a process with its process group and all its descendants, whatever their groups."""
-    members = process_tree(pid)
-    with contextlib.suppress(ProcessLookupError, PermissionError):
-        os.killpg(pid, signal.SIGKILL)
-    end_processes(members)
-
-
-def end_children(keep: Collection[int] = ()) -> None:
-    """Kill and reap all descendants of this process but the children in `keep` and their descendants."""
-    deadline = time.monotonic() + _END_S
-    while time.monotonic() < deadline:
-        ending = [child for child in psutil.Process().children() if child.pid not in keep]
-        if not ending:
-            return
-        for child in ending:
-            end_processes(process_tree(child.pid))
-        psutil.wait_procs(ending, timeout=0.1)
+def _preload() -> None:
+    """Load what the children need, so that a forked one has it at once."""
+    for name in PRELOADED:
+        with contextlib.suppress(Exception):  # the child meets it again and says what is wrong
+            importlib.import_module(name)
+    with contextlib.suppress(Exception):  # what is not loaded here each child loads itself
+        importlib.import_module("dynslam_bench.core.kernel_cache").load_kernels()
+        # remembered: the keys of the children's stage caches are of the code that is loaded here
+        module_graph()
+        # it dates what was loaded here; children that record what plug-ins read find the
+        # distributions read already
+        importlib.import_module("dynslam_bench.runs.process.recorder")
+        ImportPath(sys.path).read_all()
 
 
 if __name__ == "__main__":

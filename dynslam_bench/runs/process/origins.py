@@ -11,7 +11,8 @@ from typing import Literal
 import dynslam_bench
 
 Origin = Literal["own", "python", "library", "foreign"]
-_SITE = (f"{os.sep}site-packages{os.sep}", f"{os.sep}dist-packages{os.sep}")
+"""This package's, Python's, a library's, or a plug-in's and all other code."""
+_SITE_FOLDERS = (f"{os.sep}site-packages{os.sep}", f"{os.sep}dist-packages{os.sep}")
 
 
 class Origins:
@@ -32,9 +33,10 @@ class Origins:
         self._python = _folders(
             [*map(sysconfig.get_path, ("stdlib", "platstdlib")), os.path.dirname(os.__file__)]
         )
-        self._imported = _folders([])
+        self._imported: tuple[str, ...] = ()
         self._of_file: dict[str, Origin] = {}
         self._of_code: dict[str, Origin] = {}
+        # what is imported already and nobody else's is a library's
         imported = [place for place in _imported_places() if self.of_file(place) == "foreign"]
         self._imported = (*_folders(imported), *imported)
         self._of_file.clear()
@@ -61,16 +63,19 @@ class Origins:
         return origin
 
     def _look(self, file: str) -> Origin:
+        """Whose a file is, by the folders that it lies in."""
         if file.startswith("<"):  # frozen, or made from a text
             return "python"
         if file.startswith(self._own):
             return "own"
         for folder in self._plugin:
-            if file.startswith(folder) and not any(
-                site in file[len(folder) - 1 :] for site in _SITE
-            ):
+            if not file.startswith(folder):
+                continue
+            # an environment with libraries may lie in the plug-in's folder
+            inside = file[len(folder) - 1 :]
+            if not any(site in inside for site in _SITE_FOLDERS):
                 return "foreign"
-        if any(site in file for site in _SITE) or file.startswith(self._imported):
+        if any(site in file for site in _SITE_FOLDERS) or file.startswith(self._imported):
             return "library"
         return "python" if file.startswith(self._python) else "foreign"
 

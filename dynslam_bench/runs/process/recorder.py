@@ -50,13 +50,13 @@ from dynslam_bench.runs.process.announcing import ALL_VARIABLES, VARIABLE, VARIA
 from dynslam_bench.runs.process.collector import Collector, FileNote, is_code, stamp_of
 from dynslam_bench.runs.process.origins import Origins
 
-_SMALL = 1 << 20
+_SMALL_BYTES = 1 << 20
 """Files of up to so many bytes are digested when they are opened; larger ones, which take time, at the end."""
 _LOOK_S = 0.5
 """Seconds between two looks at the programs. One that has ended before the first look counts by its command."""
 _FILE_CLOCK = 5 if sys.platform == "linux" else None
 """Number of the clock that stamps files, the coarse one; it moves on every 1 to 10 ms."""
-_CLOCK_NS = 10_000_000
+_CLOCK_LAG_NS = 10_000_000
 """So far the clock that stamps files may be behind that of the system."""
 _ADAPTERS = "dynslam_bench.trackers.adapters"
 """The modules of this package that start programs of others."""
@@ -67,7 +67,9 @@ _RELATIVE_TO_DESCRIPTOR = ("shutil.py", "os.py", "<frozen os>")
 _KERNELS = (".nbi", ".nbc")
 """Numba's compiled code, which follows from its source."""
 _METADATA = re.compile(r"\.(?:dist|egg)-info(?:/|$)")
+"""Folders in which a distribution is described."""
 _SHELL_WORD = re.compile(r"[^\s;|&<>()'\"`$]+")
+"""A word of a shell's line."""
 _LOG = "reads-{}.jsonl"
 """In the first private folder: what a forked process has read."""
 
@@ -96,12 +98,17 @@ class ReadRecorder:
         self._anchors = anchors
         self._folders = list(private)
         self._plugins = plugins
+        # threads in which the recorder itself is at work
         self._ignored_threads: set[int] = set()
+        # the first fault of the recorder's own
         self._error: Exception | None = None
         self._ended = threading.Event()
-        self._looked: dict[tuple[int, float], float] = {}
+        # age in seconds of each program when it was looked at last, by process id and birth
+        self._age_at_look: dict[tuple[int, float], float] = {}
         self._watcher: threading.Thread | None = None
+        # descriptor of the log of a forked process; -1 in the process that makes the run
         self._log = -1
+        # the last snapshot, with the count of reads that it is of
         self._snapshot = (-1, "")
         self._handlers: dict[str, Callable[..., None]] = {
             "open": self._on_open,
@@ -129,16 +136,12 @@ class ReadRecorder:
 
     def start(self) -> None:
         """Begin to record."""
-        owned = (*self._folders, stage_cache_folder(), digest_cache_folder())
-        spellings = [
-            spelling
-            for folder in owned
-            for spelling in (os.path.abspath(folder), os.path.realpath(folder))
-        ]
+        private: list[str] = []
+        for folder in (*self._folders, stage_cache_folder(), digest_cache_folder()):
+            private.append(f"{os.path.abspath(folder)}{os.sep}")
+            private.append(f"{os.path.realpath(folder)}{os.sep}")
         self._origins = Origins(self._anchors.plugin, self._plugins)
-        self._collector = Collector(
-            self._anchors, self._origins, tuple(f"{folder}{os.sep}" for folder in spellings)
-        )
+        self._collector = Collector(self._anchors, self._origins, tuple(private))
         self._notes = self._collector.notes
         listen(self.hear, self._handlers, self.begin_log)
 
@@ -206,6 +209,7 @@ class ReadRecorder:
 
     @contextmanager
     def _ignoring_own_reads(self) -> Iterator[None]:
+        """Hear nothing of what this thread does in the block."""
         thread = threading.get_ident()
         self._ignored_threads.add(thread)
         try:
@@ -231,7 +235,10 @@ class ReadRecorder:
         return not is_own and threading.current_thread() is not threading.main_thread()
 
     def _is_asked_by_foreign(self, frame: FrameType | None) -> bool:
-        """The same, but what this package looks up for itself when a plug-in calls it does not count."""
+        """Whether foreign code asks for a variable; what this package looks up for itself does not count.
+
+        That holds where a plug-in has called this package, too.
+        """
         while frame is not None:
             origin = self._origins.of_frame(frame)
             if origin in ("foreign", "own"):
@@ -252,6 +259,7 @@ class ReadRecorder:
         if not flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC):
             self._read(frame, self._source_of(path))
             return
+        # it is opened to be written, and perhaps read before
         if flags & os.O_RDWR and not flags & os.O_TRUNC:
             self._read(frame, path, whole=True)
         self._make(path)
@@ -262,18 +270,17 @@ class ReadRecorder:
 
     def _on_database(self, frame: FrameType, name: Any) -> None:
         text = os.fsdecode(name)
-        text = text.removeprefix("file:").partition("?")[0] if text.startswith("file:") else text
+        if text.startswith("file:"):  # a URI, with options behind a question mark
+            text = text.removeprefix("file:").partition("?")[0]
         if text not in ("", ":memory:") and (path := _absolute(text)):
             self._read(frame, path, whole=True)
             self._make(path)
 
     def _on_library(self, frame: FrameType, name: Any) -> None:
         # one without a folder is found among what is mapped into memory
-        if (
-            isinstance(name, str | bytes)
-            and os.sep in os.fsdecode(name)
-            and (path := _absolute(name))
-        ):
+        if not isinstance(name, str | bytes) or os.sep not in os.fsdecode(name):
+            return
+        if path := _absolute(name):
             self._read(frame, path)
 
     def _read(self, frame: FrameType, path: str, *, whole: bool = False) -> None:
@@ -293,16 +300,16 @@ class ReadRecorder:
             self._collector.compare(path, note, stamp)
             return
         is_special = stamp is not None and not os.path.isfile(path)  # a folder, a pipe, a socket
-        if is_special or not self._can_count(path) or not self._is_foreign(frame):
+        if is_special or not self._counts_by_itself(path) or not self._is_foreign(frame):
             return
-        if self._collector.is_output(os.path.realpath(path)) or self._collector.is_of_program(
-            stamp
-        ):
+        if self._collector.is_output(os.path.realpath(path)):
+            return
+        if self._collector.is_made_by_program(stamp):
             return
         note = FileNote(stamp)
         if stamp is not None and whole:
             note.digest = content_now(path)
-        elif stamp is not None and stamp[2] <= _SMALL:
+        elif stamp is not None and stamp.size <= _SMALL_BYTES:
             note.digest = _sha256(path)
         self._notes.files[path] = note
         self._note("file", path)
@@ -324,18 +331,19 @@ class ReadRecorder:
         if self._origins.of_file(source) == "foreign":
             stamp = stamp_of(source)
             compiled = stamp_of(path)
-            if stamp is not None and compiled is not None and stamp[4] >= compiled[3]:
+            if (
+                stamp is not None
+                and compiled is not None
+                and stamp.changed_ns >= compiled.modified_ns
+            ):
                 raise _StaleByteCode(path)
         return source
 
-    def _can_count(self, path: str) -> bool:
+    def _counts_by_itself(self, path: str) -> bool:
         """Whether a file is none that counts in another way: by its distribution, as this package's code, as source."""
-        if (
-            not is_file_name(path)
-            or path.endswith(_KERNELS)
-            or BYTE_CODE_FOLDER in path
-            or _METADATA.search(path)
-        ):
+        if not is_file_name(path):
+            return False
+        if path.endswith(_KERNELS) or BYTE_CODE_FOLDER in path or _METADATA.search(path):
             return False
         if path in sys.path:  # an archive: it counts where a module is loaded from it
             return False
@@ -386,12 +394,9 @@ class ReadRecorder:
 
     def _on_list(self, frame: FrameType, name: Any) -> None:
         path = _absolute("." if name is None else name)
-        if (
-            path is None
-            or path in self._notes.folders
-            or not is_file_name(path)
-            or _is_in(frame, _IMPORTING)
-        ):
+        if path is None or path in self._notes.folders or not is_file_name(path):
+            return
+        if _is_in(frame, _IMPORTING):
             return
         if self._collector.is_output(f"{path}{os.sep}") or not self._is_foreign(frame):
             return
@@ -405,24 +410,22 @@ class ReadRecorder:
 
     def _on_import(self, frame: FrameType, module: str, *_: Any) -> None:
         top = module.partition(".")[0]
-        if (
-            top not in self._notes.modules
-            and top not in sys.stdlib_module_names
-            and self._is_foreign(frame)
-        ):
+        if top in self._notes.modules or top in sys.stdlib_module_names:
+            return
+        if self._is_foreign(frame):
             self._notes.modules.add(top)
             self._note("module", top)
 
     def _on_variable(self, frame: FrameType, name: Any) -> None:
         if self._is_asked_by_foreign(frame.f_back):
-            self._note_variables([_variable(name)])
+            self._note_variables([_variable_name(name)])
 
     def _on_all_variables(self, frame: FrameType) -> None:
         if self._is_asked_by_foreign(frame.f_back):
             self._note_variables(self._collector.environment)
 
     def _on_variable_set(self, _: FrameType, name: Any) -> None:
-        self._notes.made.add(f"${_variable(name)}")
+        self._notes.made.add(f"${_variable_name(name)}")
 
     def _note_variables(self, names: Iterable[str]) -> None:
         for name in names:
@@ -487,18 +490,19 @@ class ReadRecorder:
         if not self._notes.commands:
             return
         with self._ignoring_own_reads():
-            own = psutil.Process().cmdline()
+            command_line = psutil.Process().cmdline()
             for process in psutil.Process().children(recursive=True):
                 try:
                     born_s = process.create_time()
-                    is_fork = process.cmdline() == own
+                    is_fork = process.cmdline() == command_line
                 except psutil.Error:  # it has ended
                     continue
+                if is_fork:  # it writes down itself what it reads
+                    continue
+                key = (process.pid, born_s)
                 age_s = time.time() - born_s
-                if not is_fork and age_s >= max(
-                    least_age_s, 2 * self._looked.get((process.pid, born_s), 0.0)
-                ):
-                    self._looked[process.pid, born_s] = age_s
+                if age_s >= max(least_age_s, 2 * self._age_at_look.get(key, 0.0)):
+                    self._age_at_look[key] = age_s
                     look_at(process, self._collector.programs)
 
     # -- forked processes --------------------------------------------------------------------------
@@ -512,20 +516,19 @@ class ReadRecorder:
 
     def _add_forked(self) -> None:
         """Take over what forked processes have read and made."""
-        lines = [
-            line
-            for log in self._folders[0].glob(_LOG.format("*"))
-            for line in log.read_text().splitlines()
-        ]
-        entries = [json.loads(line) for line in lines]
+        entries: list[tuple[str, str]] = []
+        for log in self._folders[0].glob(_LOG.format("*")):
+            entries += [json.loads(line) for line in log.read_text().splitlines()]
+        # what one of them has made is no input of another
         for kind, name in entries:
             if kind == "made":
                 self._notes.made.add(name)
         for kind, name in entries:
             match kind:
                 case "file" if name not in self._notes.files:
-                    self._notes.files[name] = FileNote(stamp := stamp_of(name))
-                    if stamp is not None and stamp[4] > self._collector.began_ns:
+                    stamp = stamp_of(name)
+                    self._notes.files[name] = FileNote(stamp)
+                    if stamp is not None and stamp.changed_ns > self._collector.began_ns:
                         self._notes.changed.append(name)
                 case "folder" if name not in self._notes.folders:
                     self._notes.folders[name] = names_in(name) if os.path.isdir(name) else None
@@ -535,9 +538,8 @@ class ReadRecorder:
                     self._notes.modules.add(name)
                 case "command":
                     words, folder = json.loads(name)
-                    self._notes.commands.setdefault(
-                        Command(tuple(words), folder), self._collector.began_ns
-                    )
+                    command = Command(tuple(words), folder)
+                    self._notes.commands.setdefault(command, self._collector.began_ns)
 
 
 class _StaleByteCode(FileNotFoundError):
@@ -552,12 +554,12 @@ def _absolute(name: Any, folder: int = -1) -> str | None:
         folder: Descriptor of the folder in which a relative path begins; -1 for the working folder.
     """
     if isinstance(name, int):
-        return _of_descriptor(name)
+        return _path_of_descriptor(name)
     path = os.fsdecode(name)
     if "\0" in path:  # no file can have that name
         return None
     if not os.path.isabs(path):
-        base = os.getcwd() if folder == -1 else _of_descriptor(folder)
+        base = os.getcwd() if folder == -1 else _path_of_descriptor(folder)
         if base is None:
             return None
         path = os.path.join(base, path)
@@ -565,7 +567,7 @@ def _absolute(name: Any, folder: int = -1) -> str | None:
     return os.path.realpath(path) if ".." in path.split(os.sep) else os.path.normpath(path)
 
 
-def _of_descriptor(descriptor: int) -> str | None:
+def _path_of_descriptor(descriptor: int) -> str | None:
     """The path of an open file; None where it has none or the system does not tell."""
     try:
         path = os.readlink(f"/proc/self/fd/{descriptor}")
@@ -582,15 +584,15 @@ def _time_after_files_so_far() -> int:
     as written next.
     """
     if _FILE_CLOCK is None:
-        return time.time_ns() - _CLOCK_NS
+        return time.time_ns() - _CLOCK_LAG_NS
     tick_ns = time.clock_gettime_ns(_FILE_CLOCK)
-    end_ns = time.monotonic_ns() + 2 * _CLOCK_NS
+    end_ns = time.monotonic_ns() + 2 * _CLOCK_LAG_NS
     while time.monotonic_ns() < end_ns:
         now_ns = time.clock_gettime_ns(_FILE_CLOCK)
         if now_ns != tick_ns:
             return now_ns
         time.sleep(0.0005)
-    return time.time_ns() - _CLOCK_NS
+    return time.time_ns() - _CLOCK_LAG_NS
 
 
 def _sha256(path: str) -> str:
@@ -601,7 +603,7 @@ def _sha256(path: str) -> str:
         return ""
 
 
-def _variable(name: Any) -> str:
+def _variable_name(name: Any) -> str:
     """The name of an environment variable; anything else than a text or bytes is none, and fails where it is used."""
     return os.fsdecode(name) if isinstance(name, str | bytes) else ""
 

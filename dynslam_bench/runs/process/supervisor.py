@@ -14,20 +14,25 @@ from typing import Any
 import psutil
 
 from dynslam_bench.core import InfrastructureError
-from dynslam_bench.runs.process.fork_server import Child, process_tree
+from dynslam_bench.runs.process.fork_server import Child
+from dynslam_bench.runs.process.process_trees import process_tree
 from dynslam_bench.runs.record import Status
 from dynslam_bench.runs.spec import Limits
 
 Message = dict[str, Any]
 _POLL_S = 0.1
+"""Longest wait for a message, and least time between two measurements of the memory."""
 _TREE_S = 0.5
 """Seconds between two looks at the process tree, for which psutil reads the status of all processes."""
 _STOP_GRACE_S = 30.0
+"""A child that was asked to stop is ended after this time."""
 _FIRST_WARM = 1
 """The first frame after which nothing is loaded or compiled any more: a flow needs two frames before it compiles."""
 _END_GRACE_S = 10.0
+"""A child that has sent its last message is ended after this time."""
 _SIGNAL_GRACE_S = 0.5
-_GO_ON = "the run is not stored; the same command goes on from there"
+"""How long after a child was killed a signal may take to reach this process."""
+_NOT_STORED_HINT = "the run is not stored; the same command goes on from there"
 DEFAULT_SHARE = 0.8
 """Share of the machine's memory that all runs at a time may take together where no limit was given."""
 _CGROUP_LIMITS = (
@@ -65,7 +70,8 @@ class ServerDiedError(InfrastructureError):
 
     def __init__(self, where: str) -> None:
         super().__init__(
-            f"the run could not go on: the fork server was ended from outside{where}", _GO_ON
+            f"the run could not go on: the fork server was ended from outside{where}",
+            _NOT_STORED_HINT,
         )
         self.where = where
 
@@ -114,6 +120,11 @@ def supervise(
 
 @dataclass
 class _Supervisor:
+    """Supervises one child; see `supervise` for the arguments.
+
+    Times are those of `time.monotonic`, in seconds.
+    """
+
     child: Child
     limits: Limits
     on_progress: Callable[[Message], bool]
@@ -125,23 +136,32 @@ class _Supervisor:
     began: float | None = None
     """When the child said that it was ready."""
     last_message: float = field(default_factory=time.monotonic)
+    """When the last message came."""
     frame: int = -1
+    """The last frame that was tracked; -1 before the first one."""
     n_frames: int = 0
+    """Frames of the sequence; 0 until it is open."""
     final: Message = field(default_factory=dict)
+    """The last message of the run; empty until it comes."""
     peak_mb: float = 0.0
+    """Largest memory measured or reported."""
     stop_sent: float | None = None
-    next_look: float = 0.0
+    """When the child was asked to stop."""
+    next_measurement: float = 0.0
+    """When memory is measured next."""
     next_tree: float = 0.0
+    """When the process tree is looked at next."""
 
     def run(self) -> Verdict:
+        """Take messages until the child has ended or is over a limit."""
         connection = self.child.connection
         is_open = True
         while True:
-            if connection in wait(
-                [self.child.status_fd, *([connection] if is_open else [])], _POLL_S
-            ):
+            sources = [self.child.status_fd, connection] if is_open else [self.child.status_fd]
+            if connection in wait(sources, _POLL_S):
                 is_open = self._receive()
             if self.child.poll() is not None:
+                # messages that came before its end
                 while is_open and connection.poll(0):
                     is_open = self._receive()
                 return self.verdict_of_end()
@@ -157,7 +177,7 @@ class _Supervisor:
         """
         match self.final:
             case {"infrastructure": str(broken)}:
-                raise InfrastructureError(broken, _GO_ON)
+                raise InfrastructureError(broken, _NOT_STORED_HINT)
             case {"type": "done"}:
                 return self._verdict("ok")
             case {"type": "stopped", "frames": frames}:
@@ -176,7 +196,7 @@ class _Supervisor:
             raise ServerDiedError("" if self.began is None else self._where())
         if self.child.lost or self.began is None:
             lost = self.child.lost or f"the process that was to make it ended with code {code}"
-            raise InfrastructureError(f"the run could not go on: {lost}", _GO_ON)
+            raise InfrastructureError(f"the run could not go on: {lost}", _NOT_STORED_HINT)
         return self._verdict("crashed", _reason_of_exit(code) + self._where())
 
     def _receive(self) -> bool:
@@ -195,28 +215,57 @@ class _Supervisor:
                 self.frame = message["index"]
             case "progress":
                 if not self.on_progress(message) and self.stop_sent is None:
-                    self.stop_sent = time.monotonic()
-                    with contextlib.suppress(OSError):  # it has ended, which its status tells
-                        self.child.connection.send_bytes(b"stop")
+                    self._ask_to_stop()
             case _:
                 self.final = message
                 self.peak_mb = max(self.peak_mb, message["peak_memory_mb"])
         return True
 
+    def _ask_to_stop(self) -> None:
+        self.stop_sent = time.monotonic()
+        with contextlib.suppress(OSError):  # it has ended, which its status tells
+            self.child.connection.send_bytes(b"stop")
+
     def _over_limit(self) -> Verdict | None:
+        """The verdict on a child that has to be ended; None where it may go on.
+
+        Raises:
+            InfrastructureError: No process has begun the run within its time to start.
+        """
         now = time.monotonic()
-        limits = self.limits
-        silent_s = time.monotonic() - self.last_message
+        silent_s = now - self.last_message
         if self.final:
             return self.verdict_of_end() if silent_s > _END_GRACE_S else None
+        verdict = self._stopped(now) or self._too_late(now, silent_s)
+        if verdict is not None or self.began is None or now < self.next_measurement:
+            return verdict
+        self.next_measurement = now + _POLL_S
+        self.tick()
+        return self._too_large(now)
+
+    def _stopped(self, now: float) -> Verdict | None:
+        """The verdict on a child that is not wanted any more."""
         if self.cancelled():
             return self._verdict("stopped", f"cancelled{self._where()}")
         if self.stop_sent is not None and now - self.stop_sent > _STOP_GRACE_S:
             return self._verdict("stopped", f"stopped on request after frame {self.frame}")
+        return None
+
+    def _too_late(self, now: float, silent_s: float) -> Verdict | None:
+        """The verdict on a child that has taken too much time.
+
+        Args:
+            now: The time.
+            silent_s: Seconds since its last message.
+
+        Raises:
+            InfrastructureError: It has not begun within its time to start.
+        """
+        limits = self.limits
         if self.began is None:
             if silent_s > limits.start_s:
                 raise InfrastructureError(
-                    f"no process for the run within {limits.start_s:g} s", _GO_ON
+                    f"no process for the run within {limits.start_s:g} s", _NOT_STORED_HINT
                 )
             return None
         if limits.time_s is not None and now - self.began > limits.time_s:
@@ -224,31 +273,31 @@ class _Supervisor:
         patience_s = limits.start_s if self.frame < _FIRST_WARM else limits.frame_s
         if silent_s > patience_s:
             return self._verdict("timeout", f"no sign of life for {patience_s:g} s{self._where()}")
-        if now < self.next_look:
-            return None
-        self.next_look = now + _POLL_S
-        self.tick()
-        if now >= self.next_tree:
-            self.next_tree = now + _TREE_S
-            # only a part of it if the fork server is killed meanwhile; none if the process has
-            # ended
-            tree = process_tree(self.child.pid) if self.child.pid else []
-            rest = [
-                member
-                for member in self.child.members
-                if member not in tree and member.is_running()
-            ]
-            self.child.members = tree + rest
-        used_mb = memory_mb(self.child.members)
-        self.peak_mb = max(self.peak_mb, used_mb)
-        if self.memory_mb is not None and used_mb > self.memory_mb:
-            limit = f"the limit is {self.memory_mb:.0f} MB{self.memory_source}"
-            return self._verdict(
-                "out-of-memory", f"{used_mb:.0f} MB resident, {limit}{self._where()}"
-            )
         return None
 
+    def _too_large(self, now: float) -> Verdict | None:
+        """Measure the memory; the verdict on a child that has taken too much."""
+        if now >= self.next_tree:
+            self.next_tree = now + _TREE_S
+            self.child.members = self._members()
+        used_mb = memory_mb(self.child.members)
+        self.peak_mb = max(self.peak_mb, used_mb)
+        if self.memory_mb is None or used_mb <= self.memory_mb:
+            return None
+        limit = f"the limit is {self.memory_mb:.0f} MB{self.memory_source}"
+        return self._verdict("out-of-memory", f"{used_mb:.0f} MB resident, {limit}{self._where()}")
+
+    def _members(self) -> list[psutil.Process]:
+        """The child's process tree, and former members of it that still run."""
+        # only a part of it if the fork server is killed meanwhile; none if the process has ended
+        tree = process_tree(self.child.pid) if self.child.pid else []
+        others = [
+            member for member in self.child.members if member not in tree and member.is_running()
+        ]
+        return tree + others
+
     def _where(self) -> str:
+        """Where the run is, as the end of a reason."""
         if not self.located:
             return ""
         if not self.n_frames:
@@ -261,6 +310,7 @@ class _Supervisor:
 
 
 def _reason_of_exit(code: int) -> str:
+    """What ended a process, by its exit code: minus the number of a signal."""
     if code >= 0:
         return f"the process left with exit code {code}"
     name = {number.value: number.name for number in signal.Signals}.get(-code, f"signal {-code}")
@@ -283,7 +333,7 @@ def memory_mb(members: list[psutil.Process]) -> float:
             memory = process.memory_info() if len(members) == 1 else process.memory_full_info()
             resident.append(memory.rss)
             proportional.append(getattr(memory, "pss", memory.rss))
-    return float(max([sum(proportional), *resident[:1]]) / 1e6)
+    return float(max([sum(proportional), *resident[:1]]) / 1e6)  # of no process 0
 
 
 def machine_memory_mb() -> float:
@@ -319,7 +369,7 @@ LONGEST_LOG = 1 << 20
 """A log of up to so many bytes is kept as it is."""
 LONGEST_YET = 1 << 23
 """A log is shortened to its ends while the run lasts when it is longer."""
-_KEPT = 1 << 18
+_KEPT_BYTES = 1 << 18
 """Bytes kept of the beginning and of the end of a longer one."""
 
 
@@ -329,8 +379,8 @@ def bound_log(log: Path, most: int) -> None:
         return
     # a full disk: the log stays as far as it came
     with contextlib.suppress(OSError), log.open("r+b") as file:
-        file.seek(-_KEPT, os.SEEK_END)
+        file.seek(-_KEPT_BYTES, os.SEEK_END)
         end = file.read()
-        file.truncate(_KEPT)
+        file.truncate(_KEPT_BYTES)
         file.seek(0, os.SEEK_END)  # the processes append, so that they go on behind it
         file.write(b"\n\n[... the middle of the log was cut here ...]\n\n" + end)
