@@ -15,6 +15,7 @@ from statistics import fmean
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import stats
 
 from dynslam_bench.core import StudyError, did_you_mean
@@ -85,27 +86,36 @@ def outcome(
         raise CancelledError(f"interrupted on {instance}")
     if record.failed:
         raise InstanceFailedError(f"{instance}: {record.status}: {record.reason}")
+
+    # error, that of a static camera where nothing was tracked
     evaluation = score(store, record, protocol).online
-    ate = (
-        static_camera_m(instance, data_root)
-        if evaluation is None
-        else float(evaluation.metrics["ate_rmse_m"])
-    )
+    if evaluation is None:
+        ate_m = static_camera_m(instance, data_root)
+    else:
+        ate_m = float(evaluation.metrics["ate_rmse_m"])
+
+    # time: this process's processor seconds tell nothing of work that is done elsewhere
     total = record.timings["total"]
     elsewhere = record.device.startswith("cuda") or FOREIGN in record.timings
     processor = total if elsewhere else record.timings.get("processor", total)
-    period = record.sequence.duration_s / max(record.sequence.frames - 1, 1)
-    rtf = period / total.mean_s
+    period_s = record.sequence.duration_s / max(record.sequence.frames - 1, 1)
     return Outcome(
-        instance, record.run_id, ate, record.coverage or 0.0, total.mean_s, processor.mean_s, rtf
+        instance=instance,
+        run_id=record.run_id,
+        ate_m=ate_m,
+        coverage=record.coverage or 0.0,
+        frame_s=total.mean_s,
+        processor_s=processor.mean_s,
+        rtf=period_s / total.mean_s,
     )
 
 
 def hold_last_pose_protocol(protocol: Protocol | str) -> Protocol:
     """The protocol with lost frames held at the last pose, so that losing track never pays."""
     protocol = get_protocol(protocol)
-    held = protocol.model_copy(update={"id": f"{protocol.id}+hold", "lost_frames": "hold"})
-    return protocol if protocol.lost_frames == "hold" else held
+    if protocol.lost_frames == "hold":
+        return protocol
+    return protocol.model_copy(update={"id": f"{protocol.id}+hold", "lost_frames": "hold"})
 
 
 @lru_cache(maxsize=256)
@@ -115,14 +125,17 @@ def static_camera_m(instance: ProblemInstance, data_root: str | None) -> float:
     truth = sequence.ground_truth
     stamps = sequence.timestamps
     positions = truth.positions[(truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])]
+    # alignment puts the one point of a static camera into the mean of the true positions, [N, 3]
     return float(np.sqrt(np.square(positions - positions.mean(axis=0)).sum(axis=1).mean()))
 
 
 Outcomes = Mapping[ProblemInstance, Outcome]
 Cost = Callable[[Outcome], float]
+"""Positive number of a run, less is better."""
 WORST_SHARE = 0.25
 """Share of the scenes, the worst ones, that the worst case is the mean of; always one at least."""
 _MANY = 1e9
+"""Factor of a user's costs, which lifts them above `FLOOR_M`; it cancels out of ratios."""
 _LOST_FLOOR = 0.01
 """So many lost frames are added on both sides, as a share, so that a baseline without any can be compared with."""
 
@@ -159,6 +172,7 @@ class Objective:
         return by_scene(self._costs(outcomes), self._costs(baseline))
 
     def _costs(self, outcomes: Outcomes) -> dict[ProblemInstance, float]:
+        """The cost on each instance that counts."""
         return {
             instance: self.cost(outcome)
             for instance, outcome in outcomes.items()
@@ -180,9 +194,11 @@ class Objective:
         return centre(counted)
 
     def counted(self, ratios: Iterable[float]) -> list[float]:
-        """Those scenes' ratios that the value is the centre of."""
+        """Those scenes' ratios that the value is the centre of, the worst first."""
         ranked = sorted(ratios, reverse=True)
-        return ranked[: max(1, round(WORST_SHARE * len(ranked)))] if self.worst else ranked
+        if not self.worst:
+            return ranked
+        return ranked[: max(1, round(WORST_SHARE * len(ranked)))]
 
     def counts(self, instance: ProblemInstance) -> bool:
         """Whether an instance counts."""
@@ -203,6 +219,8 @@ OBJECTIVES = {
     )
 }
 """Objectives by name."""
+
+# Two that are needed whatever a study's own objectives are.
 ACCURACY = OBJECTIVES["accuracy"]
 SPEED = OBJECTIVES["speed"]
 
@@ -211,13 +229,13 @@ def combined_objective(objectives: Sequence[Objective]) -> Objective:
     """Several objectives as one: the geometric mean of their ratios; one stays what it is."""
     if len(objectives) == 1:
         return objectives[0]
-    return Objective(
-        "balance",
-        f"geometric mean of {' and '.join(objective.what for objective in objectives)}",
-        lambda run: math.exp(
-            sum(math.log(objective.cost(run)) for objective in objectives) / len(objectives)
-        ),
-    )
+    names = " and ".join(objective.what for objective in objectives)
+
+    def geometric_mean(run: Outcome) -> float:
+        logs = sum(math.log(objective.cost(run)) for objective in objectives)
+        return math.exp(logs / len(objectives))
+
+    return Objective("balance", f"geometric mean of {names}", geometric_mean)
 
 
 def find_objective(name: str) -> Objective:
@@ -278,9 +296,9 @@ def violations(
         outcomes: Of a configuration.
         baseline: Outcomes of the baseline at the same places, for that ratio; None to leave it out.
     """
-    values = (
-        {} if spec.min_coverage is None else {"coverage": spec.min_coverage - coverage(outcomes)}
-    )
+    values = {}
+    if spec.min_coverage is not None:
+        values["coverage"] = spec.min_coverage - coverage(outcomes)
     if spec.min_fps is not None:
         values["fps"] = (spec.min_fps - fps(outcomes)) / spec.min_fps
     if baseline is not None and spec.at_equal_accuracy and len(spec.objectives) == 1:
@@ -321,6 +339,7 @@ def by_scene(errors: Errors, baseline: Errors) -> dict[str, float]:
         Natural logarithm by scene, below 0 is better than the baseline.
     """
     reference = log_errors(baseline)
+    # at each place: median over starts against median over starts
     ratios = {
         place: np.median(logs) - np.median(reference[place])
         for place, logs in log_errors(errors).items()
@@ -354,12 +373,15 @@ def bounds(values: Iterable[float], confidence: float = 0.95) -> tuple[float, fl
         values: One a scene, two or more, taken as independent.
         confidence: Of both sides together.
     """
+    # the trimmed mean's standard error is that of the winsorised sample, whose `cut` smallest and
+    # largest values are set to the ones beside them
     sample = np.sort(list(values))
     cut = int(TRIMMED * len(sample))
     count = len(sample)
     kept = count - 2 * cut
     winsorised = np.clip(sample, sample[cut], sample[-1 - cut])
     error = float(winsorised.std(ddof=1)) * math.sqrt(count) / kept
+    # Student's t with as many degrees of freedom as values are kept, less one
     half = float(stats.t.ppf(0.5 + confidence / 2, kept - 1)) * error
     middle = centre(sample)
     return middle - half, middle + half
@@ -368,7 +390,9 @@ def bounds(values: Iterable[float], confidence: float = 0.95) -> tuple[float, fl
 # What scenes can show.
 
 _POWER = 0.8
+"""Share of studies in which a gain is to be told from nothing: four of five."""
 _MOST_SCENES = 100_000
+"""`scenes_needed` looks no further."""
 
 
 def detectable(spread: float, count: int) -> float:
@@ -380,6 +404,7 @@ def detectable(spread: float, count: int) -> float:
     """
     if count < 2:
         return 1.0
+    # power of a t-test over scenes: the quantile of its level and that of its power, in standard errors
     factor = stats.t.ppf(0.975, count - 1) + stats.t.ppf(_POWER, count - 1)
     return float(1 - math.exp(-factor * spread / math.sqrt(count)))
 
@@ -410,6 +435,7 @@ def spread_test(trials: Sequence[Mapping[str, float]]) -> float | None:
         Above `MATTER_LEVEL` the settings do not matter on these scenes; None with too few trials or
         scenes for a test.
     """
+    # one cell for each trial and scene that it ran on: row, column, log ratio
     names = sorted({scene for trial in trials for scene in trial})
     cells = [
         (row, names.index(scene), value)
@@ -420,15 +446,22 @@ def spread_test(trials: Sequence[Mapping[str, float]]) -> float | None:
     if len(trials) < 2 or free < 1:
         return None
     rows, columns, values = (np.array(column) for column in zip(*cells, strict=True))
+
+    # sums of squared residuals without and with the trials' means, the scenes' being in both
     by_scene = np.eye(len(names))[columns]
     by_trial = np.eye(len(trials))[rows]
-    left, chance = (
-        float(np.square(values - model @ np.linalg.lstsq(model, values)[0]).sum())
-        for model in (by_scene, np.hstack([by_scene, by_trial]))
-    )
-    explained = max(0.0, left - chance) / (len(trials) - 1)
+    scatter = _squared_residuals(by_scene, values)
+    chance = _squared_residuals(np.hstack([by_scene, by_trial]), values)
+
+    # F: mean square that the trials explain over the mean square of chance
+    explained = max(0.0, scatter - chance) / (len(trials) - 1)
     ratio = explained / max(chance / free, _SAME)
     return 1.0 if explained < _SAME else float(stats.f.sf(ratio, len(trials) - 1, free))
+
+
+def _squared_residuals(model: NDArray[np.float64], values: NDArray[np.float64]) -> float:
+    """Sum of the squared residuals of a linear least-squares fit; `model` has a row for each value."""
+    return float(np.square(values - model @ np.linalg.lstsq(model, values)[0]).sum())
 
 
 _SAME = 1e-18
