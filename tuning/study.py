@@ -616,7 +616,7 @@ class Study(Plan):
             "sampler": sampler,
             "pruner": build_pruner(self.spec.pruner),
         }
-        directions = ["minimize"] * len(self.objectives)
+        directions: list[Literal["minimize", "maximize"]] = ["minimize"] * len(self.objectives)
         try:
             # one worker begins the study, the others load it
             with self._turn("begin"):

@@ -255,7 +255,7 @@ def _is_number_array(values: object, columns: int) -> bool:
     """Whether this is an array of real numbers with so many columns."""
     if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu":
         return False
-    return values.shape[1:] == (columns,)
+    return bool(values.shape[1:] == (columns,))
 
 
 def _is_number(value: object) -> bool:
