@@ -35,16 +35,19 @@ def write_recording(folder: Path, frames: int) -> None:
     wall = np.random.default_rng(0).integers(0, 255, (60, 80 + frames, 3), dtype=np.uint8)
     wall = cv2.resize(wall, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
     stamps = np.round(1000 + np.arange(frames) / FPS, 6)
+    # the lists: a stamp in seconds and a path a line
     for kind in ("rgb", "depth"):
         (folder / kind).mkdir(parents=True, exist_ok=True)
         lines = [f"{stamp:.6f} {kind}/{stamp:.6f}.png\n" for stamp in stamps]
         (folder / f"{kind}.txt").write_text("".join(lines))
+    # the images
     for index, stamp in enumerate(stamps):
         colour = wall[:240, STEP_PX * index : STEP_PX * index + 320]
         depth = np.full((240, 320), 5000 * DEPTH_M, np.uint16)  # 0 where depth is missing
         cv2.imwrite(str(folder / "rgb" / f"{stamp:.6f}.png"), colour)
         cv2.imwrite(str(folder / "depth" / f"{stamp:.6f}.png"), depth)
     (folder / "camera.toml").write_text(CAMERA)
+    # the ground truth
     T_world_cam = np.tile(np.eye(4), (frames, 1, 1))  # camera to world; x right, y down, z forward
     T_world_cam[:, 0, 3] = np.arange(frames) * STEP_PX * DEPTH_M / FX
     write_tum(folder / "groundtruth.txt", Trajectory(stamps, T_world_cam))

@@ -93,25 +93,27 @@ def outcome(
         raise CancelledError(f"interrupted on {instance}")
     if record.failed:
         raise InstanceFailedError(f"{instance}: {record.status}: {record.reason}")
+
+    # error, that of a static camera where nothing was tracked
     evaluation = score(store, record, protocol).online
-    ate = (
-        static_camera_m(instance, data_root)
-        if evaluation is None
-        else float(evaluation.metrics["ate_rmse_m"])
-    )
+    if evaluation is None:
+        ate_m = static_camera_m(instance, data_root)
+    else:
+        ate_m = float(evaluation.metrics["ate_rmse_m"])
+
+    # time: this process's processor seconds tell nothing of work that is done elsewhere
     total = record.timings["total"]
     elsewhere = record.device.startswith("cuda") or FOREIGN in record.timings
     processor = total if elsewhere else record.timings.get("processor", total)
-    period = record.sequence.duration_s / max(record.sequence.frames - 1, 1)
-    rtf = period / total.mean_s
+    period_s = record.sequence.duration_s / max(record.sequence.frames - 1, 1)
     return Outcome(
-        instance,
-        record.run_id,
-        ate,
-        record.coverage or 0.0,
-        total.mean_s,
-        processor.mean_s,
-        rtf,
+        instance=instance,
+        run_id=record.run_id,
+        ate_m=ate_m,
+        coverage=record.coverage or 0.0,
+        frame_s=total.mean_s,
+        processor_s=processor.mean_s,
+        rtf=period_s / total.mean_s,
         lost=record.status == "lost" or evaluation is None,
         wall_s=record.wall_s or 0.0,
     )
@@ -120,8 +122,9 @@ def outcome(
 def hold_last_pose_protocol(protocol: Protocol | str) -> Protocol:
     """The protocol with lost frames held at the last pose, so that losing track never pays."""
     protocol = get_protocol(protocol)
-    held = protocol.model_copy(update={"id": f"{protocol.id}+hold", "lost_frames": "hold"})
-    return protocol if protocol.lost_frames == "hold" else held
+    if protocol.lost_frames == "hold":
+        return protocol
+    return protocol.model_copy(update={"id": f"{protocol.id}+hold", "lost_frames": "hold"})
 
 
 @lru_cache(maxsize=256)
@@ -131,14 +134,17 @@ def static_camera_m(instance: ProblemInstance, data_root: str | None) -> float:
     truth = sequence.ground_truth
     stamps = sequence.timestamps
     positions = truth.positions[(truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])]
+    # alignment puts the one point of a static camera into the mean of the true positions, [N, 3]
     return float(np.sqrt(np.square(positions - positions.mean(axis=0)).sum(axis=1).mean()))
 
 
 Outcomes = Mapping[ProblemInstance, Outcome]
 Cost = Callable[[Outcome], float]
+"""Positive number of a run, less is better."""
 WORST_SHARE = 0.25
 """Share of the scenes, the worst ones, that the worst case is the mean of; always one at least."""
 _MANY = 1e9
+"""Factor of a user's costs, which lifts them above `FLOOR_M`; it cancels out of ratios."""
 _LOST_FLOOR = 0.01
 """So many lost frames are added on both sides, as a share, so that a baseline without any can be compared with."""
 
@@ -175,6 +181,7 @@ class Objective:
         return by_scene(self._costs(outcomes), self._costs(baseline))
 
     def _costs(self, outcomes: Outcomes) -> dict[ProblemInstance, float]:
+        """The cost on each instance that counts."""
         return {
             instance: self.cost(outcome)
             for instance, outcome in outcomes.items()
@@ -221,6 +228,8 @@ OBJECTIVES = {
     )
 }
 """Objectives by name."""
+
+# Two that are needed whatever a study's own objectives are.
 ACCURACY = OBJECTIVES["accuracy"]
 SPEED = OBJECTIVES["speed"]
 
@@ -229,13 +238,13 @@ def combined_objective(objectives: Sequence[Objective]) -> Objective:
     """Several objectives as one: the geometric mean of their ratios; one stays what it is."""
     if len(objectives) == 1:
         return objectives[0]
-    return Objective(
-        "balance",
-        f"geometric mean of {' and '.join(objective.what for objective in objectives)}",
-        lambda run: math.exp(
-            sum(math.log(objective.cost(run)) for objective in objectives) / len(objectives)
-        ),
-    )
+    names = " and ".join(objective.what for objective in objectives)
+
+    def geometric_mean(run: Outcome) -> float:
+        logs = sum(math.log(objective.cost(run)) for objective in objectives)
+        return math.exp(logs / len(objectives))
+
+    return Objective("balance", f"geometric mean of {names}", geometric_mean)
 
 
 def find_objective(name: str) -> Objective:
@@ -296,9 +305,9 @@ def violations(
         outcomes: Of a configuration.
         baseline: Outcomes of the baseline at the same places, for that ratio; None to leave it out.
     """
-    values = (
-        {} if spec.min_coverage is None else {"coverage": spec.min_coverage - coverage(outcomes)}
-    )
+    values = {}
+    if spec.min_coverage is not None:
+        values["coverage"] = spec.min_coverage - coverage(outcomes)
     if spec.min_fps is not None:
         values["fps"] = (spec.min_fps - fps(outcomes)) / spec.min_fps
     if baseline is not None and spec.at_equal_accuracy and len(spec.objectives) == 1:
@@ -333,6 +342,7 @@ def by_scene(errors: Errors, baseline: Errors) -> dict[str, float]:
         Natural logarithm by scene, below 0 is better than the baseline.
     """
     reference = log_errors(baseline)
+    # at each place: median over starts against median over starts
     ratios = {
         place: np.median(logs) - np.median(reference[place])
         for place, logs in log_errors(errors).items()

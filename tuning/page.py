@@ -36,6 +36,8 @@ _LEVELS = {Verdict.PROVEN: "green", Verdict.WORSE: "red"}
 """Colour of the verdict; all others are amber."""
 _CONTOURS = 4
 """Contours of so many parameters are drawn, the most important ones."""
+_FEW_TRIALS = 20
+"""With fewer finished trials the page warns that the best value is partly luck."""
 
 
 def write_page(tuner: Study, summary: StudySummary) -> Path:
@@ -48,6 +50,7 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
     Returns:
         Path of ``index.html`` in the study's folder; its tables lie beside it as CSV.
     """
+    # the tables, as CSV too
     spec = tuner.spec
     candidates = _candidates(summary)
     trials = _trials(tuner, summary)
@@ -56,6 +59,9 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
     settings = settings_table(tuner.space, tuner.base, params, proven)
     for table in (candidates, trials, settings):
         write_atomic(tuner.folder / "csv" / f"{table.id}.csv", csv_text(table.frame()))
+
+    # the sections
+    note = seen_note(summary.seen)
     caption = (
         "Ratios to the baseline, below 1 is better: of the trials, where the best is partly luck; of the best ones "
         "on scenes that no trial had seen; and of the best one on the held-out scenes and recordings. Bars: intervals "
@@ -65,7 +71,7 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
         Section(
             "result",
             "Tried, chosen, judged",
-            [note] if (note := seen_note(summary.seen)) else [],
+            [note] if note else [],
             [*figure_blocks(_funnel_figure(tuner, summary), caption), Block(table=candidates)],
         ),
         Section(
@@ -79,6 +85,9 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
         ),
         Section("trials", "All trials", [], [Block("All trials", trials, folded=True)]),
     ]
+
+    command = command_line(tuner.study.user_attrs.get("command", []))
+    made_with = f"Sampler {spec.sampler}, pruner {spec.pruner}, Optuna {optuna.__version__}."
     html = sections_page(
         sections,
         title=f"Study {spec.name}: {spec.tracker}",
@@ -87,8 +96,7 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
         protocol=f"{_asked(tuner, summary)} {summary.protocol}.",
         evaluates=True,
         links=[],
-        footer=f"Sampler {spec.sampler}, pruner {spec.pruner}, Optuna {optuna.__version__}. "
-        f"Reproduce: {command_line(tuner.study.user_attrs.get('command', []))}",
+        footer=f"{made_with} Reproduce: {command}",
     )
     write_assets(tuner.folder)
     write_atomic(tuner.folder / "index.html", html)
@@ -109,19 +117,44 @@ def _asked(tuner: Study, summary: StudySummary) -> str:
         f"{name} {len(instances)} runs, {len(scenes(instances))} scenes"
         for name, instances in splits.items()
     )
-    limits = {"coverage": tuner.spec.min_coverage, "frames a second": tuner.spec.min_fps}
-    named = ", ".join(
-        f"{name} of {least:g} or more" for name, least in limits.items() if least is not None
-    )
-    return (
+    text = (
         f"Do other values of {len(tuner.space)} settings give {tuner.spec.tracker} less {goals} than "
         f"{summary.baseline}? Trials: {trials}. Runs: {sizes}."
-        + (f" Constraints: {named}." if named else "")
     )
+    limits = {"coverage": tuner.spec.min_coverage, "frames a second": tuner.spec.min_fps}
+    constraints = [
+        f"{name} of {least:g} or more" for name, least in limits.items() if least is not None
+    ]
+    if constraints:
+        text += f" Constraints: {', '.join(constraints)}."
+    return text
 
 
 def _plots(tuner: Study, summary: StudySummary) -> list[Block]:
     """Optuna's own plots of the study; ratios in place of logarithms."""
+    important = list(summary.importances)
+    params = important or [parameter.name for parameter in tuner.space]
+    blocks = []
+    for title, figure in _optuna_figures(tuner, params, bool(important)).items():
+        # a row of contours for each parameter
+        height = 60 + 170 * min(len(params), _CONTOURS) if title == "Contours" else 450
+        figure.update_layout(title=None, template={}, height=figure.layout.height or height)
+        if title in ("Contours", "Slices"):  # whole names of settings overlap
+            for axis in (*figure.select_xaxes(), *figure.select_yaxes()):
+                last_part = (axis.title.text or "").rpartition(".")[2]
+                axis.update(title={"text": last_part, "font": {"size": 11}})
+        blocks += figure_blocks(figure, f"{title}, as Optuna draws it.", title)
+    return blocks
+
+
+def _optuna_figures(tuner: Study, params: list[str], has_importances: bool) -> dict[str, go.Figure]:
+    """Optuna's plots that fit the number of objectives, by title.
+
+    Args:
+        tuner: The study.
+        params: Names of the parameters, the most important first.
+        has_importances: Whether there are trials enough for importances.
+    """
     from optuna import visualization
 
     names = [f"ratio of {objective.what} to the baseline" for objective in tuner.objectives]
@@ -129,8 +162,6 @@ def _plots(tuner: Study, summary: StudySummary) -> list[Block]:
         "target": lambda trial: math.exp(trial.values[0]),
         "target_name": names[0],
     }
-    important = list(summary.importances)
-    params = important or [parameter.name for parameter in tuner.space]
     with quiet():
         figures = {
             "History": visualization.plot_optimization_history(tuner.study, **target),
@@ -140,34 +171,24 @@ def _plots(tuner: Study, summary: StudySummary) -> list[Block]:
                 tuner.study, params=params[:_CONTOURS], **target
             ),
         }
-        if important:
+        if has_importances:
             evaluator = optuna.importance.PedAnovaImportanceEvaluator()
             figures["Importances"] = visualization.plot_param_importances(
                 tuner.study, evaluator=evaluator, **target
             )
         if len(names) == 1:
-            figures["Intermediate values"] = steps = visualization.plot_intermediate_values(
-                tuner.study
-            )
+            # this plot takes no function of the value: its traces are logarithms
+            steps = visualization.plot_intermediate_values(tuner.study)
             steps.for_each_trace(lambda trace: trace.update(y=np.exp(np.asarray(trace.y, float))))
             steps.update_yaxes(title=names[0])
+            figures["Intermediate values"] = steps
         elif len(names) < 4:
             figures["Pareto front"] = visualization.plot_pareto_front(
                 tuner.study,
                 targets=lambda trial: list(map(math.exp, trial.values)),
                 target_names=names,
             )
-    blocks = []
-    for title, figure in figures.items():
-        height = 60 + 170 * min(len(params), _CONTOURS) if title == "Contours" else 450
-        figure.update_layout(title=None, template={}, height=figure.layout.height or height)
-        if title in ("Contours", "Slices"):  # whole names of settings overlap
-            for axis in (*figure.select_xaxes(), *figure.select_yaxes()):
-                axis.update(
-                    title={"text": (axis.title.text or "").rpartition(".")[2], "font": {"size": 11}}
-                )
-        blocks += figure_blocks(figure, f"{title}, as Optuna draws it.", title)
-    return blocks
+    return figures
 
 
 def _preset(tuner: Study, summary: StudySummary, settings: Table) -> list[Block]:
@@ -182,6 +203,7 @@ def _preset(tuner: Study, summary: StudySummary, settings: Table) -> list[Block]
 
 
 def _importance_note(summary: StudySummary) -> str:
+    """The importances of the settings with their intervals, or why there are none."""
     if not summary.importances:
         return f"No importances: they need {FEWEST_TRIALS} complete or pruned trials that differ."
     shares = ", ".join(f"{name} {importance}" for name, importance in summary.importances.items())
@@ -190,6 +212,7 @@ def _importance_note(summary: StudySummary) -> str:
 
 def _funnel_figure(tuner: Study, summary: StudySummary) -> go.Figure:
     """Ratios of all trials, of the confirmed candidates, and of the choice where it is judged."""
+    # the trials, spread over the width of their stage so that they do not hide each other
     tried = tuner.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     spread = 0.5 * (np.random.default_rng(0).random(len(tried)) - 0.5)
     stages = [f"tried: {len(tried)} whole trials"]
@@ -204,6 +227,8 @@ def _funnel_figure(tuner: Study, summary: StudySummary) -> go.Figure:
             hovertemplate="%{text}: %{y:.3f}<extra></extra>",
         )
     ]
+
+    # the candidates on each split that judged some of them
     splits = {"confirm": "unseen scenes", "held_out": "held out", "recorded": "recordings"}
     for (split, words), colour in zip(splits.items(), COLOURS, strict=False):
         judged: list[tuple[Candidate, PairedRatio]] = [
@@ -211,38 +236,10 @@ def _funnel_figure(tuner: Study, summary: StudySummary) -> go.Figure:
             for candidate in summary.candidates
             if (ratio := getattr(candidate, split)) is not None and ratio.ratio is not None
         ]
-        if not judged:
-            continue
-        at = len(stages) + 0.5 * (np.linspace(0, 1, len(judged) + 2)[1:-1] - 0.5)
-        stages.append(f"{words}: {len(judged)}")
-        symbols = [
-            "star" if candidate is summary.best and summary.verdict is Verdict.PROVEN else "circle"
-            for candidate, _ in judged
-        ]
-        bars = {
-            "type": "data",
-            "symmetric": False,
-            "array": [
-                0.0 if ratio.high is None or ratio.ratio is None else ratio.high - ratio.ratio
-                for _, ratio in judged
-            ],
-            "arrayminus": [
-                0.0 if ratio.low is None or ratio.ratio is None else ratio.ratio - ratio.low
-                for _, ratio in judged
-            ],
-        }
-        traces.append(
-            go.Scatter(
-                x=at,
-                y=[ratio.ratio for _, ratio in judged],
-                mode="markers",
-                name=words,
-                error_y=bars,
-                text=[f"trial {candidate.trial}" for candidate, _ in judged],
-                marker={"color": colour, "symbol": symbols, "size": 12},
-                hovertemplate="%{text}: %{y:.3f}<extra></extra>",
-            )
-        )
+        if judged:
+            traces.append(_judged_trace(judged, summary, len(stages), words, colour))
+            stages.append(f"{words}: {len(judged)}")
+
     axis = {
         "tickvals": list(range(len(stages))),
         "ticktext": stages,
@@ -252,6 +249,36 @@ def _funnel_figure(tuner: Study, summary: StudySummary) -> go.Figure:
     figure = go.Figure(traces, go.Layout(yaxis={"title": "ratio to the baseline"}, **layout))
     figure.add_hline(1.0, **GUIDE)
     return figure
+
+
+def _judged_trace(
+    judged: list[tuple[Candidate, PairedRatio]],
+    summary: StudySummary,
+    position: int,
+    words: str,
+    colour: str,
+) -> go.Scatter:
+    """Ratios of candidates with bars for their intervals, side by side at one stage; what is proven is a star."""
+    x = position + 0.5 * (np.linspace(0, 1, len(judged) + 2)[1:-1] - 0.5)
+    symbols = []
+    above = []
+    below = []
+    for candidate, ratio in judged:
+        is_proven = candidate is summary.best and summary.verdict is Verdict.PROVEN
+        symbols.append("star" if is_proven else "circle")
+        centre = ratio.ratio or 0.0
+        above.append(0.0 if ratio.high is None else ratio.high - centre)
+        below.append(0.0 if ratio.low is None else centre - ratio.low)
+    return go.Scatter(
+        x=x,
+        y=[ratio.ratio for _, ratio in judged],
+        mode="markers",
+        name=words,
+        error_y={"type": "data", "symmetric": False, "array": above, "arrayminus": below},
+        text=[f"trial {candidate.trial}" for candidate, _ in judged],
+        marker={"color": colour, "symbol": symbols, "size": 12},
+        hovertemplate="%{text}: %{y:.3f}<extra></extra>",
+    )
 
 
 def fewer_starts(design: Design) -> str:
@@ -269,20 +296,25 @@ def warnings_of(tuner: Study) -> list[str]:
     """What a reader of the course should know, in sentences."""
     complete = tuner.study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
     infeasible = sum(not is_feasible(trial) for trial in complete)
-    notes = {
-        f"Only {len(complete)} trials were finished: the best value is partly luck.": len(complete)
-        < 20,
-        f"{infeasible} of {len(complete)} trials violate a constraint. They are candidates only where all do, and "
-        "then have to fulfil it on unseen instances.": infeasible,
-        "Trials ran at different times, so their ratios of processor time depend on the machine's other load. On the "
-        "instances of the choice and the held-out ones baseline and candidates ran in turn: those count.": (
-            "speed" in tuner.spec.objectives
-        ),
-    }
-    return [note for note, holds in notes.items() if holds]
+    notes = []
+    if len(complete) < _FEW_TRIALS:
+        notes.append(f"Only {len(complete)} trials were finished: the best value is partly luck.")
+    if infeasible:
+        notes.append(
+            f"{infeasible} of {len(complete)} trials violate a constraint. They are candidates only where all do, and "
+            "then have to fulfil it on unseen instances."
+        )
+    if "speed" in tuner.spec.objectives:
+        notes.append(
+            "Trials ran at different times, so their ratios of processor time depend on the machine's other load. "
+            "On the instances of the choice and the held-out ones baseline and candidates ran in turn: those count."
+        )
+    return notes
 
 
 def _candidates(summary: StudySummary) -> Table:
+    """The table of the best trials, as they were judged again on the splits."""
+
     def ratio(value: PairedRatio | None) -> TableCell:
         if value is None or value.ratio is None:
             return TableCell()
@@ -350,22 +382,24 @@ def _marked(summary: StudySummary, *headings: tuple[str, str]) -> list[str]:
 
 
 def _trials(tuner: Study, summary: StudySummary) -> Table:
+    """The table of all trials with their values, coverage, speed and settings."""
     names = [parameter.name for parameter in tuner.space]
-    rows = [
-        [
-            TableCell(str(trial.number), value=trial.number),
-            TableCell(
-                trial.state.name.lower(),
-                trial.user_attrs.get("reason") or trial.user_attrs.get(EARLIER, ""),
-            ),
-            *(number(math.exp(value), ".3f") for value in trial.values or ()),
-            *(TableCell() for _ in tuner.objectives if not trial.values),
-            number(trial.user_attrs.get("coverage"), ".3f"),
-            number(trial.user_attrs.get("fps"), ".1f"),
-            *(_value(trial.params.get(name)) for name in names),
-        ]
-        for trial in tuner.study.get_trials(deepcopy=False)
-    ]
+    rows = []
+    for trial in tuner.study.get_trials(deepcopy=False):
+        facts = trial.user_attrs
+        ratios = [number(math.exp(value), ".3f") for value in trial.values or ()]
+        if not trial.values:  # a failed one has an empty cell for each objective
+            ratios = [TableCell() for _ in tuner.objectives]
+        rows.append(
+            [
+                TableCell(str(trial.number), value=trial.number),
+                TableCell(trial.state.name.lower(), facts.get("reason") or facts.get(EARLIER, "")),
+                *ratios,
+                number(facts.get("coverage"), ".3f"),
+                number(facts.get("fps"), ".1f"),
+                *(_value(trial.params.get(name)) for name in names),
+            ]
+        )
     headings = _marked(
         summary, *((f"ratio of {objective.what}", "tune") for objective in tuner.objectives)
     )
@@ -394,19 +428,22 @@ def settings_table(
     ]
     setting, searched, unit = (Column(name, numeric=False) for name in ("setting", "range", "unit"))
     columns = [setting, Column("baseline"), Column("best trial"), searched, unit]
-    caption = "What was searched." + (
-        "" if proven else " The best trial is not proven: keep the baseline."
-    )
+    caption = "What was searched."
+    if not proven:
+        caption += " The best trial is not proven: keep the baseline."
     return Table("settings", "Baseline, best trial and range", caption, columns, rows)
 
 
 def _value(value: Scalar | None) -> TableCell:
+    """The cell of a setting's value; a dash where there is none."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         return number(float(value), ".4g")
     return TableCell("–" if value is None else setting_text(value))
 
 
 def _range(parameter: Parameter) -> str:
+    """The values that were searched."""
     if parameter.low is None or parameter.high is None:
         return ", ".join(map(setting_text, parameter.choices)) or "true, false"
-    return f"{parameter.low:g} to {parameter.high:g}{', log' * (parameter.scale == 'log')}"
+    scale = ", log" if parameter.scale == "log" else ""
+    return f"{parameter.low:g} to {parameter.high:g}{scale}"

@@ -85,16 +85,9 @@ def search_space(
         StudyError: A pattern matches nothing, names a setting that has no effect, or nothing is
             left to tune.
     """
+    # what the patterns choose, without fixed settings
     every = parameters(type(settings))
-    for pattern in (*spec.include, *spec.exclude):
-        if not any(fnmatchcase(parameter.name, pattern) for parameter in every):
-            similar = did_you_mean(pattern, [parameter.name for parameter in every])
-            hint = (
-                "it exists, but is not tunable"
-                if pattern in field_names(type(settings))
-                else similar
-            )
-            raise StudyError(f"'{pattern}' matches no tunable setting", hint)
+    _check_patterns(spec, every, settings)
     chosen = [
         parameter
         for parameter in every
@@ -102,13 +95,13 @@ def search_space(
         and not any(fnmatchcase(parameter.name, pattern) for pattern in spec.exclude)
         and parameter.name not in spec.fixed
     ]
+
+    # of these, what has an effect with the baseline's settings
     if hasattr(settings, "segmentation"):  # "auto" stands for a source
-        settings = apply_overrides(
-            settings, {"segmentation.source": source_of_masks(settings, list(sequences))}
-        )
-    unused = {
-        parameter.name: why for parameter in chosen if (why := why_unused(settings, parameter.name))
-    }
+        source = source_of_masks(settings, list(sequences))
+        settings = apply_overrides(settings, {"segmentation.source": source})
+    reasons = {parameter.name: why_unused(settings, parameter.name) for parameter in chosen}
+    unused = {name: why for name, why in reasons.items() if why}
     chosen = [parameter for parameter in chosen if parameter.name not in unused]
     if not chosen:
         raise StudyError(
@@ -121,6 +114,18 @@ def search_space(
                 "leave it out, or fix that otherwise",
             )
     return chosen
+
+
+def _check_patterns(spec: SpaceSpec, every: Sequence[Parameter], settings: Settings) -> None:
+    """Refuse a pattern that matches none of the tunable settings."""
+    names = [parameter.name for parameter in every]
+    for pattern in (*spec.include, *spec.exclude):
+        if any(fnmatchcase(name, pattern) for name in names):
+            continue
+        hint = did_you_mean(pattern, names)
+        if pattern in field_names(type(settings)):
+            hint = "it exists, but is not tunable"
+        raise StudyError(f"'{pattern}' matches no tunable setting", hint)
 
 
 def distributions(space: Sequence[Parameter]) -> dict[str, optuna.distributions.BaseDistribution]:
@@ -155,6 +160,7 @@ def starting_point(
         StudyError: The preset sets what the study does not tune to something else, or to a value
             out of its range.
     """
+    # what is not tuned has the baseline's value
     tuned = {parameter.name: parameter for parameter in space}
     for name, value in preset.items():
         if name not in base:
@@ -166,6 +172,8 @@ def starting_point(
                 f"the preset to start from sets {name} = {value!r}, but the study holds it at {base[name]!r}",
                 f'tune it, or say "{name}" = ... under [space.fixed]',
             )
+
+    # what is tuned has a value that the sampler could propose
     point = {name: preset.get(name, base[name]) for name in tuned}
     for name, value in point.items():
         span = distribution(tuned[name])
@@ -191,8 +199,9 @@ SPREAD = 0.39
 """Standard deviation over scenes of the log ratio of two configurations, one start each: measured 0.34 to 0.5 with
 settings that have effects."""
 START_S = 0.5
+"""Seconds of a run beside its frames, where no runs are stored."""
 FRAME_S = 0.05
-"""Seconds of a run and of a frame of it, where no runs are stored."""
+"""Seconds of a frame, where no runs are stored."""
 FLOW_FILTERS = {"box_epipolar", "class_rule", "correlation", "epipolar", "motion", "probability"}
 """Filters that judge the optical flow."""
 
@@ -229,11 +238,9 @@ class Preview(Record):
     @property
     def figures(self) -> list[str]:
         """What the scenes could show and how long it takes, for people."""
-        source = (
-            f"{self.runs} stored runs of the baseline"
-            if self.runs
-            else "other trackers' runs, none is stored yet"
-        )
+        source = "other trackers' runs, none is stored yet"
+        if self.runs:
+            source = f"{self.runs} stored runs of the baseline"
         scatter = f"spread {self.spread:.2f} over scenes, from {source}"
         if self.scenes < FEWEST:
             shown = f"{self.scenes} scenes judge this study; below {FEWEST} it claims nothing ({scatter})."
@@ -259,11 +266,13 @@ class Preview(Record):
         """The settings that are not used here, and the space without them; it takes runs of the baseline to know."""
         if not self.unused:
             return []
-        left = f"The space without them: include = {self.include}".replace("'", '"')
-        return [
-            *(f"{name} is not used here: {why}." for name, why in self.unused.items()),
-            left if self.include else "Nothing would be left of the space without them.",
-        ]
+        lines = [f"{name} is not used here: {why}." for name, why in self.unused.items()]
+        if self.include:
+            # as TOML writes it, to be copied into the study
+            lines.append(f"The space without them: include = {self.include}".replace("'", '"'))
+        else:
+            lines.append("Nothing would be left of the space without them.")
+        return lines
 
 
 class Plan:
@@ -294,25 +303,28 @@ class Plan:
         *,
         objectives: Sequence[Objective] | None = None,
     ) -> None:
-        self.spec, self.results, self.store = spec, Path(results), RunStore(results)
-        self.objectives = (
-            [find_objective(name) for name in spec.objectives]
-            if objectives is None
-            else list(objectives)
-        )
+        self.spec = spec
+        self.results = Path(results)
+        self.store = RunStore(results)
+        if objectives is None:
+            objectives = [find_objective(name) for name in spec.objectives]
+        self.objectives = list(objectives)
+
+        # the baseline: the tracker with a preset or its defaults, or another tracker, which has no
+        # settings but those of the fixed ones that it knows
         fixed = spec.space.fixed
         settings = TRACKERS.get(spec.tracker).settings
         self.held = held_settings(spec)
         self.baseline = Configuration(spec.tracker, self.held)
         if spec.baseline and not spec.baseline.endswith(".toml"):
             names = field_names(TRACKERS.get(spec.baseline).settings)
-            self.baseline = Configuration(
-                spec.baseline, {name: fixed[name] for name in fixed if name in names}
-            )
-        hold_last_pose_protocol(spec.protocol).check_scale(
-            spec.tracker, TRACKERS.get(spec.tracker).sensors
-        )
+            shared = {name: fixed[name] for name in fixed if name in names}
+            self.baseline = Configuration(spec.baseline, shared)
+        sensors = TRACKERS.get(spec.tracker).sensors
+        hold_last_pose_protocol(spec.protocol).check_scale(spec.tracker, sensors)
         self.shipped = Configuration(spec.tracker, fixed) if spec.baseline else None
+
+        # the space around trial 0, which has to lie in it, and the instances
         self.defaults: Settings = apply_overrides(settings(), self.held)
         self.base = flatten(self.defaults)
         sequences = {instance.sequence for instance in spec.instances(*spec.tune)}
@@ -323,24 +335,25 @@ class Plan:
     def preview(self, jobs: int = 1) -> Preview:
         """What the study could show, from the baseline's stored runs where there are some."""
         design = self.design
-        spec = self.spec
-        records = {
-            instance: record
-            for instance in design.reference
-            if (record := self._stored(instance)) is not None
-        }
+        stored = {instance: self._stored(instance) for instance in design.reference}
+        records = {instance: record for instance, record in stored.items() if record is not None}
+
+        # spread over scenes: the median of so many starts of a scene scatters less than one run
         judged = scenes(design.judging)
         starts = sum(map(len, judged.values())) / len(judged) if judged else 1.0
         spread = (self._scatter(records) or SPREAD) / math.sqrt(starts)
-        level = spec.level(len(judged))
-        run_s = START_S + FRAME_S * len(design.tune[0].open(spec.data_root))
+        level = self.spec.level(len(judged))
+
+        # mean time of a run, times the runs of the baseline, the trials, the choice and the judgement
+        run_s = START_S + FRAME_S * len(design.tune[0].open(self.spec.data_root))
         if records:
             run_s = float(np.mean([record.wall_s for record in records.values()]))
-        chosen = 2 * (len(design.judging) + len(design.recorded))
-        if design.held_out:
-            chosen += (spec.top + 1) * len(design.confirm)
-        runs = len(design.reference) + spec.trials * len(design.tune) + chosen
+        minutes = math.ceil(self._run_count() / jobs) * run_s / 60
+
         unused = self._unused(list(records.values()))
+        include = []
+        if unused:
+            include = [parameter.name for parameter in self.space if parameter.name not in unused]
         return Preview(
             scenes=len(judged),
             runs=len(records),
@@ -349,32 +362,41 @@ class Plan:
             power=power(GAIN, spread, len(judged), level),
             detectable=detectable(spread, len(judged), level),
             needed=scenes_needed(GAIN, spread),
-            minutes=math.ceil(runs / jobs) * run_s / 60,
+            minutes=minutes,
             unused=unused,
-            include=[parameter.name for parameter in self.space if parameter.name not in unused]
-            if unused
-            else [],
+            include=include,
         )
+
+    def _run_count(self) -> int:
+        """Runs of the whole study if no trial is pruned."""
+        design = self.design
+        spec = self.spec
+        tried = len(design.reference) + spec.trials * len(design.tune)
+        # the best trials and the baseline to choose, then the best one and the baseline to judge
+        chosen = (spec.top + 1) * len(design.confirm) if design.held_out else 0
+        judged = 2 * (len(design.judging) + len(design.recorded))
+        return tried + chosen + judged
 
     def run_spec(
         self, instance: ProblemInstance, configuration: Configuration, *, cache: bool | None = None
     ) -> RunSpec:
         """The run of a configuration on an instance; with the stage cache as the study says, unless `cache` does."""
         spec = self.spec
-        settings = dict(configuration.settings)
-        how = {
-            "study": spec.name,
-            "threads": spec.threads,
-            "cache": spec.cache if cache is None else cache,
-        }
         return instance.run_spec(
-            configuration.tracker, settings=settings, data_root=spec.data_root, **how
+            configuration.tracker,
+            settings=dict(configuration.settings),
+            data_root=spec.data_root,
+            study=spec.name,
+            threads=spec.threads,
+            cache=spec.cache if cache is None else cache,
         )
 
     def _stored(self, instance: ProblemInstance) -> RunRecord | None:
         """The baseline's run on an instance, if it is stored and came to its end."""
         record = LookUp(self.store).find(resolve(self.run_spec(instance, self.baseline)))
-        return None if record is None or record.failed or record.status == "stopped" else record
+        if record is None or record.failed or record.status == "stopped":
+            return None
+        return record
 
     def check_plugins(self) -> None:
         """Refuse to go on where what the plug-ins read has changed since the baseline ran.
@@ -401,32 +423,35 @@ class Plan:
             at: outcome(self.store, record, at, protocol, root).ate_m
             for at, record in records.items()
         }
+        # variance within places, pooled over them; that of a difference of two runs is twice it
         logs = log_errors(errors).values()
-        free = sum(len(values) - 1 for values in logs)
-        return (
-            math.sqrt(2 * sum(float(np.var(values)) * len(values) for values in logs) / free)
-            if free
-            else 0.0
-        )
+        degrees_of_freedom = sum(len(values) - 1 for values in logs)
+        if not degrees_of_freedom:
+            return 0.0
+        squares = sum(float(np.var(values)) * len(values) for values in logs)
+        return math.sqrt(2 * squares / degrees_of_freedom)
 
     def _unused(self, records: list[RunRecord]) -> dict[str, str]:
         """Settings of parts that dropped no feature on any frame of the baseline's runs."""
         if not records or self.baseline.tracker != self.spec.tracker:
             return {}
+        # the most features that each filter dropped on any frame, by the filter's name
         frames = pd.concat([load_frames(record, self.store) for record in records])
         most = frames.filter(regex="^stat_.*_dropped$").max()
         most.index = most.index.str.removeprefix("stat_").str.removesuffix("_dropped")
-        idle = dict.fromkeys(
-            most.index[most == 0], f"its test dropped no feature in {len(records)} runs"
-        )
+
+        # parts without effect, and why; the first part of a setting's name is its part
+        why = f"its test dropped no feature in {len(records)} runs"
+        idle = dict.fromkeys(most.index[most == 0], why)
         if all(record.epipolar_skipped == 1 for record in records):
             idle["epipolar"] = "F was skipped on all frames"
         if "semantic" in idle:
             idle["segmentation"] = "there were no masks on any frame"
-        if (judging := FLOW_FILTERS & set(most.index)) and judging <= idle.keys():
-            idle["flow"] = f"no verdict of {' and '.join(sorted(judging))} on it was used"
-        groups = ((parameter.name, parameter.name.split(".")[0]) for parameter in self.space)
-        return {name: idle[group] for name, group in groups if group in idle}
+        flow_filters = FLOW_FILTERS & set(most.index)
+        if flow_filters and flow_filters <= idle.keys():
+            idle["flow"] = f"no verdict of {' and '.join(sorted(flow_filters))} on it was used"
+        parts = {parameter.name: parameter.name.split(".")[0] for parameter in self.space}
+        return {name: idle[part] for name, part in parts.items() if part in idle}
 
 
 # The splits of a study.
@@ -437,7 +462,9 @@ JUDGING_SCENES = 28
 """Scenes that are made to judge on where a study names none: they prove a gain of 20 % in four of five studies at the
 usual scatter (`SPREAD`)."""
 RECORDED_FRAMES = 120
+"""Frames of each start on the recording that a study does not name itself."""
 RECORDED_STARTS = 4
+"""Starts on that recording."""
 
 
 @dataclass(frozen=True)
@@ -476,10 +503,12 @@ def design_of(spec: StudySpec, *, further: int = 0) -> Design:
     Raises:
         DynslamError: See `plan.check_splits`; or further scenes cannot be made.
     """
-    tune, confirm, held_out = (
-        spec.instances(*texts) for texts in (spec.tune, spec.confirm, spec.held_out)
-    )
+    tune = spec.instances(*spec.tune)
+    confirm = spec.instances(*spec.confirm)
+    held_out = spec.instances(*spec.held_out)
     taken = {instance.scene for instance in (*tune, *confirm, *held_out)}
+
+    # instances that judge where none are named, and those that `tune extend` has added
     if not confirm and not held_out:
         is_rendered = any(instance.sequence.startswith("synthetic/") for instance in tune)
         count = min(LOOKS) if spec.extendable else JUDGING_SCENES
@@ -498,20 +527,29 @@ def design_of(spec: StudySpec, *, further: int = 0) -> Design:
             f"study '{spec.name}' is extendable, and {judging} scenes judge it",
             f"judge on {', '.join(map(str, LOOKS))} scenes: each look has its share of the level",
         )
+
+    # the splits have to be apart, recordings that the study names included
     splits: dict[Split, list[ProblemInstance]] = {
         "tune": tune,
         "confirm": confirm,
         "held_out": held_out,
     }
     check_splits(spec.name, splits, data_root=spec.data_root)
-    recorded = _recordings(spec, taken) if spec.recorded is None else spec.instances(*spec.recorded)
+    if spec.recorded is None:
+        recorded = _recordings(spec, taken)
+    else:
+        recorded = spec.instances(*spec.recorded)
     if spec.recorded:
-        check_splits(
-            spec.name, {"tune": [*tune, *confirm], "held_out": recorded}, data_root=spec.data_root
-        )
+        splits = {"tune": [*tune, *confirm], "held_out": recorded}
+        check_splits(spec.name, splits, data_root=spec.data_root)
+
     tune = running_order(tune, spec.sampler_seed)
     return Design(
-        tuple(tune), tuple(with_more_starts(tune)), tuple(confirm), tuple(held_out), tuple(recorded)
+        tune=tuple(tune),
+        reference=tuple(with_more_starts(tune)),
+        confirm=tuple(confirm),
+        held_out=tuple(held_out),
+        recorded=tuple(recorded),
     )
 
 
@@ -519,7 +557,9 @@ def running_order(instances: Sequence[ProblemInstance], seed: int) -> list[Probl
     """The instances in the order of all trials: one of each scene in turn, so that small sets hold different scenes."""
     groups = list(scenes(instances).values())
     stream(seed, "order").shuffle(groups)
-    return [instance for turn in zip_longest(*groups) for instance in turn if instance is not None]
+    # a round holds an instance of each scene that has one left
+    rounds = zip_longest(*groups)
+    return [instance for one_each in rounds for instance in one_each if instance is not None]
 
 
 def with_more_starts(instances: Sequence[ProblemInstance]) -> list[ProblemInstance]:
@@ -528,10 +568,8 @@ def with_more_starts(instances: Sequence[ProblemInstance]) -> list[ProblemInstan
     for repeats in grouped(instances, place_of).values():
         used = {instance.offset for instance in repeats}
         unused = (offset for offset in itertools.count() if offset not in used)
-        more += [
-            replace(repeats[0], offset=offset)
-            for offset in islice(unused, max(FEWEST_STARTS - len(used), 0))
-        ]
+        added = islice(unused, max(FEWEST_STARTS - len(used), 0))
+        more += [replace(repeats[0], offset=offset) for offset in added]
     return more
 
 
@@ -539,13 +577,12 @@ def _recordings(spec: StudySpec, taken: set[str]) -> list[ProblemInstance]:
     """The first frames of the first held-out recording that is here and that the study does not name itself."""
     root = find_data_root(spec.data_root)
     for entry in catalogue().values():
-        if entry.split == "held-out" and entry.id not in taken and entry.find(root) is not None:
-            frames = min(
-                RECORDED_FRAMES + RECORDED_STARTS - 1, len(open_public(entry.id, data_root=root))
-            )
-            return [
-                ProblemInstance(entry.id, (0, frames), offset) for offset in range(RECORDED_STARTS)
-            ]
+        if entry.split != "held-out" or entry.id in taken or entry.find(root) is None:
+            continue
+        # the last start has as many frames as asked for, where the recording is that long
+        length = len(open_public(entry.id, data_root=root))
+        frames = min(RECORDED_FRAMES + RECORDED_STARTS - 1, length)
+        return [ProblemInstance(entry.id, (0, frames), offset) for offset in range(RECORDED_STARTS)]
     return []
 
 
@@ -589,18 +626,19 @@ def check_splits(
         _check_copies(name, names, opened)
     for instances in (tune, held_out):
         _check_repeats(instances, opened, apart=set(splits.get("confirm", ())))
+
+    # content: no sequence of one split may be one of the other
     scenes_of = {name: part_of(sequence).scene for name, sequence in opened.items()}
     faults = [
         f"'{one}' to tune on and '{other}' held out are the same sequence"
         for one, other in product(tuned, judged)
         if scenes_of[one] == scenes_of[other] or same_recording(opened[one], opened[other])
     ]
-    for names, used, own in ((tuned, "tune", "held-out"), (judged, "held-out", "tune")):
-        faults += [
-            _misplaced(name, used, own)
-            for name in names
-            if getattr(opened[name], "split", "") == own
-        ]
+    # catalogue and scene numbers: none may stand in the split that it is not of
+    for names, used_as, other_split in ((tuned, "tune", "held-out"), (judged, "held-out", "tune")):
+        for name in names:
+            if getattr(opened[name], "split", "") == other_split:
+                faults.append(_misplaced(name, used_as, other_split))
     if faults:
         raise StudyError(
             f"the splits of study '{name}' are not apart: {faults[0]}", "leave one out"
@@ -623,28 +661,30 @@ def _check_copies(study: str, names: Iterable[str], opened: Mapping[str, Any]) -
 def _check_repeats(
     instances: Sequence[ProblemInstance], opened: Mapping[str, Any], apart: set[ProblemInstance]
 ) -> None:
-    """Instances of one scene are repeats of the same frames or share none; those in `apart` share none with others."""
+    """Refuse instances of one scene that share frames and are no repeats of each other.
+
+    Args:
+        instances: Of the splits that may share a recording.
+        opened: Their sequences by name.
+        apart: Those of them that may share no frame with the others, whether repeats or not.
+
+    Raises:
+        StudyError: Two share frames, or an instance is named twice.
+    """
     parts: dict[ProblemInstance, Part] = {}
     for instance in instances:
         if instance in parts:
             raise StudyError(f"instance '{instance}' is named twice", "leave one out")
-        parts[instance] = part_of(
-            cast("Any", instance.cut(opened[instance.sequence])), instance.offset
-        )
+        cut = cast("Any", instance.cut(opened[instance.sequence]))
+        parts[instance] = part_of(cut, instance.offset)
     for (one, here), (other, there) in combinations(parts.items(), 2):
         if here.scene != there.scene:
             continue
-        same = [
-            (part.block, part.noise, instance.offset, instance.degradation, instance.seed)
-            for instance, part in ((one, here), (other, there))
-        ]
-        if same[0] == same[1]:
+        if _images(one, here) == _images(other, there):
             raise StudyError(f"'{one}' and '{other}' are the same frames", "leave one out")
         shared = min(here.stop, there.stop) - max(here.start, there.start)
-        repeats = place_of(one) == place_of(other) or (here.start, here.stop) == (
-            there.start,
-            there.stop,
-        )
+        same_frames = (here.start, here.stop) == (there.start, there.stop)
+        repeats = place_of(one) == place_of(other) or same_frames
         if shared > 0 and not (repeats and (one in apart) == (other in apart)):
             raise StudyError(
                 f"'{one}' and '{other}' share {shared} frames",
@@ -652,14 +692,18 @@ def _check_repeats(
             )
 
 
-def _misplaced(name: str, used: str, own: str) -> str:
-    numbers = HELD_OUT_SCENES if own == "held-out" else TUNE_SCENES
-    who = (
-        f"its scene ({numbers.start}-{numbers.stop - 1})"
-        if name.startswith("synthetic/")
-        else "the catalogue"
-    )
-    return f"'{name}' is used as {used}, but {who} puts it into the {own} split"
+def _images(instance: ProblemInstance, part: Part) -> tuple[object, ...]:
+    """What decides the images that a tracker sees, and the numbers that it draws, within a scene."""
+    return part.block, part.noise, instance.offset, instance.degradation, instance.seed
+
+
+def _misplaced(name: str, used_as: str, other_split: str) -> str:
+    """The fault of a sequence that is used in one split and belongs to the other."""
+    reason = "the catalogue"
+    if name.startswith("synthetic/"):
+        numbers = HELD_OUT_SCENES if other_split == "held-out" else TUNE_SCENES
+        reason = f"its scene ({numbers.start}-{numbers.stop - 1})"
+    return f"'{name}' is used as {used_as}, but {reason} puts it into the {other_split} split"
 
 
 # Whether two recordings show the same: by their images, never by names.
@@ -669,12 +713,15 @@ _PAIRS = 6
 _ENOUGH = 3
 """Pairs with equal images; fewer may be chance, as two paths may cross."""
 _THUMB = (32, 24)
+"""Width and height in pixels to which images are reduced before they are compared."""
 _GREY_LEVELS = 1.5
+"""Equal colours differ by no more than so many levels (of 255) on average."""
 _DEPTH_SHARE = 0.002
+"""Equal depths differ by no more than this share of the median depth, half a step of the file added."""
 
 
 def same_recording(one: Frames, other: Frames) -> bool:
-    """Whether frames of one recording are frames of the other; of two rendered scenes never: their digests tell.
+    """Whether frames of one recording are frames of the other; False for two rendered scenes, whose digests tell.
 
     Where the camera moves, equal stamps and equal true poses say it, whatever was done to the images. Else of a
     few frames with equal stamps (without any, of frames spread evenly over both) the decoded images are
@@ -685,21 +732,25 @@ def same_recording(one: Frames, other: Frames) -> bool:
         return False
     if same_path(one.ground_truth, other.ground_truth):
         return True
+
+    # candidates: frames of equal stamps, else all frames of both
     stamps = (np.round(one.timestamps, 6), np.round(other.timestamps, 6))
     _, *frames = np.intersect1d(*stamps, assume_unique=True, return_indices=True)
     if not len(frames[0]):
         frames = [np.arange(len(one)), np.arange(len(other))]
+
+    # pairs of them, spread evenly; a set, as short recordings give the same pair twice
     chosen = (
         numbers[np.linspace(0, len(numbers) - 1, _PAIRS).astype(int)].tolist() for numbers in frames
     )
     pairs = set(zip(*chosen, strict=True))
-    alike = sum(
-        _alike(one[first], other[second], one.camera, other.camera) for first, second in pairs
+    equal = sum(
+        _same_image(one[first], other[second], one.camera, other.camera) for first, second in pairs
     )
-    return alike >= min(_ENOUGH, len(one), len(other))
+    return equal >= min(_ENOUGH, len(one), len(other))
 
 
-def _alike(here: Frame, there: Frame, one: Camera, other: Camera) -> bool:
+def _same_image(here: Frame, there: Frame, one: Camera, other: Camera) -> bool:
     """Whether two frames show the same colour, and depth in the numbers that their files hold."""
     colours = [
         cv2.resize(frame.rgb.astype(np.float32), _THUMB, interpolation=cv2.INTER_AREA)
@@ -707,6 +758,7 @@ def _alike(here: Frame, there: Frame, one: Camera, other: Camera) -> bool:
     ]
     if np.abs(colours[0] - colours[1]).mean() > _GREY_LEVELS:
         return False
+    # metres times the depth factor: the whole numbers of the files
     raw = (here.depth * one.written_depth_factor, there.depth * other.written_depth_factor)
     depths = [
         cv2.resize(depth.astype(np.float32), _THUMB, interpolation=cv2.INTER_NEAREST)
@@ -738,14 +790,12 @@ def source_of_masks(settings: Settings, sequences: Sequence[str]) -> str:
 def splits_seen(settings: Settings, design: Design) -> list[str]:
     """Names of a study's splits with a scene that the network behind the masks was trained on, in their order."""
     splits = {"tune": design.tune, "confirm": design.confirm, "held_out": design.held_out}
-    names = {
-        split: {instance.sequence for instance in instances} for split, instances in splits.items()
-    }
-    return [
-        split
-        for split, sequences in names.items()
-        if any(seen_in_training(source_of_masks(settings, [name]), name) for name in sequences)
-    ]
+    seen = []
+    for split, instances in splits.items():
+        names = {instance.sequence for instance in instances}
+        if any(seen_in_training(source_of_masks(settings, [name]), name) for name in names):
+            seen.append(split)
+    return seen
 
 
 def seen_note(splits: Sequence[str]) -> str:
@@ -754,9 +804,13 @@ def seen_note(splits: Sequence[str]) -> str:
         return ""
     names = {"tune": "trials", "confirm": "choice", "held_out": "held-out instances"}
     named = " and ".join(names[split] for split in splits)
-    judged = (
-        "so nothing here judges the masks: held-out instances are rendered scenes from 100 on"
-        if "held_out" in splits
-        else "so errors there are optimistic, and the held-out instances, which it has not seen, may gain less or more"
-    )
+    if "held_out" in splits:
+        judged = (
+            "so nothing here judges the masks: held-out instances are rendered scenes from 100 on"
+        )
+    else:
+        judged = (
+            "so errors there are optimistic, and the held-out instances, which it has not seen, "
+            "may gain less or more"
+        )
     return f"{SEEN} In the {named} the masks come from a network that was trained on those very scenes, {judged}."

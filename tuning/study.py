@@ -83,8 +83,11 @@ if TYPE_CHECKING:
     from dynslam_bench.tuning.judgement import StudySummary
 
 _WAIT_S = 2.0
+"""How often a worker without a trial looks whether those of the others have ended."""
 _NAMES_S = 0.2
+"""How often it is looked whether running trials have their workers' names."""
 _BEGINNING_S = 10.0
+"""How long to wait for a worker that is beginning the study on the same storage."""
 _PRUNED_AFTER = "pruned_after"
 """User attribute: after how many instances the pruner ended a trial. Optuna's pruner gives its answer once."""
 SUMMARY_FILE = "summary.json"
@@ -243,37 +246,32 @@ class Study(Plan):
         self.reference(on_event, jobs)
         self._await_names()
         tell = on_event or (lambda _: None)
-
-        def work() -> None:
-            while not self._interrupted.is_set():
-                with self._lock:  # between the count and the new trial no other thread adds one
-                    trial = self.ask() if self._more() else None
-                if trial is None:
-                    if not self._others_run():
-                        return
-                    # should one of their workers end, its trial is made again here
-                    self._interrupted.wait(_WAIT_S)
-                    continue
-                tell(StudyEvent("started", trial.number, self.trials, f"trial {trial.number}"))
-                try:
-                    evaluation = self.evaluate(trial)
-                    self.tell(trial, evaluation)
-                # another worker took this one for dead, and was quicker
-                except UpdateFinishedTrialError:
-                    continue
-                tell(
-                    StudyEvent(
-                        "finished",
-                        trial.number,
-                        self.trials,
-                        f"trial {trial.number}: {evaluation.text}",
-                    )
-                )
-                for callback in self._callbacks:
-                    callback(self.study, self.study.get_trials(deepcopy=False)[trial.number])
-
-        self._in_threads(jobs, work, [()] * jobs)
+        self._in_threads(jobs, self._run_trials, [(tell,)] * jobs)
         return self
+
+    def _run_trials(self, tell: OnEvent) -> None:
+        """Run one trial after the other until no more are wanted and no other worker runs one."""
+        while not self._interrupted.is_set():
+            with self._lock:  # between the count and the new trial no other thread adds one
+                trial = self.ask() if self._more() else None
+            if trial is None:
+                if not self._others_run():
+                    return
+                # should one of their workers end, its trial is made again here
+                self._interrupted.wait(_WAIT_S)
+                continue
+            name = f"trial {trial.number}"
+            tell(StudyEvent("started", trial.number, self.trials, name))
+            try:
+                evaluation = self.evaluate(trial)
+                self.tell(trial, evaluation)
+            # another worker took this one for dead, and was quicker
+            except UpdateFinishedTrialError:
+                continue
+            text = f"{name}: {evaluation.text}"
+            tell(StudyEvent("finished", trial.number, self.trials, text))
+            for callback in self._callbacks:
+                callback(self.study, self.study.get_trials(deepcopy=False)[trial.number])
 
     def _in_threads(
         self, jobs: int, work: Callable[..., None], tasks: Iterable[tuple[Any, ...]]
@@ -300,7 +298,8 @@ class Study(Plan):
         ]
         if on_event is not None and missing:
             on_event(StudyEvent("reference", 0, len(missing), "the baseline"))
-        self._reference |= self.evaluate_beside([], missing, jobs=jobs, cache=self.spec.cache)[0]
+        baseline, _ = self.evaluate_beside([], missing, jobs=jobs, cache=self.spec.cache)
+        self._reference |= baseline
         return self._reference
 
     def outcomes(
@@ -332,9 +331,8 @@ class Study(Plan):
         for instance in instances:
             if interrupted():
                 raise CancelledError(f"interrupted before {instance}")
-            run = self.run_spec(
-                instance, Configuration(tracker or spec.tracker, settings), cache=cache
-            )
+            configuration = Configuration(tracker or spec.tracker, settings)
+            run = self.run_spec(instance, configuration, cache=cache)
             (record,) = run_many(
                 [run],
                 results=self.store,
@@ -373,20 +371,22 @@ class Study(Plan):
         several = [self.baseline, *configurations]
         results: list[dict[ProblemInstance, Outcome] | InstanceFailedError] = [{} for _ in several]
 
-        def one(instance: ProblemInstance, number: int) -> None:
+        def run_one(instance: ProblemInstance, number: int) -> None:
             result = results[number]
-            if isinstance(result, dict):
-                try:
-                    tracker, settings = several[number]
-                    result |= self.outcomes(settings, [instance], tracker=tracker, cache=cache)
-                except InstanceFailedError as error:
-                    if number == 0:
-                        raise StudyError(
-                            f"the baseline fails: {error.args[0]}", "a study needs one that runs"
-                        ) from error
-                    results[number] = error
+            if isinstance(result, InstanceFailedError):
+                return  # after its first failed run
+            tracker, settings = several[number]
+            try:
+                result |= self.outcomes(settings, [instance], tracker=tracker, cache=cache)
+            except InstanceFailedError as error:
+                if number == 0:
+                    raise StudyError(
+                        f"the baseline fails: {error.args[0]}", "a study needs one that runs"
+                    ) from error
+                results[number] = error
 
-        self._in_threads(jobs, one, product(instances, range(len(several))))
+        # on each instance all configurations in turn, before the next instance
+        self._in_threads(jobs, run_one, product(instances, range(len(several))))
         baseline, *others = results
         assert isinstance(baseline, dict)
         return baseline, others
@@ -433,53 +433,62 @@ class Study(Plan):
 
     def evaluate(self, trial: optuna.Trial) -> Evaluation:
         """Run a trial on one instance after the other until it ends or is pruned."""
-        outcomes: dict[ProblemInstance, Outcome] = {}
         self.check_plugins()
-        # of a trial whose worker was killed: it was not pruned before that step
-        passed = max(
-            self.study.get_trials(deepcopy=False)[trial.number].intermediate_values, default=0
-        )
         with self._heartbeats.beating():
             reference = self._reference or self.reference()
-            pruned = False
             try:
-                for instance in self.design.tune:
-                    outcomes |= self.outcomes(self.configuration_of(trial).settings, [instance])
-                    if len(outcomes) >= passed and (
-                        pruned := self._prune(trial, outcomes, instance)
-                    ):
-                        break
+                outcomes, is_pruned = self._run_until_pruned(trial)
             except CancelledError:
                 return Evaluation(TrialState.WAITING, "interrupted, it waits to be run again")
             except InstanceFailedError as error:
                 return Evaluation(TrialState.FAIL, str(error))
-        rows = [
-            [str(place), run.run_id, run.ate_m, run.coverage, run.frame_s]
-            for place, run in outcomes.items()
-        ]
-        scenes = combined_objective(self.objectives).ratios(outcomes, reference)
-        facts = {
-            "coverage": coverage(outcomes),
-            "fps": fps(outcomes),
-            "scenes": scenes,
-            "instances": rows,
-        }
-        for name, fact in facts.items():
-            trial.set_user_attr(name, fact)
-        if pruned:
-            return Evaluation(
-                TrialState.PRUNED,
-                f"pruned after {len(outcomes)} of {len(self.design.tune)} instances",
-            )
+        self._store_outcomes(trial, outcomes, reference)
+        if is_pruned:
+            done = f"{len(outcomes)} of {len(self.design.tune)} instances"
+            return Evaluation(TrialState.PRUNED, f"pruned after {done}")
+
+        # the objectives' values, and how far each constraint is violated
         values = [objective.value(outcomes, reference) for objective in self.objectives]
         violated = violations(self.spec, outcomes, reference)
         for name, value in violated.items():
             trial.set_constraint(name, value)
+
         ratios = zip(self.objectives, values, strict=True)
         text = ", ".join(f"{objective.what} x {math.exp(value):.3f}" for objective, value in ratios)
         if broken := " and ".join(name for name, value in violated.items() if value > 0):
             text += f", violates {broken}"
         return Evaluation(TrialState.COMPLETE, text, values)
+
+    def _run_until_pruned(self, trial: optuna.Trial) -> tuple[dict[ProblemInstance, Outcome], bool]:
+        """The outcomes on the instances that a trial ran on, and whether it was pruned after the last of them.
+
+        Raises:
+            CancelledError: The study was interrupted.
+            InstanceFailedError: A run failed.
+        """
+        # a trial whose worker was killed was not pruned before the last step that it reported
+        stored = self.study.get_trials(deepcopy=False)[trial.number]
+        passed = max(stored.intermediate_values, default=0)
+
+        settings = self.configuration_of(trial).settings
+        outcomes: dict[ProblemInstance, Outcome] = {}
+        for instance in self.design.tune:
+            outcomes |= self.outcomes(settings, [instance])
+            if len(outcomes) >= passed and self._prune(trial, outcomes, instance):
+                return outcomes, True
+        return outcomes, False
+
+    def _store_outcomes(self, trial: optuna.Trial, outcomes: Outcomes, reference: Outcomes) -> None:
+        """Keep with a trial what its runs came to: means, log ratios by scene, and a row for each instance."""
+        scenes = combined_objective(self.objectives).ratios(outcomes, reference)
+        rows = [
+            [str(instance), run.run_id, run.ate_m, run.coverage, run.frame_s]
+            for instance, run in outcomes.items()
+        ]
+        trial.set_user_attr("coverage", coverage(outcomes))
+        trial.set_user_attr("fps", fps(outcomes))
+        trial.set_user_attr("scenes", scenes)
+        trial.set_user_attr("instances", rows)
 
     def _prune(self, trial: optuna.Trial, outcomes: Outcomes, last: ProblemInstance) -> bool:
         """Report a trial's value after its last instance, and ask Optuna's pruner, which takes one objective.
@@ -513,7 +522,7 @@ class Study(Plan):
         if evaluation.state != TrialState.COMPLETE:
             trial.set_user_attr("reason", evaluation.text)
         with self._lock:
-            # it was put back
+            # a worker that took this one for dead has put the trial back: Optuna ends running ones
             if self.study.get_trials(deepcopy=False)[trial.number].state == TrialState.WAITING:
                 self.study._storage.set_trial_state_values(trial._trial_id, TrialState.RUNNING)
             self.study.tell(trial, evaluation.values, state=evaluation.state, skip_if_finished=True)
@@ -596,16 +605,18 @@ class Study(Plan):
             raise StudyError(
                 f"the earlier study '{spec.name}' has other objectives: {', '.join(spec.objectives)}"
             )
-        other = study.user_attrs.get("identity", {}).get("code") != self._identity["code"]
-        marks = {EARLIER: f"study {spec.name}{', other code' * other}"}
+        source = f"study {spec.name}"
+        if study.user_attrs.get("identity", {}).get("code") != self._identity["code"]:
+            source += ", other code"
+        marks = {EARLIER: source}
         spans = distributions(self.space)
-        again = {trial.number for trial in best_trials(study, self.spec.top)}
+        best = {trial.number for trial in best_trials(study, self.spec.top)}
         for trial in study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
             params = {name: value for name, value in trial.params.items() if name in spans}
             with suppress(StudyError):  # out of this study's range
                 params = starting_point(params, self.space, self.base)
-                if trial.number in again:
-                    yield params
+                if trial.number in best:
+                    yield params  # to be run on this study's instances
                 yield create_trial(
                     params=params, distributions=spans, values=trial.values, user_attrs=marks
                 )
@@ -618,19 +629,18 @@ class Study(Plan):
         """The stored study, or a new one whose first trial is the baseline, whatever is enqueued later."""
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         storage = open_storage(self.results, self.spec)
-        pruner = build_pruner(self.spec.pruner)
         how: Any = {
             "storage": storage,
             "study_name": self.spec.name,
             "sampler": sampler,
-            "pruner": pruner,
+            "pruner": build_pruner(self.spec.pruner),
         }
+        directions: list[Literal["minimize", "maximize"]] = ["minimize"] * len(self.objectives)
         try:
+            # one worker begins the study, the others load it
             with self._turn("begin"):
                 try:
-                    study = optuna.create_study(
-                        directions=["minimize"] * len(self.objectives), **how
-                    )
+                    study = optuna.create_study(directions=directions, **how)
                     self._begin(study, beginnings)
                 except optuna.exceptions.DuplicatedStudyError:
                     study = optuna.load_study(**how)
@@ -642,19 +652,20 @@ class Study(Plan):
         except Exception as error:  # storages raise their drivers' errors
             text = f"cannot open study '{self.spec.name}': {error}"
             raise StudyError(without_password(text, self.spec.storage)) from None
+
+        # refuse a study of other things; write it beside its trials for those who look at it
         self._check_identity(study)
         if study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
             self.check_plugins()
         if not self.spec.storage:
-            write_atomic(
-                self.folder / SPEC_FILE, json.dumps(self.spec.for_others(), indent=2) + "\n"
-            )
+            text = json.dumps(self.spec.for_others(), indent=2) + "\n"
+            write_atomic(self.folder / SPEC_FILE, text)
         return study
 
     def _begin(
         self, study: optuna.Study, beginnings: Sequence[FrozenTrial | dict[str, Scalar]]
     ) -> None:
-        """What a new study begins with; the identity comes last, other workers wait for it.
+        """Store what a new study begins with; the identity comes last, other workers wait for it.
 
         Where a process was killed that began the study, this goes on from there.
         """
@@ -662,6 +673,8 @@ class Study(Plan):
         study.set_user_attr("command", words_without_passwords(storable(sys.argv)))
         with quiet():
             study.set_metric_names(list(self.spec.objectives))
+
+        # trial 0 has the baseline's settings; then trials of earlier studies, and settings to try once
         first = {parameter.name: self.base[parameter.name] for parameter in self.space}
         entries: list[FrozenTrial | dict[str, Scalar]] = [first]
         settings: list[dict[str, Any]] = [first]
@@ -673,7 +686,10 @@ class Study(Plan):
             else:
                 settings.append(beginning)
             entries.append(beginning)
-        for entry in entries[len(study.get_trials(deepcopy=False)) :]:
+
+        # those that a killed process has stored are there already
+        stored = len(study.get_trials(deepcopy=False))
+        for entry in entries[stored:]:
             if isinstance(entry, FrozenTrial):
                 study.add_trial(entry)
             else:
@@ -689,10 +705,12 @@ class Study(Plan):
     def _is_half_begun(self, study: optuna.Study) -> bool:
         """Whether a process was killed that began this study; a study of others has trials, or facts of its own."""
         facts = study.user_attrs
-        is_ours = facts.get("spec") == json.loads(json.dumps(self.spec.for_others()))
-        return "identity" not in facts and (
-            is_ours or not (facts or study.get_trials(deepcopy=False))
-        )
+        if "identity" in facts:
+            return False
+        # as a storage holds it: tuples are lists there
+        spec = json.loads(json.dumps(self.spec.for_others()))
+        is_empty = not facts and not study.get_trials(deepcopy=False)
+        return facts.get("spec") == spec or is_empty
 
     def _check_identity(self, study: optuna.Study) -> None:
         """Refuse a stored study that was made with something else; data and program count only to go on with it."""
@@ -704,12 +722,12 @@ class Study(Plan):
             )
         changed = [key for key, value in self._identity.items() if stored.get(key) != value]
         if changed:
-            there, here = (
-                json.dumps(values.get(changed[0]))[:80] for values in (stored, self._identity)
-            )
+            first = changed[0]
+            there = json.dumps(stored.get(first))[:80]
+            here = json.dumps(self._identity.get(first))[:80]
             more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
             raise StudyError(
-                f"study '{self.spec.name}' is stored with other {changed[0]}{more}: {there} there, {here} here",
+                f"study '{self.spec.name}' is stored with other {first}{more}: {there} there, {here} here",
                 f"give the study another name, or delete {self.folder}",
             )
 
@@ -724,12 +742,11 @@ class Study(Plan):
             mode="json", exclude={"trials", "top", "storage", "start", "baseline"}
         )
         instances = spec.instances(*spec.tune, *spec.confirm, *spec.held_out)
-        for sequence, instance in {
-            instance.sequence: instance for instance in reversed(instances)
-        }.items():
-            run = resolve(
-                self.run_spec(instance, Configuration(spec.tracker, self.held), cache=False)
-            ).identity
+        # the first instance of each sequence stands for it
+        first_of = {instance.sequence: instance for instance in reversed(instances)}
+        configuration = Configuration(spec.tracker, self.held)
+        for sequence, instance in first_of.items():
+            run = resolve(self.run_spec(instance, configuration, cache=False)).identity
             identity[f"content of {sequence}"] = digest([run["content"], run["camera"]])
             identity |= program_of(run) | {"device": run["device"]}
         identity["baseline settings"] = [self.baseline.tracker, dict(self.baseline.settings)]
@@ -760,7 +777,8 @@ class StoredStudy:
             self.spec, root = read_stored(path)
         else:
             self.spec = read_study(path)
-        self.folder, self.study = study_folder(root, self.spec), load_study(root, self.spec)
+        self.folder = study_folder(root, self.spec)
+        self.study = load_study(root, self.spec)
 
     def frame(self) -> pd.DataFrame:
         """All trials; see `storage.trials_frame`.
@@ -776,6 +794,7 @@ class StoredStudy:
 
 
 def _objectives(given: str | Cost | Sequence[str | Cost] | None) -> list[Objective] | None:
+    """Objectives by their names, and those that are functions of a user; None for those of the spec."""
     if given is None:
         return None
     several = [given] if isinstance(given, str) or callable(given) else given
@@ -820,6 +839,7 @@ def run_study(
     if scenes or trials:
         tuner.extend(scenes=scenes, trials=trials)
     tuner.on_run = on_run
+    # a new study says what it could show: its figures at once, its proposal after the baseline's runs
     if on_event is not None and not tuner.study.get_trials(deepcopy=False)[1:]:
         for line in tuner.preview(jobs).figures:
             on_event(StudyEvent("preview", 0, tuner.trials, line))
@@ -834,6 +854,7 @@ def run_study(
 # Wilcoxon's signed-rank test against the best trial. Optuna prunes no trials of several objectives.
 
 _STARTUP_TRIALS = 8
+"""Random trials before a model of the values proposes settings."""
 
 
 class StreamedSampler(optuna.samplers.BaseSampler):
@@ -851,7 +872,7 @@ class StreamedSampler(optuna.samplers.BaseSampler):
         self._spec = spec
 
     def before_trial(self, study: optuna.Study, trial: FrozenTrial) -> None:
-        """Make the trial's sampler."""
+        """Make the trial's sampler; it has drawn none of the trial's settings yet."""
         seed = int(stream(self._spec.sampler_seed, "sampler", trial.number).integers(2**31))
         with quiet():
             self._sampler = _SAMPLERS[self._spec.sampler](self._spec, seed)
@@ -906,6 +927,7 @@ _SAMPLERS: dict[SamplerName, Callable[[StudySpec, int], optuna.samplers.BaseSamp
 FIRST_STEP = 3
 """Instances that every trial runs on before it may be pruned."""
 WILCOXON_LEVEL = 0.1
+"""Level of Wilcoxon's test: a trial is pruned below it."""
 
 _PRUNERS: dict[PrunerName, Callable[[], optuna.pruners.BasePruner]] = {
     "halving": lambda: optuna.pruners.SuccessiveHalvingPruner(

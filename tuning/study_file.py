@@ -23,6 +23,8 @@ from dynslam_bench.sequences.synthetic import parse_synthetic_id
 
 FEWEST_FRAMES = 2
 """A shorter instance has no motion."""
+
+# A text of a study file, NAME[A:B]?OPTIONS, and the values of its options.
 _TEXT = re.compile(r"(?P<name>[^\[\]?]+)(?:\[(?P<frames>[^\]]*)\])?(?:\?(?P<query>.*))?")
 _NUMBER = "[1-9][0-9]{0,8}"
 _NUMBERS = "[0-9]{1,9}(-[0-9]{1,9})?(,[0-9]{1,9}(-[0-9]{1,9})?)*"
@@ -66,20 +68,20 @@ class ProblemInstance:
     def __str__(self) -> str:
         """The text that `parse_instances` reads as this instance alone."""
         name, _, query = self.sequence.partition("?")
-        part = (
-            ""
-            if self.frames is None
-            else f"[{':'.join('' if end is None else str(end) for end in self.frames)}]"
-        )
-        degradation = ",".join(f"{kind}:{strength:g}" for kind, strength in self.degradation)
-        options = (
-            query,
-            f"offsets={self.offset}",
-            f"stride={self.stride}" if self.stride > 1 else "",
-            f"seeds={self.seed}" if self.seed else "",
-            f"degrade={degradation}" if degradation else "",
-        )
-        return f"{name}{part}?{'&'.join(filter(None, options))}"
+        part = ""
+        if self.frames is not None:
+            first, stop = self.frames
+            part = f"[{first}:{'' if stop is None else stop}]"
+        options = [query] if query else []
+        options.append(f"offsets={self.offset}")
+        if self.stride > 1:
+            options.append(f"stride={self.stride}")
+        if self.seed:
+            options.append(f"seeds={self.seed}")
+        if self.degradation:
+            strengths = ",".join(f"{kind}:{strength:g}" for kind, strength in self.degradation)
+            options.append(f"degrade={strengths}")
+        return f"{name}{part}?{'&'.join(options)}"
 
     @property
     def scene(self) -> str:
@@ -154,6 +156,8 @@ def parse_instances(
             ProblemInstance(text, offset=offset, seed=seed)
             for offset, seed in product(offsets, seeds)
         )
+
+    # NAME[A:B]?OPTIONS
     match = _TEXT.fullmatch(text)
     if match is None:
         raise StudyError(f"'{text}' names no instances", _FORM)
@@ -163,23 +167,35 @@ def parse_instances(
         frames = None if match["frames"] in (None, ":") else parse_frames(match["frames"])
     except SequenceError as error:
         raise StudyError(f"'{text}': {error.args[0]}", error.hint) from error
+
+    # options that belong to a rendered sequence's name: one name for each scene
     names = [name]
     if name.startswith("synthetic/"):
-        scene = [f"scene={number}" for number in _numbers(options.pop("scene", ""), text)] or [""]
-        rest = [f"{key}={options.pop(key)}" for key in ("frames", "noise") if key in options]
-        queries = ["&".join(filter(None, [named, *rest])) for named in scene]
-        names = [f"{name}?{query}" if query else name for query in queries]
+        names = _rendered_names(name, options, text)
     elif frames is None and "frames" in options:
         frames = (0, int(options.pop("frames")))
     for option in options.keys() & {"scene", "noise", "frames"}:
         raise StudyError(f"'{text}' may not have a {option}", _FORM)
-    starts, draws = (_numbers(options.get(key, ""), text) for key in ("offsets", "seeds"))
+
+    # the others are fields of the instances
+    offsets = _numbers(options.get("offsets", ""), text) or offsets
+    seeds = _numbers(options.get("seeds", ""), text) or seeds
     stride = int(options.get("stride", 1))
     strengths = _strengths(options.get("degrade", ""), text)
     return tuple(
         ProblemInstance(name, frames, offset, stride, strengths, seed)
-        for name, offset, seed in product(names, starts or offsets, draws or seeds)
+        for name, offset, seed in product(names, offsets, seeds)
     )
+
+
+def _rendered_names(name: str, options: dict[str, str], text: str) -> list[str]:
+    """A rendered sequence's name with each scene, its length and its noise; takes these out of the options."""
+    numbers = _numbers(options.pop("scene", ""), text)
+    others = [f"{key}={options.pop(key)}" for key in ("frames", "noise") if key in options]
+    queries = ["&".join([f"scene={number}", *others]) for number in numbers]
+    if not numbers:
+        queries = ["&".join(others)]
+    return [f"{name}?{query}" if query else name for query in queries]
 
 
 def scene_of(name: str) -> str:
@@ -219,14 +235,10 @@ def further_scenes(
         group for group in scenes(instances).values() if group[0].sequence.startswith("synthetic/")
     ]
     by_name = grouped(rendered, lambda group: parse_synthetic_id(group[0].sequence).name)
+    # the first group of each sequence, moved to each scene number in turn, where that is not in use
     moved = (
-        [
-            replace(
-                instance, sequence=str(replace(parse_synthetic_id(instance.sequence), scene=number))
-            )
-            for instance in group
-        ]
-        for number, (group, *_) in product(numbers, by_name.values())
+        [_in_scene(instance, number) for instance in groups[0]]
+        for number, groups in product(numbers, by_name.values())
     )
     used = set(taken)
     added = list(islice((group for group in moved if group[0].scene not in used), count))
@@ -238,10 +250,17 @@ def further_scenes(
     return [instance for group in added for instance in group]
 
 
+def _in_scene(instance: ProblemInstance, number: int) -> ProblemInstance:
+    """The instance in another scene of its rendered sequence."""
+    sequence = replace(parse_synthetic_id(instance.sequence), scene=number)
+    return replace(instance, sequence=str(sequence))
+
+
 def stretches_behind(
     instances: Iterable[ProblemInstance], data_root: str | None
 ) -> list[ProblemInstance]:
     """The parts of recordings moved behind the last frame that is named of each, as far as the recording goes."""
+    # of each recording, the instances with an end, their first frames and one past their last
     parts: dict[str, list[tuple[ProblemInstance, int, int]]] = {}
     for instance in instances:
         first, last = instance.frames or (0, None)
@@ -249,6 +268,7 @@ def stretches_behind(
             parts.setdefault(instance.sequence, []).append((instance, first, last))
     moved = []
     for sequence, group in parts.items():
+        # behind the last frame that is named: all parts move by what they span together
         shift = max(last for _, _, last in group) - min(first for _, first, _ in group)
         length = len(open_sequence(sequence, data_root=data_root))
         moved += [
@@ -260,6 +280,7 @@ def stretches_behind(
 
 
 def _options(query: str, text: str) -> dict[str, str]:
+    """The options behind the question mark by name, each known, written as it should be, and named once."""
     options: dict[str, str] = {}
     for option in query.split("&") if query else ():
         key, _, value = option.partition("=")
@@ -290,6 +311,7 @@ def _numbers(text: str, whole: str) -> list[int]:
 
 
 def _strengths(text: str, whole: str) -> tuple[tuple[str, float], ...]:
+    """``blur:0.5,glare:0.2`` as kinds and strengths in alphabetical order; an empty text holds none."""
     from dynslam_bench.envs import Degradation
 
     kinds = [name for name in Degradation.__dataclass_fields__ if name != "seed"]

@@ -10,10 +10,13 @@ __all__ = ["interrupted", "leave_interrupted", "main"]
 
 RESUMABLE = ("run", "bench", "tune", "demo", "report", "segmenter", "sequences")
 """Verbs that keep finished work when they are interrupted."""
+
+# Signals that ask a process to end: Ctrl-C, `kill`, and a terminal that is closed.
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _SIGNAL_CODE = 128
 """A shell's exit code for a signal is this plus the signal's number."""
 _received: list[int] = []
+"""Numbers of the signals to end that were received."""
 
 
 def main() -> None:
@@ -45,9 +48,12 @@ def interrupted() -> bool:
 
 def leave_interrupted() -> None:
     """Say how to continue, and exit: with 130 for Ctrl-C, 143 for SIGTERM, 129 for SIGHUP."""
-    resume = "; what is finished is stored, the same command goes on from there"
-    sys.stderr.write(f"interrupted{resume if sys.argv[1:2] and sys.argv[1] in RESUMABLE else ''}\n")
-    sys.exit(_SIGNAL_CODE + (_received[0] if _received else signal.SIGINT))
+    text = "interrupted"
+    if sys.argv[1:2] and sys.argv[1] in RESUMABLE:
+        text += "; what is finished is stored, the same command goes on from there"
+    sys.stderr.write(f"{text}\n")
+    number = _received[0] if _received else signal.SIGINT
+    sys.exit(_SIGNAL_CODE + number)
 
 
 def _interrupt(number: int, _: FrameType | None) -> None:

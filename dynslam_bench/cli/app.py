@@ -34,6 +34,7 @@ from dynslam_bench.cli.output import (
 from dynslam_bench.core import DynslamError
 
 INTERRUPT_CODE = 130
+"""Typer's exit code of a command that Ctrl-C has ended."""
 LISTS = ("--seed", "--offset")
 """Options that take several whole numbers."""
 app = typer.Typer(
@@ -44,6 +45,8 @@ app = typer.Typer(
     add_completion=True,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+# The verbs below the four headings of the help, in their order there.
 app.command(rich_help_panel=START)(demo.demo)
 app.add_typer(sequences.app, name="sequences", rich_help_panel=START)
 app.add_typer(trackers.app, name="trackers", rich_help_panel=START)
@@ -103,11 +106,18 @@ def doctor(as_json: AsJson = False) -> None:
 
     findings = examine()
     rows = [(finding.part, finding.name, finding.state) for finding in findings]
-    missing = [f"- {f.part} {f.name}: {f.hint or f.state}" for f in findings if f.missing]
-    heading = "\nMissing, and how to get it (of this, rendered sequences need the packages alone):"
-    present(
-        findings, table(("part", "name", "found"), rows), *([heading, *missing] if missing else [])
-    )
+    lines = [table(("part", "name", "found"), rows)]
+    missing = [finding for finding in findings if finding.missing]
+    if missing:
+        heading = (
+            "Missing, and how to get it (of this, rendered sequences need the packages alone):"
+        )
+        lines.append(f"\n{heading}")
+        lines += [
+            f"- {finding.part} {finding.name}: {finding.hint or finding.state}"
+            for finding in missing
+        ]
+    present(findings, *lines)
 
 
 @cache.command()
@@ -146,6 +156,7 @@ def start(arguments: list[str] | None = None) -> None:
     """
     arguments = expand_lists(sys.argv[1:] if arguments is None else arguments)
     try:
+        # a library's warning is one line for the user
         with warnings.catch_warnings():
             warnings.showwarning = lambda message, *_, **__: warn(f"warning: {message}")
             app(args=arguments, prog_name="dynslam-bench")
@@ -156,9 +167,11 @@ def start(arguments: list[str] | None = None) -> None:
         if interrupted():  # libraries turn an interrupt into errors of their own
             leave_interrupted()
         if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+            # a full disk is the user's to clear; what is not written yet would fail once more
             _discard_output()
             file = f" {error.filename}" if error.filename else ""
             error = DynslamError(f"cannot write{file}: {error.strerror}")
+        # only errors of the user get one line; a fault of the program keeps its traceback
         if not isinstance(error, DynslamError):
             raise
         write_error(error)
@@ -177,14 +190,19 @@ def _discard_output() -> None:
 
 
 def expand_lists(arguments: list[str]) -> list[str]:
-    """Let ``--seed 0 1 2`` stand for ``--seed 0 --seed 1 --seed 2``; likewise every option of `LISTS`."""
+    """Repeat an option of `LISTS` before each of its values.
+
+    Example:
+        ``--seed 0 1 2`` becomes ``--seed 0 --seed 1 --seed 2``.
+    """
     expanded: list[str] = []
-    option = ""
+    option = ""  # whose values are being read
     for argument in arguments:
         if argument in LISTS:
             option = argument
         elif not argument.isdigit():
             option = ""
+        # a value that follows another value, not its option
         elif option and expanded[-1] not in LISTS:
             expanded.append(option)
         expanded.append(argument)

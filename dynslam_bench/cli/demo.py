@@ -34,11 +34,13 @@ TUNED = (
 )
 """The settings of the study: the flow's search, and the thresholds of moving features."""
 STUDY_SHARE = 0.25
+"""Frames of a problem instance of the study, as a share of the runs' frames."""
 MIN_STUDY_FRAMES = 20
-"""Frames of a problem instance of the study, as a share of the runs' frames, and at least."""
+"""Frames of a problem instance of the study at least."""
 STATIC = "orb-slam2"
+"""The tracker without culling."""
 CULLING = {"mask-rcnn": "masks of people", "emfoa-oft": "masks, flow and depth tests"}
-"""The tracker without culling, and those with it."""
+"""The trackers with culling, and by what they cull."""
 MIN_FACTOR = 1.5
 """Single runs scatter by some 30 %: a smaller ratio of errors shows nothing."""
 KERNEL_FRAMES = 12
@@ -63,26 +65,29 @@ def demo(
 
     store = RunStore(results)
     store.prepare()  # before the rendering: an unwritable folder is reported at once
+
+    # what is run, and what is tuned
     specs = [
         spec.model_copy(update={"sequence": f"{spec.sequence}&frames={frames}", "frames": None})
         for spec in load_suite("demo").specs(snapshots=True)
     ]
     study = study_spec(max(MIN_STUDY_FRAMES, int(STUDY_SHARE * frames)), trials)
     write(f"{len(specs)} runs of {frames} frames, and a study of {trials} trials: some minutes")
+
+    # render while the kernels are compiled, then track
     with compiled_ahead():
         render({spec.sequence for spec in specs})
     made = WatchedRuns(store, jobs, PROTOCOL).make(
         partial(run_specs, specs, results=store.root, jobs=jobs)
     )
+
     note("making the report")
     paths = report(store.root, title="Demo: walking and sitting people, rendered")
+
+    # tune, on scenes of the study's own
     silence_optuna()
-    render(
-        {
-            instance.sequence
-            for instance in study.instances(*study.tune, *study.confirm, *study.held_out)
-        }
-    )
+    instances = study.instances(*study.tune, *study.confirm, *study.held_out)
+    render({instance.sequence for instance in instances})
     with progress(f"study {study.name}") as advance:
         bar = StudyBar(advance)
         tuned = tune(
@@ -93,12 +98,14 @@ def demo(
             on_run=bar.run,
             on_note=note,
         )
+
+    # what came of it: the tables, and sentences on them
     board = load_board(store)
     protocol = get_protocol(PROTOCOL)
     for table in (paths.leaderboard, per_sequence(board, protocol)):
         write(f"\n{table.title}\n{report_table(table)}")
     write(f"\nProtocol: {protocol.describe()}\n")
-    for line in (*tell(board.rows), f"The study: {tuned.summary.conclusion}"):
+    for line in (*culling_effect(board.rows), f"The study: {tuned.summary.conclusion}"):
         write(wrapped(line))
     write(f"\nreport: {paths.html}\nstudy:  {tuned.page}")
     if any(run.record.failed for run in made):
@@ -137,19 +144,21 @@ def render(sequences: set[str]) -> None:
             render_synthetic(name, find_data_root(None), progress=advance)
 
 
-def tell(rows: Iterable[RunRow]) -> list[str]:
+def culling_effect(rows: Iterable[RunRow]) -> list[str]:
     """What the runs show: a sentence on the effect of culling for each sequence, and the weight of single runs."""
+    # errors in metres by sequence and tracker; a name is `walking_xyz?scene=1`, without the frames
     errors: dict[str, dict[str, float]] = defaultdict(dict)
     for row in rows:
         if row.score_m is not None:
-            errors[row.sequence.id.partition("&")[0].rpartition("/")[2]][row.tracker.id] = (
-                row.score_m
-            )
+            name = row.sequence.id.partition("&")[0].rpartition("/")[2]
+            errors[name][row.tracker.id] = row.score_m
+
     lines = []
     for name, by_tracker in sorted(errors.items(), reverse=True):
         culled = {tracker: by_tracker[tracker] for tracker in CULLING if tracker in by_tracker}
         if STATIC not in by_tracker or not culled:
             continue
+        # the error without culling is so many times that of the best tracker with it
         factor = by_tracker[STATIC] / min(culled.values())
         verdict = "Culling changes nothing that one run could show."
         if factor >= MIN_FACTOR:

@@ -16,16 +16,17 @@ from dynslam_bench.core import DynslamError, read_settings
 if TYPE_CHECKING:
     from dynslam_bench.contracts import TrackerSpec
 
+# Headings below which the program's help lists its verbs.
 START = "Begin here"
 MEASURE = "Run and measure"
 REPORT = "Report and tune"
 CARE = "Extend and care"
-"""Headings below which the program's help lists its verbs."""
+
+# Headings below which the help of a verb lists its options.
 FRAMES = "Which frames, how often"
 SETTINGS = "The tracker's settings"
 MACHINE = "The machine, and how much of it"
 OUTPUT = "What is kept and shown"
-"""Headings of the options' help."""
 
 
 class DefaultGroup(TyperGroup):
@@ -55,6 +56,7 @@ class ShortHelp(TyperCommand):
 
 
 def _help_all(ctx: typer.Context, on: bool) -> None:
+    """Write the whole help and exit: the callback of ``--help-all``."""
     if on:
         ctx.meta["help-all"] = True
         typer.echo(ctx.get_help())
@@ -90,7 +92,10 @@ def complete_settings(ctx: typer.Context, incomplete: str) -> Iterable[str]:
         return []
     if "=" not in incomplete:
         return [f"{name}=" for name in flatten(spec.settings())]
-    return [f"{p.name}={choice}" for p in parameters(spec.settings) for choice in p.choices or ()]
+    assignments = []
+    for parameter in parameters(spec.settings):
+        assignments += [f"{parameter.name}={choice}" for choice in parameter.choices or ()]
+    return assignments
 
 
 def complete_presets(ctx: typer.Context) -> Iterable[str]:
@@ -110,12 +115,15 @@ def _tracker(ctx: typer.Context) -> TrackerSpec | None:
     """The tracker on the command line, its first word; None if it is unknown."""
     from dynslam_bench.trackers import TRACKERS
 
+    # what follows is not parsed yet while an option is completed
+    name = ctx.params.get("tracker") or next(iter(ctx.args), "")
     try:
-        return TRACKERS.get(str(ctx.params.get("tracker") or next(iter(ctx.args), "")))
+        return TRACKERS.get(str(name))
     except DynslamError:
         return None
 
 
+# Options that several verbs take, each with its help.
 HelpAll = Annotated[
     bool,
     typer.Option(
@@ -263,7 +271,7 @@ MemoryLimit = Annotated[
 
 
 def gather_settings(assignments: list[str] | None, file: Path | None = None) -> dict[str, Any]:
-    """Overrides by dotted name: the assignments go before the file.
+    """Overrides by dotted name, of a file and of assignments; an assignment replaces the file's value.
 
     Raises:
         SettingsError: The file cannot be read, or an assignment is not of the form NAME=VALUE.

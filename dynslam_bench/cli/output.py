@@ -23,11 +23,17 @@ if TYPE_CHECKING:
     from dynslam_bench.reports.tables.table import Table
 
 SOME_RUNS_FAILED = 3
+"""Exit code where a run failed or was lost, could not be made, or was left out of a copy."""
 VERIFICATION_FAILED = 4
+"""Exit code where something was checked and has a fault."""
 HEARTBEAT_S = 10.0
 """Off a terminal, a long operation reports its progress this often, unless JSON was asked for."""
 _MIN_WIDTH = 12
 """Characters that a shortened column of names keeps, unless more are asked for."""
+_GAP = "  "
+"""What separates the columns of a table."""
+_LINE_WIDTH = 120
+"""Characters of a wrapped line at most."""
 
 _json_mode = False
 """Whether ``--json`` was given: then nothing but errors goes to standard error."""
@@ -55,6 +61,7 @@ def write(text: str = "", *, colours: Mapping[str, int] | None = None) -> None:
     """
     text = printable(text)
     if colours and sys.stdout.isatty() and "NO_COLOR" not in os.environ:
+        # a word that fills a cell: the gap of two columns before it, that or the line's end behind
         cell = re.compile(rf"(?<=  )(?:{'|'.join(colours)})(?=  |$)", re.MULTILINE)
         text = cell.sub(lambda word: f"\033[{colours[word[0]]}m{word[0]}\033[0m", text)
     sys.stdout.write(text + "\n")
@@ -100,8 +107,8 @@ def present(value: Any, *lines: str, verified: bool = True) -> None:
         Exit: Something was checked and is not `verified`; the code is 4.
     """
     if _json_mode:
-        text = to_json(value, inf_nan_mode="null", fallback=_plain)
-        # escapes what a terminal would execute
+        text = to_json(value, inf_nan_mode="null", fallback=_as_json)
+        # `json.dumps` escapes what a terminal would execute
         sys.stdout.write(json.dumps(from_json(text), indent=2) + "\n")
     else:
         for line in lines:
@@ -110,7 +117,8 @@ def present(value: Any, *lines: str, verified: bool = True) -> None:
         raise typer.Exit(VERIFICATION_FAILED)
 
 
-def _plain(value: Any) -> Any:
+def _as_json(value: Any) -> Any:
+    """What JSON holds for a type that pydantic does not know: an array's numbers, else its text."""
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
@@ -128,31 +136,55 @@ def table(
         least: Characters that a shortened column of names keeps.
     """
     cells = [[cell_text(value) for value in row] for row in (columns, *rows)]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    needed = [_least_width(column, least) for column in zip(*cells, strict=True)]
-    room = _terminal_width() if sys.stdout.isatty() else sys.maxsize
-    while len(widths) > 1 and _line_width(needed[: len(widths)]) > room:
-        widths.pop()
-    while _line_width(widths) > room and (
-        wider := [at for at, width in enumerate(widths) if width > needed[at]]
-    ):
-        widths[max(wider, key=widths.__getitem__)] -= 1
-    lines = ["  ".join(map(_fitted, row, widths)).rstrip() for row in cells]
+    full_widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    least_widths = [_least_width(column, least) for column in zip(*cells, strict=True)]
+    widths = _widths_on_terminal(full_widths, least_widths)
+
+    # `map` ends with the shorter one: columns without a width are left out
+    lines = [_GAP.join(map(_fitted, row, widths)).rstrip() for row in cells]
     left_out = cells[0][len(widths) :]
-    return "\n".join([*lines, f"(no room for: {', '.join(left_out)})"] if left_out else lines)
+    if left_out:
+        lines.append(f"(no room for: {', '.join(left_out)})")
+    return "\n".join(lines)
+
+
+def _widths_on_terminal(full: Sequence[int], least: Sequence[int]) -> list[int]:
+    """Widths of the columns that are shown; of all of them, in full, where there is no terminal.
+
+    Args:
+        full: Characters of each column's longest cell.
+        least: Characters that each column needs.
+    """
+    widths = list(full)
+    if not sys.stdout.isatty():
+        return widths
+    terminal = _terminal_width()
+    # leave out columns from the last one on, until the least widths fit
+    while len(widths) > 1 and _line_width(least[: len(widths)]) > terminal:
+        widths.pop()
+    # then shorten the widest column by a character, again and again
+    while _line_width(widths) > terminal:
+        can_shrink = [at for at, width in enumerate(widths) if width > least[at]]
+        if not can_shrink:
+            break
+        widths[max(can_shrink, key=widths.__getitem__)] -= 1
+    return widths
 
 
 def _least_width(column: Sequence[str], least: int) -> int:
     """Characters that a column needs: `least`, or the longest cell that begins with a number."""
-    numbers = (len(cell) for cell in column if cell and not any(map(str.isalpha, cell.split()[0])))
-    return max([min(max(map(len, column)), least), *numbers])
+    longest = max(map(len, column))
+    numbers = [cell for cell in column if cell and not any(map(str.isalpha, cell.split()[0]))]
+    return max([min(longest, least), *map(len, numbers)])
 
 
 def _line_width(widths: Sequence[int]) -> int:
-    return sum(widths) + 2 * (len(widths) - 1)
+    """Characters of a line of the table, the gaps included."""
+    return sum(widths) + len(_GAP) * (len(widths) - 1)
 
 
 def _fitted(text: str, width: int) -> str:
+    """A cell filled with blanks to its column's width, or shortened in the middle to it."""
     if len(text) <= width:
         return text.ljust(width)
     return text[: width // 2] + "…" + text[len(text) - (width - 1) // 2 :]
@@ -183,20 +215,28 @@ def cell_text(value: object) -> str:
 
 
 def report_table(source: Table, names: Sequence[str] = (), most: int | None = None) -> str:
-    """A report's table as text: the columns of these names, or all in which something is written."""
+    """A report's table as text.
+
+    Args:
+        source: The report's table.
+        names: Names of the columns; all in which something is written if there are none.
+        most: Rows at most; None for all.
+    """
     source = source.displayed()
     titles = [column.name if names else column.key for column in source.columns]
     chosen = [titles.index(name) for name in names or titles if name in titles]
-    cells = [
-        [" ".join(filter(None, (row[at].text, row[at].small, row[at].tag))) for at in chosen]
-        for row in source.rows[:most]
-    ]
-    return table([titles[at] for at in chosen], cells)
+    rows = []
+    for row in source.rows[:most]:
+        # a cell's value, what stands in small print behind it, and its mark
+        parts = [(row[at].text, row[at].small, row[at].tag) for at in chosen]
+        rows.append([" ".join(filter(None, texts)) for texts in parts])
+    return table([titles[at] for at in chosen], rows)
 
 
 def wrapped(text: str) -> str:
     """Text in lines as wide as the terminal, 120 characters at most; that many where there is none."""
-    return textwrap.fill(text, min(_terminal_width(), 120) if sys.stdout.isatty() else 120)
+    width = min(_terminal_width(), _LINE_WIDTH) if sys.stdout.isatty() else _LINE_WIDTH
+    return textwrap.fill(text, width)
 
 
 def _terminal_width() -> int:
@@ -223,6 +263,13 @@ def progress(label: str, *, unit: str = "") -> Iterator[Advance]:
         with _progress_lines(label) as advance:
             yield advance
         return
+    with _progress_bar(label, unit) as advance:
+        yield advance
+
+
+@contextmanager
+def _progress_bar(label: str, unit: str) -> Iterator[Advance]:
+    """A bar of rich's, with the amount in bytes or as a count; it disappears at its end."""
     from rich.console import Console
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -240,32 +287,37 @@ def progress(label: str, *, unit: str = "") -> Iterator[Advance]:
 
         def update(done: float, total: float | None, step: str = "") -> None:
             text = printable(f"{label}: {step}" if step else label)
-            bar.update(
-                task, completed=done, total=done + 1 if total is None else total, description=text
-            )
+            # rich needs a total: an unknown one stays one ahead
+            total = done + 1 if total is None else total
+            bar.update(task, completed=done, total=total, description=text)
 
         yield update
 
 
 @contextmanager
 def _progress_lines(label: str) -> Iterator[Advance]:
+    """The last progress as a line on standard error, every `HEARTBEAT_S` seconds."""
     began = time.monotonic()
     text = label
 
     def update(done: float, total: float | None, step: str = "") -> None:
         nonlocal text
-        share = f": {done:{'.0f' if done >= 100 else '.3g'}} of {total:.0f}" if total else ""
-        spent_s = time.monotonic() - began
-        left = (
-            f", about {spent_s * (total - done) / done:.0f} s left"
-            if total and 0 < done < total
-            else ""
-        )
-        text = f"{label}{share}{left}" + (f" ({step})" if step else "")
+        line = label
+        if total:
+            amount = f"{done:.0f}" if done >= 100 else f"{done:.3g}"
+            line += f": {amount} of {total:.0f}"
+        if total and 0 < done < total:
+            # what is left takes as long for its amount as what is done
+            spent_s = time.monotonic() - began
+            line += f", about {spent_s * (total - done) / done:.0f} s left"
+        if step:
+            line += f" ({step})"
+        text = line
 
-    with call_periodically(
-        HEARTBEAT_S, lambda: warn(f"{text}, {time.monotonic() - began:.0f} s so far")
-    ):
+    def report() -> None:
+        warn(f"{text}, {time.monotonic() - began:.0f} s so far")
+
+    with call_periodically(HEARTBEAT_S, report):
         yield update
 
 

@@ -83,22 +83,21 @@ def make(
             on_progress=advance,
         )
 
-    top = ["#", "tracker", "ATE ratio", "better?", "success", "coverage", "× real time"]
+    # the headline, the first rows of the leaderboard, what is not in it, and the page
+    columns = ["#", "tracker", "ATE ratio", "better?", "success", "coverage", "× real time"]
     board = paths.leaderboard
     more = len(board.rows) - MOST_ROWS
-    left_out = [wrapped(f"Left out: {trial_words(paths.trials)}.")] if paths.trials else []
-    present(
-        {
-            name: getattr(paths, name)
-            for name in ("headline", "html", "markdown", "latex", "csv", "data")
-        },
+    lines = [
         wrapped(paths.headline),
-        report_table(board, top, MOST_ROWS),
-        (f"... and {more} more; " if more > 0 else "") + board.brief,
-        *left_out,
-        *failure_lines(paths.csv.get("failures")),
-        str(paths.html),
-    )
+        report_table(board, columns, MOST_ROWS),
+        f"... and {more} more; {board.brief}" if more > 0 else board.brief,
+    ]
+    if paths.trials:
+        lines.append(wrapped(f"Left out: {trial_words(paths.trials)}."))
+    lines += failure_lines(paths.csv.get("failures"))
+    lines.append(str(paths.html))
+    facts = ("headline", "html", "markdown", "latex", "csv", "data")
+    present({name: getattr(paths, name) for name in facts}, *lines)
 
 
 def failure_lines(file: Path | None) -> list[str]:
@@ -108,14 +107,14 @@ def failure_lines(file: Path | None) -> list[str]:
     if file is None:
         return []
     failed = pd.read_csv(file, dtype=str, keep_default_na=False)
-    counts = (
-        failed["tracker"] + " " + failed["ended"].str.extract(r"(.*?)(?:,| at |$)")[0]
-    ).value_counts()
-    words = [f"{name} ({count})" for name, count in counts.head(MOST_ROWS).items()]
-    more = f" and {len(counts) - MOST_ROWS} more" * (len(counts) > MOST_ROWS)
-    return [
-        wrapped(f"{len(failed)} run{'s' * (len(failed) > 1)} failed: {', '.join(words)}{more}.")
-    ]
+    # how a run ended, without where: `crashed at frame 5` counts as `crashed`
+    ended = failed["ended"].str.extract(r"(.*?)(?:,| at |$)")[0]
+    counts = (failed["tracker"] + " " + ended).value_counts()
+    words = ", ".join(f"{name} ({count})" for name, count in counts.head(MOST_ROWS).items())
+    if len(counts) > MOST_ROWS:
+        words += f" and {len(counts) - MOST_ROWS} more"
+    plural = "s" if len(failed) > 1 else ""
+    return [wrapped(f"{len(failed)} run{plural} failed: {words}.")]
 
 
 @app.command()
@@ -173,9 +172,8 @@ def compare(
     """Compare two results folders on the sequences that both have, with the same settings or with others."""
     from dynslam_bench.reports import compare as compare_results
 
-    result = compare_results(
-        a, b, protocol=protocol, output=output or (b if b.is_dir() else b.parent) / "compare"
-    )
+    folder = output or (b if b.is_dir() else b.parent) / "compare"
+    result = compare_results(a, b, protocol=protocol, output=folder)
     facts = {"differences": result.differences, "only_a": result.only_a, "only_b": result.only_b}
     lines = [result.table.title, report_table(result.table), "", wrapped(result.table.caption)]
     if result.only_a or result.only_b:
@@ -195,6 +193,7 @@ def audit_paper(
     from dynslam_bench.reports.model.published import claimed_results
     from dynslam_bench.sequences.catalogue import entry_of
 
+    # the ground truths that are on this machine, for the static camera's error
     truth = {}
     for name in sorted(set(claimed_results()["sequence"])):
         entry = entry_of(name)
@@ -247,27 +246,22 @@ def published(
         raise ReportError(
             f"no published number of '{name}' was read", did_you_mean(name, published_sequences())
         )
-    lines = published_for([name], None if protocol is None else get_protocol(protocol))
-    errors = published_table(lines)
+    numbers = published_for([name], None if protocol is None else get_protocol(protocol))
+    errors = published_table(numbers)
     if errors is None:
         raise ReportError(
             f"no published number of '{name}' is known to be scored as {protocol}",
             "leave --protocol out",
         )
-    differing = spans(lines)
+    differing = spans(numbers)
+    facts = {"spans": differing.to_dict("records"), "numbers": numbers.to_dict("records")}
+    lines = []
     span = span_table(differing)
-    text = (
-        []
-        if span is None
-        else [f"{span.title}, on {name}:", report_table(span.without("sequence")), ""]
-    )
-    text += [
-        f"{errors.title} of {name}:",
-        report_table(errors.without("sequence")),
-        "",
-        wrapped(errors.caption),
-    ]
-    present({"spans": differing.to_dict("records"), "numbers": lines.to_dict("records")}, *text)
+    if span is not None:
+        lines += [f"{span.title}, on {name}:", report_table(span.without("sequence")), ""]
+    lines += [f"{errors.title} of {name}:", report_table(errors.without("sequence")), ""]
+    lines.append(wrapped(errors.caption))
+    present(facts, *lines)
 
 
 def published_sequences() -> list[str]:

@@ -9,7 +9,7 @@ from datetime import timedelta
 from functools import partial
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
@@ -180,11 +180,13 @@ def run(
     """Run a tracker on sequences; runs that are stored already are not made again."""
     from dynslam_bench.api import checked, make_specs, run_specs
 
+    # settings: --settings below --set, and the two options that stand for settings above both
     overrides = opts.gather_settings(assignments, settings)
     if start_map is not None:
         overrides["backend.map.file"] = str(start_map)
     if localisation_only:
         overrides["backend.map.localisation_only"] = True
+    # one specification for each sequence, seed and offset
     specs = make_specs(
         tracker,
         sequences,
@@ -211,10 +213,10 @@ def run(
         limits=checked(runs.Limits, time_s=time_limit, memory_mb=memory_limit),
     )
     scored_under = protocol or default_protocol(tracker)
-    make = partial(
+    make_runs = partial(
         run_specs, specs, results=results, jobs=jobs, retry=retry or (), protocol=scored_under
     )
-    finish(make, results, jobs, scored_under, yes, runs.pictures_asked(specs[0]))
+    make_and_show(make_runs, results, jobs, scored_under, yes, runs.pictures_asked(specs[0]))
 
 
 def default_protocol(tracker: str) -> str:
@@ -284,7 +286,7 @@ def bench(
     from dynslam_bench.api import bench as run_suite
     from dynslam_bench.sequences.catalogue import parse_frames
 
-    make = partial(
+    make_runs = partial(
         run_suite,
         suite,
         results=results,
@@ -305,16 +307,16 @@ def bench(
         shard=parse_shard(shard),
         on_workers=show_workers,
     )
-    finish(make, results, jobs, protocol, yes)
+    make_and_show(make_runs, results, jobs, protocol, yes)
 
 
 def show_workers(rows: Sequence[dict[str, object]]) -> None:
     """What each worker of a scheduler has, on standard error."""
-    announce(
-        table(list(rows[0]), [list(row.values()) for row in rows])
-        if rows
-        else "the scheduler has no worker yet"
-    )
+    if not rows:
+        announce("the scheduler has no worker yet")
+        return
+    columns = list(rows[0])
+    announce(table(columns, [list(row.values()) for row in rows]))
 
 
 def parse_shard(text: str) -> tuple[int, int]:
@@ -323,59 +325,95 @@ def parse_shard(text: str) -> tuple[int, int]:
     Raises:
         RunError: It is not written so, or K is not 1 to N.
     """
-    if not (match := re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)) or not 1 <= int(
-        match[1]
-    ) <= int(match[2]):
+    match = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
+    shard, shards = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not 1 <= shard <= shards:
         raise RunError(f"--shard is '{text}'", "write K/N with K from 1 to N, e.g. 3/64")
-    return int(match[1]), int(match[2])
+    return shard, shards
 
 
-def finish(
-    make: Callable[..., list[RunResult]],
+def make_and_show(
+    make_runs: Callable[..., list[RunResult]],
     results: Path,
     jobs: int,
     protocol: str,
     yes: bool,
     pictures: Sequence[str] = (),
 ) -> None:
-    """Make runs, show them, and exit with 3 if some failed, were lost or cannot be made, or lack a requested map."""
-    from dynslam_bench.segmentation.build_segmenter import NetworkNotFetched
-    from dynslam_bench.segmentation.networks.checkpoints import fetch_checkpoint
+    """Make runs, show them with their files and what is to be said of them, and end with the exit code.
+
+    Args:
+        make_runs: A function of `api` that makes the runs; it takes the callbacks of `WatchedRuns`.
+        results: The results folder.
+        jobs: Runs at a time.
+        protocol: How their errors are evaluated.
+        yes: Download the network for masks without asking.
+        pictures: Names of the files, maps included, that were asked for beside each run.
+
+    Raises:
+        Exit: With 1 if none of the runs can be made; with 3 if some failed, were lost, cannot be
+            made, or lack a requested map.
+    """
     from dynslam_bench.slam.map_files import MAP_FILE
 
     store = runs.RunStore(results)
     watched = WatchedRuns(store, jobs, protocol)
-    try:
-        made = watched.make(make)
-    except NetworkNotFetched as error:  # raised before the first run
-        if not (yes or confirm_fetch(error.checkpoint)):
-            raise
-        fetch_checkpoint(error.checkpoint)
-        made = watched.make(make)
+    made = make_with_network(watched, make_runs, yes)
     if watched.faults and not made:
         raise typer.Exit(1)
     if not made:
         present([], "this part of the suite holds no runs")
         return
+
     rows = show_runs((run.record for run in made), store, protocol, watched.reused)
-    missing = show_files(rows, store, pictures)
+    missing_files = show_files(rows, store, pictures)
+    show_cautions(rows, watched)
+    note(f"{len(rows)} runs in {store.root}; report them with: dynslam-bench report {results}")
+
+    not_ok = any(row["status"] != "ok" for row in rows)
+    if watched.faults or MAP_FILE in missing_files or not_ok:
+        raise typer.Exit(SOME_RUNS_FAILED)
+
+
+def make_with_network(
+    watched: WatchedRuns, make_runs: Callable[..., list[RunResult]], yes: bool
+) -> list[RunResult]:
+    """Make runs; if the network for their masks is not here, download it on consent, and make them then.
+
+    Raises:
+        NetworkNotFetched: The user did not agree to the download, or cannot be asked.
+    """
+    from dynslam_bench.segmentation.build_segmenter import NetworkNotFetched
+    from dynslam_bench.segmentation.networks.checkpoints import fetch_checkpoint
+
+    try:
+        return watched.make(make_runs)
+    except NetworkNotFetched as error:  # raised before the first run
+        if not (yes or confirm_fetch(error.checkpoint)):
+            raise
+        fetch_checkpoint(error.checkpoint)
+        return watched.make(make_runs)
+
+
+def show_cautions(rows: Sequence[dict[str, Any]], watched: WatchedRuns) -> None:
+    """Say below the table: scenes of the network's training, a missing ground truth, faults of a recording."""
     if caution := training_scene_note(rows):
         note(caution)
-    unscored = (
-        row for row in rows if row["status"] in ("ok", "lost") and row["ate_rmse_m"] is None
-    )
-    if (first := next(unscored, None)) and not store.read_whole(
-        first["run_id"]
-    ).sequence.ground_truth:
-        path = store.folder(first["run_id"]) / "trajectory_online.txt"
-        announce(
-            f"{first['sequence']} has no ground truth, so nothing is scored; the estimated trajectory: {path}"
-        )
+    if missing_truth := no_truth_note(rows, watched.store):
+        announce(missing_truth)
+    # the check of a recording takes seconds, and `announce` writes nothing with --json
     if not json_mode() and (fault := recording_note(watched.opened, rows)):
         announce(fault)
-    note(f"{len(rows)} runs in {store.root}; report them with: dynslam-bench report {results}")
-    if watched.faults or MAP_FILE in missing or any(row["status"] != "ok" for row in rows):
-        raise typer.Exit(SOME_RUNS_FAILED)
+
+
+def no_truth_note(rows: Sequence[dict[str, Any]], store: runs.RunStore) -> str:
+    """One line on the first run that tracked but has no error, if its sequence has no ground truth; else empty."""
+    tracked = (row for row in rows if row["status"] in ("ok", "lost"))
+    first = next((row for row in tracked if row["ate_rmse_m"] is None), None)
+    if first is None or store.read_whole(first["run_id"]).sequence.ground_truth:
+        return ""
+    path = store.folder(first["run_id"]) / "trajectory_online.txt"
+    return f"{first['sequence']} has no ground truth, so nothing is scored; the estimated trajectory: {path}"
 
 
 def confirm_fetch(checkpoint: Checkpoint) -> bool:
@@ -410,36 +448,40 @@ class WatchedRuns:
         self.opened: dict[str, tuple[str, str | None, str | None]] = {}
         self.reused: set[str] = set()
         self.faults: set[str] = set()
+        # finished runs, and of running ones the share of their frames that is done
         self._done = 0.0
         self._shares: dict[str, float] = {}
 
-    def make(self, make: Callable[..., list[RunResult]]) -> list[RunResult]:
+    def make(self, make_runs: Callable[..., list[RunResult]]) -> list[RunResult]:
         """Call a function of `api` that makes runs, with a progress bar."""
         with progress("runs") as self._advance:
             self._advance(0, None, "opening sequences")
-            return make(on_plan=self._plan, on_event=self._event, on_fault=self._fault)
+            return make_runs(on_plan=self._plan, on_event=self._event, on_fault=self._fault)
 
     def _plan(self, plan: runs.Plan) -> None:
         announce(describe_plan(plan, self.store, self.jobs, self.protocol))
 
     def _event(self, event: runs.RunEvent) -> None:
+        """Count a run that has ended as 1, one that goes on as the share of its frames."""
         before = self._shares.pop(event.run_id, 0.0)
         if event.record is not None:
-            self.opened[event.record.run_id] = (
-                event.spec.sequence,
-                event.spec.data_root,
-                event.spec.camera,
-            )
             self._done += 1.0 - before
-            if event.kind == "reused":
-                self.reused.add(event.record.run_id)
-            note(event.record.describe() + (" (stored)" if event.kind == "reused" else ""))
+            self._ended(event, event.record)
         elif event.partial is not None:
-            self._shares[event.run_id] = event.partial["frames_done"] / max(
-                event.partial["frames"], 1
-            )
-            self._done += self._shares[event.run_id] - before
+            share = event.partial["frames_done"] / max(event.partial["frames"], 1)
+            self._shares[event.run_id] = share
+            self._done += share - before
         self._advance(self._done, event.total, event_text(event))
+
+    def _ended(self, event: runs.RunEvent, record: runs.RunRecord) -> None:
+        """Remember what a run was asked to open and whether it was stored, and write a line on it."""
+        spec = event.spec
+        self.opened[record.run_id] = (spec.sequence, spec.data_root, spec.camera)
+        line = record.describe()
+        if event.kind == "reused":
+            self.reused.add(record.run_id)
+            line += " (stored)"
+        note(line)
 
     def _fault(self, _: runs.RunSpec, error: DynslamError) -> None:
         if str(error) not in self.faults:
@@ -456,18 +498,24 @@ def event_text(event: runs.RunEvent) -> str:
     frames = event.partial["frames"]
     if done < frames:
         return f"{text}, frame {done} of {frames}"
-    return f"{text}, writing {', '.join(['trajectories', *runs.pictures_asked(event.spec)])}"
+    files = ["trajectories", *runs.pictures_asked(event.spec)]
+    return f"{text}, writing {', '.join(files)}"
 
 
 def describe_plan(plan: runs.Plan, store: runs.RunStore, jobs: int, protocol: str) -> str:
     """How many frames will be tracked, and the expected time by stored runs of the same trackers."""
-    text = f"{plan.runs} run{'s' * (plan.runs != 1)}, {plan.frames.total()} frames"
+    plural = "s" if plan.runs != 1 else ""
+    text = f"{plan.runs} run{plural}, {plan.frames.total()} frames"
+
+    # time of a frame, by tracker, in the runs that are stored
     times_ms = defaultdict[str, list[float]](list)
     for row in runs.list_runs(store, protocol)[0]:
         if row["frame_ms"]:
             times_ms[row["tracker"]].append(row["frame_ms"])
     if not plan.frames.keys() <= times_ms.keys():
         return f"{text}; a system's first run on a machine compiles its code for up to a minute"
+
+    # median time of a frame x frames, over the runs that go on at a time
     expected_ms = sum(frames * median(times_ms[tracker]) for tracker, frames in plan.frames.items())
     seconds = round(expected_ms / min(jobs, plan.runs) / 1000)
     return f"{text}, about {timedelta(seconds=seconds)} by the frame times of stored runs"

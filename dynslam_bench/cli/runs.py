@@ -80,12 +80,14 @@ COLOURS = {
     "invalid": 31,
 }
 """Colours of the statuses on a terminal, as ANSI codes."""
+# Columns that `runs list` sorts by, and the names of those in a row that differ (see `run_row`).
 SORTED_BY = ("started", "tracker", "sequence", "status", "ate", "ms", "coverage")
 _SORT_KEYS = {"ate": "ate_rmse_m", "ms": "frame_ms"}
 _ID_DIGITS = 8
 """Digits of an id that a terminal shows at least; runs of one request share their first twelve."""
 _NAME_WIDTH = 24
 """Characters that a sequence keeps on a terminal, so that rendered ones are told apart."""
+# The folders of a path in a setting's value: `file=/data/maps/a.npz` is shown as `file=a.npz`.
 _FOLDERS = re.compile(r"(?<==)(\w+:)?(?:~|\.{0,2})/(?:[^,/]*/)*")
 
 app = typer.Typer(help="Stored runs.", no_args_is_help=True)
@@ -143,13 +145,12 @@ def list_(
         and (tracker or "") in row["tracker"]
         and (sequence or "") in row["sequence"]
     ]
+    # runs without a value come last, in either direction
     key = _SORT_KEYS.get(column, column)
-    valued = sorted(
-        (row for row in chosen if row[key] is not None),
-        key=itemgetter(key),
-        reverse=sort.startswith("-"),
-    )
-    show_rows(valued + [row for row in chosen if row[key] is None], store, protocol)
+    with_value = [row for row in chosen if row[key] is not None]
+    without_value = [row for row in chosen if row[key] is None]
+    with_value.sort(key=itemgetter(key), reverse=sort.startswith("-"))
+    show_rows(with_value + without_value, store, protocol)
     for file in unreadable:
         warn(f"unreadable: {file.path}: {file.reason}")
 
@@ -168,13 +169,16 @@ def show(
     record = store.read(run)
     metrics = store.score(record, protocol)
     lines = [fields(run_facts(store, record))]
+
+    # how long each stage of a frame took
     if record.timings:
-        stages = record.timings.items()
         rows = [
             (name, 1000 * stage.median_s, 1000 * stage.p95_s, 1000 * stage.mean_s)
-            for name, stage in stages
+            for name, stage in record.timings.items()
         ]
         lines += ["", table(("stage", "median ms", "p95 ms", "mean ms"), rows)]
+
+    # the errors of both trajectories
     for which, evaluation in (("online", metrics.online), ("final", metrics.final)):
         if evaluation is None:
             lines += ["", f"{which}: {metrics.reasons.get(which, 'not evaluated')}"]
@@ -200,11 +204,11 @@ def rescore(
         outcomes = stored.rescore(stored.open_store(results), protocol, on_progress=advance)
     lines = []
     for outcome in outcomes:
-        changed = f": {', '.join(outcome.changed)}" if outcome.changed else ""
-        count = f"{len(outcome.changed)} with other errors than stored{changed}"
-        lines.append(
-            f"{outcome.protocol}: {outcome.runs} run{'s' * (outcome.runs != 1)} scored, {count}"
-        )
+        changed = f"{len(outcome.changed)} with other errors than stored"
+        if outcome.changed:
+            changed += f": {', '.join(outcome.changed)}"
+        plural = "s" if outcome.runs != 1 else ""
+        lines.append(f"{outcome.protocol}: {outcome.runs} run{plural} scored, {changed}")
     present(outcomes, *lines)
     for reason in outcomes[0].unreadable if outcomes else ():
         announce(f"unreadable: {reason}")
@@ -329,12 +333,11 @@ def push(
 
 
 def show_merged(merged: Merged, target: str) -> None:
-    """What was copied into a store; exit with 3 if something was left out."""
-    counts = f"{len(merged.stored)} were there already, {len(merged.left_out)} left out"
-    present(
-        merged,
-        f"{len(merged.added)} run{'s' * (len(merged.added) != 1)} copied to {target}, {counts}",
-    )
+    """Show what was copied into a store; exit with 3 if something was left out."""
+    plural = "s" if len(merged.added) != 1 else ""
+    copied = f"{len(merged.added)} run{plural} copied to {target}"
+    others = f"{len(merged.stored)} were there already, {len(merged.left_out)} left out"
+    present(merged, f"{copied}, {others}")
     for entry in merged.left_out:
         warn(f"left out {entry.path}: {entry.reason}")
     if merged.left_out:
@@ -343,12 +346,11 @@ def show_merged(merged: Merged, target: str) -> None:
 
 def run_facts(store: stored.RunStore, record: stored.RunRecord) -> dict[str, Any]:
     """The facts of a run by name; empty values are not shown."""
+    identity = "unverified: its id does not tell the contents of data and code"
     return {
         "run": record.run_id,
         "folder": store.place(record.run_id),
-        "identity": ""
-        if record.verified
-        else "unverified: its id does not tell the contents of data and code",
+        "identity": "" if record.verified else identity,
         "status": record.status,
         "reason": record.reason,
         "tracker": f"{record.tracker.label} [{record.tracker.id}, {record.tracker.provenance}]",
@@ -382,24 +384,27 @@ def show_runs(
     protocol: str,
     reused: Collection[str] = (),
 ) -> list[dict[str, Any]]:
-    """A table, or JSON, of runs with their errors under a protocol; runs in `reused` are marked as from the store.
+    """Show runs with their errors under a protocol, as a table or JSON.
+
+    Args:
+        records: The runs.
+        store: Where they are stored.
+        protocol: How their errors are evaluated.
+        reused: Ids of the runs that are marked as taken from the store.
 
     Returns:
         The table's rows, see `run_row`.
     """
-    rows = [
-        stored.run_row(
-            record, None if record.status == "stopped" else store.score(record, protocol)
-        )
-        | {"from_store": record.run_id in reused}
-        for record in records
-    ]
+    rows = []
+    for record in records:
+        metrics = None if record.status == "stopped" else store.score(record, protocol)
+        rows.append(stored.run_row(record, metrics) | {"from_store": record.run_id in reused})
     show_rows(rows, store, protocol)
     return rows
 
 
 def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: str) -> None:
-    """The same for rows that `list_runs` gave; the table has the columns in which a run has a value."""
+    """Show rows as `list_runs` gives them, as a table or JSON; the table has the columns in which a run has a value."""
     if json_mode():
         present(
             [row | {"protocol": protocol, "folder": store.place(row["run_id"])} for row in rows]
@@ -410,29 +415,39 @@ def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: 
         for title, name in COLUMNS.items()
         if any(row.get(name) not in (None, "") and row[name] is not False for row in rows)
     }
+    # a terminal gets short ids, and a pipe whole ones
     shown = list(rows)
     if sys.stdout.isatty():
         short = short_ids([*store.ids(), *(row["run_id"] for row in rows)])
         shown = [row | {"run_id": short[row["run_id"]]} for row in rows]
     cells = [[shown_cell(name, row[name]) for name in columns.values()] for row in shown]
     write(table(list(columns), cells, least=_NAME_WIDTH), colours=COLOURS)
-    ended = Counter(row["status"] for row in rows if row["status"] != "ok")
-    if ended:
-        write(
-            f"{ended.total()} of {len(rows)} runs are not ok: {', '.join(f'{n} {s}' for s, n in ended.items())}."
-        )
-    moving = (row for row in rows if row["false_motion_max_m"] is None)
-    pairs = ((row["ate_rmse_m"], row["static_camera_ate_rmse_m"]) for row in moving)
-    worse = sum(None not in pair and pair[0] > (1 + 1e-9) * pair[1] for pair in pairs)
+    for line in summary_lines(rows):
+        write(line)
+    show_remarks(rows)
+
+
+def summary_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """What stands below a table of runs: how many are not ok, or worse than a static camera; what the ATE is of."""
+    lines = []
+    counts = Counter(row["status"] for row in rows if row["status"] != "ok")
+    if counts:
+        statuses = ", ".join(f"{count} {status}" for status, count in counts.items())
+        lines.append(f"{counts.total()} of {len(rows)} runs are not ok: {statuses}.")
+
+    # false motion is measured where the true camera stands still: no bound there
+    moving = [row for row in rows if row["false_motion_max_m"] is None]
+    errors = [(row["ate_rmse_m"], row["static_camera_ate_rmse_m"]) for row in moving]
+    worse = sum(None not in pair and pair[0] > (1 + 1e-9) * pair[1] for pair in errors)
     if worse:
-        write(f"{worse} of {len(rows)} runs are worse than a static camera.")
-    if any(
-        None not in (row["ate_rmse_m"], row["coverage"]) and row["coverage"] < 1 for row in rows
-    ):
-        write(
+        lines.append(f"{worse} of {len(rows)} runs are worse than a static camera.")
+
+    scored = [row for row in rows if None not in (row["ate_rmse_m"], row["coverage"])]
+    if any(row["coverage"] < 1 for row in scored):
+        lines.append(
             "ATE: of the tracked frames alone; static camera: of all. A report uses hold-last-pose."
         )
-    show_remarks(rows)
+    return lines
 
 
 def show_remarks(rows: Sequence[dict[str, Any]]) -> None:
@@ -445,22 +460,24 @@ def show_remarks(rows: Sequence[dict[str, Any]]) -> None:
             runs_by_remark[remark].append(row)
     for remark, (first, *others) in list(runs_by_remark.items())[:MOST_REMARKS]:
         kind, _, text = remark.partition(": ")
-        more = f" and {len(others)} more run{'s' * (len(others) != 1)}" if others else ""
-        write(f"{kind}: {label_text(first['tracker'])} on {first['sequence']}{more}: {text}")
-    if len(runs_by_remark) > MOST_REMARKS:
-        write(
-            f"{len(runs_by_remark) - MOST_REMARKS} more such lines: `dynslam-bench runs show RUN` has those of a run."
-        )
+        subject = f"{label_text(first['tracker'])} on {first['sequence']}"
+        if others:
+            plural = "s" if len(others) != 1 else ""
+            subject += f" and {len(others)} more run{plural}"
+        write(f"{kind}: {subject}: {text}")
+    more = len(runs_by_remark) - MOST_REMARKS
+    if more > 0:
+        write(f"{more} more such lines: `dynslam-bench runs show RUN` has those of a run.")
 
 
 def short_ids(run_ids: Iterable[str]) -> dict[str, str]:
     """The first digits of each id: as many as no other id begins with, and at least `_ID_DIGITS`."""
     ordered = sorted(set(run_ids))
     digits = dict.fromkeys(ordered, _ID_DIGITS)
+    # of sorted ids, an id shares most digits with a neighbour
     for run_id, following in pairwise(ordered):
-        shared = next(
-            at for at in range(len(following) + 1) if run_id[: at + 1] != following[: at + 1]
-        )
+        lengths = range(len(following) + 1)
+        shared = next(at for at in lengths if run_id[: at + 1] != following[: at + 1])
         digits[run_id] = max(digits[run_id], shared + 1)
         digits[following] = max(digits[following], shared + 1)
     return {run_id: run_id[:count] for run_id, count in digits.items()}
@@ -485,14 +502,15 @@ def show_files(
     statuses = {row["run_id"]: row["status"] for row in rows}
     for (run_id, status), name in product(statuses.items(), names):
         path = store.folder(run_id) / name
-        if not path.is_file():
-            missing.add(name)
-            reasons = [
-                text for text in store.read_whole(run_id).notes if text.startswith(f"no {name}")
-            ]
-            warn(f"{[*reasons, f'no {name}: the run ended early, {status}'][0]} ({run_id})")
-        elif not json_mode():
-            write(str(path))
+        if path.is_file():
+            if not json_mode():
+                write(str(path))
+            continue
+        missing.add(name)
+        notes = store.read_whole(run_id).notes
+        stated = (text for text in notes if text.startswith(f"no {name}"))
+        reason = next(stated, f"no {name}: the run ended early, {status}")
+        warn(f"{reason} ({run_id})")
     return missing
 
 
@@ -501,10 +519,11 @@ def training_scene_note(rows: Sequence[dict[str, Any]]) -> str:
     ids = [row["sequence"] for row in rows if row["seen_in_training"]]
     if not ids:
         return ""
+    base = ids[0].partition("?")[0].partition("@")[0]
     return (
         f"{len(ids)} of {len(rows)} runs have masks of a network that was trained on their scene, the first on "
         f"{ids[0]}: a best case, which reports mark and do not rank; scenes 100-199 are held out, e.g. "
-        f"{ids[0].partition('?')[0].partition('@')[0]}?scene=100"
+        f"{base}?scene=100"
     )
 
 
@@ -523,15 +542,22 @@ def recording_note(
 
     for row in rows:
         sequence, data_root, camera = opened[row["run_id"]]
-        error = row["ate_rmse_m"]
-        bound = row["static_camera_ate_rmse_m"]
-        may_move = row["tracker"] != "never-move" and row["false_motion_max_m"] is None
-        static = may_move and None not in (error, bound) and error >= bound
-        if sequence.startswith("synthetic/") or not (row["status"] != "ok" or static):
+        if sequence.startswith("synthetic/") or not (row["status"] != "ok" or _is_no_better(row)):
             continue
         diagnosis = diagnose(sequence, data_root=data_root, camera=camera, most_frames=HINT_FRAMES)
         if diagnosis.ok:
             return ""
-        how = f"dynslam-bench sequences doctor {sequence}{f' --camera {camera}' if camera else ''}"
-        return f"{row['sequence']} has a fault: {diagnosis.findings[0].text}; more by: {how}"
+        command = f"dynslam-bench sequences doctor {sequence}"
+        if camera:
+            command += f" --camera {camera}"
+        return f"{row['sequence']} has a fault: {diagnosis.findings[0].text}; more by: {command}"
     return ""
+
+
+def _is_no_better(row: Mapping[str, Any]) -> bool:
+    """Whether a tracker that is to follow a moving camera was no better than a static camera."""
+    error = row["ate_rmse_m"]
+    bound = row["static_camera_ate_rmse_m"]
+    if row["tracker"] == "never-move" or row["false_motion_max_m"] is not None:
+        return False
+    return None not in (error, bound) and bool(error >= bound)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from fnmatch import fnmatch
 from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Optional
+from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
@@ -16,6 +18,7 @@ from dynslam_bench.core import SequenceError, did_you_mean, find_data_root
 
 if TYPE_CHECKING:
     from dynslam_bench.sequences.calibration import Quantity
+    from dynslam_bench.sequences.fetch import Verification
 
 app = typer.Typer(help="Find, fetch, check and render sequences.", no_args_is_help=True)
 Name = Annotated[
@@ -44,6 +47,7 @@ def list_(
     tags = sorted({name for summary in everything for name in summary["tags"]})
     if tag is not None and tag not in tags:
         raise SequenceError(f"no sequence has the tag '{tag}'", f"known: {', '.join(tags)}")
+    # `tum/fr3` stands for all below it, too
     patterns = (pattern, f"{pattern.rstrip('/')}/*")
     matches = [
         summary for summary in everything if any(fnmatch(summary["id"], glob) for glob in patterns)
@@ -53,33 +57,38 @@ def list_(
             f"no sequence matches '{pattern}'",
             did_you_mean(pattern, [summary["id"] for summary in everything]),
         )
-    matches = [s for s in matches if (tag is None or tag in s["tags"]) and (s["here"] or not here)]
+    if tag is not None:
+        matches = [summary for summary in matches if tag in summary["tags"]]
+    if here:
+        matches = [summary for summary in matches if summary["here"]]
+
     lines = []
-    for title, members in groupby(matches, key=lambda summary: summary["dataset"]):
-        group = list(members)
-        facts = [
-            f"{len(group)} listed, {sum(s['here'] for s in group)} here",
-            f"licence: {group[0]['license']}",
-        ]
-        facts += (
-            [f"layout: {group[0]['layout']} on the publisher's files"] if group[0]["layout"] else []
-        )
-        facts += [f"by hand: {group[0]['by_hand']}"] if group[0]["by_hand"] else []
-        columns = ("sequence", "here", "size", "tags", "split", "ground truth", "checksum")
-        rows = [
-            (s["id"], s["here"], s["size"], s["tags"], s["split"], s["ground_truth"], s["checksum"])
-            for s in group
-        ]
-        lines += [f"{title} ({'; '.join(facts)})", table(columns, rows), ""]
-    present(
-        matches,
-        *(
-            lines
-            or [
-                f"none of these is here or has the tag; all {len(everything)}: dynslam-bench sequences list"
-            ]
-        ),
-    )
+    for dataset, members in groupby(matches, key=itemgetter("dataset")):
+        lines += dataset_lines(dataset, list(members))
+    if not lines:
+        command = "dynslam-bench sequences list"
+        lines = [f"none of these is here or has the tag; all {len(everything)}: {command}"]
+    present(matches, *lines)
+
+
+def dataset_lines(dataset: str, summaries: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A heading with what a dataset's sequences share, their table, and an empty line.
+
+    Args:
+        dataset: The dataset's title.
+        summaries: Its sequences, as `catalogue.summaries` describes them; at least one.
+    """
+    first = summaries[0]
+    here = sum(summary["here"] for summary in summaries)
+    facts = [f"{len(summaries)} listed, {here} here", f"licence: {first['license']}"]
+    if first["layout"]:
+        facts.append(f"layout: {first['layout']} on the publisher's files")
+    if first["by_hand"]:
+        facts.append(f"by hand: {first['by_hand']}")
+    columns = ("sequence", "here", "size", "tags", "split", "ground truth", "checksum")
+    keys = ("id", "here", "size", "tags", "split", "ground_truth", "checksum")
+    rows = [[summary[key] for key in keys] for summary in summaries]
+    return [f"{dataset} ({'; '.join(facts)})", table(columns, rows), ""]
 
 
 @app.command()
@@ -117,9 +126,9 @@ def fetch(
     from dynslam_bench.sequences.fetch import fetch as fetch_one
 
     for name in expand(names):
-        new = status(name, data_root=data_root) is None
+        is_new = status(name, data_root=data_root) is None
         with progress(name, unit="bytes") as advance:
-            place = fetch_one(
+            folder = fetch_one(
                 name,
                 data_root=data_root,
                 progress=lambda state, advance=advance: advance(state.done, state.total),  # type: ignore[misc]
@@ -127,8 +136,11 @@ def fetch(
                 keep_archive=keep_archive,
                 url=url,
             )
-        write(str(place))
-        if new and not (receipt := Receipt.read(place / RECEIPT)).checked:
+        write(str(folder))
+        if not is_new:
+            continue
+        receipt = Receipt.read(folder / RECEIPT)
+        if not receipt.checked:
             warn(
                 f"warning: no checksum of {name} is published; that of this archive is {receipt.sha256}, "
                 "and the next fetch from there has to have the same"
@@ -154,19 +166,24 @@ def verify(
         with progress(name) as advance:
             report = verify_one(name, data_root=data_root, camera=camera, progress=advance)
         reports.append(report)
-        verdict = (
-            "ok" if report.ok else f"{len(report.faults)} fault{'s' * (len(report.faults) != 1)}"
-        )
-        how = (
-            "every file as fetched"
-            if report.manifest
-            else "not fetched by this program, frames decoded only"
-        )
-        lines.append(f"{report.id}: {verdict}, {report.frames} frames, {how}")
-        lines += [f"  {report.dropped}"] if report.dropped else []
-        lines += [f"  {fault}" for fault in report.faults]
+        lines += verification_lines(report)
     facts = [{**asdict(report), "ok": report.ok} for report in reports]
     present(facts, *lines, verified=all(report.ok for report in reports))
+
+
+def verification_lines(report: Verification) -> list[str]:
+    """The verdict on a sequence's files, then the what was not used on opening, and each fault."""
+    verdict = "ok"
+    if not report.ok:
+        plural = "s" if len(report.faults) != 1 else ""
+        verdict = f"{len(report.faults)} fault{plural}"
+    compared = "not fetched by this program, frames decoded only"
+    if report.manifest:
+        compared = "every file as fetched"
+    lines = [f"{report.id}: {verdict}, {report.frames} frames, {compared}"]
+    if report.dropped:
+        lines.append(f"  {report.dropped}")
+    return lines + [f"  {fault}" for fault in report.faults]
 
 
 @app.command()
@@ -181,12 +198,12 @@ def doctor(
 
     with progress(name) as advance:
         diagnosis = diagnose(name, data_root=data_root, camera=camera, progress=advance)
-    present(
-        {**asdict(diagnosis), "ok": diagnosis.ok, "verdict": diagnosis.verdict},
-        *(f"{f.severity} {f.id}: {f.text}\n  cure: {f.cure}" for f in diagnosis.findings),
-        f"{diagnosis.id}: {diagnosis.frames} frames compared, {diagnosis.verdict}",
-        verified=diagnosis.ok,
-    )
+    facts = {**asdict(diagnosis), "ok": diagnosis.ok, "verdict": diagnosis.verdict}
+    lines = []
+    for finding in diagnosis.findings:
+        lines += [f"{finding.severity} {finding.id}: {finding.text}", f"  cure: {finding.cure}"]
+    lines.append(f"{diagnosis.id}: {diagnosis.frames} frames compared, {diagnosis.verdict}")
+    present(facts, *lines, verified=diagnosis.ok)
 
 
 @app.command()
@@ -253,12 +270,10 @@ def compose(
     from dynslam_bench.sequences import open_sequence
     from dynslam_bench.sequences.compose import compose as paste
 
-    opened = (
-        open_sequence(host, data_root=data_root, frames=frames),
-        open_sequence(people, data_root=data_root),
-    )
+    background = open_sequence(host, data_root=data_root, frames=frames)
+    foreground = open_sequence(people, data_root=data_root)
     with progress(str(folder)) as advance:
-        made = paste(*opened, folder, instance, progress=advance)
+        made = paste(background, foreground, folder, instance, progress=advance)
     average = f"{100 * made.share:.0f} % of the pixels on average"
     largest = f"{100 * made.largest_share:.0f} % at most"
     present(
@@ -289,24 +304,26 @@ def calibrate(
     sequence = open_sequence(name, data_root=data_root, camera=camera, frames=frames)
     with progress(name) as advance:
         result = measure(sequence, progress=advance)
-    written = result.measured and output is not None
-    if output is not None and written:
-        write_camera(output, result.camera, fps=sequence.fps)
-    present(
-        {**asdict(result), "file": output if written else None},
-        table(
-            ("quantity", "estimate", "95 % interval", "camera.toml", "why"),
-            [_calibrated(quantity) for quantity in result.quantities],
-        ),
-        f"{result.windows} windows of {result.frames} frames, keypoints to {result.pixel_noise:.2f} px",
-        *([str(output)] if written else []),
-    )
-    if output is not None and not written:
+    written = output if result.measured else None
+    if written is not None:
+        write_camera(written, result.camera, fps=sequence.fps)
+
+    columns = ("quantity", "estimate", "95 % interval", "camera.toml", "why")
+    data = f"{result.windows} windows of {result.frames} frames"
+    lines = [
+        table(columns, [_quantity_row(quantity) for quantity in result.quantities]),
+        f"{data}, keypoints to {result.pixel_noise:.2f} px",
+    ]
+    if written is not None:
+        lines.append(str(written))
+    present({**asdict(result), "file": written}, *lines)
+    if output is not None and written is None:
         note(f"nothing to write: {output} is left alone")
 
 
-def _calibrated(quantity: Quantity) -> tuple[str, ...]:
-    """A row of the table of `calibrate`."""
+def _quantity_row(quantity: Quantity) -> tuple[str, ...]:
+    """A row of the table of `calibrate`: name, estimate, interval, what the file gets, and why."""
+    # times are measured in seconds and shown in milliseconds
     scale, unit = (1.0, "a metre") if quantity.name == "depth_factor" else (1e3, "ms")
     value = "" if quantity.value is None else f"{scale * quantity.value:.4g} {unit}"
     limits = [

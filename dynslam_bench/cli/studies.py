@@ -55,10 +55,9 @@ def space(
     preview = plan.preview(jobs)
 
     rows = [(p.name, range_text(p), plan.base[p.name], p.unit, p.meaning) for p in plan.space]
-    shown = table(("setting", "range", "baseline", "unit", "meaning"), rows)
-    present(
-        {"settings": plan.space, "preview": preview}, shown, "", *preview.figures, *preview.proposal
-    )
+    settings = table(("setting", "range", "baseline", "unit", "meaning"), rows)
+    lines = [settings, "", *preview.figures, *preview.proposal]
+    present({"settings": plan.space, "preview": preview}, *lines)
 
 
 @app.command()
@@ -91,6 +90,7 @@ def extend(
 
 
 def _tune(study: Path, results: Path, jobs: int, **how: Any) -> None:
+    """Run or continue a study with a progress bar, and show its conclusion; for `how` see `api.tune`."""
     from dynslam_bench.api import tune
 
     spec = tuning.read_study(study)
@@ -135,6 +135,8 @@ def status(study: Study, results: Results = Path("results"), as_json: AsJson = F
     facts["running_trials"] = [
         f"{number} ({state})" for number, state in Heartbeats(stored.study).running().items()
     ]
+
+    # the best settings: of the conclusion if there is one, else of the trial with the best values
     settings: dict[str, Any] = {}
     summary = stored.folder / "summary.json"
     conclusion = tuning.StudySummary.read(summary) if summary.is_file() else None
@@ -143,10 +145,9 @@ def status(study: Study, results: Results = Path("results"), as_json: AsJson = F
         settings = conclusion.best.params
     else:
         for trial in best_trials(stored.study, 1):
-            facts |= {
-                "best_trial": trial.number,
-                "best_ratios": [math.exp(value) for value in trial.values],
-            }
+            # values are natural logarithms of ratios to the baseline
+            ratios = [math.exp(value) for value in trial.values]
+            facts |= {"best_trial": trial.number, "best_ratios": ratios}
             settings = trial.params
     lines = ["", table(("setting", "value"), list(settings.items()))] if settings else []
     present(facts | {"best_settings": settings}, fields(facts), *lines)
@@ -181,7 +182,8 @@ class StudyBar:
         self._advance = advance
         self._runs = 0
         self._part = "baseline"
-        self._at = (0.0, None)
+        self._done = 0.0
+        self._total: float | None = None
 
     def event(self, event: tuning.StudyEvent) -> None:
         """A trial has started or finished, or the study has begun another part."""
@@ -200,23 +202,27 @@ class StudyBar:
     def run(self, event: RunEvent) -> None:
         """A run has started, progressed or finished."""
         self._runs += event.kind == "finished"
-        self._advance(
-            *self._at,
-            f"{self._part}, {self._runs} run{'s' * (self._runs != 1)} made: {event_text(event)}",
-        )
+        plural = "s" if self._runs != 1 else ""
+        step = f"{self._part}, {self._runs} run{plural} made: {event_text(event)}"
+        self._advance(self._done, self._total, step)
 
-    def _begin(self, part: str, done: float, total: Any) -> None:
+    def _begin(self, part: str, done: float, total: float | None) -> None:
+        """Show a part of the study, with how much of it is done; a total of None is unknown."""
         self._part = part
-        self._at = (done, total)
+        self._done = done
+        self._total = total
         self._advance(done, total, part)
 
 
 def show_summary(tuner: tuning.Study, summary: tuning.StudySummary, page: Path) -> None:
-    """The conclusion, the best settings and the paths of page and preset."""
+    """Show the conclusion, the best settings and the paths of page and preset."""
     from dynslam_bench.tuning.plan import seen_note
 
     preset = tuner.folder / "best.toml"
-    lines = [summary.conclusion, *filter(None, [seen_note(summary.seen)]), ""]
+    lines = [summary.conclusion]
+    if caution := seen_note(summary.seen):
+        lines.append(caution)
+    lines.append("")
     if summary.best is not None:
         lines += [table(("setting", "value"), list(summary.best.params.items())), ""]
     lines.append(f"preset: {preset}\npage:   {page}")

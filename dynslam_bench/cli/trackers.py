@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from textwrap import shorten
@@ -55,15 +56,15 @@ def list_(as_json: AsJson = False) -> None:
     ]
     lines = []
     for kind, families in tracker_groups().items():
-        lines += [f"{kind}:"] if families else []
+        if families:
+            lines.append(f"{kind}:")
         for spec, *variants in families:
-            lines.append(
-                f"  {spec.id:18} {spec.label}{'' if spec.missing() == [] else ' (not installed)'}"
-            )
+            missing = "" if spec.missing() == [] else " (not installed)"
+            lines.append(f"  {spec.id:18} {spec.label}{missing}")
             if variants:
-                lines.append(
-                    f"  {'':18} {'  '.join(variant.id.removeprefix(spec.id) for variant in variants)}"
-                )
+                # `?masks=none` of `emfoa-oft?masks=none`
+                endings = "  ".join(variant.id.removeprefix(spec.id) for variant in variants)
+                lines.append(f"  {'':18} {endings}")
     present(rows, *lines)
 
 
@@ -75,15 +76,12 @@ def info(tracker: Tracker, as_json: AsJson = False) -> None:
     from dynslam_bench.trackers import TRACKERS
 
     spec = TRACKERS.get(tracker)
-    reported = _published(spec)
+    reported = _reported_numbers(spec)
     defaults = flatten(spec.settings())
+    # settings that a study tunes, then those that only an agent changes at a frame
     shown = parameters(spec.settings)
-    shown += [
-        parameter
-        for parameter in parameters(spec.settings, online_only=True)
-        if not parameter.tunable
-    ]
-    described = {parameter.name: asdict(parameter) for parameter in shown}
+    online = parameters(spec.settings, online_only=True)
+    shown += [parameter for parameter in online if not parameter.tunable]
     facts: dict[str, Any] = {
         "id": spec.id,
         "label": spec.label,
@@ -103,82 +101,66 @@ def info(tracker: Tracker, as_json: AsJson = False) -> None:
         "assumptions": spec.assumptions,
         "remarks": spec.remarks,
         "settings": defaults,
-        "parameters": [
-            {"name": name, "default": default, "tunable": False, "online": False}
-            | described.get(name, {})
-            for name, default in defaults.items()
-        ],
+        "parameters": _all_parameters(defaults, shown),
         "reported": reported,
     }
+
+    presets = {
+        f"preset {name}": ", ".join(assignments(values)) for name, values in spec.presets.items()
+    }
+    lines = [fields(facts | presets)]
+    if shown:
+        columns = ("setting", "default", "range", "unit", "online", "meaning")
+        rows = [(p.name, p.default, range_text(p), p.unit, p.online, p.meaning) for p in shown]
+        lines.append(table(columns, rows))
     fixed = len(defaults) - len(shown)
-    sources = [
-        f"{source} ({count})"
-        for source, count in Counter(row["source"] for row in reported).items()
-    ]
-    rows = [(p.name, p.default, range_text(p), p.unit, p.online, p.meaning) for p in shown]
-    present(
-        facts | details,
-        fields(
-            facts
-            | {
-                f"preset {name}": ", ".join(assignments(values))
-                for name, values in spec.presets.items()
-            }
-        ),
-        *(
-            [table(("setting", "default", "range", "unit", "online", "meaning"), rows)]
-            if rows
-            else []
-        ),
-        *([f"and {fixed} more settings that no study tunes: see --json"] if fixed else []),
-        *(
-            [wrapped(f"numbers reported in: {', '.join(sources)}; --json lists them")]
-            if sources
-            else []
-        ),
-    )
+    if fixed:
+        lines.append(f"and {fixed} more settings that no study tunes: see --json")
+    if reported:
+        counts = Counter(row["source"] for row in reported)
+        sources = ", ".join(f"{source} ({count})" for source, count in counts.items())
+        lines.append(wrapped(f"numbers reported in: {sources}; --json lists them"))
+    present(facts | details, *lines)
+
+
+def _all_parameters(
+    defaults: Mapping[str, Any], described: Sequence[Parameter]
+) -> list[dict[str, Any]]:
+    """All settings for JSON: with range, unit and meaning if they are described, else with their default alone."""
+    descriptions = {parameter.name: asdict(parameter) for parameter in described}
+    rows = []
+    for name, default in defaults.items():
+        row = {"name": name, "default": default, "tunable": False, "online": False}
+        rows.append(row | descriptions.get(name, {}))
+    return rows
 
 
 def range_text(parameter: Parameter) -> str:
     """The values that a study may give a setting."""
     if parameter.choices:
         return shorten(", ".join(map(str, parameter.choices)), 50, placeholder=" ...")
-    return f"{parameter.low:g} to {parameter.high:g}{' (log)' if parameter.scale == 'log' else ''}"
+    scale = " (log)" if parameter.scale == "log" else ""
+    return f"{parameter.low:g} to {parameter.high:g}{scale}"
 
 
-def _published(spec: TrackerSpec) -> list[dict[str, Any]]:
+def _reported_numbers(spec: TrackerSpec) -> list[dict[str, Any]]:
     """The reported numbers of a system: those of its spec, of publications, and the claims of the paper."""
     from dynslam_bench.reports.model.published import CLAIMED, claimed_results, published
 
-    stated = [
-        (name, metric, value, "its spec", "")
-        for name, row in spec.reported.items()
-        for metric, value in row.items()
-    ]
-    measured = [
-        (
-            p.sequence,
-            p.metric,
-            p.value,
-            p.source,
-            "; ".join(str(text) for text in (p.alignment, p.remarks) if text),
-        )
-        for p in published().itertuples()
-        if p.system in spec.published_as
-    ]
-    paper = [
-        (
-            c.sequence,
-            c.quantity,
-            c.value,
-            f"EMFOA-OFT-SLAM, table {c.table}",
-            f"{CLAIMED}: see 'report audit-paper'",
-        )
-        for c in claimed_results().itertuples()
-        if c.system in spec.published_as and c.kind == "value"
-    ]
+    rows: list[tuple[Any, ...]] = []
+    for sequence, values in spec.reported.items():
+        rows += [(sequence, metric, value, "its spec", "") for metric, value in values.items()]
+    for number in published().itertuples():
+        if number.system in spec.published_as:
+            remarks = "; ".join(str(text) for text in (number.alignment, number.remarks) if text)
+            rows.append((number.sequence, number.metric, number.value, number.source, remarks))
+    for claim in claimed_results().itertuples():
+        if claim.system in spec.published_as and claim.kind == "value":
+            source = f"EMFOA-OFT-SLAM, table {claim.table}"
+            remarks = f"{CLAIMED}: see 'report audit-paper'"
+            rows.append((claim.sequence, claim.quantity, claim.value, source, remarks))
     names = ("sequence", "metric", "value", "source", "remarks")
-    return [dict(zip(names, row, strict=True)) for row in stated + measured + paper]
+    return [dict(zip(names, row, strict=True)) for row in rows]
 
 
 @app.command()
@@ -187,13 +169,8 @@ def doctor(as_json: AsJson = False) -> None:
     from dynslam_bench.testing.installation import unavailable_plugins
 
     plugins = unavailable_plugins()
-    present(
-        plugins,
-        *(
-            [f"{plugin.name}: {plugin.hint}" for plugin in plugins]
-            or ["all plug-ins are available"]
-        ),
-    )
+    lines = [f"{plugin.name}: {plugin.hint}" for plugin in plugins]
+    present(plugins, *(lines or ["all plug-ins are available"]))
 
 
 @app.command()
@@ -215,8 +192,10 @@ def test(
     from dynslam_bench.testing import isolated_tracker_report
 
     def on_check(check: Check) -> None:
-        if not json_mode():
-            write(f"{check.status:8}{check.name}" + (f": {check.message}" if check.message else ""))
+        if json_mode():
+            return
+        message = f": {check.message}" if check.message else ""
+        write(f"{check.status:8}{check.name}{message}")
 
     with progress("checking") as advance:
         report = isolated_tracker_report(

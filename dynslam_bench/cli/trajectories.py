@@ -100,16 +100,13 @@ def list_(as_json: AsJson = False) -> None:
     """List the protocols."""
     from dynslam_bench.evaluation import PROTOCOLS
 
-    present(
-        [{"digest": protocol.digest(), **protocol.model_dump()} for protocol in PROTOCOLS.values()],
-        table(
-            ("id", "digest", "meaning"),
-            [
-                (protocol.id, protocol.digest(), protocol.describe())
-                for protocol in PROTOCOLS.values()
-            ],
-        ),
-    )
+    facts = []
+    rows = []
+    for protocol in PROTOCOLS.values():
+        digest = protocol.digest()
+        facts.append({"digest": digest, **protocol.model_dump()})
+        rows.append((protocol.id, digest, protocol.describe()))
+    present(facts, table(("id", "digest", "meaning"), rows))
 
 
 @protocols.command()
@@ -138,24 +135,19 @@ def compare(
     if published is None:
         present(scores, table(columns, rows), *lines)
         return
+
+    # mark the protocols under which the published error comes out; without any, name the nearest
     marks = [agrees(score, published) for score in scores]
     defined = [score for score in scores if score.rmse_m is not None]
     nearest = min(defined, key=lambda score: abs((score.rmse_m or 0.0) - float(published)))
-    last = (
-        f"No row agrees with {published}; the nearest is {nearest.label}, {nearest.rmse_m:.6f}."
-        * (not any(marks))
-    )
+    if not any(marks):
+        closest = f"the nearest is {nearest.label}, {nearest.rmse_m:.6f}"
+        lines.append(f"No row agrees with {published}; {closest}.")
     columns.insert(2, "published")
-    rows = [
-        [*row[:2], "agrees" if mark else "", *row[2:]]
-        for row, mark in zip(rows, marks, strict=True)
-    ]
-    present(
-        [{**asdict(score), "agrees": mark} for score, mark in zip(scores, marks, strict=True)],
-        table(columns, rows),
-        *lines,
-        *filter(None, [last]),
-    )
+    for row, mark in zip(rows, marks, strict=True):
+        row.insert(2, "agrees" if mark else "")
+    facts = [{**asdict(score), "agrees": mark} for score, mark in zip(scores, marks, strict=True)]
+    present(facts, table(columns, rows), *lines)
 
 
 def import_(
@@ -250,9 +242,9 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write a stored run in a format of other tools, with its provenance beside it."""
-    which: Literal["online", "final"] | None = (
-        None if online is None else ("online" if online else "final")
-    )
+    which: Literal["online", "final"] | None = None
+    if online is not None:
+        which = "online" if online else "final"
     exported = runs.export_run(
         run, form, output, results=results, which=which, data_root=data_root, camera=camera
     )

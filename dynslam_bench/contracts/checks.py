@@ -28,6 +28,7 @@ class TrackerContractError(TrackerError):
 
 
 _MARK = "_dynslam_raised_by_tracker"
+"""Attribute of an exception that came out of a tracker's own code."""
 
 
 @contextmanager
@@ -62,10 +63,8 @@ def check_frame(frame: Frame, camera: Camera) -> None:
         raise SequenceError(
             f"frame {frame.index} has depth of type {depth.dtype}", "it must be float32, in metres"
         )
-    if rgb.shape != (camera.height, camera.width, 3) or depth.shape != (
-        camera.height,
-        camera.width,
-    ):
+    size = (camera.height, camera.width)
+    if rgb.shape != (*size, 3) or depth.shape != size:
         raise SequenceError(
             f"frame {frame.index} has colour {rgb.shape} and depth {depth.shape}, "
             f"the camera is {camera.width}x{camera.height}"
@@ -94,6 +93,7 @@ def faults(result: object, frame: Frame) -> Iterator[Fault]:
 
     Lazily, the most basic first: what comes later takes for granted that the earlier is in order.
     """
+    # type, state and pose
     if not isinstance(result, TrackResult):
         yield Fault(
             f"a {type(result).__name__}, not a TrackResult",
@@ -106,26 +106,34 @@ def faults(result: object, frame: Frame) -> Iterator[Fault]:
         yield from _pose_faults(result.T_world_cam)
     elif result.state == "ok":
         yield Fault("state 'ok' without a pose", "a lost frame says 'lost'")
+
+    # the mask of what moves
     mask = result.dynamic_mask
     if mask is not None and np.shape(mask) != frame.depth.shape:
         yield Fault(f"a dynamic mask of shape {np.shape(mask)}, the image has {frame.depth.shape}")
+
+    # statistics and times
     numbers: dict[str, Any] = {"stats": result.stats, "timings": result.timings}
     for name, values in numbers.items():
         if not isinstance(values, Mapping):
             yield Fault(f"{name} of type {type(values).__name__}", "expected numbers by name")
-        elif bad := {
+            continue
+        bad = {
             key: value for key, value in values.items() if not isinstance(value, Real | np.bool_)
-        }:
+        }
+        if bad:
             yield Fault(f"{name} with values that are no numbers: {bad}")
-    xy = result.keypoints_xy
+
+    yield from _keypoint_faults(result)
+
+
+def _keypoint_faults(result: TrackResult) -> Iterator[Fault]:
+    """What is wrong with the keypoints' pixels, or with which of them were kept."""
+    xy: Any = result.keypoints_xy
     keep = result.keypoints_keep
-    if xy is not None and (
-        not isinstance(xy, np.ndarray) or xy.dtype.kind not in "fiu" or xy.shape[1:] != (2,)
-    ):
-        yield Fault(
-            f"keypoints_xy of shape {np.shape(xy)} as {getattr(xy, 'dtype', type(xy).__name__)}",
-            "expected numbers [N, 2]",
-        )
+    if xy is not None and not _is_number_array(xy, columns=2):
+        kind = getattr(xy, "dtype", type(xy).__name__)
+        yield Fault(f"keypoints_xy of shape {np.shape(xy)} as {kind}", "expected numbers [N, 2]")
     elif xy is not None and not np.isfinite(xy).all():
         yield Fault("keypoints_xy that are not finite", "leave out features without a pixel")
     elif keep is not None and (xy is None or np.shape(keep) != (len(xy),)):
@@ -157,12 +165,15 @@ def trajectory_faults(trajectory: object) -> Iterator[Fault]:
 
 
 def check_result(result: object, frame: Frame, tracker: str) -> TrackResult:
-    """The result, if it has no faults; its pose in float64, without statistics that are not finite.
+    """Refuse a result with faults.
 
     Args:
         result: What ``track`` returned.
         frame: The frame it was given.
         tracker: The tracker's id, for the message.
+
+    Returns:
+        The result, its pose in float64, without statistics that are not finite.
 
     Raises:
         TrackerContractError: It has a fault.
@@ -191,7 +202,14 @@ def check_sensors(spec: TrackerSpec, sequence: Sequence) -> None:
 
 
 def check_trajectory(trajectory: object, tracker: str) -> Trajectory:
-    """What ``finalize`` returned, if it has no faults.
+    """Refuse a final trajectory with faults.
+
+    Args:
+        trajectory: What ``finalize`` returned.
+        tracker: The tracker's id, for the message.
+
+    Returns:
+        The trajectory.
 
     Raises:
         TrackerContractError: It has one.
@@ -205,13 +223,11 @@ def check_trajectory(trajectory: object, tracker: str) -> Trajectory:
 
 
 def _pose_faults(pose: object) -> Iterator[Fault]:
-    if not isinstance(pose, np.ndarray) or pose.shape != (4, 4):
-        kind = (
-            f"an array of shape {pose.shape}"
-            if isinstance(pose, np.ndarray)
-            else f"a {type(pose).__name__}"
-        )
-        yield Fault(f"{kind} as pose, expected a 4x4 matrix")
+    """What is wrong with a camera-to-world pose: its shape, type, numbers, or that it is no rigid transformation."""
+    if not isinstance(pose, np.ndarray):
+        yield Fault(f"a {type(pose).__name__} as pose, expected a 4x4 matrix")
+    elif pose.shape != (4, 4):
+        yield Fault(f"an array of shape {pose.shape} as pose, expected a 4x4 matrix")
     # positions in float16 are rounded to millimetres
     elif pose.dtype.kind not in "fiu" or pose.dtype == np.float16:
         yield Fault(
@@ -228,11 +244,20 @@ def _pose_faults(pose: object) -> Iterator[Fault]:
     elif not se3.is_pose(pose.astype(np.float64)):
         rotation = pose[:3, :3].astype(np.float64)
         off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        determinant = np.linalg.det(rotation)
         yield Fault(
-            f"a pose that is no rigid transformation: |R R^T - I| = {off:.2g}, det R = {np.linalg.det(rotation):.4g}",
+            f"a pose that is no rigid transformation: |R R^T - I| = {off:.2g}, det R = {determinant:.4g}",
             "the rotation drifted from orthonormal, or world-to-camera scale is mixed in",
         )
 
 
+def _is_number_array(values: object, columns: int) -> bool:
+    """Whether this is an array of real numbers with so many columns."""
+    if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu":
+        return False
+    return bool(values.shape[1:] == (columns,))
+
+
 def _is_number(value: object) -> bool:
+    """Whether this is a finite number."""
     return isinstance(value, (int, float)) and math.isfinite(value)

@@ -64,7 +64,8 @@ class KeyframeView:
         keypoints: Its features (raw pixels).
         xy: float64 ``[N, 2]`` undistorted pixels; of a rolling shutter as the middle row's camera
             would have seen them.
-        z: float32 ``[N]`` depth at the keypoints in metres, 0 missing; likewise.
+        z: float32 ``[N]`` depth at the keypoints in metres, 0 missing; of a rolling shutter as the
+            middle row's camera would have measured it.
         depth: float32 ``[H, W]`` metres, or None where the keyframe no longer keeps its image.
         timestamp: Seconds.
     """

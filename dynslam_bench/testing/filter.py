@@ -30,7 +30,9 @@ from dynslam_bench.testing.report import (
 from dynslam_bench.testing.scenes import CornerSequence, grey
 
 Steps = list[tuple[FrameBundle, FilterState]]
+"""The frames of a sequence and the state that a filter gets with each."""
 Change = Callable[[FrameBundle, FilterState], tuple[FrameBundle, FilterState]]
+"""Makes a degenerate case of a frame and its state."""
 
 
 def check_filter(construct: Callable[[], DynamicFilter]) -> None:
@@ -48,6 +50,21 @@ def check_filter(construct: Callable[[], DynamicFilter]) -> None:
 def filter_report(construct: Callable[[], DynamicFilter]) -> ConformanceReport:
     """Run all checks of `check_filter` and report each."""
     steps = filter_scene()
+
+    def determinism() -> None:
+        cause = "all randomness has to come from state.seed"
+        _repeated(construct(), construct(), steps, "two runs differ", cause)
+
+    def two_resets() -> None:
+        candidate = construct()
+        fault = "the verdict changes after a second reset()"
+        cause = "reset() keeps something of the sequence before"
+        _repeated(candidate, candidate, steps, fault, cause)
+
+    degenerate = {
+        name: partial(_run_changed, construct, steps, change)
+        for name, change in _DEGENERATE.items()
+    }
     return ConformanceReport.of("filter", construct).run_all(
         {
             "declaration": lambda: _declaration(construct()),
@@ -56,22 +73,9 @@ def filter_report(construct: Callable[[], DynamicFilter]) -> ConformanceReport:
         {
             "declared stats": lambda: _declared_stats(construct(), steps),
             "frames are left alone": lambda: _left_alone(construct(), steps),
-            "determinism": lambda: _repeated(
-                (construct(), construct()),
-                steps,
-                "two runs differ",
-                "all randomness has to come from state.seed",
-            ),
-            "two resets": lambda: _repeated(
-                (construct(),) * 2,
-                steps,
-                "the verdict changes after a second reset()",
-                "reset() keeps something of the sequence before",
-            ),
-            **{
-                name: partial(_run_changed, construct, steps, change)
-                for name, change in _DEGENERATE.items()
-            },
+            "determinism": determinism,
+            "two resets": two_resets,
+            **degenerate,
         },
     )
 
@@ -97,12 +101,10 @@ def filter_scene(frames: int = 4, *, points: int = 400) -> Steps:
     steps: Steps = []
     for index, pose in enumerate(truth.T_world_cam):
         frame = sequence[index]
+
+        # keypoints at random positions; random descriptors, as filters do not match them
         xy = rng.uniform((20, 20), (camera.width - 20, camera.height - 20), (points, 2))
         column, row = np.rint(xy).astype(int).T
-        mask = masks[index].instances == 1
-        box = np.array(
-            [[*np.argwhere(mask).min(0)[::-1], *(np.argwhere(mask).max(0)[::-1] + 1)]], np.float32
-        )
         keypoints = Keypoints(
             xy.astype(np.float32),
             np.zeros(points, np.int32),
@@ -110,25 +112,34 @@ def filter_scene(frames: int = 4, *, points: int = 400) -> Steps:
             np.ones(points, np.float32),
             rng.integers(0, 256, (points, 32), dtype=np.uint8),
         )
+
+        # the panel as a person; its box is x0, y0, x1, y1
+        mask = masks[index].instances == 1
+        pixels = np.argwhere(mask)
+        box = np.array([[*pixels.min(0)[::-1], *(pixels.max(0)[::-1] + 1)]], np.float32)
         instances = Instances(mask[None], box, ("person",), np.ones(1, np.float32))
+
         z = frame.depth[row, column]
         bundle = FrameBundle(
             index, frame.timestamp, frame.rgb, grey(frame), frame.depth, keypoints, xy, z, instances
         )
         state = FilterState(camera, np.ones(points, dtype=bool), seed=index)
         if steps:
+            # flow into the frame before: each point, moved back with the panel, seen from there
+            T_world_prev = truth.T_world_cam[index - 1]
             world = se3.transform(pose, camera.unproject(xy, z))
-            world[mask[row, column], 0] -= 0.03  # the panel's own motion
-            flow = camera.project(se3.transform(se3.inverse(truth.T_world_cam[index - 1]), world))
+            world[mask[row, column], 0] -= 0.03  # metres that the panel moves in a frame
+            flow = camera.project(se3.transform(se3.inverse(T_world_prev), world))
             inside = np.asarray(
                 ((flow > 2) & (flow < (camera.width - 3, camera.height - 3))).all(axis=1)
             )
-            state.flow = FlowResult(
-                flow.astype(np.float32), inside, np.zeros(points, np.float32), {}
-            )
+            cost = np.zeros(points, np.float32)
+            state.flow = FlowResult(flow.astype(np.float32), inside, cost, {})
+
+            # the past: the frame before, keyframes from the newest on, map points of the first
             state.previous_keep = np.ones(points, dtype=bool)
             state.previous = steps[-1][0]
-            state.T_world_prev = truth.T_world_cam[index - 1]
+            state.T_world_prev = T_world_prev
             state.T_world_pred = pose
             state.keyframes = tuple(
                 KeyframeView(
@@ -137,16 +148,17 @@ def filter_scene(frames: int = 4, *, points: int = 400) -> Steps:
                 for past, _ in reversed(steps)
             )
             first = steps[0][0]
-            state.map_points = (
-                np.arange(points, dtype=np.int64),
-                se3.transform(truth.T_world_cam[0], camera.unproject(first.xy, first.z)),
-            )
+            map_xyz = se3.transform(truth.T_world_cam[0], camera.unproject(first.xy, first.z))
+            state.map_points = (np.arange(points, dtype=np.int64), map_xyz)
         steps.append((bundle, state))
     return steps
 
 
 def check_result(result: FilterResult, frame: FrameBundle) -> FilterResult:
-    """A filter's verdict on one frame, if it keeps the contract.
+    """Check a filter's verdict on one frame.
+
+    Returns:
+        The verdict.
 
     Raises:
         ConformanceError: Something in it breaks the contract.
@@ -178,6 +190,7 @@ def check_result(result: FilterResult, frame: FrameBundle) -> FilterResult:
 
 
 def _declaration(candidate: DynamicFilter) -> None:
+    """A filter has a name and needs only what there is."""
     needs = get_args(Need)
     unknown = sorted(candidate.needs - set(needs))
     require_all(
@@ -187,6 +200,7 @@ def _declaration(candidate: DynamicFilter) -> None:
 
 
 def _run(candidate: DynamicFilter, steps: Steps) -> list[FilterResult]:
+    """Reset a filter, apply it frame by frame, and check every verdict."""
     candidate.reset(steps[0][1].camera)
     return [check_result(candidate.apply(frame, state), frame) for frame, state in steps]
 
@@ -196,6 +210,7 @@ def _run_changed(construct: Callable[[], DynamicFilter], steps: Steps, change: C
 
 
 def _declared_stats(candidate: DynamicFilter, steps: Steps) -> None:
+    """Every verdict has the statistics that the filter declares, and no others."""
     declared = set(getattr(candidate, "stats_names", DynamicFilter.stats_names))
     for index, result in enumerate(_run(candidate, steps)):
         given = set(result.stats)
@@ -208,6 +223,7 @@ def _declared_stats(candidate: DynamicFilter, steps: Steps) -> None:
 
 
 def _left_alone(candidate: DynamicFilter, steps: Steps) -> None:
+    """A filter changes neither images nor keypoints nor what earlier filters kept."""
     candidate.reset(steps[0][1].camera)
     for frame, state in steps:
         require_unchanged(
@@ -222,12 +238,11 @@ def _left_alone(candidate: DynamicFilter, steps: Steps) -> None:
 
 
 def _repeated(
-    pair: tuple[DynamicFilter, DynamicFilter], steps: Steps, fault: str, cause: str
+    first: DynamicFilter, second: DynamicFilter, steps: Steps, fault: str, cause: str
 ) -> None:
     """Run two filters, or one twice, which have to give the same."""
-    for index, (a, b) in enumerate(
-        zip(*(_run(candidate, steps) for candidate in pair), strict=True)
-    ):
+    verdicts = zip(_run(first, steps), _run(second, steps), strict=True)
+    for index, (a, b) in enumerate(verdicts):
         require_equal(a, b, ("keep", "weight"), f"{fault} at frame {index}", cause)
 
 
@@ -235,9 +250,8 @@ def _without_flow(frame: FrameBundle, state: FilterState) -> tuple[FrameBundle, 
     if state.flow is None:
         return frame, state
     lost = np.full_like(state.flow.xy, np.nan)
-    return frame, replace(
-        state, flow=FlowResult(lost, np.zeros(len(lost), bool), state.flow.cost, {})
-    )
+    flow = FlowResult(lost, np.zeros(len(lost), bool), state.flow.cost, {})
+    return frame, replace(state, flow=flow)
 
 
 def _all_masked(frame: FrameBundle, state: FilterState) -> tuple[FrameBundle, FilterState]:

@@ -57,7 +57,8 @@ def features_report(
 ) -> ConformanceReport:
     """Run all checks of `check_features` and report each."""
     scene = CornerSequence(2)
-    image, other = grey(scene[0]), grey(scene[1])
+    image = grey(scene[0])
+    other = grey(scene[1])
 
     def results(frame: Frame, least: int = 0) -> None:
         keypoints = construct().extract(grey(frame))
@@ -108,11 +109,16 @@ def check_keypoints(
     angle = keypoints.angle
     descriptors = keypoints.descriptors
     count = len(keypoints.xy)
-    types = {"octave": np.int32, "angle": np.float32, "response": np.float32}
     require_arrays(
         keypoints,
-        {"xy": (np.float32, (count, 2)), **{name: (types[name], (count,)) for name in types}},
+        {
+            "xy": (np.float32, (count, 2)),
+            "octave": (np.int32, (count,)),
+            "angle": (np.float32, (count,)),
+            "response": (np.float32, (count,)),
+        },
     )
+    # a pixel's square reaches half a pixel beyond its centre
     outside = ((xy < -0.5) | (xy > np.array(shape[::-1]) - 0.5)).any(axis=1)
     require_all(
         (
@@ -142,6 +148,7 @@ def check_keypoints(
 def _extractor_determinism(
     construct: Callable[[], FeatureExtractor], image: Image, other: Image
 ) -> None:
+    """An image gives the same keypoints from a fresh extractor and from one that has seen another image."""
     first = construct()
     first.extract(other)  # an earlier image has no influence
     cause = "unseeded randomness, or state that outlives an image"
@@ -156,6 +163,7 @@ def _extractor_determinism(
 
 
 def _masked_extraction(extractor: FeatureExtractor, image: Image) -> None:
+    """With a mask over three quarters of the image, no fewer keypoints lie beside it than without."""
     if not isinstance(extractor, MaskedExtractor):
         raise NotApplicable(
             "it has no extract_masked(): features on people take the place of others"
@@ -165,8 +173,12 @@ def _masked_extraction(extractor: FeatureExtractor, image: Image) -> None:
     masked = extractor.extract_masked(image, mask, 1.0)
     plain = extractor.extract(image)
     check_keypoints(masked, image.shape)
-    more, fewer = (int((~inside(mask, keypoints.xy)).sum()) for keypoints in (masked, plain))
-    require(more >= fewer, f"{more} keypoints beside the mask, {fewer} without asking for any")
+    beside_masked = int((~inside(mask, masked.xy)).sum())
+    beside_plain = int((~inside(mask, plain.xy)).sum())
+    require(
+        beside_masked >= beside_plain,
+        f"{beside_masked} keypoints beside the mask, {beside_plain} without asking for any",
+    )
 
 
 def check_flow(construct: Callable[[], FlowEstimator], *, points: int = 200) -> None:
@@ -185,17 +197,18 @@ def check_flow(construct: Callable[[], FlowEstimator], *, points: int = 200) -> 
 def flow_report(construct: Callable[[], FlowEstimator], *, points: int = 200) -> ConformanceReport:
     """Run all checks of `check_flow` and report each."""
     scene = CornerSequence(2)
-    first, second = grey(scene[0]), grey(scene[1])
-    grid, guess = _grid(first.shape, points), _grid(first.shape, points)
-    guess[::2] = np.nan
+    first = grey(scene[0])
+    second = grey(scene[1])
+    grid = _grid(first.shape, points)
+    guess = _grid(first.shape, points)
+    guess[::2] = np.nan  # every other point has no guess
 
     def results(
         target: Image, points: NDArray[np.float32], guess: NDArray[np.float32] | None = None
     ) -> FlowResult:
         flow = construct()
-        result = flow.track(
-            flow.prepare(first.copy()), flow.prepare(target.copy()), points.copy(), guess=guess
-        )
+        reference = flow.prepare(first.copy())
+        result = flow.track(reference, flow.prepare(target.copy()), points.copy(), guess=guess)
         check_flow_result(result, points, stats_names_of(flow))
         return result
 
@@ -271,6 +284,7 @@ def check_flow_result(
 
 
 def _grid(shape: tuple[int, ...], points: int) -> NDArray[np.float32]:
+    """About so many points ``[N, 2]``, evenly spread, 40 pixels away from the image's edges."""
     across = max(2, int(np.sqrt(points * shape[1] / shape[0])))
     x, y = np.meshgrid(
         np.linspace(40, shape[1] - 41, across),
@@ -282,11 +296,12 @@ def _grid(shape: tuple[int, ...], points: int) -> NDArray[np.float32]:
 def _flow_determinism(
     construct: Callable[[], FlowEstimator], first: Image, second: Image, points: NDArray[np.float32]
 ) -> None:
+    """Two flows with one seed give the same; rows that are not valid may differ."""
     flows = construct(), construct()
     a, b = (flow.track(flow.prepare(first), flow.prepare(second), points, seed=7) for flow in flows)
-    same = np.array_equal(a.valid, b.valid) and np.array_equal(a.xy[a.valid], b.xy[b.valid])
+    same_valid = np.array_equal(a.valid, b.valid)
     require(
-        same,
+        same_valid and np.array_equal(a.xy[a.valid], b.xy[b.valid]),
         "the same images and seed give another flow",
         "unseeded randomness, or state that outlives an image",
     )
@@ -295,6 +310,7 @@ def _flow_determinism(
 def _flow_finds_shift(
     results: Callable[..., FlowResult], image: Image, points: NDArray[np.float32]
 ) -> None:
+    """A flow from an image to the shifted image is that shift, for the median of its valid points."""
     matrix = np.array([[1, 0, SHIFT_PX[0]], [0, 1, SHIFT_PX[1]]], np.float64)
     target = cv2.warpAffine(image, matrix, image.shape[::-1], borderMode=cv2.BORDER_REFLECT)
     result = results(np.asarray(target, np.uint8), points)
@@ -402,6 +418,7 @@ def check_instances(instances: Instances, frame: Frame) -> None:
             f"{where}moving does not fit the objects",
         ),
     )
+    # the share of each mask's pixels that lie more than a pixel outside its box
     for mask, box, name in zip(instances.masks, boxes, instances.class_names, strict=True):
         rows, columns = np.nonzero(mask)
         within = (
@@ -419,7 +436,9 @@ def check_instances(instances: Instances, frame: Frame) -> None:
 
 
 def _segmenter_determinism(construct: Callable[[], Segmenter], frames: list[Frame]) -> None:
-    first, second = construct(), construct()
+    """Two segmenters give the same objects on every frame."""
+    first = construct()
+    second = construct()
     for frame in frames:
         require_equal(
             first.segment(frame),

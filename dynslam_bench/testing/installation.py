@@ -4,6 +4,7 @@ import platform
 import re
 from dataclasses import dataclass
 from importlib import metadata
+from pathlib import Path
 
 from dynslam_bench.core import find_data_root, is_writable, stage_cache_folder, weights_folder
 from dynslam_bench.core.version import install_hint, version
@@ -42,35 +43,36 @@ class Finding:
 def examine() -> list[Finding]:
     """Everything that decides what can be run on this machine; nothing is downloaded for it."""
     system = f"{platform.system()} {platform.machine()}"
-    findings = [
-        Finding(
-            "program", DISTRIBUTION, f"{version()}, Python {platform.python_version()}, {system}"
-        )
+    program = f"{version()}, Python {platform.python_version()}, {system}"
+    return [
+        Finding("program", DISTRIBUTION, program),
+        *_packages(),
+        *_weights(),
+        _recordings(),
+        _folder("stage cache", stage_cache_folder()),
+        _folder("weights", weights_folder()),
+        *unavailable_plugins(),
+        _torch_device(),
     ]
-    findings += [*_packages(), *_weights()]
-    recorded = sum(
-        summary["here"] and not summary["id"].startswith("synthetic/") for summary in summaries()
-    )
-    hint = (
-        ""
-        if recorded
-        else "rendered ones need no download; dynslam-bench sequences list, sequences fetch ID"
-    )
-    findings.append(
-        Finding("sequences", "recorded", f"{recorded} in {find_data_root()}", not recorded, hint)
-    )
-    for name, folder in (("stage cache", stage_cache_folder()), ("weights", weights_folder())):
-        good = is_writable(folder)
-        findings.append(
-            Finding(
-                "folder",
-                name,
-                f"{folder}, {'' if good else 'not '}writable",
-                not good,
-                "" if good else "another one: see core/folders.py",
-            )
-        )
-    return [*findings, *unavailable_plugins(), _torch_device()]
+
+
+def _recordings() -> Finding:
+    """How many recorded sequences there are."""
+    here = [summary["id"] for summary in summaries() if summary["here"]]
+    count = sum(not name.startswith("synthetic/") for name in here)
+    state = f"{count} in {find_data_root()}"
+    if count:
+        return Finding("sequences", "recorded", state)
+    hint = "rendered ones need no download; dynslam-bench sequences list, sequences fetch ID"
+    return Finding("sequences", "recorded", state, True, hint)
+
+
+def _folder(name: str, folder: Path) -> Finding:
+    """Whether a folder of the user's cache can be written."""
+    if is_writable(folder):
+        return Finding("folder", name, f"{folder}, writable")
+    hint = "another one: see core/folders.py"
+    return Finding("folder", name, f"{folder}, not writable", True, hint)
 
 
 def _packages() -> list[Finding]:
@@ -81,6 +83,7 @@ def _packages() -> list[Finding]:
         return [
             Finding("package", DISTRIBUTION, "not installed", True, "pip install . in the checkout")
         ]
+    # names of packages by extra, '' for those that are always needed
     extras: dict[str, list[str]] = {}
     for requirement in required:
         match = re.match(r"([\w.-]+)[^;]*(?:$|;.*extra\s*==\s*['\"]([\w-]+)['\"])", requirement)
@@ -98,27 +101,26 @@ def _packages() -> list[Finding]:
 
 
 def _package(part: str, title: str, names: list[str], hint: str) -> Finding:
-    parts = []
+    """The versions of packages that go together, or the first of them that is missing."""
+    versions = []
     for name in names:
         try:
-            parts.append(
-                metadata.version(name) if name == title else f"{name} {metadata.version(name)}"
-            )
+            version_of = metadata.version(name)
         except metadata.PackageNotFoundError:
             return Finding(part, title, f"{name} is not installed", True, hint)
-    return Finding(part, title, ", ".join(parts))
+        versions.append(version_of if name == title else f"{name} {version_of}")
+    return Finding(part, title, ", ".join(versions))
 
 
 def _weights() -> list[Finding]:
+    """The weights of the networks for masks: those of the package, and those that are fetched."""
     coco = cached_checkpoint(COCO)
-    where = (
-        f"{COCO.megabytes} MB, fetched when first used, or put {COCO.url} into {weights_folder()}"
-    )
-    fetched = (
-        Finding("weights", "coco", str(coco))
-        if coco
-        else Finding("weights", "coco", "not here", True, where)
-    )
+    if coco:
+        fetched = Finding("weights", "coco", str(coco))
+    else:
+        size = f"{COCO.megabytes} MB, fetched when first used"
+        hint = f"{size}, or put {COCO.url} into {weights_folder()}"
+        fetched = Finding("weights", "coco", "not here", True, hint)
     if embedded_weights().is_file():
         return [Finding("weights", "embedded", "in the package, for rendered people"), fetched]
     return [Finding("weights", "embedded", "missing", True, "reinstall"), fetched]
@@ -128,11 +130,10 @@ def _torch_device() -> Finding:
     """Which device ``--device auto`` takes; loads torch, which takes a second or two."""
     import torch
 
-    cuda = torch.cuda.is_available()
-    name = torch.cuda.get_device_name(0) if cuda else f"{torch.get_num_threads()} processor threads"
-    return Finding(
-        "device", "auto", f"{'cuda:0' if cuda else 'cpu'}, {name}, torch {torch.__version__}"
-    )
+    device = f"cpu, {torch.get_num_threads()} processor threads"
+    if torch.cuda.is_available():
+        device = f"cuda:0, {torch.cuda.get_device_name(0)}"
+    return Finding("device", "auto", f"{device}, torch {torch.__version__}")
 
 
 def unavailable_plugins() -> list[Finding]:
@@ -148,8 +149,7 @@ def unavailable_plugins() -> list[Finding]:
         for registry in (TRACKERS, SEGMENTERS, FEATURES, FLOWS, DATASETS)
         for failure in registry.failures()
     ]
-    specs = [tracker.spec for tracker in TRACKERS.all()]
-    failed += [
-        (f"trackers: {spec.id}", f"needs {hint}") for spec in specs for hint in spec.missing()
-    ]
+    for tracker in TRACKERS.all():
+        spec = tracker.spec
+        failed += [(f"trackers: {spec.id}", f"needs {hint}") for hint in spec.missing()]
     return [Finding("plug-in", name, "missing", True, reason) for name, reason in failed]

@@ -19,11 +19,13 @@ from dynslam_bench.runs.spec import Limits
 from dynslam_bench.testing.report import Check, ConformanceReport
 
 _WORK = "dynslam_bench.testing.isolated:work"
+"""What a child runs."""
 _CAUSES = {
     "crashed": "os._exit, exit() or a fault in a library that the tracker calls",
     "timeout": "an endless loop or a lock; --time-limit gives slow trackers more time",
     "out-of-memory": "what a frame allocates is never freed; --memory-limit gives more",
 }
+"""Likely causes of the ends of a child."""
 
 
 def isolated_tracker_report(
@@ -68,7 +70,7 @@ def isolated_tracker_report(
         "frames": frames,
         "seed": seed,
     }
-    running = ""
+    running = ""  # the check that runs in the child; empty between two
 
     def add(check: Check) -> None:
         checks.append(check)
@@ -81,6 +83,7 @@ def isolated_tracker_report(
             add(Check(**message["check"]))
         return True
 
+    # a child for all checks; after one that died or hung, another for those that are left
     while True:
         running = ""
         with contextlib.closing(TemporaryFolder()) as folder:
@@ -116,9 +119,8 @@ def _failure(verdict: Verdict, running: str, checks: list[Check]) -> Check:
         raise getattr(errors, kind, DynslamError)(verdict.reason)
     name = running or (f"after {checks[-1].name}" if checks else "loading")
     cause = "" if kind else _CAUSES.get(verdict.status, "")
-    return Check(
-        name, "failed", f"{verdict.reason} (likely cause: {cause})" if cause else verdict.reason
-    )
+    message = f"{verdict.reason} (likely cause: {cause})" if cause else verdict.reason
+    return Check(name, "failed", message)
 
 
 class _SentReport(ConformanceReport):

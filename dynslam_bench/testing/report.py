@@ -140,6 +140,13 @@ def require_equal(
 ) -> None:
     """Raise unless two results have the same arrays, or other values, under these names.
 
+    Args:
+        first: A result.
+        second: The other one.
+        names: Attributes that are compared.
+        fault: What is there in place of equal results.
+        cause: The likely cause.
+
     Raises:
         ConformanceError: They have not.
     """
@@ -167,6 +174,12 @@ def require_arrays(
     cause: str = "",
 ) -> None:
     """Raise unless the named attributes are arrays of the expected types and shapes.
+
+    Args:
+        holder: What has the attributes.
+        expected: Type and shape by name.
+        where: What is before the fault in the message.
+        cause: The likely cause.
 
     Raises:
         ConformanceError: Names the first other one.

@@ -83,21 +83,24 @@ class TurningSequence(CornerSequence):
     @staticmethod
     def pose(index: int) -> NDArray[np.float64]:
         """The camera's pose ``[4, 4]``, camera to world, at a frame."""
-        a = 2 * np.pi * index / 24
-        place = 0.12 * np.sin(a), 0.06 * np.sin(2 * a), 0.08 * (1 - np.cos(a))
-        turn = 0.05 * np.sin(2 * a), 0.1 * np.sin(a + 1), 0.08 * np.cos(a)
-        return se3.exp(np.array([*place, *turn]))
+        # a loop of 24 frames: metres along the axes, radians about them
+        phase = 2 * np.pi * index / 24
+        translation = 0.12 * np.sin(phase), 0.06 * np.sin(2 * phase), 0.08 * (1 - np.cos(phase))
+        rotation = 0.05 * np.sin(2 * phase), 0.1 * np.sin(phase + 1), 0.08 * np.cos(phase)
+        return se3.exp(np.array([*translation, *rotation]))
 
 
 class _Masks:
+    """The panel's masks, frame by frame; in the first frame nothing has moved yet."""
+
     def __init__(self, sequence: CornerSequence) -> None:
         self._sequence = sequence
 
     def __getitem__(self, index: int) -> FrameMasks:
-        panel = draw(type(self._sequence), range(len(self._sequence))[index])[2]  # type: ignore[arg-type]
-        return FrameMasks(
-            panel.astype(np.uint8), {1: "person"}, frozenset({1} if index and panel.any() else ())
-        )
+        number = range(len(self._sequence))[index]
+        _, _, panel = draw(type(self._sequence), number)  # type: ignore[arg-type]
+        moving = frozenset({1} if index and panel.any() else ())
+        return FrameMasks(panel.astype(np.uint8), {1: "person"}, moving)
 
 
 def grey(frame: Frame) -> NDArray[np.uint8]:
@@ -112,17 +115,15 @@ def hard_frames(like: Frame) -> dict[str, Frame]:
         like: A frame whose index, stamp and size they take.
     """
     black = np.zeros_like(like.rgb)
+    flat = np.full_like(like.rgb, 128)
+    noise = np.random.default_rng(3).integers(0, 256, like.rgb.shape, dtype=np.uint8)
     zero = np.zeros_like(like.depth)
     return {
         "all-black": replace(like, rgb=black, depth=zero),
         "saturated": replace(like, rgb=np.full_like(like.rgb, 255)),
         "zero depth": replace(like, depth=zero),
-        "textureless": replace(
-            like, rgb=np.full_like(like.rgb, 128), depth=np.full_like(like.depth, 2.0)
-        ),
-        "noise": replace(
-            like, rgb=np.random.default_rng(3).integers(0, 256, like.rgb.shape, dtype=np.uint8)
-        ),
+        "textureless": replace(like, rgb=flat, depth=np.full_like(like.depth, 2.0)),
+        "noise": replace(like, rgb=noise),
     }
 
 
@@ -130,23 +131,28 @@ def hard_frames(like: Frame) -> dict[str, Frame]:
 def draw(
     scene: type[CornerSequence], index: int
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]:
-    """Colour, depth and the panel's mask of a frame."""
+    """Colour uint8 ``[H, W, 3]``, depth float32 ``[H, W]`` in metres, and the panel's mask, of a frame."""
     camera = scene.camera
     pose = scene.pose(index)
     centre = pose[:3, 3]
     v, u = np.mgrid[: camera.height, : camera.width]
+
+    # rays through all pixels, in the world, with a length of 1 along the camera's optical axis
     rays = np.stack(
         [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1
     )
     ray_x, ray_y, ray_z = np.moveaxis(rays @ pose[:3, :3].T, -1, 0)
-    # walls z = 2.6 + 0.5 x and z = 2.6 - 0.7 x, the nearer one is seen; depth along a ray with
-    # z-component 1
+
+    # walls z = 2.6 + 0.5 x and z = 2.6 - 0.7 x in metres: depth along each ray; the nearer one is
+    # seen
     walls = [
         (2.6 + slope * centre[0] - centre[2]) / (ray_z - slope * ray_x) for slope in (0.5, -0.7)
     ]
     depth = np.minimum(*[np.where(wall > 0, wall, np.inf) for wall in walls])
     x = centre[0] + depth * ray_x
     y = centre[1] + depth * ray_y
+
+    # the panel z = 1.5, 0.25 m wide and 0.8 m high, which moves 0.03 m to the right in a frame
     left = -0.35 + 0.03 * index
     panel_depth = (1.5 - centre[2]) / ray_z
     panel_x = centre[0] + panel_depth * ray_x
@@ -154,6 +160,8 @@ def draw(
     panel = np.asarray(
         scene.has_panel & (panel_x > left) & (panel_x < left + 0.25) & (np.abs(panel_y) < 0.4)
     )
+
+    # what is seen, and its place on the texture; the panel has a part of its own, which moves along
     depth = np.where(panel, panel_depth, depth)
     x = np.where(panel, panel_x - left + 7.3, x)
     y = np.where(panel, panel_y + 3.1, y)
@@ -178,6 +186,7 @@ def _sample(
     size = len(texture)
     x = x * 250
     y = y * 250
+    # corners of the texel grid around each position, and the position between them
     x0 = np.floor(x).astype(np.int64)
     y0 = np.floor(y).astype(np.int64)
     fx = (x - x0)[..., None]

@@ -37,7 +37,9 @@ def sequence_report(sequence: Sequence | str | Path, *, frames: int = 3) -> Conf
     report = ConformanceReport(f"sequence {getattr(sequence, 'id', type(sequence).__name__)!r}")
     if not report.run("protocol", lambda: _protocol(sequence)):
         return report
-    chosen = sorted(set(np.linspace(0, len(sequence) - 1, max(frames, 2)).astype(int).tolist()))
+    # frames spread evenly, the first and the last among them
+    spread = np.linspace(0, len(sequence) - 1, max(frames, 2)).astype(int)
+    chosen = sorted(set(spread.tolist()))
     return report.run_all(
         {},
         {
@@ -65,9 +67,11 @@ _MEMBERS = (
     "digest",
     "__len__",
 )
+"""What a sequence has beside its frames."""
 
 
 def _protocol(sequence: Sequence) -> None:
+    """All members are there, of the right types, and there is a frame."""
     missing = [name for name in (*_MEMBERS, "__getitem__") if not hasattr(sequence, name)]
     require(
         not missing,
@@ -87,6 +91,7 @@ def _protocol(sequence: Sequence) -> None:
 
 
 def _timestamps(sequence: Sequence) -> None:
+    """One float64 stamp in seconds for each frame, increasing, at about the rate that `fps` says."""
     stamps = sequence.timestamps
     fps = sequence.fps
     require(
@@ -114,6 +119,7 @@ def _timestamps(sequence: Sequence) -> None:
 
 
 def _frames(sequence: Sequence, chosen: list[int]) -> None:
+    """Frames have the camera's size, their own index and stamp, and depth in metres."""
     size = sequence.camera.height, sequence.camera.width
     for index in chosen:
         frame = sequence[index]
@@ -128,7 +134,7 @@ def _frames(sequence: Sequence, chosen: list[int]) -> None:
         )
         depth = frame.depth
         measured = frame.depth[frame.depth > 0]
-        median = float(np.median(measured)) if len(measured) else 1.0
+        median_m = float(np.median(measured)) if len(measured) else 1.0
         require_all(
             (frame.index == index, f"frame {index} says that its index is {frame.index}"),
             (
@@ -140,11 +146,16 @@ def _frames(sequence: Sequence, chosen: list[int]) -> None:
                 f"{where}depth has values below 0 or not finite",
                 "missing depth is 0",
             ),
-            (0.05 < median < 200, f"{where}the median depth is {median:g} m", "wrong depth_factor"),
+            (
+                0.05 < median_m < 200,
+                f"{where}the median depth is {median_m:g} m",
+                "wrong depth_factor",
+            ),
         )
 
 
 def _end(sequence: Sequence) -> None:
+    """There is no frame behind the last."""
     try:
         sequence[len(sequence)]
     except IndexError:
@@ -157,6 +168,7 @@ def _end(sequence: Sequence) -> None:
 
 
 def _twice(sequence: Sequence, index: int) -> None:
+    """A frame is the same when it is read again."""
     cause = "randomness, or a buffer that is written again"
     require_equal(
         sequence[index],
@@ -168,6 +180,7 @@ def _twice(sequence: Sequence, index: int) -> None:
 
 
 def _ground_truth(sequence: Sequence) -> None:
+    """The ground truth is a trajectory on the frames' clock."""
     truth = sequence.ground_truth
     if truth is None:
         raise NotApplicable("the sequence has none")
@@ -176,8 +189,10 @@ def _ground_truth(sequence: Sequence) -> None:
         f"the ground truth is a {type(truth).__name__}, not a Trajectory",
     )
     stamps = sequence.timestamps
+    # seconds: a pose 0.1 s away from the first or last frame still counts
+    overlap = (truth.timestamps >= stamps[0] - 0.1) & (truth.timestamps <= stamps[-1] + 0.1)
     require(
-        ((truth.timestamps >= stamps[0] - 0.1) & (truth.timestamps <= stamps[-1] + 0.1)).any(),
+        overlap.any(),
         f"the ground truth spans {truth.timestamps[0]:.3f} to {truth.timestamps[-1]:.3f} s, the frames "
         f"{stamps[0]:.3f} to {stamps[-1]:.3f} s",
         "they use different clocks",
@@ -185,6 +200,7 @@ def _ground_truth(sequence: Sequence) -> None:
 
 
 def _masks(sequence: Sequence, chosen: list[int]) -> None:
+    """Masks have the frames' size, and every object has a class name."""
     source = sequence.masks
     if source is None:
         raise NotApplicable("the sequence has none")
@@ -209,6 +225,7 @@ def _masks(sequence: Sequence, chosen: list[int]) -> None:
 
 
 def _digest(sequence: Sequence) -> None:
+    """The digest is a text that stays the same."""
     first = sequence.digest()
     require(isinstance(first, str) and first, f"the digest is {first!r}, not a text")
     require(
@@ -219,6 +236,7 @@ def _digest(sequence: Sequence) -> None:
 
 
 def _pickling(sequence: Sequence) -> None:
+    """A pickled copy is the same sequence: workers get it so."""
     copy = pickle.loads(pickle.dumps(sequence))
     require(
         len(copy) == len(sequence) and copy.digest() == sequence.digest(),

@@ -19,7 +19,13 @@ from dynslam_bench.contracts import (
 )
 from dynslam_bench.contracts.checks import Fault, blemishes, faults, trajectory_faults
 from dynslam_bench.core import DynslamError
-from dynslam_bench.core.settings import Settings, apply_overrides, build, online_parameters
+from dynslam_bench.core.settings import (
+    Parameter,
+    Settings,
+    apply_overrides,
+    build,
+    online_parameters,
+)
 from dynslam_bench.evaluation import hints
 from dynslam_bench.testing.report import (
     ConformanceError,
@@ -70,40 +76,51 @@ def tracker_report(
     seed: int = 0,
     report: ConformanceReport | None = None,
 ) -> ConformanceReport:
-    """Run all checks of `check_tracker` and report each, in a report that names the tracker then; a new one by default.
+    """Run all checks of `check_tracker` and report each.
+
+    Args:
+        subject: See `check_tracker`, as for all that follow but the last.
+        settings: Overrides or settings.
+        sequence: What to track.
+        frames: How many frames to track in each check.
+        seed: Seed of the randomness.
+        report: The report to write into, which names the tracker then; a new one by default.
 
     Raises:
         PluginError: There is no such tracker.
     """
     report = ConformanceReport("") if report is None else report
-    spec = (
-        TRACKERS.get(subject)
-        if isinstance(subject, str)
-        else subject
-        if isinstance(subject, TrackerSpec)
-        else None
-    )
-    report.subject = (
-        f"tracker {spec.id!r}" if spec else ConformanceReport.of("tracker", subject).subject
-    )
-    scene = CornerSequence(frames) if sequence is None else sequence
-    turning = TurningSequence()
+    # a function that constructs trackers has no spec
+    spec: TrackerSpec | None = None
+    if isinstance(subject, str):
+        spec = TRACKERS.get(subject)
+    elif isinstance(subject, TrackerSpec):
+        spec = subject
+    report.subject = ConformanceReport.of("tracker", subject).subject
     if spec is not None:
+        report.subject = f"tracker {spec.id!r}"
         report.run("spec", lambda: _spec(spec, settings))
+
+    scene = CornerSequence(frames) if sequence is None else sequence
     run = _Runner(report, spec or subject, settings, scene, frames, seed)
     deterministic = spec is None or spec.deterministic
+    monocular = spec is not None and spec.sensors == "rgb"
+
+    def conventions() -> None:
+        turning = TurningSequence()
+        path = _Runner(report, spec or subject, settings, turning, len(turning), seed)
+        _conventions(path, monocular)
+
+    hard = {f"{name} frame": partial(_hard_frame, run, name) for name in hard_frames(scene[0])}
     return report.run_all(
         {"construction": lambda: _construction(run), "results": lambda: _results(run)},
         {
-            "camera to world": lambda: _conventions(
-                _Runner(report, spec or subject, settings, turning, len(turning), seed),
-                spec is not None and spec.sensors == "rgb",
-            ),
+            "camera to world": conventions,
             "same stats on every frame": lambda: _same_keys(run),
             "frames are left alone": lambda: _frames_left_alone(run),
             "determinism": lambda: _determinism(run, deterministic),
             "two resets": lambda: _two_resets(run, deterministic),
-            **{f"{name} frame": partial(_hard_frame, run, name) for name in hard_frames(scene[0])},
+            **hard,
             "one frame": lambda: _final(run, 1),
             "online settings": lambda: _online_settings(run, spec, settings),
             "final trajectory": lambda: _final(run),
@@ -113,7 +130,16 @@ def tracker_report(
 
 
 class _Runner:
-    """Tracks a scene, or variants of it, with fresh or given trackers."""
+    """Tracks a scene, or variants of it, with fresh or given trackers.
+
+    Args:
+        report: Gets a sign of life with each frame.
+        subject: A spec, or a function that constructs trackers.
+        settings: Of the trackers that are constructed.
+        scene: What to track.
+        frames: How many of its frames.
+        seed: Seed of the randomness.
+    """
 
     def __init__(
         self,
@@ -144,18 +170,18 @@ class _Runner:
     def track(
         self, frames: list[Frame], tracker: Any = None, changed: Settings | None = None, at: int = 0
     ) -> list[TrackResult]:
-        """Reset a tracker and track frames; a tracker that is not given is constructed, and closed at the end.
+        """Reset a tracker, track frames and check every result.
 
         Args:
             frames: What to track.
-            tracker: Which tracker.
+            tracker: The tracker; one that is not given is constructed, and closed at the end.
             changed: Settings to configure it to before one of the frames.
-            at: Which.
+            at: Number of that frame.
         """
         used = self.construct() if tracker is None else tracker
         used.reset(self.scene.camera, rng=np.random.default_rng(self.seed))
         results = []
-        poses = []
+        poses = []  # copies, taken at once
         for number, frame in enumerate(frames):
             if changed is not None and number == at:
                 used.configure(changed)
@@ -163,6 +189,7 @@ class _Runner:
             self.report.alive()
             check_result(results[-1], frame)
             poses.append(np.array(results[-1].T_world_cam))
+        # a tracker without causal poses has those of its final trajectory
         if isinstance(self.subject, TrackerSpec) and not self.subject.online:
             results = _results_of(used.finalize(), frames)
             poses = [np.array(result.T_world_cam) for result in results]
@@ -180,12 +207,11 @@ class _Runner:
 def _results_of(final: Trajectory, frames: list[Frame]) -> list[TrackResult]:
     """The final trajectory of a tracker that has no other one, frame by frame."""
     poses = dict(zip(final.timestamps.tolist(), final.T_world_cam, strict=True))
-    return [
-        TrackResult(poses[frame.timestamp], "ok")
-        if frame.timestamp in poses
-        else TrackResult(None, "lost")
-        for frame in frames
-    ]
+    results = []
+    for frame in frames:
+        pose = poses.get(frame.timestamp)
+        results.append(TrackResult(None, "lost") if pose is None else TrackResult(pose, "ok"))
+    return results
 
 
 def check_result(result: object, frame: Frame) -> None:
@@ -201,11 +227,13 @@ def check_result(result: object, frame: Frame) -> None:
 
 
 def _none_of(all_faults: Iterable[Fault], where: str) -> None:
+    """Fail with the first of the faults; what is before it in the message is `where`."""
     for fault in all_faults:
         require(False, f"{where} {fault.found}", fault.cause)
 
 
 def _spec(spec: TrackerSpec, settings: Settings | Mapping[str, Any] | None) -> None:
+    """The spec names the tracker; its settings survive JSON, and presets and overrides fit them."""
     require(spec.id and spec.label, "the spec has no id or label")
     default = spec.settings()
     require(
@@ -223,12 +251,14 @@ def _spec(spec: TrackerSpec, settings: Settings | Mapping[str, Any] | None) -> N
 
 
 def _construction(run: _Runner) -> None:
+    """A tracker can be built, has the methods, and can be closed before it has tracked."""
     tracker = run.construct()
     require_methods(tracker, "reset", "track")
     _close(tracker)
 
 
 def _results(run: _Runner) -> None:
+    """Every result keeps the contract, and one frame at least is tracked."""
     states = [result.state for result in run.track(run.frames)]
     require(
         "ok" in states,
@@ -238,6 +268,7 @@ def _results(run: _Runner) -> None:
 
 
 def _same_keys(run: _Runner) -> None:
+    """The statistics have the same names on every frame."""
     results = run.track(run.frames)
     for frame, result in zip(run.frames, results, strict=True):
         changed = set(results[0].stats) ^ set(result.stats)
@@ -253,27 +284,28 @@ def _conventions(run: _Runner, monocular: bool) -> None:
     results = run.track(run.frames)
     count = len(run.frames)
     tracked = [
-        (f.timestamp, r.T_world_cam)
-        for f, r in zip(run.frames, results, strict=True)
-        if r.state == "ok"
+        (frame.timestamp, result.T_world_cam)
+        for frame, result in zip(run.frames, results, strict=True)
+        if result.state == "ok"
     ]
     if len(tracked) < count // 2:
         raise NotApplicable(
             f"only {len(tracked)} of the {count} frames of a camera that turns were tracked"
         )
-    estimate = Trajectory(
-        np.array([stamp for stamp, _ in tracked]), np.array([pose for _, pose in tracked])
-    )
+    stamps = np.array([stamp for stamp, _ in tracked])
+    poses = np.array([pose for _, pose in tracked])
+    estimate = Trajectory(stamps, poses)
     truth = run.scene.ground_truth
     assert truth is not None
+    # hints on the path as a whole; those on stamps and on noise are no conventions
     likely = hints(estimate, truth, "tum-rgbd/v1-sim3" if monocular else "tum-rgbd/v1")
-    conventions = [
-        hint.text for hint in likely if hint.id not in ("time-shift", "below-truth-noise")
-    ]
+    others = ("time-shift", "below-truth-noise")
+    conventions = [hint.text for hint in likely if hint.id not in others]
     require(not conventions, "; ".join(conventions))
 
 
 def _frames_left_alone(run: _Runner) -> None:
+    """Tracking changes no image."""
     # earlier checks may have changed the others
     frames = [run.scene[frame.index] for frame in run.frames]
     require_unchanged(
@@ -284,6 +316,7 @@ def _frames_left_alone(run: _Runner) -> None:
 
 
 def _determinism(run: _Runner, deterministic: bool) -> None:
+    """Two trackers with one seed give the same results, bit for bit."""
     if not deterministic:
         raise NotApplicable("the spec says that it is not deterministic")
     episodes = []
@@ -300,6 +333,7 @@ def _determinism(run: _Runner, deterministic: bool) -> None:
 
 
 def _two_resets(run: _Runner, deterministic: bool) -> None:
+    """A tracker that has tracked something else gives the same results again after a reset."""
     tracker = run.construct()
     first = run.track(run.frames, tracker)
     mirrored = [
@@ -317,10 +351,9 @@ def _two_resets(run: _Runner, deterministic: bool) -> None:
 
 
 def _hard_frame(run: _Runner, name: str) -> None:
-    for position, where in (
-        (0, "the first frame"),
-        (len(run.frames) // 2, "a frame in the middle"),
-    ):
+    """A degenerate frame, at the start or in the middle, raises nothing."""
+    positions = ((0, "the first frame"), (len(run.frames) // 2, "a frame in the middle"))
+    for position, where in positions:
         frames = list(run.frames)
         frames[position] = hard_frames(frames[position])[name]
         try:
@@ -335,6 +368,7 @@ def _hard_frame(run: _Runner, name: str) -> None:
 
 
 def _final(run: _Runner, count: int | None = None) -> None:
+    """The final trajectory, after so many frames or all, is valid and has stamps of frames alone."""
     if count == 1 and isinstance(run.subject, TrackerSpec) and not run.subject.online:
         raise NotApplicable("a program for whole sequences may need more than one frame")
     tracker = run.construct()
@@ -356,6 +390,7 @@ def _final(run: _Runner, count: int | None = None) -> None:
 
 
 def _closing(run: _Runner) -> None:
+    """A tracker can be closed, and closed again."""
     tracker = run.construct()
     if getattr(tracker, "close", None) is None:
         raise NotApplicable("the tracker has no close()")
@@ -365,6 +400,7 @@ def _closing(run: _Runner) -> None:
 
 
 def _close(tracker: Tracker) -> None:
+    """Close a tracker if it can be closed."""
     try:
         close = getattr(tracker, "close", None)
         if close is not None:
@@ -386,68 +422,94 @@ def _online_settings(
     settings have an effect in the second half of an episode, changing them in its middle has to
     have one there. All online settings are moved to alternate ends.
     """
-    if spec is None or not spec.deterministic:
-        raise NotApplicable(
-            "no spec names online settings" if spec is None else "it is not deterministic"
-        )
+    if spec is None:
+        raise NotApplicable("no spec names online settings")
+    if not spec.deterministic:
+        raise NotApplicable("it is not deterministic")
     start = settings if isinstance(settings, Settings) else resolve_settings(spec, settings)
     online = online_parameters(start)
     if not online:
         raise NotApplicable("the tracker has no online settings")
     tracker = run.construct(start)
-    names = ", ".join(parameter.name for parameter in online[:4]) + (
-        ", ..." if len(online) > 4 else ""
-    )
-    fault = f"the tracker class {type(tracker).__name__} has no method configure(settings), but {names} is online"
+    names = ", ".join(parameter.name for parameter in online[:4])
+    if len(online) > 4:
+        names += ", ..."
     require(
         callable(getattr(tracker, "configure", None)),
-        fault,
+        f"the tracker class {type(tracker).__name__} has no method configure(settings), but {names} is online",
         "implement configure (see core.settings.Reconfigurable), or declare the setting without online=True",
     )
+
     fresh = run.track(run.frames, tracker)
     half = len(run.frames) // 2
     has_effect = False
-    late_effects = []
-    for first in (0, 1):
-        ends = {}
-        for number, parameter in enumerate(online, first):
-            values = parameter.choices or (parameter.low, parameter.high)
-            ends[parameter.name] = values[-(number % 2)]
+    late_effects = []  # of changes in mid-episode, where building with the values has a late effect
+    for first_end in (0, 1):
+        ends = _alternate_ends(online, first_end)
         try:
             changed = apply_overrides(start, ends)
             built = run.track(run.frames, run.construct(changed))
         except DynslamError:
             continue  # the ends do not go together
-        what = ", ".join(f"{name}={value}" for name, value in list(ends.items())[:4])
-        at = first_difference(built, run.track(run.frames, tracker, changed))
-        fault = f"configure() with {what} gives another result than building with it: {at}"
-        require(
-            not at,
-            fault,
-            "configure() does not reach the part that uses the setting, or only later",
-        )
-        at = first_difference(fresh, run.track(run.frames, tracker))
-        fault = (
-            f"after an episode configured to {what}, reset() does not bring back the settings: {at}"
-        )
-        require(
-            not at,
-            fault,
-            "remember the settings that it was built with, and put them into force in reset()",
-        )
+        _check_reconfiguration(run, tracker, changed, ends, built, fresh)
         has_effect |= bool(first_difference(fresh, built))
         if first_difference(fresh[half:], built[half:]):
-            late_effects.append(
-                first_difference(fresh, run.track(run.frames, tracker, changed, half))
-            )
-    fault = f"configure() in mid-episode changes nothing, although building with {names} does"
+            reconfigured = run.track(run.frames, tracker, changed, half)
+            late_effects.append(first_difference(fresh, reconfigured))
     require(
         any(late_effects) or not late_effects,
-        fault,
+        f"configure() in mid-episode changes nothing, although building with {names} does",
         "the settings are read once; read them on every frame",
     )
     if not has_effect:
         raise NotApplicable(f"{names} change nothing on this scene, at either end of their ranges")
+
+
+def _alternate_ends(online: list[Parameter], first_end: int) -> dict[str, Any]:
+    """Each setting at the other end of its range, or of its choices, than the one before it.
+
+    Args:
+        online: The settings.
+        first_end: The end of the first one: 0 for the low, 1 for the high end.
+    """
+    ends = {}
+    for number, parameter in enumerate(online, first_end):
+        values = parameter.choices or (parameter.low, parameter.high)
+        ends[parameter.name] = values[-(number % 2)]
+    return ends
+
+
+def _check_reconfiguration(
+    run: _Runner,
+    tracker: Any,
+    changed: Settings,
+    ends: Mapping[str, Any],
+    built: list[TrackResult],
+    fresh: list[TrackResult],
+) -> None:
+    """A reconfigured episode equals that of a tracker built so; the next one that of a fresh tracker.
+
+    Args:
+        run: Tracks the scene.
+        tracker: Built with other settings.
+        changed: Settings to configure it to before the first frame.
+        ends: What of them is changed, for messages.
+        built: Results of a tracker built with them.
+        fresh: Results of `tracker` before.
+    """
+    values = ", ".join(f"{name}={value}" for name, value in list(ends.items())[:4])
+    at = first_difference(built, run.track(run.frames, tracker, changed))
+    require(
+        not at,
+        f"configure() with {values} gives another result than building with it: {at}",
+        "configure() does not reach the part that uses the setting, or only later",
+    )
+    at = first_difference(fresh, run.track(run.frames, tracker))
+    require(
+        not at,
+        f"after an episode configured to {values}, reset() does not bring back the settings: {at}",
+        "remember the settings that it was built with, and put them into force in reset()",
+    )
 
 
 def first_difference(first: list[TrackResult], second: list[TrackResult]) -> str:
@@ -456,6 +518,7 @@ def first_difference(first: list[TrackResult], second: list[TrackResult]) -> str
         if a.state != b.state:
             return f"frame {index}, states {a.state} and {b.state}"
         arrays = ("T_world_cam", "dynamic_mask", "keypoints_xy", "keypoints_keep")
+        # names of the arrays that differ, then of the statistics
         different = [
             name for name in arrays if not np.array_equal(getattr(a, name), getattr(b, name))
         ]

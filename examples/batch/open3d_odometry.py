@@ -23,11 +23,14 @@ def main(camera: str, sequence: str, associations: str, output: str) -> None:
     )
     factor = settings.getNode("DepthMapFactor").real()
     intrinsics = o3d.core.Tensor(matrix)
+
+    # the last image, and the pose that the motions since the first one add up to
     last = None
     pose = np.eye(4)
     stamps = []
     poses = []
     for line in Path(associations).read_text().splitlines():
+        # undistort both images; depth without interpolation
         stamp, rgb, _, depth = line.split()
         colour = cv2.remap(cv2.imread(f"{sequence}/{rgb}"), *maps, cv2.INTER_LINEAR)
         raw = cv2.remap(
@@ -38,11 +41,10 @@ def main(camera: str, sequence: str, associations: str, output: str) -> None:
         )
         try:
             if last is not None:
-                arguments = {"depth_scale": factor, "depth_max": 8.0}
-                found = o3d.t.pipelines.odometry.rgbd_odometry_multi_scale(
-                    image, last, intrinsics, **arguments
+                motion = o3d.t.pipelines.odometry.rgbd_odometry_multi_scale(
+                    image, last, intrinsics, depth_scale=factor, depth_max=8.0
                 )
-                pose = pose @ found.transformation.numpy()
+                pose = pose @ motion.transformation.numpy()
         # too little texture or depth in one of them: no pose of this frame
         except RuntimeError as error:
             print(stamp, error)

@@ -13,15 +13,14 @@ from dynslam_bench.trackers.adapters.svo import Worker
 def main(camera: str, sequence: str, associations: str, output: str) -> None:
     settings = cv2.FileStorage(camera, cv2.FILE_STORAGE_READ)
     worker = Worker()
-    stated = {name: settings.getNode(f"Camera.{name}").real() for name in ("width", "height")}
-    stated |= {
+    numbers = {
         name: settings.getNode(f"Camera1.{name}").real() for name in ("fx", "fy", "cx", "cy")
     }
     distortion = [
         settings.getNode(f"Camera1.{name}").real() for name in ("k1", "k2", "p1", "p2", "k3")
     ]
-    size = {name: int(stated[name]) for name in ("width", "height")}
-    worker.reset({"camera": stated | size | {"distortion": distortion}, "options": {}})
+    size = {name: int(settings.getNode(f"Camera.{name}").real()) for name in ("width", "height")}
+    worker.reset({"camera": size | numbers | {"distortion": distortion}, "options": {}})
     stamps = []
     poses = []
     for index, line in enumerate(Path(associations).read_text().splitlines()):

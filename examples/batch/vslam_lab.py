@@ -26,25 +26,29 @@ def main(checkout: str, system: str, mode: str, camera: str, sequence: str, outp
     width, height, fps = (
         int(settings.getNode(f"Camera.{name}").real()) for name in ("width", "height", "fps")
     )
+    factor = settings.getNode("DepthMapFactor").real()
     (work / "calibration.yaml").write_text(
         "%YAML:1.2\n---\ncameras:\n"
         f"  - {{cam_name: rgb_0, cam_type: rgb+depth, depth_name: depth_0, cam_model: radtan5,"
         f" distortion_type: radtan5, focal_length: [{fx}, {fy}], principal_point: [{cx}, {cy}],"
         f" distortion_coefficients: {distortion},"
-        f" image_dimension: [{width}, {height}], fps: {fps}, depth_factor: {settings.getNode('DepthMapFactor').real()},"
+        f" image_dimension: [{width}, {height}], fps: {fps}, depth_factor: {factor},"
         " T_BS: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}\n"
     )
+
+    # the table of images: stamps in nanoseconds
     rows = ["ts_rgb_0 (ns),path_rgb_0,ts_depth_0 (ns),path_depth_0"]
     for line in Path(sequence, "associations.txt").read_text().splitlines():
         stamp, rgb, *rest = line.split()
         ns = round(float(stamp) * 1e6) * 1000
         rows.append(f"{ns},{rgb},{ns},{rest[1] if rest else ''}")
     (work / "rgb.csv").write_text("\n".join(rows) + "\n")
-    stated = {
+
+    arguments = {
         "sequence_path": sequence, "calibration_yaml": work / "calibration.yaml", "rgb_csv": work / "rgb.csv",
         "exp_folder": work, "exp_it": 0, "verbose": 0, "mode": mode,
     }  # fmt: skip
-    words = [str(word) for key, value in stated.items() for word in (f"--{key}", value)]
+    words = [str(word) for key, value in arguments.items() for word in (f"--{key}", value)]
     subprocess.run(
         ["pixi", "run", "--frozen", "-e", system, f"execute-{mode}", *words],
         cwd=checkout,

@@ -22,15 +22,15 @@ class Memory(gym.ObservationWrapper):
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
         space = env.observation_space
-        self.observation_space = gym.spaces.Box(
-            *(np.append(end, np.float32(e)) for end, e in ((space.low, 0), (space.high, 1)))
-        )
+        low = np.append(space.low, np.float32(0))
+        high = np.append(space.high, np.float32(1))
+        self.observation_space = gym.spaces.Box(low, high)
 
     def observation(self, observation: np.ndarray) -> np.ndarray:
-        frames = self.unwrapped.episode.outcomes[::-1]
-        since = next(
-            (n for n, frame in enumerate(frames) if frame.stats.get("segmented")), len(frames)
-        )
+        # frames since the last one that was segmented; all where there is none
+        latest_first = self.unwrapped.episode.outcomes[::-1]
+        segmented = (n for n, frame in enumerate(latest_first) if frame.stats.get("segmented"))
+        since = next(segmented, len(latest_first))
         return np.append(observation, np.float32(since / (since + 10)))
 
 
@@ -44,7 +44,7 @@ class Score:
 
 
 def score(benchmark: ControlBenchmark, env: gym.Env) -> Score:
-    """Of the frames so far but the first, which no action has changed."""
+    """The score of the frames so far but the first, which no action has changed."""
     frames = env.unwrapped.episode.outcomes[1:]
     reward = benchmark.reward
     earned = sum(frame.reward for frame in frames)
@@ -53,7 +53,7 @@ def score(benchmark: ControlBenchmark, env: gym.Env) -> Score:
 
 
 def play(benchmark: ControlBenchmark, env: gym.Env, policy: Policy, seed: int = 0) -> Score:
-    """One episode."""
+    """Play one episode with a policy."""
     observation, _ = env.reset(seed=seed)
     step = 0
     over = False

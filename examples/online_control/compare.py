@@ -51,20 +51,21 @@ def main(
         masks: Source of masks in recordings.
         **arguments: Of `ControlBenchmark.make`.
     """
+    # held-out scenes one by one; training scenes one by one, and all in one environment
     bench = control_benchmark(id)
-    tests = [
-        Memory(bench.make("test", n, **arguments))
-        for n in range(len(bench.test) if test is None else test)
-    ]
+    test_count = len(bench.test) if test is None else test
+    tests = [Memory(bench.make("test", n, **arguments)) for n in range(test_count)]
     trains = [Memory(bench.make("train", n, **arguments)) for n in range(scenes)]
     train = Memory(bench.make("train", range(scenes), **arguments))
 
+    def play_all(agent: Agent, envs: Sequence[gym.Env]) -> list[Score]:
+        return [play(bench, env, agent(env)) for env in envs]
+
+    # static settings on all scenes: the best one is chosen by its return on the training scenes
     statics: dict[str, Agent] = {name: partial(sweep_agent, name) for name in static.sweep(train)}
-    sweep = {
-        name: [play(bench, env, agent(env)) for env in tests] for name, agent in statics.items()
-    }
+    sweep = {name: play_all(agent, tests) for name, agent in statics.items()}
     tuned = {
-        name: np.mean([play(bench, env, agent(env)).earned for env in trains])
+        name: np.mean([score.earned for score in play_all(agent, trains)])
         for name, agent in statics.items()
     }
     best = max(statics, key=tuned.__getitem__)
@@ -75,37 +76,35 @@ def main(
         "rule by hand": [rule],
     }
     rows = {
-        name: average([[play(bench, env, agent(env)) for env in tests] for agent in agents[name]])
-        for name in agents
+        name: average([play_all(agent, tests) for agent in of_name])
+        for name, of_name in agents.items()
     }
-    each = [max(scores, key=lambda s: s.earned) for scores in zip(*sweep.values(), strict=True)]
-    ways = [spliced(bench, env, static.sweep(env).values()) for env in tests]
-    rows["best static of each scene"] = each
-    rows["hindsight splice"] = [
-        max(scores, key=lambda s: s.earned) for scores in zip(each, ways, strict=True)
-    ]
+
+    # what hindsight reaches: the best static settings of each scene, and of each stretch of it
+    best_of_scene = best_by_scene(*sweep.values())
+    splices = [spliced(bench, env, static.sweep(env).values()) for env in tests]
+    rows["best static of each scene"] = best_of_scene
+    rows["hindsight splice"] = best_by_scene(best_of_scene, splices)
     print(f"{len(tests)} held-out scenes, {scenes} training scenes, {steps} steps a learner.\n")
     print_table(rows, sweep, list(rows))
 
+    # learners of several seeds, then what they have learnt on the held-out scenes
     curves = {}
+    learners = {"evolution strategy": learn_evolution, "PPO": learn_ppo}
     began = time.perf_counter()
-    for name, learn in {"evolution strategy": learn_evolution, "PPO": learn_ppo}.items():
+    for name, learn in learners.items():
         learnt = [learn(bench, train, steps, seed) for seed in range(seeds)]
         agents[name] = [agent for agent, _ in learnt]
         curves |= {(name, seed): curve for seed, (_, curve) in enumerate(learnt)}
     learnt_s = time.perf_counter() - began
-    learners = list(dict.fromkeys(name for name, _ in curves))
-    scores = {
-        name: [[play(bench, env, agent(env)) for env in tests] for agent in agents[name]]
-        for name in learners
-    }
+    names = list(dict.fromkeys(name for name, _ in curves))
+    scores = {name: [play_all(agent, tests) for agent in agents[name]] for name in names}
     print(f"\nLearners, means of {seeds} seeds.\n")
-    print_table(rows | {name: average(runs) for name, runs in scores.items()}, sweep, learners)
+    print_table(rows | {name: average(runs) for name, runs in scores.items()}, sweep, names)
     print_curves(curves, scores)
     if data_root is not None:
-        print_recordings(
-            bench, agents, data_root, {} if masks is None else {"segmentation.source": masks}
-        )
+        settings = {} if masks is None else {"segmentation.source": masks}
+        print_recordings(bench, agents, data_root, settings)
     print(f"\n{2 * seeds * steps / learnt_s:.0f} steps a second while learning.")
 
 
@@ -127,6 +126,11 @@ def learn_ppo(bench: ControlBenchmark, env: gym.Env, steps: int, seed: int) -> t
     return lambda env: policy, curve
 
 
+def best_by_scene(*several: Sequence[Score]) -> list[Score]:
+    """Of several agents' scores, the one that earned most in each scene."""
+    return [max(scores, key=lambda score: score.earned) for scores in zip(*several, strict=True)]
+
+
 def average(runs: Sequence[Sequence[Score]]) -> list[Score]:
     """The mean over seeds of each scene's score."""
     values = np.mean([[(s.earned, s.error, s.cost) for s in run] for run in runs], axis=0)
@@ -141,6 +145,7 @@ def percent(rows: np.ndarray, column: int, base: Callable[[np.ndarray], float]) 
         column: Which of them.
         base: From the numbers of the drawn scenes to what the mean is compared with.
     """
+    # the scenes themselves, then 1000 draws of as many with replacement
     count = len(rows)
     drawn = [np.arange(count), *np.random.default_rng(0).integers(count, size=(1000, count))]
     with np.errstate(all="ignore"):  # a base of 0 gives inf
@@ -151,9 +156,12 @@ def percent(rows: np.ndarray, column: int, base: Callable[[np.ndarray], float]) 
 
 def front(statics: np.ndarray, scenes: np.ndarray) -> np.ndarray:
     """Mean costs and errors of the static settings that no other one beats in both, by rising cost."""
+    # [settings, 2], by cost, then by error
     means = statics[:, scenes, 1:].mean(axis=1)[:, ::-1]
     means = means[np.lexsort(means.T[::-1])]
-    return means[np.r_[True, means[1:, 1] < np.minimum.accumulate(means[:, 1])[:-1]]]
+    # those with a smaller error than all that cost less
+    least_error = np.minimum.accumulate(means[:, 1])
+    return means[np.r_[True, means[1:, 1] < least_error[:-1]]]
 
 
 def print_table(
@@ -164,13 +172,8 @@ def print_table(
     The error is compared with that of static settings at the agent's cost, the cost with theirs at
     the agent's error: between the static settings that no other one beats in both, linearly.
     """
-    tables = {
-        name: np.array([(-s.earned, s.error, s.cost) for s in scores])
-        for name, scores in rows.items()
-    }
-    statics = np.array(
-        [[(-s.earned, s.error, s.cost) for s in scores] for scores in sweep.values()]
-    )
+    tables = {name: losses(scores) for name, scores in rows.items()}
+    statics = np.array([losses(scores) for scores in sweep.values()])
     best = next(table for name, table in tables.items() if name.startswith("best static:"))
     print(
         "| agent | loss, mm | error, mm | cost | loss against default, % | loss against best static, % ",
@@ -199,6 +202,11 @@ def print_table(
         )
 
 
+def losses(scores: Sequence[Score]) -> np.ndarray:
+    """Losses, errors and costs ``[scenes, 3]``."""
+    return np.array([(-score.earned, score.error, score.cost) for score in scores])
+
+
 def print_recordings(
     bench: ControlBenchmark, agents: dict[str, list[Agent]], folder: str, settings: dict[str, Any]
 ) -> None:
@@ -208,16 +216,13 @@ def print_recordings(
     )
     for number, name in enumerate(bench.recordings):
         try:
-            env = Memory(
-                bench.make(
-                    "recordings", number, data_root=folder, settings={**bench.settings, **settings}
-                )
-            )
+            changed = {**bench.settings, **settings}
+            env = Memory(bench.make("recordings", number, data_root=folder, settings=changed))
             for agent, seeds in agents.items():
-                (s,) = average([[play(bench, env, each(env))] for each in seeds])
-                print(
-                    f"| {name} | {agent} | {-1e3 * s.earned:.0f} | {1e3 * s.error:.0f} | {s.cost:.1f} |"
-                )
+                (mean,) = average([[play(bench, env, each(env))] for each in seeds])
+                loss = -1e3 * mean.earned
+                error = 1e3 * mean.error
+                print(f"| {name} | {agent} | {loss:.0f} | {error:.0f} | {mean.cost:.1f} |")
         except DynslamError as error:
             print(f"| {name} | left out: {error} | | | |")
 
@@ -231,9 +236,8 @@ def print_curves(
     )
     for (name, seed), curve in curves.items():
         parts = ", ".join(f"{steps}: {-1e3 * earned:.0f}" for steps, earned in curve)
-        print(
-            f"| {name} | {seed} | {parts} | {-1e3 * np.mean([s.earned for s in scores[name][seed]]):.0f} |"
-        )
+        held_out = -1e3 * np.mean([score.earned for score in scores[name][seed]])
+        print(f"| {name} | {seed} | {parts} | {held_out:.0f} |")
 
 
 if __name__ == "__main__":

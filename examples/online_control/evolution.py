@@ -10,11 +10,14 @@ from common import FIELDS, Policy, play
 
 from dynslam_bench.envs import ControlBenchmark
 
-SEEN = 5
+INPUTS = 5
+"""Numbers that the policy sees."""
 MOTION = slice(FIELDS["motion_x"], FIELDS["motion_x"] + 6)
+"""Where the camera's motion stands in the observation."""
 
 
-def seen(observation: np.ndarray) -> np.ndarray:
+def inputs(observation: np.ndarray) -> np.ndarray:
+    """The numbers ``[5]`` that the policy sees of an observation."""
     speed = np.abs(observation[MOTION]).max()
     values = [
         observation[FIELDS[name]] for name in ("mask_fraction", "since_network", "brightness")
@@ -25,12 +28,14 @@ def seen(observation: np.ndarray) -> np.ndarray:
 def linear(env: gym.Env, weights: np.ndarray) -> Policy:
     """Segment if the weighted sum is positive; or the neutral action changed by a sum for each setting."""
     if isinstance(env.action_space, gym.spaces.Discrete):
-        return lambda observation, step: 0 if weights @ seen(observation) > 0 else 3
-    rows = weights.reshape(-1, SEEN)
+        return lambda observation, step: 0 if weights @ inputs(observation) > 0 else 3
+    rows = weights.reshape(-1, INPUTS)
     neutral = env.unwrapped.neutral_action
-    return lambda observation, step: np.clip(neutral + rows @ seen(observation), -1, 1).astype(
-        np.float32
-    )
+
+    def act(observation: np.ndarray, step: int) -> np.ndarray:
+        return np.clip(neutral + rows @ inputs(observation), -1, 1).astype(np.float32)
+
+    return act
 
 
 def evolve(
@@ -42,14 +47,16 @@ def evolve(
     """
     rng = np.random.default_rng(seed)
     rows = 1 if isinstance(env.action_space, gym.spaces.Discrete) else env.action_space.shape[0]
-    centre = np.zeros(rows * SEEN)
+    centre = np.zeros(rows * INPUTS)
     sigma = 0.5
+    # weights of the better half in the recombination, falling with the rank
     share = np.log(population / 2 + 0.5) - np.log(np.arange(1, population // 2 + 1))
     share /= share.sum()
     used = 0
     generation = 0
     curve = []
     while used < steps:
+        # mutate, play, recombine
         candidates = centre + sigma * rng.normal(size=(population, len(centre)))
         played = [
             play(benchmark, env, linear(env, weights), 1000 * seed + generation)

@@ -30,9 +30,13 @@ from slam_hpo.moth_flame_sampler import MothFlameSampler
 from slam_hpo.problem import Problem
 
 STUDIES = 30
+"""Studies of each arm, one a seed."""
 TRIALS = 50
+"""Budget of a study, in trials of full length."""
 AT = (10, 25, 50)
+"""Budgets at which the table has the regret."""
 FULL = max(FRAMES)
+"""Frames of a trial of full length."""
 SAMPLERS: dict[str, Callable[[int], BaseSampler]] = {
     "random": lambda seed: RandomSampler(seed=seed),
     "TPE": lambda seed: TPESampler(seed=seed),
@@ -42,6 +46,7 @@ SAMPLERS: dict[str, Callable[[int], BaseSampler]] = {
     "moth-flame": lambda seed: MothFlameSampler(elite=False, seed=seed, n_trials=TRIALS),
     "EMFOA": lambda seed: MothFlameSampler(seed=seed, n_trials=TRIALS),
 }
+# What is compared: samplers without a pruner, and pruners with one sampler.
 ARMS: dict[str, tuple[Callable[[int], BaseSampler], BasePruner]] = {
     **{name: (build, NopPruner()) for name, build in SAMPLERS.items()},
     "TPE, median pruner": (SAMPLERS["TPE"], MedianPruner()),
@@ -54,6 +59,7 @@ def incumbents(system: str, sampler: BaseSampler, pruner: BasePruner, seed: int)
 
     Before the first full trial it is the default configuration, whose values are 0.
     """
+    # noisy values on growing numbers of frames for the study; values without noise for the regret
     rungs = FRAMES[-1:] if isinstance(pruner, NopPruner) else FRAMES
     noisy = {frames: Problem(system, frames=frames, noise=True, seed=seed) for frames in rungs}
     true = Problem(system)
@@ -65,6 +71,7 @@ def incumbents(system: str, sampler: BaseSampler, pruner: BasePruner, seed: int)
     while spent < TRIALS * FULL:
         trial = study.ask(true.search_space)
         start = spent
+        # longer and longer runs, a run being the beginning of the next, until pruned
         for frames, problem in noisy.items():
             value = float(problem.evaluate(trial.params))
             spent = start + frames
@@ -76,21 +83,18 @@ def incumbents(system: str, sampler: BaseSampler, pruner: BasePruner, seed: int)
             study.tell(trial, value)
             if value < best and spent <= TRIALS * FULL:
                 best = value
-                rows[-(-spent // FULL) - 1 :] = (
-                    true.evaluate(trial.params),
-                    test.evaluate(trial.params),
-                )
+                budget = -(-spent // FULL)  # in full trials, rounded up
+                rows[budget - 1 :] = true.evaluate(trial.params), test.evaluate(trial.params)
     return rows
 
 
 def mean_interval(values: np.ndarray) -> np.ndarray:
     """Geometric mean of ratios ``[studies, ...]``, given as logarithms, minus 1 and its 95 % bootstrap interval, %."""
-    draws = values[np.random.default_rng(0).integers(len(values), size=(2000, len(values)))].mean(
-        axis=1
-    )
-    return np.asarray(
-        100 * np.expm1([values.mean(axis=0), *np.percentile(draws, [2.5, 97.5], axis=0)])
-    )
+    # 2000 draws of as many studies, with replacement
+    drawn = np.random.default_rng(0).integers(len(values), size=(2000, len(values)))
+    means = values[drawn].mean(axis=1)
+    low, high = np.percentile(means, [2.5, 97.5], axis=0)
+    return np.asarray(100 * np.expm1([values.mean(axis=0), low, high]))
 
 
 def cell(values: np.ndarray) -> str:
@@ -127,26 +131,22 @@ def draw(regret: dict[str, np.ndarray], path: str) -> None:
 def main(system: str, curves: str | None = None) -> None:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     warnings.simplefilter("ignore")  # experimental samplers; CMA-ES has no use for the constraint
-    found = {
+    # [studies, TRIALS, 2] by arm: logarithms of errors over the default's, on both splits
+    values = {
         name: np.stack([incumbents(system, build(seed), pruner, seed) for seed in range(STUDIES)])
         for name, (build, pruner) in ARMS.items()
     }
-    best = min(rows[..., 0].min() for rows in found.values())
-    regret = {name: rows[..., 0] - best for name, rows in found.items()}
-    lines = [
-        [
-            "sampler",
-            *(f"regret after {after}, %" for after in AT),
-            "over random's, %",
-            "test over default's, %",
-        ]
-    ]
-    for name, rows in found.items():
+    best = min(rows[..., 0].min() for rows in values.values())
+    regret = {name: rows[..., 0] - best for name, rows in values.items()}
+
+    headings = [f"regret after {after}, %" for after in AT]
+    lines = [["sampler", *headings, "over random's, %", "test over default's, %"]]
+    lines.append(["---"] * len(lines[0]))
+    random = values["random"]
+    for name, rows in values.items():
         regrets = [cell(regret[name][:, after - 1]) for after in AT]
-        lines.append(
-            [name, *regrets, cell(rows[:, -1, 0] - found["random"][:, -1, 0]), cell(rows[:, -1, 1])]
-        )
-    lines.insert(1, ["---"] * len(lines[0]))
+        over_random = cell(rows[:, -1, 0] - random[:, -1, 0])
+        lines.append([name, *regrets, over_random, cell(rows[:, -1, 1])])
     sys.stdout.write("".join(f"| {' | '.join(line)} |\n" for line in lines))
     if curves:
         draw(regret, curves)

@@ -1,8 +1,11 @@
 """Make the tables of `slam_hpo`: runs of dynslam-bench at Sobol's points, one Parquet file for each system.
 
-    python make_table.py suite mask-rcnn 0 32 > suite.toml     # a suite of the first 32
-    configurations dynslam-bench bench suite.toml --shard 1/4 --results part1  # on as many machines
-    as you like python make_table.py table mask-rcnn part1 part2 part3 part4
+    # a suite of the first 32 configurations
+    python make_table.py suite mask-rcnn 0 32 > suite.toml
+    # its runs, on as many machines as you like
+    dynslam-bench bench suite.toml --shard 1/4 --results part1
+    # the table
+    python make_table.py table mask-rcnn part1 part2 part3 part4
 
 A table may grow: later points of the sequence are added, and what is stored is not run again.
 """
@@ -21,19 +24,22 @@ from dynslam_bench.runs import RunStore
 
 DATA = Path(__file__).parent / "slam_hpo" / "data"
 POINTS = 2048
+"""Length of Sobol's sequence that the configurations are taken from."""
 
 
 def suite(system: str, first: str, count: str) -> str:
     """A suite of the default configuration and some of Sobol's points, as TOML."""
     space = SPACES[system]
     points = qmc.Sobol(len(space), seed=0).random(POINTS)[int(first) : int(first) + int(count)]
-    lines = ['name = "slam-hpo"', f"trackers = {json.dumps([system])}", "cache = true"]
-    lines += [
+    lines = [
+        'name = "slam-hpo"',
+        f"trackers = {json.dumps([system])}",
+        "cache = true",
         f"sequences = {json.dumps(SEQUENCES)}",
         f"offsets = {json.dumps(STARTS)}",
         f"stride = {STRIDE}",
+        f"frames = [0, {max(STARTS) + STRIDE * max(FRAMES)}]",
     ]
-    lines += [f"frames = [0, {max(STARTS) + STRIDE * max(FRAMES)}]"]
     for point in points:
         values = ((name, space[name].at(unit)) for name, unit in zip(space, point, strict=True))
         settings = ", ".join(f"{json.dumps(name)} = {value}" for name, value in values)
@@ -43,23 +49,24 @@ def suite(system: str, first: str, count: str) -> str:
 
 def table(system: str, *folders: str) -> str:
     """Write the Parquet file of a system from results folders."""
-    found: list[dict[str, Any]] = []
+    # a row for each run and fidelity: shorter runs are the beginnings of the stored ones
+    rows: list[dict[str, Any]] = []
     for folder in folders:
         store = RunStore(folder)
         records, unreadable = store.all()
         if unreadable:
             raise SystemExit(f"error: {unreadable[0]}")
         for record in records:
-            if record.tracker.id == system:
-                sequence = next(name for name in SEQUENCES if record.sequence.id.startswith(name))
-                same = {name: record.settings[name] for name in SPACES[system]}
-                same |= {"sequence": sequence, "start": record.offset}
-                found += [
-                    same | {"frames": length} | evaluated(store, record, length)._asdict()
-                    for length in FRAMES
-                ]
+            if record.tracker.id != system:
+                continue
+            sequence = next(name for name in SEQUENCES if record.sequence.id.startswith(name))
+            key_of_run = {name: record.settings[name] for name in SPACES[system]}
+            key_of_run |= {"sequence": sequence, "start": record.offset}
+            for length in FRAMES:
+                evaluation = evaluated(store, record, length)
+                rows.append(key_of_run | {"frames": length} | evaluation._asdict())
     data = (
-        pd.DataFrame(found)
+        pd.DataFrame(rows)
         .drop(columns="log_ate_std")
         .astype({"sequence": "category", "status": "category"})
     )

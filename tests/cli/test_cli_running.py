@@ -22,7 +22,7 @@ from reports_fake_store import add_run
 
 from dynslam_bench import cli as program
 from dynslam_bench.cli import app, demo, output, running, runs
-from dynslam_bench.cli.demo import compiled_ahead, tell
+from dynslam_bench.cli.demo import compiled_ahead, culling_effect
 from dynslam_bench.cli.output import report_table, table
 from dynslam_bench.core import WEIGHTS_VARIABLE, RunError
 from dynslam_bench.core.records import digest
@@ -401,7 +401,9 @@ def row(
 )
 def test_the_verdict_is_that_of_the_numbers(culled_m: float, verdict: str) -> None:
     rows = [row("orb-slam2", 0.02), row("mask-rcnn", culled_m), row("never-move", 0.1)]
-    first, *rest = tell([*rows, row("orb-slam2", 0.003, "synthetic/sitting_xyz?scene=104")])
+    first, *rest = culling_effect(
+        [*rows, row("orb-slam2", 0.003, "synthetic/sitting_xyz?scene=104")]
+    )
     assert "20.0 mm" in first
     assert f"{1e3 * culled_m:.1f} mm" in first
     assert verdict in first

@@ -25,15 +25,16 @@ class ShiftOdometry:
         gray = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
         response = 1.0
         if self.last is not None:
-            (right, down), response = cv2.phaseCorrelate(
-                self.last, gray, cv2.createHanningWindow(gray.shape[::-1], 5)
-            )
-            known = frame.depth[frame.depth > 0]
-            if response < self.settings.min_response or not known.size:
+            # the shift of the whole image in pixels; a window hides its edges
+            window = cv2.createHanningWindow(gray.shape[::-1], 5)
+            (right, down), response = cv2.phaseCorrelate(self.last, gray, window)
+            measured = frame.depth[frame.depth > 0]
+            if response < self.settings.min_response or not measured.size:
                 return TrackResult(None, "lost", {"response": float(response)})
-            depth = float(np.median(known))
-            self.T_world_cam[:2, 3] -= depth * np.array(
-                [right / self.camera.fx, down / self.camera.fy]
-            )
+
+            # at the median depth that shift is a translation in metres, against the image's
+            depth = float(np.median(measured))
+            shift = np.array([right / self.camera.fx, down / self.camera.fy])
+            self.T_world_cam[:2, 3] -= depth * shift
         self.last = gray
         return TrackResult(self.T_world_cam.copy(), "ok", {"response": float(response)})

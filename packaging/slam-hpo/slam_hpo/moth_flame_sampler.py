@@ -51,10 +51,8 @@ class MothFlameSampler(optunahub.samplers.SimpleBaseSampler):
         super().__init__(seed=seed)
         self._rules = EMFOA if elite else MFO
         self._rng = np.random.default_rng(seed)
-        self._n_trials, self._population = (
-            whole("n_trials", n_trials, 1),
-            whole("population", population, 2),
-        )
+        self._n_trials = whole("n_trials", n_trials, 1)
+        self._population = whole("population", population, 2)
 
     def reseed_rng(self) -> None:
         """Draw a new seed, for parallel workers."""
@@ -68,8 +66,9 @@ class MothFlameSampler(optunahub.samplers.SimpleBaseSampler):
         _check_single(study)
         if not search_space:
             return {}
+
+        # finished trials as moths, points of the unit cube [trials, settings]
         cube = _SearchSpaceTransform(search_space, transform_0_1=True)
-        sign = -1.0 if study.direction == StudyDirection.MAXIMIZE else 1.0
         trials = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE, TrialState.PRUNED))
         finished = [
             one
@@ -82,15 +81,23 @@ class MothFlameSampler(optunahub.samplers.SimpleBaseSampler):
         moths = np.array(units).reshape(-1, len(cube.bounds))
         if len(moths) < self._population:
             return cube.untransform(self._first_population(moths))
+
+        # the flames: the best of them, the best first
+        sign = -1.0 if study.direction == StudyDirection.MAXIMIZE else 1.0
         ranks = [
             (one.state == TrialState.PRUNED, sign * float(one.value or 0.0)) for one in finished
         ]
-        flames = moths[sorted(range(len(moths)), key=ranks.__getitem__)[: self._population]]
+        order = sorted(range(len(moths)), key=ranks.__getitem__)
+        flames = moths[order[: self._population]]
+
+        # this trial's moth at its last position, and the flame that it flies around (Eq. 11)
         index = trial.number % self._population
         at = min(trial.number, self._n_trials)
         own = [row for row, one in enumerate(finished) if one.number % self._population == index]
         moth = moths[own[-1] if own else -1]
         around = flames[min(index, flames_left(self._population, at, self._n_trials) - 1)]
+
+        # its flight (Eq. 8-18), clipped to the cube
         now = flight(at / self._n_trials, self._rules)
         landed = moth_positions(
             moth, flames[index], around, flames[0], now, CAUCHY_SHARE, self._rng.random
@@ -109,6 +116,11 @@ class MothFlameSampler(optunahub.samplers.SimpleBaseSampler):
         return super().sample_independent(study, trial, param_name, param_distribution)
 
     def _first_population(self, members: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The next member: drawn, or, of EMFOA's second half, the opposite of one of the first half.
+
+        Args:
+            members: ``[n, settings]``, those that there are, in the unit cube.
+        """
         unit = self._rng.random(members.shape[1])
         half = self._population // 2
         if self._rules.opposition and len(members) >= half:
@@ -116,12 +128,12 @@ class MothFlameSampler(optunahub.samplers.SimpleBaseSampler):
             # dynamic bounds, Eq. 20
             least = drawn.min(axis=0)
             greatest = drawn.max(axis=0)
-            unit = opposites(
-                members[len(members) - half], least, greatest, 0.0, 1.0, self._rng.random
-            )
+            member = members[len(members) - half]
+            unit = opposites(member, least, greatest, 0.0, 1.0, self._rng.random)
         return np.asarray(unit)
 
 
 def _check_single(study: Study) -> None:
+    """Refuse a study of several objectives."""
     if len(study.directions) > 1:
         raise ValueError("MothFlameSampler takes one objective")

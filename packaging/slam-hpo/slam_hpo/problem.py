@@ -17,6 +17,7 @@ from slam_hpo.table import METRICS, load, natural
 
 Source = Literal["surrogate", "run"]
 MIN_COVERAGE = 0.95
+"""Mean coverage that the constraint asks for."""
 OBJECTIVES = ("ate_m", "processor_s")
 
 
@@ -48,20 +49,18 @@ class Problem(optunahub.benchmarks.BaseProblem):
         noise: bool = False,
         seed: int | None = None,
     ) -> None:
-        self._bench, self._split = load(system), known("split", split, SPLITS)
-        self._frames, self._source = (
-            known("frames", frames, FRAMES),
-            known("source", source, get_args(Source)),
-        )
+        self._bench = load(system)
+        self._split = known("split", split, SPLITS)
+        self._frames = known("frames", frames, FRAMES)
+        self._source = known("source", source, get_args(Source))
         if not isinstance(metrics, list | tuple) or not metrics:
             raise SlamHpoError(f"metrics are {metrics!r}: give a list of {', '.join(OBJECTIVES)}")
         self.metric_names = [known("metric", name, OBJECTIVES) for name in metrics]
-        one = (
-            np.array([self._bench.noise(frames, metric) for metric in metrics])
-            if noise
-            else np.zeros(len(metrics))
-        )
-        self._noise = one / np.sqrt(len(SPLITS[split]) * len(STARTS))
+        # noise of a run by metric; that of a mean over all instances of the split
+        of_run = np.zeros(len(metrics))
+        if noise:
+            of_run = np.array([self._bench.noise(frames, metric) for metric in metrics])
+        self._noise = of_run / np.sqrt(len(SPLITS[split]) * len(STARTS))
         self.reseed(seed)
         self._default = self._measured(defaults(system))
 
@@ -72,12 +71,15 @@ class Problem(optunahub.benchmarks.BaseProblem):
     @property
     def search_space(self) -> dict[str, BaseDistribution]:
         """The settings' ranges."""
-        return {
-            name: IntDistribution(int(setting.low), int(setting.high), log=setting.log)
-            if setting.whole
-            else FloatDistribution(setting.low, setting.high, log=setting.log)
-            for name, setting in self._bench.space.items()
-        }
+        space: dict[str, BaseDistribution] = {}
+        for name, setting in self._bench.space.items():
+            if setting.whole:
+                low = int(setting.low)
+                high = int(setting.high)
+                space[name] = IntDistribution(low, high, log=setting.log)
+            else:
+                space[name] = FloatDistribution(setting.low, setting.high, log=setting.log)
+        return space
 
     @property
     def directions(self) -> list[optuna.study.StudyDirection]:

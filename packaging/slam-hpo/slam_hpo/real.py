@@ -52,7 +52,17 @@ def run(
 
 
 def evaluated(store: RunStore, record: RunRecord, frames: int) -> Evaluation:
-    """The first frames of a stored run; without a tracked frame it has the error of a camera that does not move."""
+    """Evaluate the first frames of a stored run.
+
+    Args:
+        store: Where it is stored.
+        record: The run.
+        frames: How many of its frames.
+
+    Returns:
+        What a run of that length has; with fewer than two tracked frames the error is that of a
+        static camera.
+    """
     from dynslam_bench.contracts import Trajectory
     from dynslam_bench.evaluation import evaluate
     from dynslam_bench.runs import load_frames
@@ -67,21 +77,19 @@ def evaluated(store: RunStore, record: RunRecord, frames: int) -> Evaluation:
     tracked = int(ok.sum())
     assert truth is not None  # every sequence is rendered
     if estimate is not None and tracked > 1:
-        begun = Trajectory(estimate.timestamps[:tracked], estimate.T_world_cam[:tracked])
-        error = evaluate(
-            begun, truth, hold_last_pose_protocol(PROTOCOL), input_timestamps=stamps
-        ).metrics["ate_rmse_m"]
+        beginning = Trajectory(estimate.timestamps[:tracked], estimate.T_world_cam[:tracked])
+        protocol = hold_last_pose_protocol(PROTOCOL)
+        evaluation = evaluate(beginning, truth, protocol, input_timestamps=stamps)
+        error = evaluation.metrics["ate_rmse_m"]
     else:
         positions = truth.positions[
             (truth.timestamps >= stamps[0]) & (truth.timestamps <= stamps[-1])
         ]
         error = float(np.sqrt(np.square(positions - positions.mean(axis=0)).sum(axis=1).mean()))
-    # the first two load networks and kernels
+    # the first two frames load networks and kernels
     processor = float(part["processor_s"].iloc[2:].mean())
     lost_at_end = int(ok[::-1].argmax()) if tracked else len(ok)
-    status = (
-        record.status
-        if record.failed
-        else judge_coverage(tracked, len(ok), lost_at_end, len(ok))[0]
-    )
+    status: str = record.status
+    if not record.failed:
+        status, *_ = judge_coverage(tracked, len(ok), lost_at_end, len(ok))
     return Evaluation(error, tracked / len(ok), processor, status)

@@ -38,16 +38,17 @@ class Range(NamedTuple):
 
     def at(self, unit: float) -> Value:
         """The value at a place in the unit interval."""
-        low, high = (np.log(self.low), np.log(self.high)) if self.log else (self.low, self.high)
+        low = np.log(self.low) if self.log else self.low
+        high = np.log(self.high) if self.log else self.high
         value = low + unit * (high - low)
         value = float(np.exp(value) if self.log else value)
         return round(value) if self.whole else float(f"{value:.4g}")
 
     def unit(self, values: ArrayLike) -> NDArray[np.float64]:
         """Places of values in the unit interval."""
-        values, low, high = (
-            np.asarray(part, dtype=float) for part in (values, self.low, self.high)
-        )
+        values = np.asarray(values, dtype=float)
+        low = np.asarray(self.low, dtype=float)
+        high = np.asarray(self.high, dtype=float)
         if self.log:
             values = np.log(values)
             low = np.log(low)
@@ -92,6 +93,7 @@ SEQUENCES = SPLITS["tune"] + SPLITS["test"]
 STARTS = (0, 4)
 """Frames of the sequence that are left out at its beginning: repeats, which differ by noise."""
 STRIDE = 2
+"""Runs take every second frame."""
 FRAMES = (20, 40, 60)
 """Fidelities: lengths of a run, every second frame. A run sees no later frame, so a shorter one is its beginning."""
 
@@ -126,6 +128,5 @@ def defaults(system: str) -> dict[str, Value]:
     Raises:
         SlamHpoError: There is no such system.
     """
-    return {
-        name: setting.default for name, setting in SPACES[known("system", system, SPACES)].items()
-    }
+    space = SPACES[known("system", system, SPACES)]
+    return {name: setting.default for name, setting in space.items()}

@@ -16,8 +16,10 @@ from numpy.typing import NDArray
 from slam_hpo.spaces import FRAMES, SEQUENCES, SPACES, STARTS, SlamHpoError, Value, defaults, known
 
 METRICS = ("ate_m", "coverage", "processor_s")
+"""What is measured of a run: the last axis of `Benchmark.values`."""
 LOST_COVERAGE = 0.5
 """A run that tracks less than this share of its frames is lost."""
+# What an instance consists of, and the choices of each: the middle axes of `Benchmark.values`.
 INSTANCE = (("sequence", SEQUENCES), ("start", STARTS), ("frames", FRAMES))
 
 
@@ -49,12 +51,14 @@ class Benchmark:
         space: Its settings.
         configurations: One row a configuration, the default first.
         values: float64 ``[configurations, sequences, starts, fidelities, 3]``, see `METRICS`.
-        status: object, likewise without the last axis.
+        status: object ``[configurations, sequences, starts, fidelities]``, how the runs ended.
     """
 
     def __init__(self, system: str, rows: pd.DataFrame) -> None:
         self.system = system
         self.space = SPACES[system]
+
+        # the configurations, the default first
         names = [*self.space]
         keys = rows[names].round(6)
         unique = keys.drop_duplicates()
@@ -64,12 +68,11 @@ class Benchmark:
             row: index
             for index, row in enumerate(self.configurations.itertuples(index=False, name=None))
         }
-        at = [
-            np.array([self._index[row] for row in keys.itertuples(index=False, name=None)]),
-            *(
-                pd.Categorical(rows[column], categories=choices).codes
-                for column, choices in INSTANCE
-            ),
+
+        # each run into its cell of the table
+        at = [np.array([self._index[row] for row in keys.itertuples(index=False, name=None)])]
+        at += [
+            pd.Categorical(rows[column], categories=choices).codes for column, choices in INSTANCE
         ]
         shape = (len(unique), len(SEQUENCES), len(STARTS), len(FRAMES))
         self.values = np.full((*shape, len(METRICS)), np.nan)
@@ -83,10 +86,12 @@ class Benchmark:
         Raises:
             SlamHpoError: There is none of this number.
         """
-        row = self.configurations.iloc[
-            known("configuration", index, range(len(self.configurations)))
-        ]
-        return {name: (int if self.space[name].whole else float)(row[name]) for name in self.space}
+        number = known("configuration", index, range(len(self.configurations)))
+        row = self.configurations.iloc[number]
+        return {
+            name: int(row[name]) if setting.whole else float(row[name])
+            for name, setting in self.space.items()
+        }
 
     def units(self, settings: Mapping[str, Any]) -> NDArray[np.float64]:
         """A configuration as a point of the unit cube, settings in the order of `space`.
@@ -104,13 +109,12 @@ class Benchmark:
                 f"{self.system} has the settings {', '.join(self.space)}; missing or unknown: {wrong}"
             )
         for name, value in settings.items():
-            low, high = self.space[name][:2]
-            if not isinstance(value, Real) or (self.space[name].whole and value % 1):
-                raise SlamHpoError(
-                    f"{name} = {value!r} is no {'whole ' * self.space[name].whole}number"
-                )
-            if not low <= value <= high:
-                raise SlamHpoError(f"{name} = {value} is outside {low} to {high}")
+            setting = self.space[name]
+            if not isinstance(value, Real) or (setting.whole and value % 1):
+                kind = "whole number" if setting.whole else "number"
+                raise SlamHpoError(f"{name} = {value!r} is no {kind}")
+            if not setting.low <= value <= setting.high:
+                raise SlamHpoError(f"{name} = {value} is outside {setting.low} to {setting.high}")
         return np.array([setting.unit(settings[name]) for name, setting in self.space.items()])
 
     def measured(
@@ -147,9 +151,9 @@ class Benchmark:
             SlamHpoError: A setting, sequence, start or number of frames is not of the benchmark.
         """
         where = _place(sequence, start, frames)
-        mean, std = (
-            part[(0, *where)] for part in self.surrogate.predict(self.units(settings)[None])
-        )
+        means, stds = self.surrogate.predict(self.units(settings)[None])
+        mean = means[(0, *where)]
+        std = stds[(0, *where)]
         ate, coverage, processor = natural(mean).tolist()
         status = "ok" if coverage >= LOST_COVERAGE else "lost"
         return Evaluation(ate, coverage, processor, status, log_ate_std=float(std[0]))
@@ -163,11 +167,14 @@ class Benchmark:
         fidelity = known("frames", frames, FRAMES)
         column = known("metric", metric, METRICS)
         logarithm = np.log(self.values[:, :, :, FRAMES.index(fidelity), METRICS.index(column)])
+        # a difference of two starts has twice the variance of one; what all configurations have in
+        # common between the starts is no noise
         between = logarithm[:, :, 0] - logarithm[:, :, 1]
         return float(np.sqrt(np.mean((between - between.mean(axis=0)) ** 2) / 2))
 
     @cached_property
     def _units(self) -> NDArray[np.float64]:
+        """The configurations in the unit cube, ``[configurations, settings]``."""
         return np.stack(
             [self.space[name].unit(self.configurations[name]) for name in self.space], axis=1
         )
@@ -221,6 +228,8 @@ class Surrogate:
         with warnings.catch_warnings():  # a setting without effect has the longest length
             warnings.simplefilter("ignore", ConvergenceWarning)
             self.process.fit(units, targets)
+
+        # leave-one-out residual alpha_i / K^-1_ii, its variance 1 / K^-1_ii, and their ratio
         precision = np.diag(np.linalg.inv(self.process.L_ @ self.process.L_.T))
         self._calibration = np.sqrt(np.mean(self.process.alpha_**2 / precision[:, None], axis=0))
 
@@ -229,16 +238,15 @@ class Surrogate:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Means and standard deviations ``[N, sequences, starts, fidelities, 3]``, see `transformed`."""
         mean, std = self.process.predict(units, return_std=True)
-        return mean.reshape(len(units), *self._shape), (std * self._calibration).reshape(
-            len(units), *self._shape
-        )
+        shape = (len(units), *self._shape)
+        return mean.reshape(shape), (std * self._calibration).reshape(shape)
 
 
 def transformed(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Metrics as the surrogate has them: logarithms of error and time."""
-    found = values.copy()
-    found[..., [0, 2]] = np.log(found[..., [0, 2]])
-    return found
+    metrics = values.copy()
+    metrics[..., [0, 2]] = np.log(metrics[..., [0, 2]])
+    return metrics
 
 
 def natural(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -248,11 +256,12 @@ def natural(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _place(sequence: str, start: int, frames: int) -> tuple[int, int, int]:
-    values = (sequence, start, frames)
-    first, second, third = (
-        c.index(known(n, v, c)) for (n, c), v in zip(INSTANCE, values, strict=True)
+    """The place of an instance in the middle axes of `Benchmark.values`."""
+    return (
+        SEQUENCES.index(known("sequence", sequence, SEQUENCES)),
+        STARTS.index(known("start", start, STARTS)),
+        FRAMES.index(known("frames", frames, FRAMES)),
     )
-    return first, second, third
 
 
 def load(system: str) -> Benchmark:
@@ -266,7 +275,6 @@ def load(system: str) -> Benchmark:
 
 @lru_cache
 def _load(system: str) -> Benchmark:
-    with (
-        files("slam_hpo").joinpath("data", f"{system.partition('?')[0]}.parquet").open("rb") as file
-    ):
+    name = system.partition("?")[0]
+    with files("slam_hpo").joinpath("data", f"{name}.parquet").open("rb") as file:
         return Benchmark(system, pd.read_parquet(file))
