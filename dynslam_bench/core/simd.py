@@ -1,4 +1,4 @@
-"""SIMD vectors inside compiled kernels: 8 float64, 16 float32, 32 uint16 or 64 uint8 numbers as one value.
+"""SIMD vectors inside compiled kernels: 16 float32, 32 uint16 or 64 uint8 numbers as one value.
 
 Written as generic vector code of fixed width (llvmlite): LLVM maps it to the processor's
 instructions. A lane is the place of one number in a vector, as in SIMD hardware. The order of
@@ -72,10 +72,7 @@ _BYTES32 = ir.VectorType(_BYTE, UINT16_LANES)
 _INTS32 = ir.VectorType(_INT32, UINT16_LANES)
 _FLOATS32 = ir.VectorType(_FLOAT, UINT16_LANES)
 _BYTES64 = ir.VectorType(_BYTE, BYTE_LANES)
-_DOUBLES = ir.VectorType(ir.DoubleType(), 8)
 
-PATCH_ROWS = 31
-"""Rows of the patches that `patch_sum` reads."""
 COSINES = (32768, 23170, 0, -23170, -32768, -23170, 0, 23170)
 """Cosines of multiples of 45 degrees, in 32768ths; two places on are the sines."""
 DERIVATIVE_SHIFT = 11
@@ -103,8 +100,6 @@ class _SimdModel(models.PrimitiveModel):
 
 FLOAT32X16 = SimdType("Float32x16", _FLOATS)
 UINT16X32 = SimdType("UInt16x32", _HALVES)
-SUMS = types.UniTuple(SimdType("Float64x8", _DOUBLES), 6)
-"""Sums of normal equations: six rows, each of six numbers of the matrix, one of the right side and a zero."""
 
 
 class _Arithmetic(AbstractTemplate):
@@ -703,95 +698,3 @@ def store_maxima(
         return context.get_dummy_value()
 
     return types.void(maxima, scores, types.int64, types.int64, types.int64), generate
-
-
-@instruction
-def patch_sum(
-    typing_context: Code, image: Code, at: Code, width: Code, weights: Code
-) -> Definition:
-    """Weighted sum of a patch of `PATCH_ROWS` rows and `UINT16_LANES` columns, exact in 32 bits.
-
-    Args:
-        typing_context: Numba's.
-        image: Flat uint8 array.
-        at: Index of the patch's first pixel.
-        width: Pixels a row of the image.
-        weights: Flat int16 array, one of each pixel of the patch, row by row.
-    """
-
-    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        image, at, width, weights = arguments
-        total = constant(_INTS32, 0)
-        for row in range(PATCH_ROWS):
-            pixels = load_vector(context, builder, kind.args[0], image, at, _BYTES32, 1)
-            first = ir.Constant(_INT64, UINT16_LANES * row)
-            factors = load_vector(context, builder, kind.args[3], weights, first, _HALVES, 2)
-            products = builder.mul(builder.zext(pixels, _INTS32), builder.sext(factors, _INTS32))
-            total = builder.add(total, products)
-            at = builder.add(at, width)
-        return _sum_of_lanes(builder, total, builder.add)
-
-    return types.int32(image, types.int64, types.int64, weights), generate
-
-
-@instruction
-def normal_equations(typing_context: Code) -> Definition:
-    """Normal equations of no residuals, all zero, for `add_normal_equation`."""
-
-    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        return context.make_tuple(builder, kind.return_type, [constant(_DOUBLES, 0.0)] * 6)
-
-    return SUMS(), generate
-
-
-@instruction
-def add_normal_equation(
-    typing_context: Code,
-    sums: Code,
-    weight: Code,
-    j0: Code,
-    j1: Code,
-    j2: Code,
-    j3: Code,
-    j4: Code,
-    j5: Code,
-    residual: Code,
-) -> Definition:
-    """Sums with ``weight j^T j`` and ``weight j^T residual`` of one residual more, j its derivatives by six numbers."""
-
-    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        sums, weight, *numbers = arguments
-        # the row (j, residual, 0)
-        row = constant(_DOUBLES, 0.0)
-        for lane, number in enumerate(numbers):
-            row = builder.insert_element(row, number, ir.Constant(_INT32, lane))
-        # row m of the sums grows by weight j_m (j, residual, 0)
-        weighted = builder.fmul(splat(builder, _DOUBLES, weight), row)
-        added = []
-        for m, old in enumerate(cgutils.unpack_tuple(builder, sums, 6)):
-            factor = builder.shuffle_vector(weighted, weighted, _lanes(*([m] * 8)))
-            added.append(builder.fadd(old, builder.fmul(factor, row)))
-        return context.make_tuple(builder, kind.return_type, added)
-
-    return SUMS(SUMS, *([types.float64] * 8)), generate
-
-
-@instruction
-def store_normal_equations(
-    typing_context: Code, sums: Code, matrix: Code, vector: Code
-) -> Definition:
-    """Write the matrix ``[6, 6]`` and the vector ``[6]`` of the sums into float64 arrays."""
-
-    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        sums, matrix, vector = arguments
-        matrix_data = context.make_array(kind.args[1])(context, builder, matrix).data
-        vector_data = context.make_array(kind.args[2])(context, builder, vector).data
-        for m, row in enumerate(cgutils.unpack_tuple(builder, sums, 6)):
-            for n in range(6):
-                pointer = builder.gep(matrix_data, [ir.Constant(_INT64, 6 * m + n)])
-                builder.store(builder.extract_element(row, ir.Constant(_INT32, n)), pointer)
-            pointer = builder.gep(vector_data, [ir.Constant(_INT64, m)])
-            builder.store(builder.extract_element(row, ir.Constant(_INT32, 6)), pointer)
-        return context.get_dummy_value()
-
-    return types.void(sums, matrix, vector), generate

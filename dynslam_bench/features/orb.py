@@ -21,9 +21,6 @@ from dynslam_bench.core import SettingsError
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.core.simd import (
     BYTE_LANES,
-    PATCH_ROWS,
-    UINT16_LANES,
-    patch_sum,
     store_corner_scores,
     store_maxima,
 )
@@ -33,12 +30,13 @@ from dynslam_bench.geometry import inside
 
 PATCH_RADIUS = 15
 """Radius of the disc whose intensity centroid gives the orientation, pixels of the level."""
-
-# row and column of each pixel of a patch from its centre, 0 outside the disc, flat int16
-_ROW, _COLUMN = np.mgrid[:PATCH_ROWS, :UINT16_LANES].astype(np.int16) - PATCH_RADIUS
+PATCH_SIDE = 32
+"""Rows and columns of the patch that is summed: the disc's 31, and one of zeros that makes whole vectors of it."""
+# row and column of each pixel of the patch from the disc's centre, 0 outside the disc
+_ROW, _COLUMN = np.mgrid[:PATCH_SIDE, :PATCH_SIDE].astype(np.int32) - PATCH_RADIUS
 _IN_DISC = _ROW * _ROW + _COLUMN * _COLUMN <= PATCH_RADIUS * PATCH_RADIUS
-_DISC_COLUMNS = (_COLUMN * _IN_DISC).reshape(-1)
-_DISC_ROWS = (_ROW * _IN_DISC).reshape(-1)
+_DISC_COLUMNS = _COLUMN * _IN_DISC
+_DISC_ROWS = _ROW * _IN_DISC
 
 EDGE = 19
 """Corners nearer to a level's border than this are not used: the rotated descriptor pattern would leave the image."""
@@ -318,8 +316,8 @@ def fast_corners(
 def orientations(
     image: NDArray[np.uint8],
     xy: NDArray[np.float32],
-    columns: NDArray[np.int16],
-    rows: NDArray[np.int16],
+    columns: NDArray[np.int32],
+    rows: NDArray[np.int32],
 ) -> NDArray[np.float32]:
     """Orientations of discs by their intensity centroid (Rublee et al., 2011, Section 3.2), degrees in [0, 360).
 
@@ -327,18 +325,24 @@ def orientations(
         image: uint8 ``[H, W]``.
         xy: Integer-valued pixels, float32 ``[N, 2]``, more than the disc's radius away from the
             border.
-        columns: Column of each pixel of the disc from its centre, flat int16, as `patch_sum` reads
-            it; 0 outside ...
+        columns: int32 ``[PATCH_SIDE, PATCH_SIDE]``, column of each pixel of the disc from its
+            centre; 0 outside ...
         rows: ... and its row.
     """
     out = np.zeros(len(xy), np.float32)
-    pixels = image.reshape(-1)
-    width = image.shape[1]
+    side = len(rows)  # a constant number of turns would be unrolled, and no vector code made
     for i in range(len(xy)):
-        first = (int(xy[i, 1]) - PATCH_RADIUS) * width + int(xy[i, 0]) - PATCH_RADIUS
-        # first moments of the grey levels
-        m10 = patch_sum(pixels, first, width, columns)
-        m01 = patch_sum(pixels, first, width, rows)
+        top = int(xy[i, 1]) - PATCH_RADIUS
+        left = int(xy[i, 0]) - PATCH_RADIUS
+        patch = image[top : top + side, left : left + side]
+        # first moments of the grey levels, exact in 32 bits
+        m10 = np.int32(0)
+        m01 = np.int32(0)
+        for row in range(side):
+            for column in range(side):
+                pixel = np.int32(patch[row, column])
+                m10 = np.int32(m10 + pixel * columns[row, column])
+                m01 = np.int32(m01 + pixel * rows[row, column])
         out[i] = math.degrees(math.atan2(float(m01), float(m10))) % 360.0
         # float32 may round up to 360
         if out[i] >= 360.0:

@@ -21,6 +21,31 @@ def transform_point(pose: Array, point: Array) -> tuple[float, float, float]:
     )
 
 
+@inlined
+def add_normal_equation(
+    matrix: Array,
+    vector: Array,
+    weight: float,
+    j0: float,
+    j1: float,
+    j2: float,
+    j3: float,
+    j4: float,
+    j5: float,
+    residual: float,
+) -> None:
+    """Add ``weight j^T j`` to a matrix ``[6, 6]`` and ``weight j^T residual`` to a vector ``[6]``.
+
+    The derivatives j of the residual by the six numbers of the twist come one by one.
+    """
+    jacobian = (j0, j1, j2, j3, j4, j5)
+    for m in range(6):
+        weighted = weight * jacobian[m]
+        for n in range(6):
+            matrix[m, n] += weighted * jacobian[n]
+        vector[m] += weighted * residual
+
+
 @kernel
 def cholesky_solve(a: Array, b: Array) -> bool:
     """Solve ``a x = b`` in place for a symmetric positive definite `a`; `b` becomes x. False if it is not definite.
