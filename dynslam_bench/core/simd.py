@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
-from functools import partial, reduce
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -54,7 +53,7 @@ FLOAT_LANES = 16
 UINT16_LANES = 32
 """Numbers of a uint16 vector, 64 bytes: four histograms of eight bins."""
 BYTE_LANES = 64
-"""Numbers of a uint8 vector, 64 bytes."""
+"""Numbers of a uint8 vector, 64 bytes: `features.fast`."""
 
 # LLVM's types of numbers; its integers have no sign
 _FLOAT = ir.FloatType()
@@ -63,7 +62,7 @@ _INT32 = ir.IntType(32)
 _UINT16 = ir.IntType(16)
 _BYTE = ir.IntType(8)
 
-# LLVM's types of vectors: sixteen numbers for float32, thirty-two for uint16, sixty-four for uint8
+# LLVM's types of vectors: sixteen numbers for float32, thirty-two for uint16
 _FLOATS = ir.VectorType(_FLOAT, FLOAT_LANES)
 _INTS = ir.VectorType(_INT32, FLOAT_LANES)
 _BYTES16 = ir.VectorType(_BYTE, FLOAT_LANES)
@@ -71,7 +70,6 @@ _HALVES = ir.VectorType(_UINT16, UINT16_LANES)
 _BYTES32 = ir.VectorType(_BYTE, UINT16_LANES)
 _INTS32 = ir.VectorType(_INT32, UINT16_LANES)
 _FLOATS32 = ir.VectorType(_FLOAT, UINT16_LANES)
-_BYTES64 = ir.VectorType(_BYTE, BYTE_LANES)
 
 COSINES = (32768, 23170, 0, -23170, -32768, -23170, 0, 23170)
 """Cosines of multiples of 45 degrees, in 32768ths; two places on are the sines."""
@@ -577,7 +575,7 @@ def descriptor_sum(
 
             distances = _histogram_distances(builder, sampled, compared, count)
             limit = splat(builder, lanes, truncation)
-            truncated = _smaller(builder, distances, limit)
+            truncated = smaller(builder, distances, limit)
             return builder.add(total, _sum_of_lanes(builder, truncated, builder.add))
 
         # the centre, the first ring, the second ring
@@ -589,112 +587,11 @@ def descriptor_sum(
     return signature, generate
 
 
-def _smaller(builder: Code, first: Code, second: Code) -> Code:
+def smaller(builder: Code, first: Code, second: Code) -> Code:
     """Code for the smaller of two numbers without sign, lane by lane."""
     return builder.select(builder.icmp_unsigned("<", first, second), first, second)
 
 
-def _larger(builder: Code, first: Code, second: Code) -> Code:
+def larger(builder: Code, first: Code, second: Code) -> Code:
     """Code for the larger of two numbers without sign, lane by lane."""
     return builder.select(builder.icmp_unsigned(">", first, second), first, second)
-
-
-@instruction
-def store_corner_scores(
-    typing_context: Code, scores: Code, image: Code, at: Code, circle: Code
-) -> Definition:
-    """Write the FAST scores of sixty-four adjacent pixels (Rosten and Drummond 2006).
-
-    The score is the largest threshold at which the pixel is a corner: nine adjacent pixels of the
-    circle around it are all brighter, or all darker, by more than the threshold. It is 0 where
-    there is none.
-
-    Args:
-        typing_context: Numba's.
-        scores: Flat uint8 array that is written.
-        image: Flat uint8 array, grey levels.
-        at: Index of the first pixel.
-        circle: int64 array, offsets of the sixteen pixels of the circle, in order.
-    """
-
-    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        scores, image, at, circle = arguments
-        smaller = partial(_smaller, builder)
-        larger = partial(_larger, builder)
-
-        def pixels(index: Code) -> Code:
-            return load_vector(context, builder, kind.args[1], image, index, _BYTES64, 1)
-
-        # the sixteen pixels of the circle, for sixty-four centres at once
-        offsets = context.make_array(kind.args[3])(context, builder, circle).data
-        ring = []
-        for k in range(16):
-            offset = builder.load(builder.gep(offsets, [ir.Constant(_INT64, k)]))
-            ring.append(pixels(builder.add(at, offset)))
-        centre = pixels(at)
-
-        def best_arc(worse: Callable[..., Code], better: Callable[..., Code]) -> Code:
-            """The grey level that all pixels of the best arc of nine reach."""
-            # the worst of two, four and eight pixels that follow each other, from every odd one on
-            twos = [worse(ring[k], ring[(k + 1) % 16]) for k in range(1, 16, 2)]
-            fours = [worse(twos[k], twos[(k + 1) % 8]) for k in range(8)]
-            eights = [worse(fours[k], fours[(k + 2) % 8]) for k in range(8)]
-            # with one more pixel at either end these are all sixteen arcs of nine
-            arcs = [worse(eights[k], better(ring[2 * k], ring[(2 * k + 9) % 16])) for k in range(8)]
-            return reduce(better, arcs)
-
-        # differences that are negative become 0, because the centre takes part
-        brighter = builder.sub(larger(best_arc(smaller, larger), centre), centre)
-        darker = builder.sub(centre, smaller(best_arc(larger, smaller), centre))
-        # the largest threshold that the difference exceeds
-        one = constant(_BYTES64, 1)
-        score = builder.sub(larger(larger(brighter, darker), one), one)
-        pointer = pointer_to(context, builder, kind.args[0], scores, at, _BYTES64)
-        builder.store(score, pointer, align=1)
-        return context.get_dummy_value()
-
-    return types.void(scores, image, types.int64, circle), generate
-
-
-@instruction
-def store_maxima(
-    typing_context: Code, maxima: Code, scores: Code, at: Code, width: Code, least: Code
-) -> Definition:
-    """Write sixty-four adjacent scores, those that are below `least` or not above all eight around them as 0.
-
-    Args:
-        typing_context: Numba's.
-        maxima: Flat uint8 array that is written.
-        scores: Flat uint8 array.
-        at: Index of the first score.
-        width: Scores a row.
-        least: In 1 to 255.
-    """
-
-    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        maxima, scores, at, width, least = arguments
-
-        def scores_at(row: Code, dx: int) -> Code:
-            index = builder.add(row, ir.Constant(_INT64, dx))
-            return load_vector(context, builder, kind.args[1], scores, index, _BYTES64, 1)
-
-        above = builder.sub(at, width)
-        below = builder.add(at, width)
-        around = [
-            *(scores_at(above, dx) for dx in (-1, 0, 1)),
-            *(scores_at(at, dx) for dx in (-1, 1)),
-            *(scores_at(below, dx) for dx in (-1, 0, 1)),
-        ]
-
-        # a maximum exceeds the eight around it, and the largest score that is too small
-        least_byte = splat(builder, _BYTES64, builder.trunc(least, _BYTE))
-        too_small = builder.sub(least_byte, constant(_BYTES64, 1))
-        bound = reduce(partial(_larger, builder), around, too_small)
-        score = load_vector(context, builder, kind.args[1], scores, at, _BYTES64, 1)
-        is_maximum = builder.icmp_unsigned(">", score, bound)
-        kept = builder.select(is_maximum, score, constant(_BYTES64, 0))
-        pointer = pointer_to(context, builder, kind.args[0], maxima, at, _BYTES64)
-        builder.store(kept, pointer, align=1)
-        return context.get_dummy_value()
-
-    return types.void(maxima, scores, types.int64, types.int64, types.int64), generate

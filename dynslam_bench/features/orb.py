@@ -19,12 +19,8 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts import Keypoints
 from dynslam_bench.core import SettingsError
 from dynslam_bench.core.compiled import kernel
-from dynslam_bench.core.simd import (
-    BYTE_LANES,
-    store_corner_scores,
-    store_maxima,
-)
 from dynslam_bench.features.brief import rotated_brief, smooth
+from dynslam_bench.features.fast import EDGE, fast_corners
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry import inside
 
@@ -37,31 +33,6 @@ _ROW, _COLUMN = np.mgrid[:PATCH_SIDE, :PATCH_SIDE].astype(np.int32) - PATCH_RADI
 _IN_DISC = _ROW * _ROW + _COLUMN * _COLUMN <= PATCH_RADIUS * PATCH_RADIUS
 _DISC_COLUMNS = _COLUMN * _IN_DISC
 _DISC_ROWS = _ROW * _IN_DISC
-
-EDGE = 19
-"""Corners nearer to a level's border than this are not used: the rotated descriptor pattern would leave the image."""
-
-CIRCLE = np.array(
-    [
-        (0, 3),
-        (1, 3),
-        (2, 2),
-        (3, 1),
-        (3, 0),
-        (3, -1),
-        (2, -2),
-        (1, -3),
-        (0, -3),
-        (-1, -3),
-        (-2, -2),
-        (-3, -1),
-        (-3, 0),
-        (-3, 1),
-        (-2, 2),
-        (-1, 3),
-    ]
-)
-"""The sixteen pixels of FAST around a corner, (column, row) each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,49 +238,6 @@ def _stable_order(keys: NDArray[np.signedinteger]) -> NDArray[np.int64]:
         order[start[key - lowest]] = i
         start[key - lowest] += 1
     return order
-
-
-@kernel
-def fast_corners(
-    image: NDArray[np.uint8], threshold: int
-) -> tuple[NDArray[np.int64], NDArray[np.int16]]:
-    """FAST corners that are stronger than their eight neighbours, row by row; the same as OpenCV's.
-
-    Args:
-        image: uint8 ``[H, W]``, more than twice `EDGE` wide and high; corners nearer to its border
-            are left out.
-        threshold: Least score, at least 1.
-
-    Returns:
-        Indices ``[N]`` into the flat image, and their scores ``[N]``.
-    """
-    height, width = image.shape
-    pixels = image.reshape(-1)
-    scores = np.zeros(image.size, np.uint8)
-    maxima = np.zeros(image.size, np.uint8)
-    circle = CIRCLE[:, 0] + CIRCLE[:, 1] * width
-    # scores of all rows but those near the upper and lower border
-    first = EDGE * width
-    last = (height - EDGE) * width
-    for at in range(first, last, BYTE_LANES):
-        store_corner_scores(scores, pixels, at, circle)
-    # none near the left and right border, nor where the last vector passed the last row
-    for y in range(EDGE, height - EDGE):
-        for x in range(EDGE):
-            scores[y * width + x] = scores[(y + 1) * width - 1 - x] = 0
-    for at in range(last, last + BYTE_LANES):
-        scores[at] = 0
-    # non-maximum suppression
-    for at in range(first, last, BYTE_LANES):
-        store_maxima(maxima, scores, at, width, threshold)
-    # list the maxima, without a branch; of four adjacent pixels one at most is a maximum
-    corners = np.empty(image.size // 4, np.int64)
-    count = 0
-    for at in range(first, last):
-        corners[count] = at
-        count += maxima[at] > 0
-    corners = corners[:count]
-    return corners, maxima[corners].astype(np.int16)
 
 
 @kernel
