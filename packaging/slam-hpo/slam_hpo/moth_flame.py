@@ -39,7 +39,7 @@ class MothFlameRules(NamedTuple):
 
 
 EMFOA = MothFlameRules(opposition=True, cauchy=True, best_flame=True, half=False, as_printed=False)
-"""The paper's enhanced search (Eq. 8-22), with its printing errors corrected."""
+"""The paper's enhanced search (Eq. 8-22), with Eq. 9-11 and 17 corrected."""
 MFO = MothFlameRules(opposition=False, cauchy=False, best_flame=False, half=False, as_printed=False)
 """Moth-flame optimisation without the enhancements (Eq. 8-12)."""
 EMFOA_LITERAL = MothFlameRules(
