@@ -22,6 +22,30 @@ def transform_point(pose: Array, point: Array) -> tuple[float, float, float]:
 
 
 @inlined
+def _add_to_row(
+    matrix: Array,
+    vector: Array,
+    m: int,
+    weighted: float,
+    j0: float,
+    j1: float,
+    j2: float,
+    j3: float,
+    j4: float,
+    j5: float,
+    residual: float,
+) -> None:
+    """Add ``weighted (j, residual)`` to row m of a matrix ``[6, 6]`` and of a vector ``[6]``."""
+    matrix[m, 0] += weighted * j0
+    matrix[m, 1] += weighted * j1
+    matrix[m, 2] += weighted * j2
+    matrix[m, 3] += weighted * j3
+    matrix[m, 4] += weighted * j4
+    matrix[m, 5] += weighted * j5
+    vector[m] += weighted * residual
+
+
+@inlined
 def add_normal_equation(
     matrix: Array,
     vector: Array,
@@ -38,12 +62,13 @@ def add_normal_equation(
 
     The derivatives j of the residual by the six numbers of the twist come one by one.
     """
-    jacobian = (j0, j1, j2, j3, j4, j5)
-    for m in range(6):
-        weighted = weight * jacobian[m]
-        for n in range(6):
-            matrix[m, n] += weighted * jacobian[n]
-        vector[m] += weighted * residual
+    # row by row, not in a loop over a tuple, each access to which is a branch in compiled code
+    _add_to_row(matrix, vector, 0, weight * j0, j0, j1, j2, j3, j4, j5, residual)
+    _add_to_row(matrix, vector, 1, weight * j1, j0, j1, j2, j3, j4, j5, residual)
+    _add_to_row(matrix, vector, 2, weight * j2, j0, j1, j2, j3, j4, j5, residual)
+    _add_to_row(matrix, vector, 3, weight * j3, j0, j1, j2, j3, j4, j5, residual)
+    _add_to_row(matrix, vector, 4, weight * j4, j0, j1, j2, j3, j4, j5, residual)
+    _add_to_row(matrix, vector, 5, weight * j5, j0, j1, j2, j3, j4, j5, residual)
 
 
 @kernel
