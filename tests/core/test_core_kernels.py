@@ -487,7 +487,7 @@ def test_an_edit_counts_for_the_kernels_that_it_is_compiled_into(tmp_path: Path)
     # instructions: their whole module counts
     instructions = package / "core" / "simd.py"
     by_instruction = changed_by(instructions, "DERIVATIVE_SHIFT = 11", "DERIVATIVE_SHIFT = 10")
-    assert {*maps, "slam.pose_optimisation._optimise"} <= by_instruction
+    assert {*maps, "flow.refinement.similarity_lucas_kanade"} <= by_instruction
     assert "geometry.gauss_newton.apply_twist" not in by_instruction
     assert not changed_by(
         instructions, "DERIVATIVE_SHIFT = 11", "DERIVATIVE_SHIFT = 11  # a comment"
