@@ -13,7 +13,7 @@ from llvmlite import ir
 from numba import types
 from numpy.typing import NDArray
 
-from dynslam_bench.core.compiled import kernel
+from dynslam_bench.core.compiled import Scalar, kernel
 from dynslam_bench.core.simd import (
     BYTE_LANES,
     Code,
@@ -167,8 +167,8 @@ def plain_corner_scores(
         score = 0
         for first in range(16):
             # the least difference of an arc of nine, for a corner that is darker than the arc or brighter
-            brighter = 255
-            darker = 255
+            brighter: Scalar = 255
+            darker: Scalar = 255
             for k in range(first, first + 9):
                 difference = np.int64(image[pixel + circle[k % 16]]) - centre
                 brighter = min(brighter, difference)
