@@ -19,6 +19,9 @@ exact_depth  # on rendered sequences: depth without the sensor's noise, to judge
 # flow.moth_flame: the equations as they read, beside the kernel that a test compares with them
 moth_positions
 opposites  # flow.moth_flame: the same
+# features.fast: the instructions in plain code, which a test compares them with
+plain_corner_scores
+plain_maxima
 
 # called by name: specs name their factories as "module:name"
 OrbExtractor  # features.registry

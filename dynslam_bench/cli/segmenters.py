@@ -139,7 +139,7 @@ def record(
     """Write a segmenter's masks of a sequence as PNG files; a call that was interrupted goes on."""
     from dynslam_bench.core.settings import apply_overrides
     from dynslam_bench.envs import resolve_device
-    from dynslam_bench.segmentation.recorded import record_masks
+    from dynslam_bench.segmentation.record import record_masks
     from dynslam_bench.segmentation.settings import SegmentationSettings
     from dynslam_bench.sequences import open_sequence
 

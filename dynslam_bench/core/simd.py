@@ -1,4 +1,4 @@
-"""SIMD vectors inside compiled kernels: 8 float64, 16 float32, 32 uint16 or 64 uint8 numbers as one value.
+"""SIMD vectors inside compiled kernels: 16 float32, 32 uint16 or 64 uint8 numbers as one value.
 
 Written as generic vector code of fixed width (llvmlite): LLVM maps it to the processor's
 instructions. A lane is the place of one number in a vector, as in SIMD hardware. The order of
@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
-from functools import partial, reduce
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -54,7 +53,7 @@ FLOAT_LANES = 16
 UINT16_LANES = 32
 """Numbers of a uint16 vector, 64 bytes: four histograms of eight bins."""
 BYTE_LANES = 64
-"""Numbers of a uint8 vector, 64 bytes."""
+"""Numbers of a uint8 vector, 64 bytes: `features.fast`."""
 
 # LLVM's types of numbers; its integers have no sign
 _FLOAT = ir.FloatType()
@@ -63,7 +62,7 @@ _INT32 = ir.IntType(32)
 _UINT16 = ir.IntType(16)
 _BYTE = ir.IntType(8)
 
-# LLVM's types of vectors: sixteen numbers for float32, thirty-two for uint16, sixty-four for uint8
+# LLVM's types of vectors: sixteen numbers for float32, thirty-two for uint16
 _FLOATS = ir.VectorType(_FLOAT, FLOAT_LANES)
 _INTS = ir.VectorType(_INT32, FLOAT_LANES)
 _BYTES16 = ir.VectorType(_BYTE, FLOAT_LANES)
@@ -71,11 +70,7 @@ _HALVES = ir.VectorType(_UINT16, UINT16_LANES)
 _BYTES32 = ir.VectorType(_BYTE, UINT16_LANES)
 _INTS32 = ir.VectorType(_INT32, UINT16_LANES)
 _FLOATS32 = ir.VectorType(_FLOAT, UINT16_LANES)
-_BYTES64 = ir.VectorType(_BYTE, BYTE_LANES)
-_DOUBLES = ir.VectorType(ir.DoubleType(), 8)
 
-PATCH_ROWS = 31
-"""Rows of the patches that `patch_sum` reads."""
 COSINES = (32768, 23170, 0, -23170, -32768, -23170, 0, 23170)
 """Cosines of multiples of 45 degrees, in 32768ths; two places on are the sines."""
 DERIVATIVE_SHIFT = 11
@@ -103,8 +98,6 @@ class _SimdModel(models.PrimitiveModel):
 
 FLOAT32X16 = SimdType("Float32x16", _FLOATS)
 UINT16X32 = SimdType("UInt16x32", _HALVES)
-SUMS = types.UniTuple(SimdType("Float64x8", _DOUBLES), 6)
-"""Sums of normal equations: six rows, each of six numbers of the matrix, one of the right side and a zero."""
 
 
 class _Arithmetic(AbstractTemplate):
@@ -582,7 +575,7 @@ def descriptor_sum(
 
             distances = _histogram_distances(builder, sampled, compared, count)
             limit = splat(builder, lanes, truncation)
-            truncated = _smaller(builder, distances, limit)
+            truncated = smaller(builder, distances, limit)
             return builder.add(total, _sum_of_lanes(builder, truncated, builder.add))
 
         # the centre, the first ring, the second ring
@@ -594,204 +587,11 @@ def descriptor_sum(
     return signature, generate
 
 
-def _smaller(builder: Code, first: Code, second: Code) -> Code:
+def smaller(builder: Code, first: Code, second: Code) -> Code:
     """Code for the smaller of two numbers without sign, lane by lane."""
     return builder.select(builder.icmp_unsigned("<", first, second), first, second)
 
 
-def _larger(builder: Code, first: Code, second: Code) -> Code:
+def larger(builder: Code, first: Code, second: Code) -> Code:
     """Code for the larger of two numbers without sign, lane by lane."""
     return builder.select(builder.icmp_unsigned(">", first, second), first, second)
-
-
-@instruction
-def store_corner_scores(
-    typing_context: Code, scores: Code, image: Code, at: Code, circle: Code
-) -> Definition:
-    """Write the FAST scores of sixty-four adjacent pixels (Rosten and Drummond 2006).
-
-    The score is the largest threshold at which the pixel is a corner: nine adjacent pixels of the
-    circle around it are all brighter, or all darker, by more than the threshold. It is 0 where
-    there is none.
-
-    Args:
-        typing_context: Numba's.
-        scores: Flat uint8 array that is written.
-        image: Flat uint8 array, grey levels.
-        at: Index of the first pixel.
-        circle: int64 array, offsets of the sixteen pixels of the circle, in order.
-    """
-
-    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        scores, image, at, circle = arguments
-        smaller = partial(_smaller, builder)
-        larger = partial(_larger, builder)
-
-        def pixels(index: Code) -> Code:
-            return load_vector(context, builder, kind.args[1], image, index, _BYTES64, 1)
-
-        # the sixteen pixels of the circle, for sixty-four centres at once
-        offsets = context.make_array(kind.args[3])(context, builder, circle).data
-        ring = []
-        for k in range(16):
-            offset = builder.load(builder.gep(offsets, [ir.Constant(_INT64, k)]))
-            ring.append(pixels(builder.add(at, offset)))
-        centre = pixels(at)
-
-        def best_arc(worse: Callable[..., Code], better: Callable[..., Code]) -> Code:
-            """The grey level that all pixels of the best arc of nine reach."""
-            # the worst of two, four and eight pixels that follow each other, from every odd one on
-            twos = [worse(ring[k], ring[(k + 1) % 16]) for k in range(1, 16, 2)]
-            fours = [worse(twos[k], twos[(k + 1) % 8]) for k in range(8)]
-            eights = [worse(fours[k], fours[(k + 2) % 8]) for k in range(8)]
-            # with one more pixel at either end these are all sixteen arcs of nine
-            arcs = [worse(eights[k], better(ring[2 * k], ring[(2 * k + 9) % 16])) for k in range(8)]
-            return reduce(better, arcs)
-
-        # differences that are negative become 0, because the centre takes part
-        brighter = builder.sub(larger(best_arc(smaller, larger), centre), centre)
-        darker = builder.sub(centre, smaller(best_arc(larger, smaller), centre))
-        # the largest threshold that the difference exceeds
-        one = constant(_BYTES64, 1)
-        score = builder.sub(larger(larger(brighter, darker), one), one)
-        pointer = pointer_to(context, builder, kind.args[0], scores, at, _BYTES64)
-        builder.store(score, pointer, align=1)
-        return context.get_dummy_value()
-
-    return types.void(scores, image, types.int64, circle), generate
-
-
-@instruction
-def store_maxima(
-    typing_context: Code, maxima: Code, scores: Code, at: Code, width: Code, least: Code
-) -> Definition:
-    """Write sixty-four adjacent scores, those that are below `least` or not above all eight around them as 0.
-
-    Args:
-        typing_context: Numba's.
-        maxima: Flat uint8 array that is written.
-        scores: Flat uint8 array.
-        at: Index of the first score.
-        width: Scores a row.
-        least: In 1 to 255.
-    """
-
-    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        maxima, scores, at, width, least = arguments
-
-        def scores_at(row: Code, dx: int) -> Code:
-            index = builder.add(row, ir.Constant(_INT64, dx))
-            return load_vector(context, builder, kind.args[1], scores, index, _BYTES64, 1)
-
-        above = builder.sub(at, width)
-        below = builder.add(at, width)
-        around = [
-            *(scores_at(above, dx) for dx in (-1, 0, 1)),
-            *(scores_at(at, dx) for dx in (-1, 1)),
-            *(scores_at(below, dx) for dx in (-1, 0, 1)),
-        ]
-
-        # a maximum exceeds the eight around it, and the largest score that is too small
-        least_byte = splat(builder, _BYTES64, builder.trunc(least, _BYTE))
-        too_small = builder.sub(least_byte, constant(_BYTES64, 1))
-        bound = reduce(partial(_larger, builder), around, too_small)
-        score = load_vector(context, builder, kind.args[1], scores, at, _BYTES64, 1)
-        is_maximum = builder.icmp_unsigned(">", score, bound)
-        kept = builder.select(is_maximum, score, constant(_BYTES64, 0))
-        pointer = pointer_to(context, builder, kind.args[0], maxima, at, _BYTES64)
-        builder.store(kept, pointer, align=1)
-        return context.get_dummy_value()
-
-    return types.void(maxima, scores, types.int64, types.int64, types.int64), generate
-
-
-@instruction
-def patch_sum(
-    typing_context: Code, image: Code, at: Code, width: Code, weights: Code
-) -> Definition:
-    """Weighted sum of a patch of `PATCH_ROWS` rows and `UINT16_LANES` columns, exact in 32 bits.
-
-    Args:
-        typing_context: Numba's.
-        image: Flat uint8 array.
-        at: Index of the patch's first pixel.
-        width: Pixels a row of the image.
-        weights: Flat int16 array, one of each pixel of the patch, row by row.
-    """
-
-    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        image, at, width, weights = arguments
-        total = constant(_INTS32, 0)
-        for row in range(PATCH_ROWS):
-            pixels = load_vector(context, builder, kind.args[0], image, at, _BYTES32, 1)
-            first = ir.Constant(_INT64, UINT16_LANES * row)
-            factors = load_vector(context, builder, kind.args[3], weights, first, _HALVES, 2)
-            products = builder.mul(builder.zext(pixels, _INTS32), builder.sext(factors, _INTS32))
-            total = builder.add(total, products)
-            at = builder.add(at, width)
-        return _sum_of_lanes(builder, total, builder.add)
-
-    return types.int32(image, types.int64, types.int64, weights), generate
-
-
-@instruction
-def normal_equations(typing_context: Code) -> Definition:
-    """Normal equations of no residuals, all zero, for `add_normal_equation`."""
-
-    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        return context.make_tuple(builder, kind.return_type, [constant(_DOUBLES, 0.0)] * 6)
-
-    return SUMS(), generate
-
-
-@instruction
-def add_normal_equation(
-    typing_context: Code,
-    sums: Code,
-    weight: Code,
-    j0: Code,
-    j1: Code,
-    j2: Code,
-    j3: Code,
-    j4: Code,
-    j5: Code,
-    residual: Code,
-) -> Definition:
-    """Sums with ``weight j^T j`` and ``weight j^T residual`` of one residual more, j its derivatives by six numbers."""
-
-    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        sums, weight, *numbers = arguments
-        # the row (j, residual, 0)
-        row = constant(_DOUBLES, 0.0)
-        for lane, number in enumerate(numbers):
-            row = builder.insert_element(row, number, ir.Constant(_INT32, lane))
-        # row m of the sums grows by weight j_m (j, residual, 0)
-        weighted = builder.fmul(splat(builder, _DOUBLES, weight), row)
-        added = []
-        for m, old in enumerate(cgutils.unpack_tuple(builder, sums, 6)):
-            factor = builder.shuffle_vector(weighted, weighted, _lanes(*([m] * 8)))
-            added.append(builder.fadd(old, builder.fmul(factor, row)))
-        return context.make_tuple(builder, kind.return_type, added)
-
-    return SUMS(SUMS, *([types.float64] * 8)), generate
-
-
-@instruction
-def store_normal_equations(
-    typing_context: Code, sums: Code, matrix: Code, vector: Code
-) -> Definition:
-    """Write the matrix ``[6, 6]`` and the vector ``[6]`` of the sums into float64 arrays."""
-
-    def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
-        sums, matrix, vector = arguments
-        matrix_data = context.make_array(kind.args[1])(context, builder, matrix).data
-        vector_data = context.make_array(kind.args[2])(context, builder, vector).data
-        for m, row in enumerate(cgutils.unpack_tuple(builder, sums, 6)):
-            for n in range(6):
-                pointer = builder.gep(matrix_data, [ir.Constant(_INT64, 6 * m + n)])
-                builder.store(builder.extract_element(row, ir.Constant(_INT32, n)), pointer)
-            pointer = builder.gep(vector_data, [ir.Constant(_INT64, m)])
-            builder.store(builder.extract_element(row, ir.Constant(_INT32, 6)), pointer)
-        return context.get_dummy_value()
-
-    return types.void(sums, matrix, vector), generate

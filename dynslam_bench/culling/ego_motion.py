@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.core.compiled import kernel
-from dynslam_bench.core.simd import add_normal_equation, normal_equations, store_normal_equations
 from dynslam_bench.culling import Rule
 from dynslam_bench.culling.settings import RigidMotionSettings
 from dynslam_bench.geometry import Camera, pixel_index, se3
 from dynslam_bench.geometry.gauss_newton import (
+    add_normal_equation,
     apply_twist,
     cholesky_solve,
     transform_point,
@@ -339,9 +339,8 @@ def _linearise(
     """
     fx = camera.fx
     fy = camera.fy
-    hessian = np.empty((6, 6))
-    gradient = np.empty(6)
-    sums = normal_equations()
+    hessian = np.zeros((6, 6))
+    gradient = np.zeros(6)
     total = 0.0
     for i in range(len(points)):
         x, y, z = transform_point(pose, points[i])
@@ -359,13 +358,30 @@ def _linearise(
         # rows of the Jacobian by (translation, rotation): of u and of v
         a = fx / z
         b = fy / z
-        sums = add_normal_equation(
-            sums, weight, a, 0.0, -fx * x / z, -fx * x * y, fx * (1 + x * x), -fx * y, du
+        add_normal_equation(
+            hessian,
+            gradient,
+            weight,
+            a,
+            0.0,
+            -fx * x / z,
+            -fx * x * y,
+            fx * (1 + x * x),
+            -fx * y,
+            du,
         )
-        sums = add_normal_equation(
-            sums, weight, 0.0, b, -fy * y / z, -fy * (1 + y * y), fy * x * y, fy * x, dv
+        add_normal_equation(
+            hessian,
+            gradient,
+            weight,
+            0.0,
+            b,
+            -fy * y / z,
+            -fy * (1 + y * y),
+            fy * x * y,
+            fy * x,
+            dv,
         )
-    store_normal_equations(sums, hessian, gradient)
     return hessian, gradient, total
 
 

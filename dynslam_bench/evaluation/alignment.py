@@ -34,9 +34,9 @@ class Similarity:
     @cached_property
     def uncertainty_deg(self) -> float | None:
         """Standard error of the rotation, see `rotation_uncertainty_deg`; None where too few positions determine it."""
-        return (
-            None if self.fitted is None else rotation_uncertainty_deg(*self.fitted, self.rotation)
-        )
+        if self.fitted is None:
+            return None
+        return rotation_uncertainty_deg(*self.fitted, self.rotation)
 
     def doubts(self, truth: Array) -> list[str]:
         """Why absolute rotational errors under this alignment may not be errors of the estimate, a line each.
@@ -89,22 +89,27 @@ def align(estimate: Array, ground_truth: Array, mode: Alignment) -> Similarity:
         return Similarity(moved[:3, :3].copy(), moved[:3, 3].copy())
     source = estimate[:, :3, 3]
     target = ground_truth[:, :3, 3]
+
     # positions about their centres, in units of their own sizes: so neither coordinates of a map
     # nor the unit matter
     centre_source, unit_source, size_source = _centred(source)
     centre_target, unit_target, size_target = _centred(target)
     covariance = unit_target.T @ unit_source / len(source)
+
     # how far the estimate's orientations are turned, summed: decides only what the positions leave
     # open
     orientation = np.tensordot(
         ground_truth[:, :3, :3], estimate[:, :3, :3], axes=((0, 2), (0, 2))
     ) / len(source)
+
+    # rotation, then scale; the translation moves centre onto centre (Umeyama, Eq. 40-42)
     if mode == "yaw":
         rotation, degenerate = _yaw(covariance, orientation)
         return Similarity(rotation, centre_target - rotation @ centre_source, 1.0, degenerate)
     rotation, weighted, degenerate = _nearest_rotation(covariance, orientation)
     scale = 1.0
-    if mode == "sim3" and size_source > 0:  # without motion every scale gives the same positions
+    # without motion every scale gives the same positions
+    if mode == "sim3" and size_source > 0:
         variance = float((unit_source**2).sum() / len(source))
         scale = weighted / variance * (size_target / size_source)
     fitted = None if degenerate else (source, target)
@@ -144,18 +149,20 @@ _ON_A_LINE = 1e-12
 
 def _nearest_rotation(covariance: Array, orientation: Array) -> tuple[Array, float, bool]:
     """Rotation that maximises ``tr(R^T C)``, the maximum, and whether C alone does not determine it."""
+    # where the positions lie on a line or in a point, the orientations decide what is left open
     u, singular, vt = np.linalg.svd(covariance)
     degenerate = bool(singular[1] <= _ON_A_LINE * singular[0])
     if degenerate:
         weight = 1e-7 * singular[0] if singular[0] > 0 else 1.0
         u, _, vt = np.linalg.svd(covariance + weight * orientation)
+    # a rotation, not a reflection
     sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = u @ sign @ vt
     return rotation, float(np.trace(rotation.T @ covariance)), degenerate
 
 
 def _yaw(covariance: Array, orientation: Array) -> tuple[Array, bool]:
-    """Rotation about z that maximises ``tr(R^T C)``."""
+    """Rotation about z that maximises ``tr(R^T C)``, and whether C alone does not determine it."""
     degenerate = (
         np.hypot(covariance[1, 0] - covariance[0, 1], covariance[0, 0] + covariance[1, 1]) < 1e-15
     )
@@ -170,6 +177,7 @@ def _yaw(covariance: Array, orientation: Array) -> tuple[Array, bool]:
 
 
 BLOCKS = 12
+"""Blocks of the path, of which each half takes six."""
 RELIABLE_DEG = 10.0
 """With a larger uncertainty of the alignment's rotation, absolute rotational errors say nothing of the tracker."""
 _GENERATOR = np.array([1, 1, -1, 1, 1, 1, -1, -1, -1, 1, -1])
@@ -196,16 +204,16 @@ def rotation_uncertainty_deg(source: Array, target: Array, rotation: Array) -> f
         covariances = np.array(
             [(to - to.mean(axis=0)).T @ (at - at.mean(axis=0)) for at, to in pairs]
         )
-        return float(
-            np.sqrt(
-                (len(source) - 1) / len(source) * (_turned_deg(covariances, rotation) ** 2).sum()
-            )
-        )
-    # the first blocks are longer by one where it does not come out even
+        squares = (_turned_deg(covariances, rotation) ** 2).sum()
+        return float(np.sqrt((len(source) - 1) / len(source) * squares))
+
+    # half-paths; the first blocks are longer by one where it does not come out even
     size, more = divmod(len(source), BLOCKS)
     starts = np.arange(BLOCKS) * size + np.minimum(np.arange(BLOCKS), more)
     source = source - source.mean(axis=0)
     target = target - target.mean(axis=0)
+
+    # covariance of each half, from sums over its blocks
     count = _HALVES @ np.diff(starts, append=len(source))
     sums = _HALVES @ np.add.reduceat(source, starts)
     target_sums = _HALVES @ np.add.reduceat(target, starts)

@@ -41,7 +41,7 @@ def compare_protocols(estimate: P, ground_truth: P) -> list[ComparisonRow]:
 
     Args:
         estimate: Estimated camera-to-world poses, or a file of them as `evaluate_loaded` takes it.
-        ground_truth: True poses, likewise.
+        ground_truth: True poses, or a file of them.
 
     Raises:
         EvaluationError: The trajectory cannot be evaluated under `tum-rgbd/v1` either.
@@ -50,7 +50,8 @@ def compare_protocols(estimate: P, ground_truth: P) -> list[ComparisonRow]:
         evaluate if isinstance(estimate, Trajectory) else evaluate_loaded
     )
     score = partial(evaluation, estimate, ground_truth)
-    score(_TUM)  # whatever cannot be scored so has no rows
+    # what cannot be scored under TUM's protocol has no rows: this raises
+    score(_TUM)
     habits = (("ATE", ABSOLUTE), ("RPE", RELATIVE))
     return [
         _row(metric, label, score, protocol)
@@ -86,6 +87,7 @@ _EVO = PROTOCOLS["evo-default"]
 def _variant(
     base: Protocol, name: str, *rpe: RPESpec, alignment: Alignment | None = None
 ) -> Protocol:
+    """A protocol with another id, other relative errors and, if it is given, another alignment."""
     return base.model_copy(
         update={"id": name, "rpe": rpe, "alignment": alignment or base.alignment}
     )
@@ -126,6 +128,7 @@ RELATIVE = (
 def _row(
     metric: str, label: str, score: Callable[[Protocol], Evaluation], protocol: Protocol
 ) -> ComparisonRow:
+    """The number under one protocol, or the reason why it is missing."""
     row = partial(ComparisonRow, metric, label, protocol=protocol.describe())
     try:
         result = score(protocol)

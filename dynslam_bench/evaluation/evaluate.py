@@ -65,7 +65,7 @@ class Evaluation(Record):
             the length of the estimated path, and ``false_motion_max_m``, its largest distance from
             its first pose.
         n_pairs: Pairs of poses that the absolute error is taken over.
-        n_pairs_rpe: The same for each relative error.
+        n_pairs_rpe: Pairs of poses that each relative error is taken over, by its key.
         n_input: Input frames; None where they are not known.
         n_tracked: Input frames with a tracked pose; None where the input frames are not known.
         coverage: Their ratio.
@@ -125,6 +125,7 @@ def evaluate(
         EvaluationError: Fewer than two poses have ground truth (with the measured gaps), or the
             policy needs the input frames.
     """
+    # the policy for lost frames, then association and alignment
     protocol = get_protocol(protocol)
     diagnostics: list[str] = []
     estimate, tracked = apply_policy(estimate, protocol, input_timestamps, diagnostics)
@@ -134,7 +135,10 @@ def evaluate(
             f"the alignment scales the estimate by {comparison.similarity.scale:.6g}"
         )
     diagnostics += comparison.similarity.doubts(comparison.truth)
-    metrics = {name: value for metric in METRICS for name, value in metric(comparison).items()}
+
+    metrics: dict[str, float] = {}
+    for measure in METRICS:
+        metrics |= measure(comparison)
     similarity = comparison.similarity
     return Evaluation(
         protocol_id=protocol.id,
@@ -198,13 +202,14 @@ def evaluate_loaded(
         EvaluationError: As `evaluate`.
     """
     protocol = get_protocol(protocol)
-    loaded = {"estimate": estimate, "ground truth": ground_truth}
-    poses, truth = (file.poses(repeats=not protocol.one_to_one) for file in loaded.values())
+    repeats = not protocol.one_to_one
+    poses = estimate.poses(repeats=repeats)
+    truth = ground_truth.poses(repeats=repeats)
     result = evaluate(poses, truth_of_file(truth, protocol), protocol)
-    described = {
-        name: file.notes.describe(repeats=not protocol.one_to_one) for name, file in loaded.items()
-    }
-    notes = [f"{name}: {note}" for name, lines in described.items() for note in lines]
+
+    # what was in disorder in the files comes first
+    notes = [f"estimate: {note}" for note in estimate.notes.describe(repeats=repeats)]
+    notes += [f"ground truth: {note}" for note in ground_truth.notes.describe(repeats=repeats)]
     if protocol.only_for:
         notes.append(
             f"{protocol.id} means something for {protocol.only_for}* only, which files do not tell"

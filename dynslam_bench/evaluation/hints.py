@@ -27,24 +27,29 @@ from dynslam_bench.geometry import Array, FileNotes, Trajectory, se3
 
 FARTHEST_M = 1e12
 """Squares of larger numbers are no numbers any more."""
+
 MOSTLY = 0.25
 """Share of the displacements that may stay unexplained where a time shift or a scale is said to explain them."""
 STEADY = 1e-3
 """Displacements whose variance is a smaller share of their squares are one steady motion."""
 LONGEST_SHIFT_S = 5.0
+"""Time shifts are looked for up to this, at most a quarter of the trajectory's time."""
 SHORTEST_SHIFT_S = 0.03
 """The clocks of good recordings differ by up to 25 ms, and a rolling shutter adds half its readout time."""
 DISPLACEMENT_S = 0.5
+"""Displacements are taken over this time, at most a sixth of the trajectory's."""
 LAG_S = 0.04
+"""Step of the coarse search for a time shift, at most a third of the displacements' time."""
 MOST_PLACES = 4096
 """Places at which displacements are taken at most: more than two minutes at intervals of `LAG_S`."""
 SCALE_FACTOR = 1.15
 """Scales closer to 1 than this factor are errors of a tracker."""
 COPY_SHARE = 1e-3
+"""No tracker's error is below this share of the extent of the path ..."""
 COPY_M = 1e-4
+"""... and below this at once, where the truth was measured."""
 EXACT_M = 1e-6
-"""No tracker is as accurate as a thousandth of the extent of the path and a tenth of a millimetre at once. Where the
-truth shows no noise of its own, as that of rendered images, it is a thousandth of a millimetre."""
+"""In place of `COPY_M` where the truth shows no noise of its own, as that of rendered images."""
 NOISE_M = 1e-5
 """A truth with less noise than this was not measured."""
 MEASURED_S = 1 / 60
@@ -73,6 +78,7 @@ def hints(
         One hint a fault, by `Hint.id`; none where the estimate is healthy, or where nothing
         explains why it is bad.
     """
+    # several recordings in one file
     sim3 = get_protocol(protocol).alignment == "sim3"
     faults = _several_recordings(estimate, ground_truth, notes)
     truth = Track(ground_truth.timestamps, ground_truth.T_world_cam)
@@ -82,6 +88,8 @@ def hints(
     )
     if inside.sum() < MIN_POSES or farthest_m > FARTHEST_M:
         return tuple(faults)
+
+    # wrong convention and late stamps; a convention that is undone may show another time shift
     stamps = estimate.timestamps[inside]
     poses = estimate.T_world_cam[inside]
     shift, left = _time_shift(stamps, poses, truth)
@@ -90,6 +98,8 @@ def hints(
         shift, left = _time_shift(stamps, poses, truth)
     late = _shift_hint(stamps, poses, truth, shift, left) if shift else []
     faults += wrong + late
+
+    # scale and noise, at the stamps that are meant
     shift = shift if late else 0.0
     covered = truth.covers(stamps + shift)
     stamps = stamps[covered] + shift
@@ -106,6 +116,7 @@ def _several_recordings(
     estimate: Trajectory, truth: Trajectory, notes: FileNotes | None
 ) -> list[Hint]:
     """Stretches of stamps that lie wholly outside of the truth's time, and lines that go back in time."""
+    # stretches of time that holes divide
     stamps = estimate.timestamps
     parts = np.split(stamps, np.flatnonzero(np.diff(stamps) > OTHER_RECORDING_S) + 1)
     outside = [
@@ -115,21 +126,22 @@ def _several_recordings(
     numbers: dict[str, float] = {}
     if 0 < len(outside) < len(parts):
         rows = sum(map(len, outside))
+        stretches = "stretches" if len(outside) > 1 else "stretch"
         evidence.append(
             f"{len(stamps) - rows} of {len(stamps)} poses lie within the truth's time, the others in {len(outside)} "
-            f"stretch{'es' * (len(outside) > 1)} of time outside of it"
+            f"{stretches} of time outside of it"
         )
         numbers |= {"poses_outside": float(rows), "stretches_outside": float(len(outside))}
     if notes is not None and notes.back_s > OTHER_RECORDING_S:
-        repeated = (
-            f", {notes.duplicates} of {notes.lines} lines repeat a stamp"
-            if notes.duplicates
-            else ""
-        )
+        repeated = ""
+        if notes.duplicates:
+            repeated = f", {notes.duplicates} of {notes.lines} lines repeat a stamp"
         evidence.append(f"the stamps of the file go back by {notes.back_s:.0f} s{repeated}")
         numbers |= {"back_s": notes.back_s, "repeated_stamps": float(notes.duplicates)}
+    if not evidence:
+        return []
     text = f"the file seems to hold several recordings: {'; '.join(evidence)}; keep the rows of one"
-    return [Hint("several-recordings", text, numbers)] if evidence else []
+    return [Hint("several-recordings", text, numbers)]
 
 
 # -- time ------------------------------------------------------------------------------------------
@@ -142,12 +154,14 @@ def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float
         Seconds to add to the stamps, 0 without clear evidence, and the share in [0, 1], at any
         scale.
     """
+    # displacements over a window, at lags of a step
     span = float(stamps[-1] - stamps[0])
     window = min(DISPLACEMENT_S, span / 6)
     step = min(LAG_S, window / 3)
     most = int(min(LONGEST_SHIFT_S, span / 4) / step)
     track = Track(stamps, poses)
-    # places on a grid of lags from which the estimate moves by a known displacement, some of them,
+
+    # places on a grid of lags from which the estimate moves by a known displacement: some of them,
     # without jumps
     at = _grid_places(track, step)
     moved = _displacements(track, stamps[0] + step * at, window)
@@ -159,13 +173,15 @@ def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float
         return 0.0, 1.0
     at = at[usable]
     moved = moved[usable]
-    # the lag at which the true displacements agree best; each place of the grid is looked at once
+
+    # coarse: the lag at which the true displacements agree best; each place of the grid is looked at once
     lags = np.arange(-most, most + 1)
     places, place_of = np.unique(at + lags[:, None], return_inverse=True)
-    expected = _displacements(truth, stamps[0] + step * places, window)[
-        place_of.reshape(len(lags), len(at))
-    ]
+    true_moved = _displacements(truth, stamps[0] + step * places, window)
+    expected = true_moved[place_of.reshape(len(lags), len(at))]
     lag = int(lags[np.argmin(_unexplained(moved, expected))])
+
+    # fine: a quarter of a step; the last one is no shift, for comparison
     fine = lag * step + np.linspace(-1, 1, 9) * step
     begin = stamps[0] + step * at
     near = _unexplained(moved, _displacements(truth, begin + np.append(fine, 0.0)[:, None], window))
@@ -174,10 +190,17 @@ def _time_shift(stamps: Array, poses: Array, truth: Track) -> tuple[float, float
     best = int(np.argmin(near))
     shift = float(fine[best])
     left = float(near[best])
-    if 0 < best < len(fine) - 1 and (bend := near[best - 1] - 2 * left + near[best + 1]) > 0:
-        shift += float(0.5 * (near[best - 1] - near[best + 1]) / bend * (fine[1] - fine[0]))
+
+    # finer: the minimum of the parabola through the best and its neighbours
+    if 0 < best < len(fine) - 1:
+        before = near[best - 1]
+        after = near[best + 1]
+        bend = before - 2 * left + after
+        if bend > 0:
+            shift += float(0.5 * (before - after) / bend * (fine[1] - fine[0]))
+
+    # clear: it explains the motion, and such a shift shows on a path of this shape
     shifted_self = _displacements(track, begin[None] + shift, window)
-    # what such a shift does to a path of this shape
     visible = float(_unexplained(moved, shifted_self)[0])
     clear = abs(shift) > SHORTEST_SHIFT_S and left < min(MOSTLY, 0.55 * now) and visible > 0.3 * now
     return (shift, left) if clear else (0.0, now)
@@ -189,12 +212,14 @@ def _grid_places(track: Track, step: float) -> Array:
     They are counted stretch by stretch, so that the work grows with the poses and not with the time
     that they span.
     """
+    # the multiples within each stretch
     since = track.stamps - track.stamps[0]
     ends = np.flatnonzero(track.holes)
     starts = np.append(0, ends[:-1] + 1)
     first = np.ceil(since[starts] / step)
     last = np.floor(since[ends] / step)
     count = np.maximum(last - first + 1, 0)
+    # every so many of them, counted through all stretches
     before = np.cumsum(count) - count
     ranks = np.arange(min(count.sum(), MOST_PLACES)) * max(1.0, np.ceil(count.sum() / MOST_PLACES))
     ranks = ranks[ranks < count.sum()]
@@ -220,6 +245,7 @@ def _unexplained(own: Array, true: Array) -> Array:
     Returns:
         ``[L]``; 1 where fewer than half of them have a counterpart.
     """
+    # the best rotation and scale of each lag (Umeyama 1991), from the moments
     valid = np.isfinite(true[..., 0])
     true = np.where(valid[..., None], true, 0.0)
     u, singular, vt = np.linalg.svd(true.transpose(0, 2, 1) @ own)
@@ -236,9 +262,8 @@ def _shift_hint(stamps: Array, poses: Array, truth: Track, shift: float, left: f
     both = truth.covers(stamps) & truth.covers(stamps + shift)
     if both.sum() < MIN_POSES:
         return []
-    error, undone = (
-        fit(poses[both], truth.at(stamps[both] + late)).sim3_m for late in (0.0, shift)
-    )
+    error = fit(poses[both], truth.at(stamps[both] + 0.0)).sim3_m
+    undone = fit(poses[both], truth.at(stamps[both] + shift)).sim3_m
     if not undone < (0.9 if left < 0.05 else 0.5) * error:
         return []
     return [
@@ -256,6 +281,8 @@ def _shift_hint(stamps: Array, poses: Array, truth: Track, shift: float, left: f
 
 
 def _scale(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
+    """A scale that explains the error, where displacements agree at some scale as well."""
+    # it must lie far from 1, and the error fall by much
     best = fit(poses, truth.at(stamps))
     scale = best.scale
     error = best.se3_m
@@ -266,20 +293,23 @@ def _scale(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
         and undone < min(0.4 * error, 0.2 * best.extent_m)
     ):
         return []
+
+    # displacements about their mean must agree: a steady motion fits many paths at some scale
     window = min(DISPLACEMENT_S, (stamps[-1] - stamps[0]) / 6)
-    moved, true = (_displacements(track, stamps, window) for track in (Track(stamps, poses), truth))
+    moved = _displacements(Track(stamps, poses), stamps, window)
+    true = _displacements(truth, stamps, window)
     both = np.isfinite(moved[:, 0]) & np.isfinite(true[:, 0])
-    varying, varied = (steps[both] - steps[both].mean(axis=0) for steps in (moved, true))
+    varying = moved[both] - moved[both].mean(axis=0)
+    true_varying = true[both] - true[both].mean(axis=0)
     steady = both.sum() < MIN_POSES or (varying**2).sum() < STEADY * (moved[both] ** 2).sum()
-    # a steady motion fits many paths at some scale
-    if steady or _unexplained(varying, varied[None])[0] > MOSTLY:
+    if steady or _unexplained(varying, true_varying[None])[0] > MOSTLY:
         return []
+
+    # a unit of this size, or no scale at all
     unit = next((name for name, size in _UNITS.items() if abs(np.log(scale / size)) < 0.1), "")
-    cure = (
-        f"are they in {unit}? give metres"
-        if unit
-        else "check the depth factor; score a tracker without depth under a protocol that finds the scale"
-    )
+    cure = "check the depth factor; score a tracker without depth under a protocol that finds the scale"
+    if unit:
+        cure = f"are they in {unit}? give metres"
     return [
         Hint(
             "scale",
@@ -290,6 +320,7 @@ def _scale(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
     ]
 
 
+# metres of other units
 _UNITS = {
     "millimetres": 1e-3,
     "centimetres": 1e-2,
@@ -301,26 +332,35 @@ _UNITS = {
 
 def _below_noise(stamps: Array, poses: Array, truth: Track) -> list[Hint]:
     """An error that no tracker reaches, or jitter of the truth's measurement that the estimate shares."""
+    # the truth between its stamps, and at the nearest: a copy may have been made by either
     between = truth.at(stamps)
     nearest = truth.poses[truth.nearest(stamps)]
     fits = [fit(poses, true) for true in (between, nearest)]
     error = min(one.sim3_m for one in fits)
+
+    # the truth's own noise; one that was not measured frequently enough tells none
     inside = (truth.stamps >= stamps[0]) & (truth.stamps <= stamps[-1])
     noise = _jitter(truth.positions[inside], 5) if truth.step < MEASURED_S else 0.0
-    least = min(COPY_M if noise > NOISE_M else EXACT_M, COPY_SHARE * fits[0].extent_m)
+
+    # the error is smaller than a tracker's
+    accuracy = COPY_M if noise > NOISE_M else EXACT_M
+    least = min(accuracy, COPY_SHARE * fits[0].extent_m)
     if error < least:
         text = f"the error of {1000 * error:.3g} mm is below what trackers reach: were the poses read from the truth?"
         return [Hint("below-truth-noise", text, {"error_m": error, "least_m": least})]
-    own = min(
-        _jitter(align(poses, true, "se3").apply(poses)[:, :3, 3] - true[:, :3, 3], 3)
-        for true in (between, nearest)
-    )
-    if own < 0.5 * noise and noise > NOISE_M:
+
+    # the error jitters less than the truth does: the estimate has the same noise
+    jitters = []
+    for true in (between, nearest):
+        aligned = align(poses, true, "se3").apply(poses)
+        jitters.append(_jitter(aligned[:, :3, 3] - true[:, :3, 3], 3))
+    jitter = min(jitters)
+    if jitter < 0.5 * noise and noise > NOISE_M:
         text = (
-            f"from frame to frame the error changes by {1000 * own:.3g} mm, less than the truth's own noise of "
+            f"from frame to frame the error changes by {1000 * jitter:.3g} mm, less than the truth's own noise of "
             f"{1000 * noise:.3g} mm: were the poses made from the truth?"
         )
-        return [Hint("below-truth-noise", text, {"jitter_m": own, "truth_noise_m": noise})]
+        return [Hint("below-truth-noise", text, {"jitter_m": jitter, "truth_noise_m": noise})]
     return []
 
 
@@ -328,10 +368,10 @@ def _jitter(positions: Array, order: int) -> float:
     """Standard deviation of white noise, per axis, that differences of some order show; metres, nan of few."""
     if len(positions) < 30:
         return float("nan")
-    return float(
-        np.median(np.abs(np.diff(positions, order, axis=0)))
-        / (0.6745 * np.sqrt(comb(2 * order, order)))
-    )
+    # the median of absolute values is 0.6745 deviations of a normal distribution; differences of
+    # order n of white noise have the variance binomial(2 n, n)
+    median = np.median(np.abs(np.diff(positions, order, axis=0)))
+    return float(median / (0.6745 * np.sqrt(comb(2 * order, order))))
 
 
 # What hints are made from: poses between their stamps, and how well positions can be aligned.
@@ -418,8 +458,9 @@ class Fit:
     Attributes:
         scale: Of the Sim(3) alignment.
         se3_m: Root mean square error after the SE(3) alignment, metres; exact to 1e-8.
-        sim3_m: The same after the Sim(3) alignment.
-        extent_m: The same of a camera that stands still.
+        sim3_m: Root mean square error after the Sim(3) alignment, metres.
+        extent_m: Root mean square distance of the true positions from their mean, metres: the error
+            of a camera that stands still.
     """
 
     scale: float
@@ -435,19 +476,25 @@ class Fit:
 
 def fit(poses: Array, truth: Array) -> Fit:
     """How well the positions of poses ``[N, 4, 4]`` can be aligned with those of the true ones."""
-    own, true = (
-        matrices[:, :3, 3] - matrices[:, :3, 3].mean(axis=0) for matrices in (poses, truth)
-    )
+    # positions about their means, their covariance and variances
+    own = poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0)
+    true = truth[:, :3, 3] - truth[:, :3, 3].mean(axis=0)
     u, singular, vt = np.linalg.svd(true.T @ own / len(own))
-    explained = (
-        singular[0] + singular[1] + np.sign(np.linalg.det(u) * np.linalg.det(vt)) * singular[2]
+    sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    explained = singular[0] + singular[1] + sign * singular[2]
+    own_variance = float((own**2).sum() / len(own))
+    true_variance = float((true**2).sum() / len(own))
+
+    # mean squared errors that are left; rounding may make them negative
+    scale = max(float(explained), 0.0) / own_variance if own_variance > 0 else 1.0
+    se3_error = own_variance + true_variance - 2 * explained
+    sim3_error = true_variance - scale * explained
+    return Fit(
+        scale=scale,
+        se3_m=float(np.sqrt(max(se3_error, 0.0))),
+        sim3_m=float(np.sqrt(max(sim3_error, 0.0))),
+        extent_m=float(np.sqrt(true_variance)),
     )
-    size = float((own**2).sum() / len(own))
-    extent = float((true**2).sum() / len(own))
-    scale = max(float(explained), 0.0) / size if size > 0 else 1.0
-    errors = (size + extent - 2 * explained, extent - scale * explained)
-    se3_m, sim3_m = (float(np.sqrt(max(error, 0.0))) for error in errors)
-    return Fit(scale, se3_m, sim3_m, float(np.sqrt(extent)))
 
 
 # Conventions of poses that an estimate may have in place of camera-to-world matrices, found by its
@@ -458,17 +505,19 @@ MIN_POSES = 8
 PAIR_S = 2.0
 """Motions from pose to pose are taken over a third of the trajectory, at most over this many seconds."""
 ROTATES_DEG = 1.5
+"""Smaller rotations are not distinguished from noise."""
 MOVES_M = 0.01
-"""Motions smaller than this are not distinguished from noise."""
+"""Smaller translations are not distinguished from noise."""
 EXPLAINED = 0.4
+"""Motions are explained if their median error is below this share of the motions themselves."""
 UNEXPLAINED = 0.25
+"""A trajectory is healthy if the motions as they stand are off by less than this share."""
 CLEARLY = 4.0
-"""Median error of the motions over the motions themselves: below the first they may be explained, above the second they
-may not. An undone fault has to be better than the trajectory as it stands by the third, a
-factor."""
+"""An undone fault has to be better than the trajectory as it stands by this factor."""
 VARIES = 0.7
+"""Least correlation of motions that are explained."""
 TIE = 0.1
-"""Least correlation of motions that are explained, and the errors between which the path does not tell."""
+"""Conventions whose scores differ by less than this are not told apart by the path."""
 
 
 def _wrong_convention(
@@ -482,23 +531,24 @@ def _wrong_convention(
         truth: The true poses.
         shift: A time shift that would explain them as well, seconds; the better explanation counts.
     """
+    # healthy motions are left alone
     pairs = _pairs(stamps)
     true_poses = truth.at(stamps)
     true = se3.between(true_poses, pairs)
     as_read, _ = _compare(se3.between(poses, pairs), true)
     if as_read < UNEXPLAINED or not np.isfinite(as_read):
         return [], poses
+
+    # a convention must explain them better than the time shift does
     limit = min(EXPLAINED, as_read / CLEARLY)
-    if shift:  # the error of the poses as they stand beside the true motions at another time
+    if shift:
         covered = truth.covers(stamps + shift)
         covered_pairs = pairs[covered[pairs].all(axis=1)]
-        limit = min(
-            limit,
-            _compare(
-                se3.between(poses, covered_pairs),
-                se3.between(truth.at(stamps + shift), covered_pairs),
-            )[0],
-        )
+        shifted = se3.between(truth.at(stamps + shift), covered_pairs)
+        with_shift, _ = _compare(se3.between(poses, covered_pairs), shifted)
+        limit = min(limit, with_shift)
+
+    # the conventions that do; else those of a body with other axes than the camera's
     candidates: list[tuple[float, Convention, Array]] = []
     for convention in CONVENTIONS:
         undone = convention.undo(poses)
@@ -508,22 +558,22 @@ def _wrong_convention(
     candidates = candidates or _in_axes_of_a_body(poses, pairs, true, true_poses)
     if not candidates:
         return [], poses
-    misfit = [error + fit(undone, true_poses).misfit for error, _, undone in candidates]
+
+    # the best by motions and positions; among equals the likeliest, which comes first
+    misfits = [error + fit(undone, true_poses).misfit for error, _, undone in candidates]
     best = [
         candidate
-        for candidate, score in zip(candidates, misfit, strict=True)
-        if score < min(misfit) + TIE
+        for candidate, misfit in zip(candidates, misfits, strict=True)
+        if misfit < min(misfits) + TIE
     ]
     error, convention, undone = best[0]
-    return [
-        Hint(
-            convention.id,
-            f"{convention.what}: the motions are off by {100 * as_read:.0f} % of the true ones, "
-            f"by {100 * error:.0f} % {convention.cure}"
-            + "".join(f" (or {other.what}: the path does not tell)" for _, other, _ in best[1:]),
-            {"motion_error": as_read, "motion_error_undone": error},
-        )
-    ], undone
+    others = "".join(f" (or {other.what}: the path does not tell)" for _, other, _ in best[1:])
+    text = (
+        f"{convention.what}: the motions are off by {100 * as_read:.0f} % of the true ones, "
+        f"by {100 * error:.0f} % {convention.cure}{others}"
+    )
+    numbers = {"motion_error": as_read, "motion_error_undone": error}
+    return [Hint(convention.id, text, numbers)], undone
 
 
 def _in_axes_of_a_body(
@@ -532,6 +582,7 @@ def _in_axes_of_a_body(
     """The convention where the truth is that of a body with axes of its own, such as a set of markers; none or one."""
     motions = se3.between(poses, pairs)
     as_turned, _ = _compare(motions, true, R_est_cam=_axes(motions, true))
+    # of the conventions only the first two, in axes that are fitted
     for convention in CONVENTIONS[:2]:
         undone = convention.undo(poses)
         motions = se3.between(undone, pairs)
@@ -581,34 +632,32 @@ def _compare(motions: Array, true: Array, R_est_cam: Array | None = None) -> tup
         motions[:, :3, 3] = motions[:, :3, 3] @ R_est_cam
     if len(true) < MIN_POSES:
         return np.inf, 0.0
-    scores = []
+    errors = []
+    correlations = []
+
+    # rotations of the half of the pairs that rotates most
     angle = np.rad2deg(se3.rotation_angle(true))
     moving = angle >= np.median(angle)
-    if (turned := float(np.median(angle[moving]))) > ROTATES_DEG:
+    true_angle = float(np.median(angle[moving]))
+    if true_angle > ROTATES_DEG:
         off = np.rad2deg(se3.rotation_angle(se3.inverse(motions[moving]) @ true[moving]))
-        scores.append(
-            (
-                float(np.median(off)) / turned,
-                _correlation(se3.scaled_axes(motions)[0], se3.scaled_axes(true)[0]),
-            )
-        )
+        errors.append(float(np.median(off)) / true_angle)
+        correlations.append(_correlation(se3.scaled_axes(motions)[0], se3.scaled_axes(true)[0]))
+
+    # translations of the half that moves most, at equal median lengths
     length = np.linalg.norm(true[:, :3, 3], axis=1)
     moving = length >= np.median(length)
     moved = true[moving, :3, 3]
     estimated = motions[moving, :3, 3]
     own_length = float(np.median(np.linalg.norm(estimated, axis=1)))
-    if (true_length := float(np.median(length[moving]))) > MOVES_M:
-        off = (
-            np.linalg.norm(estimated * (true_length / own_length) - moved, axis=1)
-            if own_length > 0
-            else length[moving]
-        )
-        scores.append(
-            (float(np.median(off)) / true_length, _correlation(motions[:, :3, 3], true[:, :3, 3]))
-        )
-    return max((error for error, _ in scores), default=np.inf), max(
-        (good for _, good in scores), default=0.0
-    )
+    true_length = float(np.median(length[moving]))
+    if true_length > MOVES_M:
+        off = length[moving]
+        if own_length > 0:
+            off = np.linalg.norm(estimated * (true_length / own_length) - moved, axis=1)
+        errors.append(float(np.median(off)) / true_length)
+        correlations.append(_correlation(motions[:, :3, 3], true[:, :3, 3]))
+    return max(errors, default=np.inf), max(correlations, default=0.0)
 
 
 @dataclass(frozen=True)
@@ -669,8 +718,10 @@ def _correlation(first: Array, second: Array) -> float:
     """Correlation of vectors ``[N, 3]`` about their means, jumps left out; 0 where one does not vary."""
     length = np.linalg.norm(first, axis=1)
     usual = length <= 6 * np.median(length)
-    first, second = (vectors[usual] - vectors[usual].mean(axis=0) for vectors in (first, second))
-    sizes = np.linalg.norm(first), np.linalg.norm(second)
-    if sizes[0] <= 0.1 * np.linalg.norm(length[usual]) or not sizes[1] > 0:
+    first = first[usual] - first[usual].mean(axis=0)
+    second = second[usual] - second[usual].mean(axis=0)
+    first_size = np.linalg.norm(first)
+    second_size = np.linalg.norm(second)
+    if first_size <= 0.1 * np.linalg.norm(length[usual]) or not second_size > 0:
         return 0.0
-    return float((first * second).sum() / (sizes[0] * sizes[1]))
+    return float((first * second).sum() / (first_size * second_size))

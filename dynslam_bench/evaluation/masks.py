@@ -67,9 +67,13 @@ def compare_masks(predicted: NDArray[np.bool_], truth: NDArray[np.bool_]) -> Mas
     if p.shape != t.shape:
         raise EvaluationError(f"masks differ in shape: {p.shape} and {t.shape}")
     return MaskCounts(
-        int((p & t).sum()), int((p & ~t).sum()), int((~p & t).sum()), int((~p & ~t).sum())
+        true_positive=int((p & t).sum()),
+        false_positive=int((p & ~t).sum()),
+        false_negative=int((~p & t).sum()),
+        true_negative=int((~p & ~t).sum()),
     )
 
 
 def _ratio(part: int, whole: int) -> float | None:
+    """A share; None of nothing."""
     return part / whole if whole else None

@@ -17,7 +17,7 @@ class OnlineSample:
         rot_deg: Cumulative rotational error in degrees.
         frame_trans_m: Frame-to-frame translational error in metres (Eq. 26 over one frame); None
             where the frame before has no ground truth.
-        frame_rot_deg: Frame-to-frame rotational error in degrees, likewise.
+        frame_rot_deg: Frame-to-frame rotational error in degrees; None as `frame_trans_m`.
         path_length_m: Length in metres of the true path since the first frame with ground truth, straight
             across frames that have none (it was at least that); no tracker changes it.
         tracked: Whether the frame was tracked.
@@ -63,12 +63,16 @@ class OnlineError:
     def __init__(self, ground_truth: Trajectory | None, max_dt: float = 0.02) -> None:
         self._truth = ground_truth if ground_truth is not None and len(ground_truth) else None
         self._max_dt = max_dt
+        # from the estimate's world to the truth's, and the last tracked pose in the latter
         self._align: Array | None = None
         self._held: Array | None = None
+        # true pose of the frame before, if it has one; pose of the last tracked frame
         self._previous_truth: Array | None = None
         self._previous_pose: Array | None = None
+        # last true pose of any frame, the path up to it, and the true motion since the last tracked pose
         self._last_truth: Array | None = None
-        self._way_m = self._lost_way_m = 0.0
+        self._path_m = 0.0
+        self._lost_way_m = 0.0
 
     def truth_at(self, timestamp: float) -> Array | None:
         """The true pose ``[4, 4]`` nearest in time, or None in a hole."""
@@ -88,6 +92,7 @@ class OnlineError:
         Returns:
             The error at this frame, or None where there is no ground truth.
         """
+        # join estimate and truth at the first frame that has both
         truth = self.truth_at(timestamp)
         if pose is not None and truth is not None and self._align is None:
             self._align = truth @ se3.inverse(pose)
@@ -101,15 +106,24 @@ class OnlineError:
         return sample
 
     def _sample(self, truth: Array, pose: Array | None) -> OnlineSample:
+        """The errors at a frame with a true pose ``[4, 4]``."""
+        # before a first tracked pose the camera stands at the first true one
         if self._held is None:
             self._held = truth.copy()
+
+        # length of the true path
         if self._last_truth is not None:
-            self._way_m += float(np.linalg.norm(truth[:3, 3] - self._last_truth[:3, 3]))
+            self._path_m += float(np.linalg.norm(truth[:3, 3] - self._last_truth[:3, 3]))
         self._last_truth = truth
+
+        # cumulative error, of the held pose
         error = se3.inverse(truth) @ self._held
         trans = float(np.linalg.norm(error[:3, 3]))
         rot = float(np.rad2deg(se3.rotation_angle(error)))
-        frame_trans = frame_rot = None
+
+        # frame-to-frame error (Eq. 26); a lost frame counts as not having moved
+        frame_trans = None
+        frame_rot = None
         if self._previous_truth is not None:
             moved = se3.inverse(self._previous_truth) @ truth
             estimated = np.eye(4)
@@ -121,13 +135,13 @@ class OnlineError:
             if pose is None:
                 self._lost_way_m += frame_trans
         return OnlineSample(
-            trans,
-            rot,
-            frame_trans,
-            frame_rot,
-            self._way_m,
-            pose is not None,
-            self._lost_way_m,
-            truth,
-            self._held,
+            trans_m=trans,
+            rot_deg=rot,
+            frame_trans_m=frame_trans,
+            frame_rot_deg=frame_rot,
+            path_length_m=self._path_m,
+            tracked=pose is not None,
+            lost_way_m=self._lost_way_m,
+            T_world_true=truth,
+            T_world_held=self._held,
         )

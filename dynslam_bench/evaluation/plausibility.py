@@ -18,8 +18,9 @@ from dynslam_bench.geometry import (
 from dynslam_bench.geometry.stamp_units import SLOWEST_S
 
 FASTEST_M_S = 100.0
+"""No camera goes faster than this from one pose to the next, if it goes as far as `LONGEST_STEP_M`."""
 LONGEST_STEP_M = 1.0
-"""No camera goes faster than the first and as far as the second from one pose to the next."""
+"""Shorter steps are not doubted, however fast."""
 LONGEST_HOLE_S = 86_400.0
 """A day: no recording has such a hole."""
 FEWEST_PAIRS = 8

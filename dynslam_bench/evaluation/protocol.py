@@ -65,32 +65,25 @@ class RPESpec(_Frozen):
 
     @model_validator(mode="after")
     def _whole_frames(self) -> RPESpec:
-        faults = {
-            f"a delta in frames is a whole number, got {self.delta:g}": (
-                self.unit == "f" and self.delta != round(self.delta)
-            ),
-            f"{self.pairs} pairs are taken over frames, not over '{self.unit}'": (
-                self.pairs in ("consecutive", "all") and self.unit != "f"
-            ),
-            f"a rate is taken over seconds, not over '{self.unit}'": self.rate and self.unit != "s",
-        }
-        for fault, holds in faults.items():
-            if holds:
-                raise ValueError(fault)
+        if self.unit == "f" and self.delta != round(self.delta):
+            raise ValueError(f"a delta in frames is a whole number, got {self.delta:g}")
+        if self.pairs in ("consecutive", "all") and self.unit != "f":
+            raise ValueError(f"{self.pairs} pairs are taken over frames, not over '{self.unit}'")
+        if self.rate and self.unit != "s":
+            raise ValueError(f"a rate is taken over seconds, not over '{self.unit}'")
         return self
 
     @property
     def key(self) -> str:
         """Part of the metrics' names: ``1s`` in ``rpe_1s_trans_rmse_m``, or ``random``."""
-        return (
-            "random"
-            if self.pairs == "tum-random"
-            else f"{self.delta:g}{self.unit}{'_rate' if self.rate else ''}"
-        )
+        if self.pairs == "tum-random":
+            return "random"
+        return f"{self.delta:g}{self.unit}{'_rate' if self.rate else ''}"
 
     def unit_of(self, part: str) -> str:
         """Unit of the error as metrics name it: m, deg, m_per_s or deg_per_s."""
-        return f"{'m' if part == 'trans' else 'deg'}{'_per_s' if self.rate else ''}"
+        unit = "m" if part == "trans" else "deg"
+        return f"{unit}_per_s" if self.rate else unit
 
     def metric(self, part: str) -> str:
         """Name of the metric, e.g. ``rpe_1s_trans_rmse_m``."""
@@ -100,8 +93,11 @@ class RPESpec(_Frozen):
         """For example ``1 s (TUM pairs)``."""
         if self.pairs == "tum-random":
             return f"{self.max_pairs} random pairs" if self.max_pairs else "all pairs"
-        unit = self.unit if self.unit != "f" else "frame" if self.delta == 1 else "frames"
-        return f"{self.delta:g} {unit} ({_PHRASES[self.pairs]}{', as a rate' if self.rate else ''})"
+        unit: str = self.unit
+        if unit == "f":
+            unit = "frame" if self.delta == 1 else "frames"
+        rate = ", as a rate" if self.rate else ""
+        return f"{self.delta:g} {unit} ({_PHRASES[self.pairs]}{rate})"
 
 
 class Protocol(_Frozen):
@@ -161,7 +157,7 @@ class Protocol(_Frozen):
         """Refuse a sequence that the protocol does not hold for.
 
         Raises:
-            EvaluationError: It is one.
+            EvaluationError: The protocol does not hold for the sequence.
         """
         if not sequence.startswith(self.only_for):
             raise EvaluationError(
@@ -181,7 +177,7 @@ class Protocol(_Frozen):
             sensors: What it looks at (`TrackerSpec.sensors`).
 
         Raises:
-            EvaluationError: They are, and it does not.
+            EvaluationError: The tracker is monocular, and the alignment leaves the scale as it is.
         """
         if sensors == "rgb" and not self.finds_scale:
             raise EvaluationError(
@@ -191,28 +187,22 @@ class Protocol(_Frozen):
 
     def describe(self) -> str:
         """One line for captions: everything that the numbers depend on."""
+        less = "<" if self.strict else "<="
+        association = "one-to-one" if self.one_to_one else "nearest"
         parts = [
             _PHRASES[self.alignment],
-            f"|dt| {'<' if self.strict else '<='} {self.max_dt:g} s {'one-to-one' if self.one_to_one else 'nearest'}",
-            *(
-                ["RPE over " + " and ".join(spec.describe() for spec in self.rpe)]
-                if self.rpe
-                else []
-            ),
-            *(
-                ["segments of " + ", ".join(f"{s:g}" for s in self.segments_m) + " m"]
-                if self.segments_m
-                else []
-            ),
-            *([_PHRASES[self.truth]] if self.truth != "as-is" else []),
-            *(
-                [f"every {self.every} matched frames, at most {self.most_frames or 'all'}"]
-                if self.thins
-                else []
-            ),
-            f"{self.trajectory} trajectory",
-            _PHRASES[self.lost_frames],
+            f"|dt| {less} {self.max_dt:g} s {association}",
         ]
+        if self.rpe:
+            parts.append("RPE over " + " and ".join(spec.describe() for spec in self.rpe))
+        if self.segments_m:
+            lengths = ", ".join(f"{length:g}" for length in self.segments_m)
+            parts.append(f"segments of {lengths} m")
+        if self.truth != "as-is":
+            parts.append(_PHRASES[self.truth])
+        if self.thins:
+            parts.append(f"every {self.every} matched frames, at most {self.most_frames or 'all'}")
+        parts += [f"{self.trajectory} trajectory", _PHRASES[self.lost_frames]]
         return f"{self.id}: " + ", ".join(parts) + f" [{self.digest()}]"
 
 
@@ -299,6 +289,7 @@ PROTOCOLS: dict[str, Protocol] = {
 @lru_cache(maxsize=64)
 def _digest(protocol: Protocol) -> str:
     """Taken once: lists of a hundred thousand runs ask for it as often."""
+    # what came after the first protocols counts where it is used only
     fields = protocol.model_dump(mode="json")
     defaults = {
         name: Protocol.model_fields[name].default

@@ -29,10 +29,14 @@ def relative_metrics(comparison: Comparison) -> dict[str, float]:
     for spec in comparison.protocol.rpe:
         take = tum_relative_errors if spec.pairs.startswith("tum") else evo_relative_errors
         errors, seconds = take(comparison, spec)
-        if spec.rate:  # across a gap TUM's rule pairs a pose with itself
+        # across a gap TUM's rule pairs a pose with itself, which has no rate
+        if spec.rate:
             errors = errors[seconds > 0]
             seconds = seconds[seconds > 0]
-        if fault := _not_over_seconds(comparison, spec, seconds):
+
+        # say what is left out, or doubtful
+        fault = _not_over_seconds(comparison, spec, seconds)
+        if fault:
             comparison.diagnostics.append(
                 f"{fault}: the relative error over {spec.key} is left out"
             )
@@ -47,6 +51,8 @@ def relative_metrics(comparison: Comparison) -> dict[str, float]:
             comparison.diagnostics.append(
                 f"{itself}, as TUM's script has it where the next pose is far"
             )
+
+        # statistics of translation and rotation, of a rate by the second
         comparison.n_pairs_rpe[spec.key] = len(errors)
         over = seconds if spec.rate else 1.0
         translation = np.linalg.norm(errors[:, :3, 3], axis=1) / over
@@ -102,6 +108,7 @@ def tum_relative_errors(comparison: Comparison, spec: RPESpec) -> tuple[Array, A
     Returns:
         Errors ``[P, 4, 4]``, and the seconds between the two poses of each pair ``[P]``.
     """
+    # pairs of poses that both have truth
     estimate = comparison.estimate
     truth = comparison.ground_truth
     pairs = select_pairs(estimate.timestamps, estimate.T_world_cam, spec)
@@ -109,10 +116,13 @@ def tum_relative_errors(comparison: Comparison, spec: RPESpec) -> tuple[Array, A
     tolerance = 2 * float(np.median(np.diff(truth.timestamps))) if len(truth) > 1 else 0.0
     covered = nearest_gap(estimate.timestamps, truth.timestamps) <= tolerance
     pairs = pairs[covered[pairs[:, 0]] & covered[pairs[:, 1]]]
+
+    # E = A B^-1 of the estimated and the true steps
     steps = se3.between(estimate.T_world_cam, pairs)
     steps[:, :3, 3] *= comparison.similarity.scale
     true_steps = se3.between(truth.T_world_cam, nearest[pairs])
-    return steps @ se3.inverse(true_steps), np.diff(estimate.timestamps[pairs], axis=1)[:, 0]
+    seconds = np.diff(estimate.timestamps[pairs], axis=1)[:, 0]
+    return steps @ se3.inverse(true_steps), seconds
 
 
 def evo_relative_errors(comparison: Comparison, spec: RPESpec) -> tuple[Array, Array]:
@@ -123,13 +133,13 @@ def evo_relative_errors(comparison: Comparison, spec: RPESpec) -> tuple[Array, A
         spec: A ``consecutive`` or ``all`` selection.
 
     Returns:
-        As `tum_relative_errors`.
+        Errors ``[P, 4, 4]``, and the seconds between the two poses of each pair ``[P]``.
     """
     pairs = select_pairs(comparison.stamps, comparison.aligned, spec)
-    errors = se3.inverse(se3.between(comparison.truth, pairs)) @ se3.between(
-        comparison.aligned, pairs
-    )
-    return errors, np.diff(comparison.stamps[pairs], axis=1)[:, 0]
+    steps = se3.between(comparison.aligned, pairs)
+    true_steps = se3.between(comparison.truth, pairs)
+    seconds = np.diff(comparison.stamps[pairs], axis=1)[:, 0]
+    return se3.inverse(true_steps) @ steps, seconds
 
 
 # Which pairs of poses a relative pose error is taken over: TUM's two ways and evo's two.
@@ -151,14 +161,19 @@ def select_pairs(stamps: Array, poses: Array, spec: RPESpec) -> Index:
         return np.zeros((0, 2), dtype=np.intp)
     if spec.pairs == "tum-random":
         return random_pairs(len(poses), spec.max_pairs)
+    # evo: pairs of so many frames, one after the other or from every pose
     if spec.pairs in ("consecutive", "all"):
         frames = round(spec.delta)
-        starts = np.arange(0, len(poses) - frames, frames if spec.pairs == "consecutive" else 1)
+        step = frames if spec.pairs == "consecutive" else 1
+        starts = np.arange(0, len(poses) - frames, step)
         return np.stack([starts, starts + frames], axis=1).astype(np.intp)
+    # TUM: from every pose to the one closest to a delta behind it; as in evaluate_rpe.py
+    # --fixed_delta the last pose ends no pair
     index = path_index(stamps, poses, spec)
     end = closest(index, index + spec.delta)
-    keep = end != len(index) - 1  # as evaluate_rpe.py --fixed_delta: the last pose ends no pair
+    keep = end != len(index) - 1
     pairs = np.stack([np.flatnonzero(keep), end[keep]], axis=1)
+    # a sample of them, where there are too many
     if spec.max_pairs and len(pairs) > spec.max_pairs:
         order = np.argsort(_uniform("rpe sample of fixed pairs", len(pairs)), kind="stable")
         pairs = pairs[np.sort(order[: spec.max_pairs])]
@@ -197,6 +212,7 @@ def closest(values: Array, targets: Array) -> Index:
 
 @lru_cache(maxsize=256)
 def _closest(value_bytes: bytes, target_bytes: bytes) -> Index:
+    """`closest` of float64 arrays as bytes; all targets are bisected at once."""
     values = np.frombuffer(value_bytes)
     targets = np.frombuffer(target_bytes)
     low = np.zeros(len(targets), dtype=np.intp)
@@ -225,9 +241,8 @@ def random_pairs(n: int, count: int) -> Index:
     """
     if count == 0 or n < np.sqrt(count):
         return np.ascontiguousarray(np.indices((n, n)).reshape(2, -1).T).astype(np.intp)
-    return np.minimum((_uniform("rpe random pairs", 2 * count) * n).astype(np.intp), n - 1).reshape(
-        count, 2
-    )
+    drawn = (_uniform("rpe random pairs", 2 * count) * n).astype(np.intp)
+    return np.minimum(drawn, n - 1).reshape(count, 2)
 
 
 def _uniform(purpose: str, count: int) -> Array:
@@ -239,6 +254,7 @@ def _uniform(purpose: str, count: int) -> Array:
 # Errors over segments of fixed length, as the KITTI odometry benchmark takes them.
 
 STEP = 10
+"""Poses between the starts of segments."""
 
 
 def segment_errors(
@@ -255,9 +271,11 @@ def segment_errors(
         Translational drift in percent ``[K]`` and rotational drift in degrees a metre ``[K]``;
         empty where the path is shorter than the shortest length.
     """
-    travelled = np.concatenate(
-        [[0.0], np.cumsum(np.linalg.norm(np.diff(ground_truth[:, :3, 3], axis=0), axis=1))]
-    )
+    # length of the true path up to every pose
+    steps = np.linalg.norm(np.diff(ground_truth[:, :3, 3], axis=0), axis=1)
+    travelled = np.concatenate([[0.0], np.cumsum(steps)])
+
+    # every start with every length, where the path is long enough
     grid = np.meshgrid(
         np.arange(0, len(travelled), STEP), np.array(lengths_m, np.float64), indexing="ij"
     )
@@ -266,10 +284,12 @@ def segment_errors(
     inside = ends < len(travelled)
     metres = metres[inside]
     pairs = np.stack([starts, ends], axis=1)[inside]
+
+    # error of the motion along each segment, by its length
     error = se3.inverse(se3.between(estimate, pairs)) @ se3.between(ground_truth, pairs)
-    return np.linalg.norm(error[:, :3, 3], axis=1) / metres * 100, np.rad2deg(
-        se3.rotation_angle(error)
-    ) / metres
+    percent = np.linalg.norm(error[:, :3, 3], axis=1) / metres * 100
+    degrees_per_m = np.rad2deg(se3.rotation_angle(error)) / metres
+    return percent, degrees_per_m
 
 
 def segment_metrics(comparison: Comparison) -> dict[str, float]:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import kernel
 
+# coordinates of the 256 pairs, a letter each: N is 0, A is -13, Z is 12
 _LETTERS = (
     "VKWSRPUBCWFPUBZAPAPZOGOTLDLJAACFAKBEXRYWAFFECUEZUUZTJIKNAPBKENGSZHZMKTLZHAJFYAZFRUSOSKXKQGTZFGHL"
     "LYMDAZFXGQIKJPKUDBHYSBTGSHUMONRIWYYARURZPMRRJBLUFIGDRYWZNFOAALFPKLLQHWJEVZXUNWOQUIYDAHCNXUZOHKHZ"
@@ -27,7 +28,8 @@ PATTERN = (np.frombuffer(_LETTERS.encode(), np.uint8).astype(np.float32) - ord("
 """The 256 pairs of places that are compared (learned by Rublee et al.), (column, row) from the keypoint each."""
 
 _GAUSSIAN = cv2.getGaussianKernel(7, 2.0, cv2.CV_32F)
-_ROWS = PATTERN.transpose(2, 1, 0).reshape(2, 512).copy()
+_COLUMNS_AND_ROWS = PATTERN.transpose(2, 1, 0).reshape(2, 512).copy()
+"""float32 ``[2, 512]``: columns, then rows of all first places, followed by all second places."""
 _ONE_BIT_A_BYTE = np.uint64(0x0102040810204080)
 """A word whose bytes are 0 or 1, times this, has them as the bits of its highest byte."""
 
@@ -47,7 +49,7 @@ def rotated_brief(
         xy: Integer-valued pixels, float32 ``[N, 2]``, at least 19 away from the border.
         angle: Orientations in degrees, float32 ``[N]``.
     """
-    return _rotated_brief(smoothed, xy, angle, *_ROWS)
+    return _rotated_brief(smoothed, xy, angle, *_COLUMNS_AND_ROWS)
 
 
 @kernel
@@ -58,6 +60,7 @@ def _rotated_brief(
     px: NDArray[np.float32],
     py: NDArray[np.float32],
 ) -> NDArray[np.uint8]:
+    """`rotated_brief` with the columns and rows of the 512 places, float32 ``[512]`` each."""
     pixels = smoothed.reshape(-1)
     width = smoothed.shape[1]
     offsets = np.empty(512, np.int32)
@@ -66,6 +69,7 @@ def _rotated_brief(
     words = darker.view(np.uint64)
     out = np.empty((len(xy), 32), np.uint8)
     for i in range(len(xy)):
+        # the pattern's places, turned by the keypoint's orientation and rounded
         radians = np.float32(angle[i]) * np.float32(math.pi / 180)
         cosine = np.float32(math.cos(radians))
         sine = np.float32(math.sin(radians))
@@ -73,9 +77,11 @@ def _rotated_brief(
             column = np.rint(px[k] * cosine - py[k] * sine)
             row = np.rint(px[k] * sine + py[k] * cosine)
             offsets[k] = np.int32(row * np.float32(width) + column)
+        # grey levels there; an unsigned index is not tested for being negative
         centre = int(xy[i, 1]) * width + int(xy[i, 0])
         for k in range(512):
             values[k] = pixels[np.uint64(centre + offsets[k])]
+        # compare the pairs, and pack eight results into a byte
         for k in range(256):
             darker[k] = values[k] < values[256 + k]
         for k in range(32):

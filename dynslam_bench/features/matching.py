@@ -16,14 +16,17 @@ from dynslam_bench.core.compiled import Scalar, inlined_statements, kernel
 
 Words = NDArray[np.uint64]
 
-_M1 = np.uint64(0x5555555555555555)
-_M2 = np.uint64(0x3333333333333333)
-_M4 = np.uint64(0x0F0F0F0F0F0F0F0F)
-_H01 = np.uint64(0x0101010101010101)
+# masks of every other bit, pair of bits and half byte, and a one in every byte
+_BITS = np.uint64(0x5555555555555555)
+_PAIRS = np.uint64(0x3333333333333333)
+_HALF_BYTES = np.uint64(0x0F0F0F0F0F0F0F0F)
+_EVERY_BYTE = np.uint64(0x0101010101010101)
+# shifts; numba adds a signed and an unsigned integer as floats
 _ONE = np.uint64(1)
 _TWO = np.uint64(2)
 _FOUR = np.uint64(4)
-_TOP = np.uint64(56)
+_HIGHEST_BYTE = np.uint64(56)
+
 FAR = 1 << 20
 """A distance above that of any two descriptors."""
 
@@ -41,11 +44,12 @@ def distance(a: Words, b: Words) -> Scalar:
     """Hamming distance of two descriptors ``[W]``; for use inside compiled kernels."""
     total = np.int64(0)
     for w in range(a.shape[0]):
+        # number of ones in the word: counted in pairs, half bytes and bytes, then the bytes added up
         v = a[w] ^ b[w]
-        v = v - ((v >> _ONE) & _M1)
-        v = (v & _M2) + ((v >> _TWO) & _M2)
-        v = (v + (v >> _FOUR)) & _M4
-        total += np.int64((v * _H01) >> _TOP)
+        v = v - ((v >> _ONE) & _BITS)
+        v = (v & _PAIRS) + ((v >> _TWO) & _PAIRS)
+        v = (v + (v >> _FOUR)) & _HALF_BYTES
+        total += np.int64((v * _EVERY_BYTE) >> _HIGHEST_BYTE)
     return total
 
 
@@ -53,6 +57,12 @@ def distance(a: Words, b: Words) -> Scalar:
 def _brute_force(
     a: Words, b: Words
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Compare all with all.
+
+    Returns:
+        For each of `a` ``[N]``: the nearest of `b`, its distance and the second nearest's; for each
+        of `b` ``[M]``: the nearest of `a`.
+    """
     n = a.shape[0]
     m = b.shape[0]
     best = np.full(n, -1, np.int64)
@@ -93,6 +103,7 @@ def match_brute_force(
     if not len(a) or not len(b):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     best, first, second, back = _brute_force(np.ascontiguousarray(a), np.ascontiguousarray(b))
+    # near enough, nearer than the second (Lowe's ratio test), and nearest in both directions
     mutual = back[best] == np.arange(len(a))
     index = np.flatnonzero((first <= max_distance) & (first < ratio * second) & mutual)
     return index, best[index]
@@ -128,7 +139,8 @@ class CellGrid:
 def _sorted_into_cells(
     xy: NDArray[np.float64], cell: float, columns: int, rows: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """`CellGrid.start` and `CellGrid.order`."""
+    """`CellGrid.start` and `CellGrid.order`, by a counting sort."""
+    # the cell of each point, and the number of points in each cell, one place on
     cells = np.empty(len(xy), np.int64)
     start = np.zeros(rows * columns + 1, np.int64)
     for i in range(len(xy)):
@@ -137,6 +149,7 @@ def _sorted_into_cells(
         cells[i] = int(row) * columns + int(column)
         start[cells[i] + 1] += 1
     start = np.cumsum(start)
+    # put each point at its cell's next free place
     order = np.empty(len(xy), np.int64)
     place = start.copy()
     for i in range(len(xy)):
@@ -146,11 +159,11 @@ def _sorted_into_cells(
 
 
 class Features(NamedTuple):
-    """Features that are searched, as the back end's `Observations` are.
+    """Features to search among, with the attributes that the back end's `Observations` have as well.
 
     Attributes:
         xy: Undistorted pixels ``[N, 2]``.
-        right: Right coordinates ``[N]``, NaN without depth.
+        right: Columns in the right image ``[N]``, pixels; NaN without depth.
         octave: int64 ``[N]``.
         words: Descriptors ``[N, W]``.
         grid: Cells of the features.
@@ -163,35 +176,77 @@ class Features(NamedTuple):
     grid: CellGrid
 
 
+class _SearchFeatures(NamedTuple):
+    """`Features` and their grid as kernels read them.
+
+    Attributes:
+        cell: Side of a cell, pixels.
+        columns: Cells in a row.
+        rows: Rows of cells.
+        start: `CellGrid.start`.
+        order: `CellGrid.order`.
+        xy: float64 ``[N, 2]``, undistorted pixels.
+        right: float64 ``[N]``, columns in the right image; NaN without depth.
+        octave: int64 ``[N]``.
+        words: uint64 ``[N, W]``, descriptors.
+        free: bool ``[N]``, features that may be matched.
+    """
+
+    cell: float
+    columns: int
+    rows: int
+    start: NDArray[np.int64]
+    order: NDArray[np.int64]
+    xy: NDArray[np.float64]
+    right: NDArray[np.float64]
+    octave: NDArray[np.int64]
+    words: Words
+    free: NDArray[np.bool_]
+
+
+class _SearchTargets(NamedTuple):
+    """What features are searched for.
+
+    Attributes:
+        xy: float64 ``[M, 2]``, expected pixels.
+        right: float64 ``[M]``, expected columns in the right image; NaN is not compared.
+        radius: float64 ``[M]``, half sides of the search windows, pixels.
+        octave_low: int64 ``[M]``, lowest octave of a match.
+        octave_high: int64 ``[M]``, highest.
+        words: uint64 ``[M, W]``, descriptors.
+    """
+
+    xy: NDArray[np.float64]
+    right: NDArray[np.float64]
+    radius: NDArray[np.float64]
+    octave_low: NDArray[np.int64]
+    octave_high: NDArray[np.int64]
+    words: Words
+
+
 @kernel
 def _search(
-    cell: float,
-    columns: int,
-    rows: int,
-    start: NDArray[np.int64],
-    order: NDArray[np.int64],
-    xy: NDArray[np.float64],
-    right: NDArray[np.float64],
-    octave: NDArray[np.int64],
-    words: Words,
-    free: NDArray[np.bool_],
-    target: NDArray[np.float64],
-    target_right: NDArray[np.float64],
-    radius: NDArray[np.float64],
-    octave_low: NDArray[np.int64],
-    octave_high: NDArray[np.int64],
-    target_words: Words,
-    max_distance: int,
-    ratio: float,
+    features: _SearchFeatures, targets: _SearchTargets, max_distance: int, ratio: float
 ) -> NDArray[np.int64]:
-    count = target.shape[0]
+    """Index of the feature that each target is matched to ``[M]``, -1 without; see `search_in_radius`."""
+    cell = features.cell
+    columns = features.columns
+    rows = features.rows
+    start = features.start
+    xy = features.xy
+    right = features.right
+    octave = features.octave
+
+    count = targets.xy.shape[0]
     match = np.full(count, -1, np.int64)
     match_distance = np.full(count, FAR, np.int64)
-    owner = np.full(xy.shape[0], -1, np.int64)
+    owner = np.full(xy.shape[0], -1, np.int64)  # the target that a feature is matched to
     for i in range(count):
-        x = target[i, 0]
-        y = target[i, 1]
-        r = radius[i]
+        # the cells that the window covers
+        x = targets.xy[i, 0]
+        y = targets.xy[i, 1]
+        r = targets.radius[i]
+        target_right = targets.right[i]
         c0 = int((x - r) // cell)
         c1 = int((x + r) // cell)
         r0 = int((y - r) // cell)
@@ -200,22 +255,28 @@ def _search(
         c1 = min(max(c1, 0), columns - 1)
         r0 = min(max(r0, 0), rows - 1)
         r1 = min(max(r1, 0), rows - 1)
+
+        # nearest and second nearest descriptor among the features in the window
         best = -1
         first = FAR
         second = FAR
         first_octave = -1
         second_octave = -2
         for row in range(r0, r1 + 1):
+            # a row's cells follow each other, and so do their features
             for k in range(start[row * columns + c0], start[row * columns + c1 + 1]):
-                j = order[k]
-                if not free[j] or octave[j] < octave_low[i] or octave[j] > octave_high[i]:
+                j = features.order[k]
+                if not features.free[j]:
+                    continue
+                if octave[j] < targets.octave_low[i] or octave[j] > targets.octave_high[i]:
                     continue
                 if abs(xy[j, 0] - x) > r or abs(xy[j, 1] - y) > r:
                     continue
-                if right[j] == right[j] and target_right[i] == target_right[i]:
-                    if abs(right[j] - target_right[i]) > r:
+                # right columns are compared where both are known: NaN is not equal to itself
+                if right[j] == right[j] and target_right == target_right:
+                    if abs(right[j] - target_right) > r:
                         continue
-                d = distance(target_words[i], words[j])
+                d = distance(targets.words[i], features.words[j])
                 if d < first:
                     second = first
                     second_octave = first_octave
@@ -225,10 +286,14 @@ def _search(
                 elif d < second:
                     second = d
                     second_octave = octave[j]
+
+        # ratio test, where both come from one octave
         if best < 0 or first > max_distance:
             continue
         if ratio < 1.0 and first_octave == second_octave and first > ratio * second:
             continue
+
+        # where another target has the feature, the smaller distance wins
         rival = owner[best]
         if rival >= 0:
             if match_distance[rival] <= first:
@@ -267,26 +332,22 @@ def search_in_radius(
         int64 ``[M]``, matched feature or -1. Where two targets claim one feature the smaller
         distance wins, then the lower index.
     """
-    f = features
     grid = features.grid
-    return _search(
-        grid.cell,
-        grid.columns,
-        grid.rows,
-        grid.start,
-        grid.order,
-        f.xy,
-        f.right,
-        f.octave,
-        f.words,
-        free,
-        *windows,
-        octave - 1,
-        octave + 1,
-        words,
-        max_distance,
-        ratio,
+    searched = _SearchFeatures(
+        cell=grid.cell,
+        columns=grid.columns,
+        rows=grid.rows,
+        start=grid.start,
+        order=grid.order,
+        xy=features.xy,
+        right=features.right,
+        octave=features.octave,
+        words=features.words,
+        free=free,
     )
+    xy, right, radius = windows
+    targets = _SearchTargets(xy, right, radius, octave - 1, octave + 1, words)
+    return _search(searched, targets, max_distance, ratio)
 
 
 def rotation_consistent(
@@ -308,9 +369,11 @@ def rotation_consistent(
     Returns:
         bool ``[N]``, True for matches in the (up to three) fullest bins.
     """
+    # histogram of the differences of orientation
     difference = np.mod(np.asarray(angle_a, np.float64) - np.asarray(angle_b, np.float64), 360.0)
     index = np.minimum((difference * (bins / 360.0)).round().astype(np.int64) % bins, bins - 1)
     counts = np.bincount(index, minlength=bins)
+    # the three fullest bins, if they hold enough matches
     top = np.argsort(-counts, kind="stable")[:3]
     good = top[counts[top] >= max(1.0, share * counts[top[0]])]
     return np.asarray(np.isin(index, good))

@@ -19,47 +19,20 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts import Keypoints
 from dynslam_bench.core import SettingsError
 from dynslam_bench.core.compiled import kernel
-from dynslam_bench.core.simd import (
-    BYTE_LANES,
-    PATCH_ROWS,
-    UINT16_LANES,
-    patch_sum,
-    store_corner_scores,
-    store_maxima,
-)
 from dynslam_bench.features.brief import rotated_brief, smooth
+from dynslam_bench.features.fast import EDGE, fast_corners
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry import inside
 
 PATCH_RADIUS = 15
 """Radius of the disc whose intensity centroid gives the orientation, pixels of the level."""
-_ROW, _COLUMN = np.mgrid[:PATCH_ROWS, :UINT16_LANES].astype(np.int16) - PATCH_RADIUS
+PATCH_SIDE = 32
+"""Rows and columns of the patch that is summed: the disc's 31, and one of zeros that makes whole vectors of it."""
+# row and column of each pixel of the patch from the disc's centre, 0 outside the disc
+_ROW, _COLUMN = np.mgrid[:PATCH_SIDE, :PATCH_SIDE].astype(np.int32) - PATCH_RADIUS
 _IN_DISC = _ROW * _ROW + _COLUMN * _COLUMN <= PATCH_RADIUS * PATCH_RADIUS
-_DISC = ((_COLUMN * _IN_DISC).reshape(-1), (_ROW * _IN_DISC).reshape(-1))
-EDGE = 19
-"""Corners nearer to a level's border than this are not used: the rotated descriptor pattern would leave the image."""
-
-CIRCLE = np.array(
-    [
-        (0, 3),
-        (1, 3),
-        (2, 2),
-        (3, 1),
-        (3, 0),
-        (3, -1),
-        (2, -2),
-        (1, -3),
-        (0, -3),
-        (-1, -3),
-        (-2, -2),
-        (-3, -1),
-        (-3, 0),
-        (-3, 1),
-        (-2, 2),
-        (-1, 3),
-    ]
-)
-"""The sixteen pixels of FAST around a corner, (column, row) each."""
+_DISC_COLUMNS = _COLUMN * _IN_DISC
+_DISC_ROWS = _ROW * _IN_DISC
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,13 +67,14 @@ class OrbExtractor:
     """
 
     def __init__(self, settings: FeatureSettings | None = None) -> None:
-        s = settings or FeatureSettings()
-        if s.fast_threshold_min > s.fast_threshold:
+        settings = settings or FeatureSettings()
+        least = settings.fast_threshold_min
+        if least > settings.fast_threshold:
             raise SettingsError(
-                f"fast_threshold_min is {s.fast_threshold_min}, above fast_threshold {s.fast_threshold}",
+                f"fast_threshold_min is {least}, above fast_threshold {settings.fast_threshold}",
                 "lower fast_threshold_min",
             )
-        self.settings = s
+        self.settings = settings
 
     def configure(self, settings: FeatureSettings) -> None:
         """Use other FAST thresholds and numbers; with a second threshold above the first, the second alone applies."""
@@ -109,23 +83,39 @@ class OrbExtractor:
     def extract(self, gray: NDArray[np.uint8]) -> Keypoints:
         """The keypoints of a uint8 ``[H, W]`` image, ordered by level; none is an empty result."""
         levels = self._levels(gray)
-        return self._describe(
-            levels, self._choose(levels, [np.ones(len(level.xy), bool) for level in levels])
-        )
+        everywhere = [np.ones(len(level.xy), bool) for level in levels]
+        return self._describe(levels, self._choose(levels, everywhere))
 
     def extract_masked(
         self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float
     ) -> Keypoints:
-        """As `extract`; with less than a share of `n_features` outside the mask, all of them are extracted there."""
+        """The keypoints of an image with enough of them outside a mask.
+
+        Args:
+            gray: uint8 ``[H, W]``.
+            mask: bool ``[H, W]``, dynamic pixels.
+            share: Least share of `n_features` outside the mask. With fewer, as many as `n_features`
+                are extracted there, beside those inside that `extract` returns.
+        """
         levels = self._levels(gray)
-        chosen = self._choose(levels, [np.ones(len(level.xy), bool) for level in levels])
+        everywhere = [np.ones(len(level.xy), bool) for level in levels]
+        chosen = self._choose(levels, everywhere)
+
+        # how many of the chosen corners lie outside the mask
         outside = [~inside(mask, level.xy * level.scale) for level in levels]
-        count = sum(
-            np.count_nonzero(out[index]) for out, index in zip(outside, chosen, strict=True)
-        )
+        count = 0
+        for is_outside, index in zip(outside, chosen, strict=True):
+            count += np.count_nonzero(is_outside[index])
+
+        # too few: those inside stay, those outside are chosen anew among themselves
         if count < share * self.settings.n_features:
-            triples = zip(outside, chosen, self._choose(levels, outside), strict=True)
-            chosen = [np.concatenate([index[~out[index]], more]) for out, index, more in triples]
+            chosen_outside = self._choose(levels, outside)
+            chosen = [
+                np.concatenate([index[~is_outside[index]], index_outside])
+                for is_outside, index, index_outside in zip(
+                    outside, chosen, chosen_outside, strict=True
+                )
+            ]
         return self._describe(levels, chosen)
 
     def _levels(self, gray: NDArray[np.uint8]) -> list[_Level]:
@@ -137,6 +127,7 @@ class OrbExtractor:
             size = round(gray.shape[1] / scale), round(gray.shape[0] / scale)
             if min(size) <= 2 * EDGE:
                 break
+            # each level is resized from the one before
             if number > 0:
                 image = np.asarray(
                     cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8
@@ -154,40 +145,45 @@ class OrbExtractor:
         quotas = level_quotas(self.settings.n_features, len(levels), self.settings.scale_factor)
         chosen: list[NDArray[np.int64]] = []
         missing = 0
-        for level, quota, among in list(zip(levels, quotas, allowed, strict=True))[::-1]:
+        coarse_to_fine = list(zip(levels, quotas, allowed, strict=True))[::-1]
+        for level, quota, among in coarse_to_fine:
+            # weak corners count in cells without a strong one
             strong = among & (level.response >= self.settings.fast_threshold)
-            filled = np.bincount(level.cells[strong], minlength=level.cells.max(initial=0) + 1) > 0
-            eligible = strong | among & ~filled[level.cells]
+            cells = level.cells.max(initial=0) + 1
+            has_strong = np.bincount(level.cells[strong], minlength=cells) > 0
+            eligible = strong | among & ~has_strong[level.cells]
             chosen.append(spread(level.cells, level.response, eligible, quota + missing))
             # a coarse level's missing features are added to the next finer level
             missing += quota - len(chosen[-1])
         return chosen[::-1]
 
     def _corners(self, image: NDArray[np.uint8], scale: float) -> _Level:
+        """A level with its FAST corners, and the cell of the grid that each lies in."""
         at, response = fast_corners(image, self.settings.fast_threshold_min)
         row, column = np.divmod(at, image.shape[1])
         cell = self.settings.cell_px
         origin = EDGE - 3
-        columns = -(-(image.shape[1] - 2 * origin) // cell)
+        columns = -(-(image.shape[1] - 2 * origin) // cell)  # rounded up
         cells = (row - origin) // cell * columns + (column - origin) // cell
-        return _Level(
-            image, scale, np.stack([column, row], axis=1).astype(np.float32), response, cells
-        )
+        xy = np.stack([column, row], axis=1).astype(np.float32)
+        return _Level(image, scale, xy, response, cells)
 
     def _describe(self, levels: Sequence[_Level], chosen: Sequence[NDArray[np.int64]]) -> Keypoints:
-        octave = np.repeat(np.arange(len(levels), dtype=np.int32), [len(index) for index in chosen])
+        """The keypoints of the chosen corners, indices by level, in pixels of the full image."""
+        counts = [len(index) for index in chosen]
+        octave = np.repeat(np.arange(len(levels), dtype=np.int32), counts)
         xy = np.empty((len(octave), 2))
         descriptors = np.empty((len(octave), 32), np.uint8)
-        angle, response = np.empty((2, len(octave)), np.float32)
+        angle = np.empty(len(octave), np.float32)
+        response = np.empty(len(octave), np.float32)
         end = 0
         for level, index in zip(levels, chosen, strict=True):
             at = level.xy[index]
-            rows = slice(end, end := end + len(index))
-            xy[rows], response[rows] = (
-                np.multiply(at, level.scale, dtype=np.float64),
-                level.response[index],
-            )
-            angle[rows] = orientations(level.image, at, *_DISC)
+            rows = slice(end, end + len(index))
+            end += len(index)
+            xy[rows] = np.multiply(at, level.scale, dtype=np.float64)
+            response[rows] = level.response[index]
+            angle[rows] = orientations(level.image, at, _DISC_COLUMNS, _DISC_ROWS)
             descriptors[rows] = rotated_brief(smooth(level.image), at, angle[rows])
         return Keypoints(xy.astype(np.float32), octave, angle, response, descriptors)
 
@@ -219,6 +215,7 @@ def spread(
     index = np.flatnonzero(allowed)
     if len(index) == 0:
         return index
+    # the strongest first; a point's rank is the number of stronger ones in its cell
     index = index[_stable_order(-response[index])]
     taken = np.zeros(cells.max() + 1, np.int64)
     rank = np.empty(len(index), np.int64)
@@ -230,7 +227,7 @@ def spread(
 
 @kernel
 def _stable_order(keys: NDArray[np.signedinteger]) -> NDArray[np.int64]:
-    """Indices that sort integers of a small range; equal ones keep their order."""
+    """Indices that sort integers of a small range, by counting; equal ones keep their order."""
     lowest = keys.min()
     start = np.zeros(keys.max() - lowest + 2, np.int64)
     order = np.empty(len(keys), np.int64)
@@ -244,51 +241,11 @@ def _stable_order(keys: NDArray[np.signedinteger]) -> NDArray[np.int64]:
 
 
 @kernel
-def fast_corners(
-    image: NDArray[np.uint8], threshold: int
-) -> tuple[NDArray[np.int64], NDArray[np.int16]]:
-    """FAST corners that are stronger than their eight neighbours, row by row; the same as OpenCV's.
-
-    Args:
-        image: uint8 ``[H, W]``, more than twice `EDGE` wide and high; corners nearer to its border
-            are left out.
-        threshold: Least score, at least 1.
-
-    Returns:
-        Indices ``[N]`` into the flat image, and their scores ``[N]``.
-    """
-    height, width = image.shape
-    pixels = image.reshape(-1)
-    scores = np.zeros(image.size, np.uint8)
-    maxima = np.zeros(image.size, np.uint8)
-    circle = CIRCLE[:, 0] + CIRCLE[:, 1] * width
-    first = EDGE * width
-    last = (height - EDGE) * width
-    for at in range(first, last, BYTE_LANES):
-        store_corner_scores(scores, pixels, at, circle)
-    for y in range(EDGE, height - EDGE):
-        for x in range(EDGE):
-            scores[y * width + x] = scores[(y + 1) * width - 1 - x] = 0
-    for at in range(last, last + BYTE_LANES):
-        scores[at] = 0
-    for at in range(first, last, BYTE_LANES):
-        store_maxima(maxima, scores, at, width, threshold)
-    # of four adjacent pixels one at most is a maximum
-    corners = np.empty(image.size // 4, np.int64)
-    count = 0
-    for at in range(first, last):
-        corners[count] = at
-        count += maxima[at] > 0
-    corners = corners[:count]
-    return corners, maxima[corners].astype(np.int16)
-
-
-@kernel
 def orientations(
     image: NDArray[np.uint8],
     xy: NDArray[np.float32],
-    columns: NDArray[np.int16],
-    rows: NDArray[np.int16],
+    columns: NDArray[np.int32],
+    rows: NDArray[np.int32],
 ) -> NDArray[np.float32]:
     """Orientations of discs by their intensity centroid (Rublee et al., 2011, Section 3.2), degrees in [0, 360).
 
@@ -296,18 +253,26 @@ def orientations(
         image: uint8 ``[H, W]``.
         xy: Integer-valued pixels, float32 ``[N, 2]``, more than the disc's radius away from the
             border.
-        columns: Column of each pixel of the disc from its centre, flat int16, as `patch_sum` reads
-            it; 0 outside ...
+        columns: int32 ``[PATCH_SIDE, PATCH_SIDE]``, column of each pixel of the disc from its
+            centre; 0 outside ...
         rows: ... and its row.
     """
     out = np.zeros(len(xy), np.float32)
-    pixels = image.reshape(-1)
-    width = image.shape[1]
+    side = len(rows)  # a constant number of turns would be unrolled, and no vector code made
     for i in range(len(xy)):
-        first = (int(xy[i, 1]) - PATCH_RADIUS) * width + int(xy[i, 0]) - PATCH_RADIUS
-        m10 = patch_sum(pixels, first, width, columns)
-        m01 = patch_sum(pixels, first, width, rows)
+        top = int(xy[i, 1]) - PATCH_RADIUS
+        left = int(xy[i, 0]) - PATCH_RADIUS
+        patch = image[top : top + side, left : left + side]
+        # first moments of the grey levels, exact in 32 bits
+        m10 = np.int32(0)
+        m01 = np.int32(0)
+        for row in range(side):
+            for column in range(side):
+                pixel = np.int32(patch[row, column])
+                m10 = np.int32(m10 + pixel * columns[row, column])
+                m01 = np.int32(m01 + pixel * rows[row, column])
         out[i] = math.degrees(math.atan2(float(m01), float(m10))) % 360.0
-        if out[i] >= 360.0:  # rounded up by float32
+        # float32 may round up to 360
+        if out[i] >= 360.0:
             out[i] = 0.0
     return out

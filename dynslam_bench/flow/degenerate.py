@@ -10,7 +10,7 @@ from dynslam_bench.contracts.flow import FlowResult
 FLAT_RANGE = 2
 """Grey levels between the darkest and the brightest pixel up to which an image has no texture."""
 STATS_NAMES = ("points", "valid", "evaluations", "degenerate")
-"""Of `flow_stats`."""
+"""Keys of `flow_stats`."""
 
 
 def flow_stats(
@@ -24,7 +24,8 @@ def flow_stats(
         evaluations: Matching costs computed.
         degenerate: Whether the images allow no flow: identical, without texture, too small.
     """
-    return dict(zip(STATS_NAMES, map(float, (points, valid, evaluations, degenerate)), strict=True))
+    values = (points, valid, evaluations, degenerate)
+    return dict(zip(STATS_NAMES, map(float, values), strict=True))
 
 
 def invalid_result(points: NDArray[np.float32], *, degenerate: bool) -> FlowResult:
@@ -61,14 +62,17 @@ def clean_points(
             f"images must be uint8 [H, W], got {reference.dtype} {reference.shape} and {target.dtype}"
         )
     points = np.ascontiguousarray(points, dtype=np.float32).reshape(-1, 2)
-    images = (reference, target)
+
+    # nothing to track
     if not len(points) or not reference.size:
         return invalid_result(points, degenerate=bool(len(points)))
-    if (
-        reference is target
-        or any(np.ptp(image) <= FLAT_RANGE for image in images)
-        or np.array_equal(*images)
-    ):
+
+    # images that allow no flow: one without texture, or the same image twice
+    if reference is target:
+        return invalid_result(points, degenerate=True)
+    if np.ptp(reference) <= FLAT_RANGE or np.ptp(target) <= FLAT_RANGE:
+        return invalid_result(points, degenerate=True)
+    if np.array_equal(reference, target):
         return invalid_result(points, degenerate=True)
     usable = usable_points(points, reference.shape)
     return np.where(usable[:, None], points, 0).astype(np.float32), usable

@@ -13,7 +13,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,6 +121,8 @@ class DenseDaisyFlow:
             return cleaned
         clean, usable = cleaned
         dense = self.flow(reference, target, seed=seed)
+
+        # read the field at the pixels that contain the points
         pixel, _ = pixel_index(clean, target.maps.gray.shape)
         xy = (clean + dense.flow[pixel]).astype(np.float32)
         cost = dense.cost[pixel]
@@ -130,11 +132,12 @@ class DenseDaisyFlow:
             & usable_points(xy, target.maps.gray.shape)
             & (cost < MAX_COST)
         )
+
+        # forward-backward check: follow the backward flow from where each point ends
         if self.settings.forward_backward_px > 0:
             ends = np.where(valid[:, None], xy, clean)
-            error = np.linalg.norm(
-                ends + dense.back[pixel_index(ends, target.maps.gray.shape)[0]] - clean, axis=1
-            )
+            end_pixel, _ = pixel_index(ends, target.maps.gray.shape)
+            error = np.linalg.norm(ends + dense.back[end_pixel] - clean, axis=1)
             valid &= error <= self.settings.forward_backward_px
         return FlowResult(
             xy, valid, cost, flow_stats(len(clean), int(valid.sum()), dense.evaluations)
@@ -144,37 +147,42 @@ class DenseDaisyFlow:
         self, reference: DescribedImage, target: DescribedImage, *, seed: int = 0
     ) -> DenseFlow:
         """Flow of every pixel from the reference to the target."""
+        # 1-3. search, refine and choose labels in both directions
         forward = _RegionLabels(self.settings, self._sparse, reference, target, seed)
         backward = _RegionLabels(self.settings, self._sparse, target, reference, seed + 1)
         flow = forward.flow()
         back = backward.flow()
+
+        # a second round: regions that are not consistent try the motion of those around them
         if self.settings.second_round:
             forward.try_regional_motion(self._consistent(flow, back))
             backward.try_regional_motion(self._consistent(back, flow))
             flow = forward.flow()
             back = backward.flow()
+
+        # 4. keep what the backward flow leads back from; fill the rest with the fitted motion
         valid = self._consistent(flow, back)
         fitted = fit_regional_motion(flow, valid, reference.regions, reference.half)
         if fitted is not None:
-            height = len(flow)
-            smooth = np.empty_like(flow)
+            filled = np.empty_like(flow)
             self._sparse.workers.run(
                 fill_and_smooth,
                 0,
-                height,
+                len(flow),
                 flow,
                 valid,
                 reference.regions.labels,
                 reference.centres,
                 fitted.astype(np.float32),
-                smooth,
+                filled,
             )
-            flow = smooth
+            flow = filled
         return DenseFlow(
             flow, valid, forward.cost(), forward.evaluations + backward.evaluations, back
         )
 
     def _consistent(self, forward: Floats, backward: Floats) -> Flags:
+        """Which pixels the backward flow leads back to, bool ``[H, W]``; see `consistent`."""
         valid = np.empty(forward.shape[:2], dtype=np.bool_)
         tolerance = np.float32(self.settings.consistency_px)
         self._sparse.workers.run(consistent, 0, len(valid), forward, backward, tolerance, valid)
@@ -208,21 +216,24 @@ def describe_image(
     maps: OrientationMaps, settings: DenseFlowSettings, sparse: SparseDaisyFlow
 ) -> DescribedImage:
     """Compute superpixels and descriptors of an image."""
+    # superpixels of the half-resolution image
     half = np.ascontiguousarray(maps.framed_half[BORDER:-BORDER, BORDER:-BORDER])
     regions = superpixels(half, max(2, settings.superpixel_px // 2))
     centres = regions.centres * 2 + 0.5  # half-resolution pixel i covers 2 i and 2 i + 1
+    neighbours = nearest(centres, sparse.workers.run)
+
+    # the unrotated descriptor of every half-resolution pixel
     tables = sparse.pair(maps, maps).tables
     descriptors = np.empty(half.size * layout.HISTOGRAMS, dtype=np.uint64)
     sparse.workers.run(read_descriptors, 0, *half.shape, maps.arrays, tables, descriptors)
-    neighbours = nearest(centres, sparse.workers.run)
     return DescribedImage(
-        maps,
-        half,
-        regions,
-        centres,
-        neighbours,
-        sparse.describe(maps, centres, tables),
-        descriptors,
+        maps=maps,
+        half=half,
+        regions=regions,
+        centres=centres,
+        neighbours=neighbours,
+        described=sparse.describe(maps, centres, tables),
+        descriptors=descriptors,
     )
 
 
@@ -248,6 +259,8 @@ class _RegionLabels:
         self._tables = cost_tables(reference.maps.gray.shape, settings.terms)
         self._best = np.full(reference.half.shape, np.inf, dtype=np.float32)
         self._winner = np.zeros((*reference.half.shape, 4), dtype=np.float32)
+
+        # search a label for each superpixel at its centre, and refine it
         centres = reference.centres
         neighbours = reference.neighbours
         target_arrays = image_arrays(pair.target, pair.tables)
@@ -257,6 +270,8 @@ class _RegionLabels:
         if settings.refinement == "lucas-kanade":
             sparse.refine_together(centres, labels, neighbours, pair)
         self.evaluations = int(state.used.sum())
+
+        # every pixel takes the best of its region's label and its neighbours'
         near = np.ascontiguousarray(neighbours[:, : settings.candidates - 1])
         self._choose(
             np.concatenate([labels[:, None], labels_as_seen(centres, labels, near)], axis=1)
@@ -272,7 +287,10 @@ class _RegionLabels:
         fitted = fit_regional_motion(self.flow(), valid, regions, self._image.half)
         if fitted is None:
             return
-        doubtful = np.unique(regions.labels[~valid[: 2 * height : 2, : 2 * width : 2]])
+        inconsistent = ~valid[: 2 * height : 2, : 2 * width : 2]
+        doubtful = np.unique(regions.labels[inconsistent])
+
+        # two candidates a region: the fitted motion's similarity, and the same refined in place
         labels = nearest_similarities(fitted)[doubtful]
         candidates = np.full((len(fitted), 2, 4), np.nan, dtype=np.float32)
         candidates[doubtful, 0] = labels
@@ -284,29 +302,24 @@ class _RegionLabels:
     def _choose(self, candidates: NDArray[np.float32]) -> None:
         """Let every pixel take the best of its region's candidates ``[K, C, 4]``, if it beats the label it has."""
         image = self._image
-        centres = self._image.centres
-        pair = self._pair
-        evaluations = np.zeros(len(centres), dtype=np.int64)
-        regions = (image.regions.members, image.regions.starts, centres, candidates)
-        reference = image_arrays(pair.reference, self._tables)
-        target = image_arrays(pair.target, self._tables)
-        guide = image.half.astype(np.float32) / np.float32(255)
-        radius = max(1, self.settings.filter_radius_px // 2)
-        smoothing = (guide, radius, np.float32(self.settings.filter_epsilon))
-        chosen = (self._best, self._winner, evaluations)
-        self._sparse.workers.run(
-            aggregate_and_choose,
-            0,
-            len(centres),
-            *regions,
-            reference,
-            target,
-            self._tables,
-            image.descriptors,
-            *smoothing,
-            *chosen,
+        count = len(image.centres)
+        regions = RegionArrays(image.regions.members, image.regions.starts, image.centres)
+        matching = PixelMatching(
+            reference=image_arrays(self._pair.reference, self._tables),
+            target=image_arrays(self._pair.target, self._tables),
+            tables=self._tables,
+            descriptors=image.descriptors,
         )
-        self.evaluations += int(evaluations.sum())
+        aggregation = GuidedFilter(
+            guide=image.half.astype(np.float32) / np.float32(255),
+            radius=max(1, self.settings.filter_radius_px // 2),
+            epsilon=np.float32(self.settings.filter_epsilon),
+        )
+        chosen = ChosenLabels(self._best, self._winner, np.zeros(count, dtype=np.int64))
+        self._sparse.workers.run(
+            aggregate_and_choose, 0, count, regions, candidates, matching, aggregation, chosen
+        )
+        self.evaluations += int(chosen.evaluations.sum())
 
     def flow(self) -> NDArray[np.float32]:
         """Displacement of every full-image pixel under the labels chosen so far."""
@@ -320,14 +333,15 @@ class _RegionLabels:
 
     def cost(self) -> NDArray[np.float32]:
         """Aggregated cost of every full-image pixel, as a share of the largest possible."""
-        full = self._image.maps.gray.shape
-        half = self._image.half.shape
-        rows, columns = (
-            np.minimum(np.arange(n) // 2, h - 1) for n, h in zip(full, half, strict=True)
-        )
-        share = self._best[np.ix_(rows, columns)]
-        # may overshoot
-        return np.asarray(np.clip(share / np.float32(self._tables.ceiling), 0, 1), dtype=np.float32)
+        height, width = self._image.maps.gray.shape
+        half_height, half_width = self._image.half.shape
+        # the half-resolution pixel of each full-image row and column; an odd last one has none
+        rows = np.minimum(np.arange(height) // 2, half_height - 1)
+        columns = np.minimum(np.arange(width) // 2, half_width - 1)
+        cost = self._best[np.ix_(rows, columns)]
+        # the guided filter may overshoot
+        share = np.clip(cost / np.float32(self._tables.ceiling), 0, 1)
+        return np.asarray(share, dtype=np.float32)
 
 
 @kernel
@@ -340,7 +354,7 @@ def consistent(
         start: First row.
         stop: One past the last.
         forward: float32 ``[H, W, 2]``.
-        backward: Likewise.
+        backward: float32 ``[H, W, 2]``, flow of the other direction.
         tolerance: Pixels.
         valid: bool ``[H, W]``, filled.
     """
@@ -350,6 +364,7 @@ def consistent(
         for x in range(width):
             u = forward[y, x, 0]
             v = forward[y, x, 1]
+            # the pixel in which the forward flow ends
             column = np.int64(np.rint(np.float32(x) + u))
             row = np.int64(np.rint(np.float32(y) + v))
             valid[y, x] = False
@@ -361,8 +376,10 @@ def consistent(
 
 def nearest_similarities(motion: NDArray[np.float64]) -> NDArray[np.float32]:
     """The similarities nearest to affine motions ``[K, 3, 2]`` at their centres, as labels ``[K, 4]``."""
+    # the similarity (a, -b; b, a) nearest to the affine map in the Frobenius norm
     a = 1 + 0.5 * (motion[:, 1, 0] + motion[:, 2, 1])
     b = 0.5 * (motion[:, 1, 1] - motion[:, 2, 0])
+    # as a label: scale in octaves and rotation in radians
     s = np.log2(np.maximum(np.hypot(a, b), 0.25))
     theta = np.arctan2(b, a)
     return np.column_stack([motion[:, 0], s, theta]).astype(np.float32)
@@ -386,6 +403,7 @@ def fit_regional_motion(
         float64 ``[K, 3, 2]``, flow at the centre, and its change per pixel along x and y; None
         where fewer than three regions are reliable.
     """
+    # regions with enough consistent pixels are reliable
     count = len(regions.centres)
     sums = np.zeros((count, 6))
     sum_regions(flow, valid, regions.labels, sums)
@@ -393,30 +411,39 @@ def fit_regional_motion(
     reliable = np.flatnonzero((consistent >= SHARE * np.maximum(sums[:, 0], 1)) & (consistent > 0))
     if len(reliable) < 3:
         return None
-    # position and flow of each region's consistent pixels
+    # mean position and mean flow of each region's consistent pixels, [K, 4]
     mean = sums[:, 2:] / np.maximum(consistent, 1)[:, None]
     centres = regions.centres.astype(np.float64) * 2 + 0.5
-    total = np.bincount(regions.labels.ravel(), weights=guide.ravel(), minlength=count)
-    grey = total / np.maximum(np.bincount(regions.labels.ravel(), minlength=count), 1)
+    region_of_pixel = regions.labels.ravel()
+    grey_sum = np.bincount(region_of_pixel, weights=guide.ravel(), minlength=count)
+    grey = grey_sum / np.maximum(np.bincount(region_of_pixel, minlength=count), 1)
+
+    # the nearest reliable regions of each, [K, near]
     near = min(NEIGHBOURS, len(reliable))
     distance, index = cKDTree(mean[reliable, :2]).query(centres, k=near)
     chosen = reliable[np.asarray(index).reshape(count, near)]
     distance = np.asarray(distance).reshape(count, near)
+
+    # near regions of a similar grey level weigh most
     spread = np.maximum(distance.mean(axis=1, keepdims=True), 1.0)
     weight = (
         np.exp(-0.5 * (distance / spread) ** 2 - np.abs(grey[chosen] - grey[:, None]) / 20.0) + 1e-6
     )
+
+    # flow = motion^T (1, dx, dy), with offsets in units of `spread`
     offset = (mean[chosen, :2] - centres[:, None]) / spread[..., None]
     basis = np.concatenate([np.ones((count, near, 1)), offset], axis=2)
     values = mean[chosen, 2:]
     motion = np.zeros((count, 3, 2))
-    for _ in range(3):  # iteratively reweighted: a foreground region must not bend the background
+    # iteratively reweighted least squares: a foreground region must not bend the background
+    for _ in range(3):
         weighted = basis * weight[..., None]
         normal = weighted.transpose(0, 2, 1) @ basis
+        # damping: the change along x and y is near zero where the regions do not tell it
         normal[:, (0, 1, 2), (0, 1, 2)] += weight.sum(axis=1, keepdims=True) * (1e-6, 0.05, 0.05)
         motion = np.linalg.solve(normal, weighted.transpose(0, 2, 1) @ values)
         weight = weight / (1 + (np.linalg.norm(values - basis @ motion, axis=2) / 2.0) ** 2)
-    motion[:, 1:] /= spread[:, :, None]
+    motion[:, 1:] /= spread[:, :, None]  # back to a change per pixel
     return motion
 
 
@@ -464,6 +491,7 @@ def fill_and_smooth(
         row = labels[min(y // 2, len(labels) - 1)]
         for x in range(flow.shape[1]):
             r = row[min(x // 2, len(row) - 1)]
+            # the fitted motion of the pixel's region at the pixel
             dx = np.float32(x) - centres[r, 0]
             dy = np.float32(y) - centres[r, 1]
             u = motion[r, 0, 0] + dx * motion[r, 1, 0] + dy * motion[r, 2, 0]
@@ -473,7 +501,8 @@ def fill_and_smooth(
             replaced = (
                 not valid[y, x] or (u - own_u) * (u - own_u) + (v - own_v) * (v - own_v) < limit
             )
-            out[y, x, 0], out[y, x, 1] = (u, v) if replaced else (own_u, own_v)
+            out[y, x, 0] = u if replaced else own_u
+            out[y, x, 1] = v if replaced else own_v
 
 
 # ---------------------------------------------------------------------- superpixels
@@ -503,20 +532,24 @@ def superpixels(
 
     Args:
         gray: The image.
-        size: ImageArrays of the initial squares, pixels.
+        size: Side of the initial squares, pixels.
         compactness: Grey levels that weigh as much as a distance of `size`.
         iterations: Of k-means.
     """
+    # initial centres (x, y, grey level): those of a grid of squares
     height, width = gray.shape
     rows = max(1, round(height / size))
     columns = max(1, round(width / size))
     y = (np.arange(rows) + 0.5) * height / rows - 0.5
     x = (np.arange(columns) + 0.5) * width / columns - 0.5
     centres = np.zeros((rows * columns, 3), dtype=np.float64)
-    centres[:, 0], centres[:, 1] = np.tile(x, rows), np.repeat(y, columns)
+    centres[:, 0] = np.tile(x, rows)
+    centres[:, 1] = np.repeat(y, columns)
     centres[:, 2] = gray[np.rint(centres[:, 1]).astype(int), np.rint(centres[:, 0]).astype(int)]
     labels = np.empty((height, width), dtype=np.int32)
     assign_pixels(gray, centres, size, (size / compactness) ** 2, iterations, labels)
+
+    # list each region's pixels
     flat = labels.reshape(-1)
     starts = np.concatenate([[0], np.cumsum(np.bincount(flat, minlength=len(centres)))])
     members = np.argsort(flat, kind="stable")
@@ -532,6 +565,7 @@ def assign_pixels(
     distance = np.empty((height, width), dtype=np.float64)
     sums = np.empty((len(centres), 4), dtype=np.float64)
     for _ in range(iterations):
+        # assignment: a pixel takes the nearest centre in position and grey level
         distance[:] = np.inf
         labels[:] = -1
         for k in range(len(centres)):
@@ -547,11 +581,13 @@ def assign_pixels(
                     if d < distance[y, x]:
                         distance[y, x] = d
                         labels[y, x] = k
+        # update: sum x, y, grey level and number of each centre's pixels
         sums[:] = 0
         for y in range(height):
             for x in range(width):
                 k = labels[y, x]
-                if k < 0:  # too far from every centre: the nearest in position
+                # a pixel too far from every centre takes the nearest in position
+                if k < 0:
                     best = np.inf
                     for other in range(len(centres)):
                         d = (x - centres[other, 0]) ** 2 + (y - centres[other, 1]) ** 2
@@ -586,6 +622,7 @@ def box_mean(
         line: float32, flat, scratch, zero in the first and last `radius` rows and in the corners.
         out: float32, flat, filled but for the outermost rows.
     """
+    # sums over the columns of the windows
     first = radius * pitch
     last = len(values) - radius * pitch
     for k in range(first, last):
@@ -593,6 +630,7 @@ def box_mean(
     for d in range(1, radius + 1):
         for k in range(first, last):
             line[k] += values[k - d * pitch] + values[k + d * pitch]
+    # sums of these over the rows, divided by the number of pixels
     for k in range(first, last):
         out[k] = line[k]
     for d in range(1, radius + 1):
@@ -617,10 +655,10 @@ def frame_patch(
 
     Args:
         guide: float32 ``[h, w]``, grey levels in [0, 1].
-        top: Of the patch.
-        left: Of the patch.
-        height: Of the patch.
-        width: Of the patch.
+        top: First row of the patch.
+        left: First column of the patch.
+        height: Rows of the patch.
+        width: Columns of the patch.
         radius: Of the window, pixels.
         patch: float32, flat ``[(height + 2 radius) * (width + 2 radius)]``, the patch in a frame of
             zeros.
@@ -636,15 +674,15 @@ def frame_patch(
     variance = work[2, :n]
     line = work[3, :n]
     square = work[4, :n]
+    # the patch, and one over the number of its pixels in each window
     for y in range(height):
         rows = np.float32(min(y + radius, height - 1) - max(y - radius, 0) + 1)
         at = (y + radius) * pitch + radius
         for x in range(width):
             columns = np.float32(min(x + radius, width - 1) - max(x - radius, 0) + 1)
-            patch[at + x], share[at + x] = (
-                guide[top + y, left + x],
-                np.float32(1) / (rows * columns),
-            )
+            patch[at + x] = guide[top + y, left + x]
+            share[at + x] = np.float32(1) / (rows * columns)
+    # mean, and variance as the mean square less the squared mean
     box_mean(patch, pitch, radius, share, line, mean)
     for k in range(n):
         square[k] = patch[k] * patch[k]
@@ -664,7 +702,7 @@ def filter_patch(
 
     Args:
         patch: float32, flat, the guide of `frame_patch`.
-        values: float32, flat, likewise framed; what is filtered (matching costs).
+        values: float32, flat, framed as the guide; what is filtered (matching costs).
         pitch: Numbers a row.
         radius: Of the window, pixels.
         epsilon: Regularisation, squared grey levels.
@@ -678,15 +716,18 @@ def filter_patch(
     offset = work[4, :n]
     slope = work[5, :n]
     product = work[6, :n]
+    # means of the values, and of guide times values
     box_mean(values, pitch, radius, share, line, offset)
     for k in range(n):
         product[k] = patch[k] * values[k]
     box_mean(product, pitch, radius, share, line, slope)
+    # linear regression on the guide in each window: slope a = covariance / (variance + epsilon)
     for k in range(n):
         spread = variance[k] + epsilon
         a = (slope[k] - mean[k] * offset[k]) / spread if spread > 0 else np.float32(0)
         slope[k] = a
         offset[k] -= a * mean[k]
+    # average slopes and offsets of the windows that contain a pixel
     box_mean(slope, pitch, radius, share, line, product)
     box_mean(offset, pitch, radius, share, line, slope)
     for k in range(n):
@@ -702,77 +743,149 @@ def read_descriptors(
         for x in range(columns):
             px = np.float32(2 * x) + np.float32(0.5)
             py = np.float32(2 * y) + np.float32(0.5)
-            read_descriptor(px, py, image, tables, out, (y * columns + x) * 17)
+            first = (y * columns + x) * layout.HISTOGRAMS
+            read_descriptor(px, py, image, tables, out, first)
 
 
 Similarity: TypeAlias = tuple[Scalar, Scalar, Scalar, Scalar]
 """Displacement u, v at a centre, and a, b: scale times cosine and sine of the rotation."""
+
+DESCRIPTOR_BYTES = layout.LENGTH
+"""Bytes of a descriptor: 17 histograms of eight bins."""
+
+
+class RegionArrays(NamedTuple):
+    """The superpixels as kernels read them.
+
+    Attributes:
+        members: int64 ``[h * w]``, `Superpixels.members`.
+        starts: int64 ``[K + 1]``, `Superpixels.starts`.
+        centres: float32 ``[K, 2]``, full-image pixels.
+    """
+
+    members: NDArray[np.int64]
+    starts: NDArray[np.int64]
+    centres: NDArray[np.float32]
+
+
+class PixelMatching(NamedTuple):
+    """What the raw cost (Eq. 1) of a pixel is computed from.
+
+    Attributes:
+        reference: Orientation maps and grey levels of the reference.
+        target: Those of the target.
+        tables: Tables of the cost, without support.
+        descriptors: `DescribedImage.descriptors` of the reference, unrotated.
+    """
+
+    reference: ImageArrays
+    target: ImageArrays
+    tables: CostTables
+    descriptors: NDArray[np.uint64]
+
+
+class GuidedFilter(NamedTuple):
+    """How costs are aggregated (Eq. 2).
+
+    Attributes:
+        guide: float32 ``[h, w]``, half-resolution grey levels in [0, 1].
+        radius: Of the windows, half-resolution pixels.
+        epsilon: float32, regularisation, squared grey levels.
+    """
+
+    guide: NDArray[np.float32]
+    radius: int
+    epsilon: Scalar
+
+
+class ChosenLabels(NamedTuple):
+    """The winners so far (Eq. 3), changed in place.
+
+    Attributes:
+        best: float32 ``[h, w]``, lowest aggregated cost.
+        winner: float32 ``[h, w, 4]``, its label around the region's centre: displacement, and
+            ``2**s (cos, sin)``.
+        evaluations: int64 ``[K]``, raw costs computed for each region.
+    """
+
+    best: NDArray[np.float32]
+    winner: NDArray[np.float32]
+    evaluations: NDArray[np.int64]
+
+
+class RotatedDescriptors(NamedTuple):
+    """The descriptors of a patch, rotated when a label first needs a rotation.
+
+    Attributes:
+        data: uint8, flat ``[13, size, 136]``.
+        size: Descriptors a rotation that `data` has room for.
+        filled: bool ``[13]``, rotations that `data` holds already.
+        scratch: uint64 ``[2, 17]``.
+    """
+
+    data: NDArray[np.uint8]
+    size: int
+    filled: NDArray[np.bool_]
+    scratch: NDArray[np.uint64]
 
 
 @kernel
 def aggregate_and_choose(
     start: int,
     stop: int,
-    members: Longs,
-    starts: Longs,
-    centres: Floats,
+    regions: RegionArrays,
     candidates: Floats,
-    reference: ImageArrays,
-    target: ImageArrays,
-    tables: CostTables,
-    straight: Words,
-    guide: Floats,
-    radius: int,
-    epsilon: Scalar,
-    best: Floats,
-    winner: Floats,
-    evaluations: Longs,
+    matching: PixelMatching,
+    aggregation: GuidedFilter,
+    chosen: ChosenLabels,
 ) -> None:
     """Raw cost, guided filter and winner takes all (Eq. 1-3) for regions start..stop, at half resolution.
 
     Args:
         start: First region.
         stop: One past the last.
-        members: `Superpixels.members`.
-        starts: `Superpixels.starts`.
-        centres: float32 ``[K, 2]``, full-image pixels.
+        regions: The superpixels.
         candidates: float32 ``[K, C, 4]``, labels around the centres; NaN means none.
-        reference: `orientation_maps.ImageArrays`.
-        target: `orientation_maps.ImageArrays`.
-        tables: `matching_cost.CostTables` without support.
-        straight: `DescribedImage.descriptors` of the reference.
-        guide: float32 ``[h, w]``, half-resolution grey levels in [0, 1].
-        radius: Of the guided filter, half-resolution pixels.
-        epsilon: Of the guided filter.
-        best: float32 ``[h, w]``, lowest aggregated cost, changed in place.
-        winner: float32 ``[h, w, 4]``, its label around the region's centre: displacement, and
-            ``2**s (cos, sin)``.
-        evaluations: int64 ``[K]``, raw costs computed.
+        matching: Images, tables and descriptors of the raw cost.
+        aggregation: Guide and windows of the filter.
+        chosen: Changed in place.
     """
+    guide = aggregation.guide
+    radius = aggregation.radius
+    best = chosen.best
+    winner = chosen.winner
     rows, columns = guide.shape
-    rotated = np.empty(0, dtype=np.uint8)
-    turned = np.empty((2, 17), dtype=np.uint64)
+
+    # scratch, made larger when a patch needs more
     size = 0
-    described = np.zeros(13, dtype=np.bool_)
+    data = np.empty(0, dtype=np.uint8)
+    filled = np.zeros(layout.ROTATIONS, dtype=np.bool_)
+    scratch = np.empty((2, layout.HISTOGRAMS), dtype=np.uint64)
     values = np.empty(0, np.float32)
     patch = np.empty(0, np.float32)
     work = np.empty((8, 0), np.float32)
+
     for r in range(start, stop):
-        if starts[r] == starts[r + 1]:
+        if regions.starts[r] == regions.starts[r + 1]:
             continue
-        region = members[starts[r] : starts[r + 1]]
+        # the patch: the region's bounding box, extended by the filter's radius, in a frame of zeros
+        region = regions.members[regions.starts[r] : regions.starts[r + 1]]
         top, left, high, wide = patch_around(region, rows, columns, radius)
         pitch = wide + 2 * radius
         n = (high + 2 * radius) * pitch
         if n > size:
             size = n
-            rotated = np.empty(13 * n * 136, dtype=np.uint8)
+            data = np.empty(layout.ROTATIONS * n * DESCRIPTOR_BYTES, dtype=np.uint8)
             values = np.empty(n, np.float32)
             patch = np.empty(n, np.float32)
             work = np.empty((8, n), np.float32)
-        described[:] = False
+        filled[:] = False
         framed = False
+        centre = (regions.centres[r, 0], regions.centres[r, 1])
+        corner = (left, top, wide, high)
+
         for c in range(candidates.shape[1]):
+            # the label as a similarity; one that is missing or changes nothing is left out
             u = candidates[r, c, 0]
             v = candidates[r, c, 1]
             s = candidates[r, c, 2]
@@ -782,34 +895,34 @@ def aggregate_and_choose(
             b = scale * np.float32(np.sin(theta))
             if not np.isfinite(u + v + a + b):
                 continue
-            centre = (centres[r, 0], centres[r, 1])
-            corner = (left, top, wide, high)
             if not differs((u, v, a, b), centre, region, columns, best, winner):
                 continue
+
+            # Eq. 1: raw costs of the patch
             if not framed:
                 frame_patch(guide, top, left, high, wide, radius, patch[:n], work)
                 values[:n] = 0
                 framed = True
             si, ti = quantised(s, theta)
-            images = (reference, target, tables)
+            rotated = RotatedDescriptors(data, size, filled, scratch)
             raw_costs(
                 (u, v, a, b),
                 (si, ti),
                 centre,
                 corner,
                 radius,
-                images,
-                straight,
+                matching,
                 columns,
                 rotated,
-                size,
-                described,
-                turned,
                 values[:n],
             )
-            described[ti] = True
-            evaluations[r] += high * wide
-            filter_patch(patch[:n], values[:n], pitch, radius, epsilon, work)
+            filled[ti] = True
+            chosen.evaluations[r] += high * wide
+
+            # Eq. 2: aggregation by the guided filter
+            filter_patch(patch[:n], values[:n], pitch, radius, aggregation.epsilon, work)
+
+            # Eq. 3: the region's pixels take the label where its cost is the lowest so far
             for member in region:
                 y = member // columns
                 x = member % columns
@@ -837,8 +950,9 @@ def differs(
     for member in region:
         y = member // columns
         x = member % columns
-        if best[y, x] == np.inf:
+        if best[y, x] == np.inf:  # it has none so far
             return True
+        # difference of the two displacements at the pixel
         dx = np.float32(2 * x) + np.float32(0.5) - centre[0]
         dy = np.float32(2 * y) + np.float32(0.5) - centre[1]
         da = a - winner[y, x, 2]
@@ -878,13 +992,9 @@ def raw_costs(
     centre: tuple[Scalar, Scalar],
     patch: tuple[int, int, int, int],
     radius: int,
-    images: tuple[ImageArrays, ImageArrays, CostTables],
-    straight: Words,
+    matching: PixelMatching,
     columns: int,
-    rotated: Bytes,
-    size: int,
-    described: Flags,
-    turned: Words,
+    rotated: RotatedDescriptors,
     raw: Floats,
 ) -> None:
     """Fill `raw` with Eq. 1 of a label around a centre, for every half-resolution pixel of a patch.
@@ -895,42 +1005,49 @@ def raw_costs(
         centre: Full-image pixels.
         patch: Its left and top, width and height, half-resolution pixels.
         radius: Width of the frame around it in `raw`.
-        images: Reference, target and tables.
-        straight: `DescribedImage.descriptors` of the reference.
+        matching: Images, tables and unrotated descriptors.
         columns: Half-resolution pixels a row of the image.
-        rotated: uint8, flat ``[13, size, 136]``, filled for rotations that are not `described` yet.
-        size: Descriptors a rotation that `rotated` has room for.
-        described: bool ``[13]``.
-        turned: uint64 ``[2, 17]``, scratch.
+        rotated: The patch's descriptors; those of a rotation that is not filled yet are written.
         raw: float32, flat ``[(height + 2 radius) * (width + 2 radius)]``, filled inside the frame.
     """
     (u, v, a, b) = label
     (left, top, wide, high) = patch
-    (reference, target, tables) = images
     (si, ti) = index
+    target = matching.target
+    tables = matching.tables
+    unrotated = matching.descriptors
     height, width = target.gray.shape
-    neutral = ti == -layout.ANGLE_LOW
-    own = straight.view(np.uint8) if neutral else rotated
+    no_rotation = ti == -layout.ANGLE_LOW
+    described = unrotated.view(np.uint8) if no_rotation else rotated.data
     for y in range(high):
         for x in range(wide):
+            # full-image position of the half-resolution pixel
             px = np.float32(2 * (left + x)) + np.float32(0.5)
             py = np.float32(2 * (top + y)) + np.float32(0.5)
-            at = (top + y) * columns + left + x
-            mine = at * 136
-            if not neutral:
-                mine = (ti * size + y * wide + x) * 136
-                if not described[ti]:
-                    rotate_descriptor(straight, at * 17, ti, turned, rotated, mine)
+
+            # where its descriptor lies
+            pixel = (top + y) * columns + left + x
+            at = pixel * DESCRIPTOR_BYTES
+            if not no_rotation:
+                at = (ti * rotated.size + y * wide + x) * DESCRIPTOR_BYTES
+                if not rotated.filled[ti]:
+                    rotate_descriptor(
+                        unrotated, pixel * layout.HISTOGRAMS, ti, rotated.scratch, rotated.data, at
+                    )
+
+            # where the label moves it in the target
             dx = px - centre[0]
             dy = py - centre[1]
             tx = centre[0] + u + a * dx - b * dy
             ty = centre[1] + v + b * dx + a * dy
+
+            # outside the target the cost is the largest possible
             cost = np.int64(tables.ceiling)
             if tx >= 0 and ty >= 0 and tx <= width - 1 and ty <= height - 1:
-                cost = np.int64(descriptor_distance(tx, ty, si, ti, own, mine, target, tables))
+                cost = np.int64(descriptor_distance(tx, ty, si, ti, described, at, target, tables))
                 if tables.appearance:
                     gray, gradient = appearance(target, tx, ty)
-                    own_gray, own_gradient = appearance(reference, px, py)
+                    own_gray, own_gradient = appearance(matching.reference, px, py)
                     cost += tables.intensity[abs(gray - own_gray)]
                     cost += tables.gradient[abs(gradient - own_gradient)]
             raw[(y + radius) * (wide + 2 * radius) + x + radius] = np.float32(cost)
@@ -947,6 +1064,7 @@ def spread_labels(
             column = min(x // 2, winner.shape[1] - 1)
             u, v, a, b = winner[row, column]
             r = regions[row, column]
+            # displacement of (dx, dy) from the centre under the similarity
             dx = np.float32(x) - centres[r, 0]
             dy = np.float32(y) - centres[r, 1]
             flow[y, x, 0] = u + a * dx - b * dy - dx

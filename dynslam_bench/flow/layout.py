@@ -14,22 +14,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 RINGS = 2
+"""Rings of histograms around the centre's."""
 ANGLES = 8
+"""Histograms a ring."""
 BINS = 8
+"""Orientations of a histogram."""
 HISTOGRAMS = RINGS * ANGLES + 1
+"""Histograms of a descriptor: the centre's, and those of the rings."""
 LENGTH = HISTOGRAMS * BINS
+"""Numbers of a descriptor."""
 RING_RADII = (8.0, 16.0)
+"""Distance of each ring from the centre, px at scale 1."""
 RING_SIGMAS = (4.0, 8.0)
+"""Sigma of each ring's Gaussian, px at scale 1."""
 
+# scale indices k: s = 2 ** (k / 4) for k in -4..5, that is 0.5 to 2.38
 SCALE_STEP_OCTAVES = 0.25
 SCALE_LOW = -4
 SCALE_HIGH = 5
-"""Scale indices: s = 2 ** (k / 4) for k in -4..5, that is 0.5 to 2.38."""
+
+# rotation indices: 7.5 degrees each, -45 to 45
 ANGLE_STEP_DEG = 7.5
 ANGLE_LOW = -6
 ANGLE_HIGH = 6
-"""Rotation indices: 7.5 degrees each, -45 to 45."""
 ROTATIONS = ANGLE_HIGH - ANGLE_LOW + 1
+"""Number of rotation indices."""
 
 LEVEL_SIGMAS = (2.0, 2.0 * 2**0.5, 4.0, 4.0 * 2**0.5, 8.0, 8.0 * 2**0.5, 16.0)
 """Gaussian sigmas of the orientation maps, px of the full image."""
@@ -63,6 +72,7 @@ def sampling_table() -> tuple[NDArray[np.int32], NDArray[np.int64]]:
         pixels, and int64 ``[scales, RINGS]``, map level of each ring at each scale: the one whose
         Gaussian is closest in ratio.
     """
+    # every point of the pattern, scaled and rotated: [scales, rotations, points, 2]
     pattern = unit_pattern()
     scales = 2.0 ** (np.arange(SCALE_LOW, SCALE_HIGH + 1) * SCALE_STEP_OCTAVES)
     theta = np.deg2rad(np.arange(ANGLE_LOW, ANGLE_HIGH + 1) * ANGLE_STEP_DEG)
@@ -70,6 +80,8 @@ def sampling_table() -> tuple[NDArray[np.int32], NDArray[np.int64]]:
     s = np.sin(theta)
     rotation = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
     points = np.einsum("s,rij,kj->srki", scales, rotation, pattern)
+
+    # the level of each ring at each scale
     sigmas = scales[:, None] * RING_SIGMAS
     levels = np.abs(np.log(LEVEL_SIGMAS) - np.log(sigmas)[..., None]).argmin(axis=-1)
     return np.rint(points * SUBPIXEL).astype(np.int32), levels

@@ -39,10 +39,13 @@ class MothFlameRules(NamedTuple):
 
 
 EMFOA = MothFlameRules(opposition=True, cauchy=True, best_flame=True, half=False, as_printed=False)
+"""The paper's enhanced search (Eq. 8-22), with Eq. 9-11 and 17 corrected."""
 MFO = MothFlameRules(opposition=False, cauchy=False, best_flame=False, half=False, as_printed=False)
+"""Moth-flame optimisation without the enhancements (Eq. 8-12)."""
 EMFOA_LITERAL = MothFlameRules(
     opposition=True, cauchy=True, best_flame=True, half=True, as_printed=True
 )
+"""The enhanced search as printed."""
 
 
 def flames_left(flames: int, iteration: int, iterations: int) -> int:
@@ -111,7 +114,7 @@ def moth_positions(
         own: Flames of their own number, which the distance is taken from.
         flames: The flames they fly around: their own, or the last that is left (Eq. 8).
         best: The best flame.
-        now: Of the iteration.
+        now: Coefficients of the iteration.
         scale: Of the Cauchy steps, per dimension.
         uniform: Draws.
     """
@@ -147,7 +150,7 @@ class FlightTable(NamedTuple):
     Attributes:
         counts: int64 ``[T]``, number of flames (Eq. 11).
         coefficients: float32 ``[T, 4]``, the fields of `Flight`.
-        opposition: Of the first population.
+        opposition: Whether the first population is drawn by opposition.
     """
 
     counts: NDArray[np.int64]

@@ -24,7 +24,9 @@ Points = NDArray[np.float32]
 LEVELS = 4
 """Pyramid levels of Lucas-Kanade, the full image included."""
 CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.01)
+"""Lucas-Kanade stops after 30 iterations, or at a step below 0.01 pixels."""
 MIN_EIGENVALUE = 1e-4
+"""Lucas-Kanade loses a point whose gradient matrix has a smaller eigenvalue (normalised as OpenCV does)."""
 PRESETS = {
     "ultrafast": cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST,
     "fast": cv2.DISOPTICAL_FLOW_PRESET_FAST,
@@ -75,17 +77,21 @@ class LucasKanadeFlow:
         clean, usable = cleaned
         if min(reference.shape) < self.smallest_side:
             return invalid_result(clean, degenerate=True)
+
+        # track from the predicted positions, where they are usable
         initial = clean
         if guess is not None:
             predicted = np.asarray(guess, dtype=np.float32).reshape(-1, 2)
             initial = np.where(usable_points(predicted, target.shape)[:, None], predicted, clean)
         xy, tracked, cost = self._follow(reference, target, clean, initial)
         valid = usable & tracked & usable_points(xy, target.shape)
+
+        # forward-backward check: track back, and compare with where the points were
         if self.settings.forward_backward_px > 0:
-            back, returned, _ = self._follow(
-                target, reference, np.where(valid[:, None], xy, clean), clean
-            )
-            valid &= returned & (np.hypot(*(back - clean).T) <= self.settings.forward_backward_px)
+            ends = np.where(valid[:, None], xy, clean)
+            back, returned, _ = self._follow(target, reference, ends, clean)
+            error = np.hypot(*(back - clean).T)
+            valid &= returned & (error <= self.settings.forward_backward_px)
         xy = np.where(np.isfinite(xy), xy, clean).astype(np.float32)
         return FlowResult(xy, valid, cost, flow_stats(len(clean), int(valid.sum())))
 
@@ -93,7 +99,7 @@ class LucasKanadeFlow:
         self, first: Image, second: Image, points: Points, initial: Points
     ) -> tuple[Points, NDArray[np.bool_], Points]:
         """Positions in the second image, whether the tracker found them, and its cost."""
-        side = self.settings.window_px | 1
+        side = self.settings.window_px | 1  # odd
         xy, status, error = cv2.calcOpticalFlowPyrLK(
             first,
             second,
@@ -133,6 +139,7 @@ class DisFlow(LucasKanadeFlow):
     def _follow(
         self, first: Image, second: Image, points: Points, initial: Points
     ) -> tuple[Points, NDArray[np.bool_], Points]:
+        """Positions in the second image by the dense flow, interpolated bilinearly at the points."""
         flow = self.dense(first, second)
         height, width = flow.shape[:2]
         corner = np.minimum(points.astype(np.int64), (width - 2, height - 2))

@@ -21,6 +21,56 @@ def transform_point(pose: Array, point: Array) -> tuple[float, float, float]:
     )
 
 
+@inlined
+def _add_to_row(
+    matrix: Array,
+    vector: Array,
+    m: int,
+    weighted: float,
+    j0: float,
+    j1: float,
+    j2: float,
+    j3: float,
+    j4: float,
+    j5: float,
+    residual: float,
+) -> None:
+    """Add ``weighted (j, residual)`` to row m of a matrix ``[6, 6]`` and of a vector ``[6]``."""
+    matrix[m, 0] += weighted * j0
+    matrix[m, 1] += weighted * j1
+    matrix[m, 2] += weighted * j2
+    matrix[m, 3] += weighted * j3
+    matrix[m, 4] += weighted * j4
+    matrix[m, 5] += weighted * j5
+    vector[m] += weighted * residual
+
+
+@inlined
+def add_normal_equation(
+    matrix: Array,
+    vector: Array,
+    weight: float,
+    j0: float,
+    j1: float,
+    j2: float,
+    j3: float,
+    j4: float,
+    j5: float,
+    residual: float,
+) -> None:
+    """Add ``weight j^T j`` to a matrix ``[6, 6]`` and ``weight j^T residual`` to a vector ``[6]``.
+
+    The derivatives j of the residual by the six numbers of the twist come one by one.
+    """
+    # row by row, not in a loop over a tuple, each access to which is a branch in compiled code
+    _add_to_row(matrix, vector, 0, weight * j0, j0, j1, j2, j3, j4, j5, residual)
+    _add_to_row(matrix, vector, 1, weight * j1, j0, j1, j2, j3, j4, j5, residual)
+    _add_to_row(matrix, vector, 2, weight * j2, j0, j1, j2, j3, j4, j5, residual)
+    _add_to_row(matrix, vector, 3, weight * j3, j0, j1, j2, j3, j4, j5, residual)
+    _add_to_row(matrix, vector, 4, weight * j4, j0, j1, j2, j3, j4, j5, residual)
+    _add_to_row(matrix, vector, 5, weight * j5, j0, j1, j2, j3, j4, j5, residual)
+
+
 @kernel
 def cholesky_solve(a: Array, b: Array) -> bool:
     """Solve ``a x = b`` in place for a symmetric positive definite `a`; `b` becomes x. False if it is not definite.

@@ -1,4 +1,8 @@
-"""Segmenters: the registry, the choice of a source for a sequence, construction, and masks from the stage cache."""
+"""Segmenters: the registry, the choice of a source for a sequence, construction, and masks from the stage cache.
+
+What reads or cleans masks needs OpenCV and is imported where it is used, so that the registry can be
+listed without it.
+"""
 
 from __future__ import annotations
 
@@ -126,29 +130,29 @@ def resolve_source(
     """
     if settings.source != "auto":
         return settings.source
+
+    # auto: the embedded network on what it was trained for, else the COCO checkpoint if it is there
     if sequence_id.startswith("synthetic/"):
         return "embedded"
     if cached_checkpoint(COCO) is not None:
         return "coco"
-    without = (
-        "segmentation.source=none"
-        if optional
-        else "a tracker such as 'emfoa-oft?masks=none' or orb-slam2"
-    )
+
+    # neither: list what the user may choose
+    options = [
+        "--yes (run, bench) or segmentation.source=coco downloads it once",
+        "segmentation.source=onnx:PATH takes your export of a network, e.g. of YOLO-seg",
+        "segmentation.source=recorded:DIR takes masks that were stored before",
+    ]
+    if masks is not None:
+        options.append("segmentation.source=oracle takes the sequence's exact masks")
+    if optional:
+        options.append("without masks: segmentation.source=none")
+    else:
+        options.append("without masks: a tracker such as 'emfoa-oft?masks=none' or orb-slam2")
     raise NetworkNotFetched(
         f"no masks for '{sequence_id or 'this sequence'}': segmentation.source=auto needs "
         f"the COCO checkpoint ({COCO.megabytes} MB), which is not in the cache",
-        options=[
-            "--yes (run, bench) or segmentation.source=coco downloads it once",
-            "segmentation.source=onnx:PATH takes your export of a network, e.g. of YOLO-seg",
-            "segmentation.source=recorded:DIR takes masks that were stored before",
-            *(
-                ["segmentation.source=oracle takes the sequence's exact masks"]
-                if masks is not None
-                else []
-            ),
-            f"without masks: {without}",
-        ],
+        options=options,
     )
 
 
@@ -171,9 +175,13 @@ def segmentation_source(settings: Settings, sequence: Sequence, *, fetch: bool =
     group = getattr(settings, "segmentation", None)
     if not isinstance(group, SegmentationSettings):
         return ""
+
+    # masks are optional for a tracker that has none by default
     default = type(settings).model_fields["segmentation"].get_default(call_default_factory=True)
     optional = isinstance(default, SegmentationSettings) and default.source == "none"
     source = resolve_source(group, sequence.id, sequence.masks, optional=optional)
+
+    # check what the source needs
     kind, _, argument = source.partition(":")
     if kind in ("oracle", "oracle-classes"):
         _load(kind, group, SegmenterContext(sequence.id, sequence.masks))
@@ -196,14 +204,20 @@ def segmentation_source(settings: Settings, sequence: Sequence, *, fetch: bool =
 
 
 def _check_recorded(folder: Path, settings: SegmentationSettings, sequence: Sequence) -> None:
-    from dynslam_bench.segmentation.recorded import RecordedSegmenter
+    """Compare a folder of recorded masks with the dynamic classes and the frames; warn where it shows no object.
+
+    Raises:
+        SegmentationError: No class is a dynamic one, or masks of frames are missing.
+    """
+    from dynslam_bench.segmentation.recorded import RecordedSegmenter  # needs OpenCV
 
     recorded = RecordedSegmenter(folder)
     check_classes(
         recorded.class_names, settings, str(recorded.folder), "the folder of recorded masks"
     )
+
+    # every frame that is segmented needs a file: all, but for the only schedule known beforehand
     missing = recorded.missing(sequence.timestamps)
-    # the only schedule that is known beforehand
     if settings.schedule == "every_nth" and settings.crowded_share >= 1:
         missing = [index for index in missing if index % settings.n == 0]
     if missing:
@@ -212,10 +226,10 @@ def _check_recorded(folder: Path, settings: SegmentationSettings, sequence: Sequ
             f"'{sequence.id}', the first is frame {missing[0]} ({sequence.timestamps[missing[0]]:.6f} s)",
             "is it of another sequence, or of another part?",
         )
+
+    changed = recorded.folder.stat().st_mtime_ns
     stamps = tuple(sequence.timestamps.tolist())
-    if not _shows_objects(
-        recorded.folder, recorded.folder.stat().st_mtime_ns, settings.class_names(), stamps
-    ):
+    if not _shows_objects(recorded.folder, changed, settings.class_names(), stamps):
         warnings.warn(
             f"the recorded masks in {recorded.folder} show no object of the classes {settings.classes} in any of "
             f"{len(sequence)} frames of '{sequence.id}'",
@@ -228,7 +242,7 @@ def _shows_objects(
     folder: Path, changed: int, classes: frozenset[str], stamps: tuple[float, ...]
 ) -> bool:
     """Whether recorded masks show an object; read once a process, as long as no file comes or goes (`changed`)."""
-    from dynslam_bench.segmentation.recorded import RecordedSegmenter
+    from dynslam_bench.segmentation.recorded import RecordedSegmenter  # needs OpenCV
 
     return RecordedSegmenter(folder).first_object(np.array(stamps), classes) is not None
 
@@ -239,16 +253,16 @@ def _check_oracle(kind: str, settings: SegmentationSettings, sequence: Sequence)
     Raises:
         SegmentationError: A dynamic class that COCO does not have is none of the sequence's, too.
     """
-    own = settings.class_names().difference(COCO_NAMES)
-    if sequence.masks is None or not (own or kind == "oracle-classes"):
+    not_coco = settings.class_names().difference(COCO_NAMES)
+    if sequence.masks is None or not (not_coco or kind == "oracle-classes"):
         return
-    from dynslam_bench.segmentation.recorded import exact_masks
+    from dynslam_bench.segmentation.recorded import exact_masks  # needs OpenCV
 
     names = exact_masks(sequence.masks, 0).class_names.values()
     try:
         check_classes(names, settings, sequence.id, "the sequence")
     except SegmentationError as error:
-        if own:
+        if not_coco:
             raise
         warnings.warn(str(error), stacklevel=2)  # a scene without people is no fault
 
@@ -293,20 +307,25 @@ def build_segmenter(
     if source == "none":
         return None
     kind, _, argument = source.partition(":")
-    name, argument = (argument, "") if kind == "plugin" else (kind, argument)
+    name = kind
+    if kind == "plugin":
+        name = argument
+        argument = ""
     floor = min(LOWEST_CONFIDENCE, settings.confidence)
     context = SegmenterContext(sequence_id, masks, device, threads, argument, floor)
     # a network looks for the further classes, too
     sought = settings.model_copy(
         update={"classes": ",".join(sorted(settings.class_names() | also))}
     )
-    code = (
-        None
-        if cache is None or kind not in NETWORKS
-        else stage_code(SEGMENTERS.get(name).entry_point)
-    )
+
+    # masks of networks are stored, if their code is known
+    code = None
+    if cache is not None and kind in NETWORKS:
+        code = stage_code(SEGMENTERS.get(name).entry_point)
     if cache is None or code is None:
         return ConfiguredSegmenter(_load(name, sought, context), settings, source, also)
+
+    # what the stored masks and their cost depend on besides the image and the code
     identity = {
         "source": source,
         "weights": weights_digest(settings, sequence_id),
@@ -324,8 +343,9 @@ def build_segmenter(
         "threads": threads,
     }
     cached = CachedSegmenter(partial(_load, name, sought, context), identity, cache, code)
+    # without a file there is nothing to wait for
     if not identity["weights"]:
-        cached.network()  # without a file there is nothing to wait for
+        cached.network()
     return ConfiguredSegmenter(cached, settings, source, also)
 
 
@@ -391,6 +411,7 @@ class CachedSegmenter:
     def segment(self, frame: Frame) -> Instances:
         """The objects in the frame."""
         begin = time.perf_counter()
+        # look the image up
         code = self._code()
         key = digest([code, self._prefix, content_digest(frame.rgb)], 32)
         entry = self._cache.get("masks", key)
@@ -399,10 +420,12 @@ class CachedSegmenter:
             instances = _unpack(entry.arrays)
             cost = entry.cost_s
         else:
-            network = self.network()  # loading is no part of the frame's cost
+            # loading the network is no part of the frame's cost
+            network = self.network()
             start = time.perf_counter()
             instances = network.segment(frame)
             cost = time.perf_counter() - start
+            # store it, unless the network read further code while it ran
             if self._code() == code:
                 self._cache.put("masks", key, _pack(instances), cost)
         self.saved_s = cost - (time.perf_counter() - begin)
@@ -410,6 +433,7 @@ class CachedSegmenter:
 
 
 def _pack(instances: Instances) -> Arrays:
+    """Objects as arrays for the stage cache, a bit a pixel."""
     arrays: Arrays = {
         "masks": np.packbits(instances.masks),
         "shape": np.array(instances.masks.shape),
@@ -421,6 +445,7 @@ def _pack(instances: Instances) -> Arrays:
 
 
 def _unpack(stored: Arrays) -> Instances:
+    """The objects that `_pack` stored."""
     shape = tuple(stored["shape"].tolist())
     masks = np.unpackbits(stored["masks"], count=int(np.prod(shape))).astype(bool).reshape(shape)
     names = tuple(stored["class_names"].tolist())
@@ -431,7 +456,7 @@ class ConfiguredSegmenter:
     """A segmenter whose objects are selected by the settings in force.
 
     Args:
-        inner: Segments.
+        inner: The segmenter.
         settings: Selects among the objects; may be replaced while a run lasts.
         source: Label stored with results.
         also: Names of further classes that pass.
@@ -457,9 +482,9 @@ class ConfiguredSegmenter:
             SegmentationError: The segmenter gave no `Instances`, or masks of another size than the
                 frame.
         """
-        # needs OpenCV, which the registry does not
-        from dynslam_bench.segmentation.postprocess import select
+        from dynslam_bench.segmentation.postprocess import select  # needs OpenCV
 
+        # check what a plug-in may get wrong
         instances = self.inner.segment(frame)
         if not isinstance(instances, Instances):
             raise SegmentationError(
@@ -480,6 +505,8 @@ class ConfiguredSegmenter:
             raise SegmentationError(
                 f"{self.source} gave boxes that are not finite", "give every object a finite box"
             )
+
+        # class names as the settings write them, then the selection
         names = tuple(canonical_name(str(name)) for name in instances.class_names)
         instances = replace(instances, class_names=names)
         self._warn_of_foreign(names)
@@ -512,10 +539,14 @@ def weights_digest(
         SegmentationError: The file cannot be read.
     """
     kind, _, argument = resolve_source(settings, sequence_id, masks).partition(":")
-    path = {"embedded": embedded_weights(), "coco": cached_checkpoint(COCO)}.get(kind)
-    if kind == "coco" and path is None:
-        return COCO.sha256_prefix
-    if kind in ("onnx", "weights", "recorded"):
+    path = None
+    if kind == "embedded":
+        path = embedded_weights()
+    elif kind == "coco":
+        path = cached_checkpoint(COCO)
+        if path is None:
+            return COCO.sha256_prefix
+    elif kind in ("onnx", "weights", "recorded"):
         path = Path(argument).expanduser()
     with translate_errors(SegmentationError, f"cannot read {path}"):
         return path_digest(path)[:12] if path is not None and path.exists() else ""

@@ -13,10 +13,10 @@ HOLE_RADIUS_PX = 3
 
 def boxes_of(masks: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Tight boxes x0, y0, x1, y1 (x1, y1 exclusive) of bool ``[K, H, W]`` masks; an empty mask gives zeros."""
-    boxes = np.array([cv2.boundingRect(mask.view(np.uint8)) for mask in masks], np.float32).reshape(
-        -1, 4
-    )
-    boxes[:, 2:] += boxes[:, :2]  # from width and height
+    # x0, y0, width, height of each
+    rectangles = [cv2.boundingRect(mask.view(np.uint8)) for mask in masks]
+    boxes = np.array(rectangles, np.float32).reshape(-1, 4)
+    boxes[:, 2:] += boxes[:, :2]
     return boxes
 
 
@@ -68,6 +68,7 @@ def dilate(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
     part = region(mask, radius + 1)
     if radius <= 0 or part is None:
         return mask
+    # distance to the nearest set pixel, within the mask's box
     grown = mask.copy()
     distance = cv2.distanceTransform(
         (~mask[part]).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
@@ -86,24 +87,25 @@ def repair(
     by depth fusion as in Blitz-SLAM and MOR-SLAM; band and local mean are assumptions. Pixels
     without depth stay as they are.
     """
-    if (part := region(mask, REPAIR_BAND_PX + HOLE_RADIUS_PX + 1)) is None:
+    part = region(mask, REPAIR_BAND_PX + HOLE_RADIUS_PX + 1)
+    if part is None:
         return mask
     patch = fill_holes(mask[part])
+    if depth is not None:
+        patch = _fit_to_depth(patch, np.asarray(depth[part], np.float32), step_m)
     repaired = mask.copy()
-    repaired[part] = (
-        patch
-        if depth is None
-        else _fit_to_depth(patch, np.asarray(depth[part], np.float32), step_m)
-    )
+    repaired[part] = patch
     return repaired
 
 
 def fill_holes(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Close gaps of up to `HOLE_RADIUS_PX` and fill the background that the mask encloses."""
+    # morphological closing
     radius = HOLE_RADIUS_PX
     element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     padded = np.pad(mask, radius + 1).view(np.uint8)
     closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, element)
+    # background that is not connected with the padding's is enclosed
     count, labels = cv2.connectedComponents(1 - closed, connectivity=4)
     filled = closed.astype(bool) if count <= 1 else labels != labels[0, 0]
     inner = slice(radius + 1, -(radius + 1))
@@ -113,6 +115,8 @@ def fill_holes(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _fit_to_depth(
     mask: NDArray[np.bool_], depth: NDArray[np.float32], step_m: float
 ) -> NDArray[np.bool_]:
+    """The second step of `repair`: decide the pixels of the band by the core's mean depth around them."""
+    # the object's core: valid depth, away from the edge
     band = REPAIR_BAND_PX
     valid = np.isfinite(depth) & (depth > 0)
     inside = cv2.distanceTransform(np.pad(mask, 1).view(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
@@ -120,6 +124,8 @@ def _fit_to_depth(
     core = mask & valid & (inside > min(band, float(inside.max()) / 2))
     if np.count_nonzero(core) < 20:
         return mask
+
+    # local mean of the core's depth
     window = (4 * band + 1, 4 * band + 1)
     weight = cv2.boxFilter(
         core.astype(np.float32), -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT
@@ -131,6 +137,8 @@ def _fit_to_depth(
         normalize=False,
         borderType=cv2.BORDER_CONSTANT,
     )
+
+    # pixels on both sides of the edge belong to the object where their depth is near that mean
     judged = valid & (weight >= 1) & (inside <= band) & (outside <= band) & ~core
     near = np.abs(depth - total / np.maximum(weight, 1)) <= step_m
     return np.asarray(np.where(judged, near, mask))

@@ -1,8 +1,6 @@
-"""Masks that no network computes here: read from PNG files, written to them, or exact masks of the sequence."""
+"""Masks that no network computes here: read from PNG files (`record` writes them), or exact masks of the sequence."""
 
-import json
 import warnings
-from collections.abc import Callable
 from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -18,19 +16,16 @@ from dynslam_bench.contracts import (
     Instances,
     MaskSource,
     SegmenterContext,
-    Sequence,
 )
-from dynslam_bench.core import SegmentationError, read_json, translate_errors, write_atomic
+from dynslam_bench.core import SegmentationError, read_json, translate_errors
 from dynslam_bench.core.images import read_image
-from dynslam_bench.segmentation.build_segmenter import build_segmenter, weights_digest
 from dynslam_bench.segmentation.postprocess import boxes_of
 from dynslam_bench.segmentation.settings import COCO_NAMES, SegmentationSettings, canonical_name
 
 CLASSES_FILE = "classes.json"
+"""Beside the masks: the class name of each number."""
 MAX_DIFFERENCE_S = 0.02
 """Largest difference of a frame's stamp and a mask's, as in TUM's association of images."""
-ORIGIN_FILE = "recorded.json"
-"""Beside the masks: the sequence and the settings that they were made of."""
 MISSPELLED = 0.8
 """Ratio (`difflib`) of a class name to a COCO name above which it is probably misspelled."""
 
@@ -59,6 +54,7 @@ class RecordedSegmenter:
     """
 
     def __init__(self, folder: Path) -> None:
+        # files named all by stamp or all by index
         self.folder = folder.expanduser()
         files = sorted(self.folder.glob("*.png"))
         if not files:
@@ -81,17 +77,18 @@ class RecordedSegmenter:
             "for example 1311868164.363181.png or 000012.png",
             of=(ValueError, OverflowError),
         ):
-            numbers = np.array(
-                [float(file.stem if self.by_stamp else int(file.stem)) for file in files]
-            )
+            keys = [float(file.stem) if self.by_stamp else float(int(file.stem)) for file in files]
+            numbers = np.array(keys)
             if not np.isfinite(numbers).all():
                 raise ValueError("a stamp is not finite")
         order = np.argsort(numbers, kind="stable")
         self._keys: NDArray[np.float64] = numbers[order]
         self._files = [files[i] for i in order]
-        self._names = read_classes(self.folder / CLASSES_FILE) or dict.fromkeys(
-            range(1 << 16), "person"
-        )
+
+        # without a table every number of a 16-bit image is a person
+        self._names = read_classes(self.folder / CLASSES_FILE)
+        if not self._names:
+            self._names = dict.fromkeys(range(1 << 16), "person")
         self.class_names = tuple(dict.fromkeys(self._names.values()))
 
     def segment(self, frame: Frame) -> Instances:
@@ -105,10 +102,10 @@ class RecordedSegmenter:
         path = self._files[nearest]
         if distance >= self._tolerance:
             within = f" within {MAX_DIFFERENCE_S} s" if self.by_stamp else ""
+            away = f", {distance:.3f} s away" if self.by_stamp else ""
             raise SegmentationError(
                 f"no recorded mask{within} of frame {frame.index} ({frame.timestamp:.6f} s) in {self.folder}",
-                f"the nearest is {path.name}"
-                + (f", {distance:.3f} s away" if self.by_stamp else ""),
+                f"the nearest is {path.name}{away}",
             )
         height, width = frame.rgb.shape[:2]
         labels = _read_labels(path, (width, height))
@@ -128,14 +125,12 @@ class RecordedSegmenter:
         numbers = [
             number for number, name in self._names.items() if canonical_name(name) in classes
         ]
-        for index, key in enumerate(
-            timestamps.tolist() if self.by_stamp else range(len(timestamps))
-        ):
+        for index, key in enumerate(self._keys_of(timestamps)):
             nearest, distance = self._nearest(key)
-            if (
-                distance < self._tolerance
-                and np.isin(_read_labels(self._files[nearest]), numbers).any()
-            ):
+            if distance >= self._tolerance:
+                continue
+            labels = _read_labels(self._files[nearest])
+            if np.isin(labels, numbers).any():
                 return index
         return None
 
@@ -145,8 +140,16 @@ class RecordedSegmenter:
         Args:
             timestamps: Stamps in seconds of all frames, in their order.
         """
-        keys = timestamps.tolist() if self.by_stamp else range(len(timestamps))
-        return [index for index, key in enumerate(keys) if self._nearest(key)[1] >= self._tolerance]
+        missing = []
+        for index, key in enumerate(self._keys_of(timestamps)):
+            _, distance = self._nearest(key)
+            if distance >= self._tolerance:
+                missing.append(index)
+        return missing
+
+    def _keys_of(self, timestamps: NDArray[np.float64]) -> list[float]:
+        """What frames are looked up by: their stamps in seconds, or their indices."""
+        return timestamps.tolist() if self.by_stamp else list(range(len(timestamps)))
 
     def _nearest(self, key: float) -> tuple[int, float]:
         """The file nearest to a stamp or index, and its distance."""
@@ -188,9 +191,9 @@ def read_classes(path: Path) -> dict[int, str]:
         'expected {"1": "person", ...}',
         of=(ValueError, AttributeError),
     ):
-        names = {
-            int(key): str(name) for key, name in read_json(path, kind=SegmentationError).items()
-        }
+        table = read_json(path, kind=SegmentationError)
+        names = {int(key): str(name) for key, name in table.items()}
+    # a name that is nearly COCO's is probably misspelled
     for name in names.values():
         meant = get_close_matches(canonical_name(name), COCO_NAMES, n=1, cutoff=MISSPELLED)
         if meant and meant[0] != canonical_name(name):
@@ -198,105 +201,6 @@ def read_classes(path: Path) -> dict[int, str]:
                 f"{path}: '{name}' is no COCO class; did you mean '{meant[0]}'?", stacklevel=2
             )
     return names
-
-
-def record_masks(
-    sequence: Sequence,
-    folder: Path,
-    settings: SegmentationSettings,
-    *,
-    device: str = "cpu",
-    threads: int = 1,
-    progress: Callable[[int, int], object] = lambda *_: None,
-) -> int:
-    """Segment every frame of a sequence, one PNG a frame, named by stamp; existing files are kept.
-
-    The files hold the objects of the settings' classes and confidence, before repair and dilation,
-    which are done when the masks are used. Where two objects overlap, the one with the higher score
-    has the pixel. Scores are not stored. It warns where no frame has an object.
-
-    Args:
-        sequence: The frames.
-        folder: Made if it does not exist.
-        settings: Source, classes, confidence.
-        device: ``cpu`` or ``cuda:N``.
-        threads: Threads a network may use.
-        progress: Called with (frames done, frames in all).
-
-    Returns:
-        How many frames were segmented now.
-
-    Raises:
-        SegmentationError: The source is ``none`` or not available, or the folder holds other masks.
-    """
-    segmenter = build_segmenter(
-        settings, sequence_id=sequence.id, masks=sequence.masks, device=device, threads=threads
-    )
-    if segmenter is None:
-        raise SegmentationError("segmentation.source=none has no masks to record")
-    origin = {
-        "sequence": sequence.id,
-        "source": segmenter.source,
-        "weights": weights_digest(settings, sequence.id, sequence.masks),
-        "classes": settings.classes,
-        "confidence": settings.confidence,
-    }
-    _begin(folder, origin)
-    classes = read_classes(folder / CLASSES_FILE)
-    segmented = 0
-    for index in range(len(sequence)):
-        path = folder / f"{sequence.timestamps[index]:.6f}.png"
-        if not path.exists():
-            before = len(classes)
-            labels = label_image(segmenter.segment(sequence[index]), classes)
-            if len(classes) > before:
-                write_atomic(folder / CLASSES_FILE, json.dumps(classes, indent=1))
-            write_atomic(path, cv2.imencode(".png", labels)[1].tobytes())
-            segmented += 1
-        progress(index + 1, len(sequence))
-    if not classes:
-        objects = f"no object of the classes {settings.classes} in any of {len(sequence)} frames of {sequence.id}"
-        warnings.warn(f"{segmenter.source} found {objects}", stacklevel=2)
-    return segmented
-
-
-def _begin(folder: Path, origin: dict[str, object]) -> None:
-    """Make the folder, or make sure that it holds the same masks."""
-    path = folder / ORIGIN_FILE
-    if path.is_file():
-        stored = read_json(path, kind=SegmentationError)
-        before = stored if isinstance(stored, dict) else {}
-        for name, value in origin.items():
-            if before.get(name) != value:
-                raise SegmentationError(
-                    f"{folder} holds other masks: {name} is '{before.get(name)}' there and '{value}' now",
-                    "record into a folder of their own",
-                )
-    elif folder.exists() and any(folder.iterdir()):
-        raise SegmentationError(f"{folder} holds something else", "record into an empty folder")
-    folder.mkdir(parents=True, exist_ok=True)
-    write_atomic(path, json.dumps(origin, indent=1))
-
-
-def label_image(instances: Instances, classes: dict[int, str]) -> NDArray[np.uint16]:
-    """Objects as a label image uint16 ``[H, W]``: 0 background, else the object's number; the highest score on top.
-
-    Args:
-        instances: The objects.
-        classes: The class of each number; a number is added where a frame has more objects of a
-            class than before.
-    """
-    labels = np.zeros(instances.masks.shape[1:], np.uint16)
-    free = sorted(classes)
-    for index in np.argsort(instances.scores, kind="stable"):
-        name = instances.class_names[index]
-        number = next(
-            (number for number in free if classes[number] == name), max(classes, default=0) + 1
-        )
-        classes[number] = name
-        free = [other for other in free if other != number]
-        labels[instances.masks[index]] = number
-    return labels
 
 
 def instances_of(masks: FrameMasks, *, where: str = "masks") -> Instances:
@@ -313,14 +217,17 @@ def instances_of(masks: FrameMasks, *, where: str = "masks") -> Instances:
     Raises:
         SegmentationError: An id in the image has no class name.
     """
+    # the objects that are visible; each needs a class
     labels = np.asarray(masks.instances)
     names = masks.class_names
     numbers = [int(number) for number in np.unique(labels) if number != 0]
-    if nameless := [number for number in numbers if number not in names]:
+    nameless = [number for number in numbers if number not in names]
+    if nameless:
         named = ", ".join(map(str, sorted(names))) or "none"
         raise SegmentationError(
             f"{where}: object {nameless[0]} has no class name", f"known numbers: {named}"
         )
+    # a mask each, [K, H, W]
     stack = np.asarray(labels[None] == np.array(numbers, labels.dtype)[:, None, None])
     classes = tuple(names[number] for number in numbers)
     moving = np.array([number in masks.moving for number in numbers], dtype=bool)

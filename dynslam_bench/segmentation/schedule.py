@@ -48,7 +48,7 @@ class _Request:
         since: Frames since the one that was segmented before it.
         answer: The objects, and the seconds that the segmenter took.
         flow: Dense flow from it to the latest frame, float32 ``[h, w, 2]``.
-        age: Frames since.
+        age: Frames from it to the latest frame.
     """
 
     due: float
@@ -58,7 +58,7 @@ class _Request:
     age: int = 0
 
     def follow(self, flow: NDArray[np.float32]) -> None:
-        """Add the flow from the frame before to a new one."""
+        """Append the flow from the latest frame to a new one: ``f(x) + g(x + f(x))``."""
         self.age += 1
         rows, columns = np.mgrid[: flow.shape[0], : flow.shape[1]].astype(np.float32)
         x = columns + self.flow[:, :, 0]
@@ -148,9 +148,11 @@ class MaskScheduler:
         if self._settings.schedule == "async" and not first:
             self.segmented = self._take(frame, gray)
         elif first or self._due(keyframe):
+            # segment this frame, and bridge what was missed
             self.segmented = True
             self._instances = self._missed.update(self.segmenter.segment(frame), max(self._age, 1))
         else:
+            # carry the masks of the previous frame by optical flow
             self.segmented = False
             if self._settings.carry == "sparse":
                 self._instances = carry_sparse(self._instances, self._gray, gray)
@@ -166,9 +168,13 @@ class MaskScheduler:
         request = self._request
         if request is not None:
             request.follow(flow)
-        live = self._settings.latency_s == 0  # then nothing waits for the segmenter
+
+        # masks are due by the frames' stamps, or with a latency of 0 when they are done
         due = request is not None and frame.timestamp >= request.due - STAMP_TOLERANCE_S
-        taken = due if request is None or not live else request.answer.done()
+        waits = self._settings.latency_s != 0
+        taken = due if request is None or waits else request.answer.done()
+
+        # carry to this frame what is due, else the masks of the previous frame
         if request is not None and taken:
             self._request = None  # an error is raised once
             instances, self.beside_s = request.answer.result()
@@ -177,6 +183,8 @@ class MaskScheduler:
             )
         else:
             self._instances = carry_dense(self._instances, flow)
+
+        # a segmenter that is idle begins with this frame
         if request is None or taken:
             answer: Future[tuple[Instances, float]] = Future()
             _working.add(answer)
@@ -188,22 +196,21 @@ class MaskScheduler:
         return taken
 
     def _frozen(self) -> Segmenter:
-        """The segmenter with the settings of now."""
-        return (
-            copy(self.segmenter)
-            if isinstance(self.segmenter, ConfiguredSegmenter)
-            else self.segmenter
-        )
+        """The segmenter with the settings of now, which later ones do not change."""
+        if isinstance(self.segmenter, ConfiguredSegmenter):
+            return copy(self.segmenter)
+        return self.segmenter
 
     def _due(self, keyframe: bool) -> bool:
+        """Whether the schedule has the segmenter run on this frame."""
         settings = self._settings
         if settings.schedule == "every":
             return True
-        if (
-            settings.crowded_share < 1
-            and select(self._instances, settings).union().mean() > settings.crowded_share
-        ):
-            return True  # the masks of the previous frame cover too much
+        # a crowded view: the masks of the previous frame cover too much
+        if settings.crowded_share < 1:
+            covered = select(self._instances, settings).union().mean()
+            if covered > settings.crowded_share:
+                return True
         if settings.schedule == "every_nth":
             return self._age >= settings.n
         return keyframe or self._age >= MAX_CARRY
@@ -212,6 +219,7 @@ class MaskScheduler:
 def _segment(segmenter: Segmenter, frame: Frame, answer: Future[tuple[Instances, float]]) -> None:
     """Segment a frame in a thread of its own; the answer holds the objects and the seconds, or the error."""
     try:
+        # without the stage cache, so that the wait is measured
         if isinstance(segmenter, ConfiguredSegmenter) and isinstance(
             segmenter.inner, CachedSegmenter
         ):
@@ -224,6 +232,18 @@ def _segment(segmenter: Segmenter, frame: Frame, answer: Future[tuple[Instances,
 
 @dataclass
 class _Track:
+    """An object that is remembered from frame to frame.
+
+    Attributes:
+        box: float32 ``[4]``, x0, y0, x1, y1, pixels.
+        mask: bool ``[H, W]``.
+        name: Its class.
+        score: Of its last detection.
+        velocity: float32 ``[4]``, change of the box, pixels a frame.
+        hits: How often it was detected.
+        missed: Segmented frames in a row without a detection of it.
+    """
+
     box: NDArray[np.float32]
     mask: NDArray[np.bool_]
     name: str
@@ -242,11 +262,12 @@ class _Track:
         self.score = float(detections.scores[index])
         self.box = box
         self.mask = detections.masks[index]
-        self.hits = self.hits + 1
+        self.hits += 1
         self.missed = 0
 
     def move(self, box: NDArray[np.float32]) -> bool:
         """Move a missed object to its predicted box; False if it left the image."""
+        # shift of the box's centre, scale of its sides
         shift = (box[:2] + box[2:] - self.box[:2] - self.box[2:]) / 2
         before = np.maximum(self.box[2:] - self.box[:2], 1)
         scale = float(np.clip(np.mean((box[2:] - box[:2]) / before), 0.8, 1.25))
@@ -285,38 +306,46 @@ class MissedDetections:
         Returns:
             The detections, followed by the bridged objects with the scores of their last
             detections: `limit` alone says how long an object is bridged, not a falling score. Exact
-                masks (with `Instances.moving`) miss nothing and
-            are returned as they are.
+            masks (with `Instances.moving`) miss nothing and are returned as they are.
         """
         if self.limit <= 0 or detections.moving is not None:
             self.reset()
             return detections
+        # match detections with the boxes predicted at constant velocity
         predicted = [
             np.asarray(track.box + track.velocity * frames, np.float32) for track in self._tracks
         ]
-        matches = dict(associate(predicted, [track.name for track in self._tracks], detections))
-        for index, detection in matches.items():
-            self._tracks[index].see(detections, detection, frames)
-        missed = [
-            (track, predicted[index])
-            for index, track in enumerate(self._tracks)
-            if index not in matches
-        ]
-        bridged = [
-            track
-            for track, box in missed
-            if track.hits >= LEAST_HITS and track.missed < self.limit and track.move(box)
-        ]
-        self._tracks = [
-            track for index, track in enumerate(self._tracks) if index in matches
-        ] + bridged
-        for new in sorted(set(range(len(detections.scores))) - set(matches.values())):
-            box = detections.boxes[new]
-            mask = detections.masks[new]
-            score = float(detections.scores[new])
-            self._tracks.append(
-                _Track(box, mask, detections.class_names[new], score, np.zeros(4, np.float32))
+        names = [track.name for track in self._tracks]
+        matches = dict(associate(predicted, names, detections))
+        seen = []
+        bridged = []
+        for index, track in enumerate(self._tracks):
+            if index in matches:
+                track.see(detections, matches[index], frames)
+                seen.append(track)
+            # one that was missed moves to its predicted box, or is forgotten
+            elif (
+                track.hits >= LEAST_HITS
+                and track.missed < self.limit
+                and track.move(predicted[index])
+            ):
+                bridged.append(track)
+
+        # detections without a match are new objects
+        unmatched = sorted(set(range(len(detections.scores))) - set(matches.values()))
+        new = [
+            _Track(
+                box=detections.boxes[index],
+                mask=detections.masks[index],
+                name=detections.class_names[index],
+                score=float(detections.scores[index]),
+                velocity=np.zeros(4, np.float32),
             )
+            for index in unmatched
+        ]
+        self._tracks = [*seen, *bridged, *new]
+
+        # return the bridged objects behind the detections
         if not bridged:
             return detections
         masks = np.stack([track.mask for track in bridged])
@@ -336,27 +365,27 @@ def associate(
     """Greedy one-to-one pairs (track, detection) of one class by falling box IoU, at least `ASSOCIATION_IOU`."""
     if not predicted or not detections.class_names:
         return []
-    same = np.array(
-        [[name == other for other in detections.class_names] for name in names], dtype=bool
-    )
-    overlap = np.where(same, box_iou(np.stack(predicted), detections.boxes), 0.0)
+    same_class = np.array(names)[:, None] == np.array(detections.class_names)[None]
+    overlap = np.where(same_class, box_iou(np.stack(predicted), detections.boxes), 0.0)
     pairs = []
     while overlap.max() >= ASSOCIATION_IOU:
-        track, detection = (
-            int(value) for value in np.unravel_index(int(np.argmax(overlap)), overlap.shape)
-        )
+        # the largest overlap left; its track and its detection take part no more
+        row, column = np.unravel_index(int(np.argmax(overlap)), overlap.shape)
+        track = int(row)
+        detection = int(column)
         pairs.append((track, detection))
         overlap[track, :] = overlap[:, detection] = 0.0
     return pairs
 
 
 def box_iou(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Intersection over union ``[N, M]`` of boxes."""
+    """Intersection over union ``[N, M]`` of boxes x0, y0, x1, y1, ``[N, 4]`` and ``[M, 4]``."""
     low = np.maximum(a[:, None, :2], b[None, :, :2])
     high = np.minimum(a[:, None, 2:], b[None, :, 2:])
     inter = np.clip(high - low, 0, None).prod(axis=2).astype(np.float64)
-    areas = [np.clip(x[:, 2:] - x[:, :2], 0, None).prod(axis=1).astype(np.float64) for x in (a, b)]
-    union = areas[0][:, None] + areas[1][None] - inter
+    area_a = np.clip(a[:, 2:] - a[:, :2], 0, None).prod(axis=1).astype(np.float64)
+    area_b = np.clip(b[:, 2:] - b[:, :2], 0, None).prod(axis=1).astype(np.float64)
+    union = area_a[:, None] + area_b[None] - inter
     return np.asarray(inter / np.maximum(union, 1e-9))
 
 
@@ -368,6 +397,7 @@ WORK_SIDE = 240
 CORNERS = 40
 """Corners that are tracked on each object in sparse mode."""
 LEAST_CORNERS = 6
+"""Consistent corners that a similarity is fitted to; with fewer an object keeps its place."""
 ROUND_TRIP_PX = 1.0
 """Largest forward-backward error of a corner that is used."""
 
@@ -403,9 +433,11 @@ def object_flow(mask: NDArray[np.bool_], flow: NDArray[np.float32]) -> NDArray[n
         mask: bool ``[h, w]``.
         flow: float32 ``[h, w, 2]``.
     """
+    # the object's inside, away from its blurred edge; a thin object counts whole
     core = cv2.erode(mask.view(np.uint8), np.ones((3, 3), np.uint8)).astype(np.float32)
     if np.count_nonzero(core) < 0.2 * np.count_nonzero(mask):
         core = mask.astype(np.float32)
+    # the median flow everywhere; near the object its local means, of the smaller window where it reaches
     inside = flow[core > 0]
     field = np.broadcast_to(np.median(inside, axis=0), flow.shape).astype(np.float32)
     for window in (31, 7):
@@ -434,7 +466,8 @@ def push_mask(mask: NDArray[np.bool_], field: NDArray[np.float32]) -> NDArray[np
     """
     height, width = mask.shape
     rows, columns = np.mgrid[: field.shape[0], : field.shape[1]].astype(np.float32)
-    back = field  # the flow at the place a pixel came from: x = x' - f(x), by fixed-point iteration
+    # the flow at the place a pixel came from: x = x' - f(x), by fixed-point iteration
+    back = field
     for _ in range(3):
         back = np.asarray(
             cv2.remap(
@@ -446,10 +479,12 @@ def push_mask(mask: NDArray[np.bool_], field: NDArray[np.float32]) -> NDArray[np
             ),
             np.float32,
         )
+    # interpolated to the mask's size, and in its pixels
     scaled = back * np.array([width / field.shape[1], height / field.shape[0]], np.float32)
     full = np.asarray(
         cv2.resize(scaled, (width, height), interpolation=cv2.INTER_LINEAR), np.float32
     )
+    # read the mask where each pixel came from
     at_x = np.arange(width, dtype=np.float32)[None] - full[:, :, 0]
     at_y = np.arange(height, dtype=np.float32)[:, None] - full[:, :, 1]
     moved = cv2.remap(
@@ -474,18 +509,19 @@ def carry_dense(instances: Instances, flow: NDArray[np.float32]) -> Instances:
 def _carry_object(mask: NDArray[np.bool_], flow: NDArray[np.float32]) -> NDArray[np.bool_]:
     """One object's moved mask, computed in a window around the object only."""
     moved = np.zeros_like(mask)
-    (height, width) = flow.shape[:2]
+    height, width = flow.shape[:2]
     step_y = mask.shape[0] / height
     step_x = mask.shape[1] / width
     small = cv2.resize(mask.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
     inside = region(small, 0)
     if inside is None:
         return moved
-    part = region(
-        small, 2 + int(np.ceil(min(float(np.abs(flow[inside]).max()), max(height, width))))
-    )
+    # a window that the object cannot leave: its box grown by the largest flow in it
+    largest_flow = min(float(np.abs(flow[inside]).max()), max(height, width))
+    part = region(small, 2 + int(np.ceil(largest_flow)))
     assert part is not None
     field = object_flow(np.ascontiguousarray(small[part]), np.ascontiguousarray(flow[part]))
+    # the same window at the mask's size
     rows, columns = part
     whole = (
         slice(round(rows.start * step_y), round(rows.stop * step_y)),
@@ -501,17 +537,17 @@ def carry_sparse(instances: Instances, previous: Gray, current: Gray) -> Instanc
     Corners on each object are tracked there and back by pyramidal Lucas-Kanade; RANSAC fits a
     similarity. An object with fewer than six consistent corners keeps its place.
     """
-    motions = [_similarity(mask, previous, current) for mask in instances.masks]
-    pairs = zip(instances.masks, motions, strict=True)
-    return _moved(
-        instances, [mask if motion is None else _warp(mask, motion) for mask, motion in pairs]
-    )
+    masks = []
+    for mask in instances.masks:
+        motion = _similarity(mask, previous, current)
+        masks.append(mask if motion is None else _warp(mask, motion))
+    return _moved(instances, masks)
 
 
 def shift_mask(
     mask: NDArray[np.bool_], dx: float, dy: float, scale: float = 1.0
 ) -> NDArray[np.bool_]:
-    """A mask moved by whole and part pixels and scaled about its box' centre."""
+    """A mask scaled about the centre of its box and moved by `dx`, `dy` pixels."""
     rows, columns = np.nonzero(mask)
     if not rows.size:
         return mask
@@ -523,6 +559,7 @@ def shift_mask(
 
 
 def _warp(mask: NDArray[np.bool_], motion: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """A mask under an affine motion ``[2, 3]``."""
     moved = cv2.warpAffine(
         mask.view(np.uint8) * np.uint8(255), motion, mask.shape[::-1], flags=cv2.INTER_LINEAR
     )
@@ -532,6 +569,8 @@ def _warp(mask: NDArray[np.bool_], motion: NDArray[np.float64]) -> NDArray[np.bo
 def _similarity(
     mask: NDArray[np.bool_], previous: Gray, current: Gray
 ) -> NDArray[np.float64] | None:
+    """The similarity ``[2, 3]`` of the corners within a mask; None with too few."""
+    # corners on the object, tracked there and back
     corners = cv2.goodFeaturesToTrack(previous, CORNERS, 0.01, 5, mask=mask.view(np.uint8))
     if corners is None or len(corners) < LEAST_CORNERS:
         return None
@@ -541,6 +580,7 @@ def _similarity(
     consistent &= (ok.reshape(-1) > 0) & (ok_back.reshape(-1) > 0)
     if np.count_nonzero(consistent) < LEAST_CORNERS:
         return None
+    # similarity by RANSAC
     motion, _ = cv2.estimateAffinePartial2D(
         corners.reshape(-1, 2)[consistent],
         there.reshape(-1, 2)[consistent],

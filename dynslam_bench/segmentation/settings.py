@@ -218,6 +218,7 @@ def check_classes(
         SegmentationError: None of the classes is a dynamic one, or a name that is no COCO name is
             none of them.
     """
+    # names that are neither COCO's nor the source's
     names = list(dict.fromkeys(known))
     spelled = {canonical_name(name) for name in names}
     asked = settings.class_names()
@@ -227,6 +228,8 @@ def check_classes(
         )
     if asked & spelled:
         return
+
+    # none is a dynamic one: name an example, people first
     people = [name for name in names if any(word in canonical_name(name) for word in PEOPLE)]
     example = canonical_name([*people, *names, "person"][0])
     shown = ", ".join(names[:CLASSES_SHOWN])
@@ -240,16 +243,17 @@ def check_classes(
 
 def _joined(value: Any) -> str:
     """A list of names as a comma-separated text; empty for what is neither list nor text."""
-    return (
-        ",".join(map(str, value))
-        if isinstance(value, (list, tuple))
-        else value
-        if isinstance(value, str)
-        else ""
-    )
+    if isinstance(value, (list, tuple)):
+        return ",".join(map(str, value))
+    return value if isinstance(value, str) else ""
 
 
 def _coco_classes(value: Any) -> str:
+    """Names as a comma-separated text.
+
+    Raises:
+        ValueError: One of them is none of COCO's, or there is none.
+    """
     text = _joined(value)
     try:
         expand_coco_classes(text)
@@ -261,9 +265,12 @@ def _coco_classes(value: Any) -> str:
 ClassList = Annotated[str, BeforeValidator(_coco_classes)]
 """Comma-separated COCO names or presets, validated; a list of names is taken as well."""
 PLAIN_SOURCES = ("auto", "none", "oracle", "oracle-classes", "embedded", "coco")
+"""Sources that are named alone."""
 PREFIXED_SOURCES = ("onnx", "recorded", "weights", "plugin")
+"""Sources that are named with a path or an id behind a colon."""
 COCO_SOURCES = ("auto", "none", "embedded", "coco")
 """Sources whose classes are COCO's; the others may bring names of their own."""
+# all forms of a source, for errors
 FORMS = "auto, none, oracle, oracle-classes, embedded, coco, onnx:PATH, recorded:DIR, weights:PATH, plugin:ID"
 NMS_IOU = 0.5
 """Overlap of two boxes of one class above which the weaker one is dropped: torchvision's and YOLO's value."""
@@ -385,9 +392,8 @@ class SegmentationSettings(Settings):
         if value in PLAIN_SOURCES or (prefix in PREFIXED_SOURCES and argument.strip()):
             return value
         if prefix in PREFIXED_SOURCES:
-            raise ValueError(
-                f"'{prefix}:' needs {'an id' if prefix == 'plugin' else 'a path'} after the colon"
-            )
+            wanted = "an id" if prefix == "plugin" else "a path"
+            raise ValueError(f"'{prefix}:' needs {wanted} after the colon")
         hint = did_you_mean(prefix, [*PLAIN_SOURCES, *(f"{name}:" for name in PREFIXED_SOURCES)])
         raise ValueError(f"not one of {FORMS}" + (f"; {hint}" if hint.startswith("did") else ""))
 
@@ -413,9 +419,8 @@ class SegmentationSettings(Settings):
             "oracle-classes": ("confidence", "mask_threshold"),
             "recorded": ("mask_threshold",),
         }
-        return dict.fromkeys(
-            fields.get(self.source.partition(":")[0], ()), f"segmentation.source is {self.source!r}"
-        )
+        kind = self.source.partition(":")[0]
+        return dict.fromkeys(fields.get(kind, ()), f"segmentation.source is {self.source!r}")
 
     def class_names(self) -> frozenset[str]:
         """The names of the dynamic classes, as `canonical_name` writes them."""

@@ -17,9 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import kernel
-from dynslam_bench.core.simd import add_normal_equation, normal_equations, store_normal_equations
 from dynslam_bench.geometry.camera import Camera
-from dynslam_bench.geometry.gauss_newton import apply_twist, cholesky_solve, transform_point
+from dynslam_bench.geometry.gauss_newton import (
+    add_normal_equation,
+    apply_twist,
+    cholesky_solve,
+    transform_point,
+)
 
 Array = NDArray[np.float64]
 
@@ -134,7 +138,8 @@ def _linearise(
 
     The cost is that of Cauchy's kernel of a squared width, or of Huber's where that is 0.
     """
-    sums = normal_equations()
+    h[:] = 0.0
+    g[:] = 0.0
     cost = 0.0
     for i in range(points.shape[0]):
         if not active[i]:
@@ -176,17 +181,14 @@ def _linearise(
         j3 = -camera.fx * x * y * iz * iz
         j4 = camera.fx * (1.0 + x * x * iz * iz)
         j5 = -a * y
-        sums = add_normal_equation(sums, w * info, a, 0.0, j2, j3, j4, j5, du)
+        add_normal_equation(h, g, w * info, a, 0.0, j2, j3, j4, j5, du)
         dv_about_x = -camera.fy * (1.0 + y * y * iz * iz)
         dv_about_y = camera.fy * x * y * iz * iz
-        sums = add_normal_equation(
-            sums, w * info, 0.0, b, -b * y * iz, dv_about_x, dv_about_y, b * x, dv
-        )
+        add_normal_equation(h, g, w * info, 0.0, b, -b * y * iz, dv_about_x, dv_about_y, b * x, dv)
         if depth:
-            sums = add_normal_equation(
-                sums, w * info_right, a, 0.0, j2 + c, j3 + c * y, j4 - c * x, j5, dr
+            add_normal_equation(
+                h, g, w * info_right, a, 0.0, j2 + c, j3 + c * y, j4 - c * x, j5, dr
             )
-    store_normal_equations(sums, h, g)
     return cost
 
 

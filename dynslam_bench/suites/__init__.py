@@ -155,35 +155,42 @@ class Suite(Record):
 
     def _entries(self, trackers: tuple[str, ...]) -> list[tuple[str, dict[str, Any]]]:
         """The trackers with their settings, row by row; `trackers` in place of the suite's if there are any."""
-        chosen = trackers or (
-            *self.trackers,
-            *(name for name in self.optional if not TRACKERS.get(name).missing()),
-        )
-        own = {*self.trackers, *self.optional}
+        # the suite's trackers, optional ones where they can run
+        installed = [name for name in self.optional if not TRACKERS.get(name).missing()]
+        chosen = trackers or (*self.trackers, *installed)
+
+        # settings may be given to the suite's trackers only
+        members = {*self.trackers, *self.optional}
         field_sets = {
-            name: set(field_names(TRACKERS.get(name).settings)) for name in {*chosen, *own}
+            name: set(field_names(TRACKERS.get(name).settings)) for name in {*chosen, *members}
         }
-        if strangers := sorted({*self.tracker_settings, *(row.tracker for row in self.rows)} - own):
+        configured = {*self.tracker_settings, *(row.tracker for row in self.rows)}
+        strangers = sorted(configured - members)
+        if strangers:
             raise RunError(
                 f"suite '{self.name}' has settings for '{strangers[0]}', which is none of its trackers",
-                did_you_mean(strangers[0], own),
+                did_you_mean(strangers[0], members),
             )
+
+        # a setting for all trackers must be a field of one of them
         settable = set().union(*field_sets.values())
-        if unknown := sorted(self.settings.keys() - settable):
+        unknown = sorted(self.settings.keys() - settable)
+        if unknown:
             raise RunError(
                 f"suite '{self.name}' sets '{unknown[0]}', which none of its trackers has",
                 did_you_mean(unknown[0], settable),
             )
+
+        # settings of all trackers, then of one tracker, then of one row: the later ones win
         rows: list[tuple[str, dict[str, Any]]] = [(tracker, {}) for tracker in chosen]
         rows += [(row.tracker, row.settings) for row in self.rows if row.tracker in chosen]
-        common = {
-            tracker: {
+        entries = []
+        for tracker, of_row in rows:
+            shared = {
                 name: value for name, value in self.settings.items() if name in field_sets[tracker]
             }
-            | self.tracker_settings.get(tracker, {})
-            for tracker in chosen
-        }
-        return [(tracker, common[tracker] | own) for tracker, own in rows]
+            entries.append((tracker, shared | self.tracker_settings.get(tracker, {}) | of_row))
+        return entries
 
 
 def suite_names() -> list[str]:
@@ -200,6 +207,7 @@ def load_suite(name: str | Path) -> Suite:
             describe a suite (with the first fault).
         PluginError: One of its trackers is not known.
     """
+    # one that comes with the package, or a file
     path = Path(name).expanduser()
     if str(name) in suite_names():
         text = files(__package__).joinpath(f"{name}.toml").read_text(encoding="utf-8")
@@ -212,9 +220,11 @@ def load_suite(name: str | Path) -> Suite:
             f"unknown suite '{name}'",
             f"{did_you_mean(str(name), suite_names())} Or name a .toml file",
         )
+
     document = parse_toml(text, where, kind=RunError)
     document.setdefault("name", Path(where).stem)
     suite = validated(Suite, document, where, RunError)
+    # all trackers must be known
     for tracker in (*suite.trackers, *suite.optional):
         TRACKERS.get(tracker)
     return suite

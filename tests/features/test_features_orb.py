@@ -5,7 +5,17 @@ import numpy as np
 import pytest
 
 from dynslam_bench.contracts.features import FeatureExtractor, MaskedExtractor
+from dynslam_bench.core.compiled import kernel
 from dynslam_bench.core.errors import PluginError, SettingsError
+from dynslam_bench.core.simd import BYTE_LANES
+from dynslam_bench.features.fast import (
+    CIRCLE,
+    fast_corners,
+    plain_corner_scores,
+    plain_maxima,
+    store_corner_scores,
+    store_maxima,
+)
 from dynslam_bench.features.matching import (
     CellGrid,
     Features,
@@ -14,7 +24,7 @@ from dynslam_bench.features.matching import (
     rotation_consistent,
     search_in_radius,
 )
-from dynslam_bench.features.orb import EDGE, OrbExtractor, fast_corners, spread
+from dynslam_bench.features.orb import EDGE, OrbExtractor, spread
 from dynslam_bench.features.registry import FEATURES, build_extractor
 from dynslam_bench.features.settings import FeatureSettings
 from dynslam_bench.geometry.camera import inside
@@ -303,3 +313,36 @@ def test_rotation_histogram_drops_the_odd_ones():
     b[:10] = (b[:10] + 90) % 360
     assert rotation_consistent(a, b)[10:].all()
     assert rotation_consistent(np.zeros(0), np.zeros(0)).shape == (0,)
+
+
+@kernel
+def vector_scores_and_maxima(image, circle, first, last, width, least):
+    scores = np.zeros(len(image), np.uint8)
+    maxima = np.zeros(len(image), np.uint8)
+    for at in range(first, last, BYTE_LANES):
+        store_corner_scores(scores, image, at, circle)
+    for at in range(first, last, BYTE_LANES):
+        store_maxima(maxima, scores, at, width, least)
+    return scores, maxima
+
+
+@pytest.mark.parametrize("levels", [256, 4])  # few levels: many equal scores, and the extremes
+def test_the_instructions_of_fast_are_equal_to_plain_code(levels):
+    rng = np.random.default_rng(levels)
+    width = 96
+    image = (rng.integers(0, levels, 24 * width) * (255 // (levels - 1))).astype(np.uint8)
+    image[8 * width : 12 * width] //= 2  # flat parts have corners too
+    circle = CIRCLE[:, 0] + CIRCLE[:, 1] * width
+    first = 4 * width
+    last = first + 24 * BYTE_LANES
+    scores, maxima = vector_scores_and_maxima(image, circle, first, last, width, 7)
+    plain_scores = np.zeros_like(scores)
+    plain = np.zeros_like(maxima)
+    for at in range(first, last, BYTE_LANES):
+        plain_corner_scores(plain_scores, image, at, circle)
+    for at in range(first, last, BYTE_LANES):
+        plain_maxima(plain, plain_scores, at, width, 7)
+    assert np.array_equal(scores, plain_scores)
+    assert np.array_equal(maxima, plain)
+    assert np.count_nonzero(scores) > 100
+    assert np.count_nonzero(maxima) > 10

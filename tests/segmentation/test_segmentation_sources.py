@@ -55,12 +55,8 @@ from dynslam_bench.segmentation.postprocess import (
     repair,
     select,
 )
-from dynslam_bench.segmentation.recorded import (
-    OracleSegmenter,
-    RecordedSegmenter,
-    label_image,
-    record_masks,
-)
+from dynslam_bench.segmentation.record import label_image, record_masks
+from dynslam_bench.segmentation.recorded import OracleSegmenter, RecordedSegmenter
 from dynslam_bench.segmentation.schedule import MaskScheduler, MissedDetections
 from dynslam_bench.segmentation.settings import (
     COCO_IDS,

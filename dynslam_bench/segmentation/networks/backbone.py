@@ -43,7 +43,8 @@ class NetworkConfig(BaseModel):
         mask_layers: How many convolutions the mask head has.
         mask_pool: RoI resolution of the mask branch; masks have twice as many pixels a side.
         canonical: Box side (input pixels) that is assigned to P4.
-        mask_canonical: The same for the mask branch; a larger value gives masks finer features.
+        mask_canonical: Box side that is assigned to P4 in the mask branch; a larger value gives
+            masks finer features.
         min_side: Shorter side of the network's input; the frame is resized to it.
         max_side: Longest side of the network's input.
         divisor: The input is padded to multiples of this.
@@ -147,10 +148,12 @@ class FrozenBatchNorm2d(nn.BatchNorm2d):
 
 
 def _norm(channels: int, config: NetworkConfig) -> nn.BatchNorm2d:
+    """The batch normalisation that `NetworkConfig.norm` asks for."""
     return nn.BatchNorm2d(channels) if config.norm == "batch" else FrozenBatchNorm2d(channels)
 
 
 def _conv(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Conv2d:
+    """A convolution without bias, padded so that a stride of 1 keeps the size."""
     return nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, bias=False)
 
 
@@ -159,6 +162,7 @@ class ResidualBlock(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, stride: int, config: NetworkConfig) -> None:
         super().__init__()
+        # output channels, kernel and stride of the convolutions
         width = outputs // 4 if config.bottleneck else outputs
         shapes = [(width, 3, stride), (width, 3, 1)]
         if config.bottleneck:
@@ -169,12 +173,11 @@ class ResidualBlock(nn.Module):
             self.add_module(f"conv{number}", _conv(channels, wanted, kernel, step))
             self.add_module(f"bn{number}", _norm(wanted, config))
             channels = wanted
-        shortcut = stride > 1 or inputs != outputs
-        self.downsample = (
-            nn.Sequential(_conv(inputs, outputs, 1, stride), _norm(outputs, config))
-            if shortcut
-            else nn.Identity()
-        )
+        # a shortcut of another size is projected
+        self.downsample: nn.Module = nn.Identity()
+        if stride > 1 or inputs != outputs:
+            projection = _conv(inputs, outputs, 1, stride)
+            self.downsample = nn.Sequential(projection, _norm(outputs, config))
 
     def forward(self, x: Tensor) -> Tensor:
         """``[B, inputs, H, W]`` to ``[B, outputs, H / stride, W / stride]``."""
@@ -261,9 +264,8 @@ def top_down(laterals: list[Tensor]) -> list[Tensor]:
     """Add each level, upsampled to the size below, to the level below; from coarse to fine."""
     fused = [laterals[-1]]
     for lateral in reversed(laterals[:-1]):
-        fused.insert(
-            0, lateral + functional.interpolate(fused[0], size=lateral.shape[-2:], mode="nearest")
-        )
+        coarser = functional.interpolate(fused[0], size=lateral.shape[-2:], mode="nearest")
+        fused.insert(0, lateral + coarser)
     return fused
 
 
@@ -280,4 +282,5 @@ class Backbone(nn.Module):
         """``[B, 3, H, W]`` to P2..P6 (for proposals and boxes) and m2..m5 (for masks)."""
         stages = self.body(x)
         levels = self.fpn(stages)
-        return levels, levels[:4] if self.cfpn is None else self.cfpn(stages, levels)
+        mask_levels = levels[:4] if self.cfpn is None else self.cfpn(stages, levels)
+        return levels, mask_levels

@@ -31,14 +31,15 @@ class Checkpoint:
 
 
 COCO = Checkpoint(
-    "coco",
-    "maskrcnn_resnet50_fpn_coco-bf2d0c1e.pth",
-    "https://download.pytorch.org/models/maskrcnn_resnet50_fpn_coco-bf2d0c1e.pth",
-    "bf2d0c1e",
-    170,
-    "BSD-3-Clause",
-    "COCO train2017",
+    id="coco",
+    file="maskrcnn_resnet50_fpn_coco-bf2d0c1e.pth",
+    url="https://download.pytorch.org/models/maskrcnn_resnet50_fpn_coco-bf2d0c1e.pth",
+    sha256_prefix="bf2d0c1e",
+    megabytes=170,
+    license="BSD-3-Clause",
+    trained_on="COCO train2017",
 )
+"""Torchvision's Mask R-CNN, ResNet-50 FPN."""
 
 
 def embedded_weights() -> Path:

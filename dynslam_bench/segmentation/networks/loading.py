@@ -20,7 +20,9 @@ from dynslam_bench.segmentation.networks.backbone import COCO_CLASSES, NetworkCo
 from dynslam_bench.segmentation.networks.network import MaskRCNN
 
 FORMAT = "dynslam-bench/mask-rcnn/1"
+"""Marks this project's files."""
 CFPN_PREFIX = "backbone.cfpn."
+"""Of the weights that torchvision's network does not have."""
 _RENAMES = (
     (re.compile(r"^(backbone\.fpn\.(?:inner|layer)_blocks\.\d+)\.(weight|bias)$"), r"\1.0.\2"),
     (re.compile(r"^(rpn\.head\.conv)\.(weight|bias)$"), r"\1.0.0.\2"),
@@ -106,9 +108,11 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], NetworkConfig | None]:
             SegmentationError, f"{path}: the network's shape is not understood", of=ValidationError
         ):
             config = NetworkConfig.model_validate_json(str(content["config"]))
-    content = next(
-        (content[key] for key in _WRAPPERS if isinstance(content.get(key), Mapping)), content
-    )
+    # training scripts wrap the weights in a table with more
+    for key in _WRAPPERS:
+        if isinstance(content.get(key), Mapping):
+            content = content[key]
+            break
     state = {str(key): value for key, value in content.items() if isinstance(value, Tensor)}
     if not state:
         raise SegmentationError(f"{path} holds no weights; its keys: {_some(map(str, content))}")
@@ -144,6 +148,7 @@ def infer_config(state: Mapping[str, Tensor], path: Path) -> NetworkConfig:
     Raises:
         SegmentationError: Weights that give the shape are missing, or the classes have no names.
     """
+    # the weights whose first dimension tells a part of the shape
     needed = {
         "stem": "backbone.body.conv1.weight",
         "classes": "roi_heads.box_predictor.cls_score.weight",
@@ -151,14 +156,15 @@ def infer_config(state: Mapping[str, Tensor], path: Path) -> NetworkConfig:
         "ratios": "rpn.head.cls_logits.weight",
         "mask_channels": "roi_heads.mask_head.0.0.weight",
     }
-    if missing := [
-        key for key in needed.values() if key not in state or state[key].dim() not in (2, 4)
-    ]:
+    missing = [key for key in needed.values() if key not in state or state[key].dim() not in (2, 4)]
+    if missing:
         raise SegmentationError(
             f"{path} is no Mask R-CNN of torchvision's layout: {missing[0]} is missing ({len(state)} keys, "
             f"for example {_some(state)})"
         )
     rows = {what: int(state[key].shape[0]) for what, key in needed.items()}
+
+    # class names, by their number (without the background)
     names = {len(COCO_CLASSES): COCO_CLASSES, 1: ("person",)}.get(rows["classes"] - 1)
     if names is None:
         raise SegmentationError(
@@ -171,21 +177,23 @@ def infer_config(state: Mapping[str, Tensor], path: Path) -> NetworkConfig:
         raise SegmentationError(
             f"{path} has {rows['ratios']} anchors a cell, torchvision's models have 3"
         )
-    stages = [
-        [key.split(".")[3] for key in state if key.startswith(f"backbone.body.layer{n}.")]
-        for n in range(1, 5)
-    ]
+
+    # blocks of the four stages: the different numbers after "backbone.body.layerN."
+    blocks = []
+    for stage in range(1, 5):
+        prefix = f"backbone.body.layer{stage}."
+        numbers = {key.split(".")[3] for key in state if key.startswith(prefix)}
+        blocks.append(len(numbers))
+    mask_layers = {key.split(".")[2] for key in state if key.startswith("roi_heads.mask_head.")}
     shape = {
-        "blocks": [len(set(blocks)) for blocks in stages],
+        "blocks": blocks,
         "bottleneck": "backbone.body.layer1.0.conv3.weight" in state,
         "stem": rows["stem"],
         "channels": rows["channels"],
         "classes": names,
         "box_hidden": int(state[needed["classes"]].shape[1]),
         "mask_channels": rows["mask_channels"],
-        "mask_layers": len(
-            {key.split(".")[2] for key in state if key.startswith("roi_heads.mask_head.")}
-        ),
+        "mask_layers": len(mask_layers),
         "cfpn": True,
     }
     with translate_errors(
@@ -208,6 +216,7 @@ def load_strictly(network: MaskRCNN, state: Mapping[str, Tensor], path: Path) ->
 
 
 def _check_fit(network: MaskRCNN, state: Mapping[str, Tensor], path: Path) -> None:
+    """Raise a SegmentationError where keys are missing or unknown, or shapes differ."""
     own = _weights(network)
     has_cfpn = any(key.startswith(CFPN_PREFIX) for key in state)
     missing = [
@@ -230,6 +239,7 @@ def _check_fit(network: MaskRCNN, state: Mapping[str, Tensor], path: Path) -> No
 
 
 def _weights(network: MaskRCNN) -> dict[str, Tensor]:
+    """The network's state without the counters of batch normalisation."""
     return {
         key: value
         for key, value in network.state_dict().items()
@@ -239,22 +249,18 @@ def _weights(network: MaskRCNN) -> dict[str, Tensor]:
 
 def save_network(network: MaskRCNN, path: Path, *, half: bool = False) -> None:
     """Write a network with its shape; `half` stores float16."""
-    state = {
-        key: value.detach().cpu().half()
-        if half and value.is_floating_point()
-        else value.detach().cpu()
-        for key, value in _weights(network).items()
-    }
+    state = {}
+    for key, value in _weights(network).items():
+        stored = value.detach().cpu()
+        state[key] = stored.half() if half and value.is_floating_point() else stored
     content = {"format": FORMAT, "config": network.config.model_dump_json(), "model": state}
-    with (
-        replacing(path) as temporary,
-        temporary.open("wb") as file,
-    ):
-        # an open file: torch.save writes no file name into it
+    # an open file: torch.save writes no file name into it
+    with replacing(path) as temporary, temporary.open("wb") as file:
         torch.save(content, file)
 
 
 def _some(keys: Iterable[str]) -> str:
+    """The first keys for an error message, and how many more there are."""
     listed = list(keys)
     more = f", and {len(listed) - KEYS_SHOWN} more" if len(listed) > KEYS_SHOWN else ""
     return ", ".join(listed[:KEYS_SHOWN]) + more

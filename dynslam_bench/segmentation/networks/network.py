@@ -19,10 +19,13 @@ from torch.nn import functional
 from dynslam_bench.segmentation.networks.backbone import Backbone, NetworkConfig, initialise
 
 MIN_PROPOSAL_PX = 1e-3
+"""Smallest side of a proposal."""
+MIN_BOX_PX = 1e-2
+"""Smallest side of a detection."""
 BOX_POOL = 7
+"""Bins a side of the features of a box."""
 SAMPLES = 2
 """Sampling points a side of a bin of `roi_align`."""
-MIN_BOX_PX = 1e-2
 
 
 def anchor_cells(config: NetworkConfig) -> list[Tensor]:
@@ -39,6 +42,7 @@ def anchors_of(cells: list[Tensor], levels: list[Tensor], height: int, width: in
     result = []
     for cell, level in zip(cells, levels, strict=True):
         rows, columns = level.shape[-2:]
+        # the cells' corners, input pixels
         y = torch.arange(rows, device=level.device, dtype=torch.float32) * (height // rows)
         x = torch.arange(columns, device=level.device, dtype=torch.float32) * (width // columns)
         yy, xx = torch.meshgrid(y, x, indexing="ij")
@@ -109,27 +113,29 @@ class RPN(nn.Module):
         image: int,
         size: tuple[int, int],
     ) -> Tensor:
-        boxes = []
-        scores = []
-        groups = []
+        """Proposals ``[K, 4]`` of one image of the batch, best first."""
+        # decode the best anchors of each level
+        level_boxes = []
+        level_scores = []
+        level_numbers = []
         for level, anchor in enumerate(anchors):
             count = min(self.config.pre_nms, len(anchor))
             best, chosen = logits[level][image].detach().float().topk(count)
-            boxes.append(
-                decode(codes[level][image].detach().float()[chosen], anchor[chosen], RPN_WEIGHTS)[
-                    :, 0
-                ]
-            )
-            scores.append(best.sigmoid())
-            groups.append(torch.full_like(chosen, level))
-        box = clip(torch.cat(boxes), *size)
-        score = torch.cat(scores)
-        group = torch.cat(groups)
-        large = ((box[:, 2:] - box[:, :2]) >= MIN_PROPOSAL_PX).all(dim=1)
-        box = box[large]
-        score = score[large]
-        group = group[large]
-        return box[grouped_nms(box, score, group, self.config.rpn_nms)[: self.config.post_nms]]
+            code = codes[level][image].detach().float()[chosen]
+            level_boxes.append(decode(code, anchor[chosen], RPN_WEIGHTS)[:, 0])
+            level_scores.append(best.sigmoid())
+            level_numbers.append(torch.full_like(chosen, level))
+
+        # cut to the image, without those that nothing is left of
+        boxes = clip(torch.cat(level_boxes), *size)
+        scores = torch.cat(level_scores)
+        numbers = torch.cat(level_numbers)
+        large = ((boxes[:, 2:] - boxes[:, :2]) >= MIN_PROPOSAL_PX).all(dim=1)
+        boxes = boxes[large]
+
+        # non-maximum suppression within each level
+        kept = grouped_nms(boxes, scores[large], numbers[large], self.config.rpn_nms)
+        return boxes[kept[: self.config.post_nms]]
 
 
 def rpn_loss(
@@ -148,32 +154,34 @@ def rpn_loss(
         truths: Boxes ``[G, 4]`` of each image.
         generator: Draws the sample.
     """
-    every = torch.cat(anchors)
-    total = 0
+    all_anchors = torch.cat(anchors)
     all_logits = torch.cat(logits, dim=1).float()
     all_codes = torch.cat(codes, dim=1).float()
+    total = 0
     objectness = []
     regression = []
     for image, truth in enumerate(truths):
-        matched = match(every, truth, high=0.7, low=0.3, keep_best=True)
+        # draw positive and negative anchors
+        matched = match(all_anchors, truth, high=0.7, low=0.3, keep_best=True)
         positive, negative = sample(matched, count=256, positive_share=0.5, generator=generator)
         index = torch.cat([positive, negative])
+
+        # cross entropy of objectness, smooth L1 of the positive anchors' codes
         label = (matched[index] >= 0).float()
         objectness.append(
             functional.binary_cross_entropy_with_logits(
                 all_logits[image, index], label, reduction="sum"
             )
         )
-        wanted = encode(truth[matched[positive]], every[positive], RPN_WEIGHTS)
+        wanted = encode(truth[matched[positive]], all_anchors[positive], RPN_WEIGHTS)
         regression.append(
             functional.smooth_l1_loss(
                 all_codes[image, positive], wanted, beta=1 / 9, reduction="sum"
             )
         )
         total += len(index)
-    return torch.stack(objectness).sum() / max(total, 1), torch.stack(regression).sum() / max(
-        total, 1
-    )
+    count = max(total, 1)
+    return torch.stack(objectness).sum() / count, torch.stack(regression).sum() / count
 
 
 def levels_of(boxes: Tensor, canonical: float, count: int) -> Tensor:
@@ -208,24 +216,29 @@ def roi_align(
     image = torch.repeat_interleave(
         torch.arange(batch, device=device), torch.tensor([len(b) for b in boxes], device=device)
     )
+    # the feature vectors of all levels as the rows of one table, level by level, image by image
     table = torch.cat([level.permute(0, 2, 3, 1).reshape(-1, channels) for level in features])
+
+    # each box's level, its size, and its first row of the table
     level = levels_of(rois, canonical, len(features))
     heights = torch.tensor([f.shape[2] for f in features], device=device)[level]
     widths = torch.tensor([f.shape[3] for f in features], device=device)[level]
-    cells = torch.tensor(
-        [0, *(batch * f.shape[2] * f.shape[3] for f in features[:-1])], device=device
-    )
-    base = cells.cumsum(dim=0)[level] + image * heights * widths
-    scales = torch.tensor([level_scale(f.shape[2], image_height) for f in features], device=device)[
-        level
-    ]
+    rows_before = [0, *(batch * f.shape[2] * f.shape[3] for f in features[:-1])]
+    base = torch.tensor(rows_before, device=device).cumsum(dim=0)[level] + image * heights * widths
+
+    # cells that the bins' samples touch and their weights, along both axes
+    level_scales = [level_scale(f.shape[2], image_height) for f in features]
+    scales = torch.tensor(level_scales, device=device)[level]
     scaled = rois.to(torch.float32) * scales[:, None]
     rows, row_weights = _axis(scaled[:, 1], scaled[:, 3], heights, size)
     columns, column_weights = _axis(scaled[:, 0], scaled[:, 2], widths, size)
-    index = (base[:, None, None] + rows * widths[:, None, None])[:, :, None, :, None] + columns[
-        :, None, :, None, :
-    ]
+
+    # rows of the table and weights of every tap, [K, bins, bins, 2 SAMPLES, 2 SAMPLES]
+    row_start = base[:, None, None] + rows * widths[:, None, None]
+    index = row_start[:, :, None, :, None] + columns[:, None, :, None, :]
     weight = row_weights[:, :, None, :, None] * column_weights[:, None, :, None, :]
+
+    # weighted sums of the taps
     taps = (2 * SAMPLES) ** 2
     bags = functional.embedding_bag(
         index.reshape(-1, taps),
@@ -247,12 +260,12 @@ def _axis(low: Tensor, high: Tensor, length: Tensor, size: int) -> tuple[Tensor,
     step = (torch.arange(size * SAMPLES, device=low.device, dtype=torch.float32) + 0.5) / (
         size * SAMPLES
     )
-    # bin by bin, as the original adds them up: start + bin * bin_size + (sample + .5) * bin_size /
-    # samples
+    # the samples, bin by bin: start + bin * bin_size + (sample + .5) * bin_size / samples
     at = low[:, None] + step * extent[:, None]
     last = (length - 1)[:, None].to(torch.float32)
     inside = (at >= -1.0) & (at <= last + 1.0)
     at = torch.minimum(at.clamp(min=0.0), last)
+    # the two cells around each, by linear interpolation; those outside count as 0
     floor = at.floor()
     fraction = at - floor
     scale = inside / SAMPLES
@@ -362,6 +375,7 @@ class RoIHeads(nn.Module):
             score: Least score.
             iou: Of the suppression within a class.
         """
+        # classes and boxes of the proposals
         pooled = roi_align(
             levels, [proposals], image_height, BOX_POOL, canonical=self.config.canonical
         )
@@ -369,6 +383,8 @@ class RoIHeads(nn.Module):
         scores = functional.softmax(logits, dim=1)[:, 1:]
         boxes = clip(decode(codes, proposals, BOX_WEIGHTS), *size)[:, 1:]
         labels = torch.arange(1, scores.shape[1] + 1, device=scores.device).expand_as(scores)
+
+        # what is confident and not empty, suppressed within each class
         keep = (scores > score) & ((boxes[:, :, 2:] - boxes[:, :, :2]) >= MIN_BOX_PX).all(dim=2)
         box = boxes[keep]
         best = scores[keep]
@@ -415,6 +431,7 @@ class RoIHeads(nn.Module):
             generator: Draws the sample.
             per_image: How many proposals an image enter the losses.
         """
+        # draw proposals of each image, the true boxes among them; positive ones have targets
         rois = []
         classes = []
         codes = []
@@ -433,28 +450,33 @@ class RoIHeads(nn.Module):
             codes.append(encode(truth[hits], boxes, BOX_WEIGHTS))
             positives.append(boxes)
             targets.append(crop_masks(mask[hits], boxes, 2 * self.config.mask_pool))
+
+        # class and box of all that were drawn; only the codes of the true class are compared
         pooled = roi_align(levels, rois, image_height, BOX_POOL, canonical=self.config.canonical)
         logits, predicted = (output.float() for output in self.box_predictor(self.box_head(pooled)))
         wanted = torch.cat(classes)
         foreground = torch.nonzero(wanted > 0)[:, 0]
-        own = predicted.reshape(len(predicted), -1, 4)[foreground, wanted[foreground]]
-        losses = {
-            "class": functional.cross_entropy(logits, wanted),
-            "box": functional.smooth_l1_loss(own, torch.cat(codes), beta=1 / 9, reduction="sum")
-            / max(len(wanted), 1),
-        }
+        of_class = predicted.reshape(len(predicted), -1, 4)[foreground, wanted[foreground]]
+        class_loss = functional.cross_entropy(logits, wanted)
+        box_sum = functional.smooth_l1_loss(of_class, torch.cat(codes), beta=1 / 9, reduction="sum")
+        box_loss = box_sum / max(len(wanted), 1)
+
+        # mask of the true class of the positive ones; without any a zero that has gradients
         target = torch.cat(targets)
-        losses["mask"] = mask_levels[0].sum() * 0
+        mask_loss = mask_levels[0].sum() * 0
         if len(target):
             mask_logits = self.masks(mask_levels, positives, image_height).float()
-            mine = mask_logits[torch.arange(len(target), device=target.device), wanted[foreground]]
-            losses["mask"] = functional.binary_cross_entropy_with_logits(mine, target)
-        return losses
+            row = torch.arange(len(target), device=target.device)
+            mask_loss = functional.binary_cross_entropy_with_logits(
+                mask_logits[row, wanted[foreground]], target
+            )
+        return {"class": class_loss, "box": box_loss, "mask": mask_loss}
 
 
 def crop_masks(masks: Tensor, boxes: Tensor, size: int) -> Tensor:
     """Targets of the mask branch: bool ``[K, H, W]`` masks inside their boxes as ``[K, size, size]`` in [0, 1]."""
     height, width = masks.shape[1:]
+    # centres of the cells in pixels, then in [-1, 1] as `grid_sample` takes them
     step = (torch.arange(size, device=boxes.device, dtype=torch.float32) + 0.5) / size
     x = boxes[:, 0, None] + step * (boxes[:, 2] - boxes[:, 0])[:, None]
     y = boxes[:, 1, None] + step * (boxes[:, 3] - boxes[:, 1])[:, None]
@@ -508,6 +530,7 @@ class MaskRCNN(nn.Module):
         return self._pad(x), size
 
     def _pad(self, x: Tensor) -> Tensor:
+        """Pad right and below to a multiple of the divisor."""
         divisor = self.config.divisor
         return functional.pad(x, (0, -int(x.shape[3]) % divisor, 0, -int(x.shape[2]) % divisor))
 
@@ -524,14 +547,15 @@ class MaskRCNN(nn.Module):
         levels, mask_levels = self.backbone(x.contiguous(memory_format=torch.channels_last))
         height = int(x.shape[2])
         width = int(x.shape[3])
-        proposals = self.rpn(levels, height, width, [size])[0][0]
+        (proposals,), *_ = self.rpn(levels, height, width, [size])
         detections = self.roi_heads.detect(
             levels[:4], mask_levels, proposals, height, size, score=score, iou=iou
         )
-        back = detections.boxes.new_tensor(
-            [image.shape[2] / size[1], image.shape[1] / size[0]]
-        ).repeat(2)
-        return detections._replace(boxes=detections.boxes * back)
+        # boxes back to pixels of the image
+        scale_x = image.shape[2] / size[1]
+        scale_y = image.shape[1] / size[0]
+        scale = detections.boxes.new_tensor([scale_x, scale_y]).repeat(2)
+        return detections._replace(boxes=detections.boxes * scale)
 
     def losses(
         self,
@@ -599,10 +623,13 @@ def _fold(conv: nn.Conv2d, norm: nn.BatchNorm2d) -> None:
 MAX_LOG_RATIO = math.log(1000.0 / 16)
 """Decoded boxes grow by at most this (log), so that exp() cannot overflow."""
 RPN_WEIGHTS = (1.0, 1.0, 1.0, 1.0)
+"""Factors of the codes (dx, dy, log dw, log dh) of the anchors."""
 BOX_WEIGHTS = (10.0, 10.0, 5.0, 5.0)
+"""Factors of the codes of the proposals."""
 NEGATIVE = -1
+"""Value of `match` for a box without an object."""
 IGNORED = -2
-"""Values of `match` for boxes without an object."""
+"""Value of `match` for a box that is neither positive nor negative."""
 
 
 def box_iou(a: Tensor, b: Tensor) -> Tensor:
@@ -612,7 +639,8 @@ def box_iou(a: Tensor, b: Tensor) -> Tensor:
     )
     width, height = shared.clamp(min=0).unbind(dim=2)
     inter = width * height
-    area_a, area_b = ((boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1]) for boxes in (a, b))
+    area_a = (a[:, 2] - a[:, 0]) * (a[:, 3] - a[:, 1])
+    area_b = (b[:, 2] - b[:, 0]) * (b[:, 3] - b[:, 1])
     return inter / (area_a[:, None] + area_b[None] - inter).clamp(min=1e-12)
 
 
@@ -631,8 +659,10 @@ def nms(boxes: Tensor, scores: Tensor, threshold: float) -> Tensor:
     Returns:
         Indices of the boxes that stay, best first.
     """
+    # overlaps [N, N] of each box with the weaker ones
     order = scores.argsort(descending=True, stable=True)
     over = torch.triu(box_iou(boxes[order], boxes[order]) > threshold, diagonal=1).to(torch.float32)
+    # a box stays where none that stays overlaps it
     keep = over.new_ones(len(order))
     for _ in range(len(order)):
         new = ((keep @ over) == 0).to(torch.float32)
@@ -681,6 +711,7 @@ def decode(codes: Tensor, references: Tensor, weights: tuple[float, float, float
 
 
 def _size_centre(boxes: Tensor) -> tuple[Tensor, Tensor]:
+    """Width and height ``[N, 2]``, and centre ``[N, 2]`` of boxes."""
     size = boxes[:, 2:] - boxes[:, :2]
     return size, boxes[:, :2] + 0.5 * size
 
@@ -697,6 +728,7 @@ def match(boxes: Tensor, truth: Tensor, *, high: float, low: float, keep_best: b
     """
     if not len(truth):
         return torch.full((len(boxes),), NEGATIVE, device=boxes.device)
+    # the object that each box overlaps most
     overlap = box_iou(truth, boxes)
     best, index = overlap.max(dim=0)
     result = index.masked_fill(best < high, IGNORED).masked_fill(best < low, NEGATIVE)

@@ -33,12 +33,15 @@ from dynslam_bench.segmentation.networks.network import (
 from dynslam_bench.segmentation.settings import NMS_IOU, SegmentationSettings
 
 OPSET = 18
+"""Version of ONNX's operators."""
 SIZE = (480, 640)
 """Height and width of the images, unless others are asked for: those of TUM and Bonn."""
 FLOOR = 0.1
+"""Least score of an object that an exported network gives."""
 SMALLEST = 32
+"""Shortest side of an image in pixels."""
 LARGEST = 4096
-"""Sides of an image in pixels."""
+"""Longest side of an image in pixels."""
 ROUNDS = 24
 """Rounds of suppression: the longest chain of boxes that suppress each other."""
 CANDIDATES = 400
@@ -54,8 +57,7 @@ def export_network(
 
     The input ``image [1, 3, H, W]`` is RGB in [0, 1]. The outputs are those of torchvision's
     exports: boxes, labels, scores, masks in the whole image. They have as many rows as the network
-    finds objects at most, unused ones of score
-    0.
+    finds objects at most; unused rows have the score 0.
 
     Args:
         source: ``embedded``, ``coco`` (fetched if need be) or ``weights:PATH``.
@@ -187,17 +189,21 @@ class StaticMaskRCNN(nn.Module):
             Boxes ``[K, 4]`` in pixels of the image, labels ``[K]`` from 1, scores ``[K]`` and masks
             ``[K, 1, H, W]``, probabilities in the whole image.
         """
+        # objects, in pixels of the input
         levels, mask_levels = self.network.backbone(self.network.prepare(image[0])[0])
         boxes, labels, scores = self._classified(levels[:4], *self._proposals(levels))
+
+        # the mask of each object's class
         config = self.network.config
         heads = self.network.roi_heads
         pooled = self._pooled(mask_levels, boxes, config.mask_pool, config.mask_canonical)
         logits = heads.mask_predictor(heads.mask_head(pooled))
         chosen = labels[:, None, None, None].expand(-1, 1, *logits.shape[2:])
         planes = torch.gather(logits, 1, chosen)[:, 0].sigmoid()
-        boxes = boxes * boxes.new_tensor(
-            [self.width / self.size[1], self.height / self.size[0]]
-        ).repeat(2)
+
+        # to pixels of the image
+        scale = [self.width / self.size[1], self.height / self.size[0]]
+        boxes = boxes * boxes.new_tensor(scale).repeat(2)
         return boxes, labels, scores, self._pasted(planes, boxes)[:, None]
 
     def _proposals(self, levels: list[Tensor]) -> tuple[Tensor, Tensor]:
@@ -206,6 +212,7 @@ class StaticMaskRCNN(nn.Module):
         boxes = []
         scores = []
         for level, (logits, codes) in enumerate(zip(*self.network.rpn.head(levels), strict=True)):
+            # the best anchors of a level, decoded and suppressed
             anchors: Tensor = getattr(self, f"anchors{level}")
             best, chosen = logits[0].topk(min(config.pre_nms, len(anchors)))
             codes = codes[0].index_select(0, chosen)
@@ -228,40 +235,42 @@ class StaticMaskRCNN(nn.Module):
         logits, codes = heads.box_predictor(heads.box_head(pooled))
         scores = functional.softmax(logits, dim=1)[:, 1:]
         boxes = clip(decode(codes, proposals, BOX_WEIGHTS), *self.size)[:, 1:]
+
+        # the best pairs of box and class; those that do not count have score 0
         classes = scores.shape[1]
         large = ((boxes[:, :, 2:] - boxes[:, :, :2]) >= MIN_BOX_PX).all(dim=2)
         passed = scores * valid[:, None] * ((scores > self.score) & large).to(scores.dtype)
         best, order = passed.reshape(-1).topk(min(CANDIDATES, passed.numel()))
         box = boxes.reshape(-1, 4).index_select(0, order)
         label = order % classes + 1
+
+        # suppression within each class
         over = (box_iou(box, box) > self.iou) & (label[:, None] == label[None, :])
-        kept, order = (best * unsuppressed(over, (best > 0).to(best.dtype))).topk(
-            min(config.max_detections, len(best))
-        )
+        left = best * unsuppressed(over, (best > 0).to(best.dtype))
+        kept, order = left.topk(min(config.max_detections, len(best)))
         return box.index_select(0, order), label.index_select(0, order), kept
 
     def _pooled(self, levels: list[Tensor], boxes: Tensor, size: int, canonical: float) -> Tensor:
         """RoIAlign ``[K, C, size, size]`` of one image's boxes; see `roi_align`."""
         if len(boxes) > CHUNK:
-            return torch.cat(
-                [
-                    self._pooled(levels, chunk, size, canonical)
-                    for chunk in torch.split(boxes, CHUNK)
-                ]
-            )
+            chunks = torch.split(boxes, CHUNK)
+            return torch.cat([self._pooled(levels, chunk, size, canonical) for chunk in chunks])
+
+        # the level of each box; padding may be empty
         count = len(boxes)
         channels = levels[0].shape[1]
-        side = (boxes[:, 2:] - boxes[:, :2]).clamp(min=1e-3)  # padding may be empty
-        level = levels_of(
-            torch.cat([boxes[:, :2], boxes[:, :2] + side], dim=1), canonical, len(levels)
-        )
+        side = (boxes[:, 2:] - boxes[:, :2]).clamp(min=1e-3)
+        corners = torch.cat([boxes[:, :2], boxes[:, :2] + side], dim=1)
+        level = levels_of(corners, canonical, len(levels))
+
+        # every level pools all boxes with weights that are zero for those of another level
         pooled: list[Tensor] = []
         for index, features in enumerate(levels):
             rows = int(features.shape[2])
             columns = int(features.shape[3])
             scaled = boxes * level_scale(rows, self.padded[0])
-            mine = (level == index).to(boxes.dtype)[:, None, None]
-            y = _bins(scaled[:, 1], scaled[:, 3], rows, size) * mine
+            of_level = (level == index).to(boxes.dtype)[:, None, None]
+            y = _bins(scaled[:, 1], scaled[:, 3], rows, size) * of_level
             x = _bins(scaled[:, 0], scaled[:, 2], columns, size)
             table = features[0].permute(1, 0, 2).reshape(rows, channels * columns)
             by_row = (y.reshape(count * size, rows) @ table).reshape(
@@ -290,6 +299,7 @@ def unsuppressed(over: Tensor, valid: Tensor) -> Tensor:
         over: Bool ``[N, N]``, which overlap too much.
         valid: ``[N]``: 0 for padding, which suppresses nothing.
     """
+    # [N, N]: the boxes before each that overlap it
     better = over.to(valid.dtype) * torch.ones(len(valid), len(valid)).tril(diagonal=-1)
     keep = column = valid[:, None]
     for _ in range(ROUNDS):
@@ -329,6 +339,5 @@ def _grown(planes: Tensor, boxes: Tensor) -> tuple[Tensor, Tensor]:
     half = (boxes[:, 2:] - boxes[:, :2]) / 2 * ((side + 2) / side)
     low = torch.trunc(centre - half)
     high = torch.trunc(centre + half) + 1
-    return functional.pad(planes, (1, 1, 1, 1)), torch.cat(
-        [low, torch.maximum(high, low + 1)], dim=1
-    )
+    grown = torch.cat([low, torch.maximum(high, low + 1)], dim=1)
+    return functional.pad(planes, (1, 1, 1, 1)), grown

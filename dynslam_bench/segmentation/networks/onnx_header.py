@@ -17,6 +17,13 @@ from dynslam_bench.core import SegmentationError, translate_errors
 Fields: TypeAlias = dict[int, list[Any]]
 """Values of a message, each an integer or a memoryview, by field number."""
 _NOTHING = memoryview(b"")
+
+# protocol buffers' wire types
+VARINT = 0
+LENGTH_DELIMITED = 2
+FIXED_BYTES = {1: 8, 5: 4}
+"""Length of numbers of fixed size, by wire type."""
+
 ELEMENTS = {
     1: "float32",
     2: "uint8",
@@ -76,13 +83,14 @@ def read_header(path: Path) -> tuple[list[TensorInfo], list[TensorInfo], dict[st
         "the file is truncated or of another format",
         of=(ValueError, IndexError, TypeError, AttributeError),
     ):
-        # also a field of another type
+        # a field of another type raises too
         model = _fields(memoryview(data))
         graph = _message(model, 7)
+
+        # older files list the weights among the inputs
         initialised = {_text(_fields(tensor), 8) for tensor in graph.get(5, ())}
-        declared, outputs = (
-            [_tensor(_fields(value)) for value in graph.get(number, ())] for number in (11, 12)
-        )
+        declared = [_tensor(_fields(value)) for value in graph.get(11, ())]
+        outputs = [_tensor(_fields(value)) for value in graph.get(12, ())]
         inputs = [tensor for tensor in declared if tensor.name not in initialised]
         entries = [(_text(entry, 1), _text(entry, 2)) for entry in map(_fields, model.get(14, ()))]
         metadata = dict(entries)
@@ -97,6 +105,7 @@ def read_header(path: Path) -> tuple[list[TensorInfo], list[TensorInfo], dict[st
 
 
 def _tensor(value: Fields) -> TensorInfo:
+    """An input or output, of a ValueInfoProto."""
     kind = _message(_message(value, 2), 1)
     sizes = [_fields(dimension).get(1, [0])[-1] for dimension in _message(kind, 2).get(1, ())]
     shape = tuple(size if 0 < size < 1 << 62 else None for size in sizes)
@@ -104,10 +113,12 @@ def _tensor(value: Fields) -> TensorInfo:
 
 
 def _message(fields: Fields, number: int) -> Fields:
+    """A message within a message; without any fields where there is none."""
     return _fields(fields.get(number, [_NOTHING])[0])
 
 
 def _text(fields: Fields, number: int) -> str:
+    """A text within a message; empty where there is none."""
     return str(fields.get(number, [_NOTHING])[0].tobytes().decode())
 
 
@@ -116,15 +127,21 @@ def _fields(data: memoryview) -> Fields:
     fields: Fields = {}
     position = 0
     while position < len(data):
+        # a key: field number and wire type
         key, position = _varint(data, position)
         kind = key & 7
-        if kind not in (0, 1, 2, 5):
+        # an integer, or the length of what follows: written before it, or fixed by the type
+        begin = position
+        if kind in (VARINT, LENGTH_DELIMITED):
+            value, begin = _varint(data, position)
+        elif kind in FIXED_BYTES:
+            value = FIXED_BYTES[kind]
+        else:
             raise ValueError(f"unknown wire type {kind}")
-        value, begin = _varint(data, position) if kind in (0, 2) else ({1: 8, 5: 4}[kind], position)
-        position = begin if kind == 0 else begin + value
+        position = begin if kind == VARINT else begin + value
         if position > len(data):
             raise ValueError(f"a field of {value} bytes ends beyond the file")
-        fields.setdefault(key >> 3, []).append(value if kind == 0 else data[begin:position])
+        fields.setdefault(key >> 3, []).append(value if kind == VARINT else data[begin:position])
     return fields
 
 

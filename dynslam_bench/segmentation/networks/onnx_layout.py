@@ -134,6 +134,7 @@ def read_metadata(metadata: Mapping[str, str], where: str) -> Metadata:
         SegmentationError: ``names`` is no table of class names, or ``end2end`` neither true nor
             false.
     """
+    # names: a table, or a list
     names: dict[int, str] | None = None
     value: Any = None
     if "names" in metadata:
@@ -150,6 +151,8 @@ def read_metadata(metadata: Mapping[str, str], where: str) -> Metadata:
             names = {int(number): str(name) for number, name in pairs}
             if any(not 0 <= number < MOST_CLASSES for number in names):
                 raise ValueError(f"a number is not between 0 and {MOST_CLASSES - 1}")
+
+    # suppression inside the network: end2end, or the exporter's argument nms
     inside = metadata.get("end2end", "").strip().casefold()
     if inside not in ("", "true", "false"):
         raise SegmentationError(
@@ -313,17 +316,17 @@ def _detections(
             classes = channels - 4 - objectness - coefficients
             names = _YOLO_NAMES.get(classes, {}) if facts.names is None else facts.names
             # without names: any number, but then detections are more than the numbers of one
-            possible = (
-                _counts(names, classes) if names or facts.names is not None else rows > channels
-            )
+            if names or facts.names is not None:
+                possible = _counts(names, classes)
+            else:
+                possible = rows > channels
             if classes >= 1 and rows >= 1 and possible:
                 layout = Layout("yolo", outputs, names, channels_first, objectness)
                 width = f"{4 + objectness}+C+M"
                 shape = f"[1, {width}, N]" if channels_first else f"[1, N, {width}]"
                 text = f"'{layout.id}' {shape} with C = {classes}, {last}"
                 yield _Fit(layout, text, rows, channels_last)
-        # corners, best score, its class: no exporter writes this with detections along the last
-        # axis
+        # corners, best score, its class: no exporter writes this along the last axis
         names = {} if facts.names is None else facts.names
         if not channels_first and channels == 6 + coefficients and _counts(names, len(names)):
             layout = Layout("yolo", outputs, names, channels_first=False, suppressed=True)
@@ -406,8 +409,8 @@ def _any_stride(plane: tuple[int, int], size: tuple[int, int]) -> bool:
 
 def _alignments(plane: tuple[int, int], size: tuple[int, int]) -> tuple[bool, ...]:
     """Whether the corners of logits may be the corners of the input: no, yes, or both where the sizes allow both."""
-    (height, width) = plane
-    (rows, columns) = size
+    height, width = plane
+    rows, columns = size
     if not (1 < height < rows and 1 < width < columns):
         return (False,)
     down, down_rest = divmod(rows - 1, height - 1)
@@ -462,11 +465,9 @@ def _not_understood(
         texts = " or ".join(fit.text for fit in shapes_allow)
         ids = dict.fromkeys(fit.layout.id for fit in shapes_allow)
         cure = " or ".join(f"--set segmentation.onnx_layout={name}" for name in ids)
-        reason = (
-            f"segmentation.onnx_layout is {asked}"
-            if asked != "auto"
-            else f"the metadata say {said}"
-        )
+        reason = f"the metadata say {said}"
+        if asked != "auto":
+            reason = f"segmentation.onnx_layout is {asked}"
         return SegmentationError(
             f"{where}: {reason}, but the outputs {listed} fit {texts}",
             f"if the shapes are right: {cure}",
@@ -493,11 +494,8 @@ def _said(facts: Metadata) -> str:
     """What the metadata say, for a message; empty if nothing."""
     parts = []
     if facts.suppressed is not None:
-        parts.append(
-            "that suppression is inside (end2end, nms)"
-            if facts.suppressed
-            else "that none is suppressed"
-        )
+        inside = "that suppression is inside (end2end, nms)"
+        parts.append(inside if facts.suppressed else "that none is suppressed")
     if facts.task:
         parts.append(f"'task' = {facts.task}")
     if facts.names is not None:
@@ -510,4 +508,5 @@ def assumed_names(layout: Layout, metadata: Mapping[str, str]) -> str:
     """What is assumed of the classes where the file does not name its one or two; empty where nothing is."""
     if "names" in metadata or len(layout.names) > 2:
         return ""
-    return f"the file names no classes, {', '.join(f'class {k} is taken for {v}' for k, v in layout.names.items())}"
+    taken = [f"class {number} is taken for {name}" for number, name in layout.names.items()]
+    return f"the file names no classes, {', '.join(taken)}"

@@ -50,6 +50,7 @@ _SCALINGS = {
 }
 """Mean and divisor of the RGB channels of a 0..255 image."""
 PAD = 114
+"""Grey level of the borders around a letterboxed image."""
 STRIDE = 32
 """An open input size is padded to a multiple of this."""
 MIN_COMPONENT_PX = 64
@@ -112,6 +113,7 @@ class OnnxSegmenter:
             SegmentationError: The network cannot run on this image, or gives outputs that do not
                 fit its layout.
         """
+        # resize to the network's input; an open size is the frame's, rounded up to the stride
         height, width = frame.rgb.shape[:2]
         padded = (-(-height // STRIDE) * STRIDE, -(-width // STRIDE) * STRIDE)
         image, place = fit(
@@ -126,13 +128,16 @@ class OnnxSegmenter:
         return height or image[0], width or image[1]
 
     def _find_layout(self, outputs: Sequence[TensorInfo], metadata: Mapping[str, str]) -> Layout:
+        """The layout of the outputs; the network runs on a grey image where the file leaves their sizes open."""
         size = self._size_of(OPEN_SIZE)
         names = [output.name for output in outputs]
         available = {str(name) for name in self._net.getUnconnectedOutLayersNames()}
-        if not set(names) <= available:  # older OpenCV names outputs by their layers
+        # older OpenCV names outputs by their layers
+        if not set(names) <= available:
             names = sorted(available)
+        # sizes that are open are known when the network has run
         declared = [output.name for output in outputs if output.shape and None not in output.shape]
-        if names != declared or None in self._size:  # sizes are known when the network has run
+        if names != declared or None in self._size:
             elements = {output.name: output.element for output in outputs}
             values = self._forward(np.full((*size, 3), PAD, np.uint8), names, "unit")
             outputs = [
@@ -149,7 +154,8 @@ class OnnxSegmenter:
             if canonical_name(name) not in NO_OBJECT
         }
         check_classes(objects.values(), self.settings, str(self.path), "the network")
-        if assumed := assumed_names(self.layout, metadata):
+        assumed = assumed_names(self.layout, metadata)
+        if assumed:
             warnings.warn(f"{self.path}: {assumed}", stacklevel=2)
         for number in _wanted(self.layout, self.settings):
             name = self.layout.names[number]
@@ -164,15 +170,12 @@ class OnnxSegmenter:
         self, image: NDArray[np.uint8], names: list[str], usual: str
     ) -> list[NDArray[np.float32]]:
         """The outputs for an image, scaled as the settings say or else as usual."""
-        scaling = (
-            usual
-            if self.settings.onnx_normalisation == "auto"
-            else self.settings.onnx_normalisation
-        )
+        scaling = self.settings.onnx_normalisation
+        if scaling == "auto":
+            scaling = usual
         mean, divisor = _SCALINGS[scaling]
-        scaled = (image.astype(np.float32) - np.array(mean, np.float32)) / np.array(
-            divisor, np.float32
-        )
+        centred = image.astype(np.float32) - np.array(mean, np.float32)
+        scaled = centred / np.array(divisor, np.float32)
         blob: NDArray[np.float32] = np.ascontiguousarray(scaled.transpose(2, 0, 1)[None])
         with (
             pinned_threads(cv2.getNumThreads, cv2.setNumThreads, self.threads),
@@ -223,10 +226,12 @@ def fit(
         keep_aspect: Letterbox (YOLO) instead of stretching (semantic networks).
     """
     height, width = rgb.shape[:2]
-    ratio = min(size[0] / height, size[1] / width)
-    rows, columns = (
-        (max(1, round(height * ratio)), max(1, round(width * ratio))) if keep_aspect else size
-    )
+    rows, columns = size
+    if keep_aspect:
+        ratio = min(size[0] / height, size[1] / width)
+        rows = max(1, round(height * ratio))
+        columns = max(1, round(width * ratio))
+    # in the middle of a grey canvas
     top = (size[0] - rows) // 2
     left = (size[1] - columns) // 2
     canvas = np.full((*size, 3), PAD, np.uint8)
@@ -234,7 +239,10 @@ def fit(
         rgb, (columns, rows), interpolation=cv2.INTER_LINEAR
     ).reshape(rows, columns, 3)
     place = Placement(
-        (height, width), size, (columns / width, rows / height), (float(left), float(top))
+        frame=(height, width),
+        input=size,
+        scale=(columns / width, rows / height),
+        offset=(float(left), float(top)),
     )
     return canvas, place
 
@@ -247,8 +255,8 @@ def _input_size(inputs: Sequence[TensorInfo], path: Path) -> tuple[int | None, i
             "a segmentation network takes one image",
         )
     shape = inputs[0].shape
-    last = len(shape) == 4 and shape[3] == 3 and shape[1] != 3
-    if last or len(shape) != 4 or shape[1] not in (3, None) or shape[0] not in (1, None):
+    channels_last = len(shape) == 4 and shape[3] == 3 and shape[1] != 3
+    if channels_last or len(shape) != 4 or shape[1] not in (3, None) or shape[0] not in (1, None):
         raise SegmentationError(f"{path}: the input {inputs[0]} is no image", "expected 1x3xHxW")
     if not inputs[0].is_real:
         raise SegmentationError(
@@ -280,9 +288,12 @@ def decode(
     for name, value in zip(layout.outputs, values, strict=True):
         if not np.isfinite(value).all():
             raise SegmentationError(f"the network's output '{name}' holds NaN or infinite values")
-    decoder = {"yolo": _decode_yolo, "semantic": _decode_semantic, "instances": _decode_instances}[
-        layout.kind
-    ]
+    decoders = {
+        "yolo": _decode_yolo,
+        "semantic": _decode_semantic,
+        "instances": _decode_instances,
+    }
+    decoder = decoders[layout.kind]
     return decoder(values, layout, place, settings, floor)
 
 
@@ -302,6 +313,7 @@ def _check_detections(boxes: Float, scores: Float, labels: Float, layout: Layout
         raise SegmentationError(
             f"the network's scores reach {scores.max():.4g}, scores end at 1", hint
         )
+    # class numbers must be whole, and have a name
     least = float(labels.min())
     most = float(labels.max())
     if least < 0 or most > max(layout.names) or (labels != np.rint(labels)).any():
@@ -310,9 +322,10 @@ def _check_detections(boxes: Float, scores: Float, labels: Float, layout: Layout
             f"{min(layout.names)} to {max(layout.names)}",
             hint,
         )
+    # corners that the network gives, not made of centre and size; a single box may be a bad detection
     reversed_corners = (boxes[:, 2:] < boxes[:, :2]).any(axis=1)
-    given = layout.suppressed or layout.kind == "instances"  # not made of centre and size
-    if given and reversed_corners.mean() > 0.5:  # a single one may be a bad detection
+    given = layout.suppressed or layout.kind == "instances"
+    if given and reversed_corners.mean() > 0.5:
         x0, y0, x1, y1 = boxes[reversed_corners][0].tolist()
         raise SegmentationError(
             f"the network's boxes end before they begin, for example x {x0:.4g} to {x1:.4g}, y {y0:.4g} to {y1:.4g}",
@@ -332,6 +345,8 @@ def _decode_yolo(
     settings: SegmentationSettings,
     floor: float,
 ) -> Instances:
+    """Objects of YOLO's detections ``[1, 4 + C + M, N]`` or ``[1, N, 6 + M]`` and prototypes ``[1, M, h, w]``."""
+    # a detection a row; its mask coefficients begin at `first`
     rows = values[0].reshape(values[0].shape[-2:])
     rows = rows.T if layout.channels_first else rows
     prototypes = values[1].reshape(values[1].shape[-3:])
@@ -341,11 +356,15 @@ def _decode_yolo(
             f"the network gives detections of {rows.shape[1]} numbers and {prototypes.shape[0]} prototypes, "
             f"the layout '{layout.id}' of {len(layout.names)} classes has {first + prototypes.shape[0]} numbers"
         )
+
+    # corners, scores and class numbers; those that are kept
     boxes, best, numbers = _corners(rows) if layout.suppressed else _best(rows, first, layout)
     above = best >= floor
     _check_detections(boxes[above], best[above], numbers[above], layout)
     labels = np.rint(numbers).astype(np.intp)
     keep = _keep(boxes, best, labels, layout, settings, floor)
+
+    # masks: the prototypes weighted by a detection's coefficients, inside its box
     logits = np.tensordot(rows[keep, first:], prototypes, axes=1).astype(np.float32)
     return _paste(
         logits,
@@ -382,14 +401,13 @@ def _decode_instances(
     settings: SegmentationSettings,
     floor: float,
 ) -> Instances:
+    """Objects of boxes ``[K, 4]``, labels ``[K]``, scores ``[K]`` and pasted masks ``[K, 1, H, W]``."""
     boxes = values[0].reshape(-1, 4)
     labels = np.rint(values[1].reshape(-1)).astype(np.intp)
     scores = values[2].reshape(-1)
-    planes = (
-        values[3].reshape(-1, *values[3].shape[-2:])
-        if values[3].size
-        else np.zeros((0, *place.input), np.float32)
-    )
+    planes = np.zeros((0, *place.input), np.float32)
+    if values[3].size:
+        planes = values[3].reshape(-1, *values[3].shape[-2:])
     if len({len(boxes), len(labels), len(scores), len(planes)}) != 1:
         raise SegmentationError(
             f"the network's outputs disagree: {len(boxes)} boxes, {len(labels)} labels, {len(scores)} scores, "
@@ -403,6 +421,7 @@ def _decode_instances(
     above = scores >= floor
     _check_detections(boxes[above], scores[above], labels[above].astype(np.float32), layout)
     keep = _keep(boxes, scores, labels, layout, settings, floor)
+    # the planes cover the whole input
     whole = np.tile(np.array([0, 0, *place.input[::-1]], np.float32), (len(keep), 1))
     planes = planes[keep].astype(np.float32)
     return _paste(
@@ -432,9 +451,9 @@ def _keep(
     keep = keep[np.argsort(-scores[keep], kind="stable")][:MAX_CANDIDATES]
     if layout.suppressed:
         return keep[:MAX_OBJECTS]
+    # suppression within each class: boxes are shifted by class, so that classes do not overlap
     corners = boxes[keep]
     extent = float(corners.max() - min(float(corners.min()), 0.0)) + 1.0
-    # classes do not overlap any more
     shifted = corners + labels[keep, None].astype(np.float32) * extent
     sized = np.concatenate([shifted[:, :2], shifted[:, 2:] - shifted[:, :2]], axis=1)
     kept = cv2.dnn.NMSBoxes(
@@ -470,23 +489,24 @@ def _paste(
     offset = np.array(place.offset)
     masks = np.zeros((len(planes), height, width), bool)
     for mask, plane, window in zip(masks, planes, windows.astype(np.float64), strict=True):
+        # the window in pixels of the frame
         x0, y0 = np.maximum(np.floor((window[:2] - offset) / scale), 0).astype(int)
         x1, y1 = np.minimum(np.ceil((window[2:] - offset) / scale), (width, height)).astype(int)
         if x1 <= x0 or y1 <= y0:
             continue
+        # pixel centres of the frame's patch -> pixel centres of the plane
         ratio = np.array([plane.shape[1] / place.input[1], plane.shape[0] / place.input[0]])
         first = ((np.array([x0, y0]) + 0.5) * scale + offset) * ratio - 0.5
-        # pixel centres of the frame's patch -> pixel centres of the plane
         to_plane = np.column_stack([np.diag(scale * ratio), first])
         size = (int(x1 - x0), int(y1 - y0))
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         patch = cv2.warpAffine(plane, to_plane, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
         mask[y0:y1, x0:x1] = patch > level
+    # boxes in pixels of the frame
     shift = np.tile(offset, 2).astype(np.float32)
     stretch = np.tile(scale, 2).astype(np.float32)
-    in_frame = np.clip((boxes - shift) / stretch, 0, np.array([width, height] * 2)).astype(
-        np.float32
-    )
+    limits = np.array([width, height] * 2)
+    in_frame = np.clip((boxes - shift) / stretch, 0, limits).astype(np.float32)
     names = tuple(canonical_name(layout.names[int(number)]) for number in labels)
     return Instances(masks, in_frame, names, scores.astype(np.float32)).visible()
 
@@ -498,11 +518,13 @@ def _decode_semantic(
     settings: SegmentationSettings,
     floor: float,
 ) -> Instances:
+    """Objects of class logits ``[1, C, h, w]``: the connected parts of each dynamic class."""
     logits = values[0].reshape(values[0].shape[-3:])
     if logits.shape[0] <= max(layout.names):
         raise SegmentationError(
             f"the network gives {logits.shape[0]} classes, its names end at {max(layout.names)}"
         )
+    # logits at the frame's pixels, by linear interpolation along both axes
     rows, columns = (
         _interpolation(
             logits.shape[1 + axis],
@@ -520,13 +542,15 @@ def _decode_semantic(
     names = []
     scores = []
     for number in _wanted(layout, settings):
-        margin = full[number] - np.delete(full, number, axis=0).max(axis=0)  # > 0 is the arg max
+        # margin over the best other class: > 0 is the arg max
+        margin = full[number] - np.delete(full, number, axis=0).max(axis=0)
         _, labels, stats, _ = cv2.connectedComponentsWithStats(
             (margin > level).astype(np.uint8), connectivity=8
         )
         for component in range(1, len(stats)):
             if stats[component, cv2.CC_STAT_AREA] < MIN_COMPONENT_PX:
                 continue
+            # its score is the probability of the mean margin
             mask = labels == component
             score = float(1 / (1 + np.exp(-float(margin[mask].mean()))))
             if score >= floor:
@@ -541,13 +565,14 @@ def _interpolation(
     cells: int, length: int, scale: float, offset: float, count: int, aligned: bool
 ) -> Float:
     """Matrix ``[count, cells]`` of linear interpolation from `cells` logits to `count` frame pixels along one axis."""
+    # where the pixels' centres lie in the input, then among the cells
     at_input = (np.arange(count) + 0.5) * scale + offset - 0.5
-    at = (
-        at_input * (cells - 1) / max(length - 1, 1)
-        if aligned
-        else (at_input + 0.5) * cells / length - 0.5
-    )
+    if aligned:
+        at = at_input * (cells - 1) / max(length - 1, 1)
+    else:
+        at = (at_input + 0.5) * cells / length - 0.5
     at = np.clip(at, 0, cells - 1)
+    # weights of the two cells around each
     low = np.minimum(np.floor(at).astype(int), max(cells - 2, 0))
     matrix = np.zeros((count, cells), np.float32)
     matrix[np.arange(count), low] = 1 - (at - low)
@@ -562,4 +587,5 @@ def _wanted(layout: Layout, settings: SegmentationSettings) -> list[int]:
 
 
 def _logit(probability: float) -> float:
+    """The value whose sigmoid is a probability."""
     return math.log(probability / (1 - probability))

@@ -21,7 +21,11 @@ from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.segmentation.training.labelled_images import open_labelled
 
 THRESHOLDS: tuple[float, ...] = tuple(round(0.5 + 0.05 * step, 2) for step in range(10))
+"""COCO's IoU thresholds 0.50, 0.55 ... 0.95."""
 RECALL_POINTS = np.linspace(0, 1, 101)
+"""COCO's recall points of the average precision."""
+LEAST_SCORE = 0.05
+"""Detections down to this score enter the average precision."""
 
 
 class MaskTally:
@@ -47,12 +51,15 @@ class MaskTally:
         self, true: NDArray[np.bool_], guess: NDArray[np.bool_], scores: NDArray[np.float32]
     ) -> None:
         """Compare the detections in an image with its labels: masks ``[M, H, W]``, ``[N, H, W]`` and scores ``[N]``."""
+        # detections by falling score
         order = np.argsort(-scores, kind="stable")
         guess = guess[order]
         scores = scores[order]
         overlap = mask_iou(guess, true)
         large = np.count_nonzero(true, axis=(1, 2)) >= max(self.min_area, 1)
         sure = scores >= self.confidence
+
+        # pixel IoU of the class, of confident detections
         if len(true) or sure.any():
             counts = compare_masks(
                 np.asarray(guess[sure].any(axis=0)), np.asarray(true.any(axis=0))
@@ -60,9 +67,14 @@ class MaskTally:
             self._counts = self._counts + counts
             if counts.iou is not None:
                 self._frame_ious.append(counts.iou)
+
+        # IoU of each object's best detection
         self.truths += int(large.sum())
         self._object_ious.extend(overlap[sure][:, large].max(axis=0, initial=0.0).tolist())
-        hits, ignored = assign(overlap, large, np.count_nonzero(guess, axis=(1, 2)) < self.min_area)
+
+        # hits of all detections at every threshold, for the average precision
+        small = np.count_nonzero(guess, axis=(1, 2)) < self.min_area
+        hits, ignored = assign(overlap, large, small)
         self._scores.extend(scores.tolist())
         self._hits.extend(hits)
         self._ignored.extend(ignored)
@@ -71,24 +83,23 @@ class MaskTally:
         """The quality over the images so far; None where there is nothing to measure.
 
         Returns:
-            ``truths`` and ``detections``: objects that are there, and that were found. ``ap``: mean
-            over IoU thresholds
-            0.50, 0.55 ... 0.95 of the average precision (COCO's 101 recall points). ``ap50``: average precision at IoU
-            0.5. ``iou``: intersection over union of the class's pixels, added up over all images. ``frame_iou``: mean
-            over the images in which the class is there or was found of their IoU. ``instance_iou``:
-            mean over the objects of the IoU of the detection that fits best (0 if there is none).
-            ``recall``: share of the objects that a detection covers with IoU >= 0.5.
+            - ``truths`` and ``detections``: objects that are there, and that were found.
+            - ``ap``: average precision (COCO's 101 recall points), mean over `THRESHOLDS`.
+            - ``ap50``: average precision at IoU 0.5.
+            - ``iou``: intersection over union of the class's pixels, added up over all images.
+            - ``frame_iou``: mean IoU of the images in which the class is there or was found.
+            - ``instance_iou``: IoU of the detection that fits an object best (0 if there is none),
+              mean over the objects.
+            - ``recall``: share of the objects that a detection covers with IoU >= 0.5.
         """
         scores = np.array(self._scores)
         best = np.array(self._object_ious)
-        hits, ignored = (
-            np.array(rows, bool).reshape(-1, len(THRESHOLDS))
-            for rows in (self._hits, self._ignored)
-        )
-        precisions = [
-            average_precision(scores[~ignored[:, k]], hits[~ignored[:, k], k], self.truths)
-            for k in range(len(THRESHOLDS))
-        ]
+        hits = np.array(self._hits, bool).reshape(-1, len(THRESHOLDS))
+        ignored = np.array(self._ignored, bool).reshape(-1, len(THRESHOLDS))
+        precisions = []
+        for k in range(len(THRESHOLDS)):
+            counted = ~ignored[:, k]
+            precisions.append(average_precision(scores[counted], hits[counted, k], self.truths))
         return {
             "truths": float(self.truths),
             "detections": float(len(scores)),
@@ -133,10 +144,12 @@ def assign(
         is ignored.
     """
     count, objects = overlap.shape
-    hits, ignored = np.zeros((2, count, len(THRESHOLDS)), bool)
+    hits = np.zeros((count, len(THRESHOLDS)), bool)
+    ignored = np.zeros((count, len(THRESHOLDS)), bool)
     for level, threshold in enumerate(THRESHOLDS):
         free = np.ones(objects, bool)
         for row in range(count):
+            # an object that is asked for comes before one that is not
             for group in (counted, ~counted):
                 candidates = np.flatnonzero(free & group & (overlap[row] >= threshold))
                 if candidates.size:
@@ -158,6 +171,7 @@ def average_precision(scores: NDArray[np.float64], hits: NDArray[np.bool_], trut
     positives = np.cumsum(hits[order])
     recall = positives / truths
     precision = positives / np.arange(1, len(order) + 1)
+    # the best precision at this recall or a higher one, 0 beyond the highest
     precision = np.maximum.accumulate(precision[::-1])[::-1]
     at = np.searchsorted(recall, RECALL_POINTS, side="left")
     return float(np.append(precision, 0.0)[np.minimum(at, len(precision))].mean())
@@ -226,13 +240,14 @@ def evaluate_segmenter(
             of the classes.
     """
     images = open_labelled(data)
-    # AP takes weak detections as well
-    low = settings.model_copy(update={"confidence": min(0.05, settings.confidence)})
+    low = settings.model_copy(update={"confidence": min(LEAST_SCORE, settings.confidence)})
     segmenter = build_segmenter(low, sequence_id="synthetic/", device=device, threads=threads)
     if segmenter is None:
         raise SegmentationError("segmentation.source=none has no masks to evaluate")
     count = len(images) if limit is None else min(limit, len(images))
     chosen = np.unique(np.linspace(0, len(images) - 1, count).round().astype(int))
+
+    # segment the images, and compare the masks class by class
     tallies = {
         name: MaskTally(settings.confidence, min_area) for name in sorted(settings.class_names())
     }
@@ -246,21 +261,25 @@ def evaluate_segmenter(
         times.append(time.perf_counter() - start)
         shown.update(image.class_names)
         for name, tally in tallies.items():
+            labelled = image.masks[[kind == name for kind in image.class_names]]
             predicted = detections.of_classes([name])
-            tally.add(
-                image.masks[[kind == name for kind in image.class_names]],
-                predicted.masks,
-                predicted.scores,
-            )
+            tally.add(labelled, predicted.masks, predicted.scores)
         progress(done, len(chosen))
+
+    # means over the classes that occur
     qualities = {name: tally.quality() for name, tally in tallies.items()}
-    there = [quality for quality in qualities.values() if quality["truths"]]
-    if not there:
+    occurring = [quality for quality in qualities.values() if quality["truths"]]
+    if not occurring:
         raise SegmentationError(
             f"none of {len(chosen)} images of {images.name} shows an object of the classes {settings.classes} with at "
             f"least {max(min_area, 1)} px: nothing is measured",
             f"labelled are: {', '.join(sorted(shown)) or 'none'}",
         )
+    reported = {
+        name: quality
+        for name, quality in qualities.items()
+        if quality["truths"] or quality["detections"]
+    }
     score = SegmenterScore(
         segmenter=resolve_source(settings, "synthetic/"),
         weights=weights_digest(settings, "synthetic/"),
@@ -268,13 +287,9 @@ def evaluate_segmenter(
         images=len(chosen),
         confidence=settings.confidence,
         min_area=min_area,
-        mean_ap=mean([quality["ap"] for quality in there]),
-        mean_iou=mean([quality["iou"] for quality in there]),
-        classes={
-            name: quality
-            for name, quality in qualities.items()
-            if quality["truths"] or quality["detections"]
-        },
+        mean_ap=mean([quality["ap"] for quality in occurring]),
+        mean_iou=mean([quality["iou"] for quality in occurring]),
+        classes=reported,
         median_ms=1000 * float(np.median(times)) if times else float("nan"),
         threads=threads,
     )

@@ -105,14 +105,14 @@ def coco_images(text: str) -> LabelledImages:
         names = {
             int(entry["id"]): canonical_name(str(entry["name"])) for entry in content["categories"]
         }
+        # class name and segmentation of the objects of each image, by its id
         shapes: dict[int, list[tuple[str, Any]]] = {
             int(entry["id"]): [] for entry in content["images"]
         }
         for entry in content["annotations"]:
             if not entry.get("iscrowd"):
-                shapes[int(entry["image_id"])].append(
-                    (names[int(entry["category_id"])], entry["segmentation"])
-                )
+                name = names[int(entry["category_id"])]
+                shapes[int(entry["image_id"])].append((name, entry["segmentation"]))
         files = [(str(entry["file_name"]), shapes[int(entry["id"])]) for entry in content["images"]]
     if not files:
         raise SegmentationError(f"{path} lists no images")
@@ -127,6 +127,7 @@ def coco_images(text: str) -> LabelledImages:
 
 
 def _read_coco(path: Path, objects: list[tuple[str, Any]]) -> LabelledImage:
+    """An image and its objects, each a class name and COCO's segmentation."""
     rgb = _read(path)
     masks = [_coco_mask(segmentation, rgb.shape[:2], path) for _, segmentation in objects]
     return _labelled(rgb, masks, [name for name, _ in objects])
@@ -158,15 +159,14 @@ def yolo_images(text: str) -> LabelledImages:
             f"there are no images in {root}", "YOLO data has images/ and labels/ side by side"
         )
 
-    described = [
-        place / "data.yaml" for place in (folder, folder.parent) if (place / "data.yaml").is_file()
-    ]
+    # the names of the classes: the nearest description's, else COCO's
+    candidates = (folder / "data.yaml", folder.parent / "data.yaml")
+    described = [path for path in candidates if path.is_file()]
     classes = _yolo_names(described[0]) if described else dict(enumerate(COCO_NAMES))
 
     def read(index: int) -> LabelledImage:
-        return _read_yolo(
-            images[index], labels / images[index].relative_to(root).with_suffix(".txt"), classes
-        )
+        label = labels / images[index].relative_to(root).with_suffix(".txt")
+        return _read_yolo(images[index], label, classes)
 
     version = _files_digest([*images, *sorted(labels.rglob("*.txt")), *described[:1]])
     return LabelledImages(f"yolo:{folder.name}", version, len(images), read)
@@ -188,6 +188,7 @@ def _yolo_names(path: Path) -> dict[int, str]:
 
 
 def _read_yolo(path: Path, label: Path, classes: Mapping[int, str]) -> LabelledImage:
+    """An image and the polygons of its label file, which may be missing."""
     rgb = _read(path)
     masks = []
     names = []
@@ -203,23 +204,26 @@ def _read_yolo(path: Path, label: Path, classes: Mapping[int, str]) -> LabelledI
         ):
             kind, *points = line.split()
             names.append(classes[int(kind)])
-            masks.append(_fill([_polygon(points) * [rgb.shape[1], rgb.shape[0]]], rgb.shape[:2]))
+            polygon = _polygon(points) * [rgb.shape[1], rgb.shape[0]]
+            masks.append(_fill([polygon], rgb.shape[:2]))
     return _labelled(rgb, masks, names)
 
 
 def _files_digest(paths: list[Path]) -> str:
+    """Digest of the names and sizes of files."""
     return digest([(str(path), path.stat().st_size) for path in paths if path.is_file()])
 
 
 def _read(path: Path) -> NDArray[np.uint8]:
-    return np.ascontiguousarray(
-        read_image(path, flags=cv2.IMREAD_COLOR, kind=SegmentationError)[:, :, ::-1], np.uint8
-    )
+    """An image file as RGB, uint8 ``[H, W, 3]``."""
+    bgr = read_image(path, flags=cv2.IMREAD_COLOR, kind=SegmentationError)
+    return np.ascontiguousarray(bgr[:, :, ::-1], np.uint8)
 
 
 def _labelled(
     rgb: NDArray[np.uint8], masks: list[NDArray[np.bool_]], names: list[str]
 ) -> LabelledImage:
+    """An image with the objects that have a pixel."""
     stack = np.stack(masks) if masks else np.zeros((0, *rgb.shape[:2]), bool)
     visible = np.asarray(stack.any(axis=(1, 2)))
     return LabelledImage(rgb, stack[visible], tuple(np.array(names, object)[visible]))
@@ -228,17 +232,20 @@ def _labelled(
 def _fill(polygons: list[NDArray[np.float64]], shape: tuple[int, ...]) -> NDArray[np.bool_]:
     """Pixels at least half covered by the union of polygons (x, y in pixels, the image's corner is 0, 0)."""
     mask = np.zeros(shape, bool)
-    for polygon in (polygon for polygon in polygons if len(polygon) >= 3):
+    for polygon in polygons:
+        if len(polygon) < 3:
+            continue
+        # the polygon's box within the image
         low = np.maximum(np.floor(polygon.min(axis=0)), 0).astype(int)
         high = np.minimum(np.ceil(polygon.max(axis=0)), shape[1::-1]).astype(int)
         if (high <= low).any():
             continue
-        # OpenCV also fills pixels that the outline touches: at this scale it hardly counts
+        # fill it at a finer scale, corners in sixteenths of a pixel; OpenCV also fills pixels that
+        # the outline touches: at this scale it hardly counts
         size = (high - low) * FINER
         fine = np.zeros((size[1], size[0]), np.uint8)
-        cv2.fillPoly(
-            fine, [np.rint(((polygon - low) * FINER - 0.5) * 16).astype(np.int32)], 255, shift=4
-        )
+        corners = np.rint(((polygon - low) * FINER - 0.5) * 16).astype(np.int32)
+        cv2.fillPoly(fine, [corners], 255, shift=4)
         whole = cv2.resize(fine, (high - low).tolist(), interpolation=cv2.INTER_AREA)
         mask[low[1] : high[1], low[0] : high[0]] |= whole >= 128
     return mask
@@ -247,7 +254,8 @@ def _fill(polygons: list[NDArray[np.float64]], shape: tuple[int, ...]) -> NDArra
 def _polygon(points: Any) -> NDArray[np.float64]:
     """Corners ``[N, 2]``; raises ValueError where one is no number or far outside of any image."""
     polygon = np.array(points, np.float64).reshape(-1, 2)
-    if not (np.abs(polygon) < 1e6).all():  # also catches NaN; OpenCV counts in 32 bits
+    # also catches NaN; OpenCV counts in 32 bits
+    if not (np.abs(polygon) < 1e6).all():
         raise ValueError("a corner is not finite, or more than a million pixels away")
     return polygon
 
@@ -270,9 +278,10 @@ def _coco_mask(segmentation: Any, shape: tuple[int, ...], where: Path) -> NDArra
             raise ValueError(
                 f"a mask of {width}x{height} with {total} pixels, the image is {shape[1]}x{shape[0]}"
             )
-        return np.ascontiguousarray(
-            np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(width, height).T
-        )
+        # runs of background and object in turn, down the columns
+        is_object = np.arange(len(runs)) % 2 == 1
+        columns = np.repeat(is_object, runs).reshape(width, height)
+        return np.ascontiguousarray(columns.T)
 
 
 _NOT_LAST = "[P-o]"
@@ -366,6 +375,7 @@ def rendered_frames(text: str = "") -> LabelledImages:
     name = f"scenes={scenes[0]}-{scenes[-1]},frames={frames},length={length},options={options:g},seed={seed}"
 
     def read(index: int) -> LabelledImage:
+        # scene, then motion, then draw; what is drawn depends on seed, sequence and draw alone
         order, draw = divmod(index, frames)
         scene, motion = divmod(order, len(REPLICA_IDS))
         sequence_id = f"{REPLICA_IDS[motion]}@{scenes[scene]}?frames={length}"
@@ -378,8 +388,10 @@ def rendered_frames(text: str = "") -> LabelledImages:
     return LabelledImages(f"synthetic:{name}", f"renderer {RENDERER_VERSION}", count, read)
 
 
-@lru_cache(maxsize=1)  # neighbours in the order share a sequence
+# neighbours in the order share a sequence
+@lru_cache(maxsize=1)
 def _rendered(sequence_id: str, variant: int | None) -> SyntheticSequence:
+    """A rendered sequence, with one of `VARIANTS` or none."""
     settings = apply_overrides(RenderSettings(), {} if variant is None else VARIANTS[variant])
     return SyntheticSequence(parse_synthetic_id(sequence_id), None, settings, threads=1)
 

@@ -41,6 +41,11 @@ from dynslam_bench.segmentation.training.labelled_images import (
 from dynslam_bench.segmentation.training.settings import TrainProgress, TrainResult, TrainSettings
 
 LOSSES = ("objectness", "anchor", "class", "box", "mask")
+"""The losses of Mask R-CNN: two of the proposals, three of the heads."""
+LARGEST_GRADIENT = 5.0
+"""Gradients are scaled down to this norm."""
+FROZEN_STATISTICS = 0.8
+"""Share of the steps after which batch statistics stay fixed, so that the weights settle to them."""
 
 
 def train(
@@ -72,8 +77,8 @@ def train(
         SegmentationError: The data or the initial weights do not fit, or `output` holds a run with
             other settings.
     """
+    # the network's input has the proportions 4:3 of most sequences' frames
     config = network_config(settings)
-    # as the frames of most sequences
     width = round(config.min_side * 4 / 3)
     height = config.min_side
     output.mkdir(parents=True, exist_ok=True)
@@ -98,6 +103,7 @@ def train(
             )
         return images
 
+    # prepare the images at that size, then learn
     sets = [load(text) for text in settings.data]
     validation = load(settings.validation)
     with pinned_threads(torch.get_num_threads, torch.set_num_threads, threads):
@@ -119,9 +125,8 @@ def network_config(settings: TrainSettings) -> NetworkConfig:
     if unknown or len(set(names)) != len(names):
         reason = f"'{unknown[0]}' is no COCO class" if unknown else "one is named twice"
         raise SegmentationError(f"the classes '{settings.classes}' cannot be learned: {reason}")
-    shape = {"embedded": EMBEDDED, "resnet18": RESNET18, "resnet50": NetworkConfig()}[
-        settings.network
-    ]
+    shapes = {"embedded": EMBEDDED, "resnet18": RESNET18, "resnet50": NetworkConfig()}
+    shape = shapes[settings.network]
     sides = {} if settings.network == "embedded" else {"min_side": 480, "max_side": 800}
     return shape.model_copy(update={"classes": tuple(names), "cfpn": settings.cfpn, **sides})
 
@@ -166,12 +171,13 @@ class TrainingRun:
             _initialise(self.network, Path(settings.init))
         self.network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.network).eval()
+
+        # weight decay for matrices and kernels, not for biases and normalisation
+        matrices = [weight for weight in self.network.parameters() if weight.dim() > 1]
+        vectors = [weight for weight in self.network.parameters() if weight.dim() <= 1]
         groups: list[dict[str, Any]] = [
-            {"params": [weight for weight in self.network.parameters() if weight.dim() > 1]},
-            {
-                "params": [weight for weight in self.network.parameters() if weight.dim() <= 1],
-                "weight_decay": 0.0,
-            },
+            {"params": matrices},
+            {"params": vectors, "weight_decay": 0.0},
         ]
         self.optimiser = torch.optim.AdamW(
             groups, lr=settings.learning_rate, weight_decay=settings.weight_decay
@@ -206,20 +212,24 @@ class TrainingRun:
         return TrainResult(self.output / "best.pt", int(self.best["step"]), self.best["iou"])
 
     def _learn(self, batch: list[Example]) -> dict[str, float]:
+        """One step of the optimiser on a batch; the losses by name."""
         settings = self.settings
         self.network.train()
-        if self.step >= 0.8 * settings.iterations:  # the weights settle to fixed batch statistics
+        if self.step >= FROZEN_STATISTICS * settings.iterations:
             for module in self.network.modules():
                 if isinstance(module, nn.BatchNorm2d):
                     module.eval()
         for group in self.optimiser.param_groups:
             group["lr"] = _rate(self.step, settings)
+
+        # the batch as tensors
         images = torch.from_numpy(np.stack([example.rgb for example in batch])).to(self.device)
         images = images.permute(0, 3, 1, 2).float() / 255
-        boxes, labels, masks = (
-            [torch.from_numpy(getattr(example, name)).to(self.device) for example in batch]
-            for name in ("boxes", "labels", "masks")
-        )
+        boxes = [torch.from_numpy(example.boxes).to(self.device) for example in batch]
+        labels = [torch.from_numpy(example.labels).to(self.device) for example in batch]
+        masks = [torch.from_numpy(example.masks).to(self.device) for example in batch]
+
+        # forward; anchors and proposals are drawn by seed and step
         generator = torch.Generator().manual_seed(settings.seed * 1_000_003 + self.step)
         with torch.autocast(
             self.device.split(":")[0], torch.bfloat16, enabled=settings.precision == "bfloat16"
@@ -232,15 +242,19 @@ class TrainingRun:
             raise SegmentationError(
                 f"training diverged at step {self.step}: the loss is {float(total)}"
             )
+
+        # backward
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(self.network.parameters(), 5.0)
+        nn.utils.clip_grad_norm_(self.network.parameters(), LARGEST_GRADIENT)
         self.optimiser.step()
         self._update_average()
         return {name: float(value.detach()) for name, value in losses.items()}
 
     @torch.no_grad()
     def _update_average(self) -> None:
+        """Move the averaged weights, which are evaluated, a little towards the network's."""
+        # at first the mean of few steps counts less
         decay = min(self.settings.average, (self.step + 1) / (self.step + 10))
         weights = self.network.state_dict()
         for key, value in self.average.state_dict().items():
@@ -251,12 +265,15 @@ class TrainingRun:
 
     def _evaluate(self, validation: PreparedImages) -> dict[str, float]:
         """Score the averaged weights, keep them if they are the best, and write the learning curve."""
+        # mean losses since the last evaluation, and the validation scores
         row = {"step": float(self.step)}
         row.update({name: float(np.mean(values)) for name, values in self.recent.items() if values})
         row["loss"] = sum(row[name] for name in LOSSES if name in row)
         row.update(validate(self.average, validation, self.device))
         self.recent = {name: [] for name in LOSSES}
         self.rows.append(row)
+
+        # keep the best, and draw the curve anew
         if row["iou"] > self.best["iou"]:
             self.best = {"iou": row["iou"], "step": float(self.step)}
             save_network(self.average, self.output / "best.pt")
@@ -351,13 +368,16 @@ def validate(network: MaskRCNN, images: PreparedImages, device: str = "cpu") -> 
             paste(plane, box, height, width, 0.5, exact=True)
             for plane, box in zip(planes, boxes, strict=True)
         ]
+
+        # the best IoU of each object with a detection of its class
         for truth, label in zip(example.masks, example.labels.tolist(), strict=True):
             same_class = [
                 mask for mask, kind in zip(masks, labels.tolist(), strict=True) if kind == label
             ]
-            best.append(
-                max((compare_masks(mask, truth).iou or 0.0 for mask in same_class), default=0.0)
-            )
+            ious = [compare_masks(mask, truth).iou or 0.0 for mask in same_class]
+            best.append(max(ious, default=0.0))
+
+        # pixels of all objects together
         union = np.any(masks, axis=0) if masks else np.zeros((height, width), bool)
         counts = counts + compare_masks(union, np.asarray(example.masks.any(axis=0)))
     return {

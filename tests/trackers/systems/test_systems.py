@@ -240,7 +240,7 @@ def test_the_papers_tracker_runs_eq_1_to_3_and_ours_the_first_term(
     chosen = dense.aggregate_and_choose
 
     def spy(*arguments) -> None:
-        calls.append(bool(arguments[8].appearance))
+        calls.append(bool(arguments[4].tables.appearance))
         chosen(*arguments)
 
     monkeypatch.setattr(dense, "aggregate_and_choose", spy)
