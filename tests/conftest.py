@@ -53,6 +53,6 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 @pytest.fixture(scope="session")
 def toy_folder(tmp_path_factory: pytest.TempPathFactory) -> str:
     """A toy sequence of 60 frames in TUM layout."""
-    from envs_toys import write_folder  # loads OpenCV
+    from helpers.envs_toys import write_folder  # loads OpenCV
 
     return str(write_folder(tmp_path_factory.mktemp("toys") / "toy", 60))

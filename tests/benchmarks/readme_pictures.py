@@ -17,9 +17,9 @@ import cv2
 
 ROOT = Path(__file__).resolve().parents[2]
 PICTURES = ROOT / "docs" / "pictures"
-sys.path.insert(0, str(ROOT / "tests" / "reports"))
+sys.path.insert(0, str(ROOT / "tests"))
 
-from reports_browser import Browser  # noqa: E402
+from helpers.reports_browser import Browser  # noqa: E402
 
 from dynslam_bench.reports import build_report  # noqa: E402
 from dynslam_bench.runs import RunStore  # noqa: E402

@@ -29,10 +29,10 @@ import optuna
 from optuna.trial import TrialState
 from scipy import stats
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tuning"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import simulated
 from command_line import parser_of
+from helpers import simulated
 
 from dynslam_bench.tuning import Verdict, distributions, finish
 from dynslam_bench.tuning.judgement import compared

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import toy_tracker
-from cli_helpers import PROGRAM, one_line
-from envs_toys import write_sequence
-from evaluation_walks import noisy
-from evaluation_walks import walk as random_walk
+from helpers import toy_tracker
+from helpers.cli_program import PROGRAM, one_line
+from helpers.envs_toys import write_sequence
+from helpers.evaluation_walks import noisy
+from helpers.evaluation_walks import walk as random_walk
 
 import dynslam_bench as db
 from dynslam_bench.cli.app import expand_lists

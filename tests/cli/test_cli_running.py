@@ -13,12 +13,12 @@ import time
 from pathlib import Path
 from unittest.mock import Mock
 
-import hostile
 import pandas as pd
 import pytest
-from cli_helpers import one_line
-from envs_toys import write_folder
-from reports_fake_store import add_run
+from helpers import hostile
+from helpers.cli_program import one_line
+from helpers.envs_toys import write_folder
+from helpers.reports_fake_store import add_run
 
 from dynslam_bench import cli as program
 from dynslam_bench.cli import app, demo, output, running, runs
@@ -189,7 +189,7 @@ def test_a_map_that_cannot_be_had_is_no_success(cli, walk):
 
 
 def test_a_run_that_was_lost_is_no_success(cli, walk):
-    toys = Path(__file__).parents[1] / "envs" / "envs_toys.py"
+    toys = Path(__file__).parents[1] / "helpers" / "envs_toys.py"
     code, out, _ = cli("run", f"{toys}:SPEC", walk, "--set", "mode=lost", "--set", "at=1", "--json")
     assert json.loads(out)[0]["status"] == "lost"
     assert code == 3
@@ -309,11 +309,12 @@ def attentive():
 def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number, start):
     tracker = tmp_path / "waits.py"
     tracker.write_text(
-        f"import sys; sys.path.insert(0, {str(HERE / 'runs')!r})\n"
+        f"import sys; sys.path.insert(0, {str(HERE)!r})\n"
         "from pathlib import Path\n"
         "from dynslam_bench.core.settings import tunable\n"
         "from dynslam_bench.trackers import TrackerSpec\n"
-        "import hostile, os\n"
+        "import os\n"
+        "from helpers import hostile\n"
         "class WaitsSettings(hostile.HostileSettings):\n"
         "    patience: float = tunable(0.5, low=0.1, high=1.0, meaning='of no use')\n"
         "class Waits(hostile.Hostile):\n"

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_helpers import one_line
-from envs_toys import ToySequence, write_folder, write_sequence
-from evaluation_walks import followed, lap, rows_of, scaled
+from helpers.cli_program import one_line
+from helpers.envs_toys import ToySequence, write_folder, write_sequence
+from helpers.evaluation_walks import followed, lap, rows_of, scaled
 
 from dynslam_bench.geometry import Trajectory, se3, write_tum
 from dynslam_bench.runs.exchange.formats import write_bag, write_pose_table

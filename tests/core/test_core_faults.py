@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from faults import in_a_small_process, survey, tree
+from helpers.faults import in_a_small_process, survey, tree
 from pydantic import Field
 
 from dynslam_bench.core import (

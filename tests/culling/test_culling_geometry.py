@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import (
+from helpers.culling_scenes import (
     ACROSS,
     CAMERA,
     ROTATION,

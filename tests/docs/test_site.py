@@ -8,7 +8,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from documented_names import ROOT
+from helpers.documented_names import ROOT
 
 pytest.importorskip("mkdocstrings", reason="the extra [docs] is not installed")
 LOADING = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src"}

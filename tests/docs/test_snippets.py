@@ -10,7 +10,7 @@ import shlex
 from pathlib import Path
 
 import pytest
-from documented_names import PAGES, ROOT, sources
+from helpers.documented_names import PAGES, ROOT, sources
 
 from dynslam_bench.cli.app import start
 from dynslam_bench.core.settings import flatten

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 import results
-from documented_names import PAGES as WRITTEN
-from documented_names import ROOT, sources
+from helpers.documented_names import PAGES as WRITTEN
+from helpers.documented_names import ROOT, sources
 
 LONGEST = 35
 MEDIAN = 18

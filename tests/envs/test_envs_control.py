@@ -9,10 +9,10 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 import pytest
-from envs_play import checked, checked_by_stable_baselines3
-from envs_toys import CAMERA, TARGET, ToySequence, images
 from gymnasium.envs.registration import EnvSpec
-from sequence_folders import SHARED, needs_shared
+from helpers.envs_play import checked, checked_by_stable_baselines3
+from helpers.envs_toys import CAMERA, TARGET, ToySequence, images
+from helpers.sequence_folders import SHARED, needs_shared
 
 from dynslam_bench.contracts import Frame, TrackResult
 from dynslam_bench.core.errors import DynslamError, SettingsError

@@ -7,7 +7,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from envs_toys import FIXED, ToySequence, write_folder
+from helpers.envs_toys import FIXED, ToySequence, write_folder
 
 from dynslam_bench.contracts import Frame, TrackerContext, TrackerSpec, TrackResult
 from dynslam_bench.contracts.checks import raised_by_tracker

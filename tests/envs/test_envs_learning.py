@@ -12,8 +12,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from envs_play import QUIET, checked, checked_by_stable_baselines3, play, rest, stepped
-from envs_toys import (
+from helpers.envs_play import QUIET, checked, checked_by_stable_baselines3, play, rest, stepped
+from helpers.envs_toys import (
     FIXED,
     SPEC,
     TARGET,
@@ -512,7 +512,9 @@ def test_keypoints_are_padded_and_thinned_and_say_what_they_are(
         lambda self, frame: replace(track(self, frame), keypoints_xy=many, keypoints_keep=None),
     )
     env = SlamEnv(
-        ToySequence(4), replace(SPEC, entry_point="envs_toys:ToyTracker"), observation=["keypoints"]
+        ToySequence(4),
+        replace(SPEC, entry_point="helpers.envs_toys:ToyTracker"),
+        observation=["keypoints"],
     )
     seen, _ = env.reset(seed=0)
     assert seen["keypoints_mask"].all()

@@ -7,7 +7,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 import pytest
-from pictures import grid, moved, moved_points, picture
+from helpers.flow_pictures import grid, moved, moved_points, picture
 
 from dynslam_bench.contracts.flow import FlowEstimator
 from dynslam_bench.core.errors import PluginError

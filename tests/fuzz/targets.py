@@ -21,7 +21,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from published_folders import WRITERS, random_poses
+from helpers.published_folders import WRITERS, random_poses
 
 from dynslam_bench.cli.output import cell_text  # how a cell of a table is written
 from dynslam_bench.contracts import Frame, MapOutputs

@@ -4,9 +4,9 @@ import json
 
 import pandas as pd
 import pytest
-from envs_toys import write_folder
-from reports_browser import Browser, needs_browser
-from reports_fake_store import add_frames, add_run, fill, page_data
+from helpers.envs_toys import write_folder
+from helpers.reports_browser import Browser, needs_browser
+from helpers.reports_fake_store import add_frames, add_run, fill, page_data
 
 from dynslam_bench.envs.slam_env import open_frames
 from dynslam_bench.reports import build_report, compare

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 import plotly.graph_objects as go
 import pytest
-from reports_fake_store import (
+from helpers.reports_fake_store import (
     PROTOCOL,
     add_frames,
     add_run,

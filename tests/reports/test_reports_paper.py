@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 import pandas as pd
 import pytest
-from reports_fake_store import PROTOCOL, add_run, rows_of, truth_of
+from helpers.reports_fake_store import PROTOCOL, add_run, rows_of, truth_of
 
 from dynslam_bench.cli.app import start
 from dynslam_bench.core.errors import ReportError

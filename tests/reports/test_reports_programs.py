@@ -11,7 +11,15 @@ from statistics import geometric_mean
 from typing import Any
 
 import pytest
-from reports_fake_store import MACHINE, PROTOCOL, add_run, columns_of, page_data, row, rows_of
+from helpers.reports_fake_store import (
+    MACHINE,
+    PROTOCOL,
+    add_run,
+    columns_of,
+    page_data,
+    row,
+    rows_of,
+)
 
 from dynslam_bench.core.fingerprint import path_digest
 from dynslam_bench.reports import ReportData, build_report, compare, load_board

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 import scikit_posthocs as posthocs
+from helpers.reports_fake_store import MACHINE, PROTOCOL, add_run, cell_of, crashed, row
 from rank_groups import simulate
-from reports_fake_store import MACHINE, PROTOCOL, add_run, cell_of, crashed, row
 from scipy import stats
 
 from dynslam_bench.cli.output import report_table

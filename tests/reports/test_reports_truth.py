@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from reports_fake_store import (
+from helpers.reports_fake_store import (
     PROTOCOL,
     add_frames,
     add_run,

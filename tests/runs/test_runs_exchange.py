@@ -17,9 +17,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from envs_toys import CAMERA, TARGET, write_folder
 from evo.core.trajectory import PoseTrajectory3D
 from evo.tools import file_interface
+from helpers.envs_toys import CAMERA, TARGET, write_folder
 from published_trajectories import SINGLE
 from rosbags.rosbag2 import Reader
 from typer.testing import CliRunner

@@ -13,10 +13,10 @@ from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Pipe
 from pathlib import Path
 
-import hostile
 import psutil
 import pytest
-from hostile import alive, until
+from helpers import hostile
+from helpers.hostile import alive, until
 
 from dynslam_bench.core import SHARED_MEMORY, InfrastructureError
 from dynslam_bench.runs import Limits, RunRecord, RunSpec, RunStore, run_many, run_one

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from envs_toys import TARGET, write_folder
+from helpers.envs_toys import TARGET, write_folder
 
 from dynslam_bench.core import PluginError, RunError
 from dynslam_bench.core.plugins import has_imported_plugins

@@ -24,12 +24,12 @@ from itertools import cycle
 from pathlib import Path
 from unittest.mock import Mock
 
-import envs_toys
 import numpy as np
 import pandas as pd
 import pytest
-from envs_toys import TARGET, truth, write_folder
-from hostile import until
+from helpers import envs_toys
+from helpers.envs_toys import TARGET, truth, write_folder
+from helpers.hostile import until
 
 from dynslam_bench.api import bench, report
 from dynslam_bench.cli.running import parse_shard, show_workers

@@ -9,8 +9,8 @@ from unittest.mock import Mock
 import cv2
 import numpy as np
 import pytest
-from envs_play import play
-from envs_toys import TARGET, ToySequence, write_folder
+from helpers.envs_play import play
+from helpers.envs_toys import TARGET, ToySequence, write_folder
 
 from dynslam_bench.contracts import KeyframeRecord, MapOutputs
 from dynslam_bench.core import WEIGHTS_VARIABLE, DynslamError, RunError, SettingsError, TrackerError

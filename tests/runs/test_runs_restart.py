@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from faults import in_a_small_process, survey, tree
+from helpers.faults import in_a_small_process, survey, tree
 
 from dynslam_bench.core import InfrastructureError, RunError
 from dynslam_bench.geometry import Trajectory, write_tum

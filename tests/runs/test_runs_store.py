@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
-from envs_toys import TARGET
-from reports_fake_store import add_run
+from helpers.envs_toys import TARGET
+from helpers.reports_fake_store import add_run
 
 from dynslam_bench.contracts import TrackResult
 from dynslam_bench.core import DynslamError, ReportError, RunError, StudyError, claimed

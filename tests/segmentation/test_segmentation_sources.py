@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from fetch_server import Server
+from helpers.fetch_server import Server
 
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.sequence import Frame, FrameMasks

@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from published_folders import WRITERS, random_poses
-from sequence_folders import make_folder, rewrite
+from helpers.published_folders import WRITERS, random_poses
+from helpers.sequence_folders import make_folder, rewrite
 
 from dynslam_bench.contracts import Frame
 from dynslam_bench.core import DynslamError, SequenceError

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sequence_folders import SHARED, Altered, needs_shared
+from helpers.sequence_folders import SHARED, Altered, needs_shared
 
 from dynslam_bench.geometry import Camera, Trajectory, se3
 from dynslam_bench.geometry.rigs import BONN_R_BODY_CAM, in_camera_axes, nearest_rotation

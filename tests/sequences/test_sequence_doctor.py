@@ -10,10 +10,10 @@ from weakref import ref
 import cv2
 import numpy as np
 import pytest
-from envs_toys import write_sequence
-from evaluation_walks import scaled, written_w_first
+from helpers.envs_toys import write_sequence
+from helpers.evaluation_walks import scaled, written_w_first
+from helpers.sequence_folders import SHARED, Altered, frame_hash, make_folder, needs_shared, rewrite
 from scipy.spatial.transform import Rotation
-from sequence_folders import SHARED, Altered, frame_hash, make_folder, needs_shared, rewrite
 
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.geometry import Camera, Trajectory, se3

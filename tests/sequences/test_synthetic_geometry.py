@@ -14,7 +14,7 @@ from unittest.mock import Mock
 import cv2
 import numpy as np
 import pytest
-from sequence_folders import U, V, flipped, frame_hash, reprojected
+from helpers.sequence_folders import U, V, flipped, frame_hash, reprojected
 
 import dynslam_bench.sequences.synthetic as package
 from dynslam_bench.core.errors import SequenceError

@@ -5,7 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from point_world import PointWorld, errors, make_backend, observed, states, track_all, without_depth
+from helpers.point_world import (
+    PointWorld,
+    errors,
+    make_backend,
+    observed,
+    states,
+    track_all,
+    without_depth,
+)
 
 from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.geometry import se3

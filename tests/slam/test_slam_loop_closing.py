@@ -4,8 +4,8 @@ from functools import partial
 
 import numpy as np
 import pytest
-from point_world import make_backend, states, track_all, without_depth
-from ring_world import RingWorld, drive, position_errors
+from helpers.point_world import make_backend, states, track_all, without_depth
+from helpers.ring_world import RingWorld, drive, position_errors
 from scipy.optimize import least_squares
 
 from dynslam_bench.evaluation.alignment import align

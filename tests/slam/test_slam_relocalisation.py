@@ -5,8 +5,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from point_world import PointWorld, make_backend, observed, states, track_all
-from ring_world import RingWorld, drive, position_errors, rotated
+from helpers.point_world import PointWorld, make_backend, observed, states, track_all
+from helpers.ring_world import RingWorld, drive, position_errors, rotated
 from scipy.spatial.transform import Rotation
 
 from dynslam_bench.geometry import Camera, se3

@@ -7,7 +7,7 @@ import struct
 import cv2
 import numpy as np
 import pytest
-from point_world import PointWorld, make_backend, states, track_all
+from helpers.point_world import PointWorld, make_backend, states, track_all
 
 from dynslam_bench.contracts.tracker import KeyframeRecord, MapOutputs
 from dynslam_bench.core.errors import DynslamError, SettingsError, TrackerError

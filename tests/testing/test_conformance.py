@@ -10,10 +10,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
-import hostile
 import numpy as np
 import pytest
-from culling_rules import RULES
+from helpers import hostile
+from helpers.culling_rules import RULES
 
 from dynslam_bench.contracts import FilterResult, FlowResult, Instances, Keypoints, TrackResult
 from dynslam_bench.core import WEIGHTS_VARIABLE, PluginError

@@ -15,7 +15,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from steering_scene import FRAMES, SmallScene, construct, difference, play, quick, settings_for
+from helpers.steering_scene import (
+    FRAMES,
+    SmallScene,
+    construct,
+    difference,
+    play,
+    quick,
+    settings_for,
+)
 
 from dynslam_bench.contracts import Frame, TrackResult
 from dynslam_bench.core.errors import (

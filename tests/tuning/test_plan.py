@@ -12,10 +12,9 @@ from typing import Any
 
 import cv2
 import pytest
-import simulated
-import toy_tracker
+from helpers import simulated, toy_tracker
+from helpers.simulated import TRACKER, SimulatedTuner, make_spec, toy_spec, valley
 from optuna.trial import TrialState
-from simulated import TRACKER, SimulatedTuner, make_spec, toy_spec, valley
 
 from dynslam_bench.cli.studies import status
 from dynslam_bench.core import DynslamError, StudyError, read_settings

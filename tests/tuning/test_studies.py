@@ -23,11 +23,10 @@ from typing import Any
 import numpy as np
 import optuna
 import pytest
-import toy_tracker
-from faults import in_a_small_process, survey
-from hostile import until
-from optuna.trial import FrozenTrial, TrialState
-from simulated import (
+from helpers import toy_tracker
+from helpers.faults import in_a_small_process, survey
+from helpers.hostile import until
+from helpers.simulated import (
     HELD_OUT,
     TRACKER,
     TUNE,
@@ -38,6 +37,7 @@ from simulated import (
     toy_spec,
     valley,
 )
+from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.exc import OperationalError
 
 from dynslam_bench.core import DynslamError, StudyError, read_settings

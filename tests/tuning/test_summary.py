@@ -14,11 +14,11 @@ from typing import Any, cast
 import numpy as np
 import optuna
 import pytest
+from helpers.reports_browser import Browser, needs_browser
+from helpers.simulated import SimulatedTuner, make_spec, toy_spec
 from optuna.trial import TrialState
-from reports_browser import Browser, needs_browser
 from scipy import stats
 from scipy.stats import mstats
-from simulated import SimulatedTuner, make_spec, toy_spec
 
 from dynslam_bench.cli.studies import status
 from dynslam_bench.core import StudyError, read_settings

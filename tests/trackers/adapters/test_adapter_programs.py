@@ -18,8 +18,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from envs_play import play
-from hostile import alive, until
+from helpers.envs_play import play
+from helpers.hostile import alive, until
 from test_adapter_controls import PACKED, XYZ, needs_data
 
 from dynslam_bench import api as db

@@ -7,11 +7,11 @@ import baseline_signatures as signatures
 import cv2
 import numpy as np
 import pytest
-from envs_play import play
-from reports_fake_store import add_run
-from scenes import ACROSS, BOX, SIDEWAYS, box_instance, on_rectangle, scene
-from steering_scene import SmallScene, construct, quick
-from steering_scene import play as play_small
+from helpers.culling_scenes import ACROSS, BOX, SIDEWAYS, box_instance, on_rectangle, scene
+from helpers.envs_play import play
+from helpers.reports_fake_store import add_run
+from helpers.steering_scene import SmallScene, construct, quick
+from helpers.steering_scene import play as play_small
 
 from dynslam_bench.contracts import Instances, TrackResult
 from dynslam_bench.core import settings as core_settings
