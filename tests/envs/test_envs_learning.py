@@ -700,6 +700,19 @@ def test_arguments_outside_their_range_and_what_cannot_be_wrapped(
         wrapper(SlamEnv(ToySequence(5), TARGET, observation=observation), **arguments)
 
 
+class Stopwatch:
+    """Tells environments how long tracking took, whatever else the machine does."""
+
+    now_s = 0.0
+
+
+@pytest.fixture
+def stopwatch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trackers take the time by which they set the stopwatch forward."""
+    clock = SimpleNamespace(perf_counter=lambda: Stopwatch.now_s, process_time=lambda: 0.0)
+    monkeypatch.setattr("dynslam_bench.envs.slam_env.time", clock)
+
+
 class Compiles(FixedTracker):
     """Takes long over the first frames that it ever sees, as what compiles its kernels does."""
 
@@ -713,13 +726,14 @@ class Compiles(FixedTracker):
     def track(self, frame):
         if type(self).slow_frames < 3:
             type(self).slow_frames += 1
-            time.sleep(0.2)
+            Stopwatch.now_s += 0.2
         return super().track(frame)
 
 
 COMPILES = replace(FIXED, entry_point=f"{__name__}:Compiles")
 
 
+@pytest.mark.usefixtures("stopwatch")
 def test_compiling_is_no_work_of_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Compiles, "slow_frames", 0)
     monkeypatch.setattr(Compiles, "resets", 0)
@@ -732,6 +746,7 @@ def test_compiling_is_no_work_of_a_frame(monkeypatch: pytest.MonkeyPatch) -> Non
     assert Compiles.resets == 3  # it is warm
 
 
+@pytest.mark.usefixtures("stopwatch")
 def test_a_live_episode_takes_as_long_as_the_recording() -> None:
     env = DropFrames(SlamEnv(ToySequence(12), TARGET))
     env.reset(seed=0)

@@ -524,9 +524,7 @@ def test_the_page_shows_verdict_funnel_and_optunas_plots(tmp_path: Path) -> None
         for width in (1440, 390):
             browser.open(page, width)
             browser.run("all('.figure').forEach((figure) => figure.scrollIntoView())")
-            browser.until(
-                "all('.figure').every((figure) => figure.querySelector('.main-svg'))", tries=200
-            )
+            browser.until("all('.figure').every((figure) => figure.querySelector('.main-svg'))")
             assert browser.faults == []
             assert browser.run("document.documentElement.scrollWidth") == width
         assert browser.violations() == []
