@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-import scikit_posthocs as posthocs
 from helpers.reports_fake_store import MACHINE, PROTOCOL, add_run, cell_of, crashed, row
 from rank_groups import simulate
 from scipy import stats
@@ -380,6 +379,8 @@ def test_weights_make_categories_count_alike_and_one_sequence_of_many_weights_is
 
 
 def test_nemenyis_differences_are_those_of_scikit_posthocs():
+    import scikit_posthocs as posthocs  # loads Matplotlib
+
     rng = np.random.default_rng(10)
     logs = {str(i): rng.normal(0.4 * i, 0.5, 10) for i in range(6)}
     p_value, difference = mean_rank_test(logs)
