@@ -29,6 +29,12 @@ KERNELS = (
 """What compiles the kernels in two rounds of two processes: rendering and SLAM, flow; then those that use both."""
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """A test that is named by its id runs, slow or not."""
+    if config.option.markexpr == "not slow" and any("::" in argument for argument in config.args):
+        config.option.markexpr = ""
+
+
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile the kernels once, on two cores: several workers would each compile all of them."""
     if getattr(session.config.option, "numprocesses", None) and not hasattr(

@@ -35,6 +35,8 @@ from dynslam_bench.runs.process.fork_server import START_VARIABLE
 from dynslam_bench.segmentation.networks import checkpoints
 from dynslam_bench.trackers import TRACKERS
 
+pytestmark = pytest.mark.slow
+
 
 def test_a_row_names_the_part_the_settings_and_its_origin(cli, facts, walk):
     command = (

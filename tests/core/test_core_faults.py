@@ -131,6 +131,7 @@ def prepared(root: Path) -> None:
 FAILED = RECORD.model_copy(update={"status": "crashed", "reason": "an earlier try"})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("before", ["nothing", "a failed run"])
 @in_a_small_process
 def test_a_run_is_there_whole_or_not_at_all_and_one_that_is_made_again_is_never_lost(

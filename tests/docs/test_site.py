@@ -11,6 +11,8 @@ import pytest
 from helpers.documented_names import ROOT
 
 pytest.importorskip("mkdocstrings", reason="the extra [docs] is not installed")
+
+pytestmark = pytest.mark.slow
 LOADING = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src"}
 
 

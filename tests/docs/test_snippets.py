@@ -21,6 +21,8 @@ from dynslam_bench.testing.template import write_tracker_template
 from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning import read_study
 
+pytestmark = pytest.mark.slow
+
 SHORTER = {
     "frames=(0, 60)": "frames=(0, 4)",
     "frames=[0, 150]": "frames=[0, 4]",

@@ -154,6 +154,7 @@ class VandalSettings(Settings):
 VANDAL = TrackerSpec("vandal", f"{__file__}:Vandal", label="Vandal", settings=VandalSettings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["rgb", "depth", "whole rgb", "a view", "masks", "camera"])
 def test_a_tracker_that_writes_fails_by_its_own_fault_and_changes_nothing(what) -> None:
     sequence = InMemory()

@@ -46,6 +46,7 @@ FINAL = Protocol.model_validate(
 CONTROL = ["noise.level_m", "noise.clip", "noise.passes", "noise.enabled"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SYNTHETIC_IDS[::8])
 def test_every_family_passes_the_checker_without_a_warning(name: str) -> None:
     checked(
@@ -53,6 +54,7 @@ def test_every_family_passes_the_checker_without_a_warning(name: str) -> None:
     )
 
 
+@pytest.mark.slow
 def test_the_default_tracker_passes_the_checker() -> None:
     small = {"preprocessing.width": 320, "preprocessing.height": 240}
     checked(

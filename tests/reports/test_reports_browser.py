@@ -12,7 +12,7 @@ from dynslam_bench.envs.slam_env import open_frames
 from dynslam_bench.reports import build_report, compare
 from dynslam_bench.sequences.view import part_of
 
-pytestmark = needs_browser
+pytestmark = [needs_browser, pytest.mark.slow]
 NAME = "Ours <b>&amp;</b> 'quoted' \N{SNOWMAN} \N{HEBREW LETTER ALEF} $x_1$"
 
 

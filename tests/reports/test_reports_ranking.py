@@ -408,6 +408,7 @@ def test_holm(p_values, corrected):
     assert holm(p_values) == pytest.approx(corrected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["normal", "heavy tails", "unequal spread", "skewed"])
 @pytest.mark.parametrize("sequences", [3, 5, 8, 20])
 def test_claims_of_simulated_boards_are_right(shape, sequences):

@@ -480,6 +480,7 @@ def sum_up(folder):
     (folder / "SHA256SUMS").write_text("".join(lines))
 
 
+@pytest.mark.slow
 def test_a_bank_is_a_results_folder_of_text_files(results, made):
     files = sorted(
         path.relative_to(made).as_posix() for path in made.rglob("*") if not path.is_dir()

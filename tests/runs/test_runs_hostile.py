@@ -30,6 +30,8 @@ from dynslam_bench.runs.process.fork_server import (
 )
 from dynslam_bench.runs.process.supervisor import ServerDiedError, supervise
 
+pytestmark = pytest.mark.slow
+
 linux = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux' subreapers and /proc")
 
 

@@ -20,6 +20,8 @@ from dynslam_bench.runs.record import run_id_of
 from dynslam_bench.runs.validity import Installation
 from dynslam_bench.trackers import TRACKERS
 
+pytestmark = pytest.mark.slow
+
 PLUGIN = """
 import os, sys
 from pathlib import Path

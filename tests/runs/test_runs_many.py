@@ -57,6 +57,8 @@ from dynslam_bench.sequences.synthetic import parse_synthetic_id
 from dynslam_bench.suites import load_suite, suite_names
 from dynslam_bench.trackers.registry import TRACKERS
 
+pytestmark = pytest.mark.slow
+
 
 def specs(folder: str, seeds: range, **change) -> list[RunSpec]:
     return [

@@ -37,6 +37,8 @@ from dynslam_bench.runs.store import runs_frame
 from dynslam_bench.slam.map_files import MAP_FILE, SavedMap, read_map, write_map
 from dynslam_bench.slam.settings import BackendSettings, StartMapSettings
 
+pytestmark = pytest.mark.slow
+
 
 def leftovers(store: RunStore) -> list[str]:
     return [path.name for path in store.runs.iterdir() if path.name.startswith(".")]

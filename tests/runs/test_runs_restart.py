@@ -19,6 +19,8 @@ from dynslam_bench.runs import store as store_module
 from dynslam_bench.runs.exchange.transfer import import_trajectory
 from dynslam_bench.runs.store import merge
 
+pytestmark = pytest.mark.slow
+
 
 def walk(path: Path, drift: float) -> Path:
     """A trajectory of 30 poses, which drifts sideways by so many metres a pose."""

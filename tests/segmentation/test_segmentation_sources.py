@@ -292,6 +292,7 @@ SMALL = SegmenterSpec("small", f"{__name__}:SmallMasks")
 BROKEN = SegmenterSpec("broken", "operator:eq")
 
 
+@pytest.mark.slow
 def test_plugins():
     def source(name):
         return SegmentationSettings(source=f"plugin:{__file__}:{name}")

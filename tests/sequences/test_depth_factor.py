@@ -15,6 +15,8 @@ from dynslam_bench.sequences.depth_scale import DepthScale, depth_scale
 from dynslam_bench.sequences.doctor import Diagnosis, Finding, examine, truth_findings
 from dynslam_bench.sequences.rgbd_motion import RgbdPair, TruthMotion
 
+pytestmark = pytest.mark.slow
+
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5, depth_factor=5000.0)
 STEP = 4
 """Frames from the first image of a pair to the second."""

@@ -785,6 +785,7 @@ def test_a_damaged_image_is_named(folder: Path, cache: StageCache) -> None:
     assert files(cache) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tracker", ["emfoa-oft?masks=none", "opencv-odometry"])
 def test_an_episode_is_the_same_to_the_bit(tracker: str) -> None:
     sequence = CornerSequence(6)

@@ -49,6 +49,7 @@ from dynslam_bench.trackers import TrackerSpec
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(RULES))
 def test_filters(name):
     check_filter(RULES[name])
@@ -74,6 +75,7 @@ def test_the_filter_scene_is_exact():
     assert (same < 25).mean() > 0.8  # the images agree with the flow
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["never-move", "constant-velocity", "mask-rcnn"])
 def test_trackers(name):
     check_tracker(
@@ -81,6 +83,7 @@ def test_trackers(name):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "sequence", [CornerSequence(3), CornerSequence(1), "synthetic/sitting_rpy?scene=2&frames=5"]
 )
@@ -112,6 +115,7 @@ def failures(report):
     return {check.name: check.message for check in report.failed}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mode", "check", "words"),
     [
@@ -128,6 +132,7 @@ def test_a_tracker_that_ends_its_process_fails_the_check(mode, check, words):
     assert "\n" not in failures(report)[check]
 
 
+@pytest.mark.slow
 def test_the_other_checks_go_on():
     """It leaves the process on a black image only: that check fails, all others are made."""
     told = []
@@ -335,6 +340,7 @@ def frames(change):
     return {"__getitem__": lambda self, index: change(CornerSequence.__getitem__(self, index))}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "words"),
     [

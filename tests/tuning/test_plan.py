@@ -64,6 +64,7 @@ def check(tune: list[str], held_out: list[str]) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_preview_takes_what_stored_runs_show_and_else_what_is_known(
     folders: list[str], tmp_path: Path
 ) -> None:
@@ -82,6 +83,7 @@ def test_a_preview_takes_what_stored_runs_show_and_else_what_is_known(
     assert "3 stored runs" in after.figures[0]
 
 
+@pytest.mark.slow
 def test_a_preview_names_the_settings_of_parts_that_decide_nothing(tmp_path: Path) -> None:
     """The camera of `sitting_static` hardly moves, so that F is never used; nobody stands in the way of an oracle."""
     spec = StudySpec(
@@ -103,6 +105,7 @@ def test_a_preview_names_the_settings_of_parts_that_decide_nothing(tmp_path: Pat
     )
 
 
+@pytest.mark.slow
 def test_ratios_are_to_the_baseline_and_the_default_stands_beside(tmp_path: Path) -> None:
     preset = tmp_path / "mine.toml"
     preset.write_text("gain = 3.0\nwobble = 0\n")
@@ -123,6 +126,7 @@ def test_ratios_are_to_the_baseline_and_the_default_stands_beside(tmp_path: Path
     assert "default settings" in write_page(tuner, summary).read_text()
 
 
+@pytest.mark.slow
 def test_the_baseline_may_be_another_tracker(folders: list[str], tmp_path: Path) -> None:
     spec = make(folders, baseline="never-move", confirm=folders[1:2], held_out=[])
     summary = finish(run_study(spec, results=tmp_path))
@@ -216,6 +220,7 @@ def test_trials_may_be_asked_for_and_told_one_by_one(tmp_path: Path) -> None:
         tuner.ask({"gain": 99.0})
 
 
+@pytest.mark.slow
 def test_an_extended_study_goes_on_with_more_scenes_and_trials(tmp_path: Path) -> None:
     spec = make_spec(trials=4, pruner="none")
     SimulatedTuner(spec, tmp_path, effect=valley, in_memory=False).run().extend(scenes=3, trials=2)
@@ -242,6 +247,7 @@ def test_any_trial_is_a_preset(tmp_path: Path) -> None:
         read_preset_text(spec, tmp_path, trial=99)
 
 
+@pytest.mark.slow
 def test_a_study_whose_trials_all_fail_is_not_judged(folders: list[str], tmp_path: Path) -> None:
     tuner = run_study(
         make(folders, start=[{"mode": "crash"}], space={"include": ["mode"]}), results=tmp_path
@@ -253,6 +259,7 @@ def test_a_study_whose_trials_all_fail_is_not_judged(folders: list[str], tmp_pat
     assert write_page(tuner, summary).is_file()
 
 
+@pytest.mark.slow
 def test_one_recording_alone_is_not_judged(
     folders: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -272,6 +279,7 @@ def test_one_recording_alone_is_not_judged(
         tuner.extend(scenes=1)
 
 
+@pytest.mark.slow
 def test_scenes_of_uneven_lengths_and_starts_count_alike(
     folders: list[str], tmp_path: Path
 ) -> None:

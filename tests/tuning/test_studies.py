@@ -72,6 +72,8 @@ from dynslam_bench.tuning.storage import (
 )
 from dynslam_bench.tuning.study import Evaluation, StudyEvent
 
+pytestmark = pytest.mark.slow
+
 
 def make(folders: list[str], **changes: object) -> StudySpec:
     splits = {"tune": folders[:2], "confirm": folders[2:3], "held_out": folders[3:4]}

@@ -70,6 +70,7 @@ def candidate(
     return Candidate.model_validate(values | changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenes", [3, 9, 10, 40])
 @pytest.mark.parametrize("lost", [0.0, 0.1], ids=["normal", "one in ten is a catastrophe"])
 def test_intervals_and_bounds_cover_the_truth(scenes: int, lost: float) -> None:
@@ -227,6 +228,7 @@ def test_settings_matter_where_trials_differ_by_more_than_their_scenes(effect: f
     assert spread_test([{"a": 1.0}, {"a": 2.0}]) is None is spread_test([])
 
 
+@pytest.mark.slow
 def test_the_scenes_that_a_gain_needs_are_the_fewest_and_show_it_in_four_of_five_studies() -> None:
     assert [scenes_needed(0.1, 0.24), scenes_needed(0.1, 0.31)] == [43, 70], (
         "measured: 40 to 70 runs"
@@ -240,6 +242,7 @@ def test_the_scenes_that_a_gain_needs_are_the_fewest_and_show_it_in_four_of_five
         assert np.mean(shown) == pytest.approx(share, abs=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [FEWEST_TRIALS - 1, 60])
 def test_importances_are_optunas_from_enough_trials_on(count: int) -> None:
     spans = dict.fromkeys("xy", optuna.distributions.FloatDistribution(0, 1))
@@ -259,6 +262,7 @@ def test_importances_are_optunas_from_enough_trials_on(count: int) -> None:
         assert all(0 <= importance.low <= importance.high <= 1 for importance in shares.values())
 
 
+@pytest.mark.slow
 def test_a_study_is_a_frame(
     folders: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -386,6 +390,7 @@ def spec(objectives: list[str], include: list[str], **changes: object):
     )
 
 
+@pytest.mark.slow
 def test_speed_decides_where_the_poses_stay_as_they_are(tmp_path: Path) -> None:
     tuner = TimedTuner(spec(["speed"], ["wobble"], pruner="halving"), tmp_path)
     with warnings.catch_warnings():
@@ -399,6 +404,7 @@ def test_speed_decides_where_the_poses_stay_as_they_are(tmp_path: Path) -> None:
     assert chosen.on_held_out["accuracy"].ratio == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_speed_that_is_paid_for_with_accuracy_is_no_gain(tmp_path: Path) -> None:
     tuner = TimedTuner(spec(["speed"], ["gain"], pruner="halving"), tmp_path)
     tuner.price = 0.6
@@ -411,6 +417,7 @@ def test_speed_that_is_paid_for_with_accuracy_is_no_gain(tmp_path: Path) -> None
     assert f'status = "{summary.verdict.value}"' in (tuner.folder / "best.toml").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("objectives", [["accuracy", "speed"], ["speed", "accuracy"]])
 def test_the_best_of_a_front_is_the_best_in_all_objectives_together(
     objectives: list[str], tmp_path: Path
@@ -514,6 +521,7 @@ def test_the_table_holds_default_chosen_and_range() -> None:
     assert "keep the baseline" in unproven.caption
 
 
+@pytest.mark.slow
 @needs_browser
 def test_the_page_shows_verdict_funnel_and_optunas_plots(tmp_path: Path) -> None:
     tuner = SimulatedTuner(make_spec(trials=12), tmp_path).run()

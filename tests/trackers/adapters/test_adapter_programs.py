@@ -41,6 +41,8 @@ from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
 from dynslam_bench.trackers.adapters import subprocess_tracker as exchange
 from dynslam_bench.trackers.adapters.specs import BatchSettings, SubprocessSettings
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = Path(__file__).resolve().parents[3] / "examples" / "batch"
 CAMERA = Camera(
     64, 48, 60.0, 61.0, 31.5, 23.5, distortion=(0.1, -0.2, 0.001, 0.002, 0.3), baseline_m=0.08
