@@ -383,6 +383,7 @@ def test_seed_lists(line, expanded):
 HEAVY = ("torch", "cv2", "numpy", "scipy", "pandas", "optuna", "gymnasium", "numba", "gtsam")
 
 
+@pytest.mark.slow
 def test_help_loads_nothing_heavy():
     code = (
         "import sys\nfrom dynslam_bench.cli.app import start\n"
@@ -396,6 +397,7 @@ def test_help_loads_nothing_heavy():
     assert done.stdout.count("Usage: dynslam-bench") == 3
 
 
+@pytest.mark.slow
 def test_output_to_a_closed_pipe_is_no_error():
     done = subprocess.run(
         ["bash", "-c", f"{sys.executable} -m dynslam_bench sequences list | head -1"],
@@ -408,6 +410,7 @@ def test_output_to_a_closed_pipe_is_no_error():
     assert done.stdout.startswith("7-Scenes"), "the first data set"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device without space")
 def test_output_to_a_full_device_is_one_line():
     command = [sys.executable, "-m", "dynslam_bench", "sequences", "list"]

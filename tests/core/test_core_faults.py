@@ -67,6 +67,7 @@ def swept(root: Path, sweep: Callable[[Path], None] = sweep_below) -> dict[str, 
     return tree(root)
 
 
+@pytest.mark.slow
 @in_a_small_process
 def test_a_file_is_the_old_one_or_the_new_one(tmp_path: Path) -> None:
     root = tmp_path / "root"
@@ -85,6 +86,7 @@ def test_a_file_is_the_old_one_or_the_new_one(tmp_path: Path) -> None:
     assert found.ends["read-only", 3] > 0
 
 
+@pytest.mark.slow
 @in_a_small_process
 def test_a_folder_is_the_old_one_or_the_new_one(tmp_path: Path) -> None:
     root = tmp_path / "root"
@@ -158,6 +160,7 @@ def test_a_run_is_there_whole_or_not_at_all_and_one_that_is_made_again_is_never_
     assert earlier or (found.ends["full", 3] > 5 and found.ends["read-only", 3] > 5)
 
 
+@pytest.mark.slow
 @in_a_small_process
 def test_a_run_is_removed_or_still_there(tmp_path: Path) -> None:
     root = tmp_path / "results"
@@ -179,6 +182,7 @@ def test_a_run_is_removed_or_still_there(tmp_path: Path) -> None:
     assert found.ends["kill", -9] == found.operations
 
 
+@pytest.mark.slow
 @in_a_small_process
 def test_a_download_goes_on_after_any_fault(here: str, tmp_path: Path) -> None:
     root = tmp_path / "data"
@@ -252,6 +256,7 @@ def test_a_name_is_claimed_once(tmp_path: Path) -> None:
         assert again
 
 
+@pytest.mark.slow
 def test_temporary_folders_go_with_their_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

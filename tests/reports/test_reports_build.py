@@ -783,6 +783,7 @@ def odd(tmp_path_factory):
     return build_report(store, root / "report")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="needs pdflatex")
 def test_latex_compiles_and_fits_a_column(odd):
     (odd.latex.parent / "paper.tex").write_text(

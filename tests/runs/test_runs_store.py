@@ -168,6 +168,7 @@ def test_a_newer_record_is_refused_not_misread(tmp_path: Path) -> None:
             RunRecord.read(tmp_path / "run.json")
 
 
+@pytest.mark.slow
 def test_what_a_killed_process_left_is_swept_up_and_nothing_else(tmp_path: Path) -> None:
     root = tmp_path / "results"
     code = (

@@ -575,6 +575,7 @@ def run_pytest(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_each_check_of_a_plug_in_is_a_test(tmp_path: Path) -> None:
     (tmp_path / "still.py").write_text(FLOW)
     out = run_pytest(tmp_path, "--dynslam-flow", "still.py:SPEC").stdout
@@ -608,6 +609,7 @@ def test_a_data_set_is_checked_by_the_sequence_that_it_lists(tmp_path: Path) -> 
         report_on("sequence", f"{tmp_path / 'corners.py'}:EMPTY")
 
 
+@pytest.mark.slow
 def test_an_unknown_subject_is_one_line(tmp_path: Path) -> None:
     ended = run_pytest(tmp_path, "--dynslam-flow", "dasiy")
     assert ended.returncode == 4

@@ -419,6 +419,7 @@ for content in sys.argv[4:]:
 """
 
 
+@pytest.mark.slow
 def test_an_edited_extractor_or_other_weights_get_no_old_keypoints(tmp_path: Path) -> None:
     plugin = tmp_path / "mine.py"
     weights = tmp_path / "net.bin"
