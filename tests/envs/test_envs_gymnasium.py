@@ -67,6 +67,7 @@ def test_the_default_tracker_passes_the_checker() -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kwargs",
     [{}, {"observation": "rgbd"}, {"control": CONTROL}]
