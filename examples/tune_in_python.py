@@ -25,7 +25,7 @@ def main(results: str = "results", frames: int = 20) -> None:
             ProblemInstance("synthetic/walking_xyz?scene=0", frames=(0, frames)),
             f"synthetic/sitting_xyz?scene=1-2&frames={frames}",
         ],
-        held_out=[f"synthetic/walking_xyz?scene=100-102&frames={frames}"],
+        held_out=[f"synthetic/walking_xyz?scene=100-105&frames={frames}"],
         objective=error_and_time,
         sampler=optuna.samplers.RandomSampler(seed=1),
         callbacks=[lambda _, trial: print(f"trial {trial.number}: {trial.params}")],

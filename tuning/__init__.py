@@ -9,7 +9,8 @@ judges the best of them on held-out instances, `write_page` shows it all. `searc
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dynslam_bench.tuning.judgement import StudySummary, Verdict, finish, read_preset_text
+    from dynslam_bench.evaluation.verdicts import Verdict
+    from dynslam_bench.tuning.judgement import StudySummary, finish, read_preset_text
     from dynslam_bench.tuning.objectives import Outcome
     from dynslam_bench.tuning.page import write_page
     from dynslam_bench.tuning.plan import Plan, Preview, distributions, search_space

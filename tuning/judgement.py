@@ -1,35 +1,39 @@
-"""After the trials: the best are judged on unseen instances, the best of them on held-out ones and kept as a preset."""
+"""After the trials: the best is judged on scenes that it was not chosen on; what is proven becomes a preset."""
 
 import json
 import math
 import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from enum import Enum
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from optuna.trial import TrialState
 from pydantic import Field
 
 from dynslam_bench.core import StudyError, read_text, write_atomic
 from dynslam_bench.core.records import Record
+from dynslam_bench.evaluation.verdicts import (
+    FEWEST,
+    LOOKS,
+    ONE_SIDED,
+    PairedRatio,
+    Verdict,
+    findings,
+    scenes_to_settle,
+    verdict_of,
+)
+from dynslam_bench.sequences.families import family_of
 from dynslam_bench.tuning.objectives import (
     ACCURACY,
-    FEWEST_SCENES,
-    MATTER_LEVEL,
     SPEED,
     Configuration,
     InstanceFailedError,
-    Objective,
     Outcomes,
-    bounds,
-    centre,
     combined_objective,
+    compare,
     hold_last_pose_protocol,
-    scenes_needed,
-    spread_test,
+    largest_gain,
     violations,
 )
 from dynslam_bench.tuning.plan import held_settings, seen_note, splits_seen
@@ -40,114 +44,13 @@ from dynslam_bench.tuning.storage import (
     importances,
     scene_ratios,
 )
-from dynslam_bench.tuning.study import StoredStudy, Study
-from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec
+from dynslam_bench.tuning.study import SUMMARY_FILE, StoredStudy, Study
+from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec, scenes
 
-_LARGEST_LOG = 700.0
-"""Larger logarithms overflow."""
-NEGLIGIBLE = 0.05
-"""A gain that is surely smaller than this share does not matter."""
-ERROR = 0.05
-"""Of an interval, half of it at either end: at most 2.5 % of the studies without anything better choose something."""
-
-
-class Ratio(Record):
-    """A ratio to the baseline, of the ATE or whatever a study is after, with its 95 % interval.
-
-    Attributes:
-        ratio: Geometric mean over the scenes, trimmed from ten on; below 1 is better than the
-            baseline.
-        low: Lower end of the interval over scenes (`objectives.bounds`); below three scenes over
-            starts, which tells nothing of other scenes. None for a single run.
-        high: Upper end.
-        n: Paired runs.
-        sequences: How many scenes they come from.
-        bound: Upper end of an interval that is wide enough for all candidates compared; None for a
-            single run.
-        spread: Standard deviation of the logarithm over what the interval is over; None for a
-            single run.
-        what: What the ratio is one of.
-    """
-
-    ratio: float
-    low: float | None = None
-    high: float | None = None
-    n: int
-    sequences: int
-    bound: float | None = None
-    spread: float | None = None
-    what: str = "ATE"
-
-    @property
-    def shows_gain(self) -> bool:
-        """Whether the whole interval lies below 1, over enough scenes for an interval."""
-        return self.high is not None and self.high < 1 and self.sequences >= FEWEST_SCENES
-
-    @property
-    def shows_loss(self) -> bool:
-        """Whether the whole interval lies above 1, over enough scenes for an interval."""
-        return self.low is not None and self.low > 1 and self.sequences >= FEWEST_SCENES
-
-    @property
-    def missing(self) -> int:
-        """How many more scenes would show a gain as large as this one in four of five studies; at least one."""
-        return max(1, scenes_needed(1 - self.ratio, self.spread or 0.0) - self.sequences)
-
-    @property
-    def interval(self) -> str:
-        """The interval in brackets; empty without one."""
-        return "" if self.low is None or self.high is None else f"[{self.low:.3f}, {self.high:.3f}]"
-
-    def __str__(self) -> str:
-        return f"{self.what} x {self.ratio:.3f} {self.interval or 'without an interval'}"
-
-
-def compared(
-    outcomes: Outcomes, baseline: Outcomes, *, objective: Objective = ACCURACY, candidates: int = 1
-) -> Ratio:
-    """A configuration beside the baseline on the same instances.
-
-    Args:
-        outcomes: Of the configuration.
-        baseline: Of the baseline.
-        objective: What is compared.
-        candidates: How many configurations are compared for one choice; the bound allows for all of
-            them (Bonferroni).
-    """
-    scenes = objective.ratios(outcomes, baseline)
-    sample = (
-        list(scenes.values())
-        if len(scenes) >= FEWEST_SCENES
-        else objective.by_start(outcomes, baseline)
-    )
-    sample = objective.counted(sample)
-    ratio = Ratio(
-        ratio=_ratio(centre(sample)), n=len(outcomes), sequences=len(scenes), what=objective.what
-    )
-    if len(sample) < 2:
-        return ratio
-    low, high = map(_ratio, bounds(sample))
-    bound = _ratio(bounds(sample, 1 - ERROR / candidates)[1])
-    return ratio.model_copy(
-        update={"low": low, "high": high, "bound": bound, "spread": float(np.std(sample, ddof=1))}
-    )
-
-
-def _ratio(logarithm: float) -> float:
-    return math.exp(min(logarithm, _LARGEST_LOG))
-
-
-# The summary of a study and its verdict.
-
-
-class Verdict(str, Enum):
-    """What a study says of its best candidate."""
-
-    PROVEN = "proven"
-    PROMISING = "promising"
-    NO_MATTER = "does not matter here"
-    WORSE = "worse"
-    NOT_JUDGED = "not judged"
+NOT_JUDGED = "not judged"
+"""Status of settings that no scenes have judged."""
+OFFERED = (Verdict.PROVEN, Verdict.BUT_LOST, Verdict.PROMISING)
+"""Verdicts with which `best.toml` sets the best trial's settings; with others it keeps the baseline's."""
 
 
 class Candidate(Record):
@@ -157,52 +60,52 @@ class Candidate(Record):
         trial: Its number.
         params: The tuned settings.
         values: What its trial had been worth.
-        confirm: On the instances for the choice, which no trial had seen.
-        held_out: On the held-out split; None without one, or if it is not the best.
+        choice: Mean log ratio on the instances of the choice, which ranks the candidates; None
+            without such instances.
+        confirm: Beside the baseline on the instances of the choice; where nothing is held out they
+            judge.
+        held_out: On the held-out instances; None without any, or if it is not the best.
         recorded: ATE on recordings; None without any, or if it is not the best.
-        on_confirm: ATE and processor time on the instances for the choice, by objective.
-        on_held_out: The same on the held-out split.
+        on_confirm: ATE and processor time on the instances of the choice, by objective.
+        on_held_out: The same on the held-out instances.
         ate_margin: What it may lose of accuracy, as a share; None where its own ratio is one of
             errors.
         feasible: Whether the constraints hold in the new runs.
         failed: Why it could not be run again; empty if it could.
+        scene_s: Seconds of runs that a judging scene took, the baseline's included.
     """
 
     trial: int
     params: dict[str, Any]
     values: list[float]
-    confirm: Ratio | None = None
-    held_out: Ratio | None = None
-    recorded: Ratio | None = None
-    on_confirm: dict[str, Ratio] = Field(default_factory=dict)
-    on_held_out: dict[str, Ratio] = Field(default_factory=dict)
+    choice: float | None = None
+    confirm: PairedRatio | None = None
+    held_out: PairedRatio | None = None
+    recorded: PairedRatio | None = None
+    on_confirm: dict[str, PairedRatio] = Field(default_factory=dict)
+    on_held_out: dict[str, PairedRatio] = Field(default_factory=dict)
     ate_margin: float | None = None
     feasible: bool = True
     failed: str = ""
+    scene_s: float = 0.0
 
     @property
-    def bound(self) -> float:
-        """Upper confidence bound of its ratio; infinite if it cannot be chosen."""
+    def evidence(self) -> PairedRatio | None:
+        """Its ratio on the scenes that judge: the held-out ones, or else those of `confirm`; None without any."""
+        return self.confirm if self.held_out is None else self.held_out
+
+    @property
+    def as_accurate(self) -> bool:
+        """Whether the judging scenes show it (nearly) as accurate as the baseline, if that is asked."""
+        if self.ate_margin is None:
+            return True
+        accuracy = (self.on_held_out or self.on_confirm).get("accuracy")
         return (
-            _bound(self.confirm)
-            if self.feasible and self.nothing_lost(self.on_confirm)
-            else math.inf
+            accuracy is not None
+            and accuracy.high is not None
+            and accuracy.high < 1 + self.ate_margin
+            and len(accuracy.losses) <= len(accuracy.losses_baseline)
         )
-
-    @property
-    def chosen(self) -> bool:
-        """Whether it is surely better than the baseline on the instances of the choice."""
-        return self.bound < 1
-
-    @property
-    def evidence(self) -> Ratio | None:
-        """Its ratio on scenes that neither trials nor choice saw, or else on those of the choice; None without any."""
-        held = self.held_out
-        return held if held is not None and held.sequences >= FEWEST_SCENES else self.confirm
-
-    def nothing_lost(self, ratios: Mapping[str, Ratio]) -> bool:
-        """Whether the upper bound of the ATE ratio shows it (nearly) as accurate as the baseline, if that is asked."""
-        return self.ate_margin is None or _bound(ratios.get("accuracy")) < 1 + self.ate_margin
 
 
 class StudySummary(Record):
@@ -214,17 +117,17 @@ class StudySummary(Record):
         baseline: What ratios are to, in words.
         protocol: Description of the protocol.
         trials: Trials by state.
-        candidates: The best configurations, judged again; the best one, whose settings became the
-            preset, first.
+        candidates: The best configurations, the best one first.
         verdict: What the study says of the best candidate.
-        conclusion: A few short sentences, see `judge`.
-        p_value: Of the test whether the settings matter at all (`objectives.spread_test`); None
-            without a test.
+        conclusion: A few short sentences, see `conclude`.
+        none_better_by: No trial is better than the baseline by more than this share on the scenes
+            that trials ran on (95 %); None where no trial has enough scenes.
+        bounded_trials: Of how many trials that is said.
         shipped: The default settings, where the baseline is something else, on ``confirm`` and
             ``held_out``.
         importances: Optuna's importances of the parameters, see `storage.importances`.
         tune: The instances that trials ran on.
-        confirm: Those of the choice.
+        confirm: Those of the choice; where nothing is held out they judged it.
         held_out: Those that judged it.
         recorded: Recordings that it was checked on.
         seen: Splits with scenes that the network behind the masks was trained on, see
@@ -239,8 +142,9 @@ class StudySummary(Record):
     candidates: list[Candidate]
     verdict: Verdict
     conclusion: str
-    p_value: float | None = None
-    shipped: dict[str, Ratio] = Field(default_factory=dict)
+    none_better_by: float | None = None
+    bounded_trials: int = 0
+    shipped: dict[str, PairedRatio] = Field(default_factory=dict)
     importances: dict[str, Importance] = Field(default_factory=dict)
     tune: list[str] = Field(default_factory=list)
     confirm: list[str] = Field(default_factory=list)
@@ -249,175 +153,163 @@ class StudySummary(Record):
     seen: list[str] = Field(default_factory=list)
 
     @property
-    def keeps_default(self) -> bool:
-        """Whether the default settings, which are not the baseline, are as good as the best trial."""
-        return beside_default(self.baseline, self.shipped, self.best).endswith("keep them.")
-
-    @property
     def best(self) -> Candidate | None:
         """The best candidate; None if no trial with other settings came to its end."""
         return self.candidates[0] if self.candidates else None
 
+    @property
+    def keeps_default(self) -> bool:
+        """Whether the default settings, which are not the baseline, are as good as the best trial."""
+        default = self.shipped.get("held_out" if self.held_out else "confirm")
+        best = None if self.best is None else self.best.evidence
+        return _is_as_good(default, best)
 
-def judge(
+    @property
+    def is_to_use(self) -> bool:
+        """Whether the best trial's settings are a result to use."""
+        return self.verdict is Verdict.PROVEN and not self.keeps_default
+
+
+def _is_as_good(default: PairedRatio | None, best: PairedRatio | None) -> bool:
+    if default is None or best is None or default.ratio is None or best.ratio is None:
+        return False
+    return default.ratio <= best.ratio
+
+
+# The verdict on the best candidate, and the sentences that say it.
+
+
+def judge(best: Candidate | None) -> tuple[Verdict, list[str]]:
+    """The verdict on the best candidate, and short sentences with its numbers, without their full stops.
+
+    `evaluation.verdicts.verdict_of` decides on the judging scenes. Beside that a candidate that violates
+    a constraint when it is run again, or is not shown to be as accurate where a study is after something
+    else, is not *proven*.
+    """
+    if best is None:
+        return Verdict.CANNOT_TELL, ["no trial with other settings came to its end"]
+    name = f"trial {best.trial}"
+    if best.failed:
+        return Verdict.CANNOT_TELL, [f"{name} failed when it was run again: {best.failed}"]
+    evidence = best.evidence
+    if evidence is None:
+        no_frames = f"no frames are left to judge {name} on; name some as held_out"
+        return Verdict.CANNOT_TELL, [no_frames]
+    verdict = verdict_of(evidence)
+    sentences = findings(evidence, name)
+    if not best.feasible:
+        if verdict in OFFERED:
+            verdict = Verdict.CANNOT_TELL
+        return verdict, [f"{name} violates a constraint when it is run again", *sentences]
+    if verdict is Verdict.PROVEN and not best.as_accurate:
+        accuracy = (best.on_held_out or best.on_confirm).get("accuracy")
+        limit = 1 + (best.ate_margin or 0.0)
+        verdict = Verdict.PROMISING
+        sentences.append(
+            f"It is not shown to be as accurate: {accuracy}, whose upper end has to lie below {limit:.2f}"
+        )
+    return verdict, sentences
+
+
+def conclude(
+    spec: StudySpec,
     candidates: Sequence[Candidate],
-    p_value: float | None = None,
+    trials: Sequence[Mapping[str, float]] = (),
+    *,
+    shipped: PairedRatio | None = None,
     failures: Sequence[str] = (),
+    families: str = "",
 ) -> tuple[Verdict, str]:
-    """The verdict on the first, best candidate, and a few short sentences with its numbers.
-
-    *Proven*: it was chosen, the whole interval on held-out scenes lies below 1, nothing is lost of accuracy where that
-    is asked, and recordings are not worse. *Worse*: an interval lies above 1, a constraint fails,
-    or the settings matter and the estimate is not below 1. *Does not matter here*: the trials
-    differ by no more than chance (`objectives.spread_test`), or the whole interval lies above 1 -
-    `NEGLIGIBLE`, or the estimate does and nothing was chosen. *Promising* is what is left.
+    """The verdict of a study and its conclusion: a few short sentences.
 
     Args:
+        spec: The study.
         candidates: The best one first.
-        p_value: Of `objectives.spread_test`.
+        trials: Log ratio by scene of each trial beside the baseline's.
+        shipped: The default settings on the judging scenes, where the baseline is something else.
         failures: Why trials failed, said where no trial did better.
+        families: A sentence on the families that judged; empty for none.
     """
-    verdict, text = _judged(candidates, p_value)
-    if not candidates and failures:
-        text += f"; {len(failures)} failed, the first one as {failures[0]}"
+    best = candidates[0] if candidates else None
+    verdict, sentences = judge(best)
+    if best is None and failures:
+        sentences.append(f"{len(failures)} failed, the first one as {failures[0]}")
+    if families and best is not None and best.evidence is not None:
+        sentences.append(families)
+
+    # where nothing is claimed: what the trials exclude, and what would settle it
+    if verdict not in (Verdict.PROVEN, Verdict.BUT_LOST) and (bound := largest_gain(trials)):
+        gain, count = bound
+        sentences.append(
+            f"None of the {count} trials with {FEWEST} scenes or more is better by more than {100 * gain:.0f} %"
+        )
+    if verdict in (Verdict.PROMISING, Verdict.CANNOT_TELL) and best is not None:
+        sentences += _settling(spec, best)
+
+    # beside another baseline, what the default settings reach
+    if shipped is not None and best is not None and best.evidence is not None:
+        keep = ", so keep them" if _is_as_good(shipped, best.evidence) else ""
+        baseline = spec.baseline
+        sentences.append(
+            f"Ratios are to {baseline}; the default settings have {shipped} there{keep}"
+        )
+    text = ". ".join([sentences[0], *(line[0].upper() + line[1:] for line in sentences[1:])])
     return verdict, f"{verdict.value.capitalize()}: {text}."
 
 
-def _judged(candidates: Sequence[Candidate], p_value: float | None) -> tuple[Verdict, str]:
-    if not candidates:
-        return Verdict.NOT_JUDGED, "no trial with other settings came to its end"
-    best = candidates[0]
-    name = f"trial {best.trial}"
-    ratio = best.evidence
-    if best.failed:
-        return Verdict.NOT_JUDGED, f"{name} failed when it was run again: {best.failed}"
-    if ratio is None or best.confirm is None:
-        return Verdict.NOT_JUDGED, f"no frames are left to confirm {name} on; name some as confirm"
-    if ratio.sequences < FEWEST_SCENES:
-        return (
-            Verdict.NOT_JUDGED,
-            f"{name} has {ratio} on {_scenes(ratio)} only, and {FEWEST_SCENES} are the fewest",
-        )
-    numbers = f"{ratio} on {_scenes(ratio)} that no trial saw"
-    numbers += (
-        f" (where it was chosen {', '.join(map(str, best.on_confirm.values()))})"
-        if best.ate_margin
-        else ""
-    )
-    gain = f"{100 * (1 - ratio.ratio):.1f} % less {ratio.what}: {numbers}"
-    no_better = f"the best, {name}, is not better than the baseline: {numbers}"
-    unsettled = _unsettled(best)
-    p = math.nan if p_value is None else p_value
-    low = math.nan if ratio.low is None else ratio.low
-    # over starts, if need be
-    recorded_low = 0.0 if best.recorded is None else best.recorded.low or 0.0
-    by_chance = p > MATTER_LEVEL and (not best.chosen or ratio.ratio >= 1) and not ratio.shows_gain
-    small = ratio.ratio > 1 - NEGLIGIBLE and not best.chosen and not ratio.shows_gain
-    verdicts = (
-        (
-            not best.feasible,
-            Verdict.WORSE,
-            f"{name} violates a constraint when it is run again ({numbers})",
-        ),
-        (recorded_low > 1, Verdict.WORSE, f"{name} has {best.recorded} on recordings ({numbers})"),
-        (
-            ratio.shows_loss,
-            Verdict.WORSE,
-            f"{name} has {100 * (ratio.ratio - 1):.1f} % more {ratio.what}: {numbers}",
-        ),
-        (not unsettled, Verdict.PROVEN, f"{name} has {gain}"),
-        (
-            by_chance,
-            Verdict.NO_MATTER,
-            f"the trials differ by no more than chance (F-test over trials and scenes, p = {p:.2f}, level "
-            f"{MATTER_LEVEL}). The best, {name}, has {numbers}",
-        ),
-        (
-            1 - NEGLIGIBLE < low and ratio.ratio < 1,
-            Verdict.NO_MATTER,
-            f"the best, {name}, gains at most {100 * (1 - low):.1f} %: {numbers}",
-        ),
-        (
-            ratio.ratio >= 1 and p_value is None,
-            Verdict.NOT_JUDGED,
-            f"{no_better}. One trial or one scene cannot tell whether settings matter",
-        ),
-        (ratio.ratio >= 1, Verdict.WORSE, f"the settings matter, but {no_better}"),
-        (small, Verdict.NO_MATTER, f"the best, {name}, has perhaps {gain}. {_NOT_WORTH}"),
-        (
-            True,
-            Verdict.PROMISING,
-            f"{name} has perhaps {gain}. It is not proven: {unsettled}. {_more_scenes(best, ratio)}",
-        ),
-    )
-    return next((verdict, text) for holds, verdict, text in verdicts if holds)
+_TOO_MANY = 1000
+"""Scenes above which nobody would settle a question."""
 
 
-_NOT_WORTH = f"A gain below {100 * NEGLIGIBLE:.0f} % is not worth more scenes"
+def _settling(spec: StudySpec, best: Candidate) -> list[str]:
+    """How many scenes would settle it, the command, and how long that runs; empty where nobody can tell."""
+    evidence = best.evidence
+    if evidence is None or best.failed or not best.feasible:
+        return []
+    needed = scenes_to_settle(evidence)
+    if needed is None:
+        return [f"Name {FEWEST} held-out scenes at least to learn more"]
+    if needed > _TOO_MANY:
+        return [f"More than {_TOO_MANY} scenes would be needed to settle it"]
+    more = max(1, needed - evidence.scenes)
+    minutes = max(1, math.ceil(more * best.scene_s / 60))
+    planned = [scenes_judged for scenes_judged in LOOKS if scenes_judged > evidence.all_scenes]
+    if spec.extendable and planned:
+        step = planned[0] - evidence.all_scenes
+        command = f"dynslam-bench tune extend STUDY.toml --scenes {step}"
+        return [f"About {needed} scenes would settle it, {minutes} min of runs: {command}"]
+    new_study = "a new study with other held-out scenes, or one that is extendable"
+    return [f"About {needed} scenes would settle it ({minutes} min more of runs): {new_study}"]
 
 
-def _more_scenes(best: Candidate, ratio: Ratio) -> str:
-    """How many more scenes would settle a promising candidate."""
-    if best.confirm is None or best.confirm.ratio >= 1:
-        return f"As it has {best.confirm} where it was chosen, nobody can tell how many more scenes would settle it"
-    if ratio.ratio > 1 - NEGLIGIBLE:
-        return _NOT_WORTH
-    missing = max(part.missing for part in ([ratio] if best.chosen else [ratio, best.confirm]))
-    return f"About {missing} more scene{'s' * (missing != 1)} would settle it"
+def families_sentence(design: Any) -> str:
+    """On which families a study judges, and whether its trials saw other scenes of them."""
+    judging = _families(design.judging)
+    tuned = _families([*design.tune, *(design.confirm if design.held_out else ())])
+    names = f"{len(judging)} famil{'y' if len(judging) == 1 else 'ies'} ({', '.join(judging[:8])})"
+    if set(judging) <= set(tuned):
+        return f"This holds on these {names}, of which trials saw other scenes"
+    if set(judging).isdisjoint(tuned):
+        return f"It was judged on {names} that no trial saw"
+    return f"It was judged on {names}, of some of which trials saw other scenes"
 
 
-def beside_default(baseline: str, shipped: Mapping[str, Ratio], best: Candidate | None) -> str:
-    """What the default settings reach where the baseline is something else; empty if it is not.
-
-    Args:
-        baseline: What ratios are to, in words.
-        shipped: The default settings beside it, by split.
-        best: The best candidate.
-    """
-    split = "held_out" if "held_out" in shipped else "confirm"
-    default = shipped.get(split)
-    mine = getattr(best, split, None)
-    if default is None or mine is None:
-        return ""
-    keep = ", so keep them" if default.ratio <= mine.ratio else ""
-    return f" Ratios are to {baseline}; the default settings have {default} there{keep}."
+def _families(instances: Sequence[ProblemInstance]) -> list[str]:
+    return list(dict.fromkeys(family_of(instance.sequence) for instance in instances))
 
 
-def _unsettled(best: Candidate) -> str:
-    """Why the best candidate is not proven; empty if it is."""
-    as_accurate = best.nothing_lost(best.on_confirm) and best.nothing_lost(
-        best.on_held_out or best.on_confirm
-    )
-    held = best.held_out
-    reasons = {
-        f"it is not shown to be as accurate (the bound has to lie below {1 + (best.ate_margin or 0.0):.2f})": (
-            not as_accurate
-        ),
-        f"its upper bound {_bound(best.confirm):.3f} where it was chosen is not below 1": not best.chosen,
-        f"fewer than {FEWEST_SCENES} held-out scenes were given to prove it on": (
-            held is None or held.sequences < FEWEST_SCENES
-        ),
-        "the interval is not below 1": held is not None and not held.shows_gain,
-    }
-    return next((reason for reason, holds in reasons.items() if holds), "")
-
-
-def _scenes(ratio: Ratio) -> str:
-    return f"{ratio.sequences} scene{'s' * (ratio.sequences != 1)}"
-
-
-def _bound(ratio: Ratio | None) -> float:
-    return math.inf if ratio is None or ratio.bound is None else ratio.bound
+# Running the best trials again.
 
 
 def finish(
     tuner: Study, on_note: Callable[[str], None] | None = None, *, jobs: int = 1
 ) -> StudySummary:
-    """Judge the best trials on the `confirm` instances and the best of them on the others; write preset and summary.
+    """Judge the best trial on scenes that it was not chosen on; write preset and summary.
 
-    The best has the smallest upper confidence bound of its ratio to the baseline on `confirm`,
-    allowing for the number of candidates; where that bound lies below 1 it is the choice. The
-    held-out split and the recordings only judge.
+    Where a study has both `confirm` and held-out instances, the best `top` trials are ranked on `confirm`
+    by their mean log ratio, those that fulfil the constraints first. Else the trials' own values rank
+    them, and the instances there are judge. Ranking needs no significance: a wrong choice costs power,
+    never a false claim, since other scenes judge.
 
     Args:
         tuner: A study with finished trials.
@@ -433,45 +325,40 @@ def finish(
     spec = tuner.spec
     design = tuner.design
     note = on_note or (lambda _: None)
-    finished = best_trials(tuner.study, spec.top + 1)
-    if not finished:
-        raise StudyError(
-            f"study '{spec.name}' has no finished trial",
-            "run it first, or see why its trials failed",
-        )
-    # then trial 0, the default settings, is a candidate too
-    is_rival = tuner.baseline.tracker != spec.tracker
-    margin = spec.ate_margin if spec.at_equal_accuracy else None
-    shipped = dict[str, Ratio]()
-    candidates = [
-        Candidate(
-            trial=trial.number,
-            params=trial.params,
-            values=list(trial.values or ()),
-            ate_margin=margin,
-        )
-        for trial in finished
-        if trial.number > 0 or is_rival
-    ][: spec.top]
-    if candidates and design.confirm:
+    shipped = dict[str, PairedRatio]()
+
+    # candidates, ranked
+    candidates = _best_trials(tuner)
+    chooses = bool(design.confirm and design.held_out)
+    if candidates and chooses:
         note(
-            f"the baseline and {len(candidates)} trials on {len(design.confirm)} instances that no trial has seen"
+            f"the baseline and {len(candidates)} trials on {len(design.confirm)} instances to choose on"
         )
-    candidates = _judge(tuner, "confirm", candidates, jobs, shipped)
-    candidates.sort(
-        key=lambda candidate: (candidate.bound, bool(candidate.failed), not candidate.feasible)
+        candidates = _run_again(tuner, "confirm", candidates, jobs, shipped)
+        candidates.sort(key=_rank_by_choice)
+    else:
+        candidates = candidates[:1]
+
+    # the best one is judged
+    if candidates and design.judging and not candidates[0].failed:
+        split = "held_out" if design.held_out else "confirm"
+        note(f"trial {candidates[0].trial} on {len(design.judging)} instances that judge it")
+        candidates[:1] = _run_again(tuner, split, candidates[:1], jobs, shipped)
+        if not candidates[0].failed:
+            candidates[:1] = _run_again(tuner, "recorded", candidates[:1], jobs, shipped)
+
+    # what that says
+    trials = [ratios for number, ratios in scene_ratios(tuner.study).items() if number > 0]
+    failed = tuner.study.get_trials(states=(TrialState.FAIL,))
+    verdict, conclusion = conclude(
+        spec,
+        candidates,
+        trials,
+        shipped=shipped.get("held_out" if design.held_out else "confirm"),
+        failures=[trial.user_attrs.get("reason", "") for trial in failed],
+        families=families_sentence(design) if design.judging else "",
     )
-    if candidates and design.confirm and not candidates[0].failed:
-        note(f"trial {candidates[0].trial} on the held-out instances")
-        for split in ("held_out", "recorded"):
-            candidates[:1] = _judge(tuner, split, candidates[:1], jobs, shipped)
-    p_value = spread_test(list(scene_ratios(tuner.study).values()))
-    reasons = [
-        trial.user_attrs.get("reason", "")
-        for trial in tuner.study.get_trials(states=(TrialState.FAIL,))
-    ]
-    verdict, conclusion = judge(candidates, p_value, reasons)
-    conclusion += beside_default(spec.baseline, shipped, candidates[0] if candidates else None)
+    bound = largest_gain(trials)
     summary = StudySummary(
         name=spec.name,
         tracker=spec.tracker,
@@ -481,7 +368,8 @@ def finish(
         candidates=candidates,
         verdict=verdict,
         conclusion=conclusion,
-        p_value=p_value,
+        none_better_by=bound[0] if bound else None,
+        bounded_trials=bound[1] if bound else 0,
         shipped=shipped,
         importances=importances(tuner.study),
         confirm=list(map(str, design.confirm)),
@@ -490,21 +378,51 @@ def finish(
         tune=list(map(str, design.tune)),
         seen=splits_seen(tuner.defaults, design),
     )
-    preset = preset_text(
-        spec,
-        summary.best.params if summary.best else {},
-        " ".join(filter(None, (conclusion, seen_note(summary.seen)))),
-        status=verdict.value,
-        tuned_on=[*summary.tune, *summary.confirm],
-        judged_on=[*summary.held_out, *summary.recorded],
-    )
-    write_atomic(tuner.folder / "best.toml", preset)
-    write_atomic(tuner.folder / "summary.json", summary.to_json())
+    _write(tuner, summary)
     return summary
 
 
-def _judge(
-    tuner: Study, split: str, candidates: Sequence[Candidate], jobs: int, shipped: dict[str, Ratio]
+def _best_trials(tuner: Study) -> list[Candidate]:
+    """The best trials with other settings than the baseline's, as far as the study asks for them.
+
+    Raises:
+        StudyError: No trial has finished.
+    """
+    spec = tuner.spec
+    finished = best_trials(tuner.study, spec.top + 1)
+    if not finished:
+        raise StudyError(
+            f"study '{spec.name}' has no finished trial",
+            "run it first, or see why its trials failed",
+        )
+    # beside another tracker trial 0, the default settings, is a candidate too
+    is_rival = tuner.baseline.tracker != spec.tracker
+    margin = spec.ate_margin if spec.at_equal_accuracy else None
+    candidates = [
+        Candidate(
+            trial=trial.number,
+            params=trial.params,
+            values=list(trial.values or ()),
+            ate_margin=margin,
+        )
+        for trial in finished
+        if trial.number > 0 or is_rival
+    ]
+    return candidates[: spec.top]
+
+
+def _rank_by_choice(candidate: Candidate) -> tuple[bool, bool, float]:
+    """Those that ran and fulfil the constraints first, then by their value on the instances of the choice."""
+    value = math.inf if candidate.choice is None else candidate.choice
+    return bool(candidate.failed), not candidate.feasible, value
+
+
+def _run_again(
+    tuner: Study,
+    split: str,
+    candidates: Sequence[Candidate],
+    jobs: int,
+    shipped: dict[str, PairedRatio],
 ) -> list[Candidate]:
     """Candidates beside the baseline on the instances of a split; `shipped` gains the shipped default's ratio there.
 
@@ -515,6 +433,9 @@ def _judge(
     if not instances or not candidates:
         return list(candidates)
     objective = ACCURACY if split == "recorded" else combined_objective(tuner.objectives)
+    level = (
+        tuner.spec.level(len(scenes(tuner.design.judging))) if split != "recorded" else ONE_SIDED
+    )
     tuned = [
         Configuration(tuner.spec.tracker, {**tuner.held, **candidate.params})
         for candidate in candidates
@@ -522,25 +443,58 @@ def _judge(
     default = [] if tuner.shipped is None else [tuner.shipped]
     baseline, runs = tuner.evaluate_beside([*tuned, *default], instances, jobs=jobs)
     if default and not isinstance(outcomes := runs.pop(), InstanceFailedError):
-        shipped[split] = compared(outcomes, baseline, objective=objective)
-    judged = []
-    for candidate, outcomes in zip(candidates, runs, strict=True):
-        update: dict[str, Any] = {"failed": str(outcomes), "feasible": False}
-        if not isinstance(outcomes, InstanceFailedError):
-            update = {
-                split: compared(outcomes, baseline, objective=objective, candidates=len(candidates))
-            }
-            if split != "recorded":
-                update[f"on_{split}"] = {
-                    one.name: compared(outcomes, baseline, objective=one)
-                    for one in (ACCURACY, SPEED)
-                }
-            if split == "confirm":
-                update["feasible"] = all(
-                    value <= 0 for value in violations(tuner.spec, outcomes).values()
-                )
-        judged.append(candidate.model_copy(update=update))
-    return judged
+        shipped[split] = compare(outcomes, baseline, objective=objective, one_sided=level)
+    return [
+        _judged_on(tuner, split, candidate, outcomes, baseline, level)
+        for candidate, outcomes in zip(candidates, runs, strict=True)
+    ]
+
+
+def _judged_on(
+    tuner: Study,
+    split: str,
+    candidate: Candidate,
+    outcomes: Outcomes | InstanceFailedError,
+    baseline: Outcomes,
+    level: float,
+) -> Candidate:
+    """A candidate with what its runs on a split came to."""
+    if isinstance(outcomes, InstanceFailedError):
+        return candidate.model_copy(update={"failed": str(outcomes), "feasible": False})
+    objective = ACCURACY if split == "recorded" else combined_objective(tuner.objectives)
+    update: dict[str, Any] = {
+        split: compare(outcomes, baseline, objective=objective, one_sided=level)
+    }
+    if split == "recorded":
+        return candidate.model_copy(update=update)
+    update[f"on_{split}"] = {
+        each.name: compare(outcomes, baseline, objective=each, one_sided=level)
+        for each in (ACCURACY, SPEED)
+    }
+    violated = violations(tuner.spec, outcomes)
+    update["feasible"] = candidate.feasible and max(violated.values(), default=0.0) <= 0.0
+    if split == "confirm":
+        update["choice"] = objective.value(outcomes, baseline)
+    wall_s = sum(run.wall_s for run in (*outcomes.values(), *baseline.values()))
+    update["scene_s"] = wall_s / len(scenes(outcomes))
+    return candidate.model_copy(update=update)
+
+
+def _write(tuner: Study, summary: StudySummary) -> None:
+    """Write `best.toml` and `summary.json` into the study's folder."""
+    params = summary.best.params if summary.best else {}
+    offered = summary.verdict in OFFERED
+    preset = preset_text(
+        tuner.spec,
+        params if offered else {},
+        " ".join(filter(None, (summary.conclusion, seen_note(summary.seen)))),
+        status=summary.verdict.value,
+        tuned_on=[*summary.tune, *(summary.confirm if summary.held_out else [])],
+        judged_on=[*(summary.held_out or summary.confirm), *summary.recorded],
+        not_offered={} if offered else params,
+    )
+    write_atomic(tuner.folder / "best.toml", preset)
+    write_atomic(tuner.folder / SUMMARY_FILE, summary.to_json())
 
 
 def read_preset_text(
@@ -580,9 +534,10 @@ def preset_text(
     tuned: Mapping[str, Any],
     remark: str,
     *,
-    status: str = Verdict.NOT_JUDGED.value,
+    status: str = NOT_JUDGED,
     tuned_on: Sequence[str] = (),
     judged_on: Sequence[str] = (),
+    not_offered: Mapping[str, Any] | None = None,
 ) -> str:
     """TOML text of tuned settings: their status, then a dotted name and its value a line under ``[settings]``.
 
@@ -596,23 +551,27 @@ def preset_text(
         status: The verdict on them.
         tuned_on: Instances that trials and choice saw.
         judged_on: Instances that judged.
+        not_offered: Settings of the best trial where the verdict recommends none: comments.
     """
     fixed = spec.space.fixed
-    remarks = {
-        remark: True,
-        f"Tuned on {_listed(tuned_on)}.": tuned_on,
-        f"Judged on {_listed(judged_on)}.": judged_on,
-        f"Fixed in that study, not part of these settings: {', '.join(_lines(fixed))}.": fixed,
-    }
-    shown = [
-        f"# {line}" for text, holds in remarks.items() if holds for line in textwrap.wrap(text, 100)
-    ]
+    remarks = [remark]
+    if tuned_on:
+        remarks.append(f"Tuned on {_listed(tuned_on)}.")
+    if judged_on:
+        remarks.append(f"Judged on {_listed(judged_on)}.")
+    if fixed:
+        names = ", ".join(_lines(fixed))
+        remarks.append(f"Fixed in that study, not part of these settings: {names}.")
+    if not_offered:
+        names = ", ".join(_lines(not_offered))
+        remarks.append(f"The best trial's settings, which are no result to use: {names}.")
+    comments = [f"# {line}" for text in remarks for line in textwrap.wrap(text, 100)]
     settings = {
         name: value for name, value in {**held_settings(spec), **tuned}.items() if name not in fixed
     }
     head = [
         f"# settings of {spec.tracker}",
-        *shown,
+        *comments,
         "",
         f"status = {json.dumps(status)}",
         "",

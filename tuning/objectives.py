@@ -2,12 +2,10 @@
 
 A configuration runs on each instance in its own process; the run store makes no run twice. All
 objectives are natural logarithms of ratios to the baseline: less is better, 0 is the baseline's
-own. Below them the statistics of such ratios: interval, power, and the test of whether settings
-matter at all.
+own. Below them configurations are compared over scenes; what that shows is said by `evaluation.verdicts`.
 """
 
 import math
-from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -15,10 +13,16 @@ from statistics import fmean
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import stats
 
 from dynslam_bench.core import StudyError, did_you_mean
 from dynslam_bench.evaluation import Protocol, get_protocol
+from dynslam_bench.evaluation.verdicts import (
+    FEWEST,
+    ONE_SIDED,
+    PairedRatio,
+    hodges_lehmann,
+    paired_ratio,
+)
 from dynslam_bench.reports.model.row import grouped
 from dynslam_bench.runs import RunRecord, RunStore, score
 from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec, scenes
@@ -38,6 +42,8 @@ class Outcome:
             is done elsewhere (a foreign program, a GPU). Unlike `frame_s` it hardly depends on what
             else the machine does.
         rtf: Real-time factor: duration of the instance's frames over the time they took.
+        lost: Whether the run lost track, as its status says, or tracked nothing.
+        wall_s: Seconds of the whole run.
     """
 
     instance: ProblemInstance
@@ -47,6 +53,8 @@ class Outcome:
     frame_s: float
     processor_s: float
     rtf: float
+    lost: bool = False
+    wall_s: float = 0.0
 
 
 class Configuration(NamedTuple):
@@ -97,7 +105,15 @@ def outcome(
     period = record.sequence.duration_s / max(record.sequence.frames - 1, 1)
     rtf = period / total.mean_s
     return Outcome(
-        instance, record.run_id, ate, record.coverage or 0.0, total.mean_s, processor.mean_s, rtf
+        instance,
+        record.run_id,
+        ate,
+        record.coverage or 0.0,
+        total.mean_s,
+        processor.mean_s,
+        rtf,
+        lost=record.status == "lost" or evaluation is None,
+        wall_s=record.wall_s or 0.0,
     )
 
 
@@ -171,18 +187,20 @@ class Objective:
         Raises:
             StudyError: None of the instances counts.
         """
-        counted = self.counted(self.ratios(outcomes, baseline).values())
+        counted = self.counted(self.ratios(outcomes, baseline))
         if not counted:
             raise StudyError(
                 f"objective '{self.name}' counts degraded instances alone, but none of the study's is",
                 'name some, e.g. "synthetic/walking_xyz?scene=0-3&frames=80&degrade=blur:0.5"',
             )
-        return centre(counted)
+        return centre(counted.values())
 
-    def counted(self, ratios: Iterable[float]) -> list[float]:
-        """Those scenes' ratios that the value is the centre of."""
-        ranked = sorted(ratios, reverse=True)
-        return ranked[: max(1, round(WORST_SHARE * len(ranked)))] if self.worst else ranked
+    def counted(self, ratios: Mapping[str, float]) -> dict[str, float]:
+        """Those scenes' ratios that the value is the mean of: all, or the worst ones."""
+        if not self.worst:
+            return dict(ratios)
+        ranked = sorted(ratios.items(), key=lambda scene: scene[1], reverse=True)
+        return dict(ranked[: max(1, round(WORST_SHARE * len(ranked)))])
 
     def counts(self, instance: ProblemInstance) -> bool:
         """Whether an instance counts."""
@@ -288,16 +306,10 @@ def violations(
     return values
 
 
-# Comparing a configuration with the baseline: paired by place, robust to single runs, with
-# intervals that cover.
+# Comparing a configuration with the baseline: paired by place, one value a scene.
 
 FLOOR_M = 1e-4
 """Errors below a tenth of a millimetre count as that: a ratio of two perfect runs tells nothing."""
-FEWEST_SCENES = 3
-"""With fewer scenes an interval over scenes means nothing."""
-TRIMMED = 0.1
-"""This share of the scenes is left out at either end (none below ten): one catastrophe decides nothing."""
-
 Errors = Mapping[ProblemInstance, float]
 """ATE in metres on each instance, lost frames held."""
 
@@ -341,95 +353,60 @@ def log_errors(errors: Errors) -> dict[ProblemInstance, list[float]]:
 
 
 def centre(values: Iterable[float]) -> float:
-    """Trimmed mean; the mean of fewer than ten."""
-    ranked = sorted(values)
-    cut = int(TRIMMED * len(ranked))
-    return fmean(ranked[cut : len(ranked) - cut])
+    """Mean of log ratios over scenes, which a search makes small: losses count in full."""
+    return fmean(values)
 
 
-def bounds(values: Iterable[float], confidence: float = 0.95) -> tuple[float, float]:
-    """Confidence interval of the centre: Student's, of the trimmed mean (Tukey and McLaughlin 1963) from ten on.
-
-    Args:
-        values: One a scene, two or more, taken as independent.
-        confidence: Of both sides together.
-    """
-    sample = np.sort(list(values))
-    cut = int(TRIMMED * len(sample))
-    count = len(sample)
-    kept = count - 2 * cut
-    winsorised = np.clip(sample, sample[cut], sample[-1 - cut])
-    error = float(winsorised.std(ddof=1)) * math.sqrt(count) / kept
-    half = float(stats.t.ppf(0.5 + confidence / 2, kept - 1)) * error
-    middle = centre(sample)
-    return middle - half, middle + half
+def lost_scenes(outcomes: Outcomes) -> set[str]:
+    """Scenes in which at least half of a configuration's starts were lost."""
+    return {
+        scene
+        for scene, instances in scenes(outcomes).items()
+        if 2 * sum(outcomes[instance].lost for instance in instances) >= len(instances)
+    }
 
 
-# What scenes can show.
-
-_POWER = 0.8
-_MOST_SCENES = 100_000
-
-
-def detectable(spread: float, count: int) -> float:
-    """Smallest gain, as a share, that so many scenes tell from nothing in four of five studies; 1 for fewer than two.
+def compare(
+    outcomes: Outcomes,
+    baseline: Outcomes,
+    *,
+    objective: Objective = ACCURACY,
+    one_sided: float = ONE_SIDED,
+) -> PairedRatio:
+    """A configuration beside the baseline on the same instances; the starts of a scene give its one value.
 
     Args:
-        spread: Standard deviation over scenes of the log ratio.
-        count: Scenes.
+        outcomes: Of the configuration.
+        baseline: Of the baseline.
+        objective: What is compared.
+        one_sided: Level of a claim.
     """
-    if count < 2:
-        return 1.0
-    factor = stats.t.ppf(0.975, count - 1) + stats.t.ppf(_POWER, count - 1)
-    return float(1 - math.exp(-factor * spread / math.sqrt(count)))
-
-
-def scenes_needed(gain: float, spread: float) -> int:
-    """The fewest scenes that tell a gain from nothing, at most `_MOST_SCENES`; see `detectable`."""
-    return 2 + bisect_left(
-        range(2, _MOST_SCENES), True, key=lambda count: detectable(spread, count) <= gain
+    ratios = objective.counted(objective.ratios(outcomes, baseline))
+    return paired_ratio(
+        ratios,
+        lost_scenes(outcomes) & ratios.keys(),
+        lost_scenes(baseline) & ratios.keys(),
+        one_sided=one_sided,
+        runs=len(outcomes),
+        what=objective.what,
     )
 
 
-MATTER_LEVEL = 0.01
-"""Level of `spread_test`. Pruning depends on the values, so the test finds a difference where there is none more often
-(`tests/benchmarks/study_null.py`)."""
+def largest_gain(trials: Iterable[Mapping[str, float]]) -> tuple[float, int] | None:
+    """By how much none of several trials is better than the baseline, as a share, and of how many that holds.
 
-
-def spread_test(trials: Sequence[Mapping[str, float]]) -> float | None:
-    """Whether trials differ by more than chance: the p-value of an F-test for trials x scenes (additive model).
-
-    Chance is what is left of the log ratios once each trial and each scene has its mean: the
-    scatter between starts, and what any change does to one scene but not to another. Pruned trials
-    count with the scenes that they ran on.
+    Each trial has a 95 % bound of its own. That none is better by more than the largest of these bounds is
+    false in at most 5 %, however many trials there are (intersection-union test, Berger 1982).
 
     Args:
-        trials: Log ratio by scene of each trial.
+        trials: Log ratio by scene of each trial; those with fewer than `FEWEST` scenes have no bound.
 
     Returns:
-        Above `MATTER_LEVEL` the settings do not matter on these scenes; None with too few trials or
-        scenes for a test.
+        None where no trial has so many.
     """
-    names = sorted({scene for trial in trials for scene in trial})
-    cells = [
-        (row, names.index(scene), value)
-        for row, trial in enumerate(trials)
-        for scene, value in trial.items()
+    bounds = [
+        hodges_lehmann(list(ratios.values()), 0.90).low
+        for ratios in trials
+        if len(ratios) >= FEWEST
     ]
-    free = len(cells) - len(names) - len(trials) + 1
-    if len(trials) < 2 or free < 1:
-        return None
-    rows, columns, values = (np.array(column) for column in zip(*cells, strict=True))
-    by_scene = np.eye(len(names))[columns]
-    by_trial = np.eye(len(trials))[rows]
-    left, chance = (
-        float(np.square(values - model @ np.linalg.lstsq(model, values)[0]).sum())
-        for model in (by_scene, np.hstack([by_scene, by_trial]))
-    )
-    explained = max(0.0, left - chance) / (len(trials) - 1)
-    ratio = explained / max(chance / free, _SAME)
-    return 1.0 if explained < _SAME else float(stats.f.sf(ratio, len(trials) - 1, free))
-
-
-_SAME = 1e-18
-"""Variances below this are rounding."""
+    return (max(0.0, -math.expm1(min(bounds))), len(bounds)) if bounds else None

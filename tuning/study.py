@@ -87,6 +87,8 @@ _NAMES_S = 0.2
 _BEGINNING_S = 10.0
 _PRUNED_AFTER = "pruned_after"
 """User attribute: after how many instances the pruner ended a trial. Optuna's pruner gives its answer once."""
+SUMMARY_FILE = "summary.json"
+"""In a study's folder once it has its verdict."""
 CRASHED_WORKER = "worker ended in the middle of the trial"
 """Why earlier versions marked a trial as failed that is not counted as one; now it waits to be run again."""
 
@@ -197,17 +199,34 @@ class Study(Plan):
         return self.spec.trials + self.extension["trials"]
 
     def extend(self, *, scenes: int = 0, trials: int = 0) -> None:
-        """Ask for more trials, and for more rendered scenes to choose and to judge on.
+        """Ask for more trials, and for more rendered scenes to judge on.
 
         Raises:
-            StudyError: So many scenes cannot be made.
+            StudyError: So many scenes cannot be made; or the study has its verdict, and looking at it
+                again would claim falsely too often.
         """
+        if (self.folder / SUMMARY_FILE).is_file():
+            self._check_second_look(scenes, trials)
         total = {
             "scenes": self.extension["scenes"] + scenes,
             "trials": self.extension["trials"] + trials,
         }
         self.design = design_of(self.spec, further=total["scenes"])
         self.study.set_user_attr("extension", total)
+
+    def _check_second_look(self, scenes: int, trials: int) -> None:
+        """Refuse what would be judged on scenes that have judged already, unless the level was planned for it."""
+        name = self.spec.name
+        if trials:
+            raise StudyError(
+                f"study '{name}' has its verdict; {trials} more trials would be judged on the same scenes",
+                f'begin a new study with other held-out scenes and start = ["{self.folder}"]',
+            )
+        if scenes and not self.spec.extendable:
+            raise StudyError(
+                f"study '{name}' has its verdict and is not extendable: a second look would claim falsely too often",
+                "begin a new study with other held-out scenes, or with extendable = true",
+            )
 
     def run(self, *, jobs: int = 1, on_event: OnEvent | None = None) -> Study:
         """Run trials until the study has as many finished ones as it asks for.

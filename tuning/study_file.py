@@ -14,6 +14,7 @@ from pydantic import Field, field_validator
 from dynslam_bench.contracts import Sequence
 from dynslam_bench.core import SequenceError, StudyError, did_you_mean, read_toml, without_passwords
 from dynslam_bench.core.records import Record, validated
+from dynslam_bench.evaluation.verdicts import LOOKS, ONE_SIDED
 from dynslam_bench.reports.model.row import grouped
 from dynslam_bench.runs.spec import RunSpec
 from dynslam_bench.sequences import SequenceView
@@ -336,11 +337,14 @@ class StudySpec(Record, frozen=True):
             trials the sampler learns from.
         tune: Instances that trials run on, written as `parse_instances` reads them:
             ``synthetic/walking_xyz?scene=0-19&frames=80&offsets=0-4``.
-        confirm: Instances without a frame of `tune`. The best trials are judged again on them, and
-            one is chosen. Empty for further scenes of rendered sequences, and for the frames behind
+        confirm: Instances without a frame of `tune`, on which the `top` best trials are ranked once
+            more. Empty for none: the trials' own values rank them. Where nothing is held out these
+            instances judge, empty for further scenes of rendered sequences, and for the frames behind
             the named part of a recording.
         held_out: Instances that decide at the end whether tuning helped; neither trials nor the
             choice see them.
+        extendable: Whether scenes may be added after a verdict (12, 24, 36, 48 judge). Each look then
+            has a smaller level, so that all together claim falsely as rarely as a single one.
         recorded: Instances of recordings that the choice must not be worse on; None for the first
             frames of a held-out recording where one is present.
         space: Which settings are tuned.
@@ -356,7 +360,7 @@ class StudySpec(Record, frozen=True):
             draws nothing from it.
         offsets: Start offsets of the instances that name none: so many leading frames are left out.
         trials: Finished trials, trial 0 (the baseline's settings) included.
-        top: How many of the best configurations are judged again on `confirm`.
+        top: How many of the best configurations are ranked again on `confirm`.
         sampler: Who proposes settings.
         sampler_seed: Seed of the sampler.
         pruner: ``wilcoxon`` is Optuna's `WilcoxonPruner` over the single instances, ``halving`` its
@@ -378,6 +382,7 @@ class StudySpec(Record, frozen=True):
     tune: tuple[str, ...] = Field(min_length=1)
     confirm: tuple[str, ...] = ()
     held_out: tuple[str, ...] = ()
+    extendable: bool = False
     recorded: tuple[str, ...] | None = None
     space: SpaceSpec = SpaceSpec()
     objectives: tuple[str, ...] = Field(default=("accuracy",), min_length=1)
@@ -415,6 +420,10 @@ class StudySpec(Record, frozen=True):
             for text in texts
             for instance in parse_instances(text, offsets=self.offsets, seeds=self.seeds)
         ]
+
+    def level(self, judging: int) -> float:
+        """One-sided level of the claims of a study that so many scenes judge."""
+        return LOOKS.get(judging, ONE_SIDED) if self.extendable else ONE_SIDED
 
     @property
     def at_equal_accuracy(self) -> bool:

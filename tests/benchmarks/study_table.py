@@ -10,8 +10,8 @@ from dynslam_bench.tuning import StudySummary
 
 SPLITS = {"confirm": "choice", "held_out": "held out"}
 
-print("| study | settings, split | scenes | ATE over the baseline's | 95 % interval |")
-print("| --- | --- | --- | --- | --- |")
+print("| study | settings, split | scenes | typical ATE over the baseline's | interval | losses |")
+print("| --- | --- | --- | --- | --- | --- |")
 for name in sys.argv[2:]:
     summary = StudySummary.read(Path(sys.argv[1]) / "studies" / name / "summary.json")
     rows = {
@@ -21,7 +21,16 @@ for name in sys.argv[2:]:
     }
     for settings, ratios in (rows | {"shipped default": summary.shipped}).items():
         for split, ratio in ratios.items():
-            interval = f"{ratio.low:.3f} to {ratio.high:.3f}"
-            print(
-                f"| {name} | {settings}, {SPLITS[split]} | {ratio.sequences} | {ratio.ratio:.3f} | {interval} |"
-            )
+            if ratio is None or ratio.ratio is None:
+                continue
+            losses = f"{len(ratio.losses)} : {len(ratio.losses_baseline)}"
+            cells = [
+                name,
+                f"{settings}, {SPLITS[split]}",
+                ratio.scenes,
+                f"{ratio.ratio:.3f}",
+                ratio.interval,
+                losses,
+            ]
+            print(f"| {' | '.join(map(str, cells))} |")
+    print(f"\n{name}: {summary.conclusion}\n", file=sys.stderr)

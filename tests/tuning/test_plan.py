@@ -19,6 +19,7 @@ from optuna.trial import TrialState
 from dynslam_bench.cli.studies import status
 from dynslam_bench.core import DynslamError, StudyError, read_settings
 from dynslam_bench.core.settings import apply_overrides
+from dynslam_bench.evaluation.verdicts import LOOKS, ONE_SIDED, power
 from dynslam_bench.sequences.catalogue import open_sequence
 from dynslam_bench.sequences.view import part_of
 from dynslam_bench.trackers import TRACKERS
@@ -34,6 +35,7 @@ from dynslam_bench.tuning import (
 )
 from dynslam_bench.tuning.objectives import InstanceFailedError
 from dynslam_bench.tuning.plan import (
+    SPREAD,
     check_splits,
     design_of,
     seen_note,
@@ -70,7 +72,7 @@ def test_a_preview_takes_what_stored_runs_show_and_else_what_is_known(
 ) -> None:
     before = Plan(make(folders), tmp_path).preview()
     assert before.runs == 0
-    assert before.spread == pytest.approx(simulated.STARTS_SD, abs=0.05)
+    assert before.spread == pytest.approx(SPREAD)
     assert before.scenes == 3
     assert not (tmp_path / "studies").exists(), "looking makes no study"
     run_study(make(folders), results=tmp_path)
@@ -79,8 +81,25 @@ def test_a_preview_takes_what_stored_runs_show_and_else_what_is_known(
     assert after.spread != before.spread
     assert after.minutes != before.minutes
     assert after.unused == {}
-    assert "10 %" in after.figures[0]
+    assert "3 scenes judge this study; below 6 it claims nothing" in after.figures[0]
     assert "3 stored runs" in after.figures[0]
+    assert after.power == 0.0
+    assert f"{after.needed} held-out scenes" in after.figures[1]
+
+
+@pytest.mark.parametrize(("held_out", "extendable"), [("100-139", False), ("100-111", True)])
+def test_a_preview_states_power_at_the_level_of_the_study(
+    held_out: str, extendable: bool, tmp_path: Path
+) -> None:
+    spec = make_spec(
+        held_out=[f"{WALK}?scene={held_out}&frames=20&offsets=0"], extendable=extendable
+    )
+    preview = SimulatedTuner(spec, tmp_path).preview()
+    assert preview.scenes == (12 if extendable else 40)
+    assert preview.level == (LOOKS[12] if extendable else ONE_SIDED)
+    assert preview.power == pytest.approx(power(0.2, SPREAD, preview.scenes, preview.level))
+    assert (preview.power >= 0.8) is not extendable
+    assert ("A design that proves 20 %" in " ".join(preview.figures)) is extendable
 
 
 @pytest.mark.slow
@@ -116,7 +135,7 @@ def test_ratios_are_to_the_baseline_and_the_default_stands_beside(tmp_path: Path
         "trials build on it"
     )
     summary = finish(tuner)
-    assert set(summary.shipped) == {"confirm", "held_out"}
+    assert set(summary.shipped) == {"held_out"}
     assert summary.baseline == str(preset)
     assert summary.shipped["held_out"].ratio == pytest.approx(math.exp(valley({}) - 1.5), abs=0.1)
     assert summary.verdict == Verdict.PROVEN
@@ -132,9 +151,9 @@ def test_the_baseline_may_be_another_tracker(folders: list[str], tmp_path: Path)
     summary = finish(run_study(spec, results=tmp_path))
     assert summary.baseline == "never-move"
     assert summary.shipped["confirm"].ratio < 1
-    assert 0 in {candidate.trial for candidate in summary.candidates}, (
-        "the default settings compete with it"
-    )
+    ranked = best_trials(Study.open(spec, tmp_path).study, 1)
+    assert summary.best is not None
+    assert summary.best.trial == ranked[0].number, "the default settings compete with it"
     with pytest.raises(StudyError, match="stored with other baseline"):
         Study(spec.model_copy(update={"baseline": ""}), tmp_path)
 
@@ -221,17 +240,42 @@ def test_trials_may_be_asked_for_and_told_one_by_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_an_extended_study_goes_on_with_more_scenes_and_trials(tmp_path: Path) -> None:
+def test_a_study_without_a_verdict_goes_on_with_more_scenes_and_trials(tmp_path: Path) -> None:
     spec = make_spec(trials=4, pruner="none")
     SimulatedTuner(spec, tmp_path, effect=valley, in_memory=False).run().extend(scenes=3, trials=2)
     again = SimulatedTuner(spec, tmp_path, effect=valley, in_memory=False).run()
     assert len(again.study.get_trials()) == 6 == again.trials
-    summary = finish(again)
-    assert (len(summary.confirm), len(summary.held_out)) == ((18 + 3) * 2, (8 + 3) * 3)
-    again.extend(scenes=1)
     with pytest.raises(StudyError, match="further scenes cannot be made"):
         again.extend(scenes=200)
-    assert again.extension == {"scenes": 4, "trials": 2}
+    assert again.extension == {"scenes": 3, "trials": 2}
+    summary = finish(again)
+    assert (len(summary.confirm), len(summary.held_out)) == (0, (8 + 3) * 3)
+    with pytest.raises(StudyError, match="not extendable: a second look would claim falsely"):
+        again.extend(scenes=1)
+    with pytest.raises(StudyError, match="2 more trials would be judged on the same scenes"):
+        again.extend(trials=2)
+
+
+def test_an_extendable_study_has_a_level_for_each_of_its_looks(tmp_path: Path) -> None:
+    twelve = f"{WALK}?scene=100-111&frames=20&offsets=0"
+    spec = make_spec(trials=4, pruner="none", held_out=[twelve], extendable=True)
+    tuner = SimulatedTuner(spec, tmp_path, in_memory=False).run()
+    first = finish(tuner)
+    with pytest.raises(StudyError, match=r"19 scenes judge it"):
+        tuner.extend(scenes=7)
+    tuner.extend(scenes=12)
+    second = finish(tuner)
+    assert first.best is not None
+    assert second.best is not None
+    assert first.best.trial == second.best.trial
+    levels = [summary.best.held_out.one_sided for summary in (first, second)]
+    assert levels == [LOOKS[12], LOOKS[24]]
+    assert second.best.held_out.scenes == 24
+
+
+def test_an_extendable_study_begins_with_a_planned_number_of_scenes(tmp_path: Path) -> None:
+    with pytest.raises(StudyError, match=r"8 scenes judge it.*judge on 12, 24, 36, 48"):
+        SimulatedTuner(make_spec(extendable=True), tmp_path)
 
 
 def test_any_trial_is_a_preset(tmp_path: Path) -> None:
@@ -253,7 +297,7 @@ def test_a_study_whose_trials_all_fail_is_not_judged(folders: list[str], tmp_pat
         make(folders, start=[{"mode": "crash"}], space={"include": ["mode"]}), results=tmp_path
     )
     summary = finish(tuner)
-    assert summary.verdict == Verdict.NOT_JUDGED
+    assert summary.verdict == Verdict.CANNOT_TELL
     assert "no trial with other settings" in summary.conclusion
     assert read_settings(tuner.folder / "best.toml") == {}
     assert write_page(tuner, summary).is_file()
@@ -265,16 +309,17 @@ def test_one_recording_alone_is_not_judged(
 ) -> None:
     tuner = run_study(make(folders, confirm=[], held_out=[], trials=3), results=tmp_path)
     summary = finish(tuner)
-    assert summary.verdict == Verdict.NOT_JUDGED
+    assert summary.verdict == Verdict.CANNOT_TELL
     assert "no frames are left" in summary.conclusion
     assert summary.best is not None
     assert summary.best.confirm is None
-    assert summary.p_value is None
+    assert summary.none_better_by is None
     page = write_page(tuner, summary).read_text()
     assert summary.conclusion in page
-    assert "not recommended: not judged" in page
+    assert "not recommended: cannot tell" in page
     status(tuner.folder)
     assert "no frames are left" in " ".join(capsys.readouterr().out.split())
+    (tuner.folder / "summary.json").unlink()
     with pytest.raises(StudyError, match="scenes can be made of rendered sequences alone"):
         tuner.extend(scenes=1)
 
@@ -296,12 +341,12 @@ def test_scenes_of_uneven_lengths_and_starts_count_alike(
 
 
 class CrashingBaseline(SimulatedTuner):
-    """Its baseline crashes on the scenes of the choice."""
+    """Its baseline crashes on the scenes that judge."""
 
     def outcomes(
         self, settings: Mapping[str, Any], instances: Sequence[ProblemInstance], **how: Any
     ) -> Any:
-        if not settings and set(instances) & set(self.design.confirm):
+        if not settings and set(instances) & set(self.design.held_out):
             raise InstanceFailedError(f"{instances[0]}: crashed: it broke")
         return super().outcomes(settings, instances, **how)
 
@@ -401,7 +446,7 @@ def test_the_catalogues_split_is_enforced(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("source", "seen"),
-    [("auto", ["tune", "confirm"]), ("embedded", ["tune", "confirm"]), ("oracle", [])],
+    [("auto", ["tune"]), ("embedded", ["tune"]), ("oracle", [])],
 )
 def test_the_embedded_network_alone_was_trained_on_the_scenes(source: str, seen: list[str]) -> None:
     design = simulated.simulated_design(make_spec())
@@ -419,15 +464,12 @@ def test_page_summary_and_preset_mark_scenes_of_the_training(masks: bool, tmp_pa
     )
     tuner = SimulatedTuner(make_spec(trials=3, **changes), tmp_path).run()
     summary = finish(tuner)
-    assert summary.seen == (["tune", "confirm"] if masks else [])
+    assert summary.seen == (["tune"] if masks else [])
     assert bool(seen_note(summary.seen)) == masks
     page = write_page(tuner, summary).read_text()
     preset = (tuner.folder / "best.toml").read_text()
-    assert ("in the trial §" in page, "unseen instances §" in page, "held-out §" in page) == (
-        masks,
-        masks,
-        False,
-    )
+    assert ("in the trial §" in page) == masks
+    assert "held-out §" not in page
     assert page.count("trained on those very scenes") >= 3 * masks
     assert ("trained on" in preset) == masks
 
@@ -524,8 +566,8 @@ def test_the_baseline_runs_from_three_starts() -> None:
     assert sorted(first) == [0, 1, 3]
 
 
-@pytest.mark.parametrize(("scenes_to_tune_on", "reserved"), [(1, 18), (11, 18), (40, 20)])
-def test_the_choice_is_made_on_further_scenes(scenes_to_tune_on: int, reserved: int) -> None:
+@pytest.mark.parametrize(("scenes_to_tune_on", "reserved"), [(1, 28), (11, 28), (40, 28)])
+def test_further_scenes_judge_where_none_are_named(scenes_to_tune_on: int, reserved: int) -> None:
     design = design_of(
         StudySpec(
             name="s", tune=(f"{WALK}?scene=0-{scenes_to_tune_on - 1}&frames=20",), recorded=()
@@ -547,7 +589,9 @@ def test_further_scenes_are_of_all_sequences_in_turn_and_of_their_split() -> Non
     spec = StudySpec(name="s", tune=tune, confirm=(tune[0].replace("0-1", "7"),), recorded=(),
                      held_out=(f"{WALK}?scene=100-101&frames=20&offsets=0",))  # fmt: skip
     design = design_of(spec, further=2)
-    assert [instance.scene.rpartition("=")[2] for instance in design.confirm] == ["7", "2", "3"]
+    assert [instance.scene.rpartition("=")[2] for instance in design.confirm] == ["7"], (
+        "what chooses stays"
+    )
     assert [instance.scene.rpartition("=")[2] for instance in design.held_out] == [
         "100",
         "101",

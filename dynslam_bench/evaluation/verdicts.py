@@ -1,0 +1,572 @@
+"""What paired errors show: the typical ratio of a candidate to a baseline, its losses, and a verdict.
+
+All statistics are over scenes. A scene has one value: the natural logarithm of the candidate's error over
+the baseline's, below 0 is better. Errors of a few scenes may be huge, so nothing here is a mean of errors:
+the typical ratio is the pseudo-median (Hodges and Lehmann 1963) with the exact interval of Wilcoxon's
+signed-rank test, over the scenes where both succeed. Scenes that one side lost are counted apart, since no
+test bounds a mean that rare catastrophes may dominate (Bahadur and Savage 1956).
+"""
+
+import math
+from bisect import bisect_left
+from collections.abc import Collection, Mapping, Sequence
+from enum import Enum
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+
+from dynslam_bench.core.records import Record
+
+Array = NDArray[np.float64]
+
+ONE_SIDED = 0.025
+"""Level of a claim, one-sided: so often is something *proven* where nothing is better."""
+FEWEST = 6
+"""Scenes below which nothing is claimed: all of five signs agree by chance in 2^-5 > 2.5 %, of six in 2^-6."""
+CATASTROPHE = 3.0
+"""An error so many times the other's counts as a loss."""
+MARGIN = 0.10
+"""Differences below this share do not matter. To exclude 5 % at the usual scatter would take 330 scenes."""
+POWER = 0.8
+"""Chance with which the stated number of scenes shows what it is stated for."""
+LOOKS = {12: 0.0062, 24: 0.0082, 36: 0.0103, 48: 0.0125}
+"""Judging scenes of an extendable study to the one-sided level of the look at them: 2.5 % in all looks together
+(Lan and DeMets 1983; looking again at the full level claims falsely in 5.6 to 6.1 % of studies)."""
+_WILCOXON_EFFICIENCY = 3.0 / math.pi
+"""Of the signed-rank test beside the t test on normal values: it needs 1 / 0.955 times the scenes (Pitman)."""
+_MOST_SCENES = 100_000
+
+
+class Verdict(str, Enum):
+    """What a comparison says of the candidate."""
+
+    PROVEN = "proven"
+    BUT_LOST = "smaller typical error, but lost"
+    PROMISING = "promising"
+    NO_DIFFERENCE = "no difference that matters"
+    CANNOT_TELL = "cannot tell"
+    WORSE = "worse"
+
+
+# -- the typical ratio ------------------------------------------------------------------------------
+
+
+class Typical(NamedTuple):
+    """A typical log ratio with its interval; the bounds are infinite where there are too few scenes for any."""
+
+    centre: float
+    low: float
+    high: float
+
+
+def hodges_lehmann(log_ratios: ArrayLike, confidence: float = 0.95) -> Typical:
+    """The pseudo-median of log ratios ``[S]``, and the exact interval that the signed-rank test leaves it.
+
+    The interval holds all shifts that Wilcoxon's signed-rank test does not reject (Hodges and Lehmann 1963,
+    Tukey 1949). It assumes scenes that are independent and scatter symmetrically, and no other shape.
+
+    Args:
+        log_ratios: One a scene, one at least.
+        confidence: Of both sides together.
+    """
+    values = np.asarray(log_ratios, dtype=np.float64)
+
+    # Walsh averages: the means of all pairs of scenes, each scene with itself among them
+    first, second = np.triu_indices(len(values))
+    averages = np.sort((values[first] + values[second]) / 2.0)
+
+    # as many averages are cut off at either end as the test's critical rank sum says
+    cut = _critical_rank_sum(len(values), round((1.0 - confidence) / 2.0, 12))
+    centre = float(np.median(averages))
+    if cut == 0:
+        return Typical(centre, -math.inf, math.inf)
+    return Typical(centre, float(averages[cut - 1]), float(averages[-cut]))
+
+
+@lru_cache(maxsize=1024)
+def _critical_rank_sum(count: int, tail: float) -> int:
+    """How many values of the signed-rank sum of `count` scenes have at most `tail` of probability at one end."""
+    # Exact null distribution: rank r is added or not, each with probability one half.
+    probabilities = np.ones(1)
+    for rank in range(1, count + 1):
+        padding = np.zeros(rank)
+        without_rank = np.concatenate([probabilities, padding])
+        with_rank = np.concatenate([padding, probabilities])
+        probabilities = (without_rank + with_rank) / 2.0
+    return int(np.searchsorted(np.cumsum(probabilities), tail, side="right"))
+
+
+# -- a comparison over scenes -------------------------------------------------------------------------
+
+
+class PairedRatio(Record):
+    """A candidate beside a baseline over scenes: the typical ratio where both succeed, and the losses.
+
+    Attributes:
+        ratio: Typical ratio, below 1 is better; None where both succeed in no scene.
+        low: Lower end of the interval at the level of the comparison; None where there are too few
+            scenes for one.
+        high: Upper end.
+        low_90: Lower end of the 90 % interval, by which differences are excluded; None likewise.
+        high_90: Upper end.
+        high_80: Upper end of the 80 % interval; None likewise.
+        spread: Standard deviation of the log ratio over these scenes; None for fewer than two.
+        scenes: Scenes where both succeed.
+        lost: Scenes that the candidate alone lost.
+        much_worse: Scenes where both succeed and the candidate has more than `CATASTROPHE` times the error.
+        lost_baseline: Scenes that the baseline alone lost.
+        much_better: Scenes where the baseline has more than `CATASTROPHE` times the error.
+        lost_both: Scenes that both lost.
+        worst: The scene with the largest ratio; empty where `ratio` is None.
+        worst_ratio: That ratio; None likewise.
+        one_sided: Level of a claim.
+        runs: Paired runs behind the scenes.
+        what: What the ratio is one of.
+    """
+
+    ratio: float | None = None
+    low: float | None = None
+    high: float | None = None
+    low_90: float | None = None
+    high_90: float | None = None
+    high_80: float | None = None
+    spread: float | None = None
+    scenes: int = 0
+    lost: tuple[str, ...] = ()
+    much_worse: tuple[str, ...] = ()
+    lost_baseline: tuple[str, ...] = ()
+    much_better: tuple[str, ...] = ()
+    lost_both: tuple[str, ...] = ()
+    worst: str = ""
+    worst_ratio: float | None = None
+    one_sided: float = ONE_SIDED
+    runs: int = 0
+    what: str = "ATE"
+
+    @property
+    def all_scenes(self) -> int:
+        """Scenes that were run, lost ones among them."""
+        return self.scenes + len(self.lost) + len(self.lost_baseline) + len(self.lost_both)
+
+    @property
+    def losses(self) -> tuple[str, ...]:
+        """Scenes that the candidate alone lost or is much worse in."""
+        return (*self.lost, *self.much_worse)
+
+    @property
+    def losses_baseline(self) -> tuple[str, ...]:
+        """Scenes that the baseline alone lost or is much worse in."""
+        return (*self.lost_baseline, *self.much_better)
+
+    @property
+    def loss_share(self) -> float:
+        """Upper 95 % bound of the share of scenes in `losses` (Clopper and Pearson 1934)."""
+        losses = len(self.losses)
+        if losses >= self.all_scenes:
+            return 1.0
+        return float(stats.beta.ppf(0.95, losses + 1, self.all_scenes - losses))
+
+    @property
+    def loses_more(self) -> bool:
+        """Whether the candidate loses more scenes than the baseline by McNemar's exact test (1947)."""
+        only_one = len(self.losses) + len(self.losses_baseline)
+        if len(self.losses) <= len(self.losses_baseline):
+            return False
+        p_value = stats.binomtest(len(self.losses), only_one, alternative="greater").pvalue
+        return bool(p_value <= ONE_SIDED)
+
+    @property
+    def excluded(self) -> float | None:
+        """Share above which a difference to either side is excluded (90 % interval); None without one."""
+        if self.low_90 is None or self.high_90 is None:
+            return None
+        return max(1.0 / self.low_90, self.high_90) - 1.0
+
+    @property
+    def interval(self) -> str:
+        """The interval in brackets; empty without one."""
+        return "" if self.low is None or self.high is None else f"[{self.low:.3f}, {self.high:.3f}]"
+
+    def __str__(self) -> str:
+        if self.ratio is None:
+            return f"{self.what}: no scene where both succeed"
+        return f"{self.what} x {self.ratio:.3f} {self.interval or 'without an interval'}"
+
+
+def paired_ratio(
+    log_ratios: Mapping[str, float],
+    lost: Collection[str] = (),
+    lost_baseline: Collection[str] = (),
+    *,
+    one_sided: float = ONE_SIDED,
+    runs: int | None = None,
+    what: str = "ATE",
+) -> PairedRatio:
+    """Compare a candidate with a baseline over scenes.
+
+    Args:
+        log_ratios: Scene to the natural logarithm of the candidate's error over the baseline's; those of
+            scenes that one side lost do not count.
+        lost: Scenes that the candidate lost, by the same names.
+        lost_baseline: Scenes that the baseline lost.
+        one_sided: Level of a claim.
+        runs: Paired runs behind the scenes; None for one a scene.
+        what: What the ratio is one of.
+    """
+    by_candidate = set(lost)
+    by_baseline = set(lost_baseline)
+    paired = {
+        name: value
+        for name, value in log_ratios.items()
+        if name not in by_candidate and name not in by_baseline
+    }
+    threshold = math.log(CATASTROPHE)
+    counts: dict[str, Any] = {
+        "scenes": len(paired),
+        "lost": tuple(sorted(by_candidate - by_baseline)),
+        "lost_baseline": tuple(sorted(by_baseline - by_candidate)),
+        "lost_both": tuple(sorted(by_candidate & by_baseline)),
+        "much_worse": tuple(name for name, value in paired.items() if value > threshold),
+        "much_better": tuple(name for name, value in paired.items() if value < -threshold),
+        "one_sided": one_sided,
+        "runs": len(log_ratios) if runs is None else runs,
+        "what": what,
+    }
+    if not paired:
+        return PairedRatio(**counts)
+
+    values = np.array(list(paired.values()))
+    worst = max(paired, key=paired.__getitem__)
+    claim = hodges_lehmann(values, 1.0 - 2.0 * one_sided)
+    within_90 = hodges_lehmann(values, 0.90)
+    within_80 = hodges_lehmann(values, 0.80)
+    return PairedRatio(
+        ratio=_ratio(claim.centre),
+        low=_bound(claim.low),
+        high=_bound(claim.high),
+        low_90=_bound(within_90.low),
+        high_90=_bound(within_90.high),
+        high_80=_bound(within_80.high),
+        spread=float(np.std(values, ddof=1)) if len(values) > 1 else None,
+        worst=worst,
+        worst_ratio=_ratio(paired[worst]),
+        **counts,
+    )
+
+
+_LARGEST_LOG = 700.0
+"""Larger logarithms overflow."""
+
+
+def _ratio(log_ratio: float) -> float:
+    return math.exp(float(np.clip(log_ratio, -_LARGEST_LOG, _LARGEST_LOG)))
+
+
+def _bound(log_ratio: float) -> float | None:
+    return _ratio(log_ratio) if math.isfinite(log_ratio) else None
+
+
+# -- the verdict -----------------------------------------------------------------------------------
+
+
+def verdict_of(comparison: PairedRatio, margin: float = MARGIN) -> Verdict:
+    """The verdict on a candidate: the first of the rules that holds.
+
+    Args:
+        comparison: The candidate beside the baseline.
+        margin: Differences below this share do not matter.
+    """
+    losses = len(comparison.losses)
+    losses_baseline = len(comparison.losses_baseline)
+
+    # more losses than the baseline's, beyond chance
+    if comparison.loses_more:
+        return Verdict.WORSE
+
+    # too few scenes for any claim
+    low = comparison.low
+    high = comparison.high
+    if comparison.scenes < FEWEST:
+        return Verdict.CANNOT_TELL
+
+    # the typical error differs
+    if low is not None and low > 1.0:
+        return Verdict.WORSE
+    if high is not None and high < 1.0:
+        return Verdict.PROVEN if losses <= losses_baseline else Verdict.BUT_LOST
+
+    # both ends of the 90 % interval within the margin: two one-sided tests (Schuirmann 1987)
+    excluded = comparison.excluded
+    if excluded is not None and excluded < margin and abs(losses - losses_baseline) <= 1:
+        return Verdict.NO_DIFFERENCE
+
+    # wrong in one of ten
+    if comparison.high_80 is not None and comparison.high_80 < 1.0:
+        return Verdict.PROMISING
+    return Verdict.CANNOT_TELL
+
+
+def findings(
+    comparison: PairedRatio, subject: str = "the candidate", margin: float = MARGIN
+) -> list[str]:
+    """What a comparison found, in short sentences without their full stops: claim, exclusion, every loss.
+
+    Args:
+        comparison: The candidate beside the baseline.
+        subject: What to call the candidate, e.g. ``trial 7``.
+        margin: As `verdict_of` takes it.
+    """
+    verdict = verdict_of(comparison, margin)
+    sentences = [_claim(comparison, verdict, subject)]
+    excluded = comparison.excluded
+    states_exclusion = verdict in (Verdict.NO_DIFFERENCE, Verdict.CANNOT_TELL)
+    if states_exclusion and excluded is not None and comparison.scenes >= FEWEST:
+        sentences.append(f"Differences above {100 * excluded:.0f} % are excluded")
+    return sentences + _loss_sentences(comparison, subject)
+
+
+def _claim(comparison: PairedRatio, verdict: Verdict, subject: str) -> str:
+    """The first sentence: what the candidate has, beside the numbers that show it."""
+    if comparison.ratio is None:
+        if not comparison.all_scenes:
+            return f"{subject} was compared on no scene"
+        return (
+            f"{subject} and the baseline both succeed on none of {_scenes(comparison.all_scenes)}"
+        )
+    numbers = f"{comparison} on {_scenes(comparison.scenes)}"
+    percent = abs(100.0 * (1.0 - comparison.ratio))
+    if verdict is Verdict.PROVEN:
+        return f"{subject} has {percent:.1f} % less {comparison.what}: {numbers}"
+    if verdict is Verdict.BUT_LOST:
+        lost_in = f"{len(comparison.losses)} of {_scenes(comparison.all_scenes)}"
+        return (
+            f"{subject} has a smaller typical {comparison.what}, but lost in {lost_in}: {numbers}"
+        )
+    if verdict is Verdict.PROMISING:
+        return f"{subject} has perhaps {percent:.1f} % less {comparison.what}: {numbers}"
+    if verdict is Verdict.WORSE and comparison.loses_more:
+        return f"{subject} loses more scenes than the baseline, where both succeed {numbers}"
+    if verdict is Verdict.WORSE:
+        return f"{subject} has {percent:.1f} % more {comparison.what}: {numbers}"
+    if comparison.scenes < FEWEST:
+        return f"{subject} has {numbers}, and {FEWEST} are the fewest for a claim"
+    return f"{subject} has {numbers}"
+
+
+def _loss_sentences(comparison: PairedRatio, subject: str) -> list[str]:
+    """Every loss of either side, with names and numbers; empty without any."""
+    sentences = []
+    if comparison.lost:
+        sentences.append(f"{subject} alone lost {_named(comparison.lost)}")
+    if comparison.much_worse:
+        times = f"more than {CATASTROPHE:g} times the error"
+        worst = f"at worst x {comparison.worst_ratio:.3g} in {comparison.worst}"
+        sentences.append(f"{subject} has {times} in {_scenes(len(comparison.much_worse))}, {worst}")
+    if comparison.losses:
+        share = 100 * comparison.loss_share
+        sentences.append(f"Such losses are at most {share:.0f} % of scenes, with 95 % confidence")
+    if comparison.losses_baseline:
+        sentences.append(f"The baseline alone lost {_named(comparison.losses_baseline)}")
+    if comparison.lost_both:
+        sentences.append(f"Both lost {_named(comparison.lost_both)}")
+    return sentences
+
+
+_MOST_NAMED = 3
+"""Scenes that a sentence names; it counts the rest."""
+
+
+def _named(names: Sequence[str]) -> str:
+    shown = ", ".join(names[:_MOST_NAMED])
+    rest = len(names) - _MOST_NAMED
+    return f"{_scenes(len(names))} ({shown}{f' and {rest} more' if rest > 0 else ''})"
+
+
+def _scenes(count: int) -> str:
+    return f"{count} scene" if count == 1 else f"{count} scenes"
+
+
+# -- how many scenes a claim takes --------------------------------------------------------------------
+
+
+def power(gain: float, spread: float, scenes: int, one_sided: float = ONE_SIDED) -> float:
+    """Chance that so many scenes show a gain; 0 below `FEWEST`.
+
+    Args:
+        gain: Share of the error that the candidate has less of, in (0, 1).
+        spread: Standard deviation over scenes of the log ratio.
+        scenes: Scenes that judge.
+        one_sided: Level of the claim.
+    """
+    if scenes < FEWEST:
+        return 0.0
+    if spread <= 0.0:
+        return 1.0
+    effective = _WILCOXON_EFFICIENCY * scenes
+    noncentrality = -math.log1p(-gain) / spread * math.sqrt(effective)
+    critical = stats.t.isf(one_sided, scenes - 1)
+    return float(stats.nct.sf(critical, scenes - 1, noncentrality))
+
+
+def detectable(spread: float, scenes: int, one_sided: float = ONE_SIDED) -> float:
+    """Smallest gain, as a share, that so many scenes show in four of five studies; 1 below `FEWEST`."""
+    if scenes < FEWEST:
+        return 1.0
+    freedom = scenes - 1
+    quantiles = stats.t.isf(one_sided, freedom) + stats.t.ppf(POWER, freedom)
+    standard_error = spread / math.sqrt(_WILCOXON_EFFICIENCY * scenes)
+    return float(-math.expm1(-quantiles * standard_error))
+
+
+def scenes_needed(gain: float, spread: float, one_sided: float = ONE_SIDED) -> int:
+    """The fewest scenes that show a gain in four of five studies, at most 100,000; see `detectable`."""
+    counts = range(FEWEST, _MOST_SCENES)
+    return FEWEST + bisect_left(
+        counts, True, key=lambda count: detectable(spread, count, one_sided) <= gain
+    )
+
+
+def scenes_to_exclude(margin: float, spread: float) -> int:
+    """The fewest scenes that exclude differences above a margin in four of five studies where there is none."""
+    # two one-sided 5 % tests, of which each fails in half of the remaining 20 %
+    quantiles = stats.norm.isf(0.05) + stats.norm.isf((1.0 - POWER) / 2.0)
+    by_normal = (quantiles * spread / math.log1p(margin)) ** 2
+    return max(FEWEST, math.ceil(by_normal / _WILCOXON_EFFICIENCY) + 2)
+
+
+def scenes_to_settle(comparison: PairedRatio, margin: float = MARGIN) -> int | None:
+    """Scenes in all that would settle what a comparison leaves open, if the truth is what it estimates.
+
+    That is the gain or loss where it is above the margin, else that no difference matters.
+
+    Returns:
+        None where that cannot be told: no scatter is known.
+    """
+    if comparison.ratio is None or comparison.spread is None:
+        return None
+    # a loss of x 1.25 is as far from 1 as a gain to x 0.8
+    difference = 1.0 - min(comparison.ratio, 1.0 / comparison.ratio)
+    if difference > 1.0 - 1.0 / (1.0 + margin):
+        return scenes_needed(difference, comparison.spread, comparison.one_sided)
+    return scenes_to_exclude(margin, comparison.spread)
+
+
+# -- boards: several trackers beside one reference, sequences of several families ----------------------
+
+FEWEST_FREE = 6
+"""Degrees of freedom within families below which nothing is said of them."""
+FEWEST_FAMILIES = 4
+"""Families below which nothing is said beyond them."""
+_SMALLEST_ERROR = 1e-12
+"""Standard errors below this are rounding."""
+
+
+class FamilyTest(NamedTuple):
+    """Tests of one tracker against the reference.
+
+    Attributes:
+        centre: Mean over families of their mean log ratios.
+        these_error: Standard error from the scatter within families, which says nothing of others.
+        these_free: Its degrees of freedom.
+        these_p: Two-sided p value of no difference on these families; 1 where nothing can be said.
+        beyond_error: Standard error from the scatter of the family means.
+        beyond_free: Its degrees of freedom.
+        beyond_p: Two-sided p value of no difference over all such families; 1 likewise.
+    """
+
+    centre: float
+    these_error: float
+    these_free: int
+    these_p: float
+    beyond_error: float
+    beyond_free: int
+    beyond_p: float
+
+
+def family_test(log_ratios: ArrayLike, families: Sequence[str]) -> FamilyTest:
+    """Test one tracker's log ratios to the reference, on these families and beyond them; families weigh the same.
+
+    Args:
+        log_ratios: One a sequence ``[S]``; nan where either side is lost: it does not count.
+        families: Family of each sequence.
+    """
+    values = np.asarray(log_ratios, dtype=np.float64)
+    groups = []
+    for family in dict.fromkeys(families):
+        of_family = np.array([name == family for name in families], dtype=bool)
+        group = values[of_family & np.isfinite(values)]
+        if len(group):
+            groups.append(group)
+    if not groups:
+        return FamilyTest(math.nan, math.nan, 0, 1.0, math.nan, 0, 1.0)
+    means = np.array([group.mean() for group in groups])
+    count = len(groups)
+    centre = float(means.mean())
+
+    # on these families: the pooled variance within them
+    free = sum(len(group) - 1 for group in groups)
+    squares = sum(float(np.square(group - group.mean()).sum()) for group in groups)
+    pooled = squares / max(free, 1)
+    these_error = math.sqrt(pooled * sum(1.0 / len(group) for group in groups)) / count
+    these_p = _two_sided(centre, these_error, free) if free >= FEWEST_FREE else 1.0
+
+    # beyond them: the family is the sample
+    beyond_error = float(means.std(ddof=1)) / math.sqrt(count) if count > 1 else math.nan
+    beyond_p = _two_sided(centre, beyond_error, count - 1) if count >= FEWEST_FAMILIES else 1.0
+    return FamilyTest(centre, these_error, free, these_p, beyond_error, count - 1, beyond_p)
+
+
+def _two_sided(centre: float, error: float, free: int) -> float:
+    return float(2.0 * stats.t.sf(abs(centre) / max(error, _SMALLEST_ERROR), free))
+
+
+def resolution_floor(error: float, free: int, trackers: int, level: float) -> float:
+    """Smallest gain, as a share, that a board of so many trackers shows in four of five; 1 where it shows none.
+
+    Args:
+        error: Standard error of the log ratio.
+        free: Its degrees of freedom.
+        trackers: How many are compared with the reference (Bonferroni, Holm's first step).
+        level: Chance of any false claim.
+    """
+    if free < 1 or not math.isfinite(error):
+        return 1.0
+    quantiles = stats.t.isf(level / (2 * trackers), free) + stats.t.ppf(POWER, free)
+    return float(-math.expm1(-quantiles * error))
+
+
+def may_be_best(logs: ArrayLike, families: Sequence[str], level: float = 0.05) -> list[int]:
+    """Numbers of the trackers that no rival beats; the best one is among them in 95 % (Hsu 1984).
+
+    Rivals of one candidate are Bonferroni-corrected; candidates need not be, since the claim is about the
+    best one alone (Mogstad and others 2024). The family is the sample.
+
+    Args:
+        logs: Log errors ``[T, S]``, none missing.
+        families: Family of each sequence.
+        level: Chance that the best one is not among them.
+    """
+    errors = np.asarray(logs, dtype=np.float64)
+    names = list(dict.fromkeys(families))
+    if len(names) < FEWEST_FAMILIES:
+        return list(range(len(errors)))
+    of_family = np.array([names.index(family) for family in families])
+    means = np.stack(
+        [errors[:, of_family == number].mean(axis=1) for number in range(len(names))], 1
+    )
+    remaining = []
+    for candidate, own in enumerate(means):
+        worst = -math.inf
+        for rival, other in enumerate(means):
+            if rival == candidate:
+                continue
+            difference = own - other
+            error = float(difference.std(ddof=1)) / math.sqrt(len(names))
+            worst = max(worst, float(difference.mean()) / max(error, _SMALLEST_ERROR))
+        p_value = stats.t.sf(worst, len(names) - 1) * (len(errors) - 1)
+        if p_value > level or len(errors) == 1:
+            remaining.append(candidate)
+    return remaining
