@@ -228,6 +228,7 @@ def test_a_state_of_another_sequence_tracker_settings_or_version_is_refused(
         SlamEnv(ToySequence(9), TARGET).clone_state()
 
 
+@pytest.mark.slow
 def test_external_programs_cannot_be_copied_and_stay_usable(tmp_path: Path) -> None:
     still = '{"state": "ok", "T_world_cam": [1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1]}'
     (tmp_path / "still.py").write_text(

@@ -459,6 +459,7 @@ def test_a_misspelled_recorded_class_is_said(sequence, tmp_path):
     assert len(warned) == 1
 
 
+@pytest.mark.slow
 def test_masks_of_own_names_are_recorded_and_used(sequence, tmp_path):
     source = f"plugin:{__file__}:OWN"
     with pytest.warns(UserWarning) as warned:
