@@ -6,6 +6,8 @@ import pytest
 
 # The tests start many interpreters, and each would compile the sources that it imports.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+# This one and its workers keep what they compile, too: collecting takes twice as long without.
+sys.dont_write_bytecode = False
 # They import the installed package, also from the checkout's folder.
 os.environ["PYTHONSAFEPATH"] = "1"
 # Their matrices are small: threads of OpenBLAS would only wait for each other.
@@ -25,6 +27,12 @@ KERNELS = (
     (TRACKER.format("emfoa-oft?masks=none"), TRACKER.format("dynaslam")),
 )
 """What compiles the kernels in two rounds of two processes: rendering and SLAM, flow; then those that use both."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """A test that is named by its id runs, slow or not."""
+    if config.option.markexpr == "not slow" and any("::" in argument for argument in config.args):
+        config.option.markexpr = ""
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
@@ -53,6 +61,6 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 @pytest.fixture(scope="session")
 def toy_folder(tmp_path_factory: pytest.TempPathFactory) -> str:
     """A toy sequence of 60 frames in TUM layout."""
-    from envs_toys import write_folder  # loads OpenCV
+    from helpers.envs_toys import write_folder  # loads OpenCV
 
     return str(write_folder(tmp_path_factory.mktemp("toys") / "toy", 60))

@@ -4,7 +4,7 @@ Written as generic vector code of fixed width (llvmlite): LLVM maps it to the pr
 instructions. A lane is the place of one number in a vector, as in SIMD hardware. The order of
 every sum is part of the program, so that results do not depend on the processor. The uint16
 operations are exact but for one square root and division, which IEEE 754 defines to the last bit;
-`tests/flow/exact_reference.py` gives the same bytes.
+`tests/helpers/exact_reference.py` gives the same bytes.
 
 How an instruction is written: the function under `instruction` gets numba's types of the arguments
 and returns the signature and a function `generate`, which writes LLVM's code with a builder. The

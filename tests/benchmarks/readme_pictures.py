@@ -17,9 +17,9 @@ import cv2
 
 ROOT = Path(__file__).resolve().parents[2]
 PICTURES = ROOT / "docs" / "pictures"
-sys.path.insert(0, str(ROOT / "tests" / "reports"))
+sys.path.insert(0, str(ROOT / "tests"))
 
-from reports_browser import Browser  # noqa: E402
+from helpers.reports_browser import Browser  # noqa: E402
 
 from dynslam_bench.reports import build_report  # noqa: E402
 from dynslam_bench.runs import RunStore  # noqa: E402
@@ -53,13 +53,13 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         browser = Browser(Path(folder) / "browser")
         browser.open(options.site / "leaderboard" / "index.html", 1400)
-        browser.until("one('.dt-search input')", tries=200)
+        browser.until("one('.dt-search input')")
         framed(browser, "main", PICTURES / "leaderboard.webp", most=760)
         store = RunStore(options.results)
         browser.open(
             build_report(store, Path(folder) / "report").run, 1100, anchor=f"#{store.ids()[0]}"
         )
-        browser.until("one('#time .main-svg') && one('#picture img').complete", tries=200)
+        browser.until("one('#time .main-svg') && one('#picture img').complete")
         browser.settle()
         framed(browser, ".panes", PICTURES / "culling.webp")
         browser.close()

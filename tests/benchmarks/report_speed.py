@@ -23,10 +23,10 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "tests" / "reports"))
+sys.path.insert(0, str(ROOT / "tests"))
 
-from reports_browser import EXECUTABLE, Browser  # noqa: E402
-from reports_fake_store import add_frames, add_run  # noqa: E402
+from helpers.reports_browser import EXECUTABLE, Browser  # noqa: E402
+from helpers.reports_fake_store import add_frames, add_run  # noqa: E402
 
 from dynslam_bench.reports import build_report  # noqa: E402
 from dynslam_bench.runs.record import IDENTITY_SCHEME  # noqa: E402

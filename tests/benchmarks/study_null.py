@@ -25,10 +25,10 @@ import numpy as np
 import optuna
 from optuna.trial import TrialState
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tuning"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-import simulated
 from command_line import parser_of
+from helpers import simulated
 
 from dynslam_bench.evaluation.verdicts import Verdict, verdict_of
 from dynslam_bench.tuning import distributions, finish

@@ -3,8 +3,8 @@
 import json
 
 import pytest
-from cli_helpers import PROGRAM
-from envs_toys import write_sequence
+from helpers.cli_program import PROGRAM
+from helpers.envs_toys import write_sequence
 
 from dynslam_bench.cli import app, output
 from dynslam_bench.core.folders import digest_cache_folder, kernels_folder, user_cache

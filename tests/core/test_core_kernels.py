@@ -118,6 +118,7 @@ def names(folder: Path) -> set[str]:
 # -- edits -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("edit", "result"),
     [
@@ -143,6 +144,7 @@ def test_an_edit_of_anything_that_is_compiled_in_takes_effect_at_once(
     assert any("outer" in name for name in names(folder) - before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "edit",
     [
@@ -288,6 +290,7 @@ def test_the_processor_counts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
 # -- files -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "damage",
     [
@@ -420,6 +423,7 @@ def test_code_of_a_module_that_has_changed_since_its_import_is_not_stored(
     kernel_code.source_digest.cache_clear()
 
 
+@pytest.mark.slow
 def test_two_instructions_of_one_function_are_told_apart() -> None:
     from dynslam_bench.core import simd
 
@@ -459,6 +463,7 @@ def printed(code: str, checkout: Path) -> Any:
     return json.loads(done.stdout)
 
 
+@pytest.mark.slow
 def test_an_edit_counts_for_the_kernels_that_it_is_compiled_into(tmp_path: Path) -> None:
     package = copied_checkout(tmp_path) / "dynslam_bench"
     before = printed(DIGESTS, tmp_path)
@@ -512,6 +517,7 @@ print(json.dumps([estimate.T_cam_world[0, 3], files]))
 """
 
 
+@pytest.mark.slow
 def test_an_edited_checkout_optimises_poses_anew_and_a_copy_shares(tmp_path: Path) -> None:
     checkout = copied_checkout(tmp_path / "checkout")
     solver = checkout / "dynslam_bench" / "geometry" / "gauss_newton.py"

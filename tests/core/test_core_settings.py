@@ -467,6 +467,7 @@ def fake_distribution(folder, group, targets, name="fake-dist"):
     (info / "entry_points.txt").write_text(f"[{group}]\n{lines}")
 
 
+@pytest.mark.slow
 def test_file_and_module_targets(tmp_path, monkeypatch):
     file = write(tmp_path / "my_tracker.py", SPEC_SOURCE.format(id="mine"))
     assert registry().get(f"{file}:SPEC").id == "mine"
@@ -478,6 +479,7 @@ def test_file_and_module_targets(tmp_path, monkeypatch):
         registry().get(f"{file}:SPECC")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("target", "expected"),
     [
@@ -496,6 +498,7 @@ def test_targets_that_cannot_be_loaded(target, expected):
         load_object(target)
 
 
+@pytest.mark.slow
 def test_a_file_that_raises_gives_its_reason_and_can_be_mended(tmp_path):
     file = write(tmp_path / "broken.py", "raise RuntimeError('no GPU here')\n")
     with pytest.raises(PluginError, match="RuntimeError: no GPU here"):
@@ -511,6 +514,7 @@ ENDINGS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("statement", ENDINGS)
 def test_an_import_that_ends_the_process_is_an_error_like_any_other(
     tmp_path, monkeypatch, statement
@@ -532,6 +536,7 @@ def test_an_import_that_ends_the_process_is_an_error_like_any_other(
     assert all(f"ends the process ({ENDINGS[statement]})" in reason for reason in reasons)
 
 
+@pytest.mark.slow
 def test_an_import_without_an_end_is_an_error_too(tmp_path, monkeypatch):
     monkeypatch.setattr(plugin_probe, "LIMIT_S", 1)
     (tmp_path / "endless.py").write_text("while True: pass\n")
@@ -539,6 +544,7 @@ def test_an_import_without_an_end_is_an_error_too(tmp_path, monkeypatch):
         load_object(f"{tmp_path / 'endless.py'}:SPEC")
 
 
+@pytest.mark.slow
 def test_environment_variable(tmp_path, monkeypatch):
     good = write(tmp_path / "good.py", SPEC_SOURCE.format(id="from-env"))
     broken = write(tmp_path / "broken.py", "import nothing_of_that_name\n")
@@ -562,6 +568,7 @@ def test_environment_variable(tmp_path, monkeypatch):
     assert trackers.failures() == []
 
 
+@pytest.mark.slow
 def test_entry_points_of_installed_distributions_come_after_the_environment_and_what_is_built_in(
     tmp_path, monkeypatch
 ):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import (
+from helpers.culling_scenes import (
     ACROSS,
     CAMERA,
     ROTATION,
@@ -310,6 +310,7 @@ def test_descriptor_matches_refine_a_poor_prediction() -> None:
     np.testing.assert_array_equal(refine_by_matches(made.frame, made.state), poor)
 
 
+@pytest.mark.slow
 def test_covariance_of_the_motion_is_that_of_sampled_motions() -> None:
     rng = np.random.default_rng(0)
     before = se3.exp(rng.normal(size=6))

@@ -6,8 +6,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from culling_rules import RULES
-from scenes import (
+from helpers.culling_rules import RULES
+from helpers.culling_scenes import (
     ACROSS,
     BOX,
     CAMERA,

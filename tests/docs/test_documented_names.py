@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import typer.main
-from documented_names import (
+from helpers.documented_names import (
     ROOT,
     SUFFIXES,
     Mention,

@@ -8,9 +8,11 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
-from documented_names import ROOT
+from helpers.documented_names import ROOT
 
 pytest.importorskip("mkdocstrings", reason="the extra [docs] is not installed")
+
+pytestmark = pytest.mark.slow
 LOADING = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src"}
 
 

@@ -10,7 +10,7 @@ import shlex
 from pathlib import Path
 
 import pytest
-from documented_names import PAGES, ROOT, sources
+from helpers.documented_names import PAGES, ROOT, sources
 
 from dynslam_bench.cli.app import start
 from dynslam_bench.core.settings import flatten
@@ -20,6 +20,8 @@ from dynslam_bench.suites import load_suite
 from dynslam_bench.testing.template import write_tracker_template
 from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning import read_study
+
+pytestmark = pytest.mark.slow
 
 SHORTER = {
     "frames=(0, 60)": "frames=(0, 4)",

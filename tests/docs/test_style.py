@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 import results
-from documented_names import PAGES as WRITTEN
-from documented_names import ROOT, sources
+from helpers.documented_names import PAGES as WRITTEN
+from helpers.documented_names import ROOT, sources
 
 LONGEST = 35
 MEDIAN = 18
@@ -211,6 +211,7 @@ def test_every_table_says_how_it_was_made(page: Path) -> None:
         assert [script for script in scripts if not (ROOT / script).exists()] == [], title
 
 
+@pytest.mark.slow
 def test_a_section_is_made_of_what_its_command_prints(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

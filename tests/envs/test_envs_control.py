@@ -9,10 +9,10 @@ from typing import Any, Literal
 import gymnasium as gym
 import numpy as np
 import pytest
-from envs_play import checked, checked_by_stable_baselines3
-from envs_toys import CAMERA, TARGET, ToySequence, images
 from gymnasium.envs.registration import EnvSpec
-from sequence_folders import SHARED, needs_shared
+from helpers.envs_play import checked, checked_by_stable_baselines3
+from helpers.envs_toys import CAMERA, TARGET, ToySequence, images
+from helpers.sequence_folders import SHARED, needs_shared
 
 from dynslam_bench.contracts import Frame, TrackResult
 from dynslam_bench.core.errors import DynslamError, SettingsError
@@ -381,6 +381,7 @@ def played(env: gym.Env, seed: int) -> list[float]:
     return rewards
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("id", BENCHMARKS)
 def test_it_passes_the_checkers(id: str) -> None:
     def make() -> gym.Env:
@@ -392,12 +393,14 @@ def test_it_passes_the_checkers(id: str) -> None:
     checked_by_stable_baselines3(make())
 
 
+@pytest.mark.slow
 def test_every_episode_draws_a_sequence_and_repeats_to_the_bit() -> None:
     first, again, other = (short("features-v0").make("train", range(2)) for _ in range(3))
     assert played(first, 5) == played(again, 5) != played(other, 6)
     assert len(played(first, 5)) == 7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("id", BENCHMARKS)
 def test_it_is_made_again_from_its_json(id: str) -> None:
     env = gym.make(f"dynslam/{id}", split="test", index=3, frames=[0, 16])
@@ -426,6 +429,7 @@ def test_the_first_action_is_the_default() -> None:
     assert np.array_equal(env.action(0), env.unwrapped.neutral_action)
 
 
+@pytest.mark.slow
 def test_a_call_of_the_network_and_keypoints_cost_their_weight() -> None:
     cases = (
         ("masks-v0", "segmented", 1.0),
@@ -490,6 +494,7 @@ def test_recordings_can_be_stepped(id: str, settings: dict[str, Any]) -> None:
 # The scenes change.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", [0, 1, 100, 101])
 def test_people_come_in_even_scenes_and_leave_in_odd_ones(scene: int) -> None:
     sequence = open_sequence(f"synthetic/changing_crowd?scene={scene}")
@@ -511,6 +516,7 @@ def test_the_camera_speeds_up_and_slows_down(scene: int) -> None:
     assert fast > 3 * slow
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", [0, 1, 100, 101])
 def test_the_light_fades_and_returns(scene: int) -> None:
     sequence = open_sequence(f"synthetic/changing_light?scene={scene}")

@@ -7,7 +7,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from envs_toys import FIXED, ToySequence, write_folder
+from helpers.envs_toys import FIXED, ToySequence, write_folder
 
 from dynslam_bench.contracts import Frame, TrackerContext, TrackerSpec, TrackResult
 from dynslam_bench.contracts.checks import raised_by_tracker
@@ -154,6 +154,7 @@ class VandalSettings(Settings):
 VANDAL = TrackerSpec("vandal", f"{__file__}:Vandal", label="Vandal", settings=VandalSettings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["rgb", "depth", "whole rgb", "a view", "masks", "camera"])
 def test_a_tracker_that_writes_fails_by_its_own_fault_and_changes_nothing(what) -> None:
     sequence = InMemory()

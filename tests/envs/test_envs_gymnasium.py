@@ -11,9 +11,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from envs_play import QUIET, checked, play, stepped
-from envs_toys import SPEC, STEP_M, TARGET, ToySequence, ToyTracker, truth
 from gymnasium.envs.registration import EnvSpec
+from helpers.envs_play import QUIET, checked, play, stepped
+from helpers.envs_toys import SPEC, STEP_M, TARGET, ToySequence, ToyTracker, truth
 
 import dynslam_bench.envs
 from dynslam_bench.core.errors import DynslamError, SequenceError, SettingsError, TrackerError
@@ -46,6 +46,7 @@ FINAL = Protocol.model_validate(
 CONTROL = ["noise.level_m", "noise.clip", "noise.passes", "noise.enabled"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SYNTHETIC_IDS[::8])
 def test_every_family_passes_the_checker_without_a_warning(name: str) -> None:
     checked(
@@ -53,6 +54,7 @@ def test_every_family_passes_the_checker_without_a_warning(name: str) -> None:
     )
 
 
+@pytest.mark.slow
 def test_the_default_tracker_passes_the_checker() -> None:
     small = {"preprocessing.width": 320, "preprocessing.height": 240}
     checked(
@@ -65,6 +67,7 @@ def test_the_default_tracker_passes_the_checker() -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kwargs",
     [{}, {"observation": "rgbd"}, {"control": CONTROL}]
@@ -427,7 +430,7 @@ def test_coverage_is_that_of_the_trajectory_that_is_scored(monkeypatch: pytest.M
     """A tracker that answers `finalize` with a few poses does not get the coverage of its online states."""
     whole = ToyTracker.finalize
     monkeypatch.setattr(ToyTracker, "finalize", lambda self: whole(self).select(slice(0, 4)))
-    spec = replace(SPEC, entry_point="envs_toys:ToyTracker")
+    spec = replace(SPEC, entry_point="helpers.envs_toys:ToyTracker")
     for protocol, tracked in ((FINAL, 4), ("tum-rgbd/v1", 12)):
         metrics = play(SlamEnv(ToySequence(12), spec, protocol=protocol))[1][-1]["episode_metrics"]
         assert (metrics["tracked_frames"], metrics["coverage"]) == (tracked, tracked / 12)

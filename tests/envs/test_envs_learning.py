@@ -12,8 +12,8 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from envs_play import QUIET, checked, checked_by_stable_baselines3, play, rest, stepped
-from envs_toys import (
+from helpers.envs_play import QUIET, checked, checked_by_stable_baselines3, play, rest, stepped
+from helpers.envs_toys import (
     FIXED,
     SPEC,
     TARGET,
@@ -228,6 +228,7 @@ def test_a_state_of_another_sequence_tracker_settings_or_version_is_refused(
         SlamEnv(ToySequence(9), TARGET).clone_state()
 
 
+@pytest.mark.slow
 def test_external_programs_cannot_be_copied_and_stay_usable(tmp_path: Path) -> None:
     still = '{"state": "ok", "T_world_cam": [1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1]}'
     (tmp_path / "still.py").write_text(
@@ -512,7 +513,9 @@ def test_keypoints_are_padded_and_thinned_and_say_what_they_are(
         lambda self, frame: replace(track(self, frame), keypoints_xy=many, keypoints_keep=None),
     )
     env = SlamEnv(
-        ToySequence(4), replace(SPEC, entry_point="envs_toys:ToyTracker"), observation=["keypoints"]
+        ToySequence(4),
+        replace(SPEC, entry_point="helpers.envs_toys:ToyTracker"),
+        observation=["keypoints"],
     )
     seen, _ = env.reset(seed=0)
     assert seen["keypoints_mask"].all()
@@ -698,6 +701,19 @@ def test_arguments_outside_their_range_and_what_cannot_be_wrapped(
         wrapper(SlamEnv(ToySequence(5), TARGET, observation=observation), **arguments)
 
 
+class Stopwatch:
+    """Tells environments how long tracking took, whatever else the machine does."""
+
+    now_s = 0.0
+
+
+@pytest.fixture
+def stopwatch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trackers take the time by which they set the stopwatch forward."""
+    clock = SimpleNamespace(perf_counter=lambda: Stopwatch.now_s, process_time=lambda: 0.0)
+    monkeypatch.setattr("dynslam_bench.envs.slam_env.time", clock)
+
+
 class Compiles(FixedTracker):
     """Takes long over the first frames that it ever sees, as what compiles its kernels does."""
 
@@ -711,13 +727,14 @@ class Compiles(FixedTracker):
     def track(self, frame):
         if type(self).slow_frames < 3:
             type(self).slow_frames += 1
-            time.sleep(0.2)
+            Stopwatch.now_s += 0.2
         return super().track(frame)
 
 
 COMPILES = replace(FIXED, entry_point=f"{__name__}:Compiles")
 
 
+@pytest.mark.usefixtures("stopwatch")
 def test_compiling_is_no_work_of_a_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Compiles, "slow_frames", 0)
     monkeypatch.setattr(Compiles, "resets", 0)
@@ -730,6 +747,7 @@ def test_compiling_is_no_work_of_a_frame(monkeypatch: pytest.MonkeyPatch) -> Non
     assert Compiles.resets == 3  # it is warm
 
 
+@pytest.mark.usefixtures("stopwatch")
 def test_a_live_episode_takes_as_long_as_the_recording() -> None:
     env = DropFrames(SlamEnv(ToySequence(12), TARGET))
     env.reset(seed=0)

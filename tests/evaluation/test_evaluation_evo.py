@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluation_walks import chained, followed, lap, noisy, walk
 from evo.core import metrics, sync
 from evo.core.trajectory import PoseTrajectory3D
 from evo.tools import file_interface
+from helpers.evaluation_walks import chained, followed, lap, noisy, walk
 
 from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.evaluation import Protocol, RPESpec, evaluate, evaluate_files

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from evaluation_walks import followed, lap, scaled
+from helpers.evaluation_walks import followed, lap, scaled
 
 from dynslam_bench.core.errors import EvaluationError
 from dynslam_bench.evaluation import Protocol, RPESpec, evaluate, hints

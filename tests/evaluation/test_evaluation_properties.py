@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluation_walks import chained, noisy, scaled, turned, walk, written_w_first
+from helpers.evaluation_walks import chained, noisy, scaled, turned, walk, written_w_first
 from scipy.signal import lfilter
 
 from dynslam_bench.core.errors import EvaluationError, TrajectoryError

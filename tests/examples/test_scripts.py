@@ -15,6 +15,8 @@ import pytest
 from dynslam_bench.testing import check_tracker
 from dynslam_bench.trackers import TRACKERS
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 

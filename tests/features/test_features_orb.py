@@ -100,6 +100,7 @@ def test_orientation_turns_with_the_image():
     assert np.abs((b.angle[j] - a.angle[i] + 90 + 180) % 360 - 180).max() < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(39, 39), (39, 640), (97, 103), (300, 401)])
 @pytest.mark.parametrize("threshold", [1, 7, 40])
 def test_the_corners_are_those_of_opencv(shape, threshold):

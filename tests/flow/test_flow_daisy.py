@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from pictures import moved, moved_points, picture
+from helpers.flow_pictures import moved, moved_points, picture
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from dynslam_bench.core.compiled import kernel

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from exact_reference import binomial, quantised_maps
-from pictures import moved, moved_points, picture
+from helpers.exact_reference import binomial, quantised_maps
+from helpers.flow_pictures import moved, moved_points, picture
 
 from dynslam_bench.flow import layout
 from dynslam_bench.flow.dense_flow import (

@@ -70,6 +70,7 @@ def drawn(seed, stepping):
     return moths, flames, uniform, jumps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("iteration", [1, 5, 6, 10])
 @pytest.mark.parametrize("family", FAMILY.values(), ids=FAMILY)
 def test_numpy_and_the_kernel_follow_the_equations(family, iteration):

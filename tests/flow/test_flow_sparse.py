@@ -7,7 +7,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 import pytest
-from pictures import grid, moved, moved_points, picture
+from helpers.flow_pictures import grid, moved, moved_points, picture
 
 from dynslam_bench.contracts.flow import FlowEstimator
 from dynslam_bench.core.errors import PluginError
@@ -277,6 +277,7 @@ def test_the_forward_backward_check_rejects_what_is_covered():
         assert result.valid[hidden].mean() < 0.2 < 0.8 < result.valid[seen].mean()
 
 
+@pytest.mark.slow
 def test_plugins(tmp_path):
     path = tmp_path / "my_flow.py"
     path.write_text(

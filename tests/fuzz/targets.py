@@ -20,8 +20,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
-from published_folders import WRITERS, random_poses
+from helpers.published_folders import WRITERS, random_poses
 
 from dynslam_bench.cli.output import cell_text  # how a cell of a table is written
 from dynslam_bench.contracts import Frame, MapOutputs
@@ -44,9 +43,7 @@ from dynslam_bench.runs.exchange import formats, transfer
 from dynslam_bench.runs.layout import INDEX_FILE
 from dynslam_bench.runs.listing import list_runs
 from dynslam_bench.segmentation import recorded
-from dynslam_bench.segmentation.networks import loading, onnx_header, onnx_layout
-from dynslam_bench.segmentation.networks.backbone import NetworkConfig
-from dynslam_bench.segmentation.networks.network import MaskRCNN
+from dynslam_bench.segmentation.networks import onnx_header, onnx_layout
 from dynslam_bench.segmentation.training import labelled_images
 from dynslam_bench.sequences import cameras, catalogue, fetch
 from dynslam_bench.sequences.readers import files, layouts
@@ -706,8 +703,6 @@ TEXTS = [
 
 
 LENS = Camera(16, 12, 20.0, 20.0, 8.0, 6.0)
-SMALL = NetworkConfig(blocks=(1, 1, 1, 1), bottleneck=False, stem=1, channels=1, classes=("person",), box_hidden=1,
-                      mask_channels=1, mask_layers=1)  # fmt: skip
 
 
 def _encoded(*suffixes: str, image: np.ndarray | None = None) -> list[bytes]:
@@ -870,8 +865,16 @@ def _extract(data: bytes | None, folder: Path) -> None:
 
 @cache
 def _checkpoints() -> list[bytes]:
-    state = MaskRCNN(SMALL).state_dict()
-    ours = {"format": loading.FORMAT, "config": SMALL.model_dump_json(), "model": state}
+    import torch  # takes a second, of every process that collects
+
+    from dynslam_bench.segmentation.networks.backbone import NetworkConfig
+    from dynslam_bench.segmentation.networks.loading import FORMAT
+    from dynslam_bench.segmentation.networks.network import MaskRCNN
+
+    small = NetworkConfig(blocks=(1, 1, 1, 1), bottleneck=False, stem=1, channels=1, classes=("person",),
+                          box_hidden=1, mask_channels=1, mask_layers=1)  # fmt: skip
+    state = MaskRCNN(small).state_dict()
+    ours = {"format": FORMAT, "config": small.model_dump_json(), "model": state}
     odd = next(iter(state))
     contents: list[Any] = [
         *(
@@ -893,7 +896,7 @@ def _checkpoints() -> list[bytes]:
             for value in (torch.full_like(state[odd], torch.nan), torch.zeros(2).to_sparse())
         ),
         ours
-        | {"config": SMALL.model_copy(update={"stem": 4096, "channels": 4096}).model_dump_json()},
+        | {"config": small.model_copy(update={"stem": 4096, "channels": 4096}).model_dump_json()},
         *(
             {"model": {**state, "roi_heads.box_predictor.cls_score.weight": torch.zeros(size, 4)}}
             for size in (91, 7)
@@ -907,6 +910,12 @@ def _checkpoints() -> list[bytes]:
         written(lambda file: torch.save(ours, file, _use_new_zipfile_serialization=False)),
         zipped({"archive/data.pkl": bytes(1 << 20)}, zipfile.ZIP_DEFLATED),
     ]
+
+
+def _load_network(data: bytes | None, folder: Path) -> object:
+    from dynslam_bench.segmentation.networks.loading import load_network
+
+    return load_network(at(folder, "net.pt", data))
 
 
 def _onnx(metadata: dict[str, bytes]) -> bytes:
@@ -978,7 +987,7 @@ BINARIES = [
     Target("archive", _extract, _archives, _tar_checked),
     Target(
         "checkpoint",
-        lambda data, folder: loading.load_network(at(folder, "net.pt", data)),
+        _load_network,
         _checkpoints,
         mutate_zip,
     ),

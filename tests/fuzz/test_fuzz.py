@@ -15,6 +15,8 @@ import pytest
 from .mutate import mutate
 from .targets import TARGETS, Target
 
+pytestmark = pytest.mark.slow
+
 INPUTS = int(os.environ.get("FUZZ_INPUTS", "60"))
 SEED = int(os.environ.get("FUZZ_SEED", "0"))
 MOST_MB = 512

@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from evaluation_walks import followed, lap, rows_of
+from helpers.evaluation_walks import followed, lap, rows_of
 
 from dynslam_bench.core.errors import TrajectoryError
 from dynslam_bench.geometry import (

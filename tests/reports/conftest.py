@@ -1,7 +1,7 @@
 """One filled store and its report."""
 
 import pytest
-from reports_fake_store import add_run, fill
+from helpers.reports_fake_store import add_run, fill
 
 from dynslam_bench.reports import build_report
 from dynslam_bench.runs.store import RunStore

@@ -4,15 +4,15 @@ import json
 
 import pandas as pd
 import pytest
-from envs_toys import write_folder
-from reports_browser import Browser, needs_browser
-from reports_fake_store import add_frames, add_run, fill, page_data
+from helpers.envs_toys import write_folder
+from helpers.reports_browser import Browser, needs_browser
+from helpers.reports_fake_store import add_frames, add_run, fill, page_data
 
 from dynslam_bench.envs.slam_env import open_frames
 from dynslam_bench.reports import build_report, compare
 from dynslam_bench.sequences.view import part_of
 
-pytestmark = needs_browser
+pytestmark = [needs_browser, pytest.mark.slow]
 NAME = "Ours <b>&amp;</b> 'quoted' \N{SNOWMAN} \N{HEBREW LETTER ALEF} $x_1$"
 
 
@@ -91,7 +91,7 @@ def open_page(browser, report, page, width=1440, anchor=""):
     browser.open(report.html.parent / f"{page}.html", width, anchor=anchor)
     browser.run("all('details').forEach((fold) => { fold.open = true; })")
     browser.run("all('.figure').forEach((figure) => figure.scrollIntoView())")
-    browser.until(READY[page], tries=200)
+    browser.until(READY[page])
     browser.settle()
 
 
@@ -191,7 +191,7 @@ def test_the_view_of_the_board_is_in_the_address(browser, report):
     assert browser.run("byId('compare').disabled") is False
     browser.run("byId('compare').click()")
     ready = "typeof byId === 'function' && byId('sentence') && byId('sentence').textContent.includes('against')"
-    browser.until(ready, tries=200)
+    browser.until(ready)
     assert browser.faults == []
 
 
@@ -293,15 +293,15 @@ def test_picture_track_and_time_move_together(browser, report):
 
 def test_a_failed_run_explains_itself(browser, report):
     browser.open(report.run, anchor=f"#{run_of(report, 'DS-SLAM', 'synthetic/walking_rpy')}")
-    browser.until("byId('run-choice').children.length === 3", tries=100)
+    browser.until("byId('run-choice').children.length === 3")
     browser.run("(byId('run-choice').children[2].selectedIndex = 1)")
     browser.run("byId('run-choice').children[2].dispatchEvent(new Event('change'))")
-    browser.until("byId('verdict').classList.contains('red')", tries=100)
+    browser.until("byId('verdict').classList.contains('red')")
     assert (
         browser.run("byId('verdict').textContent")
         == "Crashed at 30/120 frames: RuntimeError: the map is empty"
     )
-    browser.until("byId('time').layout", tries=100)
+    browser.until("byId('time').layout")
     shaded = browser.run("byId('time').layout.shapes[0]")
     assert shaded["x0"] == pytest.approx(29 / 30, abs=0.05)
     assert shaded["x1"] == pytest.approx(4.0)
@@ -369,7 +369,7 @@ def test_of_too_many_runs_some_have_no_page_and_that_is_said(browser, tmp_path):
 def test_two_trackers_are_compared_as_in_the_tables(browser, report):
     a, b = (numbers_of(report, name, "toy")[0] for name in ("ORB-SLAM2", "Mask R-CNN"))
     browser.open(report.html.parent / "compare.html", anchor=f"#a={a}&b={b}")
-    browser.until("byId('sentence').textContent.includes('against')", tries=200)
+    browser.until("byId('sentence').textContent.includes('against')")
     errors = pd.read_csv(report.csv["per_sequence"], index_col="tracker").filter(like="synthetic")
     one, other = (
         errors.loc[f"{name} (our back end)"].astype(float) for name in ("Mask R-CNN", "ORB-SLAM2")
@@ -392,10 +392,10 @@ def test_two_results_folders_are_a_page(browser, tmp_path):
     found = compare(before, after, output=tmp_path / "page")
     assert found.page == tmp_path / "page" / "index.html"
     browser.open(found.page)
-    browser.until("one('#dumbbells .main-svg')", tries=200)
+    browser.until("one('#dumbbells .main-svg')")
     assert browser.run("all('#choice option').length") == 3, "two trackers and the control"
     browser.run(
         "byId('dumbbells').emit('plotly_click', {points: [{y: byId('dumbbells').data[1].y[0]}]})"
     )
-    browser.until("one('#difference .main-svg')", tries=200)
+    browser.until("one('#difference .main-svg')")
     assert browser.faults == []

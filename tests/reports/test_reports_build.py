@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 import plotly.graph_objects as go
 import pytest
-from reports_fake_store import (
+from helpers.reports_fake_store import (
     PROTOCOL,
     add_frames,
     add_run,
@@ -53,6 +53,7 @@ from dynslam_bench.runs.store import RunStore
 PAGES = ("index", "errors", "compare", "paper", "diagnostics", "reproduce", "run")
 
 
+@pytest.mark.slow
 def test_every_page_loads_nothing_but_what_lies_beside_it(made):
     folder = made[1].html.parent
     for name in PAGES:
@@ -157,6 +158,7 @@ def test_failures_are_rows_and_count_as_not_moving(made):
     assert "counts as a static camera, or worse (1 of 41 runs)" in markdown
 
 
+@pytest.mark.slow
 def test_a_report_can_be_made_again_under_another_protocol(made, tmp_path):
     store, paths = made
     other = build_report(store, tmp_path / "other", protocol="vslam-lab", most_pages=0)
@@ -187,6 +189,7 @@ def test_reference_that_was_not_run_everywhere_gives_way_to_not_moving(made, tmp
     assert float(rows_of(paths.csv["leaderboard"])[0]["ATE ratio"]) < 0.2
 
 
+@pytest.mark.slow
 def test_small_and_odd_results(tmp_path):
     """One run; a sequence without ground truth; nothing but failures; hostile names."""
     hostile = "</script><script>alert(1)</script> & | % _ $"
@@ -302,6 +305,7 @@ def two_cores(monkeypatch):
     monkeypatch.setattr(workers.os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
 
 
+@pytest.mark.slow
 def test_workers_make_the_same_report(tmp_path, two_cores, monkeypatch):
     store = fill(tmp_path / "results", sequences=["synthetic/sitting_xyz"], seeds=(0,))
     add_run(store, "orb-slam2", "synthetic/sitting_xyz", 7, lost=range(30), status="lost")
@@ -324,6 +328,7 @@ def test_workers_make_the_same_report(tmp_path, two_cores, monkeypatch):
     assert scored[-1] == len(store.ids())
 
 
+@pytest.mark.slow
 def test_workers_run_no_script_of_the_caller_and_their_errors_and_deaths_are_named(
     two_cores, tmp_path, monkeypatch
 ):
@@ -357,6 +362,7 @@ def opened(monkeypatch):
     return found
 
 
+@pytest.mark.slow
 def test_known_runs_cost_no_file_each(store, tmp_path, opened):
     for number in range(20):
         add_run(store, f"tracker-{number % 5}", f"s/{number % 2}", number // 10, n=20)
@@ -386,6 +392,7 @@ def test_of_very_many_runs_few_have_a_page():
     assert {case: pages_for(*case) for case in wanted} == wanted
 
 
+@pytest.mark.slow
 def test_unlisted_runs_count_in_every_cell(tmp_path, monkeypatch):
     store = fill(tmp_path / "results", sequences=["synthetic/walking_xyz"])
     add_run(store, "dies", "synthetic/walking_xyz", status="crashed", reason="RuntimeError: no")
@@ -419,6 +426,7 @@ def test_long_tables_are_shown_in_part_and_written_whole(monkeypatch):
     )
 
 
+@pytest.mark.slow
 def test_the_figure_of_masks_thins_many_points_and_keeps_the_best(tmp_path, monkeypatch):
     board = make_board(
         load_runs(
@@ -479,6 +487,7 @@ DAMAGE = {
 }
 
 
+@pytest.mark.slow
 def test_damaged_files_of_a_store_cost_only_their_own_figures_and_are_named(store, tmp_path):
     sound = add_run(store, "b", "s/a", n=40)
     add_frames(store.folder(sound), 40)
@@ -517,6 +526,7 @@ def test_a_tracker_that_always_crashes_is_not_called_repeatable():
     }
 
 
+@pytest.mark.slow
 def test_a_run_that_crashed_hides_no_exact_share(tmp_path):
     """What the masks show of a frame is known if any run saw the frame, not only the first one of the sequence."""
     store = RunStore(tmp_path / "r")
@@ -604,6 +614,7 @@ def loaded_from(store):
     return rows, loaded.stopped, loaded.superseded, sorted(loaded.unreadable)
 
 
+@pytest.mark.slow
 def test_unchanged_runs_are_not_read_and_rows_are_equal(known, tmp_path, reads):
     kept = loaded_from(known)
     assert reads == []
@@ -635,6 +646,7 @@ CHANGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", CHANGES)
 def test_what_changed_shows_at_once(known, reads, change):
     before = loaded_from(known)
@@ -649,6 +661,7 @@ def test_what_changed_shows_at_once(known, reads, change):
     assert after != before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change", ["value = '{'", "value = x'ff'", "run_id = '0000000000000000'", "state = 'x'"]
 )
@@ -666,6 +679,7 @@ def test_rows_that_somebody_made_count_as_missing(known, reads, change):
     assert first in reads
 
 
+@pytest.mark.slow
 def test_trials_of_studies_are_left_out_counted_and_shown_on_request(tmp_path):
     trial = {"error": 0.001, "overrides": {"features": 500}, "study": "mine"}
     store = RunStore(tmp_path / "r")
@@ -769,6 +783,7 @@ def odd(tmp_path_factory):
     return build_report(store, root / "report")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="needs pdflatex")
 def test_latex_compiles_and_fits_a_column(odd):
     (odd.latex.parent / "paper.tex").write_text(
@@ -784,6 +799,7 @@ def test_latex_compiles_and_fits_a_column(odd):
     )
 
 
+@pytest.mark.slow
 def test_captions_are_short_and_name_no_ids(odd):
     text = odd.latex.read_text()
     captions = re.findall(r"\\caption\{(.*)\}", text)
@@ -834,6 +850,7 @@ def test_no_name_is_more_than_a_name():
     assert not set(markdown + to_latex(table)) & {"\x1b", "\u202e"}
 
 
+@pytest.mark.slow
 def test_compare_finds_what_changed(made, tmp_path):
     store, paths = made
     walking = ["synthetic/walking_xyz", "synthetic/walking_rpy"]
@@ -870,6 +887,7 @@ def test_compare_refuses_what_has_nothing_in_common(made, tmp_path):
         compare(store, other)
 
 
+@pytest.mark.slow
 def test_compare_pairs_runs_of_different_settings_and_says_what_differs(tmp_path):
     before = RunStore(tmp_path / "a")
     after = RunStore(tmp_path / "b")

@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 import pandas as pd
 import pytest
-from reports_fake_store import PROTOCOL, add_run, rows_of, truth_of
+from helpers.reports_fake_store import PROTOCOL, add_run, rows_of, truth_of
 
 from dynslam_bench.cli.app import start
 from dynslam_bench.core.errors import ReportError
@@ -102,6 +102,7 @@ def test_nothing_but_failures_has_no_such_tables(tmp_path):
     assert bar_figure(board, "rmse") is None
 
 
+@pytest.mark.slow
 def test_a_site_needs_nothing_outside_of_it(store, tmp_path, capsys):
     study = tmp_path / "study"
     output = tmp_path / "docs" / "example"
@@ -158,6 +159,7 @@ def report():
     return audit_paper()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("check", "numbers", "failed"),
     [
@@ -250,6 +252,7 @@ def test_a_table_that_is_right_passes(monkeypatch):
         assert audited.failed(check) == [], check
 
 
+@pytest.mark.slow
 def test_never_moving_can_be_recomputed_from_ground_truth():
     n = 400
     poses = np.tile(np.eye(4), (n, 1, 1))

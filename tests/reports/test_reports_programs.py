@@ -11,7 +11,15 @@ from statistics import geometric_mean
 from typing import Any
 
 import pytest
-from reports_fake_store import MACHINE, PROTOCOL, add_run, columns_of, page_data, row, rows_of
+from helpers.reports_fake_store import (
+    MACHINE,
+    PROTOCOL,
+    add_run,
+    columns_of,
+    page_data,
+    row,
+    rows_of,
+)
 
 from dynslam_bench.core.fingerprint import path_digest
 from dynslam_bench.reports import ReportData, build_report, compare, load_board
@@ -98,6 +106,7 @@ def ratio_words(store: RunStore, pairs: list[tuple[str, str]]) -> str:
 # -- programs with equal results -------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("common", [5, 6])
 def test_programs_with_five_equal_results_share_a_row(store: RunStore, common: int) -> None:
     for scene in SCENES[:7]:
@@ -113,6 +122,7 @@ def test_programs_with_five_equal_results_share_a_row(store: RunStore, common: i
     assert made_now == set(SCENES[:common])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("common", "words"), [(1, "1 run"), (4, "4 runs")])
 def test_programs_with_four_equal_results_have_a_row_each(
     store: RunStore, common: int, words: str
@@ -139,6 +149,7 @@ def test_programs_without_a_run_in_common_say_so(store: RunStore) -> None:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("differing", [1, 3])
 def test_programs_that_differ_have_a_row_each_that_says_by_how_much(
     store: RunStore, differing: int
@@ -178,6 +189,7 @@ def test_a_row_says_in_what_its_program_differs(
     assert f"other {words}: no run in common" in rows_by_label(load_board(store))
 
 
+@pytest.mark.slow
 def test_a_crash_where_another_program_succeeded_is_a_difference(store: RunStore) -> None:
     for scene in SCENES[:6]:
         add(store, scene, made_elsewhere())
@@ -187,6 +199,7 @@ def test_a_crash_where_another_program_succeeded_is_a_difference(store: RunStore
     assert remark.startswith("other code: 1 of 6 runs differs, ATE × ")
 
 
+@pytest.mark.slow
 def test_equal_failures_are_no_evidence(store: RunStore) -> None:
     for at, scene in enumerate(SCENES[:7]):
         status = "crashed" if at < 3 else "ok"
@@ -199,6 +212,7 @@ def test_equal_failures_are_no_evidence(store: RunStore) -> None:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("results", "remark"),
     [
@@ -217,6 +231,7 @@ def test_copies_of_one_result_under_several_seeds_count_once(
     assert remark in rows_by_label(load_board(store))
 
 
+@pytest.mark.slow
 def test_trackers_that_are_not_deterministic_never_share_a_row(store: RunStore) -> None:
     pairs = []
     for scene in SCENES[:7]:
@@ -236,6 +251,7 @@ def test_trackers_that_are_not_deterministic_never_share_a_row(store: RunStore) 
     }
 
 
+@pytest.mark.slow
 def test_runs_whose_ids_are_not_verified_never_share_a_row(store: RunStore) -> None:
     for scene in SCENES[:7]:
         add(store, scene, made_here() | {"scheme": IDENTITY_SCHEME - 1}, started=YESTERDAY)
@@ -248,6 +264,7 @@ def test_runs_whose_ids_are_not_verified_never_share_a_row(store: RunStore) -> N
     assert sum(run.is_current for run in board.rows) == 7
 
 
+@pytest.mark.slow
 def test_programs_share_a_row_only_where_all_pairs_agree(store: RunStore) -> None:
     """The second is equal to the first; the third is equal to the first, and differs from the second elsewhere."""
     for scene in SCENES[:5]:
@@ -265,6 +282,7 @@ def test_programs_share_a_row_only_where_all_pairs_agree(store: RunStore) -> Non
     assert remarks[other] == [SCENES[6]]
 
 
+@pytest.mark.slow
 def test_programs_that_agree_with_one_another_by_way_of_a_third_share_a_row(
     store: RunStore,
 ) -> None:
@@ -280,6 +298,7 @@ def test_programs_that_agree_with_one_another_by_way_of_a_third_share_a_row(
     }
 
 
+@pytest.mark.slow
 def test_the_remark_stands_on_the_first_page_and_in_the_tables(
     store: RunStore, tmp_path: Path
 ) -> None:
@@ -326,6 +345,7 @@ def test_of_runs_of_one_program_the_newest_counts(store: RunStore) -> None:
     assert [run.run_id for run in load_runs([store], PROTOCOL).rows] == [newest]
 
 
+@pytest.mark.slow
 def test_a_result_that_came_back_counts_in_place_of_one_between(store: RunStore) -> None:
     """What is installed equals an early program; the run of a program between them has another result."""
     for scene in SCENES[:5]:
@@ -341,6 +361,7 @@ def test_a_result_that_came_back_counts_in_place_of_one_between(store: RunStore)
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "started",
     ["2031-01-01T00:00:00+00:00", NEXT_YEAR, "2999-12-31T00:00:00Z"],
@@ -382,6 +403,7 @@ def test_a_start_that_is_no_date_counts_as_the_oldest(store: RunStore, started: 
     assert {run.started: run.is_current for run in rows} == {LAST_YEAR: True, started: False}
 
 
+@pytest.mark.slow
 def test_where_none_of_several_programs_is_installed_the_newest_ranks_and_the_report_says_so(
     store: RunStore, tmp_path: Path
 ) -> None:
@@ -500,6 +522,7 @@ def test_a_file_that_a_setting_names_counts_by_its_content(tmp_path: Path, prefi
     assert Installation().what_changed(record_of(identity, **settings)) == "the weights of net"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", ["boards_plugin:SPEC", "{folder}/boards_plugin.py:SPEC"])
 def test_no_plug_in_is_imported_to_tell_whether_it_has_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, store: RunStore, part: str
@@ -565,6 +588,7 @@ def test_choosing_among_many_runs_looks_at_each_program_once(
 # -- ids of 20 digits, and of 16 -------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("run_id", ["0123456789abcdef", "0123456789abcdef0123"])
 def test_pages_lead_to_runs_whose_ids_have_20_digits_or_16(
     store: RunStore, tmp_path: Path, run_id: str
@@ -692,6 +716,7 @@ def test_the_pareto_front_joins_trackers_that_were_timed_on_one_computer() -> No
     ]
 
 
+@pytest.mark.slow
 def test_the_first_page_has_the_time_on_one_computer(store: RunStore, tmp_path: Path) -> None:
     for at in range(3):
         add_run(store, "mine", f"s/{at}", machine=FAST, frame_s=0.02)

@@ -4,9 +4,8 @@ import json
 
 import numpy as np
 import pytest
-import scikit_posthocs as posthocs
+from helpers.reports_fake_store import MACHINE, PROTOCOL, add_run, cell_of, crashed, row
 from rank_groups import simulate
-from reports_fake_store import MACHINE, PROTOCOL, add_run, cell_of, crashed, row
 from scipy import stats
 
 from dynslam_bench.cli.output import report_table
@@ -380,6 +379,8 @@ def test_weights_make_categories_count_alike_and_one_sequence_of_many_weights_is
 
 
 def test_nemenyis_differences_are_those_of_scikit_posthocs():
+    import scikit_posthocs as posthocs  # loads Matplotlib
+
     rng = np.random.default_rng(10)
     logs = {str(i): rng.normal(0.4 * i, 0.5, 10) for i in range(6)}
     p_value, difference = mean_rank_test(logs)
@@ -407,6 +408,7 @@ def test_holm(p_values, corrected):
     assert holm(p_values) == pytest.approx(corrected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["normal", "heavy tails", "unequal spread", "skewed"])
 @pytest.mark.parametrize("sequences", [3, 5, 8, 20])
 def test_claims_of_simulated_boards_are_right(shape, sequences):

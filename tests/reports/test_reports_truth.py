@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from reports_fake_store import (
+from helpers.reports_fake_store import (
     PROTOCOL,
     add_frames,
     add_run,
@@ -201,6 +201,7 @@ def test_parts_get_no_published_rows(store, tmp_path):
     assert [is_excerpt(*length) for length in lengths] == [True, False, False]
 
 
+@pytest.mark.slow
 def test_a_final_trajectory_stands_in_no_online_table(tmp_path):
     store = RunStore(tmp_path / "r")
     only = RunStore(tmp_path / "only")
@@ -298,6 +299,7 @@ def test_the_share_without_fundamental_matrix_stands_beside_the_error():
     assert "F skipped" not in [c.name for c in leaderboard(make_board([row()]), PROTOCOL).columns]
 
 
+@pytest.mark.slow
 def test_the_page_of_a_run_stacks_stages_alone_and_claims_no_share_of_people_where_there_are_no_masks(
     store, tmp_path
 ):
@@ -724,6 +726,7 @@ def test_a_tracker_that_was_judged_only_where_its_network_was_trained_is_not_ran
     assert len(load_board(store, rank_seen=True).ranked) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rank_seen", [False, True])
 def test_every_format_carries_the_mark(seen, tmp_path, rank_seen):
     paths = build_report(seen, tmp_path / "report", rank_seen=rank_seen)
@@ -770,6 +773,7 @@ def test_a_recording_of_unknown_length_beside_published_numbers_is_named(store, 
     assert not is_excerpt("bonn/balloon", 1.0), "no source, no claim"
 
 
+@pytest.mark.slow
 def test_what_was_put_together_here_is_called_no_system_of_ours(store, tmp_path):
     """The back end in the manner of ORB-SLAM2 and masks by Mask R-CNN are others' systems in our composition."""
     for tracker in ("orb-slam2", "mask-rcnn", "emfoa-oft"):

@@ -17,9 +17,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from envs_toys import CAMERA, TARGET, write_folder
 from evo.core.trajectory import PoseTrajectory3D
 from evo.tools import file_interface
+from helpers.envs_toys import CAMERA, TARGET, write_folder
 from published_trajectories import SINGLE
 from rosbags.rosbag2 import Reader
 from typer.testing import CliRunner
@@ -360,6 +360,7 @@ def test_without_the_library_one_line_says_what_to_install(monkeypatch: pytest.M
         check_rerun()
 
 
+@pytest.mark.slow
 @needs_rerun
 def test_a_recording_of_100_frames(store: RunStore, tmp_path: Path) -> None:
     record = run_one(
@@ -405,6 +406,7 @@ def test_a_recording_that_cannot_be_written_says_so(tmp_path: Path) -> None:
         write_recording(tmp_path / "missing" / RECORDING_FILE, CAMERA, "toy", [], (nothing, None))
 
 
+@pytest.mark.slow
 @needs_rerun
 def test_the_recording_of_a_stored_run(store: RunStore, tmp_path: Path) -> None:
     record = run_one(
@@ -480,6 +482,7 @@ def sum_up(folder):
     (folder / "SHA256SUMS").write_text("".join(lines))
 
 
+@pytest.mark.slow
 def test_a_bank_is_a_results_folder_of_text_files(results, made):
     files = sorted(
         path.relative_to(made).as_posix() for path in made.rglob("*") if not path.is_dir()
@@ -501,6 +504,7 @@ def test_a_bank_is_a_results_folder_of_text_files(results, made):
     assert (again.added, len(again.stored), again.left_out) == ([], 2, [])
 
 
+@pytest.mark.slow
 def test_two_who_add_at_once_lose_nothing(results, made, tmp_path, monkeypatch):
     """The second one comes while the first has copied its runs and not yet written their checksums."""
     copied = Event()
@@ -528,6 +532,7 @@ def test_two_who_add_at_once_lose_nothing(results, made, tmp_path, monkeypatch):
     assert RunStore(target).ids() == [first, second]
 
 
+@pytest.mark.slow
 def test_trials_of_studies_are_left_out(results, tmp_path):
     store = RunStore(tmp_path / "with_trial")
     shutil.copytree(results, store.root)
@@ -557,6 +562,7 @@ FAULTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change, words", FAULTS.values(), ids=FAULTS)
 def test_faults_are_named_and_such_a_bank_is_neither_taken_nor_given(
     made, remote, tmp_path, change, words
@@ -578,6 +584,7 @@ def test_faults_are_named_and_such_a_bank_is_neither_taken_nor_given(
     assert not (tmp_path / "other").exists()
 
 
+@pytest.mark.slow
 def test_records_that_do_not_fit_are_named(made):
     """Their checksums are right: whoever changed them made those, too."""
     (first, second) = RunStore(made).ids()
@@ -598,6 +605,7 @@ def test_records_that_do_not_fit_are_named(made):
     assert "stamps" in faults[3]
 
 
+@pytest.mark.slow
 def test_through_a_bare_git_repository_and_back(made, remote, tmp_path, monkeypatch):
     assert len(bank.push(made, remote).added) == 2
     monkeypatch.chdir(Path(remote).parent)
@@ -611,6 +619,7 @@ def test_through_a_bare_git_repository_and_back(made, remote, tmp_path, monkeypa
     assert (tmp_path / "pulled" / "SHA256SUMS").read_bytes() == (made / "SHA256SUMS").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_submission_with_an_altered_trajectory_is_refused(made, remote, tmp_path):
     """With new checksums, it contradicts the run's record."""
     bank.push(made, remote)
@@ -620,6 +629,7 @@ def test_a_submission_with_an_altered_trajectory_is_refused(made, remote, tmp_pa
         bank.push(made, remote)
 
 
+@pytest.mark.slow
 def test_what_a_full_disk_cut_short_is_a_bank_and_can_be_gone_on_with(
     results, tmp_path, monkeypatch
 ):
@@ -639,6 +649,7 @@ def test_what_a_full_disk_cut_short_is_a_bank_and_can_be_gone_on_with(
     assert len(bank.add([results], tmp_path / "bank").added) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", ["trajectory_online.txt", "timestamps.txt", "groundtruth.txt"])
 def test_text_that_is_no_trajectory_is_a_fault_though_its_checksum_fits(made, file):
     sorted(made.rglob(file))[0].write_text("total garbage\n")
@@ -647,6 +658,7 @@ def test_text_that_is_no_trajectory_is_a_fault_though_its_checksum_fits(made, fi
     assert all("runs/" in fault for fault in bank.verify(made))
 
 
+@pytest.mark.slow
 def test_a_repository_of_something_else_gets_no_bank(made, remote, tmp_path):
     subprocess.run(
         ["git", "clone", "--quiet", remote, tmp_path / "code"], check=True, capture_output=True
@@ -662,6 +674,7 @@ def test_a_repository_of_something_else_gets_no_bank(made, remote, tmp_path):
         bank.push(made, remote)
 
 
+@pytest.mark.slow
 def test_an_archive_is_pulled_from_its_address(made, tmp_path, monkeypatch):
     def download(url, target):
         assert url == "https://example.org/bank.zip"

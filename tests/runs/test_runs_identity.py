@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from envs_toys import TARGET, write_folder
+from helpers.envs_toys import TARGET, write_folder
 
 from dynslam_bench.core import PluginError, RunError
 from dynslam_bench.core.plugins import has_imported_plugins
@@ -19,6 +19,8 @@ from dynslam_bench.runs import RunSpec, RunStore, identity, resolve, run_many, r
 from dynslam_bench.runs.record import run_id_of
 from dynslam_bench.runs.validity import Installation
 from dynslam_bench.trackers import TRACKERS
+
+pytestmark = pytest.mark.slow
 
 PLUGIN = """
 import os, sys

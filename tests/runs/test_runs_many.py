@@ -24,12 +24,12 @@ from itertools import cycle
 from pathlib import Path
 from unittest.mock import Mock
 
-import envs_toys
 import numpy as np
 import pandas as pd
 import pytest
-from envs_toys import TARGET, truth, write_folder
-from hostile import until
+from helpers import envs_toys
+from helpers.envs_toys import TARGET, truth, write_folder
+from helpers.hostile import until
 
 from dynslam_bench.api import bench, report
 from dynslam_bench.cli.running import parse_shard, show_workers
@@ -56,6 +56,8 @@ from dynslam_bench.sequences.catalogue import entry_of, sequence_ids
 from dynslam_bench.sequences.synthetic import parse_synthetic_id
 from dynslam_bench.suites import load_suite, suite_names
 from dynslam_bench.trackers.registry import TRACKERS
+
+pytestmark = pytest.mark.slow
 
 
 def specs(folder: str, seeds: range, **change) -> list[RunSpec]:

@@ -9,8 +9,8 @@ from unittest.mock import Mock
 import cv2
 import numpy as np
 import pytest
-from envs_play import play
-from envs_toys import TARGET, ToySequence, write_folder
+from helpers.envs_play import play
+from helpers.envs_toys import TARGET, ToySequence, write_folder
 
 from dynslam_bench.contracts import KeyframeRecord, MapOutputs
 from dynslam_bench.core import WEIGHTS_VARIABLE, DynslamError, RunError, SettingsError, TrackerError
@@ -36,6 +36,8 @@ from dynslam_bench.runs.identity import check_unchanged, start_map_of
 from dynslam_bench.runs.rows import runs_frame
 from dynslam_bench.slam.map_files import MAP_FILE, SavedMap, read_map, write_map
 from dynslam_bench.slam.settings import BackendSettings, StartMapSettings
+
+pytestmark = pytest.mark.slow
 
 
 def leftovers(store: RunStore) -> list[str]:

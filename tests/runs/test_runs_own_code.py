@@ -22,6 +22,8 @@ from dynslam_bench.core.module_graph import (
 from dynslam_bench.runs import RunSpec, resolve
 from dynslam_bench.runs.own_code import BESIDE_THE_LOOP, FINDERS, modules_of_run
 
+pytestmark = pytest.mark.slow
+
 SCENE = "synthetic/walking_xyz?scene=100&frames=6"
 # Prints the modules of this package of which a function ran while a run was made in this process.
 TRACER = """

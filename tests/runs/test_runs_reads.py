@@ -15,6 +15,8 @@ import pytest
 from dynslam_bench.core.programs import ProgramReads, is_counted, look_at, program_environment
 from dynslam_bench.core.reads import Anchors, Reads, Verifier, digest_of, search_now
 
+pytestmark = pytest.mark.slow
+
 SERVER = Path(__file__).with_name("reads_server.py")
 
 

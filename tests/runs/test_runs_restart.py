@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from faults import in_a_small_process, survey, tree
+from helpers.faults import in_a_small_process, survey, tree
 
 from dynslam_bench.core import InfrastructureError, RunError
 from dynslam_bench.geometry import Trajectory, write_tum
@@ -18,6 +18,8 @@ from dynslam_bench.runs import RunRecord, RunStore, bank, list_runs, rescore
 from dynslam_bench.runs import index as index_module
 from dynslam_bench.runs.copying import merge
 from dynslam_bench.runs.exchange.transfer import import_trajectory
+
+pytestmark = pytest.mark.slow
 
 
 def walk(path: Path, drift: float) -> Path:

@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
-from envs_toys import TARGET
-from reports_fake_store import add_run
+from helpers.envs_toys import TARGET
+from helpers.reports_fake_store import add_run
 
 from dynslam_bench.contracts import TrackResult
 from dynslam_bench.core import DynslamError, ReportError, RunError, StudyError, try_lock
@@ -169,6 +169,7 @@ def test_a_newer_record_is_refused_not_misread(tmp_path: Path) -> None:
             RunRecord.read(tmp_path / "run.json")
 
 
+@pytest.mark.slow
 def test_what_a_killed_process_left_is_swept_up_and_nothing_else(tmp_path: Path) -> None:
     root = tmp_path / "results"
     code = (

@@ -380,6 +380,7 @@ def test_auto_means_embedded_on_rendered_sequences():
     )
 
 
+@pytest.mark.slow
 def test_it_finds_people_of_a_held_out_instance(tmp_path):
     segmenter = build_segmenter(AUTO, sequence_id="synthetic/walking_xyz", threads=1)
     sequence = open_sequence("synthetic/sitting_xyz?scene=120&frames=30", data_root=tmp_path)

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from onnx_files import (
+from helpers.onnx_files import (
     BOX,
     CELLS,
     FLOAT,

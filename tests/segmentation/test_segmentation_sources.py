@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from fetch_server import Server
+from helpers.fetch_server import Server
 
 from dynslam_bench.contracts.segmenter import Instances
 from dynslam_bench.contracts.sequence import Frame, FrameMasks
@@ -288,6 +288,7 @@ SMALL = SegmenterSpec("small", f"{__name__}:SmallMasks")
 BROKEN = SegmenterSpec("broken", "operator:eq")
 
 
+@pytest.mark.slow
 def test_plugins():
     def source(name):
         return SegmentationSettings(source=f"plugin:{__file__}:{name}")
@@ -454,6 +455,7 @@ def test_a_misspelled_recorded_class_is_said(sequence, tmp_path):
     assert len(warned) == 1
 
 
+@pytest.mark.slow
 def test_masks_of_own_names_are_recorded_and_used(sequence, tmp_path):
     source = f"plugin:{__file__}:OWN"
     with pytest.warns(UserWarning) as warned:

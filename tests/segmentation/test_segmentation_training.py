@@ -225,6 +225,7 @@ def settings_for(folder, **changes):
     })  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path, small_images):
     data = write_yolo(tmp_path / "data", 2)
     cache = tmp_path / "cache"
@@ -263,6 +264,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path, small_images):
     assert started.step == 1
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small_images")
 def test_losses_fall_on_a_simple_task(tmp_path):
     data = write_yolo(tmp_path / "data", 2)
@@ -298,6 +300,7 @@ def test_what_cannot_be_trained_is_refused(tmp_path):
 # --- evaluation --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_evaluating_a_network_and_writing_the_score(tmp_path):
     data = write_yolo(tmp_path / "data", 3)
     trained = train(

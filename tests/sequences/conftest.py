@@ -1,8 +1,8 @@
 """A small published sequence, packed and served."""
 
 import pytest
-from fetch_server import FOLDER, NAME, Server, tgz
-from sequence_folders import make_folder
+from helpers.fetch_server import FOLDER, NAME, Server, tgz
+from helpers.sequence_folders import make_folder
 
 from dynslam_bench.sequences.fetch import fetch
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from published_folders import WRITERS, random_poses
-from sequence_folders import make_folder, rewrite
+from helpers.published_folders import WRITERS, random_poses
+from helpers.sequence_folders import make_folder, rewrite
 
 from dynslam_bench.contracts import Frame
 from dynslam_bench.core import DynslamError, SequenceError
@@ -100,6 +100,7 @@ WAYS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["bonn", "tum-fr1", "tum-fr3"])
 @pytest.mark.parametrize("way", WAYS)
 def test_every_way_of_naming_a_camera_gives_the_same_sequence(tmp_path, way, name):
@@ -169,6 +170,7 @@ def test_the_identity_says_that_the_poses_are_the_camera_s(tmp_path):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", ["made", "rgbd_bonn_made"])
 def test_a_composite_of_bonn_is_not_turned_a_second_time(tmp_path, target):
     """`compose` writes poses in the camera's axes."""
@@ -427,6 +429,7 @@ def test_checks_of_a_recording_name_the_missing_factor(tmp_path):
         verify(str(folder))
 
 
+@pytest.mark.slow
 def test_the_command_line_prints_the_file_as_it_stands(tmp_path):
     folder = small(tmp_path / "rec", INTRINSICS)
     command = [sys.executable, "-m", "dynslam_bench", "sequences", "info", str(folder)]

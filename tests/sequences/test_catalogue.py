@@ -14,9 +14,9 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from fetch_server import FOLDER, NAME, Server, left_behind, tgz
-from published_folders import random_poses, write_eth3d
-from sequence_folders import flipped, make_folder
+from helpers.fetch_server import FOLDER, NAME, Server, left_behind, tgz
+from helpers.published_folders import random_poses, write_eth3d
+from helpers.sequence_folders import flipped, make_folder
 
 from dynslam_bench.core.download import download
 from dynslam_bench.core.errors import DownloadError, DynslamError, SequenceError

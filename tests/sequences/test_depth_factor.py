@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sequence_folders import SHARED, Altered, needs_shared
+from helpers.sequence_folders import SHARED, Altered, needs_shared
 
 from dynslam_bench.geometry import Camera, Trajectory, se3
 from dynslam_bench.geometry.rigs import BONN_R_BODY_CAM, in_camera_axes, nearest_rotation
@@ -14,6 +14,8 @@ from dynslam_bench.sequences.calibration import Estimate, Window, _readout_quant
 from dynslam_bench.sequences.depth_scale import DepthScale, depth_scale
 from dynslam_bench.sequences.doctor import Diagnosis, Finding, examine, truth_findings
 from dynslam_bench.sequences.rgbd_motion import RgbdPair, TruthMotion
+
+pytestmark = pytest.mark.slow
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5, depth_factor=5000.0)
 STEP = 4

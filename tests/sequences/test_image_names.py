@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from sequence_folders import make_folder, rewrite
+from helpers.sequence_folders import make_folder, rewrite
 
 from dynslam_bench.core import SequenceError
 from dynslam_bench.sequences import open_sequence
@@ -190,7 +190,7 @@ def test_a_list_in_another_unit_is_refused_with_the_unit(tmp_path, text, unit):
 
 def test_a_table_in_another_unit_is_refused(tmp_path):
     """Microseconds in a column of nanoseconds are frames 33 us apart."""
-    from published_folders import random_poses, write_vslam_lab
+    from helpers.published_folders import random_poses, write_vslam_lab
 
     write_vslam_lab(tmp_path / "rec", random_poses(0))
     for table in ("rgb.csv", "groundtruth.csv"):

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from published_folders import WRITERS, lines, random_poses
-from sequence_folders import make_folder, rewrite
+from helpers.published_folders import WRITERS, lines, random_poses
+from helpers.sequence_folders import make_folder, rewrite
 
 from dynslam_bench.core import DynslamError, SequenceError
 from dynslam_bench.sequences import open_sequence

@@ -17,8 +17,8 @@ from unittest.mock import Mock
 import cv2
 import numpy as np
 import pytest
-from published_folders import WRITERS, image, lines, random_poses, write_seven_scenes
-from sequence_folders import SHARED, make_folder, needs_shared, rewrite
+from helpers.published_folders import WRITERS, image, lines, random_poses, write_seven_scenes
+from helpers.sequence_folders import SHARED, make_folder, needs_shared, rewrite
 
 from dynslam_bench.core import STAGES_VARIABLE, DynslamError, SequenceError
 from dynslam_bench.core.images import read_image
@@ -785,6 +785,7 @@ def test_a_damaged_image_is_named(folder: Path, cache: StageCache) -> None:
     assert files(cache) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tracker", ["emfoa-oft?masks=none", "opencv-odometry"])
 def test_an_episode_is_the_same_to_the_bit(tracker: str) -> None:
     sequence = CornerSequence(6)

@@ -10,10 +10,10 @@ from weakref import ref
 import cv2
 import numpy as np
 import pytest
-from envs_toys import write_sequence
-from evaluation_walks import scaled, written_w_first
+from helpers.envs_toys import write_sequence
+from helpers.evaluation_walks import scaled, written_w_first
+from helpers.sequence_folders import SHARED, Altered, frame_hash, make_folder, needs_shared, rewrite
 from scipy.spatial.transform import Rotation
-from sequence_folders import SHARED, Altered, frame_hash, make_folder, needs_shared, rewrite
 
 from dynslam_bench.core.errors import SequenceError
 from dynslam_bench.geometry import Camera, Trajectory, se3
@@ -145,10 +145,12 @@ VALUES = {"truth-time-shift": 0.2, "truth-scale": 1000.0, "depth-factor": 5.0, "
 """The sizes of some of them."""
 
 
+@pytest.mark.slow
 def test_a_sound_recording_has_no_fault(sound, examined):
     assert examined[0] == Diagnosis(sound.id, FRAMES, ())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_fault_is_named_and_measured(diagnosed, name):
     diagnosis = diagnosed(name)
@@ -161,6 +163,7 @@ def test_a_fault_is_named_and_measured(diagnosed, name):
         assert fault.value == pytest.approx(VALUES[name], rel=0.1)
 
 
+@pytest.mark.slow
 def test_an_unrelated_truth_is_named_or_said_to_be_unclear(sound, pairs):
     truths = [wander(seed)(sound.ground_truth) for seed in (0, 1)]
     ids = [
@@ -174,6 +177,7 @@ def test_an_unrelated_truth_is_named_or_said_to_be_unclear(sound, pairs):
 REST = {"frame": lambda frame, base: (base[0].rgb, base[0].depth)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("severity", "finding", "changes"),
     [
@@ -275,6 +279,7 @@ PINHOLE = Camera(320, 240, 260.0, 262.0, 160.0, 118.0, depth_factor=5000.0)
 FPS = 30.0
 
 
+@pytest.mark.slow
 def test_a_rendered_rolling_shutter_is_measured_and_what_differs_is_to_be_written(tmp_path):
     sequence = open_synthetic("synthetic/fast_desk@0?frames=20", tmp_path)
     stated = calibrate(sequence)
@@ -322,6 +327,7 @@ def still(tmp_path):
     return folder
 
 
+@pytest.mark.slow
 def test_a_camera_at_rest_tells_nothing(still):
     found = calibrate(open_sequence(still))
     assert not any(each.observable for each in found.quantities)
@@ -427,6 +433,7 @@ def people(folder):
     return open_sequence(folder / "people")
 
 
+@pytest.mark.slow
 def test_only_people_and_their_shadow_differ_from_the_host(host, folder):
     composed = open_sequence(str(folder / "made"))
     assert len(composed) == 4
@@ -451,6 +458,7 @@ def test_only_people_and_their_shadow_differ_from_the_host(host, folder):
     assert np.mean(shares) > 0.03
 
 
+@pytest.mark.slow
 def test_an_instance_repeats_and_another_one_differs(host, people, folder, tmp_path):
     again = compose(host, people, tmp_path / "made", 0)
     other = compose(host, people, tmp_path / "other" / "made", 1)
@@ -464,6 +472,7 @@ def test_an_instance_repeats_and_another_one_differs(host, people, folder, tmp_p
     )
 
 
+@pytest.mark.slow
 def test_images_are_not_held(host, tmp_path):
     people = Watched(Room("people", 22, walker=True))
     compose(host, people, tmp_path / "made", 0)
@@ -492,6 +501,7 @@ def rolled(frame, _):
 MOVING = of_poses(lambda poses: se3.exp(0.01 * np.arange(len(poses))[:, None] * np.eye(6)[0]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -708,6 +718,7 @@ def test_recorded_folders_by_any_path_and_preprocessing(tmp_path: Path) -> None:
     assert part(other).block != first.block, "another recording in a folder of the same name is not"
 
 
+@pytest.mark.slow
 def test_a_noise_seed_changes_the_noise_and_nothing_else(tmp_path: Path) -> None:
     ids = [f"{WALK}?scene=3&frames=2{noise}" for noise in ("", "&noise=1", "&noise=2")]
     plain, one, two = (open_synthetic(name, tmp_path) for name in ids)

@@ -14,7 +14,7 @@ from unittest.mock import Mock
 import cv2
 import numpy as np
 import pytest
-from sequence_folders import U, V, flipped, frame_hash, reprojected
+from helpers.sequence_folders import U, V, flipped, frame_hash, reprojected
 
 import dynslam_bench.sequences.synthetic as package
 from dynslam_bench.core.errors import SequenceError
@@ -272,6 +272,7 @@ def test_frames_keep_their_bytes(
     assert fingerprint(id, index) == expected
 
 
+@pytest.mark.slow
 def test_an_older_processor_and_several_threads_render_the_same_bytes() -> None:
     """OpenBLAS's kernels for a Nehalem, numpy without the SIMD that it found, the C library without multiply-adds."""
     extensions = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
@@ -407,6 +408,7 @@ def test_people_step_in_time_with_the_camera() -> None:
     assert np.mean([np.mean(sequence.masks[i].instances > 0) for i in (20, 60, 100)]) > 0.3
 
 
+@pytest.mark.slow
 def test_light_texture_and_depth_are_little_where_they_should_be() -> None:
     lit = opened("walking_xyz")[30]
     dark, outdoor, far = (opened(f"{name}_walking")[30] for name in ("dark", "outdoor", "far"))
@@ -651,6 +653,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["rgb", "depth", "masks"])
 def test_damaged_files_are_rendered_again(tmp_path: Path, rendered: Path, kind: str) -> None:
     root = shutil.copytree(rendered, tmp_path / "cache")
@@ -684,6 +687,7 @@ def test_the_cache_is_a_folder_in_tum_layout(tmp_path: Path) -> None:
     assert np.array_equal(folder.timestamps, sequence.timestamps)
 
 
+@pytest.mark.slow
 def test_two_forked_processes_may_render_the_same_sequence_after_their_parent_has_rendered(
     tmp_path: Path,
 ) -> None:

@@ -1,7 +1,7 @@
 """Fixtures of the back end's tests."""
 
 import pytest
-from point_world import PointWorld
+from helpers.point_world import PointWorld
 
 
 @pytest.fixture

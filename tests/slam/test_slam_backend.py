@@ -5,7 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from point_world import PointWorld, errors, make_backend, observed, states, track_all, without_depth
+from helpers.point_world import (
+    PointWorld,
+    errors,
+    make_backend,
+    observed,
+    states,
+    track_all,
+    without_depth,
+)
 
 from dynslam_bench.core.settings import apply_overrides
 from dynslam_bench.geometry import se3
@@ -64,6 +72,7 @@ def test_same_seed_same_bits_and_reset_forgets(room):
     assert np.array_equal(final, backend.finalize().T_world_cam)
 
 
+@pytest.mark.slow
 def test_full_bundle_adjustment_is_undone_when_the_run_goes_on(room):
     """`finalize` gives the same when asked twice, and a run that goes on is what it would have been."""
     asked, quiet = (make_backend(room, bundle_adjustment__full=True) for _ in range(2))
@@ -142,6 +151,7 @@ def rotation_alone(room):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("path", "noise", "limit"),
     [
@@ -235,6 +245,7 @@ def test_the_prediction_is_the_motion_models_at_the_time_of_the_frame(room):
     np.testing.assert_allclose(pose, result.T_world_cam, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_number_of_keyframes_is_bounded_and_those_around_the_camera_stay(room):
     """They overlap most: when they were culled first, the local error grew tenfold on long paths."""
     most = 16
@@ -283,6 +294,7 @@ def strolling(room):
     return [room.see(pose, index, limit=300) for index, pose in enumerate(room.path(40))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "ends", "frames", "others"),
     [
@@ -317,6 +329,7 @@ def test_a_frame_becomes_a_keyframe_exactly_when_it_is_told_to(room, monocular):
     assert states(results).count("ok") > 40
 
 
+@pytest.mark.slow
 def test_without_further_keyframes_the_camera_is_lost_where_the_map_ends_and_found_where_it_returns(
     room,
 ):
@@ -456,6 +469,7 @@ def test_a_feature_that_a_motion_would_put_behind_the_camera_stays(room):
     assert len(compensate_rolling_shutter(observed(room.blind(1), camera), camera, ahead)) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stamp_noise_s", "factor"), [(0.0, 0.4), (0.003, 0.5)])
 def test_a_shaken_camera_is_tracked_several_times_as_well(shaken_frames, stamp_noise_s, factor):
     room, frames = shaken_frames
@@ -513,6 +527,7 @@ def test_odd_stamps_and_gaps(shaken_frames, sequence, readout_s, lost):
     assert readout_s or backend.shutter.velocity is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("after", [[0, 0, 0, 0, 0.3, 0], [0.5, 0, 0, 0, 0, 0]])
 def test_a_cut_is_no_motion(shaken_frames, after):
     """From one frame to the next the camera is elsewhere."""

@@ -4,8 +4,8 @@ from functools import partial
 
 import numpy as np
 import pytest
-from point_world import make_backend, states, track_all, without_depth
-from ring_world import RingWorld, drive, position_errors
+from helpers.point_world import make_backend, states, track_all, without_depth
+from helpers.ring_world import RingWorld, drive, position_errors
 from scipy.optimize import least_squares
 
 from dynslam_bench.evaluation.alignment import align
@@ -44,6 +44,7 @@ def lap(world, frames, *, closing):
     return backend, position_errors(results, path, truth), final
 
 
+@pytest.mark.slow
 def test_a_lap_comes_back_to_where_it_began():
     world = RingWorld()
     frames = world.frames_of_a_lap(STEP)
@@ -81,6 +82,7 @@ def closed_monocular():
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_without_depth_a_lap_gets_its_scale_back(closed_monocular):
     _, backend, results, truth = closed_monocular
     loop = backend.loops.closed[0]
@@ -93,6 +95,7 @@ def test_without_depth_a_lap_gets_its_scale_back(closed_monocular):
     assert closed < 0.6 * drifted
 
 
+@pytest.mark.slow
 def test_a_map_without_depth_goes_on_after_its_loop_was_closed_and_it_was_saved(
     closed_monocular, tmp_path
 ):
@@ -156,12 +159,14 @@ def test_frames_of_a_rescaled_keyframe_move_with_it():
     assert np.array_equal(other.information, information)
 
 
+@pytest.mark.slow
 def test_corridors_that_look_the_same_are_not_taken_for_one():
     backend, errors, _ = lap(RingWorld(alike=0.5), 70, closing=True)
     assert not backend.loops.closed
     assert errors.max() < 0.2
 
 
+@pytest.mark.slow
 def test_sections_of_a_long_path_drift_independently(monkeypatch):
     monkeypatch.setattr(loop_closing, "DRIFT_SECTION", 0.001)  # by the real one this lap is closed
     world = RingWorld()
@@ -169,6 +174,7 @@ def test_sections_of_a_long_path_drift_independently(monkeypatch):
     assert not backend.loops.closed
 
 
+@pytest.mark.slow
 def test_it_changes_nothing_where_no_place_is_seen_again():
     _, without, _ = lap(RingWorld(), 60, closing=False)
     backend, errors, _ = lap(RingWorld(), 60, closing=True)
@@ -256,6 +262,7 @@ APART = [*range(25), *[None] * 20, *range(60, 90)]
 CLOSING = {"loop_closing__enabled": True}
 
 
+@pytest.mark.slow
 def test_a_submap_is_merged_when_the_camera_comes_round():
     backend, results, truth = drive(RingWorld(), AROUND, STEP, **CLOSING)
     tracking = np.array(states(results))
@@ -273,6 +280,7 @@ def test_a_submap_is_merged_when_the_camera_comes_round():
     assert np.linalg.norm(final.positions - true[:, :3, 3], axis=1).max() < 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("patience", [loop_closing.PATIENCE, 10**6])
 def test_a_submap_that_is_not_merged_is_left_where_the_camera_is_in_the_root_map(
     monkeypatch, patience
@@ -312,6 +320,7 @@ def blind_monocular_lap():
     return path, backend, results, back, world.lap(lap + 60, 0.07)
 
 
+@pytest.mark.slow
 def test_without_depth_a_submap_is_merged_with_its_unit_of_length():
     path, backend, results, merged, poses = blind_monocular_lap()
     assert [r.maps for r in results[100:merged]] == [2] * (merged - 100)
@@ -337,6 +346,7 @@ def test_without_depth_a_submap_is_merged_with_its_unit_of_length():
     )
 
 
+@pytest.mark.slow
 def test_without_depth_a_submap_that_would_not_fit_is_left_for_the_root_map(monkeypatch):
     # as where its lengths have drifted apart
     monkeypatch.setattr(Atlas, "admits_start", lambda *_: False)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from point_world import make_backend, observed, track_all, without_depth
+from helpers.point_world import make_backend, observed, track_all, without_depth
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from point_world import make_backend, observed, states, track_all, without_depth
+from helpers.point_world import make_backend, observed, states, track_all, without_depth
 
 from dynslam_bench.contracts.filter import FrameBundle
 from dynslam_bench.evaluation.alignment import align

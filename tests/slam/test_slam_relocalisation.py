@@ -5,8 +5,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from point_world import PointWorld, make_backend, observed, states, track_all
-from ring_world import RingWorld, drive, position_errors, rotated
+from helpers.point_world import PointWorld, make_backend, observed, states, track_all
+from helpers.ring_world import RingWorld, drive, position_errors, rotated
 from scipy.spatial.transform import Rotation
 
 from dynslam_bench.geometry import Camera, se3
@@ -41,6 +41,7 @@ def run(world, path, **settings):
     return backend, np.array(states(results)), position_errors(results, path, truth)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("alike", "path", "lost_from", "settings", "believing"),
     [
@@ -65,6 +66,7 @@ def test_a_kidnapped_camera_is_relocalised_at_once_in_a_known_place():
     assert errors[52:].max() < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("alike", "blind", "more", "recognised"),
     [(0.0, 30, 10, True), (0.5, 30, 0, False), (0.5, 0, 0, False)],

@@ -7,7 +7,7 @@ import struct
 import cv2
 import numpy as np
 import pytest
-from point_world import PointWorld, make_backend, states, track_all
+from helpers.point_world import PointWorld, make_backend, states, track_all
 
 from dynslam_bench.contracts.tracker import KeyframeRecord, MapOutputs
 from dynslam_bench.core.errors import DynslamError, SettingsError, TrackerError
@@ -197,6 +197,7 @@ def test_a_damaged_map_is_refused_before_it_is_used(arrays, tmp_path, change, wo
         read_map(tmp_path / "odd.npz")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("header", "words"),
     [({"schema_version": MAP_SCHEMA + 1}, "upgrade"), ({"kind": "a run"}, "kind"), ({"next_point": 5}, "above 4"),

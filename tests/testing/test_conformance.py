@@ -10,10 +10,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
-import hostile
 import numpy as np
 import pytest
-from culling_rules import RULES
+from helpers import hostile
+from helpers.culling_rules import RULES
 
 from dynslam_bench.contracts import FilterResult, FlowResult, Instances, Keypoints, TrackResult
 from dynslam_bench.core import WEIGHTS_VARIABLE, PluginError
@@ -49,6 +49,7 @@ from dynslam_bench.trackers import TrackerSpec
 SHARED = Path(__file__).resolve().parents[3] / "shared"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(RULES))
 def test_filters(name):
     check_filter(RULES[name])
@@ -74,6 +75,7 @@ def test_the_filter_scene_is_exact():
     assert (same < 25).mean() > 0.8  # the images agree with the flow
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["never-move", "constant-velocity", "mask-rcnn"])
 def test_trackers(name):
     check_tracker(
@@ -81,6 +83,7 @@ def test_trackers(name):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "sequence", [CornerSequence(3), CornerSequence(1), "synthetic/sitting_rpy?scene=2&frames=5"]
 )
@@ -112,6 +115,7 @@ def failures(report):
     return {check.name: check.message for check in report.failed}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mode", "check", "words"),
     [
@@ -128,6 +132,7 @@ def test_a_tracker_that_ends_its_process_fails_the_check(mode, check, words):
     assert "\n" not in failures(report)[check]
 
 
+@pytest.mark.slow
 def test_the_other_checks_go_on():
     """It leaves the process on a black image only: that check fails, all others are made."""
     told = []
@@ -335,6 +340,7 @@ def frames(change):
     return {"__getitem__": lambda self, index: change(CornerSequence.__getitem__(self, index))}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -569,6 +575,7 @@ def run_pytest(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_each_check_of_a_plug_in_is_a_test(tmp_path: Path) -> None:
     (tmp_path / "still.py").write_text(FLOW)
     out = run_pytest(tmp_path, "--dynslam-flow", "still.py:SPEC").stdout
@@ -602,6 +609,7 @@ def test_a_data_set_is_checked_by_the_sequence_that_it_lists(tmp_path: Path) -> 
         report_on("sequence", f"{tmp_path / 'corners.py'}:EMPTY")
 
 
+@pytest.mark.slow
 def test_an_unknown_subject_is_one_line(tmp_path: Path) -> None:
     ended = run_pytest(tmp_path, "--dynslam-flow", "dasiy")
     assert ended.returncode == 4

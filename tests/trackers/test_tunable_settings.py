@@ -15,7 +15,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from steering_scene import FRAMES, SmallScene, construct, difference, play, quick, settings_for
+from helpers.steering_scene import (
+    FRAMES,
+    SmallScene,
+    construct,
+    difference,
+    play,
+    quick,
+    settings_for,
+)
 
 from dynslam_bench.contracts import Frame, TrackResult
 from dynslam_bench.core.errors import (
@@ -217,6 +225,7 @@ def check_honest(spec, results: list[TrackResult], culling: list[TrackResult]) -
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_every_system_is_honest_and_all_its_settings_act_and_are_restored(
     name: str, scene: Scene, unsteered
@@ -241,6 +250,7 @@ def test_every_system_is_honest_and_all_its_settings_act_and_are_restored(
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [name for name in OFFERED if name not in SHOWN_ALONE and "preprocessing" not in name]
 )
@@ -302,6 +312,7 @@ def plain_scene():
     return SmallScene("synthetic/walking_xyz?scene=105")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "tracker", [name for name, spec in SYSTEMS.items() if spec.sensors == "rgb"]
 )
@@ -343,6 +354,7 @@ def run(rendered, cache: Path | None, **settings: object):
     return np.array([result.T_world_cam for result in results]), results
 
 
+@pytest.mark.slow
 def test_cached_runs_have_the_same_bits_and_load_no_network(
     rendered, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -407,6 +419,7 @@ for content in sys.argv[4:]:
 """
 
 
+@pytest.mark.slow
 def test_an_edited_extractor_or_other_weights_get_no_old_keypoints(tmp_path: Path) -> None:
     plugin = tmp_path / "mine.py"
     weights = tmp_path / "net.bin"

@@ -1,7 +1,7 @@
 """Recordings for the toy tracker."""
 
 import pytest
-import toy_tracker
+from helpers import toy_tracker
 
 
 @pytest.fixture(scope="session")

@@ -12,10 +12,9 @@ from typing import Any
 
 import cv2
 import pytest
-import simulated
-import toy_tracker
+from helpers import simulated, toy_tracker
+from helpers.simulated import TRACKER, SimulatedTuner, make_spec, toy_spec, valley
 from optuna.trial import TrialState
-from simulated import TRACKER, SimulatedTuner, make_spec, toy_spec, valley
 
 from dynslam_bench.cli.studies import status
 from dynslam_bench.core import DynslamError, StudyError, read_settings
@@ -67,6 +66,7 @@ def check(tune: list[str], held_out: list[str]) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_preview_takes_what_stored_runs_show_and_else_what_is_known(
     folders: list[str], tmp_path: Path
 ) -> None:
@@ -102,6 +102,7 @@ def test_a_preview_states_power_at_the_level_of_the_study(
     assert ("A design that proves 20 %" in " ".join(preview.figures)) is extendable
 
 
+@pytest.mark.slow
 def test_a_preview_names_the_settings_of_parts_that_decide_nothing(tmp_path: Path) -> None:
     """The camera of `sitting_static` hardly moves, so that F is never used; nobody stands in the way of an oracle."""
     spec = StudySpec(
@@ -123,6 +124,7 @@ def test_a_preview_names_the_settings_of_parts_that_decide_nothing(tmp_path: Pat
     )
 
 
+@pytest.mark.slow
 def test_ratios_are_to_the_baseline_and_the_default_stands_beside(tmp_path: Path) -> None:
     preset = tmp_path / "mine.toml"
     preset.write_text("gain = 3.0\nwobble = 0\n")
@@ -143,6 +145,7 @@ def test_ratios_are_to_the_baseline_and_the_default_stands_beside(tmp_path: Path
     assert "default settings" in write_page(tuner, summary).read_text()
 
 
+@pytest.mark.slow
 def test_the_baseline_may_be_another_tracker(folders: list[str], tmp_path: Path) -> None:
     spec = make(folders, baseline="never-move", confirm=folders[1:2], held_out=[])
     summary = finish(run_study(spec, results=tmp_path))
@@ -236,6 +239,7 @@ def test_trials_may_be_asked_for_and_told_one_by_one(tmp_path: Path) -> None:
         tuner.ask({"gain": 99.0})
 
 
+@pytest.mark.slow
 def test_a_study_without_a_verdict_goes_on_with_more_scenes_and_trials(tmp_path: Path) -> None:
     spec = make_spec(trials=4, pruner="none")
     SimulatedTuner(spec, tmp_path, effect=valley, in_memory=False).run().extend(scenes=3, trials=2)
@@ -287,6 +291,7 @@ def test_any_trial_is_a_preset(tmp_path: Path) -> None:
         read_preset_text(spec, tmp_path, trial=99)
 
 
+@pytest.mark.slow
 def test_a_study_whose_trials_all_fail_is_not_judged(folders: list[str], tmp_path: Path) -> None:
     tuner = run_study(
         make(folders, start=[{"mode": "crash"}], space={"include": ["mode"]}), results=tmp_path
@@ -298,6 +303,7 @@ def test_a_study_whose_trials_all_fail_is_not_judged(folders: list[str], tmp_pat
     assert write_page(tuner, summary).is_file()
 
 
+@pytest.mark.slow
 def test_one_recording_alone_is_not_judged(
     folders: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -318,6 +324,7 @@ def test_one_recording_alone_is_not_judged(
         tuner.extend(scenes=1)
 
 
+@pytest.mark.slow
 def test_scenes_of_uneven_lengths_and_starts_count_alike(
     folders: list[str], tmp_path: Path
 ) -> None:

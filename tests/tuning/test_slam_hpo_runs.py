@@ -13,6 +13,8 @@ import dynslam_bench as db
 from dynslam_bench.runs import RunStore
 from dynslam_bench.suites import load_suite
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "packaging" / "slam-hpo"
 SEQUENCE = "synthetic/walking_xyz?scene=130"

@@ -23,12 +23,10 @@ from typing import Any
 import numpy as np
 import optuna
 import pytest
-import toy_tracker
-from faults import in_a_small_process, survey
-from hostile import until
-from optuna.storages import RDBStorage
-from optuna.trial import FrozenTrial, TrialState
-from simulated import (
+from helpers import toy_tracker
+from helpers.faults import in_a_small_process, survey
+from helpers.hostile import until
+from helpers.simulated import (
     HELD_OUT,
     TRACKER,
     TUNE,
@@ -39,6 +37,8 @@ from simulated import (
     toy_spec,
     valley,
 )
+from optuna.storages import RDBStorage
+from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.exc import OperationalError
 
 from dynslam_bench.core import DynslamError, StudyError, read_settings
@@ -72,6 +72,8 @@ from dynslam_bench.tuning.storage import (
     worker_name,
 )
 from dynslam_bench.tuning.study import Evaluation, StudyEvent
+
+pytestmark = pytest.mark.slow
 
 
 def make(folders: list[str], **changes: object) -> StudySpec:

@@ -14,9 +14,9 @@ from typing import Any, cast
 import numpy as np
 import optuna
 import pytest
+from helpers.reports_browser import Browser, needs_browser
+from helpers.simulated import SimulatedTuner, make_spec, toy_spec
 from optuna.trial import TrialState
-from reports_browser import Browser, needs_browser
-from simulated import SimulatedTuner, make_spec, toy_spec
 
 from dynslam_bench.cli.studies import status
 from dynslam_bench.core import StudyError, read_settings
@@ -193,6 +193,7 @@ def test_none_of_the_trials_is_better_by_more_than_the_largest_bound() -> None:
     assert largest_gain([{"a": -1.0, "b": -1.0}]) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [FEWEST_TRIALS - 1, 60])
 def test_importances_are_optunas_from_enough_trials_on(count: int) -> None:
     spans = dict.fromkeys("xy", optuna.distributions.FloatDistribution(0, 1))
@@ -212,6 +213,7 @@ def test_importances_are_optunas_from_enough_trials_on(count: int) -> None:
         assert all(0 <= importance.low <= importance.high <= 1 for importance in shares.values())
 
 
+@pytest.mark.slow
 def test_a_study_is_a_frame(
     folders: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -339,6 +341,7 @@ def spec(objectives: list[str], include: list[str], **changes: object):
     )
 
 
+@pytest.mark.slow
 def test_speed_decides_where_the_poses_stay_as_they_are(tmp_path: Path) -> None:
     tuner = TimedTuner(spec(["speed"], ["wobble"], pruner="halving"), tmp_path)
     with warnings.catch_warnings():
@@ -352,6 +355,7 @@ def test_speed_decides_where_the_poses_stay_as_they_are(tmp_path: Path) -> None:
     assert chosen.on_held_out["accuracy"].ratio == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_speed_that_is_paid_for_with_accuracy_is_no_gain(tmp_path: Path) -> None:
     tuner = TimedTuner(spec(["speed"], ["gain"], pruner="halving"), tmp_path)
     tuner.price = 0.6
@@ -364,6 +368,7 @@ def test_speed_that_is_paid_for_with_accuracy_is_no_gain(tmp_path: Path) -> None
     assert f'status = "{summary.verdict.value}"' in (tuner.folder / "best.toml").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("objectives", [["accuracy", "speed"], ["speed", "accuracy"]])
 def test_the_best_of_a_front_is_the_best_in_all_objectives_together(
     objectives: list[str], tmp_path: Path
@@ -467,6 +472,7 @@ def test_the_table_holds_default_chosen_and_range() -> None:
     assert "keep the baseline" in unproven.caption
 
 
+@pytest.mark.slow
 @needs_browser
 def test_the_page_shows_verdict_funnel_and_optunas_plots(tmp_path: Path) -> None:
     tuner = SimulatedTuner(make_spec(trials=12), tmp_path).run()
@@ -477,9 +483,7 @@ def test_the_page_shows_verdict_funnel_and_optunas_plots(tmp_path: Path) -> None
         for width in (1440, 390):
             browser.open(page, width)
             browser.run("all('.figure').forEach((figure) => figure.scrollIntoView())")
-            browser.until(
-                "all('.figure').every((figure) => figure.querySelector('.main-svg'))", tries=200
-            )
+            browser.until("all('.figure').every((figure) => figure.querySelector('.main-svg'))")
             assert browser.faults == []
             assert browser.run("document.documentElement.scrollWidth") == width
         assert browser.violations() == []

@@ -134,6 +134,7 @@ def test_bound_values_stay_text(trajectory, tmp_path, monkeypatch):
     assert resolve_settings(TRACKERS.get("subprocess:true")).command == "true"
 
 
+@pytest.mark.slow
 def test_names_with_a_colon_still_load_specs(tmp_path):
     file = tmp_path / "mine.py"
     file.write_text(
@@ -176,6 +177,7 @@ needs_open3d = pytest.mark.skipif(
 )
 
 
+@pytest.mark.slow
 @needs_opencv
 def test_opencv_keeps_the_contract():
     check_tracker("opencv-odometry", frames=2)
@@ -339,6 +341,7 @@ def test_segmenter(example, plugged):
     assert tracker.track(sequence[0]).state == "ok"
 
 
+@pytest.mark.slow
 def test_flow(example, plugged):
     plugged("flow", example("my_flow.py"), FLOWS)
     flow = build_flow(FlowSettings(plugin="no-motion"))
@@ -350,6 +353,7 @@ def test_flow(example, plugged):
     assert result.valid.all()
 
 
+@pytest.mark.slow
 def test_filter_and_system(example):
     path = example("far_slam.py")
     check_filter(load_object(f"{path}:FarFilter"))
@@ -357,6 +361,7 @@ def test_filter_and_system(example):
     check_tracker(f"{path}:SPEC", frames=2)
 
 
+@pytest.mark.slow
 def test_filter_beside_masks(example):
     path = example("people_slam.py")
     carried, settings = load_object(f"{path}:CarriedFilter"), load_object(f"{path}:CarriedSettings")

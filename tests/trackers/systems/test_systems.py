@@ -7,11 +7,11 @@ import baseline_signatures as signatures
 import cv2
 import numpy as np
 import pytest
-from envs_play import play
-from reports_fake_store import add_run
-from scenes import ACROSS, BOX, SIDEWAYS, box_instance, on_rectangle, scene
-from steering_scene import SmallScene, construct, quick
-from steering_scene import play as play_small
+from helpers.culling_scenes import ACROSS, BOX, SIDEWAYS, box_instance, on_rectangle, scene
+from helpers.envs_play import play
+from helpers.reports_fake_store import add_run
+from helpers.steering_scene import SmallScene, construct, quick
+from helpers.steering_scene import play as play_small
 
 from dynslam_bench.contracts import Instances, TrackResult
 from dynslam_bench.core import settings as core_settings
@@ -81,6 +81,7 @@ def test_online_segmentation_settings_reach_every_filter(spec: TrackerSpec, walk
         assert settings.confidence == 0.77
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sof-slam", "seg-slam"])
 def test_movable_things_reach_the_rule_that_judges_them(name: str, walking) -> None:
     assert any(
@@ -166,6 +167,7 @@ def test_systems_with_a_compensation_of_their_own_bridge_longer() -> None:
 # found with.
 
 
+@pytest.mark.slow
 def test_a_crowd_in_front_of_the_camera_leaves_enough_features() -> None:
     """People cover 85 % of the features; with all of them counted the camera was lost from frame 14 on."""
     sequence = open_sequence("synthetic/walking_halfsphere?scene=102", frames=(0, 24))
@@ -232,6 +234,7 @@ def test_masks_are_grown_and_repaired_only_where_the_system_does_it(name: str) -
 # What `docs/explanation/paper.md` says of each equation: the trackers run what it says they run.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "terms"), [("emfoa-oft", 1), ("emfoa-oft-paper", 3)])
 def test_the_papers_tracker_runs_eq_1_to_3_and_ours_the_first_term(
     monkeypatch, name: str, terms: int
@@ -288,6 +291,7 @@ def test_published_classes(tracker: str, sequence: str, expected: str | None) ->
     )
 
 
+@pytest.mark.slow
 def test_table_of_a_store_of_computed_trajectories(tmp_path: Path) -> None:
     store = RunStore(tmp_path)
     for seed, (tracker, options) in product(

@@ -11,13 +11,13 @@ from typing import Any
 from unittest.mock import patch
 
 import optuna
-import toy_tracker
 
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.tuning import Outcome, ProblemInstance, Study, StudySpec
 from dynslam_bench.tuning.plan import Design, design_of
 from dynslam_bench.tuning.storage import open_storage
+from helpers import toy_tracker
 
 TRACKER = f"{toy_tracker.__file__}:SPEC"
 TUNE = "synthetic/walking_xyz?scene=0-11&frames=20&offsets=0-1"

@@ -29,6 +29,10 @@ OF_THE_DRIVER = ("GL Driver Message", "willReadFrequently", "WebGL")
 """Warnings of software that draws in place of a graphics card."""
 
 
+TRIES = 1200
+"""Looks at a page, 50 ms apart, before what is waited for counts as never true."""
+
+
 class Browser:
     """One page of a headless browser.
 
@@ -88,9 +92,9 @@ class Browser:
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 
-    def until(self, expression, tries=40):
+    def until(self, expression):
         """Wait until an expression is true; the page may give way to another one meanwhile."""
-        for _ in range(tries):
+        for _ in range(TRIES):
             with contextlib.suppress(Error):
                 if self.run(f"Boolean({expression})"):
                     return

@@ -1,9 +1,9 @@
 """Four corridors around a block, as points with known descriptors: a lap comes back to where it began."""
 
 import numpy as np
-from point_world import PointWorld, make_backend, track_all, without_depth
 
 from dynslam_bench.geometry import Camera, se3
+from helpers.point_world import PointWorld, make_backend, track_all, without_depth
 
 WIDTH = 2.0
 CORNER = 1.0

@@ -1,0 +1,1 @@
+"""What the tests of several folders share: toys, small worlds, hostile programs, servers, and their checks."""
