@@ -76,13 +76,13 @@ class _WorstFrame(NamedTuple):
     Attributes:
         error_m: The translational error in metres.
         shot: Its snapshot; None if its tracker shows neither features nor a mask.
-        index: Its index in the run's part of the sequence.
+        number: Its index in the run's part of the sequence.
         picture: Its picture.
     """
 
     error_m: float
     shot: Snapshot | None
-    index: int
+    number: int
     picture: Image
 
 
@@ -137,7 +137,7 @@ class SnapshotWriter:
     def write(self) -> None:
         """Write what was kept."""
         for frame in self._worst:
-            self._write_picture(frame.index, frame.picture)
+            self._write_picture(frame.number, frame.picture)
         worst = [frame.shot for frame in self._worst if frame.shot is not None]
         shots = sorted([*self._even, *worst], key=lambda shot: shot.index)
         if not shots:
@@ -159,9 +159,8 @@ def snapshot_of(index: int, result: TrackResult) -> Snapshot | None:
     """The snapshot of a frame that was tracked; None if its tracker shows neither features nor a mask."""
     if result.keypoints_xy is None and result.dynamic_mask is None:
         return None
-    if result.keypoints_xy is None:
-        points = np.zeros((0, 2))
-    else:
+    points: NDArray[Any] = np.zeros((0, 2))
+    if result.keypoints_xy is not None:
         points = np.asarray(result.keypoints_xy).reshape(-1, 2)
     kept = result.keypoints_keep
     mask = result.dynamic_mask

@@ -157,7 +157,9 @@ class _Supervisor:
         connection = self.child.connection
         is_open = True
         while True:
-            sources = [self.child.status_fd, connection] if is_open else [self.child.status_fd]
+            sources: list[Any] = [self.child.status_fd]
+            if is_open:
+                sources.append(connection)
             if connection in wait(sources, _POLL_S):
                 is_open = self._receive()
             if self.child.poll() is not None:
