@@ -192,7 +192,7 @@ def _decode(parameter: Parameter, share: float) -> Scalar:
     else:
         value = low + share * (high - low)
     # rounding may put a power slightly beyond its end
-    value = min(max(value, low), high)
+    value = float(min(max(value, low), high))
     return round(value) if parameter.kind == "int" else value
 
 

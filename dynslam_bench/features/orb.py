@@ -105,7 +105,7 @@ class OrbExtractor:
         outside = [~inside(mask, level.xy * level.scale) for level in levels]
         count = 0
         for is_outside, index in zip(outside, chosen, strict=True):
-            count += np.count_nonzero(is_outside[index])
+            count += int(np.count_nonzero(is_outside[index]))
 
         # too few: those inside stay, those outside are chosen anew among themselves
         if count < share * self.settings.n_features:

@@ -170,7 +170,7 @@ class OnnxSegmenter:
         self, image: NDArray[np.uint8], names: list[str], usual: str
     ) -> list[NDArray[np.float32]]:
         """The outputs for an image, scaled as the settings say or else as usual."""
-        scaling = self.settings.onnx_normalisation
+        scaling: str = self.settings.onnx_normalisation
         if scaling == "auto":
             scaling = usual
         mean, divisor = _SCALINGS[scaling]
