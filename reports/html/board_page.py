@@ -60,7 +60,7 @@ def ranking_entries(
     limits = _axis_limits([standing.ratio for standing in board.standings])
     entries = []
     for key in board.trackers:
-        entry = {"at": keys.index(key), "group": _entry_group(board, key)}
+        entry: dict[str, Any] = {"at": keys.index(key), "group": _entry_group(board, key)}
         cells = leaderboard_cells(board, key)
         entry |= _run_cells(board, key, cells, paged)
         entry |= _standing_cells(board, key, cells, limits)
