@@ -187,6 +187,7 @@ def _decode(parameter: Parameter, share: float) -> Scalar:
         return parameter.choices[min(int(share * n), n - 1)]
     low = float(parameter.low)
     high = float(parameter.high)
+    value: float
     if parameter.scale == "log":
         value = low * (high / low) ** share
     else:
