@@ -6,7 +6,8 @@ from numpy.typing import NDArray
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.culling import Rule
 from dynslam_bench.culling.settings import ReseedingSettings
-from dynslam_bench.features.orb import EDGE, level_quotas, spread
+from dynslam_bench.features.fast import EDGE
+from dynslam_bench.features.orb import level_quotas, spread
 from dynslam_bench.features.settings import FeatureSettings
 
 ORIGIN = EDGE - 3
