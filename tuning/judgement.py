@@ -468,8 +468,8 @@ def _judged_on(
     if split == "recorded":
         return candidate.model_copy(update=update)
     update[f"on_{split}"] = {
-        each.name: compare(outcomes, baseline, objective=each, one_sided=level)
-        for each in (ACCURACY, SPEED)
+        single.name: compare(outcomes, baseline, objective=single, one_sided=level)
+        for single in (ACCURACY, SPEED)
     }
     violated = violations(tuner.spec, outcomes)
     update["feasible"] = candidate.feasible and max(violated.values(), default=0.0) <= 0.0

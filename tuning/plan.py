@@ -790,12 +790,12 @@ def source_of_masks(settings: Settings, sequences: Sequence[str]) -> str:
 def splits_seen(settings: Settings, design: Design) -> list[str]:
     """Names of a study's splits with a scene that the network behind the masks was trained on, in their order."""
     splits = {"tune": design.tune, "confirm": design.confirm, "held_out": design.held_out}
-    seen = []
+    seen_splits = []
     for split, instances in splits.items():
         names = {instance.sequence for instance in instances}
         if any(seen_in_training(source_of_masks(settings, [name]), name) for name in names):
-            seen.append(split)
-    return seen
+            seen_splits.append(split)
+    return seen_splits
 
 
 def seen_note(splits: Sequence[str]) -> str:

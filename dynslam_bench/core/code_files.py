@@ -234,8 +234,8 @@ def _program_of(word: str, base: Path) -> Path | None:
     """The file of a command's first word; None where a bare name is not on ``PATH``."""
     if os.sep in word:
         return base / Path(word).expanduser()
-    found = shutil.which(word)
-    return None if found is None else Path(found)
+    program = shutil.which(word)
+    return None if program is None else Path(program)
 
 
 def _files_of_argument(word: str, base: Path) -> list[Path]:

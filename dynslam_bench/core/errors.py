@@ -191,14 +191,15 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     Returns:
         For example ``"did you mean 'epipolar.threshold_px'?"``; empty if nothing is known.
     """
+    # upper and lower case do not count
+    wanted = name.lower()
     names = sorted(set(known))
     if not names:
         return ""
 
-    # upper and lower case do not count
     spellings = {candidate.lower() for candidate in names}
     meant: list[str] = []
-    for match in difflib.get_close_matches(name.lower(), spellings, n=3, cutoff=0.5):
+    for match in difflib.get_close_matches(wanted, spellings, n=3, cutoff=0.5):
         meant += [repr(candidate) for candidate in names if candidate.lower() == match]
 
     if meant:

@@ -259,7 +259,7 @@ def _entry_points(*_path: str) -> Any:
     """The entry points of all distributions on an import path; reading them takes 12 ms.
 
     Args:
-        *_path: The import path, so that another one is read anew.
+        *_path: The import path, so that another one is read again.
     """
     return entry_points()
 

@@ -107,7 +107,7 @@ class OrbExtractor:
         for is_outside, index in zip(outside, chosen, strict=True):
             count += int(np.count_nonzero(is_outside[index]))
 
-        # too few: those inside stay, those outside are chosen anew among themselves
+        # too few: those inside stay, those outside are chosen again among themselves
         if count < share * self.settings.n_features:
             chosen_outside = self._choose(levels, outside)
             chosen = [

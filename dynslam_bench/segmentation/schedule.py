@@ -317,12 +317,12 @@ class MissedDetections:
         ]
         names = [track.name for track in self._tracks]
         matches = dict(associate(predicted, names, detections))
-        seen = []
+        detected = []
         bridged = []
         for index, track in enumerate(self._tracks):
             if index in matches:
                 track.see(detections, matches[index], frames)
-                seen.append(track)
+                detected.append(track)
             # one that was missed moves to its predicted box, or is forgotten
             elif (
                 track.hits >= LEAST_HITS
@@ -343,7 +343,7 @@ class MissedDetections:
             )
             for index in unmatched
         ]
-        self._tracks = [*seen, *bridged, *new]
+        self._tracks = [*detected, *bridged, *new]
 
         # return the bridged objects behind the detections
         if not bridged:

@@ -49,7 +49,7 @@ GROUPS = {
 }
 """Parameters that are fitted together, each group alone."""
 
-# The ten parameters in one vector, in the units of `Fit.value`, and beside it what holds for each.
+# The ten parameters in one vector, in the units of `Fit.value`, and beside it what is constant for each.
 _PARAMETERS = {
     "focal": slice(0, 1),
     "cx": slice(1, 2),

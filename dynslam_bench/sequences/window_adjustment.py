@@ -61,8 +61,8 @@ def track(images: list[NDArray[np.uint8]], allowed: list[NDArray[np.uint8]]) -> 
 
         # Each corner is looked for where its last motion leads; new ones by the median motion.
         flow = here - tracks[alive, i - 1] if i else np.full(here.shape, np.nan)
-        known = np.isfinite(flow[:, 0])
-        flow[~known] = np.median(flow[known], axis=0) if known.any() else 0.0
+        has_flow = np.isfinite(flow[:, 0])
+        flow[~has_flow] = np.median(flow[has_flow], axis=0) if has_flow.any() else 0.0
         guess = (here + flow).astype(np.float32)
         there, good = follow_corners(images[i], images[i + 1], here, guess, 0.5)
         good &= (there >= _BORDER_PX).all(axis=1)
@@ -310,8 +310,8 @@ class Window:
         # Read the depth where the point was then, and carry it to now.
         moved = then[..., :2] * inverse_then - now[..., :2] * inverse_now
         shift = moved * (self.camera.fx, self.camera.fy)
-        known = poses.within[..., None] & np.isfinite(self.xy)
-        place = np.where(known, self.raw + shift, np.nan)
+        is_known = poses.within[..., None] & np.isfinite(self.xy)
+        place = np.where(is_known, self.raw + shift, np.nan)
         observed = [inverse_depth(image, place[:, i]) for i, image in enumerate(self.depth)]
         return np.asarray(np.stack(observed, axis=1) - (inverse_then - inverse_now)[..., 0])
 

@@ -520,7 +520,7 @@ class TwoViewInitialiser:
             )
         view = View(frame, observations, matches)
 
-        # too few: begin anew with this frame
+        # too few: begin again with this frame
         if first is None or len(matches) < settings.min_matches:
             self._first = view if len(observations) >= settings.min_matches else None
             self._expected = observations.xy.copy()

@@ -286,7 +286,7 @@ def _optimise(
                 damping *= 100.0
                 if damping > MOST_DAMPING:
                     break
-        # sort all points into inliers and outliers anew
+        # sort all points into inliers and outliers again
         _classify(pose, points, measured, camera, inlier, error)
         if inlier.sum() < MIN_POINTS:
             break

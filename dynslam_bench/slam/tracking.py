@@ -233,14 +233,16 @@ def match_last_frame(
         max_distance: Largest Hamming distance.
     """
     camera = world.camera
-    seen = last.observations
+    last_observations = last.observations
 
     # the points' positions in the world: of the map, or from the last frame's depth
     mapped = last.point >= 0
-    rows = np.flatnonzero(mapped | (seen.z > 0) & (seen.z < close_m))
+    rows = np.flatnonzero(mapped | (last_observations.z > 0) & (last_observations.z < close_m))
     position = world.position[last.point[rows]]
     unmapped = ~mapped[rows]
-    in_last_camera = camera.unproject(seen.xy[rows[unmapped]], seen.z[rows[unmapped]])
+    in_last_camera = camera.unproject(
+        last_observations.xy[rows[unmapped]], last_observations.z[rows[unmapped]]
+    )
     position[unmapped] = se3.transform(se3.inverse(last.T_cam_world), in_last_camera)
 
     # their projections into the new frame
@@ -250,7 +252,7 @@ def match_last_frame(
     position = position[inside]
     uv = uv[inside]
     depth = local[inside, 2]
-    octave = seen.octave[rows]
+    octave = last_observations.octave[rows]
     right = uv[:, 0] - camera.fx * camera.baseline_m / depth
 
     # match by descriptor in a window around each
@@ -259,7 +261,7 @@ def match_last_frame(
         np.ones(len(observations.xy), bool),
         (uv, right, radius_px * world.scales[octave]),
         octave,
-        seen.words[rows],
+        last_observations.words[rows],
         max_distance=max_distance,
         ratio=LAST_FRAME_RATIO,
     )
@@ -267,7 +269,7 @@ def match_last_frame(
     matches = Matches(feature[matched], last.point[rows[matched]], position[matched])
 
     # drop matches whose features are rotated in the image unlike the others
-    angles_before = seen.angle[rows[matched]]
+    angles_before = last_observations.angle[rows[matched]]
     angles_now = observations.angle[matches.feature]
     return matches.select(rotation_consistent(angles_before, angles_now))
 

@@ -381,7 +381,7 @@ def _outcome(
         reason = record.reason or scored.reasons.get(protocol.trajectory, "it cannot be evaluated")
         return {"not_evaluated": True, "reason": reason}
 
-    # of the final trajectory of a run here, count the frames with a pose anew
+    # of the final trajectory of a run here, count the frames with a pose again
     n_tracked = evaluation.n_tracked
     frames_due = record.n_frames - record.n_dropped
     if record.kind == "imported" or protocol.trajectory == "online" or n_tracked is None:

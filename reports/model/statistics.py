@@ -235,8 +235,7 @@ def ratio_interval(log_ratios: Array, sequences: Sequences) -> Interval:
     """
     tested = sequences.test(log_ratios)
     mean = float(np.exp(tested.centre))
-    known = int(np.isfinite(log_ratios).sum())
-    if known < FEWEST:
+    if np.isfinite(log_ratios).sum() < FEWEST:
         return Interval(mean, math.nan, math.nan)
     if tested.families >= FEWEST_FAMILIES:
         half = scipy.special.stdtrit(tested.beyond_free, 0.975) * tested.beyond_error

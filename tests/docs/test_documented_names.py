@@ -31,6 +31,13 @@ from generated import reference_pages
 OF_USERS = ("results/", "path/", "~/", "videos/")
 """How paths begin that are made by runs or by the reader."""
 FOREIGN = {
+    "NUMBA_CACHE_LOCATOR_CLASSES",
+    "_CacheLocator",
+    "PR_SET_PDEATHSIG",
+    "PR_SET_CHILD_SUBREAPER",
+    "isInFrustum",
+    "TrackLocalMap",
+    "TrackWithMotionModel",
     "concurrent",
     "pd",
     "forkserver",

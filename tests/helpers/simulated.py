@@ -129,12 +129,17 @@ class SimulatedTuner(Study):
 
 
 def simulated_design(spec: StudySpec, *, further: int = 0) -> Design:
-    return _design(spec.tune, spec.confirm, spec.held_out, further)
+    return _design(spec.tune, spec.confirm, spec.held_out, spec.extendable, further)
 
 
 @cache
 def _design(
-    tune: tuple[str, ...], confirm: tuple[str, ...], held_out: tuple[str, ...], further: int
+    tune: tuple[str, ...],
+    confirm: tuple[str, ...],
+    held_out: tuple[str, ...],
+    extendable: bool,
+    further: int,
 ) -> Design:
     """Opening the sequences takes longer than a study here."""
-    return design_of(make_spec(tune=tune, confirm=confirm, held_out=held_out), further=further)
+    spec = make_spec(tune=tune, confirm=confirm, held_out=held_out, extendable=extendable)
+    return design_of(spec, further=further)

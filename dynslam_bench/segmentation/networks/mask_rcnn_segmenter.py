@@ -159,8 +159,8 @@ def paste(
     right = min(x1 + 1, width)
     bottom = min(y1 + 1, height)
     if left < right and top < bottom:
-        seen = patch[top - y0 : bottom - y0, left - x0 : right - x0]
-        mask[top:bottom, left:right] = seen >= threshold
+        visible = patch[top - y0 : bottom - y0, left - x0 : right - x0]
+        mask[top:bottom, left:right] = visible >= threshold
     return mask
 
 

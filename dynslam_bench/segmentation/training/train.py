@@ -273,7 +273,7 @@ class TrainingRun:
         self.recent = {name: [] for name in LOSSES}
         self.rows.append(row)
 
-        # keep the best, and draw the curve anew
+        # keep the best, and draw the curve again
         if row["iou"] > self.best["iou"]:
             self.best = {"iou": row["iou"], "step": float(self.step)}
             save_network(self.average, self.output / "best.pt")
