@@ -368,8 +368,11 @@ def _loss_sentences(comparison: PairedRatio, subject: str) -> list[str]:
     if comparison.losses:
         share = 100 * comparison.loss_share
         sentences.append(f"Such losses are at most {share:.0f} % of scenes, with 95 % confidence")
-    if comparison.losses_baseline:
-        sentences.append(f"The baseline alone lost {_named(comparison.losses_baseline)}")
+    if comparison.lost_baseline:
+        sentences.append(f"The baseline alone lost {_named(comparison.lost_baseline)}")
+    if comparison.much_better:
+        times = f"more than {CATASTROPHE:g} times the error"
+        sentences.append(f"The baseline has {times} in {_named(comparison.much_better)}")
     if comparison.lost_both:
         sentences.append(f"Both lost {_named(comparison.lost_both)}")
     return sentences
