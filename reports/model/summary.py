@@ -73,6 +73,7 @@ def _better_words(board: Board, ranked: list[Standing]) -> str:
     else:
         verb = f"{'is' if len(named) == 1 else 'are'} better than {board.reference_name}"
     message = f"{_names(board, named)} {verb}, {named[0].scope}"
+
     # what may be the best, and who would be better but for its losses
     endings = []
     if board.ranked_sequences.can_go_beyond:

@@ -258,7 +258,7 @@ def row(tracker="a", sequence="s", error=0.1, variant=None, **changes):
     )
     info["block"] = digest([info.get("block") or sequence, changes.get("frames")], 16)
     # every sequence is a recording of its own: no other has its duration
-    own_s = int(hashlib.sha256(sequence.encode()).hexdigest()[:4], 16) * 1e-5
+    own_s = int(info["block"][:4], 16) * 1e-5
     settings = dict(variant or {})
     changes |= {name: settings.pop(name) for name in ("device", "threads") if name in settings}
     base = dict(
