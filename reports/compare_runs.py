@@ -131,13 +131,13 @@ def compare(
     # B beside A over all sequences, as a table and as a page
     overall = {name: overall_ratio(paired) for name, paired in compared.items()}
     verdicts = {name: verdict_of(ratio) for name, ratio in overall.items()}
-    found = {name: findings(ratio, "B") for name, ratio in overall.items()}
+    sentences = {name: findings(ratio, "B") for name, ratio in overall.items()}
     page = None
     if output is not None:
         page = _write_page(Path(output), protocol, evaluated, compared, overall)
     title = f"{name_a} (A) against {name_b} (B)"
     table = _table(title, _caption(evaluated, differences), compared, overall)
-    return Comparison(overall, verdicts, found, table, only_a, only_b, differences, page)
+    return Comparison(overall, verdicts, sentences, table, only_a, only_b, differences, page)
 
 
 def _source_name(source: Path | str | RunStore) -> str:
@@ -177,8 +177,8 @@ def _caption(evaluated: str, differences: Mapping[str, list[str]]) -> str:
         f"{evaluated}. Median ATE (millimetres), lost frames held, over the repeats that both have, or all where they "
         "share none; failures count as a static camera, or worse. B / A below 1: B is better. Over all sequences: the "
         "typical ratio where both succeed, with the exact 95 % interval of Wilcoxon's signed-rank test; a sequence is "
-        "lost where half of its runs failed, and counts beside it. One recording counts once. From "
-        f"{FEWEST} sequences on a verdict is given. {what_differs}"
+        "lost where half of its runs failed or the error is three times the other's, and counts beside it. One "
+        f"recording counts once. From {FEWEST} sequences on something is claimed. {what_differs}"
     )
 
 

@@ -675,10 +675,10 @@ def copies_of(columns: Mapping[str, Sequence[RunRow]]) -> dict[str, str]:
     firsts: dict[tuple[int, int], list[tuple[str, float, float]]] = {}
     for name, rows in columns.items():
         # the truth of the earliest start: a run without ground truth tells nothing
-        known = [row for row in rows if row.static_camera_ate_rmse_m is not None]
-        if not known:
+        with_truth = [row for row in rows if row.static_camera_ate_rmse_m is not None]
+        if not with_truth:
             continue
-        first = min(known, key=lambda row: (row.imported, row.offset))
+        first = min(with_truth, key=lambda row: (row.imported, row.offset))
         static_m = first.static_camera_ate_rmse_m or 0.0
         if static_m < _MOVING_M:
             continue
