@@ -23,9 +23,9 @@ from dynslam_bench.reports.tables.leaderboard import (
 )
 from dynslam_bench.reports.tables.table import TableCell
 
-_OPPOSITE: dict[Verdict, Verdict] = {
+_OPPOSITE: dict[Verdict, str] = {
     "better": "worse",
-    "better, but lost": "worse",
+    "better, but lost": "worse, but lost fewer",
     "worse": "better",
     "cannot tell": "cannot tell",
 }
@@ -311,7 +311,7 @@ def ratios_data(board: Board) -> list[list[Any]]:
     # reversed: of the later tracker over the earlier one
     for pair in compare_pairs(board, keys[::-1]):
         # against the reference the verdict is the board's, which asks it of fewer pairs
-        verdict = pair.verdict
+        verdict: str = pair.verdict
         scope: Scope = "beyond these families" if goes_beyond else "on these families"
         if pair.other == board.reference:
             verdict = verdicts.get(pair.one, "")

@@ -23,7 +23,8 @@ function sentenceOf(ratios, a, b, names) {
   const head = `${names[1]} against ${names[0]}: ${percentText(ratio)} on ${count}`;
   if (from === null) return `${head}, too few scenes to tell.`;
   const range = `ratio ${ratio.toFixed(3)}, 95 % interval ${low.toFixed(3)} to ${high.toFixed(3)}`, apart = low > 1 || high < 1;
-  if (!apart && verdict && scope && verdict !== "cannot tell") return `${head}, shown ${scope}; the interval goes beyond them (${range}).`;
+  if (verdict.includes("lost")) return `${head}; where both succeed ${names[+(verdict.startsWith("better") !== turned)]} is better ${scope}, but it lost more sequences (${range}).`;
+  if (!apart && verdict !== "cannot tell" && scope === "on these families") return `${head}, shown ${scope}; the interval goes beyond them (${range}).`;
   if (verdict === "cannot tell" && apart) return `${head}, but among all pairs of the board one may differ so by chance (${range}).`;
   return apart ? `${head} (${range}).` : `${head}, but that may be chance (${range}).`;
 }
