@@ -132,15 +132,10 @@ def explanation(board: Board) -> str:
     return " ".join(filter(None, sentences))
 
 
-def _free(board: Board) -> int:
-    """How many more sequences than families there are."""
-    sequences = board.ranked_sequences
-    return len(sequences.names) - len(set(sequences.families))
-
-
 def _can_claim(board: Board) -> bool:
     """Whether anything can be claimed: beyond these families, or on them."""
-    return board.ranked_sequences.can_go_beyond or _free(board) >= FEWEST_FREE
+    sequences = board.ranked_sequences
+    return sequences.can_go_beyond or sequences.can_stay
 
 
 def _missing_words(board: Board) -> str:
@@ -149,7 +144,7 @@ def _missing_words(board: Board) -> str:
     families = "family" if n_families == 1 else "families"
     here = f"here {'is' if n_families == 1 else 'are'} {n_families}"
     words = f"Claims beyond these families need {FEWEST_FAMILIES} of them, and {here}."
-    if _free(board) < FEWEST_FREE:
+    if not board.ranked_sequences.can_stay:
         words += (
             f" Claims on these families need {FEWEST_FREE} more sequences than families, and here are "
             f"{len(board.common)} of {n_families} {families}."

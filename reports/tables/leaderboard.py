@@ -13,6 +13,7 @@ import numpy as np
 from dynslam_bench.core import label_text
 from dynslam_bench.evaluation import Protocol, RPESpec
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
+from dynslam_bench.evaluation.verdicts import FEWEST_FAMILIES, FEWEST_FREE
 from dynslam_bench.reports.model.board import (
     OVERALL,
     STATIC_CAMERA,
@@ -164,13 +165,15 @@ def _ratio_rule(board: Board) -> str:
         over_categories = (
             f"It is a mean over {len(groups)} categories ({names}), which all weigh the same. "
         )
-    if len(board.common) >= FEWEST:
-        over = (
-            "families of sequences" if board.ranked_sequences.can_go_beyond else "these sequences"
-        )
-        intervals = f"Brackets: Student's 95 % intervals over {over}."
-    else:
+    if len(board.common) < FEWEST:
         intervals = f"No intervals: they would need {FEWEST} sequences."
+    elif board.ranked_sequences.can_go_beyond:
+        intervals = "Brackets: Student's 95 % intervals over families of sequences."
+    elif board.ranked_sequences.can_stay:
+        intervals = "Brackets: Student's 95 % intervals over sequences of these families."
+    else:
+        free = f"{FEWEST_FREE} more sequences than families"
+        intervals = f"No intervals: they would need {FEWEST_FAMILIES} families, or {free}."
     n_families = len(set(board.ranked_sequences.families))
     of_families = f" of {n_families} families" if n_families < len(board.common) else ""
     return (

@@ -32,9 +32,11 @@ from dynslam_bench.core.records import digest
 from dynslam_bench.geometry.trajectory_files import write_tum
 from dynslam_bench.reports import ReportData, build_report, compare, figures, make_board
 from dynslam_bench.reports.build_report import FEWER_PAGES, MOST_PAGES, masks_section, pages_for
+from dynslam_bench.reports.compare_runs import overall_ratio
 from dynslam_bench.reports.html import board_page
 from dynslam_bench.reports.html.run_pages import broken, exact_shares
 from dynslam_bench.reports.model import workers
+from dynslam_bench.reports.model.board import make_cell
 from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.tables import table as tables
 from dynslam_bench.reports.tables.leaderboard import repeatability
@@ -933,6 +935,17 @@ def test_compare_counts_lost_sequences_by_name_and_a_recording_once(tmp_path):
     line = next(cells for cells in found.table.rows if cells[1].text.startswith("all "))
     assert (line[1].text, line[5].small) == ("all 8 sequences", "lost 2 of 8, A 0")
     assert [cells[3].small for cells in found.table.rows[:3]] == ["lost", "lost", ""]
+
+
+def test_compare_counts_what_is_lost_before_a_fixed_camera():
+    """Such a cell has no error, since a static camera has none there."""
+    still = {"tags": ["fixed-camera"], "static_camera_ate_rmse_m": 0.0}
+    good = make_cell([row("a", "s", 0.01, **still)])
+    gone = make_cell([crashed("a", "s", 0.01, **still)])
+    assert gone.scores == ()
+    ratio = overall_ratio([("s", good, gone)])
+    assert (ratio.ratio, ratio.lost, ratio.all_scenes) == (None, ("s",), 1)
+    assert overall_ratio([("s", gone, good)]).lost_baseline == ("s",)
 
 
 def test_compare_takes_the_nearest_settings_and_leaves_the_rest(tmp_path):

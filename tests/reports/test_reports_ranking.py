@@ -354,6 +354,7 @@ def test_claims_need_four_families_or_six_degrees_of_freedom_within_them(counts,
         assert f"need 4 of them, and here are {len(counts)}" in said
         assert "need 6 more sequences than families" in said
         assert "This board shows" not in said
+        assert "No intervals: they would need 4 families" in leaderboard(board, PROTOCOL).caption
     elif scope == "on these families":
         assert ", on these families." in headline(board)
         assert "This board shows differences from" in said
