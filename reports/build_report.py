@@ -37,6 +37,7 @@ from dynslam_bench.reports.model.board import (
     Board,
     On,
     category_boards,
+    copies_note,
     make_board,
     missing_commands,
     missing_note,
@@ -536,7 +537,7 @@ def _notes(board: Board, protocol: Protocol, loaded: Loaded, pageless: str) -> l
         notes.append(
             f"Runs with one id must be equal, but these have different results: {conflicts}."
         )
-    notes.append(missing_note(board))
+    notes += [missing_note(board), copies_note(board)]
     if board.final_only:
         final_only = ", ".join(board.labels[key] for key in board.final_only)
         notes.append(

@@ -1,5 +1,6 @@
 """Two sets of results against each other: before and after a change of the code, or of the settings."""
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -7,19 +8,25 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from dynslam_bench.core import ReportError, setting_text, sweep_temporary, write_atomic
 from dynslam_bench.evaluation import Protocol, get_protocol
-from dynslam_bench.reports.html.board_page import cell_data, ratio_numbers, settings_data
+from dynslam_bench.evaluation.verdicts import (
+    FEWEST,
+    PairedRatio,
+    Verdict,
+    findings,
+    paired_ratio,
+    verdict_of,
+)
+from dynslam_bench.reports.figures import significant
+from dynslam_bench.reports.html.board_page import cell_data, settings_data
 from dynslam_bench.reports.html.page import render, write_assets, write_side
 from dynslam_bench.reports.html.run_pages import RUN_PAGE, write_run_pages
-from dynslam_bench.reports.model.board import Cell, group_of, group_weights, make_cell, mean_of
+from dynslam_bench.reports.model.board import Cell, copies_of, make_cell, mean_of
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores
 from dynslam_bench.reports.model.names import make_labels, name_columns
 from dynslam_bench.reports.model.row import REPORT_FILE, SEEN, ReportData, RunRow, grouped
-from dynslam_bench.reports.model.statistics import FEWEST, FLOOR_M, Interval, ratio_interval
-from dynslam_bench.reports.tables.leaderboard import interval_cell
+from dynslam_bench.reports.model.statistics import FLOOR_M
 from dynslam_bench.reports.tables.table import Table, TableCell, mm, number, numbers, texts
 from dynslam_bench.runs.record import coverage_text
 from dynslam_bench.runs.store import RunStore
@@ -35,8 +42,10 @@ class Comparison:
     """What changed from A to B.
 
     Attributes:
-        overall: Tracker and what differs to the geometric mean over sequences of B's median ATE
-            over A's, with an interval from `FEWEST` sequences on; all categories weigh the same.
+        overall: Tracker and what differs to B's median ATE over A's: the typical ratio over
+            sequences where both succeed, and the sequences that either lost; A is the baseline.
+        verdicts: Tracker, as in `overall`, to the verdict on B.
+        findings: Tracker, as in `overall`, to what was found, in sentences without full stops.
         table: Every tracker and sequence with both medians.
         only_a: Runs that only A has.
         only_b: Runs that only B has.
@@ -45,7 +54,9 @@ class Comparison:
         page: The page that shows it; None where none was asked for.
     """
 
-    overall: dict[str, Interval]
+    overall: dict[str, PairedRatio]
+    verdicts: dict[str, Verdict]
+    findings: dict[str, list[str]]
     table: Table
     only_a: int
     only_b: int
@@ -117,14 +128,16 @@ def compare(
     if not compared:
         raise ReportError("none of the runs in common has ground truth", "nothing can be compared")
 
-    # the ratios over all sequences, as a table and as a page
+    # B beside A over all sequences, as a table and as a page
     overall = {name: overall_ratio(paired) for name, paired in compared.items()}
+    verdicts = {name: verdict_of(ratio) for name, ratio in overall.items()}
+    sentences = {name: findings(ratio, "B") for name, ratio in overall.items()}
     page = None
     if output is not None:
         page = _write_page(Path(output), protocol, evaluated, compared, overall)
     title = f"{name_a} (A) against {name_b} (B)"
     table = _table(title, _caption(evaluated, differences), compared, overall)
-    return Comparison(overall, table, only_a, only_b, differences, page)
+    return Comparison(overall, verdicts, sentences, table, only_a, only_b, differences, page)
 
 
 def _source_name(source: Path | str | RunStore) -> str:
@@ -133,7 +146,7 @@ def _source_name(source: Path | str | RunStore) -> str:
 
 
 def _pair_cells(a: Variants, b: Variants, columns: Mapping[str, str]) -> list[Paired]:
-    """The runs of one tracker in A and in B on the sequences on which both have errors, sorted by sequence.
+    """The runs of one tracker in A and in B on the sequences on which both have errors or are lost, by sequence.
 
     Args:
         a: Column id to the runs in A.
@@ -146,7 +159,9 @@ def _pair_cells(a: Variants, b: Variants, columns: Mapping[str, str]) -> list[Pa
         repeats = {row.repeat_key for row in a[column]} & {row.repeat_key for row in b[column]}
         cell_a = make_cell([row for row in a[column] if row.repeat_key in repeats] or a[column])
         cell_b = make_cell([row for row in b[column] if row.repeat_key in repeats] or b[column])
-        if cell_a.scores and cell_b.scores:
+        # before a fixed camera a lost cell has no error
+        is_known = all(cell.scores or cell.lost for cell in (cell_a, cell_b))
+        if is_known and (cell_a.scores or cell_b.scores):
             mark = f" {SEEN}" if cell_a.in_training or cell_b.in_training else ""
             paired.append((columns[column] + mark, cell_a, cell_b))
     return sorted(paired, key=itemgetter(0))
@@ -160,8 +175,10 @@ def _caption(evaluated: str, differences: Mapping[str, list[str]]) -> str:
     what_differs = f"What differs: {changed}." if changed else "The settings are the same."
     return (
         f"{evaluated}. Median ATE (millimetres), lost frames held, over the repeats that both have, or all where they "
-        "share none; failures count as a static camera, or worse. B / A below 1: B is better; all categories weigh the "
-        f"same. Brackets: Student's 95 % interval over sequences, from {FEWEST} of them on. {what_differs}"
+        "share none; failures count as a static camera, or worse. B / A below 1: B is better. Over all sequences: the "
+        "typical ratio where both succeed, with the exact 95 % interval of Wilcoxon's signed-rank test; a sequence is "
+        "lost where half of its runs failed or the error is three times the other's, and counts beside it. One "
+        f"recording counts once. From {FEWEST} sequences on something is claimed. {what_differs}"
     )
 
 
@@ -170,7 +187,7 @@ def _write_page(
     protocol: Protocol,
     evaluated: str,
     compared: Mapping[str, Sequence[Paired]],
-    overall: Mapping[str, Interval],
+    overall: Mapping[str, PairedRatio],
 ) -> Path:
     """Write the page: both sides of every tracker, with the pages of the runs that stand for a cell."""
     output = output.expanduser().absolute()
@@ -194,8 +211,16 @@ def _write_page(
     board = _board_data(cells, evaluated, paged)
     write_side(output, "board", board)
     ratios = [
-        [2 * at, 2 * at + 1, *ratio_numbers(overall[name]), len(pairs), ""]
-        for at, (name, pairs) in enumerate(compared.items())
+        [
+            2 * at,
+            2 * at + 1,
+            *_numbers(ratio),
+            ratio.scenes,
+            verdict_of(ratio),
+            "",
+            _sentence(ratio),
+        ]
+        for at, ratio in enumerate(overall.values())
     ]
     write_side(output, "ratios", ratios)
 
@@ -311,22 +336,47 @@ def _differences(first: RunRow, second: RunRow) -> list[str]:
     return words
 
 
-def ratio_of(_: str, a: Cell, b: Cell) -> float:
-    """B's median error over A's."""
-    return max(b.median or 0.0, FLOOR_M) / max(a.median or 0.0, FLOOR_M)
+def ratio_of(a: Cell, b: Cell) -> float | None:
+    """B's median error over A's; None where one of them has none: lost before a fixed camera."""
+    if a.median is None or b.median is None:
+        return None
+    return max(b.median, FLOOR_M) / max(a.median, FLOOR_M)
 
 
-def overall_ratio(paired: Sequence[Paired]) -> Interval:
-    """Geometric mean of the ratios over sequences, with its interval; categories weigh the same, as on a board."""
-    groups = [group_of(a.rows[0].sequence.tags) for _, a, _ in paired]
-    return ratio_interval(np.log([ratio_of(*pair) for pair in paired]), group_weights(groups))
+def overall_ratio(paired: Sequence[Paired]) -> PairedRatio:
+    """B beside A over the sequences, each recording once."""
+    copies = copies_of({sequence: [*a.rows, *b.rows] for sequence, a, b in paired})
+    log_ratios = {}
+    lost: list[str] = []
+    lost_by_a: list[str] = []
+    runs = 0
+    for sequence, cell_a, cell_b in paired:
+        if sequence in copies:
+            continue
+        lost += [sequence] * cell_b.lost
+        lost_by_a += [sequence] * cell_a.lost
+        runs += min(len(cell_a.kept), len(cell_b.kept))
+        ratio = ratio_of(cell_a, cell_b)
+        if ratio is not None:
+            log_ratios[sequence] = math.log(ratio)
+    return paired_ratio(log_ratios, lost, lost_by_a, runs=runs)
+
+
+def _numbers(ratio: PairedRatio) -> list[float | None]:
+    """A typical ratio and the ends of its interval, as the page reads them."""
+    return [significant(value) for value in (ratio.ratio, ratio.low, ratio.high)]
+
+
+def _sentence(ratio: PairedRatio) -> str:
+    """What was found, as the page says it."""
+    return f"{'. '.join(findings(ratio, 'B'))}. Verdict: {verdict_of(ratio).value}."
 
 
 def _table(
     title: str,
     caption: str,
     compared: Mapping[str, Sequence[Paired]],
-    overall: Mapping[str, Interval],
+    overall: Mapping[str, PairedRatio],
 ) -> Table:
     """Every tracker and sequence with both medians, and one line a tracker over all sequences."""
     rows: list[list[TableCell]] = []
@@ -342,7 +392,7 @@ def _table(
                     TableCell(sequence),
                     _error_cell(cell_a),
                     _error_cell(cell_b),
-                    number(ratio_of(sequence, cell_a, cell_b), ".3f"),
+                    number(ratio_of(cell_a, cell_b), ".3f"),
                     TableCell(),
                     _coverage_cell(cell_a),
                     _coverage_cell(cell_b),
@@ -351,11 +401,17 @@ def _table(
             )
 
         # a line over all sequences
-        wins = sum(ratio_of(*pair) < 1 for pair in paired)
-        ratio = interval_cell(overall[name], ".3f", "best")
-        verdict = TableCell(_verdict(overall[name], wins, len(paired)))
-        words = [TableCell(name), TableCell(f"all {len(paired)} sequences")]
-        rows.append([*words, *[TableCell()] * 2, ratio, verdict, *[TableCell()] * 3])
+        ratio = overall[name]
+        words = [TableCell(name), TableCell(_all_sequences(ratio))]
+        rows.append(
+            [
+                *words,
+                *[TableCell()] * 2,
+                _ratio_cell(ratio),
+                _verdict_cell(ratio),
+                *[TableCell()] * 3,
+            ]
+        )
     columns = [
         *texts("tracker", "sequence"),
         *numbers("ATE A", "ATE B", "B / A"),
@@ -366,8 +422,9 @@ def _table(
 
 
 def _error_cell(cell: Cell) -> TableCell:
-    """The median error of runs, in millimetres."""
-    return TableCell(mm(cell.median or 0.0), value=cell.median)
+    """The median error of runs, in millimetres, and whether the cell is lost."""
+    text = "" if cell.median is None else mm(cell.median)
+    return TableCell(text, "lost" if cell.lost else "", cell.median)
 
 
 def _coverage_cell(cell: Cell) -> TableCell:
@@ -376,12 +433,22 @@ def _coverage_cell(cell: Cell) -> TableCell:
     return TableCell(coverage_text(coverage), value=coverage)
 
 
-def _verdict(ratio: Interval, wins: int, sequences: int) -> str:
-    """Whether B is better than A; below `FEWEST` sequences on how many it is."""
-    if sequences < FEWEST:
-        if ratio.value == 1:
-            return "equal"
-        return f"B better on {wins} of {sequences}, too few to tell"
-    if ratio.high < 1:
-        return "better"
-    return "worse" if ratio.low > 1 else "no difference shown"
+def _all_sequences(ratio: PairedRatio) -> str:
+    """Over how many sequences a line is."""
+    count = ratio.all_scenes
+    return f"all {count} sequences" if count != 1 else "1 sequence"
+
+
+def _ratio_cell(ratio: PairedRatio) -> TableCell:
+    """The typical ratio with its interval, if it has one."""
+    if ratio.ratio is None:
+        return TableCell()
+    return TableCell(f"{ratio.ratio:.3f}", ratio.interval, ratio.ratio, "best")
+
+
+def _verdict_cell(ratio: PairedRatio) -> TableCell:
+    """The verdict on B, and how many sequences either alone lost."""
+    small = ""
+    if ratio.losses or ratio.losses_baseline:
+        small = f"lost {len(ratio.losses)} of {ratio.all_scenes}, A {len(ratio.losses_baseline)}"
+    return TableCell(verdict_of(ratio).value, small)

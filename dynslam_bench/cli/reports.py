@@ -174,8 +174,17 @@ def compare(
 
     folder = output or (b if b.is_dir() else b.parent) / "compare"
     result = compare_results(a, b, protocol=protocol, output=folder)
-    facts = {"differences": result.differences, "only_a": result.only_a, "only_b": result.only_b}
-    lines = [result.table.title, report_table(result.table), "", wrapped(result.table.caption)]
+    facts = {
+        "verdicts": result.verdicts,
+        "findings": result.findings,
+        "differences": result.differences,
+        "only_a": result.only_a,
+        "only_b": result.only_b,
+    }
+    lines = [result.table.title, report_table(result.table), ""]
+    for name, sentences in result.findings.items():
+        lines.append(wrapped(f"{name}: {'. '.join(sentences)}."))
+    lines += ["", wrapped(result.table.caption)]
     if result.only_a or result.only_b:
         lines.append(f"\nonly in {a}: {result.only_a} runs; only in {b}: {result.only_b} runs")
     present({"overall": result.overall, "html": result.page} | facts, *lines, str(result.page))

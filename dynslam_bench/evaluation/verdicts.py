@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+from scipy import special, stats
 
 from dynslam_bench.core.records import Record
 
@@ -502,24 +502,25 @@ def family_test(
         weights: Weight of each family; all the same where there are none.
     """
     values = np.asarray(log_ratios, dtype=np.float64)
-    groups = {}
-    for family in dict.fromkeys(families):
-        of_family = np.array([name == family for name in families], dtype=bool)
-        group = values[of_family & np.isfinite(values)]
-        if len(group):
-            groups[family] = group
-    if not groups:
+    is_known = np.isfinite(values)
+    if not is_known.any():
         return FamilyTest(math.nan, 0, math.nan, 0, 1.0, math.nan, 0.0, 1.0)
-    means = np.array([group.mean() for group in groups.values()])
-    sizes = np.array([len(group) for group in groups.values()])
-    count = len(groups)
-    share = np.array([1.0 if weights is None else weights[family] for family in groups])
+
+    # number of sequences and mean of every family with a value
+    values = values[is_known]
+    of_each = [family for family, is_in in zip(families, is_known.tolist(), strict=True) if is_in]
+    number = {family: at for at, family in enumerate(dict.fromkeys(of_each))}
+    numbers = np.array([number[family] for family in of_each])
+    sizes = np.bincount(numbers)
+    means = np.bincount(numbers, values) / sizes
+    count = len(number)
+    share = np.array([1.0 if weights is None else weights[family] for family in number])
     share = share / share.sum()
     centre = float(share @ means)
 
     # on these families: the pooled variance within them
-    free = int(sizes.sum()) - count
-    squares = sum(float(np.square(group - group.mean()).sum()) for group in groups.values())
+    free = len(values) - count
+    squares = float(np.square(values - means[numbers]).sum())
     pooled = squares / max(free, 1)
     these_error = math.sqrt(pooled * float((share**2 / sizes).sum()))
     these_p = _two_sided(centre, these_error, free) if free >= FEWEST_FREE else 1.0
@@ -542,7 +543,8 @@ def family_test(
 def _two_sided(centre: float, error: float, free: float) -> float:
     if abs(centre) < _SMALLEST_ERROR:
         return 1.0
-    return float(2.0 * stats.t.sf(abs(centre) / max(error, _SMALLEST_ERROR), free))
+    # Student's t as `scipy.stats` computes it, without what that checks before
+    return float(2.0 * special.stdtr(free, -abs(centre) / max(error, _SMALLEST_ERROR)))
 
 
 def resolution_floor(error: float, free: float, trackers: int, level: float) -> float:

@@ -13,7 +13,7 @@ from dynslam_bench.evaluation import Protocol
 from dynslam_bench.reports.figures import significant
 from dynslam_bench.reports.model.board import OVERALL, Board, Cell, compare_pairs
 from dynslam_bench.reports.model.row import SEEN, RunRow, grouped
-from dynslam_bench.reports.model.statistics import FLOOR_M, Interval, Standing, Verdict
+from dynslam_bench.reports.model.statistics import FLOOR_M, Interval, Scope, Standing, Verdict
 from dynslam_bench.reports.tables.leaderboard import (
     frame_time_cell,
     leaderboard_cells,
@@ -23,8 +23,9 @@ from dynslam_bench.reports.tables.leaderboard import (
 )
 from dynslam_bench.reports.tables.table import TableCell
 
-_OPPOSITE: dict[Verdict, Verdict] = {
+_OPPOSITE: dict[Verdict, str] = {
     "better": "worse",
+    "better, but lost": "worse, but lost fewer",
     "worse": "better",
     "cannot tell": "cannot tell",
 }
@@ -297,19 +298,27 @@ def _sequences_data(board: Board, names: Sequence[str]) -> list[dict[str, Any]]:
 
 
 def ratios_data(board: Board) -> list[list[Any]]:
-    """What ``data/ratios.js`` holds of every two trackers: their numbers, and the second against the first."""
+    """What ``data/ratios.js`` holds of every two trackers: their numbers, and the second against the first.
+
+    Two positions of trackers, ratio and ends of its interval, number of sequences, verdict and its scope.
+    """
     keys = [*board.trackers, *board.final_only]
     tracker_at = {key: at for at, key in enumerate(keys)}
     verdicts = {standing.key: standing.verdict for standing in board.standings}
+    scopes = {standing.key: standing.scope for standing in board.standings}
+    goes_beyond = board.ranked_sequences.can_go_beyond
     ratios = []
     # reversed: of the later tracker over the earlier one
     for pair in compare_pairs(board, keys[::-1]):
         # against the reference the verdict is the board's, which asks it of fewer pairs
-        verdict = pair.verdict
+        verdict: str = pair.verdict
+        scope: Scope = "beyond these families" if goes_beyond else "on these families"
         if pair.other == board.reference:
             verdict = verdicts.get(pair.one, "")
+            scope = scopes.get(pair.one, "")
         elif pair.one == board.reference:
             verdict = _OPPOSITE.get(verdicts.get(pair.other, ""), verdict)
+            scope = scopes.get(pair.other, "")
         ratios.append(
             [
                 tracker_at[pair.other],
@@ -317,6 +326,7 @@ def ratios_data(board: Board) -> list[list[Any]]:
                 *ratio_numbers(pair.ratio),
                 pair.sequences,
                 verdict,
+                scope,
             ]
         )
     return ratios

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
@@ -30,14 +31,18 @@ from dynslam_bench.reports.model.row import RunRow, command_with, grouped, part_
 from dynslam_bench.reports.model.statistics import (
     FLOOR_M,
     Interval,
+    Sequences,
     Standing,
     Verdict,
     log_medians,
     ratio_interval,
+    resolution,
     separable,
+    sequences_of,
     standings,
 )
 from dynslam_bench.runs.store import RunStore, part_words
+from dynslam_bench.sequences.families import family_of
 from dynslam_bench.sequences.tags import FIXED_CAMERA
 
 STATIC_CAMERA = "static camera (from ground truth)"
@@ -68,6 +73,12 @@ _GROUP_ORDER = ("static", "low dynamic", "high dynamic", "unknown objects", _FIX
 """Order of the groups in tables."""
 _MOST_MISSING = 8
 """Trackers whose missing cells are named."""
+_SAME_ERROR = 1e-9
+"""Relative difference up to which two errors of a static camera are of one true path."""
+_MOVING_M = 1e-3
+"""Errors of a static camera below this do not tell true paths apart: the camera hardly moves."""
+_SAME_STAMP_S = 1e-6
+"""Difference of durations up to which they are equal: rounding in files."""
 
 
 @dataclass
@@ -85,10 +96,13 @@ class Board:
             known.
         labels: Variant key to the name in tables.
         sequences: Names of the sequences with ground truth, grouped and sorted.
-        common: Those of them that the standings are taken over.
+        common: Those of them that the standings are taken over, each recording once.
+        copies: Sequence to the one before it whose true path it has: the same recording, by
+            another name or with other pixels.
         short: Sequence to what is left of its name without the parts that all share.
         tags: Sequence to its tags, with ``recorded`` or ``rendered``.
         groups: Sequence to the name of its group: what moves in its scene.
+        families: Sequence to its family, see `family_of`.
         category: Which category the board is of, `OVERALL` for all sequences: then groups have
             equal weights.
         unscored: Names of the sequences without ground truth.
@@ -115,9 +129,11 @@ class Board:
     labels: dict[str, str] = field(default_factory=dict)
     sequences: list[str] = field(default_factory=list)
     common: list[str] = field(default_factory=list)
+    copies: dict[str, str] = field(default_factory=dict)
     short: dict[str, str] = field(default_factory=dict)
     tags: dict[str, set[str]] = field(default_factory=dict)
     groups: dict[str, str] = field(default_factory=dict)
+    families: dict[str, str] = field(default_factory=dict)
     category: str = OVERALL
     unscored: list[str] = field(default_factory=list)
     cells: dict[str, dict[str, Cell]] = field(default_factory=dict)
@@ -170,6 +186,11 @@ class Board:
         return dict(zip(self.common, group_weights(groups).tolist(), strict=True))
 
     @property
+    def ranked_sequences(self) -> Sequences:
+        """The common sequences with their families and the weights of these."""
+        return sequences_of(self.common, self.families, self.weights)
+
+    @property
     def standing_by_key(self) -> dict[str, Standing]:
         """Variant key to its standing, in order."""
         return {standing.key: standing for standing in self.standings}
@@ -183,13 +204,9 @@ class Board:
 
     @property
     def emphasised(self) -> set[str]:
-        """Variant keys of those that may be first, unless that is most of them: then it would say nothing."""
-        may_be_first = {
-            standing.key
-            for standing in self.standings
-            if standing.group is not None and standing.group[0] == 1
-        }
-        return may_be_first if 2 * len(may_be_first) <= len(self.ranked) else set()
+        """Variant keys of those that may be the best, unless that is most of them: then it would say nothing."""
+        may_be_best = {standing.key for standing in self.standings if standing.may_be_best}
+        return may_be_best if 2 * len(may_be_best) <= len(self.ranked) else set()
 
     def sequence(self, row: RunRow) -> str:
         """Name of the sequence of a row."""
@@ -327,6 +344,10 @@ class Board:
             values |= {name: row.metrics.get(name) for name in metrics}
             lines.append([values[name] if name in values else getattr(row, name) for name in types])
         return pd.DataFrame(lines, columns=list(types), dtype=object).astype(types)
+
+    def lost(self, key: str) -> set[str]:
+        """The sequences whose cell a tracker lost."""
+        return {name for name, cell in self.cells[key].items() if cell.lost}
 
     def competes(self, key: str, name: str) -> bool:
         """Whether a tracker's number on a sequence may rank: no network that it uses was trained there."""
@@ -503,7 +524,15 @@ def rank(
     complete = [
         key for key in ranked if key in placed and all(errors[key].get(name) for name in reference)
     ]
-    placings = standings(placed, reference, complete, board.weights)
+    placings = standings(
+        placed,
+        reference,
+        complete,
+        families=board.families,
+        weights=board.weights,
+        lost={key: board.lost(key) for key in placed},
+        reference_lost=set() if board.reference is None else board.lost(board.reference),
+    )
     return [
         replace(standing, verdict="reference")
         if standing.key == board.reference and standing.verdict
@@ -523,17 +552,43 @@ def group_weights(groups: Sequence[str]) -> NDArray[np.float64]:
     return np.array([1.0 / sizes[group] for group in groups])
 
 
-def common_logs(
-    board: Board, keys: Sequence[str]
-) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64]]:
-    """Logarithms of some trackers' median errors on the common sequences, nan for none, and the weights of these."""
-    logs = {
+def common_logs(board: Board, keys: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+    """Logarithms of some trackers' median errors on the common sequences ``[S]``, nan for none."""
+    return {
         key: log_medians(
             {name: cell.scores for name, cell in board.cells[key].items()}, board.common
         )
         for key in keys
     }
-    return logs, np.array([*board.weights.values()])
+
+
+def board_resolution(board: Board) -> tuple[float, float]:
+    """Smallest differences, as shares, that a board shows in four of five: on these families, and beyond them.
+
+    Returns:
+        See `statistics.resolution`; 1 where nothing can be shown.
+    """
+    others = [key for key in board.ranked if key != board.reference]
+    logs = common_logs(board, others)
+    if board.reference is None:
+        # a static camera has no error before a fixed camera
+        static = {
+            name: [board.static_camera[name]]
+            for name in board.common
+            if board.groups[name] != _FIXED
+        }
+        base = log_medians(static, board.common)
+        base_lost: set[str] = set()
+    else:
+        base = common_logs(board, [board.reference])[board.reference]
+        base_lost = board.lost(board.reference)
+
+    # lost cells take no part in a claim
+    for key in others:
+        lost = board.lost(key) | base_lost
+        is_lost = np.array([name in lost for name in board.common], dtype=bool)
+        logs[key] = np.where(is_lost, np.nan, logs[key])
+    return resolution(logs, base, board.ranked_sequences)
 
 
 class Pair(NamedTuple):
@@ -558,10 +613,11 @@ class Pair(NamedTuple):
 
 def compare_pairs(board: Board, keys: Sequence[str]) -> list[Pair]:
     """Compare every two of some trackers that have a common sequence in common, in their order."""
-    logs, weights = common_logs(board, keys)
+    logs = common_logs(board, keys)
+    sequences = board.ranked_sequences
     tests = {}
     if board.common:
-        tests = separable({key: logs[key] for key in keys if key in board.ranked}, weights)
+        tests = separable({key: logs[key] for key in keys if key in board.ranked}, sequences)
     pairs = []
     for one, other in combinations(keys, 2):
         # log ratios [S], nan where one of the two has no run
@@ -569,7 +625,7 @@ def compare_pairs(board: Board, keys: Sequence[str]) -> list[Pair]:
         n_sequences = int(np.isfinite(differences).sum())
         if not n_sequences:
             continue
-        ratio = ratio_interval(differences, weights)
+        ratio = ratio_interval(differences, sequences)
         (differ, p_value) = tests.get((one, other), (False, None))
         verdict: Verdict = "" if p_value is None else "cannot tell"
         if differ:
@@ -579,8 +635,9 @@ def compare_pairs(board: Board, keys: Sequence[str]) -> list[Pair]:
 
 
 def _order_sequences(board: Board) -> None:
-    """Name the sequences and their groups, static ones first; note what a static camera scores on each."""
-    for name, rows in grouped(board.rows, board.sequence).items():
+    """Name the sequences, their groups and families, static ones first; note what a static camera scores on each."""
+    by_sequence = grouped(board.rows, board.sequence)
+    for name, rows in by_sequence.items():
         # the error of a static camera; without one there is no ground truth
         static_m = [row.static_camera_ate_rmse_m for row in rows]
         known_m = [error for error in static_m if error is not None]
@@ -589,10 +646,11 @@ def _order_sequences(board: Board) -> None:
         else:
             board.unscored.append(name)
 
-        # tags and group
+        # tags, group and family
         place = "rendered" if rows[0].sequence.id.startswith("synthetic/") else "recorded"
         board.tags[name] = {place, *(tag for row in rows for tag in row.sequence.tags)}
         board.groups[name] = group_of(board.tags[name])
+        board.families[name] = family_of(rows[0].sequence.id)
 
     # a single group without a meaning gets no heading
     if set(board.groups.values()) == {_OTHER}:
@@ -601,6 +659,55 @@ def _order_sequences(board: Board) -> None:
         board.static_camera, key=lambda name: (_GROUP_ORDER.index(board.groups[name]), name)
     )
     board.short = shortened(board.sequences)
+    board.copies = copies_of({name: by_sequence[name] for name in board.sequences})
+
+
+def copies_of(columns: Mapping[str, Sequence[RunRow]]) -> dict[str, str]:
+    """Which sequences are others once more: equal frames, duration and error of a static camera that moves.
+
+    Args:
+        columns: Sequence to its rows, in order.
+
+    Returns:
+        Sequence to the first one that it is a copy of; those that are no copies are not in it.
+    """
+    copies = {}
+    firsts: dict[tuple[int, int], list[tuple[str, float, float]]] = {}
+    for name, rows in columns.items():
+        # the truth of the earliest start: a run without ground truth tells nothing
+        with_truth = [row for row in rows if row.static_camera_ate_rmse_m is not None]
+        if not with_truth:
+            continue
+        first = min(with_truth, key=lambda row: (row.imported, row.offset))
+        static_m = first.static_camera_ate_rmse_m or 0.0
+        if static_m < _MOVING_M:
+            continue
+
+        # the sequences before it with as many frames from there
+        duration_s = first.sequence.duration_s
+        before = firsts.setdefault((first.offset, first.sequence.frames), [])
+        for other, other_m, other_s in before:
+            is_equal_m = math.isclose(static_m, other_m, rel_tol=_SAME_ERROR)
+            if is_equal_m and math.isclose(duration_s, other_s, abs_tol=_SAME_STAMP_S):
+                copies[name] = other
+                break
+        else:
+            before.append((name, static_m, duration_s))
+    return copies
+
+
+def copies_note(board: Board) -> str:
+    """Which sequences are one recording and count once, and why; empty where none are."""
+    names = grouped(board.copies, board.copies.__getitem__)
+    shown = [
+        f"{first} counts once for {', '.join([first, *others])}" for first, others in names.items()
+    ]
+    if not shown:
+        return ""
+    return (
+        f"One recording counts once: {'; '.join(shown)}. Their true paths are the same: as many frames, the same "
+        "duration, and the same error of a static camera."
+    )
 
 
 def _choose_ranked(board: Board, scored: Sequence[str]) -> None:
@@ -634,7 +741,7 @@ def _choose_ranked(board: Board, scored: Sequence[str]) -> None:
     shared = set(board.sequences)
     if competing:
         shared = set.intersection(*(sequences_of[key] for key in competing))
-    board.common = [name for name in board.sequences if name in shared]
+    board.common = _each_once(board, [name for name in board.sequences if name in shared])
 
     # ranked, or why not
     board.incomplete = [key for key in rankable if key not in competing]
@@ -647,6 +754,12 @@ def _choose_ranked(board: Board, scored: Sequence[str]) -> None:
             board.no_better.append(key)
         elif key in competing:
             board.ranked.append(key)
+
+
+def _each_once(board: Board, names: Sequence[str]) -> list[str]:
+    """Some sequences, of those that are one recording the first."""
+    first = {board.copies.get(name, name): name for name in reversed(names)}
+    return [name for name in names if first[board.copies.get(name, name)] == name]
 
 
 def _most_cells(sequences: Sequence[set[str]]) -> int:
@@ -691,6 +804,11 @@ class Cell:
     def failed(self) -> int:
         """Runs that failed."""
         return sum(row.failed for row in self.rows)
+
+    @cached_property
+    def lost(self) -> bool:
+        """Whether the cell is lost: at least half of the runs that count failed."""
+        return 2 * sum(row.failed for row in self.kept) >= len(self.kept)
 
     @property
     def success(self) -> int:
@@ -785,7 +903,7 @@ def missing_note(board: Board) -> str:
 
     # what the ranking stands on, and who is not in it
     n_common = len(board.common)
-    n_sequences = len(board.sequences)
+    n_sequences = len(_each_once(board, board.sequences))
     if board.on == "common" and board.ranked and n_common < n_sequences:
         sentences.append(
             f"The ranking stands on the {n_common} of {n_sequences} sequences that all ranked trackers have."

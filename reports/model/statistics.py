@@ -78,6 +78,11 @@ class Sequences(NamedTuple):
         """Whether there are enough families for claims beyond them."""
         return len(set(self.families)) >= FEWEST_FAMILIES
 
+    @property
+    def can_stay(self) -> bool:
+        """Whether there are enough sequences within the families for claims on these."""
+        return len(self.families) - len(set(self.families)) >= FEWEST_FREE
+
 
 @dataclass(frozen=True)
 class Standing:

@@ -1,11 +1,16 @@
 """What a board says in words: one sentence, and one paragraph for readers without statistics."""
 
-import math
 from collections import Counter
 from collections.abc import Sequence
-from statistics import median_high
 
-from dynslam_bench.reports.model.board import OVERALL, STATIC_CAMERA, Board, common_logs
+from dynslam_bench.evaluation.verdicts import FEWEST_FAMILIES, FEWEST_FREE
+from dynslam_bench.reports.model.board import (
+    OVERALL,
+    STATIC_CAMERA,
+    Board,
+    board_resolution,
+    common_logs,
+)
 from dynslam_bench.reports.model.row import HINTED, SEEN, RunRow
 from dynslam_bench.reports.model.statistics import FEWEST, Standing, mean_rank_test
 from dynslam_bench.runs.store import part_words
@@ -38,22 +43,60 @@ def headline(board: Board) -> str:
             "no tracker is called better than another."
         )
 
-    # those that may be first and are better than the reference
-    better = [
-        standing
-        for standing in ranked
-        if standing.group is not None and standing.group[0] == 1 and standing.verdict == "better"
-    ]
-    if not better:
+    # what is claimed: the trackers that are better, and which may be the best
+    claimed = _better_words(board, ranked)
+    if not claimed:
         n_worse = sum(standing.verdict == "worse" for standing in ranked)
         return f"{where}no tracker is shown to be better than {board.reference_name}; {_are(n_worse)} worse."
-    cuts_percent = sorted(round(100 * (1 - standing.ratio.value)) for standing in better)
+    return f"{where}{claimed}."
+
+
+def _better_words(board: Board, ranked: list[Standing]) -> str:
+    """Which trackers are better than the reference, how far that goes, and what may be the best; empty for none."""
+    better = [standing for standing in ranked if standing.verdict == "better"]
+    if not better:
+        return _but_lost_words(board, ranked)
+
+    # of several those that may be the best, of these the claims that go farthest
+    best = [standing for standing in ranked if standing.may_be_best]
+    named = [standing for standing in better if standing.may_be_best] or better
+    beyond = [standing for standing in named if standing.scope == "beyond these families"]
+    named = beyond or named
+
+    # by how much
+    cuts_percent = sorted(round(100 * (1 - standing.ratio.value)) for standing in named)
     smallest = cuts_percent[0]
     largest = cuts_percent[-1]
     by = f"{smallest} %" if smallest == largest else f"{smallest} to {largest} %"
-    cut = "cuts" if len(better) == 1 else "cut"
-    message = f"{where}{_names(board, better)} {cut} {board.reference_name}'s error by {by}"
-    return f"{message}; these cannot be told apart." if len(better) > 1 else f"{message}."
+    if smallest > 0:
+        verb = f"{'cuts' if len(named) == 1 else 'cut'} {board.reference_name}'s error by {by}"
+    else:
+        verb = f"{'is' if len(named) == 1 else 'are'} better than {board.reference_name}"
+    message = f"{_names(board, named)} {verb}, {named[0].scope}"
+
+    # what may be the best, and who would be better but for its losses
+    endings = []
+    if board.ranked_sequences.can_go_beyond:
+        if best != named:
+            endings.append(f"{_names(board, best)} may be the best")
+        elif len(best) > 1:
+            endings.append("each of them may be the best")
+        else:
+            endings.append("no other may be the best")
+    endings.append(_but_lost_words(board, ranked))
+    return "; ".join(filter(None, [message, *endings]))
+
+
+def _but_lost_words(board: Board, ranked: list[Standing]) -> str:
+    """The first tracker that is better where both succeed and loses more; empty for none."""
+    for standing in ranked:
+        if standing.verdict == "better, but lost":
+            by_tracker, by_reference = standing.lost
+            return (
+                f"{board.names[standing.key]} is better than {board.reference_name} where both succeed, "
+                f"{standing.scope}, but lost {by_tracker} of {standing.sequences}, the reference {by_reference}"
+            )
+    return ""
 
 
 def explanation(board: Board) -> str:
@@ -65,37 +108,74 @@ def explanation(board: Board) -> str:
             f"Read the order as a description of {_sequences(board)}, not as evidence about others: with fewer than "
             f"{FEWEST}, chance alone could produce it."
         )
-    count = Counter(standing.verdict for standing in board.standings)
-    sentences = [
-        f"Every tracker is compared with {board.reference_name} on the same sequences.",
-        "'Better' and 'worse' mean that the difference is so steady over the sequences that fewer than one such board "
-        "in twenty would hold any wrong claim.",
-        f"Here {_are(count['better'])} better, {_are(count['worse'])} worse, and of {count['cannot tell']} the data "
-        "cannot tell.",
-        "'Cannot tell' does not mean equal: the brackets hold the ratios that the data allow.",
-    ]
-    needed = _sequences_needed(board)
-    if needed > len(board.common):
-        sentences.append(
-            f"About {needed} sequences would be needed to show a difference of 10 % between typical trackers."
+    if not _can_claim(board):
+        return (
+            f"Read the order as a description of {_sequences(board)}, not as evidence: the data cannot tell who is "
+            f"better. {_missing_words(board)}"
         )
+    count = Counter(standing.verdict for standing in board.standings)
+    but_lost = count["better, but lost"]
+    lost_words = (
+        f" {_are(but_lost)} better where both succeed, but lost more sequences." if but_lost else ""
+    )
+    sentences = [
+        f"Every tracker is compared with {board.reference_name} on the same sequences, where both succeed; sequences "
+        "that a tracker lost are counted beside it.",
+        "'Better' and 'worse' hold on these families of sequences or beyond them, as they say: the difference is so "
+        "steady that fewer than one such board in twenty would hold any wrong claim.",
+        f"Here {_are(count['better'])} better, {_are(count['worse'])} worse, and of {count['cannot tell']} the data "
+        f"cannot tell.{lost_words}",
+        "'Cannot tell' does not mean equal: the brackets hold the ratios that the data allow.",
+        _best_words(board),
+        _resolution_words(board),
+    ]
+    return " ".join(filter(None, sentences))
+
+
+def _can_claim(board: Board) -> bool:
+    """Whether anything can be claimed: beyond these families, or on them."""
+    sequences = board.ranked_sequences
+    return sequences.can_go_beyond or sequences.can_stay
+
+
+def _missing_words(board: Board) -> str:
+    """What claims beyond these families would need, and where there are too few sequences claims on them."""
+    n_families = len(set(board.ranked_sequences.families))
+    families = "family" if n_families == 1 else "families"
+    here = f"here {'is' if n_families == 1 else 'are'} {n_families}"
+    words = f"Claims beyond these families need {FEWEST_FAMILIES} of them, and {here}."
+    if not board.ranked_sequences.can_stay:
+        words += (
+            f" Claims on these families need {FEWEST_FREE} more sequences than families, and here are "
+            f"{len(board.common)} of {n_families} {families}."
+        )
+    return words
+
+
+def _best_words(board: Board) -> str:
+    """Which trackers may be the best; empty where that is not known."""
+    best = [standing for standing in board.standings if standing.may_be_best]
+    if not best or not board.ranked_sequences.can_go_beyond or len(board.ranked) < 2:
+        return ""
+    return f"{_names(board, best)} may be the best: no rival is shown to be better beyond these families."
+
+
+def _resolution_words(board: Board) -> str:
+    """Which differences the board can show, and what it lacks for claims beyond its families."""
+    these, beyond = board_resolution(board)
+    scopes = []
+    if these < 1.0:
+        scopes.append(f"from {100 * these:.0f} % on these families")
+    if beyond < 1.0:
+        scopes.append(f"from {100 * beyond:.0f} % beyond {'them' if scopes else 'these families'}")
+    sentences = []
+    if scopes:
+        sentences.append(
+            f"This board shows differences {', '.join(scopes)}, in four of five such boards."
+        )
+    if not board.ranked_sequences.can_go_beyond:
+        sentences.append(_missing_words(board))
     return " ".join(sentences)
-
-
-def _sequences_needed(board: Board) -> int:
-    """On how many sequences a typical tracker's interval would reach 10 % from its middle.
-
-    The logarithm of an interval's width falls with the square root of the number of sequences.
-    """
-    widths = []
-    for standing in board.standings:
-        ratio = standing.ratio
-        if standing.rank is not None and ratio.high > ratio.value > 0:
-            widths.append(ratio.high / ratio.value)
-    # the factor between an interval's end and its middle, of a typical tracker
-    width = median_high(widths or [1.0])
-    n_common = len(board.common)
-    return math.ceil(n_common * (math.log(max(width, 1.0 + 1e-9)) / math.log(1.1)) ** 2)
 
 
 def reservations(rows: Sequence[RunRow]) -> list[str]:
@@ -134,7 +214,7 @@ def reservations(rows: Sequence[RunRow]) -> list[str]:
 
 def mean_rank_note(board: Board) -> str:
     """Friedman's test and Nemenyi's critical difference in a sentence; empty where there are too few trackers."""
-    test = mean_rank_test(common_logs(board, board.ranked)[0])
+    test = mean_rank_test(common_logs(board, board.ranked))
     if test is None:
         return ""
     p_value, difference = test

@@ -13,6 +13,7 @@ import numpy as np
 from dynslam_bench.core import label_text
 from dynslam_bench.evaluation import Protocol, RPESpec
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
+from dynslam_bench.evaluation.verdicts import FEWEST_FAMILIES, FEWEST_FREE
 from dynslam_bench.reports.model.board import (
     OVERALL,
     STATIC_CAMERA,
@@ -111,12 +112,13 @@ COLUMNS = (
     Column("tracker", numeric=False),
     Column(
         "ATE ratio",
-        meaning="geometric mean over sequences of the median ATE over that of {reference}",
+        meaning="geometric mean over families of sequences of the median ATE over that of {reference}",
     ),
     Column(
         "better?",
-        meaning="better than {reference}, worse, or cannot tell: paired t test of the log errors over sequences, "
-        "Holm-corrected over the ranked trackers; behind it the corrected p",
+        meaning="better than {reference}, worse, or cannot tell: t tests of the log errors where both succeed, "
+        "Holm-corrected over the ranked trackers; behind it whether that holds on these families of sequences or "
+        "beyond them, the corrected p, and how many sequences were lost",
     ),
     Column("wins", meaning="sequences with a smaller median ATE than {reference}"),
     Column("mean rank", meaning="mean over sequences of the rank there", latex=False),
@@ -163,13 +165,20 @@ def _ratio_rule(board: Board) -> str:
         over_categories = (
             f"It is a mean over {len(groups)} categories ({names}), which all weigh the same. "
         )
-    if len(board.common) >= FEWEST:
-        intervals = "Brackets: Student's 95 % intervals over sequences."
-    else:
+    if len(board.common) < FEWEST:
         intervals = f"No intervals: they would need {FEWEST} sequences."
+    elif board.ranked_sequences.can_go_beyond:
+        intervals = "Brackets: Student's 95 % intervals over families of sequences."
+    elif board.ranked_sequences.can_stay:
+        intervals = "Brackets: Student's 95 % intervals over sequences of these families."
+    else:
+        free = f"{FEWEST_FREE} more sequences than families"
+        intervals = f"No intervals: they would need {FEWEST_FAMILIES} families, or {free}."
+    n_families = len(set(board.ranked_sequences.families))
+    of_families = f" of {n_families} families" if n_families < len(board.common) else ""
     return (
-        f"ATE ratio: geometric mean over {_count(len(board.common), 'sequence')} of the median ATE over that of "
-        f"{board.reference_name}; below 1 is better. {over_categories}{intervals}"
+        f"ATE ratio: geometric mean over {_count(len(board.common), 'sequence')}{of_families} of the median ATE over "
+        f"that of {board.reference_name}; below 1 is better. {over_categories}{intervals}"
     )
 
 
@@ -305,17 +314,29 @@ def _standing_cells(board: Board, standing: Standing) -> dict[str, TableCell]:
 
 
 def verdict_cell(board: Board, standing: Standing) -> TableCell:
-    """Better than the reference, worse, or cannot tell, with the corrected p value; coloured where it is shown."""
+    """Better than the reference, worse, or cannot tell, with how far that goes; coloured where it is shown.
+
+    Behind it stand the scope, the corrected p value, and the sequences that one of the two alone lost.
+    """
     verdict = standing.verdict
     if not verdict:
         return TableCell()
     if len(board.common) < FEWEST and verdict != "reference":
         return TableCell()
 
-    p_text = ""
+    small: list[str] = [standing.scope]
     if standing.p_value is not None:
-        p_text = "p < 0.001" if standing.p_value < 0.001 else f"p {standing.p_value:.3f}"
-    return TableCell(verdict, p_text, shade=_VERDICT_SHADES.get(verdict))
+        small.append("p < 0.001" if standing.p_value < 0.001 else f"p {standing.p_value:.3f}")
+    small.append(lost_words(standing))
+    return TableCell(verdict, ", ".join(filter(None, small)), shade=_VERDICT_SHADES.get(verdict))
+
+
+def lost_words(standing: Standing) -> str:
+    """How many sequences a tracker alone lost, and the reference alone; empty where there are none."""
+    if not any(standing.lost):
+        return ""
+    by_tracker, by_reference = standing.lost
+    return f"lost {by_tracker} of {standing.sequences}, reference {by_reference}"
 
 
 def category_table(boards: Mapping[str, Board]) -> Table | None:
@@ -367,6 +388,10 @@ def pair_table(board: Board) -> Table | None:
         return None
     pairs = {frozenset((pair.one, pair.other)): pair for pair in compare_pairs(board, board.ranked)}
 
+    goes_beyond = board.ranked_sequences.can_go_beyond
+    scope = (
+        "beyond these families of sequences" if goes_beyond else "on these families of sequences"
+    )
     rows = []
     for key in board.ranked:
         cells = [TableCell(board.labels[key])]
@@ -377,8 +402,8 @@ def pair_table(board: Board) -> Table | None:
                 cells.append(_pair_cell(pairs[frozenset((key, other))], key))
         rows.append(cells)
     caption = (
-        "Geometric mean of the errors of the row over those of the column. Coloured: the two can be told apart (paired "
-        "t tests of the log errors over sequences, Holm-corrected over all pairs); '?': they cannot."
+        "Geometric mean of the errors of the row over those of the column. Coloured: the two can be told apart "
+        f"{scope} (t tests of the log errors, Holm-corrected over all pairs); '?': they cannot."
     )
     columns = [*texts("tracker"), *numbers(*(board.labels[key] for key in board.ranked))]
     return Table("pairs", "All pairs", caption, columns, rows)
@@ -464,7 +489,7 @@ def rank_cell(standing: Standing) -> TableCell:
 
 
 def ratio_cell(board: Board, standing: Standing) -> TableCell:
-    """The ratio to the reference with its interval, bold for those that may be first."""
+    """The ratio to the reference with its interval, bold for those that may be the best."""
     return interval_cell(standing.ratio, ".2f", "best" if standing.key in board.emphasised else "")
 
 
@@ -1000,8 +1025,8 @@ def shade(ratio: float) -> float:
     return float(np.clip(np.log(max(ratio, 1e-9)) / np.log(4), -1, 1))
 
 
-_VERDICT_SHADES = {"better": shade(0.5), "worse": shade(2.0)}
-"""Colours of verdicts: those of half and of twice the reference's error."""
+_VERDICT_SHADES = {"better": shade(0.5), "better, but lost": shade(0.7), "worse": shade(2.0)}
+"""Colours of verdicts: those of half, of 0.7 and of twice the reference's error."""
 
 
 # -- the rules, and the runs

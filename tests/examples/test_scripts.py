@@ -118,7 +118,7 @@ NOTEBOOKS = sorted((EXAMPLES / "notebooks").glob("*.ipynb"))
 SHORTER = {
     "leaderboard": {
         "FRAMES = 60": "FRAMES = 4",
-        "range(100, 106)": "range(100, 102)",
+        "range(100, 107)": "range(100, 102)",
         ', "mask-rcnn"': "",
     },
     "culling": {},

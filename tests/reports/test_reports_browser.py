@@ -386,6 +386,26 @@ def test_two_trackers_are_compared_as_in_the_tables(browser, report):
     assert browser.faults == []
 
 
+def test_what_two_trackers_sentence_says_agrees_with_the_verdict(browser, report):
+    browser.open(report.html.parent / "compare.html")
+    browser.until("byId('sentence').textContent.includes('against')")
+
+    def said(verdict, scope, turned=False):
+        entry = [0, 1, 0.8, 0.6, 1.1, 8, verdict, scope]
+        sides = "1, 0, ['b', 'a']" if turned else "0, 1, ['a', 'b']"
+        return browser.run(f"sentenceOf([{json.dumps(entry)}], {sides})")
+
+    assert "that may be chance" in said("cannot tell", "")
+    assert "20 % less error on 8 sequences, shown on these families" in said(
+        "better", "on these families"
+    )
+    for turned in (False, True):
+        lost = said("better, but lost", "beyond these families", turned)
+        assert "where both succeed b is better beyond these families, but it lost more" in lost
+        fewer = said("worse, but lost fewer", "beyond these families", turned)
+        assert "where both succeed a is better" in fewer
+
+
 def test_two_results_folders_are_a_page(browser, tmp_path):
     before, after = (fill(tmp_path / name, {"orb-slam2": 0.1, "mask-rcnn": error}, seeds=(0,))
                      for name, error in (("a", 0.02), ("b", 0.01)))  # fmt: skip
@@ -394,6 +414,9 @@ def test_two_results_folders_are_a_page(browser, tmp_path):
     browser.open(found.page)
     browser.until("one('#dumbbells .main-svg')")
     assert browser.run("all('#choice option').length") == 3, "two trackers and the control"
+    sentence = browser.run("byId('sentence').textContent")
+    assert sentence.startswith("B has ")
+    assert sentence.endswith("6 are the fewest for a claim. Verdict: cannot tell.")
     browser.run(
         "byId('dumbbells').emit('plotly_click', {points: [{y: byId('dumbbells').data[1].y[0]}]})"
     )

@@ -32,9 +32,11 @@ from dynslam_bench.core.records import digest
 from dynslam_bench.geometry.trajectory_files import write_tum
 from dynslam_bench.reports import ReportData, build_report, compare, figures, make_board
 from dynslam_bench.reports.build_report import FEWER_PAGES, MOST_PAGES, masks_section, pages_for
+from dynslam_bench.reports.compare_runs import overall_ratio
 from dynslam_bench.reports.html import board_page
 from dynslam_bench.reports.html.run_pages import broken, exact_shares
 from dynslam_bench.reports.model import workers
+from dynslam_bench.reports.model.board import make_cell
 from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.tables import table as tables
 from dynslam_bench.reports.tables.leaderboard import repeatability
@@ -860,20 +862,20 @@ def test_compare_finds_what_changed(made, tmp_path):
     changed, same = (
         comparison.overall[f"{name} (our back end)"] for name in ("Mask R-CNN", "ORB-SLAM2")
     )
-    assert changed.value == pytest.approx(0.1, rel=0.1)
-    assert same.value == pytest.approx(1.0)
-    assert np.isnan(changed.high)  # two sequences give no interval
+    assert changed.ratio == pytest.approx(0.1, rel=0.1)
+    assert same.ratio == pytest.approx(1.0)
+    assert changed.high is None, "two sequences give no interval"
     verdicts = {
         row[0].text: row[5].text for row in comparison.table.rows if row[1].text.startswith("all ")
     }
-    assert verdicts == {
-        "Mask R-CNN (our back end)": "B better on 2 of 2, too few to tell", "ORB-SLAM2 (our back end)": "equal",
-        "constant velocity": "equal",
-    }  # fmt: skip
+    assert verdicts == {label: verdict.value for label, verdict in comparison.verdicts.items()}
+    assert set(verdicts.values()) == {"cannot tell"}, "two sequences are too few for a claim"
+    found = comparison.findings["Mask R-CNN (our back end)"]
+    assert found[0].endswith("on 2 scenes, and 6 are the fewest for a claim")
     assert (comparison.only_a, comparison.only_b) == (8 + 8 + 1 + 3 * 4, 0)
     itself = compare(paths.data.parent, paths.data).overall
     assert len(itself) == 6
-    assert all(interval.value == 1 for interval in itself.values())
+    assert all(ratio.ratio == 1 for ratio in itself.values())
     assert "| Mask R-CNN (our back end) | all 2 sequences |" in to_markdown(comparison.table)
 
 
@@ -908,7 +910,42 @@ def test_compare_pairs_runs_of_different_settings_and_says_what_differs(tmp_path
         for cells in found.table.rows
         if cells[1].text.startswith("all ")
     }
-    assert verdicts[name] == "better"
+    assert verdicts[name] == "proven"
+    assert verdicts["same"] == "no difference that matters"
+    assert found.findings[name][0].startswith("B has ")
+    assert found.findings["same"][1] == "Differences above 0 % are excluded"
+
+
+def test_compare_counts_lost_sequences_by_name_and_a_recording_once(tmp_path):
+    before = RunStore(tmp_path / "a")
+    after = RunStore(tmp_path / "b")
+    for number in range(8):
+        broken = {"status": "crashed", "reason": "boom"} if number < 2 else {}
+        add_run(before, "ours", f"s/{number}", error=0.05)
+        add_run(after, "ours", f"s/{number}", error=0.02, **broken)
+    # the last one once more, with other pixels
+    for store, error in ((before, 0.05), (after, 0.02)):
+        add_run(store, "ours", "s/7", error=error, content="blurred", block={"content": "blurred"})
+    found = compare(before, after)
+    ratio = found.overall["ours"]
+    assert ratio.lost == ("s/0", "s/1")
+    assert (ratio.scenes, ratio.all_scenes) == (6, 8)
+    assert found.verdicts["ours"].value == "smaller typical error, but lost"
+    assert "B alone lost 2 scenes (s/0, s/1)" in found.findings["ours"]
+    line = next(cells for cells in found.table.rows if cells[1].text.startswith("all "))
+    assert (line[1].text, line[5].small) == ("all 8 sequences", "lost 2 of 8, A 0")
+    assert [cells[3].small for cells in found.table.rows[:3]] == ["lost", "lost", ""]
+
+
+def test_compare_counts_what_is_lost_before_a_fixed_camera():
+    """Such a cell has no error, since a static camera has none there."""
+    still = {"tags": ["fixed-camera"], "static_camera_ate_rmse_m": 0.0}
+    good = make_cell([row("a", "s", 0.01, **still)])
+    gone = make_cell([crashed("a", "s", 0.01, **still)])
+    assert gone.scores == ()
+    ratio = overall_ratio([("s", good, gone)])
+    assert (ratio.ratio, ratio.lost, ratio.all_scenes) == (None, ("s",), 1)
+    assert overall_ratio([("s", gone, good)]).lost_baseline == ("s",)
 
 
 def test_compare_takes_the_nearest_settings_and_leaves_the_rest(tmp_path):

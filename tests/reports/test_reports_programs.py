@@ -467,7 +467,7 @@ def test_results_are_compared_by_the_row_that_ranks(tmp_path: Path) -> None:
     add(after, SCENES[0], made_here(), error=0.01)
     comparison = compare(before, after)
     (ratio,) = comparison.overall.values()
-    assert ratio.value < 0.2
+    assert ratio.ratio < 0.2
 
 
 # -- what is installed -----------------------------------------------------------------------------

@@ -12,15 +12,23 @@ from dynslam_bench.cli.output import report_table
 from dynslam_bench.core.errors import ReportError
 from dynslam_bench.evaluation.protocol import MONOCULAR, get_protocol
 from dynslam_bench.reports.html.board_page import ratios_data
-from dynslam_bench.reports.model.board import OVERALL, category_boards, compare_pairs, make_board
+from dynslam_bench.reports.model.board import (
+    OVERALL,
+    category_boards,
+    compare_pairs,
+    copies_note,
+    make_board,
+    missing_note,
+)
 from dynslam_bench.reports.model.load import load_runs
 from dynslam_bench.reports.model.statistics import (
+    claims_against,
     holm,
     mean_rank_test,
     ratio_interval,
     separable,
+    sequences_of,
     standings,
-    verdicts_against,
 )
 from dynslam_bench.reports.model.summary import explanation, headline, mean_rank_note
 from dynslam_bench.reports.tables import leaderboard as tables
@@ -255,7 +263,7 @@ def test_the_headline_names_the_best_and_whether_they_can_be_told_apart(boards):
     assert "ORB-SLAM2's error by" in said
     assert "MASKS" in said
     assert "FLOW" in said
-    assert said.endswith("these cannot be told apart.")
+    assert said.endswith(", beyond these families; each of them may be the best.")
     assert "below 5 sequences" in headline(boards["fast"])
     alone = headline(make_board(rows_of_truth({"bad": SIZES["bad"]}, {"high-dynamic": 12})))
     assert (
@@ -286,7 +294,9 @@ def test_two_trackers_side_by_side_have_the_numbers_of_the_board(boards):
     reference = board.trackers.index(board.reference)
     shown = ratios_data(board)
     assert len(shown) == len(board.trackers) * (len(board.trackers) - 1) // 2
-    for a, b, *ratio, sequences, verdict in (line for line in shown if reference in line[:2]):
+    for a, b, *ratio, sequences, verdict, scope in (
+        line for line in shown if reference in line[:2]
+    ):
         standing = board.standing_by_key[board.trackers[b if a == reference else a]]
         value, low, high = ratio if a == reference else (1 / ratio[0], 1 / ratio[2], 1 / ratio[1])
         expected = standing.ratio
@@ -295,7 +305,139 @@ def test_two_trackers_side_by_side_have_the_numbers_of_the_board(boards):
         )
         turned = {"better": "worse", "worse": "better"}.get(verdict, verdict)
         assert standing.verdict == (verdict if a == reference else turned)
+        assert standing.scope == scope
         assert sequences == 18
+
+
+FAMILIES = ("walking_xyz", "walking_rpy", "sitting_xyz", "sitting_rpy")
+
+
+def of_families(counts, sizes, spread=0.05):
+    """Runs of `orb-slam2` and of trackers whose errors are `sizes` of it, on scenes of rendered families."""
+    rng = np.random.default_rng(0)
+    return [
+        row(
+            tracker, f"synthetic/{family}?scene={scene}", 0.1 * size * np.exp(rng.normal(0, spread))
+        )
+        for family, count in zip(FAMILIES, counts, strict=False)
+        for scene in range(count)
+        for tracker, size in ({"orb-slam2": 1.0} | sizes).items()
+    ]
+
+
+def standing_of(board, tracker):
+    return next(s for s in board.standings if board.first(s.key).tracker.id == tracker)
+
+
+@pytest.mark.parametrize(
+    ("counts", "verdict", "scope"),
+    [
+        ((9,), "better", "on these families"),
+        ((3, 3), "cannot tell", ""),
+        ((4, 4), "better", "on these families"),
+        ((2, 2, 2), "cannot tell", ""),
+        ((2, 2, 2, 2), "better", "beyond these families"),
+    ],
+)
+def test_claims_need_four_families_or_six_degrees_of_freedom_within_them(counts, verdict, scope):
+    board = make_board(of_families(counts, {"good": 0.3, "bad": 2.0}))
+    standing = standing_of(board, "good")
+    assert (standing.verdict, standing.scope) == (verdict, scope)
+    cell = leaderboard(board, PROTOCOL).rows[0][4]
+    assert cell.text == verdict
+    assert cell.small.startswith(scope)
+    said = explanation(board)
+    if not scope:
+        assert headline(board).endswith(
+            "no tracker is shown to be better than ORB-SLAM2; 0 are worse."
+        )
+        assert f"need 4 of them, and here are {len(counts)}" in said
+        assert "need 6 more sequences than families" in said
+        assert "This board shows" not in said
+        assert "No intervals: they would need 4 families" in leaderboard(board, PROTOCOL).caption
+    elif scope == "on these families":
+        assert ", on these families." in headline(board)
+        assert "This board shows differences from" in said
+        assert "may be the best" not in said, "families are the sample"
+    else:
+        assert headline(board).endswith(", beyond these families; no other may be the best.")
+        assert "GOOD may be the best" in said
+        assert "% beyond these families, in four of five such boards." in said
+
+
+def test_who_loses_more_than_the_reference_is_better_but_lost():
+    rows = of_families((3, 3, 3, 3), {"good": 0.3, "other": 0.9})
+    gone = [
+        run
+        for run in rows
+        if run.tracker.id == "good" and run.sequence.id in ("synthetic/walking_xyz?scene=0",)
+    ]
+    lost = [crashed("good", run.sequence.id) for run in gone]
+    board = make_board([*(run for run in rows if run not in gone), *lost])
+    standing = standing_of(board, "good")
+    assert (standing.verdict, standing.scope) == ("better, but lost", "beyond these families")
+    assert standing.lost == (1, 0)
+    table = leaderboard(board, PROTOCOL)
+    cell = next(cells for cells in table.rows if cells[2].text == "GOOD")[4]
+    assert cell.text == "better, but lost"
+    assert "lost 1 of 12, reference 0" in cell.small
+    assert "but lost 1 of 12, the reference 0" in headline(board)
+    assert "1 is better where both succeed, but lost more" in explanation(board)
+
+    # where the reference lost it, too, it is no reason against the tracker
+    both = [
+        run
+        for run in board.rows
+        if run.tracker.id != "orb-slam2" or run.sequence.id != lost[0].sequence.id
+    ]
+    board = make_board([*both, crashed("orb-slam2", lost[0].sequence.id)])
+    assert standing_of(board, "good").verdict == "better"
+    assert standing_of(board, "good").lost == (0, 0)
+
+
+def test_a_cell_is_lost_where_half_of_its_runs_failed():
+    runs = [row("a", "s", 0.1 + 0.01 * seed, seed=seed) for seed in range(3)]
+    board = make_board([*runs, crashed("a", "s", seed=3)])
+    (key,) = board.labels
+    assert board.lost(key) == set()
+    board = make_board([*runs[:2], *(crashed("a", "s", 0.01 * seed, seed=seed) for seed in (3, 4))])
+    assert board.lost(key) == {"s"}
+
+
+def test_a_recording_thrice_with_changed_pixels_is_one_sequence():
+    """By another name or content; a fixed camera's path tells nothing."""
+    same = {"duration_s": 2.5, "static_camera_ate_rmse_m": 0.2}
+    rows = [
+        row(tracker, name, error, **(same if name != "other" else {}))
+        for tracker, error in (("orb-slam2", 0.1), ("good", 0.05))
+        for name in ("desk", "desk_blurred", "desk_dark", "other")
+    ]
+    board = make_board(rows)
+    assert board.sequences == ["desk", "desk_blurred", "desk_dark", "other"]
+    assert board.common == ["desk", "other"]
+    assert standing_of(board, "good").sequences == 2
+    note = copies_note(board)
+    assert "desk counts once for desk, desk_blurred, desk_dark" in note
+    assert "error of a static camera" in note
+    assert missing_note(board) == ""
+    assert copies_note(make_board([run for run in rows if "_" not in run.sequence.id])) == ""
+
+    # the first that all have counts; what differs in time or error is another recording
+    short = [run for run in rows if (run.tracker.id, run.sequence.id) != ("good", "desk")]
+    assert make_board(short).common == ["desk_blurred", "other"]
+    for change in ({"duration_s": 2.6}, {"static_camera_ate_rmse_m": 0.2 * (1 + 1e-8)}):
+        apart = [
+            row("a", name, 0.1, **(same | values)) for name, values in (("s", {}), ("t", change))
+        ]
+        assert make_board(apart).common == ["s", "t"]
+
+
+def test_sequences_of_a_fixed_camera_are_never_one():
+    still = {"duration_s": 2.5, "static_camera_ate_rmse_m": 0.0, "tags": ["fixed-camera"]}
+    rows = [row(tracker, name, 0.1, **still) for tracker in ("orb-slam2", "b") for name in "st"]
+    board = make_board(rows)
+    assert board.common == ["s", "t"]
+    assert not board.copies
 
 
 def test_exact_masks_are_a_bound_and_never_rank_beside_others():
@@ -336,7 +478,7 @@ def test_ranks_groups_and_mean_ranks():
 def test_pairs_are_tested_as_scipy_does_and_corrected_together():
     rng = np.random.default_rng(4)
     logs = {"a": rng.normal(0, 0.2, 7), "b": rng.normal(0.35, 0.2, 7), "c": rng.normal(2, 0.2, 7)}
-    found = separable(logs, np.ones(7))
+    found = separable(logs, sequences_of([*"stuvwxy"]))
     p = holm([stats.ttest_rel(logs[a], logs[b]).pvalue for a, b in found])
     assert [p_value for _, p_value in found.values()] == pytest.approx(p)
     assert [apart for apart, _ in found.values()] == [*(p <= 0.04)]
@@ -361,18 +503,24 @@ def test_who_is_better_than_the_reference_is_tested_as_scipy_does_and_corrected_
     logs = {
         f"t{i}": base + rng.normal(shift, 0.2, 9) for i, shift in enumerate((-1.0, 0.02, 0.0, 1.0))
     }
-    found = verdicts_against(logs | {"ref": base}, base, np.ones(9))
+    none = np.zeros(9, dtype=bool)
+    lost = dict.fromkeys([*logs, "ref"], none)
+    found = claims_against(logs | {"ref": base}, base, sequences_of([*"stuvwxyz!"]), lost, none)
     expected = holm([stats.ttest_rel(log, base).pvalue for log in logs.values()])
-    assert [found[key][1] for key in logs] == pytest.approx(expected)
-    assert [found[key][0] for key in logs] == ["better", "cannot tell", "cannot tell", "worse"]
-    assert found["ref"] == ("cannot tell", None)
+    assert [found[key].p_value for key in logs] == pytest.approx(expected)
+    verdicts = [found[key].verdict for key in logs]
+    assert verdicts == ["better", "cannot tell", "cannot tell", "worse"]
+    assert {found[key].scope for key in logs} == {"", "beyond these families"}
+    assert (found["ref"].verdict, found["ref"].p_value) == ("cannot tell", None)
 
 
 def test_weights_make_categories_count_alike_and_one_sequence_of_many_weights_is_no_evidence():
     logs = np.concatenate([np.full(2, -1.0), np.full(20, 1.0)]) + np.random.default_rng(8).normal(
         0, 0.01, 22
     )
-    interval = ratio_interval(logs, np.repeat([1 / 2, 1 / 20], [2, 20]))
+    numbers = [str(number) for number in range(22)]
+    weights = dict(zip(numbers, np.repeat([1 / 2, 1 / 20], [2, 20]).tolist(), strict=True))
+    interval = ratio_interval(logs, sequences_of(numbers, None, weights))
     assert interval.value == pytest.approx(np.exp((logs[:2].mean() + logs[2:].mean()) / 2))
     assert interval.low < 0.4, "two sequences carry half of the weight"
     assert interval.high > 2.5, "two sequences carry half of the weight"
@@ -427,14 +575,16 @@ def test_ratio_is_the_geometric_mean_of_medians():
     assert places == [("a", 1, 6, "better"), ("ref", 2, 0, "cannot tell")]
 
 
-@pytest.mark.parametrize("weights", [None, np.full(13, 0.25)])
+@pytest.mark.parametrize("weights", [None, 0.25])
 def test_the_interval_of_a_ratio_is_students(weights):
     values = np.random.default_rng(1).normal(-0.3, 0.5, 12)
-    found = ratio_interval(np.append(values, np.nan), weights)
+    numbers = [str(number) for number in range(13)]
+    by_number = None if weights is None else dict.fromkeys(numbers, weights)
+    found = ratio_interval(np.append(values, np.nan), sequences_of(numbers, None, by_number))
     assert (found.low, found.high) == pytest.approx(
         np.exp(stats.ttest_1samp(values, 0).confidence_interval(0.95))
     )
-    few = ratio_interval(values[:4])
+    few = ratio_interval(values[:4], sequences_of(numbers[:4]))
     assert few.value == pytest.approx(np.exp(values[:4].mean()))
     assert np.isnan([few.low, few.high]).all()
 
