@@ -120,9 +120,6 @@ class StudySummary(Record):
         candidates: The best configurations, the best one first.
         verdict: What the study says of the best candidate.
         conclusion: A few short sentences, see `conclude`.
-        none_better_by: No trial is better than the baseline by more than this share on the scenes
-            that trials ran on (95 %); None where no trial has enough scenes.
-        bounded_trials: Of how many trials that is said.
         shipped: The default settings, where the baseline is something else, on ``confirm`` and
             ``held_out``.
         importances: Optuna's importances of the parameters, see `storage.importances`.
@@ -142,8 +139,6 @@ class StudySummary(Record):
     candidates: list[Candidate]
     verdict: Verdict
     conclusion: str
-    none_better_by: float | None = None
-    bounded_trials: int = 0
     shipped: dict[str, PairedRatio] = Field(default_factory=dict)
     importances: dict[str, Importance] = Field(default_factory=dict)
     tune: list[str] = Field(default_factory=list)
@@ -358,7 +353,6 @@ def finish(
         failures=[trial.user_attrs.get("reason", "") for trial in failed],
         families=families_sentence(design) if design.judging else "",
     )
-    bound = largest_gain(trials)
     summary = StudySummary(
         name=spec.name,
         tracker=spec.tracker,
@@ -368,8 +362,6 @@ def finish(
         candidates=candidates,
         verdict=verdict,
         conclusion=conclusion,
-        none_better_by=bound[0] if bound else None,
-        bounded_trials=bound[1] if bound else 0,
         shipped=shipped,
         importances=importances(tuner.study),
         confirm=list(map(str, design.confirm)),

@@ -277,7 +277,7 @@ def test_an_older_processor_and_several_threads_render_the_same_bytes() -> None:
     """OpenBLAS's kernels for a Nehalem, numpy without the SIMD that it found, the C library without multiply-adds."""
     extensions = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
     older = {
-        "PYTHONPATH": str(Path(__file__).parent),
+        "PYTHONPATH": f"{Path(__file__).parent}{os.pathsep}{Path(__file__).parents[1]}",
         "OPENBLAS_CORETYPE": "Nehalem",
         "NPY_DISABLE_CPU_FEATURES": " ".join(extensions),
         "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX512F,-AVX2,-FMA,-AVX",
