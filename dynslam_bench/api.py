@@ -318,7 +318,7 @@ def tune(
         results: The results folder.
         jobs: Trials at a time.
         trials: Finished trials, in place of the study's own number.
-        more_scenes: Rendered scenes to add to those that choose and judge.
+        more_scenes: Rendered scenes to add to those that judge.
         more_trials: Trials to add.
         on_event: Called with every `StudyEvent`.
         on_run: Called with every `RunEvent`.

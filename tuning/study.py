@@ -33,6 +33,7 @@ from dynslam_bench.core import (
 from dynslam_bench.core.records import digest, validated
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.core.settings import Scalar
+from dynslam_bench.evaluation.verdicts import FEWEST
 from dynslam_bench.runs import RunEvent, resolve, run_many
 from dynslam_bench.runs.record import program_of
 from dynslam_bench.tuning.database import without_password
@@ -218,7 +219,16 @@ class Study(Plan):
         self.study.set_user_attr("extension", total)
 
     def _check_second_look(self, scenes: int, trials: int) -> None:
-        """Refuse what would be judged on scenes that have judged already, unless the level was planned for it."""
+        """Refuse what would be judged on scenes that have judged already, unless the level was planned for it.
+
+        Too few scenes for any claim have judged nothing.
+        """
+        from dynslam_bench.tuning.judgement import StudySummary
+
+        best = StudySummary.read(self.folder / SUMMARY_FILE).best
+        evidence = None if best is None else best.evidence
+        if evidence is None or evidence.all_scenes < FEWEST:
+            return
         name = self.spec.name
         if trials:
             raise StudyError(

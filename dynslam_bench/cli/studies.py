@@ -80,7 +80,10 @@ def extend(
     results: Results = Path("results"),
     jobs: Jobs = 1,
     scenes: Annotated[
-        int, typer.Option(min=0, help="Further rendered scenes to choose and to judge on.")
+        int,
+        typer.Option(
+            min=0, help="Further rendered scenes to judge on, where the study is extendable."
+        ),
     ] = 0,
     trials: Annotated[int, typer.Option(min=0, help="Further trials.")] = 0,
     as_json: AsJson = False,

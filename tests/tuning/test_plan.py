@@ -319,7 +319,6 @@ def test_one_recording_alone_is_not_judged(
     assert "not recommended: cannot tell" in page
     status(tuner.folder)
     assert "no frames are left" in " ".join(capsys.readouterr().out.split())
-    (tuner.folder / "summary.json").unlink()
     with pytest.raises(StudyError, match="scenes can be made of rendered sequences alone"):
         tuner.extend(scenes=1)
 
