@@ -268,11 +268,15 @@ def own_objective(cost: Cost) -> Objective:
     name = getattr(cost, "__name__", "own").strip("<>")
 
     def checked(run: Outcome) -> float:
-        value = float(cost(run))
+        given: Any = cost(run)
+        try:
+            value = float(given)
+        except (TypeError, ValueError):
+            value = math.nan
         if not (math.isfinite(value) and value > 0):
             raise StudyError(
-                f"objective '{name}' gives {value:g} on instance '{run.instance}'",
-                "give numbers above 0",
+                f"objective '{name}' gives {given!r} on instance '{run.instance}'",
+                "return a number above 0",
             )
         # the floor of errors in metres does not apply; ratios stay as they are
         return _MANY * value

@@ -97,7 +97,7 @@ def _tune(study: Path, results: Path, jobs: int, **how: Any) -> None:
     from dynslam_bench.api import tune
 
     spec = tuning.read_study(study)
-    with progress(f"study {spec.name}") as advance:
+    with progress(f"trials of study {spec.name}") as advance:
         bar = StudyBar(advance)
         outcome = tune(
             spec,
@@ -115,7 +115,7 @@ def _tune(study: Path, results: Path, jobs: int, **how: Any) -> None:
 def worker(study: Study, results: Results = Path("results"), jobs: Jobs = 1) -> None:
     """Only run trials of a study, beside other workers on the same storage."""
     spec = tuning.read_study(study)
-    with progress(f"study {spec.name}") as advance:
+    with progress(f"trials of study {spec.name}") as advance:
         bar = StudyBar(advance)
         tuner = tuning.run_study(
             spec, results=results, jobs=jobs, on_event=bar.event, on_run=bar.run
@@ -195,7 +195,9 @@ class StudyBar:
             return
         if event.kind == "finished":
             note(event.text)
-        self._begin(event.text, event.number + (event.kind == "finished"), event.total)
+        # trials are counted, the baseline's runs are not
+        total = None if event.kind == "reference" else event.total
+        self._begin(event.text, event.number + (event.kind == "finished"), total)
 
     def note(self, text: str) -> None:
         """The final check has begun a step."""
@@ -227,6 +229,8 @@ def show_summary(tuner: tuning.Study, summary: tuning.StudySummary, page: Path) 
         lines.append(caution)
     lines.append("")
     if summary.best is not None:
+        if not summary.is_to_use:
+            lines.append("The best trial's settings, which are no result to use:")
         lines += [table(("setting", "value"), list(summary.best.params.items())), ""]
     lines.append(f"preset: {preset}\npage:   {page}")
     present({"summary": summary, "page": page, "preset": preset}, *lines)

@@ -311,8 +311,9 @@ def test_what_cannot_be_an_objective_is_refused() -> None:
     default = {instance: outcome(instance, 0.02) for instance in PLAIN}
     with pytest.raises(StudyError, match="'robustness' counts degraded instances alone"):
         OBJECTIVES["robustness"].value(default, default)
-    with pytest.raises(StudyError, match="gives 0 on instance"):
-        own_objective(lambda run: 0.0).value(default, default)
+    for given, shown in ((0.0, "0.0"), (None, "None"), ("fast", "'fast'"), (math.nan, "nan")):
+        with pytest.raises(StudyError, match=f"gives {shown} on instance"):
+            own_objective(lambda run, given=given: given).value(default, default)
 
 
 class TimedTuner(SimulatedTuner):
