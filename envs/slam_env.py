@@ -369,7 +369,7 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
             self._apply_options(options or {})
             tracker = self._build_or_reuse_tracker()
             with tracker_code():
-                # before the reset: whatever that copies is then the episode's own
+                # undo what actions have set, before `reset`: a tracker may copy its settings there
                 if self._actions.parameters:
                     tracker.configure(self.settings)  # type: ignore[attr-defined]
                 rng = np.random.default_rng(derive_seed(self.np_random))

@@ -33,7 +33,7 @@ from dynslam_bench.tuning.objectives import (
     combined_objective,
     compare,
     hold_last_pose_protocol,
-    largest_gain,
+    improvement_bound,
     violations,
 )
 from dynslam_bench.tuning.plan import held_settings, seen_note, splits_seen
@@ -233,7 +233,7 @@ def conclude(
         sentences.append(families)
 
     # where nothing is claimed: what the trials exclude, and what would settle it
-    if verdict not in (Verdict.PROVEN, Verdict.BUT_LOST) and (bound := largest_gain(trials)):
+    if verdict not in (Verdict.PROVEN, Verdict.BUT_LOST) and (bound := improvement_bound(trials)):
         gain, count = bound
         sentences.append(
             f"None of the {count} trials with {FEWEST} scenes or more is better by more than {100 * gain:.0f} %"

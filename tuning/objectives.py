@@ -387,13 +387,18 @@ def compare(
     objective: Objective = ACCURACY,
     one_sided: float = ONE_SIDED,
 ) -> PairedRatio:
-    """A configuration beside the baseline on the same instances; the starts of a scene give its one value.
+    """Compare a configuration with the baseline on the same instances, scene by scene.
+
+    A scene has one log ratio, of the medians over its repeats (start offsets and seeds), or it is lost.
 
     Args:
         outcomes: Of the configuration.
         baseline: Of the baseline.
         objective: What is compared.
-        one_sided: Level of a claim.
+        one_sided: Level of a claim, e.g. 0.025.
+
+    Returns:
+        The typical ratio of the objective with its interval, below 1 is better, and the losses.
     """
     ratios = objective.counted(objective.ratios(outcomes, baseline))
     return paired_ratio(
@@ -406,18 +411,20 @@ def compare(
     )
 
 
-def largest_gain(trials: Iterable[Mapping[str, float]]) -> tuple[float, int] | None:
-    """By how much none of several trials is better than the baseline, as a share, and of how many that holds.
+def improvement_bound(trials: Iterable[Mapping[str, float]]) -> tuple[float, int] | None:
+    """Upper 95 % confidence bound on the improvement of the best of several trials over the baseline.
 
-    Each trial has a 95 % bound of its own. That none is better by more than the largest of these bounds is
-    false in at most 5 %, however many trials there are (intersection-union test, Berger 1982).
+    Each trial has a one-sided bound of its own. The largest of them holds for all trials, whichever is the
+    best, without a correction for their number (intersection-union test, Berger 1982).
 
     Args:
         trials: Log ratio by scene of each trial; those with fewer than `FEWEST` scenes have no bound.
 
     Returns:
-        None where no trial has so many.
+        The bound, as a share: 0.1 is 10 % less error; and how many trials have enough scenes. None
+        where no trial has.
     """
+    # the lower end of a two-sided 90 % interval is a one-sided 95 % bound
     bounds = [
         hodges_lehmann(list(ratios.values()), 0.90).low
         for ratios in trials

@@ -71,17 +71,20 @@ class FeatureExtractor(Protocol):
 
 @runtime_checkable
 class MaskedExtractor(FeatureExtractor, Protocol):
-    """An extractor that can see to it that what lies on a mask takes no place of what lies outside."""
+    """An extractor that can ask for more keypoints outside a mask."""
 
     def extract_masked(
         self, gray: NDArray[np.uint8], mask: NDArray[np.bool_], share: float
     ) -> Keypoints:
-        """As `extract`; where less than a share of the keypoints sought lies outside, all are sought there too.
+        """Extract keypoints, with enough of them outside the mask.
+
+        Where fewer than `share` of the keypoints sought lie outside, as many as are sought in all are
+        extracted there, beside those on the mask.
 
         Args:
             gray: uint8 ``[H, W]``.
-            mask: bool ``[H, W]``, e.g. people, whose keypoints will not be used.
-            share: In [0, 1].
+            mask: bool ``[H, W]``, True on what moves, e.g. people, whose keypoints will not be used.
+            share: Least share outside of the keypoints sought, in [0, 1].
 
         Returns:
             The keypoints of `extract` on the mask, and outside it those of `extract` or as many as

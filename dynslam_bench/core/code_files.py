@@ -74,18 +74,20 @@ def is_code(file: Path) -> bool:
 def foreign_modules(file: Path) -> set[str]:
     """Top-level names of the modules outside its folder that a module imports, itself or through others of the folder.
 
+    The identity of a program covers these modules, too. The standard library is among them.
+
     Args:
         file: A ``.py`` file, whose folder is taken to be on the path when it is imported.
 
     Raises:
         OSError: A file cannot be read.
     """
-    own = set[str]()
+    imported = set[str]()
     foreign = set[str]()
     waiting = [file]
     while waiting:
-        names = imported_modules(waiting) - own
-        own |= names
+        names = imported_modules(waiting) - imported
+        imported |= names
         waiting = []
         for name in names:
             module = file.parent / f"{name}.py"

@@ -205,10 +205,18 @@ def _delaunay_edges(xy: NDArray[np.float64]) -> NDArray[np.intp]:
 
 
 def depth_variance(depth: NDArray[np.float32], xy: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Variance of the depth at raw pixels ``[N, 2]``, m^2: a Gaussian mixture over the 3x3 neighbourhood.
+    """Variance of the depth at pixels: that of a Gaussian mixture over the 3x3 neighbourhood.
 
     The mixture's weights are [1 2 1; 2 4 2; 1 2 1] / 16 over the pixels that have depth, its
-    components' variances those of the sensor. Depth edges thus get a large variance.
+    components' variances those of the sensor. Depth edges thus get a large variance, and with it the
+    covariance of the unprojected point (`point_covariance`).
+
+    Args:
+        depth: Metres ``[H, W]``; 0 or nan where there is none.
+        xy: Raw pixels ``[N, 2]`` that have depth.
+
+    Returns:
+        Square metres ``[N]``.
     """
     at, _ = pixel_index(np.rint(xy)[:, None] + PATCH_3X3, depth.shape)
     z = np.nan_to_num(depth[at].astype(np.float64), posinf=0.0, neginf=0.0)

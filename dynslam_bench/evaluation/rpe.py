@@ -1,4 +1,4 @@
-"""Relative pose error (the paper's Eq. 26)."""
+"""Relative pose error by the rules of TUM and evo (the paper's Eq. 26), and KITTI's drift over segments."""
 
 from collections.abc import Sequence
 from functools import lru_cache
@@ -97,12 +97,12 @@ def tum_relative_errors(comparison: Comparison, spec: RPESpec) -> tuple[Array, A
     Pairs are chosen on the whole estimate. Each pose is compared with the true pose nearest in
     time; a pair takes part if both lie within twice the median interval of the ground truth (not
     within the tolerance of the ATE). With ``A = P_i^-1 P_j`` estimated and ``B = Q_i^-1 Q_j`` true
-    the error is ``E = A B^-1``; its rotation angle equals that of the paper's ``E = B^-1 A`` (Eq.
-    26), its translation differs by a rotation of its parts.
+    the error is ``E = A B^-1``. Its rotation angle equals that of the paper's ``E = B^-1 A`` (Eq.
+    26). Its translation does not: it has the length ``|t_A - R_A R_B^T t_B|``, that of Eq. 26 ``|t_A - t_B|``.
 
     Args:
-        comparison: The scale of its alignment is that of the estimate's steps, which need no
-            alignment besides.
+        comparison: Estimate and truth. Of its alignment the scale alone is used: relative motions do
+            not depend on the rest.
         spec: A ``tum-fixed`` or ``tum-random`` selection.
 
     Returns:
@@ -146,16 +146,16 @@ def evo_relative_errors(comparison: Comparison, spec: RPESpec) -> tuple[Array, A
 
 
 def select_pairs(stamps: Array, poses: Array, spec: RPESpec) -> Index:
-    """Index pairs ``(i, j)`` ``[P, 2]`` of a trajectory.
+    """Choose the pairs of poses that a relative pose error is taken over.
 
     Args:
         stamps: Seconds ``[N]``, ascending.
-        poses: Camera-to-world poses ``[N, 4, 4]`` (of the estimate, as both tools have it).
+        poses: Camera-to-world poses ``[N, 4, 4]``, of the estimate, as TUM's script and evo choose.
         spec: Mode, delta and unit.
 
     Returns:
-        Possibly none. In mode ``tum-random`` pairs come in both directions and may join a pose with
-        itself.
+        Indices ``(i, j)`` ``[P, 2]`` into the trajectory, i before j; there may be none. In mode
+        ``tum-random`` pairs come in both directions and may join a pose with itself.
     """
     if not len(poses):
         return np.zeros((0, 2), dtype=np.intp)
@@ -167,7 +167,7 @@ def select_pairs(stamps: Array, poses: Array, spec: RPESpec) -> Index:
         step = frames if spec.pairs == "consecutive" else 1
         starts = np.arange(0, len(poses) - frames, step)
         return np.stack([starts, starts + frames], axis=1).astype(np.intp)
-    # TUM: from every pose to the one closest to a delta behind it; as in evaluate_rpe.py
+    # TUM: from every pose to the one closest to a delta later; as in evaluate_rpe.py
     # --fixed_delta the last pose ends no pair
     index = path_index(stamps, poses, spec)
     end = closest(index, index + spec.delta)
@@ -260,7 +260,9 @@ STEP = 10
 def segment_errors(
     estimate: Array, ground_truth: Array, lengths_m: Sequence[float]
 ) -> tuple[Array, Array]:
-    """Drift over segments that begin at every tenth pose and end where the true path has grown by a length.
+    """KITTI's odometry drift: error of the motion along segments of given length, as a share of that length.
+
+    As in the devkit, segments begin at every tenth pose and end where the true path has grown by the length.
 
     Args:
         estimate: Associated camera-to-world poses ``[N, 4, 4]``.

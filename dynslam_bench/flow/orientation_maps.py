@@ -142,6 +142,7 @@ def orientation_maps(
     # whole vectors of 32 numbers a row
     coarse = np.empty((quarter_rows, 32 * -(-8 * quarter_columns // 32)), dtype=np.uint16)
     half_row_pairs = -(-rows // 2)
+    # fills `framed_half`, the finer levels of `cells`, and `coarse`, from which the next call goes on
     run(
         fine_levels,
         0,

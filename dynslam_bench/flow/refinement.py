@@ -359,7 +359,13 @@ def template_fits(px: Scalar, py: Scalar, window: Window, image: Bytes) -> Scala
 
 @inlined
 def target_fits(warp: Warp, window: Window, image: Bytes) -> Scalar:
-    """Whether the warp's centre lies in the image without its border, and its patch in the image with it."""
+    """Whether the warp's centre lies in the image, and its whole patch in the image with its border.
+
+    Args:
+        warp: Where the patch lies now, in pixels of the bordered image.
+        window: Size of the patch.
+        image: uint8 ``[H + 2 BORDER, W + 2 BORDER]``.
+    """
     rows, columns = image.shape
     reach = window.radius + window.margin
     span = (abs(warp.a) + abs(warp.b)) * np.float32(reach) + np.float32(2)

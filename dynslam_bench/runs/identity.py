@@ -167,7 +167,16 @@ class Resolver:
         self._files: dict[tuple[str, str], tuple[dict[str, Any], tuple[Path, ...]]] = {}
 
     def __call__(self, spec: RunSpec) -> ResolvedRun:
-        """Look up a run; see `resolve`."""
+        """Look up everything that decides a run's result, and name it by digests.
+
+        The identity has two parts. `asked` is the request: tracker, settings, frames, seed, device.
+        `read` is what is known before the run of what it will read: code, libraries, weights, the
+        sequence's content. The run's id is made of both (`record.run_id_of`); what a plug-in opens is
+        added after its run.
+
+        Raises:
+            DynslamError: As `resolve`.
+        """
         spec = spec.absolute()
         configured = self._configuration(spec)
         tracker = configured.tracker
@@ -191,7 +200,9 @@ class Resolver:
             tracker, settings, source, sequence, changes_frames=changes_frames
         )
         anchors = anchors_of(tracker, entry_points)
-        parts = sorted(named_part(part, anchors) for part in entry_points)
+        parts = sorted(named_part(entry, anchors) for entry in entry_points)
+
+        # what it will read, as far as that is known beforehand
         read = {
             "tracker_version": tracker.version,
             "parts": parts,

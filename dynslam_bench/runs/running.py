@@ -36,7 +36,7 @@ from dynslam_bench.runs.spec import RunSpec
 from dynslam_bench.runs.store import DEFAULT_PROTOCOL, RunStore
 
 WORK = "dynslam_bench.runs.loop:run_loop"
-"""What the child does."""
+"""What the child process does; `process.child` imports and calls it."""
 PROGRESS_EVERY = 50
 """Frames between two reports of partial metrics."""
 OnProgress = Callable[[str, dict[str, Any]], bool]

@@ -41,7 +41,7 @@ from dynslam_bench.tuning.objectives import (
     centre,
     combined_objective,
     compare,
-    largest_gain,
+    improvement_bound,
     own_objective,
 )
 from dynslam_bench.tuning.page import fewer_starts, settings_table, warnings_of
@@ -185,12 +185,14 @@ def test_none_of_the_trials_is_better_by_more_than_the_largest_bound() -> None:
     false = 0
     for _ in range(400):
         trials = [dict(enumerate(rng.normal(true, 0.3, 8).tolist())) for _ in range(3)]
-        bound = largest_gain([{str(at): value for at, value in trial.items()} for trial in trials])
+        bound = improvement_bound(
+            [{str(at): value for at, value in trial.items()} for trial in trials]
+        )
         assert bound is not None
         assert bound[1] == 3
         false += bound[0] < 0.1
     assert false / 400 <= 0.07
-    assert largest_gain([{"a": -1.0, "b": -1.0}]) is None
+    assert improvement_bound([{"a": -1.0, "b": -1.0}]) is None
 
 
 @pytest.mark.slow

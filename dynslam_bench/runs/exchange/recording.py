@@ -213,11 +213,12 @@ def _layers(
     Args:
         rr: The library.
         stream: The recording.
-        shot: Features in pixels of the image at full size, and the mask.
+        shot: Features ``[N, 2]`` in pixels of the image at full size, and the mask ``[H, W]``.
         size: Width and height of the images in the recording.
-        scale: What these are of those at full size.
+        scale: Width and height of these over those at full size ``[2]``.
     """
     layers: dict[str, Any] = {}
+    # rerun's origin is the corner of the first pixel, ours its centre
     points = ((shot.points + 0.5) * scale).astype(np.float32)
     for layer, chosen in (("kept", points[shot.kept]), ("culled", points[~shot.kept])):
         layers[layer] = rr.Points2D.from_fields(positions=chosen)

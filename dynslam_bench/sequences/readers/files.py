@@ -531,10 +531,18 @@ def camera_on_body(sensor: Mapping[str, Any], where: str) -> Array:
 def camera_truth(
     stamps: NDArray[np.int64], rows: Array, T_body_cam: Array, where: str
 ) -> TumFile | None:
-    """Camera-to-world poses of the body's, rows ``tx ty tz qx qy qz qw`` ``[N, 7]`` at stamps in nanoseconds ``[N]``.
+    """The camera's true poses from those of a body, e.g. an IMU: ``T_world_cam = T_world_body @ T_body_cam``.
 
-    Rows without a rotation are left out and counted, of several with one stamp the last holds; None
-    where nothing is left.
+    Rows without a rotation are left out and counted. Of several with one stamp the last counts.
+
+    Args:
+        stamps: Nanoseconds ``[N]``.
+        rows: ``tx ty tz qx qy qz qw`` ``[N, 7]``, body to world, metres.
+        T_body_cam: Camera to body ``[4, 4]``.
+        where: What messages call the source.
+
+    Returns:
+        None where no row is left.
 
     Raises:
         SequenceError: Two stamps of `where` differ by less than 1 us.

@@ -219,19 +219,29 @@ class BatchTracker:
             (folder / f"{kind}.txt").write_text("".join(f"{row[column]}\n" for row in rows))
         (folder / "associations.txt").write_text("".join(f"{' '.join(row)}\n" for row in rows))
 
-    def _run(self, words: list[str], folder: Path) -> int | None:
-        """Run the program to its end; its exit code, or None if it had to be killed."""
+    def _run(self, command: list[str], folder: Path) -> int | None:
+        """Run the program to its end, and measure it.
+
+        Args:
+            command: The program and its arguments.
+            folder: Of the run; the program works in ``work`` below it.
+
+        Returns:
+            The exit code; None if it had to be killed. `measured` has ``program_s``, and
+            ``program_memory_mb``: the largest resident memory of the process.
+        """
         environment = program_environment(self._program.environment)
         environment |= {"OMP_NUM_THREADS": str(self._context.threads)}
         began = time.perf_counter()
         log = folder / "log.txt"
         with (
             log.open("wb") as out,
-            translate_errors(TrackerError, f"{self._program.name}: cannot start '{words[0]}'"),
+            translate_errors(TrackerError, f"{self._program.name}: cannot start '{command[0]}'"),
         ):
+            # by the file system's clock: a trajectory that is older was not written by this run
             self._started_ns = os.fstat(out.fileno()).st_mtime_ns
             process = subprocess.Popen(
-                words,
+                command,
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=subprocess.STDOUT,
@@ -250,7 +260,7 @@ class BatchTracker:
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     code = process.wait(_POLL_S)
         finally:
-            # with what it started
+            # kill the whole process group: the program and what it started
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
