@@ -166,9 +166,11 @@ class StudySummary(Record):
 
 
 def _is_as_good(default: PairedRatio | None, best: PairedRatio | None) -> bool:
+    """Whether the default settings have no larger typical ratio than the best trial, and lose no more."""
     if default is None or best is None or default.ratio is None or best.ratio is None:
         return False
-    return default.ratio <= best.ratio
+    loses_no_more = len(default.losses) <= len(best.losses)
+    return default.scenes >= FEWEST and loses_no_more and default.ratio <= best.ratio
 
 
 # The verdict on the best candidate, and the sentences that say it.
@@ -196,13 +198,16 @@ def judge(best: Candidate | None) -> tuple[Verdict, list[str]]:
         if verdict in OFFERED:
             verdict = Verdict.CANNOT_TELL
         return verdict, [f"{name} violates a constraint when it is run again", *sentences]
-    if verdict is Verdict.PROVEN and not best.as_accurate:
+    if verdict in OFFERED and not best.as_accurate:
         accuracy = (best.on_held_out or best.on_confirm).get("accuracy")
         limit = 1 + (best.ate_margin or 0.0)
-        verdict = Verdict.PROMISING
         sentences.append(
             f"It is not shown to be as accurate: {accuracy}, whose upper end has to lie below {limit:.2f}"
         )
+        is_worse = accuracy is None or verdict_of(accuracy) is Verdict.WORSE
+        verdict = Verdict.CANNOT_TELL if is_worse else Verdict.PROMISING
+    if best.recorded is not None and best.recorded.losses:
+        sentences += findings(best.recorded, f"{name} on recordings")[1:]
     return verdict, sentences
 
 
@@ -236,7 +241,8 @@ def conclude(
     if verdict not in (Verdict.PROVEN, Verdict.BUT_LOST) and (bound := improvement_bound(trials)):
         gain, count = bound
         sentences.append(
-            f"None of the {count} trials with {FEWEST} scenes or more is better by more than {100 * gain:.0f} %"
+            f"On the scenes that trials ran on none of the {count} with {FEWEST} or more is better by more than "
+            f"{math.ceil(100 * gain)} % (95 %)"
         )
     if verdict in (Verdict.PROMISING, Verdict.CANNOT_TELL) and best is not None:
         sentences += _settling(spec, best)
@@ -266,15 +272,20 @@ def _settling(spec: StudySpec, best: Candidate) -> list[str]:
         return [f"Name {FEWEST} held-out scenes at least to learn more"]
     if needed > _TOO_MANY:
         return [f"More than {_TOO_MANY} scenes would be needed to settle it"]
-    more = max(1, needed - evidence.scenes)
-    minutes = max(1, math.ceil(more * best.scene_s / 60))
-    planned = [scenes_judged for scenes_judged in LOOKS if scenes_judged > evidence.all_scenes]
-    if spec.extendable and planned:
-        step = planned[0] - evidence.all_scenes
+    # an extendable study goes on to its next look
+    further = [count for count in LOOKS if count > evidence.all_scenes]
+    if spec.extendable and further and needed <= max(LOOKS):
+        step = further[0] - evidence.all_scenes
+        minutes = max(1, math.ceil(step * best.scene_s / 60))
         command = f"dynslam-bench tune extend STUDY.toml --scenes {step}"
-        return [f"About {needed} scenes would settle it, {minutes} min of runs: {command}"]
-    new_study = "a new study with other held-out scenes, or one that is extendable"
-    return [f"About {needed} scenes would settle it ({minutes} min more of runs): {new_study}"]
+        return [
+            f"About {needed} scenes would settle it",
+            f"The next look takes {minutes} min of runs: {command}",
+        ]
+    minutes = max(1, math.ceil(needed * best.scene_s / 60))
+    return [
+        f"About {needed} held-out scenes in a new study would settle it, {minutes} min of runs to judge"
+    ]
 
 
 def families_sentence(design: Any) -> str:
@@ -283,9 +294,9 @@ def families_sentence(design: Any) -> str:
     tuned = _families([*design.tune, *(design.confirm if design.held_out else ())])
     names = f"{len(judging)} famil{'y' if len(judging) == 1 else 'ies'} ({', '.join(judging[:8])})"
     if set(judging) <= set(tuned):
-        return f"This holds on these {names}, of which trials saw other scenes"
+        return f"It was judged on {names}, of which trials saw other scenes, and says nothing of others"
     if set(judging).isdisjoint(tuned):
-        return f"It was judged on {names} that no trial saw"
+        return f"It was judged on {names} that no trial saw, and says nothing of others"
     return f"It was judged on {names}, of some of which trials saw other scenes"
 
 
@@ -334,7 +345,8 @@ def finish(
     else:
         candidates = candidates[:1]
 
-    # the best one is judged
+    # the best one is judged, once on the same scenes
+    _check_same_look(tuner, candidates)
     if candidates and design.judging and not candidates[0].failed:
         split = "held_out" if design.held_out else "confirm"
         note(f"trial {candidates[0].trial} on {len(design.judging)} instances that judge it")
@@ -401,6 +413,25 @@ def _best_trials(tuner: Study) -> list[Candidate]:
         if trial.number > 0 or is_rival
     ]
     return candidates[: spec.top]
+
+
+def _check_same_look(tuner: Study, candidates: Sequence[Candidate]) -> None:
+    """Refuse to judge another trial on scenes that have judged one: the best of several looks claims too often.
+
+    Raises:
+        StudyError: The study has a verdict on another trial.
+    """
+    file = tuner.folder / SUMMARY_FILE
+    earlier = StudySummary.read(file).best if file.is_file() else None
+    if earlier is None or earlier.evidence is None or not candidates:
+        return
+    has_judged = earlier.evidence.all_scenes >= FEWEST
+    if has_judged and earlier.trial != candidates[0].trial:
+        raise StudyError(
+            f"study '{tuner.spec.name}' has its verdict on trial {earlier.trial}; trial {candidates[0].trial} would be "
+            "judged on the same scenes",
+            f'begin a new study with other held-out scenes and start = ["{tuner.folder}"]',
+        )
 
 
 def _rank_by_choice(candidate: Candidate) -> tuple[bool, bool, float]:
@@ -475,7 +506,7 @@ def _judged_on(
 def _write(tuner: Study, summary: StudySummary) -> None:
     """Write `best.toml` and `summary.json` into the study's folder."""
     params = summary.best.params if summary.best else {}
-    offered = summary.verdict in OFFERED
+    offered = summary.verdict in OFFERED and not summary.keeps_default
     preset = preset_text(
         tuner.spec,
         params if offered else {},

@@ -400,13 +400,28 @@ def compare(
     Returns:
         The typical ratio of the objective with its interval, below 1 is better, and the losses.
     """
-    ratios = objective.counted(objective.ratios(outcomes, baseline))
+    # the worst scenes rank trials; chosen by the candidate's own ratios they cannot judge it
+    if objective.worst:
+        objective = ACCURACY
+    ratios = objective.ratios(outcomes, baseline)
+    counted = [instance for instance in outcomes if objective.counts(instance)]
+
+    # where frames lost are the cost themselves, a lost scene is a value like others
+    lost: set[str] = set()
+    lost_by_baseline: set[str] = set()
+    if objective.name != "coverage":
+        lost = lost_scenes(outcomes) & ratios.keys()
+        lost_by_baseline = lost_scenes(baseline) & ratios.keys()
     return paired_ratio(
         ratios,
-        lost_scenes(outcomes) & ratios.keys(),
-        lost_scenes(baseline) & ratios.keys(),
+        lost,
+        lost_by_baseline,
         one_sided=one_sided,
-        runs=len(outcomes),
+        runs=len(counted),
+        lost_runs=(
+            sum(outcomes[instance].lost for instance in counted),
+            sum(baseline[instance].lost for instance in counted if instance in baseline),
+        ),
         what=objective.what,
     )
 

@@ -221,21 +221,20 @@ class Study(Plan):
     def _check_second_look(self, scenes: int, trials: int) -> None:
         """Refuse what would be judged on scenes that have judged already, unless the level was planned for it.
 
-        Too few scenes for any claim have judged nothing.
+        Scenes that are too few for any claim may see other trials, but then get no further scenes.
         """
         from dynslam_bench.tuning.judgement import StudySummary
 
         best = StudySummary.read(self.folder / SUMMARY_FILE).best
         evidence = None if best is None else best.evidence
-        if evidence is None or evidence.all_scenes < FEWEST:
-            return
+        judged = 0 if evidence is None else evidence.all_scenes
         name = self.spec.name
-        if trials:
+        if trials and judged >= FEWEST:
             raise StudyError(
                 f"study '{name}' has its verdict; {trials} more trials would be judged on the same scenes",
                 f'begin a new study with other held-out scenes and start = ["{self.folder}"]',
             )
-        if scenes and not self.spec.extendable:
+        if scenes and judged and not self.spec.extendable:
             raise StudyError(
                 f"study '{name}' has its verdict and is not extendable: a second look would claim falsely too often",
                 "begin a new study with other held-out scenes, or with extendable = true",

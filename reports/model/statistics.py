@@ -278,8 +278,11 @@ def claims_against(
         return claims
     tests = {}
     for key in others:
-        either_lost = lost[key] | base_lost
-        tests[key] = sequences.test(np.where(either_lost, np.nan, logs[key] - base))
+        # where both succeed; on fewer than `FEWEST` sequences nothing is claimed
+        ratios = np.where(lost[key] | base_lost, np.nan, logs[key] - base)
+        tests[key] = sequences.test(ratios)
+        if np.isfinite(ratios).sum() < FEWEST:
+            tests[key] = tests[key]._replace(these_p=1.0, beyond_p=1.0)
     beyond = holm([tests[key].beyond_p for key in others]).tolist()
     these = holm([tests[key].these_p for key in others]).tolist()
     for key, p_beyond, p_these in zip(others, beyond, these, strict=True):
@@ -377,7 +380,12 @@ def candidates_for_best(logs: Mapping[str, Array], sequences: Sequences) -> set[
     keys = list(logs)
     if not keys or len(sequences.names) < FEWEST:
         return set(keys)
-    return {keys[at] for at in may_be_best(np.array([*logs.values()]), sequences.families)}
+    return {
+        keys[at]
+        for at in may_be_best(
+            np.array([*logs.values()]), sequences.families, weights=sequences.weights
+        )
+    }
 
 
 def mean_rank_test(logs: Mapping[str, Array]) -> tuple[float, float] | None:

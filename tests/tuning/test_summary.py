@@ -126,7 +126,7 @@ CLOSE_ACCURACY = {"accuracy": NOTHING}
     [
         ({}, Verdict.PROVEN, "less ATE: ATE x 0.745 [0.700, 0.800] on 6 scenes"),
         ({"held_out": NOTHING}, Verdict.NO_DIFFERENCE, "Differences above"),
-        ({"held_out": OPEN}, Verdict.CANNOT_TELL, "scenes would settle it"),
+        ({"held_out": OPEN}, Verdict.CANNOT_TELL, "in a new study would settle it"),
         ({"held_out": PERHAPS}, Verdict.PROMISING, "perhaps"),
         ({"held_out": LOSS}, Verdict.WORSE, "more ATE"),
         ({"held_out": on_scenes(0.7, 0.72)}, Verdict.CANNOT_TELL, "6 are the fewest"),
@@ -135,6 +135,16 @@ CLOSE_ACCURACY = {"accuracy": NOTHING}
         ({"feasible": False}, Verdict.CANNOT_TELL, "violates a constraint"),
         ({"ate_margin": 0.05, "on_held_out": WIDE_ACCURACY}, Verdict.PROMISING, "below 1.05"),
         ({"ate_margin": 0.05, "on_held_out": CLOSE_ACCURACY}, Verdict.PROVEN, "less"),
+        (
+            {"ate_margin": 0.05, "on_held_out": {"accuracy": LOSS}},
+            Verdict.CANNOT_TELL,
+            "below 1.05",
+        ),
+        (
+            {"held_out": PERHAPS, "ate_margin": 0.05, "on_held_out": {"accuracy": LOSS}},
+            Verdict.CANNOT_TELL,
+            "below 1.05",
+        ),
         ({"held_out": None, "confirm": GAIN}, Verdict.PROVEN, "less"),
         ({"held_out": None}, Verdict.CANNOT_TELL, "no frames are left"),
         ({"failed": "it broke"}, Verdict.CANNOT_TELL, "it broke"),
@@ -150,6 +160,26 @@ def test_the_conclusion_says_the_verdict_with_its_numbers(
     assert max(len(sentence.split()) for sentence in text.split(". ")) <= 34
 
 
+def test_the_worst_scenes_rank_trials_and_all_scenes_judge_them() -> None:
+    """Chosen by the candidate's own ratios, the worst quarter would always be worse."""
+    rng = np.random.default_rng(0)
+    instances = [ProblemInstance(f"synthetic/walking_xyz?scene={100 + n}") for n in range(28)]
+    errors = [dict(zip(instances, rng.lognormal(-4, 0.3, 28), strict=True)) for _ in range(2)]
+    compared = compare(outcomes(errors[0]), outcomes(errors[1]), objective=OBJECTIVES["worst"])
+    assert compared.scenes == 28
+    assert compared.what == "ATE"
+    assert verdict_of(compared) is not Verdict.WORSE
+
+
+def test_frames_lost_are_a_value_of_the_coverage_objective() -> None:
+    instances = [ProblemInstance(f"synthetic/walking_xyz?scene={100 + n}") for n in range(8)]
+    tracked = outcomes(dict.fromkeys(instances, 0.01))
+    lost = {at: replace(run, coverage=0.2, lost=True) for at, run in tracked.items()}
+    compared = compare(tracked, lost, objective=OBJECTIVES["coverage"])
+    assert compared.scenes == 8
+    assert verdict_of(compared) is Verdict.PROVEN
+
+
 def test_no_trial_and_failed_trials_cannot_tell() -> None:
     assert judge(None)[0] is Verdict.CANNOT_TELL
     _, text = conclude(SPEC, [], failures=["crashed: no memory", "crashed"])
@@ -158,9 +188,10 @@ def test_no_trial_and_failed_trials_cannot_tell() -> None:
 
 def test_an_extendable_study_names_the_command_of_its_next_look() -> None:
     spec = make_spec(tune=["synthetic/walking_xyz?scene=0-3&frames=20"], extendable=True)
-    _, text = conclude(spec, [candidate(held_out=on_scenes(*[0.6, 1.5] * 6))])
+    unsettled = on_scenes(*[0.6, 1.05, 0.7] * 4).model_copy(update={"high": 1.02})
+    _, text = conclude(spec, [candidate(held_out=unsettled)])
     assert "dynslam-bench tune extend STUDY.toml --scenes 12" in text
-    _, text = conclude(SPEC, [candidate(held_out=on_scenes(*[0.6, 1.5] * 6))])
+    _, text = conclude(SPEC, [candidate(held_out=unsettled)])
     assert "a new study" in text
     assert "extend STUDY" not in text
 
