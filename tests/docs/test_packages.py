@@ -46,6 +46,21 @@ def test_the_recipe_names_what_the_package_needs(project: dict) -> None:
     assert [line for line in wanted if f"    {line}\n" not in recipe] == []
 
 
+def test_every_page_of_the_documentation_is_in_the_navigation() -> None:
+    """The site's strict build refuses a page that is not; this says so without the site's packages."""
+    settings = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    left_out = ("lab", "paper", "example")
+    pages = [
+        page.relative_to(ROOT / "docs").as_posix()
+        for page in (ROOT / "docs").rglob("*.md")
+        if page.relative_to(ROOT / "docs").parts[0] not in left_out
+    ]
+    assert len(pages) > 30
+    assert [
+        page for page in pages if not re.search(rf"[ -] {re.escape(page)}$", settings, re.M)
+    ] == []
+
+
 # The hosted workflows, as far as they can be read here: steps are shell, and name files that exist.
 
 
