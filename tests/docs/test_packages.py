@@ -57,7 +57,7 @@ def test_every_page_of_the_documentation_is_in_the_navigation() -> None:
     ]
     assert len(pages) > 30
     assert [
-        page for page in pages if not re.search(rf"[ -] {re.escape(page)}$", settings, re.M)
+        page for page in pages if not re.search(rf"[:-] {re.escape(page)}$", settings, re.M)
     ] == []
 
 
