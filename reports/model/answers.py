@@ -68,7 +68,9 @@ def typical_error(board: Board, key: str, names: Sequence[str]) -> TypicalError:
 
 
 def error_columns(board: Board) -> dict[str, list[str]]:
-    """What moves, in everyday words, to the sequences that typical errors are over: those that all ranked trackers have.
+    """What moves, in everyday words, to the sequences that typical errors are over.
+
+    They are those that all ranked trackers have.
 
     The board of all sequences has an entry for each group of sequences, others have one. A group of
     which the ranked trackers have none in common is there with all its sequences.
