@@ -11,7 +11,7 @@ function startBoard() {
     const element = place.querySelector("table"), paging = element.rows.length > 60;
     const made = sortable(element, {
       paging, pageLength: 50, orderFixed: [0, "asc"],
-      layout: { ...TABLE.layout, bottomStart: { buttons: [{ extend: "colvis", text: "Columns", columns: ":gt(1)" }] }, topEnd: element.rows.length > 12 ? "search" : null, bottomEnd: paging ? "paging" : null },
+      layout: { ...TABLE.layout, bottomStart: { buttons: [{ extend: "colvis", text: "Columns", columns: ":gt(1)" }] }, bottomEnd: "search", bottom2End: paging ? "paging" : null },
       columnDefs: [{ targets: 0, visible: false }, { targets: [".n", 2], type: "number" }],
       search: { search: view.get("q") ?? "" },
     });
