@@ -119,7 +119,8 @@ def make_sequence(folder: Path, phase: float, frames: int = 12) -> Path:
         lists["groundtruth"].append(f"{stamp:.6f} {x:.6f} 0 0 0 0 0 1")
     for name, lines in lists.items():
         (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
-    write_camera(folder / "camera.toml", Camera(16, 12, 15.0, 15.0, 7.5, 5.5))
+    camera = Camera(16, 12, 15.0, 15.0, 7.5, 5.5, depth_factor=5000.0)
+    write_camera(folder / "camera.toml", camera)
     return folder
 
 
