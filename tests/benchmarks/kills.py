@@ -150,6 +150,7 @@ def study_of(results: Path) -> list[Any]:
     ]
     summary = json.loads((folder / "summary.json").read_text())
     for candidate in summary["candidates"]:
+        candidate.pop("scene_s", None)
         for name in ("on_confirm", "on_held_out"):
             candidate[name].pop("speed", None)
     return [trials, summary, (folder / "best.toml").read_text(), runs_of(results)]
