@@ -17,6 +17,7 @@ from dynslam_bench.core.programs import (
     is_counted,
     is_file_name,
     mapped_files,
+    modified_time_ns,
 )
 from dynslam_bench.core.reads import (
     ABSENT,
@@ -185,7 +186,7 @@ class Collector:
         self._origins = origins
         self._private = private
         self._path = list(sys.path)
-        self._mapped = mapped_files(os.getpid())
+        self._mapped = set(mapped_files(os.getpid()))
         self._loaded = {name.partition(".")[0] for name in sys.modules}
         self._texts: dict[tuple[str, Stamp], set[str]] = {}
         self._commands: dict[Command, set[str]] = {}
@@ -309,6 +310,10 @@ class Collector:
             self.compare(path, note, stamp_of(path))
         if self.notes.changed:
             return f"the file {self.notes.changed[0]}"
+        # a library of a program that was built anew while the program ran
+        for path, modified_ns in dict(self.programs.files).items():
+            if is_code(path) and self._is_rebuilt(path, modified_ns):
+                return f"the file {path} of a program"
         # what nobody saw opened is as it was loaded if it is older than that
         for path, was_loaded in modules.files.items():
             if path not in self.notes.files and self._is_newer(path, was_loaded):
@@ -334,6 +339,23 @@ class Collector:
             note.stamp = stamp  # it was written again with the same content
         else:
             self.notes.changed.append(path)
+
+    def _is_rebuilt(self, path: str, modified_ns: int | None) -> bool:
+        """Whether another file lies now where a program has its code from.
+
+        What was written after a program was started when it was seen first is the program's own.
+
+        Args:
+            path: The file.
+            modified_ns: Its time of modification when it was seen first.
+        """
+        now_ns = modified_time_ns(path)
+        first_start_ns = min(self.notes.commands.values(), default=sys.maxsize)
+        if now_ns is None or modified_ns is None or self.is_output(path):
+            return False
+        if path in self.programs.replaced:
+            return True
+        return modified_ns < first_start_ns and now_ns != modified_ns
 
     def _is_newer(self, path: str, was_loaded: bool) -> bool:
         """Whether an input has changed since the recorder was started, or since this process loaded its libraries."""
@@ -383,7 +405,7 @@ class Collector:
 
     def _libraries(self) -> set[str]:
         """The files that were mapped into memory since the start, or because a search path named them."""
-        mapped = mapped_files(os.getpid())
+        mapped = set(mapped_files(os.getpid()))
         # those that a search path of the loader names
         preloaded = set(re.split("[: ]", self.environment.get("LD_PRELOAD", "")))
         folders = folders_of(self.environment.get("LD_LIBRARY_PATH", ""))
