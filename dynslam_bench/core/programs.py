@@ -122,7 +122,7 @@ SESSION_VARIABLES = (
 )
 """These name the terminal, the login or the moment. Programs do not get them, and their values do not count."""
 DECLARED_VARIABLE = "dynslam_bench.declared_variable"
-"""Announced (`sys.audit`) of each variable, its argument, that a program's settings declare, whether it is set or not."""
+"""Announced (`sys.audit`) of each variable, its argument, that a program's settings declare, set or not."""
 _UNCOUNTED = frozenset((*RUN_VARIABLES, *PLACE_VARIABLES, *SESSION_VARIABLES))
 """The variables whose values do not count."""
 _LIBRARIES = "LD_LIBRARY_PATH"

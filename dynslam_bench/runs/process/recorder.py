@@ -60,7 +60,7 @@ from dynslam_bench.runs.process.origins import Origins
 _SMALL_BYTES = 1 << 20
 """Files of up to so many bytes are digested when they are opened; larger ones, which take time, at the end."""
 _FIRST_LOOK_S = 0.02
-"""Seconds from the start of the first program to the first look at it. A program that has ended before counts by its command."""
+"""Seconds from the first program's start to the first look. A program that has ended before counts by its command."""
 _LOOK_S = 0.5
 """Seconds between two looks at the programs when the first ones are over; each comes after twice the time."""
 _FILE_CLOCK = 5 if sys.platform == "linux" else None
