@@ -289,6 +289,29 @@ def test_a_source_that_names_a_file_which_is_opened_in_machine_code(bench: Bench
     assert bench.changed(reads) == "the file mask.png"
 
 
+@pytest.mark.parametrize(
+    "named", ["'net.onnx'", "'nets/' + name + '.onnx'", "f'{name}.onnx'", "'%s.onnx' % name"]
+)
+def test_a_network_below_the_folder_of_a_source(named: str, bench: Bench) -> None:
+    """It is opened in machine code, by a name that is put together."""
+    bench.write("plugin/nets/net.onnx", "1111")
+    bench.write("plugin/nets/net.txt", "1111")
+    bench.write("plugin/.hidden/net.onnx", "1111")
+    reads = bench.record(f"def run(name):\n    return {named}\n", name="net")
+    assert set(reads.files) == {"plugin:/mine.py", "plugin:/nets/net.onnx"}
+    edit(bench.plugin.parent / "nets/net.onnx", "2222")
+    assert bench.changed(reads) == "the file nets/net.onnx"
+
+
+@pytest.mark.parametrize("name", ["net.bin", "mask.png", "first.cfg"])
+def test_a_configuration_that_names_a_file_in_a_folder_below_it(name: str, bench: Bench) -> None:
+    bench.write("work/slam.ini", f"[model]\nfile = {name}")
+    bench.write(f"work/models/{name}", "1111")
+    reads = bench.record("def run():\n    open('slam.ini').read()\n")
+    edit(bench.work / "models" / name, "2222")
+    assert bench.changed(reads) == f"the file models/{name}"
+
+
 @pytest.mark.parametrize("name", ["a\\0b", "x" * 300, "loop", "."])
 def test_names_that_no_file_can_have(name: str, bench: Bench) -> None:
     bench.write("work/b", "")

@@ -6,10 +6,11 @@ import sys
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-from dynslam_bench.core.code_files import files_of_command
+from dynslam_bench.core.code_files import files_below, files_of_command
 from dynslam_bench.core.programs import (
     Command,
     ProgramReads,
@@ -69,6 +70,8 @@ _VARIABLE = re.compile(r"[A-Z][A-Z0-9_]{2,}")
 """A word in a text that can be the name of an environment variable."""
 _FILE_NAME = re.compile(r"[\w./~+\-]*\w\.[A-Za-z]\w{0,9}")
 """A text that can be the name of a file: it has a suffix."""
+_UP_TO_PLACEHOLDER = re.compile(r".*(?:\}|%[-+0-9.]*[a-zA-Z])")
+"""A text up to its last placeholder: of ``{name}.onnx`` the ending is left."""
 _SYSTEM_LIBRARY = re.compile(
     r"lib(?:c|m|dl|rt|util|pthread|resolv|nss_\w+|gcc_s|stdc\+\+|ssl|crypto|sqlite3|z|bz2|lzma|ffi|readline|ncursesw?|"
     r"tinfow?|panelw?|uuid|expat|mpdec|gdbm\w*|db|nsl|tirpc)[-.].*"
@@ -189,6 +192,7 @@ class Collector:
         self._mapped = set(mapped_files(os.getpid()))
         self._loaded = {name.partition(".")[0] for name in sys.modules}
         self._texts: dict[tuple[str, Stamp], set[str]] = {}
+        self._below: dict[str, list[str]] = {}
         self._commands: dict[Command, set[str]] = {}
         self._variables: dict[Command, set[str]] = {}
 
@@ -498,7 +502,8 @@ class Collector:
         """The files that foreign sources and small text files name, and those that sources name and that are not there.
 
         A name is looked for in the folder of the text, in that of the plug-in and in the working
-        folder.
+        folder. A bare name of a file, or the ending of a network's file, is also looked for in all
+        folders below that of the text: ``folder / f"{name}.onnx"``.
         """
         named: set[str] = set()
         missing: set[str] = set()
@@ -506,11 +511,29 @@ class Collector:
             for word in self._words(text):
                 places = self._places_of(word, text)
                 there = {place for place in places if os.path.isfile(place)}
+                if not there:
+                    there = self._files_below(os.path.dirname(text), word)
                 named |= there
                 if not there and text.endswith(".py") and _can_be_missing(word):
                     missing |= places
         missing = {path for path in missing if not self.is_output(path)}
         return set(filter(self._is_input, named)), missing
+
+    def _files_below(self, folder: str, word: str) -> set[str]:
+        """The files of that name, or of that ending of a network's file, in all folders below one.
+
+        Of a folder with very many files the first ones are looked at; hidden folders, environments,
+        results and recordings are left out (`files_below`).
+        """
+        ending = _UP_TO_PLACEHOLDER.sub("", word)
+        is_ending = ending.lower() in (*_NETWORKS, *_ARRAYS_AND_CLOUDS)
+        if not is_ending and _FILE_NAME.fullmatch(word) is None:
+            return set()
+        if folder not in self._below:
+            self._below[folder] = [*map(str, islice(files_below(Path(folder)), _MANY_FILES))]
+        if is_ending:
+            return {file for file in self._below[folder] if file.endswith(ending)}
+        return {file for file in self._below[folder] if os.path.basename(file) == word}
 
     def _words(self, text: str) -> set[str]:
         """The words of a text file that could be names of files; none of a file that is no such text."""
