@@ -18,6 +18,7 @@ from dynslam_bench.core import StudyError, did_you_mean
 from dynslam_bench.evaluation import Protocol, get_protocol
 from dynslam_bench.evaluation.verdicts import (
     FEWEST,
+    FLOOR_M,
     ONE_SIDED,
     PairedRatio,
     hodges_lehmann,
@@ -321,8 +322,6 @@ def violations(
 
 # Comparing a configuration with the baseline: paired by place, one value a scene.
 
-FLOOR_M = 1e-4
-"""Errors below a tenth of a millimetre count as that: a ratio of two perfect runs tells nothing."""
 Errors = Mapping[ProblemInstance, float]
 """ATE in metres on each instance, lost frames held."""
 

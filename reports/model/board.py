@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core import ReportError, assignments, did_you_mean
 from dynslam_bench.evaluation import Protocol, get_protocol
+from dynslam_bench.evaluation.verdicts import FLOOR_M
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores
 from dynslam_bench.reports.model.names import (
     OUR_BACK_END,
@@ -29,8 +30,8 @@ from dynslam_bench.reports.model.names import (
 )
 from dynslam_bench.reports.model.row import RunRow, command_with, grouped, part_options
 from dynslam_bench.reports.model.statistics import (
-    FLOOR_M,
     Interval,
+    Scope,
     Sequences,
     Standing,
     Verdict,
@@ -562,6 +563,14 @@ def common_logs(board: Board, keys: Sequence[str]) -> dict[str, NDArray[np.float
     }
 
 
+def without_lost(
+    board: Board, logs: NDArray[np.float64], lost: Collection[str]
+) -> NDArray[np.float64]:
+    """Logarithms of errors on the common sequences ``[S]``, nan on lost ones."""
+    is_lost = np.array([name in lost for name in board.common], dtype=bool)
+    return np.where(is_lost, np.nan, logs)
+
+
 def board_resolution(board: Board) -> tuple[float, float]:
     """Smallest differences, as shares, that a board shows in four of five: on these families, and beyond them.
 
@@ -585,9 +594,7 @@ def board_resolution(board: Board) -> tuple[float, float]:
 
     # lost cells take no part in a claim
     for key in others:
-        lost = board.lost(key) | base_lost
-        is_lost = np.array([name in lost for name in board.common], dtype=bool)
-        logs[key] = np.where(is_lost, np.nan, logs[key])
+        logs[key] = without_lost(board, logs[key], board.lost(key) | base_lost)
     return resolution(logs, base, board.ranked_sequences)
 
 
@@ -597,40 +604,58 @@ class Pair(NamedTuple):
     Attributes:
         one: Variant key of the first tracker.
         other: That of the second.
-        ratio: Geometric mean of the errors of the first over those of the second.
-        sequences: Sequences that both have.
+        ratio: Geometric mean of the errors of the first over those of the second where both succeed; over all
+            sequences where they succeed on none together.
+        sequences: Sequences behind it.
+        lost: Sequences that the first alone lost, and the second alone.
         p_value: Holm-corrected over all pairs of ranked trackers; None unless both are ranked.
         verdict: Of the first; empty unless both are ranked.
+        scope: How far that goes.
     """
 
     one: str
     other: str
     ratio: Interval
     sequences: int
+    lost: tuple[int, int]
     p_value: float | None
     verdict: Verdict
+    scope: Scope
 
 
 def compare_pairs(board: Board, keys: Sequence[str]) -> list[Pair]:
     """Compare every two of some trackers that have a common sequence in common, in their order."""
     logs = common_logs(board, keys)
+    succeeded = {key: without_lost(board, logs[key], board.lost(key)) for key in keys}
     sequences = board.ranked_sequences
     tests = {}
     if board.common:
-        tests = separable({key: logs[key] for key in keys if key in board.ranked}, sequences)
+        ranked = {key: succeeded[key] for key in keys if key in board.ranked}
+        tests = separable(ranked, sequences)
     pairs = []
     for one, other in combinations(keys, 2):
-        # log ratios [S], nan where one of the two has no run
-        differences = logs[one] - logs[other]
+        # log ratios [S], nan where one of the two lost or has no run
+        differences = succeeded[one] - succeeded[other]
+        if not np.isfinite(differences).any():
+            differences = logs[one] - logs[other]
         n_sequences = int(np.isfinite(differences).sum())
         if not n_sequences:
             continue
         ratio = ratio_interval(differences, sequences)
-        (differ, p_value) = tests.get((one, other), (False, None))
-        verdict: Verdict = "" if p_value is None else "cannot tell"
-        if differ:
-            verdict = "better" if ratio.value < 1 else "worse"
-        pairs.append(Pair(one, other, ratio, n_sequences, p_value, verdict))
+        both_ran = {
+            name for name in board.common if name in board.cells[one] and name in board.cells[other]
+        }
+        lost = (
+            len(both_ran & board.lost(one) - board.lost(other)),
+            len(both_ran & board.lost(other) - board.lost(one)),
+        )
+        order = tests.get((one, other))
+        verdict: Verdict = "" if order is None else "cannot tell"
+        if order is not None and order.first_by:
+            verdict = "better" if order.first_by < 0 else "worse"
+        p_value = None if order is None else order.p_value
+        scope: Scope = "" if order is None else order.scope
+        pairs.append(Pair(one, other, ratio, n_sequences, lost, p_value, verdict, scope))
     return pairs
 
 

@@ -480,9 +480,9 @@ def test_pairs_are_tested_as_scipy_does_and_corrected_together():
     logs = {"a": rng.normal(0, 0.2, 7), "b": rng.normal(0.35, 0.2, 7), "c": rng.normal(2, 0.2, 7)}
     found = separable(logs, sequences_of([*"stuvwxy"]))
     p = holm([stats.ttest_rel(logs[a], logs[b]).pvalue for a, b in found])
-    assert [p_value for _, p_value in found.values()] == pytest.approx(p)
-    assert [apart for apart, _ in found.values()] == [*(p <= 0.04)]
-    assert found["a", "c"][0]
+    assert [order.p_value for order in found.values()] == pytest.approx(p)
+    assert [order.first_by != 0 for order in found.values()] == [*(p <= 0.04)]
+    assert found["a", "c"].first_by < 0
 
 
 def test_equal_trackers_share_their_rank():
@@ -494,7 +494,7 @@ def test_equal_trackers_share_their_rank():
 def test_an_error_of_zero_has_a_ratio():
     data = {"exact": {"s0": [0.0]}, "ref": {"s0": [0.01]}}
     found, _ = standings(data, data["ref"], ["exact", "ref"])
-    assert (found.key, found.ratio.value) == ("exact", pytest.approx(1e-4))
+    assert (found.key, found.ratio.value) == ("exact", pytest.approx(1e-2))
 
 
 def test_who_is_better_than_the_reference_is_tested_as_scipy_does_and_corrected_over_the_trackers():
