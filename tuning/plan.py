@@ -480,7 +480,7 @@ class Design:
         confirm: What the best trials and the baseline run on for the choice; shares no frame with
             `tune`. Where nothing is held out it judges, and the trials' own values choose.
         held_out: What judges the choice.
-        recorded: Recordings on which the choice must not be worse.
+        recorded: Recordings that the best trial is run on at the end; they decide nothing.
     """
 
     tune: tuple[ProblemInstance, ...]

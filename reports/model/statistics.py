@@ -154,7 +154,7 @@ def standings(
     Returns:
         The ranked trackers from the best to the worst, then the others by their ratio.
     """
-    if not cells:
+    if not cells or not reference:
         return []
     names = list(reference)
     sequences = sequences_of(names, families, weights)
