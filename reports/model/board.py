@@ -43,7 +43,7 @@ from dynslam_bench.reports.model.statistics import (
     standings,
 )
 from dynslam_bench.runs.store import RunStore, part_words
-from dynslam_bench.sequences.families import family_of
+from dynslam_bench.sequences.families import family_of, same_path
 from dynslam_bench.sequences.tags import FIXED_CAMERA
 
 STATIC_CAMERA = "static camera (from ground truth)"
@@ -80,6 +80,8 @@ _MOVING_M = 1e-3
 """Errors of a static camera below this do not tell true paths apart: the camera hardly moves."""
 _SAME_STAMP_S = 1e-6
 """Difference of durations up to which they are equal: rounding in files."""
+_NEARLY = 0.1
+"""Relative difference of frames, durations and errors of a static camera up to which true poses are compared."""
 
 
 @dataclass
@@ -688,7 +690,9 @@ def _order_sequences(board: Board) -> None:
 
 
 def copies_of(columns: Mapping[str, Sequence[RunRow]]) -> dict[str, str]:
-    """Which sequences are others once more: equal frames, duration and error of a static camera that moves.
+    """Which sequences are others once more: the true poses are the same, and the camera moves.
+
+    Where the true poses are not here, as in a report, equal frames, duration and error of a static camera tell.
 
     Args:
         columns: Sequence to its rows, in order.
@@ -697,28 +701,47 @@ def copies_of(columns: Mapping[str, Sequence[RunRow]]) -> dict[str, str]:
         Sequence to the first one that it is a copy of; those that are no copies are not in it.
     """
     copies = {}
-    firsts: dict[tuple[int, int], list[tuple[str, float, float]]] = {}
+    firsts: dict[str, RunRow] = {}
     for name, rows in columns.items():
         # the truth of the earliest start: a run without ground truth tells nothing
         with_truth = [row for row in rows if row.static_camera_ate_rmse_m is not None]
         if not with_truth:
             continue
         first = min(with_truth, key=lambda row: (row.imported, row.offset))
-        static_m = first.static_camera_ate_rmse_m or 0.0
-        if static_m < _MOVING_M:
+        if (first.static_camera_ate_rmse_m or 0.0) < _MOVING_M:
             continue
-
-        # the sequences before it with as many frames from there
-        duration_s = first.sequence.duration_s
-        before = firsts.setdefault((first.offset, first.sequence.frames), [])
-        for other, other_m, other_s in before:
-            is_equal_m = math.isclose(static_m, other_m, rel_tol=_SAME_ERROR)
-            if is_equal_m and math.isclose(duration_s, other_s, abs_tol=_SAME_STAMP_S):
+        for other, other_row in firsts.items():
+            if _is_same_path(first, other_row):
                 copies[name] = other
                 break
         else:
-            before.append((name, static_m, duration_s))
+            firsts[name] = first
     return copies
+
+
+def _is_same_path(row: RunRow, other: RunRow) -> bool:
+    """Whether two runs are on one recording, whose camera moves."""
+    static_m = row.static_camera_ate_rmse_m or 0.0
+    other_m = other.static_camera_ate_rmse_m or 0.0
+    sequence = row.sequence
+    other_sequence = other.sequence
+
+    # by their numbers, however the poses are written
+    is_equal = (
+        (row.offset, sequence.frames) == (other.offset, other_sequence.frames)
+        and math.isclose(static_m, other_m, rel_tol=_SAME_ERROR)
+        and math.isclose(sequence.duration_s, other_sequence.duration_s, abs_tol=_SAME_STAMP_S)
+    )
+    if is_equal:
+        return True
+
+    # by the poses, of which a copy may lack a few; they are read where the rest is nearly equal
+    is_near = (
+        math.isclose(sequence.frames, other_sequence.frames, rel_tol=_NEARLY)
+        and math.isclose(sequence.duration_s, other_sequence.duration_s, rel_tol=_NEARLY)
+        and math.isclose(static_m, other_m, rel_tol=_NEARLY)
+    )
+    return is_near and same_path(row.ground_truth(), other.ground_truth())
 
 
 def copies_note(board: Board) -> str:
@@ -730,8 +753,8 @@ def copies_note(board: Board) -> str:
     if not shown:
         return ""
     return (
-        f"One recording counts once: {'; '.join(shown)}. Their true paths are the same: as many frames, the same "
-        "duration, and the same error of a static camera."
+        f"One recording counts once: {'; '.join(shown)}. Their true paths are the same: equal poses, or "
+        "as many frames, the same duration, and the same error of a static camera."
     )
 
 

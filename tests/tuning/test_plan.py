@@ -456,8 +456,8 @@ def test_a_copy_is_the_same_recording(tmp_path: Path) -> None:
 def disguised(whole: Path, copy: Path, how: str) -> Path:
     """A copy of a toy recording: renamed, shifted, re-encoded, beginning later, seen from elsewhere."""
     shutil.copytree(whole, copy)
-    shift = 1000.013 * (how == "shifted")
-    dropped = 5 * (how == "later")
+    shift = 1000.013 * ("shifted" in how)
+    dropped = 5 * (how == "later") + ("one fewer" in how)
     for kind in ("rgb", "depth", "groundtruth"):
         lines = [line.split() for line in (copy / f"{kind}.txt").read_text().splitlines()[dropped:]]
         for words in lines:
@@ -474,7 +474,18 @@ def disguised(whole: Path, copy: Path, how: str) -> Path:
     return copy
 
 
-@pytest.mark.parametrize("how", ["renamed", "shifted", "re-encoded", "later", "elsewhere"])
+@pytest.mark.parametrize(
+    "how",
+    [
+        "renamed",
+        "shifted",
+        "re-encoded",
+        "later",
+        "elsewhere",
+        "one fewer",
+        "one fewer and shifted",
+    ],
+)
 def test_a_copy_in_disguise_is_the_same_recording(tmp_path: Path, how: str) -> None:
     whole = toy_tracker.make_sequence(tmp_path / "whole", 0.3, 24)
     copy = disguised(whole, tmp_path / "copy", how)
@@ -484,8 +495,31 @@ def test_a_copy_in_disguise_is_the_same_recording(tmp_path: Path, how: str) -> N
     for pair in ((whole, copy), (copy, whole)):
         with pytest.raises(StudyError, match="are the same sequence"):
             check(*([str(folder)] for folder in pair))
-    for phase in (0.9, 1.7, 2.5):
+    for phase in (0.9, 1.9, 2.6):
         check([str(copy)], [str(toy_tracker.make_sequence(tmp_path / f"other{phase}", phase, 24))])
+
+
+@pytest.mark.parametrize("how", ["one fewer", "one fewer and shifted", "later"])
+def test_a_copy_of_a_fixed_cameras_recording_is_the_same_recording(
+    tmp_path: Path, how: str
+) -> None:
+    """Its poses tell nothing: every fixed camera has such ones."""
+    whole = fixed_camera(toy_tracker.make_sequence(tmp_path / "whole", 0.3, 24))
+    copy = disguised(whole, tmp_path / "copy", how)
+    with pytest.raises(StudyError, match="are the same sequence"):
+        check([str(whole)], [str(copy)])
+    with pytest.raises(StudyError, match="are the same recording"):
+        check([str(whole), str(copy)], [])
+    other = fixed_camera(toy_tracker.make_sequence(tmp_path / "other", 1.7, 24))
+    check([str(whole)], [str(other)])
+
+
+def fixed_camera(folder: Path) -> Path:
+    """The recording with the truth of a camera that stands still."""
+    truth = folder / "groundtruth.txt"
+    stamps = [line.split()[0] for line in truth.read_text().splitlines() if line[0] != "#"]
+    truth.write_text("".join(f"{stamp} 0 0 1 0 0 0 1\n" for stamp in stamps))
+    return folder
 
 
 @pytest.mark.parametrize(
