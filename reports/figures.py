@@ -12,9 +12,9 @@ import plotly.graph_objects as go
 from numpy.typing import ArrayLike
 
 from dynslam_bench.core import label_text
+from dynslam_bench.evaluation.verdicts import FLOOR_M
 from dynslam_bench.reports.model.answers import cell_error_m
 from dynslam_bench.reports.model.board import Board, timed_on_one
-from dynslam_bench.reports.model.statistics import FLOOR_M
 from dynslam_bench.reports.tables.leaderboard import (
     LOST_MARK,
     STATISTICS,

@@ -6,6 +6,7 @@ import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from optuna.trial import TrialState
@@ -20,6 +21,7 @@ from dynslam_bench.evaluation.verdicts import (
     PairedRatio,
     Verdict,
     findings,
+    paired_ratio,
     scenes_to_settle,
     verdict_of,
 )
@@ -36,7 +38,7 @@ from dynslam_bench.tuning.objectives import (
     improvement_bound,
     violations,
 )
-from dynslam_bench.tuning.plan import held_settings, seen_note, splits_seen
+from dynslam_bench.tuning.plan import Design, held_settings, seen_note, splits_seen
 from dynslam_bench.tuning.storage import (
     Importance,
     best_trials,
@@ -65,13 +67,15 @@ class Candidate(Record):
         confirm: Beside the baseline on the instances of the choice; where nothing is held out they
             judge.
         held_out: On the held-out instances; None without any, or if it is not the best.
-        recorded: ATE on recordings; None without any, or if it is not the best.
+        recorded: ATE on recordings, which is said and decides nothing; None without any, or if it is not the best.
+        beyond: By the means of the judging families that no trial saw; None for fewer than `FEWEST` of them.
         on_confirm: ATE and processor time on the instances of the choice, by objective.
         on_held_out: The same on the held-out instances.
         ate_margin: What it may lose of accuracy, as a share; None where its own ratio is one of
             errors.
         feasible: Whether the constraints hold in the new runs.
         failed: Why it could not be run again; empty if it could.
+        crashes: Why some of its runs and of the baseline's crashed on the scenes that judge; they are lost.
         scene_s: Seconds of runs that a judging scene took, the baseline's included.
     """
 
@@ -82,11 +86,13 @@ class Candidate(Record):
     confirm: PairedRatio | None = None
     held_out: PairedRatio | None = None
     recorded: PairedRatio | None = None
+    beyond: PairedRatio | None = None
     on_confirm: dict[str, PairedRatio] = Field(default_factory=dict)
     on_held_out: dict[str, PairedRatio] = Field(default_factory=dict)
     ate_margin: float | None = None
     feasible: bool = True
     failed: str = ""
+    crashes: list[str] = Field(default_factory=list)
     scene_s: float = 0.0
 
     @property
@@ -126,7 +132,7 @@ class StudySummary(Record):
         tune: The instances that trials ran on.
         confirm: Those of the choice; where nothing is held out they judged it.
         held_out: Those that judged it.
-        recorded: Recordings that it was checked on.
+        recorded: Recordings that the best one was run on at the end.
         seen: Splits with scenes that the network behind the masks was trained on, see
             `plan.seen_note`.
     """
@@ -164,6 +170,13 @@ class StudySummary(Record):
         """Whether the best trial's settings are a result to use."""
         return self.verdict is Verdict.PROVEN and not self.keeps_default
 
+    @property
+    def offered(self) -> dict[str, Any]:
+        """The settings that `best.toml` sets: the best trial's, or none where the verdict offers none."""
+        if self.best is None or self.verdict not in OFFERED or self.keeps_default:
+            return {}
+        return self.best.params
+
 
 def _is_as_good(default: PairedRatio | None, best: PairedRatio | None) -> bool:
     """Whether the default settings have no larger typical ratio than the best trial, and lose no more."""
@@ -194,6 +207,9 @@ def judge(best: Candidate | None) -> tuple[Verdict, list[str]]:
         return Verdict.CANNOT_TELL, [no_frames]
     verdict = verdict_of(evidence)
     sentences = findings(evidence, name)
+    if best.crashes:
+        count = f"{len(best.crashes)} run{'s' * (len(best.crashes) != 1)}"
+        sentences.append(f"{count} crashed and counts as lost, the first one as {best.crashes[0]}")
     if not best.feasible:
         if verdict in OFFERED:
             verdict = Verdict.CANNOT_TELL
@@ -206,8 +222,8 @@ def judge(best: Candidate | None) -> tuple[Verdict, list[str]]:
         )
         is_worse = accuracy is None or verdict_of(accuracy) is Verdict.WORSE
         verdict = Verdict.CANNOT_TELL if is_worse else Verdict.PROMISING
-    if best.recorded is not None and best.recorded.losses:
-        sentences += findings(best.recorded, f"{name} on recordings")[1:]
+    if best.recorded is not None:
+        sentences += findings(best.recorded, f"{name} on recordings")
     return verdict, sentences
 
 
@@ -236,6 +252,12 @@ def conclude(
         sentences.append(f"{len(failures)} failed, the first one as {failures[0]}")
     if families and best is not None and best.evidence is not None:
         sentences.append(families)
+        if best.beyond is not None:
+            beyond = verdict_of(best.beyond).value
+            number = best.beyond.all_scenes
+            sentences.append(
+                f"Beyond them, by the means of the {number} families that no trial saw: {beyond}, {best.beyond}"
+            )
 
     # where nothing is claimed: what the trials exclude, and what would settle it
     if verdict not in (Verdict.PROVEN, Verdict.BUT_LOST) and (bound := improvement_bound(trials)):
@@ -288,16 +310,65 @@ def _settling(spec: StudySpec, best: Candidate) -> list[str]:
     ]
 
 
-def families_sentence(design: Any) -> str:
+def families_sentence(design: Design) -> str:
     """On which families a study judges, and whether its trials saw other scenes of them."""
     judging = _families(design.judging)
-    tuned = _families([*design.tune, *(design.confirm if design.held_out else ())])
+    tuned = _tuned_families(design)
     names = f"{len(judging)} famil{'y' if len(judging) == 1 else 'ies'} ({', '.join(judging[:8])})"
     if set(judging) <= set(tuned):
         return f"It was judged on {names}, of which trials saw other scenes, and says nothing of others"
-    if set(judging).isdisjoint(tuned):
-        return f"It was judged on {names} that no trial saw, and says nothing of others"
-    return f"It was judged on {names}, of some of which trials saw other scenes"
+    # with enough families that no trial saw their means speak of others
+    unseen = len(set(judging) - set(tuned))
+    nothing = "" if unseen >= FEWEST else ", and says nothing of others"
+    if unseen == len(judging):
+        return f"It was judged on {names} that no trial saw{nothing}"
+    return f"It was judged on {names}, of some of which trials saw other scenes{nothing}"
+
+
+def beyond_families(
+    comparison: PairedRatio, ratios: Mapping[str, float], design: Design
+) -> PairedRatio | None:
+    """What the judging families that no trial saw say of others: each counts once, by the mean of its scenes.
+
+    Scenes that a side lost take no part in the means; a family of which one side alone lost half of the scenes or
+    more is lost by it.
+
+    Args:
+        comparison: Over scenes.
+        ratios: Log ratio by scene.
+        design: Of the study.
+
+    Returns:
+        None for fewer than `FEWEST` such families.
+    """
+    # the scenes of each family that no trial saw
+    tuned = _tuned_families(design)
+    members: dict[str, list[str]] = {}
+    for scene, instances in scenes(design.judging).items():
+        family = family_of(instances[0].sequence)
+        if family not in tuned and scene in ratios:
+            members.setdefault(family, []).append(scene)
+    if len(members) < FEWEST:
+        return None
+
+    # its mean where both succeed, and whether a side lost it
+    by_candidate = {*comparison.lost, *comparison.lost_both}
+    by_baseline = {*comparison.lost_baseline, *comparison.lost_both}
+    means = {}
+    lost = []
+    lost_by_baseline = []
+    for family, names in members.items():
+        known = [ratios[name] for name in names if name not in by_candidate | by_baseline]
+        means[family] = fmean(known) if known else 0.0
+        lost += [family] * (2 * len(by_candidate.intersection(names)) >= len(names))
+        lost_by_baseline += [family] * (2 * len(by_baseline.intersection(names)) >= len(names))
+    return paired_ratio(
+        means, lost, lost_by_baseline, one_sided=comparison.one_sided, what=comparison.what
+    )
+
+
+def _tuned_families(design: Design) -> list[str]:
+    return _families([*design.tune, *(design.confirm if design.held_out else ())])
 
 
 def _families(instances: Sequence[ProblemInstance]) -> list[str]:
@@ -496,9 +567,14 @@ def _judged_on(
     }
     violated = violations(tuner.spec, outcomes)
     update["feasible"] = candidate.feasible and max(violated.values(), default=0.0) <= 0.0
+    if tuner.design.judging == getattr(tuner.design, split):
+        ratios = objective.ratios(outcomes, baseline)
+        update["beyond"] = beyond_families(update[split], ratios, tuner.design)
     if split == "confirm":
         update["choice"] = objective.value(outcomes, baseline)
-    wall_s = sum(run.wall_s for run in (*outcomes.values(), *baseline.values()))
+    both = (*outcomes.values(), *baseline.values())
+    update["crashes"] = [run.crash for run in both if run.crash]
+    wall_s = sum(run.wall_s for run in both)
     update["scene_s"] = wall_s / len(scenes(outcomes))
     return candidate.model_copy(update=update)
 
@@ -506,15 +582,14 @@ def _judged_on(
 def _write(tuner: Study, summary: StudySummary) -> None:
     """Write `best.toml` and `summary.json` into the study's folder."""
     params = summary.best.params if summary.best else {}
-    offered = summary.verdict in OFFERED and not summary.keeps_default
     preset = preset_text(
         tuner.spec,
-        params if offered else {},
+        summary.offered,
         " ".join(filter(None, (summary.conclusion, seen_note(summary.seen)))),
         status=summary.verdict.value,
         tuned_on=[*summary.tune, *(summary.confirm if summary.held_out else [])],
         judged_on=[*(summary.held_out or summary.confirm), *summary.recorded],
-        not_offered={} if offered else params,
+        not_offered={} if summary.offered else params,
     )
     write_atomic(tuner.folder / "best.toml", preset)
     write_atomic(tuner.folder / SUMMARY_FILE, summary.to_json())

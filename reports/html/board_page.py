@@ -20,7 +20,7 @@ from dynslam_bench.reports.model.board import (
     more_sequences,
 )
 from dynslam_bench.reports.model.row import SEEN, RunRow, grouped
-from dynslam_bench.reports.model.statistics import FLOOR_M, Interval, Scope, Standing, Verdict
+from dynslam_bench.reports.model.statistics import Interval, Scope, Standing, Verdict
 from dynslam_bench.reports.tables.leaderboard import (
     error_cell,
     frame_time_cell,
@@ -223,13 +223,17 @@ def _axis_limits(ratios: Sequence[Interval]) -> tuple[float, float]:
     return math.log(lowest), math.log(highest)
 
 
+_SMALLEST = 1e-9
+"""Ratios below this are drawn as this, so that their logarithm exists."""
+
+
 def _interval_bar(ratio: Interval, limits: tuple[float, float]) -> dict[str, float]:
     """Places of a ratio, of the ends of its interval and of 1 on a logarithmic axis, in pixels; none of what is nan."""
     values = {"at": ratio.value, "low": ratio.low, "high": ratio.high, "one": 1.0}
     places_px = {}
     for name, value in values.items():
         if math.isfinite(value):
-            share = (math.log(max(value, FLOOR_M)) - limits[0]) / (limits[1] - limits[0])
+            share = (math.log(max(value, _SMALLEST)) - limits[0]) / (limits[1] - limits[0])
             places_px[name] = 4 + 112 * min(max(share, 0.0), 1.0)
     return places_px
 
@@ -243,7 +247,7 @@ def _by_category(key: str, boards: Mapping[str, Board]) -> list[tuple[str, float
             continue
         ratio = standing.ratio.value
         # -1 for a ratio of 1/8, 1 for one of 8
-        share = min(max(math.log(max(ratio, FLOOR_M)) / math.log(8), -1.0), 1.0)
+        share = min(max(math.log(max(ratio, _SMALLEST)) / math.log(8), -1.0), 1.0)
         dots.append((name, ratio, 12 - 8 * share))
     return dots
 
@@ -358,13 +362,12 @@ def ratios_data(board: Board) -> list[list[Any]]:
     tracker_at = {key: at for at, key in enumerate(keys)}
     verdicts = {standing.key: standing.verdict for standing in board.standings}
     scopes = {standing.key: standing.scope for standing in board.standings}
-    goes_beyond = board.ranked_sequences.can_go_beyond
     ratios = []
     # reversed: of the later tracker over the earlier one
     for pair in compare_pairs(board, keys[::-1]):
         # against the reference the verdict is the board's, which asks it of fewer pairs
         verdict: str = pair.verdict
-        scope: Scope = "beyond these families" if goes_beyond else "on these families"
+        scope: Scope = pair.scope
         if pair.other == board.reference:
             verdict = verdicts.get(pair.one, "")
             scope = scopes.get(pair.one, "")

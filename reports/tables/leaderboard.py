@@ -13,7 +13,7 @@ import numpy as np
 from dynslam_bench.core import label_text
 from dynslam_bench.evaluation import Protocol, RPESpec
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
-from dynslam_bench.evaluation.verdicts import FEWEST_FAMILIES, FEWEST_FREE
+from dynslam_bench.evaluation.verdicts import FEWEST_FAMILIES, FEWEST_FREE, FLOOR_M
 from dynslam_bench.reports.model.answers import error_columns, typical_error
 from dynslam_bench.reports.model.board import (
     OVERALL,
@@ -29,7 +29,7 @@ from dynslam_bench.reports.model.board import (
 )
 from dynslam_bench.reports.model.published import ReportedCell
 from dynslam_bench.reports.model.row import HINTED, SEEN, RunRow, grouped
-from dynslam_bench.reports.model.statistics import FEWEST, FLOOR_M, Interval, Standing
+from dynslam_bench.reports.model.statistics import FEWEST, Interval, Standing
 from dynslam_bench.reports.tables.table import (
     Column,
     Emphasis,
@@ -434,8 +434,9 @@ def pair_table(board: Board) -> Table | None:
                 cells.append(_pair_cell(pairs[frozenset((key, other))], key))
         rows.append(cells)
     caption = (
-        "Geometric mean of the errors of the row over those of the column. Coloured: the two can be told apart "
-        f"{scope} (t tests of the log errors, Holm-corrected over all pairs); '?': they cannot."
+        "Geometric mean of the errors of the row over those of the column where both succeed; behind it the sequences "
+        f"that one of them alone lost. Coloured: the two can be told apart {scope} (t tests of the log errors, "
+        "Holm-corrected over all pairs), or by what they lost (McNemar's exact test); '?': they cannot."
     )
     columns = [*texts("tracker"), *numbers(*(board.labels[key] for key in board.ranked))]
     return Table("pairs", "All pairs", caption, columns, rows)
@@ -443,12 +444,16 @@ def pair_table(board: Board) -> Table | None:
 
 def _pair_cell(pair: Pair, key: str) -> TableCell:
     """The ratio of one tracker of a pair to the other; coloured where the two can be told apart."""
-    ratio = pair.ratio.value if pair.one == key else 1.0 / pair.ratio.value
+    is_first = pair.one == key
+    ratio = pair.ratio.value if is_first else 1.0 / pair.ratio.value
+    lost, lost_by_other = pair.lost if is_first else pair.lost[::-1]
+    losses = f"lost {lost} : {lost_by_other}" if lost + lost_by_other else ""
     tip = f"p {pair.p_value:.3f}"
     if pair.verdict == "cannot tell":
-        return TableCell(f"{ratio:.2f}", "?", ratio, tip=tip)
-    colour = _VERDICT_SHADES["better" if ratio < 1 else "worse"]
-    return TableCell(f"{ratio:.2f}", "", ratio, shade=colour, tip=tip)
+        return TableCell(f"{ratio:.2f}", f"? {losses}".strip(), ratio, tip=tip)
+    is_better = (pair.verdict == "better") == is_first
+    colour = _VERDICT_SHADES["better" if is_better else "worse"]
+    return TableCell(f"{ratio:.2f}", losses, ratio, shade=colour, tip=tip)
 
 
 def speed_cell(board: Board, ended: Sequence[RunRow]) -> TableCell:
