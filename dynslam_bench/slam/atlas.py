@@ -60,20 +60,20 @@ class Atlas:
     """The root map and all submaps, by number.
 
     Args:
-        world: Keyframes and points of all maps.
+        slam_map: Keyframes and points of all maps.
         submaps: Those of a loaded map, from number 1 on.
         unit_ratio: By how much units of length of two maps may differ: 1 with depth.
 
     Attributes:
-        world: Keyframes and points of all maps.
+        map: Keyframes and points of all maps.
         active: Number of the map that the camera is in, or was in last.
         submaps: The submaps by number, merged ones included.
     """
 
     def __init__(
-        self, world: Map, submaps: Iterable[Submap] = (), *, unit_ratio: float = 1.0
+        self, slam_map: Map, submaps: Iterable[Submap] = (), *, unit_ratio: float = 1.0
     ) -> None:
-        self.world = world
+        self.map = slam_map
         self.active = 0
         self._unit_ratio = unit_ratio
         self.submaps = dict(enumerate(submaps, 1))
@@ -203,14 +203,20 @@ def open_atlas(file: str, camera: Camera, features: MapFeatures, *, depth: bool)
 
 
 def save_atlas(
-    path: Path, atlas: Atlas, world: Map, features: MapFeatures, *, depth: bool, made_by: str = ""
+    path: Path,
+    atlas: Atlas,
+    slam_map: Map,
+    features: MapFeatures,
+    *,
+    depth: bool,
+    made_by: str = "",
 ) -> None:
     """Write the atlas to a file; `open_atlas` restores every bit.
 
     Args:
         path: The file.
         atlas: The atlas.
-        world: Its keyframes and points, or a refined copy of them.
+        slam_map: Its keyframes and points, or a refined copy of them.
         features: The features that it is made of.
         depth: Whether they have depth.
         made_by: Which run made it, in words.
@@ -219,33 +225,33 @@ def save_atlas(
         TrackerError: There is no map yet, or it is too large for a file.
         DynslamError: The file cannot be written.
     """
-    if not world.next_keyframe:
+    if not slam_map.next_keyframe:
         raise TrackerError("there is no map to save: no frame has begun one")
     header = MapHeader(
         sensors="rgbd" if depth else "rgb",
-        camera=described(world.camera),
+        camera=described(slam_map.camera),
         features=features,
-        next_keyframe=world.next_keyframe,
-        next_point=world.next_point,
+        next_keyframe=slam_map.next_keyframe,
+        next_point=slam_map.next_point,
         made_by=made_by[:1000],
     )
-    write_map(path, SavedMap(header, packed(world, atlas.submaps.values())))
+    write_map(path, SavedMap(header, packed(slam_map, atlas.submaps.values())))
 
 
-def packed(world: Map, submaps: Collection[Submap]) -> dict[str, NDArray[Any]]:
+def packed(slam_map: Map, submaps: Collection[Submap]) -> dict[str, NDArray[Any]]:
     """The arrays of a map and its submaps, as `map_files` describes them."""
     # keyframes and points, oldest first; features of each keyframe, without the unused columns
-    slots = world.keyframes
-    points = world.points
-    points = points[np.argsort(world.id[points], kind="stable")]
-    features = np.arange(world.kf_point.shape[1]) < world.kf_count[slots][:, None]
-    arrays = {name: getattr(world, name)[slots] for name in KEYFRAME_ARRAYS}
-    arrays |= {name: getattr(world, name)[slots][features] for name in FEATURE_ARRAYS}
-    arrays |= {name: getattr(world, name)[points] for name in POINT_ARRAYS}
+    slots = slam_map.keyframes
+    points = slam_map.points
+    points = points[np.argsort(slam_map.id[points], kind="stable")]
+    features = np.arange(slam_map.kf_point.shape[1]) < slam_map.kf_count[slots][:, None]
+    arrays = {name: getattr(slam_map, name)[slots] for name in KEYFRAME_ARRAYS}
+    arrays |= {name: getattr(slam_map, name)[slots][features] for name in FEATURE_ARRAYS}
+    arrays |= {name: getattr(slam_map, name)[points] for name in POINT_ARRAYS}
 
     # observations, one point after the other; they name keyframes by row
-    keyframe, feature = world.observations(points)
-    row_of_keyframe = np.zeros(world.kf_alive.size, np.int32)
+    keyframe, feature = slam_map.observations(points)
+    row_of_keyframe = np.zeros(slam_map.kf_alive.size, np.int32)
     row_of_keyframe[slots] = np.arange(len(slots))
     arrays["obs_kf"] = row_of_keyframe[keyframe]
     arrays["obs_ft"] = feature
@@ -282,15 +288,15 @@ def unpacked(saved: SavedMap, camera: Camera, scales: Array) -> Atlas:
     tables["kf_frame"] = np.full(len(count), UNKNOWN_FRAME, np.int64)
     tables["kf_stamp"] = np.full(len(count), np.nan)
     tables["kf_centre"] = np.zeros((len(count), 3))
-    world = Map(camera, scales)
-    world.take_over(tables, header.next_keyframe, header.next_point)
+    slam_map = Map(camera, scales)
+    slam_map.take_over(tables, header.next_keyframe, header.next_point)
 
     submaps: list[Submap] = []
     for start, anchor, bound in zip(
         arrays["submap_start"], arrays["submap_anchor"], arrays["submap_bound"], strict=True
     ):
         submaps.append(Submap(start.copy(), anchor.copy(), float(bound)))
-    return Atlas(world, submaps, unit_ratio=1.0 if header.sensors == "rgbd" else MAX_UNIT_RATIO)
+    return Atlas(slam_map, submaps, unit_ratio=1.0 if header.sensors == "rgbd" else MAX_UNIT_RATIO)
 
 
 def _padded(rows: NDArray[Any], counts: NDArray[np.integer]) -> NDArray[Any]:

@@ -455,11 +455,11 @@ class InitialMap:
     second: View
     motion: TwoViewMotion
 
-    def insert_into(self, world: Map, T_first_world: Array, submap: int) -> list[int]:
+    def insert_into(self, slam_map: Map, T_first_world: Array, submap: int) -> list[int]:
         """Add the two views as keyframes of an empty submap, with their points; returns the keyframes' slots.
 
         Args:
-            world: The map.
+            slam_map: The map.
             T_first_world: Pose ``[4, 4]`` of the first view in the submap's world, world to camera.
             submap: The submap's number (`Map.kf_map`).
         """
@@ -469,16 +469,16 @@ class InitialMap:
         for view, pose in ((self.first, T_first_world), (self.second, T_second_world)):
             frame = view.frame
             slots.append(
-                world.add_keyframe(view.observations, pose, frame.index, frame.timestamp, submap)
+                slam_map.add_keyframe(view.observations, pose, frame.index, frame.timestamp, submap)
             )
 
         # points that both observe
         first_features, second_features = self.motion.matches.T
         position = se3.transform(se3.inverse(T_first_world), self.motion.points)
         rgb = self.first.observations.rgb[first_features]
-        points = world.add_points(position, rgb, slots[0], first_features)
-        world.observe(slots[1], second_features, points)
-        world.refresh(points)
+        points = slam_map.add_points(position, rgb, slots[0], first_features)
+        slam_map.observe(slots[1], second_features, points)
+        slam_map.refresh(points)
         return slots
 
 

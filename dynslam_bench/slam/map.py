@@ -488,32 +488,32 @@ MapView: TypeAlias = tuple[tuple[KeyframeView, ...], tuple[Slots, Array]]
 positions ``[M, 3]`` in metres of all points."""
 
 
-def points_in(world: Map, submap: int) -> Slots:
+def points_in(slam_map: Map, submap: int) -> Slots:
     """Slots of the points of a submap, ascending."""
-    points = world.points
-    return np.asarray(points[world.kf_map[world.obs_kf[points, 0]] == submap])
+    points = slam_map.points
+    return np.asarray(points[slam_map.kf_map[slam_map.obs_kf[points, 0]] == submap])
 
 
-def map_outputs(world: Map) -> MapOutputs:
+def map_outputs(slam_map: Map) -> MapOutputs:
     """Keyframes and map points for files and pictures; of points the root map's alone."""
-    points = points_in(world, 0)
-    records = tuple(_keyframe_record(world, slot) for slot in world.keyframes.tolist())
-    observations = world.n_obs[points].astype(np.int64)
+    points = points_in(slam_map, 0)
+    records = tuple(_keyframe_record(slam_map, slot) for slot in slam_map.keyframes.tolist())
+    observations = slam_map.n_obs[points].astype(np.int64)
     return MapOutputs(
-        records, world.id[points], world.position[points], world.rgb[points], observations
+        records, slam_map.id[points], slam_map.position[points], slam_map.rgb[points], observations
     )
 
 
-def _keyframe_record(world: Map, slot: int) -> KeyframeRecord:
+def _keyframe_record(slam_map: Map, slot: int) -> KeyframeRecord:
     """What files hold of a keyframe."""
     return KeyframeRecord(
-        int(world.kf_id[slot]),
-        int(world.kf_frame[slot]),
-        float(world.kf_stamp[slot]),
-        se3.inverse(world.kf_pose[slot]),
-        int(world.kf_count[slot]),
-        int(np.count_nonzero(world.kf_point[slot] >= 0)),
-        int(world.kf_map[slot]),
+        int(slam_map.kf_id[slot]),
+        int(slam_map.kf_frame[slot]),
+        float(slam_map.kf_stamp[slot]),
+        se3.inverse(slam_map.kf_pose[slot]),
+        int(slam_map.kf_count[slot]),
+        int(np.count_nonzero(slam_map.kf_point[slot] >= 0)),
+        int(slam_map.kf_map[slot]),
     )
 
 
@@ -521,12 +521,12 @@ class MapViews:
     """Views of a map for filters; computed again after a keyframe or in another submap.
 
     Args:
-        world: The map.
+        slam_map: The map.
         depth_images: How many of the newest keyframes keep their depth image.
     """
 
-    def __init__(self, world: Map, depth_images: int) -> None:
-        self._world = world
+    def __init__(self, slam_map: Map, depth_images: int) -> None:
+        self._map = slam_map
         self._max_depth_images = depth_images
         self._depth_images: dict[int, NDArray[np.float32]] = {}
         self._computed_for: tuple[int, int] | None = None
@@ -534,40 +534,40 @@ class MapViews:
     def add_keyframe(self, slot: int, depth: NDArray[np.float32]) -> None:
         """A keyframe was made; those that were culled for it lose their depth images."""
         self._depth_images[slot] = depth
-        newest = self._world.keyframes[::-1][: self._max_depth_images]
+        newest = self._map.keyframes[::-1][: self._max_depth_images]
         self._depth_images = {
             stored: image for stored, image in self._depth_images.items() if stored in newest
         }
 
     def of(self, submap: int) -> MapView:
         """What filters see while the camera is in a submap."""
-        world = self._world
-        if self._computed_for != (world.next_keyframe, submap):
-            self._computed_for = world.next_keyframe, submap
-            newest = world.submap(submap)[::-1][:VIEWS].tolist()
-            points = points_in(world, submap)
+        slam_map = self._map
+        if self._computed_for != (slam_map.next_keyframe, submap):
+            self._computed_for = slam_map.next_keyframe, submap
+            newest = slam_map.submap(submap)[::-1][:VIEWS].tolist()
+            points = points_in(slam_map, submap)
             keyframes = tuple(map(self._keyframe, newest))
-            self._view: MapView = (keyframes, (world.id[points], world.position[points]))
+            self._view: MapView = (keyframes, (slam_map.id[points], slam_map.position[points]))
         return self._view
 
     def _keyframe(self, slot: int) -> KeyframeView:
         """What filters may read of a keyframe."""
-        world = self._world
-        n = int(world.kf_count[slot])
+        slam_map = self._map
+        n = int(slam_map.kf_count[slot])
         keypoints = Keypoints(
-            world.kf_raw[slot, :n],
-            world.kf_octave[slot, :n].astype(np.int32),
-            world.kf_angle[slot, :n],
-            world.kf_response[slot, :n],
-            world.kf_words[slot, :n].view(np.uint8),
+            slam_map.kf_raw[slot, :n],
+            slam_map.kf_octave[slot, :n].astype(np.int32),
+            slam_map.kf_angle[slot, :n],
+            slam_map.kf_response[slot, :n],
+            slam_map.kf_words[slot, :n].view(np.uint8),
         )
         return KeyframeView(
-            se3.inverse(world.kf_pose[slot]),
+            se3.inverse(slam_map.kf_pose[slot]),
             keypoints,
-            world.kf_xy[slot, :n],
-            world.kf_z[slot, :n],
+            slam_map.kf_xy[slot, :n],
+            slam_map.kf_z[slot, :n],
             self._depth_images.get(slot),
-            float(world.kf_stamp[slot]),
+            float(slam_map.kf_stamp[slot]),
         )
 
 

@@ -521,7 +521,7 @@ def rescale(history: Sequence[FramePose], scales: Mapping[int, float]) -> None:
 
 
 def trajectory(
-    history: Sequence[FramePose], world: Map, settings: MotionModelSettings
+    history: Sequence[FramePose], slam_map: Map, settings: MotionModelSettings
 ) -> Trajectory:
     """Camera-to-world poses in the order of their stamps, smoothed where the settings say so.
 
@@ -530,13 +530,15 @@ def trajectory(
     """
     # frames of the root map, by stamp; of equal stamps the first
     frames = {
-        frame.timestamp: frame for frame in reversed(history) if world.kf_map[frame.reference] == 0
+        frame.timestamp: frame
+        for frame in reversed(history)
+        if slam_map.kf_map[frame.reference] == 0
     }
     stamps = np.array(sorted(frames), np.float64)
     ordered = [frames[stamp] for stamp in sorted(frames)]
 
     # world-to-camera poses by the keyframes as they are now
-    absolute = [frame.T_cam_ref @ world.kf_pose[frame.reference] for frame in ordered]
+    absolute = [frame.T_cam_ref @ slam_map.kf_pose[frame.reference] for frame in ordered]
     poses = np.array(absolute).reshape(-1, 4, 4)
 
     if settings.smooth and len(poses) > 2:
