@@ -165,14 +165,14 @@ class Features(NamedTuple):
         xy: Undistorted pixels ``[N, 2]``.
         right: Columns in the right image ``[N]``, pixels; NaN without depth.
         octave: int64 ``[N]``.
-        words: Descriptors ``[N, W]``.
+        descriptors: uint64 ``[N, W]``.
         grid: Cells of the features.
     """
 
     xy: NDArray[np.float64]
     right: NDArray[np.float64]
     octave: NDArray[np.int64]
-    words: Words
+    descriptors: Words
     grid: CellGrid
 
 
@@ -188,7 +188,7 @@ class _SearchFeatures(NamedTuple):
         xy: float64 ``[N, 2]``, undistorted pixels.
         right: float64 ``[N]``, columns in the right image; NaN without depth.
         octave: int64 ``[N]``.
-        words: uint64 ``[N, W]``, descriptors.
+        descriptors: uint64 ``[N, W]``.
         free: bool ``[N]``, features that may be matched.
     """
 
@@ -200,7 +200,7 @@ class _SearchFeatures(NamedTuple):
     xy: NDArray[np.float64]
     right: NDArray[np.float64]
     octave: NDArray[np.int64]
-    words: Words
+    descriptors: Words
     free: NDArray[np.bool_]
 
 
@@ -213,7 +213,7 @@ class _SearchTargets(NamedTuple):
         radius: float64 ``[M]``, half sides of the search windows, pixels.
         octave_low: int64 ``[M]``, lowest octave of a match.
         octave_high: int64 ``[M]``, highest.
-        words: uint64 ``[M, W]``, descriptors.
+        descriptors: uint64 ``[M, W]``.
     """
 
     xy: NDArray[np.float64]
@@ -221,7 +221,7 @@ class _SearchTargets(NamedTuple):
     radius: NDArray[np.float64]
     octave_low: NDArray[np.int64]
     octave_high: NDArray[np.int64]
-    words: Words
+    descriptors: Words
 
 
 @kernel
@@ -276,7 +276,7 @@ def _search(
                 if right[j] == right[j] and target_right == target_right:
                     if abs(right[j] - target_right) > r:
                         continue
-                d = distance(targets.words[i], features.words[j])
+                d = distance(targets.descriptors[i], features.descriptors[j])
                 if d < first:
                     second = first
                     second_octave = first_octave
@@ -310,7 +310,7 @@ def search_in_radius(
     free: NDArray[np.bool_],
     windows: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
     octave: NDArray[np.int64],
-    words: Words,
+    descriptors: Words,
     *,
     max_distance: int,
     ratio: float = 1.0,
@@ -323,7 +323,7 @@ def search_in_radius(
         windows: Expected pixels ``[M, 2]``, expected right coordinates ``[M]`` (NaN: not compared)
             and half sides of the search windows ``[M]``, pixels.
         octave: Expected octaves ``[M]``; the feature's may be one off.
-        words: Descriptors of the targets ``[M, W]``.
+        descriptors: uint64 ``[M, W]``, those of the targets.
         max_distance: Largest Hamming distance of a match.
         ratio: Nearest over second nearest, tested where both come from one octave; 1 switches the
             test off.
@@ -342,11 +342,11 @@ def search_in_radius(
         xy=features.xy,
         right=features.right,
         octave=features.octave,
-        words=features.words,
+        descriptors=features.descriptors,
         free=free,
     )
     xy, right, radius = windows
-    targets = _SearchTargets(xy, right, radius, octave - 1, octave + 1, words)
+    targets = _SearchTargets(xy, right, radius, octave - 1, octave + 1, descriptors)
     return _search(searched, targets, max_distance, ratio)
 
 

@@ -36,6 +36,8 @@ MAX_UNIT_RATIO = 10.0
 """Without depth each map has its own unit of length, the median depth of its first views: their largest ratio."""
 UNKNOWN_FRAME = -1
 """Frame of a keyframe that is of another run; its stamp is NaN."""
+TABLE_OF_ARRAY = {"kf_words": "kf_descriptor", "words": "descriptor"}
+"""The map's tables that have another name in files."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,9 +247,9 @@ def packed(slam_map: Map, submaps: Collection[Submap]) -> dict[str, NDArray[Any]
     points = slam_map.points
     points = points[np.argsort(slam_map.id[points], kind="stable")]
     features = np.arange(slam_map.kf_point.shape[1]) < slam_map.kf_count[slots][:, None]
-    arrays = {name: getattr(slam_map, name)[slots] for name in KEYFRAME_ARRAYS}
-    arrays |= {name: getattr(slam_map, name)[slots][features] for name in FEATURE_ARRAYS}
-    arrays |= {name: getattr(slam_map, name)[points] for name in POINT_ARRAYS}
+    arrays = {name: _table(slam_map, name)[slots] for name in KEYFRAME_ARRAYS}
+    arrays |= {name: _table(slam_map, name)[slots][features] for name in FEATURE_ARRAYS}
+    arrays |= {name: _table(slam_map, name)[points] for name in POINT_ARRAYS}
 
     # observations, one point after the other; they name keyframes by row
     keyframe, feature = slam_map.observations(points)
@@ -262,6 +264,11 @@ def packed(slam_map: Map, submaps: Collection[Submap]) -> dict[str, NDArray[Any]
     arrays["submap_anchor"] = places[:, 1]
     arrays["submap_bound"] = np.array([submap.bound_m for submap in submaps], np.float64)
     return arrays
+
+
+def _table(slam_map: Map, name: str) -> NDArray[Any]:
+    """The map's table that files hold under a name."""
+    return np.asarray(getattr(slam_map, TABLE_OF_ARRAY.get(name, name)))
 
 
 def unpacked(saved: SavedMap, camera: Camera, scales: Array) -> Atlas:
@@ -288,6 +295,8 @@ def unpacked(saved: SavedMap, camera: Camera, scales: Array) -> Atlas:
     tables["kf_frame"] = np.full(len(count), UNKNOWN_FRAME, np.int64)
     tables["kf_stamp"] = np.full(len(count), np.nan)
     tables["kf_centre"] = np.zeros((len(count), 3))
+    for name, table in TABLE_OF_ARRAY.items():
+        tables[table] = tables.pop(name)
     slam_map = Map(camera, scales)
     slam_map.take_over(tables, header.next_keyframe, header.next_point)
 

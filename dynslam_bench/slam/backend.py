@@ -235,7 +235,7 @@ class RgbdBackend:
 
         # match the local map around the initial pose, and fit the pose to all matches
         _, points = self._local_map.around(initial.keyframe)
-        fit = track_local_map(
+        map_fit = track_local_map(
             self.map,
             current.observations,
             initial.matches,
@@ -245,27 +245,27 @@ class RgbdBackend:
         )
 
         # undo the rolling shutter by the motion to the fitted pose, and fit again
-        observations, fit, velocity = self._refit_rolling_shutter(current, fit)
+        observations, map_fit, velocity = self._refit_rolling_shutter(current, map_fit)
 
         # a pose that too few map points agree with is rejected
         if self._mapping_enabled:
-            self.map.visible[fit.in_view] += 1
-        if fit.count < self._min_inliers():
-            return _with_match_counts(self._lose(current), fit, initial)
+            self.map.visible[map_fit.in_view] += 1
+        if map_fit.count < self._min_inliers():
+            return _with_match_counts(self._lose(current), map_fit, initial)
 
         # weigh the pose against the motion model
-        tracked = self._accept_pose(current, observations, fit)
+        tracked = self._accept_pose(current, observations, map_fit)
         self.shutter.velocity = velocity
 
         # the second frame of a map tells the motion in the first: begin the map again without its distortion
         first = self._uncompensated_first
         self._uncompensated_first = None
         if first is not None and velocity is not None:
-            return self._restart_compensated(current, first, velocity, fit.count)
+            return self._restart_compensated(current, first, velocity, map_fit.count)
 
         # insert a keyframe if the frame shows enough new
-        result = self._update_map(frame, tracked, fit, in_root_map)
-        return _with_match_counts(result, fit, initial)
+        result = self._update_map(frame, tracked, map_fit, in_root_map)
+        return _with_match_counts(result, map_fit, initial)
 
     # ------------------------------------------------------------------ steps of tracking
 
@@ -294,8 +294,8 @@ class RgbdBackend:
         """
         if self._last_frame is not None:
             return self._last_frame
-        stored_bytes = 8 * self.map.words.shape[1]
-        frame_bytes = 8 * measured.words.shape[1]
+        stored_bytes = 8 * self.map.descriptor.shape[1]
+        frame_bytes = 8 * measured.descriptors.shape[1]
         if len(measured) and frame_bytes != stored_bytes:
             raise TrackerError(
                 f"the map's descriptors have {stored_bytes} bytes, frame {frame.index}'s {frame_bytes}",
@@ -368,18 +368,18 @@ class RgbdBackend:
         self._forget_motion()
 
     def _refit_rolling_shutter(
-        self, current: CurrentFrame, fit: MapFit
+        self, current: CurrentFrame, map_fit: MapFit
     ) -> tuple[Observations, MapFit, CameraVelocity | None]:
         """The features compensated by the motion to the frame's pose, the pose fitted to them, and that motion.
 
         The motion is None, and nothing changes, where the rolling shutter is not compensated.
         """
         if not self._compensates_rolling_shutter():
-            return current.observations, fit, None
+            return current.observations, map_fit, None
         return self.shutter.refitted(
             current.measured,
             current.observations,
-            fit,
+            map_fit,
             current.last,
             current.bundle.timestamp,
             force=self._uncompensated_first is not None,
@@ -392,17 +392,17 @@ class RgbdBackend:
         return self.settings.relocalisation.min_inliers
 
     def _accept_pose(
-        self, current: CurrentFrame, observations: Observations, fit: MapFit
+        self, current: CurrentFrame, observations: Observations, map_fit: MapFit
     ) -> TrackedFrame:
         """The frame is tracked: its pose is weighed against the motion model, its inliers count as found."""
-        points = fit.matches.point[fit.inliers]
+        points = map_fit.matches.point[map_fit.inliers]
         if self._mapping_enabled:
             self.map.found[points] += 1
         stamp = current.bundle.timestamp
         pose = self.motion.update(
-            current.last, stamp, fit.estimate.T_cam_world, fit.estimate.information
+            current.last, stamp, map_fit.estimate.T_cam_world, map_fit.estimate.information
         )
-        observed = observe_points(observations, fit.matches.feature[fit.inliers], points)
+        observed = observe_points(observations, map_fit.matches.feature[map_fit.inliers], points)
         tracked = TrackedFrame(observations, observed, pose, stamp)
         self._status = CameraStatus.TRACKED
         self._unrecognised_frames = 0
@@ -542,7 +542,7 @@ class RgbdBackend:
         self,
         frame: FrameBundle,
         tracked: TrackedFrame,
-        fit: MapFit,
+        map_fit: MapFit,
         in_root_map: InitialPose | None,
     ) -> TrackResult:
         """Insert the tracked frame as a keyframe if the policy or a merge asks for it, and record its pose.
@@ -550,12 +550,12 @@ class RgbdBackend:
         Args:
             frame: The frame.
             tracked: Its pose and map points in the active map.
-            fit: The fit that gave them.
+            map_fit: The fit that gave them.
             in_root_map: Its pose in the root map, if the camera is in a submap and was found there.
         """
         timings: dict[str, float] = {}
         verdict = RootMapPose.REJECTED
-        pose = fit.estimate.T_cam_world
+        pose = map_fit.estimate.T_cam_world
         needed = in_root_map is not None or self._keyframe_policy.needs_keyframe(
             self.map, tracked, frame.index, self._reference_keyframe
         )
@@ -567,9 +567,11 @@ class RgbdBackend:
 
         T_ref_world = self.map.kf_pose[self._reference_keyframe]
         T_cam_ref = pose @ se3.inverse(T_ref_world)
-        self._record_pose(frame, T_cam_ref, fit.estimate.information)
+        self._record_pose(frame, T_cam_ref, map_fit.estimate.information)
         self._update_active_map()
-        result = self._result(tracked.T_cam_world, timings, residual_px=fit.estimate.residual_px)
+        result = self._result(
+            tracked.T_cam_world, timings, residual_px=map_fit.estimate.residual_px
+        )
 
         merged = self.atlas.active == ROOT_MAP
         if in_root_map is None or merged or verdict is RootMapPose.REJECTED:
@@ -714,11 +716,11 @@ class RgbdBackend:
         return trajectory(self.history, self._refined_map or self.map, self.settings.motion)
 
 
-def _with_match_counts(result: TrackResult, fit: MapFit, initial: InitialPose) -> TrackResult:
+def _with_match_counts(result: TrackResult, map_fit: MapFit, initial: InitialPose) -> TrackResult:
     """The result with the stats of matching."""
     counts = {
-        "matches": len(fit.matches.feature),
-        "inliers": fit.count,
+        "matches": len(map_fit.matches.feature),
+        "inliers": map_fit.count,
         "relocalised": initial.relocalised,
     }
     return replace(result, stats={**result.stats, **counts})

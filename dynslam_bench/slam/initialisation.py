@@ -168,7 +168,13 @@ def match_views(
     windows = expected, np.full(len(first), np.nan), np.full(len(first), radius_px)
     free = np.ones(len(second), bool)
     feature = search_in_radius(
-        second, free, windows, first.octave, first.words, max_distance=MAX_DISTANCE, ratio=RATIO
+        second,
+        free,
+        windows,
+        first.octave,
+        first.descriptors,
+        max_distance=MAX_DISTANCE,
+        ratio=RATIO,
     )
     rows = np.flatnonzero(feature >= 0)
     rows = rows[rotation_consistent(first.angle[rows], second.angle[feature[rows]])]

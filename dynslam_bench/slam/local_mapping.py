@@ -244,15 +244,15 @@ class LocalMapper:
         # match them with all features around
         grid = CellGrid.of(xy, slam_map.camera.width, slam_map.camera.height)
         right_of_features = slam_map.kf_right[keyframe, :n]
-        words_of_features = slam_map.kf_words[keyframe, :n]
-        features = Features(xy, right_of_features, octaves, words_of_features, grid)
+        descriptors_of_features = slam_map.kf_descriptor[keyframe, :n]
+        features = Features(xy, right_of_features, octaves, descriptors_of_features, grid)
         windows = (uv, right, FUSION_RADIUS_PX * slam_map.scales[octave])
         feature = search_in_radius(
             features,
             np.ones(n, bool),
             windows,
             octave,
-            slam_map.words[points],
+            slam_map.descriptor[points],
             max_distance=MAX_DISTANCE,
         )
         squared_error = ((xy[feature] - uv) ** 2).sum(axis=1)
@@ -465,7 +465,7 @@ class View(NamedTuple):
         xy: float64 ``[F, 2]``, undistorted pixels.
         z: float64 ``[F]``, depth in metres, 0 missing.
         octave: int64 ``[F]``.
-        words: uint64 ``[F, W]``, descriptors.
+        descriptors: uint64 ``[F, W]``.
     """
 
     pose: Array
@@ -473,7 +473,7 @@ class View(NamedTuple):
     xy: Array
     z: Array
     octave: Slots
-    words: Words
+    descriptors: Words
 
 
 @kernel
@@ -534,7 +534,7 @@ def _triangulate(
                 continue
 
             # and look more alike than the best one so far
-            d = distance(view_a.words[a], view_b.words[b])
+            d = distance(view_a.descriptors[a], view_b.descriptors[b])
             if d > MAX_DISTANCE or d >= best_distance[i]:
                 continue
 
@@ -631,5 +631,5 @@ def _view(slam_map: Map, slot: int) -> View:
         slam_map.kf_xy[slot],
         slam_map.kf_z[slot].astype(np.float64),
         slam_map.kf_octave[slot].astype(np.int64),
-        slam_map.kf_words[slot],
+        slam_map.kf_descriptor[slot],
     )

@@ -45,7 +45,7 @@ FEATURE_TABLES = {
     "kf_angle": (np.float32, 0),
     "kf_info": (float, 0),
     "kf_info_right": (float, 0),
-    "kf_words": (np.uint64, 0, 4),
+    "kf_descriptor": (np.uint64, 0, 4),
     "kf_point": (np.int32, 0),
 }
 """Type and shape of what is stored for each feature of each keyframe; a 0 becomes the number of features."""
@@ -55,7 +55,7 @@ POINT_TABLES = {
     "position": (float, 3),
     "normal": (float, 3),
     "far": (float,),
-    "words": (np.uint64, 4),
+    "descriptor": (np.uint64, 4),
     "rgb": (np.uint8, 3),
     "visible": (np.int32,),
     "found": (np.int32,),
@@ -114,12 +114,12 @@ class KeyframeViews(NamedTuple):
     """What keyframes tell of the points that they observe.
 
     Attributes:
-        words: uint64 ``[S, F, W]``, descriptors.
+        descriptors: uint64 ``[S, F, W]``.
         octave: int8 ``[S, F]``.
         centre: float64 ``[S, 3]``, camera centres in the world.
     """
 
-    words: Any
+    descriptors: Any
     octave: Any
     centre: Array
 
@@ -171,7 +171,7 @@ class Map:
         kf_angle: float32 ``[S, F]``, degrees.
         kf_info: float64 ``[S, F]``, inverse variance of the pixel, see `Observations`.
         kf_info_right: float64 ``[S, F]``, inverse variance of the right coordinate.
-        kf_words: uint64 ``[S, F, W]``, descriptors.
+        kf_descriptor: uint64 ``[S, F, W]``, bits in words of 64.
         kf_point: int32 ``[S, F]``, slot of the observed point, or -1.
         alive: bool ``[M]``, whether the point's slot is in use.
         id: int64 ``[M]``, number of the point in the order of creation.
@@ -179,7 +179,7 @@ class Map:
         normal: float64 ``[M, 3]``, mean viewing direction.
         far: float64 ``[M]``, largest distance at which the point's reference scale is still in the
             pyramid.
-        words: uint64 ``[M, W]``, descriptor.
+        descriptor: uint64 ``[M, W]``.
         rgb: uint8 ``[M, 3]``, colour.
         visible: int32 ``[M]``, frames that should have observed it.
         found: int32 ``[M]``, frames that did.
@@ -252,7 +252,7 @@ class Map:
     ) -> int:
         """Store a frame's features as a keyframe that observes no points yet; returns its slot."""
         n = len(observations)
-        slot = self._free_keyframe_slot(*observations.words.shape)
+        slot = self._free_keyframe_slot(*observations.descriptors.shape)
         self.kf_id[slot] = self.next_keyframe
         self.kf_alive[slot] = True
         self.kf_map[slot] = submap
@@ -272,7 +272,7 @@ class Map:
         self.kf_angle[slot, :n] = observations.angle
         self.kf_info[slot, :n] = observations.info
         self.kf_info_right[slot, :n] = observations.info_right
-        self.kf_words[slot, :n] = observations.words
+        self.kf_descriptor[slot, :n] = observations.descriptors
         self.kf_point[slot] = -1
         return slot
 
@@ -280,8 +280,8 @@ class Map:
         """A free slot, in tables that have room for so many features with so many words of descriptor."""
         # the first keyframe decides how long descriptors are
         if not self.next_keyframe:
-            self.kf_words = np.zeros((0, 0, words), np.uint64)
-            self.words = np.zeros((0, words), np.uint64)
+            self.kf_descriptor = np.zeros((0, 0, words), np.uint64)
+            self.descriptor = np.zeros((0, words), np.uint64)
 
         room = self.kf_point.shape[1]
         if features > room:
@@ -412,9 +412,9 @@ class Map:
 
     def refresh(self, points: Slots) -> None:
         """Renew descriptor, viewing direction and scale range of points from their observations."""
-        views = KeyframeViews(self.kf_words, self.kf_octave, self.kf_centre)
+        views = KeyframeViews(self.kf_descriptor, self.kf_octave, self.kf_centre)
         _refresh(
-            points, self._point_views, self.words, self._observation_tables, views, self.scales
+            points, self._point_views, self.descriptor, self._observation_tables, views, self.scales
         )
 
     def release(self) -> None:
@@ -559,7 +559,7 @@ class MapViews:
             slam_map.kf_octave[slot, :n].astype(np.int32),
             slam_map.kf_angle[slot, :n],
             slam_map.kf_response[slot, :n],
-            slam_map.kf_words[slot, :n].view(np.uint8),
+            slam_map.kf_descriptor[slot, :n].view(np.uint8),
         )
         return KeyframeView(
             se3.inverse(slam_map.kf_pose[slot]),
@@ -628,7 +628,7 @@ def _replace(tables: ObservationTables, old: int, new: int) -> None:
 def _refresh(
     points: Slots,
     views: PointViews,
-    words: Any,
+    descriptors: Any,
     tables: ObservationTables,
     keyframes: KeyframeViews,
     scales: Array,
@@ -651,15 +651,15 @@ def _refresh(
                 score = 0
                 for b in range(first, n):
                     score += distance(
-                        keyframes.words[obs_kf[p, a], obs_ft[p, a]],
-                        keyframes.words[obs_kf[p, b], obs_ft[p, b]],
+                        keyframes.descriptors[obs_kf[p, a], obs_ft[p, a]],
+                        keyframes.descriptors[obs_kf[p, b], obs_ft[p, b]],
                     )
                 if score < best_score:
                     best = a
                     best_score = score
         # whole rows would compile a message for shapes that differ, seconds of it
-        for w in range(words.shape[1]):
-            words[p, w] = keyframes.words[obs_kf[p, best], obs_ft[p, best], w]
+        for w in range(descriptors.shape[1]):
+            descriptors[p, w] = keyframes.descriptors[obs_kf[p, best], obs_ft[p, best], w]
 
         # scale range by the oldest observation, and mean viewing direction
         sx = 0.0

@@ -445,7 +445,7 @@ class RollingShutter:
         self,
         raw: Observations,
         observations: Observations,
-        fit: MapFit,
+        map_fit: MapFit,
         last: TrackedFrame,
         timestamp: float,
         *,
@@ -459,15 +459,15 @@ class RollingShutter:
         Args:
             raw: The measured features.
             observations: The features as `predicted` gave them.
-            fit: The pose so far, fitted to `observations`.
+            map_fit: The pose so far, fitted to `observations`.
             last: The last tracked frame.
             timestamp: The frame's stamp, seconds.
             force: Whether fewer points may agree, as before the first frame is compensated.
         """
-        pose = fit.estimate.T_cam_world
+        pose = map_fit.estimate.T_cam_world
         dt = timestamp - last.timestamp
         if not 0 < dt <= MAX_GAP_S:
-            return observations, fit, None
+            return observations, map_fit, None
 
         # velocity from the last pose; a camera exposes at a regular rate, however its frames were stamped
         usual = float(np.median(self._intervals)) if self._intervals else dt
@@ -479,9 +479,9 @@ class RollingShutter:
 
         # compensate by it and fit again
         compensated = compensate_rolling_shutter(raw, self._camera, velocity)
-        refit = fit_pose(self._camera, compensated, fit.matches, pose, fit.in_view)
-        if refit.count < MIN_AGREEING * fit.count and not force:
-            return observations, fit, None
+        refit = fit_pose(self._camera, compensated, map_fit.matches, pose, map_fit.in_view)
+        if refit.count < MIN_AGREEING * map_fit.count and not force:
+            return observations, map_fit, None
         return compensated, refit, velocity
 
 

@@ -160,7 +160,7 @@ def recognition_scores(slam_map: Map, keyframes: Slots, observations: Observatio
     _index_substrings(slam_map)
 
     # table of the frame's substrings by position and value: 0 if the frame has it, else -1
-    query = _substrings(observations.words)
+    query = _substrings(observations.descriptors)
     counts = np.full((len(query), VALUES), -1, np.int64)
     np.put_along_axis(counts, query.astype(np.int64), 0, axis=1)
 
@@ -177,9 +177,9 @@ def recognition_scores(slam_map: Map, keyframes: Slots, observations: Observatio
     return np.asarray(scores / np.sqrt(points))
 
 
-def _substrings(words: Words) -> NDArray[np.uint16]:
+def _substrings(descriptors: Words) -> NDArray[np.uint16]:
     """Every `STRIDE`-th substring of descriptors ``[N, W]``, by position ``[P, N]``."""
-    return np.ascontiguousarray(words).view(np.uint16)[:, ::STRIDE].T
+    return np.ascontiguousarray(descriptors).view(np.uint16)[:, ::STRIDE].T
 
 
 def _index_substrings(slam_map: Map) -> None:
@@ -190,8 +190,8 @@ def _index_substrings(slam_map: Map) -> None:
         new = keyframe != slam_map.kf_id[slot]
         count = substrings.shape[1]
         if new or abs(observed[slot] - count) > CHANGED * count:
-            words = slam_map.kf_words[slot, slam_map.kf_point[slot] >= 0]
-            columns = np.ascontiguousarray(_substrings(words))
+            descriptors = slam_map.kf_descriptor[slot, slam_map.kf_point[slot] >= 0]
+            columns = np.ascontiguousarray(_substrings(descriptors))
             slam_map.substrings[slot] = int(slam_map.kf_id[slot]), np.sort(columns)
 
 
@@ -222,8 +222,8 @@ def match_keyframe(slam_map: Map, keyframe: int, observations: Observations) -> 
     point = slam_map.kf_point[keyframe, : slam_map.kf_count[keyframe]]
     rows = np.flatnonzero(point >= 0)
     feature, row = match_brute_force(
-        observations.words,
-        slam_map.kf_words[keyframe, rows],
+        observations.descriptors,
+        slam_map.kf_descriptor[keyframe, rows],
         max_distance=MAX_DISTANCE,
         ratio=RATIO,
     )
@@ -581,7 +581,10 @@ class RotationEstimate:
         """
         # match the two images, and keep what fits one homography
         before, now = match_brute_force(
-            self.observations.words, observations.words, max_distance=MAX_DISTANCE, ratio=RATIO
+            self.observations.descriptors,
+            observations.descriptors,
+            max_distance=MAX_DISTANCE,
+            ratio=RATIO,
         )
         if len(before) < CONNECTED:
             return None

@@ -263,7 +263,7 @@ def match_last_frame(
         np.ones(len(observations.xy), bool),
         (uv, right, radius_px * slam_map.scales[octave]),
         octave,
-        last_observations.words[rows],
+        last_observations.descriptors[rows],
         max_distance=max_distance,
         ratio=LAST_FRAME_RATIO,
     )
@@ -314,7 +314,7 @@ def match_map(
         free,
         (uv[rest], right[rest], radius[rest]),
         octave[rest],
-        slam_map.words[wanted],
+        slam_map.descriptor[wanted],
         max_distance=settings.max_distance,
         ratio=MAP_RATIO,
     )

@@ -380,21 +380,23 @@ def test_only_the_keyframes_given_are_chosen(room, slam_map):
 def test_of_equal_scores_the_newer_keyframe_is_first(room, slam_map):
     """A frame whose substrings no keyframe has scores zero everywhere."""
     stranger = observations(PointWorld(seed=9), 0.0, 100)
-    stored = slam_map.kf_words[slam_map.keyframes].view(np.uint16)[:, :, ::STRIDE]
+    stored = slam_map.kf_descriptor[slam_map.keyframes].view(np.uint16)[:, :, ::STRIDE]
     used = np.concatenate(
         [stored[row, : slam_map.kf_count[slot]] for row, slot in enumerate(slam_map.keyframes)]
     )
-    stranger.words.view(np.uint16)[:] = np.setdiff1d(np.arange(1 << 16), used)[0]
+    stranger.descriptors.view(np.uint16)[:] = np.setdiff1d(np.arange(1 << 16), used)[0]
     newest = slam_map.keyframes[np.argsort(-slam_map.kf_id[slam_map.keyframes])]
     assert top_candidates(slam_map, slam_map.keyframes, stranger, 4) == newest[:4].tolist()
 
 
 def reference_scores(slam_map, keyframes, features):
     """The same score, counted substring by substring without an index."""
-    query = np.ascontiguousarray(features.words).view(np.uint16)[:, ::STRIDE]
+    query = np.ascontiguousarray(features.descriptors).view(np.uint16)[:, ::STRIDE]
     shared = []
     for slot in keyframes.tolist():
-        own = slam_map.kf_words[slot, slam_map.kf_point[slot] >= 0].view(np.uint16)[:, ::STRIDE]
+        own = slam_map.kf_descriptor[slot, slam_map.kf_point[slot] >= 0].view(np.uint16)[
+            :, ::STRIDE
+        ]
         shared.append([own[np.isin(own[:, p], query[:, p]), p] for p in range(query.shape[1])])
     everything = [np.concatenate([columns[p] for columns in shared]) for p in range(query.shape[1])]
     total = sum(map(len, everything))
