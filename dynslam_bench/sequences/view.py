@@ -18,7 +18,8 @@ class Wrapped:
     base: Sequence
 
     def __getattr__(self, name: str) -> object:
-        if name.startswith("__") or "base" not in vars(self):  # not yet set while unpickling
+        # `base` is not yet set while unpickling
+        if name.startswith("__") or "base" not in vars(self):
             raise AttributeError(name)
         return getattr(self.base, name)
 
@@ -147,12 +148,15 @@ def part_of(sequence: Sequence, offset: int = 0) -> Part:
         sequence: The opened sequence, cut and preprocessed or not.
         offset: How many leading frames of the named part were dropped to get it.
     """
+    # through all views to the whole sequence, and its frames that are seen
     base: Any = sequence
     frames = range(len(sequence))
     while isinstance(base, Wrapped):
         if isinstance(base, SequenceView):
             frames = base.range[frames.start : frames.stop : frames.step]
         base = base.base
+
+    # what is filmed, with and without the draw of the sensors' noise
     noise: int | None = getattr(base, "noise", None)
     scene_digest = getattr(base, "scene_digest", None)
     scene = base.digest() if scene_digest is None else str(scene_digest())
