@@ -95,16 +95,16 @@ class Atlas:
         self.active = 1 + len(self.submaps)
         self.submaps[self.active] = submap
 
-    def move_nearby(self, number: int, before: Array, after: Array, scales: Array) -> None:
+    def move_nearby(self, number: int, T_before: Array, T_after: Array, scales: Array) -> None:
         """Keyframes of a map were moved: what is known of places in its world moves with the nearest keyframe.
 
         Args:
             number: The submap, or 0.
-            before: World-to-camera poses ``[K, 4, 4]`` of its keyframes until now.
-            after: Those from now on.
+            T_before: World-to-camera poses ``[K, 4, 4]`` of its keyframes until now.
+            T_after: Those from now on.
             scales: What lengths around each were multiplied by ``[K]``.
         """
-        centres = se3.inverse(before)[:, :3, 3]
+        centres = se3.inverse(T_before)[:, :3, 3]
         for other, submap in self.submaps.items():
             if number not in (0, other):
                 continue
@@ -114,9 +114,9 @@ class Atlas:
             scale = float(scales[nearest])
 
             # it stays where it is as seen from the nearest keyframe
-            T_world_cam = se3.inverse(after[nearest])
-            moved = se3.transform(T_world_cam, scale * se3.transform(before[nearest], place))
-            rotation = float(se3.rotation_angle(T_world_cam @ before[nearest]))
+            T_world_cam = se3.inverse(T_after[nearest])
+            moved = se3.transform(T_world_cam, scale * se3.transform(T_before[nearest], place))
+            rotation = float(se3.rotation_angle(T_world_cam @ T_before[nearest]))
             slack = min(submap.slack + rotation, np.pi)
             if number:
                 self.submaps[other] = replace(submap, start=moved, slack=slack)
@@ -133,22 +133,25 @@ class Atlas:
         slacks = [self.submaps[number].slack for number in (one, other) if number in self.submaps]
         return float(sum(slacks))
 
-    def reachable(self, left: int, there: int, last: Array, now: Array, bound_m: float) -> bool:
+    def reachable(
+        self, left: int, there: int, last_centre: Array, centre: Array, bound_m: float
+    ) -> bool:
         """Whether a camera can have moved from one place to another.
 
         Args:
             left: The map in which it was tracked last.
             there: The map of the place; nothing is known of the way to submaps other than `left`.
-            last: Its centre then ``[3]``.
-            now: Its centre now.
+            last_centre: Its centre then ``[3]``.
+            centre: Its centre at the place ``[3]``.
             bound_m: How far it may have moved.
         """
+        # within one map by the straight distance; to the root map by what is known of the submap's place
         if there == left:
-            return bool(np.linalg.norm(now - last) <= bound_m)
+            return bool(np.linalg.norm(centre - last_centre) <= bound_m)
         if there != 0:
             return False
-        anchor, bound = self._from_root(left, last, bound_m)
-        return bool(np.linalg.norm(now - anchor) <= bound)
+        anchor, bound = self._from_root(left, last_centre, bound_m)
+        return bool(np.linalg.norm(centre - anchor) <= bound)
 
     def admits_start(
         self, number: int, moved: Callable[[Array], Array], drift_m: float = 0.0
@@ -283,6 +286,8 @@ def unpacked(saved: SavedMap, camera: Camera, scales: Array) -> Atlas:
     header = saved.header
     count = arrays["kf_count"]
     n_obs = arrays["n_obs"]
+
+    # what the file holds, each keyframe's features and each point's observations in a row of a table
     tables = {name: arrays[name].copy() for name in (*KEYFRAME_ARRAYS, *POINT_ARRAYS)}
     tables |= {name: _padded(arrays[name], count) for name in FEATURE_ARRAYS}
     tables |= {name: _padded(arrays[name], n_obs) for name in OBSERVATION_ARRAYS}

@@ -311,22 +311,26 @@ class LoopCloser:
     # ------------------------------------------------------------------ detect and verify
 
     def _extend_path(self, slot: int) -> None:
+        """Add the way from the last keyframe to the path length: drift grows with it."""
         pose = self.map.kf_pose[slot].copy()
         number = int(self.map.kf_id[slot])
         # the first two views of a submap
         for begun in range(next(reversed(self._path), number - 1) + 1, number):
             self._path[begun] = self._path_length
+
+        # distance, and rotation as if it were one
         if self._last_pose is not None:
             step = pose @ se3.inverse(self._last_pose)
-            rotation = ROTATION_M if self._scale_is_known else ROTATION_DEPTHS
+            length_per_radian = ROTATION_M if self._scale_is_known else ROTATION_DEPTHS
             self._path_length += float(
-                np.linalg.norm(step[:3, 3]) + rotation * se3.rotation_angle(step)
+                np.linalg.norm(step[:3, 3]) + length_per_radian * se3.rotation_angle(step)
             )
         self._last_pose = pose
         self._path[number] = self._path_length
 
     def _verified(self, slot: int, observations: Observations) -> Loop | None:
         """The first of the best-ranked candidates that is verified."""
+        # keyframes that drift may separate from this one, of this map or, for a merge, the root map
         slam_map = self.map
         old = weakly_connected(slam_map, slot)
         there = slam_map.kf_map[old]
@@ -334,29 +338,35 @@ class LoopCloser:
         old = old[(there == here) | (there == 0) | (here == 0)]
         if not len(old):
             return None
+
+        # by place recognition: a candidate has to score as well as the worst of the neighbours
         near = np.setdiff1d(around(slam_map, slot)[1:], old)
         score = recognition_scores(slam_map, np.concatenate([near, old]), observations)
         least = score[: len(near)].min(initial=np.inf)
         score = score[len(near) :]
+
+        # by geometry: the first one that is verified
         rng = stream(self._seed, "loop", int(slam_map.kf_id[slot]))
-        best = np.argsort(-score, kind="stable")[:CANDIDATES]
-        loops = (
-            self._verified_candidate(slot, int(old[k]), observations, rng)
-            for k in best
-            if score[k] >= least
-        )
-        return next((loop for loop in loops if loop is not None), None)
+        for k in np.argsort(-score, kind="stable")[:CANDIDATES]:
+            if score[k] >= least:
+                loop = self._verified_candidate(slot, int(old[k]), observations, rng)
+                if loop is not None:
+                    return loop
+        return None
 
     def _verified_candidate(
         self, slot: int, candidate: int, observations: Observations, rng: np.random.Generator
     ) -> Loop | None:
         """The loop to a candidate, if the points around it explain enough and drift explains the correction."""
+        # the pose by the points around the candidate
         s = self.settings.loop_closing
         tracking = self.settings.tracking
         least = MIN_MATCHES, MIN_MATCHES // 2
         place = recognise_place(self.map, candidate, observations, tracking, rng, *least)
         if place is None or len(place.matches) < s.min_inliers or place.share < MIN_SHARE:
             return None
+
+        # the correction, which drift has to explain; for a merge the pose must be well determined
         loop = self._loop(slot, place)
         if loop is None or (
             loop.merges and pose_uncertainty(self.map, observations, place, rng) > MERGE_UNCERTAINTY
@@ -371,6 +381,7 @@ class LoopCloser:
 
         The loop is None where the place does not determine the merge well enough.
         """
+        # a place whose keyframe was culled since counts no more, and one that fits twice neither
         loop = self._loop(slot, place)
         if loop is None or not self.map.kf_alive[place.keyframe]:
             return None, RootMapPose.REJECTED
@@ -410,28 +421,32 @@ class LoopCloser:
 
     def _scale(self, slot: int, place: InitialPose) -> float | None:
         """Median ratio of the depths of common points by the first visit and by this one; None where too few."""
+        # features with a point of each visit
         slam_map = self.map
         first = place.matches
         own = slam_map.kf_point[slot, first.feature].astype(np.int64)
         both = (own >= 0) & (own != first.point)
-        then = se3.transform(place.T_cam_world, slam_map.position[first.point[both]])[:, 2]
-        now = se3.transform(slam_map.kf_pose[slot], slam_map.position[own[both]])[:, 2]
-        ahead = (then > 0) & (now > 0)
-        return (
-            float(np.exp(np.median(np.log(then[ahead] / now[ahead]))))
-            if ahead.sum() >= MIN_SCALE_POINTS
-            else None
-        )
+
+        # depths of both points before the camera, each by its visit's pose
+        first_z = se3.transform(place.T_cam_world, slam_map.position[first.point[both]])[:, 2]
+        own_z = se3.transform(slam_map.kf_pose[slot], slam_map.position[own[both]])[:, 2]
+        ahead = (first_z > 0) & (own_z > 0)
+        if ahead.sum() < MIN_SCALE_POINTS:
+            return None
+        return float(np.exp(np.median(np.log(first_z[ahead] / own_z[ahead]))))
 
     def _within_drift(self, slot: int, loop: Loop) -> bool:
         """Whether drift explains the correction; between submaps, whether the camera can have moved from one there."""
         place = loop.place
         correction = loop.correction
+        # between submaps: matches, and the rotation that the maps may have against each other
         if loop.merges:
             if len(place.matches) < MERGE_INLIERS or place.share < MERGE_SHARE:
                 return False
             slack = self.atlas.slack(*self.map.kf_map[[slot, place.keyframe]].tolist())
             return loop.fits and bool(np.radians(correction.rotated_deg) <= slack)
+
+        # within a map: scale, distance and rotation in proportion to the path
         if not 1 / MAX_SCALE < correction.scale < MAX_SCALE:
             return False
         path = self._path_since(place.keyframe)
@@ -443,6 +458,7 @@ class LoopCloser:
 
     def _fits(self, slot: int, loop: Loop) -> bool:
         """Whether the younger of two submaps can have begun where the merge puts its start."""
+        # path from where the older map was left, on either map, to the two ends of the loop
         younger, _, correction = self._merge_of(slot, loop)
         share = 0.0 if self._scale_is_known else self.settings.loop_closing.drift_share
         left = self._path_at(int(self.map.submap(younger)[0]))
@@ -462,6 +478,8 @@ class LoopCloser:
         depth = float(
             np.median(se3.transform(slam_map.kf_pose[slot], slam_map.position[points])[:, 2])
         )
+
+        # both hypotheses of where the camera is, by the map that says so
         hypotheses = {
             own: replace(place, T_cam_world=slam_map.kf_pose[slot], depth=depth),
             other: replace(place, depth=depth * loop.correction.scale),
@@ -491,6 +509,7 @@ class LoopCloser:
 
     def _correct(self, slot: int, loop: Loop) -> dict[int, float]:
         """Spread the correction over all keyframes of the map by a pose graph; returns the scales of those rescaled."""
+        # the loop edge; a small correction is left to fusion and bundle adjustment
         slam_map = self.map
         correction = loop.correction
         loop_edge = self._edge(loop.place.keyframe, slot, correction.T_cam_now, LOOP_WEIGHT)
@@ -501,6 +520,7 @@ class LoopCloser:
         if (size < NEGLIGIBLE).all():
             return {}
 
+        # the essential graph: keyframes of the map and edges of strong covisibility
         submap = int(slam_map.kf_map[slot])
         slots = slam_map.submap(submap)
         ids = slam_map.kf_id[slots]
@@ -533,6 +553,7 @@ class LoopCloser:
             poses_before: World-to-camera poses ``[S, 4, 4]`` of all slots before the correction.
             scales: What lengths around each slot are multiplied by ``[S]``.
         """
+        # in the frame of the first observer's camera, as it was
         slam_map = self.map
         points = slam_map.points_of(slots)
         reference = slam_map.obs_kf[points, 0]
@@ -540,16 +561,20 @@ class LoopCloser:
         t_before = poses_before[reference, :3, 3]
         local = np.einsum("nij,nj->ni", R_before, slam_map.position[points]) + t_before
         local *= scales[reference, None]
-        now = se3.inverse(slam_map.kf_pose[reference])
-        slam_map.position[points] = np.einsum("nij,nj->ni", now[:, :3, :3], local) + now[:, :3, 3]
+
+        # back to the world by the corrected pose
+        T_world_cam = se3.inverse(slam_map.kf_pose[reference])
+        R_after = T_world_cam[:, :3, :3]
+        t_after = T_world_cam[:, :3, 3]
+        slam_map.position[points] = np.einsum("nij,nj->ni", R_after, local) + t_after
         slam_map.refresh(points)
 
     def _merge_of(self, slot: int, loop: Loop) -> tuple[int, int, Correction]:
         """The younger of the two submaps, the older one, and the correction of the younger."""
         own, other = self.map.kf_map[[slot, loop.place.keyframe]].tolist()
-        return (
-            (own, other, loop.correction) if own > other else (other, own, loop.correction.inverse)
-        )
+        if own > other:
+            return own, other, loop.correction
+        return other, own, loop.correction.inverse
 
     def _merge(self, slot: int, loop: Loop) -> dict[int, float]:
         """Merge two submaps (ORB-SLAM3's ``MergeLocal``): the younger moves onto the older or the root map.
@@ -558,8 +583,11 @@ class LoopCloser:
         """
         slam_map = self.map
         younger, older, correction = self._merge_of(slot, loop)
+        # move the younger map's keyframes and points
         slots = slam_map.move_submap(younger, correction.T_now_before, older, correction.scale)
         rescaled = self._rescale_loop_edges(slots, np.full(len(slots), correction.scale))
+
+        # connect the two by the place that both show
         loop_edge = self._edge(loop.place.keyframe, slot, slam_map.kf_pose[slot], LOOP_WEIGHT)
         self._loop_edges.append(loop_edge)
         return rescaled
@@ -570,6 +598,7 @@ class LoopCloser:
         return dict(zip(slots.tolist(), scales.tolist(), strict=True))
 
     def _edge(self, one: int, other: int, pose_of_other: Array, weight: float = 1.0) -> Edge:
+        """The edge between two keyframes by the pose of the first and one of the other, both world to camera."""
         id_one, id_other = self.map.kf_id[[one, other]].tolist()
         return Edge(id_one, id_other, pose_of_other @ se3.inverse(self.map.kf_pose[one]), weight)
 
@@ -582,11 +611,13 @@ class LoopCloser:
         for slot in slots.tolist():
             near, shared = self.map.covisible(slot)
             older = self.map.kf_id[near] < self.map.kf_id[slot]
+            # the one that shares most, and all that share many
             linked = [*near[older][:1], *near[older & (shared >= STRONG_COVISIBILITY)]]
             pairs |= {(int(other), slot) for other in linked}
         return [self._edge(a, b, self.map.kf_pose[b]) for a, b in sorted(pairs)]
 
     def _fuse(self, slot: int, candidate: int) -> None:
+        """Fuse the points around both ends of a loop, and adjust what lies around the new keyframe."""
         points = self.map.points_of(around(self.map, candidate))
         for keyframe in around(self.map, slot).tolist():
             self.mapper.fuse_into(keyframe, points)
@@ -672,18 +703,23 @@ def spread_scale(ids: Slots, edges: Sequence[Edge], loop_edge: Edge, scale: floa
     Returns:
         Factors ``[N]``.
     """
+    # the wanted difference of the logarithms along each edge: 0, but for the loop's
     all_edges = [*edges, loop_edge]
     one, other = np.searchsorted(ids, [[edge.one, edge.other] for edge in all_edges]).T
     row = np.arange(len(all_edges))
     wanted = np.zeros(len(all_edges))
     wanted[-1] = np.log(scale)
-    ends = np.r_[row, row], np.r_[one, other]
-    values = np.r_[-np.ones(len(row)), np.ones(len(row))]
+
+    # the oldest keyframe of each component stays
     _, part = connected_components(
         coo_array((np.ones(len(row)), (one, other)), shape=(len(ids), len(ids))), False
     )
     _, oldest = np.unique(part, return_index=True)
     free = np.setdiff1d(np.arange(len(ids)), oldest)
+
+    # weighted least squares by the normal equations; a row of the Jacobian holds -1 and 1
+    ends = np.r_[row, row], np.r_[one, other]
+    values = np.r_[-np.ones(len(row)), np.ones(len(row))]
     jacobian = coo_array((values, ends), shape=(len(row), len(ids))).tocsc()[:, free]
     weight = diags_array(np.array([edge.weight for edge in all_edges]))
     logarithms = np.zeros(len(ids))
@@ -704,11 +740,14 @@ def optimise_poses(ids: Slots, poses: Array, edges: Sequence[Edge]) -> Array:
     Returns:
         World to camera ``[N, 4, 4]``.
     """
+    # rows of the poses at both ends, the inverse of each measured pose, and its standard deviations
     one, other = np.searchsorted(ids, [[edge.one, edge.other] for edge in edges]).T
     back = se3.inverse(np.array([edge.T_other_one for edge in edges]))
     sigmas = SIGMAS / np.sqrt([[edge.weight] for edge in edges])
     error = _edge_errors(poses, one, other, back, sigmas)
     cost = float(np.square(error).sum())
+
+    # Levenberg-Marquardt: a step that does not lower the cost is repeated with more damping
     damping = 1e-6
     for _ in range(GRAPH_ITERATIONS):
         trial = se3.exp(_graph_step(poses, one, other, error, sigmas, damping)) @ poses
@@ -736,14 +775,19 @@ def _graph_step(
     poses: Array, one: Slots, other: Slots, error: Array, sigmas: Array, damping: float
 ) -> Array:
     """Twists ``[N, 6]`` on the left of the poses that lower the cost; that of the first one is zero."""
+    # how each error follows a twist on the left of either pose: blocks [6, 6]
     jacobian_log = _inverse_left_jacobian(error * sigmas)
     weight = 1.0 / sigmas[:, :, None]
     by_other = weight * jacobian_log
     by_one = -by_other @ _adjoint(poses[other] @ se3.inverse(poses[one]))
+
+    # the sparse Jacobian [6 E, 6 N - 6], two blocks a row; the first pose stays
     blocks = np.stack([by_one, by_other], axis=1).reshape(-1, 6, 6)
     columns = np.stack([one, other], axis=1).ravel()
     block_rows = blocks, columns, 2 * np.arange(len(error) + 1)
     jacobian = bsr_array(block_rows, shape=(error.size, 6 * len(poses))).tocsc()[:, 6:]
+
+    # damped normal equations
     normal = (jacobian.T @ jacobian).tocsc()
     normal = normal + diags_array(damping * normal.diagonal() + 1e-12)
     twists = -spsolve(normal.tocsc(), jacobian.T @ error.ravel()).reshape(-1, 6)

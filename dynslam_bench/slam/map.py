@@ -251,6 +251,7 @@ class Map:
         submap: int = 0,
     ) -> int:
         """Store a frame's features as a keyframe that observes no points yet; returns its slot."""
+        # the keyframe: number, map, frame, pose
         n = len(observations)
         slot = self._free_keyframe_slot(*observations.descriptors.shape)
         self.kf_id[slot] = self.next_keyframe
@@ -262,6 +263,7 @@ class Map:
         self.next_keyframe += 1
         self.set_pose(slot, T_cam_world)
 
+        # its features, which observe no point yet
         raw = observations.keypoints
         self.kf_raw[slot, :n] = raw.xy
         self.kf_response[slot, :n] = raw.response
@@ -283,6 +285,7 @@ class Map:
             self.kf_descriptor = np.zeros((0, 0, words), np.uint64)
             self.descriptor = np.zeros((0, words), np.uint64)
 
+        # wider tables for more features than any keyframe had, longer ones for another keyframe
         room = self.kf_point.shape[1]
         if features > room:
             self._grow(FEATURE_TABLES, features, axis=1)
@@ -315,6 +318,7 @@ class Map:
 
     def covisible_of(self, points: NDArray[np.integer], exclude: int = -1) -> tuple[Slots, Slots]:
         """Keyframes that observe any of the points (-1 entries are skipped), most first, and how many."""
+        # one entry for each shared point; equal counts: the newer keyframe first
         observers, _ = self.observations(points[points >= 0])
         counts = np.bincount(observers[observers != exclude], minlength=self.kf_alive.size)
         slots = np.flatnonzero(counts)
@@ -332,11 +336,14 @@ class Map:
             merged_into: The other's number.
             scale: What lengths in the submap's world are multiplied by before it is moved.
         """
+        # scale the keyframes' translations, then move their poses: T_cam_new = T_cam_old T_new_old^-1
         slots = self.submap(number)
         points = self.points_of(slots)
         self.kf_pose[slots, :3, 3] *= scale
         for slot in slots.tolist():
             self.set_pose(slot, self.kf_pose[slot] @ se3.inverse(T_new_old))
+
+        # the points, likewise
         self.position[points] = se3.transform(T_new_old, scale * self.position[points])
         self.kf_map[slots] = merged_into
         self.refresh(points)
@@ -369,6 +376,8 @@ class Map:
         fresh = np.arange(self._top, end, dtype=np.int64)
         slots = np.concatenate([np.array(reused, np.int64), fresh])
         self._top = end
+
+        # the points, observed once
         self.id[slots] = np.arange(self.next_point, self.next_point + n)
         self.next_point += n
         self.alive[slots] = True
@@ -405,6 +414,7 @@ class Map:
         """Replace a point by another that is the same point of the scene."""
         self._reserve(int(self.n_obs[new] + self.n_obs[old]))
         _replace(self._observation_tables, old, new)
+        # the frames that should have observed either one, and those that did, count for the new one
         for count in (self.visible, self.found):
             count[new] += count[old]
         self.alive[old] = False
@@ -432,6 +442,7 @@ class Map:
 
     def observations(self, points: NDArray[np.integer]) -> tuple[Ints, Ints]:
         """Keyframe slots and feature numbers of the observations of points, one point after the other."""
+        # row and column of each observation in the tables [M, O]
         count = self.n_obs[points].astype(np.int64)
         row = np.repeat(points, count)
         column = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
@@ -577,12 +588,14 @@ class MapViews:
 @kernel
 def _link_one(tables: ObservationTables, keyframe: int, feature: int, point: int) -> None:
     """Add an observation of a point; a second one by the same keyframe is skipped."""
+    # in the point's list
     end = tables.n_obs[point]
     if (tables.obs_kf[point, :end] == keyframe).any():
         return
     tables.obs_kf[point, end] = keyframe
     tables.obs_ft[point, end] = feature
     tables.n_obs[point] += 1
+    # in the keyframe's
     tables.kf_point[keyframe, feature] = point
 
 
@@ -604,6 +617,7 @@ def _unlink(tables: ObservationTables, keyframes: Slots, features: Slots) -> Non
         if p < 0:
             continue
         tables.kf_point[keyframes[i], features[i]] = -1
+        # close the gap in the point's list, whose order stays
         left = 0
         for o in range(tables.n_obs[p]):
             if obs_kf[p, o] != keyframes[i] or obs_ft[p, o] != features[i]:
@@ -661,7 +675,8 @@ def _refresh(
         for w in range(descriptors.shape[1]):
             descriptors[p, w] = keyframes.descriptors[obs_kf[p, best], obs_ft[p, best], w]
 
-        # scale range by the oldest observation, and mean viewing direction
+        # mean viewing direction, and scale range by the oldest observation: at `far` the patch that it
+        # saw at its octave would have the size of octave 0
         sx = 0.0
         sy = 0.0
         sz = 0.0
@@ -770,6 +785,7 @@ def _redundancy(
         p = tables.kf_point[keyframe, f]
         if p < 0 or not close[f]:
             continue
+        # other keyframes that observe the point as finely, up to one octave
         total = total + 1
         fine = 0
         for o in range(tables.n_obs[p]):

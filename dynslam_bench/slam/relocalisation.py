@@ -280,7 +280,7 @@ def _triples(n: int, count: int, rng: np.random.Generator) -> Slots:
     a = rng.integers(n, size=count)
     b = rng.integers(n - 1, size=count)
     c = rng.integers(n - 2, size=count)
-    # skip the indices that are taken
+    # skip the indices that are taken, so that the three differ
     b += b >= a
     for other in (np.minimum(a, b), np.maximum(a, b)):
         c += c >= other
@@ -290,6 +290,7 @@ def _triples(n: int, count: int, rng: np.random.Generator) -> Slots:
 def _three_point_poses(position: Array, xy: Array, camera: Camera) -> Array:
     """All poses ``[H, 4, 4]``, world to camera, that fit any of the samples ``[S, 3, 3]`` and ``[S, 3, 2]``."""
     solutions = [np.zeros((0, 6))]
+    # up to four poses a sample, as rotation vector and translation (AP3P)
     for points, pixels in zip(position, xy, strict=True):
         try:
             _, rotations, translations = cv2.solveP3P(
@@ -300,6 +301,8 @@ def _three_point_poses(position: Array, xy: Array, camera: Camera) -> Array:
             continue
         vectors = np.reshape(rotations, (-1, 3))
         solutions.append(np.hstack([vectors, np.reshape(translations, (-1, 3))]))
+
+    # as matrices, without solutions that are no numbers
     flat = np.concatenate(solutions)
     flat = flat[np.isfinite(flat).all(axis=1)]
     poses = np.tile(np.eye(4), (len(flat), 1, 1))
@@ -317,9 +320,9 @@ def _ransac_place(
     min_inliers: int,
 ) -> InitialPose | None:
     """The RANSAC pose of matches with a keyframe; None where fewer than `min_inliers` fit it."""
-    f = matches.feature
+    feature = matches.feature
     ransac = ransac_pose(
-        matches.position, observations.xy[f], observations.info[f], slam_map.camera, rng
+        matches.position, observations.xy[feature], observations.info[feature], slam_map.camera, rng
     )
     if ransac is None:
         return None
@@ -393,14 +396,14 @@ def verify_place(
     points = slam_map.points_of(around(slam_map, keyframe))
     estimate = solve(slam_map.camera, observations, matches, candidate.T_cam_world)
     for _ in range(ROUNDS):
-        before = len(matches)
+        count = len(matches)
         more, _ = match_map(
             slam_map, observations, estimate.T_cam_world, matches, points, settings, WIDEN
         )
         joined = matches.joined(more)
         estimate = solve(slam_map.camera, observations, joined, estimate.T_cam_world)
         matches = joined.select(estimate.inliers)
-        if len(matches) <= before:
+        if len(matches) <= count:
             break
     T_cam_world = estimate.T_cam_world
 
@@ -413,6 +416,7 @@ def verify_place(
         in_view = in_view[~observations.mask[pixels]]
     share = float(np.isin(in_view, matches.point).mean()) if len(in_view) else 0.0
 
+    # depth of the place, which distances there are compared with
     depth = np.nan
     if len(matches):
         depth = float(np.median(se3.transform(T_cam_world, matches.position)[:, 2]))
@@ -580,19 +584,19 @@ class RotationEstimate:
             camera: Intrinsics without distortion.
         """
         # match the two images, and keep what fits one homography
-        before, now = match_brute_force(
+        row_before, row_now = match_brute_force(
             self.observations.descriptors,
             observations.descriptors,
             max_distance=MAX_DISTANCE,
             ratio=RATIO,
         )
-        if len(before) < CONNECTED:
+        if len(row_before) < CONNECTED:
             return None
-        xy_before = self.observations.xy[before]
-        xy_now = observations.xy[now]
+        xy_before = self.observations.xy[row_before]
+        xy_now = observations.xy[row_now]
         homography, mask = cv2.findHomography(xy_before, xy_now, cv2.RANSAC, HOMOGRAPHY_PX)
-        fits = np.zeros(len(before), bool) if homography is None else mask.ravel() > 0
-        if np.count_nonzero(fits) < max(CONNECTED, CONNECTED_SHARE * len(before)):
+        fits = np.zeros(len(row_before), bool) if homography is None else mask.ravel() > 0
+        if np.count_nonzero(fits) < max(CONNECTED, CONNECTED_SHARE * len(row_before)):
             return None
 
         # the rotation that aligns their bearings best
@@ -719,8 +723,11 @@ class RelocalisationGate:
         A camera that moves fast, as on a car, may go on as the motion model has it: world-to-camera
         `prediction`.
         """
+        # rotation by the two images
         unrotated = RotationEstimate(last.observations, np.eye(3))
         rotation = unrotated.advanced(observations, self._atlas.map.camera)
+
+        # distance: the predicted step, and what the largest speed adds to it
         centres = se3.inverse(np.stack([last.T_cam_world, prediction]))[:, :3, 3]
         step = float(np.linalg.norm(centres[1] - centres[0]))
         return MotionBound(

@@ -27,7 +27,7 @@ MARGIN_PX = 8.0
 LAST_FRAME_RATIO = 0.9
 """Largest ratio of nearest to second nearest descriptor distance in the search of the last frame's points."""
 MAP_RATIO = 0.85
-"""Largest such ratio in the search of the local map's points."""
+"""Largest ratio of nearest to second nearest descriptor distance in the search of the local map's points."""
 FRONTAL_COSINE = 0.998
 """Points seen within this cosine of their mean viewing direction have the narrow search window (ORB-SLAM2)."""
 OBLIQUE_FACTOR = 1.6
@@ -332,14 +332,14 @@ def solve(
     rounds: int = 4,
 ) -> PoseEstimate:
     """The world-to-camera pose ``[4, 4]`` that fits the matches, starting from a given one."""
-    f = matches.feature
+    feature = matches.feature
     return optimise_pose(
         T_cam_world,
         matches.position,
-        observations.xy[f],
-        observations.right[f],
-        observations.info[f],
-        observations.info_right[f],
+        observations.xy[feature],
+        observations.right[feature],
+        observations.info[feature],
+        observations.info_right[feature],
         camera,
         rounds=rounds,
     )
@@ -393,6 +393,7 @@ def track_local_map(
         candidates: Slots of the points of the local map.
         settings: Radius, descriptor distance and number of inliers.
     """
+    # points of the local map that are in view and have no match yet
     more, in_view = match_map(slam_map, observations, T_cam_world, matches, candidates, settings)
     matches = matches.joined(more)
 
@@ -443,6 +444,7 @@ def unconnected(slam_map: Map, keyframe: int, gap: int = MIN_KEYFRAME_GAP) -> Sl
 
     Those of other submaps always are.
     """
+    # neighbours in the covisibility graph, and their neighbours
     near, _ = slam_map.covisible(keyframe)
     further, _ = slam_map.covisible_of(slam_map.points_of(near))
     return _long_ago(slam_map, keyframe, gap, np.concatenate([near, further]))
@@ -455,6 +457,7 @@ def weakly_connected(slam_map: Map, keyframe: int, gap: int = MIN_KEYFRAME_GAP) 
     inaccurately, a second visit is connected with the first by fewer points and drifts beside it:
     such a place may be recognised again. Keyframes of other submaps always may.
     """
+    # neighbours by strong edges of the covisibility graph, and theirs
     near, shared = slam_map.covisible(keyframe)
     near = near[shared >= STRONG_COVISIBILITY]
     further = []
