@@ -122,6 +122,7 @@ def mask_iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Intersection over union ``[N, M]`` of masks ``[N, H, W]`` and ``[M, H, W]``."""
     if not len(a) or not len(b):
         return np.zeros((len(a), len(b)))
+    # common pixels of all pairs by one product
     x = a.reshape(len(a), -1).astype(np.float32)
     y = b.reshape(len(b), -1).astype(np.float32)
     inter = (x @ y.T).astype(np.float64)
@@ -167,6 +168,7 @@ def average_precision(scores: NDArray[np.float64], hits: NDArray[np.bool_], trut
     """Area under the precision-recall curve at COCO's 101 recall points; NaN without objects."""
     if not truths:
         return float("nan")
+    # recall and precision after each detection, the surest first
     order = np.argsort(-scores, kind="stable")
     positives = np.cumsum(hits[order])
     recall = positives / truths
@@ -239,6 +241,7 @@ def evaluate_segmenter(
         SegmentationError: The segmenter or the data are not available, or no image shows an object
             of the classes.
     """
+    # detections down to a low score, which the precision-recall curve needs
     images = open_labelled(data)
     low = settings.model_copy(update={"confidence": min(LEAST_SCORE, settings.confidence)})
     segmenter = build_segmenter(low, sequence_id="synthetic/", device=device, threads=threads)
