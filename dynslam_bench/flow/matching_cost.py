@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
-from dynslam_bench.core.simd import Bytes, Floats, Ints, Longs, Words, descriptor_sum
+from dynslam_bench.core.simd import Bytes, Floats, Ints, Longs, Words
 from dynslam_bench.flow import layout
+from dynslam_bench.flow.descriptor_vectors import descriptor_sum
 from dynslam_bench.flow.orientation_maps import ImageArrays
 
 OUTSIDE = 1 << 20

@@ -19,13 +19,11 @@ from dynslam_bench.core.simd import (
     Ints,
     load,
     load_bytes,
-    sample,
     spread,
-    square,
     store,
-    store_offsets,
     total,
 )
+from dynslam_bench.flow.sampling import sample, square, store_offsets
 from dynslam_bench.geometry.gauss_newton import cholesky_solve
 
 BORDER = 48
