@@ -240,7 +240,8 @@ def _search(
     count = targets.xy.shape[0]
     match = np.full(count, -1, np.int64)
     match_distance = np.full(count, FAR, np.int64)
-    owner = np.full(xy.shape[0], -1, np.int64)  # the target that a feature is matched to
+    # the target that a feature is matched to
+    owner = np.full(xy.shape[0], -1, np.int64)
     for i in range(count):
         # the cells that the window covers
         x = targets.xy[i, 0]

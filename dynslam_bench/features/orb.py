@@ -163,7 +163,8 @@ class OrbExtractor:
         row, column = np.divmod(at, image.shape[1])
         cell = self.settings.cell_px
         origin = EDGE - 3
-        columns = -(-(image.shape[1] - 2 * origin) // cell)  # rounded up
+        # cells a row, rounded up
+        columns = -(-(image.shape[1] - 2 * origin) // cell)
         cells = (row - origin) // cell * columns + (column - origin) // cell
         xy = np.stack([column, row], axis=1).astype(np.float32)
         return _Level(image, scale, xy, response, cells)
@@ -258,7 +259,8 @@ def orientations(
         rows: ... and its row.
     """
     out = np.zeros(len(xy), np.float32)
-    side = len(rows)  # a constant number of turns would be unrolled, and no vector code made
+    # a constant number of turns would be unrolled, and no vector code made
+    side = len(rows)
     for i in range(len(xy)):
         top = int(xy[i, 1]) - PATCH_RADIUS
         left = int(xy[i, 0]) - PATCH_RADIUS

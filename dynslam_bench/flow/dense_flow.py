@@ -219,7 +219,8 @@ def describe_image(
     # superpixels of the half-resolution image
     half = np.ascontiguousarray(maps.framed_half[BORDER:-BORDER, BORDER:-BORDER])
     regions = superpixels(half, max(2, settings.superpixel_px // 2))
-    centres = regions.centres * 2 + 0.5  # half-resolution pixel i covers 2 i and 2 i + 1
+    # half-resolution pixel i covers 2 i and 2 i + 1
+    centres = regions.centres * 2 + 0.5
     neighbours = nearest(centres, sparse.workers.run)
 
     # the unrotated descriptor of every half-resolution pixel
@@ -443,7 +444,8 @@ def fit_regional_motion(
         normal[:, (0, 1, 2), (0, 1, 2)] += weight.sum(axis=1, keepdims=True) * (1e-6, 0.05, 0.05)
         motion = np.linalg.solve(normal, weighted.transpose(0, 2, 1) @ values)
         weight = weight / (1 + (np.linalg.norm(values - basis @ motion, axis=2) / 2.0) ** 2)
-    motion[:, 1:] /= spread[:, :, None]  # back to a change per pixel
+    # back to a change per pixel
+    motion[:, 1:] /= spread[:, :, None]
     return motion
 
 
@@ -950,7 +952,8 @@ def differs(
     for member in region:
         y = member // columns
         x = member % columns
-        if best[y, x] == np.inf:  # it has none so far
+        # it has none so far
+        if best[y, x] == np.inf:
             return True
         # difference of the two displacements at the pixel
         dx = np.float32(2 * x) + np.float32(0.5) - centre[0]

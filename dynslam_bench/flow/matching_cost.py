@@ -116,7 +116,8 @@ def cost_tables(
     per_level = np.stack([geometry.base, geometry.stride, geometry.shift, geometry.bias], axis=1)
 
     # byte offset of each histogram, for every scale, rotation, quarter of the centre's cell, histogram
-    level = np.repeat(ring_level, (9, 8), axis=1)  # [scales, 17]
+    # level of each histogram, [scales, 17]
+    level = np.repeat(ring_level, (9, 8), axis=1)
     steps = np.asarray(layout.LEVEL_STEPS)[level][:, None, None, :, None]
     quarters = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
     centres = quarters[None, None, :, None, :]

@@ -585,7 +585,8 @@ def align_translation(
         sum_of_w = np.float64(sum_w)
         mean = sum_of_w / n
         variance = ww - mean * sum_of_w
-        score = np.float32(-1)  # a flat target looks like anything
+        # a flat target looks like anything
+        score = np.float32(-1)
         if variance >= n * FLAT_VARIANCE:
             score = np.float32(wt / np.sqrt(variance * template.energy))
         if iteration == 0:

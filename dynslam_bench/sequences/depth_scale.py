@@ -129,8 +129,10 @@ def depth_scale(
     columns = np.concatenate(
         [
             true[..., None],
-            relative[:, :3, :3] - np.eye(3),  # by the lever arm
-            -se3.hat(true),  # by the turn of the axes
+            # by the lever arm
+            relative[:, :3, :3] - np.eye(3),
+            # by the turn of the axes
+            -se3.hat(true),
             by_shift[..., None],
             -by_readout[..., None],
         ],
@@ -232,13 +234,15 @@ def _regression(columns: Array, measured: Array, scaled: Array, fixed: Array) ->
             the scale.
         fixed: Standard deviations that do not depend on the scale; 0 in both: no bound.
     """
+    # a first guess by the lengths
     lengths = np.linalg.norm(measured, axis=1)
     scale = float(np.median(lengths) / np.median(np.linalg.norm(columns[..., 0], axis=1)))
     sigma = float(np.median(lengths)) / 2
     weight = np.ones(len(measured))
     if not (np.isfinite(scale) and sigma > 0):
         return None
-    # Reweighted least squares with priors that grow with the scale.
+
+    # reweighted least squares, by normal equations of each pair, with priors that grow with the scale.
     for _ in range(_ROUNDS):
         deviation = np.maximum(scaled * scale, fixed)
         prior = np.diag(np.where(deviation > 0, 1 / np.maximum(deviation, 1e-12) ** 2, 0.0))
@@ -251,21 +255,21 @@ def _regression(columns: Array, measured: Array, scaled: Array, fixed: Array) ->
         sigma = max(float(np.median(residual)) / 1.54, 1e-4)
         weight = 1 / (1 + (residual / sigma / CAUCHY) ** 2)
 
-    # The variance: by a jackknife over blocks, and what the bounds leave open.
+    # the variance: by a jackknife over blocks, and what the bounds leave open.
     blocks = np.arange(len(measured)) // BLOCK
     count = int(blocks[-1]) + 1
     scales = []
     for block in range(count):
         kept = blocks != block
-        part = np.linalg.solve(normals[kept].sum(axis=0) + prior, pulls[kept].sum(axis=0))
-        scales.append(float(part[0]))
+        without_block = np.linalg.solve(normals[kept].sum(axis=0) + prior, pulls[kept].sum(axis=0))
+        scales.append(float(without_block[0]))
     without = np.array(scales)
     jackknife = (count - 1) / count * float(((without - without.mean()) ** 2).sum())
     inverse = np.linalg.inv(normals.sum(axis=0) + prior)
     left_open = float((inverse @ prior @ inverse)[0, 0])
     variance = max(jackknife + left_open, float(inverse[0, 0]))
 
-    # Half of the 95 % interval, with what all pairs share.
+    # half of the 95 % interval, with what all pairs share.
     value = float(factors[0])
     statistical = student.ppf(0.975, count - 1) * np.sqrt(variance)
     half = float(np.hypot(statistical, 1.96 * SYSTEMATIC * factors[0]))

@@ -279,7 +279,8 @@ def verify(
     entry = entry_of(name)
     folder = Path(name).expanduser() if entry is None else status(name, data_root=data_root)
     if folder is None or not folder.is_dir():
-        open_sequence(name, data_root=data_root)  # says what is missing
+        # says what is missing
+        open_sequence(name, data_root=data_root)
         raise SequenceError(
             f"'{name}' is not a recorded sequence", "rendered sequences need no verification"
         )

@@ -46,17 +46,16 @@ def motion_tags(truth: Trajectory) -> set[str]:
     # the first pose of each step of time: work by poses, however long the holes between them are
     # (as the floats of Unix time resolve the step)
     step_s = (times[0] + STEP_S) - times[0]
-    steps = np.floor((times - times[0]) / step_s)
-    index = np.unique(
-        np.append(np.flatnonzero(np.append(True, np.diff(steps) > 0)), len(times) - 1)
-    )
+    step_number = np.floor((times - times[0]) / step_s)
+    is_first = np.append(True, np.diff(step_number) > 0)
+    index = np.unique(np.append(np.flatnonzero(is_first), len(times) - 1))
     poses = truth.T_world_cam[index]
 
     # mean speeds, by distances and rotations between these poses
     duration_s = times[-1] - times[0]
-    steps = se3.inverse(poses[:-1]) @ poses[1:]
-    steps_m = np.linalg.norm(steps[:, :3, 3], axis=1)
-    turned_deg = np.degrees(se3.rotation_angle(steps))
+    motions = se3.inverse(poses[:-1]) @ poses[1:]
+    steps_m = np.linalg.norm(motions[:, :3, 3], axis=1)
+    turned_deg = np.degrees(se3.rotation_angle(motions))
     fast = steps_m.sum() >= FAST_M_S * duration_s or turned_deg.sum() >= FAST_DEG_S * duration_s
 
     # a loop: two places close to each other that are far apart along the path

@@ -278,7 +278,8 @@ class LoopCloser:
         self._fuse(slot, confirmed.place.keyframe)
         self._shortcuts.append((self._path_at(confirmed.place.keyframe), self._path_length))
         self.closed.append(confirmed)
-        self._last_pose = self.map.kf_pose[slot].copy()  # a correction adds no path
+        # the path goes on from the corrected pose: a correction adds none
+        self._last_pose = self.map.kf_pose[slot].copy()
         return LoopClosingResult(rescaled, root_map_pose)
 
     def _transfer_loop_edges(self) -> None:

@@ -208,7 +208,8 @@ def detect_layout(
     # without those that the user, the metadata or the number of rows exclude
     if asked != "auto":
         fits = [fit for fit in shapes_allow if fit.layout.id == asked]
-        fits = [fit for fit in fits if fit.layout.names] or fits  # the others are of no use
+        # layouts without class names are of no use where others have them
+        fits = [fit for fit in fits if fit.layout.names] or fits
     else:
         fits = [fit for fit in fits if _agrees(fit, facts)]
     fits = _by_rows(fits, size)
@@ -237,11 +238,13 @@ def _agrees(fit: _Fit, facts: Metadata) -> bool:
     if facts.task and layout.kind not in _TASKS[facts.task]:
         return False
     if fit.channels_last and facts.task:
-        return False  # Ultralytics exports ONNX with channels first
+        # Ultralytics exports ONNX with channels first
+        return False
     if layout.kind != "yolo":
         return True
     if layout.objectness and (facts.task or facts.suppressed is not None):
-        return False  # YOLOv5's exporter, whose networks have it, writes neither entry
+        # YOLOv5's exporter, whose networks have it, writes neither entry
+        return False
     return facts.suppressed is None or layout.suppressed == facts.suppressed
 
 
@@ -364,9 +367,10 @@ def _semantic(
 
 def _usual_scaling(facts: Metadata, *, aligned: bool) -> Literal["unit", "symmetric", "imagenet"]:
     """Input scaling of most semantic networks of such an exporter."""
-    if facts.task:  # Ultralytics
+    # by the exporter: Ultralytics' networks, TensorFlow's DeepLab, torchvision's models
+    if facts.task:
         return "unit"
-    return "symmetric" if aligned else "imagenet"  # TensorFlow's DeepLab; torchvision's models
+    return "symmetric" if aligned else "imagenet"
 
 
 def _of_rank(outputs: Iterable[TensorInfo], rank: int) -> list[TensorInfo]:

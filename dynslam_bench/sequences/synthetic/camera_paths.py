@@ -39,8 +39,10 @@ def camera_poses(motion: str, people: str, scene: int, times: Array) -> Array:
     # TUM's sitting_xyz is slower.
     tempo = 0.72 if people == "sitting" and motion == "xyz" else 1.0
     t = np.asarray(times, dtype=np.float64)
-    offset = np.zeros((len(t), 3))  # along the camera's rest axes: right, down, forward
-    angles = np.zeros((len(t), 3))  # about right (pitch), down (yaw), forward (roll)
+    # along the camera's rest axes: right, down, forward
+    offset = np.zeros((len(t), 3))
+    # about right (pitch), down (yaw), forward (roll)
+    angles = np.zeros((len(t), 3))
     order = rng.permutation(3)
     signs = np.where(rng.random(3) < 0.5, -1.0, 1.0)
     if motion == "xyz":
@@ -74,7 +76,8 @@ def _halfsphere(t: Array, tempo: float, sign: float) -> tuple[Array, Array]:
     around = 2 * math.pi * t / (6.1 / tempo)
     lift = 0.5 - 0.5 * cos(2 * math.pi * t / (16.9 / tempo) + 0.4)
     radius = 0.36
-    distance = 0.9  # of what it looks at
+    # of what it looks at
+    distance = 0.9
     offset[:, 0] = sign * radius * sin(around)
     offset[:, 1] = -radius * (0.85 * lift - 0.12) * cos(around * 0.5 + 0.3)
     offset[:, 2] = -0.1 + 0.2 * cos(around) * (0.4 + 0.6 * lift)

@@ -454,7 +454,13 @@ def partition(start: Point, end: Point, plan: Plan, doors: tuple[float, ...] = (
 
 
 def _stretch(scene: int, number: int, half: float) -> tuple[Plan, np.random.Generator]:
-    """The plan of a stretch of wall about its own origin, and its stream."""
+    """The plan of a stretch of wall along y = 0, from x = -half to half, and the stream of its draws.
+
+    Args:
+        scene: The scene.
+        number: Which of its stretches.
+        half: Half the length, metres.
+    """
     plan = replace(
         plan_room(scene, number), back_y=0.0, left_x=-half, right_x=half, desk_x=0.0, desk_y=-1.0
     )

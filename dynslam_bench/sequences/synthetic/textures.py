@@ -103,6 +103,7 @@ def plaster(rng: np.random.Generator, size: int = 512) -> Image:
 
 def wood(rng: np.random.Generator, size: int = 256) -> Image:
     """Wood grain along u."""
+    # wavy rings across v, and streaks along u
     warp = 6 * fractal(rng, size, 4, 2)
     v = np.arange(size)[:, None] + warp
     rings = sin(v * 2 * np.pi * 9 / size) * 0.5 + sin(v * 2 * np.pi * 23 / size + 1.3) * 0.3
