@@ -188,16 +188,21 @@ class Alignment(NamedTuple):
 def make_workspace(radius: int, margin: int) -> Workspace:
     """The arrays for windows of a radius and translations up to a margin, pixels."""
     side = 2 * radius + 1
+    # sizes: rows of the patch, rounded up to whole vectors of sixteen
     pitch = 2 * (radius + margin) + 1
     length = 16 * ((side * pitch + 15) // 16)
     patch_length = 16 * ((pitch * pitch + 15) // 16)
     # vectors that begin inside the window read up to two rows and two vectors beyond it
     slack = 2 * pitch + 32
+
+    # where each sample of the patch lies on its grid
     grid_columns = np.zeros(patch_length, dtype=np.int32)
     grid_rows = np.zeros(patch_length, dtype=np.int32)
     for k in range(pitch * pitch):
         grid_columns[k] = k % pitch
         grid_rows[k] = k // pitch
+
+    # which samples belong to the window, and how far right of and below its centre they lie
     mask = np.zeros(length, dtype=np.float32)
     right = np.zeros(length, dtype=np.float32)
     down = np.zeros(length, dtype=np.float32)
@@ -364,6 +369,7 @@ def target_fits(warp: Warp, window: Window, image: Bytes) -> Scalar:
         window: Size of the patch.
         image: uint8 ``[H + 2 BORDER, W + 2 BORDER]``.
     """
+    # half the width of the patch in the image, under the warp
     rows, columns = image.shape
     reach = window.radius + window.margin
     span = (abs(warp.a) + abs(warp.b)) * np.float32(reach) + np.float32(2)

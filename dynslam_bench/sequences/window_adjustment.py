@@ -48,26 +48,28 @@ def track(images: list[NDArray[np.uint8]], allowed: list[NDArray[np.uint8]]) -> 
     height, width = images[0].shape
     tracks = np.full((0, n, 2), np.nan)
     for i in range(n - 1):
-        # Detect new corners where few are left.
+        # detect new corners where few are left.
         alive = np.isfinite(tracks[:, i, 0])
         if alive.sum() < POINTS and i < n - 3:
             fresh = corners(images[i], allowed[i], tracks[alive, i], POINTS - int(alive.sum()))
             tracks = np.pad(tracks, ((0, len(fresh)), (0, 0), (0, 0)), constant_values=np.nan)
             tracks[len(alive) :, i] = fresh
             alive = np.isfinite(tracks[:, i, 0])
-        here = tracks[alive, i].astype(np.float32)
-        if not len(here):
+        pixels = tracks[alive, i].astype(np.float32)
+        if not len(pixels):
             continue
 
         # each corner is looked for where its last motion leads; new ones by the median motion.
-        flow = here - tracks[alive, i - 1] if i else np.full(here.shape, np.nan)
+        flow = pixels - tracks[alive, i - 1] if i else np.full(pixels.shape, np.nan)
         has_flow = np.isfinite(flow[:, 0])
         flow[~has_flow] = np.median(flow[has_flow], axis=0) if has_flow.any() else 0.0
-        guess = (here + flow).astype(np.float32)
-        there, good = follow_corners(images[i], images[i + 1], here, guess, 0.5)
-        good &= (there >= _BORDER_PX).all(axis=1)
-        good &= (there < (width - _BORDER_PX, height - _BORDER_PX)).all(axis=1)
-        tracks[np.flatnonzero(alive)[good], i + 1] = there[good]
+        guess = (pixels + flow).astype(np.float32)
+        next_pixels, good = follow_corners(images[i], images[i + 1], pixels, guess, 0.5)
+        good &= (next_pixels >= _BORDER_PX).all(axis=1)
+        good &= (next_pixels < (width - _BORDER_PX, height - _BORDER_PX)).all(axis=1)
+        tracks[np.flatnonzero(alive)[good], i + 1] = next_pixels[good]
+
+    # corners that were seen in four images at least
     long = np.isfinite(tracks[..., 0]).sum(axis=1) >= 4
     return np.asarray(tracks[long])
 

@@ -191,6 +191,7 @@ def _fill_pose_jacobian(
     out: Array,
 ) -> None:
     """Derivatives ``[3, 6]`` of (u, v, right) by a twist (translation, rotation) in the camera frame."""
+    # a rotation about an axis moves the point by the cross product: (0, -z, y), (z, 0, -x), (-y, x, 0)
     out[0, 0] = du_dx
     out[0, 1] = 0.0
     out[0, 2] = du_dz
@@ -214,6 +215,7 @@ def _fill_pose_jacobian(
 @inlined
 def _invert_symmetric(h: Array, out: Array) -> None:
     """The inverse of a symmetric matrix ``[3, 3]``, of which the lower triangle is read; nothing if it is singular."""
+    # by the adjugate: cofactors over the determinant
     h00 = h[0, 0]
     h10 = h[1, 0]
     h11 = h[1, 1]
@@ -384,6 +386,7 @@ def _move_points(
 ) -> None:
     """Solve for the points by back-substitution: ``points^-1 (point_gradient - coupling^T twists)``."""
     start = observations.start
+    # each point by itself: its gradient less what the poses' twists change, times the inverse block
     for i in range(points.shape[0]):
         b0 = system.point_gradient[i, 0]
         b1 = system.point_gradient[i, 1]
@@ -561,8 +564,8 @@ def full_bundle(slam_map: Map) -> Bundle | None:
     keyframes = slam_map.keyframes
     if len(keyframes) < 2:
         return None
-    everything = int(slam_map.n_obs[slam_map.points].sum())
-    return _bundle(slam_map, keyframes[1:], keyframes[:1], slam_map.points, everything)
+    all_observations = int(slam_map.n_obs[slam_map.points].sum())
+    return _bundle(slam_map, keyframes[1:], keyframes[:1], slam_map.points, all_observations)
 
 
 def _bundle(

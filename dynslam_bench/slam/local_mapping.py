@@ -281,8 +281,9 @@ class LocalMapper:
         bundle = local_bundle(slam_map, slot, settings.window)
         if bundle is not None:
             points = bundle.points
-            out = ~adjust(slam_map, bundle, settings.iterations)
-            slam_map.unobserve(bundle.poses[bundle.problem.obs_pose[out]], bundle.features[out])
+            outliers = ~apply_bundle_adjustment(slam_map, bundle, settings.iterations)
+            observers = bundle.poses[bundle.problem.obs_pose[outliers]]
+            slam_map.unobserve(observers, bundle.features[outliers])
             slam_map.refresh(points[slam_map.alive[points]])
 
     # ------------------------------------------------------------------ keyframes
@@ -354,7 +355,7 @@ class LocalMapper:
         slam_map.remove_keyframe(slot)
 
 
-def adjust(slam_map: Map, bundle: Bundle, iterations: int) -> NDArray[np.bool_]:
+def apply_bundle_adjustment(slam_map: Map, bundle: Bundle, iterations: int) -> NDArray[np.bool_]:
     """Put refined poses and points into the map; returns which observations of the bundle fit them."""
     result = adjust_bundle(bundle.problem, iterations)
     variable = bundle.poses[: bundle.problem.variable]
@@ -369,7 +370,7 @@ def refined(slam_map: Map) -> Map:
     copy = deepcopy(slam_map)
     bundle = full_bundle(slam_map)
     if bundle is not None:
-        adjust(copy, bundle, FULL_ITERATIONS)
+        apply_bundle_adjustment(copy, bundle, FULL_ITERATIONS)
         copy.refresh(copy.points)
     return copy
 

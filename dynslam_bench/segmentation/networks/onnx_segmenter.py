@@ -385,6 +385,7 @@ def _corners(rows: Float) -> tuple[Float, Float, Float]:
 
 def _best(rows: Float, first: int, layout: Layout) -> tuple[Float, Float, Float]:
     """Corners, best scores and their class numbers of detections with centre, size and a score a class."""
+    # scores of the classes, times the objectness where there is one
     scores = rows[:, 4 + layout.objectness : first]
     if layout.objectness:
         scores = scores * rows[:, 4:5]
