@@ -116,19 +116,19 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         # a point that continues a keypoint of the last frame takes over its observations
         link = link_to_previous(frame, state)
         last = _in_world(self._last, pose)
-        before = np.concatenate([last[None], self._past])[: self.settings.window]
-        past = np.full((len(before), len(frame.xy), 12), np.nan)
-        past[:, link >= 0] = before[:, link[link >= 0]]
+        of_keypoints = np.concatenate([last[None], self._past])[: self.settings.window]
+        past = np.full((len(of_keypoints), len(frame.xy), 12), np.nan)
+        past[:, link >= 0] = of_keypoints[:, link[link >= 0]]
 
         # any other was at the end of its flow, at the depth that the last frame has there
-        loose = np.flatnonzero((link < 0) & flow.valid & np.isfinite(flow.xy).all(axis=1))
-        raw = flow.xy[loose]
+        unlinked = np.flatnonzero((link < 0) & flow.valid & np.isfinite(flow.xy).all(axis=1))
+        raw = flow.xy[unlinked]
         pixels, visible = pixel_index(raw, previous.depth.shape)
         z = np.where(visible, previous.depth[pixels], 0)
         observations = self._observe(
             state.camera.undistort_points(raw), raw, z, previous.depth, state.camera
         )
-        past[0, loose] = _in_world(observations, pose)
+        past[0, unlinked] = _in_world(observations, pose)
         return past
 
     def _observe(

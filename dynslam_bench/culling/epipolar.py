@@ -271,8 +271,11 @@ def contradiction(
     """
     if state.T_world_prev is None or state.T_world_pred is None:
         return 0.0
+    # where points with depth were in the previous image, if only the camera moved
     rows = matches.valid & state.keep & (frame.z > 0)
     _, expected = rigid_flow(frame, state, rows)
+
+    # of those that were there: how many the epipolar test rejects
     rows[rows] = np.linalg.norm(expected - matches.x1[rows], axis=1) < RIGID_PX
     if np.count_nonzero(rows) < MIN_MATCHES:
         return 0.0

@@ -102,11 +102,14 @@ def match_brute_force(
     """
     if not len(a) or not len(b):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    best, first, second, back = _brute_force(np.ascontiguousarray(a), np.ascontiguousarray(b))
+    nearest, distances, second_distances, nearest_in_a = _brute_force(
+        np.ascontiguousarray(a), np.ascontiguousarray(b)
+    )
     # near enough, nearer than the second (Lowe's ratio test), and nearest in both directions
-    mutual = back[best] == np.arange(len(a))
-    index = np.flatnonzero((first <= max_distance) & (first < ratio * second) & mutual)
-    return index, best[index]
+    mutual = nearest_in_a[nearest] == np.arange(len(a))
+    distinct = distances < ratio * second_distances
+    index = np.flatnonzero((distances <= max_distance) & distinct & mutual)
+    return index, nearest[index]
 
 
 @dataclass(frozen=True, eq=False)

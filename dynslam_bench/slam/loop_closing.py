@@ -743,16 +743,16 @@ def optimise_poses(ids: Slots, poses: Array, edges: Sequence[Edge]) -> Array:
     """
     # rows of the poses at both ends, the inverse of each measured pose, and its standard deviations
     one, other = np.searchsorted(ids, [[edge.one, edge.other] for edge in edges]).T
-    back = se3.inverse(np.array([edge.T_other_one for edge in edges]))
+    T_one_other = se3.inverse(np.array([edge.T_other_one for edge in edges]))
     sigmas = SIGMAS / np.sqrt([[edge.weight] for edge in edges])
-    error = _edge_errors(poses, one, other, back, sigmas)
+    error = _edge_errors(poses, one, other, T_one_other, sigmas)
     cost = float(np.square(error).sum())
 
     # Levenberg-Marquardt: a step that does not lower the cost is repeated with more damping
     damping = 1e-6
     for _ in range(GRAPH_ITERATIONS):
         trial = se3.exp(_graph_step(poses, one, other, error, sigmas, damping)) @ poses
-        trial_error = _edge_errors(trial, one, other, back, sigmas)
+        trial_error = _edge_errors(trial, one, other, T_one_other, sigmas)
         lower = float(np.square(trial_error).sum())
         if not lower < cost:
             damping *= 30.0
@@ -767,9 +767,11 @@ def optimise_poses(ids: Slots, poses: Array, edges: Sequence[Edge]) -> Array:
     return poses
 
 
-def _edge_errors(poses: Array, one: Slots, other: Slots, back: Array, sigmas: Array) -> Array:
+def _edge_errors(
+    poses: Array, one: Slots, other: Slots, T_one_other: Array, sigmas: Array
+) -> Array:
     """Error of each edge ``[E, 6]``: the twist left between it and the poses, in its sigmas."""
-    return se3.log(poses[other] @ se3.inverse(poses[one]) @ back) / sigmas
+    return se3.log(poses[other] @ se3.inverse(poses[one]) @ T_one_other) / sigmas
 
 
 def _graph_step(

@@ -543,7 +543,12 @@ class MapViews:
         self._computed_for: tuple[int, int] | None = None
 
     def add_keyframe(self, slot: int, depth: NDArray[np.float32]) -> None:
-        """A keyframe was made; those that were culled for it lose their depth images."""
+        """Keep the depth image of a new keyframe; older and culled ones lose theirs.
+
+        Args:
+            slot: The keyframe.
+            depth: Metres ``[H, W]``, 0 missing.
+        """
         self._depth_images[slot] = depth
         newest = self._map.keyframes[::-1][: self._max_depth_images]
         self._depth_images = {

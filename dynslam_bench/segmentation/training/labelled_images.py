@@ -168,6 +168,7 @@ def yolo_images(text: str) -> LabelledImages:
     classes = _yolo_names(described[0]) if described else dict(enumerate(COCO_NAMES))
 
     def read(index: int) -> LabelledImage:
+        """An image and its label file of the same name."""
         label = labels / images[index].relative_to(root).with_suffix(".txt")
         return _read_yolo(images[index], label, classes)
 
@@ -382,6 +383,7 @@ def rendered_frames(text: str = "") -> LabelledImages:
     name = f"scenes={scenes[0]}-{scenes[-1]},frames={frames},length={length},options={options:g},seed={seed}"
 
     def read(index: int) -> LabelledImage:
+        """Render the `index`-th frame that is drawn."""
         # scene, then motion, then draw; what is drawn depends on seed, sequence and draw alone
         order, draw = divmod(index, frames)
         scene, motion = divmod(order, len(REPLICA_IDS))
