@@ -30,6 +30,7 @@ PATCH_SIDE = 32
 """Rows and columns of the patch that is summed: the disc's 31, and one of zeros that makes whole vectors of it."""
 # row and column of each pixel of the patch from the disc's centre, 0 outside the disc
 _ROW, _COLUMN = np.mgrid[:PATCH_SIDE, :PATCH_SIDE].astype(np.int32) - PATCH_RADIUS
+# columns and rows inside the disc: weights of the first moments
 _IN_DISC = _ROW * _ROW + _COLUMN * _COLUMN <= PATCH_RADIUS * PATCH_RADIUS
 _DISC_COLUMNS = _COLUMN * _IN_DISC
 _DISC_ROWS = _ROW * _IN_DISC

@@ -80,6 +80,7 @@ STRATEGIES: dict[SearchName, Strategy] = {
     "emfoa-literal": Strategy(moth_flame.EMFOA_LITERAL, 0.5, False),
     "random": Strategy(None, 1.0, False),
 }
+"""Label searches by the value of the setting ``search``."""
 
 
 class SearchRules(NamedTuple):

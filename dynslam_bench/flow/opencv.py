@@ -32,6 +32,7 @@ PRESETS = {
     "fast": cv2.DISOPTICAL_FLOW_PRESET_FAST,
     "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
 }
+"""OpenCV's presets of DIS by the value of the setting ``dis_preset``."""
 SMALLEST_SIDE = 32
 """DIS fails on images below its patch and pyramid sizes."""
 

@@ -14,6 +14,7 @@ _NAME = re.compile(r"(?P<name>[^\s\[(]+)\s*(?:[\[(]\s*(?P<unit>[^\])]*?)\s*[\])]
 _STAMP = re.compile(
     r"(?:time_?stamps?|times?|ts|t|stamps?|sec(?:ond)?s?)(?:_(?P<unit>[a-z]+))?", re.IGNORECASE
 )
+"""The name of a stamp, perhaps with its unit: ``timestamp``, ``t``, ``time_ns``."""
 _PART = re.compile(r"(?P<vector>.*?)[_.]?(?P<axis>[xyzw])", re.IGNORECASE)
 """A part of a vector: ``qw``, ``p_RS_R_x``, ``position.x``, ``x``."""
 _SYMBOLS = {symbol: unit for unit in UNITS for symbol in (unit.symbol, f"{unit.symbol}ec")}

@@ -43,6 +43,7 @@ UNITS = (
     StampUnit("microseconds", "us", 6),
     StampUnit("nanoseconds", "ns", 9),
 )
+"""The units that are recognised, from the largest to the smallest."""
 LATEST_S = 9e9
 """The year 2255. Later stamps are no seconds, and 64 bits of nanoseconds end there."""
 SLOWEST_S = 5.0

@@ -59,6 +59,7 @@ _PARAMETERS = {
     "lever": slice(7, 10),
 }
 _COUNT = 10
+"""Parameters in all."""
 _PRIOR = np.array([1.0, 200.0, 200.0, 2.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
 """Standard deviations of the weak prior about the stated values."""
 _SCALES = np.array([0.1, 10, 10, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1])

@@ -383,6 +383,7 @@ def _builtin() -> Iterator[DatasetSpec]:
 
 
 DATASETS: Registry[DatasetSpec] = Registry("sequences", DatasetSpec, _builtin)
+"""Data sets by the prefix of their ids, built in and of plug-ins."""
 
 
 # Lists and descriptions for people.

@@ -98,8 +98,8 @@ def depth_scale(
     relative = truth.between(start, end)[1]
     rates = list(zip(_turning_rates(truth, start), _turning_rates(truth, end), strict=True))
 
-    # Translations ``[N, 3]`` under a global shutter, and how they change with the readout time.
     def translations(readout_s: float) -> Array:
+        """Measured translations ``[N, 3]`` under a readout time."""
         return np.stack(
             [
                 translation_of(pair, T, both_rates, camera, readout_s, first_guess)
@@ -107,9 +107,12 @@ def depth_scale(
             ]
         )
 
+    # under a global shutter, and how they change with the readout time
     still = translations(0.0)
     rolling = translations(_READOUT_STEP_S)
     by_readout = (rolling - still) / _READOUT_STEP_S
+
+    # the readout time: stated, else the usual one with a wide prior
     if camera.readout_s > 0:
         readout_s = camera.readout_s
         readout_sigma_s = STATED_READOUT_SIGMA_S
@@ -117,12 +120,12 @@ def depth_scale(
         readout_s = READOUT_S
         readout_sigma_s = READOUT_SIGMA_S
 
-    # How the true translations change with a shift in time.
+    # how the true translations change with a shift in time.
     later = truth.between(start + _SHIFT_S, end + _SHIFT_S)[1]
     earlier = truth.between(start - _SHIFT_S, end - _SHIFT_S)[1]
     by_shift = (later - earlier)[:, :3, 3] / (2 * _SHIFT_S)
 
-    # What the translations consist of ``[N, 3, 9]``, and the prior of each column's factor.
+    # what the translations consist of ``[N, 3, 9]``, and the prior of each column's factor.
     true = relative[:, :3, 3]
     if not (np.linalg.norm(true, axis=1) > 0).any():
         return None

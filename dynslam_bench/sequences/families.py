@@ -22,9 +22,11 @@ def family_of(sequence: str) -> str:
         return sequence
 
 
+# how far the numbers of one path may lie apart: rounding in files
 _STAMP_S = 1e-6
+"""Of stamps, seconds."""
 _POSE = 1e-6
-"""How far the stamps in seconds and the entries of the poses of one path may lie apart: rounding in files."""
+"""Of the entries of poses, metres and parts of a rotation matrix."""
 
 
 def same_path(one: Trajectory | None, other: Trajectory | None) -> bool:

@@ -86,6 +86,7 @@ SUBMAP_ARRAYS = {
 }
 """Type and shape of what is stored for each submap that was not merged (`Atlas`); I submaps."""
 _LAYOUT = KEYFRAME_ARRAYS | FEATURE_ARRAYS | POINT_ARRAYS | OBSERVATION_ARRAYS | SUBMAP_ARRAYS
+"""All arrays of a file."""
 
 
 MAX_TABLE_BYTES = 1 << 30

@@ -24,6 +24,7 @@ KNOWN = (
     "known: YOLO-seg [1, 4+C+M, N] or, after suppression, [1, N, 6+M], with prototypes [1, M, h, w]; semantic logits "
     "[1, C, h, w]; boxes, labels, scores, masks as torchvision exports them"
 )
+"""The layouts that are read, for messages."""
 _YOLO_NAMES = {len(COCO_NAMES): dict(enumerate(COCO_NAMES)), 1: {0: "person"}}
 """Names of the classes of a YOLO network without names, by their number."""
 _SEMANTIC_NAMES = {

@@ -130,6 +130,7 @@ def read_associations(path: Path) -> tuple[ImageList, ImageList]:
 LEFT_OUT = "frame numbers without an image"
 """Key of `ImageList.irregular` for gaps in the frame numbers."""
 _IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+"""Suffixes of images, in small letters."""
 
 
 def list_folder(folder: Path, name: str, fps: float | None) -> ImageList:

@@ -60,6 +60,7 @@ PEOPLE_LIST = "people.txt"
 ASSOCIATIONS = ("associations.txt", "associated.txt", "associate.txt", "association.txt")
 """Names of a list of pairs."""
 TRUTHS = ("groundtruth.txt", "pose.txt")
+"""Names of a ground truth in TUM's format."""
 
 
 # TUM RGB-D, Bonn Dynamic, Wild-SLAM MoCap, and recordings of one's own.
@@ -189,6 +190,7 @@ def read_icl_nuim(folder: Path, fps: float | None) -> Contents:
     return Contents(colour, depth, False, truth, _not_taken(file), _ICL_CAMERA, rate)
 
 
+# the camera that the data set states for all sequences
 _SEVEN_SCENES_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0, depth_factor=MILLIMETRES)
 # how platforms write a number that is none
 _LOST = ("nan", "inf", "#ind", "#qnan", "#inf")
@@ -238,6 +240,7 @@ def _kinect_fusion_pose(path: Path) -> Array | None:
         ) from None
 
 
+# the data set's intrinsics
 _SHIBUYA_CAMERA = Camera(
     640, 360, *2 * (772.5483399593904,), 320.0, 180.0, depth_factor=1.0, baseline_m=0.25
 )
@@ -519,6 +522,7 @@ LAYOUTS = (
     Layout("euroc", ("cam0/data.csv",), read_euroc),
     TUM,
 )
+"""All layouts, in the order in which they are tried."""
 
 
 def layouts_of(folder: Path, catalogued: str = "") -> list[Layout]:

@@ -54,6 +54,7 @@ _SHAPES = {
     "corridor": _Shape(-14.0, 3900, 1),
     "rooms": _Shape(0.0, 6600, 2),
 }
+"""The buildings by name."""
 
 
 class _LoosePiece(NamedTuple):
@@ -299,6 +300,7 @@ _BUILDERS: dict[str, Callable[[_Building], Walk]] = {
     "corridor": _corridor,
     "rooms": _rooms,
 }
+"""What furnishes each building."""
 
 LOOPS = {
     f"loop_{name}{change}": Variant(

@@ -21,6 +21,7 @@ from dynslam_bench.sequences.synthetic.arithmetic import Array, arctan2, cos, no
 # * rpy: rotations about the three principal axes, one after the other.
 
 MOTIONS = ("xyz", "static", "halfsphere", "rpy")
+"""Names of the motions, those of TUM's fr3 sequences."""
 EYE_HEIGHT_M = 1.35
 """Height of the camera at rest."""
 TILT_RAD = math.radians(10.0)

@@ -45,6 +45,7 @@ class Primitive:
 
 
 Parts = list[Primitive]
+"""The primitives that a thing is made of."""
 
 
 def primitive(
@@ -96,6 +97,7 @@ def primitive(
     )
 
 
+# `primitive` of each kind
 box = partial(primitive, BOX)
 cone = partial(primitive, ROUND_CONE)
 quad = partial(primitive, QUAD)

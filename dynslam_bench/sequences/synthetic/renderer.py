@@ -522,6 +522,7 @@ def _adapted(sensor: SensorSettings, world: Mapping[str, Any]) -> SensorSettings
 
 
 _MOST_THREADS = 4
+"""Threads of one frame, at most."""
 
 
 def default_threads() -> int:
