@@ -191,7 +191,7 @@ class DenseDaisyFlow:
 
 @dataclass(frozen=True, eq=False)
 class DescribedImage:
-    """What both directions, and the next pair, need of one image; sizes are those of the half-resolution image.
+    """One image, prepared for both directions and for the next pair; sizes are those of the half-resolution image.
 
     Attributes:
         maps: Its orientation maps.
@@ -771,7 +771,7 @@ class RegionArrays(NamedTuple):
 
 
 class PixelMatching(NamedTuple):
-    """What the raw cost (Eq. 1) of a pixel is computed from.
+    """Images, descriptors and tables that give the raw cost (Eq. 1) of a pixel.
 
     Attributes:
         reference: Orientation maps and grey levels of the reference.
@@ -787,7 +787,7 @@ class PixelMatching(NamedTuple):
 
 
 class GuidedFilter(NamedTuple):
-    """How costs are aggregated (Eq. 2).
+    """The guided filter by which costs are aggregated (Eq. 2).
 
     Attributes:
         guide: float32 ``[h, w]``, half-resolution grey levels in [0, 1].

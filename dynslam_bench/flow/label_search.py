@@ -53,7 +53,7 @@ _MIX2 = np.uint64(0x94D049BB133111EB)
 
 
 class Strategy(NamedTuple):
-    """How a search chooses the labels that it evaluates.
+    """A strategy of label search: how it chooses the labels that it evaluates.
 
     Attributes:
         rules: The moth-flame equations in force; None for random searches.
@@ -84,7 +84,7 @@ STRATEGIES: dict[SearchName, Strategy] = {
 
 
 class SearchRules(NamedTuple):
-    """How `run_phase` chooses labels: a `Strategy` with its tables.
+    """A `Strategy` with its tables, as `run_phase` reads it.
 
     Attributes:
         flights: Number of flames and coefficients of each iteration.
@@ -105,7 +105,7 @@ class SearchRules(NamedTuple):
 
 
 class SearchPlan(NamedTuple):
-    """How a budget is spent.
+    """The plan of a search: how its budget of evaluations is spent.
 
     Attributes:
         population: Labels kept a point.

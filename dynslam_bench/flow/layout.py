@@ -94,7 +94,7 @@ def sampling_table() -> tuple[NDArray[np.int32], NDArray[np.int64]]:
 
 
 class MapGeometry(NamedTuple):
-    """Where each level lies in the flat histogram array.
+    """Geometry of the maps: where each level lies in the flat histogram array.
 
     Attributes:
         base: int64 ``[LEVELS]``, index of each level's first histogram (the corner of its margin).

@@ -76,13 +76,13 @@ class Workspace(NamedTuple):
         right: float32 ``[length]``, column from the window's centre.
         down: float32 ``[length]``, row from the window's centre.
         grid_columns: int32 ``[pitch * pitch ...]``, column of each pixel of the patch.
-        grid_rows: int32, likewise, its row.
-        squares: int32, likewise, scratch of `warp_patch`.
+        grid_rows: int32 ``[pitch * pitch ...]``, its row.
+        squares: int32 ``[pitch * pitch ...]``, scratch of `warp_patch`.
         patch: float32 ``[pitch * pitch ...]``, the warped target.
         frame: float32, the template's samples: the window with a frame of one pixel.
         template: float32 ``[length]``, the window's grey levels without their mean.
         gradient_x: float32 ``[length]``, differences over two pixels along x.
-        gradient_y: float32 ``[length]``, likewise along y.
+        gradient_y: float32 ``[length]``, differences over two pixels along y.
         hessian: float64 ``[4, 4]``, normal equations of translation, scale and rotation.
         steepest: float64 ``[4]``, their right side, then their solution.
     """
@@ -161,7 +161,7 @@ class Warp(NamedTuple):
 
 
 class Alignment(NamedTuple):
-    """Where the translations within one warp ended, in pixels of the patch.
+    """Result of the translations within one warp, in pixels of the patch.
 
     Attributes:
         x: Offset after the last step.

@@ -31,7 +31,7 @@ class StampUnit:
 
     @property
     def per_s(self) -> float:
-        """How many of it are a second."""
+        """Number of units in a second."""
         return float(10**self.digits)
 
 
@@ -71,11 +71,11 @@ MOST_FRAMES = 1e8
 
 @dataclass(frozen=True)
 class _Measured:
-    """What is measured of stamps, in the unit that they are written in.
+    """Size, span and step of stamps, in the unit that they are written in.
 
     Attributes:
         latest: The largest of them, without signs.
-        usual: Their median, likewise.
+        usual: Their median, without signs.
         span: From the first to the last.
         step: Median difference of distinct ones in order of time; None for fewer than two.
     """

@@ -39,7 +39,7 @@ _UNIT_TOLERANCE = 0.01
 
 @dataclass(frozen=True)
 class FileNotes:
-    """What a file held that was not taken as it stands.
+    """Counts of what a file held that was not taken as it stands.
 
     Attributes:
         lines: Lines with a pose, skipped ones included.

@@ -593,6 +593,6 @@ def _similarity(
 
 
 def _moved(instances: Instances, masks: list[NDArray[np.bool_]]) -> Instances:
-    """The same objects under new masks, without those that left the image."""
+    """Objects under new masks, without those that left the image."""
     stack = np.array(masks, bool).reshape(instances.masks.shape)
     return replace(instances, masks=stack, boxes=boxes_of(stack)).visible()

@@ -36,7 +36,7 @@ POSES = (
 
 @dataclass(frozen=True)
 class Unpacked:
-    """What came of a bag.
+    """The result of unpacking a bag.
 
     Attributes:
         folder: The sequence's folder.

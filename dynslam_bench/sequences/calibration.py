@@ -106,7 +106,7 @@ class Quantity:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What was measured in a recording.
+    """The result of calibrating a recording.
 
     Attributes:
         camera: The recording's camera with the measured values in place of its own.

@@ -88,7 +88,7 @@ Cutout = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]
 
 @dataclass(frozen=True)
 class Composed:
-    """What `compose` wrote.
+    """The result of `compose`.
 
     Attributes:
         folder: The sequence, in TUM layout with ``people.txt``.
@@ -590,7 +590,7 @@ def paste(
 def _shadow(
     shown: NDArray[np.bool_], z: NDArray[np.float32], behind: NDArray[np.float32], camera: Camera
 ) -> NDArray[np.bool_]:
-    """What a projector to the right of the depth camera does not light, because the person stands in its way."""
+    """Pixels ``[H, W]`` in the person's shadow, which a projector to the right of the depth camera does not light."""
     # Disparities in pixels of the person and of what is behind; a pixel is dark if a surface some
     # pixels to its right has a disparity that is larger by more than these pixels.
     scale = camera.fx * _SHADOW_BASELINE_M

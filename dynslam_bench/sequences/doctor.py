@@ -50,7 +50,7 @@ _UNREADABLE = (DynslamError, OSError, ValueError)
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What the check of a recording found.
+    """The result of checking a recording.
 
     Attributes:
         id: What the caller named: an id or the path of a folder.
@@ -147,7 +147,7 @@ def examine(
 
 @dataclass(frozen=True, eq=False)
 class _Measurement:
-    """What was measured in the frames of a recording.
+    """Measurements in the frames of a recording.
 
     Attributes:
         statistics: Statistics of the images.

@@ -49,7 +49,7 @@ MANIFEST = "manifest.sha256"
 
 
 class Receipt(Record):
-    """What was fetched, stored inside the sequence's folder.
+    """Record of a fetched archive, stored inside the sequence's folder.
 
     Attributes:
         schema_version: Version of this record.

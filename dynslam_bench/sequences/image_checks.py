@@ -45,7 +45,7 @@ _PEAK_REACH = 30
 
 @dataclass(eq=False)
 class ImageStatistics:
-    """What is kept of the frames that were read, stretch by stretch.
+    """Statistics of the frames that were read, collected stretch by stretch.
 
     Attributes:
         depth_factor: Raw units a metre.
@@ -75,7 +75,7 @@ class ImageStatistics:
 
     @property
     def frames(self) -> int:
-        """How many frames were added."""
+        """Number of frames that were added."""
         return sum(len(colour) for colour, _ in self.contours)
 
     def add(self, stretch: list[Frame]) -> None:

@@ -328,7 +328,7 @@ def read_as(poses: Array, reading: str) -> Array:
 
 
 def agreement(measured: Array, true: Array, bounds: tuple[float, float] = (1e-6, 1e6)) -> float:
-    """How well vectors ``[N, 3]`` agree up to a gain within bounds: 1 - weighted median of their relative differences.
+    """Agreement of vectors ``[N, 3]`` up to a gain within bounds: 1 - weighted median of their relative differences.
 
     1 is perfect; independent directions give some 0.3; less is the opposite.
     """
@@ -373,7 +373,7 @@ def rotation_between(measured: Array, true: Array, *, proper: bool = True) -> Ar
 
 @dataclass(frozen=True)
 class Match:
-    """How well a truth, read in one convention and shifted in time, agrees with the measured motions.
+    """Agreement of a truth, read in one convention and shifted in time, with the measured motions.
 
     Attributes:
         reading: One of `READINGS`.

@@ -108,7 +108,7 @@ class Masks:
 
 @dataclass(frozen=True)
 class Part:
-    """Which frames of which content are seen.
+    """The part of a sequence that is seen: which frames of which content.
 
     Attributes:
         id: Id without a length: ``synthetic/walking_xyz?scene=0`` for all its lengths; a noise seed
@@ -139,7 +139,7 @@ class Part:
 
 
 def part_of(sequence: Sequence, offset: int = 0) -> Part:
-    """What part a sequence is.
+    """The part of a whole sequence that an opened sequence is.
 
     A sequence whose frames are cut from a longer one may offer ``whole_id``, ``scene_digest()`` and
     ``noise``, as the rendered ones do; any other is its own whole.

@@ -624,7 +624,7 @@ def triangulate(
 
 
 def _view(slam_map: Map, slot: int) -> View:
-    """What triangulation reads of a keyframe."""
+    """A keyframe's features as triangulation reads them."""
     n = int(slam_map.kf_count[slot])
     return View(
         slam_map.kf_pose[slot],

@@ -175,7 +175,7 @@ class RootMapPose(Enum):
 
 @dataclass(frozen=True, eq=False)
 class LoopClosingResult:
-    """What `LoopCloser.close` did.
+    """The result of `LoopCloser.close`.
 
     Attributes:
         rescaled: What lengths around keyframes were multiplied by, by the keyframes' slots; with

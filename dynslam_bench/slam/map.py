@@ -81,7 +81,7 @@ DEPTH_IMAGES = 8
 
 
 class ObservationTables(NamedTuple):
-    """Which keyframe observes which point: both directions of the same relation, as compiled loops take them.
+    """Observations of points by keyframes, in both directions, as compiled loops take them.
 
     Attributes:
         obs_kf: int32 ``[M, O]``, by point the slots of the keyframes that observe it, oldest first.
@@ -97,7 +97,7 @@ class ObservationTables(NamedTuple):
 
 
 class PointViews(NamedTuple):
-    """From where points are recognised.
+    """Positions of points, and the views from which they are recognised.
 
     Attributes:
         position: float64 ``[M, 3]``, world points.
@@ -111,7 +111,7 @@ class PointViews(NamedTuple):
 
 
 class KeyframeViews(NamedTuple):
-    """What keyframes tell of the points that they observe.
+    """Keyframes as the points that they observe need them.
 
     Attributes:
         descriptors: uint64 ``[S, F, W]``.

@@ -121,7 +121,7 @@ class MapFeatures(Record):
 
 
 class MapHeader(Record):
-    """What a map file says of the map.
+    """Header of a map file.
 
     Attributes:
         kind: Says that the file is a map.

@@ -330,7 +330,7 @@ class CameraMotion:
 
 @dataclass(frozen=True, eq=False)
 class CameraVelocity:
-    """How the world moves in the camera frame: ``X(t) = exp(angular t) X(0) + linear t``.
+    """Velocity of the world in the camera frame: ``X(t) = exp(angular t) X(0) + linear t``.
 
     Attributes:
         linear: ``[3]``, metres a second.

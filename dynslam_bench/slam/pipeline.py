@@ -91,7 +91,7 @@ class StageClock:
 
 @dataclass(frozen=True, eq=False)
 class PreviousFrame:
-    """What filters and flow read of the frame before.
+    """The previous frame, as filters and flow read it.
 
     Attributes:
         frame: The frame.

@@ -640,7 +640,7 @@ def _bearings(xy: Array, camera: Camera) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class MotionBound:
-    """Where the camera can be.
+    """Bound on where the camera can be since it was tracked last.
 
     Attributes:
         atlas: Where the submaps may lie; the camera was tracked last in the active one.

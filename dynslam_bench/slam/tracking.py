@@ -141,7 +141,7 @@ class InitialPose:
 
 
 class LastFrameSearch(NamedTuple):
-    """How the last frame's points are searched in the new frame.
+    """A search of the last frame's points in the new frame.
 
     Attributes:
         widen: Factor on the search window.

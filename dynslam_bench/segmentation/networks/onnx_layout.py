@@ -55,7 +55,7 @@ _ANCHORS = 3
 
 @dataclass(frozen=True)
 class Layout:
-    """How to read a network's outputs.
+    """The layout of a network's outputs: how they are read.
 
     Attributes:
         kind: Which decoder.
@@ -90,7 +90,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Metadata:
-    """What a file says of its network.
+    """Metadata of a network's file.
 
     Attributes:
         names: Class number to name; None where the file names no classes.

@@ -200,7 +200,7 @@ def build(settings: SegmentationSettings, context: SegmenterContext) -> OnnxSegm
 
 @dataclass(frozen=True)
 class Placement:
-    """Where the frame lies in the network's input: ``x_input = x_frame * scale_x + offset_x``, likewise y.
+    """Scale and offset of the frame in the network's input: ``x_input = x_frame * scale_x + offset_x``, likewise y.
 
     Attributes:
         frame: Height and width of the frame.

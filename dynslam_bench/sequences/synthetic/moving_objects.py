@@ -38,7 +38,7 @@ _CARRIER_ID = 9
 
 
 class Script(NamedTuple):
-    """What moves, and the timeline of the person who carries it.
+    """The things that move, and the timeline of the person who carries them.
 
     Attributes:
         bodies: The things.

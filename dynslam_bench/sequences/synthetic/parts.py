@@ -154,7 +154,7 @@ def along(start: Array, end: Array, side: Array) -> tuple[Array, float]:
 
 @dataclass(frozen=True)
 class At:
-    """Where a thing is at one time.
+    """Place and direction of a thing at one time: a key of its timeline.
 
     Attributes:
         t: Seconds.
@@ -173,7 +173,7 @@ class At:
 
 @dataclass(frozen=True)
 class Key:
-    """Where and how a person is at one time, and where a chair is.
+    """Place and activity of a person, or place of a chair, at one time: a key of the timeline.
 
     Attributes:
         t: Seconds.

@@ -54,7 +54,7 @@ _SHIRTS = ("print", "print", "plaid:1", "plaid:1", "stripes", "stripes")
 
 @dataclass(frozen=True)
 class Person:
-    """What does not change about a person: size, build, colours and clothes.
+    """Appearance of a person, which does not change: size, build, colours and clothes.
 
     Attributes:
         instance: Id in the masks.
@@ -87,7 +87,7 @@ class Person:
 
 @dataclass(frozen=True)
 class Posture:
-    """What a person does at one time.
+    """Place, direction and activity of a person at one time.
 
     Attributes:
         x: Place on the floor, metres.
@@ -246,7 +246,7 @@ class _Figure:
         self.hips = product(body, _yaw(-twist))
 
     def style(self, texture: str, tint: Array, **more: Any) -> dict[str, Any]:
-        """How a limb of this person looks."""
+        """Arguments of `primitive` for a limb of this person: its look and its instance."""
         return {"instance": self.who.instance, "texture": texture, "tint": tint, **more}
 
     def wave(self, frequency: float, phase: float) -> float:
@@ -367,7 +367,7 @@ def _head(figure: _Figure) -> Parts:
 
 
 def _hair(figure: _Figure, skull: Array, head: Array) -> Parts:
-    """What covers the head.
+    """Hair and cap: what covers the head.
 
     Args:
         figure: The person.

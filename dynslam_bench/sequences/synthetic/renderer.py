@@ -230,7 +230,7 @@ class Renderer:
         return depth, self._ids[hit >> 3]
 
     def cast(self, view: View) -> tuple[HitImage, Array]:
-        """What every pixel of a view sees (8 * primitive + face, -1 for nothing) and its z-depth in metres."""
+        """Surface that every pixel of a view sees (8 * primitive + face, -1 for nothing), and its z-depth in metres."""
         return self._cast(*self._tiles(view))
 
     def _rows(self, work: Callable[[int, int], None]) -> None:
@@ -284,7 +284,7 @@ class Renderer:
         return tiles, Primitives(scene.kind, camera_to_local, scene.shape)
 
     def _cast(self, tiles: Tiles, primitives: Primitives) -> tuple[HitImage, Array]:
-        """What every pixel sees (`cast_geometry`) and its z-depth in metres."""
+        """The surface that every pixel sees (`cast_geometry`) and its z-depth in metres."""
         hit = np.empty(SIZE, np.int32)
         depth = np.empty(SIZE)
         self._rows(

@@ -47,7 +47,7 @@ Actor = tuple[Person, Callable[[float], Posture]]
 
 @dataclass(frozen=True, eq=False)
 class Optics:
-    """What a sequence's sensors do beside the defaults.
+    """Settings of a sequence's sensors that differ from the defaults.
 
     Attributes:
         readout_s: From the first row's exposure to the last one's; 0 is a global shutter. The
