@@ -397,14 +397,14 @@ def read_frame(image: Bytes, x: Scalar, y: Scalar, rows: int, pitch: int, out: F
     for block in range((pitch + 15) // 16):
         first = min(16 * block, max(pitch - 16, 0))
         at = row * stride + column + first
-        before = load_bytes(flat, at)
-        before = before + right * (load_bytes(flat, at + 1) - before)
+        above = load_bytes(flat, at)
+        above = above + right * (load_bytes(flat, at + 1) - above)
         for r in range(rows):
             at += stride
-            after = load_bytes(flat, at)
-            after = after + right * (load_bytes(flat, at + 1) - after)
-            store(out, r * pitch + first, before + lower * (after - before))
-            before = after
+            below = load_bytes(flat, at)
+            below = below + right * (load_bytes(flat, at + 1) - below)
+            store(out, r * pitch + first, above + lower * (below - above))
+            above = below
 
 
 @inlined

@@ -156,19 +156,19 @@ class Walk:
 
     def at(self, times: Array) -> Array:
         """Places ``[N, 2]`` at times (seconds)."""
-        # Place in control points, its whole and its fractional part.
+        # place in control points, its whole and its fractional part
         s = np.asarray(times, dtype=np.float64) * (len(self.control) / self.lap_s)
         i = np.floor(s).astype(np.int64)
         f = (s - i)[:, None]
         g = 1 - f
         n = len(self.control)
-        before, here, after, beyond = (self.control[(i + k) % n] for k in (-1, 0, 1, 2))
-        # The cubic B-spline's basis.
+        p0, p1, p2, p3 = (self.control[(i + k) % n] for k in (-1, 0, 1, 2))
+        # the cubic B-spline's basis at the four control points around it
         return np.asarray(
-            g * g * g / 6 * before
-            + (3 * f * f * f - 6 * f * f + 4) / 6 * here
-            + (-3 * f * f * f + 3 * f * f + 3 * f + 1) / 6 * after
-            + f * f * f / 6 * beyond
+            g * g * g / 6 * p0
+            + (3 * f * f * f - 6 * f * f + 4) / 6 * p1
+            + (-3 * f * f * f + 3 * f * f + 3 * f + 1) / 6 * p2
+            + f * f * f / 6 * p3
         )
 
     def time_nearest(self, place: tuple[float, float]) -> float:
