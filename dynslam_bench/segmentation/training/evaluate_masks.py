@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
 
-from dynslam_bench.contracts import Frame
+from dynslam_bench.contracts import Frame, Segmenter
 from dynslam_bench.core import SegmentationError, write_atomic
 from dynslam_bench.core.records import Record, schema
 from dynslam_bench.evaluation import MaskCounts, compare_masks
@@ -18,7 +18,7 @@ from dynslam_bench.segmentation.build_segmenter import (
     weights_digest,
 )
 from dynslam_bench.segmentation.settings import SegmentationSettings
-from dynslam_bench.segmentation.training.labelled_images import open_labelled
+from dynslam_bench.segmentation.training.labelled_images import LabelledImage, open_labelled
 
 THRESHOLDS: tuple[float, ...] = tuple(round(0.5 + 0.05 * step, 2) for step in range(10))
 """COCO's IoU thresholds 0.50, 0.55 ... 0.95."""
@@ -213,6 +213,21 @@ class SegmenterScore(Record):
     threads: int
 
 
+def _add_image(
+    tallies: dict[str, MaskTally], segmenter: Segmenter, image: LabelledImage, index: int
+) -> float:
+    """Segment an image and add its masks to the tally of each class; returns the seconds that it took."""
+    frame = Frame(index, float(index), image.rgb, np.zeros(image.rgb.shape[:2], np.float32))
+    start = time.perf_counter()
+    detections = segmenter.segment(frame)
+    seconds = time.perf_counter() - start
+    for name, tally in tallies.items():
+        labelled = image.masks[[kind == name for kind in image.class_names]]
+        predicted = detections.of_classes([name])
+        tally.add(labelled, predicted.masks, predicted.scores)
+    return seconds
+
+
 def evaluate_segmenter(
     settings: SegmentationSettings,
     data: str,
@@ -258,15 +273,8 @@ def evaluate_segmenter(
     shown: set[str] = set()
     for done, index in enumerate(chosen.tolist(), 1):
         image = images[index]
-        frame = Frame(index, float(index), image.rgb, np.zeros(image.rgb.shape[:2], np.float32))
-        start = time.perf_counter()
-        detections = segmenter.segment(frame)
-        times.append(time.perf_counter() - start)
+        times.append(_add_image(tallies, segmenter, image, index))
         shown.update(image.class_names)
-        for name, tally in tallies.items():
-            labelled = image.masks[[kind == name for kind in image.class_names]]
-            predicted = detections.of_classes([name])
-            tally.add(labelled, predicted.masks, predicted.scores)
         progress(done, len(chosen))
 
     # means over the classes that occur

@@ -99,31 +99,20 @@ class RecordedSequence:
         self._any_depth_size = any_depth_size
         self._furthest_m = contents.furthest_m
 
-        # the images that are there, the depth images' stamps as the camera delays them
-        people = contents.people
-        listed = [*contents.colour.files, *contents.depth.files]
-        if people is not None:
-            listed += people.files
-        for file in listed:
-            inside(folder, file, where=f"a list of images in {folder}", kind=SequenceError)
-        delayed = contents.depth.stamps_ns + round(1e9 * camera.depth_delay_s)
+        # the images that are there, in pairs of a colour and a depth image
+        _check_inside(folder, contents)
         paired = contents.paired and not camera.depth_delay_s
-        tolerated = 0.0 if paired else MISSING_TOLERATED
-        colour = _existing(folder, contents.colour, "colour", tolerated)
-        depth = replace(contents.depth, stamps_ns=delayed)
-        depth = _existing(folder, depth, "depth", tolerated)
-
-        # pairs of a colour and a depth image
+        colour, depth = _existing_images(folder, contents, camera, paired=paired)
         if paired:
             first = second = np.arange(len(colour))
         else:
             first, second = _associated(folder, colour, depth, max_time_difference_s)
+
+        # stamps in seconds, the frame rate, and the files of each frame
         self.timestamps_ns = colour.stamps_ns[first]
         self.timestamps = colour.stamps[first]
         self.timestamps_ns.flags.writeable = False
         self.timestamps.flags.writeable = False
-
-        # stamps in seconds, the frame rate, and the files of each frame
         _check_unit(folder, self.timestamps)
         self.fps, rate_note = _frame_rate(fps, self.timestamps)
         self.depth_timestamps = depth.stamps[second]
@@ -132,8 +121,8 @@ class RecordedSequence:
 
         # masks of people, and the truth in the camera's axes
         self._people: list[str] = []
-        if people is not None:
-            self._people = self._mask_files(_existing(folder, people, "mask", 0.0))
+        if contents.people is not None:
+            self._people = self._mask_files(_existing(folder, contents.people, "mask", 0.0))
         self.masks: MaskSource | None = Masks(self._masks_of) if self._people else None
         self.ground_truth, turned = _truth_of_camera(contents.truth, camera)
 
@@ -144,7 +133,7 @@ class RecordedSequence:
             **(colour.irregular + depth.irregular),
             **self._count_poses(),
         }
-        parts = [
+        phrases = [
             f"{len(self)} frames of {len(colour)} colour and {len(depth)} depth images "
             f"(|dt| < {max_time_difference_s:g} s)",
             *(f"{count} {what}" for what, count in counts.items() if count),
@@ -155,7 +144,7 @@ class RecordedSequence:
             *notes,
             rate_note,
         ]
-        self.dropped = "; ".join(part for part in parts if part)
+        self.dropped = "; ".join(phrase for phrase in phrases if phrase)
 
         # most damage shows in the first frame
         self[0]
@@ -245,6 +234,33 @@ class RecordedSequence:
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.id}: {len(self)} frames in {self.folder}>"
+
+
+def _check_inside(folder: Path, contents: Contents) -> None:
+    """Refuse lists with a file outside of the folder."""
+    listed = [*contents.colour.files, *contents.depth.files]
+    if contents.people is not None:
+        listed += contents.people.files
+    for file in listed:
+        inside(folder, file, where=f"a list of images in {folder}", kind=SequenceError)
+
+
+def _existing_images(
+    folder: Path, contents: Contents, camera: Camera, *, paired: bool
+) -> tuple[ImageList, ImageList]:
+    """The colour and the depth images whose files are there, the depth's stamps as the camera delays them.
+
+    Args:
+        folder: The sequence's folder.
+        contents: Its lists.
+        camera: Tells by how much depth is exposed later than its stamps say.
+        paired: Whether the lists are paired entry by entry, so that no file may be missing.
+    """
+    tolerated = 0.0 if paired else MISSING_TOLERATED
+    colour = _existing(folder, contents.colour, "colour", tolerated)
+    delayed = contents.depth.stamps_ns + round(1e9 * camera.depth_delay_s)
+    depth = replace(contents.depth, stamps_ns=delayed)
+    return colour, _existing(folder, depth, "depth", tolerated)
 
 
 def _associated(
