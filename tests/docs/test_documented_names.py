@@ -105,6 +105,7 @@ def missing(named: list[Mention], known: object) -> list[str]:
     )  # type: ignore[operator]
 
 
+@pytest.mark.slow
 def test_files_and_folders_exist() -> None:
     path = re.compile(r"(?:[\w.-]+/)+(?:[\w.-]+\.(?:py|toml|md|jsonl))?")
     named = [m for m in mentions() if path.fullmatch(m.text) and not m.text.startswith(OF_USERS)]
@@ -132,6 +133,7 @@ def _is_symbol(text: str) -> bool:
     )
 
 
+@pytest.mark.slow
 def test_identifiers_exist() -> None:
     identifier = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)(?:\(\))?")
     named = [

@@ -201,6 +201,7 @@ def reused_pose(self, frame):
     return TrackResult(self.pose, "ok")
 
 
+@pytest.mark.slow
 def test_a_good_tracker_passes():
     report = tracker_report(Good, frames=4)
     assert report.ok
