@@ -341,6 +341,7 @@ GEOMETRY = "emfoa-oft?masks=none"
 # Excerpt, tracker, frames, stride, and the least ATE so far in mm. Of Bonn crowd as many frames as
 # are needed for a system that culls nothing to fail (295 and 206 mm there): all 200 with a network
 # would take a minute.
+@pytest.mark.slow
 @pytest.mark.parametrize("excerpt, tracker, frames, stride, least_mm", [
     pytest.param("tum/rgbd_dataset_freiburg1_xyz", "orb-slam2", None, 1, 4.9, id="fr1_xyz"),
     pytest.param("tum/rgbd_dataset_freiburg1_rpy", "orb-slam2", None, 1, 5.2, id="fr1_rpy"),
