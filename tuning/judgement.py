@@ -9,7 +9,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from optuna.trial import TrialState
+from optuna.trial import FrozenTrial, TrialState
 from pydantic import Field
 
 from dynslam_bench.core import StudyError, read_text, write_atomic
@@ -235,6 +235,7 @@ def conclude(
     shipped: PairedRatio | None = None,
     failures: Sequence[str] = (),
     families: str = "",
+    inert: int = 0,
 ) -> tuple[Verdict, str]:
     """The verdict of a study and its conclusion: a few short sentences.
 
@@ -243,13 +244,19 @@ def conclude(
         candidates: The best one first.
         trials: Log ratio by scene of each trial beside the baseline's.
         shipped: The default settings on the judging scenes, where the baseline is something else.
-        failures: Why trials failed, said where no trial did better.
+        failures: Why trials failed.
         families: A sentence on the families that judged; empty for none.
+        inert: See `without_effect`.
     """
+    if inert:
+        return Verdict.NO_DIFFERENCE, (
+            f"{Verdict.NO_DIFFERENCE.value.capitalize()}: nothing that the study set has an effect. All {inert} trials "
+            f"with other settings have the baseline's trajectories to the last bit. Does {spec.tracker} read its settings?"
+        )
     best = candidates[0] if candidates else None
     verdict, sentences = judge(best)
-    if best is None and failures:
-        sentences.append(f"{len(failures)} failed, the first one as {failures[0]}")
+    if failures:
+        sentences.append(f"{len(failures)} trials failed, the first one as {failures[0]}")
     if families and best is not None and best.evidence is not None:
         sentences.append(families)
         if best.beyond is not None:
@@ -404,10 +411,11 @@ def finish(
     note = on_note or (lambda _: None)
     shipped = dict[str, PairedRatio]()
 
-    # candidates, ranked
+    # candidates, ranked; there is nothing to choose or judge where no setting changes anything
     candidates = _best_trials(tuner)
+    inert = without_effect(tuner)
     chooses = bool(design.confirm and design.held_out)
-    if candidates and chooses:
+    if candidates and chooses and not inert:
         note(
             f"the baseline and {len(candidates)} trials on {len(design.confirm)} instances to choose on"
         )
@@ -418,7 +426,7 @@ def finish(
 
     # the best one is judged, once on the same scenes
     _check_same_look(tuner, candidates)
-    if candidates and design.judging and not candidates[0].failed:
+    if candidates and design.judging and not candidates[0].failed and not inert:
         split = "held_out" if design.held_out else "confirm"
         note(f"trial {candidates[0].trial} on {len(design.judging)} instances that judge it")
         candidates[:1] = _run_again(tuner, split, candidates[:1], jobs, shipped)
@@ -435,6 +443,7 @@ def finish(
         shipped=shipped.get("held_out" if design.held_out else "confirm"),
         failures=[trial.user_attrs.get("reason", "") for trial in failed],
         families=families_sentence(design) if design.judging else "",
+        inert=inert,
     )
     summary = StudySummary(
         name=spec.name,
@@ -484,6 +493,42 @@ def _best_trials(tuner: Study) -> list[Candidate]:
         if trial.number > 0 or is_rival
     ]
     return candidates[: spec.top]
+
+
+def without_effect(tuner: Study) -> int:
+    """How many trials had other settings than trial 0, where all of them gave its trajectories to the last bit.
+
+    Such settings change nothing: a program may ignore them. 0 where a trial gave another trajectory,
+    or there is none to compare.
+    """
+    finished = tuner.study.get_trials(
+        deepcopy=False, states=(TrialState.COMPLETE, TrialState.PRUNED)
+    )
+    first = next((trial for trial in finished if trial.number == 0), None)
+    if first is None:
+        return 0
+    baseline = _runs_of(first)
+    compared = 0
+    for trial in finished:
+        if trial.params == first.params:
+            continue
+        runs = {name: run for name, run in _runs_of(trial).items() if name in baseline}
+        for name, run in runs.items():
+            if _tracks(tuner, run) != _tracks(tuner, baseline[name]):
+                return 0
+        compared += bool(runs)
+    return compared
+
+
+def _runs_of(trial: FrozenTrial) -> dict[str, str]:
+    """The id of a trial's run on each instance."""
+    return {str(row[0]): str(row[1]) for row in trial.user_attrs.get("instances", ())}
+
+
+def _tracks(tuner: Study, run: str) -> list[bytes]:
+    """The files of a run's trajectories."""
+    folder = tuner.store.folder(run)
+    return [file.read_bytes() for file in sorted(folder.glob("trajectory_*.txt"))]
 
 
 def _check_same_look(tuner: Study, candidates: Sequence[Candidate]) -> None:
