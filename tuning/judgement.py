@@ -27,7 +27,6 @@ from dynslam_bench.sequences.families import family_of
 from dynslam_bench.tuning.objectives import (
     ACCURACY,
     SPEED,
-    Configuration,
     InstanceFailedError,
     Outcomes,
     combined_objective,
@@ -36,7 +35,7 @@ from dynslam_bench.tuning.objectives import (
     improvement_bound,
     violations,
 )
-from dynslam_bench.tuning.plan import held_settings, seen_note, splits_seen
+from dynslam_bench.tuning.plan import held_settings, known_settings, seen_note, splits_seen
 from dynslam_bench.tuning.storage import (
     Importance,
     best_trials,
@@ -45,7 +44,7 @@ from dynslam_bench.tuning.storage import (
     scene_ratios,
 )
 from dynslam_bench.tuning.study import SUMMARY_FILE, StoredStudy, Study
-from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec, scenes
+from dynslam_bench.tuning.study_file import TRACKER, ProblemInstance, StudySpec, scenes
 
 NOT_JUDGED = "not judged"
 """Status of settings that no scenes have judged."""
@@ -459,10 +458,7 @@ def _run_again(
     level = (
         tuner.spec.level(len(scenes(tuner.design.judging))) if split != "recorded" else ONE_SIDED
     )
-    tuned = [
-        Configuration(tuner.spec.tracker, {**tuner.held, **candidate.params})
-        for candidate in candidates
-    ]
+    tuned = [tuner.configuration(candidate.params) for candidate in candidates]
     default = [] if tuner.shipped is None else [tuner.shipped]
     baseline, runs = tuner.evaluate_beside([*tuned, *default], instances, jobs=jobs)
     if default and not isinstance(outcomes := runs.pop(), InstanceFailedError):
@@ -592,8 +588,12 @@ def preset_text(
     settings = {
         name: value for name, value in {**held_settings(spec), **tuned}.items() if name not in fixed
     }
+    # of a study with a choice of trackers: the settings that the chosen one has
+    tracker = str(settings.pop(TRACKER, spec.tracker))
+    if TRACKER in tuned:
+        settings = known_settings(tracker, settings)
     head = [
-        f"# settings of {spec.tracker}",
+        f"# settings of {tracker}",
         *comments,
         "",
         f"status = {json.dumps(status)}",

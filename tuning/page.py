@@ -133,7 +133,8 @@ def _asked(tuner: Study, summary: StudySummary) -> str:
 def _plots(tuner: Study, summary: StudySummary) -> list[Block]:
     """Optuna's own plots of the study; ratios in place of logarithms."""
     important = list(summary.importances)
-    params = important or [parameter.name for parameter in tuner.space]
+    tried = {name for trial in tuner.study.get_trials(deepcopy=False) for name in trial.params}
+    params = important or [parameter.name for parameter in tuner.space if parameter.name in tried]
     blocks = []
     for title, figure in _optuna_figures(tuner, params, bool(important)).items():
         # a row of contours for each parameter
@@ -196,7 +197,9 @@ def _preset(tuner: Study, summary: StudySummary, settings: Table) -> list[Block]
     shown = Block(table=settings)
     text = read_text(tuner.folder / "best.toml")
     if summary.is_to_use:
-        command = f"dynslam-bench run {tuner.spec.tracker} SEQUENCE --settings best.toml"
+        params = summary.best.params if summary.best else {}
+        tracker = tuner.configuration(params).tracker
+        command = f"dynslam-bench run '{tracker}' SEQUENCE --settings best.toml"
         return [shown, Block(text=text), Block(title="Use them", text=command)]
     why = "the default settings are as good" if summary.keeps_default else summary.verdict.value
     return [shown, Block(title=f"best.toml, not recommended: {why}", text=text)]

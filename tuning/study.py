@@ -54,7 +54,8 @@ from dynslam_bench.tuning.objectives import (
     own_objective,
     violations,
 )
-from dynslam_bench.tuning.plan import Plan, design_of, distributions, starting_point
+from dynslam_bench.tuning.plan import Plan, design_of
+from dynslam_bench.tuning.space import starting_point
 from dynslam_bench.tuning.storage import (
     EARLIER,
     NAMELESS_S,
@@ -71,6 +72,7 @@ from dynslam_bench.tuning.storage import (
     worker_name,
 )
 from dynslam_bench.tuning.study_file import (
+    TRACKER,
     ProblemInstance,
     PrunerName,
     SamplerName,
@@ -420,7 +422,7 @@ class Study(Plan):
 
     def configuration_of(self, trial: FrozenTrial | optuna.Trial) -> Configuration:
         """What a trial runs with."""
-        return Configuration(self.spec.tracker, {**self.held, **trial.params})
+        return self.configuration(trial.params)
 
     def ask(self, settings: Mapping[str, Scalar] | None = None) -> optuna.Trial:
         """The next trial: the first is the baseline's, then come those that wait, then the sampler's.
@@ -434,9 +436,10 @@ class Study(Plan):
         """
         with self._lock:
             if settings is not None:
-                self.study.enqueue_trial(starting_point(settings, self.space, self.base))
+                self.study.enqueue_trial(starting_point(settings, self.search))
             self._heartbeats.beat()
-            trial = self.study.ask(distributions(self.space))
+            trial = self.study.ask()
+            self.search.suggest(trial)
             trial.set_user_attr("worker", worker_name())
         return trial
 
@@ -604,7 +607,7 @@ class Study(Plan):
                 yield from self._earlier(Path(entry).expanduser())
             else:
                 preset = read_settings(Path(entry)) if isinstance(entry, str) else entry
-                yield starting_point(preset, self.space, self.base)
+                yield starting_point(preset, self.search)
 
     def _earlier(self, folder: Path) -> Iterator[FrozenTrial | dict[str, Scalar]]:
         """Complete trials of an earlier study, marked as such; its best ones are to be tried again."""
@@ -618,16 +621,20 @@ class Study(Plan):
         if study.user_attrs.get("identity", {}).get("code") != self._identity["code"]:
             source += ", other code"
         marks = {EARLIER: source}
-        spans = distributions(self.space)
+        spans = self.search.distributions()
         best = {trial.number for trial in best_trials(study, self.spec.top)}
         for trial in study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
             params = {name: value for name, value in trial.params.items() if name in spans}
             with suppress(StudyError):  # out of this study's range
-                params = starting_point(params, self.space, self.base)
+                params = starting_point(params, self.search)
                 if trial.number in best:
                     yield params  # to be run on this study's instances
+                effective = self.search.effective(params)
                 yield create_trial(
-                    params=params, distributions=spans, values=trial.values, user_attrs=marks
+                    params=effective,
+                    distributions={name: spans[name] for name in effective},
+                    values=trial.values,
+                    user_attrs=marks,
                 )
 
     def _open(
@@ -753,11 +760,15 @@ class Study(Plan):
         instances = spec.instances(*spec.tune, *spec.confirm, *spec.held_out)
         # the first instance of each sequence stands for it
         first_of = {instance.sequence: instance for instance in reversed(instances)}
-        configuration = Configuration(spec.tracker, self.held)
+        configuration = self.configuration({})
         for sequence, instance in first_of.items():
             run = resolve(self.run_spec(instance, configuration, cache=False)).identity
             identity[f"content of {sequence}"] = digest([run["content"], run["camera"]])
             identity |= program_of(run) | {"device": run["device"]}
+        for tracker in self.trackers[1:]:
+            other = self.configuration({TRACKER: tracker})
+            run = resolve(self.run_spec(instances[0], other, cache=False)).identity
+            identity[f"program of {tracker}"] = digest(program_of(run))
         identity["baseline settings"] = [self.baseline.tracker, dict(self.baseline.settings)]
         return identity | {"parameters": digest([repr(parameter) for parameter in self.space])}
 

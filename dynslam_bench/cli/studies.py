@@ -54,7 +54,12 @@ def space(
     plan = tuning.Plan(tuning.read_study(study), results)
     preview = plan.preview(jobs)
 
-    rows = [(p.name, range_text(p), plan.base[p.name], p.unit, p.meaning) for p in plan.space]
+    rows = []
+    for parameter in plan.space:
+        name = parameter.name
+        # a setting that only other choices give an effect has no value in the baseline
+        value = "-" if plan.search.why_not(name, {}) else plan.base[name]
+        rows.append((name, range_text(parameter), value, parameter.unit, parameter.meaning))
     settings = table(("setting", "range", "baseline", "unit", "meaning"), rows)
     lines = [settings, "", *preview.figures, *preview.proposal]
     present({"settings": plan.space, "preview": preview}, *lines)

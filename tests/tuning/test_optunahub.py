@@ -1,4 +1,4 @@
-"""The package for OptunaHub: a problem of real runs, and EMFOA as a sampler. Both are loaded from a copy of its folder."""
+"""The package for OptunaHub, loaded from a copy of its folder: a problem of real runs, and EMFOA as a sampler."""
 
 import shutil
 from pathlib import Path
