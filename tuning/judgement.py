@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from optuna.trial import TrialState
+from optuna.trial import FrozenTrial, TrialState
 from pydantic import Field
 
 from dynslam_bench.core import StudyError, read_text, write_atomic
@@ -33,10 +33,10 @@ from dynslam_bench.tuning.objectives import (
     compare,
     hold_last_pose_protocol,
     improvement_bound,
-    violations,
 )
 from dynslam_bench.tuning.plan import held_settings, known_settings, seen_note, splits_seen
 from dynslam_bench.tuning.storage import (
+    EARLIER,
     Importance,
     best_trials,
     count_states,
@@ -307,7 +307,11 @@ def _families(instances: Sequence[ProblemInstance]) -> list[str]:
 
 
 def finish(
-    tuner: Study, on_note: Callable[[str], None] | None = None, *, jobs: int = 1
+    tuner: Study,
+    on_note: Callable[[str], None] | None = None,
+    *,
+    jobs: int = 1,
+    trial: int | None = None,
 ) -> StudySummary:
     """Judge the best trial on scenes that it was not chosen on; write preset and summary.
 
@@ -320,6 +324,7 @@ def finish(
         tuner: A study with finished trials.
         on_note: Called with a line on every step.
         jobs: Runs at a time.
+        trial: The number of a trial to be judged in place of the best, e.g. one of the front.
 
     Returns:
         The summary; `best.toml` and `summary.json` lie in the study's folder.
@@ -333,7 +338,7 @@ def finish(
     shipped = dict[str, PairedRatio]()
 
     # candidates, ranked
-    candidates = _best_trials(tuner)
+    candidates = _best_trials(tuner) if trial is None else [_named_trial(tuner, trial)]
     chooses = bool(design.confirm and design.held_out)
     if candidates and chooses:
         note(
@@ -400,18 +405,37 @@ def _best_trials(tuner: Study) -> list[Candidate]:
         )
     # beside another tracker trial 0, the default settings, is a candidate too
     is_rival = tuner.baseline.tracker != spec.tracker
-    margin = spec.ate_margin if spec.at_equal_accuracy else None
-    candidates = [
-        Candidate(
-            trial=trial.number,
-            params=trial.params,
-            values=list(trial.values or ()),
-            ate_margin=margin,
-        )
-        for trial in finished
-        if trial.number > 0 or is_rival
-    ]
+    candidates = [_candidate(tuner, trial) for trial in finished if trial.number > 0 or is_rival]
     return candidates[: spec.top]
+
+
+def _named_trial(tuner: Study, number: int) -> Candidate:
+    """The candidate that a user has chosen.
+
+    Raises:
+        StudyError: There is no complete trial of that number, or it has the baseline's settings.
+    """
+    complete = {
+        trial.number: trial for trial in tuner.study.get_trials(states=(TrialState.COMPLETE,))
+    }
+    if number not in complete or EARLIER in complete[number].user_attrs:
+        raise StudyError(
+            f"study '{tuner.spec.name}' has no complete trial {number}", "see tune status"
+        )
+    if number == 0 and tuner.baseline.tracker == tuner.spec.tracker:
+        raise StudyError("trial 0 has the baseline's settings", "choose another one")
+    return _candidate(tuner, complete[number])
+
+
+def _candidate(tuner: Study, trial: FrozenTrial) -> Candidate:
+    """A trial as a candidate that nothing has judged yet."""
+    spec = tuner.spec
+    return Candidate(
+        trial=trial.number,
+        params=trial.params,
+        values=list(trial.values or ()),
+        ate_margin=spec.ate_margin if spec.at_equal_accuracy else None,
+    )
 
 
 def _check_same_look(tuner: Study, candidates: Sequence[Candidate]) -> None:
@@ -490,7 +514,7 @@ def _judged_on(
         single.name: compare(outcomes, baseline, objective=single, one_sided=level)
         for single in (ACCURACY, SPEED)
     }
-    violated = violations(tuner.spec, outcomes)
+    violated = tuner.violations(outcomes)
     update["feasible"] = candidate.feasible and max(violated.values(), default=0.0) <= 0.0
     if split == "confirm":
         update["choice"] = objective.value(outcomes, baseline)

@@ -6,7 +6,7 @@ apart.
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, islice, product, zip_longest
 from pathlib import Path
@@ -50,11 +50,15 @@ from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning.objectives import (
     Configuration,
     Objective,
+    Outcome,
+    Outcomes,
     find_objective,
     hold_last_pose_protocol,
     log_errors,
     outcome,
     place_of,
+    quantity,
+    violations,
 )
 from dynslam_bench.tuning.space import build_space, starting_point
 from dynslam_bench.tuning.study_file import (
@@ -192,6 +196,8 @@ class Plan:
         spec: The study.
         results: The results folder.
         objectives: In place of those that the study names, in their order.
+        constraints: Further ones by name: functions of `objectives.Outcome` whose mean over the
+            instances has to be <= 0.
 
     Attributes:
         held: See `held_settings`.
@@ -214,6 +220,7 @@ class Plan:
         results: str | Path = "results",
         *,
         objectives: Sequence[Objective] | None = None,
+        constraints: Mapping[str, Callable[[Outcome], float]] | None = None,
     ) -> None:
         self.spec = spec
         self.results = Path(results)
@@ -221,6 +228,9 @@ class Plan:
         if objectives is None:
             objectives = [find_objective(name) for name in spec.objectives]
         self.objectives = list(objectives)
+        self.constraints = dict(constraints or {})
+        for name in spec.limits:
+            quantity(name)  # refuses an unknown one
 
         # the baseline: the tracker with a preset or its defaults, or another tracker, which has no
         # settings but those of the fixed ones that it knows
@@ -296,6 +306,10 @@ class Plan:
         chosen = (spec.top + 1) * len(design.confirm) if design.held_out else 0
         judged = 2 * (len(design.judging) + len(design.recorded))
         return tried + chosen + judged
+
+    def violations(self, outcomes: Outcomes, baseline: Outcomes | None = None) -> dict[str, float]:
+        """How far each constraint is violated, see `objectives.violations`."""
+        return violations(self.spec, outcomes, baseline, self.constraints)
 
     def configuration(self, params: Mapping[str, Any]) -> Configuration:
         """What a configuration of the space runs with: its tracker, and those settings that it has."""

@@ -328,7 +328,7 @@ def _strengths(text: str, whole: str) -> tuple[tuple[str, float], ...]:
 
 SamplerName = Literal["tpe", "random", "nsga2", "gp"]
 PrunerName = Literal["halving", "wilcoxon", "none"]
-EQUALLY_ACCURATE = ("accuracy", "worst", "robustness")
+EQUALLY_ACCURATE = ("accuracy", "worst", "robustness", "relative", "final")
 """Objectives that hold the error themselves."""
 Offset = Annotated[int, Field(ge=0)]
 
@@ -499,11 +499,16 @@ class StudySpec(Record, frozen=True):
         objectives: ``accuracy``: geometric mean over scenes of the ATE ratio to the baseline (its
             logarithm is minimised, see `objectives.by_scene`); ``speed``: the same of the processor
             time a frame; ``worst``: ATE in the worst quarter of the scenes; ``robustness``: ATE on
-            the degraded instances; ``coverage``: share of lost frames.
+            the degraded instances; ``coverage``: share of lost frames; ``relative``: relative error;
+            ``final``: ATE of the final trajectory; ``network_calls``: frames on which the segmenter
+            ran; ``memory``: largest resident memory; ``time:STAGE``: time of a stage.
         ate_margin: What a study of anything but error alone may lose of accuracy, as a share: the
             upper bound of the ATE ratio must lie below 1 + this.
         min_coverage: Hard constraint on the mean coverage; None for none.
         min_fps: Hard constraint on frames a second, segmentation included; None for none.
+        limits: Hard constraints: largest means over the instances, by name: ``processor_s``,
+            ``memory_mb``, ``network_calls`` and other fields of `objectives.Outcome`, or
+            ``time:STAGE`` in milliseconds.
         seeds: Seeds of the instances that name none. A seed changes nothing for a tracker that
             draws nothing from it.
         offsets: Start offsets of the instances that name none: so many leading frames are left out.
@@ -537,6 +542,7 @@ class StudySpec(Record, frozen=True):
     ate_margin: float = Field(default=0.05, gt=0, le=1)
     min_coverage: float | None = Field(default=0.95, ge=0, le=1)
     min_fps: float | None = Field(default=None, gt=0)
+    limits: dict[str, Annotated[float, Field(gt=0)]] = Field(default_factory=dict)
     seeds: tuple[int, ...] = Field(default=(0,), min_length=1)
     offsets: tuple[Offset, ...] = Field(default=(0, 3), min_length=1)
     trials: int = Field(default=40, ge=2)

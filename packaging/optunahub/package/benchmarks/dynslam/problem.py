@@ -10,8 +10,7 @@ import optuna
 import optunahub
 from optuna.distributions import BaseDistribution
 
-from dynslam_bench.tuning import Outcome, ProblemInstance, Study, StudySpec, distributions
-from dynslam_bench.tuning.objectives import violations
+from dynslam_bench.tuning import Outcome, ProblemInstance, Study, StudySpec
 
 Outcomes = dict[ProblemInstance, Outcome]
 FEATURES = StudySpec(
@@ -57,7 +56,7 @@ class Problem(optunahub.benchmarks.BaseProblem):
     @property
     def search_space(self) -> dict[str, BaseDistribution]:
         """The settings' ranges."""
-        return distributions(self._study.space)
+        return self._study.search.distributions()
 
     @property
     def directions(self) -> list[optuna.study.StudyDirection]:
@@ -73,11 +72,12 @@ class Problem(optunahub.benchmarks.BaseProblem):
 
     def evaluate_constraints(self, params: dict[str, Any]) -> dict[str, float]:
         """How far each constraint of the study is violated; 0 or less where it holds."""
-        return violations(self._study.spec, self._outcomes(params), self._reference())
+        return self._study.violations(self._outcomes(params), self._reference())
 
     def _outcomes(self, params: dict[str, Any]) -> Outcomes:
         """What the settings came to on each instance."""
-        return self._study.outcomes(self._study.held | params, self._instances)
+        tracker, settings = self._study.configuration(params)
+        return self._study.outcomes(settings, self._instances, tracker=tracker)
 
     def _reference(self) -> Outcomes:
         """What the baseline came to on each instance."""
