@@ -29,17 +29,22 @@ from dynslam_bench.sequences.families import family_of
 from dynslam_bench.tuning.objectives import (
     ACCURACY,
     SPEED,
-    Configuration,
     InstanceFailedError,
     Outcomes,
     combined_objective,
     compare,
     hold_last_pose_protocol,
     improvement_bound,
-    violations,
 )
-from dynslam_bench.tuning.plan import Design, held_settings, seen_note, splits_seen
+from dynslam_bench.tuning.plan import (
+    Design,
+    held_settings,
+    known_settings,
+    seen_note,
+    splits_seen,
+)
 from dynslam_bench.tuning.storage import (
+    EARLIER,
     Importance,
     best_trials,
     count_states,
@@ -47,7 +52,7 @@ from dynslam_bench.tuning.storage import (
     scene_ratios,
 )
 from dynslam_bench.tuning.study import SUMMARY_FILE, StoredStudy, Study
-from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec, scenes
+from dynslam_bench.tuning.study_file import TRACKER, ProblemInstance, StudySpec, scenes
 
 NOT_JUDGED = "not judged"
 """Status of settings that no scenes have judged."""
@@ -386,7 +391,11 @@ def _families(instances: Sequence[ProblemInstance]) -> list[str]:
 
 
 def finish(
-    tuner: Study, on_note: Callable[[str], None] | None = None, *, jobs: int = 1
+    tuner: Study,
+    on_note: Callable[[str], None] | None = None,
+    *,
+    jobs: int = 1,
+    trial: int | None = None,
 ) -> StudySummary:
     """Judge the best trial on scenes that it was not chosen on; write preset and summary.
 
@@ -399,6 +408,7 @@ def finish(
         tuner: A study with finished trials.
         on_note: Called with a line on every step.
         jobs: Runs at a time.
+        trial: The number of a trial to be judged in place of the best, e.g. one of the front.
 
     Returns:
         The summary; `best.toml` and `summary.json` lie in the study's folder.
@@ -412,7 +422,7 @@ def finish(
     shipped = dict[str, PairedRatio]()
 
     # candidates, ranked; there is nothing to choose or judge where no setting changes anything
-    candidates = _best_trials(tuner)
+    candidates = _best_trials(tuner) if trial is None else [_named_trial(tuner, trial)]
     inert = without_effect(tuner)
     chooses = bool(design.confirm and design.held_out)
     if candidates and chooses and not inert:
@@ -481,17 +491,7 @@ def _best_trials(tuner: Study) -> list[Candidate]:
         )
     # beside another tracker trial 0, the default settings, is a candidate too
     is_rival = tuner.baseline.tracker != spec.tracker
-    margin = spec.ate_margin if spec.at_equal_accuracy else None
-    candidates = [
-        Candidate(
-            trial=trial.number,
-            params=trial.params,
-            values=list(trial.values or ()),
-            ate_margin=margin,
-        )
-        for trial in finished
-        if trial.number > 0 or is_rival
-    ]
+    candidates = [_candidate(tuner, trial) for trial in finished if trial.number > 0 or is_rival]
     return candidates[: spec.top]
 
 
@@ -529,6 +529,35 @@ def _tracks(tuner: Study, run: str) -> list[bytes]:
     """The files of a run's trajectories."""
     folder = tuner.store.folder(run)
     return [file.read_bytes() for file in sorted(folder.glob("trajectory_*.txt"))]
+
+
+def _named_trial(tuner: Study, number: int) -> Candidate:
+    """The candidate that a user has chosen.
+
+    Raises:
+        StudyError: There is no complete trial of that number, or it has the baseline's settings.
+    """
+    complete = {
+        trial.number: trial for trial in tuner.study.get_trials(states=(TrialState.COMPLETE,))
+    }
+    if number not in complete or EARLIER in complete[number].user_attrs:
+        raise StudyError(
+            f"study '{tuner.spec.name}' has no complete trial {number}", "see tune status"
+        )
+    if number == 0 and tuner.baseline.tracker == tuner.spec.tracker:
+        raise StudyError("trial 0 has the baseline's settings", "choose another one")
+    return _candidate(tuner, complete[number])
+
+
+def _candidate(tuner: Study, trial: FrozenTrial) -> Candidate:
+    """A trial as a candidate that nothing has judged yet."""
+    spec = tuner.spec
+    return Candidate(
+        trial=trial.number,
+        params=trial.params,
+        values=list(trial.values or ()),
+        ate_margin=spec.ate_margin if spec.at_equal_accuracy else None,
+    )
 
 
 def _check_same_look(tuner: Study, candidates: Sequence[Candidate]) -> None:
@@ -575,10 +604,7 @@ def _run_again(
     level = (
         tuner.spec.level(len(scenes(tuner.design.judging))) if split != "recorded" else ONE_SIDED
     )
-    tuned = [
-        Configuration(tuner.spec.tracker, {**tuner.held, **candidate.params})
-        for candidate in candidates
-    ]
+    tuned = [tuner.configuration(candidate.params) for candidate in candidates]
     default = [] if tuner.shipped is None else [tuner.shipped]
     baseline, runs = tuner.evaluate_beside([*tuned, *default], instances, jobs=jobs)
     if default and not isinstance(outcomes := runs.pop(), InstanceFailedError):
@@ -610,7 +636,7 @@ def _judged_on(
         single.name: compare(outcomes, baseline, objective=single, one_sided=level)
         for single in (ACCURACY, SPEED)
     }
-    violated = violations(tuner.spec, outcomes)
+    violated = tuner.violations(outcomes)
     update["feasible"] = candidate.feasible and max(violated.values(), default=0.0) <= 0.0
     if tuner.design.judging == getattr(tuner.design, split):
         ratios = objective.ratios(outcomes, baseline)
@@ -712,8 +738,12 @@ def preset_text(
     settings = {
         name: value for name, value in {**held_settings(spec), **tuned}.items() if name not in fixed
     }
+    # of a study with a choice of trackers: the settings that the chosen one has
+    tracker = str(settings.pop(TRACKER, spec.tracker))
+    if TRACKER in tuned:
+        settings = known_settings(tracker, settings)
     head = [
-        f"# settings of {spec.tracker}",
+        f"# settings of {tracker}",
         *comments,
         "",
         f"status = {json.dumps(status)}",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,14 @@ from optuna.distributions import BaseDistribution
 from optuna.study import Study, StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
-from slam_hpo.moth_flame import EMFOA, MFO, flames_left, flight, moth_positions, opposites
-from slam_hpo.spaces import whole
+from dynslam_bench.flow.moth_flame import (
+    EMFOA,
+    MFO,
+    flames_left,
+    flight,
+    moth_positions,
+    opposites,
+)
 
 CAUCHY_SHARE = 0.05
 """Scale of the Cauchy steps of Eq. 13, as a share of the unit interval."""
@@ -47,12 +54,18 @@ class MothFlameSampler(optunahub.samplers.SimpleBaseSampler):
         n_trials: int = 100,
         population: int = 8,
     ) -> None:
-        seed = None if seed is None else whole("seed", seed)
+        for name, value, least in (
+            ("seed", seed or 0, 0),
+            ("n_trials", n_trials, 1),
+            ("population", population, 2),
+        ):
+            if not isinstance(value, Integral) or value < least:
+                raise ValueError(f"{name} {value!r} is no whole number >= {least}")
         super().__init__(seed=seed)
         self._rules = EMFOA if elite else MFO
         self._rng = np.random.default_rng(seed)
-        self._n_trials = whole("n_trials", n_trials, 1)
-        self._population = whole("population", population, 2)
+        self._n_trials = n_trials
+        self._population = population
 
     def reseed_rng(self) -> None:
         """Draw a new seed, for parallel workers."""
