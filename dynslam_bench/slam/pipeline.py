@@ -504,8 +504,7 @@ def least_masked(
         needed: How many features must remain.
     """
     # distance of each feature from the mask's outside
-    padded = np.pad(mask, 1).view(np.uint8)
-    depth = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+    depth = cv2.distanceTransform(mask.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     at, _ = pixel_index(xy, mask.shape)
     masked_px = depth[at]
 

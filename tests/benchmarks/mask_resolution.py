@@ -23,9 +23,9 @@ import one_thread  # noqa: F401  # before all others
 
 # isort: split
 import argparse
+import itertools
 import json
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -47,10 +47,12 @@ FAMILIES = ("xyz", "halfsphere", "rpy", "static")
 TRACKERS = (
     "mask-rcnn",
     "mask-rcnn segmentation.source=oracle",
-    "dynaslam",
-    "emfoa-oft",
+    "dynaslam segmentation.source=oracle",
+    "emfoa-oft segmentation.source=oracle",
+    "orb-slam2",
 )
-FRAMES = 60
+WITHOUT_MASKS = ("orb-slam2", "emfoa-oft?masks=none")
+FRAMES = 40
 """Frames of a run."""
 FAR_M = 0.1
 """A camera centre farther from the true one is far off."""
@@ -70,8 +72,13 @@ FILLED_STEP = 0.01
 """Motion of the enlarged person in a frame, as a share of the image's width."""
 OTHER_INSTANCE = 250
 """Number of the false or enlarged object."""
+CASES = ("plain", "false", *FILLED_FROM)
 NO_ERROR_M = 1.0
 """Error of a run without a tracked pose, metres; it bounds all others."""
+
+
+RUN = ("tracker", "case", "size", "family", "scene", "stride", "start")
+"""What names a run."""
 
 
 class Clip:
@@ -183,10 +190,10 @@ def _filled(
     return replace(frame, rgb=rgb, depth=depth), filled
 
 
-def run(label: str, clip: Clip, cache: str | None) -> dict[str, float]:
+def run(label: str, clip: Clip, cache: str) -> dict[str, float]:
     """Coverage, ATE in metres, frames that are `ok` and far off, and a checksum of all poses."""
     tracker_id, *assignments = label.split()
-    context = TrackerContext(sequence_id=clip.id, masks=clip.masks, cache=cache)  # type: ignore[arg-type]
+    context = TrackerContext(sequence_id=clip.id, masks=clip.masks, cache=cache or None)  # type: ignore[arg-type]
     tracker = build_tracker(tracker_id, parse_assignments(assignments), context)
     tracker.reset(clip.camera, rng=np.random.default_rng(0))
     follower = OnlineError(clip.truth)
@@ -211,52 +218,25 @@ def run(label: str, clip: Clip, cache: str | None) -> dict[str, float]:
     }
 
 
-def cases_of(trackers: list[str]) -> Iterator[tuple[str, str]]:
-    """Cases and trackers: where a case changes the masks, they are exact."""
-    for tracker in trackers:
-        yield "plain", tracker
-    exact = [t for t in trackers if "source=oracle" in t] or [
-        f"{tracker} segmentation.source=oracle" for tracker in trackers[:1]
-    ]
-    for case in ("false", *FILLED_FROM):
-        for tracker in exact:
-            yield case, tracker
-
-
-def measure(chosen: argparse.Namespace, cache: str | None) -> pd.DataFrame:
+def measure(chosen: argparse.Namespace) -> pd.DataFrame:
     """A row a run."""
-    rows = []
-    for scene in chosen.scenes:
-        for family in chosen.families:
-            for stride in chosen.strides:
-                for start in chosen.starts:
-                    name = f"synthetic/walking_{family}?scene={scene}"
-                    whole = Clip(name, start, stride)
-                    for size in chosen.sizes:
-                        width, height = map(int, size.split("x"))
-                        clip = whole if size == "640x480" else whole.resized(width, height)
-                        for case, tracker in cases_of(chosen.trackers):
-                            if case != "plain" and start != chosen.starts[0]:
-                                continue
-                            figures = run(tracker, clip.in_case(case), cache)
-                            rows.append(
-                                {
-                                    "tracker": tracker,
-                                    "case": case,
-                                    "size": size,
-                                    "family": family,
-                                    "scene": scene,
-                                    "stride": stride,
-                                    "start": start,
-                                    **figures,
-                                }
-                            )
-                    print(name, stride, start, flush=True, file=sys.stderr)
+    rows: list[dict[str, object]] = []
+    clips = itertools.product(chosen.scenes, chosen.families, chosen.strides, chosen.starts)
+    for scene, family, stride, start in clips:
+        name = f"synthetic/walking_{family}?scene={scene}"
+        whole = Clip(name, start, stride)
+        print(name, stride, start, flush=True, file=sys.stderr)
+        for size, case in itertools.product(chosen.sizes, chosen.cases):
+            width, height = map(int, size.split("x"))
+            clip = whole.resized(width, height).in_case(case)
+            for tracker in chosen.trackers:
+                # where a case changes the masks, they are exact
+                exact = "segmentation.source=" in tracker or tracker in WITHOUT_MASKS
+                if case != "plain" and not exact:
+                    continue
+                keys = (tracker, case, size, family, scene, stride, start)
+                rows.append(dict(zip(RUN, keys, strict=True)) | run(tracker, clip, chosen.cache))
     return pd.DataFrame(rows)
-
-
-RUN = ["tracker", "case", "size", "family", "scene", "stride", "start"]
-"""What names a run."""
 
 
 def ratio(first: pd.Series, second: pd.Series) -> str:
@@ -350,6 +330,7 @@ def main() -> None:
         scenes=(100, 101, 102, 103, 104, 105),
         strides=(1, 2),
         starts=(0, 4),
+        cases=CASES,
         record="",
         before="",
         after="",
@@ -361,7 +342,7 @@ def main() -> None:
     if chosen.after:
         runs = pd.DataFrame(json.loads(Path(chosen.after).read_text()))
     else:
-        runs = measure(chosen, chosen.cache or None)
+        runs = measure(chosen)
     if chosen.record:
         Path(chosen.record).write_text(json.dumps(runs.to_dict("records")))
     print(table(before, runs))

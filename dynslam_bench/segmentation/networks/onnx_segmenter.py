@@ -55,8 +55,7 @@ PAD = 114
 STRIDE = 32
 """An open input size is padded to a multiple of this."""
 MIN_COMPONENT_SIDE_PX = 8
-"""Connected parts of a semantic map smaller than a square of this side, at an image width of 640, are noise and become no
-object."""
+"""A part of a semantic map smaller than a square of this side, at an image width of 640, is noise and no object."""
 MAX_OBJECTS = 100
 """Objects an image, as torchvision's models have it."""
 MAX_CANDIDATES = 1000
