@@ -191,7 +191,7 @@ def _filled(
 
 
 def run(label: str, clip: Clip, cache: str) -> dict[str, float]:
-    """Coverage, ATE in metres, frames that are `ok` and far off, and a checksum of all poses."""
+    """Coverage, ATE in metres, frames that are `ok` and far off or on which the guard acted, a checksum of poses."""
     tracker_id, *assignments = label.split()
     context = TrackerContext(sequence_id=clip.id, masks=clip.masks, cache=cache or None)  # type: ignore[arg-type]
     tracker = build_tracker(tracker_id, parse_assignments(assignments), context)
@@ -199,9 +199,11 @@ def run(label: str, clip: Clip, cache: str) -> dict[str, float]:
     follower = OnlineError(clip.truth)
     poses: dict[float, np.ndarray] = {}
     far = 0
+    guarded = 0
     for frame in clip.frames:
         result = tracker.track(frame)
         pose = result.T_world_cam if result.state == "ok" else None
+        guarded += result.stats.get("guard_undone", 0) + result.stats.get("guard_returned", 0) > 0
         sample = follower.update(frame.timestamp, pose)
         if pose is not None:
             poses[frame.timestamp] = pose
@@ -214,6 +216,7 @@ def run(label: str, clip: Clip, cache: str) -> dict[str, float]:
         "coverage": len(poses) / len(clip.frames),
         "ate": float(ate),
         "far": far,
+        "guarded": guarded,
         "sum": float(np.sum([*poses.values()])),
     }
 
@@ -236,6 +239,9 @@ def measure(chosen: argparse.Namespace) -> pd.DataFrame:
                     continue
                 keys = (tracker, case, size, family, scene, stride, start)
                 rows.append(dict(zip(RUN, keys, strict=True)) | run(tracker, clip, chosen.cache))
+        # what there is so far: the whole takes long
+        if chosen.record:
+            Path(chosen.record).write_text(json.dumps(rows))
     return pd.DataFrame(rows)
 
 
@@ -343,8 +349,6 @@ def main() -> None:
         runs = pd.DataFrame(json.loads(Path(chosen.after).read_text()))
     else:
         runs = measure(chosen)
-    if chosen.record:
-        Path(chosen.record).write_text(json.dumps(runs.to_dict("records")))
     print(table(before, runs))
     if runs.start.nunique() > 1:
         print("\n" + null(runs))
