@@ -145,7 +145,7 @@ def test_false_masks_on_a_sixth_of_the_image_lose_no_frame(size) -> None:
 def test_the_guard_gives_back_features_beside_the_mask_alone_while_the_camera_is_tracked(
     size,
 ) -> None:
-    wall = Wall(size, masked={6: (0.0, 1.0, 0.08, 1.0)})
+    wall = Wall(size, masked={6: (0.0, 1.0, 0.06, 1.0)})
     results, _ = play(wall)
     result = results[6]
     assert 0 < result.stats["guard_returned"] <= 60
