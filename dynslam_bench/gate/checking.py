@@ -295,6 +295,8 @@ def record(
             "a baseline that tracks nothing judges nothing: see dynslam-bench run",
         )
 
+    if trajectories is None:
+        origin.name = "the recorded baseline"
     baseline = Baseline(
         question=gate.config.question,
         asked=gate.config.model_dump(mode="json"),
