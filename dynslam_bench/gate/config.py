@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -56,7 +57,7 @@ class GateConfig(Record):
         suite: A suite in place of trackers and sequences.
         cases: Single runs beside them, with the fields of `RunSpec`.
         confirm: Sequences of the confirmation set, which is looked at on request alone.
-        settings: Overrides of the trackers' settings.
+        settings: Overrides of the trackers' settings; ``$VARIABLE`` in a text is replaced.
         frames: Part of every sequence; without it all.
         stride: Take every so many frames.
         threads: Threads of a run.
@@ -202,13 +203,25 @@ class Gate:
     def _located(self, spec: RunSpec) -> RunSpec:
         """A run with the folder of its sequence, and that of its camera, in full."""
         places = (self.folder, self.data_root)
-        found = [place / spec.sequence for place in places if (place / spec.sequence).is_dir()]
-        sequence = str(found[0].absolute()) if found else spec.sequence
+        folders = [place / spec.sequence for place in places]
+        existing = [folder for folder in folders if folder.is_dir()]
+        sequence = str(existing[0].absolute()) if existing else spec.sequence
         camera = spec.camera
         if camera is not None and (self.folder / camera).is_file():
             camera = str((self.folder / camera).absolute())
-        update = {"sequence": sequence, "camera": camera, "data_root": str(self.data_root)}
+        settings = {name: _expanded(value) for name, value in spec.settings.items()}
+        update = {
+            "sequence": sequence,
+            "settings": settings,
+            "camera": camera,
+            "data_root": str(self.data_root),
+        }
         return spec.model_copy(update=update)
+
+
+def _expanded(value: Any) -> Any:
+    """A setting's value with environment variables in place of their names."""
+    return os.path.expandvars(value) if isinstance(value, str) else value
 
 
 def load_gate(path: str | Path = GATE_FILE, *, data_root: str | Path | None = None) -> Gate:
@@ -269,6 +282,11 @@ def _by_name(specs: list[RunSpec]) -> Cases:
     one_tracker = len({spec.tracker for spec in specs}) == 1
     cases: Cases = {}
     for spec in specs:
+        if spec in cases.values():
+            raise RunError(
+                f"the gate runs {spec.tracker} on {spec.sequence} twice in the same way",
+                "remove one: the rounds repeat every sequence",
+            )
         name = label_text(spec.sequence)
         if not one_tracker:
             name = f"{label_text(spec.tracker)} on {name}"
@@ -277,7 +295,5 @@ def _by_name(specs: list[RunSpec]) -> Cases:
             name += f" {start}:{'' if stop is None else stop}"
         if name in cases:
             name += f" {digest(spec, 6)}"
-        if name in cases:
-            raise RunError(f"two cases of the gate are the same: {name}", "remove one")
         cases[name] = spec
     return cases

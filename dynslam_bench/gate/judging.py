@@ -32,6 +32,8 @@ from dynslam_bench.gate.result import (
 )
 
 Array = NDArray[np.float64]
+_ROUNDING = 1e-9
+"""Shares that differ by less are equal."""
 
 
 class Findings(NamedTuple):
@@ -199,24 +201,25 @@ def _guardrails(
 
 
 def _coverage(baseline: Side, candidate: Side, rounds: int, limit: float) -> GuardrailResult:
-    """The mean coverage must not fall by more than a limit."""
-    before = _mean_coverage(baseline, rounds)
-    after = _mean_coverage(candidate, rounds)
-    if before is None or after is None:
+    """The mean coverage must not fall by more than a limit; lost runs are counted elsewhere."""
+    shares = []
+    for case in candidate.by_case:
+        pairs = zip(baseline.of(case, rounds), candidate.of(case, rounds), strict=True)
+        for before, after in pairs:
+            is_known = before.coverage is not None and after.coverage is not None
+            if is_known and not (before.is_lost or after.is_lost):
+                shares.append((before.coverage, after.coverage))
+    if not shares:
         text = "coverage is not known"
         return GuardrailResult(name="coverage", state="not measured", limit=limit, text=text)
-    fall = before - after
-    is_broken = fall > limit + 1e-12
-    text = f"coverage {100 * before:.1f} % -> {100 * after:.1f} %"
+    share_before, share_after = np.mean(np.array(shares, dtype=np.float64), axis=0).tolist()
+    fall = share_before - share_after
+    is_broken = fall > limit + _ROUNDING
+    text = f"coverage {100 * share_before:.1f} % -> {100 * share_after:.1f} %"
     if is_broken:
         text += f": a fall of more than {100 * limit:g} points"
     state: Literal["broken", "held"] = "broken" if is_broken else "held"
     return GuardrailResult(name="coverage", state=state, limit=limit, measured=fall, text=text)
-
-
-def _mean_coverage(side: Side, rounds: int) -> float | None:
-    shares = [run.coverage for run in side.all(rounds) if run.coverage is not None]
-    return float(np.mean(shares)) if shares else None
 
 
 def _failures(baseline: Side, candidate: Side, rounds: int, limit: int) -> GuardrailResult:

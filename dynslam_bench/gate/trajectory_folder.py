@@ -39,7 +39,7 @@ def import_folder(folder: Path, cases: Cases, store: RunStore, gate: Gate) -> li
         DynslamError: A file cannot be read, or does not belong to the sequence.
     """
     files = {case: _files_of(folder.expanduser(), case) for case in cases}
-    missing = [case for case, found in files.items() if not found]
+    missing = [case for case, of_case in files.items() if not of_case]
     if missing:
         raise RunError(
             f"{folder} has no trajectory of {len(missing)} of {len(cases)} sequences: {', '.join(missing)}",
@@ -47,9 +47,9 @@ def import_folder(folder: Path, cases: Cases, store: RunStore, gate: Gate) -> li
             f"{file_name(missing[0])}",
         )
     measurements = []
-    for case, found in files.items():
+    for case, of_case in files.items():
         spec = cases[case]
-        for number, file in enumerate(found):
+        for number, file in enumerate(of_case):
             record = import_trajectory(
                 file,
                 TRAJECTORIES,
