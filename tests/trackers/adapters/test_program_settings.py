@@ -1,7 +1,6 @@
 """Settings, templates and containers that a program's TOML file declares."""
 
 import json
-import os
 import stat
 import sys
 import textwrap
