@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynslam_bench.core import ReportError, write_atomic
 from dynslam_bench.envs.rendering import VIEWS, main_view
@@ -198,7 +199,7 @@ class _Panels:
         return figure
 
 
-def _gaps(stamps: Array) -> Array:
+def _gaps(stamps: Array) -> NDArray[np.intp]:
     """Rows before which poses are missing: the step in time is over `GAP_STEPS` median ones."""
     steps = np.diff(stamps)
     if not len(steps):
