@@ -14,6 +14,7 @@ from dynslam_bench.core import ReportError, write_atomic
 from dynslam_bench.envs.rendering import VIEWS, main_view
 from dynslam_bench.geometry import Array, Trajectory, se3
 from dynslam_bench.reports.figures import COLOURS, DASHES, NEUTRAL, safe
+from dynslam_bench.reports.tables.table import mm
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
@@ -49,7 +50,7 @@ class PlottedTrajectory:
     @property
     def title(self) -> str:
         """The label with the error."""
-        return f"{self.label}: {1000 * self.rmse_m:.4g} mm"
+        return f"{self.label}: {mm(self.rmse_m)} mm"
 
 
 def plot_trajectories(
