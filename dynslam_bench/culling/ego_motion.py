@@ -103,28 +103,29 @@ def depth_sigma(z: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def static_share(
-    frame: FrameBundle, state: FilterState, before: NDArray[np.floating]
+    frame: FrameBundle, state: FilterState, previous_xy: NDArray[np.floating]
 ) -> NDArray[np.float64]:
     """Share of static keypoints around each point's origin in the previous frame.
 
     Args:
         frame: The current frame.
         state: With the previous frame and which of its keypoints were kept.
-        before: Raw pixels of the points in the previous image, ``[N, 2]``.
+        previous_xy: Raw pixels of the points in the previous image, ``[N, 2]``.
 
     Returns:
         Share of kept keypoints in the cell of the previous image, ``[N]`` in [0, 1]; 1 where there
         were none.
     """
     if state.previous is None or state.previous_keep is None:
-        return np.ones(len(before))
+        return np.ones(len(previous_xy))
+    # kept keypoints and all keypoints by cell of the previous image
     shape = frame.gray.shape
     side = at_width(STATIC_CELL, shape[1])
     cell, cells = cell_index(state.previous.keypoints.xy, side, shape)
     count = np.bincount(cell, minlength=np.prod(cells))
     kept = np.bincount(cell, weights=state.previous_keep, minlength=np.prod(cells))
     share = np.where(count > 0, kept / np.maximum(count, 1), 1.0)
-    return np.asarray(share[cell_index(before, side, shape)[0]])
+    return np.asarray(share[cell_index(previous_xy, side, shape)[0]])
 
 
 def rigid_flow(
@@ -215,6 +216,7 @@ def _motion_of_distant_points(
 
     None where too few points agree. Arguments as of `_align`.
     """
+    # distant: beyond the geometric mean of near and far depths
     far = points[:, 2] > np.sqrt(np.prod(np.quantile(points[:, 2], NEAR_FAR)))
     rotation_steps = len(ROTATION_STEPS_PX)
     T_prev_cur, agreeing = _align(
@@ -257,6 +259,7 @@ def prior_information(state: FilterState, T_prev_cur: NDArray[np.float64]) -> ND
     """
     if state.motion_covariance is None or state.T_world_prev is None:
         return NO_PRIOR
+    # how (position in the world, rotation in the camera) turns into the twist of the motion
     jacobian = np.zeros((6, 6))
     jacobian[:3, :3] = state.T_world_prev[:3, :3].T
     jacobian[3:, 3:] = -T_prev_cur[:3, :3]

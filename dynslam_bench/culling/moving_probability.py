@@ -17,7 +17,7 @@ from dynslam_bench.segmentation.settings import SegmentationSettings
 UNKNOWN = 0.5
 """Probability of a new feature."""
 CERTAIN = (0.25, 0.75)
-"""Below the first a feature is certainly static, above the second certainly dynamic (Detect-SLAM)."""
+"""Probabilities: below the first a feature is certainly static, above the second certainly dynamic (Detect-SLAM)."""
 HIT = 0.9
 """Probability that a moving point lies on a mask, and a static one off it (Bayes rule; our assumption)."""
 RATE = 0.3
@@ -106,6 +106,7 @@ def link_to_previous(
     link = np.full(len(frame.xy), -1, dtype=np.intp)
     if state.flow is None or state.previous is None or not len(state.previous.xy):
         return link
+    # the previous keypoint nearest to the end of each point's flow
     rows = np.flatnonzero(state.flow.valid & np.isfinite(state.flow.xy).all(axis=1))
     previous = cKDTree(state.previous.keypoints.xy)
     distance, nearest = previous.query(state.flow.xy[rows], distance_upper_bound=radius_px)
@@ -131,11 +132,14 @@ def expand(
     Returns:
         Probabilities ``[N]``; those with a history unchanged.
     """
+    # the nearest certain feature of each new one
     expanded = probability.copy()
     certain = np.flatnonzero(linked & ((probability < CERTAIN[0]) | (probability > CERTAIN[1])))
     new = np.flatnonzero(~linked)
     distance, nearest = cKDTree(xy[certain]).query(xy[new], distance_upper_bound=radius_px)
     near = np.isfinite(distance)
+
+    # pulled from "unknown" towards that one's probability, by a Gaussian of the distance
     influence = np.exp(-0.5 * np.square(np.asarray(distance)[near] / (0.5 * radius_px)))
     of_nearest = probability[certain[np.asarray(nearest)[near]]]
     expanded[new[near]] = UNKNOWN + influence * (of_nearest - UNKNOWN)

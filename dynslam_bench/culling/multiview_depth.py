@@ -339,14 +339,19 @@ def refine_by_matches(
     octave = frame.keypoints.octave.astype(np.int64)
     previous_octave = previous.keypoints.octave.astype(np.int64)
     grid = CellGrid.of(xy, camera.width, camera.height)
-    words = as_words(previous.keypoints.descriptors[rows])
+    descriptors = as_words(previous.keypoints.descriptors[rows])
     features = Features(
         xy, np.full(len(xy), np.nan), octave, as_words(frame.keypoints.descriptors), grid
     )
     for radius in (radius_px, 2 * radius_px):
         windows = expected, np.full(len(rows), np.nan), np.full(len(rows), radius)
         match = search_in_radius(
-            features, state.keep, windows, previous_octave[rows], words, max_distance=MAX_DISTANCE
+            features,
+            state.keep,
+            windows,
+            previous_octave[rows],
+            descriptors,
+            max_distance=MAX_DISTANCE,
         )
         rows_matched = rows[match >= 0]
         now = match[match >= 0]

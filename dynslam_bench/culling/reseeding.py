@@ -41,13 +41,14 @@ class ReseedingFilter(Rule[ReseedingSettings]):
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Choose the features that are used."""
-        static = state.keep
-        used = self._choose(frame, static)
-        usual = self._choose(frame, np.ones(len(static), dtype=bool))
+        # what would be used of all features, and what is used of the static ones
+        is_static = state.keep
+        usual = self._choose(frame, np.ones(len(is_static), dtype=bool))
+        used = self._choose(frame, is_static)
         # features that earlier filters dropped are not judged again
         return self.verdict(
-            used | ~static,
-            static=np.count_nonzero(static),
+            used | ~is_static,
+            static=np.count_nonzero(is_static),
             reseeded=np.count_nonzero(used & ~usual),
             missing=max(self.settings.budget - int(np.count_nonzero(used)), 0),
         )
@@ -56,6 +57,8 @@ class ReseedingFilter(Rule[ReseedingSettings]):
         """At most `budget` of the allowed features, bool ``[N]``, shared among levels and cells."""
         if np.count_nonzero(allowed) <= self.settings.budget:
             return allowed.copy()
+
+        # from the coarsest level to the finest, each with its quota
         octave = frame.keypoints.octave
         side = cell_side(self._features, frame.gray.shape[1])
         chosen = np.zeros(len(allowed), dtype=bool)

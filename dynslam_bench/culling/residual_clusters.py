@@ -96,13 +96,13 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
         # difference in grey levels and in depth
         x, y = xy.astype(np.intp).T
         gray = frame.gray[y, x].astype(np.float64)
-        colour = np.abs(gray - state.previous.gray[warped]) / 255
-        before = np.nan_to_num(state.previous.depth[warped])
-        relative = np.abs(points[:, 2] - before) / np.maximum(z, MIN_DEPTH_M)
-        depth = np.where(before > 0, relative, 0.0)
+        gray_residual = np.abs(gray - state.previous.gray[warped]) / 255
+        previous_z = np.nan_to_num(state.previous.depth[warped])
+        relative = np.abs(points[:, 2] - previous_z) / np.maximum(z, MIN_DEPTH_M)
+        depth_residual = np.where(previous_z > 0, relative, 0.0)
         return np.where(
             visible & (points[:, 2] > MIN_DEPTH_M),
-            colour + self.settings.depth_weight * depth,
+            gray_residual + self.settings.depth_weight * depth_residual,
             np.nan,
         )
 
@@ -138,7 +138,7 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
         members = np.bincount(label[measured], minlength=count)
         total = np.bincount(label[measured], weights=residual[measured], minlength=count)
         mean = total / np.maximum(members, 1)
-        static = max(float(np.median(mean[members > 0])), 1e-4)
+        static_mean = max(float(np.median(mean[members > 0])), 1e-4)
 
         # prior by the share of the cluster that lies on people
         on_people = np.bincount(label, weights=people, minlength=count)
@@ -146,6 +146,8 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
         prior = STATIC_PRIOR + (self.settings.prior - STATIC_PRIOR) * share
 
         # exponential residuals, with a larger mean where the cluster moves
-        likelihood = np.exp(-mean / (RATIO * static)) / RATIO
-        posterior = prior * likelihood / (prior * likelihood + (1 - prior) * np.exp(-mean / static))
+        likelihood = np.exp(-mean / (RATIO * static_mean)) / RATIO
+        posterior = (
+            prior * likelihood / (prior * likelihood + (1 - prior) * np.exp(-mean / static_mean))
+        )
         return np.asarray((posterior > self.settings.threshold) & (members > 0))

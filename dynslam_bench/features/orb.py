@@ -31,6 +31,7 @@ PATCH_SIDE = 32
 """Rows and columns of the patch that is summed: the disc's 31, and one of zeros that makes whole vectors of it."""
 # row and column of each pixel of the patch from the disc's centre, 0 outside the disc
 _ROW, _COLUMN = np.mgrid[:PATCH_SIDE, :PATCH_SIDE].astype(np.int32) - PATCH_RADIUS
+# columns and rows inside the disc: weights of the first moments
 _IN_DISC = _ROW * _ROW + _COLUMN * _COLUMN <= PATCH_RADIUS * PATCH_RADIUS
 _DISC_COLUMNS = _COLUMN * _IN_DISC
 _DISC_ROWS = _ROW * _IN_DISC
@@ -163,7 +164,8 @@ class OrbExtractor:
         at, response = fast_corners(image, self.settings.fast_threshold_min)
         row, column = np.divmod(at, image.shape[1])
         origin = EDGE - 3
-        columns = -(-(image.shape[1] - 2 * origin) // cell)  # rounded up
+        # cells a row, rounded up
+        columns = -(-(image.shape[1] - 2 * origin) // cell)
         cells = (row - origin) // cell * columns + (column - origin) // cell
         xy = np.stack([column, row], axis=1).astype(np.float32)
         return _Level(image, scale, xy, response, cells)
@@ -267,7 +269,8 @@ def orientations(
         rows: ... and its row.
     """
     out = np.zeros(len(xy), np.float32)
-    side = len(rows)  # a constant number of turns would be unrolled, and no vector code made
+    # a constant number of turns would be unrolled, and no vector code made
+    side = len(rows)
     for i in range(len(xy)):
         top = int(xy[i, 1]) - PATCH_RADIUS
         left = int(xy[i, 0]) - PATCH_RADIUS

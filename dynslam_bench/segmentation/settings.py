@@ -391,6 +391,7 @@ class SegmentationSettings(Settings):
     @field_validator("source")
     @classmethod
     def _known_source(cls, value: str) -> str:
+        """Refuse a source that does not exist, or lacks the argument behind its colon."""
         prefix, _, argument = value.partition(":")
         if value in PLAIN_SOURCES or (prefix in PREFIXED_SOURCES and argument.strip()):
             return value

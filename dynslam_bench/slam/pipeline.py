@@ -91,7 +91,7 @@ class StageClock:
 
 @dataclass(frozen=True, eq=False)
 class PreviousFrame:
-    """What filters and flow read of the frame before.
+    """The previous frame, as filters and flow read it.
 
     Attributes:
         frame: The frame.
@@ -207,23 +207,29 @@ class SlamPipeline:
         state = self._filter_state(bundle)
 
         # static keypoints; flow runs on demand, on what the masks leave
-        static, image = self._cull(bundle, state, clock)
+        filter_result, image = self._cull(bundle, state, clock)
 
         # pose by the static keypoints, with mapping and loop closing
-        result = backend.track(bundle, static.keep, static.weight)
+        result = backend.track(bundle, filter_result.keep, filter_result.weight)
 
         # remember the frame for the next one; its pose only if it is in the root map's world
         pose = result.T_world_cam if result.state == backend.state == "ok" else None
-        self._previous = PreviousFrame(bundle, static.keep, image, pose)
+        self._previous = PreviousFrame(bundle, filter_result.keep, image, pose)
         self._keyframe_due = result.state != "ok" or bool(result.stats["keyframe"])
 
         # report; a detector in a thread of its own is not a part of the frame's time
         timings = clock.seconds | dict(result.timings)
         if self._masks is not None and self._masks.beside_s:
             timings["detector"] = self._masks.beside_s
-        stats = self._stats(bundle, state, static, result)
+        stats = self._stats(bundle, state, filter_result, result)
         return TrackResult(
-            result.T_world_cam, result.state, stats, timings, static.mask, keypoints.xy, static.keep
+            result.T_world_cam,
+            result.state,
+            stats,
+            timings,
+            filter_result.mask,
+            keypoints.xy,
+            filter_result.keep,
         )
 
     # ------------------------------------------------------------------ steps of a frame
@@ -364,15 +370,21 @@ class SlamPipeline:
         return image
 
     def _stats(
-        self, frame: FrameBundle, state: FilterState, static: FilterResult, result: TrackResult
+        self,
+        frame: FrameBundle,
+        state: FilterState,
+        filter_result: FilterResult,
+        result: TrackResult,
     ) -> dict[str, float]:
         """The frame's diagnostics, the same keys on every frame."""
         stats = {
             "keypoints": float(len(frame.xy)),
-            "culled": float(np.count_nonzero(~static.keep)),
+            "culled": float(np.count_nonzero(~filter_result.keep)),
             **{name: float(value) for name, value in result.stats.items()},
-            "mask_fraction": 0.0 if static.mask is None else float(static.mask.mean()),
-            **static.stats,
+            "mask_fraction": 0.0
+            if filter_result.mask is None
+            else float(filter_result.mask.mean()),
+            **filter_result.stats,
         }
         flow_stats = {} if state.flow is None else state.flow.stats
         for name in getattr(self._flow, "stats_names", ()):

@@ -201,7 +201,7 @@ def build(settings: SegmentationSettings, context: SegmenterContext) -> OnnxSegm
 
 @dataclass(frozen=True)
 class Placement:
-    """Where the frame lies in the network's input: ``x_input = x_frame * scale_x + offset_x``, likewise y.
+    """Scale and offset of the frame in the network's input: ``x_input = x_frame * scale_x + offset_x``, likewise y.
 
     Attributes:
         frame: Height and width of the frame.
@@ -386,6 +386,7 @@ def _corners(rows: Float) -> tuple[Float, Float, Float]:
 
 def _best(rows: Float, first: int, layout: Layout) -> tuple[Float, Float, Float]:
     """Corners, best scores and their class numbers of detections with centre, size and a score a class."""
+    # scores of the classes, times the objectness where there is one
     scores = rows[:, 4 + layout.objectness : first]
     if layout.objectness:
         scores = scores * rows[:, 4:5]
@@ -403,6 +404,7 @@ def _decode_instances(
     floor: float,
 ) -> Instances:
     """Objects of boxes ``[K, 4]``, labels ``[K]``, scores ``[K]`` and pasted masks ``[K, 1, H, W]``."""
+    # as many of each
     boxes = values[0].reshape(-1, 4)
     labels = np.rint(values[1].reshape(-1)).astype(np.intp)
     scores = values[2].reshape(-1)
@@ -419,9 +421,12 @@ def _decode_instances(
             f"the network's masks are {planes.shape[2]}x{planes.shape[1]}, its input {place.input[1]}x{place.input[0]}",
             "masks must be pasted into the whole image, as torchvision's export does",
         )
+
+    # detections that count
     above = scores >= floor
     _check_detections(boxes[above], scores[above], labels[above].astype(np.float32), layout)
     keep = _keep(boxes, scores, labels, layout, settings, floor)
+
     # the planes cover the whole input
     whole = np.tile(np.array([0, 0, *place.input[::-1]], np.float32), (len(keep), 1))
     planes = planes[keep].astype(np.float32)
