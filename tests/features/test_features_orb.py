@@ -98,8 +98,8 @@ def test_a_small_image_keeps_its_weak_corners_beside_a_strong_one():
     image[124:134, 124:134] = 112  # weak square beside it
     image = cv2.GaussianBlur(image, (3, 3), 0.8)
     settings = FeatureSettings(levels=1, fast_threshold=30, fast_threshold_min=5, cell_px=40)
-    found = OrbExtractor(settings).extract(image)
-    assert (np.abs(found.xy - 129).max(axis=1) < 9).any()
+    features = OrbExtractor(settings).extract(image)
+    assert (np.abs(features.xy - 129).max(axis=1) < 9).any()
 
 
 def test_orientation_turns_with_the_image():
