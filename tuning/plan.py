@@ -7,7 +7,6 @@ apart.
 import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import combinations, islice, product, zip_longest
@@ -178,14 +177,14 @@ def starting_point(
     # what is tuned has a value that the sampler could propose
     point = {name: preset.get(name, base[name]) for name in tuned}
     for name, value in point.items():
-        span = distribution(tuned[name])
-        fits = False
-        with suppress(ValueError):  # no number, or none of the choices
-            fits = span._contains(span.to_internal_repr(value))
-        if not fits:
+        try:  # Optuna makes no trial of a value that its distribution does not contain
+            optuna.trial.create_trial(
+                params={name: value}, distributions={name: distribution(tuned[name])}, value=0.0
+            )
+        except ValueError:
             raise StudyError(
                 f"the preset to start from sets {name} = {value!r}, out of the range that the study tunes"
-            )
+            ) from None
     return point
 
 
