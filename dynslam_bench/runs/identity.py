@@ -334,7 +334,7 @@ def _files_of(
     Raises:
         DynslamError: One cannot be read.
     """
-    weights = named_digests(settings)
+    weights = named_digests(settings, words=is_foreign(tracker.entry_point))
     group = getattr(settings, "segmentation", None)
     if source in ("embedded", "coco") and isinstance(group, SegmentationSettings):
         weights[source] = weights_digest(group.model_copy(update={"source": source}))
