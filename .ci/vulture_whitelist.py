@@ -128,3 +128,9 @@ pytest_addoption  # pytest calls it
 pytest_collection_modifyitems  # pytest calls it
 _.runtest  # pytest calls it
 _.reportinfo  # pytest calls it
+
+dynslam_gate  # gate.pytest_plugin: pytest calls it
+reran_baseline  # gate.result: for those who read the file
+describe_batch  # trackers.adapters: specs name them as "module:name"
+describe_served
+build_described
