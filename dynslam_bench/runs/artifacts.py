@@ -134,8 +134,8 @@ class SnapshotWriter:
             self._worst = sorted(self._worst, key=lambda entry: -entry.error_m)[:WORST]
 
     def _write_picture(self, index: int, picture: Image) -> None:
-        # OpenCV takes blue first
         options = (cv2.IMWRITE_WEBP_QUALITY, _PICTURE_QUALITY)
+        # OpenCV takes blue first
         _, data = cv2.imencode(".webp", np.ascontiguousarray(picture[:, :, ::-1]), options)
         (self._folder / PICTURE.format(index)).write_bytes(data.tobytes())
 
