@@ -76,7 +76,8 @@ from dynslam_bench.reports.tables import leaderboard as tables
 from dynslam_bench.reports.tables.published import published_table, span_table
 from dynslam_bench.reports.tables.quotes import quotes
 from dynslam_bench.reports.tables.table import Table, csv_text, prose, to_latex, to_markdown
-from dynslam_bench.runs.store import RunStore, part_words
+from dynslam_bench.runs.rows import part_words
+from dynslam_bench.runs.store import RunStore
 
 COMPARE_PAGE = "compare.html"
 """The page that shows two trackers side by side."""
