@@ -539,6 +539,7 @@ def test_frames_without_any_texture_are_lost_and_only_those(sitting, value: int)
     assert len(lost) <= len(BAD) + 2, f"recovery within two frames, but lost: {lost}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [0.35, 2.2], ids=["under-exposed", "over-exposed"])
 def test_a_wrong_exposure_is_survived(sitting, gain: float) -> None:
     def exposed(frame: Frame) -> Frame:
