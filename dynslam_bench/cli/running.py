@@ -217,7 +217,7 @@ def run(
     make_runs = partial(
         run_specs, specs, results=results, jobs=jobs, retry=retry or (), protocol=scored_under
     )
-    make_and_show(make_runs, results, jobs, scored_under, yes, runs.pictures_asked(specs[0]))
+    make_and_show(make_runs, results, jobs, scored_under, yes, runs.requested_files(specs[0]))
 
 
 def default_protocol(tracker: str) -> str:
@@ -505,7 +505,7 @@ def event_text(event: runs.RunEvent) -> str:
     if done < frames:
         return f"{text}, frame {done} of {frames}"
     # all frames are tracked: the rest is writing
-    files = ["trajectories", *runs.pictures_asked(event.spec)]
+    files = ["trajectories", *runs.requested_files(event.spec)]
     return f"{text}, writing {', '.join(files)}"
 
 
