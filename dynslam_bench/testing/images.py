@@ -229,7 +229,7 @@ def flow_report(construct: Callable[[], FlowEstimator], *, points: int = 200) ->
         )
 
     def outside() -> None:
-        # beside the image, far from it, and nowhere
+        # beside the image, far from it, and at no place
         strange = np.array([[-5, 5], [1e6, 5], [np.nan, 5]], np.float32)
         valid = results(second, np.concatenate([grid, strange])).valid
         require(not valid[-3:].any(), "a point outside the reference image is valid in the target")
