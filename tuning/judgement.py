@@ -256,7 +256,8 @@ def conclude(
     if inert:
         return Verdict.NO_DIFFERENCE, (
             f"{Verdict.NO_DIFFERENCE.value.capitalize()}: nothing that the study set has an effect. All {inert} trials "
-            f"with other settings have the baseline's trajectories to the last bit. Does {spec.tracker} read its settings?"
+            "with other settings have the baseline's trajectories to the last bit. "
+            f"Does {spec.tracker} read its settings?"
         )
     best = candidates[0] if candidates else None
     verdict, sentences = judge(best)
@@ -370,8 +371,9 @@ def beyond_families(
     lost = []
     lost_by_baseline = []
     for family, names in members.items():
-        known = [ratios[name] for name in names if name not in by_candidate | by_baseline]
-        means[family] = fmean(known) if known else 0.0
+        # ratios of the scenes that both have tracked
+        of_both = [ratios[name] for name in names if name not in by_candidate | by_baseline]
+        means[family] = fmean(of_both) if of_both else 0.0
         lost += [family] * (2 * len(by_candidate.intersection(names)) >= len(names))
         lost_by_baseline += [family] * (2 * len(by_baseline.intersection(names)) >= len(names))
     return paired_ratio(

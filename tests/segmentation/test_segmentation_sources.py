@@ -962,6 +962,7 @@ def test_beside_tracking_missed_detections_count_the_frames_between_those_segmen
     assert apart == [1, 1, 3, 3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("epoch", [0.0, 1311868164.3])
 def test_beside_tracking_masks_are_due_at_the_same_frames_from_any_first_stamp(epoch):
     """A latency of three frames is three frames, however the sum of stamp and latency is rounded."""
