@@ -510,11 +510,13 @@ def coarse_levels(
     line = np.zeros(length + 32 * np.max(blurs[:, 1]) + SPILL, dtype=np.uint16)
     reach = level_reach(blurs)
     for row in range(max(start - reach[0], 0), stop + reach[0]):
+        # the source's row into its ring
         if row < rows:
             source = coarse[row]
             at = (row & (RING - 1)) * pitch
             for i in range(0, length, 32):
                 store_uint16(rings[0], at + i, load_uint16(source, i))
+        # the rows of all levels that it completes
         blur_cascade(
             rings,
             pitch,
