@@ -20,7 +20,7 @@ from dynslam_bench.culling.settings import (
     MovingVoteSettings,
     Unmatched,
 )
-from dynslam_bench.geometry import Camera, inside
+from dynslam_bench.geometry import Camera, at_width, inside
 from dynslam_bench.segmentation.postprocess import dynamic_mask, select
 
 Points = NDArray[np.float64]
@@ -471,7 +471,7 @@ class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
         moving, corners, judged = self._moving_corners(
             state.previous.gray, frame.gray, state.camera
         )
-        side = 2 * self.settings.radius_px + 1
+        side = 2 * round(at_width(self.settings.radius_px, people.shape[1])) + 1
         dilated = cv2.dilate(people.view(np.uint8), np.ones((side, side), np.uint8))
         votes = np.count_nonzero(inside(dilated.astype(bool), moving))
 

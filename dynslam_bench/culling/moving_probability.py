@@ -10,7 +10,7 @@ from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.culling import ObjectRule
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import ProbabilitySettings
-from dynslam_bench.geometry import Camera, inside
+from dynslam_bench.geometry import Camera, at_width, inside
 from dynslam_bench.segmentation.postprocess import dynamic_mask
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
@@ -65,7 +65,8 @@ class ProbabilityFilter(ObjectRule[ProbabilitySettings]):
         moving = np.full(len(link), UNKNOWN)
         moving[linked] = self._probability[link[linked]]
         if settings.expand_px > 0:
-            moving = expand(xy, moving, linked, settings.expand_px)
+            radius = at_width(settings.expand_px, frame.gray.shape[1])
+            moving = expand(xy, moving, linked, radius)
 
         # update by whether they lie on a dynamic object: moving average, or Bayes' rule
         if frame.instances is not None:

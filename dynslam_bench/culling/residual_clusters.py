@@ -8,13 +8,13 @@ from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.culling import ObjectRule
 from dynslam_bench.culling.settings import ResidualSettings
-from dynslam_bench.geometry import inside, pixel_index, se3
+from dynslam_bench.geometry import at_width, inside, pixel_index, se3
 from dynslam_bench.segmentation.postprocess import select
 
 STEP = 8
-"""The image is sampled on every eighth pixel."""
+"""Distance of the samples along both axes, at an image width of 640."""
 CLUSTER_PX = 160.0
-"""Distance in the image that counts as much as `CLUSTER_M` in depth."""
+"""Distance in the image, at a width of 640, that counts as much as `CLUSTER_M` in depth."""
 CLUSTER_M = 0.5
 """Difference in depth that counts as much as `CLUSTER_PX` in the image, metres."""
 MIN_DEPTH_M = 0.1
@@ -45,7 +45,8 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
 
         # sample the image where it has depth
         height, width = frame.depth.shape
-        rows, columns = np.mgrid[STEP // 2 : height : STEP, STEP // 2 : width : STEP]
+        step = max(1, round(at_width(STEP, width)))
+        rows, columns = np.mgrid[step // 2 : height : step, step // 2 : width : step]
         z = np.nan_to_num(frame.depth[rows, columns]).ravel()
         valid = z > 0
         if np.count_nonzero(valid) < 4 * self.settings.clusters:
@@ -54,7 +55,7 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
 
         # residuals after warping, clusters in the image and in depth, and which of them move
         residual = self._residual(frame, state, xy, z[valid])
-        label = self._cluster(xy, z[valid], state.seed)
+        label = self._cluster(xy / at_width(CLUSTER_PX, width), z[valid], state.seed)
         people = np.zeros(len(xy), bool)
         if frame.instances is not None:
             people = inside(select(frame.instances, self.segmentation).union(), xy)
@@ -106,10 +107,13 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
         )
 
     def _cluster(
-        self, xy: NDArray[np.float64], z: NDArray[np.floating], seed: int
+        self, places: NDArray[np.float64], z: NDArray[np.floating], seed: int
     ) -> NDArray[np.intp]:
-        """Cluster ``[N]`` of each sample by k-means over pixels ``[N, 2]`` and depth ``[N]``, from random centres."""
-        features = np.column_stack([xy / CLUSTER_PX, np.asarray(z) / CLUSTER_M]).astype(np.float32)
+        """Cluster ``[N]`` of each sample by k-means over places ``[N, 2]`` and depth ``[N]``, from random centres.
+
+        Places are in units of `CLUSTER_PX`.
+        """
+        features = np.column_stack([places, np.asarray(z) / CLUSTER_M]).astype(np.float32)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 6, 0.05)
         centres = stream(seed, self.name).choice(
             len(features), self.settings.clusters, replace=False

@@ -1,6 +1,6 @@
 """The moth-flame equations (Eq. 8-22), and the members of the moth-flame family.
 
-The Optuna sampler (`slam_hpo.moth_flame_sampler`) calls them. The flow's search is compiled:
+The sampler of `packaging/optunahub` calls them. The flow's search is compiled:
 `move_moths` of `label_search` is `moth_positions` for one point, with `flight_table`,
 `spiral_table` and `cauchy_table` from here. Moths and flames are arrays of any leading shape with
 the dimensions of the problem last; `uniform(shape)` draws from [0, 1).

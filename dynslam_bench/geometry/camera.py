@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 TUM_DEPTH_FACTOR = 5000.0
 """Raw depth units a metre of TUM's files."""
+STATED_WIDTH = 640
+"""Width of the images in whose pixels sizes of things in the image are stated."""
 
 
 @dataclass(frozen=True)
@@ -181,6 +183,20 @@ def pixel_index(
     row = rounded[..., 1]
     visible = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
     return (row.clip(0, shape[0] - 1), column.clip(0, shape[1] - 1)), visible
+
+
+def at_width(size_px: float, width: int) -> float:
+    """A size in the image, stated in pixels of an image 640 pixels wide, in pixels of one of another width.
+
+    For the sizes of regions, which shrink with the image: how far a mask is grown, the cells in
+    which points are counted. Not for the noise of a pixel's position, nor for patches that need a
+    number of pixels.
+
+    Args:
+        size_px: The size at a width of `STATED_WIDTH`.
+        width: The image's width, pixels.
+    """
+    return size_px * width / STATED_WIDTH
 
 
 def inside(mask: NDArray[np.bool_], xy: NDArray[np.floating]) -> NDArray[np.bool_]:

@@ -71,6 +71,8 @@ MIN_CLOSE = 100
 """Fewer tracked close points than this are few (ORB-SLAM2)."""
 NEW_CLOSE = 70
 """More close features than this that are not in the map are many: where few are tracked, they make a keyframe."""
+NEW_SHARE = 0.5
+"""More than this share of the close features are many, too: beside people and in small images there are few in all."""
 VIEW_SHARE = 0.9
 """A keyframe is made when less than this share of the last keyframe's points lies in the image."""
 MOVED_SHARE = 0.97
@@ -422,7 +424,8 @@ class KeyframePolicy:
 
         # many close features are not in the map, and few are tracked or the last keyframe is long ago
         close = (tracked.observations.z > 0) & (tracked.observations.z < self._close_m)
-        many_new = np.count_nonzero(close & ~matched) > NEW_CLOSE
+        enough_new = min(NEW_CLOSE, NEW_SHARE * np.count_nonzero(close))
+        many_new = np.count_nonzero(close & ~matched) > enough_new
         few_close = np.count_nonzero(close & matched) < MIN_CLOSE
         if many_new and (few_close or frame - self._last >= settings.max_gap):
             return True

@@ -168,6 +168,7 @@ def test_an_edit_of_what_is_not_compiled_in_compiles_nothing(
     assert names(folder) == before
 
 
+@pytest.mark.slow
 def test_checkouts_with_equal_sources_share_what_is_compiled(
     folder: Path, tmp_path: Path, refuse: Callable[[], None]
 ) -> None:
@@ -188,6 +189,7 @@ def test_a_constant_that_was_changed_in_memory_counts_as_changed(tmp_path: Path)
     assert outer_kernel(tmp_path / "toys")(3.0) == 116.0
 
 
+@pytest.mark.slow
 def test_an_option_of_the_decorator_counts(tmp_path: Path) -> None:
     inverted = ("toys/inner.py", "x * factor", "factor / (x - 16)")
     with pytest.raises(ZeroDivisionError):

@@ -357,6 +357,7 @@ def test_without_depth_a_submap_that_would_not_fit_is_left_for_the_root_map(monk
     assert all(np.linalg.norm(r.T_world_cam[:3, 3]) < 10.0 for r in results[back:])
 
 
+@pytest.mark.slow
 def test_maps_that_never_meet_stay_apart_and_filters_see_the_active_one():
     backend, results, _ = drive(RingWorld(), APART, STEP, **CLOSING)
     assert set(states(results)[25:]) == {"lost"}

@@ -33,6 +33,7 @@ def observers(slam_map, point):
     return list(zip(keyframes.tolist(), features.tolist(), strict=True))
 
 
+@pytest.mark.slow
 def test_points_and_keyframes_agree_on_their_observations(room):
     """Table entries of features that a keyframe does not have, since another one has more, observe nothing either."""
     backend = make_backend(room)

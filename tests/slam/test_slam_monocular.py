@@ -93,6 +93,7 @@ def before_a_wall(room, seed, noise_px):
     return frames
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise_px", [0.8, 1.5])
 def test_a_motion_that_leaves_out_contradicting_points_is_not_accepted(room, noise_px):
     """The homography's other motion fits the wall and drops the things before it; it is 72 degrees off."""

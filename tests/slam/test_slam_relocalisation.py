@@ -81,6 +81,7 @@ def test_a_frame_of_two_places_tells_nothing(alike, blind, more, recognised):
     assert blind or tracking[2 * QUARTER] == "lost", "too far for a tenth of a second"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("alike", "aliased"), [(0.2, False), (0.6, True)])
 def test_perceptual_aliasing(alike, aliased):
     world = RingWorld(alike=alike)

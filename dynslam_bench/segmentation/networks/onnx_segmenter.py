@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, Instances, SegmenterContext
 from dynslam_bench.core import SegmentationError, translate_errors
+from dynslam_bench.geometry import at_width
 from dynslam_bench.segmentation.networks import pinned_threads
 from dynslam_bench.segmentation.networks.onnx_header import TensorInfo, read_header
 from dynslam_bench.segmentation.networks.onnx_layout import (
@@ -53,8 +54,8 @@ PAD = 114
 """Grey level of the borders around a letterboxed image."""
 STRIDE = 32
 """An open input size is padded to a multiple of this."""
-MIN_COMPONENT_PX = 64
-"""Smaller connected parts of a semantic map are noise and become no object."""
+MIN_COMPONENT_SIDE_PX = 8
+"""A part of a semantic map smaller than a square of this side, at an image width of 640, is noise and no object."""
 MAX_OBJECTS = 100
 """Objects an image, as torchvision's models have it."""
 MAX_CANDIDATES = 1000
@@ -543,6 +544,7 @@ def _decode_semantic(
     )
     full = np.matmul(np.matmul(rows, logits), columns.T)
     level = _logit(settings.mask_threshold)
+    least_area = at_width(MIN_COMPONENT_SIDE_PX, place.frame[1]) ** 2
     masks = [np.zeros((0, *place.frame), bool)]
     names = []
     scores = []
@@ -553,7 +555,7 @@ def _decode_semantic(
             (margin > level).astype(np.uint8), connectivity=8
         )
         for component in range(1, len(stats)):
-            if stats[component, cv2.CC_STAT_AREA] < MIN_COMPONENT_PX:
+            if stats[component, cv2.CC_STAT_AREA] < least_area:
                 continue
             # its score is the probability of the mean margin
             mask = labels == component

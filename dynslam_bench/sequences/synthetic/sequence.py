@@ -28,7 +28,7 @@ from dynslam_bench.geometry import Camera, Trajectory, write_tum
 from dynslam_bench.sequences.cameras import write_camera
 from dynslam_bench.sequences.synthetic.ids import SyntheticId
 from dynslam_bench.sequences.synthetic.renderer import Rendered, Renderer, default_threads
-from dynslam_bench.sequences.synthetic.scene import Scene, row_times
+from dynslam_bench.sequences.synthetic.scene import Scene, World, row_times
 from dynslam_bench.sequences.synthetic.settings import CAMERA, FPS, RENDERER_VERSION, RenderSettings
 from dynslam_bench.sequences.view import Masks
 
@@ -220,12 +220,12 @@ class SyntheticSequence:
     @property
     def camera(self) -> Camera:
         """The camera of TUM's fr3 sequences, without distortion; the fast sequences' has a rolling shutter."""
-        return replace(CAMERA, readout_s=self.scene.world.optics.readout_s)
+        return replace(CAMERA, readout_s=self.world.optics.readout_s)
 
     @cached_property
     def ground_truth(self) -> Trajectory:
         """Exact camera-to-world poses of all frames; needs no rendering."""
-        return Trajectory(self.timestamps, self.scene.world.camera(np.arange(len(self)) / FPS))
+        return Trajectory(self.timestamps, self.world.camera(np.arange(len(self)) / FPS))
 
     @property
     def masks(self) -> Masks:
@@ -241,9 +241,14 @@ class SyntheticSequence:
         return FrameMasks(ids, self.scene.world.class_names, self.scene.moving(i))
 
     @cached_property
+    def world(self) -> World:
+        """The room, its bodies and people, and the camera's path."""
+        return self._id.variant.build(self._id.scene)
+
+    @cached_property
     def scene(self) -> Scene:
         """The geometry behind the frames."""
-        return Scene(self._id.variant.build(self._id.scene), self._id.scene, self.settings)
+        return Scene(self.world, self._id.scene, self.settings)
 
     @cached_property
     def renderer(self) -> Renderer:
