@@ -86,7 +86,7 @@ def observe(
         np.asarray(keep, bool) & np.isfinite(frame.xy).all(axis=1) & (weight > 0)
     )
 
-    # their pixels and depths, 0 beyond the sensor's reach
+    # their pixels and depths, 0 beyond `MAX_DEPTH_M`
     xy = np.ascontiguousarray(frame.xy[index], dtype=np.float64)
     z = frame.z[index].astype(np.float64)
     z = np.where((z > 0) & (z < MAX_DEPTH_M), z, 0.0)
