@@ -139,6 +139,7 @@ def measure_pair(
         pose = se3.inverse(T_second_first)
         if not np.isfinite(pose).all():
             pose = None
+    # how far the corners moved, and how much of the image has a depth
     displacements = np.linalg.norm(pixels_second - pixels_first, axis=1)
     return RgbdPair(
         first=first.index,
