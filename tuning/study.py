@@ -754,10 +754,14 @@ class Study(Plan):
         # the first instance of each sequence stands for it
         first_of = {instance.sequence: instance for instance in reversed(instances)}
         configuration = Configuration(spec.tracker, self.held)
+        programs: dict[str, set[str]] = defaultdict(set)
         for sequence, instance in first_of.items():
             run = resolve(self.run_spec(instance, configuration, cache=False)).identity
             identity[f"content of {sequence}"] = digest([run["content"], run["camera"]])
-            identity |= program_of(run) | {"device": run["device"]}
+            for name, value in (program_of(run) | {"device": run["device"]}).items():
+                programs[name].add(value)
+        # rendered and recorded sequences are read by other code, and may have other sources of masks
+        identity |= {name: " ".join(sorted(values)) for name, values in programs.items()}
         identity["baseline settings"] = [self.baseline.tracker, dict(self.baseline.settings)]
         return identity | {"parameters": digest([repr(parameter) for parameter in self.space])}
 

@@ -599,6 +599,17 @@ def test_another_module_of_that_name_earlier_on_the_path(name: str, bench: Bench
     assert bench.changed(again) == f"the file {file}"
 
 
+@pytest.mark.parametrize("module", ["part", "inner.part"])
+def test_a_module_of_a_namespace_package_in_an_earlier_folder(module: str, bench: Bench) -> None:
+    name = f"spread/{module.replace('.', '/')}.py"
+    bench.write("first/spread/another.py", "")
+    bench.write(f"second/{name}", "VALUE = 1111")
+    bench.path += [str(bench.root / "first"), str(bench.root / "second")]
+    reads = bench.record(f"from spread.{module} import VALUE\ndef run():\n    pass\n")
+    bench.write(f"first/{name}", "VALUE = 2222")
+    assert bench.changed(reads) == f"the file {bench.root / 'first' / name}"
+
+
 def test_a_module_that_could_not_be_imported(bench: Bench) -> None:
     on_path(bench)
     source = "def run():\n    try:\n        import library\n    except ImportError:\n        pass\n"

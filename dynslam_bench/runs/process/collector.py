@@ -4,7 +4,7 @@ import os
 import re
 import sys
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -163,12 +163,15 @@ class Modules:
             started.
         files: Files of modules that belong to no distribution, and whether they were loaded before
             the recorder was started.
+        absent: Files that are not there, and would be loaded in place of modules of namespace
+            packages.
     """
 
     imports: ImportPath
     places: dict[str, str] = field(default_factory=dict)
     distributions: dict[str, bool] = field(default_factory=dict)
     files: dict[str, bool] = field(default_factory=dict)
+    absent: set[str] = field(default_factory=set)
 
 
 class Collector:
@@ -217,7 +220,7 @@ class Collector:
         # so do files that these name
         named, missing = self._named_files(files)
         files |= {path: content_now(path) for path in named - files.keys()}
-        files |= dict.fromkeys(missing - files.keys(), ABSENT)
+        files |= dict.fromkeys((missing | modules.absent) - files.keys(), ABSENT)
 
         folders = {
             path: self._folder(path, names) for path, names in dict(self.notes.folders).items()
@@ -388,6 +391,7 @@ class Collector:
             modules.distributions |= dict.fromkeys(distributions, was_loaded)
             if not distributions or self._origins.is_plugin(name):
                 modules.files[_on_disk(file)] = was_loaded
+                modules.absent |= _absent_before(name, file, imports.folders)
             file_of_top.setdefault(top, file)
 
         # where each is found on the import path
@@ -570,6 +574,28 @@ def _can_be_missing(word: str) -> bool:
         and top not in sys.modules
         and top not in sys.stdlib_module_names
     )
+
+
+def _absent_before(module: str, file: str, folders: Sequence[str]) -> set[str]:
+    """The files that Python would load in place of a module of a namespace package, in earlier folders of the path.
+
+    Args:
+        module: Its dotted name.
+        file: Where it was found.
+        folders: The import path.
+    """
+    package = sys.modules.get(module.partition(".")[0])
+    # a package with an __init__.py lies in one folder
+    if "." not in module or package is None or getattr(package, "__file__", None) is not None:
+        return set()
+    absent: set[str] = set()
+    for folder in folders:
+        if file.startswith(f"{folder}{os.sep}"):
+            break
+        place = os.path.join(folder, *module.split("."))
+        candidates = {f"{place}.py", os.path.join(place, "__init__.py")}
+        absent |= {path for path in candidates if not os.path.exists(path)}
+    return absent
 
 
 def _on_disk(file: str) -> str:
