@@ -137,6 +137,29 @@ def edit(path: Path, text: str) -> None:
     os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
 
 
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with programs in C: one opens ``settings.cfg``, one loads ``libpart.so``, and waits for a line."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("needs a C compiler")
+    folder = tmp_path_factory.mktemp("compiled")
+    sources = {
+        "opens": '#include <stdio.h>\nint main() { return fopen("settings.cfg", "r") == 0; }',
+        "loads": "#include <stdio.h>\n#include <dlfcn.h>\n"
+        "int main(int count, char **words) "
+        '{ void *part = dlopen(words[1], 2); puts("ready"); fflush(stdout); getchar(); return part == 0; }',
+        "libmode.so": '#include <stdlib.h>\nint mode() { return getenv("MY_SLAM_MODE") != 0; }',
+        "libpart.so": "int part() { return 1111; }",
+    }
+    for name, source in sources.items():
+        (folder / "source.c").write_text(source)
+        options = ["-shared", "-fPIC"] if name.endswith(".so") else []
+        words = [compiler, *options, "source.c", "-o", name, "-ldl"]
+        subprocess.run(words, cwd=folder, check=True)
+    return folder
+
+
 # -- files and folders -----------------------------------------------------------------------------
 
 READ_ALL = """
@@ -303,6 +326,20 @@ def test_a_network_below_the_folder_of_a_source(named: str, bench: Bench) -> Non
     assert bench.changed(reads) == "the file nets/net.onnx"
 
 
+def test_networks_in_a_folder_that_a_configuration_names(bench: Bench) -> None:
+    bench.write("work/slam.json", '{"folder": "models/small", "name": "net"}')
+    bench.write("work/models/small/net.onnx", "1111")
+    bench.write("work/models/other.onnx", "1111")
+    reads = bench.record("def run():\n    open('slam.json').read()\n")
+    assert set(reads.files) == {
+        "plugin:/mine.py",
+        "work:/slam.json",
+        "work:/models/small/net.onnx",
+    }
+    edit(bench.work / "models/small/net.onnx", "2222")
+    assert bench.changed(reads) == "the file models/small/net.onnx"
+
+
 @pytest.mark.parametrize("name", ["net.bin", "mask.png", "first.cfg"])
 def test_a_configuration_that_names_a_file_in_a_folder_below_it(name: str, bench: Bench) -> None:
     bench.write("work/slam.ini", f"[model]\nfile = {name}")
@@ -378,6 +415,7 @@ LOOKS = [
     "os.environb.get(b'MY_SLAM_MODE')",
     "os.path.expandvars('$MY_SLAM_MODE/x')",
     "os.path.expandvars(b'$MY_SLAM_MODE/x')",
+    "__import__('ctypes').CDLL(None).getenv(b'MY_SLAM_MODE')",
     "__import__('string').Template('$MY_SLAM_MODE').safe_substitute(os.environ)",
 ]
 LISTINGS = [
@@ -388,6 +426,7 @@ LISTINGS = [
     "[key for key in os.environ]",
     "list(os.environ.items())",
     "dict(os.environb)",
+    *(["open('/proc/self/environ').read()"] if sys.platform == "linux" else []),
 ]
 
 
@@ -434,6 +473,18 @@ def test_whose_look_at_a_variable_counts(source: str, counts: bool, bench: Bench
     bench.path.append(str(bench.root / "path"))
     bench.environment["MODE"] = "fast"
     assert set(bench.record(source).environment) == ({"$MODE"} if counts else set())
+
+
+def test_a_variable_that_a_native_library_of_the_plug_in_looks_up(
+    bench: Bench, compiled: Path
+) -> None:
+    bench.environment["MY_SLAM_MODE"] = "fast"
+    bench.environment["ANOTHER"] = "1"
+    source = "import ctypes\ndef run(library):\n    ctypes.CDLL(library).mode()\n"
+    reads = bench.record(source, library=str(compiled / "libmode.so"))
+    assert {"$MY_SLAM_MODE"} == set(reads.environment)
+    bench.environment["MY_SLAM_MODE"] = "slow"
+    assert bench.changed(reads) == "the environment variable MY_SLAM_MODE"
 
 
 def test_a_secret_is_neither_stored_nor_hidden_from_the_comparison(bench: Bench) -> None:
@@ -932,28 +983,6 @@ def test_an_environment_variable_that_a_program_looks_up(
     assert bench.changed(reads) == ""
     bench.environment["MY_SLAM_MODE"] = "fast"
     assert bench.changed(reads) == "the environment variable MY_SLAM_MODE"
-
-
-@pytest.fixture(scope="module")
-def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with programs in C: one opens ``settings.cfg``, one loads ``libpart.so``, and waits for a line."""
-    compiler = shutil.which("cc")
-    if compiler is None:
-        pytest.skip("needs a C compiler")
-    folder = tmp_path_factory.mktemp("compiled")
-    sources = {
-        "opens": '#include <stdio.h>\nint main() { return fopen("settings.cfg", "r") == 0; }',
-        "loads": "#include <stdio.h>\n#include <dlfcn.h>\n"
-        "int main(int count, char **words) "
-        '{ void *part = dlopen(words[1], 2); puts("ready"); fflush(stdout); getchar(); return part == 0; }',
-        "libpart.so": "int part() { return 1111; }",
-    }
-    for name, source in sources.items():
-        (folder / "source.c").write_text(source)
-        options = ["-shared", "-fPIC"] if name.endswith(".so") else []
-        words = [compiler, *options, "source.c", "-o", name, "-ldl"]
-        subprocess.run(words, cwd=folder, check=True)
-    return folder
 
 
 def test_a_file_that_a_compiled_program_names(bench: Bench, compiled: Path) -> None:

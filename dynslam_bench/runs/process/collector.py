@@ -43,6 +43,8 @@ _LONGEST_TEXT = 1 << 16
 """Text files of up to so many bytes are searched for names of files; longer ones are data."""
 _LONGEST_SOURCE = 1 << 20
 """Python sources of up to so many bytes are searched, and files of programs for names of variables."""
+_LONGEST_LIBRARY = 1 << 24
+"""Bytes of the longest native library that is searched for names of variables."""
 _MANY_FILES = 10_000
 """A folder with more files is not read whole where a program's arguments name it."""
 _TEXT_SUFFIXES = (".yaml", ".yml", ".toml", ".json", ".cfg", ".ini", ".conf", ".txt", ".xml")
@@ -58,6 +60,9 @@ _NETWORKS = (
     ".weights",
     ".engine",
     ".safetensors",
+    ".bin",
+    ".param",
+    ".mnn",
 )
 _ARRAYS_AND_CLOUDS = (".h5", ".hdf5", ".ply", ".pcd")
 _READ_IN_MACHINE_CODE = (*_IMAGES, *_VIDEOS, *_NETWORKS, *_ARRAYS_AND_CLOUDS)
@@ -227,6 +232,7 @@ class Collector:
         }
         links = {path: link_now(path, self._anchors) for path in (*files, *folders, *programs)}
         variables = self.notes.variables.union(*map(self._variables_of, dict(self.notes.commands)))
+        variables |= self._variables_in(files)
         used_distributions = modules.distributions.keys() | distributions
 
         name = self._anchors.name
@@ -473,6 +479,26 @@ class Collector:
             }
         return self._variables[command]
 
+    def _variables_in(self, files: Iterable[str]) -> set[str]:
+        """The variables that foreign libraries, or sources that name ``getenv``, hold the names of.
+
+        Machine code looks variables up unannounced. Of a library those count that are set.
+        """
+        names: set[str] = set()
+        set_now = set(filter(is_counted, self.environment)) - set(SEARCH_PATHS)
+        for file in files:
+            stamp = stamp_of(file)
+            if stamp is None or not is_code(file) or self._origins.of_file(file) != "foreign":
+                continue
+            if file.endswith(".py"):
+                if b"getenv" in Path(file).read_bytes():
+                    names |= {word for word in self._words(file) if _VARIABLE.fullmatch(word)}
+            elif stamp.size <= _LONGEST_LIBRARY and os.path.isfile(file):
+                content = Path(file).read_bytes()
+                names |= {name for name in set_now if os.fsencode(name) in content}
+        names -= {name.removeprefix("$") for name in self.notes.made}
+        return {name for name in names if is_counted(name) and name not in SEARCH_PATHS}
+
     def _is_too_wide(self, folder: str) -> bool:
         """Whether a folder holds so much that a program that is told of it does not read it all."""
         places = [
@@ -507,7 +533,8 @@ class Collector:
 
         A name is looked for in the folder of the text, in that of the plug-in and in the working
         folder. A bare name of a file, or the ending of a network's file, is also looked for in all
-        folders below that of the text: ``folder / f"{name}.onnx"``.
+        folders below that of the text: ``folder / f"{name}.onnx"``. Of a folder that a text names by its
+        path the networks in it count.
         """
         named: set[str] = set()
         missing: set[str] = set()
@@ -517,6 +544,7 @@ class Collector:
                 there = {place for place in places if os.path.isfile(place)}
                 if not there:
                     there = self._files_below(os.path.dirname(text), word)
+                    there |= _networks_in({place for place in places if os.sep in word})
                 named |= there
                 if not there and text.endswith(".py") and _can_be_missing(word):
                     missing |= places
@@ -574,6 +602,16 @@ def _can_be_missing(word: str) -> bool:
         and top not in sys.modules
         and top not in sys.stdlib_module_names
     )
+
+
+def _networks_in(folders: Iterable[str]) -> set[str]:
+    """The files of networks that lie in folders."""
+    return {
+        os.path.join(folder, name)
+        for folder in filter(os.path.isdir, folders)
+        for name in os.listdir(folder)
+        if name.lower().endswith(_NETWORKS)
+    }
 
 
 def _absent_before(module: str, file: str, folders: Sequence[str]) -> set[str]:

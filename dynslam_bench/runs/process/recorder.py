@@ -73,6 +73,8 @@ _IMPORTING = ("<frozen importlib", "<frozen zipimport", os.path.dirname(importli
 """Beginnings of the files that search for modules and for metadata: these list all folders of the path."""
 _RELATIVE_TO_DESCRIPTOR = ("shutil.py", "os.py", "<frozen os>")
 """These open files by their names in folders that they hold open; the announcement does not tell which folder."""
+_ENVIRONMENT = re.compile(r"/proc/(?:self|\d+)/environ")
+"""Where Linux lists the variables of a process."""
 _KERNELS = (".nbi", ".nbc")
 """Numba's compiled code, which follows from its source."""
 _METADATA = re.compile(r"\.(?:dist|egg)-info(?:/|$)")
@@ -263,6 +265,10 @@ class ReadRecorder:
             return
         path = _absolute(name)
         if path is None:
+            return
+        if _ENVIRONMENT.fullmatch(path):
+            if self._is_asked_by_foreign(frame):
+                self._note_variables(self._collector.environment)
             return
         if mode is None and not os.path.isabs(name) and _is_in(frame, _RELATIVE_TO_DESCRIPTOR):
             return
