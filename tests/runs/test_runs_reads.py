@@ -900,6 +900,12 @@ def a_tool(bench: Bench, name: str = "bin/tool") -> Path:
         (["../bin/tool", "--config", "slam.yaml"], "work/net.bin"),
         (["../bin/tool", "maps"], "work/maps/a/associations.txt"),
         (["/bin/sh", "-c", "../bin/tool < slam.yaml"], "bin/tool"),
+        (["/bin/sh", "-c", "cat<net.bin"], "work/net.bin"),
+        ([sys.executable, "-c", "print(open('net.bin').read())"], "work/net.bin"),
+        (
+            [sys.executable, "-W", "ignore", "-c", 'open("maps/a/associations.txt")'],
+            "work/maps/a/associations.txt",
+        ),
         ([sys.executable, "script.py"], "work/script.py"),
         ([sys.executable, "script.py"], "work/part.py"),
     ],
@@ -918,7 +924,8 @@ def test_what_a_program_is_made_of(words: list[str], edited: str, bench: Bench) 
     file = bench.root / edited
     text = file.read_text()
     edit(file, text.replace("1111", "2222").replace("net", "bet"))
-    shown = "the content of the folder maps" if "maps" in edited else edited.removeprefix("work/")
+    is_folder = "maps" in words
+    shown = "the content of the folder maps" if is_folder else edited.removeprefix("work/")
     assert bench.changed(reads).endswith(f"{shown} of a program")
 
 

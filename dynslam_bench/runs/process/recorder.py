@@ -79,8 +79,8 @@ _KERNELS = (".nbi", ".nbc")
 """Numba's compiled code, which follows from its source."""
 _METADATA = re.compile(r"\.(?:dist|egg)-info(?:/|$)")
 """Folders in which a distribution is described."""
-_SHELL_WORD = re.compile(r"[^\s;|&<>()'\"`$]+")
-"""A word of a shell's line."""
+_WORD_OF_CODE = re.compile(r"[^\s;|&<>()'\"`$,]+")
+"""A word of a line of code that can be the name of a file."""
 _LOG = "reads-{}.jsonl"
 """In the first private folder: what a forked process has read."""
 
@@ -482,9 +482,9 @@ class ReadRecorder:
         if not self._is_foreign(frame) and not _is_adapter(frame):
             return
         texts = [os.fsdecode(word) for word in words]
-        # what a shell's line names counts as arguments do
-        if texts[1:2] == ["-c"] and texts[0].endswith("sh"):
-            texts += _SHELL_WORD.findall(texts[2])
+        # what a line of code names counts as arguments do: sh -c LINE, python -c LINE
+        if "-c" in texts[1:-1]:
+            texts += _WORD_OF_CODE.findall(texts[texts.index("-c", 1) + 1])
         command = Command(tuple(texts), _absolute("." if folder is None else folder) or os.getcwd())
         if command not in self._notes.commands:
             self._notes.commands[command] = _time_after_files_so_far()
