@@ -383,6 +383,40 @@ def test_a_file_that_is_missing_and_never_opened(look: str, bench: Bench) -> Non
     assert bench.changed(reads) == "the file tuned.yaml"
 
 
+@pytest.mark.parametrize(
+    "look",
+    [
+        "os.path.exists('op' + 'tional')",
+        "os.path.isfile('op' + 'tional')",
+        "Path('op' + 'tional').is_dir()",
+        "Path('op' + 'tional').exists()",
+        "os.fork() and os.wait() or (os.path.exists('op' + 'tional'), os._exit(0))",
+    ],
+)
+@pytest.mark.parametrize("appears", ["file", "folder"])
+def test_a_file_or_folder_that_is_looked_for_and_not_there(
+    look: str, appears: str, bench: Bench
+) -> None:
+    source = f"import os\nfrom pathlib import Path\ndef run():\n    return {look}\n"
+    reads = bench.record(source)
+    assert reads.files["work:/optional"] == ""
+    bench.write("work/optional" if appears == "file" else "work/optional/a", "1111")
+    assert bench.changed(reads) == "the file optional"
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        "open('out.png', 'w').close()",
+        "os.mkdir('out.png')",
+        "import cv2, numpy; cv2.imwrite('out.png', numpy.zeros((2, 2)))",
+    ],
+)
+def test_what_a_run_looks_for_and_then_makes_is_no_input(make: str, bench: Bench) -> None:
+    source = f"import os\ndef run():\n    if not os.path.exists('out.png'):\n        {make}\n"
+    assert "work:/out.png" not in bench.record(source).files
+
+
 @pytest.mark.parametrize("text", ["$WEIGHTS/net.bin", "${WEIGHTS}/net.bin", "~/net.bin"])
 def test_a_variable_in_a_path(text: str, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     def point_to(folder: str) -> None:

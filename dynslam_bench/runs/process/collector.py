@@ -144,6 +144,7 @@ class Notes:
         commands: When each command was started first, in nanoseconds since the epoch.
         made: Files that the run has written or removed.
         made_folders: Beginnings of the paths of what lies in folders that it has made.
+        missing: Files and folders that were looked for, and not there.
         changed: Files that were another when they were opened again.
     """
 
@@ -154,6 +155,7 @@ class Notes:
     commands: dict[Command, int] = field(default_factory=dict)
     made: set[str] = field(default_factory=set)
     made_folders: tuple[str, ...] = ()
+    missing: set[str] = field(default_factory=set)
     changed: list[str] = field(default_factory=list)
 
 
@@ -225,7 +227,8 @@ class Collector:
         # so do files that these name
         named, missing = self._named_files(files)
         files |= {path: content_now(path) for path in named - files.keys()}
-        files |= dict.fromkeys((missing | modules.absent) - files.keys(), ABSENT)
+        missing |= modules.absent | self._still_missing()
+        files |= dict.fromkeys(missing - files.keys(), ABSENT)
 
         folders = {
             path: self._folder(path, names) for path, names in dict(self.notes.folders).items()
@@ -264,7 +267,7 @@ class Collector:
 
     def _is_input(self, path: str) -> bool:
         """Whether something lies at a path that was there before the run."""
-        if not is_file_name(path) or self.is_output(path):
+        if not is_file_name(path) or self.is_output(path) or path in self.notes.missing:
             return False
         stamp = stamp_of(path)
         return stamp is not None and not self.is_made_by_program(stamp)
@@ -277,6 +280,14 @@ class Collector:
         """Digest of a file that was not taken when the file was opened."""
         content = content_now(path)
         return ABSENT if note.stamp is None and content != UNREADABLE else content
+
+    def _still_missing(self) -> set[str]:
+        """What was looked for and is not there at the end either: the rest was made by the run."""
+        return {
+            path
+            for path in set(self.notes.missing)
+            if not self.is_output(path) and not os.path.lexists(path)
+        }
 
     def _folder(self, path: str, names: list[str] | None) -> str:
         """Digest of the names in a folder as it was listed.
