@@ -1068,7 +1068,7 @@ def test_a_library_that_a_program_loads(bench: Bench, compiled: Path) -> None:
     assert bench.changed(reads) == f"the file {Path(library).name} of a program"
 
 
-def test_a_library_of_a_program_that_is_built_anew_meanwhile(bench: Bench, compiled: Path) -> None:
+def test_a_library_of_a_program_that_is_rebuilt_meanwhile(bench: Bench, compiled: Path) -> None:
     (bench.root / "elsewhere").mkdir()
     library = shutil.copy(compiled / "libpart.so", bench.root / "elsewhere")
     words = [str(compiled / "loads"), str(library)]

@@ -2,7 +2,7 @@
 
 Python announces openings, listings, imports and programs to audit hooks (`sys.audit`). What is
 looked up in ``os.environ`` is announced by a subclass of its class, in the same way. So are files
-that somebody looks for (``os.path.exists``, ``Path.is_file``) and that are not there, by a function
+that are looked for (``os.path.exists``, ``Path.is_file``) and that are not there, by a function
 in place of ``os.stat``.
 """
 

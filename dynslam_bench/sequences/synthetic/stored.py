@@ -34,13 +34,13 @@ def renderings(cache_root: Path) -> list[Rendering]:
     Args:
         cache_root: As for `open_synthetic`.
     """
-    found = []
+    stored = []
     for folder in sorted((cache_root / "synthetic").glob("*@*")):
         if folder.is_dir():
             files = [path for path in folder.rglob("*") if path.is_file()]
             size = sum(path.stat().st_size for path in files)
-            found.append(Rendering(folder, size, _is_current(folder, cache_root)))
-    return found
+            stored.append(Rendering(folder, size, _is_current(folder, cache_root)))
+    return stored
 
 
 def _is_current(folder: Path, cache_root: Path) -> bool:
