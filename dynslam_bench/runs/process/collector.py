@@ -549,11 +549,13 @@ class Collector:
         """
         named: set[str] = set()
         missing: set[str] = set()
+        texts = list(texts)
+        opened_names = set(map(os.path.basename, texts))
         for text in texts:
             for word in self._words(text):
                 places = self._places_of(word, text)
                 there = {place for place in places if os.path.isfile(place)}
-                if not there:
+                if not there and word not in opened_names:
                     there = self._files_below(os.path.dirname(text), word)
                     there |= _networks_in({place for place in places if os.sep in word})
                 named |= there
