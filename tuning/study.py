@@ -7,6 +7,7 @@ import math
 import sys
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext, suppress
@@ -822,10 +823,14 @@ class Study(Plan):
         # the first instance of each sequence stands for it
         first_of = {instance.sequence: instance for instance in reversed(instances)}
         configuration = self.configuration({})
+        programs: dict[str, set[str]] = defaultdict(set)
         for sequence, instance in first_of.items():
             run = resolve(self.run_spec(instance, configuration, cache=False)).identity
             identity[f"content of {sequence}"] = digest([run["content"], run["camera"]])
-            identity |= program_of(run) | {"device": run["device"]}
+            for name, value in (program_of(run) | {"device": run["device"]}).items():
+                programs[name].add(value)
+        # rendered and recorded sequences are read by other code, and may have other sources of masks
+        identity |= {name: " ".join(sorted(values)) for name, values in programs.items()}
         for tracker in self.trackers[1:]:
             other = self.configuration({TRACKER: tracker})
             run = resolve(self.run_spec(instances[0], other, cache=False)).identity

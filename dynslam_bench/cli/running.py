@@ -510,14 +510,17 @@ def event_text(event: runs.RunEvent) -> str:
 
 
 def describe_plan(plan: runs.Plan, store: runs.RunStore, jobs: int, protocol: str) -> str:
-    """How many frames will be tracked, and the expected time by stored runs of the same trackers."""
+    """How many frames will be tracked, and the expected time by this machine's stored runs of the same trackers."""
+    from dynslam_bench.core.fingerprint import this_machine  # loads numpy
+
     plural = "s" if plan.runs != 1 else ""
     text = f"{plan.runs} run{plural}, {plan.frames.total()} frames"
 
-    # time of a frame, by tracker, in the runs that are stored
+    # time of a frame, by tracker, in the runs that are stored and were made on such a machine
+    cpu = this_machine().cpu
     times_ms = defaultdict[str, list[float]](list)
     for row in runs.list_runs(store, protocol)[0]:
-        if row["frame_ms"]:
+        if row["frame_ms"] and row["cpu"] == cpu:
             times_ms[row["tracker"]].append(row["frame_ms"])
     if not plan.frames.keys() <= times_ms.keys():
         return f"{text}; a system's first run on a machine compiles its code for up to a minute"

@@ -25,6 +25,7 @@ from dynslam_bench.cli import app, demo, output, running, runs
 from dynslam_bench.cli.demo import compiled_ahead, culling_effect
 from dynslam_bench.cli.output import report_table, table
 from dynslam_bench.core import WEIGHTS_VARIABLE, RunError
+from dynslam_bench.core.fingerprint import this_machine
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.sanitise import printable
 from dynslam_bench.geometry.trajectory_files import read_tum
@@ -60,7 +61,9 @@ def test_a_row_names_the_part_the_settings_and_its_origin(cli, facts, walk):
     assert "my control" in cli("runs", "show")[1]
 
 
-def test_the_number_of_frames_and_the_expected_time_are_written_before_the_run(cli, walk):
+def test_the_number_of_frames_and_the_expected_time_are_written_before_the_run(
+    cli, walk, monkeypatch
+):
     command = ("run", "constant-velocity", walk, "--set")
     unknown = (
         "1 run, 4 frames; a system's first run on a machine compiles its code for up to a minute"
@@ -72,6 +75,10 @@ def test_the_number_of_frames_and_the_expected_time_are_written_before_the_run(c
     )
     assert "frames" not in cli(*command, "frames=4")[2], "it is stored: nothing will be tracked"
     assert cli(*command, "frames=5", "--json")[2] == ""
+    # the stored runs are those of another machine
+    other = this_machine().model_copy(update={"cpu": "another"})
+    monkeypatch.setattr("dynslam_bench.core.fingerprint.this_machine", lambda: other)
+    assert "compiles its code" in cli(*command, "frames=6")[2].splitlines()[0]
 
 
 def test_a_row_names_files_without_their_folders(cli, facts, walk):
