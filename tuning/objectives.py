@@ -469,6 +469,12 @@ def compare(
             sum(outcomes[instance].lost for instance in counted),
             sum(baseline[instance].lost for instance in counted if instance in baseline),
         ),
+        floored={
+            instance.scene
+            for runs in (outcomes, baseline)
+            for instance, run in runs.items()
+            if objective.cost(run) < FLOOR_M
+        },
         what=objective.what,
     )
 

@@ -554,6 +554,16 @@ def test_lost_cells_of_pairs_are_counted_and_not_averaged():
     assert candidates_for_best({"a": logs["a"], "quick": quick}, sequences) == {"a", "quick"}
 
 
+def test_a_board_that_lost_everything_and_one_whose_reference_did_say_so():
+    every = [crashed(tracker, f"s{n}", 0.2) for tracker in ("orb-slam2", "b") for n in range(8)]
+    board = make_board(every)
+    assert headline(board) == "No tracker can be ranked."
+    assert explanation(board) == ""
+    kept = [row(tracker, f"s{n}", 0.1) for tracker in ("b", "c") for n in range(8)]
+    board = make_board([run for run in every if run.tracker.id != "b"] + kept)
+    assert "lost all, so no tracker can be compared" in headline(board)
+
+
 @pytest.mark.filterwarnings("error")
 def test_nothing_has_no_standings():
     assert standings({}, {}, []) == []

@@ -269,6 +269,7 @@ def test_a_study_is_a_frame(
     assert summary.best is not None, "status names the trial of best.toml"
     assert summary.conclusion in shown, "status names the trial of best.toml"
     assert re.search(rf"best_trial +{summary.best.trial}\n", shown)
+    assert bool(re.search(r"^setting +value", shown, re.MULTILINE)) == bool(summary.offered)
 
     frame = Study.open(tuner.folder).frame()
     trials = tuner.study.get_trials()
