@@ -362,8 +362,8 @@ def beyond_families(
     lost = []
     lost_by_baseline = []
     for family, names in members.items():
-        known = [ratios[name] for name in names if name not in by_candidate | by_baseline]
-        means[family] = fmean(known) if known else 0.0
+        both_succeed = [ratios[name] for name in names if name not in by_candidate | by_baseline]
+        means[family] = fmean(both_succeed) if both_succeed else 0.0
         lost += [family] * (2 * len(by_candidate.intersection(names)) >= len(names))
         lost_by_baseline += [family] * (2 * len(by_baseline.intersection(names)) >= len(names))
     return paired_ratio(

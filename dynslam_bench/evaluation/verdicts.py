@@ -693,7 +693,7 @@ def may_be_best(
 
     Rivals of one candidate are Bonferroni-corrected; candidates need not be, since the claim is about the
     best one alone (Mogstad and others 2024). The family is the sample. Two trackers are compared where both
-    succeed; who loses more sequences than the other beats it nowhere.
+    succeed; who loses more sequences than the other is not said to beat it.
 
     Args:
         logs: Log errors ``[T, S]``; nan where a tracker lost.
