@@ -9,7 +9,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from optuna.trial import TrialState
+from optuna.trial import FrozenTrial, TrialState
 from pydantic import Field
 
 from dynslam_bench.core import StudyError, read_text, write_atomic
@@ -29,17 +29,22 @@ from dynslam_bench.sequences.families import family_of
 from dynslam_bench.tuning.objectives import (
     ACCURACY,
     SPEED,
-    Configuration,
     InstanceFailedError,
     Outcomes,
     combined_objective,
     compare,
     hold_last_pose_protocol,
     improvement_bound,
-    violations,
 )
-from dynslam_bench.tuning.plan import Design, held_settings, seen_note, splits_seen
+from dynslam_bench.tuning.plan import (
+    Design,
+    held_settings,
+    known_settings,
+    seen_note,
+    splits_seen,
+)
 from dynslam_bench.tuning.storage import (
+    EARLIER,
     Importance,
     best_trials,
     count_states,
@@ -47,7 +52,7 @@ from dynslam_bench.tuning.storage import (
     scene_ratios,
 )
 from dynslam_bench.tuning.study import SUMMARY_FILE, StoredStudy, Study
-from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec, scenes
+from dynslam_bench.tuning.study_file import TRACKER, ProblemInstance, StudySpec, scenes
 
 NOT_JUDGED = "not judged"
 """Status of settings that no scenes have judged."""
@@ -235,6 +240,7 @@ def conclude(
     shipped: PairedRatio | None = None,
     failures: Sequence[str] = (),
     families: str = "",
+    inert: int = 0,
 ) -> tuple[Verdict, str]:
     """The verdict of a study and its conclusion: a few short sentences.
 
@@ -243,13 +249,19 @@ def conclude(
         candidates: The best one first.
         trials: Log ratio by scene of each trial beside the baseline's.
         shipped: The default settings on the judging scenes, where the baseline is something else.
-        failures: Why trials failed, said where no trial did better.
+        failures: Why trials failed.
         families: A sentence on the families that judged; empty for none.
+        inert: See `without_effect`.
     """
+    if inert:
+        return Verdict.NO_DIFFERENCE, (
+            f"{Verdict.NO_DIFFERENCE.value.capitalize()}: nothing that the study set has an effect. All {inert} trials "
+            f"with other settings have the baseline's trajectories to the last bit. Does {spec.tracker} read its settings?"
+        )
     best = candidates[0] if candidates else None
     verdict, sentences = judge(best)
-    if best is None and failures:
-        sentences.append(f"{len(failures)} failed, the first one as {failures[0]}")
+    if failures:
+        sentences.append(f"{len(failures)} trials failed, the first one as {failures[0]}")
     if families and best is not None and best.evidence is not None:
         sentences.append(families)
         if best.beyond is not None:
@@ -383,7 +395,11 @@ def _families(instances: Sequence[ProblemInstance]) -> list[str]:
 
 
 def finish(
-    tuner: Study, on_note: Callable[[str], None] | None = None, *, jobs: int = 1
+    tuner: Study,
+    on_note: Callable[[str], None] | None = None,
+    *,
+    jobs: int = 1,
+    trial: int | None = None,
 ) -> StudySummary:
     """Judge the best trial on scenes that it was not chosen on; write preset and summary.
 
@@ -396,6 +412,7 @@ def finish(
         tuner: A study with finished trials.
         on_note: Called with a line on every step.
         jobs: Runs at a time.
+        trial: The number of a trial to be judged in place of the best, e.g. one of the front.
 
     Returns:
         The summary; `best.toml` and `summary.json` lie in the study's folder.
@@ -408,10 +425,11 @@ def finish(
     note = on_note or (lambda _: None)
     shipped = dict[str, PairedRatio]()
 
-    # candidates, ranked
-    candidates = _best_trials(tuner)
+    # candidates, ranked; there is nothing to choose or judge where no setting changes anything
+    candidates = _best_trials(tuner) if trial is None else [_named_trial(tuner, trial)]
+    inert = without_effect(tuner)
     chooses = bool(design.confirm and design.held_out)
-    if candidates and chooses:
+    if candidates and chooses and not inert:
         note(
             f"the baseline and {len(candidates)} trials on {len(design.confirm)} instances to choose on"
         )
@@ -422,7 +440,7 @@ def finish(
 
     # the best one is judged, once on the same scenes
     _check_same_look(tuner, candidates)
-    if candidates and design.judging and not candidates[0].failed:
+    if candidates and design.judging and not candidates[0].failed and not inert:
         split = "held_out" if design.held_out else "confirm"
         note(f"trial {candidates[0].trial} on {len(design.judging)} instances that judge it")
         candidates[:1] = _run_again(tuner, split, candidates[:1], jobs, shipped)
@@ -439,6 +457,7 @@ def finish(
         shipped=shipped.get("held_out" if design.held_out else "confirm"),
         failures=[trial.user_attrs.get("reason", "") for trial in failed],
         families=families_sentence(design) if design.judging else "",
+        inert=inert,
     )
     summary = StudySummary(
         name=spec.name,
@@ -476,18 +495,73 @@ def _best_trials(tuner: Study) -> list[Candidate]:
         )
     # beside another tracker trial 0, the default settings, is a candidate too
     is_rival = tuner.baseline.tracker != spec.tracker
-    margin = spec.ate_margin if spec.at_equal_accuracy else None
-    candidates = [
-        Candidate(
-            trial=trial.number,
-            params=trial.params,
-            values=list(trial.values or ()),
-            ate_margin=margin,
-        )
-        for trial in finished
-        if trial.number > 0 or is_rival
-    ]
+    candidates = [_candidate(tuner, trial) for trial in finished if trial.number > 0 or is_rival]
     return candidates[: spec.top]
+
+
+def without_effect(tuner: Study) -> int:
+    """How many trials had other settings than trial 0, where all of them gave its trajectories to the last bit.
+
+    Such settings change nothing: a program may ignore them. 0 where a trial gave another trajectory,
+    or there is none to compare.
+    """
+    finished = tuner.study.get_trials(
+        deepcopy=False, states=(TrialState.COMPLETE, TrialState.PRUNED)
+    )
+    first = next((trial for trial in finished if trial.number == 0), None)
+    if first is None:
+        return 0
+    baseline = _runs_of(first)
+    compared = 0
+    for trial in finished:
+        if trial.params == first.params:
+            continue
+        runs = {name: run for name, run in _runs_of(trial).items() if name in baseline}
+        for name, run in runs.items():
+            if _tracks(tuner, run) != _tracks(tuner, baseline[name]):
+                return 0
+        compared += bool(runs)
+    return compared
+
+
+def _runs_of(trial: FrozenTrial) -> dict[str, str]:
+    """The id of a trial's run on each instance."""
+    return {str(row[0]): str(row[1]) for row in trial.user_attrs.get("instances", ())}
+
+
+def _tracks(tuner: Study, run: str) -> list[bytes]:
+    """The files of a run's trajectories."""
+    folder = tuner.store.folder(run)
+    return [file.read_bytes() for file in sorted(folder.glob("trajectory_*.txt"))]
+
+
+def _named_trial(tuner: Study, number: int) -> Candidate:
+    """The candidate that a user has chosen.
+
+    Raises:
+        StudyError: There is no complete trial of that number, or it has the baseline's settings.
+    """
+    complete = {
+        trial.number: trial for trial in tuner.study.get_trials(states=(TrialState.COMPLETE,))
+    }
+    if number not in complete or EARLIER in complete[number].user_attrs:
+        raise StudyError(
+            f"study '{tuner.spec.name}' has no complete trial {number}", "see tune status"
+        )
+    if number == 0 and tuner.baseline.tracker == tuner.spec.tracker:
+        raise StudyError("trial 0 has the baseline's settings", "choose another one")
+    return _candidate(tuner, complete[number])
+
+
+def _candidate(tuner: Study, trial: FrozenTrial) -> Candidate:
+    """A trial as a candidate that nothing has judged yet."""
+    spec = tuner.spec
+    return Candidate(
+        trial=trial.number,
+        params=trial.params,
+        values=list(trial.values or ()),
+        ate_margin=spec.ate_margin if spec.at_equal_accuracy else None,
+    )
 
 
 def _check_same_look(tuner: Study, candidates: Sequence[Candidate]) -> None:
@@ -534,10 +608,7 @@ def _run_again(
     level = (
         tuner.spec.level(len(scenes(tuner.design.judging))) if split != "recorded" else ONE_SIDED
     )
-    tuned = [
-        Configuration(tuner.spec.tracker, {**tuner.held, **candidate.params})
-        for candidate in candidates
-    ]
+    tuned = [tuner.configuration(candidate.params) for candidate in candidates]
     default = [] if tuner.shipped is None else [tuner.shipped]
     baseline, runs = tuner.evaluate_beside([*tuned, *default], instances, jobs=jobs)
     if default and not isinstance(outcomes := runs.pop(), InstanceFailedError):
@@ -569,7 +640,7 @@ def _judged_on(
         single.name: compare(outcomes, baseline, objective=single, one_sided=level)
         for single in (ACCURACY, SPEED)
     }
-    violated = violations(tuner.spec, outcomes)
+    violated = tuner.violations(outcomes)
     update["feasible"] = candidate.feasible and max(violated.values(), default=0.0) <= 0.0
     if tuner.design.judging == getattr(tuner.design, split):
         ratios = objective.ratios(outcomes, baseline)
@@ -671,8 +742,12 @@ def preset_text(
     settings = {
         name: value for name, value in {**held_settings(spec), **tuned}.items() if name not in fixed
     }
+    # of a study with a choice of trackers: the settings that the chosen one has
+    tracker = str(settings.pop(TRACKER, spec.tracker))
+    if TRACKER in tuned:
+        settings = known_settings(tracker, settings)
     head = [
-        f"# settings of {spec.tracker}",
+        f"# settings of {tracker}",
         *comments,
         "",
         f"status = {json.dumps(status)}",

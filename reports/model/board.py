@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core import ReportError, assignments, did_you_mean
 from dynslam_bench.evaluation import Protocol, get_protocol
-from dynslam_bench.evaluation.verdicts import FLOOR_M
+from dynslam_bench.evaluation.verdicts import FLOOR_M, scenes_needed
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores
 from dynslam_bench.reports.model.names import (
     OUR_BACK_END,
@@ -30,6 +30,8 @@ from dynslam_bench.reports.model.names import (
 )
 from dynslam_bench.reports.model.row import RunRow, command_with, grouped, part_options
 from dynslam_bench.reports.model.statistics import (
+    FAMILY_ERROR,
+    FEWEST,
     Interval,
     Scope,
     Sequences,
@@ -598,6 +600,36 @@ def board_resolution(board: Board) -> tuple[float, float]:
     for key in others:
         logs[key] = without_lost(board, logs[key], board.lost(key) | base_lost)
     return resolution(logs, base, board.ranked_sequences)
+
+
+MOST_FURTHER = 500
+"""Further sequences above which none are proposed: nobody runs so many to tell two trackers apart."""
+
+
+def more_sequences(board: Board, key: str) -> int | None:
+    """How many further sequences would tell a tracker from the reference, if the truth is what is measured here.
+
+    Returns:
+        None where that cannot be said: without a reference or a scatter, or for more than
+        `MOST_FURTHER`.
+    """
+    if board.reference is None or len(board.common) < FEWEST:
+        return None
+    logs = common_logs(board, [key, board.reference])
+    lost = board.lost(key) | board.lost(board.reference)
+    is_lost = np.array([name in lost for name in board.common], dtype=bool)
+    differences = logs[key] - logs[board.reference]
+    differences = differences[~is_lost & np.isfinite(differences)]
+    if len(differences) < FEWEST:
+        return None
+    spread = float(differences.std(ddof=1))
+    gain = 1.0 - math.exp(-abs(float(differences.mean())))
+    n_tests = max(len(board.ranked) - 1, 1)
+    if not (spread > 0 and gain > 0):
+        return None
+    needed = scenes_needed(gain, spread, FAMILY_ERROR / 2 / n_tests)
+    further = max(needed, len(differences) + 1) - len(differences)
+    return further if further <= MOST_FURTHER else None
 
 
 class Pair(NamedTuple):

@@ -14,6 +14,7 @@ from dynslam_bench.core import label_text
 from dynslam_bench.evaluation import Protocol, RPESpec
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.verdicts import FEWEST_FAMILIES, FEWEST_FREE, FLOOR_M
+from dynslam_bench.reports.model.answers import error_columns, typical_error
 from dynslam_bench.reports.model.board import (
     OVERALL,
     STATIC_CAMERA,
@@ -84,10 +85,21 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
         meaning = column.meaning.replace("{reference}", board.reference_name)
         columns.append(replace(column, meaning=meaning))
 
+    # errors in millimetres stand behind the name
+    errors = error_columns(board)
+    error_headings = [
+        Column(f"{meaning}, mm", meaning=f"median over {len(names)} sequences of the median ATE")
+        for meaning, names in errors.items()
+    ]
+    behind = 1 + [column.name for column in columns].index("tracker")
+    keys = [*board.trackers, *board.final_only]
     rows = []
-    for key in board.trackers:
+    for key in keys:
         cells = leaderboard_cells(board, key)
-        rows.append([cells[column.name] for column in columns])
+        row = [cells[column.name] for column in columns]
+        row[behind:behind] = [error_cell(board, key, names) for names in errors.values()]
+        rows.append(row)
+    columns[behind:behind] = error_headings
 
     brief = f"Geometric mean of the ATE over that of {board.reference_name}"
     if any(math.isfinite(standing.ratio.low) for standing in board.standings):
@@ -98,7 +110,7 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
         _leaderboard_caption(board, protocol, has_epipolar=has_epipolar),
         columns,
         rows,
-        board.unranked_rows(board.trackers),
+        board.unranked_rows(keys),
         board.separators(),
         brief,
     )
@@ -243,6 +255,26 @@ def leaderboard_cells(board: Board, key: str) -> dict[str, TableCell]:
     elif standing is not None:
         cells |= _standing_cells(board, standing)
     return cells
+
+
+def error_cell(board: Board, key: str, names: Sequence[str]) -> TableCell:
+    """The typical error in millimetres over some sequences; behind it how many are lost or missing."""
+    present = [name for name in names if name in board.cells[key]]
+    error = typical_error(board, key, names)
+    if error.median_m is None:
+        return TableCell("–", "" if present else "not run")
+    remarks = []
+    if error.lost:
+        remarks.append(f"lost {error.lost}")
+    if error.sequences < error.asked:
+        remarks.append(f"{error.sequences} of {error.asked}")
+    return TableCell(
+        mm(error.median_m),
+        ", ".join(remarks),
+        error.median_m,
+        emphasis="failed" if error.lost else "",
+        tip=f"median over {error.sequences} sequences",
+    )
 
 
 def _run_cells(board: Board, key: str) -> dict[str, TableCell]:

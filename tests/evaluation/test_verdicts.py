@@ -193,6 +193,7 @@ def test_all_lost_a_lost_baseline_and_no_scenes_cannot_tell() -> None:
     assert verdict_of(judged([0.9] * 8, every)) is Verdict.WORSE
 
 
+@pytest.mark.slow
 def test_rules_are_those_of_the_prototype() -> None:
     if not PROTOTYPE.is_file():
         pytest.skip("../shared/prototypes is not here")

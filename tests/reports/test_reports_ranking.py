@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from helpers.reports_fake_store import MACHINE, PROTOCOL, add_run, cell_of, crashed, row
+from helpers.reports_fake_store import MACHINE, PROTOCOL, add_run, cell_named, cell_of, crashed, row
 from rank_groups import simulate
 from scipy import stats
 
@@ -345,7 +345,7 @@ def test_claims_need_four_families_or_six_degrees_of_freedom_within_them(counts,
     board = make_board(of_families(counts, {"good": 0.3, "bad": 2.0}))
     standing = standing_of(board, "good")
     assert (standing.verdict, standing.scope) == (verdict, scope)
-    cell = leaderboard(board, PROTOCOL).rows[0][4]
+    cell = cell_named(leaderboard(board, PROTOCOL), "GOOD", "better?")
     assert cell.text == verdict
     assert cell.small.startswith(scope)
     said = explanation(board)
@@ -380,7 +380,7 @@ def test_who_loses_more_than_the_reference_is_better_but_lost():
     assert (standing.verdict, standing.scope) == ("better, but lost", "beyond these families")
     assert standing.lost == (1, 0)
     table = leaderboard(board, PROTOCOL)
-    cell = next(cells for cells in table.rows if cells[2].text == "GOOD")[4]
+    cell = cell_named(table, "GOOD", "better?")
     assert cell.text == "better, but lost"
     assert "lost 1 of 12, reference 0" in cell.small
     assert "but lost 1 of 12, the reference 0" in headline(board)
