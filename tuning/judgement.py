@@ -518,6 +518,8 @@ def without_effect(tuner: Study) -> int:
             continue
         runs = {name: run for name, run in _runs_of(trial).items() if name in baseline}
         for name, run in runs.items():
+            if not (run and baseline[name]):
+                return 0
             if _tracks(tuner, run) != _tracks(tuner, baseline[name]):
                 return 0
         compared += bool(runs)
