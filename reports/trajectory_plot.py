@@ -120,8 +120,8 @@ class _Panels:
 
     def _path(self, trajectory: Trajectory) -> Array:
         """Camera centres in the view in metres ``[N, 2]``, with nan where frames are missing."""
-        seen = self._positions(trajectory) @ VIEWS[self.view].T
-        return np.insert(seen, _gaps(trajectory.timestamps), np.nan, axis=0)
+        centres = self._positions(trajectory) @ VIEWS[self.view].T
+        return np.insert(centres, _gaps(trajectory.timestamps), np.nan, axis=0)
 
     def _error_line(self, estimate: PlottedTrajectory) -> Array:
         """Seconds since the first pose and errors in millimetres ``[N, 2]``, with nan where frames are missing."""

@@ -375,8 +375,9 @@ def beyond_families(
     lost = []
     lost_by_baseline = []
     for family, names in members.items():
-        both_succeed = [ratios[name] for name in names if name not in by_candidate | by_baseline]
-        means[family] = fmean(both_succeed) if both_succeed else 0.0
+        # ratios of the scenes that both have tracked
+        of_both = [ratios[name] for name in names if name not in by_candidate | by_baseline]
+        means[family] = fmean(of_both) if of_both else 0.0
         lost += [family] * (2 * len(by_candidate.intersection(names)) >= len(names))
         lost_by_baseline += [family] * (2 * len(by_baseline.intersection(names)) >= len(names))
     return paired_ratio(

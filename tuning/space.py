@@ -6,10 +6,9 @@ study's own conditions hold.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
-from itertools import islice, product
+from itertools import chain, islice, product
 from typing import Any
 
 import optuna
@@ -99,8 +98,8 @@ class SearchSpace:
             if value not in wanted:
                 return f"{other} is {value!r}"
         # those of the settings themselves
-        known = {key: value for key, value in values.items() if key in names and key != name}
-        return why_unused(apply_overrides(settings, known), name)
+        others = {key: value for key, value in values.items() if key in names and key != name}
+        return why_unused(apply_overrides(settings, others), name)
 
     def why_never(self, name: str) -> str:
         """Why a setting has no effect whatever is chosen; empty where some choices give it one.
@@ -169,11 +168,11 @@ def build_space(
             setting, a setting can have no effect, or nothing is left to tune.
     """
     _check_names(spec, settings)
-    found = [_chosen(spec, each) for each in settings.values()]
+    by_tracker = [_chosen(spec, defaults) for defaults in settings.values()]
 
     # one parameter a name, in the order of the trackers
     merged: dict[str, Parameter] = {}
-    for parameter in (one for each in found for one in each):
+    for parameter in chain.from_iterable(by_tracker):
         there = merged.get(parameter.name)
         merged[parameter.name] = parameter if there is None else _merged(there, parameter)
     every = list(merged.values())
@@ -208,8 +207,9 @@ def build_space(
 
 def _check_names(spec: SpaceSpec, settings: Mapping[str, Settings]) -> None:
     """Refuse patterns and names that match no setting of any tracker, and names that are tuned and fixed."""
-    tunable = [one.name for each in settings.values() for one in parameters(type(each))]
-    fields = {name for each in settings.values() for name in field_names(type(each))}
+    groups = [type(defaults) for defaults in settings.values()]
+    tunable = [parameter.name for group in groups for parameter in parameters(group)]
+    fields = {name for group in groups for name in field_names(group)}
     for pattern in (*spec.include, *spec.exclude):
         if any(fnmatchcase(name, pattern) for name in tunable):
             continue
@@ -418,15 +418,21 @@ def starting_point(
     point = {name: preset.get(name, base[name]) for name in spans}
     for name, value in point.items():
         span = spans[name]
-        fits = False
-        with suppress(ValueError):  # no number, or none of the choices
-            fits = span._contains(span.to_internal_repr(value))
-        if not fits and name in space.effective(point):
+        if not _is_within(span, name, value) and name in space.effective(point):
             raise StudyError(
                 f"{what} sets {name} = {value!r}, out of the range that the study tunes: {_span_text(span)}",
                 'make the range wider, or begin with a baseline within it (baseline = "PRESET.toml")',
             )
     return point
+
+
+def _is_within(span: BaseDistribution, name: str, value: Scalar) -> bool:
+    """Whether a distribution contains a value: Optuna makes no trial of one that lies outside."""
+    try:
+        optuna.trial.create_trial(params={name: value}, distributions={name: span}, value=0.0)
+    except ValueError:  # out of the range, no number, or none of the choices
+        return False
+    return True
 
 
 def _span_text(span: BaseDistribution) -> str:

@@ -121,7 +121,7 @@ class DaisySettings(FlowMethodSettings):
 
     @property
     def unused(self) -> Mapping[str, str]:
-        """The fields of the label search, where another flow runs."""
+        """Fields of the label search that have no effect because another flow runs, and why."""
         reason = ""
         if self.plugin:
             reason = f"flow.plugin is {self.plugin!r}"

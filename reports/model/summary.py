@@ -13,7 +13,7 @@ from dynslam_bench.reports.model.board import (
 )
 from dynslam_bench.reports.model.row import HINTED, SEEN, RunRow
 from dynslam_bench.reports.model.statistics import FEWEST, Standing, mean_rank_test
-from dynslam_bench.runs.store import part_words
+from dynslam_bench.runs.rows import part_words
 
 _MOST_NAMED = 3
 """Trackers that a sentence names; of more the first, and how many others."""

@@ -137,6 +137,7 @@ VARIABLES = ("each", "found", "known", "nowhere", "seen", "told")
 """As names of variables: they do not say what they hold."""
 
 
+@pytest.mark.slow
 def test_our_words_are_not_used() -> None:
     words = "|".join("[ _]?".join(word.split()) for word in OUR_WORDS)
     text = re.compile(rf"(?<![A-Za-z])(?:{words})(?![a-z])", re.IGNORECASE)

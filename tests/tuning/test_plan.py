@@ -85,6 +85,7 @@ def test_a_preview_takes_what_stored_runs_show_and_else_what_is_known(
     assert f"{after.needed} held-out scenes" in after.figures[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("held_out", "extendable"), [("100-139", False), ("100-111", True)])
 def test_a_preview_states_power_at_the_level_of_the_study(
     held_out: str, extendable: bool, tmp_path: Path
@@ -176,6 +177,7 @@ def earlier(tmp_path: Path) -> Study:
     ).run()
 
 
+@pytest.mark.slow
 def test_a_study_begins_with_what_an_earlier_one_learnt(earlier: Study, tmp_path: Path) -> None:
     spec = make_spec(
         name="second", trials=5, pruner="none", start=[str(earlier.folder), {"gain": 0.9}]
@@ -254,6 +256,7 @@ def test_a_study_without_a_verdict_goes_on_with_more_scenes_and_trials(tmp_path:
         again.extend(trials=2)
 
 
+@pytest.mark.slow
 def test_another_trial_is_not_judged_on_scenes_that_have_judged(tmp_path: Path) -> None:
     """However the further trials were asked for; the same trial may be judged again."""
     spec = make_spec(trials=3, pruner="none")
@@ -632,6 +635,7 @@ def test_the_embedded_network_alone_was_trained_on_the_scenes(source: str, seen:
     assert splits_seen(TRACKERS.get(TRACKER).settings(), design) == [], "a system without masks"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("masks", [True, False])
 def test_page_summary_and_preset_mark_scenes_of_the_training(masks: bool, tmp_path: Path) -> None:
     changes = (
@@ -741,6 +745,7 @@ def test_the_baseline_runs_from_three_starts() -> None:
     assert sorted(first) == [0, 1, 3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scenes_to_tune_on", "reserved"), [(1, 28), (11, 28), (40, 28)])
 def test_further_scenes_judge_where_none_are_named(scenes_to_tune_on: int, reserved: int) -> None:
     design = design_of(

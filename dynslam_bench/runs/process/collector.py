@@ -314,7 +314,7 @@ class Collector:
             self.compare(path, note, stamp_of(path))
         if self.notes.changed:
             return f"the file {self.notes.changed[0]}"
-        # a library of a program that was built anew while the program ran
+        # a library of a program that was built again while the program ran
         for path, modified_ns in dict(self.programs.files).items():
             if is_code(path) and self._is_rebuilt(path, modified_ns):
                 return f"the file {path} of a program"

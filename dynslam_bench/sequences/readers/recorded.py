@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, FrameMasks, MaskSource
-from dynslam_bench.core import SequenceError, inside, translate_errors
+from dynslam_bench.core import SequenceError, path_below, translate_errors
 from dynslam_bench.core.fingerprint import contents_digest
 from dynslam_bench.core.images import read_image
 from dynslam_bench.core.records import digest
@@ -242,7 +242,7 @@ def _check_inside(folder: Path, contents: Contents) -> None:
     if contents.people is not None:
         listed += contents.people.files
     for file in listed:
-        inside(folder, file, where=f"a list of images in {folder}", kind=SequenceError)
+        path_below(folder, file, where=f"a list of images in {folder}", kind=SequenceError)
 
 
 def _existing_images(
