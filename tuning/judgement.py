@@ -276,8 +276,8 @@ def conclude(
     if verdict not in (Verdict.PROVEN, Verdict.BUT_LOST) and (bound := improvement_bound(trials)):
         gain, count = bound
         sentences.append(
-            f"On the scenes that trials ran on none of the {count} with {FEWEST} or more is better by more than "
-            f"{math.ceil(100 * gain)} % (95 %)"
+            f"On the scenes that trials ran on none of the {count} trials with {FEWEST} or more is better by "
+            f"more than {math.ceil(100 * gain)} % (95 %)"
         )
     if verdict in (Verdict.PROMISING, Verdict.CANNOT_TELL) and best is not None:
         sentences += _settling(spec, best)
@@ -303,6 +303,10 @@ def _settling(spec: StudySpec, best: Candidate) -> list[str]:
     if evidence is None or best.failed or not best.feasible:
         return []
     needed = scenes_to_settle(evidence)
+    if needed is None and evidence.all_scenes >= FEWEST:
+        return [
+            "More scenes of this kind would not settle it: judge on scenes that both sides track"
+        ]
     if needed is None:
         return [f"Name {FEWEST} held-out scenes at least to learn more"]
     if needed > _TOO_MANY:
@@ -516,6 +520,8 @@ def without_effect(tuner: Study) -> int:
             continue
         runs = {name: run for name, run in _runs_of(trial).items() if name in baseline}
         for name, run in runs.items():
+            if not (run and baseline[name]):
+                return 0
             if _tracks(tuner, run) != _tracks(tuner, baseline[name]):
                 return 0
         compared += bool(runs)

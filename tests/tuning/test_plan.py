@@ -405,6 +405,76 @@ def test_a_crash_in_a_scene_that_judges_is_a_loss_there_and_ends_nothing(
     assert "it broke" in summary.conclusion
 
 
+class LosingTuner(SimulatedTuner):
+    """Its baseline, or both sides, lose all scenes that judge, or have no error there."""
+
+    losers: tuple[str, ...] = ()
+    is_perfect = False
+
+    def outcomes(
+        self, settings: Mapping[str, Any], instances: Sequence[ProblemInstance], **how: Any
+    ) -> Any:
+        side = "candidate" if settings else "baseline"
+        judging = set(self.design.held_out)
+        drawn = super().outcomes(settings, instances, **how)
+        for instance in judging & set(instances):
+            drawn[instance] = replace(drawn[instance], lost=side in self.losers)
+            if self.is_perfect:
+                drawn[instance] = replace(drawn[instance], ate_m=0.0)
+        return drawn
+
+
+@pytest.mark.parametrize(
+    ("losers", "verdict", "said"),
+    [
+        (("baseline", "candidate"), Verdict.CANNOT_TELL, "judge on scenes that both sides track"),
+        (("baseline",), Verdict.CANNOT_TELL, "judge on scenes that both sides track"),
+        (
+            ("candidate",),
+            Verdict.WORSE,
+            "loses more scenes than the baseline: both succeed on none",
+        ),
+    ],
+)
+def test_scenes_that_a_side_lost_say_what_cannot_be_said(
+    losers: tuple[str, ...], verdict: Verdict, said: str, tmp_path: Path
+) -> None:
+    tuner = LosingTuner(make_spec(trials=3), tmp_path).run()
+    tuner.losers = losers
+    summary = finish(tuner)
+    assert summary.verdict is verdict
+    assert said in summary.conclusion
+    assert summary.offered == {}
+
+
+def test_errors_below_the_floor_are_equal_and_said(tmp_path: Path) -> None:
+    tuner = LosingTuner(make_spec(trials=3), tmp_path).run()
+    tuner.is_perfect = True
+    summary = finish(tuner)
+    assert summary.verdict is Verdict.CANNOT_TELL
+    assert "exactly the same error in 8 scenes" in summary.conclusion
+    assert "an error below 0.1 mm counts as 0.1 mm" in summary.conclusion
+
+
+def test_claims_beyond_the_families_rest_on_six_that_no_trial_saw(tmp_path: Path) -> None:
+    names = ("sitting_xyz", "sitting_rpy", "walking_rpy", "objects_balloon", "objects_trolley")
+    every = (*names, "walking_static")
+    for families in (names, every):
+        held_out = [f"synthetic/{name}?scene=100-101&frames=20&offsets=0" for name in families]
+        spec = make_spec(held_out=held_out, trials=4)
+        summary = finish(SimulatedTuner(spec, tmp_path / str(len(families)), effect=valley).run())
+        assert summary.best is not None
+        beyond = summary.best.beyond
+        if families is names:
+            assert beyond is None
+            assert "says nothing of others" in summary.conclusion
+            continue
+        assert beyond is not None
+        assert beyond.all_scenes == 6
+        assert "by the means of the 6 families that no trial saw" in summary.conclusion
+        assert "says nothing of others" not in summary.conclusion
+
+
 def test_a_candidate_that_crashes_everywhere_is_not_judged(tmp_path: Path) -> None:
     tuner = CrashingTuner(make_spec(trials=3), tmp_path).run()
     tuner.candidate_crashes_on = EVERY
