@@ -235,7 +235,7 @@ def conclude(
     if inert:
         return Verdict.NO_DIFFERENCE, (
             f"{Verdict.NO_DIFFERENCE.value.capitalize()}: nothing that the study set has an effect. All {inert} trials "
-            f"with other settings have the baseline's trajectories to the last bit. Does {spec.tracker} read its settings?"
+            f"with other settings have the baseline's trajectories to the last bit. Does the tracker read its settings?"
         )
     best = candidates[0] if candidates else None
     verdict, sentences = judge(best)

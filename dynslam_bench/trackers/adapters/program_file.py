@@ -27,6 +27,7 @@ from dynslam_bench.core.settings import (
     apply_overrides,
     field_names,
     flatten,
+    names,
     tunable,
 )
 from dynslam_bench.geometry import Camera
@@ -478,7 +479,7 @@ class ProgramDocument(Generic[P]):
         own = [*self.template_files, *named]
         if self.container is not None:
             own += self.container.files
-        return [*own, *files_of_command([*command, *map(str, own)], self.here)]
+        return list(dict.fromkeys(files_of_command([*command, *map(str, own)], self.here)))
 
     def check(self, kind: str) -> None:
         """The program must be there.
@@ -682,8 +683,10 @@ def camera_values(camera: Camera, fps: float) -> dict[str, str]:
 class BatchSettings(Settings):
     """Settings of `batch:FILE`, beside those that the file declares."""
 
-    program: str = Field(
-        "", description="TOML file that describes the program, see docs/how-to/program.md"
+    program: str = names(
+        "",
+        "description",
+        meaning="TOML file that describes the program, see docs/how-to/program.md",
     )
     timeout_s: float = Field(3600.0, gt=0, description="seconds that the program may take")
 
@@ -704,8 +707,10 @@ class BatchSettings(Settings):
 class ServedSettings(ProgramSettings):
     """Settings of `subprocess:FILE.toml`, beside those that the file declares."""
 
-    command: str = Field(
-        "", description="TOML file that describes the program, see docs/how-to/program.md"
+    command: str = names(
+        "",
+        "description",
+        meaning="TOML file that describes the program, see docs/how-to/program.md",
     )
 
     def document(self) -> ProgramDocument[ServedProgram]:

@@ -1,7 +1,6 @@
 """Settings, templates and containers that a program's TOML file declares."""
 
 import json
-import os
 import stat
 import sys
 import textwrap
@@ -66,7 +65,13 @@ default = true
 features = 500
 "tracking.radius" = 1.0
 """
-TEMPLATE = "n: {features}\nradius: {tracking.radius}\nloops: {loops}\nfx: {camera.fx}\nshell: ${HOME} {{features}} {a: 1}\n"
+TEMPLATE = """\
+n: {features}
+radius: {tracking.radius}
+loops: {loops}
+fx: {camera.fx}
+shell: ${HOME} {{features}} {a: 1}
+"""
 
 
 @pytest.fixture
@@ -210,7 +215,11 @@ BAD = {
         TEMPLATE,
         "'viewer': the default is 'off', which has no range",
     ),
-    "no table": (changed(FILE, "[settings.loops]\ndefault = true", "[settings]\nloops = true"), TEMPLATE, "not a table"),
+    "no table": (
+        changed(FILE, "[settings.loops]\ndefault = true", "[settings]\nloops = true"),
+        TEMPLATE,
+        "not a table",
+    ),
     "an unknown key": (changed(FILE, "unit =", "units ="), TEMPLATE, "unknown key 'units'.*did you mean 'unit'"),
     "a name that is taken": (
         changed(FILE, "[settings.loops]", "[settings.timeout_s]"),
@@ -228,7 +237,11 @@ BAD = {
         TEMPLATE,
         "preset 'fast' sets an unknown 'featurs'",
     ),
-    "a preset of unfit values": (changed(FILE, "features = 500", "features = 5"), TEMPLATE, "preset 'fast': setting 'features'"),
+    "a preset of unfit values": (
+        changed(FILE, "features = 500", "features = 5"),
+        TEMPLATE,
+        "preset 'fast': setting 'features'",
+    ),
 }  # fmt: skip
 
 
@@ -541,7 +554,7 @@ def test_a_program_that_answers_frame_by_frame_gets_its_settings(
 
 
 def test_a_missing_file_of_a_served_program(tmp_path):
-    with pytest.raises(SettingsError, match="cannot read .*nowhere.toml"):
+    with pytest.raises(SettingsError, match=r"cannot read .*nowhere\.toml"):
         TRACKERS.get(f"subprocess:{tmp_path / 'nowhere.toml'}")
     assert (
         TRACKERS.get("subprocess:prog --config slam.toml").settings.__name__ == "SubprocessSettings"
