@@ -581,7 +581,7 @@ def _check_names(document: ProgramDocument[Any], places: set[str]) -> None:
 def _check_placeholders(
     document: ProgramDocument[Any], places: set[str], *, needs_all: bool
 ) -> None:
-    """Refuse placeholders that stand for nothing, and settings that go nowhere."""
+    """Refuse placeholders that stand for nothing, and settings that reach no program."""
     program = document.program
     texts = {"command": " ".join(program.command), "environment": " ".join(program.environment)}
     for target, text in document.templates.items():
@@ -806,11 +806,11 @@ def _described(document: ProgramDocument[Any], base: type[Settings]) -> dict[str
 
 def _check_preset(settings: type[Settings], name: str, values: Mapping[str, Any]) -> None:
     """Refuse a preset with unknown settings or unfit values."""
-    known = field_names(settings)
+    available = field_names(settings)
     for setting in values:
-        if setting not in known:
+        if setting not in available:
             raise SettingsError(
-                f"preset '{name}' sets an unknown '{setting}'", did_you_mean(setting, known)
+                f"preset '{name}' sets an unknown '{setting}'", did_you_mean(setting, available)
             )
     try:
         apply_overrides(settings(), values)

@@ -26,6 +26,7 @@ from dynslam_bench.trackers.adapters.program_file import (
     text_of,
 )
 from dynslam_bench.trackers.registry import resolve_settings
+from dynslam_bench.tuning import Study
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
 CAMERA = Camera(640, 480, 500.0, 510.0, 320.0, 240.0, (0.1, -0.2, 0.0, 0.0, 0.3), 5000.0)
@@ -425,18 +426,19 @@ with open(sys.argv[-1], "w") as file:
 
 
 @pytest.mark.slow
-def test_the_program_reads_its_settings_in_each_engine(slam, engine, tmp_path):
+def test_the_program_reads_its_settings_in_each_engine(slam, engine, tmp_path, toy_folder):
     name, seen, _ = engine
     tracker = slam(contained(name, tmp_path), code=WRITES)
     how = {"frames": (0, 6), "results": tmp_path / "results"}
-    run = db.run(tracker, "synthetic/walking_xyz", settings={"viewer": "on"}, **how)
+    run = db.run(tracker, toy_folder, settings={"viewer": "on"}, **how)
     assert run.status == "ok", run.record.reason
-    assert np.allclose(run.final.positions[:, 0], 0.002 * np.arange(6))
+    final = run.store.trajectory(run.record.run_id, "final")
+    assert np.allclose(final.positions[:, 0], 0.002 * np.arange(6))
     assert json.loads(seen.read_text())[0] in ("run", "exec")
 
 
 @pytest.mark.slow
-def test_a_container_ends_with_its_run(slam, engine, tmp_path):
+def test_a_container_ends_with_its_run(slam, engine, tmp_path, toy_folder):
     name, _, _ = engine
     if name == "apptainer":
         pytest.skip("its processes are children of the run's")
@@ -452,7 +454,7 @@ def test_a_container_ends_with_its_run(slam, engine, tmp_path):
     tracker = slam(contained(name, tmp_path), code=code)
     run = db.run(
         tracker,
-        "synthetic/walking_xyz",
+        toy_folder,
         frames=(0, 3),
         settings={"timeout_s": 5},
         results=tmp_path / "r",
@@ -476,11 +478,11 @@ def _ends(pid):
 
 
 @pytest.mark.slow
-def test_a_value_that_the_program_refuses_is_a_row(slam, tmp_path):
+def test_a_value_that_the_program_refuses_is_a_row(slam, tmp_path, toy_folder):
     tracker = slam(code=WRITES)
     run = db.run(
         tracker,
-        "synthetic/walking_xyz",
+        toy_folder,
         frames=(0, 3),
         settings={"features": 6000},
         results=tmp_path / "r",
@@ -565,19 +567,19 @@ def test_a_missing_file_of_a_served_program(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_study_says_that_a_program_ignores_its_settings(slam, tmp_path):
+def test_a_study_says_that_a_program_ignores_its_settings(slam, tmp_path, toy_folder):
     tracker = slam(code=WRITES)  # without its viewer it stands still
     study = {
         "name": "inert",
         "tracker": tracker,
-        "tune": ["synthetic/walking_xyz?scene=0-2&frames=6"],
-        "held_out": ["synthetic/walking_xyz?scene=100-105&frames=6"],
+        "tune": [f"{toy_folder}[0:10]?offsets=0-1"],
+        "held_out": [f"{toy_folder}[30:40]"],
         "recorded": [],
         "offsets": [0],
         "trials": 4,
         "space": {"include": ["features", "tracking.radius"]},
     }
-    summary = db.tune(study, results=tmp_path / "results")
+    summary = Study(results=tmp_path / "results", **study).run().finish()
     assert "nothing that the study set has an effect" in summary.conclusion
     assert "All 3 trials" in summary.conclusion
     assert summary.best is None or summary.best.evidence is None, "nothing was left to judge"
