@@ -16,9 +16,6 @@ from dynslam_bench.core.reads import Reads
 from dynslam_bench.evaluation import Protocol, get_protocol
 from dynslam_bench.runs.frames import FRAMES_FILE, FrameLog
 from dynslam_bench.runs.identity import ResolvedRun, check_unchanged, resolve
-from dynslam_bench.runs.make_record import (
-    judge_coverage as judge_coverage,  # SLAM-HPO takes it here
-)
 from dynslam_bench.runs.make_record import make_record
 from dynslam_bench.runs.own_code import plugins_of_run
 from dynslam_bench.runs.process.fork_server import Child, ForkServer

@@ -530,22 +530,23 @@ for line in sys.stdin:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("in_container", [False, True], ids=["native", "container"])
-def test_a_program_that_answers_frame_by_frame_gets_its_settings(
-    slam, tmp_path, in_container, request
-):
-    text = SERVED
-    if in_container:
-        request.getfixturevalue("engine")
-        name = request.node.callspec.params["engine"]
-        image = "toy.sif" if name == "apptainer" else "toy:1"
-        (tmp_path / "toy.sif").write_bytes(b"image")
-        text = changed(text, "final = false", f'image = "{image}"\nengine = "{name}"')
-    tracker_id = slam(text, "step: {step_m}", ANSWERS, kind="subprocess")
-    assert [parameter.name for parameter in parameters(TRACKERS.get(tracker_id).settings)] == [
-        "step_m",
-        "group.count",
-    ]
+def test_a_program_that_answers_frame_by_frame_gets_its_settings(slam):
+    check_served(slam(SERVED, "step: {step_m}", ANSWERS, kind="subprocess"))
+
+
+@pytest.mark.slow
+def test_so_does_one_in_a_container(slam, engine, tmp_path):
+    name, seen, _ = engine
+    image = "toy.sif" if name == "apptainer" else "toy:1"
+    (tmp_path / "toy.sif").write_bytes(b"image")
+    text = changed(SERVED, "final = false", f'image = "{image}"\nengine = "{name}"')
+    check_served(slam(text, "step: {step_m}", ANSWERS, kind="subprocess"))
+    assert json.loads(seen.read_text())[0] in ("run", "exec")
+
+
+def check_served(tracker_id):
+    declared = parameters(TRACKERS.get(tracker_id).settings)
+    assert [parameter.name for parameter in declared] == ["step_m", "group.count"]
     tracker = build_tracker(tracker_id, {"step_m": 0.25, "group.count": "4"}, TrackerContext())
     sequence = CornerSequence(3)
     for _ in range(2):  # each sequence begins in a new folder
