@@ -574,7 +574,6 @@ def test_a_study_says_that_a_program_ignores_its_settings(slam, tmp_path, toy_fo
         "name": "inert",
         "tracker": tracker,
         "tune": [f"{toy_folder}[0:10]?offsets=0-1"],
-        "held_out": [f"{toy_folder}[30:40]"],
         "recorded": [],
         "offsets": [0],
         "trials": 4,
