@@ -11,8 +11,8 @@ import pytest
 
 from dynslam_bench import api as db
 from dynslam_bench.contracts import TrackerContext
-from dynslam_bench.core.errors import SettingsError
-from dynslam_bench.core.settings import flatten, parameters
+from dynslam_bench.core.errors import DynslamError, SettingsError
+from dynslam_bench.core.settings import apply_overrides, flatten, parameters
 from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.geometry import Camera
 from dynslam_bench.runs import RunSpec, resolve
@@ -20,13 +20,17 @@ from dynslam_bench.testing import CornerSequence
 from dynslam_bench.trackers import TRACKERS, build_tracker
 from dynslam_bench.trackers.adapters.program_file import (
     CAMERA_NAMES,
+    BatchSettings,
     camera_values,
     fill,
     read_batch,
+    read_declared,
+    settings_class,
     text_of,
 )
 from dynslam_bench.trackers.registry import resolve_settings
-from dynslam_bench.tuning import Study
+from dynslam_bench.tuning import Study, StudySpec
+from dynslam_bench.tuning.plan import Plan
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
 CAMERA = Camera(640, 480, 500.0, 510.0, 320.0, 240.0, (0.1, -0.2, 0.0, 0.0, 0.3), 5000.0)
@@ -164,6 +168,46 @@ def test_numbers_are_written_so_that_every_parser_reads_them():
     values = camera_values(CAMERA, 29.7)
     assert tuple(values) == CAMERA_NAMES
     assert (values["camera.fps"], values["camera.k3"], values["camera.bf"]) == ("30", "0.3", "37.5")
+
+
+def test_a_setting_has_the_type_of_its_default():
+    table = {
+        "share": {"default": 0.5, "choices": [0.5, 1.0]},
+        "flag": {"default": 1, "choices": [0, 1]},
+        "wide": {"default": 1, "low": 0.5, "high": 2},
+        "fixed": {"default": 5, "limits": [1, 9]},
+        "text": {"default": "x y"},
+    }
+    kind = settings_class(BatchSettings, read_declared(table, "slam.toml"))
+    assert [(one.name, one.kind) for one in parameters(kind)] == [
+        ("share", "categorical"),
+        ("flag", "categorical"),
+        ("wide", "float"),
+    ]
+    texts = {"share": "1.0", "flag": "0", "wide": "2", "fixed": "3", "text": "z"}
+    assert flatten(apply_overrides(kind(), texts)).items() >= {
+        ("share", 1.0),
+        ("flag", 0),
+        ("wide", 2.0),
+        ("fixed", 3),
+        ("text", "z"),
+    }
+    for name, value in {"share": "0.7", "flag": "2", "fixed": "10", "text": "a\nb"}.items():
+        with pytest.raises(SettingsError, match=f"setting '{name}'"):
+            apply_overrides(kind(), {name: value})
+
+
+@pytest.mark.parametrize("span, words", [([5, 100], "10"), ([300, 20000], "10000")])
+def test_a_study_may_not_search_beyond_the_limits(slam, span, words):
+    spec = StudySpec(
+        name="mine",
+        tracker=slam(),
+        tune=("synthetic/walking_xyz?scene=0-2&frames=6",),
+        held_out=("synthetic/walking_xyz?scene=100-105&frames=6",),
+        space={"include": ("features",), "range": {"features": span}},
+    )
+    with pytest.raises(DynslamError, match=f"features.*{words}"):
+        Plan(spec)
 
 
 def changed(text, old, new):
