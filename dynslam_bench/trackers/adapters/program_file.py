@@ -61,6 +61,8 @@ BATCH_NAMES = ("sequence", "associations", "camera", "output", "folder")
 """Placeholders for the paths that a program for whole sequences gets."""
 COMMON_NAMES = ("here", "python", "threads", *CAMERA_NAMES)
 """Placeholders that every program has."""
+_LITERAL: Any = Literal
+"""Makes the type of a setting with choices, which are known only when a file is read."""
 _ONE_LINE = r"^[^\x00-\x1f\x7f]*$"
 """A text that can stand in a command line and in a line of a file."""
 
@@ -154,7 +156,7 @@ class ProgramSetting(Record):
     def field(self) -> tuple[Any, Any]:
         """Type and field of a settings class."""
         if self.choices:
-            return Literal[self.choices], tunable(
+            return _LITERAL[self.choices], tunable(
                 self.default, meaning=self.meaning, unit=self.unit
             )
         if isinstance(self.default, bool):
@@ -164,7 +166,8 @@ class ProgramSetting(Record):
 
         # a number: whole where all that is written of it is
         numbers = (self.default, *self._bounds)
-        kind = int if all(isinstance(number, int) for number in numbers) else float
+        is_whole = all(isinstance(number, int) for number in numbers)
+        kind: type[int] | type[float] = int if is_whole else float
         if self.low is not None:
             field = tunable(
                 kind(self.default),
