@@ -445,7 +445,7 @@ class ProgramDocument(Generic[P]):
             work: Its working folder, which is there as long as the run.
             writable: Folders that it may write.
         """
-        declared = [entry for entry in self.program.environment if "=" not in entry]
+        declared = self._handed_through
         environment = program_environment(declared) | {**variables, **filled.variables}
         if self.container is None:
             return filled.words, environment
@@ -460,11 +460,18 @@ class ProgramDocument(Generic[P]):
         return command, environment
 
     @property
+    def _handed_through(self) -> list[str]:
+        """Names of the environment variables that the program gets as they are."""
+        return [entry for entry in self.program.environment if "=" not in entry]
+
+    @property
     def version(self) -> str:
         """The program's version with a digest of what the file says of how it runs."""
         decisive = self.program.decisive
+        # what a program in a container looks up is not seen from outside
         if self.container is not None:
             decisive["image"] = self.container.identity()
+            decisive["variables"] = {name: os.environ.get(name) for name in self._handed_through}
         return f"{self.program.version}+{digest(decisive)}"
 
     def files(self, settings: Settings) -> list[Path]:

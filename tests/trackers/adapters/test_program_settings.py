@@ -431,10 +431,15 @@ def test_the_command_of_a_container(slam, engine, tmp_path):
         assert ("--gpus all" in text) == (name == "docker")
 
 
-def test_the_image_is_a_part_of_the_identity(slam, engine, tmp_path):
+def test_the_image_is_a_part_of_the_identity(slam, engine, tmp_path, monkeypatch):
     name, _, digest = engine
-    tracker = slam(contained(name, tmp_path))
+    text = changed(contained(name, tmp_path), "MODE={viewer}", 'MODE={viewer}", "MY_MODE')
+    tracker = slam(text)
     first = identity(tracker)
+    assert identity(tracker) == first
+    monkeypatch.setenv("MY_MODE", "slow")
+    assert identity(tracker) != first
+    monkeypatch.delenv("MY_MODE")
     assert identity(tracker) == first
     digest.write_text("sha256:22")
     (tmp_path / "toy.sif").write_bytes(b"another image")
