@@ -256,13 +256,15 @@ def conclude(
     if inert:
         return Verdict.NO_DIFFERENCE, (
             f"{Verdict.NO_DIFFERENCE.value.capitalize()}: nothing that the study set has an effect. All {inert} trials "
-            "with other settings have the baseline's trajectories to the last bit. "
-            f"Does {spec.tracker} read its settings?"
+            f"with other settings have the baseline's trajectories to the last bit. Does the tracker read its settings?"
         )
     best = candidates[0] if candidates else None
     verdict, sentences = judge(best)
     if failures:
-        sentences.append(f"{len(failures)} trials failed, the first one as {failures[0]}")
+        count = f"{len(failures)} trials failed, the first one as"
+        if len(failures) == 1:
+            count = "1 trial failed:"
+        sentences.append(f"{count} {failures[0]}")
     if families and best is not None and best.evidence is not None:
         sentences.append(families)
         if best.beyond is not None:

@@ -53,7 +53,8 @@ def named_digests(settings: Settings, *, words: bool = False) -> dict[str, str]:
     depth of lists and tables, and a text with the prefix ``onnx:``, ``weights:`` or ``recorded:``.
     So does a text that is written as a path, with a separator, or as a file's name with an ending,
     where that is there. ``~`` and ``$VARIABLE`` are replaced. A bare word without an ending is a
-    word, whatever lies in the working folder, unless `words` is set.
+    word, whatever lies in the working folder, unless `words` is set. The description of a tracker
+    does not count: its version has what decides of it.
 
     Args:
         settings: The settings.
@@ -63,10 +64,14 @@ def named_digests(settings: Settings, *, words: bool = False) -> dict[str, str]:
         PluginError: One cannot be read.
     """
     # declared names, also where nothing tells them from a word
-    texts = {name: value for name, (kind, value) in named(settings).items() if kind == "file"}
+    references = named(settings)
+    texts = {name: value for name, (kind, value) in references.items() if kind == "file"}
 
     # then what is written as a path, at any depth of a setting's value
+    descriptions = {name for name, (kind, _) in references.items() if kind == "description"}
     for name in field_names(type(settings)):
+        if name in descriptions:
+            continue
         for setting, value in _leaves_of(name, attrgetter(name)(settings)):
             text = _path_in(value)
             if not text and words and os.path.isfile(value):  # noqa: PTH113 - any text

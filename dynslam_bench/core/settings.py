@@ -151,13 +151,18 @@ def tunable(
 
 
 def names(
-    default: str, kind: Literal["file", "features", "flow"], *, meaning: str, otherwise: str = ""
+    default: str,
+    kind: Literal["file", "description", "features", "flow"],
+    *,
+    meaning: str,
+    otherwise: str = "",
 ) -> Any:
     """A field of text that names something else, whose content decides the result as well.
 
     Args:
         default: The default value.
-        kind: ``file``: a path of a file or folder; else a plug-in of that kind, by id or
+        kind: ``file``: a path of a file or folder; ``description``: a file that describes the tracker,
+            in whose version counts what of it decides; else a plug-in of that kind, by id or
             ``module:Attr``.
         meaning: One line for the documentation table.
         otherwise: Environment variable that names it where the field is empty.

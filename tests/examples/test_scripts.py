@@ -12,8 +12,11 @@ from typing import Any
 
 import pytest
 
+from dynslam_bench import api as db
+from dynslam_bench.core.settings import parameters
 from dynslam_bench.testing import check_tracker
 from dynslam_bench.trackers import TRACKERS
+from dynslam_bench.tuning import read_study
 
 pytestmark = pytest.mark.slow
 
@@ -76,6 +79,37 @@ def test_own_tracker_is_found_where_it_is_installed(
 def test_own_tracker_keeps_the_contract(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(EXAMPLES / "own_tracker")
     check_tracker("own_tracker:SPEC")
+
+
+COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
+
+
+@pytest.mark.skipif(COMPILER is None, reason="there is no C++ compiler here")
+def test_a_cpp_program_reads_its_settings_from_a_template(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for file in (EXAMPLES / "program").iterdir():
+        shutil.copy(file, tmp_path)
+    monkeypatch.chdir(tmp_path)
+    flags = ["-O2", "-Wall", "-Wextra", "-Werror", "-o", "odometry"]
+    subprocess.run([COMPILER, *flags, "odometry.cpp"], check=True, capture_output=True)
+    how: dict[str, Any] = {"frames": (0, 12), "results": tmp_path / "results"}
+    sequence = "synthetic/sitting_xyz?scene=100"
+    runs = [
+        db.run("batch:odometry.toml", sequence, settings=settings, **how)
+        for settings in ({}, {"huber": 4.0, "keyframe_m": 0.1})
+    ]
+    for run in runs:
+        assert run.status == "ok", run.record.reason
+        assert run.record.coverage == 1.0
+        assert run.metrics["ate_rmse_m"] < 0.5 * run.metrics["static_camera_ate_rmse_m"]
+    assert runs[0].metrics["ate_rmse_m"] != runs[1].metrics["ate_rmse_m"]
+
+    # its study is one of its two settings
+    study = read_study("study.toml")
+    spec = TRACKERS.get(study.tracker)
+    assert [parameter.name for parameter in parameters(spec.settings)] == ["huber", "keyframe_m"]
+    assert study.instances(*study.held_out)
 
 
 @pytest.mark.parametrize("benchmark", ["masks-v0", "features-v0"])

@@ -184,6 +184,15 @@ def test_no_trial_and_failed_trials_cannot_tell() -> None:
     assert judge(None)[0] is Verdict.CANNOT_TELL
     _, text = conclude(SPEC, [], failures=["crashed: no memory", "crashed"])
     assert "2 trials failed, the first one as crashed: no memory" in text
+    # so where a program refuses a part of the range, and other trials did better
+    _, text = conclude(SPEC, [candidate()], failures=["crashed: n above 5000"])
+    assert "1 trial failed: crashed: n above 5000" in text
+
+
+def test_settings_without_any_effect_are_named() -> None:
+    verdict, text = conclude(SPEC, [candidate()], inert=3)
+    assert verdict is Verdict.NO_DIFFERENCE
+    assert "All 3 trials with other settings have the baseline's trajectories" in text
 
 
 def test_an_extendable_study_names_the_command_of_its_next_look() -> None:

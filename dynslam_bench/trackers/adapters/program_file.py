@@ -27,6 +27,7 @@ from dynslam_bench.core.settings import (
     apply_overrides,
     field_names,
     flatten,
+    names,
     tunable,
 )
 from dynslam_bench.geometry import Camera
@@ -60,6 +61,8 @@ BATCH_NAMES = ("sequence", "associations", "camera", "output", "folder")
 """Placeholders for the paths that a program for whole sequences gets."""
 COMMON_NAMES = ("here", "python", "threads", *CAMERA_NAMES)
 """Placeholders that every program has."""
+_LITERAL: Any = Literal
+"""Makes the type of a setting with choices, which are known only when a file is read."""
 _ONE_LINE = r"^[^\x00-\x1f\x7f]*$"
 """A text that can stand in a command line and in a line of a file."""
 
@@ -153,7 +156,7 @@ class ProgramSetting(Record):
     def field(self) -> tuple[Any, Any]:
         """Type and field of a settings class."""
         if self.choices:
-            return Literal[self.choices], tunable(
+            return _LITERAL[self.choices], tunable(
                 self.default, meaning=self.meaning, unit=self.unit
             )
         if isinstance(self.default, bool):
@@ -163,7 +166,8 @@ class ProgramSetting(Record):
 
         # a number: whole where all that is written of it is
         numbers = (self.default, *self._bounds)
-        kind = int if all(isinstance(number, int) for number in numbers) else float
+        is_whole = all(isinstance(number, int) for number in numbers)
+        kind: type[int] | type[float] = int if is_whole else float
         if self.low is not None:
             field = tunable(
                 kind(self.default),
@@ -441,7 +445,7 @@ class ProgramDocument(Generic[P]):
             work: Its working folder, which is there as long as the run.
             writable: Folders that it may write.
         """
-        declared = [entry for entry in self.program.environment if "=" not in entry]
+        declared = self._handed_through
         environment = program_environment(declared) | {**variables, **filled.variables}
         if self.container is None:
             return filled.words, environment
@@ -456,11 +460,18 @@ class ProgramDocument(Generic[P]):
         return command, environment
 
     @property
+    def _handed_through(self) -> list[str]:
+        """Names of the environment variables that the program gets as they are."""
+        return [entry for entry in self.program.environment if "=" not in entry]
+
+    @property
     def version(self) -> str:
         """The program's version with a digest of what the file says of how it runs."""
         decisive = self.program.decisive
+        # what a program in a container looks up is not seen from outside
         if self.container is not None:
             decisive["image"] = self.container.identity()
+            decisive["variables"] = {name: os.environ.get(name) for name in self._handed_through}
         return f"{self.program.version}+{digest(decisive)}"
 
     def files(self, settings: Settings) -> list[Path]:
@@ -478,7 +489,7 @@ class ProgramDocument(Generic[P]):
         own = [*self.template_files, *named]
         if self.container is not None:
             own += self.container.files
-        return [*own, *files_of_command([*command, *map(str, own)], self.here)]
+        return list(dict.fromkeys(files_of_command([*command, *map(str, own)], self.here)))
 
     def check(self, kind: str) -> None:
         """The program must be there.
@@ -580,7 +591,7 @@ def _check_names(document: ProgramDocument[Any], places: set[str]) -> None:
 def _check_placeholders(
     document: ProgramDocument[Any], places: set[str], *, needs_all: bool
 ) -> None:
-    """Refuse placeholders that stand for nothing, and settings that have no placeholder."""
+    """Refuse placeholders that stand for nothing, and settings that reach no program."""
     program = document.program
     texts = {"command": " ".join(program.command), "environment": " ".join(program.environment)}
     for target, text in document.templates.items():
@@ -682,8 +693,10 @@ def camera_values(camera: Camera, fps: float) -> dict[str, str]:
 class BatchSettings(Settings):
     """Settings of `batch:FILE`, beside those that the file declares."""
 
-    program: str = Field(
-        "", description="TOML file that describes the program, see docs/how-to/program.md"
+    program: str = names(
+        "",
+        "description",
+        meaning="TOML file that describes the program, see docs/how-to/program.md",
     )
     timeout_s: float = Field(3600.0, gt=0, description="seconds that the program may take")
 
@@ -704,8 +717,10 @@ class BatchSettings(Settings):
 class ServedSettings(ProgramSettings):
     """Settings of `subprocess:FILE.toml`, beside those that the file declares."""
 
-    command: str = Field(
-        "", description="TOML file that describes the program, see docs/how-to/program.md"
+    command: str = names(
+        "",
+        "description",
+        meaning="TOML file that describes the program, see docs/how-to/program.md",
     )
 
     def document(self) -> ProgramDocument[ServedProgram]:
@@ -801,11 +816,11 @@ def _described(document: ProgramDocument[Any], base: type[Settings]) -> dict[str
 
 def _check_preset(settings: type[Settings], name: str, values: Mapping[str, Any]) -> None:
     """Refuse a preset with unknown settings or unfit values."""
-    names = field_names(settings)
+    available = field_names(settings)
     for setting in values:
-        if setting not in names:
+        if setting not in available:
             raise SettingsError(
-                f"preset '{name}' sets an unknown '{setting}'", did_you_mean(setting, names)
+                f"preset '{name}' sets an unknown '{setting}'", did_you_mean(setting, available)
             )
     try:
         apply_overrides(settings(), values)

@@ -11,8 +11,8 @@ import pytest
 
 from dynslam_bench import api as db
 from dynslam_bench.contracts import TrackerContext
-from dynslam_bench.core.errors import SettingsError
-from dynslam_bench.core.settings import flatten, parameters
+from dynslam_bench.core.errors import DynslamError, SettingsError
+from dynslam_bench.core.settings import apply_overrides, flatten, parameters
 from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.geometry import Camera
 from dynslam_bench.runs import RunSpec, resolve
@@ -20,12 +20,17 @@ from dynslam_bench.testing import CornerSequence
 from dynslam_bench.trackers import TRACKERS, build_tracker
 from dynslam_bench.trackers.adapters.program_file import (
     CAMERA_NAMES,
+    BatchSettings,
     camera_values,
     fill,
     read_batch,
+    read_declared,
+    settings_class,
     text_of,
 )
 from dynslam_bench.trackers.registry import resolve_settings
+from dynslam_bench.tuning import Study, StudySpec
+from dynslam_bench.tuning.plan import Plan
 
 EXAMPLES = Path(__file__).resolve().parents[3] / "examples"
 CAMERA = Camera(640, 480, 500.0, 510.0, 320.0, 240.0, (0.1, -0.2, 0.0, 0.0, 0.3), 5000.0)
@@ -65,7 +70,13 @@ default = true
 features = 500
 "tracking.radius" = 1.0
 """
-TEMPLATE = "n: {features}\nradius: {tracking.radius}\nloops: {loops}\nfx: {camera.fx}\nshell: ${HOME} {{features}} {a: 1}\n"
+TEMPLATE = """\
+n: {features}
+radius: {tracking.radius}
+loops: {loops}
+fx: {camera.fx}
+shell: ${HOME} {{features}} {a: 1}
+"""
 
 
 @pytest.fixture
@@ -159,6 +170,46 @@ def test_numbers_are_written_so_that_every_parser_reads_them():
     assert (values["camera.fps"], values["camera.k3"], values["camera.bf"]) == ("30", "0.3", "37.5")
 
 
+def test_a_setting_has_the_type_of_its_default():
+    table = {
+        "share": {"default": 0.5, "choices": [0.5, 1.0]},
+        "flag": {"default": 1, "choices": [0, 1]},
+        "wide": {"default": 1, "low": 0.5, "high": 2},
+        "fixed": {"default": 5, "limits": [1, 9]},
+        "text": {"default": "x y"},
+    }
+    kind = settings_class(BatchSettings, read_declared(table, "slam.toml"))
+    assert [(one.name, one.kind) for one in parameters(kind)] == [
+        ("share", "categorical"),
+        ("flag", "categorical"),
+        ("wide", "float"),
+    ]
+    texts = {"share": "1.0", "flag": "0", "wide": "2", "fixed": "3", "text": "z"}
+    assert flatten(apply_overrides(kind(), texts)).items() >= {
+        ("share", 1.0),
+        ("flag", 0),
+        ("wide", 2.0),
+        ("fixed", 3),
+        ("text", "z"),
+    }
+    for name, value in {"share": "0.7", "flag": "2", "fixed": "10", "text": "a\nb"}.items():
+        with pytest.raises(SettingsError, match=f"setting '{name}'"):
+            apply_overrides(kind(), {name: value})
+
+
+@pytest.mark.parametrize("span, words", [([5, 100], "10"), ([300, 20000], "10000")])
+def test_a_study_may_not_search_beyond_the_limits(slam, span, words):
+    spec = StudySpec(
+        name="mine",
+        tracker=slam(),
+        tune=("synthetic/walking_xyz?scene=0-2&frames=6",),
+        held_out=("synthetic/walking_xyz?scene=100-105&frames=6",),
+        space={"include": ("features",), "range": {"features": span}},
+    )
+    with pytest.raises(DynslamError, match=f"features.*{words}"):
+        Plan(spec)
+
+
 def changed(text, old, new):
     assert old in text
     return text.replace(old, new)
@@ -209,7 +260,11 @@ BAD = {
         TEMPLATE,
         "'viewer': the default is 'off', which has no range",
     ),
-    "no table": (changed(FILE, "[settings.loops]\ndefault = true", "[settings]\nloops = true"), TEMPLATE, "not a table"),
+    "no table": (
+        changed(FILE, "[settings.loops]\ndefault = true", "[settings]\nloops = true"),
+        TEMPLATE,
+        "not a table",
+    ),
     "an unknown key": (changed(FILE, "unit =", "units ="), TEMPLATE, "unknown key 'units'.*did you mean 'unit'"),
     "a name that is taken": (
         changed(FILE, "[settings.loops]", "[settings.timeout_s]"),
@@ -227,7 +282,11 @@ BAD = {
         TEMPLATE,
         "preset 'fast' sets an unknown 'featurs'",
     ),
-    "a preset of unfit values": (changed(FILE, "features = 500", "features = 5"), TEMPLATE, "preset 'fast': setting 'features'"),
+    "a preset of unfit values": (
+        changed(FILE, "features = 500", "features = 5"),
+        TEMPLATE,
+        "preset 'fast': setting 'features'",
+    ),
 }  # fmt: skip
 
 
@@ -372,10 +431,15 @@ def test_the_command_of_a_container(slam, engine, tmp_path):
         assert ("--gpus all" in text) == (name == "docker")
 
 
-def test_the_image_is_a_part_of_the_identity(slam, engine, tmp_path):
+def test_the_image_is_a_part_of_the_identity(slam, engine, tmp_path, monkeypatch):
     name, _, digest = engine
-    tracker = slam(contained(name, tmp_path))
+    text = changed(contained(name, tmp_path), "MODE={viewer}", 'MODE={viewer}", "MY_MODE')
+    tracker = slam(text)
     first = identity(tracker)
+    assert identity(tracker) == first
+    monkeypatch.setenv("MY_MODE", "slow")
+    assert identity(tracker) != first
+    monkeypatch.delenv("MY_MODE")
     assert identity(tracker) == first
     digest.write_text("sha256:22")
     (tmp_path / "toy.sif").write_bytes(b"another image")
@@ -411,18 +475,19 @@ with open(sys.argv[-1], "w") as file:
 
 
 @pytest.mark.slow
-def test_the_program_reads_its_settings_in_each_engine(slam, engine, tmp_path):
+def test_the_program_reads_its_settings_in_each_engine(slam, engine, tmp_path, toy_folder):
     name, seen, _ = engine
     tracker = slam(contained(name, tmp_path), code=WRITES)
     how = {"frames": (0, 6), "results": tmp_path / "results"}
-    run = db.run(tracker, "synthetic/walking_xyz", settings={"viewer": "on"}, **how)
+    run = db.run(tracker, toy_folder, settings={"viewer": "on"}, **how)
     assert run.status == "ok", run.record.reason
-    assert np.allclose(run.final.positions[:, 0], 0.002 * np.arange(6))
+    final = run.store.trajectory(run.record.run_id, "final")
+    assert np.allclose(final.positions[:, 0], 0.002 * np.arange(6))
     assert json.loads(seen.read_text())[0] in ("run", "exec")
 
 
 @pytest.mark.slow
-def test_a_container_ends_with_its_run(slam, engine, tmp_path):
+def test_a_container_ends_with_its_run(slam, engine, tmp_path, toy_folder):
     name, _, _ = engine
     if name == "apptainer":
         pytest.skip("its processes are children of the run's")
@@ -438,7 +503,7 @@ def test_a_container_ends_with_its_run(slam, engine, tmp_path):
     tracker = slam(contained(name, tmp_path), code=code)
     run = db.run(
         tracker,
-        "synthetic/walking_xyz",
+        toy_folder,
         frames=(0, 3),
         settings={"timeout_s": 5},
         results=tmp_path / "r",
@@ -462,11 +527,11 @@ def _ends(pid):
 
 
 @pytest.mark.slow
-def test_a_value_that_the_program_refuses_is_a_row(slam, tmp_path):
+def test_a_value_that_the_program_refuses_is_a_row(slam, tmp_path, toy_folder):
     tracker = slam(code=WRITES)
     run = db.run(
         tracker,
-        "synthetic/walking_xyz",
+        toy_folder,
         frames=(0, 3),
         settings={"features": 6000},
         results=tmp_path / "r",
@@ -514,22 +579,23 @@ for line in sys.stdin:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("in_container", [False, True], ids=["native", "container"])
-def test_a_program_that_answers_frame_by_frame_gets_its_settings(
-    slam, tmp_path, in_container, request
-):
-    text = SERVED
-    if in_container:
-        request.getfixturevalue("engine")
-        name = request.node.callspec.params["engine"]
-        image = "toy.sif" if name == "apptainer" else "toy:1"
-        (tmp_path / "toy.sif").write_bytes(b"image")
-        text = changed(text, "final = false", f'image = "{image}"\nengine = "{name}"')
-    tracker_id = slam(text, "step: {step_m}", ANSWERS, kind="subprocess")
-    assert [parameter.name for parameter in parameters(TRACKERS.get(tracker_id).settings)] == [
-        "step_m",
-        "group.count",
-    ]
+def test_a_program_that_answers_frame_by_frame_gets_its_settings(slam):
+    check_served(slam(SERVED, "step: {step_m}", ANSWERS, kind="subprocess"))
+
+
+@pytest.mark.slow
+def test_so_does_one_in_a_container(slam, engine, tmp_path):
+    name, seen, _ = engine
+    image = "toy.sif" if name == "apptainer" else "toy:1"
+    (tmp_path / "toy.sif").write_bytes(b"image")
+    text = changed(SERVED, "final = false", f'image = "{image}"\nengine = "{name}"')
+    check_served(slam(text, "step: {step_m}", ANSWERS, kind="subprocess"))
+    assert json.loads(seen.read_text())[0] in ("run", "exec")
+
+
+def check_served(tracker_id):
+    declared = parameters(TRACKERS.get(tracker_id).settings)
+    assert [parameter.name for parameter in declared] == ["step_m", "group.count"]
     tracker = build_tracker(tracker_id, {"step_m": 0.25, "group.count": "4"}, TrackerContext())
     sequence = CornerSequence(3)
     for _ in range(2):  # each sequence begins in a new folder
@@ -540,7 +606,7 @@ def test_a_program_that_answers_frame_by_frame_gets_its_settings(
 
 
 def test_a_missing_file_of_a_served_program(tmp_path):
-    with pytest.raises(SettingsError, match="cannot read .*nowhere.toml"):
+    with pytest.raises(SettingsError, match=r"cannot read .*nowhere\.toml"):
         TRACKERS.get(f"subprocess:{tmp_path / 'nowhere.toml'}")
     assert (
         TRACKERS.get("subprocess:prog --config slam.toml").settings.__name__ == "SubprocessSettings"
@@ -551,19 +617,18 @@ def test_a_missing_file_of_a_served_program(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_study_says_that_a_program_ignores_its_settings(slam, tmp_path):
+def test_a_study_says_that_a_program_ignores_its_settings(slam, tmp_path, toy_folder):
     tracker = slam(code=WRITES)  # without its viewer it stands still
     study = {
         "name": "inert",
         "tracker": tracker,
-        "tune": ["synthetic/walking_xyz?scene=0-2&frames=6"],
-        "held_out": ["synthetic/walking_xyz?scene=100-105&frames=6"],
+        "tune": [f"{toy_folder}[0:10]?offsets=0-1"],
         "recorded": [],
         "offsets": [0],
         "trials": 4,
         "space": {"include": ["features", "tracking.radius"]},
     }
-    summary = db.tune(study, results=tmp_path / "results")
+    summary = Study(results=tmp_path / "results", **study).run().finish()
     assert "nothing that the study set has an effect" in summary.conclusion
     assert "All 3 trials" in summary.conclusion
     assert summary.best is None or summary.best.evidence is None, "nothing was left to judge"
