@@ -251,8 +251,8 @@ class Plan:
             self.baseline = Configuration(spec.baseline, known_settings(spec.baseline, fixed))
         self.shipped = None
         if spec.baseline:
-            known = fixed if len(self.trackers) == 1 else known_settings(spec.tracker, fixed)
-            self.shipped = Configuration(spec.tracker, known)
+            defaults = fixed if len(self.trackers) == 1 else known_settings(spec.tracker, fixed)
+            self.shipped = Configuration(spec.tracker, defaults)
 
         # the space around trial 0, which has to lie in it, and the instances
         self.defaults = around[spec.tracker]

@@ -99,8 +99,8 @@ class SearchSpace:
             if value not in wanted:
                 return f"{other} is {value!r}"
         # those of the settings themselves
-        known = {key: value for key, value in values.items() if key in names and key != name}
-        return why_unused(apply_overrides(settings, known), name)
+        others = {key: value for key, value in values.items() if key in names and key != name}
+        return why_unused(apply_overrides(settings, others), name)
 
     def why_never(self, name: str) -> str:
         """Why a setting has no effect whatever is chosen; empty where some choices give it one.
@@ -169,11 +169,11 @@ def build_space(
             setting, a setting can have no effect, or nothing is left to tune.
     """
     _check_names(spec, settings)
-    found = [_chosen(spec, each) for each in settings.values()]
+    chosen = [_chosen(spec, group) for group in settings.values()]
 
     # one parameter a name, in the order of the trackers
     merged: dict[str, Parameter] = {}
-    for parameter in (one for each in found for one in each):
+    for parameter in (one for of_tracker in chosen for one in of_tracker):
         there = merged.get(parameter.name)
         merged[parameter.name] = parameter if there is None else _merged(there, parameter)
     every = list(merged.values())
@@ -208,8 +208,8 @@ def build_space(
 
 def _check_names(spec: SpaceSpec, settings: Mapping[str, Settings]) -> None:
     """Refuse patterns and names that match no setting of any tracker, and names that are tuned and fixed."""
-    tunable = [one.name for each in settings.values() for one in parameters(type(each))]
-    fields = {name for each in settings.values() for name in field_names(type(each))}
+    tunable = [one.name for group in settings.values() for one in parameters(type(group))]
+    fields = {name for group in settings.values() for name in field_names(type(group))}
     for pattern in (*spec.include, *spec.exclude):
         if any(fnmatchcase(name, pattern) for name in tunable):
             continue
