@@ -414,19 +414,27 @@ def starting_point(
                 f'tune it, or say "{name}" = ... under [space.fixed]',
             )
 
-    # what is tuned has a value that the sampler could propose
+    # what is tuned has a value that the sampler could propose, unless nothing uses it
     point = {name: preset.get(name, base[name]) for name in spans}
-    for name, value in point.items():
-        span = spans[name]
-        fits = False
-        with suppress(ValueError):  # no number, or none of the choices
-            fits = span._contains(span.to_internal_repr(value))
-        if not fits and name in space.effective(point):
+    misfits = [name for name, value in point.items() if not _fits(spans[name], value)]
+    if misfits:
+        used = space.effective(point | {name: base[name] for name in misfits})
+        for name in misfits:
+            if name not in used:
+                continue
+            tuned = _span_text(spans[name])
             raise StudyError(
-                f"{what} sets {name} = {value!r}, out of the range that the study tunes: {_span_text(span)}",
+                f"{what} sets {name} = {point[name]!r}, out of the range that the study tunes: {tuned}",
                 'make the range wider, or begin with a baseline within it (baseline = "PRESET.toml")',
             )
     return point
+
+
+def _fits(span: BaseDistribution, value: Any) -> bool:
+    """Whether a sampler could propose a value."""
+    with suppress(ValueError):  # no number, or none of the choices
+        return span._contains(span.to_internal_repr(value))
+    return False
 
 
 def _span_text(span: BaseDistribution) -> str:
