@@ -22,6 +22,16 @@ opposites  # flow.moth_flame: the same
 # features.fast: the instructions in plain code, which a test compares them with
 plain_corner_scores
 plain_maxima
+# core.simd and flow: likewise
+plain_total
+plain_average
+plain_average_of_pairs
+plain_derivatives
+plain_store_normalised
+plain_store_offsets
+plain_square
+plain_sample
+plain_descriptor_sum
 
 # called by name: specs name their factories as "module:name"
 OrbExtractor  # features.registry

@@ -1,7 +1,7 @@
 """dynslam-bench: benchmark and tune visual SLAM in dynamic scenes through Gymnasium environments.
 
-The public interface is `run`, `bench`, `tune`, `report`, `load`, `sequence` and `trackers`, see
-`dynslam_bench.api`:
+The public interface is `run`, `bench`, `tune`, `report`, `load`, `sequence`, see `dynslam_bench.api`,
+and the packages `trackers` and `gate`:
 
     import dynslam_bench as db
     db.run("emfoa-oft", "synthetic/walking_xyz?scene=100", frames=(0, 60)).metrics
@@ -13,11 +13,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dynslam_bench import trackers
+    from dynslam_bench import gate, trackers
     from dynslam_bench.api import bench, load, report, run, sequence, tune
 
 __version__: str
-__all__ = ["bench", "load", "report", "run", "sequence", "trackers", "tune"]
+__all__ = ["bench", "gate", "load", "report", "run", "sequence", "trackers", "tune"]
+
+_PACKAGES = ("gate", "trackers")
+"""Names of the public interface that are packages."""
 
 _checkout = Path(__file__).resolve().parent.parent
 if (_checkout / "pyproject.toml").is_file() and (_checkout / "envs" / "__init__.py").is_file():
@@ -37,11 +40,9 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    return (
-        import_module("dynslam_bench.trackers")
-        if name == "trackers"
-        else getattr(import_module("dynslam_bench.api"), name)
-    )
+    if name in _PACKAGES:
+        return import_module(f"dynslam_bench.{name}")
+    return getattr(import_module("dynslam_bench.api"), name)
 
 
 def __dir__() -> list[str]:

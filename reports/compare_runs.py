@@ -12,6 +12,7 @@ from dynslam_bench.core import ReportError, setting_text, sweep_temporary, write
 from dynslam_bench.evaluation import Protocol, get_protocol
 from dynslam_bench.evaluation.verdicts import (
     FEWEST,
+    FLOOR_M,
     PairedRatio,
     Verdict,
     findings,
@@ -26,7 +27,6 @@ from dynslam_bench.reports.model.board import Cell, copies_of, make_cell, mean_o
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores
 from dynslam_bench.reports.model.names import make_labels, name_columns
 from dynslam_bench.reports.model.row import REPORT_FILE, SEEN, ReportData, RunRow, grouped
-from dynslam_bench.reports.model.statistics import FLOOR_M
 from dynslam_bench.reports.tables.table import Table, TableCell, mm, number, numbers, texts
 from dynslam_bench.runs.record import coverage_text
 from dynslam_bench.runs.store import RunStore
@@ -70,6 +70,7 @@ def compare(
     *,
     protocol: Protocol | str = "tum-rgbd/v1",
     output: Path | str | None = None,
+    conclusion: str = "",
 ) -> Comparison:
     """Compare two results folders, or two reports, on the sequences that both have.
 
@@ -82,6 +83,7 @@ def compare(
         b: The other results folder, store, or folder of a report.
         protocol: How results folders are evaluated; a report brings its own.
         output: Folder of a page that shows it; None for none.
+        conclusion: What the page says in place of the verdict, where another rule judged the runs.
 
     Raises:
         ReportError: One holds no runs, nothing is in both, or their numbers stem from different
@@ -134,7 +136,7 @@ def compare(
     sentences = {name: findings(ratio, "B") for name, ratio in overall.items()}
     page = None
     if output is not None:
-        page = _write_page(Path(output), protocol, evaluated, compared, overall)
+        page = _write_page(Path(output), protocol, evaluated, compared, overall, conclusion)
     title = f"{name_a} (A) against {name_b} (B)"
     table = _table(title, _caption(evaluated, differences), compared, overall)
     return Comparison(overall, verdicts, sentences, table, only_a, only_b, differences, page)
@@ -188,6 +190,7 @@ def _write_page(
     evaluated: str,
     compared: Mapping[str, Sequence[Paired]],
     overall: Mapping[str, PairedRatio],
+    conclusion: str,
 ) -> Path:
     """Write the page: both sides of every tracker, with the pages of the runs that stand for a cell."""
     output = output.expanduser().absolute()
@@ -218,7 +221,7 @@ def _write_page(
             ratio.scenes,
             verdict_of(ratio),
             "",
-            _sentence(ratio),
+            conclusion or _sentence(ratio),
         ]
         for at, ratio in enumerate(overall.values())
     ]

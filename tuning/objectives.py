@@ -18,7 +18,9 @@ from dynslam_bench.contracts import Trajectory
 from dynslam_bench.core import StudyError, did_you_mean
 from dynslam_bench.evaluation import Evaluation, Protocol, evaluate, get_protocol
 from dynslam_bench.evaluation.verdicts import (
+    CATASTROPHE,
     FEWEST,
+    FLOOR_M,
     ONE_SIDED,
     PairedRatio,
     hodges_lehmann,
@@ -45,6 +47,7 @@ class Outcome:
         rtf: Real-time factor: duration of the instance's frames over the time they took.
         lost: Whether the run lost track, as its status says, or tracked nothing.
         wall_s: Seconds of the whole run.
+        crash: Why the run did not come to its end; empty if it did.
         rpe_m: Relative error in metres: translation RMSE over the first delta of the protocol, one
             second under ``tum-rgbd/v1``; NaN where the protocol has none, or the part is shorter.
         final_ate_m: `ate_m` of the final trajectory; of the online one where there is no other.
@@ -62,6 +65,7 @@ class Outcome:
     rtf: float
     lost: bool = False
     wall_s: float = 0.0
+    crash: str = ""
     rpe_m: float = math.nan
     final_ate_m: float = math.nan
     network_calls: float = 0.0
@@ -141,6 +145,28 @@ def outcome(
     )
 
 
+_NEVER_S = 1e6
+"""Frame time of a run that crashed: more than any other."""
+
+
+def crashed(instance: ProblemInstance, reason: str, data_root: str | None) -> Outcome:
+    """The outcome of a run that crashed where scenes judge: lost, and slower than any, with a static camera's error."""
+    static_m = static_camera_m(instance, data_root)
+    return Outcome(
+        instance=instance,
+        run_id="",
+        ate_m=static_m,
+        coverage=0.0,
+        frame_s=_NEVER_S,
+        processor_s=_NEVER_S,
+        rtf=0.0,
+        lost=True,
+        crash=reason,
+        final_ate_m=static_m,
+        network_calls=1.0,
+    )
+
+
 def _relative_error(evaluation: Evaluation, protocol: Protocol) -> float:
     """Translation RMSE in metres over the first delta of a protocol; NaN where it has none."""
     if not protocol.rpe:
@@ -204,6 +230,10 @@ STAGE = "time:"
 """Begins the name of an objective or a limit on a stage's time, e.g. ``time:tracking``."""
 
 
+_LOSS = math.log(CATASTROPHE)
+"""Log ratio of a scene that one side alone lost, at least."""
+
+
 @dataclass(frozen=True)
 class Objective:
     """Something to be made small.
@@ -223,17 +253,38 @@ class Objective:
     degraded: bool = False
 
     def by_start(self, outcomes: Outcomes, baseline: Outcomes) -> list[float]:
-        """Natural logarithm of the ratio on each instance that counts and that both ran."""
+        """Natural logarithm of the ratio on each instance that counts and that both ran; losses as in `ratios`."""
         reference = self._costs(baseline)
         return [
-            math.log(max(cost, FLOOR_M) / max(reference[instance], FLOOR_M))
+            self._with_loss(
+                math.log(max(cost, FLOOR_M)) - math.log(max(reference[instance], FLOOR_M)),
+                outcomes[instance].lost,
+                baseline[instance].lost,
+            )
             for instance, cost in self._costs(outcomes).items()
             if instance in reference
         ]
 
     def ratios(self, outcomes: Outcomes, baseline: Outcomes) -> dict[str, float]:
-        """Natural logarithm of the ratio to the baseline by scene; empty without any instance that counts."""
-        return by_scene(self._costs(outcomes), self._costs(baseline))
+        """Natural logarithm of the ratio to the baseline by scene; empty without any instance that counts.
+
+        In a scene that one side alone lost that side has `CATASTROPHE` times the other's cost at least, so that
+        losing never pays: a run that gives up is fast, and before a fixed camera it has no error.
+        """
+        lost = lost_scenes(outcomes)
+        lost_by_baseline = lost_scenes(baseline)
+        ratios = by_scene(self._costs(outcomes), self._costs(baseline))
+        return {
+            scene: self._with_loss(ratio, scene in lost, scene in lost_by_baseline)
+            for scene, ratio in ratios.items()
+        }
+
+    def _with_loss(self, log_ratio: float, lost: bool, lost_by_baseline: bool) -> float:
+        """A log ratio, or what it is at least where one side alone lost."""
+        # lost frames may be the cost themselves
+        if self.name == "coverage" or lost == lost_by_baseline:
+            return log_ratio
+        return max(log_ratio, _LOSS) if lost else min(log_ratio, -_LOSS)
 
     def _costs(self, outcomes: Outcomes) -> dict[ProblemInstance, float]:
         """The cost on each instance that counts."""
@@ -385,8 +436,9 @@ def coverage(outcomes: Outcomes) -> float:
 
 
 def fps(outcomes: Outcomes) -> float:
-    """Frames a second: the inverse of the mean frame time."""
-    return 1.0 / float(np.mean([outcome.frame_s for outcome in outcomes.values()]))
+    """Frames a second: the inverse of the mean frame time of the runs that came to their end; 0 without any."""
+    frame_s = [outcome.frame_s for outcome in outcomes.values() if not outcome.crash]
+    return 1.0 / float(np.mean(frame_s)) if frame_s else 0.0
 
 
 _QUANTITIES = (
@@ -452,8 +504,6 @@ def violations(
 
 # Comparing a configuration with the baseline: paired by place, one value a scene.
 
-FLOOR_M = 1e-4
-"""Errors below a tenth of a millimetre count as that: a ratio of two perfect runs tells nothing."""
 Errors = Mapping[ProblemInstance, float]
 """ATE in metres on each instance, lost frames held."""
 

@@ -421,7 +421,7 @@ class Design:
         confirm: What the best trials and the baseline run on for the choice; shares no frame with
             `tune`. Where nothing is held out it judges, and the trials' own values choose.
         held_out: What judges the choice.
-        recorded: Recordings on which the choice must not be worse.
+        recorded: Recordings that the best trial is run on at the end; they decide nothing.
     """
 
     tune: tuple[ProblemInstance, ...]
@@ -655,6 +655,8 @@ _PAIRS = 6
 """So many pairs of frames are compared by their images."""
 _ENOUGH = 3
 """Pairs with equal images; fewer may be chance, as two paths may cross."""
+_MOST_LEFT_OUT = 20
+"""So many frames that one sequence lacks at the beginning are looked for, and more where they are left out evenly."""
 _THUMB = (32, 24)
 """Width and height in pixels to which images are reduced before they are compared."""
 _GREY_LEVELS = 1.5
@@ -666,31 +668,50 @@ _DEPTH_SHARE = 0.002
 def same_recording(one: Frames, other: Frames) -> bool:
     """Whether frames of one recording are frames of the other; False for two rendered scenes, whose digests tell.
 
-    Where the camera moves, equal stamps and equal true poses say it, whatever was done to the images. Else of a
-    few frames with equal stamps (without any, of frames spread evenly over both) the decoded images are
-    compared, reduced to `_THUMB` pixels. Other names, other image files and a smaller size leave a copy a copy,
-    and so do frames that are left out or other stamps, one of the two.
+    Where the camera moves, equal true poses say it, whatever was done to stamps and images. Else the decoded images
+    of a few frames are compared, reduced to `_THUMB` pixels: of frames with equal stamps, then of frames spread
+    over the shorter one with those of the other that may be the same. Other names, other image files and a smaller
+    size leave a copy a copy, and so do frames that are left out and other stamps.
     """
     if hasattr(one, "scene_digest") and hasattr(other, "scene_digest"):
         return False
     if same_path(one.ground_truth, other.ground_truth):
         return True
 
-    # candidates: frames of equal stamps, else all frames of both
-    stamps = (np.round(one.timestamps, 6), np.round(other.timestamps, 6))
-    _, *frames = np.intersect1d(*stamps, assume_unique=True, return_indices=True)
-    if not len(frames[0]):
-        frames = [np.arange(len(one)), np.arange(len(other))]
+    shorter, longer = sorted((one, other), key=len)
+    enough = min(_ENOUGH, len(shorter))
 
-    # pairs of them, spread evenly; a set, as short recordings give the same pair twice
-    chosen = (
-        numbers[np.linspace(0, len(numbers) - 1, _PAIRS).astype(int)].tolist() for numbers in frames
-    )
-    pairs = set(zip(*chosen, strict=True))
-    equal = sum(
-        _same_image(one[first], other[second], one.camera, other.camera) for first, second in pairs
-    )
-    return equal >= min(_ENOUGH, len(one), len(other))
+    # frames of equal stamps
+    stamps = (np.round(shorter.timestamps, 6), np.round(longer.timestamps, 6))
+    _, *frames = np.intersect1d(*stamps, assume_unique=True, return_indices=True)
+    if len(frames[0]):
+        chosen = _spread_over(len(frames[0]))
+        pairs = zip(frames[0][chosen].tolist(), frames[1][chosen].tolist(), strict=True)
+        equal = sum(_any_same_image(shorter, first, longer, [second]) for first, second in pairs)
+        if equal >= enough:
+            return True
+
+    # whatever the stamps: frames may be left out anywhere, or evenly
+    left_out = len(longer) - len(shorter)
+    equal = 0
+    for first in _spread_over(len(shorter)):
+        evenly = round(first * (len(longer) - 1) / max(len(shorter) - 1, 1))
+        near = {first + shift for shift in range(min(left_out, _MOST_LEFT_OUT) + 1)}
+        near |= {evenly - 1, evenly, evenly + 1}
+        near_frames = sorted(number for number in near if 0 <= number < len(longer))
+        equal += _any_same_image(shorter, first, longer, near_frames)
+    return equal >= enough
+
+
+def _spread_over(count: int) -> list[int]:
+    """Up to `_PAIRS` of so many numbers, spread evenly."""
+    return sorted(set(np.linspace(0, count - 1, _PAIRS).astype(int).tolist()))
+
+
+def _any_same_image(one: Frames, first: int, other: Frames, candidates: Sequence[int]) -> bool:
+    """Whether a frame of one sequence shows the same as one of the other's."""
+    frame = one[first]
+    return any(_same_image(frame, other[second], one.camera, other.camera) for second in candidates)
 
 
 def _same_image(here: Frame, there: Frame, one: Camera, other: Camera) -> bool:

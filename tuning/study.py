@@ -47,6 +47,7 @@ from dynslam_bench.tuning.objectives import (
     Outcomes,
     combined_objective,
     coverage,
+    crashed,
     find_objective,
     fps,
     hold_last_pose_protocol,
@@ -339,7 +340,9 @@ class Study(Plan):
         ]
         if on_event is not None and missing:
             on_event(StudyEvent("reference", 0, len(missing), "the baseline"))
-        baseline, _ = self.evaluate_beside([], missing, jobs=jobs, cache=self.spec.cache)
+        baseline, _ = self.evaluate_beside(
+            [], missing, jobs=jobs, cache=self.spec.cache, crash_is_loss=False
+        )
         self._reference |= baseline
         return self._reference
 
@@ -391,46 +394,57 @@ class Study(Plan):
         *,
         jobs: int = 1,
         cache: bool = False,
+        crash_is_loss: bool = True,
     ) -> tuple[
         dict[ProblemInstance, Outcome], list[dict[ProblemInstance, Outcome] | InstanceFailedError]
     ]:
         """Run the baseline and configurations instance by instance: other load on the machine slows all of them alike.
+
+        A crash is a loss there, of whichever side: one scene of many that judge decides nothing alone.
 
         Args:
             configurations: What to run.
             instances: Where.
             jobs: Runs at a time.
             cache: Whether to use the stage cache, with which times cannot be compared.
+            crash_is_loss: Whether a baseline that crashes has lost that instance, and no more.
 
         Returns:
             The outcomes of the baseline, and for each configuration its outcomes, or the error of
-            its first failed run; it runs on no instance after it.
+            its first run where all of its runs crashed.
 
         Raises:
-            StudyError: The baseline fails; says where and why.
+            StudyError: The baseline crashes: everywhere, or at all where that is no loss; says where and why.
         """
         several = [self.baseline, *configurations]
-        results: list[dict[ProblemInstance, Outcome] | InstanceFailedError] = [{} for _ in several]
+        results: list[dict[ProblemInstance, Outcome]] = [{} for _ in several]
+        errors: list[dict[ProblemInstance, InstanceFailedError]] = [{} for _ in several]
+
+        def baseline_fails(error: InstanceFailedError) -> StudyError:
+            return StudyError(f"the baseline fails: {error.args[0]}", "a study needs one that runs")
 
         def run_one(instance: ProblemInstance, number: int) -> None:
-            result = results[number]
-            if isinstance(result, InstanceFailedError):
-                return  # after its first failed run
             tracker, settings = several[number]
             try:
-                result |= self.outcomes(settings, [instance], tracker=tracker, cache=cache)
+                results[number] |= self.outcomes(settings, [instance], tracker=tracker, cache=cache)
             except InstanceFailedError as error:
-                if number == 0:
-                    raise StudyError(
-                        f"the baseline fails: {error.args[0]}", "a study needs one that runs"
-                    ) from error
-                results[number] = error
+                if number == 0 and not crash_is_loss:
+                    raise baseline_fails(error) from error
+                errors[number][instance] = error
+                results[number][instance] = crashed(instance, str(error), self.spec.data_root)
 
         # on each instance all configurations in turn, before the next instance
         self._in_threads(jobs, run_one, product(instances, range(len(several))))
-        baseline, *others = results
-        assert isinstance(baseline, dict)
-        return baseline, others
+
+        # who crashed everywhere has shown nothing
+        crashed_everywhere = [
+            next(iter(failed.values())) if failed and len(failed) == len(instances) else None
+            for failed in errors
+        ]
+        if crashed_everywhere[0] is not None:
+            raise baseline_fails(crashed_everywhere[0])
+        others = zip(results[1:], crashed_everywhere[1:], strict=True)
+        return results[0], [result if error is None else error for result, error in others]
 
     @staticmethod
     def open(study: StudySpec | Path | str, results: Path | str = "results") -> StoredStudy:

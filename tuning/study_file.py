@@ -493,8 +493,9 @@ class StudySpec(Record, frozen=True):
             choice see them.
         extendable: Whether scenes may be added after a verdict (12, 24, 36, 48 judge). Each look then
             has a smaller level, so that all together claim falsely as rarely as a single one.
-        recorded: Instances of recordings that the choice must not be worse on; None for the first
-            frames of a held-out recording where one is present.
+        recorded: Instances of recordings that the best trial is run on beside the baseline; the conclusion says what
+            they show, and they decide nothing. None for the first frames of a held-out recording where one is
+            present.
         space: Which settings are tuned.
         objectives: ``accuracy``: geometric mean over scenes of the ATE ratio to the baseline (its
             logarithm is minimised, see `objectives.by_scene`); ``speed``: the same of the processor

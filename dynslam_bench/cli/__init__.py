@@ -23,8 +23,8 @@ def main() -> None:
     """Entry point of ``dynslam-bench``.
 
     Exit codes: 0 done, 1 user error (one line, no traceback), 2 usage, 3 some runs failed or were
-    lost (or could not write the map that was asked for), 4 verification failed, 128 plus the
-    signal's number after one (130 for Ctrl-C).
+    lost (or could not write the map that was asked for), 4 verification failed or regressed, 5 undecided,
+    128 plus the signal's number after one (130 for Ctrl-C).
     """
     for number in _SIGNALS:  # an ignored signal, e.g. SIGHUP below `nohup`, stays ignored
         if signal.getsignal(number) is not signal.SIG_IGN:

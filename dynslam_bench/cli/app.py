@@ -10,6 +10,7 @@ import typer
 
 from dynslam_bench.cli import (
     demo,
+    gates,
     interrupted,
     leave_interrupted,
     reports,
@@ -61,6 +62,7 @@ app.command(rich_help_panel=MEASURE)(trajectories.export)
 app.add_typer(studies.app, name="tune", rich_help_panel=REPORT)
 app.add_typer(reports.app, name="report", rich_help_panel=REPORT)
 app.command(rich_help_panel=REPORT)(reports.published)
+app.add_typer(gates.app, name="gate", rich_help_panel=REPORT)
 app.add_typer(segmenters.app, name="segmenter", rich_help_panel=CARE)
 cache = typer.Typer(
     help="The stage cache: results that do not depend on the settings under study.",

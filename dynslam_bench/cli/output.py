@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 SOME_RUNS_FAILED = 3
 """Exit code where a run failed or was lost, could not be made, or was left out of a copy."""
 VERIFICATION_FAILED = 4
-"""Exit code where something was checked and has a fault."""
+"""Exit code where something was checked and has a fault, or a gate found a regression."""
 HEARTBEAT_S = 10.0
 """Off a terminal, a long operation reports its progress this often, unless JSON was asked for."""
 _MIN_WIDTH = 12

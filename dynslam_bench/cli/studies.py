@@ -154,13 +154,13 @@ def status(study: Study, results: Results = Path("results"), as_json: AsJson = F
         f"{number} ({state})" for number, state in Heartbeats(stored.study).running().items()
     ]
 
-    # the best settings: of the conclusion if there is one, else of the trial with the best values
+    # the best settings: those that the conclusion offers if there is one, else of the trial with the best values
     settings: dict[str, Any] = {}
     summary = stored.folder / "summary.json"
     conclusion = tuning.StudySummary.read(summary) if summary.is_file() else None
     if conclusion is not None and conclusion.best is not None:  # as `tune best`
         facts |= {"best_trial": conclusion.best.trial, "conclusion": conclusion.conclusion}
-        settings = conclusion.best.params
+        settings = conclusion.offered
     else:
         for trial in best_trials(stored.study, 1):
             # values are natural logarithms of ratios to the baseline

@@ -27,14 +27,16 @@ from dynslam_bench.core.simd import (
     Bytes,
     Halves,
     Longs,
-    average,
-    average_of_pairs,
-    derivatives,
     load_uint16,
-    store_normalised,
     store_uint16,
 )
 from dynslam_bench.flow import layout
+from dynslam_bench.flow.histogram_vectors import (
+    average,
+    average_of_pairs,
+    derivatives,
+    store_normalised,
+)
 from dynslam_bench.flow.layout import MapGeometry, map_geometry
 from dynslam_bench.flow.refinement import BORDER
 from dynslam_bench.flow.workers import Workers

@@ -32,7 +32,7 @@ class Observations:
         right: float64 ``[N]`` right coordinate ``u - fx * baseline / z``, NaN without depth.
         octave: int64 ``[N]``.
         angle: float64 ``[N]`` degrees.
-        words: uint64 ``[N, W]`` descriptors.
+        descriptors: uint64 ``[N, W]``, bits in words of 64.
         info: float64 ``[N]`` inverse variance of the pixel coordinates, 1/px^2, times the filters'
             weight.
         info_right: float64 ``[N]`` inverse variance of the right coordinate, times the weight; 0
@@ -49,7 +49,7 @@ class Observations:
     right: Array
     octave: NDArray[np.int64]
     angle: Array
-    words: Words
+    descriptors: Words
     info: Array
     info_right: Array
     grid: CellGrid

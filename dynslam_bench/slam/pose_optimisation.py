@@ -73,7 +73,7 @@ class Intrinsics(NamedTuple):
 
 
 class Measurements(NamedTuple):
-    """Where N points were observed, and how exactly.
+    """Measured places of N points in an image, and how exact they are.
 
     Attributes:
         uv: float64 ``[N, 2]``, undistorted pixels.

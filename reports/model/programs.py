@@ -12,8 +12,8 @@ from statistics import geometric_mean
 from typing import Any, Literal, NamedTuple
 
 from dynslam_bench.core.records import digest
+from dynslam_bench.evaluation.verdicts import FLOOR_M
 from dynslam_bench.reports.model.row import RunRow, grouped
-from dynslam_bench.reports.model.statistics import FLOOR_M
 from dynslam_bench.runs.record import PROGRAM
 from dynslam_bench.runs.store import FINAL, ONLINE
 from dynslam_bench.runs.validity import Installation

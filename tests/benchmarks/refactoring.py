@@ -1,10 +1,10 @@
 """Does a change of the code's shape leave every result as it was, to the last bit?
 
-    python tests/benchmarks/refactoring.py --record      # before: write refactoring.json beside
-    this script python tests/benchmarks/refactoring.py               # after: compare, exit code 1
-    where anything differs python tests/benchmarks/refactoring.py --only orb-slam2      # after, of
-    some trackers python tests/benchmarks/refactoring.py --times 5     # frame times only, to be
-    paired with another checkout's
+    python tests/benchmarks/refactoring.py --record          # before: write refactoring.json
+    python tests/benchmarks/refactoring.py                   # after: exit code 1 where anything differs
+    python tests/benchmarks/refactoring.py --only orb-slam2  # after, of some trackers
+
+Whether it made them slower: ``dynslam-bench gate compare REVISION --gate tests/benchmarks/speed.gate.toml``.
 
 Twelve trackers on three sequences (two rendered instances that nobody tunes on, and the Bonn
 excerpt where it is present), one thread, seed 0. A digest covers the state and the 16 numbers of
@@ -19,8 +19,6 @@ from one_thread import ROOT  # before all others
 import hashlib
 import json
 import platform
-import statistics
-import time
 from pathlib import Path
 
 import cv2
@@ -55,8 +53,8 @@ def machine() -> dict[str, str]:
     }
 
 
-def run(tracker_id: str, name: str, frames: int) -> tuple[str, list[float]]:
-    """Digest of everything a tracker says about a sequence's first frames, and its frame times in seconds."""
+def run(tracker_id: str, name: str, frames: int) -> str:
+    """Digest of everything a tracker says about a sequence's first frames."""
     sequence = open_sequence(name, frames=(0, frames))
     rendered = name.startswith("synthetic/")
     masked = tracker_id not in ("orb-slam2", "emfoa-oft?masks=none", "dynaslam-g", "dai-slam")
@@ -66,18 +64,15 @@ def run(tracker_id: str, name: str, frames: int) -> tuple[str, list[float]]:
     )
     tracker.reset(sequence.camera, rng=np.random.default_rng(0))
     whole = hashlib.sha256()
-    times = []
     for frame in (sequence[i] for i in range(len(sequence))):
-        start = time.perf_counter()
         result = tracker.track(frame)
-        times.append(time.perf_counter() - start)
         whole.update(result.state.encode())
         whole.update(" ".join(sorted(result.stats)).encode())
         for array in (result.T_world_cam, result.keypoints_keep):
             whole.update(b"none" if array is None else np.ascontiguousarray(array).tobytes())
     if hasattr(tracker, "finalize"):
         whole.update(np.ascontiguousarray(tracker.finalize().T_world_cam).tobytes())
-    return whole.hexdigest()[:16], times
+    return whole.hexdigest()[:16]
 
 
 def main() -> int:
@@ -86,25 +81,12 @@ def main() -> int:
     parser.add_argument(
         "--only", nargs="+", choices=TRACKERS, default=TRACKERS, help="compare these trackers alone"
     )
-    parser.add_argument(
-        "--times", type=int, default=0, help="rounds over orb-slam2 and emfoa-oft; prints medians"
-    )
     arguments = parser.parse_args()
     if arguments.record and arguments.only != TRACKERS:
         parser.error("--record takes all trackers")
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     sequences = [name for name in SEQUENCES if name.startswith("synthetic/") or Path(name).is_dir()]
-    if arguments.times:
-        for tracker in ("orb-slam2", "emfoa-oft"):
-            rounds = [
-                statistics.median(run(tracker, SEQUENCES[0], 60)[1]) for _ in range(arguments.times)
-            ]
-            print(
-                f"{tracker:12s} {1000 * statistics.median(rounds):.2f} ms",
-                " ".join(f"{1e3 * t:.2f}" for t in rounds),
-            )
-        return 0
     before = {} if arguments.record else json.loads(RECORDED.read_text())
     if before and (before["machine"] != machine() or before["frames"] != arguments.frames):
         print(
@@ -116,7 +98,7 @@ def main() -> int:
     for name in sequences:
         for tracker in arguments.only:
             key = f"{tracker} | {'bonn/crowd' if name == str(EXCERPT) else name}"
-            digests[key] = run(tracker, name, arguments.frames)[0]
+            digests[key] = run(tracker, name, arguments.frames)
             verdict = (
                 ""
                 if arguments.record

@@ -148,6 +148,7 @@ def test_our_words_are_not_used() -> None:
     assert [(file, found) for file, found in used if found] == []
 
 
+@pytest.mark.slow
 def test_variables_are_named_by_what_they_hold() -> None:
     places = [
         f"{file.relative_to(ROOT)}:{node.lineno}"

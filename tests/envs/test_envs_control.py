@@ -145,6 +145,7 @@ def test_every_choice_has_an_equal_share() -> None:
     assert all(abs(chosen.count(kind) - 1000) <= 2 for kind in "abc")
 
 
+@pytest.mark.slow
 def test_an_action_is_in_force_from_its_frame_on_and_reset_undoes_it() -> None:
     env = SlamEnv(ToySequence(12), TARGET, control=["noise.enabled", "noise.level_m"])
     off = np.array([-1.0, 0.0])
@@ -478,6 +479,7 @@ def test_what_is_not_there(call: Any, words: str) -> None:
         call()
 
 
+@pytest.mark.slow
 @needs_shared
 @pytest.mark.parametrize(
     ("id", "settings"), [("masks-v0", {"segmentation.source": "embedded"}), ("features-v0", {})]

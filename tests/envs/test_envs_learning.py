@@ -110,6 +110,7 @@ def test_a_window_longer_than_the_sequence() -> None:
 COPIED = "orb-slam2 emfoa-oft?masks=none never-move dynaslam-g opencv-odometry mask-rcnn mask-rcnn+async".split()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tracker", COPIED)
 def test_a_copied_and_a_restored_episode_go_on_to_the_bit(tracker: str) -> None:
     masked = tracker.startswith("mask-rcnn")
@@ -159,6 +160,7 @@ def test_what_fails_beside_tracking_on_the_last_frames_is_warned_of_when_the_env
         env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tracker", ["emfoa-oft", "dynaslam", "ds-slam"])
 def test_a_restored_tracker_takes_every_online_setting(tracker: str) -> None:
     online = online_parameters(resolve_settings(TRACKERS.get(tracker), ORACLE))
@@ -177,6 +179,7 @@ def test_a_restored_tracker_takes_every_online_setting(tracker: str) -> None:
     assert rest(env, action) == expected
 
 
+@pytest.mark.slow
 def test_a_state_with_a_cached_network_can_be_pickled_and_copies_share_the_network() -> None:
     env = stepped(SlamEnv("synthetic/walking_xyz?scene=0&frames=3", "mask-rcnn", cache=True), 1)
     state = env.clone_state()
@@ -339,6 +342,7 @@ def test_vector_environments_take_every_part(fixed: bool) -> None:
 # Rewards.
 
 
+@pytest.mark.slow
 def test_a_network_call_costs_its_weight() -> None:
     settings = ORACLE | {"segmentation.schedule": "every_nth", "segmentation.n": 2}
     (plain, infos, _), (default, *_), (dear, *_) = (

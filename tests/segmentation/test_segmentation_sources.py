@@ -860,6 +860,7 @@ def run(settings, count=10, keyframes=()):
     return stage.segmenter.calls, quality
 
 
+@pytest.mark.slow
 def test_every_frame_every_nth_and_keyframes(monkeypatch):
     assert run(SegmentationSettings())[0] == list(range(10))
     calls, quality = run(SegmentationSettings(schedule="every_nth", n=4))
@@ -873,6 +874,7 @@ def test_every_frame_every_nth_and_keyframes(monkeypatch):
     assert min(run(SegmentationSettings(schedule="every_nth", n=5, carry="sparse"))[1]) > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("when", "rests"), [("every_nth", [0, 4, 8]), ("keyframes", [0])])
 def test_where_masks_cover_much_of_the_view_every_frame_is_segmented(when, rests):
     covered = scene(0)[1].mean()  # carried masks may cover a little less or more

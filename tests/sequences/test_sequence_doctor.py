@@ -265,6 +265,7 @@ def test_stretches_cover_a_short_recording_and_sample_a_long_one():
     assert parts[-1][1] == 6000
 
 
+@pytest.mark.slow
 @needs_shared
 @pytest.mark.parametrize("name", ["tum/rgbd_dataset_freiburg1_rpy", "fixed_camera/man_130"])
 def test_real_recordings_have_no_fault(name):
@@ -533,6 +534,7 @@ def test_a_folder_that_exists_is_left_alone(host, people, tmp_path):
     assert (tmp_path / "thesis.tex").read_text() == "work"
 
 
+@pytest.mark.slow
 @needs_shared
 def test_a_real_person_is_pasted_into_a_real_recording(tmp_path):
     host = open_sequence(str(SHARED / "data/tum/rgbd_dataset_freiburg1_rpy"), frames="0:3")

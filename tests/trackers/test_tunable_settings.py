@@ -476,6 +476,7 @@ def test_each_sets_something_else_than_the_default(tracker, name):
     assert changed <= set(spec.presets[name])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("more", "asked"), [({}, [1, 0, 1, 0, 1, 0, 1]), ({"crowded_share": 0.1}, [1] * 7)]
 )
@@ -529,6 +530,7 @@ def track(sitting, change: Callable[[Frame], Frame], bad: range = BAD):
     return states
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [0, 127], ids=["covered lens", "fog"])
 def test_frames_without_any_texture_are_lost_and_only_those(sitting, value: int) -> None:
     states = track(sitting, lambda frame: replace(frame, rgb=np.full_like(frame.rgb, value)))
@@ -574,6 +576,7 @@ def test_a_sudden_turn_is_no_translation(sitting, degrees: int) -> None:
     assert result.state == "lost" or np.linalg.norm(result.T_world_cam[:3, 3]) < 0.02
 
 
+@pytest.mark.slow
 def test_a_gap_of_a_second_is_bridged_or_said(sitting) -> None:
     tracker = started(sitting)
     truth = sitting.ground_truth.T_world_cam
@@ -606,6 +609,7 @@ def test_frames_of_another_kind_are_refused_in_one_line(sitting) -> None:
             tracker.track(wrong)
 
 
+@pytest.mark.slow
 def test_missing_depth_is_missing_however_it_is_written_and_buffers_may_be_reused(sitting) -> None:
     def poses(missing: float, *, reuse: bool) -> bytes:
         tracker = started(sitting, "emfoa-oft?masks=none")

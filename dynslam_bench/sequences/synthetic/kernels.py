@@ -19,7 +19,7 @@ Vector = tuple[float, float, float]
 
 
 class Tiles(NamedTuple):
-    """For each tile of the image the primitives that may be seen in it.
+    """The primitives that may be seen in each tile of the image.
 
     Attributes:
         columns: Tiles in a row.
@@ -50,7 +50,7 @@ class Primitives(NamedTuple):
 
 
 class Materials(NamedTuple):
-    """What the faces of the primitives look like.
+    """Textures, colours and light of the primitives' faces.
 
     Attributes:
         texture: int32 ``[P, 6]`` number of each face's texture in the atlas.
@@ -67,7 +67,7 @@ class Materials(NamedTuple):
 
 
 class DepthModel(NamedTuple):
-    """What the structured-light depth camera measures; see `settings.DepthSensor`.
+    """Model of the structured-light depth camera; see `settings.DepthSensor`.
 
     Attributes:
         fx: Focal length, pixels.

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 from helpers.culling_scenes import ACROSS, BOX, SIDEWAYS, box_instance, on_rectangle, scene
-from helpers.envs_play import play
 from helpers.reports_fake_store import add_run
 from helpers.steering_scene import SmallScene, construct, quick
 from helpers.steering_scene import play as play_small
@@ -17,7 +16,6 @@ from dynslam_bench.contracts import Instances, TrackResult
 from dynslam_bench.core import settings as core_settings
 from dynslam_bench.core.errors import DynslamError, SettingsError
 from dynslam_bench.core.settings import parameters, settings_table
-from dynslam_bench.envs.slam_env import SlamEnv
 from dynslam_bench.flow import dense_flow as dense
 from dynslam_bench.flow.opencv import LEVELS
 from dynslam_bench.flow.settings import PublishedFlowSettings
@@ -331,35 +329,6 @@ def test_a_store_without_the_reference_system_is_a_clear_error(tmp_path: Path) -
         DynslamError, match=r"exact masks on synthetic/walking_xyz.*suite 'dynamic'"
     ):
         signatures.report(tmp_path)
-
-
-SHARED = Path(__file__).resolve().parents[4] / "shared"
-YOLO = SHARED / "weights" / "yolov8n-seg_480x640_fp32.onnx"
-GEOMETRY = "emfoa-oft?masks=none"
-
-
-# Excerpt, tracker, frames, stride, and the least ATE so far in mm. Of Bonn crowd as many frames as
-# are needed for a system that culls nothing to fail (295 and 206 mm there): all 200 with a network
-# would take a minute.
-@pytest.mark.parametrize("excerpt, tracker, frames, stride, least_mm", [
-    pytest.param("tum/rgbd_dataset_freiburg1_xyz", "orb-slam2", None, 1, 4.9, id="fr1_xyz"),
-    pytest.param("tum/rgbd_dataset_freiburg1_rpy", "orb-slam2", None, 1, 5.2, id="fr1_rpy"),
-    pytest.param("fixed_camera/man_130", GEOMETRY, None, 1, 0.3, id="man_130, no masks"),
-    pytest.param("bonn/rgbd_bonn_crowd", GEOMETRY, (0, 100), 1, 7.0, id="crowd, no masks"),
-    pytest.param("bonn/rgbd_bonn_crowd", "mask-rcnn", (0, 140), 2, 11.5, id="crowd, YOLO"),
-])  # fmt: skip
-def test_the_error_on_a_recording_has_not_grown(excerpt, tracker, frames, stride, least_mm):
-    needed = [SHARED / "data" / excerpt, *([YOLO] if tracker == "mask-rcnn" else [])]
-    missing = [str(path) for path in needed if not path.exists()]
-    if missing:
-        pytest.skip(f"not here: {', '.join(missing)}")
-    masks = {"segmentation.source": f"onnx:{YOLO}"} if tracker == "mask-rcnn" else {}
-    _, infos, _ = play(
-        SlamEnv(str(needed[0]), tracker, settings=masks, frames=frames, stride=stride)
-    )
-    metrics = infos[-1]["episode_metrics"]
-    assert metrics["coverage"] == 1.0
-    assert 1000 * metrics["ate_rmse_m"] < 1.3 * least_mm
 
 
 TESTED = {

@@ -1,0 +1,242 @@
+"""What a gate measured of one side, and the baseline file that holds it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from dynslam_bench.core import DynslamError, RunError, read_lines
+from dynslam_bench.core.fingerprint import Machine
+from dynslam_bench.core.records import Record, schema
+from dynslam_bench.runs.record import RunRecord
+from dynslam_bench.runs.store import RunStore, evaluation_code
+
+BASELINE_FILE = "gate-baseline.json"
+"""Lies beside ``gate.toml``, and is committed."""
+BASELINE_SCHEMA = 1
+"""Version of the fields of `Baseline`."""
+Array = NDArray[np.float64]
+
+
+class Measurement(Record):
+    """One run, as a gate keeps it.
+
+    Attributes:
+        case: Name of what was run.
+        round: From 0.
+        run_id: The run.
+        status: How it ended, see `RunRecord`.
+        reason: One line; empty for ``ok``.
+        ate_m: Absolute trajectory error in metres under the gate's protocol; None for a run that was
+            lost, failed or cannot be scored.
+        coverage: Share of the frames that were tracked.
+        frame_time_s: Median time of a frame; None where it is not known.
+        memory_mb: Largest memory; None where it is not known.
+        trajectories: SHA-256 of the poses by the trajectory, ``online`` and ``final``.
+        program: Code, weights and libraries that made it, as short texts.
+    """
+
+    case: str
+    round: int = Field(ge=0)
+    run_id: str = ""
+    status: str
+    reason: str = ""
+    ate_m: float | None = Field(default=None, ge=0)
+    coverage: float | None = Field(default=None, ge=0, le=1)
+    frame_time_s: float | None = None
+    memory_mb: float | None = None
+    trajectories: dict[str, str] = Field(default_factory=dict)
+    program: dict[str, str] = Field(default_factory=dict)
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether it has no error that counts."""
+        return self.ate_m is None
+
+
+def measurement_of(
+    case: str, number: int, record: RunRecord, store: RunStore, protocol: Any
+) -> Measurement:
+    """What a gate keeps of a stored run.
+
+    Args:
+        case: Name of what was run.
+        number: Of the round.
+        record: The run.
+        store: Where it is stored.
+        protocol: How it is scored.
+    """
+    metrics = store.score(record, protocol)
+    error = metrics.metrics.get("ate_rmse_m")
+    reason = record.reason
+    if error is None and not reason:
+        reason = "; ".join(metrics.reasons.values())
+    digests = {
+        which: poses_digest(store.folder(record.run_id) / f"trajectory_{which}.txt")
+        for which in ("online", "final")
+    }
+    return Measurement(
+        case=case,
+        round=number,
+        run_id=record.run_id,
+        status=record.status,
+        reason=reason,
+        ate_m=error if record.status == "ok" else None,
+        coverage=record.coverage,
+        frame_time_s=record.frame_time_s,
+        memory_mb=record.peak_memory_mb,
+        trajectories={which: text for which, text in digests.items() if text},
+        program=record.program,
+    )
+
+
+def poses_digest(file: Path) -> str:
+    """SHA-256 of the poses in a TUM file, without its comments; empty where there is no file."""
+    if not file.is_file():
+        return ""
+    lines = read_lines(file, kind=RunError)
+    poses = [line.strip() for line in lines if line.strip() and not line.startswith("#")]
+    return sha256("\n".join(poses).encode()).hexdigest()
+
+
+class Side:
+    """All measurements of one side, by case and round.
+
+    Attributes:
+        name: What messages call it.
+        by_case: Case to its measurements, in the order of the rounds.
+    """
+
+    def __init__(self, name: str, measurements: Iterable[Measurement] = ()) -> None:
+        self.name = name
+        self.by_case: dict[str, list[Measurement]] = {}
+        for measurement in measurements:
+            self.add(measurement)
+
+    def add(self, measurement: Measurement) -> None:
+        """Take in the next round of a case."""
+        self.by_case.setdefault(measurement.case, []).append(measurement)
+
+    def of(self, case: str, rounds: int) -> list[Measurement]:
+        """The first rounds of a case."""
+        return self.by_case[case][:rounds]
+
+    def all(self, rounds: int) -> list[Measurement]:
+        """The first rounds of all cases."""
+        return [run for case in self.by_case for run in self.of(case, rounds)]
+
+    def rounds(self) -> int:
+        """Rounds that all cases have."""
+        return min((len(runs) for runs in self.by_case.values()), default=0)
+
+    def errors(self, cases: Iterable[str], rounds: int) -> Array:
+        """Errors in metres of cases and rounds ``[S, K]``; nan is a lost run."""
+        return _matrix([[run.ate_m for run in self.of(case, rounds)] for case in cases])
+
+    def frame_times(self, cases: Iterable[str], rounds: int) -> Array:
+        """Median times of a frame in seconds ``[S, K]``; nan where one is not known."""
+        return _matrix([[run.frame_time_s for run in self.of(case, rounds)] for case in cases])
+
+    def memory(self, cases: Iterable[str], rounds: int) -> Array:
+        """Largest memory in MB ``[S, K]``; nan where it is not known."""
+        return _matrix([[run.memory_mb for run in self.of(case, rounds)] for case in cases])
+
+
+def _matrix(rows: list[list[float | None]]) -> Array:
+    return np.array(rows, dtype=np.float64)
+
+
+class Origin(Record):
+    """Which program one side of a gate is.
+
+    Attributes:
+        name: In words: a revision, ``the working tree``, ``the recorded runs``.
+        revision: Commit of the repository that holds the gate; empty where there is none.
+        uncommitted: Files with changes that the revision does not hold.
+    """
+
+    name: str
+    revision: str = ""
+    uncommitted: list[str] = Field(default_factory=list)
+
+    def describe(self) -> str:
+        """In words, with the commit and what differs from it."""
+        words = self.name
+        if self.revision and self.revision[:12] not in self.name:
+            words += f" at {self.revision[:12]}"
+        if self.uncommitted:
+            words += f" with uncommitted changes in {', '.join(self.uncommitted)}"
+        return words
+
+
+class Baseline(Record):
+    """The baseline file.
+
+    Attributes:
+        schema_version: Of this record.
+        question: Digest of the question that it was recorded for.
+        asked: That question, so that a change of it can be named.
+        protocol: Id of the protocol of the errors.
+        protocol_digest: Its digest.
+        code: Digest of the evaluation code.
+        origin: Which program was measured.
+        recorded: When, UTC, ISO 8601.
+        machine: The computer.
+        versions: Of Python and the packages that matter.
+        runs: The development set.
+        confirmation: The confirmation set; empty without one.
+        looks: What became known of the confirmation set: one line for each look at it.
+    """
+
+    schema_version: int = schema(BASELINE_SCHEMA)
+    question: str
+    asked: dict[str, Any]
+    protocol: str
+    protocol_digest: str
+    code: str = Field(default_factory=evaluation_code)
+    origin: Origin
+    recorded: str
+    machine: Machine
+    versions: dict[str, str]
+    runs: list[Measurement]
+    confirmation: list[Measurement] = Field(default_factory=list)
+    looks: list[str] = Field(default_factory=list)
+
+    def changed(self, asked: dict[str, Any]) -> list[str]:
+        """What of the question is other than when the baseline was recorded, a line each."""
+        return _differences(self.asked, asked)
+
+
+def _differences(before: dict[str, Any], now: dict[str, Any], prefix: str = "") -> list[str]:
+    lines = []
+    for name in sorted(before.keys() | now.keys()):
+        old = before.get(name)
+        new = now.get(name)
+        if isinstance(old, dict) and isinstance(new, dict):
+            lines += _differences(old, new, f"{prefix}{name}.")
+        elif old != new:
+            lines.append(f"{prefix}{name} was {old}, is {new}")
+    return lines
+
+
+def read_baseline(path: Path) -> Baseline:
+    """Read a baseline file.
+
+    Raises:
+        RunError: There is none, or it is damaged.
+    """
+    if not path.is_file():
+        raise RunError(
+            f"there is no baseline {path}",
+            "record what is good now with: dynslam-bench gate record, and commit the file",
+        )
+    try:
+        return Baseline.read(path)
+    except DynslamError as error:
+        raise RunError(str(error.args[0]), error.hint or "record it again") from error

@@ -1,0 +1,544 @@
+"""The gate: from measurements to a verdict, the files that it reads, and revisions that are built and run in turns."""
+
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.envs_toys import TARGET, write_folder
+from helpers.gate_repository import (
+    BUILD,
+    TRACKER,
+    commit,
+    git,
+    make_repository,
+    write_version,
+)
+
+from dynslam_bench import gate as gates
+from dynslam_bench.core import RunError
+from dynslam_bench.evaluation.gate import GateVerdict
+from dynslam_bench.gate.baseline import Measurement, Side, poses_digest
+from dynslam_bench.gate.config import GateConfig, Guardrails
+from dynslam_bench.gate.judging import judge
+from dynslam_bench.gate.trajectory_folder import file_name
+from dynslam_bench.geometry import Trajectory, read_tum, write_tum
+
+CASES = [f"sequence {number}" for number in range(8)]
+CONFIG = GateConfig(trackers=("a",), sequences=("b",))
+
+
+def side_of(name, errors, **facts):
+    """A side whose errors are ``[S, K]``; nan is a lost run."""
+    runs = []
+    for case, of_case in zip(CASES, np.asarray(errors, float), strict=False):
+        for number, error in enumerate(of_case.tolist()):
+            lost = math.isnan(error)
+            runs.append(
+                Measurement(
+                    case=case,
+                    round=number,
+                    status="lost" if lost else "ok",
+                    reason="it lost track" if lost else "",
+                    ate_m=None if lost else error,
+                    coverage=0.2 if lost else 1.0,
+                    trajectories={"online": repr((case, number, error))},
+                    **facts,
+                )
+            )
+    return Side(name, runs)
+
+
+def noisy(sequences=8, rounds=10, scale=1.0, seed=0, spread=0.1):
+    """Errors of one centimetre that scatter from run to run."""
+    rng = np.random.default_rng(seed)
+    return 0.01 * scale * np.exp(spread * rng.normal(size=(sequences, rounds)))
+
+
+def judged(baseline, candidate, rounds, config=CONFIG, **how):
+    return judge(side_of("a", baseline), side_of("b", candidate), config, rounds, **how)
+
+
+# -- what is found in measurements -------------------------------------------------------------------
+
+
+def test_equal_bits_are_identical_after_one_round() -> None:
+    errors = noisy()
+    found = judged(errors, errors, 1)
+    assert found.verdict is GateVerdict.IDENTICAL
+    assert found.exit_code == 0
+    assert all(case.identical for case in found.cases)
+
+
+def test_one_round_that_differs_tells_nothing() -> None:
+    found = judged(noisy(), 3.0 * noisy(), 1)
+    assert found.verdict is GateVerdict.UNDECIDED
+    assert found.exit_code == 5
+
+
+@pytest.mark.parametrize(
+    ("scale", "verdict", "code"),
+    [(1.3, GateVerdict.REGRESSED, 4), (0.7, GateVerdict.IMPROVED, 0)],
+)
+def test_a_change_of_thirty_percent_is_found(scale, verdict, code) -> None:
+    found = judged(noisy(), noisy(scale=scale, seed=1), 4)
+    assert found.verdict is verdict
+    assert found.exit_code == code
+    assert math.exp(found.estimate.centre) == pytest.approx(scale, rel=0.1)
+
+
+def test_no_difference_needs_both_ends_within_the_margin() -> None:
+    found = judged(noisy(spread=0.02), noisy(spread=0.02, seed=1), 3)
+    assert found.verdict is GateVerdict.NO_DIFFERENCE
+    narrow = CONFIG.model_copy(update={"margin": 0.001})
+    found = judged(noisy(spread=0.02), noisy(spread=0.02, seed=1), 3, narrow)
+    assert found.verdict is GateVerdict.UNDECIDED
+
+
+@pytest.mark.parametrize("others", [0.95, 0.5])
+def test_one_sequence_that_is_lost_is_never_an_improvement(others) -> None:
+    baseline = noisy(spread=0.01)
+    candidate = others * noisy(spread=0.01, seed=1)
+    candidate[0] = math.nan
+    for rounds in (2, 3, 4, 6, 8, 10):
+        found = judged(baseline, candidate, rounds)
+        assert found.verdict in (GateVerdict.UNDECIDED, GateVerdict.REGRESSED)
+        assert found.exit_code in (3, 4)
+
+
+def test_one_more_lost_run_is_never_an_improvement() -> None:
+    baseline = noisy()
+    candidate = noisy(scale=0.7, seed=1)
+    candidate[0, 0] = math.nan
+    found = judged(baseline, candidate, 4)
+    assert found.verdict is GateVerdict.UNDECIDED
+    assert found.exit_code == 3
+    assert found.lost == (1, 0)
+
+
+@pytest.mark.parametrize("who", ["candidate", "baseline", "both"])
+def test_when_all_runs_are_lost_nothing_passes(who) -> None:
+    lost = np.full((8, 4), math.nan)
+    baseline = noisy(rounds=4) if who == "candidate" else lost
+    candidate = noisy(rounds=4) if who == "baseline" else lost
+    found = judged(baseline, candidate, 4)
+    assert found.exit_code in (3, 4)
+    assert found.verdict not in (
+        GateVerdict.IDENTICAL,
+        GateVerdict.IMPROVED,
+        GateVerdict.NO_DIFFERENCE,
+    )
+
+
+def test_sequences_that_both_lose_shrink_no_interval() -> None:
+    baseline = noisy(4, 4)
+    candidate = noisy(4, 4, seed=1)
+    without = judged(baseline, candidate, 4).estimate
+    lost = np.full((4, 4), math.nan)
+    with_lost = judged(np.vstack([baseline, lost]), np.vstack([candidate, lost]), 4).estimate
+    assert with_lost == without
+
+
+@pytest.mark.parametrize("rounds", [2, 3, 4, 6, 8, 10])
+@pytest.mark.parametrize("seed", [0, 10, 20])
+def test_exchanging_the_sides_turns_the_verdict_around(seed, rounds) -> None:
+    baseline = noisy(seed=seed)
+    candidate = noisy(seed=seed + 1, scale=1.1)
+    forward = judged(baseline, candidate, rounds)
+    backward = judged(candidate, baseline, rounds)
+    turned = {
+        GateVerdict.REGRESSED: GateVerdict.IMPROVED,
+        GateVerdict.IMPROVED: GateVerdict.REGRESSED,
+    }
+    assert backward.verdict is turned.get(forward.verdict, forward.verdict)
+    assert backward.estimate.centre == pytest.approx(-forward.estimate.centre)
+
+
+# -- guardrails ----------------------------------------------------------------------------------------
+
+
+def guarded(**limits):
+    return CONFIG.model_copy(update={"guardrails": Guardrails(**limits)})
+
+
+def test_a_fall_of_coverage_breaks_a_gate_whose_errors_are_smaller() -> None:
+    baseline = side_of("a", noisy())
+    candidate = side_of("b", noisy(scale=0.5, seed=1))
+    for run in candidate.all(10):
+        run.coverage = 0.9
+    found = judge(baseline, candidate, CONFIG, 4)
+    assert found.verdict is GateVerdict.IMPROVED
+    assert found.exit_code == 4
+    assert [rail.state for rail in found.guardrails] == ["broken"]
+    assert found.guardrails[0].measured == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("times", "spread", "state"), [(1.5, 0.02, "broken"), (1.0, 0.02, "held"), (1.15, 0.3, "open")]
+)
+def test_frame_times_are_paired(times, spread, state) -> None:
+    rng = np.random.default_rng(3)
+    baseline = side_of("a", noisy(spread=0.02))
+    candidate = side_of("b", noisy(spread=0.02, seed=1))
+    for before, after in zip(baseline.all(10), candidate.all(10), strict=True):
+        before.frame_time_s = 0.02 * math.exp(spread * rng.normal())
+        after.frame_time_s = 0.02 * times * math.exp(spread * rng.normal())
+    found = judge(baseline, candidate, guarded(frame_time=1.2), 4)
+    assert found.guardrails[-1].state == state
+    assert found.exit_code == {"broken": 4, "held": 0, "open": 5}[state]
+    untimed = judge(baseline, candidate, guarded(frame_time=1.2), 4, timed=False)
+    assert untimed.guardrails[-1].state == "not measured"
+
+
+def test_a_floor_names_the_sequence() -> None:
+    candidate = noisy(spread=0.01, seed=1)
+    candidate[3] *= 1.6
+    found = judged(noisy(spread=0.01), candidate, 2, guarded(sequence=1.5))
+    assert found.guardrails[-1].state == "broken"
+    assert "sequence 3" in found.guardrails[-1].text
+
+
+def test_lost_runs_may_be_limited_by_number() -> None:
+    baseline = noisy(spread=0.01)
+    candidate = noisy(spread=0.01, seed=1)
+    candidate[0, 0] = math.nan
+    assert judged(baseline, candidate, 10, guarded(failures=0)).exit_code == 4
+    assert judged(baseline, candidate, 10, guarded(failures=1)).exit_code == 3
+
+
+# -- the question --------------------------------------------------------------------------------------
+
+
+def write_gate(folder, sequences, **values):
+    """A question in a folder."""
+    lines = {"trackers": [TRACKER], "sequences": [str(path) for path in sequences], "build": BUILD}
+    lines |= values
+    tables = {name: value for name, value in lines.items() if isinstance(value, dict)}
+    text = "".join(
+        f"{name} = {json.dumps(value)}\n" for name, value in lines.items() if name not in tables
+    )
+    for name, table in tables.items():
+        text += f"[{name}]\n" + "".join(
+            f"{key} = {json.dumps(value)}\n" for key, value in table.items()
+        )
+    (folder / "gate.toml").write_text(text)
+    return folder / "gate.toml"
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"marginn": 0.1},
+        {"rounds": 5},
+        {"protocol": "none"},
+        {"sequences": []},
+        {"suite": "smoke"},
+        {"margin": 0},
+        {"guardrails": {"frame_time": 0.9}},
+    ],
+)
+def test_a_wrong_question_is_refused(tmp_path, values) -> None:
+    with pytest.raises(Exception) as caught:
+        gates.load_gate(write_gate(tmp_path, ["synthetic/walking_xyz"], **values))
+    assert "\n" not in str(caught.value)
+
+
+def test_no_question_says_how_to_write_one(tmp_path) -> None:
+    with pytest.raises(RunError) as caught:
+        gates.check(tmp_path / "gate.toml")
+    assert "gate init" in caught.value.hint
+
+
+def test_a_question_is_written_and_read_again(tmp_path) -> None:
+    file = gates.init(tmp_path / "gate.toml", trackers=['subprocess:./a "b"'], build='c "d" \\')
+    gate = gates.load_gate(file)
+    assert gate.config.trackers == ('subprocess:./a "b"',)
+    assert gate.config.build == 'c "d" \\'
+    assert len(gate.cases()) == 8
+    with pytest.raises(RunError):
+        gates.init(file)
+
+
+def test_a_suite_and_single_cases_are_run_too(tmp_path) -> None:
+    (tmp_path / "gate.toml").write_text(
+        'suite = "smoke"\n[[cases]]\ntracker = "never-move"\nsequence = "synthetic/walking_rpy"\nframes = [0, 9]\n'
+    )
+    cases = gates.load_gate(tmp_path / "gate.toml").cases()
+    assert len(cases) == 9
+    assert {spec.seed for spec in cases.values()} == {0}
+
+
+def test_equal_cases_are_refused(tmp_path) -> None:
+    file = write_gate(tmp_path, ["synthetic/walking_xyz", "synthetic/walking_xyz"])
+    with pytest.raises(RunError):
+        gates.load_gate(file).cases()
+
+
+def test_the_digest_of_poses_ignores_comments(tmp_path) -> None:
+    (tmp_path / "a.txt").write_text("# of A\n1.0 0 0 0 0 0 0 1\n")
+    (tmp_path / "b.txt").write_text("# of B\n1.0 0 0 0 0 0 0 1\n")
+    assert poses_digest(tmp_path / "a.txt") == poses_digest(tmp_path / "b.txt") != ""
+
+
+# -- a repository that is built and run ------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def sequences(tmp_path_factory):
+    """Two short recordings of the toy world."""
+    root = tmp_path_factory.mktemp("sequences")
+    return [write_folder(root / "one", 14), write_folder(root / "two", 18)]
+
+
+@pytest.fixture
+def repository(tmp_path, sequences):
+    """A repository with one commit and a question."""
+    folder = make_repository(tmp_path / "repository")
+    write_gate(folder, sequences)
+    commit(folder, "ask")
+    return folder
+
+
+@pytest.mark.slow
+def test_from_nothing_to_a_verdict_by_one_command(tmp_path, sequences) -> None:
+    folder = make_repository(tmp_path / "repository")
+    write_version(folder, 0.02)
+    commit(folder, "twice the noise")
+    script = Path(__file__).parents[2] / "packaging" / "gate-action" / "gate.sh"
+    package = str(Path(__file__).parents[2])
+    variables = {
+        "PYTHON": sys.executable,
+        "PYTHONPATH": package,
+        "TRACKER": TRACKER,
+        "BUILD": BUILD,
+        "SEQUENCES": "\n".join(map(str, sequences)),
+        "SUMMARY": str(tmp_path / "summary.md"),
+    }
+    ended = subprocess.run(
+        ["bash", str(script), "HEAD~1", "HEAD"],
+        cwd=folder,
+        env=os.environ | variables,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == 4, ended.stderr
+    summary = (tmp_path / "summary.md").read_text()
+    assert summary.startswith("**regressed**")
+    assert len(summary.splitlines()) <= 10
+    assert not git(folder, "worktree", "list").count("\n"), "the checkouts are removed"
+
+
+@pytest.mark.slow
+def test_record_check_and_compare(repository) -> None:
+    question = repository / "gate.toml"
+    results = repository / "results"
+    made = gates.record(question, results=results)
+    assert {run.status for run in made.runs} == {"ok"}
+    commit(repository, "baseline")
+
+    # nothing changed: equal to the last bit, after one round
+    same = gates.check(question, results=results)
+    assert same.verdict is GateVerdict.IDENTICAL
+    assert same.rounds == 1
+    assert not same.reran_baseline
+
+    # twice the noise, not committed: the baseline is built and run again, in turns
+    write_version(repository, 0.02)
+    worse = gates.check(question, results=results)
+    assert worse.verdict is GateVerdict.REGRESSED
+    assert worse.exit_code == 4
+    assert worse.reran_baseline
+    assert worse.candidate.uncommitted == [git(repository, "diff", "--name-only")]
+    assert Path(worse.page).is_file()
+    assert worse.sentence in (Path(worse.page).parent / "data" / "ratios.js").read_text()
+
+    # by the recorded runs alone
+    by_files = gates.check(question, files_only=True, results=results)
+    assert by_files.verdict is GateVerdict.REGRESSED
+    assert not by_files.reran_baseline
+
+    # the other way around, of two revisions
+    second = commit(repository, "twice the noise")
+    better = gates.compare(second, "HEAD~1", question, results=results)
+    assert better.verdict is GateVerdict.IMPROVED
+    assert better.ratio == pytest.approx(0.5, rel=0.3)
+
+
+@pytest.mark.slow
+def test_a_loss_beside_small_gains_is_no_improvement(repository, sequences) -> None:
+    write_version(repository, 0.0095, lost_in=sequences[0].name)
+    commit(repository, "5 % better, but lost on one")
+    result = gates.compare(
+        "HEAD~1", "HEAD", repository / "gate.toml", results=repository / "results"
+    )
+    assert result.verdict not in (
+        GateVerdict.IMPROVED,
+        GateVerdict.NO_DIFFERENCE,
+        GateVerdict.IDENTICAL,
+    )
+    assert not result.passed
+
+
+@pytest.mark.slow
+def test_a_confirmation_set_is_counted(repository, sequences) -> None:
+    write_gate(repository, sequences[:1], confirm=[str(sequences[1])])
+    commit(repository, "confirm")
+    question = repository / "gate.toml"
+    gates.record(question, results=repository / "results", rounds=1)
+    assert gates.check(question, results=repository / "results").look == 0
+    first = gates.check(question, confirm=True, results=repository / "results")
+    second = gates.check(question, confirm=True, results=repository / "results")
+    assert [first.look, second.look] == [1, 2]
+    assert [case.case for case in second.cases] == ["two"]
+
+
+@pytest.mark.slow
+def test_a_plug_in_is_judged(tmp_path, sequences) -> None:
+    file = write_gate(
+        tmp_path, sequences[:1], trackers=[TARGET], build="", settings={"noise.level_m": 1e-3}
+    )
+    gates.record(file, results=tmp_path / "results")
+    result = gates.check(file, results=tmp_path / "results")
+    assert result.verdict is GateVerdict.IDENTICAL
+
+
+@pytest.mark.slow
+class TestBadInput:
+    """Each fault is one line with its cure, and never a pass."""
+
+    def test_no_baseline(self, repository) -> None:
+        with pytest.raises(RunError) as caught:
+            gates.check(repository / "gate.toml")
+        assert "gate record" in caught.value.hint
+
+    def test_uncommitted_changes(self, repository) -> None:
+        write_version(repository, 0.03)
+        with pytest.raises(RunError) as caught:
+            gates.record(repository / "gate.toml")
+        assert git(repository, "diff", "--name-only") in str(caught.value)
+        assert "--uncommitted" in caught.value.hint
+
+    def test_a_revision_that_does_not_exist(self, repository) -> None:
+        with pytest.raises(RunError) as caught:
+            gates.compare("nowhere", "", repository / "gate.toml")
+        assert "'nowhere'" in str(caught.value)
+
+    def test_no_repository(self, tmp_path, sequences) -> None:
+        with pytest.raises(RunError) as caught:
+            gates.compare("HEAD", "", write_gate(tmp_path, sequences))
+        assert "git init" in caught.value.hint
+
+    def test_a_build_that_fails(self, repository) -> None:
+        command = "echo the compiler says no; exit 7"
+        with pytest.raises(RunError) as caught:
+            gates.compare("HEAD", "HEAD", repository / "gate.toml", build_command=command)
+        assert "code 7: the compiler says no" in str(caught.value)
+        assert not git(repository, "worktree", "list").count("\n")
+
+    def test_missing_sequences(self, repository, sequences) -> None:
+        question = write_gate(repository, [*sequences, "tum/fr3/walking_xyz", "nowhere/at_all"])
+        with pytest.raises(RunError) as caught:
+            gates.compare("HEAD", "HEAD", question, data_root=repository)
+        assert "2 of 4 sequences" in str(caught.value)
+
+    def test_another_protocol_machine_and_question(self, repository, sequences) -> None:
+        question = repository / "gate.toml"
+        gates.record(question, results=repository / "results", rounds=1)
+        file = repository / "gate-baseline.json"
+        text = json.loads(file.read_text())
+
+        # another machine: said, and errors are compared
+        text["machine"]["cpu"] = "Another CPU"
+        file.write_text(json.dumps(text))
+        write_gate(repository, sequences, margin=0.2)
+        result = gates.check(question, results=repository / "results")
+        assert result.verdict is GateVerdict.IDENTICAL
+        assert any("Another CPU" in note for note in result.notes)
+        assert result.changed_question == ["margin was 0.1, is 0.2"]
+
+        # sequences that the baseline lacks
+        write_gate(repository, [*sequences, "synthetic/walking_xyz"])
+        with pytest.raises(RunError) as caught:
+            gates.check(question)
+        assert "lacks 1 of 3" in str(caught.value)
+
+        # another protocol
+        write_gate(repository, sequences, protocol="evo-default")
+        with pytest.raises(RunError) as caught:
+            gates.check(question)
+        assert "evo-default" in str(caught.value)
+
+    def test_a_damaged_baseline(self, repository) -> None:
+        (repository / "gate-baseline.json").write_text("{}")
+        with pytest.raises(RunError) as caught:
+            gates.check(repository / "gate.toml")
+        assert "\n" not in str(caught.value)
+
+    def test_all_runs_lost(self, repository) -> None:
+        write_version(repository, 0.01, lost_in="op")
+        commit(repository, "loses everything")
+        with pytest.raises(RunError) as caught:
+            gates.record(repository / "gate.toml", results=repository / "results")
+        assert "all 4 runs were lost" in str(caught.value)
+        result = gates.compare(
+            "HEAD~1", "HEAD", repository / "gate.toml", results=repository / "results"
+        )
+        assert result.exit_code in (3, 4)
+        assert "all runs of the candidate" in result.sentence
+
+
+# -- trajectories of others --------------------------------------------------------------------------------
+
+
+def write_trajectories(folder, sequences, noise_m, runs=1, seed=0):
+    """Trajectory files as a gate reads them: the truth with noise."""
+    rng = np.random.default_rng(seed)
+    for sequence in sequences:
+        truth = read_tum(sequence / "groundtruth.txt")
+        for number in range(runs):
+            poses = truth.T_world_cam.copy()
+            poses[:, :3, 3] += noise_m * rng.normal(size=(len(poses), 3))
+            several = folder / file_name(sequence.name)
+            target = (
+                several / f"{number}.txt"
+                if runs > 1
+                else folder / f"{file_name(sequence.name)}.txt"
+            )
+            target.parent.mkdir(parents=True, exist_ok=True)
+            write_tum(target, Trajectory(truth.timestamps, poses))
+    return folder
+
+
+def test_trajectories_of_others_are_judged(tmp_path, sequences) -> None:
+    question = write_gate(tmp_path, sequences, build="")
+    results = tmp_path / "results"
+    one = write_trajectories(tmp_path / "one", sequences, 0.01)
+    gates.record(question, trajectories=one, results=results)
+
+    # the same files; then others, of which one a sequence tells nothing
+    assert gates.check(question, trajectories=one, results=results).verdict is GateVerdict.IDENTICAL
+    other = write_trajectories(tmp_path / "other", sequences, 0.05, seed=1)
+    single = gates.check(question, trajectories=other, results=results)
+    assert single.verdict is GateVerdict.UNDECIDED
+    assert single.exit_code == 5
+
+    # several runs of both sides
+    before = write_trajectories(tmp_path / "before", sequences, 0.01, runs=3, seed=2)
+    after = write_trajectories(tmp_path / "after", sequences, 0.05, runs=3, seed=3)
+    gates.record(question, trajectories=before, results=results)
+    assert (
+        gates.check(question, trajectories=after, results=results).verdict is GateVerdict.REGRESSED
+    )
+
+
+def test_a_missing_trajectory_is_named(tmp_path, sequences) -> None:
+    question = write_gate(tmp_path, sequences, build="")
+    files = write_trajectories(tmp_path / "files", sequences[:1], 0.01)
+    with pytest.raises(RunError) as caught:
+        gates.record(question, trajectories=files)
+    assert "two.txt" in caught.value.hint
