@@ -85,8 +85,6 @@ SORTED_BY = ("started", "tracker", "sequence", "status", "ate", "ms", "coverage"
 _SORT_KEYS = {"ate": "ate_rmse_m", "ms": "frame_ms"}
 _ID_DIGITS = 8
 """Digits of an id that a terminal shows at least; runs of one request share their first twelve."""
-_NAME_WIDTH = 24
-"""Characters that a sequence keeps on a terminal, so that rendered ones are told apart."""
 # The folders of a path in a setting's value: `file=/data/maps/a.npz` is shown as `file=a.npz`.
 _FOLDERS = re.compile(r"(?<==)(\w+:)?(?:~|\.{0,2})/(?:[^,/]*/)*")
 
@@ -421,7 +419,7 @@ def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: 
         short = short_ids([*store.ids(), *(row["run_id"] for row in rows)])
         shown = [row | {"run_id": short[row["run_id"]]} for row in rows]
     cells = [[shown_cell(name, row[name]) for name in columns.values()] for row in shown]
-    write(table(list(columns), cells, least=_NAME_WIDTH), colours=COLOURS)
+    write(table(list(columns), cells), colours=COLOURS)
     for line in summary_lines(rows):
         write(line)
     show_remarks(rows)
