@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import islice, product
-from typing import Any
+from typing import Any, cast
 
 import optuna
 from optuna.distributions import (
@@ -60,7 +60,7 @@ class SearchSpace:
         """Values of all settings where nothing is tuned, by dotted name, the tracker's name among them."""
         first = next(iter(self.settings))
         values: dict[str, Any] = {}
-        for settings in reversed(self.settings.values()):
+        for settings in reversed(list(self.settings.values())):
             values |= flatten(settings)
         return values | ({TRACKER: first} if len(self.settings) > 1 else {})
 
@@ -181,11 +181,7 @@ def build_space(
         meaning = "the system"
         names = tuple(settings)
         every.insert(0, Parameter(TRACKER, "categorical", names[0], choices=names, meaning=meaning))
-    steps = {
-        name: span.step
-        for name, span in spec.range.items()
-        if isinstance(span, Range) and span.step
-    }
+    steps = {name: span.step for name, span in spec.range.items() if span.step}
     space = SearchSpace(tuple(every), shown or settings, spec.when, steps)
     list(space._in_order())
 
@@ -366,8 +362,7 @@ def _suggest(trial: optuna.Trial, parameter: Parameter, step: float | None) -> S
             parameter.name, span.low, span.high, step=span.step, log=span.log
         )
     assert isinstance(span, CategoricalDistribution)
-    value: Any = trial.suggest_categorical(parameter.name, span.choices)
-    return value  # type: ignore[no-any-return]
+    return cast("Scalar", trial.suggest_categorical(parameter.name, span.choices))
 
 
 def search_space(settings: Settings, spec: SpaceSpec) -> list[Parameter]:
