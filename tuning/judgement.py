@@ -25,6 +25,7 @@ from dynslam_bench.evaluation.verdicts import (
     scenes_to_settle,
     verdict_of,
 )
+from dynslam_bench.runs.layout import is_id
 from dynslam_bench.sequences.families import family_of
 from dynslam_bench.tuning.objectives import (
     ACCURACY,
@@ -524,7 +525,9 @@ def without_effect(tuner: Study) -> int:
         for name, run in runs.items():
             if not (run and baseline[name]):
                 return 0
-            if _tracks(tuner, run) != _tracks(tuner, baseline[name]):
+            tracks = _tracks(tuner, run)
+            # a run that is no longer stored has nothing to compare
+            if not tracks or tracks != _tracks(tuner, baseline[name]):
                 return 0
         compared += bool(runs)
     return compared
@@ -536,7 +539,9 @@ def _runs_of(trial: FrozenTrial) -> dict[str, str]:
 
 
 def _tracks(tuner: Study, run: str) -> list[bytes]:
-    """The files of a run's trajectories."""
+    """The files of a run's trajectories; none for a run that is not stored."""
+    if not is_id(run):
+        return []
     folder = tuner.store.folder(run)
     return [file.read_bytes() for file in sorted(folder.glob("trajectory_*.txt"))]
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import chain, islice, product
-from typing import Any
+from typing import Any, cast
 
 import optuna
 from optuna.distributions import (
@@ -59,7 +59,7 @@ class SearchSpace:
         """Values of all settings where nothing is tuned, by dotted name, the tracker's name among them."""
         first = next(iter(self.settings))
         values: dict[str, Any] = {}
-        for settings in reversed(self.settings.values()):
+        for settings in reversed(list(self.settings.values())):
             values |= flatten(settings)
         return values | ({TRACKER: first} if len(self.settings) > 1 else {})
 
@@ -180,11 +180,7 @@ def build_space(
         meaning = "the system"
         names = tuple(settings)
         every.insert(0, Parameter(TRACKER, "categorical", names[0], choices=names, meaning=meaning))
-    steps = {
-        name: span.step
-        for name, span in spec.range.items()
-        if isinstance(span, Range) and span.step
-    }
+    steps = {name: span.step for name, span in spec.range.items() if span.step}
     space = SearchSpace(tuple(every), shown or settings, spec.when, steps)
     list(space._in_order())
 
@@ -366,8 +362,7 @@ def _suggest(trial: optuna.Trial, parameter: Parameter, step: float | None) -> S
             parameter.name, span.low, span.high, step=span.step, log=span.log
         )
     assert isinstance(span, CategoricalDistribution)
-    value: Any = trial.suggest_categorical(parameter.name, span.choices)
-    return value  # type: ignore[no-any-return]
+    return cast("Scalar", trial.suggest_categorical(parameter.name, span.choices))
 
 
 def search_space(settings: Settings, spec: SpaceSpec) -> list[Parameter]:
@@ -414,13 +409,19 @@ def starting_point(
                 f'tune it, or say "{name}" = ... under [space.fixed]',
             )
 
-    # what is tuned has a value that the sampler could propose
+    # what is tuned has a value that the sampler could propose, unless nothing uses it
     point = {name: preset.get(name, base[name]) for name in spans}
-    for name, value in point.items():
-        span = spans[name]
-        if not _is_within(span, name, value) and name in space.effective(point):
+    misfits = [
+        name for name, value in point.items() if not _is_within(spans[name], name, value)
+    ]
+    if misfits:
+        used = space.effective(point | {name: base[name] for name in misfits})
+        for name in misfits:
+            if name not in used:
+                continue
+            tuned = _span_text(spans[name])
             raise StudyError(
-                f"{what} sets {name} = {value!r}, out of the range that the study tunes: {_span_text(span)}",
+                f"{what} sets {name} = {point[name]!r}, out of the range that the study tunes: {tuned}",
                 'make the range wider, or begin with a baseline within it (baseline = "PRESET.toml")',
             )
     return point
