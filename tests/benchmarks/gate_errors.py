@@ -108,7 +108,9 @@ def fixed(candidate: Array, baseline: Array, rounds: int) -> Decision:
 
 def frozen(candidate: Array, baseline: Array) -> Decision:
     """One run of each sequence must stay below 1.10 times a frozen number."""
-    limits = 1.10 * np.nanmedian(baseline[:, :FROZEN_RUNS], axis=1)
+    first = baseline[:, :FROZEN_RUNS]
+    all_lost = np.isnan(first).all(axis=1, keepdims=True)
+    limits = 1.10 * np.nanmedian(np.where(all_lost, np.inf, first), axis=1)
     is_above = np.isnan(candidate[:, 0]) | (candidate[:, 0] > limits)
     verdict = GateVerdict.REGRESSED if is_above.any() else GateVerdict.NO_DIFFERENCE
     return Decision(verdict, 1)
