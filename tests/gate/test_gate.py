@@ -118,6 +118,7 @@ def test_one_more_lost_run_is_never_an_improvement() -> None:
     assert found.verdict is GateVerdict.UNDECIDED
     assert found.exit_code == 3
     assert found.lost == (1, 0)
+    assert found.guardrails[0].measured == 0.0, "the coverage is that of runs that were not lost"
 
 
 @pytest.mark.parametrize("who", ["candidate", "baseline", "both"])
