@@ -22,6 +22,16 @@ opposites  # flow.moth_flame: the same
 # features.fast: the instructions in plain code, which a test compares them with
 plain_corner_scores
 plain_maxima
+# core.simd and flow: likewise
+plain_total
+plain_average
+plain_average_of_pairs
+plain_derivatives
+plain_store_normalised
+plain_store_offsets
+plain_square
+plain_sample
+plain_descriptor_sum
 
 # called by name: specs name their factories as "module:name"
 OrbExtractor  # features.registry
@@ -91,8 +101,6 @@ modified_ns  # trackers.adapters.orbslam3: part of the key of the cached functio
 descriptor_bytes  # FeatureSpec
 median_dt_s  # evaluation
 translation_m  # evaluation: the alignment
-pixels_first  # sequences.doctor reads it by name
-pixels_second  # the same
 n_ground_truth  # evaluation
 hole_at_s  # evaluation
 n_initialising  # run.json
@@ -122,3 +130,9 @@ dynslam_gate  # a fixture of pytest
 reran_baseline  # a field of gate.json
 _.runtest  # pytest calls it
 _.reportinfo  # pytest calls it
+
+dynslam_gate  # gate.pytest_plugin: pytest calls it
+reran_baseline  # gate.result: for those who read the file
+describe_batch  # trackers.adapters: specs name them as "module:name"
+describe_served
+build_described

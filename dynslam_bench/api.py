@@ -305,6 +305,7 @@ def tune(
     results: str | Path = "results",
     jobs: int = 1,
     trials: int | None = None,
+    choose: int | None = None,
     more_scenes: int = 0,
     more_trials: int = 0,
     on_event: Callable[..., None] | None = None,
@@ -318,6 +319,7 @@ def tune(
         results: The results folder.
         jobs: Trials at a time.
         trials: Finished trials, in place of the study's own number.
+        choose: The number of a trial to be judged in place of the best, e.g. one of the front.
         more_scenes: Rendered scenes to add to those that judge.
         more_trials: Trials to add.
         on_event: Called with every `StudyEvent`.
@@ -340,7 +342,7 @@ def tune(
         on_event=on_event,
         on_run=on_run,
     )
-    summary = finish(tuner, on_note, jobs=jobs)
+    summary = finish(tuner, on_note, jobs=jobs, trial=choose)
     return StudyResult(summary, write_page(tuner, summary), tuner)
 
 

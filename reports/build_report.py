@@ -14,7 +14,11 @@ import dynslam_bench
 from dynslam_bench.core import ReportError, read_json, sweep_temporary, write_atomic
 from dynslam_bench.evaluation import Protocol, get_protocol
 from dynslam_bench.reports import figures
-from dynslam_bench.reports.html.board_page import MEANINGS, board_data, ranking_entries, ratios_data
+from dynslam_bench.reports.html.board_page import (
+    board_data,
+    ranking_entries,
+    ratios_data,
+)
 from dynslam_bench.reports.html.page import (
     ASSETS,
     Block,
@@ -32,6 +36,12 @@ from dynslam_bench.reports.html.run_pages import (
     error_by_share,
     write_run_pages,
 )
+from dynslam_bench.reports.model.answers import (
+    MEANINGS,
+    answers,
+    error_columns,
+    limits,
+)
 from dynslam_bench.reports.model.board import (
     OVERALL,
     Board,
@@ -45,7 +55,7 @@ from dynslam_bench.reports.model.board import (
 from dynslam_bench.reports.model.load import (
     Loaded,
     OnProgress,
-    load_runs,
+    load_for_report,
     no_progress,
     open_stores,
     trial_words,
@@ -64,8 +74,10 @@ from dynslam_bench.reports.model.summary import explanation, headline, mean_rank
 from dynslam_bench.reports.model.workers import worker_pool
 from dynslam_bench.reports.tables import leaderboard as tables
 from dynslam_bench.reports.tables.published import published_table, span_table
+from dynslam_bench.reports.tables.quotes import quotes
 from dynslam_bench.reports.tables.table import Table, csv_text, prose, to_latex, to_markdown
-from dynslam_bench.runs.store import RunStore, part_words
+from dynslam_bench.runs.rows import part_words
+from dynslam_bench.runs.store import RunStore
 
 COMPARE_PAGE = "compare.html"
 """The page that shows two trackers side by side."""
@@ -126,7 +138,9 @@ class _Content:
         protocol: How errors were computed.
         board: The board of all sequences.
         boards: Category to its board, see `category_boards`.
-        notes: What a reader has to know about the ranking, in sentences.
+        monocular: Category to the board of the trackers whose scale comes from the truth.
+        notes: Category to what a reader has to know about its ranking, in sentences.
+        common_notes: Notes that apply to all categories.
         sections: File name of a page to its sections.
         trials: How many runs were left out since they are trials of studies.
         paged: Ids of the runs that have a page of their own.
@@ -136,7 +150,9 @@ class _Content:
     protocol: Protocol
     board: Board
     boards: Mapping[str, Board]
-    notes: list[str]
+    monocular: Mapping[str, Board]
+    notes: Mapping[str, list[str]]
+    common_notes: list[str]
     sections: Mapping[str, list[Section]]
     trials: int
     paged: Collection[str]
@@ -208,7 +224,7 @@ def build_report(
 
     with worker_pool(sum(len(store.ids()) for store in stores)) as pool:
         # score the runs and rank the trackers
-        loaded = load_runs(stores, protocol, on_progress, pool, trials=trials)
+        loaded, protocol = load_for_report(stores, protocol, on_progress, pool, trials=trials)
         board = make_board(loaded.rows, reference, on, rank_seen=rank_seen)
 
         # write the pages of runs; only failures and typical runs have pictures
@@ -230,7 +246,9 @@ def build_report(
         protocol=protocol,
         board=board,
         boards=boards,
-        notes=_notes(board, protocol, loaded, pageless),
+        monocular=_monocular_boards(loaded, boards),
+        notes={category: _board_notes(part, loaded) for category, part in boards.items()},
+        common_notes=_common_notes(protocol, loaded, pageless),
         sections={
             "errors.html": [errors_section(board, protocol), categories_section(boards, protocol)],
             "paper.html": [paper_section(board, protocol)],
@@ -254,6 +272,19 @@ def build_report(
     write_side(output, "board", board_data(board, boards, protocol, paged_ids, pictured, pageless))
     write_side(output, "ratios", ratios_data(board))
     return _write(content, output)
+
+
+def _monocular_boards(loaded: Loaded, boards: Mapping[str, Board]) -> dict[str, Board]:
+    """Category to the board of the monocular trackers that were run on its sequences."""
+    apart = {}
+    for category, part in boards.items():
+        columns = {row.column_id for row in part.rows}
+        rows = [row for row in loaded.monocular if row.column_id in columns]
+        if category == OVERALL:
+            rows = loaded.monocular
+        if rows:
+            apart[category] = make_board(rows)
+    return apart
 
 
 # -- which runs have a page
@@ -395,10 +426,12 @@ def _markdown(content: _Content, shown: Iterable[Table], facts: Sequence[Fact], 
     """Headline, facts, notes and tables as Markdown."""
     board = content.board
     counts = ", ".join(f"{value} {name}" for value, name, _ in facts)
-    notes = [how_to_read(board), *content.notes]
+    notes = [how_to_read(board), *content.notes[OVERALL], *content.common_notes]
     for section in content.all_sections:
         notes += section.notes
-    head = f"# {prose(content.title)}\n\n{prose(headline(board))}\n\n{content.protocol.describe()}\n\n{counts}\n\n"
+    said = [*answers(board), f"{headline(board)} {limits(board)}"]
+    opening = "\n\n".join(prose(sentence) for sentence in said)
+    head = f"# {prose(content.title)}\n\n{opening}\n\n{content.protocol.describe()}\n\n{counts}\n\n"
     quoted = "".join(f"> {prose(note)}\n\n" for note in notes)
     return head + quoted + "\n".join(map(to_markdown, shown)) + f"\n{footer}\n"
 
@@ -406,11 +439,23 @@ def _markdown(content: _Content, shown: Iterable[Table], facts: Sequence[Fact], 
 def _first_page(content: _Content, facts: Sequence[Fact], footer: str) -> str:
     """The page that a report begins with: the ranking by category, and accuracy against speed."""
     board = content.board
-    speed = figures.speed_figure(board)
+    boards = content.boards
+    said = {category: answers(part) for category, part in boards.items()}
+    sentences = {category: headline(part) for category, part in boards.items()}
+    columns = {category: error_columns(part) for category, part in boards.items()}
     rankings = {
-        category: ranking_entries(part, board, content.boards, content.paged)
-        for category, part in content.boards.items()
+        category: ranking_entries(part, board, boards, content.paged, content.monocular)
+        for category, part in boards.items()
     }
+    quoted = {
+        category: quotes(
+            part, content.protocol, [*said[category], sentences[category]], columns[category]
+        )
+        for category, part in boards.items()
+    }
+    charts = {"speed": figures.speed_figure(board)}
+    for number, part in enumerate(boards.values()):
+        charts[f"errors-{number}"] = figures.error_figure(part)
     return render(
         "board.html.j2",
         title=content.title,
@@ -418,16 +463,20 @@ def _first_page(content: _Content, facts: Sequence[Fact], footer: str) -> str:
         here="index.html",
         footer=footer,
         scripts=["board.js"],
-        sentence=headline(board),
-        sentences={category: headline(part) for category, part in content.boards.items()},
+        answers=said,
+        sentences=sentences,
+        limits={category: limits(part) for category, part in boards.items()},
         facts=facts,
         categories=rankings,
+        columns=columns,
         meanings=MEANINGS,
         reference=board.reference_name,
         explanation=how_to_read(board),
         notes=content.notes,
+        common_notes=content.common_notes,
+        quotes=quoted,
         caption=_speed_caption(content),
-        figures={} if speed is None else {"speed": speed},
+        figures={name: chart for name, chart in charts.items() if chart is not None},
     )
 
 
@@ -529,25 +578,36 @@ _MOST_COMMANDS = 200
 """Commands that are shown."""
 
 
-def _notes(board: Board, protocol: Protocol, loaded: Loaded, pageless: str) -> list[str]:
-    """What a reader has to know about the ranking: contradictions, gaps, and what is left out or not ranked."""
+def _board_notes(board: Board, loaded: Loaded) -> list[str]:
+    """What a reader has to know about the ranking of a category: gaps, and what is not ranked."""
+    notes = [missing_note(board), copies_note(board)]
+    if board.final_only:
+        final_only = ", ".join(board.labels[key] for key in board.final_only)
+        notes.append(
+            f"Not ranked, since only final trajectories are known, which use later frames: {final_only}."
+        )
+    if board.unscored:
+        notes.append(
+            f"Without ground truth, and so in no table of errors: {', '.join(board.unscored)}."
+        )
+    notes += [*_program_notes(board, loaded), tables.computer_note(board)]
+    return [note for note in notes if note]
+
+
+def _common_notes(protocol: Protocol, loaded: Loaded, pageless: str) -> list[str]:
+    """What a reader has to know about all categories: contradictions, and what is left out."""
     notes = []
     if loaded.conflicts:
         conflicts = "; ".join(first_of(loaded.conflicts, _MOST_NOTES, "and {} more"))
         notes.append(
             f"Runs with one id must be equal, but these have different results: {conflicts}."
         )
-    notes += [missing_note(board), copies_note(board)]
-    if board.final_only:
-        final_only = ", ".join(board.labels[key] for key in board.final_only)
+    notes += [loaded.protocol_note, _left_out_note(loaded)]
+    if loaded.monocular:
         notes.append(
-            f"Only in the table of final trajectories, as nothing else is known of them: {final_only}."
+            f"{len(loaded.monocular)} runs of monocular trackers are scored with the scale of the truth "
+            f"({loaded.monocular[0].protocol_id}), and rank with nothing else."
         )
-    if board.unscored:
-        notes.append(
-            f"Without ground truth, and so in no table of errors: {', '.join(board.unscored)}."
-        )
-    notes += [_left_out_note(loaded), *_program_notes(board, loaded), tables.computer_note(board)]
     if loaded.without_scale:
         notes.append(f"Left out: {without_scale_words(loaded.without_scale, protocol)}.")
     if loaded.trials:

@@ -12,6 +12,7 @@ from dynslam_bench.core import ReportError, setting_text, sweep_temporary, write
 from dynslam_bench.evaluation import Protocol, get_protocol
 from dynslam_bench.evaluation.verdicts import (
     FEWEST,
+    FLOOR_M,
     PairedRatio,
     Verdict,
     findings,
@@ -26,7 +27,6 @@ from dynslam_bench.reports.model.board import Cell, copies_of, make_cell, mean_o
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores
 from dynslam_bench.reports.model.names import make_labels, name_columns
 from dynslam_bench.reports.model.row import REPORT_FILE, SEEN, ReportData, RunRow, grouped
-from dynslam_bench.reports.model.statistics import FLOOR_M
 from dynslam_bench.reports.tables.table import Table, TableCell, mm, number, numbers, texts
 from dynslam_bench.runs.record import coverage_text
 from dynslam_bench.runs.store import RunStore

@@ -12,13 +12,15 @@ import plotly.graph_objects as go
 from numpy.typing import ArrayLike
 
 from dynslam_bench.core import label_text
+from dynslam_bench.evaluation.verdicts import FLOOR_M
+from dynslam_bench.reports.model.answers import cell_error_m
 from dynslam_bench.reports.model.board import Board, timed_on_one
-from dynslam_bench.reports.model.statistics import FLOOR_M
 from dynslam_bench.reports.tables.leaderboard import (
     LOST_MARK,
     STATISTICS,
     has_lost,
     medians,
+    run_link,
     time_marks,
 )
 
@@ -199,6 +201,72 @@ def speed_figure(board: Board) -> go.Figure | None:
     if figure is not None:
         figure.add_vline(1.0, **GUIDE)
         figure.add_hline(1.0, **GUIDE)
+    return figure
+
+
+def error_figure(board: Board) -> go.Figure | None:
+    """A line for each tracker, a point for its error on each sequence, and a bar at the median; None without errors.
+
+    The axis is logarithmic, in millimetres. Crosses are sequences that the tracker lost. A click on
+    a point opens its run (``customdata``).
+    """
+    names = board.common or board.sequences
+    look = looks(board)
+    lines: list[str] = []
+    traces: list[Any] = []
+    for key in [*board.trackers, *board.final_only]:
+        present = [name for name in names if name in board.cells[key]]
+        cells = {name: board.cells[key][name] for name in present}
+        errors_m = {name: error for name in present if (error := cell_error_m(cells[name]))}
+        if not errors_m:
+            continue
+        line = wrapped(board.names[key])
+        lines.append(line)
+        is_open = key not in board.ranked
+        symbols = [
+            "x" if cells[name].lost else look[key]["symbol"] + "-open" * is_open
+            for name in errors_m
+        ]
+        traces.append(
+            go.Scatter(
+                x=rounded([1000.0 * error for error in errors_m.values()]),
+                y=[line] * len(errors_m),
+                mode="markers",
+                marker={"size": 9, "color": look[key]["color"], "symbol": symbols},
+                customdata=[run_link(cells[name].typical) for name in errors_m],
+                text=[safe(board.short.get(name, name)) for name in errors_m],
+                hovertemplate="%{text}<br>%{x:.4g} mm<extra></extra>",
+            )
+        )
+        traces.append(
+            go.Scatter(
+                x=rounded([1000.0 * float(np.median(list(errors_m.values())))]),
+                y=[line],
+                mode="markers",
+                marker={
+                    "size": 20,
+                    "color": look[key]["color"],
+                    "symbol": "line-ns",
+                    "line": {"width": 3, "color": look[key]["color"]},
+                },
+                hovertemplate="median %{x:.4g} mm<extra></extra>",
+            )
+        )
+    figure = figure_of(
+        traces,
+        90 + 30 * len(lines),
+        showlegend=False,
+        xaxis=log_axis("absolute trajectory error (mm), left is better"),
+        yaxis={"categoryorder": "array", "categoryarray": lines[::-1]},
+    )
+    static_m = [board.static_camera[name] for name in names if board.static_camera[name] > 0]
+    if figure is not None and static_m:
+        static_mm = 1000.0 * float(np.median(static_m))
+        # an invisible point on the line: axes are fitted to points, not to lines
+        blank = go.Scatter(x=[static_mm], y=lines[:1], mode="markers", opacity=0, hoverinfo="skip")
+        figure.add_trace(blank)
+        label = {"text": "not moving", "xanchor": "right", "yanchor": "bottom"}
+        figure.add_vline(static_mm, **GUIDE, annotation=label)
     return figure
 
 

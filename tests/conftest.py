@@ -1,6 +1,9 @@
+import hashlib
 import os
 import subprocess
 import sys
+from importlib.metadata import version
+from pathlib import Path
 
 import pytest
 
@@ -37,12 +40,35 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile the kernels once, on two cores: several workers would each compile all of them."""
-    if getattr(session.config.option, "numprocesses", None) and not hasattr(
-        session.config, "workerinput"
-    ):
-        for codes in KERNELS:
-            for process in [subprocess.Popen([sys.executable, "-c", code]) for code in codes]:
-                process.wait()
+    is_worker = hasattr(session.config, "workerinput")
+    if is_worker or not getattr(session.config.option, "numprocesses", None):
+        return
+    # even where everything lies compiled, loading it takes 25 s of processor
+    stamp = kernels_stamp()
+    if stamp.exists():
+        return
+    for codes in KERNELS:
+        processes = [subprocess.Popen([sys.executable, "-c", code]) for code in codes]
+        exits = [process.wait() for process in processes]
+        if any(exits):
+            return  # the tests tell what is wrong
+    stamp.parent.mkdir(parents=True, exist_ok=True)
+    stamp.touch()
+
+
+def kernels_stamp() -> Path:
+    """A file in the cache of kernels: it is there when these sources, Python and numba have been compiled."""
+    from dynslam_bench.core.folders import kernels_folder
+    from dynslam_bench.core.module_graph import module_files
+
+    sources = {file: file.read_bytes() for file in map(Path, module_files().values())}
+    # kernels read the constants of modules beside them
+    folders = {file.parent for file, text in sources.items() if b"core.compiled import" in text}
+    state = hashlib.sha256(f"{sys.version} numba {version('numba')} {KERNELS}".encode())
+    for file in sorted(sources):
+        if file.parent in folders:
+            state.update(sources[file])
+    return kernels_folder() / f"tests-{state.hexdigest()[:16]}.compiled"
 
 
 @pytest.fixture

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from dynslam_bench.tuning.judgement import StudySummary, finish, read_preset_text
     from dynslam_bench.tuning.objectives import Outcome
     from dynslam_bench.tuning.page import write_page
-    from dynslam_bench.tuning.plan import Plan, Preview, distributions, search_space
+    from dynslam_bench.tuning.plan import Plan, Preview
+    from dynslam_bench.tuning.space import distributions, search_space
     from dynslam_bench.tuning.study import Evaluation, Study, StudyEvent, run_study
     from dynslam_bench.tuning.study_file import (
         ProblemInstance,
@@ -35,13 +36,13 @@ _HOMES = {
     "StudySpec": "study_file",
     "StudySummary": "judgement",
     "Verdict": "judgement",
-    "distributions": "plan",
+    "distributions": "space",
     "finish": "judgement",
     "parse_instances": "study_file",
     "read_preset_text": "judgement",
     "read_study": "study_file",
     "run_study": "study",
-    "search_space": "plan",
+    "search_space": "space",
     "write_page": "page",
 }
 

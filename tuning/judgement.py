@@ -6,9 +6,10 @@ import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
-from optuna.trial import TrialState
+from optuna.trial import FrozenTrial, TrialState
 from pydantic import Field
 
 from dynslam_bench.core import StudyError, read_text, write_atomic
@@ -20,6 +21,7 @@ from dynslam_bench.evaluation.verdicts import (
     PairedRatio,
     Verdict,
     findings,
+    paired_ratio,
     scenes_to_settle,
     verdict_of,
 )
@@ -27,17 +29,22 @@ from dynslam_bench.sequences.families import family_of
 from dynslam_bench.tuning.objectives import (
     ACCURACY,
     SPEED,
-    Configuration,
     InstanceFailedError,
     Outcomes,
     combined_objective,
     compare,
     hold_last_pose_protocol,
     improvement_bound,
-    violations,
 )
-from dynslam_bench.tuning.plan import held_settings, seen_note, splits_seen
+from dynslam_bench.tuning.plan import (
+    Design,
+    held_settings,
+    known_settings,
+    seen_note,
+    splits_seen,
+)
 from dynslam_bench.tuning.storage import (
+    EARLIER,
     Importance,
     best_trials,
     count_states,
@@ -45,7 +52,7 @@ from dynslam_bench.tuning.storage import (
     scene_ratios,
 )
 from dynslam_bench.tuning.study import SUMMARY_FILE, StoredStudy, Study
-from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec, scenes
+from dynslam_bench.tuning.study_file import TRACKER, ProblemInstance, StudySpec, scenes
 
 NOT_JUDGED = "not judged"
 """Status of settings that no scenes have judged."""
@@ -65,13 +72,15 @@ class Candidate(Record):
         confirm: Beside the baseline on the instances of the choice; where nothing is held out they
             judge.
         held_out: On the held-out instances; None without any, or if it is not the best.
-        recorded: ATE on recordings; None without any, or if it is not the best.
+        recorded: ATE on recordings, which is said and decides nothing; None without any, or if it is not the best.
+        beyond: By the means of the judging families that no trial saw; None for fewer than `FEWEST` of them.
         on_confirm: ATE and processor time on the instances of the choice, by objective.
         on_held_out: The same on the held-out instances.
         ate_margin: What it may lose of accuracy, as a share; None where its own ratio is one of
             errors.
         feasible: Whether the constraints hold in the new runs.
         failed: Why it could not be run again; empty if it could.
+        crashes: Why some of its runs and of the baseline's crashed on the scenes that judge; they are lost.
         scene_s: Seconds of runs that a judging scene took, the baseline's included.
     """
 
@@ -82,11 +91,13 @@ class Candidate(Record):
     confirm: PairedRatio | None = None
     held_out: PairedRatio | None = None
     recorded: PairedRatio | None = None
+    beyond: PairedRatio | None = None
     on_confirm: dict[str, PairedRatio] = Field(default_factory=dict)
     on_held_out: dict[str, PairedRatio] = Field(default_factory=dict)
     ate_margin: float | None = None
     feasible: bool = True
     failed: str = ""
+    crashes: list[str] = Field(default_factory=list)
     scene_s: float = 0.0
 
     @property
@@ -126,7 +137,7 @@ class StudySummary(Record):
         tune: The instances that trials ran on.
         confirm: Those of the choice; where nothing is held out they judged it.
         held_out: Those that judged it.
-        recorded: Recordings that it was checked on.
+        recorded: Recordings that the best one was run on at the end.
         seen: Splits with scenes that the network behind the masks was trained on, see
             `plan.seen_note`.
     """
@@ -164,6 +175,13 @@ class StudySummary(Record):
         """Whether the best trial's settings are a result to use."""
         return self.verdict is Verdict.PROVEN and not self.keeps_default
 
+    @property
+    def offered(self) -> dict[str, Any]:
+        """The settings that `best.toml` sets: the best trial's, or none where the verdict offers none."""
+        if self.best is None or self.verdict not in OFFERED or self.keeps_default:
+            return {}
+        return self.best.params
+
 
 def _is_as_good(default: PairedRatio | None, best: PairedRatio | None) -> bool:
     """Whether the default settings have no larger typical ratio than the best trial, and lose no more."""
@@ -194,6 +212,9 @@ def judge(best: Candidate | None) -> tuple[Verdict, list[str]]:
         return Verdict.CANNOT_TELL, [no_frames]
     verdict = verdict_of(evidence)
     sentences = findings(evidence, name)
+    if best.crashes:
+        count = f"{len(best.crashes)} run{'s' * (len(best.crashes) != 1)}"
+        sentences.append(f"{count} crashed and counts as lost, the first one as {best.crashes[0]}")
     if not best.feasible:
         if verdict in OFFERED:
             verdict = Verdict.CANNOT_TELL
@@ -206,8 +227,8 @@ def judge(best: Candidate | None) -> tuple[Verdict, list[str]]:
         )
         is_worse = accuracy is None or verdict_of(accuracy) is Verdict.WORSE
         verdict = Verdict.CANNOT_TELL if is_worse else Verdict.PROMISING
-    if best.recorded is not None and best.recorded.losses:
-        sentences += findings(best.recorded, f"{name} on recordings")[1:]
+    if best.recorded is not None:
+        sentences += findings(best.recorded, f"{name} on recordings")
     return verdict, sentences
 
 
@@ -219,6 +240,7 @@ def conclude(
     shipped: PairedRatio | None = None,
     failures: Sequence[str] = (),
     families: str = "",
+    inert: int = 0,
 ) -> tuple[Verdict, str]:
     """The verdict of a study and its conclusion: a few short sentences.
 
@@ -227,15 +249,28 @@ def conclude(
         candidates: The best one first.
         trials: Log ratio by scene of each trial beside the baseline's.
         shipped: The default settings on the judging scenes, where the baseline is something else.
-        failures: Why trials failed, said where no trial did better.
+        failures: Why trials failed.
         families: A sentence on the families that judged; empty for none.
+        inert: See `without_effect`.
     """
+    if inert:
+        return Verdict.NO_DIFFERENCE, (
+            f"{Verdict.NO_DIFFERENCE.value.capitalize()}: nothing that the study set has an effect. All {inert} trials "
+            "with other settings have the baseline's trajectories to the last bit. "
+            f"Does {spec.tracker} read its settings?"
+        )
     best = candidates[0] if candidates else None
     verdict, sentences = judge(best)
-    if best is None and failures:
-        sentences.append(f"{len(failures)} failed, the first one as {failures[0]}")
+    if failures:
+        sentences.append(f"{len(failures)} trials failed, the first one as {failures[0]}")
     if families and best is not None and best.evidence is not None:
         sentences.append(families)
+        if best.beyond is not None:
+            beyond = verdict_of(best.beyond).value
+            number = best.beyond.all_scenes
+            sentences.append(
+                f"Beyond them, by the means of the {number} families that no trial saw: {beyond}, {best.beyond}"
+            )
 
     # where nothing is claimed: what the trials exclude, and what would settle it
     if verdict not in (Verdict.PROVEN, Verdict.BUT_LOST) and (bound := improvement_bound(trials)):
@@ -288,16 +323,66 @@ def _settling(spec: StudySpec, best: Candidate) -> list[str]:
     ]
 
 
-def families_sentence(design: Any) -> str:
+def families_sentence(design: Design) -> str:
     """On which families a study judges, and whether its trials saw other scenes of them."""
     judging = _families(design.judging)
-    tuned = _families([*design.tune, *(design.confirm if design.held_out else ())])
+    tuned = _tuned_families(design)
     names = f"{len(judging)} famil{'y' if len(judging) == 1 else 'ies'} ({', '.join(judging[:8])})"
     if set(judging) <= set(tuned):
         return f"It was judged on {names}, of which trials saw other scenes, and says nothing of others"
-    if set(judging).isdisjoint(tuned):
-        return f"It was judged on {names} that no trial saw, and says nothing of others"
-    return f"It was judged on {names}, of some of which trials saw other scenes"
+    # with enough families that no trial saw their means speak of others
+    unseen = len(set(judging) - set(tuned))
+    nothing = "" if unseen >= FEWEST else ", and says nothing of others"
+    if unseen == len(judging):
+        return f"It was judged on {names} that no trial saw{nothing}"
+    return f"It was judged on {names}, of some of which trials saw other scenes{nothing}"
+
+
+def beyond_families(
+    comparison: PairedRatio, ratios: Mapping[str, float], design: Design
+) -> PairedRatio | None:
+    """What the judging families that no trial saw say of others: each counts once, by the mean of its scenes.
+
+    Scenes that a side lost take no part in the means; a family of which one side alone lost half of the scenes or
+    more is lost by it.
+
+    Args:
+        comparison: Over scenes.
+        ratios: Log ratio by scene.
+        design: Of the study.
+
+    Returns:
+        None for fewer than `FEWEST` such families.
+    """
+    # the scenes of each family that no trial saw
+    tuned = _tuned_families(design)
+    members: dict[str, list[str]] = {}
+    for scene, instances in scenes(design.judging).items():
+        family = family_of(instances[0].sequence)
+        if family not in tuned and scene in ratios:
+            members.setdefault(family, []).append(scene)
+    if len(members) < FEWEST:
+        return None
+
+    # its mean where both succeed, and whether a side lost it
+    by_candidate = {*comparison.lost, *comparison.lost_both}
+    by_baseline = {*comparison.lost_baseline, *comparison.lost_both}
+    means = {}
+    lost = []
+    lost_by_baseline = []
+    for family, names in members.items():
+        # ratios of the scenes that both have tracked
+        of_both = [ratios[name] for name in names if name not in by_candidate | by_baseline]
+        means[family] = fmean(of_both) if of_both else 0.0
+        lost += [family] * (2 * len(by_candidate.intersection(names)) >= len(names))
+        lost_by_baseline += [family] * (2 * len(by_baseline.intersection(names)) >= len(names))
+    return paired_ratio(
+        means, lost, lost_by_baseline, one_sided=comparison.one_sided, what=comparison.what
+    )
+
+
+def _tuned_families(design: Design) -> list[str]:
+    return _families([*design.tune, *(design.confirm if design.held_out else ())])
 
 
 def _families(instances: Sequence[ProblemInstance]) -> list[str]:
@@ -308,7 +393,11 @@ def _families(instances: Sequence[ProblemInstance]) -> list[str]:
 
 
 def finish(
-    tuner: Study, on_note: Callable[[str], None] | None = None, *, jobs: int = 1
+    tuner: Study,
+    on_note: Callable[[str], None] | None = None,
+    *,
+    jobs: int = 1,
+    trial: int | None = None,
 ) -> StudySummary:
     """Judge the best trial on scenes that it was not chosen on; write preset and summary.
 
@@ -321,6 +410,7 @@ def finish(
         tuner: A study with finished trials.
         on_note: Called with a line on every step.
         jobs: Runs at a time.
+        trial: The number of a trial to be judged in place of the best, e.g. one of the front.
 
     Returns:
         The summary; `best.toml` and `summary.json` lie in the study's folder.
@@ -333,10 +423,11 @@ def finish(
     note = on_note or (lambda _: None)
     shipped = dict[str, PairedRatio]()
 
-    # candidates, ranked
-    candidates = _best_trials(tuner)
+    # candidates, ranked; there is nothing to choose or judge where no setting changes anything
+    candidates = _best_trials(tuner) if trial is None else [_named_trial(tuner, trial)]
+    inert = without_effect(tuner)
     chooses = bool(design.confirm and design.held_out)
-    if candidates and chooses:
+    if candidates and chooses and not inert:
         note(
             f"the baseline and {len(candidates)} trials on {len(design.confirm)} instances to choose on"
         )
@@ -347,7 +438,7 @@ def finish(
 
     # the best one is judged, once on the same scenes
     _check_same_look(tuner, candidates)
-    if candidates and design.judging and not candidates[0].failed:
+    if candidates and design.judging and not candidates[0].failed and not inert:
         split = "held_out" if design.held_out else "confirm"
         note(f"trial {candidates[0].trial} on {len(design.judging)} instances that judge it")
         candidates[:1] = _run_again(tuner, split, candidates[:1], jobs, shipped)
@@ -364,6 +455,7 @@ def finish(
         shipped=shipped.get("held_out" if design.held_out else "confirm"),
         failures=[trial.user_attrs.get("reason", "") for trial in failed],
         families=families_sentence(design) if design.judging else "",
+        inert=inert,
     )
     summary = StudySummary(
         name=spec.name,
@@ -401,18 +493,73 @@ def _best_trials(tuner: Study) -> list[Candidate]:
         )
     # beside another tracker trial 0, the default settings, is a candidate too
     is_rival = tuner.baseline.tracker != spec.tracker
-    margin = spec.ate_margin if spec.at_equal_accuracy else None
-    candidates = [
-        Candidate(
-            trial=trial.number,
-            params=trial.params,
-            values=list(trial.values or ()),
-            ate_margin=margin,
-        )
-        for trial in finished
-        if trial.number > 0 or is_rival
-    ]
+    candidates = [_candidate(tuner, trial) for trial in finished if trial.number > 0 or is_rival]
     return candidates[: spec.top]
+
+
+def without_effect(tuner: Study) -> int:
+    """How many trials had other settings than trial 0, where all of them gave its trajectories to the last bit.
+
+    Such settings change nothing: a program may ignore them. 0 where a trial gave another trajectory,
+    or there is none to compare.
+    """
+    finished = tuner.study.get_trials(
+        deepcopy=False, states=(TrialState.COMPLETE, TrialState.PRUNED)
+    )
+    first = next((trial for trial in finished if trial.number == 0), None)
+    if first is None:
+        return 0
+    baseline = _runs_of(first)
+    compared = 0
+    for trial in finished:
+        if trial.params == first.params:
+            continue
+        runs = {name: run for name, run in _runs_of(trial).items() if name in baseline}
+        for name, run in runs.items():
+            if _tracks(tuner, run) != _tracks(tuner, baseline[name]):
+                return 0
+        compared += bool(runs)
+    return compared
+
+
+def _runs_of(trial: FrozenTrial) -> dict[str, str]:
+    """The id of a trial's run on each instance."""
+    return {str(row[0]): str(row[1]) for row in trial.user_attrs.get("instances", ())}
+
+
+def _tracks(tuner: Study, run: str) -> list[bytes]:
+    """The files of a run's trajectories."""
+    folder = tuner.store.folder(run)
+    return [file.read_bytes() for file in sorted(folder.glob("trajectory_*.txt"))]
+
+
+def _named_trial(tuner: Study, number: int) -> Candidate:
+    """The candidate that a user has chosen.
+
+    Raises:
+        StudyError: There is no complete trial of that number, or it has the baseline's settings.
+    """
+    complete = {
+        trial.number: trial for trial in tuner.study.get_trials(states=(TrialState.COMPLETE,))
+    }
+    if number not in complete or EARLIER in complete[number].user_attrs:
+        raise StudyError(
+            f"study '{tuner.spec.name}' has no complete trial {number}", "see tune status"
+        )
+    if number == 0 and tuner.baseline.tracker == tuner.spec.tracker:
+        raise StudyError("trial 0 has the baseline's settings", "choose another one")
+    return _candidate(tuner, complete[number])
+
+
+def _candidate(tuner: Study, trial: FrozenTrial) -> Candidate:
+    """A trial as a candidate that nothing has judged yet."""
+    spec = tuner.spec
+    return Candidate(
+        trial=trial.number,
+        params=trial.params,
+        values=list(trial.values or ()),
+        ate_margin=spec.ate_margin if spec.at_equal_accuracy else None,
+    )
 
 
 def _check_same_look(tuner: Study, candidates: Sequence[Candidate]) -> None:
@@ -459,10 +606,7 @@ def _run_again(
     level = (
         tuner.spec.level(len(scenes(tuner.design.judging))) if split != "recorded" else ONE_SIDED
     )
-    tuned = [
-        Configuration(tuner.spec.tracker, {**tuner.held, **candidate.params})
-        for candidate in candidates
-    ]
+    tuned = [tuner.configuration(candidate.params) for candidate in candidates]
     default = [] if tuner.shipped is None else [tuner.shipped]
     baseline, runs = tuner.evaluate_beside([*tuned, *default], instances, jobs=jobs)
     if default and not isinstance(outcomes := runs.pop(), InstanceFailedError):
@@ -494,11 +638,16 @@ def _judged_on(
         single.name: compare(outcomes, baseline, objective=single, one_sided=level)
         for single in (ACCURACY, SPEED)
     }
-    violated = violations(tuner.spec, outcomes)
+    violated = tuner.violations(outcomes)
     update["feasible"] = candidate.feasible and max(violated.values(), default=0.0) <= 0.0
+    if tuner.design.judging == getattr(tuner.design, split):
+        ratios = objective.ratios(outcomes, baseline)
+        update["beyond"] = beyond_families(update[split], ratios, tuner.design)
     if split == "confirm":
         update["choice"] = objective.value(outcomes, baseline)
-    wall_s = sum(run.wall_s for run in (*outcomes.values(), *baseline.values()))
+    both = (*outcomes.values(), *baseline.values())
+    update["crashes"] = [run.crash for run in both if run.crash]
+    wall_s = sum(run.wall_s for run in both)
     update["scene_s"] = wall_s / len(scenes(outcomes))
     return candidate.model_copy(update=update)
 
@@ -506,15 +655,14 @@ def _judged_on(
 def _write(tuner: Study, summary: StudySummary) -> None:
     """Write `best.toml` and `summary.json` into the study's folder."""
     params = summary.best.params if summary.best else {}
-    offered = summary.verdict in OFFERED and not summary.keeps_default
     preset = preset_text(
         tuner.spec,
-        params if offered else {},
+        summary.offered,
         " ".join(filter(None, (summary.conclusion, seen_note(summary.seen)))),
         status=summary.verdict.value,
         tuned_on=[*summary.tune, *(summary.confirm if summary.held_out else [])],
         judged_on=[*(summary.held_out or summary.confirm), *summary.recorded],
-        not_offered={} if offered else params,
+        not_offered={} if summary.offered else params,
     )
     write_atomic(tuner.folder / "best.toml", preset)
     write_atomic(tuner.folder / SUMMARY_FILE, summary.to_json())
@@ -592,8 +740,12 @@ def preset_text(
     settings = {
         name: value for name, value in {**held_settings(spec), **tuned}.items() if name not in fixed
     }
+    # of a study with a choice of trackers: the settings that the chosen one has
+    tracker = str(settings.pop(TRACKER, spec.tracker))
+    if TRACKER in tuned:
+        settings = known_settings(tracker, settings)
     head = [
-        f"# settings of {spec.tracker}",
+        f"# settings of {tracker}",
         *comments,
         "",
         f"status = {json.dumps(status)}",

@@ -7,24 +7,27 @@ own. Below them configurations are compared over scenes; what that shows is said
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from statistics import fmean
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from dynslam_bench.contracts import Trajectory
 from dynslam_bench.core import StudyError, did_you_mean
-from dynslam_bench.evaluation import Protocol, get_protocol
+from dynslam_bench.evaluation import Evaluation, Protocol, evaluate, get_protocol
 from dynslam_bench.evaluation.verdicts import (
+    CATASTROPHE,
     FEWEST,
+    FLOOR_M,
     ONE_SIDED,
     PairedRatio,
     hodges_lehmann,
     paired_ratio,
 )
 from dynslam_bench.reports.model.row import grouped
-from dynslam_bench.runs import RunRecord, RunStore, score
+from dynslam_bench.runs import RunRecord, RunStore, load_frames, score
 from dynslam_bench.tuning.study_file import ProblemInstance, StudySpec, scenes
 
 
@@ -44,6 +47,13 @@ class Outcome:
         rtf: Real-time factor: duration of the instance's frames over the time they took.
         lost: Whether the run lost track, as its status says, or tracked nothing.
         wall_s: Seconds of the whole run.
+        crash: Why the run did not come to its end; empty if it did.
+        rpe_m: Relative error in metres: translation RMSE over the first delta of the protocol, one
+            second under ``tum-rgbd/v1``; NaN where the protocol has none, or the part is shorter.
+        final_ate_m: `ate_m` of the final trajectory; of the online one where there is no other.
+        network_calls: Frames on which the segmenter ran, as a share; 0 without masks.
+        memory_mb: Largest resident memory; NaN where it is not known.
+        stages: Mean seconds a frame of each stage, by name, e.g. ``tracking``.
     """
 
     instance: ProblemInstance
@@ -55,6 +65,12 @@ class Outcome:
     rtf: float
     lost: bool = False
     wall_s: float = 0.0
+    crash: str = ""
+    rpe_m: float = math.nan
+    final_ate_m: float = math.nan
+    network_calls: float = 0.0
+    memory_mb: float = math.nan
+    stages: Mapping[str, float] = field(default_factory=dict)
 
 
 class Configuration(NamedTuple):
@@ -94,12 +110,17 @@ def outcome(
     if record.failed:
         raise InstanceFailedError(f"{instance}: {record.status}: {record.reason}")
 
-    # error, that of a static camera where nothing was tracked
-    evaluation = score(store, record, protocol).online
+    # errors, those of a static camera where nothing was tracked
+    metrics = score(store, record, protocol)
+    evaluation = metrics.online
     if evaluation is None:
         ate_m = static_camera_m(instance, data_root)
+        rpe_m = static_camera_rpe_m(instance, protocol, data_root)
     else:
         ate_m = float(evaluation.metrics["ate_rmse_m"])
+        rpe_m = _relative_error(evaluation, protocol)
+    final = metrics.final or evaluation
+    final_ate_m = ate_m if final is None else float(final.metrics["ate_rmse_m"])
 
     # time: this process's processor seconds tell nothing of work that is done elsewhere
     total = record.timings["total"]
@@ -116,7 +137,51 @@ def outcome(
         rtf=period_s / total.mean_s,
         lost=record.status == "lost" or evaluation is None,
         wall_s=record.wall_s or 0.0,
+        rpe_m=rpe_m,
+        final_ate_m=final_ate_m,
+        network_calls=_network_calls(store, record),
+        memory_mb=math.nan if record.peak_memory_mb is None else record.peak_memory_mb,
+        stages={stage: time.mean_s for stage, time in record.timings.items()},
     )
+
+
+_NEVER_S = 1e6
+"""Frame time of a run that crashed: more than any other."""
+
+
+def crashed(instance: ProblemInstance, reason: str, data_root: str | None) -> Outcome:
+    """The outcome of a run that crashed where scenes judge: lost, and slower than any, with a static camera's error."""
+    static_m = static_camera_m(instance, data_root)
+    return Outcome(
+        instance=instance,
+        run_id="",
+        ate_m=static_m,
+        coverage=0.0,
+        frame_s=_NEVER_S,
+        processor_s=_NEVER_S,
+        rtf=0.0,
+        lost=True,
+        crash=reason,
+        final_ate_m=static_m,
+        network_calls=1.0,
+    )
+
+
+def _relative_error(evaluation: Evaluation, protocol: Protocol) -> float:
+    """Translation RMSE in metres over the first delta of a protocol; NaN where it has none."""
+    if not protocol.rpe:
+        return math.nan
+    return float(evaluation.metrics.get(protocol.rpe[0].metric("trans"), math.nan))
+
+
+def _network_calls(store: RunStore, record: RunRecord) -> float:
+    """Share of the frames on which a run's segmenter ran; 0 for a run without masks."""
+    if not record.segmentation:
+        return 0.0
+    frames = load_frames(record, store)
+    if "stat_segmented" not in frames:
+        return 0.0
+    return float(frames["stat_segmented"].fillna(0.0).mean())
 
 
 def hold_last_pose_protocol(protocol: Protocol | str) -> Protocol:
@@ -138,6 +203,18 @@ def static_camera_m(instance: ProblemInstance, data_root: str | None) -> float:
     return float(np.sqrt(np.square(positions - positions.mean(axis=0)).sum(axis=1).mean()))
 
 
+@lru_cache(maxsize=256)
+def static_camera_rpe_m(
+    instance: ProblemInstance, protocol: Protocol, data_root: str | None
+) -> float:
+    """Relative error in metres of a static camera on an instance; NaN where the protocol has none."""
+    sequence: Any = instance.open(data_root)
+    stamps = sequence.timestamps
+    still = Trajectory(stamps, np.repeat(np.eye(4)[None], len(stamps), axis=0))
+    evaluation = evaluate(still, sequence.ground_truth, protocol, input_timestamps=stamps)
+    return _relative_error(evaluation, protocol)
+
+
 Outcomes = Mapping[ProblemInstance, Outcome]
 Cost = Callable[[Outcome], float]
 """Positive number of a run, less is better."""
@@ -147,6 +224,14 @@ _MANY = 1e9
 """Factor of a user's costs, which lifts them above `FLOOR_M`; it cancels out of ratios."""
 _LOST_FLOOR = 0.01
 """So many lost frames are added on both sides, as a share, so that a baseline without any can be compared with."""
+_CALLS_FLOOR = 0.01
+"""The same for the frames on which a network ran."""
+STAGE = "time:"
+"""Begins the name of an objective or a limit on a stage's time, e.g. ``time:tracking``."""
+
+
+_LOSS = math.log(CATASTROPHE)
+"""Log ratio of a scene that one side alone lost, at least."""
 
 
 @dataclass(frozen=True)
@@ -168,17 +253,38 @@ class Objective:
     degraded: bool = False
 
     def by_start(self, outcomes: Outcomes, baseline: Outcomes) -> list[float]:
-        """Natural logarithm of the ratio on each instance that counts and that both ran."""
+        """Natural logarithm of the ratio on each instance that counts and that both ran; losses as in `ratios`."""
         reference = self._costs(baseline)
         return [
-            math.log(max(cost, FLOOR_M) / max(reference[instance], FLOOR_M))
+            self._with_loss(
+                math.log(max(cost, FLOOR_M)) - math.log(max(reference[instance], FLOOR_M)),
+                outcomes[instance].lost,
+                baseline[instance].lost,
+            )
             for instance, cost in self._costs(outcomes).items()
             if instance in reference
         ]
 
     def ratios(self, outcomes: Outcomes, baseline: Outcomes) -> dict[str, float]:
-        """Natural logarithm of the ratio to the baseline by scene; empty without any instance that counts."""
-        return by_scene(self._costs(outcomes), self._costs(baseline))
+        """Natural logarithm of the ratio to the baseline by scene; empty without any instance that counts.
+
+        In a scene that one side alone lost that side has `CATASTROPHE` times the other's cost at least, so that
+        losing never pays: a run that gives up is fast, and before a fixed camera it has no error.
+        """
+        lost = lost_scenes(outcomes)
+        lost_by_baseline = lost_scenes(baseline)
+        ratios = by_scene(self._costs(outcomes), self._costs(baseline))
+        return {
+            scene: self._with_loss(ratio, scene in lost, scene in lost_by_baseline)
+            for scene, ratio in ratios.items()
+        }
+
+    def _with_loss(self, log_ratio: float, lost: bool, lost_by_baseline: bool) -> float:
+        """A log ratio, or what it is at least where one side alone lost."""
+        # lost frames may be the cost themselves
+        if self.name == "coverage" or lost == lost_by_baseline:
+            return log_ratio
+        return max(log_ratio, _LOSS) if lost else min(log_ratio, -_LOSS)
 
     def _costs(self, outcomes: Outcomes) -> dict[ProblemInstance, float]:
         """The cost on each instance that counts."""
@@ -225,9 +331,43 @@ OBJECTIVES = {
         ),
         Objective("robustness", "ATE on degraded instances", lambda run: run.ate_m, degraded=True),
         Objective("coverage", "share of lost frames", lambda run: 1 - run.coverage + _LOST_FLOOR),
+        Objective("relative", "relative error", lambda run: _given(run, "rpe_m", run.rpe_m)),
+        Objective("final", "final ATE", lambda run: run.final_ate_m),
+        Objective("network_calls", "network calls", lambda run: run.network_calls + _CALLS_FLOOR),
+        Objective("memory", "memory", lambda run: _given(run, "memory_mb", run.memory_mb)),
     )
 }
 """Objectives by name."""
+
+
+def _given(run: Outcome, name: str, value: float) -> float:
+    """The value of an outcome's field.
+
+    Raises:
+        StudyError: The run has none.
+    """
+    if math.isfinite(value):
+        return value
+    cures = {
+        "rpe_m": "take a protocol with a relative error, and instances longer than its delta (one second "
+        "under tum-rgbd/v1)",
+        "memory_mb": "leave the objective out",
+    }
+    raise StudyError(f"'{run.instance}' has no {name}", cures[name])
+
+
+def stage_time(run: Outcome, stage: str) -> float:
+    """Mean milliseconds a frame of a stage.
+
+    Raises:
+        StudyError: The run has no such stage.
+    """
+    if stage not in run.stages:
+        raise StudyError(
+            f"'{run.instance}' has no stage '{stage}'", did_you_mean(stage, list(run.stages))
+        )
+    return 1000 * run.stages[stage]
+
 
 # Two that are needed whatever a study's own objectives are.
 ACCURACY = OBJECTIVES["accuracy"]
@@ -253,6 +393,9 @@ def find_objective(name: str) -> Objective:
     Raises:
         StudyError: There is none of that name.
     """
+    if name.startswith(STAGE):
+        stage = name.removeprefix(STAGE)
+        return Objective(name, f"time of {stage}", lambda run: stage_time(run, stage))
     if name not in OBJECTIVES:
         raise StudyError(f"unknown objective '{name}'", did_you_mean(name, list(OBJECTIVES)))
     return OBJECTIVES[name]
@@ -293,12 +436,41 @@ def coverage(outcomes: Outcomes) -> float:
 
 
 def fps(outcomes: Outcomes) -> float:
-    """Frames a second: the inverse of the mean frame time."""
-    return 1.0 / float(np.mean([outcome.frame_s for outcome in outcomes.values()]))
+    """Frames a second: the inverse of the mean frame time of the runs that came to their end; 0 without any."""
+    frame_s = [outcome.frame_s for outcome in outcomes.values() if not outcome.crash]
+    return 1.0 / float(np.mean(frame_s)) if frame_s else 0.0
+
+
+_QUANTITIES = (
+    "ate_m",
+    "rpe_m",
+    "final_ate_m",
+    "frame_s",
+    "processor_s",
+    "network_calls",
+    "memory_mb",
+)
+"""Fields of an outcome that a study may limit."""
+
+
+def quantity(name: str) -> Cost:
+    """What a study limits, as a function of an outcome: a field, or ``time:STAGE`` in milliseconds.
+
+    Raises:
+        StudyError: There is none of that name.
+    """
+    if name.startswith(STAGE):
+        return lambda run: stage_time(run, name.removeprefix(STAGE))
+    if name not in _QUANTITIES:
+        raise StudyError(f"unknown limit '{name}'", did_you_mean(name, [*_QUANTITIES, STAGE]))
+    return lambda run: float(getattr(run, name))
 
 
 def violations(
-    spec: StudySpec, outcomes: Outcomes, baseline: Outcomes | None = None
+    spec: StudySpec,
+    outcomes: Outcomes,
+    baseline: Outcomes | None = None,
+    constraints: Mapping[str, Callable[[Outcome], float]] | None = None,
 ) -> dict[str, float]:
     """How far each constraint is violated, relatively; <= 0 is fulfilled.
 
@@ -308,12 +480,23 @@ def violations(
             objectives holds the error itself.
         outcomes: Of a configuration.
         baseline: Outcomes of the baseline at the same places, for that ratio; None to leave it out.
+        constraints: A user's own by name: the mean of each over the instances has to be <= 0.
     """
     values = {}
     if spec.min_coverage is not None:
         values["coverage"] = spec.min_coverage - coverage(outcomes)
     if spec.min_fps is not None:
         values["fps"] = (spec.min_fps - fps(outcomes)) / spec.min_fps
+    for name, most in spec.limits.items():
+        mean = fmean(quantity(name)(run) for run in outcomes.values())
+        # what is not known fulfils no limit
+        values[name] = mean / most - 1 if math.isfinite(mean) else math.inf
+    for name, constraint in (constraints or {}).items():
+        values[name] = fmean(float(constraint(run)) for run in outcomes.values())
+        if math.isnan(values[name]):
+            raise StudyError(
+                f"constraint '{name}' gives no number", "return one that is <= 0 where it holds"
+            )
     if baseline is not None and spec.at_equal_accuracy and len(spec.objectives) == 1:
         values["ate"] = ACCURACY.value(outcomes, baseline) - math.log1p(spec.ate_margin)
     return values
@@ -321,8 +504,6 @@ def violations(
 
 # Comparing a configuration with the baseline: paired by place, one value a scene.
 
-FLOOR_M = 1e-4
-"""Errors below a tenth of a millimetre count as that: a ratio of two perfect runs tells nothing."""
 Errors = Mapping[ProblemInstance, float]
 """ATE in metres on each instance, lost frames held."""
 

@@ -26,9 +26,9 @@ from dynslam_bench.reports.tables.table import (
     number,
     numbers,
 )
-from dynslam_bench.tuning.judgement import Candidate, StudySummary
+from dynslam_bench.tuning.judgement import Candidate, StudySummary, preset_text
 from dynslam_bench.tuning.plan import FEWEST_STARTS, Design, seen_note
-from dynslam_bench.tuning.storage import EARLIER, FEWEST_TRIALS, is_feasible, quiet
+from dynslam_bench.tuning.storage import EARLIER, FEWEST_TRIALS, front_trials, is_feasible, quiet
 from dynslam_bench.tuning.study import Study
 from dynslam_bench.tuning.study_file import scenes
 
@@ -86,8 +86,12 @@ def write_page(tuner: Study, summary: StudySummary) -> Path:
         Section("trials", "All trials", [], [Block("All trials", trials, folded=True)]),
     ]
 
+    if len(tuner.objectives) > 1:
+        sections.insert(1, _front(tuner))
     command = command_line(tuner.study.user_attrs.get("command", []))
-    made_with = f"Sampler {spec.sampler}, pruner {spec.pruner}, Optuna {optuna.__version__}."
+    made_with = (
+        f"Sampler {tuner.sampler_name}, pruner {tuner.pruner_name}, Optuna {optuna.__version__}."
+    )
     html = sections_page(
         sections,
         title=f"Study {spec.name}: {spec.tracker}",
@@ -125,6 +129,8 @@ def _asked(tuner: Study, summary: StudySummary) -> str:
     constraints = [
         f"{name} of {least:g} or more" for name, least in limits.items() if least is not None
     ]
+    constraints += [f"{name} of {most:g} or less" for name, most in tuner.spec.limits.items()]
+    constraints += list(tuner.constraints)
     if constraints:
         text += f" Constraints: {', '.join(constraints)}."
     return text
@@ -133,7 +139,8 @@ def _asked(tuner: Study, summary: StudySummary) -> str:
 def _plots(tuner: Study, summary: StudySummary) -> list[Block]:
     """Optuna's own plots of the study; ratios in place of logarithms."""
     important = list(summary.importances)
-    params = important or [parameter.name for parameter in tuner.space]
+    tried = {name for trial in tuner.study.get_trials(deepcopy=False) for name in trial.params}
+    params = important or [parameter.name for parameter in tuner.space if parameter.name in tried]
     blocks = []
     for title, figure in _optuna_figures(tuner, params, bool(important)).items():
         # a row of contours for each parameter
@@ -196,10 +203,50 @@ def _preset(tuner: Study, summary: StudySummary, settings: Table) -> list[Block]
     shown = Block(table=settings)
     text = read_text(tuner.folder / "best.toml")
     if summary.is_to_use:
-        command = f"dynslam-bench run {tuner.spec.tracker} SEQUENCE --settings best.toml"
+        params = summary.best.params if summary.best else {}
+        tracker = tuner.configuration(params).tracker
+        command = f"dynslam-bench run '{tracker}' SEQUENCE --settings best.toml"
         return [shown, Block(text=text), Block(title="Use them", text=command)]
     why = "the default settings are as good" if summary.keeps_default else summary.verdict.value
     return [shown, Block(title=f"best.toml, not recommended: {why}", text=text)]
+
+
+def _front(tuner: Study) -> Section:
+    """The Pareto front: where its trials lie, their settings, and how to take one of them."""
+    front = front_trials(tuner.study)
+    names = [parameter.name for parameter in tuner.space]
+    rows = []
+    for trial in front:
+        ratios = [number(math.exp(value), ".3f") for value in trial.values]
+        settings = [_value(trial.params.get(name)) for name in names]
+        rows.append([TableCell(str(trial.number), value=trial.number), *ratios, *settings])
+    headings = [f"ratio of {objective.what}" for objective in tuner.objectives]
+    table = Table(
+        "front",
+        "The front",
+        "No other trial that fulfils the constraints is better in all objectives. The ratios are those of the trials, "
+        "and optimistic: the front was selected for them.",
+        [Column("trial"), *numbers(*headings, *names)],
+        rows,
+    )
+
+    # each trial of the front as a preset to copy
+    presets = []
+    for trial in front:
+        pairs = zip(tuner.objectives, trial.values, strict=True)
+        values = ", ".join(f"{one.what} x {math.exp(value):.3f}" for one, value in pairs)
+        remark = (
+            f"Trial {trial.number} of the front, {values}; not judged on scenes that no trial saw."
+        )
+        text = preset_text(tuner.spec, trial.params, remark)
+        presets.append(Block(title=f"Trial {trial.number}: {values}", text=text, folded=True))
+    note = (
+        "Open a trial for its settings as a preset. Before a study has its verdict, dynslam-bench tune run "
+        "STUDY.toml --choose TRIAL has that trial judged on the held-out instances, in place of the best in all "
+        "objectives together."
+    )
+    write_atomic(tuner.folder / "csv" / "front.csv", csv_text(table.frame()))
+    return Section("front", "The front: choose", [note], [Block(table=table), *presets])
 
 
 def _importance_note(summary: StudySummary) -> str:

@@ -6,33 +6,26 @@ apart.
 
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from fnmatch import fnmatchcase
 from itertools import combinations, islice, product, zip_longest
 from pathlib import Path
 from typing import Any, Literal, cast
 
 import cv2
 import numpy as np
-import optuna
 import pandas as pd
 
 from dynslam_bench.contracts import Frame
 from dynslam_bench.contracts import Sequence as Frames
-from dynslam_bench.core import StudyError, did_you_mean, find_data_root, read_settings
+from dynslam_bench.core import StudyError, find_data_root, read_settings
 from dynslam_bench.core.records import Record
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.core.settings import (
-    Parameter,
-    Scalar,
     Settings,
     apply_overrides,
     field_names,
     flatten,
-    parameters,
-    why_unused,
 )
 from dynslam_bench.evaluation.verdicts import (
     FEWEST,
@@ -57,15 +50,20 @@ from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning.objectives import (
     Configuration,
     Objective,
+    Outcome,
+    Outcomes,
     find_objective,
     hold_last_pose_protocol,
     log_errors,
     outcome,
     place_of,
+    quantity,
+    violations,
 )
+from dynslam_bench.tuning.space import build_space, starting_point
 from dynslam_bench.tuning.study_file import (
+    TRACKER,
     ProblemInstance,
-    SpaceSpec,
     StudySpec,
     further_scenes,
     scenes,
@@ -73,120 +71,33 @@ from dynslam_bench.tuning.study_file import (
 )
 
 
-def search_space(
-    settings: Settings, spec: SpaceSpec, sequences: Iterable[str] = ()
-) -> list[Parameter]:
-    """The parameters of a study; what has no effect with the baseline's settings is no part of it.
-
-    Args:
-        settings: The tracker's, the baseline's and the fixed ones among them.
-        spec: Which of them are tuned.
-        sequences: What the study runs on, which decides what the source of masks ``auto`` is.
+def _trackers(spec: StudySpec) -> list[str]:
+    """The trackers to choose from, the study's own first, whose settings are trial 0.
 
     Raises:
-        StudyError: A pattern matches nothing, names a setting that has no effect, or nothing is
-            left to tune.
+        StudyError: The study's own is none of them.
     """
-    # what the patterns choose, without fixed settings
-    every = parameters(type(settings))
-    _check_patterns(spec, every, settings)
-    chosen = [
-        parameter
-        for parameter in every
-        if any(fnmatchcase(parameter.name, pattern) for pattern in spec.include)
-        and not any(fnmatchcase(parameter.name, pattern) for pattern in spec.exclude)
-        and parameter.name not in spec.fixed
-    ]
-
-    # of these, what has an effect with the baseline's settings
-    if hasattr(settings, "segmentation"):  # "auto" stands for a source
-        source = source_of_masks(settings, list(sequences))
-        settings = apply_overrides(settings, {"segmentation.source": source})
-    reasons = {parameter.name: why_unused(settings, parameter.name) for parameter in chosen}
-    unused = {name: why for name, why in reasons.items() if why}
-    chosen = [parameter for parameter in chosen if parameter.name not in unused]
-    if not chosen:
+    choices = [str(name) for name in spec.space.choices.get(TRACKER, (spec.tracker,))]
+    if spec.tracker not in choices:
         raise StudyError(
-            "the space is empty: all that matches is excluded, fixed, or switched off by a fixed value"
+            f"the trackers to choose from lack '{spec.tracker}', with which trial 0 runs",
+            f'add it to space.choices.tracker, or say tracker = "{choices[0]}"',
         )
-    for name in spec.include:
-        if name in unused:
-            raise StudyError(
-                f"'{name}' has no effect in this study: {unused[name]}",
-                "leave it out, or fix that otherwise",
-            )
-    return chosen
+    return [spec.tracker, *(name for name in choices if name != spec.tracker)]
 
 
-def _check_patterns(spec: SpaceSpec, every: Sequence[Parameter], settings: Settings) -> None:
-    """Refuse a pattern that matches none of the tunable settings."""
-    names = [parameter.name for parameter in every]
-    for pattern in (*spec.include, *spec.exclude):
-        if any(fnmatchcase(name, pattern) for name in names):
-            continue
-        hint = did_you_mean(pattern, names)
-        if pattern in field_names(type(settings)):
-            hint = "it exists, but is not tunable"
-        raise StudyError(f"'{pattern}' matches no tunable setting", hint)
+def known_settings(tracker: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of the values that a tracker has settings for."""
+    names = set(field_names(TRACKERS.get(tracker).settings))
+    return {name: value for name, value in values.items() if name in names}
 
 
-def distributions(space: Sequence[Parameter]) -> dict[str, optuna.distributions.BaseDistribution]:
-    """A space of `search_space` as ``optuna.Study.ask`` takes it."""
-    return {parameter.name: distribution(parameter) for parameter in space}
-
-
-def distribution(parameter: Parameter) -> optuna.distributions.BaseDistribution:
-    """Optuna's distribution of a parameter."""
-    if parameter.low is None or parameter.high is None:
-        return optuna.distributions.CategoricalDistribution(parameter.choices)
-    if parameter.kind == "int":
-        low = int(parameter.low)
-        high = int(parameter.high)
-        return optuna.distributions.IntDistribution(low, high, log=parameter.scale == "log")
-    return optuna.distributions.FloatDistribution(
-        parameter.low, parameter.high, log=parameter.scale == "log"
-    )
-
-
-def starting_point(
-    preset: Mapping[str, Any], space: Sequence[Parameter], base: Mapping[str, Any]
-) -> dict[str, Scalar]:
-    """A preset as a configuration of a study; what it does not say is as the baseline has it.
-
-    Args:
-        preset: Settings by dotted name.
-        space: The study's, from `search_space`.
-        base: Values of all settings that are not tuned.
-
-    Raises:
-        StudyError: The preset sets what the study does not tune to something else, or to a value
-            out of its range.
-    """
-    # what is not tuned has the baseline's value
-    tuned = {parameter.name: parameter for parameter in space}
-    for name, value in preset.items():
-        if name not in base:
-            raise StudyError(
-                f"the preset to start from sets an unknown '{name}'", did_you_mean(name, list(base))
-            )
-        if name not in tuned and base[name] != value:
-            raise StudyError(
-                f"the preset to start from sets {name} = {value!r}, but the study holds it at {base[name]!r}",
-                f'tune it, or say "{name}" = ... under [space.fixed]',
-            )
-
-    # what is tuned has a value that the sampler could propose
-    point = {name: preset.get(name, base[name]) for name in tuned}
-    for name, value in point.items():
-        span = distribution(tuned[name])
-        fits = False
-        with suppress(ValueError):  # no number, or none of the choices
-            fits = span._contains(span.to_internal_repr(value))
-        if not fits:
-            raise StudyError(
-                f"the preset to start from sets {name} = {value!r}, out of the range that the study tunes"
-            )
-    return point
+def _with_source(settings: Settings, sequences: Iterable[str]) -> Settings:
+    """The settings with the source of masks that ``auto`` stands for on these sequences."""
+    if not hasattr(settings, "segmentation"):
+        return settings
+    source = source_of_masks(settings, list(sequences))
+    return apply_overrides(settings, {"segmentation.source": source})
 
 
 def held_settings(spec: StudySpec) -> dict[str, Any]:
@@ -285,14 +196,18 @@ class Plan:
         spec: The study.
         results: The results folder.
         objectives: In place of those that the study names, in their order.
+        constraints: Further ones by name: functions of `objectives.Outcome` whose mean over the
+            instances has to be <= 0.
 
     Attributes:
         held: See `held_settings`.
         baseline: What ratios are to.
         shipped: The tracker's default settings, where the baseline is something else.
         defaults: The settings of trial 0.
-        base: The same by dotted name.
-        space: What is tuned.
+        base: The same by dotted name, and the settings of other trackers to choose from.
+        trackers: The trackers to choose from, the study's own first.
+        search: The space.
+        space: What is tuned, as its parameters.
         design: On which instances.
 
     Raises:
@@ -305,6 +220,7 @@ class Plan:
         results: str | Path = "results",
         *,
         objectives: Sequence[Objective] | None = None,
+        constraints: Mapping[str, Callable[[Outcome], float]] | None = None,
     ) -> None:
         self.spec = spec
         self.results = Path(results)
@@ -312,27 +228,39 @@ class Plan:
         if objectives is None:
             objectives = [find_objective(name) for name in spec.objectives]
         self.objectives = list(objectives)
+        self.constraints = dict(constraints or {})
+        for name in spec.limits:
+            quantity(name)  # refuses an unknown one
 
         # the baseline: the tracker with a preset or its defaults, or another tracker, which has no
         # settings but those of the fixed ones that it knows
         fixed = spec.space.fixed
-        settings = TRACKERS.get(spec.tracker).settings
         self.held = held_settings(spec)
         self.baseline = Configuration(spec.tracker, self.held)
         if spec.baseline and not spec.baseline.endswith(".toml"):
-            names = field_names(TRACKERS.get(spec.baseline).settings)
-            shared = {name: fixed[name] for name in fixed if name in names}
-            self.baseline = Configuration(spec.baseline, shared)
-        sensors = TRACKERS.get(spec.tracker).sensors
-        hold_last_pose_protocol(spec.protocol).check_scale(spec.tracker, sensors)
+            self.baseline = Configuration(spec.baseline, known_settings(spec.baseline, fixed))
         self.shipped = Configuration(spec.tracker, fixed) if spec.baseline else None
 
+        # the trackers to choose from, the study's own first
+        self.trackers = _trackers(spec)
+        protocol = hold_last_pose_protocol(spec.protocol)
+        around: dict[str, Settings] = {}
+        for tracker in self.trackers:
+            described = TRACKERS.get(tracker)
+            protocol.check_scale(tracker, described.sensors)
+            held = self.held
+            if len(self.trackers) > 1:
+                held = known_settings(tracker, self.held)
+            around[tracker] = apply_overrides(described.settings(), held)
+
         # the space around trial 0, which has to lie in it, and the instances
-        self.defaults: Settings = apply_overrides(settings(), self.held)
-        self.base = flatten(self.defaults)
+        self.defaults = around[spec.tracker]
         sequences = {instance.sequence for instance in spec.instances(*spec.tune)}
-        self.space = search_space(self.defaults, spec.space, sequences)
-        starting_point({}, self.space, self.base)
+        shown = {tracker: _with_source(settings, sequences) for tracker, settings in around.items()}
+        self.search = build_space(spec.space, around, shown)
+        self.space = list(self.search.parameters)
+        self.base = self.search.base | flatten(self.defaults)
+        starting_point({}, self.search, what="the baseline")
         self.design = design_of(spec)
 
     def preview(self, jobs: int = 1) -> Preview:
@@ -378,6 +306,18 @@ class Plan:
         chosen = (spec.top + 1) * len(design.confirm) if design.held_out else 0
         judged = 2 * (len(design.judging) + len(design.recorded))
         return tried + chosen + judged
+
+    def violations(self, outcomes: Outcomes, baseline: Outcomes | None = None) -> dict[str, float]:
+        """How far each constraint is violated, see `objectives.violations`."""
+        return violations(self.spec, outcomes, baseline, self.constraints)
+
+    def configuration(self, params: Mapping[str, Any]) -> Configuration:
+        """What a configuration of the space runs with: its tracker, and those settings that it has."""
+        tracker = str(params.get(TRACKER, self.spec.tracker))
+        settings = {**self.held, **params}
+        if len(self.trackers) > 1:
+            settings = known_settings(tracker, settings)
+        return Configuration(tracker, settings)
 
     def run_spec(
         self, instance: ProblemInstance, configuration: Configuration, *, cache: bool | None = None
@@ -435,7 +375,7 @@ class Plan:
 
     def _unused(self, records: list[RunRecord]) -> dict[str, str]:
         """Settings of parts that dropped no feature on any frame of the baseline's runs."""
-        if not records or self.baseline.tracker != self.spec.tracker:
+        if not records or self.baseline.tracker != self.spec.tracker or len(self.trackers) > 1:
             return {}
         # the most features that each filter dropped on any frame, by the filter's name
         frames = pd.concat([load_frames(record, self.store) for record in records])
@@ -480,7 +420,7 @@ class Design:
         confirm: What the best trials and the baseline run on for the choice; shares no frame with
             `tune`. Where nothing is held out it judges, and the trials' own values choose.
         held_out: What judges the choice.
-        recorded: Recordings on which the choice must not be worse.
+        recorded: Recordings that the best trial is run on at the end; they decide nothing.
     """
 
     tune: tuple[ProblemInstance, ...]
@@ -714,6 +654,8 @@ _PAIRS = 6
 """So many pairs of frames are compared by their images."""
 _ENOUGH = 3
 """Pairs with equal images; fewer may be chance, as two paths may cross."""
+_MOST_LEFT_OUT = 20
+"""So many frames that one sequence lacks at the beginning are looked for, and more where they are left out evenly."""
 _THUMB = (32, 24)
 """Width and height in pixels to which images are reduced before they are compared."""
 _GREY_LEVELS = 1.5
@@ -725,31 +667,50 @@ _DEPTH_SHARE = 0.002
 def same_recording(one: Frames, other: Frames) -> bool:
     """Whether frames of one recording are frames of the other; False for two rendered scenes, whose digests tell.
 
-    Where the camera moves, equal stamps and equal true poses say it, whatever was done to the images. Else of a
-    few frames with equal stamps (without any, of frames spread evenly over both) the decoded images are
-    compared, reduced to `_THUMB` pixels. Other names, other image files and a smaller size leave a copy a copy,
-    and so do frames that are left out or other stamps, one of the two.
+    Where the camera moves, equal true poses say it, whatever was done to stamps and images. Else the decoded images
+    of a few frames are compared, reduced to `_THUMB` pixels: of frames with equal stamps, then of frames spread
+    over the shorter one with those of the other that may be the same. Other names, other image files and a smaller
+    size leave a copy a copy, and so do frames that are left out and other stamps.
     """
     if hasattr(one, "scene_digest") and hasattr(other, "scene_digest"):
         return False
     if same_path(one.ground_truth, other.ground_truth):
         return True
 
-    # candidates: frames of equal stamps, else all frames of both
-    stamps = (np.round(one.timestamps, 6), np.round(other.timestamps, 6))
-    _, *frames = np.intersect1d(*stamps, assume_unique=True, return_indices=True)
-    if not len(frames[0]):
-        frames = [np.arange(len(one)), np.arange(len(other))]
+    shorter, longer = sorted((one, other), key=len)
+    enough = min(_ENOUGH, len(shorter))
 
-    # pairs of them, spread evenly; a set, as short recordings give the same pair twice
-    chosen = (
-        numbers[np.linspace(0, len(numbers) - 1, _PAIRS).astype(int)].tolist() for numbers in frames
-    )
-    pairs = set(zip(*chosen, strict=True))
-    equal = sum(
-        _same_image(one[first], other[second], one.camera, other.camera) for first, second in pairs
-    )
-    return equal >= min(_ENOUGH, len(one), len(other))
+    # frames of equal stamps
+    stamps = (np.round(shorter.timestamps, 6), np.round(longer.timestamps, 6))
+    _, *frames = np.intersect1d(*stamps, assume_unique=True, return_indices=True)
+    if len(frames[0]):
+        chosen = _spread_over(len(frames[0]))
+        pairs = zip(frames[0][chosen].tolist(), frames[1][chosen].tolist(), strict=True)
+        equal = sum(_any_same_image(shorter, first, longer, [second]) for first, second in pairs)
+        if equal >= enough:
+            return True
+
+    # whatever the stamps: frames may be left out anywhere, or evenly
+    left_out = len(longer) - len(shorter)
+    equal = 0
+    for first in _spread_over(len(shorter)):
+        evenly = round(first * (len(longer) - 1) / max(len(shorter) - 1, 1))
+        near = {first + shift for shift in range(min(left_out, _MOST_LEFT_OUT) + 1)}
+        near |= {evenly - 1, evenly, evenly + 1}
+        near_frames = sorted(number for number in near if 0 <= number < len(longer))
+        equal += _any_same_image(shorter, first, longer, near_frames)
+    return equal >= enough
+
+
+def _spread_over(count: int) -> list[int]:
+    """Up to `_PAIRS` of so many numbers, spread evenly."""
+    return sorted(set(np.linspace(0, count - 1, _PAIRS).astype(int).tolist()))
+
+
+def _any_same_image(one: Frames, first: int, other: Frames, candidates: Sequence[int]) -> bool:
+    """Whether a frame of one sequence shows the same as one of the other's."""
+    frame = one[first]
+    return any(_same_image(frame, other[second], one.camera, other.camera) for second in candidates)
 
 
 def _same_image(here: Frame, there: Frame, one: Camera, other: Camera) -> bool:

@@ -86,6 +86,30 @@ def best_trials(study: optuna.Study, count: int) -> list[FrozenTrial]:
     return list(distinct.values())[:count]
 
 
+def front_trials(study: optuna.Study) -> list[FrozenTrial]:
+    """The Pareto front of a study of several objectives: feasible trials of its own that no other one beats in all.
+
+    Returns:
+        The best in the first objective first, without repeats of the same values; empty for a study
+        of one objective.
+    """
+    if len(study.directions) < 2:
+        return []
+    own = optuna.create_study(directions=study.directions)
+    with quiet():
+        own.add_trials(
+            trial
+            for trial in study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
+            if EARLIER not in trial.user_attrs and is_feasible(trial)
+        )
+    values = {tuple(trial.values) for trial in own.best_trials} if own.trials else set()
+    front: dict[tuple[float, ...], FrozenTrial] = {}
+    for trial in study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
+        if tuple(trial.values) in values and is_feasible(trial) and EARLIER not in trial.user_attrs:
+            front.setdefault(tuple(trial.values), trial)
+    return [front[key] for key in sorted(front)]
+
+
 def count_states(study: optuna.Study) -> dict[str, int]:
     """How many trials are complete, pruned, fail, running, waiting; states without a trial are left out."""
     return dict(Counter(trial.state.name.lower() for trial in study.get_trials(deepcopy=False)))

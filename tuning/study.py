@@ -47,14 +47,15 @@ from dynslam_bench.tuning.objectives import (
     Outcomes,
     combined_objective,
     coverage,
+    crashed,
     find_objective,
     fps,
     hold_last_pose_protocol,
     outcome,
     own_objective,
-    violations,
 )
-from dynslam_bench.tuning.plan import Plan, design_of, distributions, starting_point
+from dynslam_bench.tuning.plan import Plan, design_of
+from dynslam_bench.tuning.space import starting_point
 from dynslam_bench.tuning.storage import (
     EARLIER,
     NAMELESS_S,
@@ -71,6 +72,7 @@ from dynslam_bench.tuning.storage import (
     worker_name,
 )
 from dynslam_bench.tuning.study_file import (
+    TRACKER,
     ProblemInstance,
     PrunerName,
     SamplerName,
@@ -147,7 +149,11 @@ class Study(Plan):
         results: The results folder.
         objective: In place of the spec's: names of objectives, or functions from
             `objectives.Outcome` to a cost above 0, one or several.
-        sampler: Any of Optuna's, in place of the spec's.
+        sampler: Any of Optuna's or a name, in place of the spec's.
+        pruner: Any of Optuna's or a name, in place of the spec's. `WilcoxonPruner` is told the value of each
+            instance, every other one the value over all instances so far.
+        constraints: Hard constraints by name, beside the spec's: functions of `objectives.Outcome`
+            whose mean over the instances has to be <= 0.
         callbacks: Called with Optuna's study and the trial after each trial.
         **fields: Fields of `StudySpec`, in place of the spec's; `tune`, `confirm` and `held_out` take instances, too.
 
@@ -166,31 +172,58 @@ class Study(Plan):
         results: str | Path = "results",
         *,
         objective: str | Cost | Sequence[str | Cost] | None = None,
-        sampler: optuna.samplers.BaseSampler | None = None,
+        sampler: optuna.samplers.BaseSampler | SamplerName | None = None,
+        pruner: optuna.pruners.BasePruner | PrunerName | None = None,
+        constraints: Mapping[str, Callable[[Outcome], float]] | None = None,
         callbacks: Iterable[Callable[[optuna.Study, FrozenTrial], object]] = (),
         **fields: Any,
     ) -> None:
         base = read_study(spec) if isinstance(spec, Path | str) else spec
         changes = {key: _texts(value) for key, value in fields.items()}
+        # by name they are fields of the spec
+        if isinstance(sampler, str):
+            changes["sampler"] = sampler
+            sampler = None
+        if isinstance(pruner, str):
+            changes["pruner"] = pruner
+            pruner = None
         objectives = _objectives(objective)
         if objectives is not None:
             changes["objectives"] = tuple(objective.name for objective in objectives)
         if base is None or changes:
             values = {"name": "study"} if base is None else base.model_dump()
             base = validated(StudySpec, values | changes, "the study", StudyError)
-        super().__init__(base, results, objectives=objectives)
+        super().__init__(base, results, objectives=objectives, constraints=constraints)
+        self._has_own_pruner = pruner is not None
+        self._pruner = pruner or build_pruner(base.pruner)
         self._callbacks = tuple(callbacks)
         self.store.prepare()
         self.folder = study_folder(self.results, base)
         self._identity = self._identify()
+        if constraints:
+            self._identity["constraints"] = sorted(constraints)
         self._lock = threading.RLock()
         self._interrupted = threading.Event()
+        self._is_exhausted = False
         self._reference: dict[ProblemInstance, Outcome] = {}
         self.on_run: OnRun | None = None
         self.study = self._open(sampler or StreamedSampler(base), list(self._beginnings()))
         self._heartbeats = Heartbeats(self.study)
         if self.extension["scenes"]:
             self.design = design_of(base, further=self.extension["scenes"])
+
+    @property
+    def sampler_name(self) -> str:
+        """Who proposes settings: the spec's sampler, or the class of the one that was given."""
+        sampler = self.study.sampler
+        if isinstance(sampler, StreamedSampler):
+            return self.spec.sampler
+        return type(sampler).__name__
+
+    @property
+    def pruner_name(self) -> str:
+        """Who prunes trials: the spec's pruner, or the class of the one that was given."""
+        return type(self._pruner).__name__ if self._has_own_pruner else self.spec.pruner
 
     @property
     def extension(self) -> dict[str, int]:
@@ -307,7 +340,9 @@ class Study(Plan):
         ]
         if on_event is not None and missing:
             on_event(StudyEvent("reference", 0, len(missing), "the baseline"))
-        baseline, _ = self.evaluate_beside([], missing, jobs=jobs, cache=self.spec.cache)
+        baseline, _ = self.evaluate_beside(
+            [], missing, jobs=jobs, cache=self.spec.cache, crash_is_loss=False
+        )
         self._reference |= baseline
         return self._reference
 
@@ -359,58 +394,69 @@ class Study(Plan):
         *,
         jobs: int = 1,
         cache: bool = False,
+        crash_is_loss: bool = True,
     ) -> tuple[
         dict[ProblemInstance, Outcome], list[dict[ProblemInstance, Outcome] | InstanceFailedError]
     ]:
         """Run the baseline and configurations instance by instance: other load on the machine slows all of them alike.
+
+        A crash is a loss there, of whichever side: one scene of many that judge decides nothing alone.
 
         Args:
             configurations: What to run.
             instances: Where.
             jobs: Runs at a time.
             cache: Whether to use the stage cache, with which times cannot be compared.
+            crash_is_loss: Whether a baseline that crashes has lost that instance, and no more.
 
         Returns:
             The outcomes of the baseline, and for each configuration its outcomes, or the error of
-            its first failed run; it runs on no instance after it.
+            its first run where all of its runs crashed.
 
         Raises:
-            StudyError: The baseline fails; says where and why.
+            StudyError: The baseline crashes: everywhere, or at all where that is no loss; says where and why.
         """
         several = [self.baseline, *configurations]
-        results: list[dict[ProblemInstance, Outcome] | InstanceFailedError] = [{} for _ in several]
+        results: list[dict[ProblemInstance, Outcome]] = [{} for _ in several]
+        errors: list[dict[ProblemInstance, InstanceFailedError]] = [{} for _ in several]
+
+        def baseline_fails(error: InstanceFailedError) -> StudyError:
+            return StudyError(f"the baseline fails: {error.args[0]}", "a study needs one that runs")
 
         def run_one(instance: ProblemInstance, number: int) -> None:
-            result = results[number]
-            if isinstance(result, InstanceFailedError):
-                return  # after its first failed run
             tracker, settings = several[number]
             try:
-                result |= self.outcomes(settings, [instance], tracker=tracker, cache=cache)
+                results[number] |= self.outcomes(settings, [instance], tracker=tracker, cache=cache)
             except InstanceFailedError as error:
-                if number == 0:
-                    raise StudyError(
-                        f"the baseline fails: {error.args[0]}", "a study needs one that runs"
-                    ) from error
-                results[number] = error
+                if number == 0 and not crash_is_loss:
+                    raise baseline_fails(error) from error
+                errors[number][instance] = error
+                results[number][instance] = crashed(instance, str(error), self.spec.data_root)
 
         # on each instance all configurations in turn, before the next instance
         self._in_threads(jobs, run_one, product(instances, range(len(several))))
-        baseline, *others = results
-        assert isinstance(baseline, dict)
-        return baseline, others
+
+        # who crashed everywhere has shown nothing
+        crashed_everywhere = [
+            next(iter(failed.values())) if failed and len(failed) == len(instances) else None
+            for failed in errors
+        ]
+        if crashed_everywhere[0] is not None:
+            raise baseline_fails(crashed_everywhere[0])
+        others = zip(results[1:], crashed_everywhere[1:], strict=True)
+        return results[0], [result if error is None else error for result, error in others]
 
     @staticmethod
     def open(study: StudySpec | Path | str, results: Path | str = "results") -> StoredStudy:
         """Open a stored study to look at; see `StoredStudy`."""
         return StoredStudy(study, results)
 
-    def finish(self, *, jobs: int = 1) -> StudySummary:
-        """Judge the best trials, write preset, summary and page; see `judgement.finish`."""
+    def finish(self, *, jobs: int = 1, trial: int | None = None) -> StudySummary:
+        """Judge the best trials, or the one of that number; write preset, summary and page; see `judgement.finish`."""
         from dynslam_bench.tuning.judgement import finish
         from dynslam_bench.tuning.page import write_page
 
-        summary = finish(self, jobs=jobs)
+        summary = finish(self, jobs=jobs, trial=trial)
         write_page(self, summary)
         return summary
 
@@ -420,7 +466,7 @@ class Study(Plan):
 
     def configuration_of(self, trial: FrozenTrial | optuna.Trial) -> Configuration:
         """What a trial runs with."""
-        return Configuration(self.spec.tracker, {**self.held, **trial.params})
+        return self.configuration(trial.params)
 
     def ask(self, settings: Mapping[str, Scalar] | None = None) -> optuna.Trial:
         """The next trial: the first is the baseline's, then come those that wait, then the sampler's.
@@ -434,9 +480,10 @@ class Study(Plan):
         """
         with self._lock:
             if settings is not None:
-                self.study.enqueue_trial(starting_point(settings, self.space, self.base))
+                self.study.enqueue_trial(starting_point(settings, self.search))
             self._heartbeats.beat()
-            trial = self.study.ask(distributions(self.space))
+            trial = self.study.ask()
+            self.search.suggest(trial)
             trial.set_user_attr("worker", worker_name())
         return trial
 
@@ -458,7 +505,7 @@ class Study(Plan):
 
         # the objectives' values, and how far each constraint is violated
         values = [objective.value(outcomes, reference) for objective in self.objectives]
-        violated = violations(self.spec, outcomes, reference)
+        violated = self.violations(outcomes, reference)
         for name, value in violated.items():
             trial.set_constraint(name, value)
 
@@ -479,10 +526,10 @@ class Study(Plan):
         stored = self.study.get_trials(deepcopy=False)[trial.number]
         passed = max(stored.intermediate_values, default=0)
 
-        settings = self.configuration_of(trial).settings
+        tracker, settings = self.configuration_of(trial)
         outcomes: dict[ProblemInstance, Outcome] = {}
         for instance in self.design.tune:
-            outcomes |= self.outcomes(settings, [instance])
+            outcomes |= self.outcomes(settings, [instance], tracker=tracker)
             if len(outcomes) >= passed and self._prune(trial, outcomes, instance):
                 return outcomes, True
         return outcomes, False
@@ -510,13 +557,14 @@ class Study(Plan):
         step = len(outcomes)
         if trial.user_attrs.get(_PRUNED_AFTER) == step:  # its worker was killed after that
             return True
-        if self.spec.pruner == "none" or len(self.objectives) > 1 or not objective.counts(last):
+        never_prunes = isinstance(self._pruner, optuna.pruners.NopPruner)
+        if never_prunes or len(self.objectives) > 1 or not objective.counts(last):
             return False
         with quiet():  # a value that a killed worker has reported is not reported again
-            if self.spec.pruner == "wilcoxon":
+            if isinstance(self._pruner, optuna.pruners.WilcoxonPruner):
                 (value,) = objective.by_start({last: outcomes[last]}, reference)
                 trial.report(value, step)
-            elif max(violations(self.spec, outcomes, reference).values(), default=0) <= 0:
+            elif max(self.violations(outcomes, reference).values(), default=0) <= 0:
                 trial.report(objective.value(outcomes, reference), step)
         is_pruned = 0 < trial.number and step < len(self.design.tune) and trial.should_prune()
         if is_pruned:
@@ -533,22 +581,36 @@ class Study(Plan):
         with self._lock:
             # a worker that took this one for dead has put the trial back: Optuna ends running ones
             if self.study.get_trials(deepcopy=False)[trial.number].state == TrialState.WAITING:
-                self.study._storage.set_trial_state_values(trial._trial_id, TrialState.RUNNING)
-            self.study.tell(trial, evaluation.values, state=evaluation.state, skip_if_finished=True)
+                self._storage.set_trial_state_values(self._id_of(trial), TrialState.RUNNING)
+            try:
+                self.study.tell(
+                    trial, evaluation.values, state=evaluation.state, skip_if_finished=True
+                )
+            except RuntimeError as error:
+                # samplers of a grid stop the study after their last point, which Optuna takes as a
+                # fault of those who ask and tell; the trial is stored by then
+                if "Study.stop" not in str(error):
+                    raise
+                self._is_exhausted = True
 
     def _put_back(self, trial: FrozenTrial) -> None:
         """Let a running trial wait to be run again: it keeps its number, and so its settings.
 
         Nothing is done where another worker has run it meanwhile, or runs it.
         """
-        storage = self.study._storage
         worker = trial.user_attrs.get("worker", "")
         with self._turn("put-back"), suppress(UpdateFinishedTrialError):
-            now = storage.get_trial(trial._trial_id)
+            trial_id = self._id_of(trial)
+            now = self._storage.get_trial(trial_id)
             if now.state != TrialState.RUNNING or now.user_attrs.get("worker", "") != worker:
                 return
-            storage.set_trial_user_attr(trial._trial_id, "worker", "")
-            storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
+            self._storage.set_trial_user_attr(trial_id, "worker", "")
+            self._storage.set_trial_state_values(trial_id, TrialState.WAITING)
+
+    def _id_of(self, trial: optuna.Trial | FrozenTrial) -> int:
+        """The storage's own number of a trial, which counts those of all its studies."""
+        study_id = self._storage.get_study_id_from_name(self.spec.name)
+        return self._storage.get_trial_id_from_study_id_trial_number(study_id, trial.number)
 
     def _turn(self, what: str) -> AbstractContextManager[None]:
         """Do something alone among the workers that share the study's folder; a database has no such lock.
@@ -579,6 +641,8 @@ class Study(Plan):
 
     def _more(self) -> bool:
         """Whether another trial is wanted; running ones count, those of dead workers wait to be run again."""
+        if self._is_exhausted:
+            return False
         with self._lock:
             for trial in self.study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
                 if self._heartbeats.is_dead(trial):
@@ -604,7 +668,7 @@ class Study(Plan):
                 yield from self._earlier(Path(entry).expanduser())
             else:
                 preset = read_settings(Path(entry)) if isinstance(entry, str) else entry
-                yield starting_point(preset, self.space, self.base)
+                yield starting_point(preset, self.search)
 
     def _earlier(self, folder: Path) -> Iterator[FrozenTrial | dict[str, Scalar]]:
         """Complete trials of an earlier study, marked as such; its best ones are to be tried again."""
@@ -618,16 +682,20 @@ class Study(Plan):
         if study.user_attrs.get("identity", {}).get("code") != self._identity["code"]:
             source += ", other code"
         marks = {EARLIER: source}
-        spans = distributions(self.space)
+        spans = self.search.distributions()
         best = {trial.number for trial in best_trials(study, self.spec.top)}
         for trial in study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,)):
             params = {name: value for name, value in trial.params.items() if name in spans}
             with suppress(StudyError):  # out of this study's range
-                params = starting_point(params, self.space, self.base)
+                params = starting_point(params, self.search)
                 if trial.number in best:
                     yield params  # to be run on this study's instances
+                effective = self.search.effective(params)
                 yield create_trial(
-                    params=params, distributions=spans, values=trial.values, user_attrs=marks
+                    params=effective,
+                    distributions={name: spans[name] for name in effective},
+                    values=trial.values,
+                    user_attrs=marks,
                 )
 
     def _open(
@@ -637,12 +705,12 @@ class Study(Plan):
     ) -> optuna.Study:
         """The stored study, or a new one whose first trial is the baseline, whatever is enqueued later."""
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        storage = open_storage(self.results, self.spec)
+        self._storage = open_storage(self.results, self.spec)
         how: Any = {
-            "storage": storage,
+            "storage": self._storage,
             "study_name": self.spec.name,
             "sampler": sampler,
-            "pruner": build_pruner(self.spec.pruner),
+            "pruner": self._pruner,
         }
         directions: list[Literal["minimize", "maximize"]] = ["minimize"] * len(self.objectives)
         try:
@@ -753,11 +821,15 @@ class Study(Plan):
         instances = spec.instances(*spec.tune, *spec.confirm, *spec.held_out)
         # the first instance of each sequence stands for it
         first_of = {instance.sequence: instance for instance in reversed(instances)}
-        configuration = Configuration(spec.tracker, self.held)
+        configuration = self.configuration({})
         for sequence, instance in first_of.items():
             run = resolve(self.run_spec(instance, configuration, cache=False)).identity
             identity[f"content of {sequence}"] = digest([run["content"], run["camera"]])
             identity |= program_of(run) | {"device": run["device"]}
+        for tracker in self.trackers[1:]:
+            other = self.configuration({TRACKER: tracker})
+            run = resolve(self.run_spec(instances[0], other, cache=False)).identity
+            identity[f"program of {tracker}"] = digest(program_of(run))
         identity["baseline settings"] = [self.baseline.tracker, dict(self.baseline.settings)]
         return identity | {"parameters": digest([repr(parameter) for parameter in self.space])}
 

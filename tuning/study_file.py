@@ -9,11 +9,12 @@ from itertools import islice, product
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from dynslam_bench.contracts import Sequence
 from dynslam_bench.core import SequenceError, StudyError, did_you_mean, read_toml, without_passwords
 from dynslam_bench.core.records import Record, validated
+from dynslam_bench.core.settings import Scalar
 from dynslam_bench.evaluation.verdicts import LOOKS, ONE_SIDED
 from dynslam_bench.reports.model.row import grouped
 from dynslam_bench.runs.spec import RunSpec
@@ -327,23 +328,148 @@ def _strengths(text: str, whole: str) -> tuple[tuple[str, float], ...]:
 
 SamplerName = Literal["tpe", "random", "nsga2", "gp"]
 PrunerName = Literal["halving", "wilcoxon", "none"]
-EQUALLY_ACCURATE = ("accuracy", "worst", "robustness")
+EQUALLY_ACCURATE = ("accuracy", "worst", "robustness", "relative", "final")
 """Objectives that hold the error themselves."""
 Offset = Annotated[int, Field(ge=0)]
 
 
-class SpaceSpec(Record, frozen=True):
-    """Which settings are tuned.
+TRACKER = "tracker"
+"""Name under `SpaceSpec.choices` of the tracker itself."""
+
+
+class Range(Record, frozen=True):
+    """The range of a setting in a study; written as ``[low, high]`` where that is all.
 
     Attributes:
-        include: Patterns of dotted names, e.g. ``flow.*``; a parameter must match one.
+        low: Its least value.
+        high: Its largest value.
+        scale: ``log`` where ratios matter; None for what the setting declares.
+        step: Distance between its values; None for every number.
+    """
+
+    low: float
+    high: float
+    scale: Literal["linear", "log"] | None = None
+    step: float | None = Field(default=None, gt=0)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_ends(cls, given: Any) -> Any:
+        if isinstance(given, list | tuple):
+            if len(given) != 2:
+                raise ValueError("write a range as [low, high]")
+            return {"low": given[0], "high": given[1]}
+        return given
+
+    @model_validator(mode="after")
+    def _check_ends(self) -> "Range":
+        if self.low >= self.high:
+            raise ValueError(f"the range ends at {self.high:g}, below its beginning {self.low:g}")
+        if self.scale == "log" and self.step:
+            raise ValueError("a range has a log scale or a step, not both")
+        return self
+
+
+class SpaceSpec(Record, frozen=True):
+    """Which settings are tuned, in which ranges, and when.
+
+    From Python it may also be a plain mapping of names to `optuna.distributions`.
+
+    Attributes:
+        include: Patterns of dotted names, e.g. ``flow.*``, of settings that are tuned in the range
+            that they declare. All of them where a study gives neither this nor ranges nor choices.
         exclude: Patterns that take parameters out again.
         fixed: Values for every run, dotted name to value; fixed parameters are not tuned.
+        range: Ranges of a study's own: ``[200, 1500]``, or a table with ``low``, ``high``, ``scale``
+            and ``step``. They may go beyond what a setting declares, as far as it takes the values.
+        choices: Choices of a study's own, also of settings that declare none. Those of ``tracker``
+            are the systems to choose from; a setting is tuned where the chosen one has it.
+        when: Conditions of a study's own: a setting is tuned only where the named ones have one of
+            these values. Settings that others switch off are left out in any case.
     """
 
     include: tuple[str, ...] = ("*",)
     exclude: tuple[str, ...] = ()
     fixed: dict[str, Any] = Field(default_factory=dict)
+    range: dict[str, Range] = Field(default_factory=dict)
+    choices: dict[str, Annotated[tuple[Scalar, ...], Field(min_length=2)]] = Field(
+        default_factory=dict
+    )
+    when: dict[str, dict[str, tuple[Scalar, ...]]] = Field(default_factory=dict)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read(cls, given: Any) -> Any:
+        if not isinstance(given, dict):
+            return given
+        values = dict(given)
+        # a plain mapping of names to distributions
+        if values and all(hasattr(value, "to_internal_repr") for value in values.values()):
+            values = {"range": values}
+
+        # names in nested tables, and distributions in their place
+        spans = flat_names(values.get("range", {}), {"low", "high", "scale", "step"})
+        choices = flat_names(values.get("choices", {}), set())
+        for name, span in list(spans.items()):
+            if hasattr(span, "to_internal_repr"):
+                del spans[name]
+                kind, written = _written(span)
+                (choices if kind == "choices" else spans)[name] = written
+        values |= {"range": spans, "choices": choices}
+        values["fixed"] = flat_names(values.get("fixed", {}), set())
+        if "when" in values:
+            values["when"] = {
+                name: {
+                    other: wanted if isinstance(wanted, list | tuple) else (wanted,)
+                    for other, wanted in flat_names(conditions, set()).items()
+                }
+                for name, conditions in values["when"].items()
+            }
+        if "include" not in values:
+            values["include"] = () if spans or choices else ("*",)
+        return values
+
+    @field_validator("choices")
+    @classmethod
+    def _choices_differ(cls, choices: dict[str, tuple[Scalar, ...]]) -> Any:
+        for name, values in choices.items():
+            if len({(type(value), value) for value in values}) < len(values):
+                raise ValueError(f"the choices of '{name}' name one twice")
+        return choices
+
+
+def flat_names(given: Any, own: set[str]) -> Any:
+    """Nested tables as dotted names; a table of nothing but the keys `own` is a value."""
+    if not isinstance(given, dict):
+        return given
+    flat: dict[str, Any] = {}
+    for name, value in given.items():
+        is_table = isinstance(value, dict) and not (value and value.keys() <= own)
+        if is_table:
+            inner = flat_names(value, own)
+            flat |= {f"{name}.{rest}": entry for rest, entry in inner.items()}
+        else:
+            flat[name] = value
+    return flat
+
+
+def _written(span: Any) -> tuple[str, Any]:
+    """A distribution of Optuna's as a study's file has it: ``range`` or ``choices``, and the value.
+
+    Raises:
+        ValueError: It is of another kind.
+    """
+    if hasattr(span, "choices"):
+        return "choices", tuple(span.choices)
+    if not (hasattr(span, "low") and hasattr(span, "high")):
+        raise ValueError(f"{type(span).__name__} is neither a range nor choices")
+    is_plain_step = span.step is None or (span.step == 1 and isinstance(span.low, int))
+    return "range", {
+        "low": span.low,
+        "high": span.high,
+        "scale": "log" if span.log else "linear",
+        "step": None if is_plain_step else span.step,
+    }
 
 
 class StudySpec(Record, frozen=True):
@@ -367,17 +493,23 @@ class StudySpec(Record, frozen=True):
             choice see them.
         extendable: Whether scenes may be added after a verdict (12, 24, 36, 48 judge). Each look then
             has a smaller level, so that all together claim falsely as rarely as a single one.
-        recorded: Instances of recordings that the choice must not be worse on; None for the first
-            frames of a held-out recording where one is present.
+        recorded: Instances of recordings that the best trial is run on beside the baseline; the conclusion says what
+            they show, and they decide nothing. None for the first frames of a held-out recording where one is
+            present.
         space: Which settings are tuned.
         objectives: ``accuracy``: geometric mean over scenes of the ATE ratio to the baseline (its
             logarithm is minimised, see `objectives.by_scene`); ``speed``: the same of the processor
             time a frame; ``worst``: ATE in the worst quarter of the scenes; ``robustness``: ATE on
-            the degraded instances; ``coverage``: share of lost frames.
+            the degraded instances; ``coverage``: share of lost frames; ``relative``: relative error;
+            ``final``: ATE of the final trajectory; ``network_calls``: frames on which the segmenter
+            ran; ``memory``: largest resident memory; ``time:STAGE``: time of a stage.
         ate_margin: What a study of anything but error alone may lose of accuracy, as a share: the
             upper bound of the ATE ratio must lie below 1 + this.
         min_coverage: Hard constraint on the mean coverage; None for none.
         min_fps: Hard constraint on frames a second, segmentation included; None for none.
+        limits: Hard constraints: largest means over the instances, by name: ``processor_s``,
+            ``memory_mb``, ``network_calls`` and other fields of `objectives.Outcome`, or
+            ``time:STAGE`` in milliseconds.
         seeds: Seeds of the instances that name none. A seed changes nothing for a tracker that
             draws nothing from it.
         offsets: Start offsets of the instances that name none: so many leading frames are left out.
@@ -411,6 +543,7 @@ class StudySpec(Record, frozen=True):
     ate_margin: float = Field(default=0.05, gt=0, le=1)
     min_coverage: float | None = Field(default=0.95, ge=0, le=1)
     min_fps: float | None = Field(default=None, gt=0)
+    limits: dict[str, Annotated[float, Field(gt=0)]] = Field(default_factory=dict)
     seeds: tuple[int, ...] = Field(default=(0,), min_length=1)
     offsets: tuple[Offset, ...] = Field(default=(0, 3), min_length=1)
     trials: int = Field(default=40, ge=2)

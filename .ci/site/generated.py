@@ -18,7 +18,7 @@ from dynslam_bench.evaluation import PROTOCOLS
 from dynslam_bench.reports.model.board import Board
 from dynslam_bench.reports.model.published import KINDS, lines_of, records
 from dynslam_bench.runs import RunRecord, load_frames
-from dynslam_bench.runs.store import runs_frame
+from dynslam_bench.runs.rows import runs_frame
 from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning.storage import trials_frame
 

@@ -27,6 +27,7 @@ from dynslam_bench.cli.output import (
     download_bar,
     present,
     set_json_mode,
+    set_wide,
     table,
     warn,
     write,
@@ -85,10 +86,14 @@ def _root(
         Optional[bool],
         typer.Option("--version", callback=_version, is_eager=True, help="Show the version."),
     ] = None,
+    wide: Annotated[
+        bool, typer.Option("--wide", help="Show all columns of tables, wider than the terminal.")
+    ] = False,
 ) -> None:
     """Benchmark and tune visual SLAM in dynamic scenes."""
     from dynslam_bench.core.download import show_downloads
 
+    set_wide(wide)
     show_downloads(download_bar)
 
 

@@ -54,7 +54,12 @@ def space(
     plan = tuning.Plan(tuning.read_study(study), results)
     preview = plan.preview(jobs)
 
-    rows = [(p.name, range_text(p), plan.base[p.name], p.unit, p.meaning) for p in plan.space]
+    rows = []
+    for parameter in plan.space:
+        name = parameter.name
+        # a setting that only other choices give an effect has no value in the baseline
+        value = "-" if plan.search.why_not(name, {}) else plan.base[name]
+        rows.append((name, range_text(parameter), value, parameter.unit, parameter.meaning))
     settings = table(("setting", "range", "baseline", "unit", "meaning"), rows)
     lines = [settings, "", *preview.figures, *preview.proposal]
     present({"settings": plan.space, "preview": preview}, *lines)
@@ -68,10 +73,14 @@ def run(
     trials: Annotated[
         Optional[int], typer.Option(min=2, help="Finished trials, in place of the file's.")
     ] = None,
+    choose: Annotated[
+        Optional[int],
+        typer.Option(min=0, help="Judge this trial, e.g. of the front, in place of the best."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Run a study or continue it; then check the best on the held-out split, and write the page."""
-    _tune(study, results, jobs, trials=trials)
+    _tune(study, results, jobs, trials=trials, choose=choose)
 
 
 @app.command()
@@ -126,7 +135,13 @@ def worker(study: Study, results: Results = Path("results"), jobs: Jobs = 1) -> 
 @app.command()
 def status(study: Study, results: Results = Path("results"), as_json: AsJson = False) -> None:
     """Show the progress of a study."""
-    from dynslam_bench.tuning.storage import Heartbeats, best_trials, count_states, extension_of
+    from dynslam_bench.tuning.storage import (
+        Heartbeats,
+        best_trials,
+        count_states,
+        extension_of,
+        front_trials,
+    )
 
     stored = tuning.Study.open(study, results)
     facts: dict[str, Any] = {
@@ -139,13 +154,13 @@ def status(study: Study, results: Results = Path("results"), as_json: AsJson = F
         f"{number} ({state})" for number, state in Heartbeats(stored.study).running().items()
     ]
 
-    # the best settings: of the conclusion if there is one, else of the trial with the best values
+    # the best settings: those that the conclusion offers if there is one, else of the trial with the best values
     settings: dict[str, Any] = {}
     summary = stored.folder / "summary.json"
     conclusion = tuning.StudySummary.read(summary) if summary.is_file() else None
     if conclusion is not None and conclusion.best is not None:  # as `tune best`
         facts |= {"best_trial": conclusion.best.trial, "conclusion": conclusion.conclusion}
-        settings = conclusion.best.params
+        settings = conclusion.offered
     else:
         for trial in best_trials(stored.study, 1):
             # values are natural logarithms of ratios to the baseline
@@ -153,6 +168,20 @@ def status(study: Study, results: Results = Path("results"), as_json: AsJson = F
             facts |= {"best_trial": trial.number, "best_ratios": ratios}
             settings = trial.params
     lines = ["", table(("setting", "value"), list(settings.items()))] if settings else []
+
+    # several objectives: the trials to choose from
+    front = front_trials(stored.study)
+    if front:
+        facts["front"] = [trial.number for trial in front]
+        rows = [
+            (trial.number, *(f"{math.exp(value):.3f}" for value in trial.values)) for trial in front
+        ]
+        ratios = [f"ratio of {name}" for name in stored.spec.objectives]
+        lines += [
+            "",
+            "The front, each to be judged by tune run --choose TRIAL:",
+            table(("trial", *ratios), rows),
+        ]
     present(facts | {"best_settings": settings}, fields(facts), *lines)
 
 

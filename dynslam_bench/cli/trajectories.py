@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Optional
 
+import numpy as np
 import typer
 
 from dynslam_bench import runs
@@ -20,7 +22,7 @@ from dynslam_bench.cli.options import (
     Timestamps,
     names_of,
 )
-from dynslam_bench.cli.output import SOME_RUNS_FAILED, announce, present, table
+from dynslam_bench.cli.output import SOME_RUNS_FAILED, announce, cell_text, present, table
 from dynslam_bench.cli.runs import show_runs
 
 if TYPE_CHECKING:
@@ -44,23 +46,105 @@ Topics = Annotated[
 
 
 def evaluate(
-    estimate: Estimate,
+    estimates: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="ESTIMATE...",
+            help="Trajectories: TUM, EuRoC, VSLAM-LAB, a bag; KITTI or COLMAP with --timestamps.",
+        ),
+    ],
     ground_truth: GroundTruth,
     protocol: ProtocolId = "tum-rgbd/v1",
     timestamps: Timestamps = None,
     topic: Topics = None,
+    plot: Annotated[
+        Optional[Path],
+        typer.Option(help="Draw tracks and errors over time: FILE.png, .svg, .pdf or .html."),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Evaluate a trajectory file against a ground-truth file."""
-    loaded, truth = read_pair(estimate, ground_truth, timestamps, topic)
-    result, likely = scored_with_hints(loaded, truth, protocol)
-    present(
-        {**result.model_dump(), "hints": likely},
-        result.summary(),
-        result.protocol,
-        table(("metric", "value"), list(result.metrics.items())),
-        *remarks(result, likely),
-    )
+    """Evaluate trajectory files against a ground-truth file."""
+    # all files are read and scored before anything is written
+    pairs = [read_pair(estimate, ground_truth, timestamps, topic) for estimate in estimates]
+    scored = [scored_with_hints(loaded, truth, protocol) for loaded, truth in pairs]
+    drawn = None
+    if plot is not None:
+        drawn = draw([path.stem for path in estimates], pairs, protocol, plot)
+
+    facts = [{**result.model_dump(), "hints": likely} for result, likely in scored]
+    written = [] if drawn is None else [str(drawn)]
+    # one file in full
+    if len(scored) == 1:
+        result, likely = scored[0]
+        lines = [result.summary(), result.protocol, statistics_table(result)]
+        present(facts[0], *lines, *remarks(result, likely), *written)
+        return
+    # several side by side, with the remarks on each
+    lines = [scored[0][0].protocol, comparison_table(estimates, [result for result, _ in scored])]
+    for path, (result, likely) in zip(estimates, scored, strict=True):
+        lines += [f"{path.name}: {line}" for line in remarks(result, likely)]
+    facts = [{"file": str(path)} | fact for path, fact in zip(estimates, facts, strict=True)]
+    present(facts, *lines, *written)
+
+
+STATISTICS = ("rmse", "mean", "median", "std", "min", "max", "sse")
+"""Statistics of an error, in the order of the columns."""
+_METRIC = re.compile(rf"(?P<error>.+)_(?P<statistic>{'|'.join(STATISTICS)})_(?P<unit>[a-z]+?)2?$")
+"""Name of a statistic of an error; a sum of squares has the unit squared."""
+
+
+def statistics_table(result: Evaluation) -> str:
+    """Errors as rows, their statistics as columns; then the metrics that are single numbers."""
+    rows: dict[tuple[str, str], dict[str, float]] = {}
+    single = []
+    for name, value in result.metrics.items():
+        # `ate_rmse_m` is the statistic `rmse` of the error `ate` in the unit `m`
+        match = _METRIC.match(name)
+        if match is None or name.startswith("static_camera"):
+            single.append((name, value))
+        else:
+            rows.setdefault((match["error"], match["unit"]), {})[match["statistic"]] = value
+    cells = [
+        [f"{error} ({unit})", *[values.get(statistic) for statistic in STATISTICS]]
+        for (error, unit), values in rows.items()
+    ]
+    lines = [table(("error", *STATISTICS), cells)]
+    lines += [f"{name}  {cell_text(value)}" for name, value in single]
+    return "\n".join(lines)
+
+
+def comparison_table(paths: list[Path], results: list[Evaluation]) -> str:
+    """A row for each of several estimates: its absolute errors, and its relative ones by their rmse."""
+    shown = [
+        name
+        for name in results[0].metrics
+        if name.endswith(("_rmse_m", "_rmse_deg", "ate_median_m", "ate_max_m"))
+    ]
+    rows = [
+        [path.name, result.n_pairs, *[result.metrics.get(name) for name in shown]]
+        for path, result in zip(paths, results, strict=True)
+    ]
+    return table(("file", "poses", *shown), rows)
+
+
+def draw(
+    labels: list[str], pairs: list[tuple[TumFile, TumFile]], protocol: str, path: Path
+) -> Path:
+    """Draw estimates beside their common ground truth; see `plot_trajectories`."""
+    from dynslam_bench.evaluation import get_protocol
+    from dynslam_bench.evaluation.comparison import truth_of_file
+    from dynslam_bench.evaluation.evaluate import pose_errors
+    from dynslam_bench.reports.trajectory_plot import PlottedTrajectory, plot_trajectories
+
+    # the truth as the protocol takes it; each estimate aligned with it
+    truth = truth_of_file(pairs[0][1].trajectory, get_protocol(protocol))
+    plotted = []
+    for label, (loaded, _) in zip(labels, pairs, strict=True):
+        aligned, _, series = pose_errors(loaded.trajectory, truth, protocol)
+        errors_m = series["trans_m"]
+        rmse_m = float(np.sqrt(np.square(errors_m).mean()))
+        plotted.append(PlottedTrajectory(label, aligned, errors_m, rmse_m))
+    return plot_trajectories(plotted, truth, path)
 
 
 def read_pair(
@@ -127,6 +211,7 @@ def compare(
     """Show how one trajectory scores under every protocol of the field."""
     from dynslam_bench.evaluation.compare_protocols import agrees, compare_protocols
 
+    # one trajectory under all protocols
     loaded, truth = read_pair(estimate, ground_truth, timestamps, topic)
     scores = compare_protocols(loaded, truth)
     lines = remarks(*scored_with_hints(loaded, truth, "tum-rgbd/v1"))
@@ -188,6 +273,7 @@ def import_(
     as_json: AsJson = False,
 ) -> None:
     """Put a trajectory from elsewhere beside our own runs."""
+    # stored as a record beside the runs, then shown as one
     store = runs.RunStore(results)
     record = runs.import_trajectory(
         trajectory,
@@ -242,6 +328,7 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write a stored run in a format of other tools, with its provenance beside it."""
+    # without either option the run's best trajectory is taken
     which: Literal["online", "final"] | None = None
     if online is not None:
         which = "online" if online else "final"

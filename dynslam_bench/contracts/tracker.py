@@ -92,8 +92,9 @@ class TrackerSpec:
             here although all of `requires` can be imported, else an empty string.
         online: Whether it gives poses frame by frame; of a batch program only the final trajectory
             exists.
-        describe: ``"module:function"``; called with the file behind ``id:``, the function returns
-            what the file tells of this spec, by field; empty if there is none.
+        describe: ``"module:function"``; called with the text behind ``id:``, the function returns
+            what the file of that name tells of this spec, by field (settings and presets, for
+            example); empty if it names no such file, or there is no function.
         files: ``"module:function"``; called with the settings, the function returns the files whose
             content decides what the tracker does and that no setting names by itself, for a run's
             identity; empty if there are none.

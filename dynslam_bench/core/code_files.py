@@ -29,8 +29,10 @@ _TEXT = (
     ".toml",
     ".json",
     ".cfg",
+    ".conf",
     ".ini",
     ".xml",
+    ".txt",
     ".c",
     ".cc",
     ".cpp",
@@ -38,9 +40,17 @@ _TEXT = (
     ".h",
     ".hpp",
 )
-"""How scripts, sources and configurations end, which may name other files."""
+"""How scripts, sources, configurations and lists end, which may name other files."""
+_SOURCES = (b".c", b".cc", b".cpp", b".cxx", b".cu", b".h", b".hpp", b".hxx", b".inl", b".ipp")
+"""A compiled program holds the names of its sources, which it does not read."""
 _LARGEST_TEXT = 1 << 20
 """Bytes of the largest text that is searched for names of files."""
+_LARGEST_BINARY = 1 << 22
+"""Bytes of the largest compiled program that is searched: 4 MB take a tenth of a second."""
+_ELF = b"\x7fELF"
+"""How compiled programs of Linux begin."""
+_NAME_IN_BINARY = re.compile(rb"[\w./~+\-]{1,300}\.[A-Za-z]\w{0,9}")
+"""The name of a file with an ending."""
 _WORD = re.compile(rb"[\w./~+\-]+")
 """What could be a path, quoted or not."""
 _QUOTED = re.compile(rb"[\"']([\w.+\-]+)(?:/[^\"'\n]*)?[\"']")
@@ -86,10 +96,12 @@ def foreign_modules(file: Path) -> set[str]:
     foreign = set[str]()
     waiting = [file]
     while waiting:
+        # what the files that were found last import
         names = imported_modules(waiting) - imported
         imported |= names
         waiting = []
         for name in names:
+            # a name is a module or a package of the folder, or it is foreign
             module = file.parent / f"{name}.py"
             package = file.parent / name
             if module.is_file():
@@ -116,6 +128,7 @@ def program_files(folder: Path) -> list[Path]:
     Raises:
         OSError: The folder cannot be read.
     """
+    # all code counts
     everything = list(files_below(folder))
     code = {file for file in everything if is_code(file)}
 
@@ -124,6 +137,7 @@ def program_files(folder: Path) -> list[Path]:
     for file in filter(is_python, code):
         quoted |= {name.decode() for name in _QUOTED.findall(file.read_bytes())}
 
+    # of all other files, those that the code names
     counted = []
     others = []
     for file in everything:
@@ -255,7 +269,7 @@ def _files_of_argument(word: str, base: Path) -> list[Path]:
 def _is_shell_script(file: Path) -> bool:
     if file.suffix:
         return file.suffix in (".sh", ".bash")
-    return bool(_words(file))
+    return _is_file(file) and _names_interpreter(file)
 
 
 def _module_files(module: str, base: Path) -> list[Path]:
@@ -286,6 +300,7 @@ def _linked_libraries(program: Path) -> list[Path]:
     """The shared libraries of a program that are none of the operating system's, as ``ldd`` finds them."""
     if _is_of_system(program) or shutil.which("ldd") is None:
         return []
+    # lines of `ldd` read "libname.so => /path/libname.so (0x...)"
     listed = subprocess.run(
         ["ldd", str(program)], capture_output=True, text=True, check=False
     ).stdout
@@ -302,6 +317,7 @@ def _with_named_files(files: Iterable[Path], base: Path) -> list[Path]:
         if file in reached:
             continue
         reached[file] = None
+        # words that may name a file beside it, or in the working folder
         path_like = sorted(word for word in _words(file) if "." in word or "/" in word)
         for word in path_like:
             path = Path(word).expanduser() if word.startswith("~/") else Path(word)
@@ -327,19 +343,45 @@ def _named(code: list[Path], others: list[Path]) -> list[Path]:
 
 
 def _words(file: Path) -> set[str]:
-    """The words of a script or configuration that could be names of files."""
+    """The words of a script, configuration or compiled program that could be names of files."""
     try:
+        # scripts and configurations are text; the rest may be a compiled program
+        is_text = file.suffix in _TEXT or (not file.suffix and _names_interpreter(file))
+        if not is_text:
+            return _words_of_binary(file)
         if file.stat().st_size > _LARGEST_TEXT:
             return set()
-        with file.open("rb") as opened:
-            # without an ending it is a script where it names its interpreter
-            is_script = not file.suffix and opened.read(2) == b"#!"
-            if file.suffix not in _TEXT and not is_script:
-                return set()
         text = _FORMAT.sub(b" ", file.read_bytes())
         return {word.decode(errors="replace").rstrip(".") for word in _WORD.findall(text)}
     except OSError:
         return set()
+
+
+def _names_interpreter(file: Path) -> bool:
+    """Whether a file is a script: its first line names what runs it.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    with file.open("rb") as opened:
+        return opened.read(2) == b"#!"
+
+
+def _words_of_binary(file: Path) -> set[str]:
+    """The texts in a compiled program that are written as names of files with an ending.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    if file.stat().st_size > _LARGEST_BINARY or _is_of_system(file.resolve()):
+        return set()
+    with file.open("rb") as opened:
+        if opened.read(len(_ELF)) != _ELF:
+            return set()
+    # strings of a compiled program end with a null byte
+    texts = set(file.read_bytes().split(b"\0"))
+    names = filter(_NAME_IN_BINARY.fullmatch, texts)
+    return {name.decode() for name in names if not name.endswith(_SOURCES)}
 
 
 def _is_of_system(path: Path) -> bool:

@@ -46,14 +46,18 @@ _FILE_PREFIXES = ("onnx", "weights", "recorded")
 # -- what settings name ----------------------------------------------------------------------------
 
 
-def named_digests(settings: Settings) -> dict[str, str]:
+def named_digests(settings: Settings, *, words: bool = False) -> dict[str, str]:
     """Digest of the content of every file and folder that settings name and that is there, by the setting's name.
 
     A setting counts that is declared to name a file (`core.settings.names`), a path in it at any
     depth of lists and tables, and a text with the prefix ``onnx:``, ``weights:`` or ``recorded:``.
     So does a text that is written as a path, with a separator, or as a file's name with an ending,
     where that is there. ``~`` and ``$VARIABLE`` are replaced. A bare word without an ending is a
-    word, whatever lies in the working folder.
+    word, whatever lies in the working folder, unless `words` is set.
+
+    Args:
+        settings: The settings.
+        words: Whether a bare word counts, too, where a file has that name: a plug-in may open it.
 
     Raises:
         PluginError: One cannot be read.
@@ -65,6 +69,8 @@ def named_digests(settings: Settings) -> dict[str, str]:
     for name in field_names(type(settings)):
         for setting, value in _leaves_of(name, attrgetter(name)(settings)):
             text = _path_in(value)
+            if not text and words and os.path.isfile(value):  # noqa: PTH113 - any text
+                text = str(value)
             if text:
                 texts.setdefault(setting, text)
 

@@ -1,7 +1,7 @@
 """What is compiled into a kernel, as a digest.
 
 A kernel's machine code holds the kernels that it calls, the constants that they use, wherever these
-are defined, and the instructions of `core.simd`. Kernels and constants are described as they are in
+are defined, and vector instructions. Kernels and constants are described as they are in
 memory when the kernel is compiled: by bytecode and value, without comments, docstrings and line
 numbers. What only numba can look into (its types, instructions in LLVM's language) is described by
 the source of its module and of all that this module imports.

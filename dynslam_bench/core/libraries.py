@@ -12,18 +12,21 @@ SEARCH_VARIABLES = ("LD_LIBRARY_PATH", "LD_PRELOAD", "DYLD_LIBRARY_PATH", "DYLD_
 """Variables of the linker: with others the same module may run other code."""
 
 
-def library_identity(module: str) -> str:
+def library_identity(module: str, imports: ImportPath | None = None) -> str:
     """Version and files of the distribution that a module is imported from, or the digest of the files alone.
 
     A module that lies before the installed one on the import path hides it, and is the one that counts.
 
     Args:
         module: A top-level module; it is not imported.
+        imports: Where it is looked up; for several modules pass one, which reads each folder once.
+            None for this process's import path as it is now.
 
     Returns:
         For example ``2.1.0 0a1b2c3d4e5f``; empty where there is no such module.
     """
-    imports = ImportPath(sys.path)
+    if imports is None:
+        imports = ImportPath(sys.path)
     place = imports.find(module)
     if not place:
         return ""

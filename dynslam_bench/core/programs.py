@@ -9,6 +9,7 @@ import contextlib
 import os
 import re
 import shutil
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -120,6 +121,8 @@ SESSION_VARIABLES = (
     "PYTEST_CURRENT_TEST",
 )
 """These name the terminal, the login or the moment. Programs do not get them, and their values do not count."""
+DECLARED_VARIABLE = "dynslam_bench.declared_variable"
+"""Announced (`sys.audit`) of each variable, its argument, that a program's settings declare, set or not."""
 _UNCOUNTED = frozenset((*RUN_VARIABLES, *PLACE_VARIABLES, *SESSION_VARIABLES))
 """The variables whose values do not count."""
 _LIBRARIES = "LD_LIBRARY_PATH"
@@ -127,6 +130,8 @@ _OF_OPENCV = re.compile(r"/cv2/\.\./\.\./lib\w*/?$")
 """The folders that ``import cv2`` adds to ``LD_LIBRARY_PATH``."""
 _NOT_FILES = ("/proc/", "/sys/", "/dev/", "/memfd:", "/SYSV", "[")
 """Beginnings of what is mapped, or named, and is no file on a disk."""
+_REMOVED = " (deleted)"
+"""Stands behind the name of a mapped file that was removed."""
 
 
 def is_counted(variable: str) -> bool:
@@ -146,6 +151,8 @@ def program_environment(
             count.
         environment: Where values are taken from; None for this process's variables.
     """
+    for name in declared:
+        sys.audit(DECLARED_VARIABLE, name)
     source = os.environ if environment is None else environment
     names = (*RESULT_VARIABLES, *RUN_VARIABLES, *PLACE_VARIABLES, *declared)
     variables = {name: source[name] for name in names if name in source}
@@ -227,11 +234,14 @@ class ProgramReads:
     """What the processes of a program were made of.
 
     Attributes:
-        files: Executables and everything that is mapped into memory.
+        files: Executables and everything that is mapped into memory, each with its time of
+            modification when it was seen first, in nanoseconds; None where it was not there.
+        replaced: Of these, files in whose place another one lay already: what is mapped was removed.
         commands: The command of each process.
     """
 
-    files: set[str] = field(default_factory=set)
+    files: dict[str, int | None] = field(default_factory=dict)
+    replaced: set[str] = field(default_factory=set)
     commands: set[Command] = field(default_factory=set)
 
 
@@ -239,14 +249,28 @@ def look_at(process: psutil.Process, reads: ProgramReads) -> None:
     """Add what one process shows; nothing where it has ended."""
     with contextlib.suppress(psutil.Error, OSError):
         words = process.cmdline()
-        files = {process.exe(), *mapped_files(process.pid)}
+        mapped = mapped_files(process.pid)
         if words:
             reads.commands.add(Command(tuple(words), process.cwd()))
-        reads.files |= {file for file in files if is_file_name(file)}
+        for file in {process.exe(), *mapped}:
+            if is_file_name(file):
+                reads.files.setdefault(file, modified_time_ns(file))
+            if mapped.get(file) and os.path.exists(file):
+                reads.replaced.add(file)
 
 
-def mapped_files(pid: int) -> set[str]:
-    """The files that are mapped into a process's memory; empty where the system does not tell.
+def modified_time_ns(file: str) -> int | None:
+    """The time of modification of a file in nanoseconds; None where it is not there."""
+    try:
+        return os.stat(file).st_mtime_ns
+    except OSError:
+        return None
+
+
+def mapped_files(pid: int) -> dict[str, bool]:
+    """The files that are mapped into a process's memory, and whether each was removed since.
+
+    Empty where the system does not tell.
 
     Raises:
         OSError: The process has ended or is another user's.
@@ -254,16 +278,17 @@ def mapped_files(pid: int) -> set[str]:
     """
     maps = Path(f"/proc/{pid}/maps")
     if maps.is_file():
-        return set(_paths_in(maps.read_text(errors="surrogateescape").splitlines()))
+        return dict(_paths_in(maps.read_text(errors="surrogateescape").splitlines()))
     process = psutil.Process(pid)
     if not hasattr(process, "memory_maps"):  # macOS
-        return set()
-    return {entry.path for entry in process.memory_maps() if is_file_name(entry.path)}
+        return {}
+    return {entry.path: False for entry in process.memory_maps() if is_file_name(entry.path)}
 
 
-def _paths_in(maps: Sequence[str]) -> Iterator[str]:
-    """The paths in a table of mapped memory: the sixth column, which may hold spaces."""
+def _paths_in(maps: Sequence[str]) -> Iterator[tuple[str, bool]]:
+    """The paths in a table of mapped memory, its sixth column, which may hold spaces; and whether each was removed."""
     for line in maps:
         columns = line.split(maxsplit=5)
         if len(columns) == 6 and is_file_name(columns[5]):
-            yield columns[5].removesuffix(" (deleted)")
+            path = columns[5].removesuffix(_REMOVED)
+            yield path, path != columns[5]

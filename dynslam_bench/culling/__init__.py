@@ -16,6 +16,7 @@ from dynslam_bench.segmentation.settings import SegmentationSettings
 
 S = TypeVar("S", bound=Settings)
 Number: TypeAlias = "float | np.number[Any] | np.bool_"
+"""A value of a rule's stats."""
 
 
 class Rule(DynamicFilter, Generic[S]):

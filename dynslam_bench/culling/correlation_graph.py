@@ -63,14 +63,14 @@ class CorrelationFilter(Rule[CorrelationSettings]):
             return self.verdict(keep)
 
         # points that were observed before; those observed long enough are settled
-        now = _in_world(local, state.T_world_pred)
-        observed = np.asarray(np.isfinite(past).all(axis=2) & np.isfinite(now).all(axis=1))
+        current = _in_world(local, state.T_world_pred)
+        observed = np.asarray(np.isfinite(past).all(axis=2) & np.isfinite(current).all(axis=1))
         rows = np.flatnonzero(observed.any(axis=0))
         if len(rows) < MIN_POINTS:
             return self.verdict(keep)
         age = len(past) - observed[::-1, rows].argmax(axis=0)
         settled = age >= min(self.settings.settled, len(past))
-        now = now[rows]
+        current = current[rows]
         past = past[:, rows]
         observed = observed[:, rows]
         xy = frame.xy[rows]
@@ -79,10 +79,10 @@ class CorrelationFilter(Rule[CorrelationSettings]):
             return self.verdict(keep, tracked=len(rows), settled=len(old))
 
         # the largest component of the settled points is static
-        static = np.ones(len(rows), dtype=bool)
+        is_static = np.ones(len(rows), dtype=bool)
         edges = _delaunay_edges(xy[old])
-        uncut = self._agree(now[old], past[:, old], observed[:, old], edges)
-        static[old], components = self._static_component(edges[uncut], now[old, :3])
+        uncut = self._agree(current[old], past[:, old], observed[:, old], edges)
+        is_static[old], components = self._static_component(edges[uncut], current[old, :3])
         total = len(edges)
         cut = np.count_nonzero(~uncut)
 
@@ -92,15 +92,15 @@ class CorrelationFilter(Rule[CorrelationSettings]):
             edges = edges[settled[edges].sum(axis=1) == 1]
             # the younger point first
             edges = np.where(settled[edges[:, :1]], edges[:, ::-1], edges)
-            uncut = self._agree(now, past, observed, edges)
+            uncut = self._agree(current, past, observed, edges)
             total = total + len(edges)
             cut = cut + np.count_nonzero(~uncut)
             # a static neighbour votes for or against, a moving one that agrees votes against
             by_static = np.where(uncut, 1, -1)
             by_moving = np.where(uncut, -1, 0)
-            vote = np.where(static[edges[:, 1]], by_static, by_moving)
-            static[~settled] = np.bincount(edges[:, 0], vote, len(rows))[~settled] >= 0
-        keep[rows[~static]] = False
+            vote = np.where(is_static[edges[:, 1]], by_static, by_moving)
+            is_static[~settled] = np.bincount(edges[:, 0], vote, len(rows))[~settled] >= 0
+        keep[rows[~is_static]] = False
         return self.verdict(
             keep, tracked=len(rows), settled=len(old), edges=total, cut=cut, components=components
         )
@@ -116,19 +116,19 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         # a point that continues a keypoint of the last frame takes over its observations
         link = link_to_previous(frame, state)
         last = _in_world(self._last, pose)
-        before = np.concatenate([last[None], self._past])[: self.settings.window]
-        past = np.full((len(before), len(frame.xy), 12), np.nan)
-        past[:, link >= 0] = before[:, link[link >= 0]]
+        of_keypoints = np.concatenate([last[None], self._past])[: self.settings.window]
+        past = np.full((len(of_keypoints), len(frame.xy), 12), np.nan)
+        past[:, link >= 0] = of_keypoints[:, link[link >= 0]]
 
         # any other was at the end of its flow, at the depth that the last frame has there
-        loose = np.flatnonzero((link < 0) & flow.valid & np.isfinite(flow.xy).all(axis=1))
-        raw = flow.xy[loose]
+        unlinked = np.flatnonzero((link < 0) & flow.valid & np.isfinite(flow.xy).all(axis=1))
+        raw = flow.xy[unlinked]
         pixels, visible = pixel_index(raw, previous.depth.shape)
         z = np.where(visible, previous.depth[pixels], 0)
         observations = self._observe(
             state.camera.undistort_points(raw), raw, z, previous.depth, state.camera
         )
-        past[0, loose] = _in_world(observations, pose)
+        past[0, unlinked] = _in_world(observations, pose)
         return past
 
     def _observe(
@@ -146,12 +146,19 @@ class CorrelationFilter(Rule[CorrelationSettings]):
 
     def _agree(
         self,
-        now: NDArray[np.float64],
+        current: NDArray[np.float64],
         past: NDArray[np.float64],
         observed: NDArray[np.bool_],
         edges: NDArray[np.intp],
     ) -> NDArray[np.bool_]:
-        """Which edges ``[E]`` keep their vector since the oldest frame in which both ends were observed."""
+        """Which edges ``[E]`` keep their vector since the oldest frame in which both ends were observed.
+
+        Args:
+            current: World positions and covariances ``[N, 3 + 9]`` of this frame's points.
+            past: Those in the K frames before, newest first, ``[K, N, 3 + 9]``; NaN unobserved.
+            observed: bool ``[K, N]``, in which of these each point was observed.
+            edges: Pairs of points ``[E, 2]``.
+        """
         both = observed[:, edges[:, 0]] & observed[:, edges[:, 1]]
         oldest = len(past) - 1 - both[::-1].argmax(axis=0)
         first, second = edges.T
@@ -159,11 +166,11 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         # change of the vector, and the sum of the four points' covariances
         first_then = past[oldest, first]
         second_then = past[oldest, second]
-        change = now[first, :3] - now[second, :3] - first_then[:, :3] + second_then[:, :3]
-        total = now[first, 3:] + now[second, 3:] + first_then[:, 3:] + second_then[:, 3:]
+        change = current[first, :3] - current[second, :3] - first_then[:, :3] + second_then[:, :3]
+        total = current[first, 3:] + current[second, 3:] + first_then[:, 3:] + second_then[:, 3:]
         covariance = total.reshape(-1, 3, 3)
 
-        # squared Mahalanobis distance; edges that cannot be compared are not cut
+        # squared Mahalanobis distance d^T C^-1 d; edges that cannot be compared are not cut
         comparable = both.any(axis=0)
         solved = np.linalg.solve(covariance[comparable], change[comparable, :, None])[:, :, 0]
         squared_distance = (change[comparable] * solved).sum(axis=1)
@@ -182,8 +189,8 @@ class CorrelationFilter(Rule[CorrelationSettings]):
         if self.settings.largest == "volume":
             measure = np.array([_volume(points[label == body]) for body in range(len(size))])
         # with equal volumes the one with more points
-        static = int(np.lexsort((size, measure))[-1])
-        return np.asarray(label == static), len(size)
+        largest = int(np.lexsort((size, measure))[-1])
+        return np.asarray(label == largest), len(size)
 
 
 def _in_world(local: NDArray[np.float64], T_world_cam: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ from dynslam_bench.core.seeding import stream
 from dynslam_bench.culling import ObjectRule
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import BoxDepthSettings, DepthBlockSettings, DepthRansacSettings
-from dynslam_bench.geometry import inside
+from dynslam_bench.geometry import at_width, inside
 from dynslam_bench.segmentation.postprocess import dilate, select
 
 MIN_POINTS = 3
@@ -102,7 +102,7 @@ class BoxDepthFilter(ObjectRule[BoxDepthSettings]):
         segmented = [self._segment(box, depth) for box in boxes]
         people = [mask for mask in segmented if mask is not None]
         union = np.logical_or.reduce([np.zeros(depth.shape, bool), *people])
-        mask = dilate(union, self.settings.dilation_px)
+        mask = dilate(union, at_width(self.settings.dilation_px, depth.shape[1]))
         keep = ~inside(mask, frame.keypoints.xy)
         ignored = len(boxes) - len(people)
         return self.verdict(
@@ -122,7 +122,8 @@ class BoxDepthFilter(ObjectRule[BoxDepthSettings]):
             return None
 
         # the largest connected region at that depth, in the box with a margin
-        place = _window(box, self.settings.margin_px, self.settings.margin_px, depth.shape)
+        margin = at_width(self.settings.margin_px, depth.shape[1])
+        place = _window(box, margin, margin, depth.shape)
         window = depth[place]
         near = (window > 0) & (np.abs(window - np.median(valid)) <= self.settings.depth_m)
         count, label, stats, _ = cv2.connectedComponentsWithStats(
@@ -179,7 +180,8 @@ class DepthBlockFilter(ObjectRule[DepthBlockSettings]):
         blocks = 0
         if mask.any():
             whole, blocks = covered_blocks(mask, frame.depth, self.settings)
-            mask = dilate(mask | whole, self.segmentation.dilation_px)
+            radius = at_width(self.segmentation.dilation_px, mask.shape[1])
+            mask = dilate(mask | whole, radius)
         keep = ~inside(mask, frame.keypoints.xy)
         objects = len(people)
         share = float(mask.mean())

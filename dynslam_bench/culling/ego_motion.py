@@ -4,6 +4,7 @@ The test finds motion along epipolar lines, and any motion while the camera only
 still.
 """
 
+import math
 from typing import NamedTuple
 
 import cv2
@@ -14,7 +15,7 @@ from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.core.compiled import kernel
 from dynslam_bench.culling import Rule
 from dynslam_bench.culling.settings import RigidMotionSettings
-from dynslam_bench.geometry import Camera, pixel_index, se3
+from dynslam_bench.geometry import Camera, at_width, pixel_index, se3
 from dynslam_bench.geometry.gauss_newton import (
     add_normal_equation,
     apply_twist,
@@ -49,7 +50,7 @@ NOISE_PX = (0.2, 1.0)
 ROLLING_SHUTTER_SHARE = 0.05
 """Added to the scale, as a share of a point's flow: a rolling shutter distorts fast motion."""
 STATIC_CELL = 32
-"""Side of the cells of `static_share`, pixels."""
+"""Side of the cells of `static_share`, pixels at an image width of 640."""
 CORRELATION = 100.0
 """Factor on the information of the motion model against that of the flow: errors of points on one object are correlated
 (the back end inflates the covariance of its poses for the same reason)."""
@@ -61,7 +62,8 @@ MEAN_S = 0.07
 MEMORY_S = 1.65
 """Time constant with which the count of a point's failures decays."""
 NEARBY_PX = 24.0
-"""Points within this distance along both axes share their counts if their depths are similar."""
+"""Points within this distance along both axes, at an image width of 640, share their counts if their depths are
+similar."""
 SIMILAR_DEPTH = 0.1
 """Depths are similar if they differ by no more than this share."""
 MAX_FAILURES = 2.5
@@ -70,9 +72,9 @@ after an object has stopped. It would otherwise become a part of the map, and ta
 A whole image that fails in a frame or two, as after a wrong stamp, stays below."""
 
 CELL = 16
-"""Side of the cells in which failing points are counted, pixels."""
+"""Side of the cells in which failing points are counted, pixels at an image width of 640."""
 NEIGHBOURHOOD = (5, 5)
-"""Cells around a point in which it needs company: 80 x 80 px."""
+"""Cells around a point in which it needs company: 80 x 80 px at an image width of 640."""
 MIN_FAILING = 3
 """Fewest failing points of a moving region."""
 PATCH_3X3 = np.array([(dx, dy) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
@@ -101,26 +103,29 @@ def depth_sigma(z: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def static_share(
-    frame: FrameBundle, state: FilterState, before: NDArray[np.floating]
+    frame: FrameBundle, state: FilterState, previous_xy: NDArray[np.floating]
 ) -> NDArray[np.float64]:
     """Share of static keypoints around each point's origin in the previous frame.
 
     Args:
         frame: The current frame.
         state: With the previous frame and which of its keypoints were kept.
-        before: Raw pixels of the points in the previous image, ``[N, 2]``.
+        previous_xy: Raw pixels of the points in the previous image, ``[N, 2]``.
 
     Returns:
         Share of kept keypoints in the cell of the previous image, ``[N]`` in [0, 1]; 1 where there
         were none.
     """
     if state.previous is None or state.previous_keep is None:
-        return np.ones(len(before))
-    cell, cells = cell_index(state.previous.keypoints.xy, STATIC_CELL, frame.gray.shape)
+        return np.ones(len(previous_xy))
+    # kept keypoints and all keypoints by cell of the previous image
+    shape = frame.gray.shape
+    side = at_width(STATIC_CELL, shape[1])
+    cell, cells = cell_index(state.previous.keypoints.xy, side, shape)
     count = np.bincount(cell, minlength=np.prod(cells))
     kept = np.bincount(cell, weights=state.previous_keep, minlength=np.prod(cells))
     share = np.where(count > 0, kept / np.maximum(count, 1), 1.0)
-    return np.asarray(share[cell_index(before, STATIC_CELL, frame.gray.shape)[0]])
+    return np.asarray(share[cell_index(previous_xy, side, shape)[0]])
 
 
 def rigid_flow(
@@ -211,6 +216,7 @@ def _motion_of_distant_points(
 
     None where too few points agree. Arguments as of `_align`.
     """
+    # distant: beyond the geometric mean of near and far depths
     far = points[:, 2] > np.sqrt(np.prod(np.quantile(points[:, 2], NEAR_FAR)))
     rotation_steps = len(ROTATION_STEPS_PX)
     T_prev_cur, agreeing = _align(
@@ -253,6 +259,7 @@ def prior_information(state: FilterState, T_prev_cur: NDArray[np.float64]) -> ND
     """
     if state.motion_covariance is None or state.T_world_prev is None:
         return NO_PRIOR
+    # how (position in the world, rotation in the camera) turns into the twist of the motion
     jacobian = np.zeros((6, 6))
     jacobian[:3, :3] = state.T_world_prev[:3, :3].T
     jacobian[3:, 3:] = -T_prev_cur[:3, :3]
@@ -430,7 +437,12 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
         if self._memory is not None:
             origin = np.where(flow.valid[:, None], flow.xy, xy)
             before = nearby_mean(
-                state.previous.keypoints.xy, state.previous.z, self._memory, origin, frame.z
+                state.previous.keypoints.xy,
+                state.previous.z,
+                self._memory,
+                origin,
+                frame.z,
+                at_width(NEARBY_PX, shape[1]),
             )
 
         # mean residual over its limit; the mean's noise is this share of one residual's
@@ -471,7 +483,9 @@ class RigidMotionFilter(Rule[RigidMotionSettings]):
 
 
 @kernel
-def nearby_mean(xy: Floats, z: Floats, values: Array, at: Floats, at_z: Floats) -> Array:
+def nearby_mean(
+    xy: Floats, z: Floats, values: Array, at: Floats, at_z: Floats, nearby_px: float
+) -> Array:
     """Mean value of the points around each pixel whose depth is similar, so that an object's edge is not averaged away.
 
     Args:
@@ -480,6 +494,7 @@ def nearby_mean(xy: Floats, z: Floats, values: Array, at: Floats, at_z: Floats) 
         values: ``[N, K]``.
         at: Raw pixels ``[M, 2]``.
         at_z: Depths there ``[M]``, metres; where 0, points of any depth count.
+        nearby_px: Largest distance along either axis, pixels.
 
     Returns:
         Means ``[M, K]``; 0 where there is no such point.
@@ -492,15 +507,17 @@ def nearby_mean(xy: Floats, z: Floats, values: Array, at: Floats, at_z: Floats) 
     sorted_values = values[order]
     means = np.zeros((len(at), values.shape[1]))
     for i in range(len(at)):
+        # the rows that may be near, from the first one on
         column = at[i, 0]
         depth = at_z[i]
         tolerance = SIMILAR_DEPTH * at_z[i]
-        last = at[i, 1] + NEARBY_PX
+        last = at[i, 1] + nearby_px
         count = 0
-        for k in range(np.searchsorted(rows, at[i, 1] - NEARBY_PX), len(rows)):
+        for k in range(np.searchsorted(rows, at[i, 1] - nearby_px), len(rows)):
             if rows[k] > last:
                 break
-            if abs(columns[k] - column) <= NEARBY_PX and (
+            # add up those that are near in the image and in depth
+            if abs(columns[k] - column) <= nearby_px and (
                 depth <= 0 or abs(depths[k] - depth) <= tolerance
             ):
                 for j in range(means.shape[1]):
@@ -537,11 +554,11 @@ def nearest_depth(
 
 
 def cell_index(
-    xy: NDArray[np.floating], size: int, shape: tuple[int, ...]
+    xy: NDArray[np.floating], size: float, shape: tuple[int, ...]
 ) -> tuple[NDArray[np.intp], tuple[int, int]]:
     """Cell of each pixel ``[N, 2]`` in a grid over an image ``(H, W)``, row by row, and the grid's rows and columns."""
-    rows = -(-shape[0] // size)
-    columns = -(-shape[1] // size)
+    rows = math.ceil(shape[0] / size)
+    columns = math.ceil(shape[1] / size)
     cell = np.floor(xy / size).astype(np.intp)
     return cell[:, 1].clip(0, rows - 1) * columns + cell[:, 0].clip(0, columns - 1), (rows, columns)
 
@@ -578,7 +595,7 @@ def failing_regions(
     """
     if share <= 0 or not failing.any():
         return failing
-    index, grid = cell_index(xy, CELL, size)
+    index, grid = cell_index(xy, at_width(CELL, size[1]), size)
     failures = _neighbourhood_sum(failing & tested, index, grid)[index]
     tests = _neighbourhood_sum(tested, index, grid)[index]
     return np.asarray(failing & (failures >= MIN_FAILING) & (failures >= share * tests))

@@ -20,7 +20,7 @@ from dynslam_bench.culling.settings import (
     MovingVoteSettings,
     Unmatched,
 )
-from dynslam_bench.geometry import Camera, inside
+from dynslam_bench.geometry import Camera, at_width, inside
 from dynslam_bench.segmentation.postprocess import dynamic_mask, select
 
 Points = NDArray[np.float64]
@@ -39,8 +39,8 @@ MIN_OUTSIDE = 20
 
 
 def fundamental_matrix(
-    first: Points,
-    second: Points,
+    x1: Points,
+    x2: Points,
     *,
     inlier_px: float = 1.0,
     max_draws: int = 2000,
@@ -50,8 +50,8 @@ def fundamental_matrix(
     """The matrix F with ``x2^T F x1 = 0`` (Eq. 24) for matched pixels, by RANSAC.
 
     Args:
-        first: Undistorted pixels x1, float64 ``[N, 2]``.
-        second: Undistorted pixels x2, float64 ``[N, 2]``.
+        x1: Undistorted pixels of the previous image, float64 ``[N, 2]``.
+        x2: Those of the current one that they are matched with, float64 ``[N, 2]``.
         inlier_px: Distance in pixels up to which a match agrees with F.
         max_draws: Most samples that RANSAC draws.
         min_matches: Fewer matches give no F.
@@ -61,27 +61,27 @@ def fundamental_matrix(
     Returns:
         F ``[3, 3]``, or None where it cannot be estimated (too few points, degenerate).
     """
-    agree = np.ones(len(first), dtype=bool)
-    for fit in range(refits + 1):
+    agree = np.ones(len(x1), dtype=bool)
+    for refit in range(refits + 1):
         if np.count_nonzero(agree) < min_matches:
             return None
         # RANSAC at first, then the eight-point algorithm on all that agree
-        if fit == 0:
+        if refit == 0:
             matrix, _ = cv2.findFundamentalMat(
-                first, second, cv2.FM_RANSAC, inlier_px, CONFIDENCE, max_draws
+                x1, x2, cv2.FM_RANSAC, inlier_px, CONFIDENCE, max_draws
             )
         else:
-            matrix, _ = cv2.findFundamentalMat(first[agree], second[agree], cv2.FM_8POINT)
+            matrix, _ = cv2.findFundamentalMat(x1[agree], x2[agree], cv2.FM_8POINT)
         if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
             return None
-        agree = epipolar_distance(np.asarray(matrix, dtype=np.float64), first, second) < inlier_px
+        agree = epipolar_distance(np.asarray(matrix, dtype=np.float64), x1, x2) < inlier_px
     return np.asarray(matrix, dtype=np.float64)
 
 
-def epipolar_distance(matrix: NDArray[np.float64], first: Points, second: Points) -> Points:
+def epipolar_distance(matrix: NDArray[np.float64], x1: Points, x2: Points) -> Points:
     """Distances ``[N]`` in pixels of x2 to the epipolar line of x1 (Eq. 25, with the root that the text lost)."""
-    lines = np.column_stack([first, np.ones(len(first))]) @ matrix.T
-    signed = (lines[:, :2] * second).sum(axis=1) + lines[:, 2]
+    lines = np.column_stack([x1, np.ones(len(x1))]) @ matrix.T
+    signed = (lines[:, :2] * x2).sum(axis=1) + lines[:, 2]
     return np.asarray(np.abs(signed) / np.maximum(np.hypot(lines[:, 0], lines[:, 1]), 1e-12))
 
 
@@ -89,28 +89,30 @@ class Matches(NamedTuple):
     """Keypoints and where their flow ends, undistorted pixels.
 
     Attributes:
-        before: float64 ``[N, 2]``, x1 in the previous image.
-        now: float64 ``[N, 2]``, x2 in the current one.
+        x1: float64 ``[N, 2]``, in the previous image.
+        x2: float64 ``[N, 2]``, in the current one.
         valid: bool ``[N]``, keypoints whose flow succeeded.
         tested: bool ``[N]``, keypoints that are tested.
     """
 
-    before: Points
-    now: Points
+    x1: Points
+    x2: Points
     valid: Flags
     tested: Flags
 
-    def distances(self, fit: Flags, inlier_px: float = 1.0) -> Points | None:
-        """Epipolar distances ``[N]`` of the tested matches, 0 for others, by the F of the matches `fit` (bool ``[N]``).
+    def distances(self, fitted: Flags, inlier_px: float = 1.0) -> Points | None:
+        """Epipolar distances ``[N]`` in pixels of the tested matches, 0 for others; None where F cannot be estimated.
 
-        None where F cannot be estimated.
+        Args:
+            fitted: bool ``[N]``, matches that F is fitted to.
+            inlier_px: Distance in pixels up to which one of them agrees with F.
         """
-        matrix = fundamental_matrix(self.before[fit], self.now[fit], inlier_px=inlier_px)
+        matrix = fundamental_matrix(self.x1[fitted], self.x2[fitted], inlier_px=inlier_px)
         if matrix is None:
             return None
-        distance = np.zeros(len(fit))
+        distance = np.zeros(len(fitted))
         distance[self.tested] = epipolar_distance(
-            matrix, self.before[self.tested], self.now[self.tested]
+            matrix, self.x1[self.tested], self.x2[self.tested]
         )
         return distance
 
@@ -171,17 +173,21 @@ class EpipolarFilter(Rule[EpipolarSettings]):
             return self.verdict(keep)
 
         # views that determine no F are not judged
-        fit = matches.valid & state.keep
-        stats: dict[str, Number] = {"matches": np.count_nonzero(fit), "degenerate": 1, "f_asked": 1}
-        if self._is_degenerate(matches.before[fit], matches.now[fit], state.camera, stats):
+        fitted = matches.valid & state.keep
+        stats: dict[str, Number] = {
+            "matches": np.count_nonzero(fitted),
+            "degenerate": 1,
+            "f_asked": 1,
+        }
+        if self._is_degenerate(matches.x1[fitted], matches.x2[fitted], state.camera, stats):
             return self.verdict(keep, **stats)
 
         # F of the kept points (Eq. 24); points too far from their epipolar line fail (Eq. 25)
-        distance = matches.distances(fit)
+        distance = matches.distances(fitted)
         if distance is None:
             return self.verdict(keep, **stats)
         failing = distance > self.settings.threshold_px
-        stats["inliers"] = np.count_nonzero(fit & ~failing)
+        stats["inliers"] = np.count_nonzero(fitted & ~failing)
 
         # an F that rejects what follows the camera's motion is not that of the static scene
         if self.settings.max_contradiction < 1:
@@ -204,44 +210,44 @@ class EpipolarFilter(Rule[EpipolarSettings]):
         return self.verdict(~moving, **stats)
 
     def _is_degenerate(
-        self, before: Points, now: Points, camera: Camera, stats: dict[str, Number]
+        self, x1: Points, x2: Points, camera: Camera, stats: dict[str, Number]
     ) -> bool:
         """Whether matches or parallax are too small or one homography explains the view; fills in both stats."""
-        if len(before) < MIN_MATCHES:
+        if len(x1) < MIN_MATCHES:
             return True
         # no parallax: a pure rotation
-        parallax_px = stats["parallax_px"] = rotation_residual(before, now, camera)
-        flow_px = float(np.median(np.linalg.norm(before - now, axis=1)))
+        parallax_px = stats["parallax_px"] = rotation_residual(x1, x2, camera)
+        flow_px = float(np.median(np.linalg.norm(x1 - x2, axis=1)))
         if parallax_px < max(self.settings.min_parallax_px, self.settings.parallax_share * flow_px):
             return True
         # a plane
-        share = stats["homography_share"] = homography_share(before, now)
+        share = stats["homography_share"] = homography_share(x1, x2)
         return share > self.settings.homography_share
 
 
-def rotation_residual(first: Points, second: Points, camera: Camera) -> float:
+def rotation_residual(x1: Points, x2: Points, camera: Camera) -> float:
     """Median distance in pixels between matches ``[N, 2]`` and the best pure rotation: the parallax."""
-    rays = camera.unproject(np.stack([first, second]), np.ones((2, len(first))))
+    rays = camera.unproject(np.stack([x1, x2]), np.ones((2, len(x1))))
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-    weight = np.ones(len(first))
-    residual = np.zeros(len(first))
+    weight = np.ones(len(x1))
+    residual = np.zeros(len(x1))
     # iteratively reweighted, so that moving objects do not influence the rotation
     for _ in range(3):
         # the rotation that aligns the rays best (Kabsch), by singular value decomposition
         u, _, vt = np.linalg.svd((rays[1] * weight[:, None]).T @ rays[0])
         rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-        residual = np.linalg.norm(camera.project(rays[0] @ rotation.T) - second, axis=1)
+        residual = np.linalg.norm(camera.project(rays[0] @ rotation.T) - x2, axis=1)
         weight = 1.0 / np.maximum(residual, 0.5)
     return float(np.median(residual))
 
 
-def homography_share(first: Points, second: Points) -> float:
+def homography_share(x1: Points, x2: Points) -> float:
     """Share of the matches ``[N, 2]`` within 1 px of one homography: 1 for a plane or a pure rotation.
 
     Of a homography with the share 0.8 that matters, one of 50 draws of four matches is free of
     outliers but for once in 10^11.
     """
-    matrix, mask = cv2.findHomography(first, second, cv2.RANSAC, 1.0, maxIters=50, confidence=0.99)
+    matrix, mask = cv2.findHomography(x1, x2, cv2.RANSAC, 1.0, maxIters=50, confidence=0.99)
     return 0.0 if matrix is None else float(np.mean(mask))
 
 
@@ -265,9 +271,12 @@ def contradiction(
     """
     if state.T_world_prev is None or state.T_world_pred is None:
         return 0.0
+    # where points with depth were in the previous image, if only the camera moved
     rows = matches.valid & state.keep & (frame.z > 0)
     _, expected = rigid_flow(frame, state, rows)
-    rows[rows] = np.linalg.norm(expected - matches.before[rows], axis=1) < RIGID_PX
+
+    # of those that were there: how many the epipolar test rejects
+    rows[rows] = np.linalg.norm(expected - matches.x1[rows], axis=1) < RIGID_PX
     if np.count_nonzero(rows) < MIN_MATCHES:
         return 0.0
     return float(failing[rows].mean())
@@ -326,23 +335,23 @@ class BoxEpipolarFilter(ObjectRule[BoxEpipolarSettings]):
         # matches that F is fitted to: outside this frame's boxes, outside the previous one's, or all
         in_box = in_boxes(frame.keypoints.xy, boxes).any(axis=0)
         if settings.fit == "kept":
-            fit = tested
+            fitted = tested
         elif settings.fit == "outside previous":
             previous_boxes = dynamic_boxes(state.previous, self.segmentation)
             # a place that no box contains, where there is no flow
-            before = np.nan_to_num(state.flow.xy, nan=-1e6)
-            fit = tested & ~in_boxes(before, previous_boxes).any(axis=0)
+            flow_ends = np.nan_to_num(state.flow.xy, nan=-1e6)
+            fitted = tested & ~in_boxes(flow_ends, previous_boxes).any(axis=0)
         else:
-            fit = tested & ~in_box
-        if np.count_nonzero(fit) < MIN_OUTSIDE:
-            fit = tested
+            fitted = tested & ~in_box
+        if np.count_nonzero(fitted) < MIN_OUTSIDE:
+            fitted = tested
         stats: dict[str, Number] = {
-            "matches": np.count_nonzero(fit),
+            "matches": np.count_nonzero(fitted),
             "lost": np.count_nonzero(lost),
             "boxes": len(boxes),
             "f_asked": 1,
         }
-        distance = matches.distances(fit, settings.inlier_px)
+        distance = matches.distances(fitted, settings.inlier_px)
         if distance is None:
             return self.verdict(keep, failed=1, **stats)
 
@@ -462,7 +471,7 @@ class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
         moving, corners, judged = self._moving_corners(
             state.previous.gray, frame.gray, state.camera
         )
-        side = 2 * self.settings.radius_px + 1
+        side = 2 * round(at_width(self.settings.radius_px, people.shape[1])) + 1
         dilated = cv2.dilate(people.view(np.uint8), np.ones((side, side), np.uint8))
         votes = np.count_nonzero(inside(dilated.astype(bool), moving))
 
@@ -525,15 +534,15 @@ class MovingVoteFilter(ObjectRule[MovingVoteSettings]):
         after = after[good]
 
         # F by RANSAC, and the corners off their epipolar line
-        first = camera.undistort_points(before)
-        second = camera.undistort_points(after)
+        x1 = camera.undistort_points(before)
+        x2 = camera.undistort_points(after)
         inlier_px = self.settings.inlier_px
         matrix = fundamental_matrix(
-            first, second, inlier_px=inlier_px, max_draws=1000, min_matches=VOTE_MATCHES, refits=0
+            x1, x2, inlier_px=inlier_px, max_draws=1000, min_matches=VOTE_MATCHES, refits=0
         )
         if matrix is None:
             return no_corners, len(before), False
-        off_line = epipolar_distance(matrix, first, second) > self.settings.threshold_px
+        off_line = epipolar_distance(matrix, x1, x2) > self.settings.threshold_px
         return after[off_line], len(before), True
 
 

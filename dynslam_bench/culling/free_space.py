@@ -10,7 +10,7 @@ from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.culling import Rule
 from dynslam_bench.culling.ego_motion import depth_sigma, failing_regions
 from dynslam_bench.culling.settings import FreeSpaceSettings
-from dynslam_bench.geometry import Camera, pixel_index, se3
+from dynslam_bench.geometry import Camera, at_width, pixel_index, se3
 
 Array = NDArray[np.float64]
 
@@ -20,8 +20,9 @@ MAX_AGE_S = 10.0
 """Older keyframes are not compared: objects may have been moved for good since."""
 MIN_DEPTH_M = 0.1
 """Points nearer than this to a keyframe's camera plane are not tested."""
-PATCH = np.ones((7, 7), np.uint8)
-"""Neighbourhood whose smallest depth must lie behind the point: depth edges and pose errors are no evidence."""
+PATCH_PX = 3
+"""Half side, at an image width of 640, of the neighbourhood whose smallest depth must lie behind the point: depth edges
+and pose errors are no evidence."""
 
 
 class FreeSpaceFilter(Rule[FreeSpaceSettings]):
@@ -70,7 +71,9 @@ class FreeSpaceFilter(Rule[FreeSpaceSettings]):
             # in a copied episode the id may be another image's
             cached_for, eroded = self._smallest.get(id(depth), (None, None))
             if cached_for is not depth:
-                eroded = cv2.erode(depth, PATCH)
+                half = max(1, round(at_width(PATCH_PX, camera.width)))
+                patch = np.ones((2 * half + 1, 2 * half + 1), np.uint8)
+                eroded = cv2.erode(depth, patch)
             smallest[id(depth)] = (depth, eroded)
             surface[number] = eroded[row[number], column[number]]
         self._smallest = smallest

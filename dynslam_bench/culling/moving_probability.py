@@ -10,14 +10,14 @@ from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.culling import ObjectRule
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import ProbabilitySettings
-from dynslam_bench.geometry import Camera, inside
+from dynslam_bench.geometry import Camera, at_width, inside
 from dynslam_bench.segmentation.postprocess import dynamic_mask
 from dynslam_bench.segmentation.settings import SegmentationSettings
 
 UNKNOWN = 0.5
 """Probability of a new feature."""
 CERTAIN = (0.25, 0.75)
-"""Below the first a feature is certainly static, above the second certainly dynamic (Detect-SLAM)."""
+"""Probabilities: below the first a feature is certainly static, above the second certainly dynamic (Detect-SLAM)."""
 HIT = 0.9
 """Probability that a moving point lies on a mask, and a static one off it (Bayes rule; our assumption)."""
 RATE = 0.3
@@ -65,7 +65,8 @@ class ProbabilityFilter(ObjectRule[ProbabilitySettings]):
         moving = np.full(len(link), UNKNOWN)
         moving[linked] = self._probability[link[linked]]
         if settings.expand_px > 0:
-            moving = expand(xy, moving, linked, settings.expand_px)
+            radius = at_width(settings.expand_px, frame.gray.shape[1])
+            moving = expand(xy, moving, linked, radius)
 
         # update by whether they lie on a dynamic object: moving average, or Bayes' rule
         if frame.instances is not None:
@@ -105,6 +106,7 @@ def link_to_previous(
     link = np.full(len(frame.xy), -1, dtype=np.intp)
     if state.flow is None or state.previous is None or not len(state.previous.xy):
         return link
+    # the previous keypoint nearest to the end of each point's flow
     rows = np.flatnonzero(state.flow.valid & np.isfinite(state.flow.xy).all(axis=1))
     previous = cKDTree(state.previous.keypoints.xy)
     distance, nearest = previous.query(state.flow.xy[rows], distance_upper_bound=radius_px)
@@ -130,11 +132,14 @@ def expand(
     Returns:
         Probabilities ``[N]``; those with a history unchanged.
     """
+    # the nearest certain feature of each new one
     expanded = probability.copy()
     certain = np.flatnonzero(linked & ((probability < CERTAIN[0]) | (probability > CERTAIN[1])))
     new = np.flatnonzero(~linked)
     distance, nearest = cKDTree(xy[certain]).query(xy[new], distance_upper_bound=radius_px)
     near = np.isfinite(distance)
+
+    # pulled from "unknown" towards that one's probability, by a Gaussian of the distance
     influence = np.exp(-0.5 * np.square(np.asarray(distance)[near] / (0.5 * radius_px)))
     of_nearest = probability[certain[np.asarray(nearest)[near]]]
     expanded[new[near]] = UNKNOWN + influence * (of_nearest - UNKNOWN)

@@ -19,7 +19,7 @@ from dynslam_bench.culling import Rule
 from dynslam_bench.culling.ego_motion import refine_prediction
 from dynslam_bench.culling.settings import MultiViewSettings
 from dynslam_bench.features.matching import CellGrid, Features, as_words, search_in_radius
-from dynslam_bench.geometry import Camera, inside, se3
+from dynslam_bench.geometry import Camera, at_width, inside, se3
 from dynslam_bench.segmentation.postprocess import dilate
 
 MAX_REFERENCE_DEPTH_M = 6.0
@@ -33,7 +33,8 @@ MAX_DEPTH_M = 40.0
 GROW_M = 0.2
 """Largest depth difference to the mean of a region (our assumption)."""
 MARGIN_PX = 20
-"""Half side of the window around a projected point; points nearer to the image's border are not tested."""
+"""Half side of the window around a projected point, at an image width of 640; points nearer to the image's border are
+not tested."""
 
 
 class MultiViewFilter(Rule[MultiViewSettings]):
@@ -72,8 +73,10 @@ class MultiViewFilter(Rule[MultiViewSettings]):
         if self.settings.grow:
             region = grow(depth, np.ascontiguousarray(seeds), GROW_M, BIN_M)
         region[seeds[:, 1], seeds[:, 0]] = 1
-        mask = dilate(region.astype(bool), self.settings.dilation_px)
-        dropped = inside(dilate(mask, self.settings.border_px), frame.keypoints.xy)
+        width = depth.shape[1]
+        mask = dilate(region.astype(bool), at_width(self.settings.dilation_px, width))
+        border = at_width(self.settings.border_px, width)
+        dropped = inside(dilate(mask, border), frame.keypoints.xy)
         return self.verdict(
             ~dropped,
             mask,
@@ -121,24 +124,31 @@ class MultiViewFilter(Rule[MultiViewSettings]):
         pixels[ahead] = camera.distort_points(camera.project(local[ahead]))
         visible = ahead & (cosine > np.cos(np.deg2rad(self.settings.max_parallax_deg)))
         visible &= local[:, 2] < MAX_PROJECTED_DEPTH_M
-        size = (camera.width - MARGIN_PX - 2, camera.height - MARGIN_PX - 2)
-        visible &= ((pixels >= MARGIN_PX) & (pixels <= size)).all(axis=1)
+        margin = window_margin(depth)
+        size = (camera.width - margin - 2, camera.height - margin - 2)
+        visible &= ((pixels >= margin) & (pixels <= size)).all(axis=1)
 
         # hidden by something nearer, where depth is even
         centre = np.ceil(pixels[visible]).astype(np.int64)
-        is_hidden = hidden(depth, centre, local[visible, 2], self.settings.tau_m, MARGIN_PX)
+        is_hidden = hidden(depth, centre, local[visible, 2], self.settings.tau_m, margin)
         seeds = centre[is_hidden]
         return np.asarray(seeds[_depth_variance(depth, seeds) < self.settings.max_variance])
 
 
+def window_margin(depth: NDArray[np.float32]) -> int:
+    """`MARGIN_PX` at the width of a depth image ``[H, W]``, whole pixels."""
+    return max(1, round(at_width(MARGIN_PX, depth.shape[1])))
+
+
 def _depth_variance(depth: NDArray[np.float32], xy: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Variance ``[N]`` of the depth in the 41x41 neighbourhoods of pixels ``[N, 2]``, m^2.
+    """Variance ``[N]`` of the depth in the neighbourhoods of pixels ``[N, 2]``, m^2; of 41x41 at a width of 640.
 
     Missing depth counts as 0, as in the authors' code: no seed lies beside missing depth.
     """
     height, width = depth.shape
-    x0, y0 = (xy - MARGIN_PX).clip(0).T
-    x1, y1 = np.minimum(xy + MARGIN_PX + 1, (width, height)).T
+    margin = window_margin(depth)
+    x0, y0 = (xy - margin).clip(0).T
+    x1, y1 = np.minimum(xy + margin + 1, (width, height)).T
     n = (x1 - x0) * (y1 - y0)
 
     def window_means(table: NDArray[np.generic]) -> NDArray[np.float64]:
@@ -309,6 +319,7 @@ def refine_by_matches(
         or state.T_world_pred is None
     ):
         return state.T_world_pred
+    # features of the previous frame with a depth, which its filters kept
     trusted = previous.z > 0
     if state.previous_keep is not None:
         trusted &= state.previous_keep
@@ -329,21 +340,26 @@ def refine_by_matches(
     octave = frame.keypoints.octave.astype(np.int64)
     previous_octave = previous.keypoints.octave.astype(np.int64)
     grid = CellGrid.of(xy, camera.width, camera.height)
-    words = as_words(previous.keypoints.descriptors[rows])
+    descriptors = as_words(previous.keypoints.descriptors[rows])
     features = Features(
         xy, np.full(len(xy), np.nan), octave, as_words(frame.keypoints.descriptors), grid
     )
     for radius in (radius_px, 2 * radius_px):
         windows = expected, np.full(len(rows), np.nan), np.full(len(rows), radius)
         match = search_in_radius(
-            features, state.keep, windows, previous_octave[rows], words, max_distance=MAX_DISTANCE
+            features,
+            state.keep,
+            windows,
+            previous_octave[rows],
+            descriptors,
+            max_distance=MAX_DISTANCE,
         )
-        rows_matched = rows[match >= 0]
-        now = match[match >= 0]
-        if len(now) >= MIN_MATCHES:
+        previous_matched = rows[match >= 0]
+        current_matched = match[match >= 0]
+        if len(current_matched) >= MIN_MATCHES:
             # refine the pose by the matches as if they were a flow
             ends = np.full((len(xy), 2), np.nan, np.float32)
-            ends[now] = previous.keypoints.xy[rows_matched]
+            ends[current_matched] = previous.keypoints.xy[previous_matched]
             matches = FlowResult(ends, np.isfinite(ends[:, 0]), np.zeros(len(xy), np.float32))
             return refine_prediction(frame, replace(state, flow=matches))
     return state.T_world_pred

@@ -7,7 +7,7 @@ from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.culling import Rule
 from dynslam_bench.culling.settings import ReseedingSettings
 from dynslam_bench.features.fast import EDGE
-from dynslam_bench.features.orb import level_quotas, spread
+from dynslam_bench.features.orb import cell_side, level_quotas, spread
 from dynslam_bench.features.settings import FeatureSettings
 
 ORIGIN = EDGE - 3
@@ -41,13 +41,14 @@ class ReseedingFilter(Rule[ReseedingSettings]):
 
     def apply(self, frame: FrameBundle, state: FilterState) -> FilterResult:
         """Choose the features that are used."""
-        static = state.keep
-        used = self._choose(frame, static)
-        usual = self._choose(frame, np.ones(len(static), dtype=bool))
+        # what would be used of all features, and what is used of the static ones
+        is_static = state.keep
+        usual = self._choose(frame, np.ones(len(is_static), dtype=bool))
+        used = self._choose(frame, is_static)
         # features that earlier filters dropped are not judged again
         return self.verdict(
-            used | ~static,
-            static=np.count_nonzero(static),
+            used | ~is_static,
+            static=np.count_nonzero(is_static),
             reseeded=np.count_nonzero(used & ~usual),
             missing=max(self.settings.budget - int(np.count_nonzero(used)), 0),
         )
@@ -56,7 +57,10 @@ class ReseedingFilter(Rule[ReseedingSettings]):
         """At most `budget` of the allowed features, bool ``[N]``, shared among levels and cells."""
         if np.count_nonzero(allowed) <= self.settings.budget:
             return allowed.copy()
+
+        # from the coarsest level to the finest, each with its quota
         octave = frame.keypoints.octave
+        side = cell_side(self._features, frame.gray.shape[1])
         chosen = np.zeros(len(allowed), dtype=bool)
         missing = 0
         levels = max(self._features.levels, int(octave.max()) + 1)
@@ -68,7 +72,7 @@ class ReseedingFilter(Rule[ReseedingSettings]):
             # cell of each feature in its level
             at_level = frame.keypoints.xy[rows] / self._features.scale_factor**level
             xy = np.rint(at_level - ORIGIN).clip(0)
-            column, row = (xy / self._features.cell_px).astype(np.int64).T
+            column, row = (xy / side).astype(np.int64).T
             cells = row * (column.max(initial=0) + 1) + column
 
             # ranks of the responses, so that equal ones stay equal and keep their order

@@ -8,13 +8,13 @@ from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.core.seeding import stream
 from dynslam_bench.culling import ObjectRule
 from dynslam_bench.culling.settings import ResidualSettings
-from dynslam_bench.geometry import inside, pixel_index, se3
+from dynslam_bench.geometry import at_width, inside, pixel_index, se3
 from dynslam_bench.segmentation.postprocess import select
 
 STEP = 8
-"""The image is sampled on every eighth pixel."""
+"""Distance of the samples along both axes, at an image width of 640."""
 CLUSTER_PX = 160.0
-"""Distance in the image that counts as much as `CLUSTER_M` in depth."""
+"""Distance in the image, at a width of 640, that counts as much as `CLUSTER_M` in depth."""
 CLUSTER_M = 0.5
 """Difference in depth that counts as much as `CLUSTER_PX` in the image, metres."""
 MIN_DEPTH_M = 0.1
@@ -45,7 +45,8 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
 
         # sample the image where it has depth
         height, width = frame.depth.shape
-        rows, columns = np.mgrid[STEP // 2 : height : STEP, STEP // 2 : width : STEP]
+        step = max(1, round(at_width(STEP, width)))
+        rows, columns = np.mgrid[step // 2 : height : step, step // 2 : width : step]
         z = np.nan_to_num(frame.depth[rows, columns]).ravel()
         valid = z > 0
         if np.count_nonzero(valid) < 4 * self.settings.clusters:
@@ -54,7 +55,7 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
 
         # residuals after warping, clusters in the image and in depth, and which of them move
         residual = self._residual(frame, state, xy, z[valid])
-        label = self._cluster(xy, z[valid], state.seed)
+        label = self._cluster(xy / at_width(CLUSTER_PX, width), z[valid], state.seed)
         people = np.zeros(len(xy), bool)
         if frame.instances is not None:
             people = inside(select(frame.instances, self.segmentation).union(), xy)
@@ -95,21 +96,24 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
         # difference in grey levels and in depth
         x, y = xy.astype(np.intp).T
         gray = frame.gray[y, x].astype(np.float64)
-        colour = np.abs(gray - state.previous.gray[warped]) / 255
-        before = np.nan_to_num(state.previous.depth[warped])
-        relative = np.abs(points[:, 2] - before) / np.maximum(z, MIN_DEPTH_M)
-        depth = np.where(before > 0, relative, 0.0)
+        gray_residual = np.abs(gray - state.previous.gray[warped]) / 255
+        previous_z = np.nan_to_num(state.previous.depth[warped])
+        relative = np.abs(points[:, 2] - previous_z) / np.maximum(z, MIN_DEPTH_M)
+        depth_residual = np.where(previous_z > 0, relative, 0.0)
         return np.where(
             visible & (points[:, 2] > MIN_DEPTH_M),
-            colour + self.settings.depth_weight * depth,
+            gray_residual + self.settings.depth_weight * depth_residual,
             np.nan,
         )
 
     def _cluster(
-        self, xy: NDArray[np.float64], z: NDArray[np.floating], seed: int
+        self, places: NDArray[np.float64], z: NDArray[np.floating], seed: int
     ) -> NDArray[np.intp]:
-        """Cluster ``[N]`` of each sample by k-means over pixels ``[N, 2]`` and depth ``[N]``, from random centres."""
-        features = np.column_stack([xy / CLUSTER_PX, np.asarray(z) / CLUSTER_M]).astype(np.float32)
+        """Cluster ``[N]`` of each sample by k-means over places ``[N, 2]`` and depth ``[N]``, from random centres.
+
+        Places are in units of `CLUSTER_PX`.
+        """
+        features = np.column_stack([places, np.asarray(z) / CLUSTER_M]).astype(np.float32)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 6, 0.05)
         centres = stream(seed, self.name).choice(
             len(features), self.settings.clusters, replace=False
@@ -134,7 +138,7 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
         members = np.bincount(label[measured], minlength=count)
         total = np.bincount(label[measured], weights=residual[measured], minlength=count)
         mean = total / np.maximum(members, 1)
-        static = max(float(np.median(mean[members > 0])), 1e-4)
+        static_mean = max(float(np.median(mean[members > 0])), 1e-4)
 
         # prior by the share of the cluster that lies on people
         on_people = np.bincount(label, weights=people, minlength=count)
@@ -142,6 +146,8 @@ class ResidualFilter(ObjectRule[ResidualSettings]):
         prior = STATIC_PRIOR + (self.settings.prior - STATIC_PRIOR) * share
 
         # exponential residuals, with a larger mean where the cluster moves
-        likelihood = np.exp(-mean / (RATIO * static)) / RATIO
-        posterior = prior * likelihood / (prior * likelihood + (1 - prior) * np.exp(-mean / static))
+        likelihood = np.exp(-mean / (RATIO * static_mean)) / RATIO
+        posterior = (
+            prior * likelihood / (prior * likelihood + (1 - prior) * np.exp(-mean / static_mean))
+        )
         return np.asarray((posterior > self.settings.threshold) & (members > 0))

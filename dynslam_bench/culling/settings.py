@@ -1,11 +1,12 @@
 """Settings of the rejection rules, one class a rule; importing this module loads neither OpenCV nor torch."""
 
+import math
 from typing import Any, Literal
 
 from pydantic import Field
 
 from dynslam_bench.core.settings import Settings, tunable
-from dynslam_bench.segmentation.settings import ClassList
+from dynslam_bench.segmentation.settings import AT_640, ClassList
 
 Unmatched = Literal["keep", "drop", "judge"]
 """A feature whose flow failed stays untested, is dropped, or is tested at the place where the flow lost it."""
@@ -39,6 +40,10 @@ class GuardSettings(Settings):
     min_fraction: float = Field(
         0.05, ge=0.0, le=1.0, description="smallest share of the keypoints that culling must leave"
     )
+
+    def needed(self, total: int) -> int:
+        """How many of `total` keypoints culling must leave."""
+        return min(total, max(self.min_features, math.ceil(self.min_fraction * total)))
 
 
 class EpipolarSettings(Settings):
@@ -162,7 +167,7 @@ class BoxDepthSettings(Settings):
         meaning="half the depth range of a person",
     )
     margin_px: int = tunable(
-        30, low=0, high=60, limits=(0, 200), unit="px", meaning="how far the box is enlarged"
+        30, low=0, high=60, limits=(0, 200), unit=AT_640, meaning="how far the box is enlarged"
     )
     core: float = tunable(
         0.7,
@@ -182,7 +187,7 @@ class BoxDepthSettings(Settings):
         meaning="a mask that covers more of the image is ignored",
     )
     dilation_px: int = tunable(
-        3, low=0, high=20, limits=(0, 100), unit="px", meaning="radius by which masks are grown"
+        3, low=0, high=20, limits=(0, 100), unit=AT_640, meaning="radius by which masks are grown"
     )
 
 
@@ -385,7 +390,7 @@ class ProbabilitySettings(Settings):
         0.0,
         ge=0.0,
         le=500.0,
-        description="radius of Detect-SLAM's matching point expansion, pixels; 0 disables it",
+        description="radius of Detect-SLAM's matching point expansion, pixels at an image width of 640; 0 disables it",
     )
 
 
@@ -422,7 +427,7 @@ class MovingVoteSettings(Settings):
         low=0,
         high=30,
         limits=(0, 200),
-        unit="px",
+        unit=AT_640,
         meaning="distance to a person within which a moving corner votes",
     )
     min_votes: int = tunable(
@@ -480,7 +485,7 @@ class MultiViewSettings(Settings):
         low=0,
         high=30,
         limits=(0, 100),
-        unit="px",
+        unit=AT_640,
         meaning="radius by which the result is grown",
     )
     border_px: int = tunable(
@@ -488,7 +493,7 @@ class MultiViewSettings(Settings):
         low=0,
         high=30,
         limits=(0, 100),
-        unit="px",
+        unit=AT_640,
         meaning="further radius within which features at the result's border are dropped (15 in the code)",
     )
 

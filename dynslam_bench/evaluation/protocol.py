@@ -216,6 +216,12 @@ PROTOCOLS: dict[str, Protocol] = {
             alignment="sim3",
             rpe=(RPESpec(delta=1, unit="s"), RPESpec(delta=1, unit="f")),
         ),
+        # of systems that give a trajectory at their end only
+        Protocol(
+            id="tum-rgbd/v1-final",
+            trajectory="final",
+            rpe=(RPESpec(delta=1, unit="s"), RPESpec(delta=1, unit="f")),
+        ),
         Protocol(id="tum-rgbd/v1-random-pairs", rpe=(RPESpec(pairs="tum-random"),)),
         Protocol(
             id="evo-default",

@@ -28,6 +28,7 @@ PATTERN = (np.frombuffer(_LETTERS.encode(), np.uint8).astype(np.float32) - ord("
 """The 256 pairs of places that are compared (learned by Rublee et al.), (column, row) from the keypoint each."""
 
 _GAUSSIAN = cv2.getGaussianKernel(7, 2.0, cv2.CV_32F)
+"""Seven weights along one axis, of a Gaussian of 2 pixels."""
 _COLUMNS_AND_ROWS = PATTERN.transpose(2, 1, 0).reshape(2, 512).copy()
 """float32 ``[2, 512]``: columns, then rows of all first places, followed by all second places."""
 _ONE_BIT_A_BYTE = np.uint64(0x0102040810204080)

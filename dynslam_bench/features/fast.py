@@ -52,6 +52,7 @@ CIRCLE = np.array(
 )
 """The sixteen pixels of FAST around a corner, (column, row) each."""
 
+# LLVM's types
 _BYTE = ir.IntType(8)
 _INT64 = ir.IntType(64)
 _BYTES64 = ir.VectorType(_BYTE, BYTE_LANES)

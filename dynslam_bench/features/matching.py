@@ -65,24 +65,26 @@ def _brute_force(
     """
     n = a.shape[0]
     m = b.shape[0]
-    best = np.full(n, -1, np.int64)
-    first = np.full(n, FAR, np.int64)
-    second = np.full(n, FAR, np.int64)
-    back = np.full(m, -1, np.int64)
-    back_distance = np.full(m, FAR, np.int64)
+    nearest = np.full(n, -1, np.int64)
+    distances = np.full(n, FAR, np.int64)
+    second_distances = np.full(n, FAR, np.int64)
+    nearest_in_a = np.full(m, -1, np.int64)
+    distances_in_a = np.full(m, FAR, np.int64)
     for i in range(n):
         for j in range(m):
             d = distance(a[i], b[j])
-            if d < first[i]:
-                second[i] = first[i]
-                first[i] = d
-                best[i] = j
-            elif d < second[i]:
-                second[i] = d
-            if d < back_distance[j]:
-                back_distance[j] = d
-                back[j] = i
-    return best, first, second, back
+            # nearest and second nearest of b; of equal ones the lower index
+            if d < distances[i]:
+                second_distances[i] = distances[i]
+                distances[i] = d
+                nearest[i] = j
+            elif d < second_distances[i]:
+                second_distances[i] = d
+            # nearest of a
+            if d < distances_in_a[j]:
+                distances_in_a[j] = d
+                nearest_in_a[j] = i
+    return nearest, distances, second_distances, nearest_in_a
 
 
 def match_brute_force(
@@ -102,11 +104,14 @@ def match_brute_force(
     """
     if not len(a) or not len(b):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    best, first, second, back = _brute_force(np.ascontiguousarray(a), np.ascontiguousarray(b))
+    nearest, distances, second_distances, nearest_in_a = _brute_force(
+        np.ascontiguousarray(a), np.ascontiguousarray(b)
+    )
     # near enough, nearer than the second (Lowe's ratio test), and nearest in both directions
-    mutual = back[best] == np.arange(len(a))
-    index = np.flatnonzero((first <= max_distance) & (first < ratio * second) & mutual)
-    return index, best[index]
+    mutual = nearest_in_a[nearest] == np.arange(len(a))
+    distinct = distances < ratio * second_distances
+    index = np.flatnonzero((distances <= max_distance) & distinct & mutual)
+    return index, nearest[index]
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,14 +170,14 @@ class Features(NamedTuple):
         xy: Undistorted pixels ``[N, 2]``.
         right: Columns in the right image ``[N]``, pixels; NaN without depth.
         octave: int64 ``[N]``.
-        words: Descriptors ``[N, W]``.
+        descriptors: uint64 ``[N, W]``.
         grid: Cells of the features.
     """
 
     xy: NDArray[np.float64]
     right: NDArray[np.float64]
     octave: NDArray[np.int64]
-    words: Words
+    descriptors: Words
     grid: CellGrid
 
 
@@ -188,7 +193,7 @@ class _SearchFeatures(NamedTuple):
         xy: float64 ``[N, 2]``, undistorted pixels.
         right: float64 ``[N]``, columns in the right image; NaN without depth.
         octave: int64 ``[N]``.
-        words: uint64 ``[N, W]``, descriptors.
+        descriptors: uint64 ``[N, W]``.
         free: bool ``[N]``, features that may be matched.
     """
 
@@ -200,7 +205,7 @@ class _SearchFeatures(NamedTuple):
     xy: NDArray[np.float64]
     right: NDArray[np.float64]
     octave: NDArray[np.int64]
-    words: Words
+    descriptors: Words
     free: NDArray[np.bool_]
 
 
@@ -213,7 +218,7 @@ class _SearchTargets(NamedTuple):
         radius: float64 ``[M]``, half sides of the search windows, pixels.
         octave_low: int64 ``[M]``, lowest octave of a match.
         octave_high: int64 ``[M]``, highest.
-        words: uint64 ``[M, W]``, descriptors.
+        descriptors: uint64 ``[M, W]``.
     """
 
     xy: NDArray[np.float64]
@@ -221,7 +226,7 @@ class _SearchTargets(NamedTuple):
     radius: NDArray[np.float64]
     octave_low: NDArray[np.int64]
     octave_high: NDArray[np.int64]
-    words: Words
+    descriptors: Words
 
 
 @kernel
@@ -240,7 +245,8 @@ def _search(
     count = targets.xy.shape[0]
     match = np.full(count, -1, np.int64)
     match_distance = np.full(count, FAR, np.int64)
-    owner = np.full(xy.shape[0], -1, np.int64)  # the target that a feature is matched to
+    # the target that a feature is matched to
+    owner = np.full(xy.shape[0], -1, np.int64)
     for i in range(count):
         # the cells that the window covers
         x = targets.xy[i, 0]
@@ -276,7 +282,7 @@ def _search(
                 if right[j] == right[j] and target_right == target_right:
                     if abs(right[j] - target_right) > r:
                         continue
-                d = distance(targets.words[i], features.words[j])
+                d = distance(targets.descriptors[i], features.descriptors[j])
                 if d < first:
                     second = first
                     second_octave = first_octave
@@ -310,7 +316,7 @@ def search_in_radius(
     free: NDArray[np.bool_],
     windows: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
     octave: NDArray[np.int64],
-    words: Words,
+    descriptors: Words,
     *,
     max_distance: int,
     ratio: float = 1.0,
@@ -323,7 +329,7 @@ def search_in_radius(
         windows: Expected pixels ``[M, 2]``, expected right coordinates ``[M]`` (NaN: not compared)
             and half sides of the search windows ``[M]``, pixels.
         octave: Expected octaves ``[M]``; the feature's may be one off.
-        words: Descriptors of the targets ``[M, W]``.
+        descriptors: uint64 ``[M, W]``, those of the targets.
         max_distance: Largest Hamming distance of a match.
         ratio: Nearest over second nearest, tested where both come from one octave; 1 switches the
             test off.
@@ -342,11 +348,11 @@ def search_in_radius(
         xy=features.xy,
         right=features.right,
         octave=features.octave,
-        words=features.words,
+        descriptors=features.descriptors,
         free=free,
     )
     xy, right, radius = windows
-    targets = _SearchTargets(xy, right, radius, octave - 1, octave + 1, words)
+    targets = _SearchTargets(xy, right, radius, octave - 1, octave + 1, descriptors)
     return _search(searched, targets, max_distance, ratio)
 
 

@@ -22,7 +22,8 @@ from dynslam_bench.core.compiled import kernel
 from dynslam_bench.features.brief import rotated_brief, smooth
 from dynslam_bench.features.fast import EDGE, fast_corners
 from dynslam_bench.features.settings import FeatureSettings
-from dynslam_bench.geometry import inside
+from dynslam_bench.geometry import at_width, inside
+from dynslam_bench.geometry.camera import STATED_WIDTH
 
 PATCH_RADIUS = 15
 """Radius of the disc whose intensity centroid gives the orientation, pixels of the level."""
@@ -30,6 +31,7 @@ PATCH_SIDE = 32
 """Rows and columns of the patch that is summed: the disc's 31, and one of zeros that makes whole vectors of it."""
 # row and column of each pixel of the patch from the disc's centre, 0 outside the disc
 _ROW, _COLUMN = np.mgrid[:PATCH_SIDE, :PATCH_SIDE].astype(np.int32) - PATCH_RADIUS
+# columns and rows inside the disc: weights of the first moments
 _IN_DISC = _ROW * _ROW + _COLUMN * _COLUMN <= PATCH_RADIUS * PATCH_RADIUS
 _DISC_COLUMNS = _COLUMN * _IN_DISC
 _DISC_ROWS = _ROW * _IN_DISC
@@ -132,7 +134,7 @@ class OrbExtractor:
                 image = np.asarray(
                     cv2.resize(image, size, interpolation=cv2.INTER_LINEAR), dtype=np.uint8
                 )
-            levels.append(self._corners(image, scale))
+            levels.append(self._corners(image, scale, cell_side(self.settings, gray.shape[1])))
         return levels
 
     def _choose(
@@ -157,13 +159,13 @@ class OrbExtractor:
             missing += quota - len(chosen[-1])
         return chosen[::-1]
 
-    def _corners(self, image: NDArray[np.uint8], scale: float) -> _Level:
-        """A level with its FAST corners, and the cell of the grid that each lies in."""
+    def _corners(self, image: NDArray[np.uint8], scale: float, cell: int) -> _Level:
+        """A level with its FAST corners, and the cell of the grid, of so many pixels, that each lies in."""
         at, response = fast_corners(image, self.settings.fast_threshold_min)
         row, column = np.divmod(at, image.shape[1])
-        cell = self.settings.cell_px
         origin = EDGE - 3
-        columns = -(-(image.shape[1] - 2 * origin) // cell)  # rounded up
+        # cells a row, rounded up
+        columns = -(-(image.shape[1] - 2 * origin) // cell)
         cells = (row - origin) // cell * columns + (column - origin) // cell
         xy = np.stack([column, row], axis=1).astype(np.float32)
         return _Level(image, scale, xy, response, cells)
@@ -186,6 +188,15 @@ class OrbExtractor:
             angle[rows] = orientations(level.image, at, _DISC_COLUMNS, _DISC_ROWS)
             descriptors[rows] = rotated_brief(smooth(level.image), at, angle[rows])
         return Keypoints(xy.astype(np.float32), octave, angle, response, descriptors)
+
+
+def cell_side(settings: FeatureSettings, width: int) -> int:
+    """Side of the grid's cells in pixels of each level, of an image of a width.
+
+    Narrow images have smaller cells, not larger ones: a weak corner counts only in a cell without a
+    strong one, and few corners would be left.
+    """
+    return max(1, round(at_width(settings.cell_px, min(width, STATED_WIDTH))))
 
 
 def level_quotas(n_features: int, levels: int, scale_factor: float) -> list[int]:
@@ -258,7 +269,8 @@ def orientations(
         rows: ... and its row.
     """
     out = np.zeros(len(xy), np.float32)
-    side = len(rows)  # a constant number of turns would be unrolled, and no vector code made
+    # a constant number of turns would be unrolled, and no vector code made
+    side = len(rows)
     for i in range(len(xy)):
         top = int(xy[i, 1]) - PATCH_RADIUS
         left = int(xy[i, 0]) - PATCH_RADIUS

@@ -24,8 +24,10 @@ ORB = FeatureSpec(
     summary="oriented FAST corners with rotated BRIEF, spread evenly over image and scales",
     license="MIT",
 )
+"""The extractor that comes with the package."""
 
 FEATURES: Registry[FeatureSpec] = Registry("features", FeatureSpec, lambda: [ORB])
+"""Extractors by id, built in and of plug-ins."""
 
 
 def build_extractor(settings: FeatureSettings | None = None) -> FeatureExtractor:
@@ -91,6 +93,7 @@ class CachedExtractor:
         self._address(settings)
 
     def _address(self, settings: Settings) -> None:
+        """Note what the keypoints depend on beside the image and the code."""
         weights = named_digests(settings)
         self._prefix = digest(
             [weights, settings.model_dump(mode="json"), machine_digest(), self._threads]
@@ -101,7 +104,14 @@ class CachedExtractor:
         return self._answer([content_digest(gray)], lambda: self._extractor.extract(gray))
 
     def _answer(self, inputs: list[Any], compute: Callable[[], Keypoints]) -> Keypoints:
+        """The stored keypoints, or those that are computed now.
+
+        Args:
+            inputs: Digests of the images and numbers that the keypoints depend on.
+            compute: Extracts them.
+        """
         begin = time.perf_counter()
+        # look the inputs up
         code = self._code()
         key = digest([code, self._prefix, *inputs], 32)
         entry = self._cache.get("features", key)
@@ -113,6 +123,7 @@ class CachedExtractor:
             start = time.perf_counter()
             keypoints = compute()
             cost = time.perf_counter() - start
+            # store them, unless the extractor read further code while it ran
             if self._code() == code:
                 self._cache.put("features", key, vars(keypoints), cost)
         self.saved_s = cost - (time.perf_counter() - begin)
@@ -120,7 +131,7 @@ class CachedExtractor:
 
 
 class CachedMaskedExtractor(CachedExtractor):
-    """The same for an extractor with masked extraction."""
+    """A `CachedExtractor` of an extractor with masked extraction."""
 
     _extractor: MaskedExtractor
 

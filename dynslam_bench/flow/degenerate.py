@@ -74,5 +74,7 @@ def clean_points(
         return invalid_result(points, degenerate=True)
     if np.array_equal(reference, target):
         return invalid_result(points, degenerate=True)
+
+    # points that can be tracked
     usable = usable_points(points, reference.shape)
     return np.where(usable[:, None], points, 0).astype(np.float32), usable

@@ -191,7 +191,7 @@ class DenseDaisyFlow:
 
 @dataclass(frozen=True, eq=False)
 class DescribedImage:
-    """What both directions, and the next pair, need of one image; sizes are those of the half-resolution image.
+    """One image, prepared for both directions and for the next pair; sizes are those of the half-resolution image.
 
     Attributes:
         maps: Its orientation maps.
@@ -219,7 +219,8 @@ def describe_image(
     # superpixels of the half-resolution image
     half = np.ascontiguousarray(maps.framed_half[BORDER:-BORDER, BORDER:-BORDER])
     regions = superpixels(half, max(2, settings.superpixel_px // 2))
-    centres = regions.centres * 2 + 0.5  # half-resolution pixel i covers 2 i and 2 i + 1
+    # half-resolution pixel i covers 2 i and 2 i + 1
+    centres = regions.centres * 2 + 0.5
     neighbours = nearest(centres, sparse.workers.run)
 
     # the unrotated descriptor of every half-resolution pixel
@@ -443,7 +444,8 @@ def fit_regional_motion(
         normal[:, (0, 1, 2), (0, 1, 2)] += weight.sum(axis=1, keepdims=True) * (1e-6, 0.05, 0.05)
         motion = np.linalg.solve(normal, weighted.transpose(0, 2, 1) @ values)
         weight = weight / (1 + (np.linalg.norm(values - basis @ motion, axis=2) / 2.0) ** 2)
-    motion[:, 1:] /= spread[:, :, None]  # back to a change per pixel
+    # back to a change per pixel
+    motion[:, 1:] /= spread[:, :, None]
     return motion
 
 
@@ -769,7 +771,7 @@ class RegionArrays(NamedTuple):
 
 
 class PixelMatching(NamedTuple):
-    """What the raw cost (Eq. 1) of a pixel is computed from.
+    """Images, descriptors and tables that give the raw cost (Eq. 1) of a pixel.
 
     Attributes:
         reference: Orientation maps and grey levels of the reference.
@@ -785,7 +787,7 @@ class PixelMatching(NamedTuple):
 
 
 class GuidedFilter(NamedTuple):
-    """How costs are aggregated (Eq. 2).
+    """The guided filter by which costs are aggregated (Eq. 2).
 
     Attributes:
         guide: float32 ``[h, w]``, half-resolution grey levels in [0, 1].
@@ -950,7 +952,8 @@ def differs(
     for member in region:
         y = member // columns
         x = member % columns
-        if best[y, x] == np.inf:  # it has none so far
+        # it has none so far
+        if best[y, x] == np.inf:
             return True
         # difference of the two displacements at the pixel
         dx = np.float32(2 * x) + np.float32(0.5) - centre[0]

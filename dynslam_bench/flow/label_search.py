@@ -53,7 +53,7 @@ _MIX2 = np.uint64(0x94D049BB133111EB)
 
 
 class Strategy(NamedTuple):
-    """How a search chooses the labels that it evaluates.
+    """A strategy of label search: how it chooses the labels that it evaluates.
 
     Attributes:
         rules: The moth-flame equations in force; None for random searches.
@@ -80,10 +80,11 @@ STRATEGIES: dict[SearchName, Strategy] = {
     "emfoa-literal": Strategy(moth_flame.EMFOA_LITERAL, 0.5, False),
     "random": Strategy(None, 1.0, False),
 }
+"""Label searches by the value of the setting ``search``."""
 
 
 class SearchRules(NamedTuple):
-    """How `run_phase` chooses labels: a `Strategy` with its tables.
+    """A `Strategy` with its tables, as `run_phase` reads it.
 
     Attributes:
         flights: Number of flames and coefficients of each iteration.
@@ -104,7 +105,7 @@ class SearchRules(NamedTuple):
 
 
 class SearchPlan(NamedTuple):
-    """How a budget is spent.
+    """The plan of a search: how its budget of evaluations is spent.
 
     Attributes:
         population: Labels kept a point.
@@ -340,6 +341,7 @@ def run_phase(
     high = np.empty(4, dtype=np.float32)
     trials = np.empty((max(population, candidates.shape[1]), 4), dtype=np.float32)
     for i in range(start, stop):
+        # the point's bounds, and its moths and flames so far
         lower = state.lower[i]
         upper = state.upper[i]
         moths = state.moths[i]
@@ -397,7 +399,8 @@ def run_phase(
             elif stage == INITIAL:
                 stage = OPPOSITES if opposition else SEARCH
             elif stage == OPPOSITES:
-                for m in range(population):  # the best N of X and its opposites
+                # the best N of X and its opposites
+                for m in range(population):
                     if costs[m] < ceiling:
                         moths[m] = flames[m]
                 stage = SEARCH
@@ -425,7 +428,8 @@ def place_moths(
     for m in range(placed, len(moths)):
         random = advance(random)
         bits = scrambled(random)
-        for j in range(4):  # LB + (UB - LB) rand
+        # a draw within the bounds, LB + (UB - LB) rand
+        for j in range(4):
             moths[m, j] = lower[j] + (upper[j] - lower[j]) * uniform(bits, j)
             trials[m - placed, j] = moths[m, j]
     return random
@@ -446,7 +450,8 @@ def opposite_labels(
     `low` and `high`, float32 ``[4]``, are scratch.
     """
     population = len(moths)
-    for j in range(4):  # dynamic bounds dy, dz (Eq. 20)
+    # dynamic bounds dy, dz (Eq. 20)
+    for j in range(4):
         low[j] = moths[0, j]
         high[j] = moths[0, j]
         for m in range(1, population):
@@ -458,8 +463,10 @@ def opposite_labels(
         random = advance(random)
         bits = scrambled(random)
         for j in range(4):
-            opposite = factor * (low[j] + high[j]) - moths[m, j]  # Eq. 19
-            if opposite < lower[j] or opposite > upper[j]:  # Eq. 21-22
+            # the opposite in the population's bounds (Eq. 19)
+            opposite = factor * (low[j] + high[j]) - moths[m, j]
+            # outside the label's bounds: a draw within them (Eq. 21-22)
+            if opposite < lower[j] or opposite > upper[j]:
                 opposite = lower[j] + (upper[j] - lower[j]) * uniform(bits, j)
             trials[m, j] = opposite
     return random
@@ -500,7 +507,8 @@ def move_moths(
     stepping = flight[3] > 0
     last_flame = rules.flights.counts[iteration] - 1
     for m in range(len(moths)):
-        flame = min(m, last_flame)  # Eq. 8
+        # moths beyond the number of flames fly around the last one (Eq. 8)
+        flame = min(m, last_flame)
         random = advance(random)
         bits = scrambled(random)
         cauchy_bits = np.uint64(0)
@@ -508,13 +516,17 @@ def move_moths(
             random = advance(random)
             cauchy_bits = scrambled(random)
         for j in range(4):
-            t = span * uniform(bits, j) + np.float32(1)  # Eq. 10
+            # where on the spiral (Eq. 10)
+            t = span * uniform(bits, j) + np.float32(1)
             distance = abs(flames[m, j] - moths[m, j])
             goal = flames[flame, j]
-            if pulling:  # Eq. 17
+            # the goal: the flame, pulled towards the best one (Eq. 17)
+            if pulling:
                 goal = own * goal + best * flames[0, j]
-            position = distance * spiral_factor(t, rules.spiral) + goal  # Eq. 8, 12
-            if stepping:  # Eq. 13
+            # a spiral around it (Eq. 8, 12)
+            position = distance * spiral_factor(t, rules.spiral) + goal
+            # a Cauchy step, looked up for 12 random bits (Eq. 13)
+            if stepping:
                 draw = np.int64((cauchy_bits >> np.uint64(16 * j)) & np.uint64(4095))
                 position += rules.cauchy[draw] * rules.steps[j]
             position = min(max(position, lower[j]), upper[j])
@@ -896,7 +908,8 @@ def dissenting_labels(
         it has more support than the point's own label.
     """
     limit = tolerance * tolerance
-    u, v = np.ascontiguousarray(predictions[:, :, :2].T)  # [K, N] each
+    # displacements by prediction and point, [K, N] each
+    u, v = np.ascontiguousarray(predictions[:, :, :2].T)
     # how many predictions agree with each: [K, N]
     du = u[:, None] - u
     dv = v[:, None] - v

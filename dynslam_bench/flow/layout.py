@@ -30,13 +30,19 @@ RING_SIGMAS = (4.0, 8.0)
 
 # scale indices k: s = 2 ** (k / 4) for k in -4..5, that is 0.5 to 2.38
 SCALE_STEP_OCTAVES = 0.25
+"""Octaves from one scale index to the next."""
 SCALE_LOW = -4
+"""Lowest scale index."""
 SCALE_HIGH = 5
+"""Highest scale index."""
 
 # rotation indices: 7.5 degrees each, -45 to 45
 ANGLE_STEP_DEG = 7.5
+"""Degrees from one rotation index to the next."""
 ANGLE_LOW = -6
+"""Lowest rotation index."""
 ANGLE_HIGH = 6
+"""Highest rotation index."""
 ROTATIONS = ANGLE_HIGH - ANGLE_LOW + 1
 """Number of rotation indices."""
 
@@ -88,7 +94,7 @@ def sampling_table() -> tuple[NDArray[np.int32], NDArray[np.int64]]:
 
 
 class MapGeometry(NamedTuple):
-    """Where each level lies in the flat histogram array.
+    """Geometry of the maps: where each level lies in the flat histogram array.
 
     Attributes:
         base: int64 ``[LEVELS]``, index of each level's first histogram (the corner of its margin).

@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.core.compiled import Scalar, inlined, kernel
-from dynslam_bench.core.simd import Bytes, Floats, Ints, Longs, Words, descriptor_sum
+from dynslam_bench.core.simd import Bytes, Floats, Ints, Longs, Words
 from dynslam_bench.flow import layout
+from dynslam_bench.flow.descriptor_vectors import descriptor_sum
 from dynslam_bench.flow.orientation_maps import ImageArrays
 
 OUTSIDE = 1 << 20
@@ -115,7 +116,8 @@ def cost_tables(
     per_level = np.stack([geometry.base, geometry.stride, geometry.shift, geometry.bias], axis=1)
 
     # byte offset of each histogram, for every scale, rotation, quarter of the centre's cell, histogram
-    level = np.repeat(ring_level, (9, 8), axis=1)  # [scales, 17]
+    # level of each histogram, [scales, 17]
+    level = np.repeat(ring_level, (9, 8), axis=1)
     steps = np.asarray(layout.LEVEL_STEPS)[level][:, None, None, :, None]
     quarters = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
     centres = quarters[None, None, :, None, :]

@@ -1,6 +1,6 @@
 """The moth-flame equations (Eq. 8-22), and the members of the moth-flame family.
 
-The Optuna sampler (`slam_hpo.moth_flame_sampler`) calls them. The flow's search is compiled:
+The sampler of `packaging/optunahub` calls them. The flow's search is compiled:
 `move_moths` of `label_search` is `moth_positions` for one point, with `flight_table`,
 `spiral_table` and `cauchy_table` from here. Moths and flames are arrays of any leading shape with
 the dimensions of the problem last; `uniform(shape)` draws from [0, 1).
@@ -58,6 +58,7 @@ def flame_counts(population: int, iterations: int, rules: MothFlameRules) -> NDA
 
     As printed, the count is taken from the last one instead of N, and collapses.
     """
+    # Eq. 11 for each iteration
     counts = []
     last = population
     for iteration in range(1, iterations + 1):
@@ -84,12 +85,17 @@ class Flight(NamedTuple):
 
 def flight(progress: Any, rules: MothFlameRules) -> Flight:
     """The coefficients at ``progress = l / T``, in the precision of `progress`."""
-    r = 1 + progress if rules.as_printed else -1 - progress  # Eq. 9
+    # r falls from -1 to -2 (Eq. 9)
+    r = 1 + progress if rules.as_printed else -1 - progress
+
+    # first half: the own flame alone, with Cauchy steps
     first_half = bool(progress <= 0.5)
     stepping = rules.cauchy and first_half
     if first_half or not rules.best_flame:
         return Flight(r - 1, 1 + 0 * progress, 0 * progress, stepping)
-    a = 0.6 - 0.4 * progress  # Eq. 18
+
+    # second half: own and best flame, weighted by a and 1 - a (Eq. 18)
+    a = 0.6 - 0.4 * progress
     share = 0.5 if rules.half else 1.0
     return Flight(r - 1, share * a, share * (1 - a), stepping)
 
@@ -105,7 +111,7 @@ def cauchy(uniform: Any) -> Any:
 
 
 def moth_positions(
-    moths: Any, own: Any, flames: Any, best: Any, now: Flight, scale: Any, uniform: Uniform
+    moths: Any, own: Any, flames: Any, best: Any, iteration: Flight, scale: Any, uniform: Uniform
 ) -> Any:
     """New positions: a spiral around the flame, attraction to the best flame, a Cauchy step (Eq. 8, 10, 12, 13, 17).
 
@@ -114,15 +120,22 @@ def moth_positions(
         own: Flames of their own number, which the distance is taken from.
         flames: The flames they fly around: their own, or the last that is left (Eq. 8).
         best: The best flame.
-        now: Coefficients of the iteration.
+        iteration: Its coefficients.
         scale: Of the Cauchy steps, per dimension.
         uniform: Draws.
     """
-    t = now.span * uniform(moths.shape) + 1  # Eq. 10
-    goal = now.own * flames + now.best * best if now.best else flames  # Eq. 17
-    position = spiral(np.abs(own - moths), t) + goal  # Eq. 8, 12
-    if now.stepping:
-        position = position + cauchy(uniform(moths.shape)) * scale  # Eq. 13
+    # where on the spiral each moth is drawn, from 1 at the flame to r (Eq. 10)
+    t = iteration.span * uniform(moths.shape) + 1
+
+    # the goal: the flame, in the second half pulled towards the best one (Eq. 17)
+    goal = flames
+    if iteration.best:
+        goal = iteration.own * flames + iteration.best * best
+
+    # a spiral around the goal (Eq. 8, 12), and a Cauchy step in the first half (Eq. 13)
+    position = spiral(np.abs(own - moths), t) + goal
+    if iteration.stepping:
+        position = position + cauchy(uniform(moths.shape)) * scale
     return position
 
 
@@ -132,16 +145,19 @@ def opposites(
     """Elite opposition-based learning (Eq. 19-22).
 
     Args:
-        members: Of the population.
+        members: Positions ``[..., D]`` of one or several members of the population.
         least: Lower dynamic bounds of the population (dy of Eq. 20).
         greatest: Upper dynamic bounds (dz).
         low: Lower bounds; an opposite outside the bounds is replaced by a draw within them.
         high: Upper bounds.
         uniform: Draws.
     """
-    opposite = uniform((*members.shape[:-1], 1)) * (least + greatest) - members  # Eq. 19
+    # the opposite of each member in the population's bounds, by one draw a member (Eq. 19)
+    opposite = uniform((*members.shape[:-1], 1)) * (least + greatest) - members
+
+    # outside of the bounds a draw within them (Eq. 21-22)
     drawn = low + (high - low) * uniform(members.shape)
-    return np.where((opposite < low) | (opposite > high), drawn, opposite)  # Eq. 21-22
+    return np.where((opposite < low) | (opposite > high), drawn, opposite)
 
 
 class FlightTable(NamedTuple):

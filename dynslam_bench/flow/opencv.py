@@ -32,6 +32,7 @@ PRESETS = {
     "fast": cv2.DISOPTICAL_FLOW_PRESET_FAST,
     "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
 }
+"""OpenCV's presets of DIS by the value of the setting ``dis_preset``."""
 SMALLEST_SIDE = 32
 """DIS fails on images below its patch and pyramid sizes."""
 
@@ -99,7 +100,8 @@ class LucasKanadeFlow:
         self, first: Image, second: Image, points: Points, initial: Points
     ) -> tuple[Points, NDArray[np.bool_], Points]:
         """Positions in the second image, whether the tracker found them, and its cost."""
-        side = self.settings.window_px | 1  # odd
+        # windows have an odd side
+        side = self.settings.window_px | 1
         xy, status, error = cv2.calcOpticalFlowPyrLK(
             first,
             second,
@@ -142,6 +144,7 @@ class DisFlow(LucasKanadeFlow):
         """Positions in the second image by the dense flow, interpolated bilinearly at the points."""
         flow = self.dense(first, second)
         height, width = flow.shape[:2]
+        # the four pixels around each point, and where the point lies between them
         corner = np.minimum(points.astype(np.int64), (width - 2, height - 2))
         fx, fy = (points - corner).T[:, :, None]
         x, y = corner.T

@@ -19,13 +19,11 @@ from dynslam_bench.core.simd import (
     Ints,
     load,
     load_bytes,
-    sample,
     spread,
-    square,
     store,
-    store_offsets,
     total,
 )
+from dynslam_bench.flow.sampling import sample, square, store_offsets
 from dynslam_bench.geometry.gauss_newton import cholesky_solve
 
 BORDER = 48
@@ -78,13 +76,13 @@ class Workspace(NamedTuple):
         right: float32 ``[length]``, column from the window's centre.
         down: float32 ``[length]``, row from the window's centre.
         grid_columns: int32 ``[pitch * pitch ...]``, column of each pixel of the patch.
-        grid_rows: int32, likewise, its row.
-        squares: int32, likewise, scratch of `warp_patch`.
+        grid_rows: int32 ``[pitch * pitch ...]``, its row.
+        squares: int32 ``[pitch * pitch ...]``, scratch of `warp_patch`.
         patch: float32 ``[pitch * pitch ...]``, the warped target.
         frame: float32, the template's samples: the window with a frame of one pixel.
         template: float32 ``[length]``, the window's grey levels without their mean.
         gradient_x: float32 ``[length]``, differences over two pixels along x.
-        gradient_y: float32 ``[length]``, likewise along y.
+        gradient_y: float32 ``[length]``, differences over two pixels along y.
         hessian: float64 ``[4, 4]``, normal equations of translation, scale and rotation.
         steepest: float64 ``[4]``, their right side, then their solution.
     """
@@ -163,7 +161,7 @@ class Warp(NamedTuple):
 
 
 class Alignment(NamedTuple):
-    """Where the translations within one warp ended, in pixels of the patch.
+    """Result of the translations within one warp, in pixels of the patch.
 
     Attributes:
         x: Offset after the last step.
@@ -190,16 +188,21 @@ class Alignment(NamedTuple):
 def make_workspace(radius: int, margin: int) -> Workspace:
     """The arrays for windows of a radius and translations up to a margin, pixels."""
     side = 2 * radius + 1
+    # sizes: rows of the patch, rounded up to whole vectors of sixteen
     pitch = 2 * (radius + margin) + 1
     length = 16 * ((side * pitch + 15) // 16)
     patch_length = 16 * ((pitch * pitch + 15) // 16)
     # vectors that begin inside the window read up to two rows and two vectors beyond it
     slack = 2 * pitch + 32
+
+    # where each sample of the patch lies on its grid
     grid_columns = np.zeros(patch_length, dtype=np.int32)
     grid_rows = np.zeros(patch_length, dtype=np.int32)
     for k in range(pitch * pitch):
         grid_columns[k] = k % pitch
         grid_rows[k] = k // pitch
+
+    # which samples belong to the window, and how far right of and below its centre they lie
     mask = np.zeros(length, dtype=np.float32)
     right = np.zeros(length, dtype=np.float32)
     down = np.zeros(length, dtype=np.float32)
@@ -209,6 +212,7 @@ def make_workspace(radius: int, margin: int) -> Workspace:
             mask[k] = np.float32(1)
             right[k] = np.float32(x - radius)
             down[k] = np.float32(y - radius)
+    # the rest is filled for every point: rows of pixels, patch, gradients, template and equations
     return Workspace(
         pitch,
         length,
@@ -366,6 +370,7 @@ def target_fits(warp: Warp, window: Window, image: Bytes) -> Scalar:
         window: Size of the patch.
         image: uint8 ``[H + 2 BORDER, W + 2 BORDER]``.
     """
+    # half the width of the patch in the image, under the warp
     rows, columns = image.shape
     reach = window.radius + window.margin
     span = (abs(warp.a) + abs(warp.b)) * np.float32(reach) + np.float32(2)
@@ -393,14 +398,14 @@ def read_frame(image: Bytes, x: Scalar, y: Scalar, rows: int, pitch: int, out: F
     for block in range((pitch + 15) // 16):
         first = min(16 * block, max(pitch - 16, 0))
         at = row * stride + column + first
-        before = load_bytes(flat, at)
-        before = before + right * (load_bytes(flat, at + 1) - before)
+        above = load_bytes(flat, at)
+        above = above + right * (load_bytes(flat, at + 1) - above)
         for r in range(rows):
             at += stride
-            after = load_bytes(flat, at)
-            after = after + right * (load_bytes(flat, at + 1) - after)
-            store(out, r * pitch + first, before + lower * (after - before))
-            before = after
+            below = load_bytes(flat, at)
+            below = below + right * (load_bytes(flat, at + 1) - below)
+            store(out, r * pitch + first, above + lower * (below - above))
+            above = below
 
 
 @inlined
@@ -587,7 +592,8 @@ def align_translation(
         sum_of_w = np.float64(sum_w)
         mean = sum_of_w / n
         variance = ww - mean * sum_of_w
-        score = np.float32(-1)  # a flat target looks like anything
+        # a flat target looks like anything
+        score = np.float32(-1)
         if variance >= n * FLAT_VARIANCE:
             score = np.float32(wt / np.sqrt(variance * template.energy))
         if iteration == 0:
@@ -643,6 +649,8 @@ def similarity_equations(
     at, weights = patch_shift(alignment.sampled_x, alignment.sampled_y, window.margin, space.pitch)
     mean_t = spread(template.mean)
     zero = spread(np.float32(0))
+    # sums over the window, sixteen samples at a time: of each derivative, and of products of two of
+    # {s, r, gx = x, gy = y, template t, patch w}
     sum_s = zero
     sum_r = zero
     sx = zero
@@ -657,6 +665,7 @@ def similarity_equations(
     ws = zero
     wr = zero
     for k in range(0, space.length, 16):
+        # patch, gradients and offsets of these samples, and from them the two derivatives
         w = shifted(space.patch, at + k, space.pitch, weights) - mean_t
         gx = load(space.gradient_x, k)
         gy = load(space.gradient_y, k)

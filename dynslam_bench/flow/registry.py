@@ -28,6 +28,7 @@ BUILT_IN = (
 )
 
 FLOWS: Registry[FlowSpec] = Registry("flow", FlowSpec, lambda: BUILT_IN)
+"""Flows by id, built in and of plug-ins."""
 
 
 def spec_of(settings: FlowMethodSettings) -> FlowSpec:

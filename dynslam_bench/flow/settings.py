@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Literal
 
 from pydantic import Field
@@ -117,6 +118,19 @@ class DaisySettings(FlowMethodSettings):
     refinement_window_px: int = Field(
         17, ge=5, le=41, description="side of the refinement's window, odd"
     )
+
+    @property
+    def unused(self) -> Mapping[str, str]:
+        """Fields of the label search that have no effect because another flow runs, and why."""
+        reason = ""
+        if self.plugin:
+            reason = f"flow.plugin is {self.plugin!r}"
+        elif self.method != "daisy":
+            reason = f"flow.method is {self.method!r}"
+        if not reason:
+            return {}
+        own = type(self).model_fields.keys() - FlowMethodSettings.model_fields.keys()
+        return dict.fromkeys(own, reason)
 
 
 class FlowSettings(DaisySettings):

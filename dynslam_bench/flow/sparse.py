@@ -180,6 +180,7 @@ class SparseDaisyFlow:
     ) -> NDArray[np.float32]:
         """Distance in pixels ``[N]`` from each point to where its end in the target is refined back to."""
         count = len(points)
+        # from the ends, by the inverse label, with one image in the place of the other
         ends = points + labels[:, :2]
         inverse = -labels
         window = Window(1, self.settings.refinement_window_px // 2, margin=BACKWARD_MARGIN, warps=1)
@@ -219,10 +220,12 @@ class SparseDaisyFlow:
         correlation = self.refine(points, labels, pair)
         if not STRATEGIES[self.settings.search].propagates or len(points) < 3:
             return correlation
+
         # what neighbours agree on
         predictions = labels_as_seen(points, labels, neighbours)
         alternative, dissents = dissenting_labels(predictions, labels, np.float32(CONSENSUS_PX))
         self._take_better(points, labels, correlation, alternative, dissents, pair)
+
         if self.settings.similarity_seeds:
             # the motion that most points share; without one it is NaN, and no point dissents
             costs = np.rint(COSTS_PER_CORRELATION * (1 - correlation)).astype(np.int64)
@@ -267,6 +270,7 @@ class SparseDaisyFlow:
         self, points: NDArray[np.float32], labels: NDArray[np.float32], pair: Pair
     ) -> NDArray[np.float32]:
         """Refine labels in place at half, then full resolution; returns the windows' correlation ``[N]``."""
+        # half resolution, then full
         reference = pair.reference
         target = pair.target
         correlation = np.empty(len(points), dtype=np.float32)

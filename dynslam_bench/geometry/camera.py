@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 TUM_DEPTH_FACTOR = 5000.0
 """Raw depth units a metre of TUM's files."""
+STATED_WIDTH = 640
+"""Width of the images in whose pixels sizes of things in the image are stated."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,7 @@ class Camera:
 
         The pixels of points behind the camera mean nothing.
         """
+        # points at least 5 cm ahead; others are replaced by one that can be projected
         ahead = points[:, 2] > 0.05
         uv = self.project(np.where(ahead[:, None], points, [0.0, 0.0, 1.0]))
         size = self.width + margin_px, self.height + margin_px
@@ -129,15 +132,15 @@ class Camera:
 
         coefficients = np.asarray(self.distortion)
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-9)
-        undistorted = (
-            cv2.undistortPointsIter(
+        # the distortion is inverted by iteration; older OpenCV has criteria under another name
+        if hasattr(cv2, "undistortPointsIter"):
+            undistorted = cv2.undistortPointsIter(
                 pixels[:, None], self.matrix, coefficients, np.eye(3), self.matrix, criteria
             )
-            if hasattr(cv2, "undistortPointsIter")
-            else cv2.undistortPoints(
+        else:
+            undistorted = cv2.undistortPoints(
                 pixels[:, None], self.matrix, coefficients, None, self.matrix, criteria=criteria
             )
-        )
         return np.asarray(undistorted, dtype=np.float64).reshape(-1, 2)
 
     def undistortion_maps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -155,6 +158,7 @@ class Camera:
     def distort_points(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
         """Distorted pixels ``[N, 2]`` of the undistorted pixels ``[N, 2]``; the inverse of `undistort_points`."""
         pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+        # rays (x, y, 1), their squared radius, and where the lens puts them (OpenCV's model)
         k1, k2, p1, p2, k3 = self.distortion
         x, y = ((pixels - (self.cx, self.cy)) / (self.fx, self.fy)).T
         r2 = x * x + y * y
@@ -171,6 +175,7 @@ def pixel_index(
     xy: NDArray[np.floating], shape: tuple[int, ...]
 ) -> tuple[tuple[NDArray[np.intp], NDArray[np.intp]], NDArray[np.bool_]]:
     """Rows and columns of pixels ``[..., 2]``, rounded and moved into an image ``(H, W)``, and which lie in it."""
+    # what is no number counts as outside
     rounded = np.rint(np.nan_to_num(xy, nan=-1.0, posinf=-1.0, neginf=-1.0).clip(-1, 1e6)).astype(
         np.intp
     )
@@ -178,6 +183,20 @@ def pixel_index(
     row = rounded[..., 1]
     visible = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
     return (row.clip(0, shape[0] - 1), column.clip(0, shape[1] - 1)), visible
+
+
+def at_width(size_px: float, width: int) -> float:
+    """A size in the image, stated in pixels of an image 640 pixels wide, in pixels of one of another width.
+
+    For the sizes of regions, which shrink with the image: how far a mask is grown, the cells in
+    which points are counted. Not for the noise of a pixel's position, nor for patches that need a
+    number of pixels.
+
+    Args:
+        size_px: The size at a width of `STATED_WIDTH`.
+        width: The image's width, pixels.
+    """
+    return size_px * width / STATED_WIDTH
 
 
 def inside(mask: NDArray[np.bool_], xy: NDArray[np.floating]) -> NDArray[np.bool_]:

@@ -14,6 +14,7 @@ _NAME = re.compile(r"(?P<name>[^\s\[(]+)\s*(?:[\[(]\s*(?P<unit>[^\])]*?)\s*[\])]
 _STAMP = re.compile(
     r"(?:time_?stamps?|times?|ts|t|stamps?|sec(?:ond)?s?)(?:_(?P<unit>[a-z]+))?", re.IGNORECASE
 )
+"""The name of a stamp, perhaps with its unit: ``timestamp``, ``t``, ``time_ns``."""
 _PART = re.compile(r"(?P<vector>.*?)[_.]?(?P<axis>[xyzw])", re.IGNORECASE)
 """A part of a vector: ``qw``, ``p_RS_R_x``, ``position.x``, ``x``."""
 _SYMBOLS = {symbol: unit for unit in UNITS for symbol in (unit.symbol, f"{unit.symbol}ec")}
@@ -37,16 +38,20 @@ class Heading:
 
 def parse_heading(text: str) -> Heading | None:
     """The heading that a line is, without its ``#``, with commas or spaces between the names; None if it is none."""
+    # cells between commas, else names between spaces
     text = text.strip().lstrip("#%").strip().replace('"', "")
     cells = [cell.strip() for cell in text.split(",")]
     if len(cells) == 1:
         cells = [match[0] for match in _NAME.finditer(text)]
-    if cells and not cells[-1]:  # a comma at the end
+    # a comma at the end
+    if cells and not cells[-1]:
         cells.pop()
+
     # a column without a name numbers the rows, as pandas writes it
     names = [_NAME.fullmatch(cell) for cell in cells]
     if any(cell and name is None for cell, name in zip(cells, names, strict=True)):
         return None
+
     # the stamp, and the parts of vectors by the name that they share
     stamp_column = None
     unit = ""
@@ -61,6 +66,8 @@ def parse_heading(text: str) -> Heading | None:
             unit = name["unit"] or stamp["unit"] or ""
         elif part is not None:
             vectors.setdefault(part["vector"].lower(), {}).setdefault(part["axis"].lower(), column)
+
+    # the first vector of three parts is the position, the first of four the quaternion
     position = next((axes for axes in vectors.values() if axes.keys() == set("xyz")), None)
     quaternion = next((axes for axes in vectors.values() if axes.keys() == set("xyzw")), None)
     if stamp_column is None or position is None or quaternion is None:

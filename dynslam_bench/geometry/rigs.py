@@ -6,6 +6,7 @@ from dynslam_bench.geometry import se3
 from dynslam_bench.geometry.se3 import Array
 
 Matrix = tuple[tuple[float, float, float], ...]
+"""The rows of a 3x3 matrix."""
 
 # Bonn RGB-D Dynamic: the markers on the camera. The publisher states T_ROS and T_m; a camera pose
 # is T_ROS^-1 T_marker T_ROS T_m. The linear part of T_m is a rotation times 1.059.
@@ -28,6 +29,7 @@ BONN_R_BODY_CAM: Matrix = (
 
 def nearest_rotation(matrix: Array | Matrix) -> Array:
     """The rotations ``[..., 3, 3]`` nearest to matrices that are nearly rotations, up to scale."""
+    # without the singular values, which are the scale
     left, _, right = np.linalg.svd(np.array(matrix))
     return np.asarray(left @ right)
 
@@ -44,6 +46,7 @@ def bonn_camera(poses: Array) -> Array:
         poses: Positions of the markers with the camera's orientations ``[N, 4, 4]``, as Bonn's
             sequences give them.
     """
+    # the camera's centre on the markers, in the axes of the camera
     lever_cam = nearest_rotation(BONN_R_BODY_CAM).T @ (BONN_T_ROS[:3, :3] @ BONN_T_M[:3, 3])
     moved = poses.copy()
     moved[:, :3, 3] += poses[:, :3, :3] @ lever_cam
@@ -60,7 +63,9 @@ def bonn_as_droid_w(poses: Array) -> Array:
         poses: Positions of the markers with the camera's orientations ``[N, 4, 4]``, as Bonn's
             sequences give them.
     """
+    # the markers' own poses, T of the formula
     markers = se3.with_rotation(poses, poses[:, :3, :3] @ nearest_rotation(BONN_R_BODY_CAM).T)
     corrected = BONN_T_ROS.T @ markers @ BONN_T_ROS @ BONN_T_M
+    # relative to the first one, and rotations without the scale
     relative = np.linalg.inv(corrected[0]) @ corrected
     return se3.with_rotation(relative, nearest_rotation(relative[:, :3, :3]))

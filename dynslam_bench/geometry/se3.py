@@ -17,10 +17,15 @@ def hat(v: Array) -> Array:
 
 
 def exp(xi: Array) -> Array:
-    """Poses ``[..., 4, 4]`` of twists ``[..., 6]`` = (translation rho, rotation phi in rad)."""
+    """Poses ``[..., 4, 4]`` of twists ``[..., 6]`` = (translation rho, rotation phi in rad).
+
+    Rotation by Rodrigues' formula ``R = I + a [phi] + b [phi]^2``, translation ``V rho`` with
+    ``V = I + b [phi] + c [phi]^2``.
+    """
     xi = np.asarray(xi, dtype=np.float64)
     rho = xi[..., :3]
     phi = xi[..., 3:]
+    # a = sin t / t, b = (1 - cos t) / t^2, c = (t - sin t) / t^3; their series where the angle is small
     theta = np.linalg.norm(phi, axis=-1)[..., None, None]
     small = theta < 1e-5
     safe = np.where(small, 1.0, theta)
@@ -34,10 +39,14 @@ def exp(xi: Array) -> Array:
 
 
 def log(pose: Array) -> Array:
-    """Twists ``[..., 6]`` = (rho, phi) of poses ``[..., 4, 4]``; rotation angles in [0, pi]."""
+    """Twists ``[..., 6]`` = (rho, phi) of poses ``[..., 4, 4]``; rotation angles in [0, pi].
+
+    The inverse of `exp`: ``rho = V^-1 t`` with ``V^-1 = I - [phi] / 2 + f [phi]^2``.
+    """
     pose = np.asarray(pose, dtype=np.float64)
     flat = pose.reshape(-1, 4, 4)
     phi = rotation_vectors(flat)
+    # f = (1 - (t / 2) / tan(t / 2)) / t^2; its series where the angle is small
     theta = np.linalg.norm(phi, axis=-1)[:, None, None]
     small = theta < 1e-5
     safe = np.where(small, 1.0, theta)
@@ -74,6 +83,7 @@ def from_quaternion(translation: Array, quaternion: Array) -> Array:
     # loaded when needed: code that only copies poses does not load it
     from scipy.spatial.transform import Rotation
 
+    # very large and very small numbers are scaled, so that their squares are numbers
     quaternion = np.asarray(quaternion, dtype=np.float64)
     largest = np.abs(quaternion).max(axis=-1, keepdims=True, initial=0.0)
     if ((largest > _SQUARES) | ((largest > 0) & (largest < 1 / _SQUARES))).any():
@@ -100,11 +110,13 @@ def rotation_vectors(pose: Array) -> Array:
     """Rotation vectors ``[..., 3]`` in rad of poses or rotation matrices, of length in [0, pi]."""
     pose = np.asarray(pose, dtype=np.float64)
     axes, angle = scaled_axes(pose)
-    if np.max(angle, initial=0.0) > 3.0:  # near a half turn the sine does not tell the axis
+    # near a half turn the sine does not tell the axis
+    if np.max(angle, initial=0.0) > 3.0:
         from scipy.spatial.transform import Rotation
 
         rotation = Rotation.from_matrix(pose[..., :3, :3].reshape(-1, 3, 3))
         return np.asarray(rotation.as_rotvec().reshape(*angle.shape, 3))
+    # axes times the sine become axes times the angle; near zero both are the same
     sine = np.sin(angle)
     return np.asarray(
         axes * np.where(sine > 1e-9, angle / np.where(sine > 1e-9, sine, 1.0), 1.0)[..., None]
@@ -113,6 +125,7 @@ def rotation_vectors(pose: Array) -> Array:
 
 def scaled_axes(pose: Array) -> tuple[Array, Array]:
     """Axes ``[..., 3]`` times the sine of the angle, and the angles ``[...]``, of rotations."""
+    # R - R^T holds twice the axis times the sine, the trace is 1 + 2 cos
     pose = np.asarray(pose, dtype=np.float64)
     x = pose[..., 2, 1] - pose[..., 1, 2]
     y = pose[..., 0, 2] - pose[..., 2, 0]
@@ -122,9 +135,11 @@ def scaled_axes(pose: Array) -> tuple[Array, Array]:
     return 0.5 * np.stack([x, y, z], axis=-1), np.asarray(angle)
 
 
+# how far the poses of a camera that stands still may lie apart: the noise of a motion capture system
 STILL_M = 1e-3
+"""In position, metres."""
 STILL_DEG = 0.1
-"""How far the poses of a camera that stands still may lie apart: the noise of a motion capture system."""
+"""In orientation, degrees."""
 
 
 def is_static(poses: Array) -> bool:
@@ -135,7 +150,7 @@ def is_static(poses: Array) -> bool:
 
 
 def between(poses: Array, pairs: NDArray[np.intp]) -> Array:
-    """Motions ``[P, 4, 4]`` from one pose to the other of pairs ``[P, 2]`` of poses ``[N, 4, 4]``."""
+    """The second pose of each pair ``[P, 2]`` of poses ``[N, 4, 4]`` in the frame of the first one, ``[P, 4, 4]``."""
     return np.asarray(inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]])
 
 

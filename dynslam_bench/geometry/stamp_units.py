@@ -31,17 +31,19 @@ class StampUnit:
 
     @property
     def per_s(self) -> float:
-        """How many of it are a second."""
+        """Number of units in a second."""
         return float(10**self.digits)
 
 
 SECONDS = StampUnit("seconds", "s", 0)
+"""What TUM's format prescribes."""
 UNITS = (
     SECONDS,
     StampUnit("milliseconds", "ms", 3),
     StampUnit("microseconds", "us", 6),
     StampUnit("nanoseconds", "ns", 9),
 )
+"""The units that are recognised, from the largest to the smallest."""
 LATEST_S = 9e9
 """The year 2255. Later stamps are no seconds, and 64 bits of nanoseconds end there."""
 SLOWEST_S = 5.0
@@ -49,7 +51,8 @@ SLOWEST_S = 5.0
 FASTEST_FINE_S = 0.9e-3
 """Shortest median step in a unit smaller than the second: a little more than 1000 Hz.
 
-At 200 Hz, a frequent rate of motion capture, this limit and `SLOWEST_FINE_S` leave one unit."""
+At 200 Hz, a frequent rate of motion capture, this limit and `SLOWEST_FINE_S` leave one unit.
+"""
 SLOWEST_FINE_S = 4.0
 """Longest median step in a unit smaller than the second: 0.25 Hz."""
 SPARSE_S = 60.0
@@ -59,19 +62,20 @@ SHORTEST_S = 0.5
 UNIX_S = 1e9
 """Unix time of the year 2001: stamps between it and `LATEST_S` are Unix time."""
 LEAST_STATED_S = 1e-6
+"""A heading whose unit makes steps shorter than this contradicts the stamps."""
 MOST_STATED_S = 1e5
-"""A heading whose unit makes steps beyond these limits contradicts the stamps."""
+"""A heading whose unit makes steps longer than this contradicts the stamps."""
 MOST_FRAMES = 1e8
 """Forty days at 30 frames a second: larger whole numbers are no numbers of frames."""
 
 
 @dataclass(frozen=True)
 class _Measured:
-    """What is measured of stamps, in the unit that they are written in.
+    """Size, span and step of stamps, in the unit that they are written in.
 
     Attributes:
         latest: The largest of them, without signs.
-        usual: Their median, likewise.
+        usual: Their median, without signs.
         span: From the first to the last.
         step: Median difference of distinct ones in order of time; None for fewer than two.
     """
@@ -105,6 +109,7 @@ def unit_of(
     Raises:
         TrajectoryError: No unit is possible, several are, or the stated one is not.
     """
+    # size, span and median step of the stamps; a stated unit only has to agree with them
     values = np.asarray(stamps, dtype=np.float64)
     sizes = np.abs(values)
     span = float(values.max() - values.min())
@@ -112,23 +117,29 @@ def unit_of(
     if stated is not None:
         _check_stated(stated, measured, source)
         return stated, ""
+
+    # what can be seconds at the rate of a camera is seconds
     step = measured.step
     if measured.latest <= LATEST_S and (step is None or step <= SLOWEST_S):
         return SECONDS, ""
+
+    # else the only unit that is possible
     possible = _possible_units(measured)
     if possible == [SECONDS]:
         return SECONDS, ""
     if len(possible) == 1:
-        return possible[
-            0
-        ], f"stamps {_described(measured)}: taken as {_with_rate(possible[0], step)}"
+        unit = possible[0]
+        return unit, f"stamps {_described(measured)}: taken as {_with_rate(unit, step)}"
+
+    # none, perhaps because of one stamp that is far from the others, or several
     if not possible:
         one_is_far = measured.usual <= LATEST_S and step is not None and step <= SLOWEST_S
+        cure = "write seconds"
+        if one_is_far:
+            cure = f"remove the line with the stamp {measured.latest:.10g}"
         raise TrajectoryError(
             f"the stamps of {source} {_described(measured)}: in no unit are they those of a trajectory",
-            f"remove the line with the stamp {measured.latest:.10g}"
-            if one_is_far
-            else "write seconds",
+            cure,
         )
     example = f"# timestamp [{possible[0].symbol}] tx ty tz qx qy qz qw"
     raise TrajectoryError(
@@ -139,6 +150,7 @@ def unit_of(
 
 def _possible_units(measured: _Measured) -> list[StampUnit]:
     """The units that stamps may be in which are no seconds at the rate of a camera, the likeliest first."""
+    # units in which no stamp lies beyond 2255, and those in which they are Unix time
     in_range = [unit for unit in UNITS if measured.latest <= LATEST_S * unit.per_s]
     unix = [unit for unit in in_range if measured.usual >= UNIX_S * unit.per_s]
     step = measured.step

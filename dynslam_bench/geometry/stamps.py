@@ -17,6 +17,7 @@ from dynslam_bench.core import DynslamError, TrajectoryError
 
 Index = NDArray[np.intp]
 NS_PER_S = 1_000_000_000
+"""Nanoseconds a second."""
 LEAST_GAP_NS = 1000
 """Stamps of one list that are closer, and not equal, are refused.
 
@@ -24,7 +25,9 @@ No camera and no motion capture is so fast, float64 seconds hardly tell them apa
 decimals do not.
 """
 _EXACT = Context(prec=400, rounding=ROUND_HALF_EVEN)
+"""Decimal arithmetic of 400 digits, more than any stamp has."""
 _LARGEST_NS = 2**63 - 1
+"""The largest stamp that 64 bits hold: the year 2262."""
 
 
 def parse_ns(text: str, digits: int = 0) -> int:

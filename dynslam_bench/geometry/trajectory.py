@@ -33,12 +33,15 @@ class Trajectory:
     _may_repeat: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
+        # stamps and poses, as many of each, finite
         stamps = np.ascontiguousarray(self.timestamps, dtype=np.float64)
         poses = np.ascontiguousarray(self.T_world_cam, dtype=np.float64).reshape(-1, 4, 4)
         if stamps.shape != (len(poses),):
             raise TrajectoryError(f"a trajectory has {stamps.size} stamps but {len(poses)} poses")
         if not np.isfinite(stamps).all() or not np.isfinite(poses).all():
             raise TrajectoryError("a trajectory holds values that are not finite")
+
+        # stamps in order of time
         steps = np.diff(stamps)
         wrong = steps < 0 if self._may_repeat else steps <= 0
         if wrong.any():
@@ -46,6 +49,8 @@ class Trajectory:
             raise TrajectoryError(
                 f"stamps are not strictly increasing: {stamps[at]:.9f} then {stamps[at + 1]:.9f}"
             )
+
+        # the class is frozen
         object.__setattr__(self, "timestamps", stamps)
         object.__setattr__(self, "T_world_cam", poses)
         if self.exact_ns is not None:
@@ -56,6 +61,8 @@ class Trajectory:
                 raise TrajectoryError(
                     f"a trajectory has {stamps.size} stamps but {len(self.timestamps_ns)} in ns"
                 )
+
+        # stamps that differ as floats may be one number of nanoseconds
         if len(stamps) > 1 and steps.min() * NS_PER_S < LEAST_GAP_NS and not self._may_repeat:
             gaps = np.diff(self.timestamps_ns)
             at = int(gaps.argmin())

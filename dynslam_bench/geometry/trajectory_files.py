@@ -39,7 +39,7 @@ _UNIT_TOLERANCE = 0.01
 
 @dataclass(frozen=True)
 class FileNotes:
-    """What a file held that was not taken as it stands.
+    """Counts of what a file held that was not taken as it stands.
 
     Attributes:
         lines: Lines with a pose, skipped ones included.
@@ -72,6 +72,7 @@ class FileNotes:
         else:
             duplicates = "replaced by a later line with the same stamp"
         of = f"of {self.lines} lines"
+        # a count and its phrase
         phrases = [
             (self.not_finite, f"{self.not_finite} {of} skipped: not finite"),
             (self.zero_quaternions, f"{self.zero_quaternions} {of} skipped: all-zero quaternion"),
@@ -128,13 +129,15 @@ def load_tum(path: str | Path) -> TumFile:
             number), stamps of a unit that is not known or that mostly repeat each other, two stamps
             that differ by less than 1 us, or no valid pose.
     """
+    # the table, in the order of columns that the heading states
     path = Path(path)
     heading, line_of_heading = _find_heading(path)
     heading = heading or Heading(8, tuple(range(8)), None)
     table = _read_table(
         path, heading.columns, _COLUMNS, without=line_of_heading, stamp_column=heading.order[0]
     )
-    # Columns in TUM's order; lines without a pose are left out.
+
+    # columns in TUM's order; lines without a pose are left out
     values = table.values[:, list(heading.order)]
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
     norm = np.linalg.norm(np.where(finite[:, None], values[:, 4:8], 0.0), axis=1)
@@ -147,13 +150,16 @@ def load_tum(path: str | Path) -> TumFile:
     )
     if not valid.any():
         raise NoPoseError(f"{path} holds no valid pose", "; ".join(counted.describe()))
-    # Stamps, exactly as they are written.
+
+    # stamps in nanoseconds, exactly as they are written
     kept = values[valid]
     texts = [table.texts[row] for row in np.flatnonzero(valid)]
     moved = (np.diff(kept[:, 1:], axis=0) != 0).any(axis=1)
     ns, unit_note = _stamps_of(texts, kept[:, 0], str(path), stated=heading.unit, moved=moved)
     line_of = dict(zip(ns.tolist(), np.array(table.numbers)[valid].tolist(), strict=True))
     refuse_close(np.sort(ns), str(path), TrajectoryError, line_of.get)
+
+    # poses, sorted by their stamps
     poses = se3.from_quaternion(kept[:, 1:4], kept[:, 4:8])
     return ordered_file(ns, poses, replace(counted, stamps=unit_note))
 
@@ -180,7 +186,7 @@ def _stamps_of(
         TrajectoryError: Most stamps, or a third of them with other poses, repeat the one before;
             their unit is not known; or one lies beyond the range of 64 bits.
     """
-    # Stamps that lost their last digits repeat each other.
+    # stamps that lost their last digits repeat each other
     repeated = np.diff(values) == 0
     repeats = np.flatnonzero(repeated)
     others = 0 if moved is None else int((repeated & moved).sum())
@@ -190,6 +196,8 @@ def _stamps_of(
             f"{texts[repeats[0]][:40]}: digits were lost when they were written",
             "write all digits of the stamps, e.g. with the format %.9f in place of %g, and no 32-bit floats",
         )
+
+    # whole nanoseconds from the text, so that no digit is lost in a float
     unit, note = unit_of(values, source, stated)
     try:
         return np.array([parse_ns(text, unit.digits) for text in texts], dtype=np.int64), note
@@ -209,6 +217,7 @@ def _find_heading(path: Path) -> tuple[Heading | None, int]:
     """
     commented: list[Heading] = []
     for number, line in enumerate(read_lines(path, kind=TrajectoryError), start=1):
+        # comments that are headings, until the first row
         text = line.strip()
         if text.startswith(("#", "%")):
             heading = parse_heading(text)
@@ -217,6 +226,7 @@ def _find_heading(path: Path) -> tuple[Heading | None, int]:
         parts = _parts(text)
         if not parts:
             continue
+        # the first row, or a heading that is no comment
         if is_number(parts[0]):
             return _joined([heading for heading in commented if heading.columns == len(parts)]), 0
         heading = parse_heading(text)
@@ -247,6 +257,7 @@ def ordered_file(
         T_world_cam: Camera-to-world poses ``[N, 4, 4]``.
         notes: The counts of skipped lines.
     """
+    # in order of time; of equal stamps the last line counts
     order = np.argsort(ns, kind="stable")
     exact = ns[order]
     last_of_stamp = np.append(np.diff(exact) > 0, True)
@@ -284,14 +295,19 @@ def format_tum(trajectory: Trajectory, *, comment: str = "") -> str:
 
     The heading states the unit of the stamps where their steps do not tell it.
     """
+    # position and quaternion of each pose
     stamps = [format_ns(ns) for ns in trajectory.timestamps_ns.tolist()]
     position, quaternion = se3.to_quaternion(trajectory.T_world_cam)
     rows = np.concatenate([position, quaternion], axis=1).tolist()
+
+    # the heading, with the unit where steps as long as these leave it open
     is_sparse = (median_step(trajectory.timestamps) or 0.0) > SLOWEST_S
-    columns = (
-        _COLUMNS.replace("timestamp", f"timestamp [{SECONDS.symbol}]") if is_sparse else _COLUMNS
-    )
+    columns = _COLUMNS
+    if is_sparse:
+        columns = columns.replace("timestamp", f"timestamp [{SECONDS.symbol}]")
     heading = [f"# {line}" for line in (*comment.splitlines(), columns)]
+
+    # one pose a line
     lines = [
         " ".join([stamp, *map("{:.9f}".format, row)])
         for stamp, row in zip(stamps, rows, strict=True)
@@ -389,6 +405,7 @@ def _read_table(
                 f"{path} line {number} has {len(parts)} values, not the {columns} of '{meaning}'",
                 _hint(parts),
             )
+        # the stamp's text is kept, as a float may not hold all of its digits
         texts.append(parts[stamp_column])
         try:
             values.extend(map(float, parts))
@@ -426,6 +443,7 @@ def _hint(parts: list[str]) -> str:
 # numbers a line.
 
 _MEANING = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
+"""What stands in a line of KITTI's format."""
 
 
 def read_kitti(path: str | Path, times: str | Path) -> Trajectory:
@@ -448,6 +466,7 @@ def read_kitti(path: str | Path, times: str | Path) -> Trajectory:
 
 def _load_kitti(path: Path, times: Path) -> TumFile:
     """The trajectory of `read_kitti`, with the notes on both files."""
+    # rigid poses, whose rotations are made orthonormal
     rows = read_table(path, 12, _MEANING)
     matrices = rows.reshape(-1, 3, 4)
     poses = se3.from_matrix(matrices[:, :, 3], matrices[:, :, :3])
@@ -457,6 +476,8 @@ def _load_kitti(path: Path, times: Path) -> TumFile:
                 f"{path}: pose {index} of {len(poses)} is no rigid transformation", _MEANING
             )
     poses = se3.with_rotation(poses, nearest_rotation(poses[:, :3, :3]))
+
+    # a stamp for each, from the other file
     ns, unit_note = _load_stamps(times)
     if len(ns) != len(poses):
         raise TrajectoryError(f"{path} has {len(poses)} poses but {times} has {len(ns)} stamps")

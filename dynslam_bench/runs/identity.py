@@ -5,6 +5,7 @@ again while all that was read for it is unchanged.
 """
 
 import json
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -28,7 +29,7 @@ from dynslam_bench.core.module_graph import (
     read_module_graph,
 )
 from dynslam_bench.core.plugins import load_object
-from dynslam_bench.core.reads import Anchors
+from dynslam_bench.core.reads import Anchors, ImportPath
 from dynslam_bench.core.settings import Settings, flatten
 from dynslam_bench.core.version import release
 from dynslam_bench.envs import Degradation
@@ -333,7 +334,7 @@ def _files_of(
     Raises:
         DynslamError: One cannot be read.
     """
-    weights = named_digests(settings)
+    weights = named_digests(settings, words=is_foreign(tracker.entry_point))
     group = getattr(settings, "segmentation", None)
     if source in ("embedded", "coco") and isinstance(group, SegmentationSettings):
         weights[source] = weights_digest(group.model_copy(update={"source": source}))
@@ -347,7 +348,8 @@ def _files_of(
 
 def libraries() -> dict[str, str]:
     """What computes with a run's data: versions of the modules that are imported, and what comes before them."""
-    identities = {name: library_identity(module) for name, module in LIBRARIES.items()}
+    imports = ImportPath(sys.path)
+    identities = {name: library_identity(module, imports) for name, module in LIBRARIES.items()}
     return identities | search_path()
 
 

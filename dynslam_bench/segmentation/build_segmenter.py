@@ -209,7 +209,8 @@ def _check_recorded(folder: Path, settings: SegmentationSettings, sequence: Sequ
     Raises:
         SegmentationError: No class is a dynamic one, or masks of frames are missing.
     """
-    from dynslam_bench.segmentation.recorded import RecordedSegmenter  # needs OpenCV
+    # the module needs OpenCV
+    from dynslam_bench.segmentation.recorded import RecordedSegmenter
 
     recorded = RecordedSegmenter(folder)
     check_classes(
@@ -242,7 +243,8 @@ def _shows_objects(
     folder: Path, changed: int, classes: frozenset[str], stamps: tuple[float, ...]
 ) -> bool:
     """Whether recorded masks show an object; read once a process, as long as no file comes or goes (`changed`)."""
-    from dynslam_bench.segmentation.recorded import RecordedSegmenter  # needs OpenCV
+    # the module needs OpenCV
+    from dynslam_bench.segmentation.recorded import RecordedSegmenter
 
     return RecordedSegmenter(folder).first_object(np.array(stamps), classes) is not None
 
@@ -256,7 +258,8 @@ def _check_oracle(kind: str, settings: SegmentationSettings, sequence: Sequence)
     not_coco = settings.class_names().difference(COCO_NAMES)
     if sequence.masks is None or not (not_coco or kind == "oracle-classes"):
         return
-    from dynslam_bench.segmentation.recorded import exact_masks  # needs OpenCV
+    # the module needs OpenCV
+    from dynslam_bench.segmentation.recorded import exact_masks
 
     names = exact_masks(sequence.masks, 0).class_names.values()
     try:
@@ -264,7 +267,8 @@ def _check_oracle(kind: str, settings: SegmentationSettings, sequence: Sequence)
     except SegmentationError as error:
         if not_coco:
             raise
-        warnings.warn(str(error), stacklevel=2)  # a scene without people is no fault
+        # a scene without people is no fault
+        warnings.warn(str(error), stacklevel=2)
 
 
 @lru_cache(maxsize=16)
@@ -482,7 +486,8 @@ class ConfiguredSegmenter:
             SegmentationError: The segmenter gave no `Instances`, or masks of another size than the
                 frame.
         """
-        from dynslam_bench.segmentation.postprocess import select  # needs OpenCV
+        # the module needs OpenCV
+        from dynslam_bench.segmentation.postprocess import select
 
         # check what a plug-in may get wrong
         instances = self.inner.segment(frame)

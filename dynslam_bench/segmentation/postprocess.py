@@ -1,14 +1,18 @@
 """From instances to the dynamic pixels: selection, repair, dilation. Pure functions."""
 
+import math
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Instances
+from dynslam_bench.geometry import at_width
 from dynslam_bench.segmentation.settings import REPAIR_BAND_PX, SegmentationSettings, expand_classes
 
 HOLE_RADIUS_PX = 3
-"""Radius of the closing that fills small gaps (MOR-SLAM's morphological step; the radius is this project's)."""
+"""Radius of the closing that fills small gaps (MOR-SLAM's morphological step; the radius is this project's), at a width
+of 640."""
 
 
 def boxes_of(masks: NDArray[np.bool_]) -> NDArray[np.float32]:
@@ -56,16 +60,16 @@ def dynamic_mask(
     if settings.repair == "depth" and len(masks):
         masks = np.array([repair(mask, depth, settings.repair_depth_m) for mask in masks])
     union = masks.any(axis=0)
-    return dilate(np.asarray(union), settings.dilation_px)
+    return dilate(np.asarray(union), at_width(settings.dilation_px, union.shape[1]))
 
 
-def dilate(mask: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
-    """Grow a bool ``[H, W]`` mask by a disc of `radius` pixels.
+def dilate(mask: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
+    """Grow a bool ``[H, W]`` mask by a disc of `radius` pixels of this mask.
 
     A pixel is set if a set pixel lies within `radius` of it (Euclidean distance between pixel
     centres). For radius 15, DynaSLAM's 31 x 31 ellipse approximates this disc.
     """
-    part = region(mask, radius + 1)
+    part = region(mask, math.ceil(radius) + 1)
     if radius <= 0 or part is None:
         return mask
     # distance to the nearest set pixel, within the mask's box
@@ -82,26 +86,27 @@ def repair(
 ) -> NDArray[np.bool_]:
     """Fill the holes of one object's mask; with depth, also fit its border to the depth edges.
 
-    Within `REPAIR_BAND_PX` of the mask's edge, a pixel with valid depth belongs to the object if
+    Within `REPAIR_BAND_PX` (at the image's width) of the mask's edge, a pixel with valid depth belongs to the object if
     its depth is within `step_m` of the mean depth of the object's core nearby. This is mask repair
     by depth fusion as in Blitz-SLAM and MOR-SLAM; band and local mean are assumptions. Pixels
     without depth stay as they are.
     """
-    part = region(mask, REPAIR_BAND_PX + HOLE_RADIUS_PX + 1)
+    width = mask.shape[1]
+    part = region(mask, math.ceil(at_width(REPAIR_BAND_PX + HOLE_RADIUS_PX, width)) + 1)
     if part is None:
         return mask
-    patch = fill_holes(mask[part])
+    patch = fill_holes(mask[part], max(1, round(at_width(HOLE_RADIUS_PX, width))))
     if depth is not None:
-        patch = _fit_to_depth(patch, np.asarray(depth[part], np.float32), step_m)
+        band = at_width(REPAIR_BAND_PX, width)
+        patch = _fit_to_depth(patch, np.asarray(depth[part], np.float32), step_m, band)
     repaired = mask.copy()
     repaired[part] = patch
     return repaired
 
 
-def fill_holes(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Close gaps of up to `HOLE_RADIUS_PX` and fill the background that the mask encloses."""
+def fill_holes(mask: NDArray[np.bool_], radius: int = HOLE_RADIUS_PX) -> NDArray[np.bool_]:
+    """Close gaps of up to `radius` pixels and fill the background that the mask encloses."""
     # morphological closing
-    radius = HOLE_RADIUS_PX
     element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     padded = np.pad(mask, radius + 1).view(np.uint8)
     closed = cv2.morphologyEx(padded, cv2.MORPH_CLOSE, element)
@@ -113,11 +118,10 @@ def fill_holes(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _fit_to_depth(
-    mask: NDArray[np.bool_], depth: NDArray[np.float32], step_m: float
+    mask: NDArray[np.bool_], depth: NDArray[np.float32], step_m: float, band: float
 ) -> NDArray[np.bool_]:
-    """The second step of `repair`: decide the pixels of the band by the core's mean depth around them."""
+    """The second step of `repair`: decide the pixels of the `band` by the core's mean depth around them."""
     # the object's core: valid depth, away from the edge
-    band = REPAIR_BAND_PX
     valid = np.isfinite(depth) & (depth > 0)
     inside = cv2.distanceTransform(np.pad(mask, 1).view(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
     outside = cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, 3)
@@ -126,7 +130,8 @@ def _fit_to_depth(
         return mask
 
     # local mean of the core's depth
-    window = (4 * band + 1, 4 * band + 1)
+    side = 4 * round(band) + 1
+    window = (side, side)
     weight = cv2.boxFilter(
         core.astype(np.float32), -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT
     )

@@ -63,6 +63,8 @@ class RecordedSegmenter:
                 f"the folder of recorded masks {self.folder} {reason}",
                 "it needs one PNG a frame, named by stamp or index",
             )
+
+        # named by stamp or by index, all alike
         stamped = sum("." in file.stem for file in files)
         if stamped not in (0, len(files)):
             raise SegmentationError(
@@ -81,6 +83,8 @@ class RecordedSegmenter:
             numbers = np.array(keys)
             if not np.isfinite(numbers).all():
                 raise ValueError("a stamp is not finite")
+
+        # in order of time
         order = np.argsort(numbers, kind="stable")
         self._keys: NDArray[np.float64] = numbers[order]
         self._files = [files[i] for i in order]
@@ -98,6 +102,7 @@ class RecordedSegmenter:
             SegmentationError: No file for the frame, an unreadable file, a wrong size, an object
                 without a class.
         """
+        # the file of the frame's stamp or index
         nearest, distance = self._nearest(frame.timestamp if self.by_stamp else frame.index)
         path = self._files[nearest]
         if distance >= self._tolerance:
@@ -107,6 +112,8 @@ class RecordedSegmenter:
                 f"no recorded mask{within} of frame {frame.index} ({frame.timestamp:.6f} s) in {self.folder}",
                 f"the nearest is {path.name}{away}",
             )
+
+        # its objects; what moves is not recorded
         height, width = frame.rgb.shape[:2]
         labels = _read_labels(path, (width, height))
         instances = instances_of(FrameMasks(labels, self._names, frozenset()), where=str(path))
@@ -122,6 +129,7 @@ class RecordedSegmenter:
         Raises:
             SegmentationError: A file cannot be read, or is a colour image.
         """
+        # their numbers in the label images, frame by frame
         numbers = [
             number for number, name in self._names.items() if canonical_name(name) in classes
         ]
@@ -168,6 +176,7 @@ def _read_labels(path: Path, size: tuple[int, int] | None = None) -> NDArray[Any
         flags=cv2.IMREAD_UNCHANGED,
         kind=SegmentationError,
     )
+    # three equal channels count as one
     labels: NDArray[Any] = np.atleast_3d(image)
     if (labels[:, :, :3] != labels[:, :, :1]).any():
         raise SegmentationError(
@@ -246,7 +255,8 @@ def exact_masks(source: MaskSource, index: int) -> FrameMasks:
         raise SegmentationError(f"there are no exact masks for frame {index}") from error
     except MemoryError:
         raise
-    except Exception as error:  # the masks of a plug-in's data set may raise anything
+    # the masks of a plug-in's data set may raise anything
+    except Exception as error:
         raise SegmentationError(
             f"the exact masks of frame {index} cannot be read: {error}"
         ) from error

@@ -176,7 +176,8 @@ class MaskScheduler:
 
         # carry to this frame what is due, else the masks of the previous frame
         if request is not None and taken:
-            self._request = None  # an error is raised once
+            # an error is raised once
+            self._request = None
             instances, self.beside_s = request.answer.result()
             self._instances = carry_dense(
                 self._missed.update(instances, request.since), request.flow
@@ -226,7 +227,8 @@ def _segment(segmenter: Segmenter, frame: Frame, answer: Future[tuple[Instances,
             segmenter.inner = segmenter.inner.network()
         start = time.perf_counter()
         answer.set_result((segmenter.segment(frame), time.perf_counter() - start))
-    except BaseException as error:  # raised again where the masks are taken
+    # raised again where the masks are taken
+    except BaseException as error:
         answer.set_exception(error)
 
 
@@ -591,6 +593,6 @@ def _similarity(
 
 
 def _moved(instances: Instances, masks: list[NDArray[np.bool_]]) -> Instances:
-    """The same objects under new masks, without those that left the image."""
+    """Objects under new masks, without those that left the image."""
     stack = np.array(masks, bool).reshape(instances.masks.shape)
     return replace(instances, masks=stack, boxes=boxes_of(stack)).visible()

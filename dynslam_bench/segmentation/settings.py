@@ -277,15 +277,18 @@ NMS_IOU = 0.5
 MAX_CARRY = 10
 """Frames after which the schedule ``keyframes`` segments without a keyframe: carried masks drift."""
 REPAIR_BAND_PX = 8
-"""Width of the border, on both sides of a mask's edge, in which depth decides; wider than the networks' errors."""
+"""Width of the border, on both sides of a mask's edge, in which depth decides, at an image width of 640; wider than the
+networks' errors."""
+AT_640 = "px at width 640"
+"""Unit of the size of a region in the image: it is scaled with the image's width."""
 
 
 class SegmentationSettings(Settings):
     """Which pixels are dynamic because of what they show.
 
-    Pixel quantities are pixels of the input frame. `dilation_px` is the *radius* of the structuring
-    element: 15 grows a mask by 15 pixels on every side (an element of 31 x 31 pixels, as in
-    DynaSLAM).
+    `dilation_px` is the *radius* of the structuring element at an image width of 640 pixels, and
+    is scaled with the width: 15 grows a mask by 15 pixels on every side (an element of 31 x 31
+    pixels, as in DynaSLAM), and by 7.5 pixels where the image is 320 pixels wide.
     """
 
     source: str = "auto"
@@ -318,9 +321,9 @@ class SegmentationSettings(Settings):
         low=0,
         high=30,
         limits=(0, 200),
-        unit="px",
+        unit=AT_640,
         online=True,
-        meaning="radius by which masks are grown (ellipse of 2r + 1 pixels)",
+        meaning="radius by which masks are grown; scaled with the image's width",
     )
     schedule: Literal["every", "every_nth", "keyframes", "async"] = tunable(
         "every",
@@ -388,6 +391,7 @@ class SegmentationSettings(Settings):
     @field_validator("source")
     @classmethod
     def _known_source(cls, value: str) -> str:
+        """Refuse a source that does not exist, or lacks the argument behind its colon."""
         prefix, _, argument = value.partition(":")
         if value in PLAIN_SOURCES or (prefix in PREFIXED_SOURCES and argument.strip()):
             return value

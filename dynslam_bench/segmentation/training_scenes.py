@@ -18,5 +18,6 @@ def seen_in_training(source: str, sequence_id: str) -> bool:
         return False
     try:
         return parse_synthetic_id(sequence_id).scene in TUNE_SCENES
-    except SequenceError:  # an imported trajectory may name any sequence
+    # an imported trajectory may name any sequence
+    except SequenceError:
         return False

@@ -36,7 +36,7 @@ POSES = (
 
 @dataclass(frozen=True)
 class Unpacked:
-    """What came of a bag.
+    """The result of unpacking a bag.
 
     Attributes:
         folder: The sequence's folder.
@@ -83,19 +83,25 @@ def unpack_bag(
     if target.exists():
         raise SequenceError(f"{target} exists already", "name a folder that does not")
     with _opened(source) as reader:
+        # which topics to take
         topics = _Topics(reader, source)
         chosen_colour = topics.image("colour", colour)
         chosen_depth = topics.image("depth", depth)
         chosen_truth = topics.pose(truth)
+
+        # write images, camera and truth; the frames of reference that the images name show whether they
+        # are registered
         with atomic_folder(target) as work:
-            # The frames of reference that the images name show whether they are registered.
             colour_frame = _write_images(reader, topics.connections[chosen_colour], work, "rgb")
             depth_frame = _write_images(reader, topics.connections[chosen_depth], work, "depth")
             write_camera(work / CAMERA_FILE, topics.camera(chosen_colour))
             if chosen_truth:
                 poses = _read(reader, topics.connections[chosen_truth])
                 write_lines(work / "groundtruth.txt", map(pose_line, poses))
+            # only what opens as a sequence is kept
             count = len(open_folder(work))
+
+    # what a user should know
     notes = []
     if colour_frame != depth_frame:
         notes.append(
@@ -130,13 +136,21 @@ def read_bag_poses(
     table = np.array(lines, dtype=np.float64).reshape(-1, 8)
     if not np.isfinite(table).all():
         raise SequenceError(f"{source} holds poses that are not finite")
-    # Stamps are parsed from their text: floating point does not hold nanoseconds.
+    # stamps are parsed from their text: floating point does not hold nanoseconds
     stamps_ns = np.array([parse_ns(line[0]) for line in lines], dtype=np.int64)
     return stamps_ns, table[:, 1:]
 
 
 class _Topics:
-    """The topics of a bag, and which of them to take."""
+    """The topics of a bag, and which of them to take.
+
+    Args:
+        reader: The opened bag.
+        source: Its path, for messages.
+
+    Attributes:
+        connections: The connections of each topic, by its name.
+    """
 
     def __init__(self, reader: Any, source: Path) -> None:
         self.reader = reader
@@ -169,6 +183,7 @@ class _Topics:
 
     def camera(self, colour: str) -> Camera:
         """The calibration beside the colour images' topic, else the only one."""
+        # calibrations whose namespace the topic of the images begins with
         namespace = colour.rpartition("/")[0]
         infos = self.of_types((INFO,))
         beside = [topic for topic in infos if namespace.startswith(topic.rpartition("/")[0])]
@@ -216,6 +231,7 @@ def _write_images(reader: Any, connections: list[Any], work: Path, name: str) ->
 
 
 def _read(reader: Any, connections: list[Any]) -> Iterator[Any]:
+    """The messages of a topic's connections, in the bag's order."""
     for connection, _, raw in reader.messages(connections=connections):
         yield reader.deserialize(raw, connection.msgtype)
 
@@ -258,6 +274,7 @@ DEPTHS: dict[str, np.dtype[Any]] = {
     "mono16": np.dtype(np.uint16),
     "32FC1": np.dtype(np.float32),
 }
+"""Type of the numbers of each encoding of depth."""
 MILLIMETRES = 1000.0
 """Units a metre of a 16-bit depth image, as REP 118 of ROS has it; one of floating-point numbers is in metres."""
 
@@ -290,6 +307,7 @@ def colour_file(message: Any, where: str) -> tuple[str, bytes]:
         raise SequenceError(
             f"{where} is of '{message.encoding}', expected one of {', '.join(COLOURS)}"
         )
+    # pixels in OpenCV's order, as a PNG
     channels, code = COLOURS[message.encoding]
     pixels = _pixels(message, np.dtype(np.uint8), channels, where)
     if code is not None:
@@ -319,6 +337,7 @@ def depth_file(message: Any, where: str) -> tuple[str, bytes]:
 
 def _pixels(message: Any, kind: np.dtype[Any], channels: int, where: str) -> NDArray[Any]:
     """The pixels ``[H, W]`` or ``[H, W, channels]`` of an uncompressed image in the machine's byte order."""
+    # as many bytes as the size says, or more a row
     height = int(message.height)
     width = int(message.width)
     step = int(message.step)
@@ -328,7 +347,8 @@ def _pixels(message: Any, kind: np.dtype[Any], channels: int, where: str) -> NDA
         raise SequenceError(
             f"{where} is {width}x{height} of {message.encoding} in {len(data)} bytes, {step} a row"
         )
-    # Rows may be padded.
+
+    # rows without their padding, in the machine's byte order
     rows = np.ascontiguousarray(data.reshape(height, step)[:, :used])
     values = rows.view(kind.newbyteorder(">" if message.is_bigendian else "<")).astype(kind)
     return values.reshape(height, width, channels) if channels > 1 else values
@@ -341,6 +361,7 @@ def camera_of(message: Any, where: str) -> Camera:
         SequenceError: Its distortion is not the radial-tangential one of five coefficients, or it
             is none.
     """
+    # K, row by row, and the distortion k1, k2, p1, p2, k3
     k = _coefficients(message, "k")
     d = _coefficients(message, "d")
     valid = len(k) == 9 and np.isfinite(k).all()

@@ -72,11 +72,13 @@ LARGEST_TRUTH_GAP_S = 0.1
 SYSTEMATIC_S = 0.001
 """Standard deviation of what all windows share: intrinsics, depth errors, the sub-pixel error of tracking.
 
-Windows of 10 to 25 frames give 23.4 to 27.3 ms on the excerpt of fr1_xyz."""
+Windows of 10 to 25 frames give 23.4 to 27.3 ms on the excerpt of fr1_xyz.
+"""
 SYSTEMATIC_FACTOR = 0.012
 """Relative standard deviation of lengths that all windows share.
 
-1.5 % are missing where depth is noisy (`fast_desk`)."""
+1.5 % are missing where depth is noisy (`fast_desk`).
+"""
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,7 @@ class Quantity:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What was measured in a recording.
+    """The result of calibrating a recording.
 
     Attributes:
         camera: The recording's camera with the measured values in place of its own.
@@ -147,6 +149,7 @@ def calibrate(
         SequenceError: There is no depth, there are too few frames, or too few windows have points
             that can be tracked.
     """
+    # depth, and frames enough for two windows
     if not getattr(sequence, "has_depth", True):
         raise SequenceError(
             f"{sequence.id} has no depth images", "calibration needs depth beside colour"
@@ -159,7 +162,7 @@ def calibrate(
             "record some seconds of a textured scene with a camera that is turned to and fro",
         )
 
-    # Track keypoints through windows, and estimate what all windows share.
+    # track keypoints through windows, and estimate what all windows share.
     windows = _read_windows(sequence, length, progress)
     with translate_errors(
         SequenceError,
@@ -169,7 +172,7 @@ def calibrate(
     ):
         readout, delay = adjust(windows)
 
-    # What each estimate means for the camera's file.
+    # what each estimate means for the camera's file
     camera = sequence.camera
     quantities = (
         _readout_quantity(readout, windows, camera),
@@ -190,6 +193,7 @@ def _read_windows(
     sequence: Sequence, length: int, progress: Callable[[int, int], None]
 ) -> list[Window]:
     """The usable windows of those that `_choose` names, `LEAST_WINDOWS` at least."""
+    # each window, or why it cannot be used
     starts = _choose(sequence, length)
     windows = []
     faults = []
@@ -199,6 +203,8 @@ def _read_windows(
         except Unusable as fault:
             faults.append(str(fault))
         progress(done + 1, len(starts))
+
+    # too few: the most frequent reason
     if len(windows) < LEAST_WINDOWS:
         common = max(set(faults), key=faults.count)
         raise SequenceError(
@@ -220,7 +226,8 @@ def window_of(sequence: Sequence, first: int, length: int) -> Window:
         raise Unusable("frames are missing")
     if not any(frame.depth.any() for frame in frames):
         raise Unusable("the depth images are empty")
-    # Corners are detected where depth is known all around, and tracked through the grey images.
+
+    # corners are detected where depth is known all around, and tracked through the grey images.
     around = np.ones((9, 9))
     masks = []
     images = []
@@ -250,11 +257,14 @@ def _stamps(sequence: Sequence, first: int, length: int) -> tuple[Array, Array]:
 
 def _regular(stamps: Array) -> Array:
     """Evenly spaced stamps where a camera's even ticks explain them; a stamp is given some time after the exposure."""
+    # whole numbers of the usual interval between the stamps
     gaps = np.diff(stamps)
     interval = np.median(gaps)
     ticks = np.maximum(np.round(gaps / interval), 1)
     if np.abs(gaps - ticks * interval).max() > JITTER * interval:
         return stamps
+
+    # a line through the stamps over these numbers
     count = np.concatenate([[0.0], np.cumsum(ticks)])
     line = np.polyfit(count, stamps - stamps[0], 1)
     return np.asarray(np.polyval(line, count) + stamps[0])
@@ -265,6 +275,8 @@ def _choose(sequence: Sequence, length: int) -> list[int]:
     starts = list(range(0, len(sequence) - length + 1, length // 2))
     if len(starts) <= MOST_WINDOWS:
         return starts
+
+    # of some windows spread over the recording those of most change
     candidates = np.linspace(0, len(starts) - 1, min(len(starts), CANDIDATES))
     spread = candidates.round().astype(int).tolist()
     changes = [_velocity_change(sequence, starts[i], starts[i] + length - 2) for i in spread]
@@ -276,22 +288,26 @@ def _velocity_change(sequence: Sequence, first: int, last: int) -> float:
     """Pixels a frame by which the image's velocity changes between two frames; 0 where few corners are followed."""
     velocities = []
     for i in (first, last):
-        now = _half_size_grey(sequence, i)
-        later = _half_size_grey(sequence, i + 1)
-        start = corners(now, np.ones(now.shape, np.uint8), np.zeros((0, 2)), 40)
+        # corners of the frame
+        image = _half_size_grey(sequence, i)
+        next_image = _half_size_grey(sequence, i + 1)
+        start = corners(image, np.ones(image.shape, np.uint8), np.zeros((0, 2)), 40)
         if len(start) < LEAST_POINTS:
             return 0.0
-        there, status, _ = cv2.calcOpticalFlowPyrLK(
-            now, later, start, start.copy(), winSize=(21, 21), maxLevel=3
+
+        # their median motion to the next frame
+        end, status, _ = cv2.calcOpticalFlowPyrLK(
+            image, next_image, start, start.copy(), winSize=(21, 21), maxLevel=3
         )
         good = status[:, 0] > 0
         if good.sum() < LEAST_POINTS:
             return 0.0
-        velocities.append(np.median(there[good] - start[good], axis=0))
+        velocities.append(np.median(end[good] - start[good], axis=0))
     return float(np.linalg.norm(velocities[1] - velocities[0]))
 
 
 def _half_size_grey(sequence: Sequence, index: int) -> NDArray[np.uint8]:
+    """A frame's brightness at half the resolution."""
     grey = cv2.cvtColor(sequence[index].rgb, cv2.COLOR_RGB2GRAY)
     return np.asarray(cv2.resize(grey, None, fx=0.5, fy=0.5), np.uint8)
 
@@ -326,10 +342,10 @@ def adjust(windows: list[Window]) -> tuple[Estimate, Estimate]:
     Returns:
         Readout time and delay in seconds.
     """
-    # Start from a global shutter and the delay of a grid at which the depths fit best.
+    # start from a global shutter and the delay of a grid at which the depths fit best.
     shared = np.array([0.0, _coarse_delay(windows)])
     for turn in range(ROUNDS):
-        # Linearise every window about the shared values.
+        # linearise every window about the shared values.
         equations: list[ReducedEquations] = []
         for window in windows:
             window.move_depth(*shared)
@@ -338,7 +354,8 @@ def adjust(windows: list[Window]) -> tuple[Estimate, Estimate]:
             equations.append(window.normal_equations(shared[0]))
         information = np.array([equation.information for equation in equations])
         slopes = np.array([equation.slope for equation in equations])
-        # One Gauss-Newton step of the shared values, then of each window's poses and points.
+
+        # one Gauss-Newton step of the shared values, then of each window's poses and points.
         solution = np.linalg.lstsq(information.sum(0), slopes.sum(0), rcond=None)[0]
         step = np.clip(-solution, -LARGEST_STEP_S, LARGEST_STEP_S)
         for window, equation in zip(windows, equations, strict=True):
@@ -347,7 +364,7 @@ def adjust(windows: list[Window]) -> tuple[Estimate, Estimate]:
         if turn >= ROUGH_ROUNDS and np.abs(step).max() < CONVERGED_S:
             break
 
-    # The value that each window alone would give, and its information, for the interval.
+    # the value that each window alone would give, and its information, for the interval.
     slopes = slopes + information @ step
     own_information = np.maximum(np.diagonal(information, axis1=1, axis2=2), 1e-12)
     values = shared - slopes / own_information
@@ -358,6 +375,7 @@ def adjust(windows: list[Window]) -> tuple[Estimate, Estimate]:
 
 def _coarse_delay(windows: list[Window]) -> float:
     """The delay in seconds of a grid at which the mean robust cost of a depth is least."""
+    # mean cost of a depth, of all windows together
     grid: list[float] = np.linspace(-LARGEST_DELAY_S, LARGEST_DELAY_S, DELAYS_TRIED).tolist()
     means = []
     for delay in grid:
@@ -375,16 +393,18 @@ def _over_windows(
     (2001), not less than that of the fixed effects. Windows that share frames count as fewer.
     """
     k = len(values)
-    # Fixed effects, and by how much the windows scatter more than these say (Cochran's Q).
+    # fixed effects, and by how much the windows scatter more than these say (Cochran's Q).
     mean = float((values * information).sum() / information.sum())
     q = float((information * (values - mean) ** 2).sum())
     spare = information.sum() - (information**2).sum() / information.sum()
     between = max(0.0, (q - (k - 1)) / max(spare, 1e-12))
-    # Random effects.
+
+    # random effects
     weights = 1 / (1 / np.maximum(information, 1e-12) + between)
     mean = float((values * weights).sum() / weights.sum())
     scatter = float((weights * (values - mean) ** 2).sum() / ((k - 1) * weights.sum()))
-    # Windows that overlap the next one.
+
+    # windows that overlap the next one, and the interval
     starts = np.array([window.start for window in windows])
     length = float(np.median([np.ptp(window.stamps) for window in windows]))
     overlapping = float((np.diff(starts) < length).mean())

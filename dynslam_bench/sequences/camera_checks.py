@@ -83,7 +83,7 @@ def camera_findings(
     end = motions.end + stated.shift_s
     T_world_first, relative, turns, valid = truth.between(start, end)
 
-    # Pairs on whose rotation images and truth agree.
+    # pairs on whose rotation images and truth agree.
     size = np.linalg.norm(motions.rotation, axis=1) + np.linalg.norm(turns, axis=1)
     difference = np.linalg.norm(motions.rotation - turns, axis=1)
     agreeing = valid & (difference < 0.5 * (size + 2 * ROTATION_NOISE))
@@ -91,11 +91,11 @@ def camera_findings(
         case = "depth-factor-unmeasured/pairs"
         return [finding_of(case, agreeing.sum(), pairs=len(pairs), least=LEAST_PAIRS)]
 
-    # The truth's unit.
+    # the truth's unit
     if 1 / stated.gain > LEAST_UNIT and 0.15 < motions.depth_m < 20:
         return [_unit_finding(1 / stated.gain, motions.depth_m)]
 
-    # One wrong value of the camera or its mounting.
+    # one wrong value of the camera or its mounting
     used = [pair for pair, use in zip(pairs, agreeing, strict=True) if use]
     relative = relative[agreeing]
     fits = _Fits(
@@ -106,7 +106,7 @@ def camera_findings(
     if explained and fits.best != "scale":
         return [_fit_finding(fits, camera)]
 
-    # Axes of the positions.
+    # axes of the positions
     if not explained and stated.weights[1] >= 0.4 and stated.translation < UNLIKE:
         measured = motions.translation[agreeing]
         R_world_first = T_world_first[agreeing, :3, :3]
@@ -116,7 +116,7 @@ def camera_findings(
             if explained_share(used, turned, camera) > explained_share(used, relative, camera):
                 return [finding]
 
-    # The depth factor.
+    # the depth factor
     first_guess = float(np.exp(-fits.groups["scale"].value["scale"][0]))
     share = _depth_share(used)
     if share < _LEAST_DEPTH:
@@ -147,11 +147,14 @@ def _unit_finding(ratio: float, depth_m: float) -> Finding:
 
 def _explains_errors(fits: _Fits, pairs: list[RgbdPair]) -> bool:
     """Whether the best fitted value explains the reprojection errors so well that it is at fault."""
+    # how large the value is, how sure, and which part of the errors remains with it
     name = fits.best
     fit = fits.groups[name]
     size = fit.size(name)
     sigma = fit.size_sigma(name)
     remaining = fit.cost / fits.stated.cost
+
+    # a lever arm has stricter rules
     rules = _EXPLAINED
     if name == "lever":
         rules = _EXPLAINED_BY_LEVER
@@ -203,7 +206,7 @@ def _position_axes(
         explain little.
     """
     identity = np.broadcast_to(np.eye(3), R_world_first.shape)
-    # The axes in which the positions may be turned, and rotations to them and back.
+    # the axes in which the positions may be turned, and rotations to them and back.
     frames = (
         ("world", R_world_first, np.swapaxes(R_world_first, 1, 2)),
         ("camera", identity, identity),
@@ -211,6 +214,7 @@ def _position_axes(
     for where, R_to, R_back in frames:
         measured = np.einsum("nij,nj->ni", R_to, steps)
         true = np.einsum("nij,nj->ni", R_to, relative[:, :3, 3])
+        # the rotation or mirror image that explains the positions best
         W = rotation_between(measured, true, proper=False)
         mirrored = np.linalg.det(W) < 0
         angle = angle_degrees(W)
@@ -218,6 +222,8 @@ def _position_axes(
         explains = alike >= GOOD and alike > stated.translation + 0.2
         if not (explains and (mirrored or angle > 15)):
             continue
+
+        # the motions with the positions turned back
         how = "mirrored" if mirrored else f"turned by {angle:.0f} degrees"
         shares = {"then": 100 * alike, "now": 100 * stated.translation}
         turned = relative.copy()
@@ -233,6 +239,7 @@ def angle_degrees(X: Array) -> float:
 
 def axes_text(R_body_cam: Array) -> str:
     """The rotation that gives a truth the camera's axes; one within 20 degrees of swapped axes is written as such."""
+    # three decimals, or whole numbers for axes that are nearly swapped
     written = R_body_cam.round(3)
     swapped = np.round(R_body_cam)
     is_rotation = np.array_equal(swapped @ swapped.T, np.eye(3))
@@ -260,7 +267,7 @@ def _depth_factor_findings(scale: DepthScale, camera: Camera, *, sure: bool) -> 
         if not sure:
             return [finding_of("depth-factor-unmeasured/apart", None, **interval)]
         new = scale.value * old
-        # The usual factor within the interval that is nearest to the estimate.
+        # the usual factor within the interval that is nearest to the estimate.
         usual = [factor for factor in USUAL_FACTORS if scale.low <= factor / old <= scale.high]
         facts = {
             "new": new,

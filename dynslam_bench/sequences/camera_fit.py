@@ -49,7 +49,7 @@ GROUPS = {
 }
 """Parameters that are fitted together, each group alone."""
 
-# The ten parameters in one vector, in the units of `Fit.value`, and beside it what is constant for each.
+# the ten parameters in one vector, in the units of `Fit.value`, and beside it what is constant for each
 _PARAMETERS = {
     "focal": slice(0, 1),
     "cx": slice(1, 2),
@@ -59,6 +59,7 @@ _PARAMETERS = {
     "lever": slice(7, 10),
 }
 _COUNT = 10
+"""Parameters in all."""
 _PRIOR = np.array([1.0, 200.0, 200.0, 2.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
 """Standard deviations of the weak prior about the stated values."""
 _SCALES = np.array([0.1, 10, 10, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1])
@@ -93,16 +94,20 @@ class _Corners:
 
     def reprojection_errors(self, x: Array) -> Array:
         """Reprojection errors ``[N, 2]`` in pixels under the values ``[10]``, in the order of `_PARAMETERS`."""
+        # rays of the corners in the first frame, by the fitted intrinsics
         camera = self.camera
         focal = np.exp(x[0]) * np.array([camera.fx, camera.fy])
         centre = np.array([camera.cx, camera.cy]) + x[1:3]
         rays = np.concatenate(
             [(self.first - centre) / focal, np.ones((len(self.first), 1))], axis=1
         )
-        # The truth moves the body, on which the camera is mounted.
+
+        # the truth moves the body, on which the camera is mounted: T_cam = T_body_cam^-1 T_body T_body_cam
         T_body_cam = se3.exp(np.concatenate([np.zeros(3), x[4:7]]))
         T_body_cam[:3, 3] = x[7:10]
         motions = (se3.inverse(T_body_cam) @ self.T_second_first @ T_body_cam)[self.pair]
+
+        # points at the scaled depth, moved to the second frame and projected
         points = np.exp(x[3]) * self.depth[:, None] * rays
         moved = np.einsum("nij,nj->ni", motions[:, :3, :3], points) + motions[:, :3, 3]
         z = np.maximum(moved[:, 2:], 0.05)
@@ -124,6 +129,7 @@ def fit_camera(
         camera: The stated camera.
         free: Names of what is fitted, of `Fit.value`; the rest stays as stated.
     """
+    # the corners, and which of the ten values are fitted
     corners = _gather_corners(pairs, relative, camera)
     index: list[int] = []
     for name in free:
@@ -140,10 +146,13 @@ def fit_camera(
         errors = corners.reprojection_errors(filled(part))
         return np.concatenate([_robust(errors), filled(part) / _PRIOR])
 
+    # least squares, begun at the stated values
     part = np.zeros(len(index))
     if index:
         solution = least_squares(residuals, part, x_scale=_SCALES[index])
         part = np.asarray(solution.x, np.float64)
+
+    # errors and standard deviations at the solution
     x = filled(part)
     errors = corners.reprojection_errors(x)
     deviation = filled(_deviations(corners, x, errors, index))
@@ -194,7 +203,7 @@ def _deviations(corners: _Corners, x: Array, errors: Array, index: list[int]) ->
     weight = 1 / np.sqrt(1 + ((errors / _OUTLIER_PX) ** 2).sum(axis=1))
     prior = np.diag(1 / _PRIOR**2) * _OUTLIER_PX**2
 
-    # Derivatives of the errors ``[N, 2, 10]`` by central differences.
+    # derivatives of the errors ``[N, 2, 10]`` by central differences.
     differences = []
     for step in np.diag(_STEPS):
         later = corners.reprojection_errors(x + step)
@@ -202,7 +211,7 @@ def _deviations(corners: _Corners, x: Array, errors: Array, index: list[int]) ->
         differences.append((later - earlier) / (2 * step.sum()))
     slopes = np.stack(differences, axis=-1)
 
-    # The sandwich: the inverse information on either side of the scatter of the pairs' gradients.
+    # the sandwich: the inverse information on either side of the scatter of the pairs' gradients.
     fitted = np.ix_(index, index)
     information = np.einsum("npi,n,npj->ij", slopes, weight, slopes) + prior
     inverse = np.linalg.inv(information[fitted])

@@ -18,6 +18,7 @@ from dynslam_bench.geometry.rigs import BONN_R_BODY_CAM, nearest_rotation
 from dynslam_bench.sequences.readers.files import MILLIMETRES, Contents, size_of_first, stated_file
 
 CAMERA_FILE = "camera.toml"
+"""Name of the file in a sequence's folder that describes its camera."""
 
 _WILD_SLAM_DISTORTION = (
     -0.0550149604678154,
@@ -32,11 +33,11 @@ PRIMESENSE_READOUT_S = 0.026
 """Readout time of the Kinect and the Xtion, which have rolling shutters; measured, not published with the sequences.
 
 Of 0, 13, 20, 26 and 33 ms it has the least error, or within 2 % of it, on excerpts of fr1_xyz,
-fr1_rpy and Bonn crowd
-(``docs/results/recordings.md``)."""
+fr1_rpy and Bonn crowd (``docs/results/recordings.md``).
+"""
 
 CAMERAS: dict[str, Camera] = {
-    # Calibration of the colour cameras as published with the TUM RGB-D benchmark.
+    # calibration of the colour cameras as published with the TUM RGB-D benchmark
     "tum-fr1": Camera(
         640,
         480,
@@ -59,6 +60,7 @@ CAMERAS: dict[str, Camera] = {
         depth_factor=TUM_DEPTH_FACTOR,
         readout_s=PRIMESENSE_READOUT_S,
     ),
+    # the images of freiburg3 are undistorted already
     "tum-fr3": Camera(
         640,
         480,
@@ -68,8 +70,8 @@ CAMERAS: dict[str, Camera] = {
         247.6,
         depth_factor=TUM_DEPTH_FACTOR,
         readout_s=PRIMESENSE_READOUT_S,
-    ),  # images are undistorted already
-    # Calibration published with the Bonn RGB-D Dynamic Dataset. Its ground truth is that of the
+    ),
+    # calibration published with the Bonn RGB-D Dynamic Dataset; its ground truth is that of the
     # markers on the camera. The lever arm of 2 cm is left out: positions stay those of the file, to
     # which published errors refer; the protocol bonn-camera/v1 takes it into account.
     "bonn": Camera(
@@ -84,7 +86,7 @@ CAMERAS: dict[str, Camera] = {
         readout_s=PRIMESENSE_READOUT_S,
         R_body_cam=BONN_R_BODY_CAM,
     ),
-    # Wild-SLAM MoCap, as its authors' configurations state them.
+    # Wild-SLAM MoCap, as its authors' configurations state them
     "wild-slam": Camera(
         1280,
         720,
@@ -123,6 +125,7 @@ class CameraError(SequenceError):
 # Files.
 
 INTRINSICS = ("width", "height", "fx", "fy", "cx", "cy")
+"""Keys of a `camera.toml` that a camera cannot be without."""
 
 Positive = Annotated[float, Field(gt=0)]
 _Row = tuple[float, float, float]
@@ -178,9 +181,12 @@ class CameraFile(Settings):
         Raises:
             SequenceError: It names a camera that is not known, or intrinsics are missing.
         """
+        # a known camera, of which the file changes some values
         stated = {key: getattr(self, key) for key in self.model_fields_set - {"name", "fps"}}
         if self.name is not None:
             return replace(known_camera(self.name), **stated)
+
+        # all intrinsics by the file, or all by the folder
         missing = [key for key in INTRINSICS if stated.get(key) is None]
         if not missing:
             return Camera(**stated)
@@ -285,8 +291,11 @@ def chosen_camera(folder: Path, choice: str | Path | Camera | None = None) -> Ch
     if isinstance(choice, Camera):
         return ChosenCamera(choice, "the camera that was given")
     if choice is None:
+        # the file in the folder
         inside = stated_file(folder, CAMERA_FILE)
         return None if inside is None else ChosenCamera(read_camera(inside), str(inside))
+
+    # a name, or the path of a file
     path = Path(choice).expanduser()
     if str(choice) in CAMERAS or (path.suffix.lower() != ".toml" and not path.is_file()):
         return ChosenCamera(known_camera(str(choice)), f"camera {choice}")
@@ -325,6 +334,7 @@ def camera_of(
             error brings a ``camera.toml`` to copy.
         SequenceError: It has values that nobody could mean.
     """
+    # what was chosen, else what the folder's files state, else what its name implies
     named = catalogued or camera_by_name(folder)
     of_dataset = CAMERAS[named] if named else None
     base = contents.camera or of_dataset
@@ -344,6 +354,8 @@ def camera_of(
             ),
             template=_template(folder, contents, None),
         )
+
+    # what belongs to the recording and not to the lens
     if camera.depth_factor is None and contents.camera is not None:
         camera = replace(camera, depth_factor=contents.camera.depth_factor)
     if camera.R_body_cam is None and of_dataset is not None:
@@ -351,6 +363,8 @@ def camera_of(
     if not contents.truth_of_body:
         camera = replace(camera, R_body_cam=None)
     check_camera(camera, f"the camera of {folder}" if chosen is None else chosen.source)
+
+    # images of raw numbers need a unit; arrays hold metres
     if camera.depth_factor is None and any(
         not file.endswith(".npy") for file in contents.depth.files
     ):
@@ -394,6 +408,7 @@ def _template(
     folder: Path, contents: Contents, chosen: ChosenCamera | None, camera: Camera | None = None
 ) -> str:
     """A ``camera.toml`` that is complete but for what nobody knows: left empty, with a remark what belongs there."""
+    # what the images, the chosen file and the camera tell
     stated: dict[str, Any] = {}
     with suppress(SequenceError):
         stated["width"], stated["height"] = size_of_first(folder, contents.colour)
@@ -403,6 +418,8 @@ def _template(
     if camera is not None:
         stated |= {key: getattr(camera, key) for key in INTRINSICS}
         distortion = [float(value) for value in camera.distortion]
+
+    # intrinsics, empty where nothing tells them
     remarks = {
         "width": "of the colour images, in pixels",
         "height": "",
@@ -415,24 +432,27 @@ def _template(
         _template_line(f"{key} = {stated.get(key, '')}", remark) for key, remark in remarks.items()
     ]
     lines.append(_template_line(f"distortion = {distortion}", "k1, k2, p1, p2, k3"))
+
+    # the two usual depth factors, with the distance that each one gives
     median = _median_raw_depth(folder, contents)
     lines.append(
         "# raw depth units a metre: keep the line whose distance is that of the scene, without its first #"
     )
-    for factor, whose in (
-        (MILLIMETRES, "millimetres, as most cameras write them"),
-        (TUM_DEPTH_FACTOR, "TUM's files"),
-    ):
-        distance = (
-            "" if median is None else f": the first image's median is {median / factor:.3g} m"
-        )
-        lines.append(_template_line(f"# depth_factor = {factor}", whose + distance))
+    remark_of_factor = {
+        MILLIMETRES: "millimetres, as most cameras write them",
+        TUM_DEPTH_FACTOR: "TUM's files",
+    }
+    for factor, remark in remark_of_factor.items():
+        if median is not None:
+            remark += f": the first image's median is {median / factor:.3g} m"
+        lines.append(_template_line(f"# depth_factor = {factor}", remark))
     rate = chosen.fps if chosen is not None else contents.fps
     lines += [] if rate is None else [f"fps = {rate}"]
     return "\n".join(lines)
 
 
 def _template_line(text: str, remark: str) -> str:
+    """A line of a `camera.toml`, with a remark behind it."""
     return f"{text:28}  # {remark}" if remark else text.rstrip()
 
 
@@ -443,12 +463,15 @@ _FOCAL_LENGTHS = (0.02, 100.0)
 _DEPTH_FACTORS = (1.0, 655_350.0)
 """A raw unit is a metre; 65535 raw units, the most that 16 bits hold, are 0.1 m."""
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
+"""Radial (k) and tangential (p) distortion, in OpenCV's order."""
 _BASELINES_M = (0.001, 10.0)
+"""Baselines of stereo pairs, metres."""
 _LONGEST_S = 1.0
 """Longest readout time and delay of depth: slower than any camera."""
 _MOST_FOLDED = 0.05
 """Share of the pixels that a distortion may send to a wrong place: calibrations are often poor in the corners."""
 _FOLDED_PX = 1.0
+"""A pixel that comes back farther than this from its place was sent to a wrong one."""
 
 
 def check_camera(camera: Camera, where: str) -> None:
@@ -471,12 +494,16 @@ def _faults(camera: Camera) -> Iterator[str]:
     """What is wrong with a camera, one phrase each; later ones take for granted that earlier ones are none."""
     if len(camera.distortion) != len(_COEFFICIENTS):
         yield f"distortion has {len(camera.distortion)} coefficients, expected {', '.join(_COEFFICIENTS)}"
+
+    # all numbers are finite
     names = (*INTRINSICS, "baseline_m", "readout_s", "depth_delay_s")
     numbers: dict[str, float] = {name: getattr(camera, name) for name in names}
     numbers |= zip(_COEFFICIENTS, camera.distortion, strict=True)
     for name, value in numbers.items():
         if not np.isfinite(value):
             yield f"{name} is {value}, expected a finite number"
+
+    # intrinsics lie in the ranges of real lenses
     if min(camera.width, camera.height) < 1:
         yield f"an image of {camera.width} x {camera.height} pixels"
     for name, size in (("fx", camera.width), ("fy", camera.height)):
@@ -486,6 +513,8 @@ def _faults(camera: Camera) -> Iterator[str]:
     for name, size in (("cx", camera.width), ("cy", camera.height)):
         if not 0 <= numbers[name] <= size:
             yield f"the principal point's {name} is {numbers[name]:g} px, outside of the image's {size} px"
+
+    # depth, baseline and times
     low, high = _DEPTH_FACTORS
     if camera.depth_factor is not None and not low <= camera.depth_factor <= high:
         yield f"depth_factor is {camera.depth_factor:g} raw units a metre, expected {low:g} to {high:g}"
@@ -496,6 +525,8 @@ def _faults(camera: Camera) -> Iterator[str]:
         yield f"readout_s is {camera.readout_s:g} s, expected 0 to {_LONGEST_S:g}"
     if abs(camera.depth_delay_s) > _LONGEST_S:
         yield f"depth_delay_s is {camera.depth_delay_s:g} s, expected at most {_LONGEST_S:g} either way"
+
+    # the rotation is one, and the distortion can be undone
     if camera.R_body_cam is not None and not _is_rotation(camera.R_body_cam):
         yield f"R_body_cam is no rotation: {[list(row) for row in camera.R_body_cam]}"
     folded = _folded_share(camera)

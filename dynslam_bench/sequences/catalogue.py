@@ -188,9 +188,12 @@ def open_sequence(
         SequenceError: Unknown id (with a did-you-mean), not on this machine (with URL, size, path
             and the command that fetches it), damaged, or no frame in the part asked for.
     """
+    # the whole sequence
     settings = preprocessing or PreprocessingSettings()
     root = find_data_root(data_root)
     sequence = _open_whole(str(name), root, camera, settings)
+
+    # what is asked for of its images, and the part of it
     if settings.changes_images:
         from dynslam_bench.sequences.preprocessing import Preprocessed
 
@@ -263,7 +266,8 @@ def open_folder(
 
     settings = settings or PreprocessingSettings()
     entry = entry or entry_of(folder.resolve().name)
-    # What the folder holds, by its layout, and the camera that was chosen or that it states.
+
+    # what the folder holds, by its layout, and the camera that was chosen or that it states
     catalogued = entry.layout if entry else ""
     layout = find_layout(folder, catalogued)
     chosen = chosen_camera(folder, camera)
@@ -272,7 +276,8 @@ def open_folder(
     notes = layout_notes(folder, layout, catalogued)
     if camera is not None and (folder / CAMERA_FILE).exists():
         notes = (*notes, f"{CAMERA_FILE} of the folder is not used: another camera was chosen")
-    # What the catalogue says of it.
+
+    # what the catalogue says of it
     about: dict[str, Any] = {"id": f"folder/{folder.resolve().name}"}
     if entry is not None:
         about = {
@@ -298,6 +303,7 @@ def _open_whole(
     name: str, data_root: Path, camera: str | Path | Camera | None, settings: PreprocessingSettings
 ) -> Sequence:
     """Open a sequence with all of its frames, by its id, its published folder name or its path."""
+    # a name of the catalogue that is a folder here as well means the catalogue's, if that is there
     path = Path(name).expanduser()
     is_path = name.startswith((".", "/", "~", "\\"))
     entry = None if is_path else entry_of(name)
@@ -306,11 +312,12 @@ def _open_whole(
             f"'{name}' names the sequence '{entry.id}', which is not at {entry.folders(data_root)[0]}",
             f"for the folder of that name here write ./{name}",
         )
-    # One of the catalogue.
+
+    # one of the catalogue
     if entry is not None:
         return open_public(entry.id, data_root=data_root, camera=camera, settings=settings)
 
-    # One of another data set, by the prefix of its id.
+    # one of another data set, by the prefix of its id
     prefix, separator, _ = name.partition("/")
     public = {entry.dataset for entry in catalogue().values()}
     if separator and not is_path and prefix not in public:
@@ -320,7 +327,7 @@ def _open_whole(
         if dataset is not None:
             return cast("Sequence", load_object(dataset.entry_point)(name, data_root=data_root))
 
-    # A folder.
+    # a folder
     if is_bag(path):
         raise SequenceError(
             f"{path} is a bag", f"unpack it first: dynslam-bench sequences unpack {path} FOLDER"
@@ -344,7 +351,7 @@ def parse_frames(frames: Iterable[int | None] | str | None) -> tuple[int, int | 
     """
     if frames is None:
         return 0, None
-    # A pair is written as text, and read like it.
+    # a pair is written as text, and read like it
     if not isinstance(frames, str):
         ends = frames if isinstance(frames, Iterable) else [frames]
         frames = ":".join("" if end is None else str(end) for end in ends)
@@ -376,6 +383,7 @@ def _builtin() -> Iterator[DatasetSpec]:
 
 
 DATASETS: Registry[DatasetSpec] = Registry("sequences", DatasetSpec, _builtin)
+"""Data sets by the prefix of their ids, built in and of plug-ins."""
 
 
 # Lists and descriptions for people.
@@ -454,12 +462,15 @@ def describe(
         SequenceError: Unknown name, or it is here but damaged.
     """
     root = find_data_root(data_root)
+    # what the catalogue says
     entry = entry_of(name)
     facts: dict[str, Any] = {}
     if entry is not None:
         facts = _public_facts(entry)
         if entry.find(root) is None:
             return facts | {"here": False, "fetch": entry.how_to_get()}
+
+    # what is here
     sequence = open_sequence(name, data_root=data_root, camera=camera)
     truth = sequence.ground_truth
     folder = getattr(sequence, "folder", None)

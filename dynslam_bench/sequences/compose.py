@@ -38,7 +38,9 @@ _LEAST_PX = 0.01
 _BORDER_PX = 2
 """A person who reaches the left, right or upper border so closely is partly outside."""
 _SQUARE = np.ones((3, 3), np.uint8)
+"""Neighbourhood for specks, and for edges of depth."""
 _DISC = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (5, 5))
+"""Neighbourhood for holes, and for the uncertain band along an outline."""
 _LEAST_DISC = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (9, 9))
 """What is seen of a person and is smaller is left out: points that were drawn without neighbours."""
 _SHIFT_PX = 1.5
@@ -86,7 +88,7 @@ Cutout = tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.bool_]]
 
 @dataclass(frozen=True)
 class Composed:
-    """What `compose` wrote.
+    """The result of `compose`.
 
     Attributes:
         folder: The sequence, in TUM layout with ``people.txt``.
@@ -170,6 +172,7 @@ def _checked_truth(host: Sequence, target: Path) -> Trajectory:
         raise SequenceError(
             f"'{host.id}' has people already", "compose the recording that was its host"
         )
+    # every frame needs a pose, by which people are placed in its world
     begin = truth.timestamps[0] - _GAP_S
     end = truth.timestamps[-1] + _GAP_S
     outside = int(np.count_nonzero((host.timestamps < begin) | (host.timestamps > end)))
@@ -186,6 +189,7 @@ def _check_fixed(people: Sequence) -> None:
     truth = people.ground_truth
     if truth is not None and len(truth) > 1 and not se3.is_static(truth.T_world_cam):
         raise SequenceError(f"the camera of '{people.id}' moves", cure)
+    # without a truth: shifts of a few images against the first one, by phase correlation
     sampled = np.linspace(0, len(people) - 1, _SAMPLED).astype(int).tolist()
     first, *others = (
         cv2.cvtColor(people[i].rgb, cv2.COLOR_RGB2GRAY).astype(np.float32) for i in sampled
@@ -262,15 +266,19 @@ class Cutouts:
         colours = []
         centres = []
         for i in range(len(people)):
+            # what is nearer than the background is the person
             frame = people[i]
             colours.append(frame.rgb.reshape(-1, 3).mean(axis=0))
             mask = _person(self._nearer(frame), frame.rgb)
-            # Someone who is partly outside cannot be pasted whole.
+
+            # someone who is partly outside cannot be pasted whole.
             left = mask[:, :_BORDER_PX].any()
             right = mask[:, -_BORDER_PX:].any()
             above = mask[:_BORDER_PX].any()
             if mask.mean() < _LEAST_PX or left or right or above:
                 continue
+
+            # keep the mask, and where the person is: the median of their points
             self._masks.append((i, np.packbits(mask)))
             pixels = self.camera.undistort_points(np.stack(np.nonzero(mask)[::-1], axis=1))
             points = self.camera.unproject(pixels, self._depth(frame, mask)[mask])
@@ -311,6 +319,7 @@ def _background(people: Sequence) -> Array:
         measured = np.where(depths > 0, depths, np.nan)
         # never measured: nobody is told from what is behind
         measured[:, ~(depths > 0).any(axis=0)] = 0
+        # people who stand before the background are nearer than the farthest measurements
         farthest = np.nanquantile(measured, 0.9, axis=0)
         far = np.where(measured >= 0.97 * farthest, measured, np.nan)
         blocks.append(np.nanmedian(far, axis=0))
@@ -340,6 +349,7 @@ def _person(nearer: NDArray[np.bool_], rgb: NDArray[np.uint8]) -> NDArray[np.boo
 
 def _filled(depth: NDArray[np.float32]) -> NDArray[np.float32]:
     """Depth everywhere: where it is 0, that of the nearest pixel that has one; 0 where none has."""
+    # the number of the nearest measured pixel for each pixel, and that one's depth
     empty = (depth == 0).astype(np.uint8)
     by_pixel = cv2.DIST_LABEL_PIXEL
     _, labels = cv2.distanceTransformWithLabels(empty, cv2.DIST_L2, 5, labelType=by_pixel)
@@ -401,12 +411,15 @@ class _Actor:
         distance. Where this place lies behind or in the host's surfaces, the person is brought
         nearer and made smaller in proportion.
         """
+        # the host's surfaces in a few reduced images
         small = host.camera.resized(host.camera.width // _REDUCED, host.camera.height // _REDUCED)
         sampled = np.linspace(0, len(host) - 1, _SAMPLED).astype(int).tolist()
         surfaces = []
         for i in sampled:
             reduced = host[i].depth[::_REDUCED, ::_REDUCED]
             surfaces.append(_filled(reduced[: small.height, : small.width]))
+
+        # draw places; each is tried at its distance, then nearer and smaller
         centre = np.median(self.cutouts.centres[self.played.astype(int)], axis=0)
         best = self.T_world_people
         least = np.inf
@@ -417,6 +430,8 @@ class _Actor:
                 shift = scale * (target - self.R_start_people @ centre)
                 T_start_people = se3.from_matrix(shift, scale * self.R_start_people)
                 self.T_world_people = self.T_world_cam[0] @ T_start_people
+
+                # cost: a wrong share of the image, hidden parts, a size that differs from the real one
                 share, hidden = self._visibility(small, sampled, surfaces)
                 outside = max(_SHARES[0] - share, share - _SHARES[1], 0.0)
                 cost = 10 * outside + hidden / max(share, 1e-3) - 0.05 * scale
@@ -459,10 +474,10 @@ class _Actor:
         at = self.played[index]
         cutouts = self.cutouts
         last = len(cutouts.centres) - 1
-        now = min(int(at), last)
-        after = min(int(at) + 1, last)
-        rgb, pixels, depth = _upsampled(cutouts.cutout(now), upsampled)
-        step_m = (at - now) * (cutouts.centres[after] - cutouts.centres[now])
+        earlier = min(int(at), last)
+        later = min(int(at) + 1, last)
+        rgb, pixels, depth = _upsampled(cutouts.cutout(earlier), upsampled)
+        step_m = (at - earlier) * (cutouts.centres[later] - cutouts.centres[earlier])
         moved = cutouts.camera.unproject(cutouts.camera.undistort_points(pixels), depth) + step_m
 
         # Project them into the host's image.
@@ -527,6 +542,7 @@ def _closed(
     colour: NDArray[np.float32], z: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Colour and depth without the small holes between drawn points, which get the mean of their neighbours."""
+    # holes are what closing by 5x5 pixels fills; their values: the mean of the drawn neighbours
     drawn = (z > 0).astype(np.float32)
     whole = cv2.morphologyEx(drawn, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
     count = cv2.blur(drawn, (5, 5))
@@ -575,7 +591,7 @@ def paste(
 def _shadow(
     shown: NDArray[np.bool_], z: NDArray[np.float32], behind: NDArray[np.float32], camera: Camera
 ) -> NDArray[np.bool_]:
-    """What a projector to the right of the depth camera does not light, because the person stands in its way."""
+    """Pixels ``[H, W]`` in the person's shadow, which a projector to the right of the depth camera does not light."""
     # Disparities in pixels of the person and of what is behind; a pixel is dark if a surface some
     # pixels to its right has a disparity that is larger by more than these pixels.
     scale = camera.fx * _SHADOW_BASELINE_M

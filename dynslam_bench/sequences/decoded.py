@@ -55,6 +55,7 @@ class Decoded(Wrapped):
 
 def _mapped(sequence: Sequence) -> NDArray[np.void]:
     """The frames as a mapped array of records ``rgb`` and ``depth``, which is written if it is not there or damaged."""
+    # the file of this content, of these frames and of the code that decodes them
     cache = StageCache()
     part = part_of(sequence)
     code = [
@@ -66,6 +67,8 @@ def _mapped(sequence: Sequence) -> NDArray[np.void]:
     path = cache.path(
         "frames", digest([sequence.digest(), part.start, part.stop, part.stride, code]), ".npy"
     )
+
+    # one process decodes, the others wait for its lock and find the file
     if (frames := _read(path)) is None:
         with translate_errors(
             DynslamError, f"cannot write the stage cache {cache.folder}", f"set {STAGES_VARIABLE}"
@@ -76,7 +79,9 @@ def _mapped(sequence: Sequence) -> NDArray[np.void]:
                 _write(sequence, path, cache.max_bytes)
                 cache.prune()
                 frames = np.load(path, mmap_mode="r", allow_pickle=False)
-    with contextlib.suppress(OSError):  # a cache that can only be read
+
+    # note that it was used; a cache that can only be read has no such note
+    with contextlib.suppress(OSError):
         os.utime(path)
     return frames
 
@@ -90,6 +95,13 @@ def _read(path: Path) -> NDArray[np.void] | None:
 
 
 def _write(sequence: Sequence, path: Path, max_bytes: int) -> None:
+    """Decode all frames into a file that `_read` maps.
+
+    Raises:
+        SequenceError: They would fill more than half of the cache's `max_bytes`.
+        DynslamError: The file cannot be written.
+    """
+    # one record a frame
     size = (sequence.camera.height, sequence.camera.width)
     kind = np.dtype([("rgb", np.uint8, (*size, 3)), ("depth", np.float32, size)], align=True)
     count = len(sequence) * kind.itemsize
@@ -106,6 +118,7 @@ def _write(sequence: Sequence, path: Path, max_bytes: int) -> None:
         replacing(path) as temporary,
         temporary.open("wb") as file,
     ):
+        # NumPy's header, then record by record: the frames are never in memory together
         header = {
             "descr": npy.dtype_to_descr(kind),
             "fortran_order": False,

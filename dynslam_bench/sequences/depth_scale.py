@@ -98,8 +98,8 @@ def depth_scale(
     relative = truth.between(start, end)[1]
     rates = list(zip(_turning_rates(truth, start), _turning_rates(truth, end), strict=True))
 
-    # Translations ``[N, 3]`` under a global shutter, and how they change with the readout time.
     def translations(readout_s: float) -> Array:
+        """Measured translations ``[N, 3]`` under a readout time."""
         return np.stack(
             [
                 translation_of(pair, T, both_rates, camera, readout_s, first_guess)
@@ -107,9 +107,12 @@ def depth_scale(
             ]
         )
 
+    # under a global shutter, and how they change with the readout time
     still = translations(0.0)
     rolling = translations(_READOUT_STEP_S)
     by_readout = (rolling - still) / _READOUT_STEP_S
+
+    # the readout time: stated, else the usual one with a wide prior
     if camera.readout_s > 0:
         readout_s = camera.readout_s
         readout_sigma_s = STATED_READOUT_SIGMA_S
@@ -117,20 +120,22 @@ def depth_scale(
         readout_s = READOUT_S
         readout_sigma_s = READOUT_SIGMA_S
 
-    # How the true translations change with a shift in time.
+    # how the true translations change with a shift in time.
     later = truth.between(start + _SHIFT_S, end + _SHIFT_S)[1]
     earlier = truth.between(start - _SHIFT_S, end - _SHIFT_S)[1]
     by_shift = (later - earlier)[:, :3, 3] / (2 * _SHIFT_S)
 
-    # What the translations consist of ``[N, 3, 9]``, and the prior of each column's factor.
+    # what the translations consist of ``[N, 3, 9]``, and the prior of each column's factor.
     true = relative[:, :3, 3]
     if not (np.linalg.norm(true, axis=1) > 0).any():
         return None
     columns = np.concatenate(
         [
             true[..., None],
-            relative[:, :3, :3] - np.eye(3),  # by the lever arm
-            -se3.hat(true),  # by the turn of the axes
+            # by the lever arm
+            relative[:, :3, :3] - np.eye(3),
+            # by the turn of the axes
+            -se3.hat(true),
             by_shift[..., None],
             -by_readout[..., None],
         ],
@@ -232,13 +237,15 @@ def _regression(columns: Array, measured: Array, scaled: Array, fixed: Array) ->
             the scale.
         fixed: Standard deviations that do not depend on the scale; 0 in both: no bound.
     """
+    # a first guess by the lengths
     lengths = np.linalg.norm(measured, axis=1)
     scale = float(np.median(lengths) / np.median(np.linalg.norm(columns[..., 0], axis=1)))
     sigma = float(np.median(lengths)) / 2
     weight = np.ones(len(measured))
     if not (np.isfinite(scale) and sigma > 0):
         return None
-    # Reweighted least squares with priors that grow with the scale.
+
+    # reweighted least squares, by normal equations of each pair, with priors that grow with the scale.
     for _ in range(_ROUNDS):
         deviation = np.maximum(scaled * scale, fixed)
         prior = np.diag(np.where(deviation > 0, 1 / np.maximum(deviation, 1e-12) ** 2, 0.0))
@@ -251,21 +258,21 @@ def _regression(columns: Array, measured: Array, scaled: Array, fixed: Array) ->
         sigma = max(float(np.median(residual)) / 1.54, 1e-4)
         weight = 1 / (1 + (residual / sigma / CAUCHY) ** 2)
 
-    # The variance: by a jackknife over blocks, and what the bounds leave open.
+    # the variance: by a jackknife over blocks, and what the bounds leave open.
     blocks = np.arange(len(measured)) // BLOCK
     count = int(blocks[-1]) + 1
     scales = []
     for block in range(count):
         kept = blocks != block
-        part = np.linalg.solve(normals[kept].sum(axis=0) + prior, pulls[kept].sum(axis=0))
-        scales.append(float(part[0]))
+        without_block = np.linalg.solve(normals[kept].sum(axis=0) + prior, pulls[kept].sum(axis=0))
+        scales.append(float(without_block[0]))
     without = np.array(scales)
     jackknife = (count - 1) / count * float(((without - without.mean()) ** 2).sum())
     inverse = np.linalg.inv(normals.sum(axis=0) + prior)
     left_open = float((inverse @ prior @ inverse)[0, 0])
     variance = max(jackknife + left_open, float(inverse[0, 0]))
 
-    # Half of the 95 % interval, with what all pairs share.
+    # half of the 95 % interval, with what all pairs share.
     value = float(factors[0])
     statistical = student.ppf(0.975, count - 1) * np.sqrt(variance)
     half = float(np.hypot(statistical, 1.96 * SYSTEMATIC * factors[0]))

@@ -50,7 +50,7 @@ _UNREADABLE = (DynslamError, OSError, ValueError)
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What the check of a recording found.
+    """The result of checking a recording.
 
     Attributes:
         id: What the caller named: an id or the path of a folder.
@@ -120,9 +120,12 @@ def examine(
         most_frames: Frames that are read at most.
         progress: Called with the frames done and the frames to do.
     """
+    # read the frames, and measure images and motion
     with_depth = bool(getattr(sequence, "has_depth", True))
     measurement = _measure(sequence, with_depth, most_frames, progress)
     statistics = measurement.statistics
+
+    # files, single images, then the truth
     findings = []
     if measurement.unreadable:
         count = len(measurement.unreadable)
@@ -133,7 +136,7 @@ def examine(
             findings.append(finding_of("too-short", statistics.frames))
         of_images = image_findings(statistics, with_depth)
         findings += of_images
-        # The truth is compared with the motion of sound images only.
+        # the truth is compared with the motion of sound images only
         if statistics.frames >= FEWEST and not any(map(is_fault, of_images)):
             findings += truth_findings(
                 sequence.timestamps, sequence.ground_truth, sequence.camera, measurement.pairs
@@ -144,7 +147,7 @@ def examine(
 
 @dataclass(frozen=True, eq=False)
 class _Measurement:
-    """What was measured in the frames of a recording.
+    """Measurements in the frames of a recording.
 
     Attributes:
         statistics: Statistics of the images.
@@ -163,10 +166,13 @@ def _measure(
     sequence: Sequence, with_depth: bool, most_frames: int, progress: Progress
 ) -> _Measurement:
     """Read stretches of a recording and measure its images and its camera's motion."""
+    # stretches of the recording, and the interval of its stamps (30 Hz for a single frame)
     parts = [range(*stretch) for stretch in stretches(len(sequence), most_frames)]
     tried = sum(map(len, parts))
     interval_s = np.median(np.diff(sequence.timestamps)) if len(sequence) > 1 else 1 / 30
     statistics = ImageStatistics(sequence.camera.written_depth_factor, float(interval_s))
+
+    # one stretch at a time is in memory
     pairs = list[RgbdPair]()
     unreadable = list[str]()
     done = 0
@@ -197,12 +203,15 @@ def stretches(frames: int, most: int) -> list[tuple[int, int]]:
 
 def _unopened_finding(error: Exception) -> Finding:
     """Why a recording cannot be opened: no depth, or depth of another size or form; the rest is said as it is."""
+    # a depth image of another size than the colour image, by the message's numbers
     text = _message(error)
     other_size = re.search(r"is (\d+)x(\d+), but its colour image is (\d+)x(\d+)", text)
     if other_size:
         columns, rows, width, height = map(int, other_size.groups())
         facts = {"columns": columns, "rows": rows, "width": width, "height": height}
         return finding_of("depth-size", columns / width, **facts)
+
+    # no depth, depth of another form, or anything else
     if re.search("nor a folder depth$", text):
         case = "no-depth/opening"
     elif re.search("^depth image ", text):

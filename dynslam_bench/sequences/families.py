@@ -1,6 +1,7 @@
 """Which sequences go together: those of one family film one kind of scene, those of one path are one recording."""
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from dynslam_bench.core import SequenceError
 from dynslam_bench.geometry import se3
@@ -22,21 +23,28 @@ def family_of(sequence: str) -> str:
         return sequence
 
 
-_STAMP_S = 1e-6
 _POSE = 1e-6
-"""How far the stamps in seconds and the entries of the poses of one path may lie apart: rounding in files."""
+"""How far poses of one path may lie apart, metres and parts of a rotation matrix: rounding in files."""
+_SHARED = 0.9
+"""Share of the longer path's poses that a copy has at least: a few may be left out, at an end or between."""
 
 
 def same_path(one: Trajectory | None, other: Trajectory | None) -> bool:
-    """Whether two true trajectories of moving cameras have equal poses at equal stamps: one recording.
+    """Whether two true trajectories of moving cameras hold the same poses: one recording.
 
-    Of cameras that stand still it is False, since many recordings may share such a truth: their images tell.
+    Stamps may be shifted, and a few poses may be left out: two recordings never have many equal poses. Of cameras
+    that stand still it is False, since many recordings may share such a truth: their images tell.
     """
-    if one is None or other is None or len(one) != len(other) or len(one) < 2:
+    if one is None or other is None:
         return False
-    if not np.allclose(one.timestamps, other.timestamps, rtol=0.0, atol=_STAMP_S):
+    shorter, longer = sorted((one, other), key=len)
+    if len(shorter) < max(2, _SHARED * len(longer)) or se3.is_static(shorter.T_world_cam):
         return False
-    poses = one.T_world_cam
-    if not np.allclose(poses, other.T_world_cam, rtol=0.0, atol=_POSE):
-        return False
-    return not se3.is_static(poses)
+
+    # the nearest position of the longer path to each of the shorter one, and whether the whole pose is equal
+    distances, nearest = cKDTree(longer.positions).query(shorter.positions)
+    is_near = distances <= _POSE
+    poses = shorter.T_world_cam[is_near]
+    differences = np.abs(poses - longer.T_world_cam[nearest[is_near]]).max(axis=(1, 2))
+    shared = int((differences <= _POSE).sum()) if len(poses) else 0
+    return shared >= _SHARED * len(longer)

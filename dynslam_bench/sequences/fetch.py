@@ -49,7 +49,7 @@ MANIFEST = "manifest.sha256"
 
 
 class Receipt(Record):
-    """What was fetched, stored inside the sequence's folder.
+    """Record of a fetched archive, stored inside the sequence's folder.
 
     Attributes:
         schema_version: Version of this record.
@@ -148,6 +148,7 @@ def fetch(
         SequenceError: Unknown id, one that has to be got by hand, or a faulty archive.
         DownloadError: The archive cannot be downloaded.
     """
+    # what is here already is left alone
     entry = _known(name)
     root = find_data_root(data_root)
     folder = entry.find(root)
@@ -157,7 +158,8 @@ def fetch(
         raise SequenceError(
             f"'{entry.id}' cannot be fetched by this program: {entry.by_hand}", entry.how_to_get()
         )
-    # Download every archive; the catalogue knows the first one's checksum only.
+
+    # download every archive; the catalogue knows the first one's checksum only.
     parts: list[Download] = []
     for address in (url or entry.url, *entry.more_urls):
         archive = root / ".downloads" / _archive_name(address, entry)
@@ -173,15 +175,17 @@ def fetch(
         )
         parts.append(Download(address, archive, sha256))
 
-    # The others have to be what their address gave before.
+    # the others have to be what their address gave before.
     unstated = parts if entry.sha256 is None else parts[1:]
     if checksum:
         for part in unstated:
             _compare_checksum(root, part)
 
+    # unpack them into the sequence's folder
     place = entry.folders(root)[0]
     _install(entry, place, parts, checksum and entry.sha256 is not None, progress)
-    # Checksums are kept only of archives whose sequence could be opened.
+
+    # checksums are kept only of archives whose sequence could be opened.
     for part in unstated:
         line = f"{part.sha256}  {without_passwords(part.address)}\n"
         write_atomic(_checksum_file(root, part), line)
@@ -208,6 +212,7 @@ def _install(
     hint = "make room or check the permissions and run the same command again, the archive is kept"
     with translate_errors(SequenceError, fault, hint):
         try:
+            # the files, a receipt and their checksums; the folder appears if it opens as a sequence
             with atomic_folder(place) as work:
                 files = _unpack_sequence(entry, parts, work, progress)
                 receipt = Receipt(
@@ -232,9 +237,12 @@ def _unpack_sequence(
     entry: CatalogueEntry, parts: list[Download], work: Path, progress: Report
 ) -> dict[str, str]:
     """Unpack the folder of the archives that is the sequence into `work`; SHA-256 of each file by its path in it."""
+    # all archives over one another, of which one folder is the sequence
     unpacked = work / ".unpacked"
     sums = _unpack(parts, unpacked, progress)
     top = _top(unpacked, entry, parts[0].archive)
+
+    # its files move up, and their names in the checksums likewise
     inner = "" if top == unpacked else f"{top.relative_to(unpacked).as_posix()}/"
     shutil.copytree(top, work, copy_function=os.replace, dirs_exist_ok=True)
     shutil.rmtree(unpacked)
@@ -275,11 +283,12 @@ def verify(
     Raises:
         SequenceError: Unknown id, or the sequence is not here, or it needs a `camera` to be named.
     """
-    # Where it lies.
+    # where it lies
     entry = entry_of(name)
     folder = Path(name).expanduser() if entry is None else status(name, data_root=data_root)
     if folder is None or not folder.is_dir():
-        open_sequence(name, data_root=data_root)  # says what is missing
+        # says what is missing
+        open_sequence(name, data_root=data_root)
         raise SequenceError(
             f"'{name}' is not a recorded sequence", "rendered sequences need no verification"
         )
@@ -289,7 +298,8 @@ def verify(
         raise
     except DynslamError as error:
         return Verification(name, folder, 0, (str(error),), False, "")
-    # Decode every frame.
+
+    # decode every frame
     faults = []
     for index in range(len(sequence)):
         try:
@@ -297,7 +307,8 @@ def verify(
         except SequenceError as error:
             faults.append(f"frame {index}: {error}")
         progress(index + 1, len(sequence))
-    # Compare every file with its checksum.
+
+    # compare every file with its checksum
     manifest = folder / MANIFEST
     if manifest.is_file():
         try:
@@ -369,8 +380,9 @@ MAX_MEMBERS = 200_000
 MAX_HEADER = 1 << 20
 """Most bytes of one name or one set of attributes in a tar archive."""
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+"""Errors of a disk, or of a user's share of it, that is full."""
 
-# What Python's readers of archives raise over damaged ones; OSError is gzip's, too.
+# what Python's readers of archives raise over damaged ones; OSError is gzip's, too.
 _DAMAGE = (
     tarfile.TarError,
     zipfile.BadZipFile,
@@ -408,6 +420,7 @@ def extract(archive: Path, target: Path, progress: Report = lambda state: None) 
     try:
         members = _zip_members if zipfile.is_zipfile(archive) else _tar_members
         for name, stream in members(archive):
+            # block by block, with the checksum
             path = target / safe_name(archive, name)
             path.parent.mkdir(parents=True, exist_ok=True)
             checksum = hashlib.sha256()
@@ -423,7 +436,7 @@ def extract(archive: Path, target: Path, progress: Report = lambda state: None) 
             f"{archive.name} holds one name twice: {error.filename}, refused"
         ) from error
     except _DAMAGE as error:
-        # Faults of the target are not the archive's.
+        # faults of the target are not the archive's.
         if isinstance(error, OSError) and (error.filename is not None or error.errno in DISK_FULL):
             raise
         size = archive.stat().st_size
@@ -514,6 +527,7 @@ class _Counted:
         self.total = 0
 
     def read(self, size: int = -1) -> bytes:
+        """See `io.BufferedIOBase.read`."""
         block = self.stream.read(size)
         self.total += len(block)
         _check(self.archive, self.total)

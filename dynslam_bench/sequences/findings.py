@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 Severity = Literal["fault", "note"]
+"""See `Finding.severity`."""
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ _PEAK_REACH = 30
 
 @dataclass(eq=False)
 class ImageStatistics:
-    """What is kept of the frames that were read, stretch by stretch.
+    """Statistics of the frames that were read, collected stretch by stretch.
 
     Attributes:
         depth_factor: Raw units a metre.
@@ -75,11 +75,12 @@ class ImageStatistics:
 
     @property
     def frames(self) -> int:
-        """How many frames were added."""
+        """Number of frames that were added."""
         return sum(len(colour) for colour, _ in self.contours)
 
     def add(self, stretch: list[Frame]) -> None:
         """Add consecutive frames of one size."""
+        # single images
         grays = [
             np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8) for frame in stretch
         ]
@@ -87,11 +88,11 @@ class ImageStatistics:
         self.blank += sum(bool(gray.std() < 1.0) for gray in grays)
         self._add_depths(depths)
 
-        # Images that are repeated.
+        # images that are repeated
         self.colour_run = max(self.colour_run, _longest_run([frame.rgb for frame in stretch]))
         self.depth_run = max(self.depth_run, _longest_run(depths))
 
-        # Contours of both streams.
+        # contours of both streams
         self.cell_px = max(1, round(stretch[0].rgb.shape[1] / MAP_WIDTH))
         colour_maps = [_standardised(_colour_contours(gray, self.cell_px)) for gray in grays]
         depth_maps = [_standardised(_depth_contours(depth, self.cell_px)) for depth in depths]
@@ -124,11 +125,14 @@ def _roughness(depth: Map, factor: float) -> tuple[float, float]:
 
     NaN where few neighbours have depth. A surface is smooth; with its bytes swapped it is noise.
     """
+    # raw values of every second row, as they were stored
     metric = depth[::2].astype(np.float64)
     raw = np.clip(np.round(metric * factor), 0, 65535).astype(np.uint16)
     both = (raw[:, 1:] > 0) & (raw[:, :-1] > 0)
     if both.sum() < 100:
         return np.nan, np.nan
+
+    # steps along the rows in either byte order, at most 100 %
     readings = np.stack([raw, raw.byteswap()]).astype(np.float64)
     steps = np.abs(np.diff(readings, axis=2)) / np.maximum(readings[:, :, 1:], 1)
     stored, swapped = np.minimum(steps, 1)[:, both].mean(axis=1)
@@ -140,6 +144,7 @@ def _roughness(depth: Map, factor: float) -> tuple[float, float]:
 
 def _colour_contours(gray: NDArray[np.uint8], cell: int) -> Map:
     """Square root of the brightness gradient ``[H, W]``, one value a cell of `cell` pixels."""
+    # the mean of each cell, and its gradient
     size = (gray.shape[1] // cell, gray.shape[0] // cell)
     small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     gradient = np.hypot(cv2.Sobel(small, -1, 1, 0), cv2.Sobel(small, -1, 0, 1))
@@ -151,7 +156,7 @@ def _depth_contours(depth: Map, cell: int) -> Map:
     rows = depth.shape[0] // cell
     columns = depth.shape[1] // cell
     blocks = depth[: rows * cell, : columns * cell].reshape(rows, cell, columns, cell)
-    # The farthest and the nearest depth of each cell and its eight neighbours.
+    # the farthest and the nearest depth of each cell and its eight neighbours.
     around = np.ones((3, 3), np.uint8)
     least = np.where(blocks > 0, blocks, np.inf).min(axis=(1, 3))
     far = cv2.dilate(blocks.max(axis=(1, 3)), around)
@@ -189,6 +194,7 @@ def _correlations_by_delay(
     surfaces = np.zeros((len(delays), *shape), np.float32)
     pairs = np.zeros(len(delays), np.intp)
     for colour, depth in statistics.contours:
+        # by the correlation theorem, for all pairs of images with this delay
         colour_spectra = np.fft.rfft2(colour)
         depth_spectra = np.conj(np.fft.rfft2(depth))
         for row, delay in enumerate(delays):
@@ -207,6 +213,7 @@ def _scores_by_delay(colour_maps: Map, depth_maps: Map) -> NDArray[np.float64]:
     """
     colour = _blurred_rows(colour_maps)
     depth = _blurred_rows(depth_maps)
+    # all pairs of images at once; those of one delay lie on a diagonal
     products = colour @ depth.T
     scores = np.full((len(colour), 2 * MOST_DELAY + 1), np.nan)
     for column, delay in enumerate(range(-MOST_DELAY, MOST_DELAY + 1)):
@@ -223,6 +230,7 @@ def _blurred_rows(maps: Map) -> Map:
 
 def _peak(surface: Map, reach: int) -> tuple[float, tuple[int, int]]:
     """Height in standard deviations and place (row, column) of the peak within `reach` cells of no shift."""
+    # shifts near 0 lie in all four corners of a circular correlation: roll them together
     height, width = surface.shape
     reach_y = min(reach, height // 2 - 1)
     reach_x = min(reach, width // 2 - 1)
@@ -267,7 +275,7 @@ def _check_frozen(statistics: ImageStatistics) -> Finding | None:
     """One image that is repeated while the other stream changes."""
     colour = statistics.colour_run >= FROZEN_FRAMES
     depth = statistics.depth_run >= FROZEN_FRAMES
-    # A rendered camera at rest repeats both; the truth says whether it rests.
+    # a rendered camera at rest repeats both; the truth says whether it rests.
     if colour == depth:
         return None
     if colour:
@@ -290,13 +298,14 @@ def _check_units(statistics: ImageStatistics) -> Finding | None:
     factor = statistics.depth_factor
     if DEPTH_RANGE_M[0] <= median <= DEPTH_RANGE_M[1]:
         return None
-    # The first usual factor that gives a median depth of 0.4 to 8 m.
+    # the first usual factor that gives a median depth of 0.4 to 8 m.
     likely = next((usual for usual in USUAL_FACTORS if 0.4 < median * factor / usual < 8), factor)
     return finding_of("depth-units", median, factor=factor, likely=likely)
 
 
 def _check_flipped(statistics: ImageStatistics) -> Finding | None:
     """Colour images whose contours fit the depth's only upside down, mirrored or both."""
+    # the peak of the correlation with the depth turned in each way
     peaks = {}
     for name, (rows, columns) in FLIPS.items():
         surfaces = [
@@ -312,7 +321,7 @@ def _check_flipped(statistics: ImageStatistics) -> Finding | None:
 
 def _check_delay(statistics: ImageStatistics) -> Finding | None:
     """Depth images that fit colour images of some frames before or after."""
-    # Agreement of the contours by delay: of each image ``[N, D]``, and on average ``[D]``.
+    # agreement of the contours by delay: of each image ``[N, D]``, and on average ``[D]``.
     scores = np.concatenate(
         [_scores_by_delay(colour, depth) for colour, depth in statistics.contours]
     )
@@ -322,7 +331,7 @@ def _check_delay(statistics: ImageStatistics) -> Finding | None:
     column = int(np.argmax(mean))
     delay = float(column - MOST_DELAY)
 
-    # The best delay needs a clear peak over all shifts of the image, too.
+    # the best delay needs a clear peak over all shifts of the image, too.
     surfaces, _ = _correlations_by_delay(statistics, range(-MOST_DELAY, MOST_DELAY + 1))
     peaks = np.zeros(len(surfaces))
     for i, surface in enumerate(surfaces):
@@ -333,6 +342,7 @@ def _check_delay(statistics: ImageStatistics) -> Finding | None:
     if not _is_better_delay(scores, mean, peaks, column):
         return None
 
+    # the delay to a fraction of a frame
     delay += _vertex(mean, column)
     seconds = delay * statistics.seconds_a_frame
     side, change = ("before", "earlier") if delay > 0 else ("after", "later")
@@ -365,7 +375,7 @@ def _is_better_delay(
     reference = MOST_DELAY - 1 + int(np.argmax(mean[near]))
     gain = scores[:, column] - scores[:, reference]
     gain = gain[np.isfinite(gain)]
-    # Five successive images count as one observation.
+    # five successive images count as one observation.
     sigmas = float(gain.mean() / max(gain.std() / np.sqrt(len(gain) / 5), 1e-9))
     if sigmas < 4 or mean[column] < 1.25 * max(mean[reference], 0):
         return False
@@ -382,7 +392,7 @@ def _vertex(values: NDArray[np.float64], column: int) -> float:
 
 def _check_registration(statistics: ImageStatistics) -> Finding | None:
     """Depth that lies beside the colour by some pixels."""
-    # Mean correlation ``[3, H, W]`` with the depth one frame before, the same and one frame later.
+    # mean correlation ``[3, H, W]`` with the depth one frame before, the same and one frame later.
     sums, pairs = _correlations_by_delay(statistics, range(-1, 2))
     surfaces = sums / np.maximum(pairs, 1)[:, None, None]
     peaks = [_peak(surface, _PEAK_REACH) for surface in surfaces]
@@ -390,7 +400,7 @@ def _check_registration(statistics: ImageStatistics) -> Finding | None:
     best = heights.index(max(heights))
     clear, (row, column) = peaks[best]
 
-    # The shift of the highest peak, from cells of a circular correlation to signed pixels.
+    # the shift of the highest peak, from cells of a circular correlation to signed pixels.
     height, width = surfaces.shape[1:]
     down = (row + height // 2) % height - height // 2
     right = (column + width // 2) % width - width // 2

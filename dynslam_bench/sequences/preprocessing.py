@@ -43,6 +43,7 @@ class Preprocessed(Wrapped):
         return None if source is None else Masks(lambda index: self._masks_of(source[index]))
 
     def _masks_of(self, masks: FrameMasks) -> FrameMasks:
+        """A frame's masks, undistorted and resized."""
         kind = masks.instances.dtype
         # what OpenCV can remap
         narrow = kind if kind in (np.uint8, np.int16, np.uint16) else np.int16
@@ -62,6 +63,7 @@ class Preprocessed(Wrapped):
         return Frame(frame.index, frame.timestamp, rgb, self._geometry(frame.depth, colour=False))
 
     def _geometry(self, image: Image, *, colour: bool) -> Any:
+        """An image ``[H, W]`` or ``[H, W, 3]``, undistorted and resized; only colours are interpolated."""
         if self.settings.undistort and self.base.camera.is_distorted:
             maps = _undistortion(self.base.camera.resized(image.shape[1], image.shape[0]))
             interpolation = cv2.INTER_LINEAR if colour else cv2.INTER_NEAREST
@@ -82,9 +84,12 @@ def resize(image: Image, width: int, height: int, *, colour: bool) -> Any:
     if image.shape[:2] == (height, width):
         return image
     smaller = width * height < image.shape[0] * image.shape[1]
-    interpolation = (
-        (cv2.INTER_AREA if smaller else cv2.INTER_LINEAR) if colour else cv2.INTER_NEAREST_EXACT
-    )
+    if not colour:
+        interpolation = cv2.INTER_NEAREST_EXACT
+    elif smaller:
+        interpolation = cv2.INTER_AREA
+    else:
+        interpolation = cv2.INTER_LINEAR
     return cv2.resize(image, (width, height), interpolation=interpolation)
 
 
@@ -98,6 +103,7 @@ def normalise(rgb: NDArray[np.uint8], settings: PreprocessingSettings) -> NDArra
     """
     if settings.normalisation == "none":
         return rgb
+    # luminance and two channels of colour, of which only the first is changed
     luminance, *chroma = cv2.split(cv2.cvtColor(rgb, cv2.COLOR_RGB2YCrCb))
     if settings.normalisation == "equalise":
         luminance = cv2.equalizeHist(luminance)
@@ -110,5 +116,7 @@ def normalise(rgb: NDArray[np.uint8], settings: PreprocessingSettings) -> NDArra
         luminance = cv2.convertScaleAbs(
             np.clip((luminance - mean.item()) * gain + 255 * settings.target_mean, 0, 255)
         )
+
+    # back to RGB
     merged = cv2.merge([luminance, *chroma])
     return np.asarray(cv2.cvtColor(merged, cv2.COLOR_YCrCb2RGB), dtype=np.uint8)

@@ -82,7 +82,8 @@ def rgbd_pairs(frames: Sequence[Frame], camera: Camera) -> Iterator[RgbdPair]:
     for frame in frames:
         gray = np.asarray(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
         due = True
-        # Track the corners from the last frame, and end the pair where they have moved far enough.
+
+        # track the corners from the last frame, and end the pair where they have moved far enough
         if len(points):
             tracked, good = follow_corners(last_gray, gray, points, points, _BACK_AND_FORTH_PX)
             start = start[good]
@@ -91,12 +92,15 @@ def rgbd_pairs(frames: Sequence[Frame], camera: Camera) -> Iterator[RgbdPair]:
             due = frame.index - first.index >= MOST_FRAMES_APART or moved >= FAR_ENOUGH_PX
             if len(points) >= LEAST_INLIERS and due:
                 yield measure_pair(first, frame, start, points, camera)
-        # Begin the next pair, also where too few corners are left.
+
+        # begin the next pair, also where too few corners are left
         if len(points) < LEAST_INLIERS or due:
             first = frame
             start = _corners(gray, frame.depth)
             points = start
         last_gray = gray
+
+    # what is left of the stretch
     if frames[-1].index - first.index > 1 and len(points) >= LEAST_INLIERS:
         yield measure_pair(first, frames[-1], start, points, camera)
 
@@ -105,14 +109,14 @@ def measure_pair(
     first: Frame, second: Frame, start: Pixels, end: Pixels, camera: Camera
 ) -> RgbdPair:
     """The pair of two frames whose corners `start` ``[N, 2]`` were found again at `end` ``[N, 2]``, raw pixels."""
-    # Undistorted pixels in both frames, and points ``[N, 3]`` in the first camera.
+    # undistorted pixels in both frames, and points ``[N, 3]`` in the first camera.
     x, y = np.round(start).astype(int).T
     depth = np.asarray(first.depth[y, x], dtype=np.float64)
     pixels_first = camera.undistort_points(start)
     pixels_second = camera.undistort_points(end)
     points = camera.unproject(pixels_first, depth)
 
-    # PnP with RANSAC, refined on the inliers.
+    # PnP with RANSAC on the first frame's depth, refined on the inliers.
     inliers = np.zeros(len(points), bool)
     pose = None
     cv2.setRNGSeed(0)
@@ -135,6 +139,7 @@ def measure_pair(
         pose = se3.inverse(T_second_first)
         if not np.isfinite(pose).all():
             pose = None
+    # how far the corners moved, and how much of the image has a depth
     displacements = np.linalg.norm(pixels_second - pixels_first, axis=1)
     return RgbdPair(
         first=first.index,
@@ -151,12 +156,13 @@ def measure_pair(
 
 def _corners(gray: NDArray[np.uint8], depth: NDArray[np.float32]) -> Pixels:
     """Corners ``[N, 2]`` that lie on a surface, not at its edge."""
+    # within 5x5 pixels the depth is measured everywhere and has no step
     window = np.ones((5, 5), np.uint8)
     near = cv2.erode(depth, window)
     far = cv2.dilate(depth, window)
     mask = ((near > 0) & (far - near < _DEPTH_EDGE * near)).astype(np.uint8)
     corners = cv2.goodFeaturesToTrack(gray, CORNERS, 0.01, max(6, gray.shape[1] // 60), mask=mask)
-    # OpenCV gives None where there is no corner.
+    # OpenCV gives None where there is no corner
     return np.asarray([] if corners is None else corners, np.float32).reshape(-1, 2)
 
 
@@ -172,11 +178,14 @@ def follow_corners(
     A corner is found if it lies inside the image and, tracked back, ends within `tolerance_px` of
     where it began. `guess` ``[N, 2]`` is where the search begins.
     """
+    # there and back
     options: Any = {"maxLevel": 4, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
     there, status, _ = cv2.calcOpticalFlowPyrLK(before, after, points, guess.copy(), **options)
     back, status_back, _ = cv2.calcOpticalFlowPyrLK(after, before, there, points.copy(), **options)
     good = (status.reshape(-1) == 1) & (status_back.reshape(-1) == 1)
     good &= np.linalg.norm(back - points, axis=1) < tolerance_px
+
+    # inside the image
     height, width = after.shape
     good &= (there >= 0).all(axis=1) & (there <= (width - 1, height - 1)).all(axis=1)
     return np.asarray(there, np.float32), np.asarray(good, np.bool_)
@@ -203,6 +212,7 @@ def explained_share(pairs: Sequence[RgbdPair], relative: Array, camera: Camera) 
     Returns:
         The mean share, with the factor of the translations for which it is largest.
     """
+    # for each length of the translations: the mean share over all pairs
     T_second_first = se3.inverse(relative)
     means = []
     for length in _LENGTHS:
@@ -271,7 +281,7 @@ class TruthMotion:
     def __init__(self, truth: Trajectory, reading: str = READINGS[0]) -> None:
         self.poses = read_as(truth.T_world_cam, reading)
         self.stamps = truth.timestamps
-        # Rotation vectors from each pose to the next; a wider gap than some steps is a hole.
+        # rotation vectors from each pose to the next; a wider gap than some steps is a hole.
         steps = se3.inverse(self.poses[:-1]) @ self.poses[1:]
         gaps = np.diff(self.stamps)
         self._turns = se3.log(steps)[:, 3:] if len(steps) else np.zeros((0, 3))
@@ -281,17 +291,21 @@ class TruthMotion:
         """Poses ``[N, 4, 4]`` and whether the truth has them: not beyond its ends nor in its holes."""
         if len(self.stamps) < 2:
             return np.tile(np.eye(4), (len(stamps), 1, 1)), np.zeros(len(stamps), bool)
-        # The poses before and after each stamp, and how far it lies between them.
+
+        # the poses before and after each stamp, and how far it lies between them.
         after = np.searchsorted(self.stamps, stamps, side="right")
         index = np.clip(after - 1, 0, len(self.stamps) - 2)
         low = self.stamps[index]
         high = self.stamps[index + 1]
         share = np.clip((stamps - low) / (high - low), 0, 1)[:, None]
-        # Interpolate rotations along the shortest turn, and positions along a line.
+
+        # interpolate rotations along the shortest turn, and positions along a line.
         turn = np.pad(share * self._turns[index], ((0, 0), (3, 0)))
         R = self.poses[index, :3, :3] @ se3.exp(turn)[:, :3, :3]
         poses = se3.with_rotation(self.poses[index], R)
         poses[:, :3, 3] += share * (self.poses[index + 1, :3, 3] - self.poses[index, :3, 3])
+
+        # not beyond the ends, and not in a hole
         inside = (stamps >= self.stamps[0] - _SLACK_S) & (stamps <= self.stamps[-1] + _SLACK_S)
         return poses, inside & (high - low <= self._widest)
 
@@ -315,14 +329,16 @@ def read_as(poses: Array, reading: str) -> Array:
 
 
 def agreement(measured: Array, true: Array, bounds: tuple[float, float] = (1e-6, 1e6)) -> float:
-    """How well vectors ``[N, 3]`` agree up to a gain within bounds: 1 - weighted median of their relative differences.
+    """Agreement of vectors ``[N, 3]`` up to a gain within bounds: 1 - weighted median of their relative differences.
 
     1 is perfect; independent directions give some 0.3; less is the opposite.
     """
+    # relative difference of each pair of vectors, after the gain: 0 for equal ones, 1 for opposite ones
     true = best_gain(measured, true, *bounds) * true
     size = np.linalg.norm(measured, axis=1) + np.linalg.norm(true, axis=1)
     difference = np.linalg.norm(measured - true, axis=1) / np.maximum(size, 1e-12)
-    # The median of the differences, weighted by the vectors' size.
+
+    # the median of the differences, weighted by the vectors' size.
     order = np.argsort(difference)
     total = np.cumsum(size[order])
     if not len(total) or total[-1] <= 0:
@@ -347,7 +363,7 @@ def rotation_between(measured: Array, true: Array, *, proper: bool = True) -> Ar
     X = np.eye(3)
     gain = 1.0 / best_gain(measured, true)
     for _ in range(4):
-        # Orthogonal Procrustes, then weights by the distance of each vector.
+        # orthogonal Procrustes, then weights by the distance of each vector.
         left, _, right = np.linalg.svd((true * weight[:, None]).T @ measured)
         sign = np.linalg.det(left @ right) if proper else 1.0
         X = left @ np.diag([1.0, 1.0, sign]) @ right
@@ -358,7 +374,7 @@ def rotation_between(measured: Array, true: Array, *, proper: bool = True) -> Ar
 
 @dataclass(frozen=True)
 class Match:
-    """How well a truth, read in one convention and shifted in time, agrees with the measured motions.
+    """Agreement of a truth, read in one convention and shifted in time, with the measured motions.
 
     Attributes:
         reading: One of `READINGS`.
@@ -396,10 +412,13 @@ def weighted_mean(rotation: float, translation: float, weights: tuple[float, flo
 
 def match(motions: Motions, truth: TruthMotion, reading: str, shift_s: float) -> Match:
     """Compare the motions with those of a truth under a shift in time."""
+    # the truth's motions between the shifted stamps, where it has poses
     _, relative, turns, valid = truth.between(motions.start + shift_s, motions.end + shift_s)
     share = float(valid.mean()) if len(valid) else 0.0
     if valid.sum() < _FEWEST_MOTIONS:
         return Match(reading, shift_s, share)
+
+    # agreement of rotations and of translations, weighted by how far they are above the noise
     rotation = motions.rotation[valid]
     translation = motions.translation[valid]
     true_rotation = turns[valid]

@@ -66,6 +66,7 @@ class PreprocessingSettings(Settings):
     @field_validator("height")
     @classmethod
     def _both_sides(cls, height: int | None, info: ValidationInfo) -> int | None:
+        """Refuse a width without a height, and the reverse."""
         width = info.data.get("width")
         if (width is None) != (height is None):
             raise ValueError(f"width is {width} but height is {height}; give both or neither")

@@ -8,16 +8,22 @@ from dynslam_bench.geometry import Trajectory, se3
 
 Tag = Literal["static", "low-dynamic", "high-dynamic", "unknown-objects"]
 """What moves in a scene: nothing, people who stay where they are, people who walk, things that are no people."""
+# mean speeds from which a camera counts as fast; TUM's fr1/desk has 0.4 m/s and 23 deg/s, fr1/rpy 0.06
+# and 50
 FAST_M_S = 1.0
+"""Metres a second."""
 FAST_DEG_S = 40.0
-"""Mean speeds from which a camera counts as fast; TUM's fr1/desk has 0.4 m/s and 23 deg/s, fr1/rpy 0.06 and 50."""
+"""Degrees a second."""
 STEP_S = 0.1
 """Time over which speeds are taken, so that the noise of a motion capture system does not count as motion."""
 LOOP_PATH_M = 10.0
+"""Length of a loop's path, at least."""
 LOOP_EXTENT_M = 2.0
+"""Largest distance between two places of a path with a loop, at least."""
 LOOP_GAP_M = 1.0
-"""A loop is a path of such a length and extent at least, whose ends come as close as this."""
+"""Distance between the ends of a loop, at most."""
 MOST_POSES = 500
+"""Poses among which loops are looked for, at most: every pair of them is compared."""
 FIXED_CAMERA = "fixed-camera"
 """Tag of a sequence whose camera stands still: not moving is right there, and a static camera's error is zero."""
 
@@ -38,21 +44,30 @@ def motion_tags(truth: Trajectory) -> set[str]:
         return {FIXED_CAMERA}
     times = truth.timestamps
     # the first pose of each step of time: work by poses, however long the holes between them are
-    step_s = (times[0] + STEP_S) - times[0]  # as the floats of Unix time resolve it
-    steps = np.floor((times - times[0]) / step_s)
-    index = np.unique(
-        np.append(np.flatnonzero(np.append(True, np.diff(steps) > 0)), len(times) - 1)
-    )
+    # (as the floats of Unix time resolve the step)
+    step_s = (times[0] + STEP_S) - times[0]
+    step_number = np.floor((times - times[0]) / step_s)
+    is_first = np.append(True, np.diff(step_number) > 0)
+    index = np.unique(np.append(np.flatnonzero(is_first), len(times) - 1))
     poses = truth.T_world_cam[index]
+
+    # mean speeds, by distances and rotations between these poses
     duration_s = times[-1] - times[0]
-    steps = se3.inverse(poses[:-1]) @ poses[1:]
-    steps_m = np.linalg.norm(steps[:, :3, 3], axis=1)
-    turned_deg = np.degrees(se3.rotation_angle(steps))
+    motions = se3.inverse(poses[:-1]) @ poses[1:]
+    steps_m = np.linalg.norm(motions[:, :3, 3], axis=1)
+    turned_deg = np.degrees(se3.rotation_angle(motions))
     fast = steps_m.sum() >= FAST_M_S * duration_s or turned_deg.sum() >= FAST_DEG_S * duration_s
+
+    # a loop: two places close to each other that are far apart along the path
     some = np.linspace(0, len(index) - 1, min(len(index), MOST_POSES)).astype(int)
     path_m = np.concatenate([[0.0], steps_m.cumsum()])[some]
     positions = poses[some, :3, 3]
     apart_m = np.linalg.norm(positions[:, None] - positions, axis=2)
     closes = (apart_m <= LOOP_GAP_M) & (path_m - path_m[:, None] >= LOOP_PATH_M)
     loop = apart_m.max() >= LOOP_EXTENT_M and closes.any()
-    return {tag for tag, holds in (("fast", fast), ("loop", loop)) if holds}
+    tags = set()
+    if fast:
+        tags.add("fast")
+    if loop:
+        tags.add("loop")
+    return tags

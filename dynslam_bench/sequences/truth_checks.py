@@ -91,7 +91,7 @@ def truth_findings(
         camera: The stated camera.
         pairs: Pairs of frames and their motions.
     """
-    # Do truth and images share time?
+    # do truth and images share time?
     if truth is None:
         return [finding_of("no-truth", None)]
     begin, end = truth.timestamps[[0, -1]]
@@ -105,7 +105,7 @@ def truth_findings(
     if covered < max(LEAST_COVERAGE * len(stamps), 3):
         return [finding_of("truth-sparse", covered, frames=len(stamps), within=SAME_FRAME_S)]
 
-    # Do the images show a motion?
+    # do the images show a motion?
     usable = [
         pair for pair in pairs if pair.T_first_second is not None and pair.inliers.mean() >= 0.5
     ]
@@ -124,7 +124,7 @@ def _rest_finding(
 ) -> Finding:
     """Images that do not move beside a truth that does, or does not either."""
     _, relative, turns, valid = truth.between(motions.start, motions.end)
-    # Angles by which rotation and translation move a pixel at the median depth.
+    # angles by which rotation and translation move a pixel at the median depth.
     rotation = np.linalg.norm(turns, axis=1)
     translation = np.linalg.norm(relative[:, :3, 3], axis=1)
     angles = rotation + translation / motions.depth_m
@@ -188,7 +188,7 @@ def _compare(
         return [finding_of("motion-unmeasured/small", len(pairs))]
     stated = search.stated
 
-    # A truth of published markers is compared in the camera's axes.
+    # a truth of published markers is compared in the camera's axes.
     for rig, R_body_cam in markers.items():
         in_axes = truth.with_poses(in_camera_axes(truth.T_world_cam, R_body_cam))
         if _agrees_instead(search.motions, in_axes, stated):
@@ -196,7 +196,7 @@ def _compare(
             note = finding_of("truth-markers", angle, rig=rig, name=rig.capitalize())
             return [note, *_compare(stamps, in_axes, camera, pairs, tried, {})]
 
-    # A truth that agrees in another convention or under a shift in time. Where people fill the
+    # a truth that agrees in another convention or under a shift in time; where people fill the
     # view, another reading may fit their motion, but not that of the background.
     if _is_clearly_better(search) and search.explained(search.best) > search.explained(stated):
         in_other_axes = None
@@ -204,11 +204,11 @@ def _compare(
             in_other_axes = _other_axes_finding(search)
         return _misread_findings(search) if in_other_axes is None else [in_other_axes]
 
-    # A truth that agrees as it is stored measures camera and depth.
+    # a truth that agrees as it is stored measures camera and depth.
     if stated.rotation >= UNLIKE and stated.weights[0] >= 0.3:
         return camera_findings(search.motions, search.readings[_STORED], stated, camera, pairs)
 
-    # A truth of this recording whose motion is not the one on which most corners agree.
+    # a truth of this recording whose motion is not the one on which most corners agree.
     share, by_chance = _shares_by_order(search)
     if share > max(LEAST_SHARE, BEYOND_CHANCE * by_chance):
         case = "truth-unclear/moving"
@@ -220,6 +220,7 @@ def _search(
     stamps: Array, truth: Trajectory, camera: Camera, pairs: list[RgbdPair]
 ) -> _Search | None:
     """Compare the truth with the motions in all conventions and under all shifts in time; None where they are small."""
+    # every convention under every shift, where the truth has poses for half of the motions
     motions = motions_of(pairs, stamps)
     readings = {reading: TruthMotion(truth, reading) for reading in READINGS}
     steps = round(LARGEST_SHIFT_S / _STEP_S)
@@ -231,6 +232,8 @@ def _search(
             candidate = match(motions, readings[name], name, float(shift))
             if candidate.share >= 0.5:
                 matches.append(candidate)
+
+    # as it is stored, with a small shift at most
     as_stored = [
         candidate
         for candidate in matches
@@ -238,7 +241,8 @@ def _search(
     ]
     if not as_stored or sum(as_stored[0].weights) < 0.4:
         return None
-    # The unshifted truth, unless a small shift fits better.
+
+    # the unshifted truth, unless a small shift fits better.
     stated = max(as_stored, key=_total)
     unshifted = min(as_stored, key=lambda candidate: abs(candidate.shift_s))
     if unshifted.total > stated.total - 0.02:
@@ -260,17 +264,22 @@ def _is_clearly_better(search: _Search) -> bool:
     shifted = abs(best.shift_s) >= LEAST_TIME_S
     if best.reading == _STORED and not shifted:
         return False
-    # A shift of a short recording may fit by chance.
+
+    # a shift of a short recording may fit by chance
     duration_s = float((search.motions.end - search.motions.start).sum())
     long = len(search.pairs) >= MANY_PAIRS and duration_s >= 2 * LARGEST_SHIFT_S
     needed = GOOD if long or not shifted else SURE
-    now = search.stated.clearest
-    then = best.clearest
-    return then >= needed and 1 - then < 0.65 * (1 - now) and now < then - 0.05
+
+    # the best agreement is good, and much better than that of the truth as it is stored
+    as_stored = search.stated.clearest
+    otherwise = best.clearest
+    much_better = 1 - otherwise < 0.65 * (1 - as_stored) and as_stored < otherwise - 0.05
+    return otherwise >= needed and much_better
 
 
 def _misread_findings(search: _Search) -> list[Finding]:
     """The convention in which the truth agrees, and its shift in time to a few milliseconds."""
+    # the shift in finer steps
     best = search.best
     fine = [
         match(search.motions, search.readings[best.reading], best.reading, best.shift_s + offset)
@@ -278,6 +287,8 @@ def _misread_findings(search: _Search) -> list[Finding]:
     ]
     shift = max(fine, key=_total).shift_s
     shares = {"then": 100 * best.clearest, "now": 100 * search.stated.clearest}
+
+    # both may be found
     findings = []
     if best.reading != _STORED:
         findings.append(finding_of(_MISREAD[best.reading], best.total, **shares))
@@ -289,6 +300,7 @@ def _misread_findings(search: _Search) -> list[Finding]:
 
 def _other_axes_finding(search: _Search) -> Finding | None:
     """Other axes, where these explain rotations and translations better than another reading of the file."""
+    # agreement after the axes are turned as rotations and translations fit best
     motions = search.motions
     truth = search.readings[_STORED]
     _, relative, turns, valid = truth.between(motions.start, motions.end)
@@ -342,6 +354,7 @@ def _disagreement_findings(search: _Search, tried: int) -> list[Finding]:
             )
             if valid.mean() < 0.5:
                 continue
+            # the axes in which the rotations agree best, and how well they do
             measured = motions.rotation[valid]
             true = turns[valid]
             X = rotation_between(measured, true)
@@ -353,6 +366,7 @@ def _disagreement_findings(search: _Search, tried: int) -> list[Finding]:
     if best_alike >= GOOD:
         return [_axes_finding(best_axes, best_alike, stated)]
 
+    # a truth of another recording agrees in no axes; else too little is seen to tell
     count = len(motions.start)
     enough = stated.weights[0] >= 0.5 and count >= LEAST_UNLIKE and count >= 0.5 * tried
     if enough and closest < UNRELATED:

@@ -18,7 +18,8 @@ class Wrapped:
     base: Sequence
 
     def __getattr__(self, name: str) -> object:
-        if name.startswith("__") or "base" not in vars(self):  # not yet set while unpickling
+        # `base` is not yet set while unpickling
+        if name.startswith("__") or "base" not in vars(self):
             raise AttributeError(name)
         return getattr(self.base, name)
 
@@ -107,7 +108,7 @@ class Masks:
 
 @dataclass(frozen=True)
 class Part:
-    """Which frames of which content are seen.
+    """The part of a sequence that is seen: which frames of which content.
 
     Attributes:
         id: Id without a length: ``synthetic/walking_xyz?scene=0`` for all its lengths; a noise seed
@@ -138,7 +139,7 @@ class Part:
 
 
 def part_of(sequence: Sequence, offset: int = 0) -> Part:
-    """What part a sequence is.
+    """The part of a whole sequence that an opened sequence is.
 
     A sequence whose frames are cut from a longer one may offer ``whole_id``, ``scene_digest()`` and
     ``noise``, as the rendered ones do; any other is its own whole.
@@ -147,12 +148,15 @@ def part_of(sequence: Sequence, offset: int = 0) -> Part:
         sequence: The opened sequence, cut and preprocessed or not.
         offset: How many leading frames of the named part were dropped to get it.
     """
+    # through all views to the whole sequence, and its frames that are seen
     base: Any = sequence
     frames = range(len(sequence))
     while isinstance(base, Wrapped):
         if isinstance(base, SequenceView):
             frames = base.range[frames.start : frames.stop : frames.step]
         base = base.base
+
+    # what is filmed, with and without the draw of the sensors' noise
     noise: int | None = getattr(base, "noise", None)
     scene_digest = getattr(base, "scene_digest", None)
     scene = base.digest() if scene_digest is None else str(scene_digest())

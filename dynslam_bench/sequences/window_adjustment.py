@@ -48,26 +48,28 @@ def track(images: list[NDArray[np.uint8]], allowed: list[NDArray[np.uint8]]) -> 
     height, width = images[0].shape
     tracks = np.full((0, n, 2), np.nan)
     for i in range(n - 1):
-        # Detect new corners where few are left.
+        # detect new corners where few are left.
         alive = np.isfinite(tracks[:, i, 0])
         if alive.sum() < POINTS and i < n - 3:
             fresh = corners(images[i], allowed[i], tracks[alive, i], POINTS - int(alive.sum()))
             tracks = np.pad(tracks, ((0, len(fresh)), (0, 0), (0, 0)), constant_values=np.nan)
             tracks[len(alive) :, i] = fresh
             alive = np.isfinite(tracks[:, i, 0])
-        here = tracks[alive, i].astype(np.float32)
-        if not len(here):
+        pixels = tracks[alive, i].astype(np.float32)
+        if not len(pixels):
             continue
 
-        # Each corner is looked for where its last motion leads; new ones by the median motion.
-        flow = here - tracks[alive, i - 1] if i else np.full(here.shape, np.nan)
+        # each corner is looked for where its last motion leads; new ones by the median motion.
+        flow = pixels - tracks[alive, i - 1] if i else np.full(pixels.shape, np.nan)
         has_flow = np.isfinite(flow[:, 0])
         flow[~has_flow] = np.median(flow[has_flow], axis=0) if has_flow.any() else 0.0
-        guess = (here + flow).astype(np.float32)
-        there, good = follow_corners(images[i], images[i + 1], here, guess, 0.5)
-        good &= (there >= _BORDER_PX).all(axis=1)
-        good &= (there < (width - _BORDER_PX, height - _BORDER_PX)).all(axis=1)
-        tracks[np.flatnonzero(alive)[good], i + 1] = there[good]
+        guess = (pixels + flow).astype(np.float32)
+        next_pixels, good = follow_corners(images[i], images[i + 1], pixels, guess, 0.5)
+        good &= (next_pixels >= _BORDER_PX).all(axis=1)
+        good &= (next_pixels < (width - _BORDER_PX, height - _BORDER_PX)).all(axis=1)
+        tracks[np.flatnonzero(alive)[good], i + 1] = next_pixels[good]
+
+    # corners that were seen in four images at least
     long = np.isfinite(tracks[..., 0]).sum(axis=1) >= 4
     return np.asarray(tracks[long])
 
@@ -76,10 +78,13 @@ def corners(
     image: NDArray[np.uint8], allowed: NDArray[np.uint8], taken: Array, count: int
 ) -> NDArray[np.float32]:
     """Corners ``[N, 2]`` spread over the cells of a grid, away from those that there are."""
+    # not within 12 pixels of those that there are
     height, width = image.shape
     free = allowed.copy()
     for x, y in taken:
         cv2.circle(free, (int(x), int(y)), 12, 0, -1)
+
+    # the best of each cell, 4 rows by 5 columns
     rows = np.linspace(0, height, 5).astype(int).tolist()
     columns = np.linspace(0, width, 6).astype(int).tolist()
     pixels = [np.zeros((0, 2), np.float32)]
@@ -97,24 +102,26 @@ def inverse_depth(depth: NDArray[np.float32], pixels: Array) -> Array:
     """Mean inverse depth ``[N]`` of the 5x5 pixels around `pixels` ``[N, 2]``; NaN at edges, holes and outside."""
     height, width = depth.shape
     place: Array = np.asarray(np.round(pixels))
-    ahead = (place >= 2).all(axis=1)
-    before = (place < (width - 2, height - 2)).all(axis=1)
-    inside = np.asarray(np.isfinite(place).all(axis=1) & ahead & before)
+    above_least = (place >= 2).all(axis=1)
+    below_most = (place < (width - 2, height - 2)).all(axis=1)
+    inside = np.asarray(np.isfinite(place).all(axis=1) & above_least & below_most)
 
-    # The 5x5 pixels around each place, flat ``[N, 25]``.
+    # the 5x5 pixels around each place, flat ``[N, 25]``.
     u, v = np.where(inside[:, None], place, 2).astype(np.intp).T
     around = np.arange(-2, 3)
     rows = v[:, None, None] + around[:, None]
     columns = u[:, None, None] + around
     patch = depth[rows, columns].reshape(len(u), 25).astype(np.float64)
 
+    # mean and range of the measured ones
     measured = patch > 0
     inverse = 1 / np.where(measured, patch, 1.0)
     count = measured.sum(axis=1)
     mean = (inverse * measured).sum(axis=1) / np.maximum(count, 1)
     largest = np.where(measured, inverse, -np.inf).max(axis=1)
     smallest = np.where(measured, inverse, np.inf).min(axis=1)
-    # A hole has fewer measurements, an edge has a wide spread.
+
+    # a hole has fewer measurements, an edge has a wide spread.
     valid = inside & (count >= 20) & (largest - smallest < 0.12 * mean)
     return np.where(valid, mean, np.nan)
 
@@ -158,7 +165,7 @@ class Window:
         observed = [inverse_depth(image, pixels[:, i]) for i, image in enumerate(depth)]
         self.inverse_depth = np.stack(observed, axis=1)
 
-        # Initial poses by PnP from frame to frame; initial points by the median over the frames.
+        # initial poses by PnP from frame to frame; initial points by the median over the frames.
         self.R, self.centre = self._chain_poses()
         with np.errstate(divide="ignore", invalid="ignore"):
             points = camera.unproject(self.xy, 1 / self.inverse_depth)
@@ -171,11 +178,12 @@ class Window:
         self.xy = self.xy[keep]
         self.inverse_depth = self.inverse_depth[keep]
         self.points = np.nanmedian(world[keep], axis=1)
-        # Slope of the inverse depths by the delay, and each pixel's row as a share of the readout.
+
+        # slope of the inverse depths by the delay, and each pixel's row as a share of the readout.
         self.depth_drift = np.zeros(self.raw.shape[:2])
         self.late = np.nan_to_num((self.raw[..., 1] + 0.5) / camera.height - 0.5)
 
-        # Adjustment with a global shutter and no delay.
+        # adjustment with a global shutter and no delay.
         self.noise = 1.0, 0.01
         self.measure_noise(0.0)
         for _ in range(4):
@@ -189,7 +197,8 @@ class Window:
         T_cam_first = [np.eye(4)]
         for i in range(len(self.stamps) - 1):
             T_cam_first.append(self._step_by_pnp(i) @ T_cam_first[-1])
-        # The world is the middle frame's camera.
+
+        # the world is the middle frame's camera.
         middle = len(T_cam_first) // 2
         T_cam_world = np.array(T_cam_first) @ np.linalg.inv(T_cam_first[middle])
         R = T_cam_world[:, :3, :3]
@@ -197,9 +206,12 @@ class Window:
 
     def _step_by_pnp(self, i: int) -> Array:
         """Pose ``[4, 4]`` of frame `i`'s camera in the next one's, by PnP; drops the points that do not follow it."""
+        # points with depth in this frame that were followed to the next one
         usable = np.isfinite(self.inverse_depth[:, i]) & np.isfinite(self.xy[:, i + 1, 0])
         if usable.sum() < LEAST_POINTS:
             raise Unusable("too few points with depth can be followed")
+
+        # PnP with RANSAC, refined on its inliers
         matrix = self.camera.matrix
         points = self.camera.unproject(self.xy[usable, i], 1 / self.inverse_depth[usable, i])
         pixels = self.xy[usable, i + 1]
@@ -221,6 +233,7 @@ class Window:
         )
         step = se3.from_matrix(shift[:, 0], cv2.Rodrigues(turn)[0])
 
+        # points that move otherwise are not followed any further
         predicted = self.camera.project(points @ step[:3, :3].T + step[:3, 3])
         error = np.linalg.norm(predicted - pixels, axis=1)
         moving = np.flatnonzero(usable)[~(error < _MOVING_PX)]
@@ -232,16 +245,20 @@ class Window:
         """The camera at times `offset` ``[L, n]`` seconds after the frames' stamps."""
         n = len(self.stamps)
         times = self.stamps + offset
-        # The frame nearest to each time, and the `STENCIL` frames around every frame.
+
+        # the frame nearest to each time, and the `STENCIL` frames around every frame.
         nearest = np.searchsorted((self.stamps[1:] + self.stamps[:-1]) / 2, times)
         first = np.clip(np.arange(n) - STENCIL // 2, 0, n - STENCIL)
         nodes = first[:, None] + np.arange(STENCIL)
-        # Interpolate rotation vectors from the nearest frame, and centres, as polynomials in time.
+
+        # interpolate rotation vectors from the nearest frame, and centres, as polynomials in time.
         spread = self.stamps[nodes] - self.stamps[:, None]
         turns = _rotation_vectors(self.R[nodes] @ np.swapaxes(self.R, 1, 2)[:, None])
         weights, slopes = _lagrange(spread[nearest], times - self.stamps[nearest])
         turn = turns[nearest]
         centres = self.centre[nodes][nearest]
+
+        # half an interval beyond the first and the last frame the poses are known
         first_time = 1.5 * self.stamps[0] - 0.5 * self.stamps[1]
         last_time = 1.5 * self.stamps[-1] - 0.5 * self.stamps[-2]
         return _InterpolatedPoses(
@@ -293,33 +310,44 @@ class Window:
                 image's are.
             delay_s: By which the depth images are exposed later than their stamps say.
         """
-        now = self._in_camera(self._at(self.late * readout_s))
-        self.inverse_depth = self._depth_at(now, readout_s, delay_s)
-        before = self._depth_at(now, readout_s, delay_s - _DIFFERENCE_S)
-        after = self._depth_at(now, readout_s, delay_s + _DIFFERENCE_S)
-        drift = (after - before) / (2 * _DIFFERENCE_S)
+        # inverse depths ``[L, n]`` under this delay
+        points = self._in_camera(self._at(self.late * readout_s))
+        self.inverse_depth = self._depth_at(points, readout_s, delay_s)
+
+        # how they change with the delay, by central differences
+        earlier = self._depth_at(points, readout_s, delay_s - _DIFFERENCE_S)
+        later = self._depth_at(points, readout_s, delay_s + _DIFFERENCE_S)
+        drift = (later - earlier) / (2 * _DIFFERENCE_S)
         self.inverse_depth[~np.isfinite(drift)] = np.nan
         self.depth_drift = np.nan_to_num(drift)
 
-    def _depth_at(self, now: Array, readout_s: float, delay_s: float) -> Array:
-        """Inverse depth ``[L, n]`` at the pixels' time of images exposed `delay_s` after their stamps."""
+    def _depth_at(self, points: Array, readout_s: float, delay_s: float) -> Array:
+        """Inverse depth ``[L, n]`` at the pixels' time of images exposed `delay_s` after their stamps.
+
+        Args:
+            points: ``[L, n, 3]`` in the camera when the pixels were exposed, metres.
+            readout_s: Readout time.
+            delay_s: The delay.
+        """
+        # the points in the camera when the depth was exposed
         poses = self._at(self.late * readout_s + self.offsets + delay_s)
-        then = self._in_camera(poses)
-        inverse_now = 1 / np.maximum(now[..., 2:], _NEAREST_M)
-        inverse_then = 1 / np.maximum(then[..., 2:], _NEAREST_M)
-        # Read the depth where the point was then, and carry it to now.
-        moved = then[..., :2] * inverse_then - now[..., :2] * inverse_now
+        delayed = self._in_camera(poses)
+        inverse = 1 / np.maximum(points[..., 2:], _NEAREST_M)
+        delayed_inverse = 1 / np.maximum(delayed[..., 2:], _NEAREST_M)
+
+        # read the depth where the point was then, and carry it to the pixels' time
+        moved = delayed[..., :2] * delayed_inverse - points[..., :2] * inverse
         shift = moved * (self.camera.fx, self.camera.fy)
         is_known = poses.within[..., None] & np.isfinite(self.xy)
         place = np.where(is_known, self.raw + shift, np.nan)
         observed = [inverse_depth(image, place[:, i]) for i, image in enumerate(self.depth)]
-        return np.asarray(np.stack(observed, axis=1) - (inverse_then - inverse_now)[..., 0])
+        return np.asarray(np.stack(observed, axis=1) - (delayed_inverse - inverse)[..., 0])
 
     def depth_cost(self, delay_s: float) -> tuple[float, int]:
         """Robust cost of the depth images under a delay without a rolling shutter, and how many depths it sums."""
-        now = self._in_camera(self._at(np.zeros_like(self.late)))
-        predicted = 1 / np.maximum(now[..., 2], _NEAREST_M)
-        error = (predicted - self._depth_at(now, 0.0, delay_s)) / self.noise[1]
+        points = self._in_camera(self._at(np.zeros_like(self.late)))
+        predicted = 1 / np.maximum(points[..., 2], _NEAREST_M)
+        error = (predicted - self._depth_at(points, 0.0, delay_s)) / self.noise[1]
         valid = np.isfinite(error)
         return float(np.log1p((error[valid] / CAUCHY) ** 2).sum()), int(valid.sum())
 

@@ -36,6 +36,8 @@ MAX_UNIT_RATIO = 10.0
 """Without depth each map has its own unit of length, the median depth of its first views: their largest ratio."""
 UNKNOWN_FRAME = -1
 """Frame of a keyframe that is of another run; its stamp is NaN."""
+TABLE_OF_ARRAY = {"kf_words": "kf_descriptor", "words": "descriptor"}
+"""The map's tables that have another name in files."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,20 +62,20 @@ class Atlas:
     """The root map and all submaps, by number.
 
     Args:
-        world: Keyframes and points of all maps.
+        slam_map: Keyframes and points of all maps.
         submaps: Those of a loaded map, from number 1 on.
         unit_ratio: By how much units of length of two maps may differ: 1 with depth.
 
     Attributes:
-        world: Keyframes and points of all maps.
+        map: Keyframes and points of all maps.
         active: Number of the map that the camera is in, or was in last.
         submaps: The submaps by number, merged ones included.
     """
 
     def __init__(
-        self, world: Map, submaps: Iterable[Submap] = (), *, unit_ratio: float = 1.0
+        self, slam_map: Map, submaps: Iterable[Submap] = (), *, unit_ratio: float = 1.0
     ) -> None:
-        self.world = world
+        self.map = slam_map
         self.active = 0
         self._unit_ratio = unit_ratio
         self.submaps = dict(enumerate(submaps, 1))
@@ -93,16 +95,16 @@ class Atlas:
         self.active = 1 + len(self.submaps)
         self.submaps[self.active] = submap
 
-    def move_nearby(self, number: int, before: Array, after: Array, scales: Array) -> None:
+    def move_nearby(self, number: int, T_before: Array, T_after: Array, scales: Array) -> None:
         """Keyframes of a map were moved: what is known of places in its world moves with the nearest keyframe.
 
         Args:
             number: The submap, or 0.
-            before: World-to-camera poses ``[K, 4, 4]`` of its keyframes until now.
-            after: Those from now on.
+            T_before: World-to-camera poses ``[K, 4, 4]`` of its keyframes until now.
+            T_after: Those from now on.
             scales: What lengths around each were multiplied by ``[K]``.
         """
-        centres = se3.inverse(before)[:, :3, 3]
+        centres = se3.inverse(T_before)[:, :3, 3]
         for other, submap in self.submaps.items():
             if number not in (0, other):
                 continue
@@ -112,9 +114,9 @@ class Atlas:
             scale = float(scales[nearest])
 
             # it stays where it is as seen from the nearest keyframe
-            T_world_cam = se3.inverse(after[nearest])
-            moved = se3.transform(T_world_cam, scale * se3.transform(before[nearest], place))
-            rotation = float(se3.rotation_angle(T_world_cam @ before[nearest]))
+            T_world_cam = se3.inverse(T_after[nearest])
+            moved = se3.transform(T_world_cam, scale * se3.transform(T_before[nearest], place))
+            rotation = float(se3.rotation_angle(T_world_cam @ T_before[nearest]))
             slack = min(submap.slack + rotation, np.pi)
             if number:
                 self.submaps[other] = replace(submap, start=moved, slack=slack)
@@ -131,22 +133,25 @@ class Atlas:
         slacks = [self.submaps[number].slack for number in (one, other) if number in self.submaps]
         return float(sum(slacks))
 
-    def reachable(self, left: int, there: int, last: Array, now: Array, bound_m: float) -> bool:
+    def reachable(
+        self, left: int, there: int, last_centre: Array, centre: Array, bound_m: float
+    ) -> bool:
         """Whether a camera can have moved from one place to another.
 
         Args:
             left: The map in which it was tracked last.
             there: The map of the place; nothing is known of the way to submaps other than `left`.
-            last: Its centre then ``[3]``.
-            now: Its centre now.
+            last_centre: Its centre then ``[3]``.
+            centre: Its centre at the place ``[3]``.
             bound_m: How far it may have moved.
         """
+        # within one map by the straight distance; to the root map by what is known of the submap's place
         if there == left:
-            return bool(np.linalg.norm(now - last) <= bound_m)
+            return bool(np.linalg.norm(centre - last_centre) <= bound_m)
         if there != 0:
             return False
-        anchor, bound = self._from_root(left, last, bound_m)
-        return bool(np.linalg.norm(now - anchor) <= bound)
+        anchor, bound = self._from_root(left, last_centre, bound_m)
+        return bool(np.linalg.norm(centre - anchor) <= bound)
 
     def admits_start(
         self, number: int, moved: Callable[[Array], Array], drift_m: float = 0.0
@@ -203,14 +208,20 @@ def open_atlas(file: str, camera: Camera, features: MapFeatures, *, depth: bool)
 
 
 def save_atlas(
-    path: Path, atlas: Atlas, world: Map, features: MapFeatures, *, depth: bool, made_by: str = ""
+    path: Path,
+    atlas: Atlas,
+    slam_map: Map,
+    features: MapFeatures,
+    *,
+    depth: bool,
+    made_by: str = "",
 ) -> None:
     """Write the atlas to a file; `open_atlas` restores every bit.
 
     Args:
         path: The file.
         atlas: The atlas.
-        world: Its keyframes and points, or a refined copy of them.
+        slam_map: Its keyframes and points, or a refined copy of them.
         features: The features that it is made of.
         depth: Whether they have depth.
         made_by: Which run made it, in words.
@@ -219,33 +230,33 @@ def save_atlas(
         TrackerError: There is no map yet, or it is too large for a file.
         DynslamError: The file cannot be written.
     """
-    if not world.next_keyframe:
+    if not slam_map.next_keyframe:
         raise TrackerError("there is no map to save: no frame has begun one")
     header = MapHeader(
         sensors="rgbd" if depth else "rgb",
-        camera=described(world.camera),
+        camera=described(slam_map.camera),
         features=features,
-        next_keyframe=world.next_keyframe,
-        next_point=world.next_point,
+        next_keyframe=slam_map.next_keyframe,
+        next_point=slam_map.next_point,
         made_by=made_by[:1000],
     )
-    write_map(path, SavedMap(header, packed(world, atlas.submaps.values())))
+    write_map(path, SavedMap(header, packed(slam_map, atlas.submaps.values())))
 
 
-def packed(world: Map, submaps: Collection[Submap]) -> dict[str, NDArray[Any]]:
+def packed(slam_map: Map, submaps: Collection[Submap]) -> dict[str, NDArray[Any]]:
     """The arrays of a map and its submaps, as `map_files` describes them."""
     # keyframes and points, oldest first; features of each keyframe, without the unused columns
-    slots = world.keyframes
-    points = world.points
-    points = points[np.argsort(world.id[points], kind="stable")]
-    features = np.arange(world.kf_point.shape[1]) < world.kf_count[slots][:, None]
-    arrays = {name: getattr(world, name)[slots] for name in KEYFRAME_ARRAYS}
-    arrays |= {name: getattr(world, name)[slots][features] for name in FEATURE_ARRAYS}
-    arrays |= {name: getattr(world, name)[points] for name in POINT_ARRAYS}
+    slots = slam_map.keyframes
+    points = slam_map.points
+    points = points[np.argsort(slam_map.id[points], kind="stable")]
+    features = np.arange(slam_map.kf_point.shape[1]) < slam_map.kf_count[slots][:, None]
+    arrays = {name: _table(slam_map, name)[slots] for name in KEYFRAME_ARRAYS}
+    arrays |= {name: _table(slam_map, name)[slots][features] for name in FEATURE_ARRAYS}
+    arrays |= {name: _table(slam_map, name)[points] for name in POINT_ARRAYS}
 
     # observations, one point after the other; they name keyframes by row
-    keyframe, feature = world.observations(points)
-    row_of_keyframe = np.zeros(world.kf_alive.size, np.int32)
+    keyframe, feature = slam_map.observations(points)
+    row_of_keyframe = np.zeros(slam_map.kf_alive.size, np.int32)
     row_of_keyframe[slots] = np.arange(len(slots))
     arrays["obs_kf"] = row_of_keyframe[keyframe]
     arrays["obs_ft"] = feature
@@ -256,6 +267,11 @@ def packed(world: Map, submaps: Collection[Submap]) -> dict[str, NDArray[Any]]:
     arrays["submap_anchor"] = places[:, 1]
     arrays["submap_bound"] = np.array([submap.bound_m for submap in submaps], np.float64)
     return arrays
+
+
+def _table(slam_map: Map, name: str) -> NDArray[Any]:
+    """The map's table that files hold under a name."""
+    return np.asarray(getattr(slam_map, TABLE_OF_ARRAY.get(name, name)))
 
 
 def unpacked(saved: SavedMap, camera: Camera, scales: Array) -> Atlas:
@@ -270,6 +286,8 @@ def unpacked(saved: SavedMap, camera: Camera, scales: Array) -> Atlas:
     header = saved.header
     count = arrays["kf_count"]
     n_obs = arrays["n_obs"]
+
+    # what the file holds, each keyframe's features and each point's observations in a row of a table
     tables = {name: arrays[name].copy() for name in (*KEYFRAME_ARRAYS, *POINT_ARRAYS)}
     tables |= {name: _padded(arrays[name], count) for name in FEATURE_ARRAYS}
     tables |= {name: _padded(arrays[name], n_obs) for name in OBSERVATION_ARRAYS}
@@ -282,15 +300,17 @@ def unpacked(saved: SavedMap, camera: Camera, scales: Array) -> Atlas:
     tables["kf_frame"] = np.full(len(count), UNKNOWN_FRAME, np.int64)
     tables["kf_stamp"] = np.full(len(count), np.nan)
     tables["kf_centre"] = np.zeros((len(count), 3))
-    world = Map(camera, scales)
-    world.take_over(tables, header.next_keyframe, header.next_point)
+    for name, table in TABLE_OF_ARRAY.items():
+        tables[table] = tables.pop(name)
+    slam_map = Map(camera, scales)
+    slam_map.take_over(tables, header.next_keyframe, header.next_point)
 
     submaps: list[Submap] = []
     for start, anchor, bound in zip(
         arrays["submap_start"], arrays["submap_anchor"], arrays["submap_bound"], strict=True
     ):
         submaps.append(Submap(start.copy(), anchor.copy(), float(bound)))
-    return Atlas(world, submaps, unit_ratio=1.0 if header.sensors == "rgbd" else MAX_UNIT_RATIO)
+    return Atlas(slam_map, submaps, unit_ratio=1.0 if header.sensors == "rgbd" else MAX_UNIT_RATIO)
 
 
 def _padded(rows: NDArray[Any], counts: NDArray[np.integer]) -> NDArray[Any]:

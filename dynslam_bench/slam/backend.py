@@ -147,26 +147,33 @@ class RgbdBackend:
             SettingsError: The map cannot be read, or was made with another camera, other features
                 or another sensor.
         """
+        # the map, empty or loaded, and what builds it
         s = self.settings
         self.camera = camera.undistorted()
         self.seed = int(seed)
         self.atlas = open_atlas(s.map.file, self.camera, self._features, depth=self.uses_depth)
-        self.world = self.atlas.world
-        self.mapper = LocalMapper(self.world, s)
+        self.map = self.atlas.map
+        self.mapper = LocalMapper(self.map, s)
+        self._keyframe_policy = KeyframePolicy(s.keyframes, self.mapper.close_m)
+
+        # the camera's motion
         self.history: list[FramePose] = []
         self.motion = CameraMotion(s.motion)
         self.shutter = RollingShutter(self.camera, self.motion.intervals)
+
+        # loops and relocalisation
         self.loops = LoopCloser(
             self.atlas, self.mapper, s, self.seed, scale_is_known=self.uses_depth
         )
-        self._status = CameraStatus.INITIALISING
-        self._mapping_enabled = not s.map.localisation_only
         self._gate = RelocalisationGate(
             self.atlas, s.relocalisation.max_speed, anywhere=bool(s.map.file)
         )
-        self._keyframe_policy = KeyframePolicy(s.keyframes, self.mapper.close_m)
-        self._local_map = LocalMap(self.world, connected_only=s.loop_closing.enabled)
-        self._map_views = MapViews(self.world, DEPTH_IMAGES if self.uses_depth else 0)
+        self._local_map = LocalMap(self.map, connected_only=s.loop_closing.enabled)
+        self._map_views = MapViews(self.map, DEPTH_IMAGES if self.uses_depth else 0)
+
+        # the state of tracking
+        self._status = CameraStatus.INITIALISING
+        self._mapping_enabled = not s.map.localisation_only
         self._unrecognised_frames = 0
         self._reference_keyframe = -1
         self._last_frame: TrackedFrame | None = None
@@ -206,8 +213,8 @@ class RgbdBackend:
         """
         begin = perf_counter()
         self._refined_map = None
-        measured = observe(frame, keep, weight, self.camera, self.world.scales)
-        has_map = self.world.next_keyframe > 0
+        measured = observe(frame, keep, weight, self.camera, self.map.scales)
+        has_map = self.map.next_keyframe > 0
         if has_map:
             result = self._track(frame, measured)
         else:
@@ -235,8 +242,8 @@ class RgbdBackend:
 
         # match the local map around the initial pose, and fit the pose to all matches
         _, points = self._local_map.around(initial.keyframe)
-        fit = track_local_map(
-            self.world,
+        map_fit = track_local_map(
+            self.map,
             current.observations,
             initial.matches,
             initial.T_cam_world,
@@ -245,27 +252,27 @@ class RgbdBackend:
         )
 
         # undo the rolling shutter by the motion to the fitted pose, and fit again
-        observations, fit, velocity = self._refit_rolling_shutter(current, fit)
+        observations, map_fit, velocity = self._refit_rolling_shutter(current, map_fit)
 
         # a pose that too few map points agree with is rejected
         if self._mapping_enabled:
-            self.world.visible[fit.in_view] += 1
-        if fit.count < self._min_inliers():
-            return _with_match_counts(self._lose(current), fit, initial)
+            self.map.visible[map_fit.in_view] += 1
+        if map_fit.count < self._min_inliers():
+            return _with_match_counts(self._lose(current), map_fit, initial)
 
         # weigh the pose against the motion model
-        tracked = self._accept_pose(current, observations, fit)
+        tracked = self._accept_pose(current, observations, map_fit)
         self.shutter.velocity = velocity
 
         # the second frame of a map tells the motion in the first: begin the map again without its distortion
         first = self._uncompensated_first
         self._uncompensated_first = None
         if first is not None and velocity is not None:
-            return self._restart_compensated(current, first, velocity, fit.count)
+            return self._restart_compensated(current, first, velocity, map_fit.count)
 
         # insert a keyframe if the frame shows enough new
-        result = self._update_map(frame, tracked, fit, in_root_map)
-        return _with_match_counts(result, fit, initial)
+        result = self._update_map(frame, tracked, map_fit, in_root_map)
+        return _with_match_counts(result, map_fit, initial)
 
     # ------------------------------------------------------------------ steps of tracking
 
@@ -294,8 +301,8 @@ class RgbdBackend:
         """
         if self._last_frame is not None:
             return self._last_frame
-        stored_bytes = 8 * self.world.words.shape[1]
-        frame_bytes = 8 * measured.words.shape[1]
+        stored_bytes = 8 * self.map.descriptor.shape[1]
+        frame_bytes = 8 * measured.descriptors.shape[1]
         if len(measured) and frame_bytes != stored_bytes:
             raise TrackerError(
                 f"the map's descriptors have {stored_bytes} bytes, frame {frame.index}'s {frame_bytes}",
@@ -303,7 +310,7 @@ class RgbdBackend:
             )
         keep_none = np.zeros(len(frame.xy), bool)
         weight = keep_none.astype(np.float32)
-        empty = observe(frame, keep_none, weight, self.camera, self.world.scales)
+        empty = observe(frame, keep_none, weight, self.camera, self.map.scales)
         return TrackedFrame(empty, np.zeros(0, np.int64), np.eye(4), frame.timestamp)
 
     def _estimate_initial_pose(
@@ -315,7 +322,7 @@ class RgbdBackend:
 
         # from the last frame
         from_last_frame = pose_from_last_frame(
-            self.world,
+            self.map,
             current.last,
             current.observations,
             current.prediction,
@@ -356,9 +363,9 @@ class RgbdBackend:
             bound = self._gate.while_tracked(last, current.measured, stamp, current.prediction)
             return keyframes, bound
         # how other submaps lie to the active one is unknown
-        keyframes = self.world.keyframes
+        keyframes = self.map.keyframes
         maps = (ROOT_MAP, self.atlas.active)
-        keyframes = keyframes[np.isin(self.world.kf_map[keyframes], maps)]
+        keyframes = keyframes[np.isin(self.map.kf_map[keyframes], maps)]
         return keyframes, self._gate.while_lost(last, current.measured, stamp)
 
     def _leave_submap(self, last: TrackedFrame) -> None:
@@ -368,18 +375,18 @@ class RgbdBackend:
         self._forget_motion()
 
     def _refit_rolling_shutter(
-        self, current: CurrentFrame, fit: MapFit
+        self, current: CurrentFrame, map_fit: MapFit
     ) -> tuple[Observations, MapFit, CameraVelocity | None]:
         """The features compensated by the motion to the frame's pose, the pose fitted to them, and that motion.
 
         The motion is None, and nothing changes, where the rolling shutter is not compensated.
         """
         if not self._compensates_rolling_shutter():
-            return current.observations, fit, None
+            return current.observations, map_fit, None
         return self.shutter.refitted(
             current.measured,
             current.observations,
-            fit,
+            map_fit,
             current.last,
             current.bundle.timestamp,
             force=self._uncompensated_first is not None,
@@ -392,23 +399,23 @@ class RgbdBackend:
         return self.settings.relocalisation.min_inliers
 
     def _accept_pose(
-        self, current: CurrentFrame, observations: Observations, fit: MapFit
+        self, current: CurrentFrame, observations: Observations, map_fit: MapFit
     ) -> TrackedFrame:
         """The frame is tracked: its pose is weighed against the motion model, its inliers count as found."""
-        points = fit.matches.point[fit.inliers]
+        points = map_fit.matches.point[map_fit.inliers]
         if self._mapping_enabled:
-            self.world.found[points] += 1
+            self.map.found[points] += 1
         stamp = current.bundle.timestamp
         pose = self.motion.update(
-            current.last, stamp, fit.estimate.T_cam_world, fit.estimate.information
+            current.last, stamp, map_fit.estimate.T_cam_world, map_fit.estimate.information
         )
-        observed = observe_points(observations, fit.matches.feature[fit.inliers], points)
+        observed = observe_points(observations, map_fit.matches.feature[map_fit.inliers], points)
         tracked = TrackedFrame(observations, observed, pose, stamp)
         self._status = CameraStatus.TRACKED
         self._unrecognised_frames = 0
         self._last_frame = tracked
         # the reference keyframe shares most points with the frame
-        covisible, _ = self.world.covisible_of(points)
+        covisible, _ = self.map.covisible_of(points)
         if len(covisible):
             self._reference_keyframe = int(covisible[0])
         self._update_active_map()
@@ -451,20 +458,20 @@ class RgbdBackend:
 
     def _update_active_map(self) -> None:
         """The active map is that of the reference keyframe, which a merge may have changed."""
-        self.atlas.active = int(self.world.kf_map[self._reference_keyframe])
+        self.atlas.active = int(self.map.kf_map[self._reference_keyframe])
 
     def _result(
         self, T_cam_world: Array | None, timings: Mapping[str, float] | None = None, **stats: float
     ) -> TrackResult:
         """A frame's result with the state and the map as they are now; with `timings` if it became a keyframe."""
-        world = self.world
+        slam_map = self.map
         pose = None if T_cam_world is None else se3.inverse(T_cam_world)
-        maps = set(world.kf_map[world.kf_alive].tolist())
+        maps = set(slam_map.kf_map[slam_map.kf_alive].tolist())
         counts = {
             "matches": 0,
             "inliers": 0,
-            "map_points": len(world.points),
-            "keyframes": world.keyframe_count,
+            "map_points": len(slam_map.points),
+            "keyframes": slam_map.keyframe_count,
             "keyframe": bool(timings),
             "maps": len(maps),
             "loops": len(self.loops.closed),
@@ -542,7 +549,7 @@ class RgbdBackend:
         self,
         frame: FrameBundle,
         tracked: TrackedFrame,
-        fit: MapFit,
+        map_fit: MapFit,
         in_root_map: InitialPose | None,
     ) -> TrackResult:
         """Insert the tracked frame as a keyframe if the policy or a merge asks for it, and record its pose.
@@ -550,14 +557,14 @@ class RgbdBackend:
         Args:
             frame: The frame.
             tracked: Its pose and map points in the active map.
-            fit: The fit that gave them.
+            map_fit: The fit that gave them.
             in_root_map: Its pose in the root map, if the camera is in a submap and was found there.
         """
         timings: dict[str, float] = {}
         verdict = RootMapPose.REJECTED
-        pose = fit.estimate.T_cam_world
+        pose = map_fit.estimate.T_cam_world
         needed = in_root_map is not None or self._keyframe_policy.needs_keyframe(
-            self.world, tracked, frame.index, self._reference_keyframe
+            self.map, tracked, frame.index, self._reference_keyframe
         )
         if self._mapping_enabled and needed:
             timings, verdict = self._insert_keyframe(frame, tracked, in_root_map)
@@ -565,11 +572,13 @@ class RgbdBackend:
             pose = tracked.T_cam_world
             self.motion.relocate(pose)
 
-        T_ref_world = self.world.kf_pose[self._reference_keyframe]
+        T_ref_world = self.map.kf_pose[self._reference_keyframe]
         T_cam_ref = pose @ se3.inverse(T_ref_world)
-        self._record_pose(frame, T_cam_ref, fit.estimate.information)
+        self._record_pose(frame, T_cam_ref, map_fit.estimate.information)
         self._update_active_map()
-        result = self._result(tracked.T_cam_world, timings, residual_px=fit.estimate.residual_px)
+        result = self._result(
+            tracked.T_cam_world, timings, residual_px=map_fit.estimate.residual_px
+        )
 
         merged = self.atlas.active == ROOT_MAP
         if in_root_map is None or merged or verdict is RootMapPose.REJECTED:
@@ -582,7 +591,7 @@ class RgbdBackend:
 
     def _record_root_map_pose(self, in_root_map: InitialPose) -> None:
         """The last recorded pose becomes relative to a keyframe of the root map."""
-        T_ref_world = self.world.kf_pose[in_root_map.keyframe]
+        T_ref_world = self.map.kf_pose[in_root_map.keyframe]
         recorded = self.history[-1]
         recorded.reference = in_root_map.keyframe
         recorded.T_cam_ref = in_root_map.T_cam_world @ se3.inverse(T_ref_world)
@@ -591,7 +600,7 @@ class RgbdBackend:
         """Tracking continues in the root map; the submap stays apart."""
         matched = in_root_map.matches.point
         # mapping may have removed some of the matched points since
-        alive = np.where(self.world.alive[matched], matched, -1)
+        alive = np.where(self.map.alive[matched], matched, -1)
         observed = observe_points(tracked.observations, in_root_map.matches.feature, alive)
         self._last_frame = replace(tracked, point=observed, T_cam_world=in_root_map.T_cam_world)
         self._reference_keyframe = in_root_map.keyframe
@@ -618,7 +627,7 @@ class RgbdBackend:
         Returns:
             Seconds by stage, and whether the pose in the root map counts.
         """
-        world = self.world
+        slam_map = self.map
         verdict = RootMapPose.REJECTED
 
         # local mapping
@@ -636,21 +645,21 @@ class RgbdBackend:
         # loop closing
         if self.settings.loop_closing.enabled:
             begin = perf_counter()
-            T_before = world.kf_pose[slot].copy()
+            T_before = slam_map.kf_pose[slot].copy()
             closing = self.loops.close(slot, tracked.observations, in_root_map)
             verdict = closing.root_map_pose
             rescale(self.history, closing.rescaled)
             # the rotation by a loop with depth is within the motion's noise
             if slot in closing.rescaled:
-                self.motion.transform(T_before, world.kf_pose[slot], closing.rescaled[slot])
+                self.motion.transform(T_before, slam_map.kf_pose[slot], closing.rescaled[slot])
             timings["loop_closing"] = perf_counter() - begin
 
         # the tracked frame takes over what mapping made of it
         self._keyframe_policy.keyframe_added(frame.index)
         self._map_views.add_keyframe(slot, frame.depth)
-        tracked.point = world.kf_point[slot, : len(tracked.observations)].astype(np.int64)
-        tracked.T_cam_world = world.kf_pose[slot].copy()
-        world.release()
+        tracked.point = slam_map.kf_point[slot, : len(tracked.observations)].astype(np.int64)
+        tracked.T_cam_world = slam_map.kf_pose[slot].copy()
+        slam_map.release()
         return timings, verdict
 
     def _transfer_history(self) -> None:
@@ -684,7 +693,7 @@ class RgbdBackend:
 
     def outputs(self) -> MapOutputs:
         """Keyframes and map points for ``keyframes.csv``, ``map.ply`` and pictures."""
-        return map_outputs(self._refined_map or self.world)
+        return map_outputs(self._refined_map or self.map)
 
     def save_map(self, path: Path, made_by: str = "") -> None:
         """Write the map to a file from which a later run may start (`backend.map.file`).
@@ -697,8 +706,10 @@ class RgbdBackend:
             TrackerError: There is no map yet, or it is too large for a file.
             DynslamError: The file cannot be written.
         """
-        world = self._refined_map or self.world
-        save_atlas(path, self.atlas, world, self._features, depth=self.uses_depth, made_by=made_by)
+        slam_map = self._refined_map or self.map
+        save_atlas(
+            path, self.atlas, slam_map, self._features, depth=self.uses_depth, made_by=made_by
+        )
 
     def finalize(self) -> Trajectory:
         """Camera-to-world poses of all tracked frames, re-expressed relative to the refined keyframes.
@@ -708,15 +719,15 @@ class RgbdBackend:
         """
         refines = self._mapping_enabled and self.settings.bundle_adjustment.full
         if refines and self._refined_map is None:
-            self._refined_map = refined(self.world)
-        return trajectory(self.history, self._refined_map or self.world, self.settings.motion)
+            self._refined_map = refined(self.map)
+        return trajectory(self.history, self._refined_map or self.map, self.settings.motion)
 
 
-def _with_match_counts(result: TrackResult, fit: MapFit, initial: InitialPose) -> TrackResult:
+def _with_match_counts(result: TrackResult, map_fit: MapFit, initial: InitialPose) -> TrackResult:
     """The result with the stats of matching."""
     counts = {
-        "matches": len(fit.matches.feature),
-        "inliers": fit.count,
+        "matches": len(map_fit.matches.feature),
+        "inliers": map_fit.count,
         "relocalised": initial.relocalised,
     }
     return replace(result, stats={**result.stats, **counts})
@@ -768,11 +779,11 @@ class MonocularBackend(RgbdBackend):
         self, initial: InitialMap, T_first_world: Array, seconds: float
     ) -> TrackResult:
         """The two views become keyframes; the second, which is the current frame, is tracked."""
-        first, second = initial.insert_into(self.world, T_first_world, self.atlas.active)
+        first, second = initial.insert_into(self.map, T_first_world, self.atlas.active)
         frame = initial.second.frame
         observations = initial.second.observations
-        pose = self.world.kf_pose[second].copy()
-        point = self.world.kf_point[second, : len(observations)].astype(np.int64)
+        pose = self.map.kf_pose[second].copy()
+        point = self.map.kf_point[second, : len(observations)].astype(np.int64)
         self._initialiser = TwoViewInitialiser()
         self._status = CameraStatus.TRACKED
         self._last_frame = TrackedFrame(observations, point, pose, frame.timestamp)

@@ -191,6 +191,7 @@ def _fill_pose_jacobian(
     out: Array,
 ) -> None:
     """Derivatives ``[3, 6]`` of (u, v, right) by a twist (translation, rotation) in the camera frame."""
+    # a rotation about an axis moves the point by the cross product: (0, -z, y), (z, 0, -x), (-y, x, 0)
     out[0, 0] = du_dx
     out[0, 1] = 0.0
     out[0, 2] = du_dz
@@ -214,6 +215,7 @@ def _fill_pose_jacobian(
 @inlined
 def _invert_symmetric(h: Array, out: Array) -> None:
     """The inverse of a symmetric matrix ``[3, 3]``, of which the lower triangle is read; nothing if it is singular."""
+    # by the adjugate: cofactors over the determinant
     h00 = h[0, 0]
     h10 = h[1, 0]
     h11 = h[1, 1]
@@ -223,6 +225,7 @@ def _invert_symmetric(h: Array, out: Array) -> None:
     c00 = h11 * h22 - h21 * h21
     c10 = h20 * h21 - h10 * h22
     c20 = h10 * h21 - h20 * h11
+    # expansion along the first column
     determinant = h00 * c00 + h10 * c10 + h20 * c20
     if determinant > MIN_DETERMINANT:
         t = 1.0 / determinant
@@ -384,6 +387,7 @@ def _move_points(
 ) -> None:
     """Solve for the points by back-substitution: ``points^-1 (point_gradient - coupling^T twists)``."""
     start = observations.start
+    # each point by itself: its gradient less what the poses' twists change, times the inverse block
     for i in range(points.shape[0]):
         b0 = system.point_gradient[i, 0]
         b1 = system.point_gradient[i, 1]
@@ -451,6 +455,7 @@ def _adjust(
     damping = DAMPING
     trial = np.empty_like(chi2)
     for _ in range(iterations):
+        # try a step
         new_poses = poses.copy()
         new_points = points.copy()
         solved = _step(
@@ -527,24 +532,24 @@ class Bundle:
     features: Slots
 
 
-def local_bundle(world: Map, slot: int, window: int) -> Bundle | None:
+def local_bundle(slam_map: Map, slot: int, window: int) -> Bundle | None:
     """The local window around a keyframe, cut to the observation budget; None if there is nothing to refine.
 
     Variable are the keyframe and its most covisible ones; fixed are further keyframes that observe
     the same points, and always at least one. The oldest keyframe of all is never variable.
 
     Args:
-        world: The map.
+        slam_map: The map.
         slot: The keyframe.
         window: Variable keyframes at most.
     """
-    near, _ = world.covisible(slot)
+    near, _ = slam_map.covisible(slot)
     variable = np.concatenate([[slot], near[: window - 1]]).astype(np.int64)
-    variable = variable[world.kf_id[variable] > 0]
+    variable = variable[slam_map.kf_id[variable] > 0]
     if not len(variable):
         return None
-    points = world.points_of(variable)
-    fixed, _ = world.covisible_of(points)
+    points = slam_map.points_of(variable)
+    fixed, _ = slam_map.covisible_of(points)
     fixed = fixed[~np.isin(fixed, variable)][:FIXED_KEYFRAMES]
 
     # without any other observer the least covisible keyframe stays
@@ -553,34 +558,34 @@ def local_bundle(world: Map, slot: int, window: int) -> Bundle | None:
             return None
         fixed = variable[-1:]
         variable = variable[:-1]
-    return _bundle(world, variable, fixed, points, MAX_OBSERVATIONS)
+    return _bundle(slam_map, variable, fixed, points, MAX_OBSERVATIONS)
 
 
-def full_bundle(world: Map) -> Bundle | None:
+def full_bundle(slam_map: Map) -> Bundle | None:
     """All keyframes and points; the oldest keyframe stays. None if there are no two keyframes."""
-    keyframes = world.keyframes
+    keyframes = slam_map.keyframes
     if len(keyframes) < 2:
         return None
-    everything = int(world.n_obs[world.points].sum())
-    return _bundle(world, keyframes[1:], keyframes[:1], world.points, everything)
+    all_observations = int(slam_map.n_obs[slam_map.points].sum())
+    return _bundle(slam_map, keyframes[1:], keyframes[:1], slam_map.points, all_observations)
 
 
 def _bundle(
-    world: Map, variable: Slots, fixed: Slots, points: Slots, max_observations: int
+    slam_map: Map, variable: Slots, fixed: Slots, points: Slots, max_observations: int
 ) -> Bundle | None:
     """The bundle of these keyframes and points (slots); None if no point is observed often enough."""
     # observations of the points, and the number in the bundle of the pose that each is made from
     poses = np.concatenate([variable, fixed])
-    pose_number = np.full(world.kf_alive.size, -1, np.int64)
+    pose_number = np.full(slam_map.kf_alive.size, -1, np.int64)
     pose_number[poses] = np.arange(len(poses))
-    keyframes, all_features = world.observations(points)
-    of_point = np.repeat(np.arange(len(points)), world.n_obs[points])
+    keyframes, all_features = slam_map.observations(points)
+    of_point = np.repeat(np.arange(len(points)), slam_map.n_obs[points])
     pose = pose_number[keyframes]
 
     # points with the longest tracks first, while the budget lasts
     views = np.bincount(of_point[pose >= 0], minlength=len(points))
     supported = np.flatnonzero(views >= MIN_VIEWS)
-    order = supported[np.lexsort((world.id[points[supported]], -views[supported]))]
+    order = supported[np.lexsort((slam_map.id[points[supported]], -views[supported]))]
     order = np.sort(order[np.cumsum(views[order]) <= max_observations])
     if not len(order):
         return None
@@ -595,15 +600,15 @@ def _bundle(
     features = all_features[used].astype(np.int64)
     observers = poses[obs_pose]
     problem = BundleProblem(
-        world.kf_pose[poses],
+        slam_map.kf_pose[poses],
         len(variable),
-        world.position[points],
+        slam_map.position[points],
         obs_pose,
         obs_point,
-        world.kf_xy[observers, features],
-        world.kf_right[observers, features],
-        world.kf_info[observers, features],
-        world.kf_info_right[observers, features],
-        world.camera,
+        slam_map.kf_xy[observers, features],
+        slam_map.kf_right[observers, features],
+        slam_map.kf_info[observers, features],
+        slam_map.kf_info_right[observers, features],
+        slam_map.camera,
     )
     return Bundle(problem, poses, points, features)

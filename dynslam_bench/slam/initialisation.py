@@ -168,7 +168,13 @@ def match_views(
     windows = expected, np.full(len(first), np.nan), np.full(len(first), radius_px)
     free = np.ones(len(second), bool)
     feature = search_in_radius(
-        second, free, windows, first.octave, first.words, max_distance=MAX_DISTANCE, ratio=RATIO
+        second,
+        free,
+        windows,
+        first.octave,
+        first.descriptors,
+        max_distance=MAX_DISTANCE,
+        ratio=RATIO,
     )
     rows = np.flatnonzero(feature >= 0)
     rows = rows[rotation_consistent(first.angle[rows], second.angle[feature[rows]])]
@@ -455,11 +461,11 @@ class InitialMap:
     second: View
     motion: TwoViewMotion
 
-    def insert_into(self, world: Map, T_first_world: Array, submap: int) -> list[int]:
+    def insert_into(self, slam_map: Map, T_first_world: Array, submap: int) -> list[int]:
         """Add the two views as keyframes of an empty submap, with their points; returns the keyframes' slots.
 
         Args:
-            world: The map.
+            slam_map: The map.
             T_first_world: Pose ``[4, 4]`` of the first view in the submap's world, world to camera.
             submap: The submap's number (`Map.kf_map`).
         """
@@ -469,16 +475,16 @@ class InitialMap:
         for view, pose in ((self.first, T_first_world), (self.second, T_second_world)):
             frame = view.frame
             slots.append(
-                world.add_keyframe(view.observations, pose, frame.index, frame.timestamp, submap)
+                slam_map.add_keyframe(view.observations, pose, frame.index, frame.timestamp, submap)
             )
 
         # points that both observe
         first_features, second_features = self.motion.matches.T
         position = se3.transform(se3.inverse(T_first_world), self.motion.points)
         rgb = self.first.observations.rgb[first_features]
-        points = world.add_points(position, rgb, slots[0], first_features)
-        world.observe(slots[1], second_features, points)
-        world.refresh(points)
+        points = slam_map.add_points(position, rgb, slots[0], first_features)
+        slam_map.observe(slots[1], second_features, points)
+        slam_map.refresh(points)
         return slots
 
 

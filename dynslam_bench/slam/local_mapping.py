@@ -23,6 +23,7 @@ from dynslam_bench.features.matching import (
     search_in_radius,
 )
 from dynslam_bench.geometry import se3
+from dynslam_bench.geometry.camera import STATED_WIDTH
 from dynslam_bench.slam.bundle_adjustment import Bundle, adjust_bundle, full_bundle, local_bundle
 from dynslam_bench.slam.map import Array, Map, Slots
 from dynslam_bench.slam.observations import Observations
@@ -71,6 +72,8 @@ MIN_CLOSE = 100
 """Fewer tracked close points than this are few (ORB-SLAM2)."""
 NEW_CLOSE = 70
 """More close features than this that are not in the map are many: where few are tracked, they make a keyframe."""
+NEW_SHARE = 0.5
+"""More than this share of the close features are many, too, in images below VGA's width, which have few in all."""
 VIEW_SHARE = 0.9
 """A keyframe is made when less than this share of the last keyframe's points lies in the image."""
 MOVED_SHARE = 0.97
@@ -81,7 +84,7 @@ class LocalMapper:
     """Adds keyframes to the map and keeps it clean and consistent.
 
     Args:
-        world: The map to work on.
+        slam_map: The map to work on.
         settings: Settings of the back end.
 
     Attributes:
@@ -89,13 +92,13 @@ class LocalMapper:
             pose ``T_culled_replacement``.
     """
 
-    def __init__(self, world: Map, settings: BackendSettings) -> None:
-        self.world = world
+    def __init__(self, slam_map: Map, settings: BackendSettings) -> None:
+        self.map = slam_map
         self.settings = settings
-        self.close_m = CLOSE_BASELINES * world.camera.baseline_m
+        self.close_m = CLOSE_BASELINES * slam_map.camera.baseline_m
         self.culled: list[tuple[int, int, Array]] = []
-        points = world.points
-        self._young: Slots = points[world.next_keyframe - 1 - world.born[points] < YOUNG]
+        points = slam_map.points
+        self._young: Slots = points[slam_map.next_keyframe - 1 - slam_map.born[points] < YOUNG]
 
     def insert(
         self,
@@ -120,15 +123,15 @@ class LocalMapper:
             The keyframe's slot, and the seconds spent on ``mapping`` and ``bundle_adjustment``.
         """
         begin = perf_counter()
-        world = self.world
+        slam_map = self.map
         self.culled.clear()
-        first = not world.submap(submap).size
+        first = not slam_map.submap(submap).size
 
         # the keyframe, and what it observes of the map
-        slot = world.add_keyframe(observations, T_cam_world, frame, stamp, submap)
+        slot = slam_map.add_keyframe(observations, T_cam_world, frame, stamp, submap)
         features = np.flatnonzero(point >= 0)
-        world.observe(slot, features, point[features])
-        world.refresh(world.points_of(slot))
+        slam_map.observe(slot, features, point[features])
+        slam_map.refresh(slam_map.points_of(slot))
 
         # remove bad points, create points from depth
         self._cull_points()
@@ -137,7 +140,7 @@ class LocalMapper:
             return slot, {"mapping": perf_counter() - begin, "bundle_adjustment": 0.0}
 
         # create points by triangulation, where few features are close enough for their depth
-        neighbours = world.covisible(slot)[0][: self.settings.mapping.neighbours]
+        neighbours = slam_map.covisible(slot)[0][: self.settings.mapping.neighbours]
         close = np.count_nonzero((observations.z > 0) & (observations.z < self.close_m))
         if close / max(len(observations), 1) < self.settings.mapping.triangulate_below:
             self._points_from_triangulation(slot, neighbours, observations)
@@ -157,8 +160,8 @@ class LocalMapper:
         self, slot: int, observations: Observations, *, everything: bool
     ) -> None:
         """Points for features without one: all close ones, and the nearest hundred in any case."""
-        world = self.world
-        has_no_point = world.kf_point[slot, : len(observations)] < 0
+        slam_map = self.map
+        has_no_point = slam_map.kf_point[slot, : len(observations)] < 0
         free = np.flatnonzero(has_no_point & (observations.z > 0))
         nearest_first = free[np.argsort(observations.z[free], kind="stable")]
         if everything:
@@ -166,8 +169,8 @@ class LocalMapper:
         else:
             close = np.count_nonzero(observations.z[free] < self.close_m)
             chosen = nearest_first[: max(close, MIN_DEPTH_POINTS)]
-        T_world_cam = se3.inverse(world.kf_pose[slot])
-        local = world.camera.unproject(observations.xy[chosen], observations.z[chosen])
+        T_world_cam = se3.inverse(slam_map.kf_pose[slot])
+        local = slam_map.camera.unproject(observations.xy[chosen], observations.z[chosen])
         self._add_points(slot, chosen, se3.transform(T_world_cam, local), observations)
 
     def _points_from_triangulation(
@@ -176,7 +179,7 @@ class LocalMapper:
         """Points for features without one, by triangulation with each neighbouring keyframe in turn."""
         for neighbour in neighbours.tolist():
             features, neighbour_features, position = triangulate(
-                self.world, slot, neighbour, self.settings.mapping.min_parallax_sigmas
+                self.map, slot, neighbour, self.settings.mapping.min_parallax_sigmas
             )
             second = (neighbour, neighbour_features)
             self._add_points(slot, features, position, observations, second)
@@ -198,23 +201,23 @@ class LocalMapper:
             observations: All features of the keyframe.
             second: Another keyframe that observes the points, and its features ``[N]``.
         """
-        created = self.world.add_points(position, observations.rgb[features], slot, features)
+        created = self.map.add_points(position, observations.rgb[features], slot, features)
         if second is not None:
-            self.world.observe(*second, created)
-        self.world.refresh(created)
+            self.map.observe(*second, created)
+        self.map.refresh(created)
         self._young = np.concatenate([self._young, created])
 
     def _cull_points(self) -> None:
         """Remove young points that are seldom found where they should be seen, or that few keyframes observe."""
-        world = self.world
-        young = self._young[world.alive[self._young]]
+        slam_map = self.map
+        young = self._young[slam_map.alive[self._young]]
         # in keyframes
-        age = world.next_keyframe - 1 - world.born[young]
+        age = slam_map.next_keyframe - 1 - slam_map.born[young]
         min_found_ratio = self.settings.mapping.min_found_ratio
-        seldom_found = world.found[young] < min_found_ratio * world.visible[young]
-        seldom_observed = (age >= OBSERVED_AFTER) & (world.n_obs[young] < MIN_OBSERVATIONS)
+        seldom_found = slam_map.found[young] < min_found_ratio * slam_map.visible[young]
+        seldom_observed = (age >= OBSERVED_AFTER) & (slam_map.n_obs[young] < MIN_OBSERVATIONS)
         bad = seldom_found | seldom_observed
-        world.remove_points(young[bad])
+        slam_map.remove_points(young[bad])
         self._young = young[~bad & (age < YOUNG)]
 
     # ------------------------------------------------------------------ fusion
@@ -222,96 +225,97 @@ class LocalMapper:
     def _fuse(self, slot: int, neighbours: Slots) -> None:
         """Match the new keyframe's points in its neighbours and theirs in it; merge duplicates."""
         for other in neighbours.tolist():
-            self.fuse_into(other, self.world.points_of(slot))
-        self.fuse_into(slot, self.world.points_of(neighbours))
-        self.world.refresh(self.world.points_of(slot))
+            self.fuse_into(other, self.map.points_of(slot))
+        self.fuse_into(slot, self.map.points_of(neighbours))
+        self.map.refresh(self.map.points_of(slot))
 
     def fuse_into(self, keyframe: int, candidates: Slots) -> None:
         """Match points in a keyframe: new observations of them, and duplicates among its own points."""
-        world = self.world
-        n = int(world.kf_count[keyframe])
-        xy = world.kf_xy[keyframe, :n]
-        octaves = world.kf_octave[keyframe, :n].astype(np.int64)
+        slam_map = self.map
+        n = int(slam_map.kf_count[keyframe])
+        xy = slam_map.kf_xy[keyframe, :n]
+        octaves = slam_map.kf_octave[keyframe, :n].astype(np.int64)
         # a view: it follows what is observed and replaced below
-        observed = world.kf_point[keyframe, :n]
+        observed = slam_map.kf_point[keyframe, :n]
 
         # project the points that the keyframe does not observe yet
-        is_observed = np.zeros(world.alive.size, bool)
+        is_observed = np.zeros(slam_map.alive.size, bool)
         is_observed[observed[observed >= 0]] = True
-        candidates = candidates[world.alive[candidates] & ~is_observed[candidates]]
-        points, uv, right, octave, _ = world.project(world.kf_pose[keyframe], candidates)
+        candidates = candidates[slam_map.alive[candidates] & ~is_observed[candidates]]
+        points, uv, right, octave, _ = slam_map.project(slam_map.kf_pose[keyframe], candidates)
 
         # match them with all features around
-        grid = CellGrid.of(xy, world.camera.width, world.camera.height)
-        right_of_features = world.kf_right[keyframe, :n]
-        words_of_features = world.kf_words[keyframe, :n]
-        features = Features(xy, right_of_features, octaves, words_of_features, grid)
-        windows = (uv, right, FUSION_RADIUS_PX * world.scales[octave])
+        grid = CellGrid.of(xy, slam_map.camera.width, slam_map.camera.height)
+        right_of_features = slam_map.kf_right[keyframe, :n]
+        descriptors_of_features = slam_map.kf_descriptor[keyframe, :n]
+        features = Features(xy, right_of_features, octaves, descriptors_of_features, grid)
+        windows = (uv, right, FUSION_RADIUS_PX * slam_map.scales[octave])
         feature = search_in_radius(
             features,
             np.ones(n, bool),
             windows,
             octave,
-            world.words[points],
+            slam_map.descriptor[points],
             max_distance=MAX_DISTANCE,
         )
         squared_error = ((xy[feature] - uv) ** 2).sum(axis=1)
-        variance = world.scales[octaves[feature]] ** 2
+        variance = slam_map.scales[octaves[feature]] ** 2
         good = (feature >= 0) & (squared_error / variance < CHI2_POINT)
         points = points[good]
         feature = feature[good]
 
         # a feature without a point observes the matched one
         empty = observed[feature] < 0
-        world.observe(keyframe, feature[empty], points[empty])
+        slam_map.observe(keyframe, feature[empty], points[empty])
 
         # a feature with a point shows a duplicate: the less observed point is replaced
         for row, point in zip(feature[~empty].tolist(), points[~empty].tolist(), strict=True):
             duplicate = int(observed[row])
-            if duplicate >= 0 and duplicate != point and world.alive[point]:
-                less, more = sorted((duplicate, point), key=world.n_obs.__getitem__)
-                world.replace_point(less, more)
+            if duplicate >= 0 and duplicate != point and slam_map.alive[point]:
+                less, more = sorted((duplicate, point), key=slam_map.n_obs.__getitem__)
+                slam_map.replace_point(less, more)
 
     # ------------------------------------------------------------------ bundle adjustment
 
     def adjust(self, slot: int) -> None:
         """Local bundle adjustment around a keyframe; observations that do not fit afterwards are removed."""
-        world = self.world
+        slam_map = self.map
         settings = self.settings.bundle_adjustment
-        bundle = local_bundle(world, slot, settings.window)
+        bundle = local_bundle(slam_map, slot, settings.window)
         if bundle is not None:
             points = bundle.points
-            out = ~adjust(world, bundle, settings.iterations)
-            world.unobserve(bundle.poses[bundle.problem.obs_pose[out]], bundle.features[out])
-            world.refresh(points[world.alive[points]])
+            outliers = ~apply_bundle_adjustment(slam_map, bundle, settings.iterations)
+            observers = bundle.poses[bundle.problem.obs_pose[outliers]]
+            slam_map.unobserve(observers, bundle.features[outliers])
+            slam_map.refresh(points[slam_map.alive[points]])
 
     # ------------------------------------------------------------------ keyframes
 
     def _cull_keyframes(self, slot: int) -> None:
         """Remove redundant keyframes, and the most redundant ones where there are too many."""
-        world = self.world
+        slam_map = self.map
         settings = self.settings.keyframes
 
         # neighbours most of whose close points others see as well
-        neighbours, _ = world.covisible(slot)
-        newest = world.keyframes[-2:]
+        neighbours, _ = slam_map.covisible(slot)
+        newest = slam_map.keyframes[-2:]
         for neighbour in neighbours.tolist():
-            if neighbour in newest or world.kf_id[neighbour] == 0:
+            if neighbour in newest or slam_map.kf_id[neighbour] == 0:
                 continue
-            total, redundant = world.redundancy(neighbour, self.close_m)
+            total, redundant = slam_map.redundancy(neighbour, self.close_m)
             if total and redundant > settings.redundant_share * total:
                 self.cull_keyframe(neighbour)
 
         # too many keyframes in all: the most redundant one, of equal ones the oldest
-        while world.keyframe_count > settings.maximum:
+        while slam_map.keyframe_count > settings.maximum:
             candidates = self._dispensable(slot)
             if not len(candidates):
                 break
             shares = []
             for candidate in candidates.tolist():
-                total, redundant = world.redundancy(candidate, self.close_m)
+                total, redundant = slam_map.redundancy(candidate, self.close_m)
                 shares.append(redundant / max(total, 1))
-            order = np.lexsort((world.kf_id[candidates], np.negative(shares)))
+            order = np.lexsort((slam_map.kf_id[candidates], np.negative(shares)))
             self.cull_keyframe(int(candidates[order[0]]))
 
     def _dispensable(self, slot: int) -> Slots:
@@ -320,16 +324,16 @@ class LocalMapper:
         Tracking depends on the newest and on those around the camera, which overlap most: they stay
         if others can be culled.
         """
-        world = self.world
+        slam_map = self.map
         # neither the first one nor the two newest, nor the last one of a submap
-        inner = world.keyframes[1:-2]
-        keyframes_by_submap = np.bincount(world.kf_map[world.keyframes])
-        inner = inner[keyframes_by_submap[world.kf_map[inner]] > 1]
+        inner = slam_map.keyframes[1:-2]
+        keyframes_by_submap = np.bincount(slam_map.kf_map[slam_map.keyframes])
+        inner = inner[keyframes_by_submap[slam_map.kf_map[inner]] > 1]
 
         # old and distant ones, else old ones, else any
-        near, _ = world.covisible(slot)
+        near, _ = slam_map.covisible(slot)
         recent = self.settings.keyframes.maximum // RECENT_SHARE
-        old = inner[world.kf_id[inner] < world.kf_id[slot] - recent]
+        old = inner[slam_map.kf_id[inner] < slam_map.kf_id[slot] - recent]
         distant = old[~np.isin(old, near)]
         chosen = inner
         for slots in (distant, old):
@@ -338,38 +342,38 @@ class LocalMapper:
                 break
 
         # compare a few, others each time
-        return np.asarray(np.roll(chosen, -COMPARED * world.next_keyframe)[:COMPARED])
+        return np.asarray(np.roll(chosen, -COMPARED * slam_map.next_keyframe)[:COMPARED])
 
     def cull_keyframe(self, slot: int) -> None:
         """Remove a keyframe; `culled` names its replacement, the most covisible keyframe or the newest of its map."""
-        world = self.world
-        covisible, _ = world.covisible(slot)
+        slam_map = self.map
+        covisible, _ = slam_map.covisible(slot)
         if len(covisible):
             replacement = int(covisible[0])
         else:
-            same_map = world.submap(int(world.kf_map[slot]))
+            same_map = slam_map.submap(int(slam_map.kf_map[slot]))
             replacement = int(same_map[same_map != slot][-1])
-        T_culled_replacement = world.kf_pose[slot] @ se3.inverse(world.kf_pose[replacement])
+        T_culled_replacement = slam_map.kf_pose[slot] @ se3.inverse(slam_map.kf_pose[replacement])
         self.culled.append((slot, replacement, T_culled_replacement))
-        world.remove_keyframe(slot)
+        slam_map.remove_keyframe(slot)
 
 
-def adjust(world: Map, bundle: Bundle, iterations: int) -> NDArray[np.bool_]:
+def apply_bundle_adjustment(slam_map: Map, bundle: Bundle, iterations: int) -> NDArray[np.bool_]:
     """Put refined poses and points into the map; returns which observations of the bundle fit them."""
     result = adjust_bundle(bundle.problem, iterations)
     variable = bundle.poses[: bundle.problem.variable]
     for slot, pose in zip(variable.tolist(), result.poses, strict=False):
-        world.set_pose(slot, pose)
-    world.position[bundle.points] = result.points
+        slam_map.set_pose(slot, pose)
+    slam_map.position[bundle.points] = result.points
     return result.inliers
 
 
-def refined(world: Map) -> Map:
+def refined(slam_map: Map) -> Map:
     """A copy of the map after full bundle adjustment, as at the end of a run."""
-    copy = deepcopy(world)
-    bundle = full_bundle(world)
+    copy = deepcopy(slam_map)
+    bundle = full_bundle(slam_map)
     if bundle is not None:
-        adjust(copy, bundle, FULL_ITERATIONS)
+        apply_bundle_adjustment(copy, bundle, FULL_ITERATIONS)
         copy.refresh(copy.points)
     return copy
 
@@ -399,11 +403,13 @@ class KeyframePolicy:
         self._last = frame
         self._most_inliers = 0
 
-    def needs_keyframe(self, world: Map, tracked: TrackedFrame, frame: int, reference: int) -> bool:
+    def needs_keyframe(
+        self, slam_map: Map, tracked: TrackedFrame, frame: int, reference: int
+    ) -> bool:
         """Whether a tracked frame should become a keyframe (ORB-SLAM's ``NeedNewKeyFrame``).
 
         Args:
-            world: The map.
+            slam_map: The map.
             tracked: The frame, with the points that it observes.
             frame: Its index.
             reference: Slot of the keyframe that shares most points with it.
@@ -419,35 +425,38 @@ class KeyframePolicy:
 
         # many close features are not in the map, and few are tracked or the last keyframe is long ago
         close = (tracked.observations.z > 0) & (tracked.observations.z < self._close_m)
-        many_new = np.count_nonzero(close & ~matched) > NEW_CLOSE
+        enough_new: float = NEW_CLOSE
+        if slam_map.camera.width < STATED_WIDTH:
+            enough_new = min(NEW_CLOSE, NEW_SHARE * np.count_nonzero(close))
+        many_new = np.count_nonzero(close & ~matched) > enough_new
         few_close = np.count_nonzero(close & matched) < MIN_CLOSE
         if many_new and (few_close or frame - self._last >= settings.max_gap):
             return True
 
         # little of what the reference keyframe shows is tracked
-        if inliers < settings.tracked_share * established_points(world, reference):
+        if inliers < settings.tracked_share * established_points(slam_map, reference):
             return True
 
         # the view has moved on from the newest keyframe
-        newest = int(np.where(world.kf_alive, world.kf_id, -1).argmax())
-        view = share_in_view(world, newest, tracked.T_cam_world)
+        newest = int(np.where(slam_map.kf_alive, slam_map.kf_id, -1).argmax())
+        view = share_in_view(slam_map, newest, tracked.T_cam_world)
         if view < VIEW_SHARE:
             return True
         return view < MOVED_SHARE and inliers < settings.tracked_share * self._most_inliers
 
 
-def established_points(world: Map, keyframe: int) -> int:
+def established_points(slam_map: Map, keyframe: int) -> int:
     """How many of a keyframe's points `ESTABLISHED` keyframes observe, or all of its submap if that is young."""
-    points = world.kf_point[keyframe]
-    young = np.count_nonzero(world.kf_alive & (world.kf_map == world.kf_map[keyframe]))
-    return int(np.count_nonzero(world.n_obs[points[points >= 0]] >= min(ESTABLISHED, young)))
+    points = slam_map.kf_point[keyframe]
+    young = np.count_nonzero(slam_map.kf_alive & (slam_map.kf_map == slam_map.kf_map[keyframe]))
+    return int(np.count_nonzero(slam_map.n_obs[points[points >= 0]] >= min(ESTABLISHED, young)))
 
 
-def share_in_view(world: Map, keyframe: int, T_cam_world: Array) -> float:
+def share_in_view(slam_map: Map, keyframe: int, T_cam_world: Array) -> float:
     """Which share of a keyframe's points lies in another camera's image; 1 if it has none."""
-    points = world.kf_point[keyframe]
-    position = world.position[points[points >= 0]]
-    _, inside = world.camera.view(position @ T_cam_world[:3, :3].T + T_cam_world[:3, 3])
+    points = slam_map.kf_point[keyframe]
+    position = slam_map.position[points[points >= 0]]
+    _, inside = slam_map.camera.view(position @ T_cam_world[:3, :3].T + T_cam_world[:3, 3])
     return float(np.mean(inside)) if len(inside) else 1.0
 
 
@@ -463,7 +472,7 @@ class View(NamedTuple):
         xy: float64 ``[F, 2]``, undistorted pixels.
         z: float64 ``[F]``, depth in metres, 0 missing.
         octave: int64 ``[F]``.
-        words: uint64 ``[F, W]``, descriptors.
+        descriptors: uint64 ``[F, W]``.
     """
 
     pose: Array
@@ -471,7 +480,7 @@ class View(NamedTuple):
     xy: Array
     z: Array
     octave: Slots
-    words: Words
+    descriptors: Words
 
 
 @kernel
@@ -532,7 +541,7 @@ def _triangulate(
                 continue
 
             # and look more alike than the best one so far
-            d = distance(view_a.words[a], view_b.words[b])
+            d = distance(view_a.descriptors[a], view_b.descriptors[b])
             if d > MAX_DISTANCE or d >= best_distance[i]:
                 continue
 
@@ -592,7 +601,7 @@ def _triangulate(
 
 
 def triangulate(
-    world: Map, slot: int, other: int, min_parallax_sigmas: float
+    slam_map: Map, slot: int, other: int, min_parallax_sigmas: float
 ) -> tuple[Slots, Slots, Array]:
     """Features of two keyframes that observe no point yet and show one point along an epipolar line.
 
@@ -600,7 +609,7 @@ def triangulate(
     where it is large enough, a measured depth must agree.
 
     Args:
-        world: The map.
+        slam_map: The map.
         slot: The new keyframe.
         other: One that observes the same part of the scene.
         min_parallax_sigmas: Smallest parallax in standard deviations of a feature's position.
@@ -609,25 +618,25 @@ def triangulate(
         Features of `slot`, features of `other`, world points ``[M, 3]``.
     """
     features, other_features, depth = _triangulate(
-        _view(world, slot),
-        _view(world, other),
-        world.scales,
-        intrinsics_of(world.camera),
+        _view(slam_map, slot),
+        _view(slam_map, other),
+        slam_map.scales,
+        intrinsics_of(slam_map.camera),
         float(min_parallax_sigmas),
     )
-    local = world.camera.unproject(world.kf_xy[slot, features], depth)
-    position = se3.transform(se3.inverse(world.kf_pose[slot]), local)
+    local = slam_map.camera.unproject(slam_map.kf_xy[slot, features], depth)
+    position = se3.transform(se3.inverse(slam_map.kf_pose[slot]), local)
     return features, other_features, position
 
 
-def _view(world: Map, slot: int) -> View:
-    """What triangulation reads of a keyframe."""
-    n = int(world.kf_count[slot])
+def _view(slam_map: Map, slot: int) -> View:
+    """A keyframe's features as triangulation reads them."""
+    n = int(slam_map.kf_count[slot])
     return View(
-        world.kf_pose[slot],
-        np.flatnonzero(world.kf_point[slot, :n] < 0),
-        world.kf_xy[slot],
-        world.kf_z[slot].astype(np.float64),
-        world.kf_octave[slot].astype(np.int64),
-        world.kf_words[slot],
+        slam_map.kf_pose[slot],
+        np.flatnonzero(slam_map.kf_point[slot, :n] < 0),
+        slam_map.kf_xy[slot],
+        slam_map.kf_z[slot].astype(np.float64),
+        slam_map.kf_octave[slot].astype(np.int64),
+        slam_map.kf_descriptor[slot],
     )

@@ -175,7 +175,7 @@ class RootMapPose(Enum):
 
 @dataclass(frozen=True, eq=False)
 class LoopClosingResult:
-    """What `LoopCloser.close` did.
+    """The result of `LoopCloser.close`.
 
     Attributes:
         rescaled: What lengths around keyframes were multiplied by, by the keyframes' slots; with
@@ -211,7 +211,7 @@ class LoopCloser:
         scale_is_known: bool = True,
     ) -> None:
         self.atlas = atlas
-        self.world = atlas.world
+        self.map = atlas.map
         self.mapper = mapper
         self.settings = settings
         self.closed: list[Loop] = []
@@ -278,7 +278,8 @@ class LoopCloser:
         self._fuse(slot, confirmed.place.keyframe)
         self._shortcuts.append((self._path_at(confirmed.place.keyframe), self._path_length))
         self.closed.append(confirmed)
-        self._last_pose = self.world.kf_pose[slot].copy()  # a correction adds no path
+        # the path goes on from the corrected pose: a correction adds none
+        self._last_pose = self.map.kf_pose[slot].copy()
         return LoopClosingResult(rescaled, root_map_pose)
 
     def _transfer_loop_edges(self) -> None:
@@ -288,8 +289,8 @@ class LoopCloser:
         for culled, replacement, T_culled_replacement in self.mapper.culled:
             self._loop_edges = transferred_edges(
                 self._loop_edges,
-                int(self.world.kf_id[culled]),
-                int(self.world.kf_id[replacement]),
+                int(self.map.kf_id[culled]),
+                int(self.map.kf_id[replacement]),
                 T_culled_replacement,
             )
 
@@ -298,7 +299,7 @@ class LoopCloser:
         if loop is None:
             self._consistent.clear()
             return None
-        centre = self.world.kf_centre[slot]
+        centre = self.map.kf_centre[slot]
         if self._consistent and not loop.correction.agrees(self._consistent[-1], centre):
             self._consistent.clear()
         self._consistent.append(loop.correction)
@@ -311,56 +312,65 @@ class LoopCloser:
     # ------------------------------------------------------------------ detect and verify
 
     def _extend_path(self, slot: int) -> None:
-        pose = self.world.kf_pose[slot].copy()
-        number = int(self.world.kf_id[slot])
+        """Add the way from the last keyframe to the path length: drift grows with it."""
+        pose = self.map.kf_pose[slot].copy()
+        number = int(self.map.kf_id[slot])
         # the first two views of a submap
         for begun in range(next(reversed(self._path), number - 1) + 1, number):
             self._path[begun] = self._path_length
+
+        # distance, and rotation as if it were one
         if self._last_pose is not None:
             step = pose @ se3.inverse(self._last_pose)
-            rotation = ROTATION_M if self._scale_is_known else ROTATION_DEPTHS
+            length_per_radian = ROTATION_M if self._scale_is_known else ROTATION_DEPTHS
             self._path_length += float(
-                np.linalg.norm(step[:3, 3]) + rotation * se3.rotation_angle(step)
+                np.linalg.norm(step[:3, 3]) + length_per_radian * se3.rotation_angle(step)
             )
         self._last_pose = pose
         self._path[number] = self._path_length
 
     def _verified(self, slot: int, observations: Observations) -> Loop | None:
         """The first of the best-ranked candidates that is verified."""
-        world = self.world
-        old = weakly_connected(world, slot)
-        there = world.kf_map[old]
-        here = world.kf_map[slot]
+        # keyframes that drift may separate from this one, of this map or, for a merge, the root map
+        slam_map = self.map
+        old = weakly_connected(slam_map, slot)
+        there = slam_map.kf_map[old]
+        here = slam_map.kf_map[slot]
         old = old[(there == here) | (there == 0) | (here == 0)]
         if not len(old):
             return None
-        near = np.setdiff1d(around(world, slot)[1:], old)
-        score = recognition_scores(world, np.concatenate([near, old]), observations)
+
+        # by place recognition: a candidate has to score as well as the worst of the neighbours
+        near = np.setdiff1d(around(slam_map, slot)[1:], old)
+        score = recognition_scores(slam_map, np.concatenate([near, old]), observations)
         least = score[: len(near)].min(initial=np.inf)
         score = score[len(near) :]
-        rng = stream(self._seed, "loop", int(world.kf_id[slot]))
-        best = np.argsort(-score, kind="stable")[:CANDIDATES]
-        loops = (
-            self._verified_candidate(slot, int(old[k]), observations, rng)
-            for k in best
-            if score[k] >= least
-        )
-        return next((loop for loop in loops if loop is not None), None)
+
+        # by geometry: the first one that is verified
+        rng = stream(self._seed, "loop", int(slam_map.kf_id[slot]))
+        for k in np.argsort(-score, kind="stable")[:CANDIDATES]:
+            if score[k] >= least:
+                loop = self._verified_candidate(slot, int(old[k]), observations, rng)
+                if loop is not None:
+                    return loop
+        return None
 
     def _verified_candidate(
         self, slot: int, candidate: int, observations: Observations, rng: np.random.Generator
     ) -> Loop | None:
         """The loop to a candidate, if the points around it explain enough and drift explains the correction."""
+        # the pose by the points around the candidate
         s = self.settings.loop_closing
         tracking = self.settings.tracking
         least = MIN_MATCHES, MIN_MATCHES // 2
-        place = recognise_place(self.world, candidate, observations, tracking, rng, *least)
+        place = recognise_place(self.map, candidate, observations, tracking, rng, *least)
         if place is None or len(place.matches) < s.min_inliers or place.share < MIN_SHARE:
             return None
+
+        # the correction, which drift has to explain; for a merge the pose must be well determined
         loop = self._loop(slot, place)
         if loop is None or (
-            loop.merges
-            and pose_uncertainty(self.world, observations, place, rng) > MERGE_UNCERTAINTY
+            loop.merges and pose_uncertainty(self.map, observations, place, rng) > MERGE_UNCERTAINTY
         ):
             return None
         return loop if self._within_drift(slot, loop) else None
@@ -372,8 +382,9 @@ class LoopCloser:
 
         The loop is None where the place does not determine the merge well enough.
         """
+        # a place whose keyframe was culled since counts no more, and one that fits twice neither
         loop = self._loop(slot, place)
-        if loop is None or not self.world.kf_alive[place.keyframe]:
+        if loop is None or not self.map.kf_alive[place.keyframe]:
             return None, RootMapPose.REJECTED
         matters = loop.fits or self._scale_is_known
         if matters and self._aliased(slot, observations, loop):
@@ -390,7 +401,7 @@ class LoopCloser:
             return merge, RootMapPose.REJECTED
 
         # a camera that waits too long for a merge leaves the submap
-        frame = int(self.world.kf_frame[slot])
+        frame = int(self.map.kf_frame[slot])
         if self._in_root_map_since is None:
             self._in_root_map_since = frame
         waited = frame - self._in_root_map_since
@@ -403,36 +414,40 @@ class LoopCloser:
         scale = 1.0 if self._scale_is_known else self._scale(slot, place)
         if scale is None:
             return None
-        correction = Correction(self.world.kf_pose[slot].copy(), place.T_cam_world, scale)
+        correction = Correction(self.map.kf_pose[slot].copy(), place.T_cam_world, scale)
         loop = Loop(
-            place, correction, bool(self.world.kf_map[place.keyframe] != self.world.kf_map[slot])
+            place, correction, bool(self.map.kf_map[place.keyframe] != self.map.kf_map[slot])
         )
         return replace(loop, fits=self._fits(slot, loop)) if loop.merges else loop
 
     def _scale(self, slot: int, place: InitialPose) -> float | None:
         """Median ratio of the depths of common points by the first visit and by this one; None where too few."""
-        world = self.world
+        # features with a point of each visit
+        slam_map = self.map
         first = place.matches
-        own = world.kf_point[slot, first.feature].astype(np.int64)
+        own = slam_map.kf_point[slot, first.feature].astype(np.int64)
         both = (own >= 0) & (own != first.point)
-        then = se3.transform(place.T_cam_world, world.position[first.point[both]])[:, 2]
-        now = se3.transform(world.kf_pose[slot], world.position[own[both]])[:, 2]
-        ahead = (then > 0) & (now > 0)
-        return (
-            float(np.exp(np.median(np.log(then[ahead] / now[ahead]))))
-            if ahead.sum() >= MIN_SCALE_POINTS
-            else None
-        )
+
+        # depths of both points before the camera, each by its visit's pose
+        first_z = se3.transform(place.T_cam_world, slam_map.position[first.point[both]])[:, 2]
+        own_z = se3.transform(slam_map.kf_pose[slot], slam_map.position[own[both]])[:, 2]
+        ahead = (first_z > 0) & (own_z > 0)
+        if ahead.sum() < MIN_SCALE_POINTS:
+            return None
+        return float(np.exp(np.median(np.log(first_z[ahead] / own_z[ahead]))))
 
     def _within_drift(self, slot: int, loop: Loop) -> bool:
         """Whether drift explains the correction; between submaps, whether the camera can have moved from one there."""
         place = loop.place
         correction = loop.correction
+        # between submaps: matches, and the rotation that the maps may have against each other
         if loop.merges:
             if len(place.matches) < MERGE_INLIERS or place.share < MERGE_SHARE:
                 return False
-            slack = self.atlas.slack(*self.world.kf_map[[slot, place.keyframe]].tolist())
+            slack = self.atlas.slack(*self.map.kf_map[[slot, place.keyframe]].tolist())
             return loop.fits and bool(np.radians(correction.rotated_deg) <= slack)
+
+        # within a map: scale, distance and rotation in proportion to the path
         if not 1 / MAX_SCALE < correction.scale < MAX_SCALE:
             return False
         path = self._path_since(place.keyframe)
@@ -444,11 +459,12 @@ class LoopCloser:
 
     def _fits(self, slot: int, loop: Loop) -> bool:
         """Whether the younger of two submaps can have begun where the merge puts its start."""
+        # path from where the older map was left, on either map, to the two ends of the loop
         younger, _, correction = self._merge_of(slot, loop)
         share = 0.0 if self._scale_is_known else self.settings.loop_closing.drift_share
-        left = self._path_at(int(self.world.submap(younger)[0]))
+        left = self._path_at(int(self.map.submap(younger)[0]))
         place = loop.place.keyframe
-        ends = (slot, place) if self.world.kf_map[slot] == younger else (place, slot)
+        ends = (slot, place) if self.map.kf_map[slot] == younger else (place, slot)
         on_younger, on_older = (abs(self._path_at(keyframe) - left) for keyframe in ends)
         # from the meeting place back to where the older was left
         path = correction.scale * on_younger + on_older
@@ -456,18 +472,27 @@ class LoopCloser:
 
     def _aliased(self, slot: int, observations: Observations, loop: Loop) -> bool:
         """Whether the keyframe fits two places: nothing but what is seen tells how two maps lie to each other."""
-        world = self.world
+        slam_map = self.map
         place = loop.place
-        own, other = world.kf_map[[slot, place.keyframe]].tolist()
-        points = world.kf_point[slot, world.kf_point[slot] >= 0]
-        depth = float(np.median(se3.transform(world.kf_pose[slot], world.position[points])[:, 2]))
+        own, other = slam_map.kf_map[[slot, place.keyframe]].tolist()
+        points = slam_map.kf_point[slot, slam_map.kf_point[slot] >= 0]
+        depth = float(
+            np.median(se3.transform(slam_map.kf_pose[slot], slam_map.position[points])[:, 2])
+        )
+
+        # both hypotheses of where the camera is, by the map that says so
         hypotheses = {
-            own: replace(place, T_cam_world=world.kf_pose[slot], depth=depth),
+            own: replace(place, T_cam_world=slam_map.kf_pose[slot], depth=depth),
             other: replace(place, depth=depth * loop.correction.scale),
         }
         tracking = self.settings.tracking
         return is_aliased(
-            world, observations, hypotheses, weakly_connected(world, slot), tracking, self._seed
+            slam_map,
+            observations,
+            hypotheses,
+            weakly_connected(slam_map, slot),
+            tracking,
+            self._seed,
         )
 
     def _path_since(self, slot: int) -> float:
@@ -479,31 +504,33 @@ class LoopCloser:
 
     def _path_at(self, slot: int) -> float:
         """Path length up to a keyframe; 0 for those of a loaded map."""
-        return self._path.get(int(self.world.kf_id[slot]), 0.0)
+        return self._path.get(int(self.map.kf_id[slot]), 0.0)
 
     # ------------------------------------------------------------------ correct and fuse
 
     def _correct(self, slot: int, loop: Loop) -> dict[int, float]:
         """Spread the correction over all keyframes of the map by a pose graph; returns the scales of those rescaled."""
-        world = self.world
+        # the loop edge; a small correction is left to fusion and bundle adjustment
+        slam_map = self.map
         correction = loop.correction
         loop_edge = self._edge(loop.place.keyframe, slot, correction.T_cam_now, LOOP_WEIGHT)
-        older = edges_within(world.kf_id[world.keyframes], self._loop_edges)
+        older = edges_within(slam_map.kf_id[slam_map.keyframes], self._loop_edges)
         self._loop_edges = [*older, loop_edge]
         log_scale = abs(np.log(correction.scale))
         size = np.array([correction.moved_m, correction.rotated_deg, log_scale])
         if (size < NEGLIGIBLE).all():
             return {}
 
-        submap = int(world.kf_map[slot])
-        slots = world.submap(submap)
-        ids = world.kf_id[slots]
-        poses_before = world.kf_pose.copy()
+        # the essential graph: keyframes of the map and edges of strong covisibility
+        submap = int(slam_map.kf_map[slot])
+        slots = slam_map.submap(submap)
+        ids = slam_map.kf_id[slots]
+        poses_before = slam_map.kf_pose.copy()
         edges = self._covisibility_edges(slots)
 
         # without depth the scales first
         rescaled: dict[int, float] = {}
-        scales = np.ones(world.kf_alive.size)
+        scales = np.ones(slam_map.kf_alive.size)
         if not self._scale_is_known:
             kept_scale = [*edges, *edges_within(ids, older)]
             scales[slots] = spread_scale(ids, kept_scale, loop_edge, correction.scale)
@@ -514,7 +541,7 @@ class LoopCloser:
         graph = [*edges, *edges_within(ids, self._loop_edges)]
         poses = optimise_poses(ids, poses_before[slots], graph)
         for keyframe, pose in zip(slots.tolist(), poses, strict=True):
-            world.set_pose(keyframe, pose)
+            slam_map.set_pose(keyframe, pose)
         self.atlas.move_nearby(submap, poses_before[slots], poses, scales[slots])
         self._move_points(slots, poses_before, scales)
         return rescaled
@@ -527,45 +554,54 @@ class LoopCloser:
             poses_before: World-to-camera poses ``[S, 4, 4]`` of all slots before the correction.
             scales: What lengths around each slot are multiplied by ``[S]``.
         """
-        world = self.world
-        points = world.points_of(slots)
-        reference = world.obs_kf[points, 0]
+        # in the frame of the first observer's camera, as it was
+        slam_map = self.map
+        points = slam_map.points_of(slots)
+        reference = slam_map.obs_kf[points, 0]
         R_before = poses_before[reference, :3, :3]
         t_before = poses_before[reference, :3, 3]
-        local = np.einsum("nij,nj->ni", R_before, world.position[points]) + t_before
+        local = np.einsum("nij,nj->ni", R_before, slam_map.position[points]) + t_before
         local *= scales[reference, None]
-        now = se3.inverse(world.kf_pose[reference])
-        world.position[points] = np.einsum("nij,nj->ni", now[:, :3, :3], local) + now[:, :3, 3]
-        world.refresh(points)
+
+        # back to the world by the corrected pose
+        T_world_cam = se3.inverse(slam_map.kf_pose[reference])
+        R_after = T_world_cam[:, :3, :3]
+        t_after = T_world_cam[:, :3, 3]
+        slam_map.position[points] = np.einsum("nij,nj->ni", R_after, local) + t_after
+        slam_map.refresh(points)
 
     def _merge_of(self, slot: int, loop: Loop) -> tuple[int, int, Correction]:
         """The younger of the two submaps, the older one, and the correction of the younger."""
-        own, other = self.world.kf_map[[slot, loop.place.keyframe]].tolist()
-        return (
-            (own, other, loop.correction) if own > other else (other, own, loop.correction.inverse)
-        )
+        own, other = self.map.kf_map[[slot, loop.place.keyframe]].tolist()
+        if own > other:
+            return own, other, loop.correction
+        return other, own, loop.correction.inverse
 
     def _merge(self, slot: int, loop: Loop) -> dict[int, float]:
         """Merge two submaps (ORB-SLAM3's ``MergeLocal``): the younger moves onto the older or the root map.
 
         Returns the scales of the keyframes that were moved, by slot.
         """
-        world = self.world
+        slam_map = self.map
         younger, older, correction = self._merge_of(slot, loop)
-        slots = world.move_submap(younger, correction.T_now_before, older, correction.scale)
+        # move the younger map's keyframes and points
+        slots = slam_map.move_submap(younger, correction.T_now_before, older, correction.scale)
         rescaled = self._rescale_loop_edges(slots, np.full(len(slots), correction.scale))
-        loop_edge = self._edge(loop.place.keyframe, slot, world.kf_pose[slot], LOOP_WEIGHT)
+
+        # connect the two by the place that both show
+        loop_edge = self._edge(loop.place.keyframe, slot, slam_map.kf_pose[slot], LOOP_WEIGHT)
         self._loop_edges.append(loop_edge)
         return rescaled
 
     def _rescale_loop_edges(self, slots: Slots, scales: Array) -> dict[int, float]:
         """Multiply the lengths of loop edges at keyframes ``[N]`` by scales ``[N]``; returns the scales by slot."""
-        self._loop_edges = rescaled_edges(self._loop_edges, self.world.kf_id[slots], scales)
+        self._loop_edges = rescaled_edges(self._loop_edges, self.map.kf_id[slots], scales)
         return dict(zip(slots.tolist(), scales.tolist(), strict=True))
 
     def _edge(self, one: int, other: int, pose_of_other: Array, weight: float = 1.0) -> Edge:
-        id_one, id_other = self.world.kf_id[[one, other]].tolist()
-        return Edge(id_one, id_other, pose_of_other @ se3.inverse(self.world.kf_pose[one]), weight)
+        """The edge between two keyframes by the pose of the first and one of the other, both world to camera."""
+        id_one, id_other = self.map.kf_id[[one, other]].tolist()
+        return Edge(id_one, id_other, pose_of_other @ se3.inverse(self.map.kf_pose[one]), weight)
 
     def _covisibility_edges(self, slots: Slots) -> list[Edge]:
         """Edges of each keyframe to the older ones that share many points, and to the one that shares most.
@@ -574,17 +610,19 @@ class LoopCloser:
         """
         pairs = set()
         for slot in slots.tolist():
-            near, shared = self.world.covisible(slot)
-            older = self.world.kf_id[near] < self.world.kf_id[slot]
+            near, shared = self.map.covisible(slot)
+            older = self.map.kf_id[near] < self.map.kf_id[slot]
+            # the one that shares most, and all that share many
             linked = [*near[older][:1], *near[older & (shared >= STRONG_COVISIBILITY)]]
             pairs |= {(int(other), slot) for other in linked}
-        return [self._edge(a, b, self.world.kf_pose[b]) for a, b in sorted(pairs)]
+        return [self._edge(a, b, self.map.kf_pose[b]) for a, b in sorted(pairs)]
 
     def _fuse(self, slot: int, candidate: int) -> None:
-        points = self.world.points_of(around(self.world, candidate))
-        for keyframe in around(self.world, slot).tolist():
+        """Fuse the points around both ends of a loop, and adjust what lies around the new keyframe."""
+        points = self.map.points_of(around(self.map, candidate))
+        for keyframe in around(self.map, slot).tolist():
             self.mapper.fuse_into(keyframe, points)
-        self.world.refresh(points[self.world.alive[points]])
+        self.map.refresh(points[self.map.alive[points]])
         self.mapper.adjust(slot)
 
 
@@ -666,18 +704,23 @@ def spread_scale(ids: Slots, edges: Sequence[Edge], loop_edge: Edge, scale: floa
     Returns:
         Factors ``[N]``.
     """
+    # the wanted difference of the logarithms along each edge: 0, but for the loop's
     all_edges = [*edges, loop_edge]
     one, other = np.searchsorted(ids, [[edge.one, edge.other] for edge in all_edges]).T
     row = np.arange(len(all_edges))
     wanted = np.zeros(len(all_edges))
     wanted[-1] = np.log(scale)
-    ends = np.r_[row, row], np.r_[one, other]
-    values = np.r_[-np.ones(len(row)), np.ones(len(row))]
+
+    # the oldest keyframe of each component stays
     _, part = connected_components(
         coo_array((np.ones(len(row)), (one, other)), shape=(len(ids), len(ids))), False
     )
     _, oldest = np.unique(part, return_index=True)
     free = np.setdiff1d(np.arange(len(ids)), oldest)
+
+    # weighted least squares by the normal equations; a row of the Jacobian holds -1 and 1
+    ends = np.r_[row, row], np.r_[one, other]
+    values = np.r_[-np.ones(len(row)), np.ones(len(row))]
     jacobian = coo_array((values, ends), shape=(len(row), len(ids))).tocsc()[:, free]
     weight = diags_array(np.array([edge.weight for edge in all_edges]))
     logarithms = np.zeros(len(ids))
@@ -698,15 +741,18 @@ def optimise_poses(ids: Slots, poses: Array, edges: Sequence[Edge]) -> Array:
     Returns:
         World to camera ``[N, 4, 4]``.
     """
+    # rows of the poses at both ends, the inverse of each measured pose, and its standard deviations
     one, other = np.searchsorted(ids, [[edge.one, edge.other] for edge in edges]).T
-    back = se3.inverse(np.array([edge.T_other_one for edge in edges]))
+    T_one_other = se3.inverse(np.array([edge.T_other_one for edge in edges]))
     sigmas = SIGMAS / np.sqrt([[edge.weight] for edge in edges])
-    error = _edge_errors(poses, one, other, back, sigmas)
+    error = _edge_errors(poses, one, other, T_one_other, sigmas)
     cost = float(np.square(error).sum())
+
+    # Levenberg-Marquardt: a step that does not lower the cost is repeated with more damping
     damping = 1e-6
     for _ in range(GRAPH_ITERATIONS):
         trial = se3.exp(_graph_step(poses, one, other, error, sigmas, damping)) @ poses
-        trial_error = _edge_errors(trial, one, other, back, sigmas)
+        trial_error = _edge_errors(trial, one, other, T_one_other, sigmas)
         lower = float(np.square(trial_error).sum())
         if not lower < cost:
             damping *= 30.0
@@ -721,23 +767,30 @@ def optimise_poses(ids: Slots, poses: Array, edges: Sequence[Edge]) -> Array:
     return poses
 
 
-def _edge_errors(poses: Array, one: Slots, other: Slots, back: Array, sigmas: Array) -> Array:
+def _edge_errors(
+    poses: Array, one: Slots, other: Slots, T_one_other: Array, sigmas: Array
+) -> Array:
     """Error of each edge ``[E, 6]``: the twist left between it and the poses, in its sigmas."""
-    return se3.log(poses[other] @ se3.inverse(poses[one]) @ back) / sigmas
+    return se3.log(poses[other] @ se3.inverse(poses[one]) @ T_one_other) / sigmas
 
 
 def _graph_step(
     poses: Array, one: Slots, other: Slots, error: Array, sigmas: Array, damping: float
 ) -> Array:
     """Twists ``[N, 6]`` on the left of the poses that lower the cost; that of the first one is zero."""
+    # how each error follows a twist on the left of either pose: blocks [6, 6]
     jacobian_log = _inverse_left_jacobian(error * sigmas)
     weight = 1.0 / sigmas[:, :, None]
     by_other = weight * jacobian_log
     by_one = -by_other @ _adjoint(poses[other] @ se3.inverse(poses[one]))
+
+    # the sparse Jacobian [6 E, 6 N - 6], two blocks a row; the first pose stays
     blocks = np.stack([by_one, by_other], axis=1).reshape(-1, 6, 6)
     columns = np.stack([one, other], axis=1).ravel()
     block_rows = blocks, columns, 2 * np.arange(len(error) + 1)
     jacobian = bsr_array(block_rows, shape=(error.size, 6 * len(poses))).tocsc()[:, 6:]
+
+    # damped normal equations
     normal = (jacobian.T @ jacobian).tocsc()
     normal = normal + diags_array(damping * normal.diagonal() + 1e-12)
     twists = -spsolve(normal.tocsc(), jacobian.T @ error.ravel()).reshape(-1, 6)

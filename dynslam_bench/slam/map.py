@@ -45,7 +45,7 @@ FEATURE_TABLES = {
     "kf_angle": (np.float32, 0),
     "kf_info": (float, 0),
     "kf_info_right": (float, 0),
-    "kf_words": (np.uint64, 0, 4),
+    "kf_descriptor": (np.uint64, 0, 4),
     "kf_point": (np.int32, 0),
 }
 """Type and shape of what is stored for each feature of each keyframe; a 0 becomes the number of features."""
@@ -55,7 +55,7 @@ POINT_TABLES = {
     "position": (float, 3),
     "normal": (float, 3),
     "far": (float,),
-    "words": (np.uint64, 4),
+    "descriptor": (np.uint64, 4),
     "rgb": (np.uint8, 3),
     "visible": (np.int32,),
     "found": (np.int32,),
@@ -81,7 +81,7 @@ DEPTH_IMAGES = 8
 
 
 class ObservationTables(NamedTuple):
-    """Which keyframe observes which point: both directions of the same relation, as compiled loops take them.
+    """Observations of points by keyframes, in both directions, as compiled loops take them.
 
     Attributes:
         obs_kf: int32 ``[M, O]``, by point the slots of the keyframes that observe it, oldest first.
@@ -97,7 +97,7 @@ class ObservationTables(NamedTuple):
 
 
 class PointViews(NamedTuple):
-    """From where points are recognised.
+    """Positions of points, and the views from which they are recognised.
 
     Attributes:
         position: float64 ``[M, 3]``, world points.
@@ -111,15 +111,15 @@ class PointViews(NamedTuple):
 
 
 class KeyframeViews(NamedTuple):
-    """What keyframes tell of the points that they observe.
+    """Keyframes as the points that they observe need them.
 
     Attributes:
-        words: uint64 ``[S, F, W]``, descriptors.
+        descriptors: uint64 ``[S, F, W]``.
         octave: int8 ``[S, F]``.
         centre: float64 ``[S, 3]``, camera centres in the world.
     """
 
-    words: Any
+    descriptors: Any
     octave: Any
     centre: Array
 
@@ -171,7 +171,7 @@ class Map:
         kf_angle: float32 ``[S, F]``, degrees.
         kf_info: float64 ``[S, F]``, inverse variance of the pixel, see `Observations`.
         kf_info_right: float64 ``[S, F]``, inverse variance of the right coordinate.
-        kf_words: uint64 ``[S, F, W]``, descriptors.
+        kf_descriptor: uint64 ``[S, F, W]``, bits in words of 64.
         kf_point: int32 ``[S, F]``, slot of the observed point, or -1.
         alive: bool ``[M]``, whether the point's slot is in use.
         id: int64 ``[M]``, number of the point in the order of creation.
@@ -179,7 +179,7 @@ class Map:
         normal: float64 ``[M, 3]``, mean viewing direction.
         far: float64 ``[M]``, largest distance at which the point's reference scale is still in the
             pyramid.
-        words: uint64 ``[M, W]``, descriptor.
+        descriptor: uint64 ``[M, W]``.
         rgb: uint8 ``[M, 3]``, colour.
         visible: int32 ``[M]``, frames that should have observed it.
         found: int32 ``[M]``, frames that did.
@@ -251,8 +251,9 @@ class Map:
         submap: int = 0,
     ) -> int:
         """Store a frame's features as a keyframe that observes no points yet; returns its slot."""
+        # the keyframe: number, map, frame, pose
         n = len(observations)
-        slot = self._free_keyframe_slot(*observations.words.shape)
+        slot = self._free_keyframe_slot(*observations.descriptors.shape)
         self.kf_id[slot] = self.next_keyframe
         self.kf_alive[slot] = True
         self.kf_map[slot] = submap
@@ -262,6 +263,7 @@ class Map:
         self.next_keyframe += 1
         self.set_pose(slot, T_cam_world)
 
+        # its features, which observe no point yet
         raw = observations.keypoints
         self.kf_raw[slot, :n] = raw.xy
         self.kf_response[slot, :n] = raw.response
@@ -272,7 +274,7 @@ class Map:
         self.kf_angle[slot, :n] = observations.angle
         self.kf_info[slot, :n] = observations.info
         self.kf_info_right[slot, :n] = observations.info_right
-        self.kf_words[slot, :n] = observations.words
+        self.kf_descriptor[slot, :n] = observations.descriptors
         self.kf_point[slot] = -1
         return slot
 
@@ -280,9 +282,10 @@ class Map:
         """A free slot, in tables that have room for so many features with so many words of descriptor."""
         # the first keyframe decides how long descriptors are
         if not self.next_keyframe:
-            self.kf_words = np.zeros((0, 0, words), np.uint64)
-            self.words = np.zeros((0, words), np.uint64)
+            self.kf_descriptor = np.zeros((0, 0, words), np.uint64)
+            self.descriptor = np.zeros((0, words), np.uint64)
 
+        # wider tables for more features than any keyframe had, longer ones for another keyframe
         room = self.kf_point.shape[1]
         if features > room:
             self._grow(FEATURE_TABLES, features, axis=1)
@@ -315,6 +318,7 @@ class Map:
 
     def covisible_of(self, points: NDArray[np.integer], exclude: int = -1) -> tuple[Slots, Slots]:
         """Keyframes that observe any of the points (-1 entries are skipped), most first, and how many."""
+        # one entry for each shared point; equal counts: the newer keyframe first
         observers, _ = self.observations(points[points >= 0])
         counts = np.bincount(observers[observers != exclude], minlength=self.kf_alive.size)
         slots = np.flatnonzero(counts)
@@ -332,11 +336,14 @@ class Map:
             merged_into: The other's number.
             scale: What lengths in the submap's world are multiplied by before it is moved.
         """
+        # scale the keyframes' translations, then move their poses: T_cam_new = T_cam_old T_new_old^-1
         slots = self.submap(number)
         points = self.points_of(slots)
         self.kf_pose[slots, :3, 3] *= scale
         for slot in slots.tolist():
             self.set_pose(slot, self.kf_pose[slot] @ se3.inverse(T_new_old))
+
+        # the points, likewise
         self.position[points] = se3.transform(T_new_old, scale * self.position[points])
         self.kf_map[slots] = merged_into
         self.refresh(points)
@@ -369,6 +376,8 @@ class Map:
         fresh = np.arange(self._top, end, dtype=np.int64)
         slots = np.concatenate([np.array(reused, np.int64), fresh])
         self._top = end
+
+        # the points, observed once
         self.id[slots] = np.arange(self.next_point, self.next_point + n)
         self.next_point += n
         self.alive[slots] = True
@@ -405,6 +414,7 @@ class Map:
         """Replace a point by another that is the same point of the scene."""
         self._reserve(int(self.n_obs[new] + self.n_obs[old]))
         _replace(self._observation_tables, old, new)
+        # the frames that should have observed either one, and those that did, count for the new one
         for count in (self.visible, self.found):
             count[new] += count[old]
         self.alive[old] = False
@@ -412,9 +422,9 @@ class Map:
 
     def refresh(self, points: Slots) -> None:
         """Renew descriptor, viewing direction and scale range of points from their observations."""
-        views = KeyframeViews(self.kf_words, self.kf_octave, self.kf_centre)
+        views = KeyframeViews(self.kf_descriptor, self.kf_octave, self.kf_centre)
         _refresh(
-            points, self._point_views, self.words, self._observation_tables, views, self.scales
+            points, self._point_views, self.descriptor, self._observation_tables, views, self.scales
         )
 
     def release(self) -> None:
@@ -432,6 +442,7 @@ class Map:
 
     def observations(self, points: NDArray[np.integer]) -> tuple[Ints, Ints]:
         """Keyframe slots and feature numbers of the observations of points, one point after the other."""
+        # row and column of each observation in the tables [M, O]
         count = self.n_obs[points].astype(np.int64)
         row = np.repeat(points, count)
         column = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
@@ -488,32 +499,32 @@ MapView: TypeAlias = tuple[tuple[KeyframeView, ...], tuple[Slots, Array]]
 positions ``[M, 3]`` in metres of all points."""
 
 
-def points_in(world: Map, submap: int) -> Slots:
+def points_in(slam_map: Map, submap: int) -> Slots:
     """Slots of the points of a submap, ascending."""
-    points = world.points
-    return np.asarray(points[world.kf_map[world.obs_kf[points, 0]] == submap])
+    points = slam_map.points
+    return np.asarray(points[slam_map.kf_map[slam_map.obs_kf[points, 0]] == submap])
 
 
-def map_outputs(world: Map) -> MapOutputs:
+def map_outputs(slam_map: Map) -> MapOutputs:
     """Keyframes and map points for files and pictures; of points the root map's alone."""
-    points = points_in(world, 0)
-    records = tuple(_keyframe_record(world, slot) for slot in world.keyframes.tolist())
-    observations = world.n_obs[points].astype(np.int64)
+    points = points_in(slam_map, 0)
+    records = tuple(_keyframe_record(slam_map, slot) for slot in slam_map.keyframes.tolist())
+    observations = slam_map.n_obs[points].astype(np.int64)
     return MapOutputs(
-        records, world.id[points], world.position[points], world.rgb[points], observations
+        records, slam_map.id[points], slam_map.position[points], slam_map.rgb[points], observations
     )
 
 
-def _keyframe_record(world: Map, slot: int) -> KeyframeRecord:
+def _keyframe_record(slam_map: Map, slot: int) -> KeyframeRecord:
     """What files hold of a keyframe."""
     return KeyframeRecord(
-        int(world.kf_id[slot]),
-        int(world.kf_frame[slot]),
-        float(world.kf_stamp[slot]),
-        se3.inverse(world.kf_pose[slot]),
-        int(world.kf_count[slot]),
-        int(np.count_nonzero(world.kf_point[slot] >= 0)),
-        int(world.kf_map[slot]),
+        int(slam_map.kf_id[slot]),
+        int(slam_map.kf_frame[slot]),
+        float(slam_map.kf_stamp[slot]),
+        se3.inverse(slam_map.kf_pose[slot]),
+        int(slam_map.kf_count[slot]),
+        int(np.count_nonzero(slam_map.kf_point[slot] >= 0)),
+        int(slam_map.kf_map[slot]),
     )
 
 
@@ -521,53 +532,58 @@ class MapViews:
     """Views of a map for filters; computed again after a keyframe or in another submap.
 
     Args:
-        world: The map.
+        slam_map: The map.
         depth_images: How many of the newest keyframes keep their depth image.
     """
 
-    def __init__(self, world: Map, depth_images: int) -> None:
-        self._world = world
+    def __init__(self, slam_map: Map, depth_images: int) -> None:
+        self._map = slam_map
         self._max_depth_images = depth_images
         self._depth_images: dict[int, NDArray[np.float32]] = {}
         self._computed_for: tuple[int, int] | None = None
 
     def add_keyframe(self, slot: int, depth: NDArray[np.float32]) -> None:
-        """A keyframe was made; those that were culled for it lose their depth images."""
+        """Keep the depth image of a new keyframe; older and culled ones lose theirs.
+
+        Args:
+            slot: The keyframe.
+            depth: Metres ``[H, W]``, 0 missing.
+        """
         self._depth_images[slot] = depth
-        newest = self._world.keyframes[::-1][: self._max_depth_images]
+        newest = self._map.keyframes[::-1][: self._max_depth_images]
         self._depth_images = {
             stored: image for stored, image in self._depth_images.items() if stored in newest
         }
 
     def of(self, submap: int) -> MapView:
         """What filters see while the camera is in a submap."""
-        world = self._world
-        if self._computed_for != (world.next_keyframe, submap):
-            self._computed_for = world.next_keyframe, submap
-            newest = world.submap(submap)[::-1][:VIEWS].tolist()
-            points = points_in(world, submap)
+        slam_map = self._map
+        if self._computed_for != (slam_map.next_keyframe, submap):
+            self._computed_for = slam_map.next_keyframe, submap
+            newest = slam_map.submap(submap)[::-1][:VIEWS].tolist()
+            points = points_in(slam_map, submap)
             keyframes = tuple(map(self._keyframe, newest))
-            self._view: MapView = (keyframes, (world.id[points], world.position[points]))
+            self._view: MapView = (keyframes, (slam_map.id[points], slam_map.position[points]))
         return self._view
 
     def _keyframe(self, slot: int) -> KeyframeView:
         """What filters may read of a keyframe."""
-        world = self._world
-        n = int(world.kf_count[slot])
+        slam_map = self._map
+        n = int(slam_map.kf_count[slot])
         keypoints = Keypoints(
-            world.kf_raw[slot, :n],
-            world.kf_octave[slot, :n].astype(np.int32),
-            world.kf_angle[slot, :n],
-            world.kf_response[slot, :n],
-            world.kf_words[slot, :n].view(np.uint8),
+            slam_map.kf_raw[slot, :n],
+            slam_map.kf_octave[slot, :n].astype(np.int32),
+            slam_map.kf_angle[slot, :n],
+            slam_map.kf_response[slot, :n],
+            slam_map.kf_descriptor[slot, :n].view(np.uint8),
         )
         return KeyframeView(
-            se3.inverse(world.kf_pose[slot]),
+            se3.inverse(slam_map.kf_pose[slot]),
             keypoints,
-            world.kf_xy[slot, :n],
-            world.kf_z[slot, :n],
+            slam_map.kf_xy[slot, :n],
+            slam_map.kf_z[slot, :n],
             self._depth_images.get(slot),
-            float(world.kf_stamp[slot]),
+            float(slam_map.kf_stamp[slot]),
         )
 
 
@@ -577,12 +593,14 @@ class MapViews:
 @kernel
 def _link_one(tables: ObservationTables, keyframe: int, feature: int, point: int) -> None:
     """Add an observation of a point; a second one by the same keyframe is skipped."""
+    # in the point's list
     end = tables.n_obs[point]
     if (tables.obs_kf[point, :end] == keyframe).any():
         return
     tables.obs_kf[point, end] = keyframe
     tables.obs_ft[point, end] = feature
     tables.n_obs[point] += 1
+    # in the keyframe's
     tables.kf_point[keyframe, feature] = point
 
 
@@ -604,6 +622,7 @@ def _unlink(tables: ObservationTables, keyframes: Slots, features: Slots) -> Non
         if p < 0:
             continue
         tables.kf_point[keyframes[i], features[i]] = -1
+        # close the gap in the point's list, whose order stays
         left = 0
         for o in range(tables.n_obs[p]):
             if obs_kf[p, o] != keyframes[i] or obs_ft[p, o] != features[i]:
@@ -628,7 +647,7 @@ def _replace(tables: ObservationTables, old: int, new: int) -> None:
 def _refresh(
     points: Slots,
     views: PointViews,
-    words: Any,
+    descriptors: Any,
     tables: ObservationTables,
     keyframes: KeyframeViews,
     scales: Array,
@@ -651,17 +670,18 @@ def _refresh(
                 score = 0
                 for b in range(first, n):
                     score += distance(
-                        keyframes.words[obs_kf[p, a], obs_ft[p, a]],
-                        keyframes.words[obs_kf[p, b], obs_ft[p, b]],
+                        keyframes.descriptors[obs_kf[p, a], obs_ft[p, a]],
+                        keyframes.descriptors[obs_kf[p, b], obs_ft[p, b]],
                     )
                 if score < best_score:
                     best = a
                     best_score = score
         # whole rows would compile a message for shapes that differ, seconds of it
-        for w in range(words.shape[1]):
-            words[p, w] = keyframes.words[obs_kf[p, best], obs_ft[p, best], w]
+        for w in range(descriptors.shape[1]):
+            descriptors[p, w] = keyframes.descriptors[obs_kf[p, best], obs_ft[p, best], w]
 
-        # scale range by the oldest observation, and mean viewing direction
+        # mean viewing direction, and scale range by the oldest observation: at `far` the patch that it
+        # saw at its octave would have the size of octave 0
         sx = 0.0
         sy = 0.0
         sz = 0.0
@@ -770,6 +790,7 @@ def _redundancy(
         p = tables.kf_point[keyframe, f]
         if p < 0 or not close[f]:
             continue
+        # other keyframes that observe the point as finely, up to one octave
         total = total + 1
         fine = 0
         for o in range(tables.n_obs[p]):

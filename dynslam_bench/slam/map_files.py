@@ -86,6 +86,7 @@ SUBMAP_ARRAYS = {
 }
 """Type and shape of what is stored for each submap that was not merged (`Atlas`); I submaps."""
 _LAYOUT = KEYFRAME_ARRAYS | FEATURE_ARRAYS | POINT_ARRAYS | OBSERVATION_ARRAYS | SUBMAP_ARRAYS
+"""All arrays of a file."""
 
 
 MAX_TABLE_BYTES = 1 << 30
@@ -120,7 +121,7 @@ class MapFeatures(Record):
 
 
 class MapHeader(Record):
-    """What a map file says of the map.
+    """Header of a map file.
 
     Attributes:
         kind: Says that the file is a map.
@@ -169,6 +170,7 @@ class SavedMap:
         Raises:
             SettingsError: Names what differs.
         """
+        # what the map was made with, and what the system has
         header = self.header
         saved: dict[str, Any] = {
             "sensors": header.sensors,
@@ -198,6 +200,7 @@ def write_map(path: Path, saved: SavedMap) -> None:
         TrackerError: The map is too large to be read again.
         DynslamError: The folder cannot be written.
     """
+    # what is too large to be read again is not written
     header = np.frombuffer(saved.header.to_json().encode(), np.uint8)
     size = sum(array.nbytes + ARRAY_HEADER_BYTES for array in (header, *saved.arrays.values()))
     if size > MOST_BYTES:
@@ -205,6 +208,8 @@ def write_map(path: Path, saved: SavedMap) -> None:
             f"the map holds {size / 1e6:.0f} MB, at most {MOST_BYTES / 1e6:.0f} are read of such a file",
             "keep fewer keyframes (backend.keyframes.maximum) or features (features.n_features)",
         )
+
+    # one array a table, and the header as text
     data = io.BytesIO()
     np.savez_compressed(data, **{HEADER: header}, **saved.arrays)  # type: ignore[arg-type]
     write_atomic(path, data.getvalue())
@@ -217,6 +222,7 @@ def read_map(path: Path) -> SavedMap:
         SettingsError: The file cannot be read, is no map, of a newer version, or damaged; names the
             first fault.
     """
+    # the header, which says that it is a map
     arrays = read_npz(path, kind=SettingsError)
     if HEADER not in arrays:
         raise SettingsError(f"{path} is no map: it holds no header", MAKE_ONE)
@@ -227,6 +233,8 @@ def read_map(path: Path) -> SavedMap:
         raise SettingsError(f"{path} is no map: its header is no text", MAKE_ONE) from error
     except DynslamError as error:
         raise SettingsError(str(error)) from error
+
+    # the tables
     arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     fault = next(_faults(arrays, header), None)
     if fault is not None:
@@ -249,8 +257,8 @@ def _faults(arrays: Arrays, header: MapHeader) -> Iterator[str]:
             yield f"it holds an unknown array '{name[:40]}'"
     yield from _layout_faults(arrays)
 
-    # indices out of bounds
-    last = {
+    # indices out of bounds: the largest value of each table
+    largest = {
         "kf_id": header.next_keyframe - 1,
         "born": header.next_keyframe - 1,
         "id": header.next_point - 1,
@@ -261,7 +269,7 @@ def _faults(arrays: Arrays, header: MapHeader) -> Iterator[str]:
         "obs_kf": len(arrays["kf_id"]) - 1,
         "obs_ft": np.inf,
     }
-    for name, most in last.items():
+    for name, most in largest.items():
         if not ((arrays[name] >= 0) & (arrays[name] <= most)).all():
             yield f"'{name}' holds values below 0 or above {most}"
 
@@ -289,16 +297,23 @@ def _layout_faults(arrays: Arrays) -> Iterator[str]:
 
 def _size_faults(arrays: Arrays) -> Iterator[str]:
     """Values that are not finite, tables that would be too large, and counts that do not add up."""
+    # numbers that are computed with
     for name in ("kf_pose", "kf_xy", "kf_z", "position", "normal", "far"):
         if not np.isfinite(arrays[name]).all():
             yield f"'{name}' holds values that are not finite"
+
+    # descriptors
     words = max(arrays["kf_words"].shape[1], arrays["words"].shape[1])
     if words > MAX_WORDS:
         yield f"a descriptor has {words} words of 64 bits, at most {MAX_WORDS} are read"
+
+    # a keyframe at least, and an observation of each point
     count = arrays["kf_count"]
     n_obs = arrays["n_obs"].astype(np.int64)
     if not (len(count) and n_obs.all()):
         yield "it holds no keyframe, or a point that none observes"
+
+    # features a keyframe and observations a point: the counts, bytes of one, how many the file holds
     for name, counts, size, held in (
         ("kf_count", count, FEATURE_BYTES + 8 * words, len(arrays["kf_xy"])),
         ("n_obs", n_obs, OBSERVATION_BYTES, len(arrays["obs_kf"])),
@@ -382,6 +397,7 @@ def read_ply(path: Path) -> Cloud:
         RunError: It cannot be read, or is no such file.
     """
     data = read_bytes(path, limit=TABLE_BYTES, kind=RunError)
+    # the header tells the number of rows: it has to be the one that this package writes for as many
     head, _, body = data.partition(b"end_header\n")
     rows = len(body) // _PLY_LAYOUT.itemsize
     if head + b"end_header\n" != _ply_header(rows) or len(body) != rows * _PLY_LAYOUT.itemsize:

@@ -74,6 +74,7 @@ def pose_covariance(T_cam_world: Array, information: Array, inflation: float = I
 
 def _process_noise(dt: float, settings: MotionModelSettings) -> Array:
     """Covariance ``[12, 12]`` that an acceleration, constant for `dt` seconds, adds to a `MotionState`."""
+    # an acceleration a moves by a t^2 / 2 and adds a t to the speed
     variance = np.repeat([settings.acceleration**2, settings.angular_acceleration**2], 3)
     noise = np.zeros((12, 12))
     pose = np.arange(6)
@@ -141,6 +142,7 @@ class MotionState:
 
     def transformed(self, rotation: Array, scale: float) -> MotionState:
         """The state after the world was rotated by ``[3, 3]`` and its lengths were multiplied by `scale`."""
+        # position, velocity and their covariance; rotation and angular velocity are the camera's
         by = np.eye(12)
         by[:3, :3] = by[6:9, 6:9] = scale * rotation
         return MotionState(
@@ -195,6 +197,7 @@ def smooth(
     Returns:
         Smoothed world-to-camera poses ``[N, 4, 4]``.
     """
+    # parts without gaps, each by itself
     out = np.array(T_cam_world)
     cuts = np.flatnonzero(np.diff(stamps) > MAX_GAP_S) + 1
     for rows in np.split(np.arange(len(stamps)), cuts):
@@ -283,8 +286,11 @@ class CameraMotion:
             timestamp: The stamp of the new one, seconds.
             jitter: Share of the usual interval within which a regular stamp is taken instead.
         """
+        # a stamp that is nearly regular counts as regular
         if abs(timestamp - last.timestamp - self._interval) <= jitter * self._interval:
             timestamp = last.timestamp + self._interval
+
+        # constant velocity, where it is known
         dt = timestamp - last.timestamp
         if self.state is None or not 0 < dt <= MAX_GAP_S:
             return last.T_cam_world, None
@@ -305,11 +311,14 @@ class CameraMotion:
         Returns:
             World-to-camera pose; the measured one where nothing is known of the gap.
         """
+        # after a gap the filter begins again at the measured pose
         covariance = pose_covariance(measured, information)
         dt = timestamp - last.timestamp
         if self.state is None or not 0 < dt <= MAX_GAP_S:
             self.state = MotionState.at(measured, covariance)
             return measured
+
+        # predict, then update by the measurement
         self._interval = dt
         self.intervals.append(dt)
         self.state = self.state.predicted(dt, self._settings).updated(measured, covariance)
@@ -321,7 +330,7 @@ class CameraMotion:
 
 @dataclass(frozen=True, eq=False)
 class CameraVelocity:
-    """How the world moves in the camera frame: ``X(t) = exp(angular t) X(0) + linear t``.
+    """Velocity of the world in the camera frame: ``X(t) = exp(angular t) X(0) + linear t``.
 
     Attributes:
         linear: ``[3]``, metres a second.
@@ -332,17 +341,18 @@ class CameraVelocity:
     angular: Array
 
     @classmethod
-    def between(cls, before: Array, now: Array, seconds: float) -> CameraVelocity:
+    def between(cls, T_earlier: Array, T_later: Array, seconds: float) -> CameraVelocity:
         """The velocity between two world-to-camera poses ``[4, 4]``, in the camera frame of the later one.
 
         Args:
-            before: The earlier pose.
-            now: The later pose.
+            T_earlier: The earlier pose.
+            T_later: The later pose.
             seconds: The time between them.
         """
-        angular = se3.rotation_vectors(now[:3, :3] @ before[:3, :3].T) / seconds
-        moved_back = se3.inverse(before)[:3, 3] - se3.inverse(now)[:3, 3]
-        return cls(now[:3, :3] @ moved_back / seconds, angular)
+        angular = se3.rotation_vectors(T_later[:3, :3] @ T_earlier[:3, :3].T) / seconds
+        # the world moves against the camera's centre
+        moved_back = se3.inverse(T_earlier)[:3, 3] - se3.inverse(T_later)[:3, 3]
+        return cls(T_later[:3, :3] @ moved_back / seconds, angular)
 
 
 def compensate_rolling_shutter(
@@ -445,7 +455,7 @@ class RollingShutter:
         self,
         raw: Observations,
         observations: Observations,
-        fit: MapFit,
+        map_fit: MapFit,
         last: TrackedFrame,
         timestamp: float,
         *,
@@ -459,15 +469,15 @@ class RollingShutter:
         Args:
             raw: The measured features.
             observations: The features as `predicted` gave them.
-            fit: The pose so far, fitted to `observations`.
+            map_fit: The pose so far, fitted to `observations`.
             last: The last tracked frame.
             timestamp: The frame's stamp, seconds.
             force: Whether fewer points may agree, as before the first frame is compensated.
         """
-        pose = fit.estimate.T_cam_world
+        pose = map_fit.estimate.T_cam_world
         dt = timestamp - last.timestamp
         if not 0 < dt <= MAX_GAP_S:
-            return observations, fit, None
+            return observations, map_fit, None
 
         # velocity from the last pose; a camera exposes at a regular rate, however its frames were stamped
         usual = float(np.median(self._intervals)) if self._intervals else dt
@@ -479,9 +489,9 @@ class RollingShutter:
 
         # compensate by it and fit again
         compensated = compensate_rolling_shutter(raw, self._camera, velocity)
-        refit = fit_pose(self._camera, compensated, fit.matches, pose, fit.in_view)
-        if refit.count < MIN_AGREEING * fit.count and not force:
-            return observations, fit, None
+        refit = fit_pose(self._camera, compensated, map_fit.matches, pose, map_fit.in_view)
+        if refit.count < MIN_AGREEING * map_fit.count and not force:
+            return observations, map_fit, None
         return compensated, refit, velocity
 
 
@@ -521,7 +531,7 @@ def rescale(history: Sequence[FramePose], scales: Mapping[int, float]) -> None:
 
 
 def trajectory(
-    history: Sequence[FramePose], world: Map, settings: MotionModelSettings
+    history: Sequence[FramePose], slam_map: Map, settings: MotionModelSettings
 ) -> Trajectory:
     """Camera-to-world poses in the order of their stamps, smoothed where the settings say so.
 
@@ -530,13 +540,15 @@ def trajectory(
     """
     # frames of the root map, by stamp; of equal stamps the first
     frames = {
-        frame.timestamp: frame for frame in reversed(history) if world.kf_map[frame.reference] == 0
+        frame.timestamp: frame
+        for frame in reversed(history)
+        if slam_map.kf_map[frame.reference] == 0
     }
     stamps = np.array(sorted(frames), np.float64)
     ordered = [frames[stamp] for stamp in sorted(frames)]
 
     # world-to-camera poses by the keyframes as they are now
-    absolute = [frame.T_cam_ref @ world.kf_pose[frame.reference] for frame in ordered]
+    absolute = [frame.T_cam_ref @ slam_map.kf_pose[frame.reference] for frame in ordered]
     poses = np.array(absolute).reshape(-1, 4, 4)
 
     if settings.smooth and len(poses) > 2:

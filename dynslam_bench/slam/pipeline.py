@@ -38,7 +38,7 @@ from dynslam_bench.core.errors import TrackerError
 from dynslam_bench.core.seeding import derive_seed, stream
 from dynslam_bench.core.settings import OnlineSettings, Reconfigurable, Settings
 from dynslam_bench.culling.settings import GuardSettings
-from dynslam_bench.geometry import Camera, Trajectory, se3
+from dynslam_bench.geometry import Camera, Trajectory, pixel_index, se3
 from dynslam_bench.segmentation.postprocess import dynamic_mask
 from dynslam_bench.segmentation.settings import SegmentationSettings
 from dynslam_bench.slam.backend import RgbdBackend
@@ -91,7 +91,7 @@ class StageClock:
 
 @dataclass(frozen=True, eq=False)
 class PreviousFrame:
-    """What filters and flow read of the frame before.
+    """The previous frame, as filters and flow read it.
 
     Attributes:
         frame: The frame.
@@ -207,23 +207,29 @@ class SlamPipeline:
         state = self._filter_state(bundle)
 
         # static keypoints; flow runs on demand, on what the masks leave
-        static, image = self._cull(bundle, state, clock)
+        filter_result, image = self._cull(bundle, state, clock)
 
         # pose by the static keypoints, with mapping and loop closing
-        result = backend.track(bundle, static.keep, static.weight)
+        result = backend.track(bundle, filter_result.keep, filter_result.weight)
 
         # remember the frame for the next one; its pose only if it is in the root map's world
         pose = result.T_world_cam if result.state == backend.state == "ok" else None
-        self._previous = PreviousFrame(bundle, static.keep, image, pose)
+        self._previous = PreviousFrame(bundle, filter_result.keep, image, pose)
         self._keyframe_due = result.state != "ok" or bool(result.stats["keyframe"])
 
         # report; a detector in a thread of its own is not a part of the frame's time
         timings = clock.seconds | dict(result.timings)
         if self._masks is not None and self._masks.beside_s:
             timings["detector"] = self._masks.beside_s
-        stats = self._stats(bundle, state, static, result)
+        stats = self._stats(bundle, state, filter_result, result)
         return TrackResult(
-            result.T_world_cam, result.state, stats, timings, static.mask, keypoints.xy, static.keep
+            result.T_world_cam,
+            result.state,
+            stats,
+            timings,
+            filter_result.mask,
+            keypoints.xy,
+            filter_result.keep,
         )
 
     # ------------------------------------------------------------------ steps of a frame
@@ -287,9 +293,9 @@ class SlamPipeline:
 
         Returns:
             The filters' common verdict. Its stats are every filter's, each name with the filter's
-            before it, and how many of the last filters the guard set aside because too few
-            keypoints would be left. Beside it this frame's image as the flow prepared it, None if
-            no flow ran.
+            before it, how many of the last filters the guard set aside because too few keypoints
+            would be left, and how many masked keypoints it gave back. Beside it this frame's image
+            as the flow prepared it, None if no flow ran.
         """
         # each filter judges what the ones before have left
         image = None
@@ -306,18 +312,45 @@ class SlamPipeline:
                 stats[f"{dynamic_filter.name}_{key}"] = value
 
         # the starvation guard sets the last filters aside while too few keypoints would be left
-        keeps = [verdict.keep for verdict in verdicts]
-        keep, undone = combine_verdicts(keeps, self._guard, len(frame.xy))
+        keep, undone, returned = self._guarded(frame, verdicts)
         stats["guard_undone"] = float(undone)
+        stats["guard_returned"] = float(np.count_nonzero(returned))
 
-        # weights multiply and masks join, of the filters that count
+        # weights multiply and masks join, of the filters that count; what is given back counts in full
         counted = verdicts[: len(verdicts) - undone]
         weight = np.ones(len(frame.xy), np.float32)
         for verdict in counted:
             weight *= verdict.weight
+        weight[returned] = 1
         masks = [verdict.mask for verdict in counted if verdict.mask is not None]
         mask = np.logical_or.reduce(masks) if masks else None
         return FilterResult(keep, weight, stats, mask), image
+
+    def _guarded(
+        self, frame: FrameBundle, verdicts: Sequence[FilterResult]
+    ) -> tuple[NDArray[np.bool_], int, NDArray[np.bool_]]:
+        """The starvation guard: which keypoints are used, ``[N]``.
+
+        Beside them how many of the last verdicts it sets aside, and which masked keypoints ``[N]``
+        it gives back.
+        """
+        total = len(frame.xy)
+        needed = self._guard.needed(total)
+        keep, undone = combine_verdicts([verdict.keep for verdict in verdicts], total, needed)
+        returned = np.zeros(total, bool)
+
+        # the first verdict leaves enough, or there is no mask that tells which keypoints are the least doubtful
+        if undone < len(verdicts) or not verdicts:
+            return keep, undone, returned
+        first = verdicts[0]
+        mask = first.mask if frame.mask is None else frame.mask
+        if mask is None:
+            return keep, undone, returned
+
+        # masked keypoints are given back to a camera that is tracked; no map begins with them
+        if self._backend.state == "ok":
+            returned = least_masked(first.keep, mask, frame.keypoints.xy, needed)
+        return first.keep | returned, len(verdicts) - 1, returned
 
     def _run_flow(self, frame: FrameBundle, state: FilterState, clock: StageClock) -> Any:
         """Compute the flow to the previous image and the pose that it predicts.
@@ -347,15 +380,21 @@ class SlamPipeline:
         return image
 
     def _stats(
-        self, frame: FrameBundle, state: FilterState, static: FilterResult, result: TrackResult
+        self,
+        frame: FrameBundle,
+        state: FilterState,
+        filter_result: FilterResult,
+        result: TrackResult,
     ) -> dict[str, float]:
         """The frame's diagnostics, the same keys on every frame."""
         stats = {
             "keypoints": float(len(frame.xy)),
-            "culled": float(np.count_nonzero(~static.keep)),
+            "culled": float(np.count_nonzero(~filter_result.keep)),
             **{name: float(value) for name, value in result.stats.items()},
-            "mask_fraction": 0.0 if static.mask is None else float(static.mask.mean()),
-            **static.stats,
+            "mask_fraction": 0.0
+            if filter_result.mask is None
+            else float(filter_result.mask.mean()),
+            **filter_result.stats,
         }
         flow_stats = {} if state.flow is None else state.flow.stats
         for name in getattr(self._flow, "stats_names", ()):
@@ -453,7 +492,7 @@ def _depth_at(keypoints: Keypoints, depth: NDArray[np.float32]) -> NDArray[np.fl
 
 
 def combine_verdicts(
-    verdicts: Sequence[NDArray[np.bool_]], settings: GuardSettings, total: int
+    verdicts: Sequence[NDArray[np.bool_]], total: int, needed: int
 ) -> tuple[NDArray[np.bool_], int]:
     """The starvation guard: combine the filters' verdicts, without the last ones while too few features remain.
 
@@ -461,19 +500,42 @@ def combine_verdicts(
 
     Args:
         verdicts: bool ``[N]`` a filter, True = keep, in the order of application.
-        settings: How many features must remain.
         total: N.
+        needed: How many features must remain.
 
     Returns:
         The combined keep mask ``[N]`` and how many verdicts were set aside; with all set aside
         every feature is kept.
     """
-    needed = min(total, max(settings.min_features, int(np.ceil(settings.min_fraction * total))))
     for undone in range(len(verdicts)):
         keep = np.logical_and.reduce(verdicts[: len(verdicts) - undone])
         if np.count_nonzero(keep) >= needed:
             return keep, undone
     return np.ones(total, dtype=bool), len(verdicts)
+
+
+def least_masked(
+    keep: NDArray[np.bool_], mask: NDArray[np.bool_], xy: NDArray[np.floating], needed: int
+) -> NDArray[np.bool_]:
+    """The features that the starvation guard gives back: the fewest, nearest to the mask's outside first.
+
+    Args:
+        keep: bool ``[N]``, the features that are left, fewer than needed.
+        mask: bool ``[H, W]``, dynamic pixels.
+        xy: Raw pixels of the features ``[N, 2]``.
+        needed: How many features must remain.
+    """
+    # distance of each feature from the mask's outside
+    depth = cv2.distanceTransform(mask.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    at, _ = pixel_index(xy, mask.shape)
+    masked_px = depth[at]
+
+    # as many of the dropped ones as are missing
+    dropped = np.flatnonzero(~keep)
+    nearest = dropped[np.argsort(masked_px[dropped], kind="stable")]
+    returned = np.zeros(len(keep), bool)
+    returned[nearest[: max(0, needed - int(np.count_nonzero(keep)))]] = True
+    return returned
 
 
 def flow_to_previous(

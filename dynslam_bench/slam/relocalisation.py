@@ -129,12 +129,12 @@ laps none of 4,000 sections of 3 to 30 steps exceeded the share and half the ang
 
 
 def top_candidates(
-    world: Map, keyframes: Slots, observations: Observations, count: int
+    slam_map: Map, keyframes: Slots, observations: Observations, count: int
 ) -> list[int]:
     """The keyframes with the highest place-recognition scores.
 
     Args:
-        world: The map.
+        slam_map: The map.
         keyframes: Slots to choose from, ``[S]``.
         observations: The frame's features.
         count: How many to choose at most.
@@ -145,27 +145,27 @@ def top_candidates(
     """
     if len(keyframes) <= count or not len(observations):
         return list(map(int, keyframes[:count]))
-    scores = recognition_scores(world, keyframes, observations)
-    order = np.lexsort((-world.kf_id[keyframes], -scores))
+    scores = recognition_scores(slam_map, keyframes, observations)
+    order = np.lexsort((-slam_map.kf_id[keyframes], -scores))
     return list(map(int, keyframes[order[:count]]))
 
 
-def recognition_scores(world: Map, keyframes: Slots, observations: Observations) -> Array:
+def recognition_scores(slam_map: Map, keyframes: Slots, observations: Observations) -> Array:
     """Place-recognition scores ``[S]`` of keyframes; comparable within one call alone.
 
     The sum of the weights of the substrings that a keyframe shares with the frame, over the root of
     its number of points: many points share more by chance. The weight is the logarithm of how much
     rarer a substring is than all of the frame's together.
     """
-    _index_substrings(world)
+    _index_substrings(slam_map)
 
     # table of the frame's substrings by position and value: 0 if the frame has it, else -1
-    query = _substrings(observations.words)
+    query = _substrings(observations.descriptors)
     counts = np.full((len(query), VALUES), -1, np.int64)
     np.put_along_axis(counts, query.astype(np.int64), 0, axis=1)
 
     # how often all keyframes together have each of them
-    indexed = [world.substrings[slot][1] for slot in keyframes.tolist()]
+    indexed = [slam_map.substrings[slot][1] for slot in keyframes.tolist()]
     for substrings in indexed:
         _count_shared(substrings, counts)
 
@@ -177,22 +177,22 @@ def recognition_scores(world: Map, keyframes: Slots, observations: Observations)
     return np.asarray(scores / np.sqrt(points))
 
 
-def _substrings(words: Words) -> NDArray[np.uint16]:
+def _substrings(descriptors: Words) -> NDArray[np.uint16]:
     """Every `STRIDE`-th substring of descriptors ``[N, W]``, by position ``[P, N]``."""
-    return np.ascontiguousarray(words).view(np.uint16)[:, ::STRIDE].T
+    return np.ascontiguousarray(descriptors).view(np.uint16)[:, ::STRIDE].T
 
 
-def _index_substrings(world: Map) -> None:
+def _index_substrings(slam_map: Map) -> None:
     """Sort the substrings of new keyframes, and of those that have gained or lost many points."""
-    observed = np.count_nonzero(world.kf_point >= 0, axis=1)
-    for slot in np.flatnonzero(world.kf_alive).tolist():
-        keyframe, substrings = world.substrings.get(slot, (-1, np.zeros((0, 0), np.uint16)))
-        new = keyframe != world.kf_id[slot]
+    observed = np.count_nonzero(slam_map.kf_point >= 0, axis=1)
+    for slot in np.flatnonzero(slam_map.kf_alive).tolist():
+        keyframe, substrings = slam_map.substrings.get(slot, (-1, np.zeros((0, 0), np.uint16)))
+        new = keyframe != slam_map.kf_id[slot]
         count = substrings.shape[1]
         if new or abs(observed[slot] - count) > CHANGED * count:
-            words = world.kf_words[slot, world.kf_point[slot] >= 0]
-            columns = np.ascontiguousarray(_substrings(words))
-            world.substrings[slot] = int(world.kf_id[slot]), np.sort(columns)
+            descriptors = slam_map.kf_descriptor[slot, slam_map.kf_point[slot] >= 0]
+            columns = np.ascontiguousarray(_substrings(descriptors))
+            slam_map.substrings[slot] = int(slam_map.kf_id[slot]), np.sort(columns)
 
 
 @kernel
@@ -217,15 +217,18 @@ def _sum_weights(substrings: NDArray[np.uint16], weight: NDArray[np.float64]) ->
 # ---------------------------------------------------------------------- pose
 
 
-def match_keyframe(world: Map, keyframe: int, observations: Observations) -> Matches:
+def match_keyframe(slam_map: Map, keyframe: int, observations: Observations) -> Matches:
     """Match a frame's features to those of a keyframe that observe map points, by descriptor alone."""
-    point = world.kf_point[keyframe, : world.kf_count[keyframe]]
+    point = slam_map.kf_point[keyframe, : slam_map.kf_count[keyframe]]
     rows = np.flatnonzero(point >= 0)
     feature, row = match_brute_force(
-        observations.words, world.kf_words[keyframe, rows], max_distance=MAX_DISTANCE, ratio=RATIO
+        observations.descriptors,
+        slam_map.kf_descriptor[keyframe, rows],
+        max_distance=MAX_DISTANCE,
+        ratio=RATIO,
     )
     slots = point[rows[row]].astype(np.int64)
-    return Matches(feature, slots, world.position[slots])
+    return Matches(feature, slots, slam_map.position[slots])
 
 
 def ransac_pose(
@@ -277,7 +280,7 @@ def _triples(n: int, count: int, rng: np.random.Generator) -> Slots:
     a = rng.integers(n, size=count)
     b = rng.integers(n - 1, size=count)
     c = rng.integers(n - 2, size=count)
-    # skip the indices that are taken
+    # skip the indices that are taken, so that the three differ
     b += b >= a
     for other in (np.minimum(a, b), np.maximum(a, b)):
         c += c >= other
@@ -287,6 +290,7 @@ def _triples(n: int, count: int, rng: np.random.Generator) -> Slots:
 def _three_point_poses(position: Array, xy: Array, camera: Camera) -> Array:
     """All poses ``[H, 4, 4]``, world to camera, that fit any of the samples ``[S, 3, 3]`` and ``[S, 3, 2]``."""
     solutions = [np.zeros((0, 6))]
+    # up to four poses a sample, as rotation vector and translation (AP3P)
     for points, pixels in zip(position, xy, strict=True):
         try:
             _, rotations, translations = cv2.solveP3P(
@@ -297,6 +301,8 @@ def _three_point_poses(position: Array, xy: Array, camera: Camera) -> Array:
             continue
         vectors = np.reshape(rotations, (-1, 3))
         solutions.append(np.hstack([vectors, np.reshape(translations, (-1, 3))]))
+
+    # as matrices, without solutions that are no numbers
     flat = np.concatenate(solutions)
     flat = flat[np.isfinite(flat).all(axis=1)]
     poses = np.tile(np.eye(4), (len(flat), 1, 1))
@@ -306,7 +312,7 @@ def _three_point_poses(position: Array, xy: Array, camera: Camera) -> Array:
 
 
 def _ransac_place(
-    world: Map,
+    slam_map: Map,
     keyframe: int,
     observations: Observations,
     matches: Matches,
@@ -314,9 +320,9 @@ def _ransac_place(
     min_inliers: int,
 ) -> InitialPose | None:
     """The RANSAC pose of matches with a keyframe; None where fewer than `min_inliers` fit it."""
-    f = matches.feature
+    feature = matches.feature
     ransac = ransac_pose(
-        matches.position, observations.xy[f], observations.info[f], world.camera, rng
+        matches.position, observations.xy[feature], observations.info[feature], slam_map.camera, rng
     )
     if ransac is None:
         return None
@@ -327,7 +333,7 @@ def _ransac_place(
 
 
 def pnp_poses(
-    world: Map,
+    slam_map: Map,
     keyframes: list[int],
     observations: Observations,
     rng: np.random.Generator,
@@ -336,7 +342,7 @@ def pnp_poses(
     """Poses by descriptor matches: a good one at once, the others after all candidates, the best first.
 
     Args:
-        world: The map.
+        slam_map: The map.
         keyframes: Slots to match against; the ones with the most matches are tried first.
         observations: The frame's features.
         rng: Draws RANSAC's samples.
@@ -346,18 +352,20 @@ def pnp_poses(
         return
 
     # keyframes with the most descriptor matches first, of equal ones the newer
-    matched = [(match_keyframe(world, keyframe, observations), keyframe) for keyframe in keyframes]
-    matched.sort(key=lambda pair: (-len(pair[0]), -int(world.kf_id[pair[1]])))
+    matched = [
+        (match_keyframe(slam_map, keyframe, observations), keyframe) for keyframe in keyframes
+    ]
+    matched.sort(key=lambda pair: (-len(pair[0]), -int(slam_map.kf_id[pair[1]])))
     others: list[InitialPose] = []
     for matches, keyframe in matched[:PNP_CANDIDATES]:
         if len(matches) < max(MIN_PNP_INLIERS, min_inliers // 3):
             break
 
         # a pose by RANSAC, fitted to its inliers
-        place = _ransac_place(world, keyframe, observations, matches, rng, MIN_PNP_INLIERS)
+        place = _ransac_place(slam_map, keyframe, observations, matches, rng, MIN_PNP_INLIERS)
         if place is None:
             continue
-        estimate = solve(world.camera, observations, place.matches, place.T_cam_world)
+        estimate = solve(slam_map.camera, observations, place.matches, place.T_cam_world)
         inliers = place.matches.select(estimate.inliers)
         candidate = InitialPose(estimate.T_cam_world, inliers, keyframe)
         if estimate.count >= 2 * min_inliers:
@@ -371,12 +379,12 @@ def pnp_poses(
 
 
 def verify_place(
-    world: Map, candidate: InitialPose, observations: Observations, settings: TrackingSettings
+    slam_map: Map, candidate: InitialPose, observations: Observations, settings: TrackingSettings
 ) -> InitialPose:
     """Match all points around a keyframe, and fit the pose to them, again while that gives more matches.
 
     Args:
-        world: The map.
+        slam_map: The map.
         candidate: A pose, the matches that agree on it, and the keyframe.
         observations: The frame's features.
         settings: Radius and descriptor distances.
@@ -385,29 +393,30 @@ def verify_place(
     matches = candidate.matches
 
     # match the points around and fit the pose, while that gives more inliers
-    points = world.points_of(around(world, keyframe))
-    estimate = solve(world.camera, observations, matches, candidate.T_cam_world)
+    points = slam_map.points_of(around(slam_map, keyframe))
+    estimate = solve(slam_map.camera, observations, matches, candidate.T_cam_world)
     for _ in range(ROUNDS):
-        before = len(matches)
+        count = len(matches)
         more, _ = match_map(
-            world, observations, estimate.T_cam_world, matches, points, settings, WIDEN
+            slam_map, observations, estimate.T_cam_world, matches, points, settings, WIDEN
         )
         joined = matches.joined(more)
-        estimate = solve(world.camera, observations, joined, estimate.T_cam_world)
+        estimate = solve(slam_map.camera, observations, joined, estimate.T_cam_world)
         matches = joined.select(estimate.inliers)
-        if len(matches) <= before:
+        if len(matches) <= count:
             break
     T_cam_world = estimate.T_cam_world
 
     # share of the keyframe's own points in view, and behind no mask, that is matched
-    own = world.kf_point[keyframe]
-    in_view, uv, *_ = world.project(T_cam_world, own[own >= 0].astype(np.int64))
+    own = slam_map.kf_point[keyframe]
+    in_view, uv, *_ = slam_map.project(T_cam_world, own[own >= 0].astype(np.int64))
     if observations.mask is not None:
         # the distortion is less than what masks are dilated by
         pixels, _ = pixel_index(uv, observations.mask.shape)
         in_view = in_view[~observations.mask[pixels]]
     share = float(np.isin(in_view, matches.point).mean()) if len(in_view) else 0.0
 
+    # depth of the place, which distances there are compared with
     depth = np.nan
     if len(matches):
         depth = float(np.median(se3.transform(T_cam_world, matches.position)[:, 2]))
@@ -415,7 +424,7 @@ def verify_place(
 
 
 def recognise_place(
-    world: Map,
+    slam_map: Map,
     keyframe: int,
     observations: Observations,
     settings: TrackingSettings,
@@ -426,7 +435,7 @@ def recognise_place(
     """The verified pose at a keyframe's place; None with too few matches by descriptor or inliers of RANSAC.
 
     Args:
-        world: The map.
+        slam_map: The map.
         keyframe: Slot of the keyframe.
         observations: The frame's features.
         settings: Radius and descriptor distances.
@@ -434,15 +443,15 @@ def recognise_place(
         min_matches: Matches by descriptor that are needed.
         min_inliers: Inliers of RANSAC that are needed.
     """
-    matches = match_keyframe(world, keyframe, observations)
+    matches = match_keyframe(slam_map, keyframe, observations)
     if len(matches) < min_matches:
         return None
-    candidate = _ransac_place(world, keyframe, observations, matches, rng, min_inliers)
-    return None if candidate is None else verify_place(world, candidate, observations, settings)
+    candidate = _ransac_place(slam_map, keyframe, observations, matches, rng, min_inliers)
+    return None if candidate is None else verify_place(slam_map, candidate, observations, settings)
 
 
 def pose_uncertainty(
-    world: Map, observations: Observations, place: InitialPose, rng: np.random.Generator
+    slam_map: Map, observations: Observations, place: InitialPose, rng: np.random.Generator
 ) -> float:
     """How badly the matches determine the pose, e.g. those on one distant poster; up to 1 is precise enough.
 
@@ -451,7 +460,7 @@ def pose_uncertainty(
     not settle it.
 
     Args:
-        world: The map.
+        slam_map: The map.
         observations: The frame's features.
         place: The place, with matches and pose.
         rng: Draws the halves.
@@ -466,7 +475,7 @@ def pose_uncertainty(
     # dilution of precision: position's uncertainty by the inner matches, with the information of one
     off_centre = np.abs(xy - np.median(xy, axis=0)).max(axis=1)
     inner_matches = matches.select(off_centre <= np.quantile(off_centre, INNER_SHARE))
-    inner = solve(world.camera, observations, inner_matches, T_cam_world)
+    inner = solve(slam_map.camera, observations, inner_matches, T_cam_world)
     if inner.count < MIN_SPREAD_MATCHES // 2:
         return np.inf
     covariance = pose_covariance(inner.T_cam_world, inner.information, inner.count)
@@ -475,7 +484,7 @@ def pose_uncertainty(
     # spread of the positions by random halves of the matches
     halves = [matches.select(rng.permutation(count) < count // 2) for _ in range(SPLITS)]
     poses = np.array(
-        [solve(world.camera, observations, half, T_cam_world).T_cam_world for half in halves]
+        [solve(slam_map.camera, observations, half, T_cam_world).T_cam_world for half in halves]
     )
     centres = se3.inverse(poses)[:, :3, 3]
     spread = np.sqrt(np.square(centres - np.median(centres, axis=0)).sum(axis=1).mean())
@@ -484,9 +493,9 @@ def pose_uncertainty(
     return worst if np.isfinite(worst) else np.inf
 
 
-def around(world: Map, keyframe: int) -> Slots:
+def around(slam_map: Map, keyframe: int) -> Slots:
     """Slots of a keyframe, first, and of those that share most points with it."""
-    near, _ = world.covisible(keyframe)
+    near, _ = slam_map.covisible(keyframe)
     return np.concatenate([[keyframe], near[:AROUND]]).astype(np.int64)
 
 
@@ -501,7 +510,7 @@ def contradict(one: InitialPose, other: InitialPose) -> bool:
 
 
 def is_aliased(
-    world: Map,
+    slam_map: Map,
     observations: Observations,
     hypotheses: Mapping[int, InitialPose],
     keyframes: Slots,
@@ -512,7 +521,7 @@ def is_aliased(
     """Whether a frame's features fit two places of one submap.
 
     Args:
-        world: The map.
+        slam_map: The map.
         observations: The features.
         hypotheses: The frame's pose by submap, as far as it is known.
         keyframes: Slots of the keyframes whose places may be others.
@@ -521,17 +530,17 @@ def is_aliased(
         possible: Whether the frame can have been taken in a submap at a world-to-camera pose.
     """
     min_share = ALIASING_SHARE * max(place.share for place in hypotheses.values())
-    for submap in np.unique(world.kf_map[keyframes]).tolist():
+    for submap in np.unique(slam_map.kf_map[keyframes]).tolist():
         places = [hypotheses[submap]] if submap in hypotheses else []
-        slots = keyframes[world.kf_map[keyframes] == submap]
-        for slot in top_candidates(world, slots, observations, ALIASING_CANDIDATES):
+        slots = keyframes[slam_map.kf_map[keyframes] == submap]
+        for slot in top_candidates(slam_map, slots, observations, ALIASING_CANDIDATES):
             # another place counts if it shows as much, and the camera can be there
             other = recognise_place(
-                world,
+                slam_map,
                 slot,
                 observations,
                 settings,
-                stream(seed, "lookalikes", int(world.kf_id[slot])),
+                stream(seed, "lookalikes", int(slam_map.kf_id[slot])),
                 min_matches=MIN_ALIASING_MATCHES // 2,
                 min_inliers=MIN_ALIASING_MATCHES // 3,
             )
@@ -575,16 +584,19 @@ class RotationEstimate:
             camera: Intrinsics without distortion.
         """
         # match the two images, and keep what fits one homography
-        before, now = match_brute_force(
-            self.observations.words, observations.words, max_distance=MAX_DISTANCE, ratio=RATIO
+        row_before, row_now = match_brute_force(
+            self.observations.descriptors,
+            observations.descriptors,
+            max_distance=MAX_DISTANCE,
+            ratio=RATIO,
         )
-        if len(before) < CONNECTED:
+        if len(row_before) < CONNECTED:
             return None
-        xy_before = self.observations.xy[before]
-        xy_now = observations.xy[now]
+        xy_before = self.observations.xy[row_before]
+        xy_now = observations.xy[row_now]
         homography, mask = cv2.findHomography(xy_before, xy_now, cv2.RANSAC, HOMOGRAPHY_PX)
-        fits = np.zeros(len(before), bool) if homography is None else mask.ravel() > 0
-        if np.count_nonzero(fits) < max(CONNECTED, CONNECTED_SHARE * len(before)):
+        fits = np.zeros(len(row_before), bool) if homography is None else mask.ravel() > 0
+        if np.count_nonzero(fits) < max(CONNECTED, CONNECTED_SHARE * len(row_before)):
             return None
 
         # the rotation that aligns their bearings best
@@ -628,7 +640,7 @@ def _bearings(xy: Array, camera: Camera) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class MotionBound:
-    """Where the camera can be.
+    """Bound on where the camera can be since it was tracked last.
 
     Attributes:
         atlas: Where the submaps may lie; the camera was tracked last in the active one.
@@ -711,8 +723,11 @@ class RelocalisationGate:
         A camera that moves fast, as on a car, may go on as the motion model has it: world-to-camera
         `prediction`.
         """
+        # rotation by the two images
         unrotated = RotationEstimate(last.observations, np.eye(3))
-        rotation = unrotated.advanced(observations, self._atlas.world.camera)
+        rotation = unrotated.advanced(observations, self._atlas.map.camera)
+
+        # distance: the predicted step, and what the largest speed adds to it
         centres = se3.inverse(np.stack([last.T_cam_world, prediction]))[:, :3, 3]
         step = float(np.linalg.norm(centres[1] - centres[0]))
         return MotionBound(
@@ -722,7 +737,7 @@ class RelocalisationGate:
     def _advance(self, observations: Observations) -> None:
         """Follow the rotation to the next image, until two images are not connected."""
         if self.rotation is not None:
-            self.rotation = self.rotation.advanced(observations, self._atlas.world.camera)
+            self.rotation = self.rotation.advanced(observations, self._atlas.map.camera)
 
     @property
     def slack(self) -> float:
@@ -793,7 +808,7 @@ class PoseSearch:
 
     def in_root_map(self) -> InitialPose | None:
         """The pose in the root map of a camera that is tracked in a submap, as strict as for a lost one."""
-        root_map = self.bound.atlas.world.submap(0)
+        root_map = self.bound.atlas.map.submap(0)
         pose = replace(self, keyframes=root_map, lost=True)._relocalise(MIN_MATCHES)
         if pose is None or len(pose.matches) < self.settings.relocalisation.min_inliers:
             return None
@@ -802,18 +817,18 @@ class PoseSearch:
     def _relocalise(self, min_inliers: int) -> InitialPose | None:
         """A pose by descriptors: from the reference keyframe, else from the best-ranked candidates."""
         rng = stream(self.seed, "relocalisation", self.frame)
-        world = self.bound.atlas.world
+        slam_map = self.bound.atlas.map
         least = self.settings.tracking.min_inliers
 
         # the camera was tracked in the frame before: it is near the reference keyframe
         if not self.lost:
-            for candidate in pnp_poses(world, [self.reference], self.observations, rng, least):
+            for candidate in pnp_poses(slam_map, [self.reference], self.observations, rng, least):
                 if len(candidate.matches) >= min_inliers and self._within_bound(candidate):
                     return candidate
 
         # the first of the best-ranked keyframes whose place is verified
-        keyframes = top_candidates(world, self.keyframes, self.observations, CANDIDATES)
-        for candidate in pnp_poses(world, keyframes, self.observations, rng, least):
+        keyframes = top_candidates(slam_map, self.keyframes, self.observations, CANDIDATES)
+        for candidate in pnp_poses(slam_map, keyframes, self.observations, rng, least):
             if len(candidate.matches) >= min_inliers:
                 pose = self._verified(candidate)
                 if pose is not None:
@@ -822,17 +837,17 @@ class PoseSearch:
 
     def _verified(self, candidate: InitialPose) -> InitialPose | None:
         """The pose at a candidate's place, if it is within the motion bound and the place is verified."""
-        world = self.bound.atlas.world
+        slam_map = self.bound.atlas.map
         observations = self.observations
         settings = self.settings
 
         # within the motion bound
-        submap = int(world.kf_map[candidate.keyframe])
+        submap = int(slam_map.kf_map[candidate.keyframe])
         if not self.bound.admits(submap, candidate.T_cam_world):
             return None
 
         # most of what should be in view is seen
-        place = verify_place(world, candidate, observations, settings.tracking)
+        place = verify_place(slam_map, candidate, observations, settings.tracking)
         factor = MANY_POINTS_SHARE if len(place.matches) >= MANY_POINTS else 1.0
         if place.share < factor * settings.relocalisation.min_share:
             return None
@@ -841,13 +856,13 @@ class PoseSearch:
 
         # the matches determine the pose well
         rng = stream(self.seed, "halves", self.frame)
-        uncertainty = pose_uncertainty(world, observations, place, rng)
+        uncertainty = pose_uncertainty(slam_map, observations, place, rng)
         if uncertainty > 1:
             return None
 
         # the features fit no second place
         aliased = is_aliased(
-            world,
+            slam_map,
             observations,
             {submap: place},
             self.keyframes,

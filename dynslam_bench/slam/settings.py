@@ -14,6 +14,7 @@ from dynslam_bench.core.errors import SettingsError
 from dynslam_bench.core.settings import Settings, names, tunable
 
 NO_DEPTH = "no effect: there is no depth"
+"""Why a setting is not used by a system without depth."""
 
 
 class TrackingSettings(Settings):

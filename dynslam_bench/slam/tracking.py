@@ -27,7 +27,7 @@ MARGIN_PX = 8.0
 LAST_FRAME_RATIO = 0.9
 """Largest ratio of nearest to second nearest descriptor distance in the search of the last frame's points."""
 MAP_RATIO = 0.85
-"""Largest such ratio in the search of the local map's points."""
+"""Largest ratio of nearest to second nearest descriptor distance in the search of the local map's points."""
 FRONTAL_COSINE = 0.998
 """Points seen within this cosine of their mean viewing direction have the narrow search window (ORB-SLAM2)."""
 OBLIQUE_FACTOR = 1.6
@@ -141,7 +141,7 @@ class InitialPose:
 
 
 class LastFrameSearch(NamedTuple):
-    """How the last frame's points are searched in the new frame.
+    """A search of the last frame's points in the new frame.
 
     Attributes:
         widen: Factor on the search window.
@@ -163,7 +163,7 @@ LAST_FRAME_SEARCHES = (
 
 
 def pose_from_last_frame(
-    world: Map,
+    slam_map: Map,
     last: TrackedFrame,
     observations: Observations,
     prediction: Array,
@@ -173,7 +173,7 @@ def pose_from_last_frame(
     """The best pose from the last frame; each search is wider than the one before, until a pose is trusted.
 
     Args:
-        world: The map.
+        slam_map: The map.
         last: The last tracked frame.
         observations: The new frame's features.
         prediction: Its world-to-camera pose by the motion model.
@@ -184,19 +184,21 @@ def pose_from_last_frame(
     for search in LAST_FRAME_SEARCHES:
         # match around the predicted projections
         matches = match_last_frame(
-            world,
+            slam_map,
             last,
             observations,
             prediction,
             search.widen * settings.radius_px,
-            CLOSE_BASELINES * world.camera.baseline_m if search.uses_depth else 0.0,
+            CLOSE_BASELINES * slam_map.camera.baseline_m if search.uses_depth else 0.0,
             settings.max_distance,
         )
         if len(matches) < search.min_matches:
             continue
 
         # fit the pose; the one with the most inliers is kept
-        estimate = solve(world.camera, observations, matches, prediction, rounds=LAST_FRAME_ROUNDS)
+        estimate = solve(
+            slam_map.camera, observations, matches, prediction, rounds=LAST_FRAME_ROUNDS
+        )
         if estimate.count >= MIN_MATCHES and (best is None or estimate.count > len(best.matches)):
             inliers = matches.select(estimate.inliers)
             best = InitialPose(estimate.T_cam_world, inliers, reference, relocalised=False)
@@ -209,7 +211,7 @@ def pose_from_last_frame(
 
 
 def match_last_frame(
-    world: Map,
+    slam_map: Map,
     last: TrackedFrame,
     observations: Observations,
     T_cam_world: Array,
@@ -223,7 +225,7 @@ def match_last_frame(
     `close_m`.
 
     Args:
-        world: The map.
+        slam_map: The map.
         last: The last tracked frame.
         observations: The new frame's features.
         T_cam_world: Predicted pose of the new frame.
@@ -232,13 +234,13 @@ def match_last_frame(
             alone.
         max_distance: Largest Hamming distance.
     """
-    camera = world.camera
+    camera = slam_map.camera
     last_observations = last.observations
 
     # the points' positions in the world: of the map, or from the last frame's depth
     mapped = last.point >= 0
     rows = np.flatnonzero(mapped | (last_observations.z > 0) & (last_observations.z < close_m))
-    position = world.position[last.point[rows]]
+    position = slam_map.position[last.point[rows]]
     unmapped = ~mapped[rows]
     in_last_camera = camera.unproject(
         last_observations.xy[rows[unmapped]], last_observations.z[rows[unmapped]]
@@ -259,9 +261,9 @@ def match_last_frame(
     feature = search_in_radius(
         observations,
         np.ones(len(observations.xy), bool),
-        (uv, right, radius_px * world.scales[octave]),
+        (uv, right, radius_px * slam_map.scales[octave]),
         octave,
-        last_observations.words[rows],
+        last_observations.descriptors[rows],
         max_distance=max_distance,
         ratio=LAST_FRAME_RATIO,
     )
@@ -275,7 +277,7 @@ def match_last_frame(
 
 
 def match_map(
-    world: Map,
+    slam_map: Map,
     observations: Observations,
     T_cam_world: Array,
     matches: Matches,
@@ -286,7 +288,7 @@ def match_map(
     """Match map points in view to the features that have no match yet.
 
     Args:
-        world: The map.
+        slam_map: The map.
         observations: The new frame's features.
         T_cam_world: Its pose so far.
         matches: Matches so far; their features and points are left alone.
@@ -298,7 +300,7 @@ def match_map(
         New matches, and the slots of all candidates in view (matched or not).
     """
     # points that should be in view and have no match yet, features that have none
-    points, uv, right, octave, cosine = world.project(T_cam_world, candidates)
+    points, uv, right, octave, cosine = slam_map.project(T_cam_world, candidates)
     rest = ~np.isin(points, matches.point)
     wanted = points[rest]
     free = np.ones(len(observations.xy), bool)
@@ -306,19 +308,19 @@ def match_map(
 
     # match by descriptor; the window grows with the octave, and away from the usual viewing direction
     view_factor = np.where(cosine > FRONTAL_COSINE, 1.0, OBLIQUE_FACTOR)
-    radius = settings.map_radius_px * widen * view_factor * world.scales[octave]
+    radius = settings.map_radius_px * widen * view_factor * slam_map.scales[octave]
     feature = search_in_radius(
         observations,
         free,
         (uv[rest], right[rest], radius[rest]),
         octave[rest],
-        world.words[wanted],
+        slam_map.descriptor[wanted],
         max_distance=settings.max_distance,
         ratio=MAP_RATIO,
     )
     matched = feature >= 0
     matched_points = wanted[matched]
-    return Matches(feature[matched], matched_points, world.position[matched_points]), points
+    return Matches(feature[matched], matched_points, slam_map.position[matched_points]), points
 
 
 def solve(
@@ -330,14 +332,14 @@ def solve(
     rounds: int = 4,
 ) -> PoseEstimate:
     """The world-to-camera pose ``[4, 4]`` that fits the matches, starting from a given one."""
-    f = matches.feature
+    feature = matches.feature
     return optimise_pose(
         T_cam_world,
         matches.position,
-        observations.xy[f],
-        observations.right[f],
-        observations.info[f],
-        observations.info_right[f],
+        observations.xy[feature],
+        observations.right[feature],
+        observations.info[feature],
+        observations.info_right[feature],
         camera,
         rounds=rounds,
     )
@@ -372,7 +374,7 @@ def fit_pose(
 
 
 def track_local_map(
-    world: Map,
+    slam_map: Map,
     observations: Observations,
     matches: Matches,
     T_cam_world: Array,
@@ -384,21 +386,22 @@ def track_local_map(
     Points that only the last frame's depth gives are left out where there are enough map points.
 
     Args:
-        world: The map.
+        slam_map: The map.
         observations: The frame's features.
         matches: Matches of the initial pose.
         T_cam_world: The initial pose.
         candidates: Slots of the points of the local map.
         settings: Radius, descriptor distance and number of inliers.
     """
-    more, in_view = match_map(world, observations, T_cam_world, matches, candidates, settings)
+    # points of the local map that are in view and have no match yet
+    more, in_view = match_map(slam_map, observations, T_cam_world, matches, candidates, settings)
     matches = matches.joined(more)
 
     # enough map points: leave out what only the last frame's depth gives
     mapped = matches.point >= 0
     if np.count_nonzero(mapped) >= 2 * settings.min_inliers:
         matches = matches.select(mapped)
-    return fit_pose(world.camera, observations, matches, T_cam_world, in_view)
+    return fit_pose(slam_map.camera, observations, matches, T_cam_world, in_view)
 
 
 # ---------------------------------------------------------------------- the local map
@@ -412,58 +415,62 @@ class LocalMap:
     projection, the pose would jump there, and the path since would keep its drift.
 
     Args:
-        world: The map.
+        slam_map: The map.
         connected_only: Whether loops are closed.
     """
 
-    def __init__(self, world: Map, *, connected_only: bool) -> None:
-        self._world = world
+    def __init__(self, slam_map: Map, *, connected_only: bool) -> None:
+        self._map = slam_map
         self._connected_only = connected_only
         self._computed_for: tuple[int, int] | None = None
 
     def around(self, reference: int) -> tuple[Slots, Slots]:
         """Slots of the keyframes around one, oldest first, and slots of the points to match there."""
-        world = self._world
-        if self._computed_for != (reference, world.next_keyframe):
-            self._computed_for = reference, world.next_keyframe
-            self._keyframes = world.keyframes
-            self._points = world.points
+        slam_map = self._map
+        if self._computed_for != (reference, slam_map.next_keyframe):
+            self._computed_for = reference, slam_map.next_keyframe
+            self._keyframes = slam_map.keyframes
+            self._points = slam_map.points
             # with loop closing, what the covisibility graph does not reach is left to the loop closer
-            distant = unconnected(world, reference) if self._connected_only else ()
+            distant = unconnected(slam_map, reference) if self._connected_only else ()
             if len(distant):
                 self._keyframes = self._keyframes[~np.isin(self._keyframes, distant)]
-                self._points = world.points_of(self._keyframes)
+                self._points = slam_map.points_of(self._keyframes)
         return self._keyframes, self._points
 
 
-def unconnected(world: Map, keyframe: int, gap: int = MIN_KEYFRAME_GAP) -> Slots:
+def unconnected(slam_map: Map, keyframe: int, gap: int = MIN_KEYFRAME_GAP) -> Slots:
     """Slots of the keyframes made `gap` before or after one, or longer, that share no covisible keyframe with it.
 
     Those of other submaps always are.
     """
-    near, _ = world.covisible(keyframe)
-    further, _ = world.covisible_of(world.points_of(near))
-    return _long_ago(world, keyframe, gap, np.concatenate([near, further]))
+    # neighbours in the covisibility graph, and their neighbours
+    near, _ = slam_map.covisible(keyframe)
+    further, _ = slam_map.covisible_of(slam_map.points_of(near))
+    return _long_ago(slam_map, keyframe, gap, np.concatenate([near, further]))
 
 
-def weakly_connected(world: Map, keyframe: int, gap: int = MIN_KEYFRAME_GAP) -> Slots:
+def weakly_connected(slam_map: Map, keyframe: int, gap: int = MIN_KEYFRAME_GAP) -> Slots:
     """Slots of the keyframes made `gap` before or after one, or longer, that are not strongly covisible with it.
 
     Strong covisibility counts directly or over one third keyframe. After a loop that was closed
     inaccurately, a second visit is connected with the first by fewer points and drifts beside it:
     such a place may be recognised again. Keyframes of other submaps always may.
     """
-    near, shared = world.covisible(keyframe)
+    # neighbours by strong edges of the covisibility graph, and theirs
+    near, shared = slam_map.covisible(keyframe)
     near = near[shared >= STRONG_COVISIBILITY]
     further = []
     for neighbour in near.tolist():
-        second, second_shared = world.covisible(neighbour)
+        second, second_shared = slam_map.covisible(neighbour)
         further.append(second[second_shared >= STRONG_COVISIBILITY])
-    return _long_ago(world, keyframe, gap, np.concatenate([near, *further]))
+    return _long_ago(slam_map, keyframe, gap, np.concatenate([near, *further]))
 
 
-def _long_ago(world: Map, keyframe: int, gap: int, connected: Slots) -> Slots:
+def _long_ago(slam_map: Map, keyframe: int, gap: int, connected: Slots) -> Slots:
     """Slots of the keyframes made `gap` before or after one, or longer, without the connected; all of other submaps."""
-    long_ago = np.abs(world.kf_id - world.kf_id[keyframe]) >= gap
+    long_ago = np.abs(slam_map.kf_id - slam_map.kf_id[keyframe]) >= gap
     long_ago[connected] = False
-    return np.flatnonzero(world.kf_alive & (long_ago | (world.kf_map != world.kf_map[keyframe])))
+    return np.flatnonzero(
+        slam_map.kf_alive & (long_ago | (slam_map.kf_map != slam_map.kf_map[keyframe]))
+    )

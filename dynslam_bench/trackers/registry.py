@@ -1,6 +1,7 @@
 """All trackers by id: built in, from entry points, from the environment variable, from a file."""
 
 import inspect
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from hashlib import sha256
@@ -74,21 +75,22 @@ class TrackerRegistry(Registry[TrackerSpec]):
 
 
 def _bind(spec: TrackerSpec, value: str) -> TrackerSpec:
-    """The spec of ``id:value``; a named file's content becomes part of the version, and so of a run's identity."""
+    """The spec of ``id:value``; what a named file says becomes part of the version, and so of a run's identity."""
     if not value.strip():
         raise PluginError(
             f"'{spec.id}:' lacks its {spec.parameter}", f"write {spec.id}:{spec.parameter.upper()}"
         )
-    # a file's content is a part of the version
-    path = Path(value).expanduser()
-    content = f"+{sha256(path.read_bytes()).hexdigest()[:12]}" if path.is_file() else ""
-    described = load_object(spec.describe)(path) if spec.describe else {}
+    described = load_object(spec.describe)(value) if spec.describe else {}
 
-    # what the file says of itself replaces label, version and other fields
-    label = f"{spec.label}: {path.name if content else value}"
-    fields = {"label": label, "version": spec.version} | described
+    # what the file says of itself replaces label, version and other fields; else a file's content is
+    # a part of the version
+    fields = {"label": f"{spec.label}: {value}", "version": spec.version} | described
+    path = os.path.expanduser(value)  # noqa: PTH111 - it takes words that cannot be a path
+    if not described and os.path.isfile(path):  # noqa: PTH113
+        content = Path(path).read_bytes()
+        fields["label"] = f"{spec.label}: {Path(path).name}"
+        fields["version"] += f"+{sha256(content).hexdigest()[:12]}"
     fields["id"] = f"{spec.id}:{value}"
-    fields["version"] += content
     fields["parameter"] = ""
     return replace(spec, **fields, bound={**spec.bound, spec.parameter: value})
 

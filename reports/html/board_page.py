@@ -11,12 +11,21 @@ import numpy as np
 from dynslam_bench.core import setting_text
 from dynslam_bench.evaluation import Protocol
 from dynslam_bench.reports.figures import significant
-from dynslam_bench.reports.model.board import OVERALL, Board, Cell, compare_pairs
+from dynslam_bench.reports.model.answers import error_columns
+from dynslam_bench.reports.model.board import (
+    OVERALL,
+    Board,
+    Cell,
+    compare_pairs,
+    more_sequences,
+)
 from dynslam_bench.reports.model.row import SEEN, RunRow, grouped
-from dynslam_bench.reports.model.statistics import FLOOR_M, Interval, Scope, Standing, Verdict
+from dynslam_bench.reports.model.statistics import Interval, Scope, Standing, Verdict
 from dynslam_bench.reports.tables.leaderboard import (
+    error_cell,
     frame_time_cell,
     leaderboard_cells,
+    lost_words,
     median_of,
     rank_cell,
     run_link,
@@ -32,48 +41,73 @@ _OPPOSITE: dict[Verdict, str] = {
 """Verdict of one tracker against another to that of the other against the one."""
 MOST_LISTED = 5000
 """Runs that are listed one by one; of more, those that have a page, and the first of every cell."""
-MEANINGS = {
-    "static": "nothing moves",
-    "low dynamic": "people sit",
-    "high dynamic": "people walk",
-    "unknown objects": "objects of no class",
-    "fixed camera": "the camera stands still",
+
+
+GROUPS = {
+    0: "ranked",
+    1: "shown, not ranked",
+    2: "final trajectories only",
+    3: "monocular, scaled to the truth",
+    4: "bounds",
 }
-"""Categories in everyday words."""
+"""Groups of rows, in their order; a line is drawn between two of them."""
+_FINAL_ONLY = 2
+_MONOCULAR = 3
+_BOUND = 4
 
 
 def ranking_entries(
-    board: Board, whole: Board, boards: Mapping[str, Board], paged: Collection[str] = ()
+    board: Board,
+    whole: Board,
+    boards: Mapping[str, Board],
+    paged: Collection[str] = (),
+    monocular: Mapping[str, Board] | None = None,
 ) -> list[dict[str, Any]]:
     """The rows of one category, cells by the names that `board.html.j2` calls them by.
 
-    ``at`` numbers the tracker on all pages; ``group`` is 0 for ranked trackers, 1 for others, 2 for
-    controls (bounds). The name leads to the tracker's run with the median error on the first
-    sequence where that has a page, and the successes lead to its first failure.
+    ``at`` numbers the tracker on all pages; ``group`` is one of `GROUPS`. The name leads to the
+    tracker's run with the median error on the first sequence where that has a page, and the
+    successes lead to its first failure.
 
     Args:
         board: Of the category.
         whole: Of all sequences: the numbers of trackers.
         boards: Of all categories, for the column that shows them side by side.
         paged: Ids of the runs that have a page.
+        monocular: Boards of trackers whose scale comes from the truth, by category.
     """
     keys = [*whole.trackers, *whole.final_only]
     limits = _axis_limits([standing.ratio for standing in board.standings])
+    columns = error_columns(board)
     entries = []
-    for key in board.trackers:
+    for key in [*board.trackers, *board.final_only]:
         entry: dict[str, Any] = {"at": keys.index(key), "group": _entry_group(board, key)}
         cells = leaderboard_cells(board, key)
         entry |= _run_cells(board, key, cells, paged)
         entry |= _standing_cells(board, key, cells, limits)
         entry["by_category"] = _by_category(key, boards)
+        entry["errors"] = [error_cell(board, key, names) for names in columns.values()]
         entries.append(entry)
+
+    # monocular trackers are on a board of their own: their protocol is another one
+    apart = (monocular or {}).get(board.category)
+    if apart is not None:
+        for key in [*apart.trackers, *apart.final_only]:
+            cells = leaderboard_cells(apart, key)
+            entry = {"at": None, "group": _MONOCULAR} | _run_cells(apart, key, cells, paged)
+            entry |= {"rank": TableCell("–"), "ratio": TableCell(), "bar": {}, "by_category": []}
+            entry["verdict"] = TableCell("not ranked", "monocular: its scale is that of the truth")
+            entry["errors"] = [error_cell(apart, key, names) for names in columns.values()]
+            entries.append(entry)
     return sorted(entries, key=itemgetter("group"))
 
 
 def _entry_group(board: Board, key: str) -> int:
-    """0 for a ranked tracker, 1 for another one, 2 for a control."""
+    """Which of `GROUPS` a tracker is in."""
+    if key in board.final_only:
+        return _FINAL_ONLY
     if board.first(key).tracker.provenance == "control":
-        return 2
+        return _BOUND
     return int(key not in board.ranked)
 
 
@@ -129,7 +163,11 @@ def _standing_cells(
     """
     standing = board.standing_by_key.get(key)
     why_unranked = board.unranked_why(key)
-    verdict = TableCell("not ranked", why_unranked) if why_unranked else cells["better?"]
+    if key in board.final_only:
+        why_unranked = "final trajectory only"
+    verdict = TableCell("not ranked", why_unranked)
+    if not why_unranked:
+        verdict = _verdict_cell(board, standing, cells["better?"])
     if standing is None:
         return {
             "rank": TableCell("–"),
@@ -143,6 +181,20 @@ def _standing_cells(
         "bar": _interval_bar(standing.ratio, limits),
         "verdict": verdict,
     }
+
+
+def _verdict_cell(board: Board, standing: Standing | None, cell: TableCell) -> TableCell:
+    """The verdict with how far it goes, or with the sequences that would settle it; the p value is its tip."""
+    if standing is None or not cell.text:
+        return cell
+    small = lost_words(standing)
+    tip = "" if standing.p_value is None else f"p {standing.p_value:.2g}, Holm-corrected"
+    if standing.verdict == "cannot tell":
+        more = more_sequences(board, standing.key)
+        settle = f"about {more} more sequences would settle it" if more else ""
+        return replace(cell, small="; ".join(filter(None, [settle, small])), tip=tip)
+    text = f"{cell.text} {standing.scope}".strip()
+    return replace(cell, text=text, small=small, tip=tip)
 
 
 def _ratio_cell(board: Board, standing: Standing, cell: TableCell) -> TableCell:
@@ -171,13 +223,17 @@ def _axis_limits(ratios: Sequence[Interval]) -> tuple[float, float]:
     return math.log(lowest), math.log(highest)
 
 
+_SMALLEST = 1e-9
+"""Ratios below this are drawn as this, so that their logarithm exists."""
+
+
 def _interval_bar(ratio: Interval, limits: tuple[float, float]) -> dict[str, float]:
     """Places of a ratio, of the ends of its interval and of 1 on a logarithmic axis, in pixels; none of what is nan."""
     values = {"at": ratio.value, "low": ratio.low, "high": ratio.high, "one": 1.0}
     places_px = {}
     for name, value in values.items():
         if math.isfinite(value):
-            share = (math.log(max(value, FLOOR_M)) - limits[0]) / (limits[1] - limits[0])
+            share = (math.log(max(value, _SMALLEST)) - limits[0]) / (limits[1] - limits[0])
             places_px[name] = 4 + 112 * min(max(share, 0.0), 1.0)
     return places_px
 
@@ -191,7 +247,7 @@ def _by_category(key: str, boards: Mapping[str, Board]) -> list[tuple[str, float
             continue
         ratio = standing.ratio.value
         # -1 for a ratio of 1/8, 1 for one of 8
-        share = min(max(math.log(max(ratio, FLOOR_M)) / math.log(8), -1.0), 1.0)
+        share = min(max(math.log(max(ratio, _SMALLEST)) / math.log(8), -1.0), 1.0)
         dots.append((name, ratio, 12 - 8 * share))
     return dots
 
@@ -306,13 +362,12 @@ def ratios_data(board: Board) -> list[list[Any]]:
     tracker_at = {key: at for at, key in enumerate(keys)}
     verdicts = {standing.key: standing.verdict for standing in board.standings}
     scopes = {standing.key: standing.scope for standing in board.standings}
-    goes_beyond = board.ranked_sequences.can_go_beyond
     ratios = []
     # reversed: of the later tracker over the earlier one
     for pair in compare_pairs(board, keys[::-1]):
         # against the reference the verdict is the board's, which asks it of fewer pairs
         verdict: str = pair.verdict
-        scope: Scope = "beyond these families" if goes_beyond else "on these families"
+        scope: Scope = pair.scope
         if pair.other == board.reference:
             verdict = verdicts.get(pair.one, "")
             scope = scopes.get(pair.one, "")

@@ -82,11 +82,17 @@ def render(template: str, **values: Any) -> str:
         template: Name of the template.
         **values: What it shows; all pages need ``title``.
     """
+    return _templates().get_template(template).render(**values)
+
+
+@cache
+def _templates() -> Environment:
+    """The pages' templates; each is compiled when it is rendered first."""
     environment = Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, loader=FunctionLoader(resource)
     )
     environment.filters |= {"breakable": _breakable, "script": to_script, "figure": figure_json}
-    return environment.get_template(template).render(**values)
+    return environment
 
 
 def _breakable(name: str) -> Markup:

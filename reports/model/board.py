@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.core import ReportError, assignments, did_you_mean
 from dynslam_bench.evaluation import Protocol, get_protocol
+from dynslam_bench.evaluation.verdicts import FLOOR_M, scenes_needed
 from dynslam_bench.reports.model.load import check_one_protocol, load_runs, open_stores
 from dynslam_bench.reports.model.names import (
     OUR_BACK_END,
@@ -29,8 +30,10 @@ from dynslam_bench.reports.model.names import (
 )
 from dynslam_bench.reports.model.row import RunRow, command_with, grouped, part_options
 from dynslam_bench.reports.model.statistics import (
-    FLOOR_M,
+    FAMILY_ERROR,
+    FEWEST,
     Interval,
+    Scope,
     Sequences,
     Standing,
     Verdict,
@@ -41,8 +44,9 @@ from dynslam_bench.reports.model.statistics import (
     sequences_of,
     standings,
 )
-from dynslam_bench.runs.store import RunStore, part_words
-from dynslam_bench.sequences.families import family_of
+from dynslam_bench.runs.rows import part_words
+from dynslam_bench.runs.store import RunStore
+from dynslam_bench.sequences.families import family_of, same_path
 from dynslam_bench.sequences.tags import FIXED_CAMERA
 
 STATIC_CAMERA = "static camera (from ground truth)"
@@ -79,6 +83,8 @@ _MOVING_M = 1e-3
 """Errors of a static camera below this do not tell true paths apart: the camera hardly moves."""
 _SAME_STAMP_S = 1e-6
 """Difference of durations up to which they are equal: rounding in files."""
+_NEARLY = 0.1
+"""Relative difference of frames, durations and errors of a static camera up to which true poses are compared."""
 
 
 @dataclass
@@ -562,6 +568,14 @@ def common_logs(board: Board, keys: Sequence[str]) -> dict[str, NDArray[np.float
     }
 
 
+def without_lost(
+    board: Board, logs: NDArray[np.float64], lost: Collection[str]
+) -> NDArray[np.float64]:
+    """Logarithms of errors on the common sequences ``[S]``, nan on lost ones."""
+    is_lost = np.array([name in lost for name in board.common], dtype=bool)
+    return np.where(is_lost, np.nan, logs)
+
+
 def board_resolution(board: Board) -> tuple[float, float]:
     """Smallest differences, as shares, that a board shows in four of five: on these families, and beyond them.
 
@@ -585,10 +599,38 @@ def board_resolution(board: Board) -> tuple[float, float]:
 
     # lost cells take no part in a claim
     for key in others:
-        lost = board.lost(key) | base_lost
-        is_lost = np.array([name in lost for name in board.common], dtype=bool)
-        logs[key] = np.where(is_lost, np.nan, logs[key])
+        logs[key] = without_lost(board, logs[key], board.lost(key) | base_lost)
     return resolution(logs, base, board.ranked_sequences)
+
+
+MOST_FURTHER = 500
+"""Further sequences above which none are proposed: nobody runs so many to tell two trackers apart."""
+
+
+def more_sequences(board: Board, key: str) -> int | None:
+    """How many further sequences would tell a tracker from the reference, if the truth is what is measured here.
+
+    Returns:
+        None where that cannot be said: without a reference or a scatter, or for more than
+        `MOST_FURTHER`.
+    """
+    if board.reference is None or len(board.common) < FEWEST:
+        return None
+    logs = common_logs(board, [key, board.reference])
+    lost = board.lost(key) | board.lost(board.reference)
+    is_lost = np.array([name in lost for name in board.common], dtype=bool)
+    differences = logs[key] - logs[board.reference]
+    differences = differences[~is_lost & np.isfinite(differences)]
+    if len(differences) < FEWEST:
+        return None
+    spread = float(differences.std(ddof=1))
+    gain = 1.0 - math.exp(-abs(float(differences.mean())))
+    n_tests = max(len(board.ranked) - 1, 1)
+    if not (spread > 0 and gain > 0):
+        return None
+    needed = scenes_needed(gain, spread, FAMILY_ERROR / 2 / n_tests)
+    further = max(needed, len(differences) + 1) - len(differences)
+    return further if further <= MOST_FURTHER else None
 
 
 class Pair(NamedTuple):
@@ -597,40 +639,58 @@ class Pair(NamedTuple):
     Attributes:
         one: Variant key of the first tracker.
         other: That of the second.
-        ratio: Geometric mean of the errors of the first over those of the second.
-        sequences: Sequences that both have.
+        ratio: Geometric mean of the errors of the first over those of the second where both succeed; over all
+            sequences where they succeed on none together.
+        sequences: Sequences behind it.
+        lost: Sequences that the first alone lost, and the second alone.
         p_value: Holm-corrected over all pairs of ranked trackers; None unless both are ranked.
         verdict: Of the first; empty unless both are ranked.
+        scope: How far that goes.
     """
 
     one: str
     other: str
     ratio: Interval
     sequences: int
+    lost: tuple[int, int]
     p_value: float | None
     verdict: Verdict
+    scope: Scope
 
 
 def compare_pairs(board: Board, keys: Sequence[str]) -> list[Pair]:
     """Compare every two of some trackers that have a common sequence in common, in their order."""
     logs = common_logs(board, keys)
+    succeeded = {key: without_lost(board, logs[key], board.lost(key)) for key in keys}
     sequences = board.ranked_sequences
     tests = {}
     if board.common:
-        tests = separable({key: logs[key] for key in keys if key in board.ranked}, sequences)
+        ranked = {key: succeeded[key] for key in keys if key in board.ranked}
+        tests = separable(ranked, sequences)
     pairs = []
     for one, other in combinations(keys, 2):
-        # log ratios [S], nan where one of the two has no run
-        differences = logs[one] - logs[other]
+        # log ratios [S], nan where one of the two lost or has no run
+        differences = succeeded[one] - succeeded[other]
+        if not np.isfinite(differences).any():
+            differences = logs[one] - logs[other]
         n_sequences = int(np.isfinite(differences).sum())
         if not n_sequences:
             continue
         ratio = ratio_interval(differences, sequences)
-        (differ, p_value) = tests.get((one, other), (False, None))
-        verdict: Verdict = "" if p_value is None else "cannot tell"
-        if differ:
-            verdict = "better" if ratio.value < 1 else "worse"
-        pairs.append(Pair(one, other, ratio, n_sequences, p_value, verdict))
+        both_ran = {
+            name for name in board.common if name in board.cells[one] and name in board.cells[other]
+        }
+        lost = (
+            len(both_ran & board.lost(one) - board.lost(other)),
+            len(both_ran & board.lost(other) - board.lost(one)),
+        )
+        order = tests.get((one, other))
+        verdict: Verdict = "" if order is None else "cannot tell"
+        if order is not None and order.first_by:
+            verdict = "better" if order.first_by < 0 else "worse"
+        p_value = None if order is None else order.p_value
+        scope: Scope = "" if order is None else order.scope
+        pairs.append(Pair(one, other, ratio, n_sequences, lost, p_value, verdict, scope))
     return pairs
 
 
@@ -663,7 +723,9 @@ def _order_sequences(board: Board) -> None:
 
 
 def copies_of(columns: Mapping[str, Sequence[RunRow]]) -> dict[str, str]:
-    """Which sequences are others once more: equal frames, duration and error of a static camera that moves.
+    """Which sequences are others once more: the true poses are the same, and the camera moves.
+
+    Where the true poses are not here, as in a report, equal frames, duration and error of a static camera tell.
 
     Args:
         columns: Sequence to its rows, in order.
@@ -672,28 +734,47 @@ def copies_of(columns: Mapping[str, Sequence[RunRow]]) -> dict[str, str]:
         Sequence to the first one that it is a copy of; those that are no copies are not in it.
     """
     copies = {}
-    firsts: dict[tuple[int, int], list[tuple[str, float, float]]] = {}
+    firsts: dict[str, RunRow] = {}
     for name, rows in columns.items():
         # the truth of the earliest start: a run without ground truth tells nothing
         with_truth = [row for row in rows if row.static_camera_ate_rmse_m is not None]
         if not with_truth:
             continue
         first = min(with_truth, key=lambda row: (row.imported, row.offset))
-        static_m = first.static_camera_ate_rmse_m or 0.0
-        if static_m < _MOVING_M:
+        if (first.static_camera_ate_rmse_m or 0.0) < _MOVING_M:
             continue
-
-        # the sequences before it with as many frames from there
-        duration_s = first.sequence.duration_s
-        before = firsts.setdefault((first.offset, first.sequence.frames), [])
-        for other, other_m, other_s in before:
-            is_equal_m = math.isclose(static_m, other_m, rel_tol=_SAME_ERROR)
-            if is_equal_m and math.isclose(duration_s, other_s, abs_tol=_SAME_STAMP_S):
+        for other, other_row in firsts.items():
+            if _is_same_path(first, other_row):
                 copies[name] = other
                 break
         else:
-            before.append((name, static_m, duration_s))
+            firsts[name] = first
     return copies
+
+
+def _is_same_path(row: RunRow, other: RunRow) -> bool:
+    """Whether two runs are on one recording, whose camera moves."""
+    static_m = row.static_camera_ate_rmse_m or 0.0
+    other_m = other.static_camera_ate_rmse_m or 0.0
+    sequence = row.sequence
+    other_sequence = other.sequence
+
+    # by their numbers, however the poses are written
+    is_equal = (
+        (row.offset, sequence.frames) == (other.offset, other_sequence.frames)
+        and math.isclose(static_m, other_m, rel_tol=_SAME_ERROR)
+        and math.isclose(sequence.duration_s, other_sequence.duration_s, abs_tol=_SAME_STAMP_S)
+    )
+    if is_equal:
+        return True
+
+    # by the poses, of which a copy may lack a few; they are read where the rest is nearly equal
+    is_near = (
+        math.isclose(sequence.frames, other_sequence.frames, rel_tol=_NEARLY)
+        and math.isclose(sequence.duration_s, other_sequence.duration_s, rel_tol=_NEARLY)
+        and math.isclose(static_m, other_m, rel_tol=_NEARLY)
+    )
+    return is_near and same_path(row.ground_truth(), other.ground_truth())
 
 
 def copies_note(board: Board) -> str:
@@ -705,8 +786,8 @@ def copies_note(board: Board) -> str:
     if not shown:
         return ""
     return (
-        f"One recording counts once: {'; '.join(shown)}. Their true paths are the same: as many frames, the same "
-        "duration, and the same error of a static camera."
+        f"One recording counts once: {'; '.join(shown)}. Their true paths are the same: equal poses, or "
+        "as many frames, the same duration, and the same error of a static camera."
     )
 
 

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from dynslam_bench.core import DynslamError, ReportError
 from dynslam_bench.core.module_graph import PACKAGE, PLUMBING, module_graph
-from dynslam_bench.evaluation.protocol import MONOCULAR, Protocol
+from dynslam_bench.evaluation.protocol import MONOCULAR, PROTOCOLS, Protocol
 from dynslam_bench.reports.model.programs import choose_runs
 from dynslam_bench.reports.model.row import RunRow, grouped, make_row
 from dynslam_bench.reports.model.workers import WorkerPool, run_jobs
@@ -91,6 +91,9 @@ class Loaded:
         trials: How many were left out since they are trials of studies.
         unreadable: Folders without a valid record, with reasons.
         conflicts: Runs that should be equal and are not, in words.
+        monocular: One run of every variant, column and repeat of the trackers whose scale is
+            unknown, scored with the scale of the truth.
+        protocol_note: Why another protocol than the one asked for took its place; else empty.
     """
 
     rows: list[RunRow] = field(default_factory=list)
@@ -102,6 +105,67 @@ class Loaded:
     trials: int = 0
     unreadable: list[str] = field(default_factory=list)
     conflicts: list[str] = field(default_factory=list)
+    monocular: list[RunRow] = field(default_factory=list)
+    protocol_note: str = ""
+
+
+def load_for_report(
+    stores: Sequence[RunStore],
+    protocol: Protocol,
+    on_progress: OnProgress = no_progress,
+    pool: WorkerPool | None = None,
+    *,
+    trials: bool = False,
+) -> tuple[Loaded, Protocol]:
+    """Read all runs for a report in which nobody is left out.
+
+    Where all runs have final trajectories only, the protocol's variant for those takes its place.
+    Runs of monocular trackers are scored under its variant with Sim(3) alignment.
+
+    Args:
+        stores: As in `load_runs`.
+        protocol: As in `load_runs`.
+        on_progress: As in `load_runs`.
+        pool: As in `load_runs`.
+        trials: As in `load_runs`.
+
+    Returns:
+        The runs, and the protocol that they are scored under.
+
+    Raises:
+        ReportError: As `load_runs`.
+    """
+    scaled = PROTOCOLS.get(f"{protocol.id}-sim3")
+    try:
+        loaded = load_runs(stores, protocol, on_progress, pool, trials=trials)
+    except ReportError:
+        if scaled is None:
+            raise
+        # monocular trackers alone; where there is no run at all, this says so again
+        loaded = load_runs(stores, scaled, on_progress, pool, trials=trials)
+        words = "All trackers are monocular: they are scored with the scale of the truth"
+        loaded.protocol_note = f"{words}, under {scaled.id}."
+        return loaded, scaled
+
+    # final trajectories alone
+    final = PROTOCOLS.get(f"{protocol.id}-final")
+    if final is not None and all(map(_has_final_only, loaded.rows)):
+        loaded = load_runs(stores, final, on_progress, pool, trials=trials)
+        words = "All runs have final trajectories only, which use later frames"
+        loaded.protocol_note = f"{words}: they are scored under {final.id}."
+        protocol = final
+
+    # monocular trackers beside others
+    if loaded.without_scale and scaled is not None:
+        everything = load_runs(stores, scaled, on_progress, pool, trials=trials)
+        loaded.monocular = [row for row in everything.rows if row.tracker.sensors == "rgb"]
+        loaded.without_scale = 0
+    return loaded, protocol
+
+
+def _has_final_only(row: RunRow) -> bool:
+    """Whether nothing but the final trajectory of a run is known."""
+    return not row.metrics and row.final_ate_m is not None
 
 
 def load_runs(

@@ -21,8 +21,10 @@ from numpy.typing import NDArray
 from dynslam_bench.evaluation.verdicts import (
     FEWEST_FAMILIES,
     FEWEST_FREE,
+    FLOOR_M,
     FamilyTest,
     family_test,
+    loses_more_p,
     may_be_best,
     resolution_floor,
 )
@@ -32,15 +34,15 @@ Cells = Mapping[str, Mapping[str, Sequence[float]]]
 """Tracker to sequence to the errors of its runs there, in metres."""
 Verdict = Literal["better", "better, but lost", "worse", "cannot tell", "reference", ""]
 """How a tracker stands to the reference; empty for one that is not ranked."""
-Scope = Literal["", "on these families", "beyond these families"]
-"""How far a verdict goes; empty where nothing is claimed."""
+Scope = Literal["", "on these families", "beyond these families", "by lost sequences"]
+"""How far a verdict goes, or that losses alone show it; empty where nothing is claimed."""
 
-FLOOR_M = 1e-6
-"""Errors below a micrometre count as one, so that their logarithm exists."""
 FEWEST = 5
 """Sequences below which no interval is given and no two trackers are called different."""
 FAMILY_ERROR = 0.04
 """Chance of any wrong claim in one family of tests; below 5 % since errors are only about log-normal."""
+LOSS_ERROR = 0.01
+"""Chance of any wrong claim by losses alone: with `FAMILY_ERROR` 5 % for all that is said of these families."""
 
 
 @dataclass(frozen=True)
@@ -152,6 +154,8 @@ def standings(
     Returns:
         The ranked trackers from the best to the worst, then the others by their ratio.
     """
+    if not cells or not reference:
+        return []
     names = list(reference)
     sequences = sequences_of(names, families, weights)
     base = log_medians(reference, names)
@@ -177,8 +181,9 @@ def standings(
         np.reshape([*ranked_logs.values()], (len(ranked), len(names))), axis=0
     )
     mean_ranks = dict(zip(ranked, by_sequence.mean(axis=1).tolist(), strict=True))
-    groups = rank_groups(ranked_logs, sequences)
-    best = candidates_for_best(ranked_logs, sequences)
+    succeeded = {key: np.where(is_lost[key], np.nan, log) for key, log in ranked_logs.items()}
+    groups = rank_groups(succeeded, sequences)
+    best = candidates_for_best(succeeded, sequences)
 
     unordered = []
     for key, log in logs.items():
@@ -253,6 +258,47 @@ def ratio_interval(log_ratios: Array, sequences: Sequences) -> Interval:
     return Interval(mean, low, high)
 
 
+class Duel(NamedTuple):
+    """Two trackers on the sequences where both succeed, and what they lost.
+
+    Attributes:
+        test: Of the log ratios of the first to the second.
+        lost: Sequences that the first alone lost, and the second alone.
+    """
+
+    test: FamilyTest
+    lost: tuple[int, int]
+
+    @property
+    def loses_more_p(self) -> float:
+        """One-sided p value of the first losing no more sequences than the second."""
+        return loses_more_p(*self.lost)
+
+    @property
+    def difference_by_losses_p(self) -> float:
+        """Two-sided p value of both losing as many."""
+        return min(1.0, 2.0 * min(loses_more_p(*self.lost), loses_more_p(*self.lost[::-1])))
+
+
+def duel(log: Array, other: Array, sequences: Sequences) -> Duel:
+    """Compare two trackers; with fewer than `FEWEST` sequences where both succeed only their losses tell.
+
+    Args:
+        log: Log errors of the first ``[S]``; nan where it lost.
+        other: Those of the second.
+        sequences: The sequences.
+    """
+    differences = log - other
+    tested = sequences.test(differences)
+    if np.isfinite(differences).sum() < FEWEST:
+        tested = tested._replace(these_p=1.0, beyond_p=1.0)
+    is_lost = ~np.isfinite(log)
+    other_is_lost = ~np.isfinite(other)
+    lost = int((is_lost & ~other_is_lost).sum())
+    lost_by_other = int((other_is_lost & ~is_lost).sum())
+    return Duel(tested, (lost, lost_by_other))
+
+
 def claims_against(
     logs: Mapping[str, Array],
     base: Array,
@@ -263,7 +309,8 @@ def claims_against(
     """Whether each tracker is better than the reference, Holm-corrected over the trackers.
 
     All claims of a board beyond its families are right together with a chance of at least 95 % (a
-    family-wise error of `FAMILY_ERROR`), and so are all claims on these families.
+    family-wise error of `FAMILY_ERROR`), and so are all claims on these families, where claims by lost
+    sequences alone (McNemar's exact test) have `LOSS_ERROR`.
 
     Args:
         logs: Tracker to the logarithms of its median errors ``[S]``.
@@ -276,17 +323,18 @@ def claims_against(
     others = [key for key, log in logs.items() if not np.array_equal(log, base)]
     if not others or len(base) < FEWEST:
         return claims
-    tests = {}
-    for key in others:
-        # where both succeed; on fewer than `FEWEST` sequences nothing is claimed
-        ratios = np.where(lost[key] | base_lost, np.nan, logs[key] - base)
-        tests[key] = sequences.test(ratios)
-        if np.isfinite(ratios).sum() < FEWEST:
-            tests[key] = tests[key]._replace(these_p=1.0, beyond_p=1.0)
-    beyond = holm([tests[key].beyond_p for key in others]).tolist()
-    these = holm([tests[key].these_p for key in others]).tolist()
-    for key, p_beyond, p_these in zip(others, beyond, these, strict=True):
-        loses_more = (lost[key] & ~base_lost).sum() > (base_lost & ~lost[key]).sum()
+    reference = np.where(base_lost, np.nan, base)
+    duels = [duel(np.where(lost[key], np.nan, logs[key]), reference, sequences) for key in others]
+    beyond = holm([one.test.beyond_p for one in duels]).tolist()
+    these = holm([one.test.these_p for one in duels]).tolist()
+    by_losses = holm([one.loses_more_p for one in duels]).tolist()
+    for key, one, p_beyond, p_these, p_losses in zip(
+        others, duels, beyond, these, by_losses, strict=True
+    ):
+        # more losses than the reference's, beyond chance, whatever the errors are elsewhere
+        if p_losses <= LOSS_ERROR:
+            claims[key] = Claim("worse", "by lost sequences", p_losses)
+            continue
         if p_beyond <= FAMILY_ERROR:
             scope: Scope = "beyond these families"
             p_value = p_beyond
@@ -296,10 +344,10 @@ def claims_against(
         else:
             claims[key] = Claim("cannot tell", "", min(p_beyond, p_these))
             continue
-        if tests[key].centre > 0:
+        if one.test.centre > 0:
             verdict: Verdict = "worse"
         else:
-            verdict = "better, but lost" if loses_more else "better"
+            verdict = "better, but lost" if one.lost[0] > one.lost[1] else "better"
         claims[key] = Claim(verdict, scope, p_value)
     return claims
 
@@ -336,40 +384,63 @@ def resolution(logs: Mapping[str, Array], base: Array, sequences: Sequences) -> 
     )
 
 
-def separable(
-    logs: Mapping[str, Array], sequences: Sequences
-) -> dict[tuple[str, str], tuple[bool, float]]:
+class Order(NamedTuple):
+    """Which of two trackers is better.
+
+    Attributes:
+        first_by: Below 0 where the first is shown to be better, above 0 where the second is, else 0.
+        p_value: Holm-corrected over all pairs.
+        scope: How far that goes.
+    """
+
+    first_by: float
+    p_value: float
+    scope: Scope = ""
+
+
+def separable(logs: Mapping[str, Array], sequences: Sequences) -> dict[tuple[str, str], Order]:
     """Which trackers the sequences tell apart, Holm-corrected over all pairs.
 
     The order of all pairs that are called separable is right together with a chance of at least 95
-    %: beyond these families where there are `FEWEST_FAMILIES`, else on these families.
+    %: beyond these families where there are `FEWEST_FAMILIES`, else on these families. Two trackers are
+    compared where both succeed. Who is better there and lost more sequences is not called better; who lost
+    more beyond chance (McNemar's exact test) is worse.
 
     Args:
         logs: Tracker to the logarithms of its median errors ``[S]``, in the same order of
-            sequences, none missing.
+            sequences; nan where it lost.
         sequences: The sequences.
 
     Returns:
-        For every pair ``(a, b)``, a before b in `logs`, whether they differ, and the corrected p
-        value.
+        For every pair ``(a, b)``, a before b in `logs`.
     """
     pairs = list(combinations(logs, 2))
     if not pairs or len(sequences.names) < FEWEST:
-        return dict.fromkeys(pairs, (False, 1.0))
-    tests = [sequences.test(logs[a] - logs[b]) for a, b in pairs]
-    p_values = [tested.beyond_p if sequences.can_go_beyond else tested.these_p for tested in tests]
-    corrected = holm(p_values).tolist()
-    return {pair: (p <= FAMILY_ERROR, p) for pair, p in zip(pairs, corrected, strict=True)}
+        return dict.fromkeys(pairs, Order(0.0, 1.0))
+    duels = [duel(logs[a], logs[b], sequences) for a, b in pairs]
+    by_error = holm(
+        [one.test.beyond_p if sequences.can_go_beyond else one.test.these_p for one in duels]
+    ).tolist()
+    by_losses = holm([one.difference_by_losses_p for one in duels]).tolist()
+    scope: Scope = "beyond these families" if sequences.can_go_beyond else "on these families"
+    orders = {}
+    for pair, one, p_error, p_losses in zip(pairs, duels, by_error, by_losses, strict=True):
+        surplus = one.lost[0] - one.lost[1]
+        orders[pair] = Order(0.0, p_error)
+        if p_losses <= LOSS_ERROR:
+            orders[pair] = Order(float(surplus), p_losses, "by lost sequences")
+        elif p_error <= FAMILY_ERROR and one.test.centre * surplus >= 0:
+            orders[pair] = Order(one.test.centre, p_error, scope)
+    return orders
 
 
 def rank_groups(logs: Mapping[str, Array], sequences: Sequences) -> dict[str, tuple[int, int]]:
     """First and last rank that the data leave open to every tracker; arguments as in `separable`."""
     better = dict.fromkeys(logs, 0)
     worse = dict.fromkeys(logs, 0)
-    means = {key: sequences.mean(log) for key, log in logs.items()}
-    for (a, b), (apart, _) in separable(logs, sequences).items():
-        if apart:
-            first, second = (a, b) if means[a] < means[b] else (b, a)
+    for (a, b), order in separable(logs, sequences).items():
+        if order.first_by:
+            first, second = (a, b) if order.first_by < 0 else (b, a)
             worse[first] += 1
             better[second] += 1
     return {key: (1 + better[key], len(logs) - worse[key]) for key in logs}

@@ -13,7 +13,7 @@ from dynslam_bench.reports.model.board import (
 )
 from dynslam_bench.reports.model.row import HINTED, SEEN, RunRow
 from dynslam_bench.reports.model.statistics import FEWEST, Standing, mean_rank_test
-from dynslam_bench.runs.store import part_words
+from dynslam_bench.runs.rows import part_words
 
 _MOST_NAMED = 3
 """Trackers that a sentence names; of more the first, and how many others."""
@@ -122,7 +122,8 @@ def explanation(board: Board) -> str:
         f"Every tracker is compared with {board.reference_name} on the same sequences, where both succeed; sequences "
         "that a tracker lost are counted beside it.",
         "'Better' and 'worse' hold on these families of sequences or beyond them, as they say: the difference is so "
-        "steady that fewer than one such board in twenty would hold any wrong claim of either kind.",
+        "steady that fewer than one such board in twenty would hold any wrong claim of one kind, and fewer than one in "
+        "ten of either. 'Worse' by lost sequences means more losses than chance explains.",
         f"Here {_are(count['better'])} better, {_are(count['worse'])} worse, and of {count['cannot tell']} the data "
         f"cannot tell.{lost_words}",
         "'Cannot tell' does not mean equal: the brackets hold the ratios that the data allow.",

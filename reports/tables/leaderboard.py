@@ -13,7 +13,8 @@ import numpy as np
 from dynslam_bench.core import label_text
 from dynslam_bench.evaluation import Protocol, RPESpec
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
-from dynslam_bench.evaluation.verdicts import FEWEST_FAMILIES, FEWEST_FREE
+from dynslam_bench.evaluation.verdicts import FEWEST_FAMILIES, FEWEST_FREE, FLOOR_M
+from dynslam_bench.reports.model.answers import error_columns, typical_error
 from dynslam_bench.reports.model.board import (
     OVERALL,
     STATIC_CAMERA,
@@ -28,7 +29,7 @@ from dynslam_bench.reports.model.board import (
 )
 from dynslam_bench.reports.model.published import ReportedCell
 from dynslam_bench.reports.model.row import HINTED, SEEN, RunRow, grouped
-from dynslam_bench.reports.model.statistics import FEWEST, FLOOR_M, Interval, Standing
+from dynslam_bench.reports.model.statistics import FEWEST, Interval, Standing
 from dynslam_bench.reports.tables.table import (
     Column,
     Emphasis,
@@ -84,10 +85,21 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
         meaning = column.meaning.replace("{reference}", board.reference_name)
         columns.append(replace(column, meaning=meaning))
 
+    # errors in millimetres stand behind the name
+    errors = error_columns(board)
+    error_headings = [
+        Column(f"{meaning}, mm", meaning=f"median over {len(names)} sequences of the median ATE")
+        for meaning, names in errors.items()
+    ]
+    behind = 1 + [column.name for column in columns].index("tracker")
+    keys = [*board.trackers, *board.final_only]
     rows = []
-    for key in board.trackers:
+    for key in keys:
         cells = leaderboard_cells(board, key)
-        rows.append([cells[column.name] for column in columns])
+        row = [cells[column.name] for column in columns]
+        row[behind:behind] = [error_cell(board, key, names) for names in errors.values()]
+        rows.append(row)
+    columns[behind:behind] = error_headings
 
     brief = f"Geometric mean of the ATE over that of {board.reference_name}"
     if any(math.isfinite(standing.ratio.low) for standing in board.standings):
@@ -98,7 +110,7 @@ def leaderboard(board: Board, protocol: Protocol) -> Table:
         _leaderboard_caption(board, protocol, has_epipolar=has_epipolar),
         columns,
         rows,
-        board.unranked_rows(board.trackers),
+        board.unranked_rows(keys),
         board.separators(),
         brief,
     )
@@ -243,6 +255,26 @@ def leaderboard_cells(board: Board, key: str) -> dict[str, TableCell]:
     elif standing is not None:
         cells |= _standing_cells(board, standing)
     return cells
+
+
+def error_cell(board: Board, key: str, names: Sequence[str]) -> TableCell:
+    """The typical error in millimetres over some sequences; behind it how many are lost or missing."""
+    present = [name for name in names if name in board.cells[key]]
+    error = typical_error(board, key, names)
+    if error.median_m is None:
+        return TableCell("–", "" if present else "not run")
+    remarks = []
+    if error.lost:
+        remarks.append(f"lost {error.lost}")
+    if error.sequences < error.asked:
+        remarks.append(f"{error.sequences} of {error.asked}")
+    return TableCell(
+        mm(error.median_m),
+        ", ".join(remarks),
+        error.median_m,
+        emphasis="failed" if error.lost else "",
+        tip=f"median over {error.sequences} sequences",
+    )
 
 
 def _run_cells(board: Board, key: str) -> dict[str, TableCell]:
@@ -402,8 +434,9 @@ def pair_table(board: Board) -> Table | None:
                 cells.append(_pair_cell(pairs[frozenset((key, other))], key))
         rows.append(cells)
     caption = (
-        "Geometric mean of the errors of the row over those of the column. Coloured: the two can be told apart "
-        f"{scope} (t tests of the log errors, Holm-corrected over all pairs); '?': they cannot."
+        "Geometric mean of the errors of the row over those of the column where both succeed; behind it the sequences "
+        f"that one of them alone lost. Coloured: the two can be told apart {scope} (t tests of the log errors, "
+        "Holm-corrected over all pairs), or by what they lost (McNemar's exact test); '?': they cannot."
     )
     columns = [*texts("tracker"), *numbers(*(board.labels[key] for key in board.ranked))]
     return Table("pairs", "All pairs", caption, columns, rows)
@@ -411,12 +444,16 @@ def pair_table(board: Board) -> Table | None:
 
 def _pair_cell(pair: Pair, key: str) -> TableCell:
     """The ratio of one tracker of a pair to the other; coloured where the two can be told apart."""
-    ratio = pair.ratio.value if pair.one == key else 1.0 / pair.ratio.value
+    is_first = pair.one == key
+    ratio = pair.ratio.value if is_first else 1.0 / pair.ratio.value
+    lost, lost_by_other = pair.lost if is_first else pair.lost[::-1]
+    losses = f"lost {lost} : {lost_by_other}" if lost + lost_by_other else ""
     tip = f"p {pair.p_value:.3f}"
     if pair.verdict == "cannot tell":
-        return TableCell(f"{ratio:.2f}", "?", ratio, tip=tip)
-    colour = _VERDICT_SHADES["better" if ratio < 1 else "worse"]
-    return TableCell(f"{ratio:.2f}", "", ratio, shade=colour, tip=tip)
+        return TableCell(f"{ratio:.2f}", f"? {losses}".strip(), ratio, tip=tip)
+    is_better = (pair.verdict == "better") == is_first
+    colour = _VERDICT_SHADES["better" if is_better else "worse"]
+    return TableCell(f"{ratio:.2f}", losses, ratio, shade=colour, tip=tip)
 
 
 def speed_cell(board: Board, ended: Sequence[RunRow]) -> TableCell:

@@ -119,7 +119,8 @@ def make_sequence(folder: Path, phase: float, frames: int = 12) -> Path:
         lists["groundtruth"].append(f"{stamp:.6f} {x:.6f} 0 0 0 0 0 1")
     for name, lines in lists.items():
         (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
-    write_camera(folder / "camera.toml", Camera(16, 12, 15.0, 15.0, 7.5, 5.5))
+    camera = Camera(16, 12, 15.0, 15.0, 7.5, 5.5, depth_factor=5000.0)
+    write_camera(folder / "camera.toml", camera)
     return folder
 
 
@@ -149,6 +150,7 @@ def study_of(results: Path) -> list[Any]:
     ]
     summary = json.loads((folder / "summary.json").read_text())
     for candidate in summary["candidates"]:
+        candidate.pop("scene_s", None)
         for name in ("on_confirm", "on_held_out"):
             candidate[name].pop("speed", None)
     return [trials, summary, (folder / "best.toml").read_text(), runs_of(results)]

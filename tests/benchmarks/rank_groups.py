@@ -65,11 +65,10 @@ def simulate(shape, quality, sequences, boards, seed=0):
         logs = {str(k): log[k] for k in range(trackers)}
 
         # the order of all pairs that are told apart
-        means = log.mean(axis=1)
         pairs = [
-            (quality[int(a)] - quality[int(b)]) * (means[int(a)] - means[int(b)]) > 0
-            for (a, b), (apart, _) in separable(logs, of_board).items()
-            if apart
+            (quality[int(a)] - quality[int(b)]) * order.first_by > 0
+            for (a, b), order in separable(logs, of_board).items()
+            if order.first_by
         ]
 
         # the best one; of equal ones the first, which was chosen before

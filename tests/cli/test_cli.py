@@ -200,6 +200,7 @@ def test_a_faulty_recording_is_found_by_the_doctor_and_named_after_a_bad_run(cli
     assert "sequences doctor" not in cli("run", "constant-velocity", sound)[2]
 
 
+@pytest.mark.slow
 def test_sequences_render(cli, tmp_path):
     name = "synthetic/sitting_static?scene=1&frames=2"
     code, out, _ = cli("sequences", "render", name, "--data-root", tmp_path / "data")
@@ -489,6 +490,7 @@ def test_the_protocol_of_a_published_number_is_marked(cli, facts, pair):
 # The public interface for Python: lazy, typed names, each with the result of its command.
 
 
+@pytest.mark.slow
 def test_a_suite_its_report_and_its_frame(walk: Path, tmp_path: Path) -> None:
     suite = tmp_path / "mine.toml"
     suite.write_text(f"trackers = ['never-move', 'constant-velocity']\nsequences = ['{walk}']\n")

@@ -1,5 +1,6 @@
 """Trajectory files at every entrance: units of stamps, headings, lost digits, warnings and hints."""
 
+import json
 import re
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.cli_program import one_line
 from helpers.envs_toys import ToySequence, write_folder, write_sequence
-from helpers.evaluation_walks import followed, lap, rows_of, scaled
+from helpers.evaluation_walks import followed, lap, noisy, rows_of, scaled, walk
 
 from dynslam_bench.geometry import Trajectory, se3, write_tum
 from dynslam_bench.runs.exchange.formats import write_bag, write_pose_table
@@ -254,3 +255,37 @@ def test_the_hints_of_conventions_can_be_followed(cli, tmp_path):
             code, out, _ = cli("eval", "estimate.txt", "truth.txt")
             assert code == 0
             assert (f"hint: {name}: " in out) == hinted, (name, out)
+
+
+# -- several estimates
+
+
+def test_eval_takes_several_estimates_and_draws_them(cli, tmp_path):
+    truth = walk(n=90)
+    files = [tmp_path / name for name in ("first.txt", "second.txt", "truth.txt")]
+    write_tum(files[0], noisy(truth))
+    write_tum(files[1], noisy(truth, seed=2))
+    write_tum(files[2], truth)
+    code, out, err = cli("eval", *files, "--plot", tmp_path / "plot.png")
+    assert code == 0, err
+    assert (tmp_path / "plot.png").is_file()
+    rows = [line.split() for line in out.splitlines() if line.startswith(("first", "second"))]
+    assert [row[:2] for row in rows] == [["first.txt", "90"], ["second.txt", "90"]]
+
+    code, out, err = cli("eval", *files, "--json")
+    facts = json.loads(out)
+    assert [fact["file"] for fact in facts] == [str(path) for path in files[:2]]
+    alone = [json.loads(cli("eval", path, files[2], "--json")[1]) for path in files[:2]]
+    assert [fact["metrics"] for fact in facts] == [fact["metrics"] for fact in alone]
+
+
+def test_eval_of_one_estimate_shows_every_statistic(cli, tmp_path):
+    truth = walk(n=90)
+    write_tum(tmp_path / "first.txt", noisy(truth))
+    write_tum(tmp_path / "truth.txt", truth)
+    files = tmp_path / "first.txt", tmp_path / "truth.txt"
+    metrics = json.loads(cli("eval", *files, "--json")[1])["metrics"]
+    out = cli("eval", *files)[1]
+    assert len(out.splitlines()) < 14
+    numbers = set(out.split())
+    assert [name for name, value in metrics.items() if f"{value:.4g}" not in numbers] == []

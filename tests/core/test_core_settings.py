@@ -254,6 +254,10 @@ def test_only_what_names_a_file_counts_as_one(
     (tmp_path / "orb").mkdir()
     write(tmp_path / "auto", "a file called like a setting")
     assert named_digests(Whole()) == {}, "a folder called like a word changes nothing"
+    assert set(named_digests(Whole(), words=True)) == {"inner.source"}
+    write(tmp_path / "fast", "a plug-in may open it")
+    assert named_digests(Whole(word="fast")) == {}
+    assert set(named_digests(Whole(word="fast"), words=True)) == {"inner.source", "word"}
     net = write(tmp_path / "net.onnx", "one")
     write(tmp_path / "voc.txt", "words")
     masks = write(tmp_path / "elsewhere" / "000000.png", "1111")

@@ -58,7 +58,8 @@ from dynslam_bench.culling.settings import (
 from dynslam_bench.culling.template_matching import TemplateFilter
 from dynslam_bench.features.orb import OrbExtractor
 from dynslam_bench.features.settings import FeatureSettings
-from dynslam_bench.slam.pipeline import combine_verdicts
+from dynslam_bench.geometry import inside
+from dynslam_bench.slam.pipeline import combine_verdicts, least_masked
 
 RESEEDING = ReseedingFilter(ReseedingSettings(budget=600), FeatureSettings(n_features=900))
 
@@ -421,12 +422,36 @@ def test_guard_undoes_the_least_reliable_verdict_first() -> None:
         ([nothing, nothing], ~nothing, 2),
         ([semantic], semantic, 0),
     ):
-        keep, count = combine_verdicts(verdicts, GuardSettings(min_features=40), 100)
+        keep, count = combine_verdicts(verdicts, 100, 40)
         assert count == undone
         np.testing.assert_array_equal(keep, expected)
-    assert (
-        combine_verdicts([semantic], GuardSettings(min_features=0, min_fraction=0.8), 100)[1] == 1
-    )
+    assert combine_verdicts([semantic], 100, 80)[1] == 1
+
+
+def test_guard_needs_the_larger_of_its_number_and_its_share_but_no_more_than_there_are() -> None:
+    settings = GuardSettings(min_features=60, min_fraction=0.1)
+    assert [settings.needed(total) for total in (0, 40, 100, 600, 601, 1000)] == [
+        0, 40, 60, 60, 61, 100,
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("width", "height"), [(640, 480), (320, 240), (400, 300), (161, 120)])
+def test_guard_gives_back_the_features_nearest_to_the_outside_of_the_mask(
+    width: int, height: int
+) -> None:
+    mask = np.zeros((height, width), bool)
+    mask[:, width // 4 :] = True
+    # features on a row, from the left; those with x < width / 4 are left
+    x = np.linspace(0, width - 1, 101)
+    xy = np.column_stack([x, np.full(101, height / 2)])
+    order = np.random.default_rng(width).permutation(101)
+    keep = ~inside(mask, xy[order])
+    left = np.count_nonzero(keep)
+    returned = least_masked(keep, mask, xy[order], left + 7)
+    assert not (returned & keep).any()
+    np.testing.assert_array_equal(np.sort(x[order][returned]), x[left : left + 7])
+    assert not least_masked(keep, mask, xy[order], left).any()
+    assert not least_masked(keep, mask, xy[order], 3).any()
 
 
 # Settings of culling rules that no short episode shows: each changes the verdict on a scene made

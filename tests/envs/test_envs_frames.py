@@ -181,6 +181,7 @@ def unchanged(sequence: InMemory, untouched: InMemory) -> None:
         assert frame.depth.flags.writeable
 
 
+@pytest.mark.slow
 def test_names_of_classes_are_the_tracker_s_own_copy() -> None:
     sequence = InMemory()
     untouched = InMemory()

@@ -122,6 +122,7 @@ def test_one_seed_gives_identical_bytes_and_pickle_an_equal_environment(toy_fold
     assert first == rollout(env, 20, 5) == rollout(duplicate, 20, 5) != rollout(env, 20, 6)
 
 
+@pytest.mark.slow
 def test_async_vector_env(toy_folder: str) -> None:
     kwargs = {"sequence": toy_folder, "tracker": TARGET, "frames": [0, 3]}
     make = lambda: gym.make("dynslam_bench.envs:dynslam/Sequence-v0", **kwargs)  # noqa: E731

@@ -58,6 +58,7 @@ PARTS = ["stats", "rgb", "depth", "gray", "keypoints", "privileged"]
 # Windows.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sequence", [CornerSequence(7), "synthetic/sitting_xyz?frames=7"])
 def test_a_window_is_the_episode_of_these_frames_alone(sequence: Any) -> None:
     tracker, settings = ("mask-rcnn", ORACLE) if isinstance(sequence, str) else ("orb-slam2", {})
@@ -110,6 +111,7 @@ def test_a_window_longer_than_the_sequence() -> None:
 COPIED = "orb-slam2 emfoa-oft?masks=none never-move dynaslam-g opencv-odometry mask-rcnn mask-rcnn+async".split()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tracker", COPIED)
 def test_a_copied_and_a_restored_episode_go_on_to_the_bit(tracker: str) -> None:
     masked = tracker.startswith("mask-rcnn")
@@ -159,6 +161,7 @@ def test_what_fails_beside_tracking_on_the_last_frames_is_warned_of_when_the_env
         env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tracker", ["emfoa-oft", "dynaslam", "ds-slam"])
 def test_a_restored_tracker_takes_every_online_setting(tracker: str) -> None:
     online = online_parameters(resolve_settings(TRACKERS.get(tracker), ORACLE))
@@ -177,6 +180,7 @@ def test_a_restored_tracker_takes_every_online_setting(tracker: str) -> None:
     assert rest(env, action) == expected
 
 
+@pytest.mark.slow
 def test_a_state_with_a_cached_network_can_be_pickled_and_copies_share_the_network() -> None:
     env = stepped(SlamEnv("synthetic/walking_xyz?scene=0&frames=3", "mask-rcnn", cache=True), 1)
     state = env.clone_state()
@@ -303,6 +307,7 @@ def test_sub_environments_run_other_sequences(tmp_path: Path) -> None:
     assert len({tuple(order) for order in orders}) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mode", "seeds"), [("round_robin", (0, 0, 1)), ("random", (5, 5, 6))])
 def test_sequence_sampler(mode: str, seeds: tuple[int, ...], tmp_path: Path) -> None:
     folders = [str(write_folder(tmp_path / f"toy{length}", length)) for length in (5, 6)]
@@ -339,6 +344,7 @@ def test_vector_environments_take_every_part(fixed: bool) -> None:
 # Rewards.
 
 
+@pytest.mark.slow
 def test_a_network_call_costs_its_weight() -> None:
     settings = ORACLE | {"segmentation.schedule": "every_nth", "segmentation.n": 2}
     (plain, infos, _), (default, *_), (dear, *_) = (

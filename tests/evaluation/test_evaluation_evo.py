@@ -220,6 +220,7 @@ needs_author = pytest.mark.skipif(
 )
 
 
+@pytest.mark.slow
 @needs_author
 def test_an_authors_evo_tables_are_given_back():
     lines = list(published())

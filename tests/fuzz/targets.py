@@ -1237,13 +1237,13 @@ def _map_seeds() -> list[bytes]:
 def _read_map(data: bytes | None, folder: Path) -> None:
     """What is read is worked on as a run does, whose compiled loops check no index."""
     atlas = open_atlas(str(at(folder, "map.npz", data)), LENS, FEATURES, depth=True)
-    world = atlas.world
-    world.refresh(world.points)
-    for slot in world.keyframes.tolist():
-        world.covisible(slot)
-        world.project(world.kf_pose[slot], world.points)
-    packed(atlas.world, atlas.submaps.values())
-    world.remove_keyframe(int(world.keyframes[0]))
+    slam_map = atlas.map
+    slam_map.refresh(slam_map.points)
+    for slot in slam_map.keyframes.tolist():
+        slam_map.covisible(slot)
+        slam_map.project(slam_map.kf_pose[slot], slam_map.points)
+    packed(atlas.map, atlas.submaps.values())
+    slam_map.remove_keyframe(int(slam_map.keyframes[0]))
 
 
 EXCHANGE = [

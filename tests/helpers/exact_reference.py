@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dynslam_bench.core.simd import COSINES, DERIVATIVE_SHIFT
 from dynslam_bench.flow import layout
+from dynslam_bench.flow.histogram_vectors import COSINES, DERIVATIVE_SHIFT
 from dynslam_bench.flow.orientation_maps import FIXED_POINT, NORM_FLOOR
 
 Array = NDArray[np.generic]

@@ -93,6 +93,7 @@ def add_run(
     run_id=None,
     deterministic=True,
     machine=MACHINE,
+    sensors="rgbd",
 ):
     """Store one run whose trajectory is the truth with noise of the given size.
 
@@ -125,7 +126,7 @@ def add_run(
     record = RunRecord(
         kind=kind, run_id=run_id, status=status, reason=reason,
         tracker=TrackerInfo(id=tracker, label=label or tracker, provenance=provenance, ranked=ranked, given=given,
-                            deterministic=deterministic),
+                            deterministic=deterministic, sensors=sensors),
         overrides=overrides or {}, seed=seed, device="cpu",
         sequence=SequenceInfo(id=sequence, part=part, frames=n, duration_s=duration_s or n / 30, fps=30.0,
                               content=content or "", block=digest(block, 16) if block else "", noise=noise,
@@ -280,6 +281,13 @@ def crashed(tracker="c", sequence="s", error=0.001, **changes):
 
 def cell_of(table, name, column=1):
     return next(cells for cells in table.rows if cells[0].text == name)[column]
+
+
+def cell_named(table, tracker, column):
+    """The cell of a leaderboard in the row of a tracker and the column of a name."""
+    headings = [heading.name for heading in table.columns]
+    rows = {cells[headings.index("tracker")].text: cells for cells in table.rows}
+    return rows[tracker][headings.index(column)]
 
 
 def columns_of(table, *names):

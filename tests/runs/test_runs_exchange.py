@@ -756,6 +756,7 @@ def test_a_truth_of_another_time_is_refused(tmp_path):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     not PUBLISHED.is_dir(), reason="needs the authors' trajectories in ../shared/data/trajectories"
 )

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -286,6 +287,29 @@ def test_a_source_that_names_a_file_which_is_opened_in_machine_code(bench: Bench
     assert set(reads.files) == {"plugin:/mine.py", "plugin:/mask.png"}
     edit(bench.plugin.parent / "mask.png", "2222")
     assert bench.changed(reads) == "the file mask.png"
+
+
+@pytest.mark.parametrize(
+    "named", ["'net.onnx'", "'nets/' + name + '.onnx'", "f'{name}.onnx'", "'%s.onnx' % name"]
+)
+def test_a_network_below_the_folder_of_a_source(named: str, bench: Bench) -> None:
+    """It is opened in machine code, by a name that is put together."""
+    bench.write("plugin/nets/net.onnx", "1111")
+    bench.write("plugin/nets/net.txt", "1111")
+    bench.write("plugin/.hidden/net.onnx", "1111")
+    reads = bench.record(f"def run(name):\n    return {named}\n", name="net")
+    assert set(reads.files) == {"plugin:/mine.py", "plugin:/nets/net.onnx"}
+    edit(bench.plugin.parent / "nets/net.onnx", "2222")
+    assert bench.changed(reads) == "the file nets/net.onnx"
+
+
+@pytest.mark.parametrize("name", ["net.bin", "mask.png", "first.cfg"])
+def test_a_configuration_that_names_a_file_in_a_folder_below_it(name: str, bench: Bench) -> None:
+    bench.write("work/slam.ini", f"[model]\nfile = {name}")
+    bench.write(f"work/models/{name}", "1111")
+    reads = bench.record("def run():\n    open('slam.ini').read()\n")
+    edit(bench.work / "models" / name, "2222")
+    assert bench.changed(reads) == f"the file models/{name}"
 
 
 @pytest.mark.parametrize("name", ["a\\0b", "x" * 300, "loop", "."])
@@ -897,6 +921,80 @@ def test_an_environment_variable_that_a_program_looks_up(
     assert bench.changed(reads) == ""
     bench.environment["MY_SLAM_MODE"] = "fast"
     assert bench.changed(reads) == "the environment variable MY_SLAM_MODE"
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with programs in C: one opens ``settings.cfg``, one loads ``libpart.so``, and waits for a line."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("needs a C compiler")
+    folder = tmp_path_factory.mktemp("compiled")
+    sources = {
+        "opens": '#include <stdio.h>\nint main() { return fopen("settings.cfg", "r") == 0; }',
+        "loads": "#include <stdio.h>\n#include <dlfcn.h>\n"
+        "int main(int count, char **words) "
+        '{ void *part = dlopen(words[1], 2); puts("ready"); fflush(stdout); getchar(); return part == 0; }',
+        "libpart.so": "int part() { return 1111; }",
+    }
+    for name, source in sources.items():
+        (folder / "source.c").write_text(source)
+        options = ["-shared", "-fPIC"] if name.endswith(".so") else []
+        words = [compiler, *options, "source.c", "-o", name, "-ldl"]
+        subprocess.run(words, cwd=folder, check=True)
+    return folder
+
+
+def test_a_file_that_a_compiled_program_names(bench: Bench, compiled: Path) -> None:
+    bench.write("work/settings.cfg", "1111")
+    bench.write("work/source.c", "1111")
+    reads = bench.record(START, words=[str(compiled / "opens")])
+    edit(bench.work / "source.c", "2222")
+    assert bench.changed(reads) == ""
+    edit(bench.work / "settings.cfg", "2222")
+    assert bench.changed(reads) == "the file settings.cfg of a program"
+
+
+def test_a_file_in_a_list_that_a_script_names(bench: Bench) -> None:
+    bench.write("work/list.txt", "maps/a.bin\n")
+    bench.write("work/maps/a.bin", "1111")
+    bench.write("work/all.sh", "#!/bin/sh\ncat $(cat list.txt)")
+    reads = bench.record(START, words=["/bin/sh", "all.sh"])
+    edit(bench.work / "maps/a.bin", "2222")
+    assert bench.changed(reads) == "the file maps/a.bin of a program"
+
+
+LOADED = """
+import subprocess
+def run(words):
+    program = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    program.stdout.readline()
+"""
+REPLACED = """
+import subprocess
+def run(words, library, built):
+    program = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    program.stdout.readline()
+    subprocess.run(["cp", "--remove-destination", built, library])
+"""
+
+
+def test_a_library_that_a_program_loads(bench: Bench, compiled: Path) -> None:
+    library = shutil.copy(compiled / "libpart.so", bench.write("work/part", "").parent)
+    words = [str(compiled / "loads"), f"./{Path(library).name}"]
+    reads = bench.record(LOADED, words=words)
+    Path(library).write_bytes(Path(library).read_bytes() + b"1")
+    assert bench.changed(reads) == f"the file {Path(library).name} of a program"
+
+
+def test_a_library_of_a_program_that_is_built_anew_meanwhile(bench: Bench, compiled: Path) -> None:
+    (bench.root / "elsewhere").mkdir()
+    library = shutil.copy(compiled / "libpart.so", bench.root / "elsewhere")
+    words = [str(compiled / "loads"), str(library)]
+    answer = bench.child.ask(
+        bench.job(REPLACED, words=words, library=str(library), built=str(compiled / "opens"))
+    )
+    assert f"the file {library} of a program has changed while" in answer["fault"]
 
 
 def test_an_environment_variable_that_every_program_gets(bench: Bench) -> None:

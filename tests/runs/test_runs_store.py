@@ -112,6 +112,7 @@ def test_a_part_has_one_run_id_however_it_is_written() -> None:
     )
 
 
+@pytest.mark.slow
 def test_what_a_plug_in_that_a_setting_names_reads_is_recorded(
     toy_folder: str, tmp_path: Path
 ) -> None:

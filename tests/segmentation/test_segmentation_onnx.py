@@ -581,6 +581,7 @@ def test_a_filters_further_classes_are_sought_by_the_network(tmp_path):
         assert found.class_names == ("person", "chair")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     not (WEIGHTS.is_dir() and BONN.is_dir()), reason="needs ../shared/weights and ../shared/data"
 )

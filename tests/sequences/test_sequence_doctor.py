@@ -248,6 +248,7 @@ def matrix_of(text):
     return np.array([[float(value) for value in row.split(",")] for row in text.split(";")])
 
 
+@pytest.mark.slow
 def test_the_cure_of_turned_axes_is_their_inverse_and_a_rotation(diagnosed):
     (finding,) = diagnosed("truth-axes").findings
     cure = matrix_of(re.search(r"\[(.*)\]", finding.cure).group(1))
@@ -265,6 +266,7 @@ def test_stretches_cover_a_short_recording_and_sample_a_long_one():
     assert parts[-1][1] == 6000
 
 
+@pytest.mark.slow
 @needs_shared
 @pytest.mark.parametrize("name", ["tum/rgbd_dataset_freiburg1_rpy", "fixed_camera/man_130"])
 def test_real_recordings_have_no_fault(name):
@@ -479,6 +481,7 @@ def test_images_are_not_held(host, tmp_path):
     assert people.most < 20
 
 
+@pytest.mark.slow
 def test_masks_count_as_content_and_have_to_be_there(folder, tmp_path):
     made = shutil.copytree(folder / "made", tmp_path / "made")
     before = open_sequence(str(made)).digest()
@@ -533,6 +536,7 @@ def test_a_folder_that_exists_is_left_alone(host, people, tmp_path):
     assert (tmp_path / "thesis.tex").read_text() == "work"
 
 
+@pytest.mark.slow
 @needs_shared
 def test_a_real_person_is_pasted_into_a_real_recording(tmp_path):
     host = open_sequence(str(SHARED / "data/tum/rgbd_dataset_freiburg1_rpy"), frames="0:3")

@@ -174,6 +174,7 @@ def test_controls(walking, people: str, persons: bool) -> None:
     assert sequence.digest() != walking.digest()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", ["lighting_change", "glare", "shadow"])
 def test_lighting_options_change_colours_only(option: str, walking) -> None:
     sequence = opened("walking_xyz?scene=1", **{option: True})
@@ -262,6 +263,7 @@ def fingerprint(id: str, index: int, threads: int = 1) -> str:
     return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()[:16]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("id", "index", "renderer", "family", "expected"), KEPT)
 def test_frames_keep_their_bytes(
     id: str, index: int, renderer: int, family: int, expected: str
@@ -615,6 +617,7 @@ def test_ground_truth_and_digest_need_no_rendering(tmp_path: Path) -> None:
     assert "renderer" not in vars(sequence)
 
 
+@pytest.mark.slow
 def test_rendering_goes_on_where_it_stopped(tmp_path: Path) -> None:
     progress = Mock(side_effect=[None, None, None, KeyboardInterrupt])
     with pytest.raises(KeyboardInterrupt):

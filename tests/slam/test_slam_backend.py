@@ -258,7 +258,7 @@ def test_the_number_of_keyframes_is_bounded_and_those_around_the_camera_stay(roo
     for index, pose in enumerate(truth):
         results += track_all(backend, [room.see(pose, index)])
         made += [index] if results[-1].keyframe else []
-        kept = backend.world.kf_frame[backend.world.keyframes].tolist()
+        kept = backend.map.kf_frame[backend.map.keyframes].tolist()
         assert len(kept) == min(len(made), most)
         assert kept[-4:] == made[-4:]
         assert kept[0] == 0
@@ -322,7 +322,7 @@ def test_a_frame_becomes_a_keyframe_exactly_when_it_is_told_to(room, monocular):
     for index, pose in enumerate(room.path(60)):
         schedule = "every" if wanted[index] else "none"
         backend.configure(apply_overrides(backend.settings, {"keyframes.schedule": schedule}))
-        begins = backend.world.keyframe_count == 0
+        begins = backend.map.keyframe_count == 0
         frame = room.see(pose, index)
         results += track_all(backend, [without_depth(frame) if monocular else frame])
         assert results[-1].keyframe == (results[-1].state == "ok" and (begins or wanted[index]))
@@ -488,12 +488,12 @@ def test_a_shaken_camera_is_tracked_several_times_as_well(shaken_frames, stamp_n
 def test_the_first_frame_is_compensated_too(shaken_frames):
     room, frames = shaken_frames
     backend, results = rolling_backend(room, frames[:2], READOUT_S)
-    world = backend.world
+    slam_map = backend.map
     assert states(results) == ["ok", "ok"]
-    assert world.kf_id[0] == 0
+    assert slam_map.kf_id[0] == 0
     assert results[1].timings["mapping"] > 0, "the first keyframe was inserted again"
     _, at_once = rolling(room, shaken, 3, depthless=0.0, limit=500)
-    left = np.linalg.norm(world.kf_xy[0, : world.kf_count[0]] - at_once.xy, axis=1)
+    left = np.linalg.norm(slam_map.kf_xy[0, : slam_map.kf_count[0]] - at_once.xy, axis=1)
     assert np.median(left) < 0.4 * np.median(np.linalg.norm(frames[0].xy - at_once.xy, axis=1))
 
 
@@ -522,7 +522,7 @@ def test_odd_stamps_and_gaps(shaken_frames, sequence, readout_s, lost):
     with np.errstate(all="raise"):
         backend, results = rolling_backend(room, frames, readout_s)
     assert {i for i, r in enumerate(results) if r.state != "ok"} == lost
-    assert backend.world.kf_frame[0] == frames[0].index
+    assert backend.map.kf_frame[0] == frames[0].index
     assert len(backend.finalize()) == len(frames) - len(lost)
     assert readout_s or backend.shutter.velocity is None
 

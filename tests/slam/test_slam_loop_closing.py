@@ -56,9 +56,9 @@ def test_a_lap_comes_back_to_where_it_began():
     assert np.linalg.norm(se3.inverse(loop.place.T_cam_world)[:3, 3]) < 20 * STEP
     assert loop.correction.moved_m == pytest.approx(drift, rel=0.5)
     assert final < 0.8 * drift, "the whole trajectory is corrected, not its end alone"
-    index = backend.world.points
-    assert (backend.world.n_obs[index] > 0).all()
-    assert np.isfinite(backend.world.position[index]).all()
+    index = backend.map.points
+    assert (backend.map.n_obs[index] > 0).all()
+    assert np.isfinite(backend.map.position[index]).all()
 
 
 def rmse(poses, true):
@@ -121,7 +121,7 @@ def test_a_map_without_depth_goes_on_after_its_loop_was_closed_and_it_was_saved(
         < 0.05
     )
     # in the saved map's unit
-    before = trajectory(made.history, made.world, made.settings.motion).T_world_cam[:60]
+    before = trajectory(made.history, made.map, made.settings.motion).T_world_cam[:60]
     lengths = [
         np.linalg.norm(np.diff(track[:, :3, 3], axis=0), axis=1).sum() for track in (online, before)
     ]
@@ -178,7 +178,7 @@ def test_sections_of_a_long_path_drift_independently(monkeypatch):
 def test_it_changes_nothing_where_no_place_is_seen_again():
     _, without, _ = lap(RingWorld(), 60, closing=False)
     backend, errors, _ = lap(RingWorld(), 60, closing=True)
-    assert len(weakly_connected(backend.world, int(backend.world.keyframes[-1])))
+    assert len(weakly_connected(backend.map, int(backend.map.keyframes[-1])))
     assert (errors == without).all()
 
 
@@ -357,22 +357,23 @@ def test_without_depth_a_submap_that_would_not_fit_is_left_for_the_root_map(monk
     assert all(np.linalg.norm(r.T_world_cam[:3, 3]) < 10.0 for r in results[back:])
 
 
+@pytest.mark.slow
 def test_maps_that_never_meet_stay_apart_and_filters_see_the_active_one():
     backend, results, _ = drive(RingWorld(), APART, STEP, **CLOSING)
     assert set(states(results)[25:]) == {"lost"}
     assert len(backend.finalize()) == 25
     assert results[-1].maps == 2
     outputs = backend.outputs()
-    world = backend.world
+    slam_map = backend.map
     assert {record.map for record in outputs.keyframes} == {0, 1}
-    assert 0 < len(outputs.positions) < len(world.points), (
+    assert 0 < len(outputs.positions) < len(slam_map.points), (
         "where those of the submap lie is unknown"
     )
     views, (ids, _) = backend.view()
     assert views, "keyframes of the root map are older"
     assert all(view.timestamp > 2.4 for view in views), "keyframes of the root map are older"
-    assert set(ids.tolist()) == set(world.id[world.points_of(world.submap(1))].tolist())
-    assert 0 < len(ids) < len(world.points)
+    assert set(ids.tolist()) == set(slam_map.id[slam_map.points_of(slam_map.submap(1))].tolist())
+    assert 0 < len(ids) < len(slam_map.points)
     assert backend.predict(8.0)[0] is not None
     without, results, _ = drive(RingWorld(), APART, STEP)
     assert set(states(results)[25:]) == {"lost"}

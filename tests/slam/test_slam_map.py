@@ -16,11 +16,11 @@ from dynslam_bench.slam.map import Map
 from dynslam_bench.slam.tracking import LocalMap, unconnected, weakly_connected
 
 
-def keyframe_of(room, world, pose, index, octave=0):
+def keyframe_of(room, slam_map, pose, index, octave=0):
     observations = observed(
-        without_depth(room.see(pose, index, noise_px=0.0)), room.camera, levels=len(world.scales)
+        without_depth(room.see(pose, index, noise_px=0.0)), room.camera, levels=len(slam_map.scales)
     )
-    return world.add_keyframe(
+    return slam_map.add_keyframe(
         replace(observations, octave=observations.octave + octave),
         se3.inverse(pose),
         index,
@@ -28,78 +28,79 @@ def keyframe_of(room, world, pose, index, octave=0):
     )
 
 
-def observers(world, point):
-    keyframes, features = world.observations(np.array([point]))
+def observers(slam_map, point):
+    keyframes, features = slam_map.observations(np.array([point]))
     return list(zip(keyframes.tolist(), features.tolist(), strict=True))
 
 
+@pytest.mark.slow
 def test_points_and_keyframes_agree_on_their_observations(room):
     """Table entries of features that a keyframe does not have, since another one has more, observe nothing either."""
     backend = make_backend(room)
     track_all(
         backend, [room.see(pose, i, limit=300 + 2 * i) for i, pose in enumerate(room.path(120))]
     )
-    world = backend.world
-    points = world.points
-    (keyframe, feature) = np.nonzero((world.kf_point >= 0) & world.kf_alive[:, None])
+    slam_map = backend.map
+    points = slam_map.points
+    (keyframe, feature) = np.nonzero((slam_map.kf_point >= 0) & slam_map.kf_alive[:, None])
     by_feature = dict(
-        zip(zip(keyframe, feature, strict=True), world.kf_point[keyframe, feature], strict=True)
+        zip(zip(keyframe, feature, strict=True), slam_map.kf_point[keyframe, feature], strict=True)
     )
-    pairs = zip(*world.observations(points), strict=True)
-    by_point = dict(zip(pairs, np.repeat(points, world.n_obs[points]), strict=True))
+    pairs = zip(*slam_map.observations(points), strict=True)
+    by_point = dict(zip(pairs, np.repeat(points, slam_map.n_obs[points]), strict=True))
     assert by_feature == by_point
     assert len(by_point) > 1000
 
 
 def test_a_point_has_as_many_observations_as_keyframes_see_it(room):
-    world = Map(room.camera, np.ones(1))
-    first = keyframe_of(room, world, np.eye(4), 0)
-    points = world.add_points(
+    slam_map = Map(room.camera, np.ones(1))
+    first = keyframe_of(room, slam_map, np.eye(4), 0)
+    points = slam_map.add_points(
         np.ones((300, 3)), np.zeros((300, 3), np.uint8), first, np.arange(300)
     )
     for index in range(1, 100):
-        world.observe(keyframe_of(room, world, np.eye(4), index), np.array([7]), points[:1])
-    assert observers(world, points[0]) == [(0, 0), *((index, 7) for index in range(1, 100))]
+        slam_map.observe(keyframe_of(room, slam_map, np.eye(4), index), np.array([7]), points[:1])
+    assert observers(slam_map, points[0]) == [(0, 0), *((index, 7) for index in range(1, 100))]
 
 
 def test_merged_points_keep_every_observation_once(room):
-    world = Map(room.camera, np.ones(1))
-    slots = [keyframe_of(room, world, np.eye(4), index) for index in range(40)]
-    one, other, last = world.add_points(
+    slam_map = Map(room.camera, np.ones(1))
+    slots = [keyframe_of(room, slam_map, np.eye(4), index) for index in range(40)]
+    one, other, last = slam_map.add_points(
         np.ones((3, 3)), np.zeros((3, 3), np.uint8), slots[0], np.arange(3)
     )
     for slot in slots[1:]:
-        world.observe(
+        slam_map.observe(
             slot, np.array([0, 1]) if slot % 2 else np.array([1, 0]), np.array([one, other])
         )
     for slot in slots[20:]:
-        world.unobserve(np.array([slot]), np.array([1 if slot % 2 else 0]))
-    world.observe(slots[1], np.array([2]), np.array([last]))
-    before = observers(world, last), observers(world, one), observers(world, other)
+        slam_map.unobserve(np.array([slot]), np.array([1 if slot % 2 else 0]))
+    slam_map.observe(slots[1], np.array([2]), np.array([last]))
+    before = observers(slam_map, last), observers(slam_map, one), observers(slam_map, other)
     assert [len(pairs) for pairs in before] == [2, 40, 20]
-    world.replace_point(int(one), int(last))
-    merged = observers(world, last)
+    slam_map.replace_point(int(one), int(last))
+    merged = observers(slam_map, last)
     assert set(merged) >= set(before[0])
     assert len({slot for slot, _ in merged}) == len(merged) == 40
-    assert observers(world, other) == before[2]
+    assert observers(slam_map, other) == before[2]
 
 
 def test_the_room_of_removed_points_is_used_again(room):
-    world = Map(room.camera, np.ones(1))
-    slots = [keyframe_of(room, world, np.eye(4), index) for index in range(9)]
+    slam_map = Map(room.camera, np.ones(1))
+    slots = [keyframe_of(room, slam_map, np.eye(4), index) for index in range(9)]
     sizes = []
     for _ in range(6):
-        points = world.add_points(
+        points = slam_map.add_points(
             np.ones((200, 3)), np.zeros((200, 3), np.uint8), slots[0], np.arange(200)
         )
         for slot in slots[1:]:
-            world.observe(slot, np.arange(200), points)
-        world.replace_point(int(points[0]), int(points[1]))
-        world.remove_points(points)
-        world.release()
-        assert not world.n_obs.any()
-        assert (world.kf_point[slots] < 0).all()
-        sizes.append(world.obs_kf.size)
+            slam_map.observe(slot, np.arange(200), points)
+        slam_map.replace_point(int(points[0]), int(points[1]))
+        slam_map.remove_points(points)
+        slam_map.release()
+        assert not slam_map.n_obs.any()
+        assert (slam_map.kf_point[slots] < 0).all()
+        sizes.append(slam_map.obs_kf.size)
     assert sizes[1:] == sizes[1:2] * 5
 
 
@@ -121,12 +122,12 @@ def test_a_coarse_feature_needs_a_larger_parallax(room, octaves, sigmas, triangu
     room.points = room.points[:400] * [1.0, 1.0, 0.0] + [0.0, 0.0, 3.0]
     room.descriptors = room.descriptors[:400]
     step = np.eye(4)
-    world = Map(room.camera, 1.2 ** np.arange(8))
+    slam_map = Map(room.camera, 1.2 ** np.arange(8))
     step[0, 3] = 3.0 * np.tan(np.deg2rad(1.5))
     one, other = (
-        keyframe_of(room, world, p, i, octaves[i]) for i, p in enumerate((np.eye(4), step))
+        keyframe_of(room, slam_map, p, i, octaves[i]) for i, p in enumerate((np.eye(4), step))
     )
-    features, _, position = triangulate(world, one, other, sigmas)
+    features, _, position = triangulate(slam_map, one, other, sigmas)
     assert (len(features) > 30) is triangulated
     assert triangulated or not len(features)
     assert np.allclose(position[:, 2], 3.0, rtol=0.01)
@@ -143,14 +144,16 @@ SHARED = 10
 def chain(room):
     """Six keyframes in a row; each shares ten points with the next, and with no other."""
     observations = observed(room.see(np.eye(4), 0), room.camera, levels=1)
-    world = Map(room.camera, np.ones(1))
+    slam_map = Map(room.camera, np.ones(1))
     last = np.zeros(0, np.int64)
     for index in range(6):
-        slot = world.add_keyframe(observations, np.eye(4), index, float(index))
-        world.observe(slot, np.arange(len(last)), last)
+        slot = slam_map.add_keyframe(observations, np.eye(4), index, float(index))
+        slam_map.observe(slot, np.arange(len(last)), last)
         fresh = np.arange(SHARED, 2 * SHARED)
-        last = world.add_points(np.ones((SHARED, 3)), np.zeros((SHARED, 3), np.uint8), slot, fresh)
-    return world
+        last = slam_map.add_points(
+            np.ones((SHARED, 3)), np.zeros((SHARED, 3), np.uint8), slot, fresh
+        )
+    return slam_map
 
 
 @pytest.mark.parametrize(
@@ -174,7 +177,9 @@ def test_the_local_map_is_the_whole_map_or_the_connected_part(chain, monkeypatch
     keyframes, points = LocalMap(chain, connected_only=False).around(5)
     assert keyframes.tolist() == [0, 1, 2, 3, 4, 5]
     assert (points == chain.points).all()
-    monkeypatch.setattr(tracking, "unconnected", lambda world, slot: unconnected(world, slot, 2))
+    monkeypatch.setattr(
+        tracking, "unconnected", lambda slam_map, slot: unconnected(slam_map, slot, 2)
+    )
     local_map = LocalMap(chain, connected_only=True)
     keyframes, points = local_map.around(5)
     assert keyframes.tolist() == [3, 4, 5]

@@ -93,6 +93,7 @@ def before_a_wall(room, seed, noise_px):
     return frames
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise_px", [0.8, 1.5])
 def test_a_motion_that_leaves_out_contradicting_points_is_not_accepted(room, noise_px):
     """The homography's other motion fits the wall and drops the things before it; it is 72 degrees off."""
@@ -188,10 +189,10 @@ def test_the_initial_map_has_a_median_depth_of_one(room, skipped):
     backend = make(room)
     results = track_all(backend, see(room, [*skipped, np.eye(4), *[SIDEWAYS] * MIN_VIEWS]))
     assert states(results) == ["initialising"] * (len(results) - 1) + ["ok"]
-    world = backend.world
-    assert world.kf_frame[world.keyframes].tolist() == [len(skipped), len(results) - 1]
+    slam_map = backend.map
+    assert slam_map.kf_frame[slam_map.keyframes].tolist() == [len(skipped), len(results) - 1]
     assert np.median(
-        se3.transform(world.kf_pose[0], world.position[world.points])[:, 2]
+        se3.transform(slam_map.kf_pose[0], slam_map.position[slam_map.points])[:, 2]
     ) == pytest.approx(1.0)
 
 
@@ -229,7 +230,7 @@ def test_keyframes_without_depth_are_culled_and_the_baseline_changes_nothing(roo
     all_kept = make(room, keyframes__redundant_share=1.0)
     for backend in (usual, all_kept):
         track_all(backend, frames)
-    assert usual.world.keyframe_count < all_kept.world.keyframe_count
+    assert usual.map.keyframe_count < all_kept.map.keyframe_count
     for baseline_m in (0.06, 0.08, 40 / 525):
         other = make(room)
         other.reset(replace(room.camera, baseline_m=baseline_m), seed=0)

@@ -81,6 +81,7 @@ def test_a_frame_of_two_places_tells_nothing(alike, blind, more, recognised):
     assert blind or tracking[2 * QUARTER] == "lost", "too far for a tenth of a second"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("alike", "aliased"), [(0.2, False), (0.6, True)])
 def test_perceptual_aliasing(alike, aliased):
     world = RingWorld(alike=alike)
@@ -89,12 +90,12 @@ def test_perceptual_aliasing(alike, aliased):
     lap = world.lap(2 * QUARTER, STEP)
     observations = observed(world.see(lap[10], 999), world.camera)
     here = InitialPose(se3.inverse(lap[10]) @ lap[0], None, 0, share=1.0, depth=3.0)
-    everywhere = backend.world.keyframes
+    everywhere = backend.map.keyframes
     assert (tracking == "ok").all()
-    assert is_aliased(backend.world, observations, {0: here}, everywhere, settings, 0) is aliased
-    assert not is_aliased(backend.world, observations, {0: here}, everywhere[:4], settings, 0)
+    assert is_aliased(backend.map, observations, {0: here}, everywhere, settings, 0) is aliased
+    assert not is_aliased(backend.map, observations, {0: here}, everywhere[:4], settings, 0)
     near = lambda submap, pose: not contradict(here, InitialPose(pose, None, 0, depth=3.0))  # noqa: E731
-    assert not is_aliased(backend.world, observations, {0: here}, everywhere, settings, 0, near)
+    assert not is_aliased(backend.map, observations, {0: here}, everywhere, settings, 0, near)
 
 
 def test_a_lost_camera_predicts_nothing_and_its_rotation_is_followed_in_every_frame(monkeypatch):
@@ -188,11 +189,11 @@ def mapped():
 
 def verified(backend, observations, patch, T_cam_world):
     """The verified place, from matches in a part of the image and from a pose."""
-    every = match_keyframe(backend.world, 0, observations)
+    every = match_keyframe(backend.map, 0, observations)
     few = every.select(patch(observations.xy[every.feature]))
     assert 8 <= len(few) < len(every) / 4
     return verify_place(
-        backend.world, InitialPose(T_cam_world, few, 0), observations, TrackingSettings()
+        backend.map, InitialPose(T_cam_world, few, 0), observations, TrackingSettings()
     )
 
 
@@ -237,7 +238,7 @@ def test_one_patch_does_not_determine_the_pose_nor_do_a_few_matches_beside_it(
     track_all(backend, [room.see(FIRST, 0, depthless=0.0, limit=4000)])
     pose = se3.exp(np.array([0.1, 0.05, 0.0, 0.0, 0.02, 0.01]))
     observations = observed(room.see(pose, 1, noise_px=1.0, limit=4000), room.camera)
-    every = match_keyframe(backend.world, 0, observations)
+    every = match_keyframe(backend.map, 0, observations)
     rng = np.random.default_rng(seed)
     off = np.abs(observations.xy[every.feature] - [260, 200]).max(axis=1)
     patch = rng.permutation(np.flatnonzero(off < half))
@@ -250,7 +251,7 @@ def test_one_patch_does_not_determine_the_pose_nor_do_a_few_matches_beside_it(
     assert len(place.matches) > 60
     assert np.array_equal(fitted.information, fitted.information.T)
     assert (
-        pose_uncertainty(backend.world, observations, place, np.random.default_rng(0)) <= 1
+        pose_uncertainty(backend.map, observations, place, np.random.default_rng(0)) <= 1
     ) == precise
 
 
@@ -259,9 +260,9 @@ def test_a_few_matches_determine_no_pose(count):
     room, backend = mapped()
     observations = observed(room.see(FIRST, 1), room.camera)
     place = InitialPose(
-        FIRST, match_keyframe(backend.world, 0, observations).select(np.arange(count)), 0
+        FIRST, match_keyframe(backend.map, 0, observations).select(np.arange(count)), 0
     )
-    assert pose_uncertainty(backend.world, observations, place, np.random.default_rng(0)) == np.inf
+    assert pose_uncertainty(backend.map, observations, place, np.random.default_rng(0)) == np.inf
 
 
 CAMERA = Camera(640, 480, 535.0, 539.0, 320.0, 247.0)
@@ -340,55 +341,63 @@ def observations(room, angle, index):
 
 
 @pytest.fixture
-def world(room):
+def slam_map(room):
     """A map of twelve keyframes around a room, every feature a point of its own."""
-    world = Map(room.camera, np.ones(1))
+    slam_map = Map(room.camera, np.ones(1))
     for index, angle in enumerate(ANGLES):
         features = observations(room, angle, index)
-        slot = world.add_keyframe(features, np.eye(4), index, index / 30)
-        world.add_points(np.ones((len(features), 3)), features.rgb, slot, np.arange(len(features)))
-    return world
+        slot = slam_map.add_keyframe(features, np.eye(4), index, index / 30)
+        slam_map.add_points(
+            np.ones((len(features), 3)), features.rgb, slot, np.arange(len(features))
+        )
+    return slam_map
 
 
 @pytest.mark.parametrize("place", [0, 5, 11])
-def test_the_keyframe_of_the_same_place_is_ranked_first(room, world, place):
-    best = top_candidates(world, world.keyframes, observations(room, ANGLES[place] + 0.02, 100), 3)
+def test_the_keyframe_of_the_same_place_is_ranked_first(room, slam_map, place):
+    best = top_candidates(
+        slam_map, slam_map.keyframes, observations(room, ANGLES[place] + 0.02, 100), 3
+    )
     assert len(best) == 3
-    assert world.kf_frame[best[0]] == place
-    ranked = world.kf_frame[
-        top_candidates(world, world.keyframes, observations(room, ANGLES[4], 100), 11)
+    assert slam_map.kf_frame[best[0]] == place
+    ranked = slam_map.kf_frame[
+        top_candidates(slam_map, slam_map.keyframes, observations(room, ANGLES[4], 100), 11)
     ].tolist()
     assert ranked[0] == 4
     assert set(ranked[1:3]) == {3, 5}
 
 
-def test_only_the_keyframes_given_are_chosen(room, world):
-    given = world.keyframes[[1, 2, 8, 9]]
-    best = top_candidates(world, given, observations(room, ANGLES[5], 100), 2)
+def test_only_the_keyframes_given_are_chosen(room, slam_map):
+    given = slam_map.keyframes[[1, 2, 8, 9]]
+    best = top_candidates(slam_map, given, observations(room, ANGLES[5], 100), 2)
     assert len(best) == 2
     assert set(best) <= set(given.tolist())
-    assert top_candidates(world, given, observations(room, 0.0, 100), 4) == given.tolist()
-    assert top_candidates(world, world.keyframes, observed(room.blind(0), room.camera), 2) == [0, 1]
+    assert top_candidates(slam_map, given, observations(room, 0.0, 100), 4) == given.tolist()
+    assert top_candidates(
+        slam_map, slam_map.keyframes, observed(room.blind(0), room.camera), 2
+    ) == [0, 1]
 
 
-def test_of_equal_scores_the_newer_keyframe_is_first(room, world):
+def test_of_equal_scores_the_newer_keyframe_is_first(room, slam_map):
     """A frame whose substrings no keyframe has scores zero everywhere."""
     stranger = observations(PointWorld(seed=9), 0.0, 100)
-    stored = world.kf_words[world.keyframes].view(np.uint16)[:, :, ::STRIDE]
+    stored = slam_map.kf_descriptor[slam_map.keyframes].view(np.uint16)[:, :, ::STRIDE]
     used = np.concatenate(
-        [stored[row, : world.kf_count[slot]] for row, slot in enumerate(world.keyframes)]
+        [stored[row, : slam_map.kf_count[slot]] for row, slot in enumerate(slam_map.keyframes)]
     )
-    stranger.words.view(np.uint16)[:] = np.setdiff1d(np.arange(1 << 16), used)[0]
-    newest = world.keyframes[np.argsort(-world.kf_id[world.keyframes])]
-    assert top_candidates(world, world.keyframes, stranger, 4) == newest[:4].tolist()
+    stranger.descriptors.view(np.uint16)[:] = np.setdiff1d(np.arange(1 << 16), used)[0]
+    newest = slam_map.keyframes[np.argsort(-slam_map.kf_id[slam_map.keyframes])]
+    assert top_candidates(slam_map, slam_map.keyframes, stranger, 4) == newest[:4].tolist()
 
 
-def reference_scores(world, keyframes, features):
+def reference_scores(slam_map, keyframes, features):
     """The same score, counted substring by substring without an index."""
-    query = np.ascontiguousarray(features.words).view(np.uint16)[:, ::STRIDE]
+    query = np.ascontiguousarray(features.descriptors).view(np.uint16)[:, ::STRIDE]
     shared = []
     for slot in keyframes.tolist():
-        own = world.kf_words[slot, world.kf_point[slot] >= 0].view(np.uint16)[:, ::STRIDE]
+        own = slam_map.kf_descriptor[slot, slam_map.kf_point[slot] >= 0].view(np.uint16)[
+            :, ::STRIDE
+        ]
         shared.append([own[np.isin(own[:, p], query[:, p]), p] for p in range(query.shape[1])])
     everything = [np.concatenate([columns[p] for columns in shared]) for p in range(query.shape[1])]
     total = sum(map(len, everything))
@@ -399,45 +408,48 @@ def reference_scores(world, keyframes, features):
             for p, column in enumerate(columns)
             for value in column
         ]
-        scores.append(sum(weights) / np.sqrt(max(np.count_nonzero(world.kf_point[slot] >= 0), 1)))
+        scores.append(
+            sum(weights) / np.sqrt(max(np.count_nonzero(slam_map.kf_point[slot] >= 0), 1))
+        )
     return np.array(scores)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_index_follows_keyframes_that_come_and_go(room, seed):
     """Keyframes of many sizes, some features without a point, slots used again, and only some asked for."""
-    world = Map(room.camera, np.ones(1))
+    slam_map = Map(room.camera, np.ones(1))
     rng = np.random.default_rng(seed)
     compared = 0
     for number in range(40):
-        if world.keyframe_count < 4 or rng.random() < 0.6:
+        if slam_map.keyframe_count < 4 or rng.random() < 0.6:
             features = observations(room, rng.uniform(0, 6), number)
-            slot = world.add_keyframe(features, np.eye(4), number, number / 30)
+            slot = slam_map.add_keyframe(features, np.eye(4), number, number / 30)
             some = np.flatnonzero(rng.random(len(features)) < 0.6)
-            world.add_points(np.ones((len(some), 3)), features.rgb[some], slot, some)
+            slam_map.add_points(np.ones((len(some), 3)), features.rgb[some], slot, some)
         else:
-            world.remove_keyframe(int(rng.choice(world.keyframes)))
-        asked = world.keyframes[rng.random(world.keyframe_count) < 0.8]
+            slam_map.remove_keyframe(int(rng.choice(slam_map.keyframes)))
+        asked = slam_map.keyframes[rng.random(slam_map.keyframe_count) < 0.8]
         if number % 3 == 0 and len(asked):  # not each time: several come and go in between
             features = observations(room, rng.uniform(0, 6), 1000 + number)
             compared = compared + 1
-            expected = reference_scores(world, asked, features)
+            expected = reference_scores(slam_map, asked, features)
             np.testing.assert_allclose(
-                recognition_scores(world, asked, features), expected, rtol=1e-9
+                recognition_scores(slam_map, asked, features), expected, rtol=1e-9
             )
     assert compared > 8
 
 
-def test_a_keyframe_is_indexed_again_when_many_of_its_points_changed(room, world):
-    (slot,) = world.keyframes[:1]
-    count = int(np.count_nonzero(world.kf_point[slot] >= 0))
+def test_a_keyframe_is_indexed_again_when_many_of_its_points_changed(room, slam_map):
+    (slot,) = slam_map.keyframes[:1]
+    count = int(np.count_nonzero(slam_map.kf_point[slot] >= 0))
     for removed, indexed in (
         (0, count),
         (int(count * CHANGED), count),
         (int(count * CHANGED) + 1, None),
     ):
-        world.kf_point[slot, :removed] = -1
-        recognition_scores(world, world.keyframes, observations(room, 0.0, 100))
-        assert world.substrings[slot][1].shape[1] == (
+        slam_map.kf_point[slot, :removed] = -1
+        recognition_scores(slam_map, slam_map.keyframes, observations(room, 0.0, 100))
+        assert slam_map.substrings[slot][1].shape[1] == (
             count - removed if indexed is None else indexed
         )

@@ -50,7 +50,7 @@ def made(tmp_path_factory):
 
 def test_a_loaded_map_is_the_saved_one_to_the_last_bit(made, tmp_path):
     room, _, file, backend = made
-    saved = packed(backend.world, [])
+    saved = packed(backend.map, [])
     loaded = read_map(file)
     assert loaded.header.made_by == "a run"
     assert saved.keys() == loaded.arrays.keys()
@@ -103,13 +103,13 @@ def test_a_loaded_map_continues_to_grow(made, tmp_path, loops):
     results = track_all(backend, frames)
     assert states(results) == ["lost"] * 3 + ["ok"] * HALF
     assert errors_m(results[3:], poses[HALF:], poses[0]).max() < 0.05
-    assert results[-1].map_points > len(before.world.points)
+    assert results[-1].map_points > len(before.map.points)
     assert any(r.keyframe for r in results)
     new = [record.frame for record in backend.outputs().keyframes if record.frame >= 0]
-    assert 0 < len(new) < backend.world.keyframe_count
+    assert 0 < len(new) < backend.map.keyframe_count
     assert min(new) >= 3
     backend.save_map(tmp_path / "grown.npz")
-    assert len(read_map(tmp_path / "grown.npz").arrays["kf_id"]) == backend.world.keyframe_count
+    assert len(read_map(tmp_path / "grown.npz").arrays["kf_id"]) == backend.map.keyframe_count
 
 
 @pytest.mark.parametrize(

@@ -201,6 +201,7 @@ def reused_pose(self, frame):
     return TrackResult(self.pose, "ok")
 
 
+@pytest.mark.slow
 def test_a_good_tracker_passes():
     report = tracker_report(Good, frames=4)
     assert report.ok
@@ -336,6 +337,11 @@ def test_the_spec_is_checked_too(tmp_path):
     assert "preset 'fast' does not fit" in report.checks[0].message
 
 
+def unnamed_masks(sequence):
+    """A sequence's masks without the names of their classes."""
+    return [replace(CornerSequence(4).masks[i], class_names={}) for i in range(4)]
+
+
 def frames(change):
     return {"__getitem__": lambda self, index: change(CornerSequence.__getitem__(self, index))}
 
@@ -364,7 +370,7 @@ def frames(change):
             "differs when it is read",
         ),
         (
-            {"masks": [replace(CornerSequence(4).masks[i], class_names={}) for i in range(4)]},
+            {"masks": property(unnamed_masks)},
             "have no class name",
         ),
         (

@@ -50,6 +50,7 @@ from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
 from dynslam_bench.trackers.registry import all_specs, resolve_settings
 from dynslam_bench.trackers.systems.composition import UnfilteredSystemSettings
 from dynslam_bench.tuning import SpaceSpec, search_space
+from dynslam_bench.tuning.plan import source_of_masks
 
 SYSTEMS = {
     spec.id: spec for spec in all_specs() if issubclass(spec.settings, UnfilteredSystemSettings)
@@ -67,7 +68,11 @@ def offered() -> dict[str, tuple[str, Parameter]]:
     """Every setting that a study of some system draws on rendered sequences, with the first such system."""
     settings: dict[str, tuple[str, Parameter]] = {}
     for spec in SYSTEMS.values():
-        for parameter in search_space(spec.settings(), SpaceSpec(), ["synthetic/walking_xyz"]):
+        tracker_settings = spec.settings()
+        if hasattr(tracker_settings, "segmentation"):  # "auto" stands for a source of masks
+            source = source_of_masks(tracker_settings, ["synthetic/walking_xyz"])
+            tracker_settings = apply_overrides(tracker_settings, {"segmentation.source": source})
+        for parameter in search_space(tracker_settings, SpaceSpec()):
             settings.setdefault(parameter.name, (spec.id, parameter))
     return settings
 
@@ -476,6 +481,7 @@ def test_each_sets_something_else_than_the_default(tracker, name):
     assert changed <= set(spec.presets[name])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("more", "asked"), [({}, [1, 0, 1, 0, 1, 0, 1]), ({"crowded_share": 0.1}, [1] * 7)]
 )
@@ -529,6 +535,7 @@ def track(sitting, change: Callable[[Frame], Frame], bad: range = BAD):
     return states
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [0, 127], ids=["covered lens", "fog"])
 def test_frames_without_any_texture_are_lost_and_only_those(sitting, value: int) -> None:
     states = track(sitting, lambda frame: replace(frame, rgb=np.full_like(frame.rgb, value)))
@@ -537,6 +544,7 @@ def test_frames_without_any_texture_are_lost_and_only_those(sitting, value: int)
     assert len(lost) <= len(BAD) + 2, f"recovery within two frames, but lost: {lost}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [0.35, 2.2], ids=["under-exposed", "over-exposed"])
 def test_a_wrong_exposure_is_survived(sitting, gain: float) -> None:
     def exposed(frame: Frame) -> Frame:
@@ -574,6 +582,7 @@ def test_a_sudden_turn_is_no_translation(sitting, degrees: int) -> None:
     assert result.state == "lost" or np.linalg.norm(result.T_world_cam[:3, 3]) < 0.02
 
 
+@pytest.mark.slow
 def test_a_gap_of_a_second_is_bridged_or_said(sitting) -> None:
     tracker = started(sitting)
     truth = sitting.ground_truth.T_world_cam
@@ -606,6 +615,7 @@ def test_frames_of_another_kind_are_refused_in_one_line(sitting) -> None:
             tracker.track(wrong)
 
 
+@pytest.mark.slow
 def test_missing_depth_is_missing_however_it_is_written_and_buffers_may_be_reused(sitting) -> None:
     def poses(missing: float, *, reuse: bool) -> bytes:
         tracker = started(sitting, "emfoa-oft?masks=none")

@@ -59,7 +59,7 @@ def on_scenes(*ratios: float, lost: Sequence[int] = (), **changes: object) -> Pa
 
 
 GAIN = on_scenes(0.7, 0.72, 0.75, 0.77, 0.8, 0.74)
-NOTHING = on_scenes(1.01, 0.99, 1.0, 1.02, 0.98, 1.0)
+NOTHING = on_scenes(1.01, 0.99, 1.005, 1.02, 0.98, 0.995)
 OPEN = on_scenes(0.4, 1.9, 0.7, 1.5, 0.9, 1.2)
 PERHAPS = on_scenes(0.5, 0.6, 0.9, 0.7, 1.3, 0.8, 0.9)
 LOSS = on_scenes(1.3, 1.4, 1.5, 1.6, 1.2, 1.3)

@@ -6,10 +6,11 @@ import sys
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-from dynslam_bench.core.code_files import files_of_command
+from dynslam_bench.core.code_files import files_below, files_of_command
 from dynslam_bench.core.programs import (
     Command,
     ProgramReads,
@@ -17,6 +18,7 @@ from dynslam_bench.core.programs import (
     is_counted,
     is_file_name,
     mapped_files,
+    modified_time_ns,
 )
 from dynslam_bench.core.reads import (
     ABSENT,
@@ -68,6 +70,8 @@ _VARIABLE = re.compile(r"[A-Z][A-Z0-9_]{2,}")
 """A word in a text that can be the name of an environment variable."""
 _FILE_NAME = re.compile(r"[\w./~+\-]*\w\.[A-Za-z]\w{0,9}")
 """A text that can be the name of a file: it has a suffix."""
+_UP_TO_PLACEHOLDER = re.compile(r".*(?:\}|%[-+0-9.]*[a-zA-Z])")
+"""A text up to its last placeholder: of ``{name}.onnx`` the ending is left."""
 _SYSTEM_LIBRARY = re.compile(
     r"lib(?:c|m|dl|rt|util|pthread|resolv|nss_\w+|gcc_s|stdc\+\+|ssl|crypto|sqlite3|z|bz2|lzma|ffi|readline|ncursesw?|"
     r"tinfow?|panelw?|uuid|expat|mpdec|gdbm\w*|db|nsl|tirpc)[-.].*"
@@ -185,9 +189,10 @@ class Collector:
         self._origins = origins
         self._private = private
         self._path = list(sys.path)
-        self._mapped = mapped_files(os.getpid())
+        self._mapped = set(mapped_files(os.getpid()))
         self._loaded = {name.partition(".")[0] for name in sys.modules}
         self._texts: dict[tuple[str, Stamp], set[str]] = {}
+        self._below: dict[str, list[str]] = {}
         self._commands: dict[Command, set[str]] = {}
         self._variables: dict[Command, set[str]] = {}
 
@@ -309,6 +314,10 @@ class Collector:
             self.compare(path, note, stamp_of(path))
         if self.notes.changed:
             return f"the file {self.notes.changed[0]}"
+        # a library of a program that was built again while the program ran
+        for path, modified_ns in dict(self.programs.files).items():
+            if is_code(path) and self._is_rebuilt(path, modified_ns):
+                return f"the file {path} of a program"
         # what nobody saw opened is as it was loaded if it is older than that
         for path, was_loaded in modules.files.items():
             if path not in self.notes.files and self._is_newer(path, was_loaded):
@@ -334,6 +343,23 @@ class Collector:
             note.stamp = stamp  # it was written again with the same content
         else:
             self.notes.changed.append(path)
+
+    def _is_rebuilt(self, path: str, modified_ns: int | None) -> bool:
+        """Whether another file lies now where a program has its code from.
+
+        What was written after a program was started when it was seen first is the program's own.
+
+        Args:
+            path: The file.
+            modified_ns: Its time of modification when it was seen first.
+        """
+        now_ns = modified_time_ns(path)
+        first_start_ns = min(self.notes.commands.values(), default=sys.maxsize)
+        if now_ns is None or modified_ns is None or self.is_output(path):
+            return False
+        if path in self.programs.replaced:
+            return True
+        return modified_ns < first_start_ns and now_ns != modified_ns
 
     def _is_newer(self, path: str, was_loaded: bool) -> bool:
         """Whether an input has changed since the recorder was started, or since this process loaded its libraries."""
@@ -383,7 +409,7 @@ class Collector:
 
     def _libraries(self) -> set[str]:
         """The files that were mapped into memory since the start, or because a search path named them."""
-        mapped = mapped_files(os.getpid())
+        mapped = set(mapped_files(os.getpid()))
         # those that a search path of the loader names
         preloaded = set(re.split("[: ]", self.environment.get("LD_PRELOAD", "")))
         folders = folders_of(self.environment.get("LD_LIBRARY_PATH", ""))
@@ -476,7 +502,8 @@ class Collector:
         """The files that foreign sources and small text files name, and those that sources name and that are not there.
 
         A name is looked for in the folder of the text, in that of the plug-in and in the working
-        folder.
+        folder. A bare name of a file, or the ending of a network's file, is also looked for in all
+        folders below that of the text: ``folder / f"{name}.onnx"``.
         """
         named: set[str] = set()
         missing: set[str] = set()
@@ -484,11 +511,29 @@ class Collector:
             for word in self._words(text):
                 places = self._places_of(word, text)
                 there = {place for place in places if os.path.isfile(place)}
+                if not there:
+                    there = self._files_below(os.path.dirname(text), word)
                 named |= there
                 if not there and text.endswith(".py") and _can_be_missing(word):
                     missing |= places
         missing = {path for path in missing if not self.is_output(path)}
         return set(filter(self._is_input, named)), missing
+
+    def _files_below(self, folder: str, word: str) -> set[str]:
+        """The files of that name, or of that ending of a network's file, in all folders below one.
+
+        Of a folder with very many files the first ones are looked at; hidden folders, environments,
+        results and recordings are left out (`files_below`).
+        """
+        ending = _UP_TO_PLACEHOLDER.sub("", word)
+        is_ending = ending.lower() in (*_NETWORKS, *_ARRAYS_AND_CLOUDS)
+        if not is_ending and _FILE_NAME.fullmatch(word) is None:
+            return set()
+        if folder not in self._below:
+            self._below[folder] = [*map(str, islice(files_below(Path(folder)), _MANY_FILES))]
+        if is_ending:
+            return {file for file in self._below[folder] if file.endswith(ending)}
+        return {file for file in self._below[folder] if os.path.basename(file) == word}
 
     def _words(self, text: str) -> set[str]:
         """The words of a text file that could be names of files; none of a file that is no such text."""

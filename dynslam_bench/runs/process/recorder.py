@@ -36,7 +36,14 @@ import psutil
 
 from dynslam_bench.core.errors import RunError
 from dynslam_bench.core.folders import digest_cache_folder, stage_cache_folder
-from dynslam_bench.core.programs import RESULT_VARIABLES, Command, is_counted, is_file_name, look_at
+from dynslam_bench.core.programs import (
+    DECLARED_VARIABLE,
+    RESULT_VARIABLES,
+    Command,
+    is_counted,
+    is_file_name,
+    look_at,
+)
 from dynslam_bench.core.reads import (
     BYTE_CODE_FOLDER,
     SEARCH_PATHS,
@@ -52,8 +59,10 @@ from dynslam_bench.runs.process.origins import Origins
 
 _SMALL_BYTES = 1 << 20
 """Files of up to so many bytes are digested when they are opened; larger ones, which take time, at the end."""
+_FIRST_LOOK_S = 0.02
+"""Seconds from the first program's start to the first look. A program that has ended before counts by its command."""
 _LOOK_S = 0.5
-"""Seconds between two looks at the programs. One that has ended before the first look counts by its command."""
+"""Seconds between two looks at the programs when the first ones are over; each comes after twice the time."""
 _FILE_CLOCK = 5 if sys.platform == "linux" else None
 """Number of the clock that stamps files, the coarse one; it moves on every 1 to 10 ms."""
 _CLOCK_LAG_NS = 10_000_000
@@ -121,6 +130,7 @@ class ReadRecorder:
             VARIABLE: self._on_variable,
             ALL_VARIABLES: self._on_all_variables,
             VARIABLE_SET: self._on_variable_set,
+            DECLARED_VARIABLE: self._on_declared_variable,
             "os.rename": self._on_rename,
             "os.link": self._on_rename,
             "os.symlink": self._on_symlink,
@@ -427,6 +437,9 @@ class ReadRecorder:
     def _on_variable_set(self, _: FrameType, name: Any) -> None:
         self._notes.made.add(f"${_variable_name(name)}")
 
+    def _on_declared_variable(self, _: FrameType, name: str) -> None:
+        self._note_variables([name])
+
     def _note_variables(self, names: Iterable[str]) -> None:
         for name in names:
             is_known = name in self._notes.variables or f"${name}" in self._notes.made
@@ -478,8 +491,10 @@ class ReadRecorder:
     def _watch(self) -> None:
         """Look at the programs until the end; runs in a thread of its own, as the run may wait for a program."""
         self._ignored_threads.add(threading.get_ident())
-        while not self._ended.wait(_LOOK_S):
-            self._look_at_programs(_LOOK_S / 2)
+        wait_s = _FIRST_LOOK_S
+        while not self._ended.wait(wait_s):
+            self._look_at_programs(wait_s / 2)
+            wait_s = min(2 * wait_s, _LOOK_S)
 
     def _look_at_programs(self, least_age_s: float) -> None:
         """Note what the processes below this one are made of: each again when its age has doubled.

@@ -21,7 +21,9 @@ COCO_CLASSES: tuple[str, ...] = tuple(COCO_IDS.get(number, "") for number in ran
 Count = Annotated[int, Field(ge=1, le=4096)]
 """Of channels, layers or pixels; the upper bound refuses files with an absurd shape."""
 Blocks = Annotated[int, Field(ge=1, le=64)]
+"""Of residual blocks or layers."""
 Side = Annotated[float, Field(gt=0, le=1e5)]
+"""Of a box, pixels; of an anchor's ratio as well."""
 
 
 class NetworkConfig(BaseModel):
@@ -181,6 +183,7 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """``[B, inputs, H, W]`` to ``[B, outputs, H / stride, W / stride]``."""
+        # no activation between the last convolution and the sum
         y = x
         for number in range(1, self.convolutions + 1):
             y = self.get_submodule(f"bn{number}")(self.get_submodule(f"conv{number}")(y))
@@ -194,8 +197,10 @@ class Trunk(nn.Module):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
+        # stem: 7x7 with stride 2; forward pools it by 2 again
         self.conv1 = nn.Conv2d(3, config.stem, 7, 2, 3, bias=False)
         self.bn1 = _norm(config.stem, config)
+        # stages C2..C5: the first block of each but C2 halves the resolution
         inputs = config.stem
         for stage, (count, outputs) in enumerate(zip(config.blocks, config.stages, strict=True)):
             blocks = [ResidualBlock(inputs, outputs, 1 if stage == 0 else 2, config)]
@@ -229,6 +234,7 @@ class FPN(nn.Module):
 
     def forward(self, stages: list[Tensor]) -> list[Tensor]:
         """C2..C5 to P2..P6."""
+        # laterals, sums from coarse to fine, smoothing; P6 is every second pixel of P5
         fused = top_down([block(x) for block, x in zip(self.inner_blocks, stages, strict=True)])
         levels = [block(x) for block, x in zip(self.layer_blocks, fused, strict=True)]
         return [*levels, levels[-1][:, :, ::2, ::2]]
@@ -255,6 +261,7 @@ class CFPN(nn.Module):
 
     def forward(self, stages: list[Tensor], levels: list[Tensor]) -> list[Tensor]:
         """C2..C5 and P2..P5 (a longer list is cut) to the mask branch's m2..m5."""
+        # m5..m2, added to the FPN's levels
         fused = top_down([reduce(x) for reduce, x in zip(self.reduce, stages, strict=True)])
         smoothed = [smooth(x) for smooth, x in zip(self.smooth, fused, strict=True)]
         return [level + extra for level, extra in zip(levels[: len(stages)], smoothed, strict=True)]

@@ -36,6 +36,7 @@ _RENAMES = (
 )
 """Names of the file published in 2019, and today's."""
 _WRAPPERS = ("model", "state_dict", "model_state_dict")
+"""Keys under which training scripts store the weights."""
 MAX_EXPANSION = 4
 """Largest ratio of a checkpoint's unpacked size to its file size; torch stores weights uncompressed."""
 KEYS_SHOWN = 4
@@ -56,7 +57,8 @@ def load_network(path: Path) -> MaskRCNN:
     """
     state, config = read_weights(path)
     config = config or infer_config(state, path)
-    with torch.device("meta"):  # compares the shapes before memory is allocated for them
+    # compare the shapes before memory is allocated for them
+    with torch.device("meta"):
         _check_fit(MaskRCNN(config), state, path)
     network = MaskRCNN(config)
     load_strictly(network, state, path)
@@ -97,6 +99,7 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], NetworkConfig | None]:
     Raises:
         SegmentationError: The file holds no weights, or a shape that is not understood.
     """
+    # this project's files carry the network's shape
     content = read_checkpoint(path)
     config = None
     if "config" in content and "format" in content:
@@ -108,11 +111,14 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], NetworkConfig | None]:
             SegmentationError, f"{path}: the network's shape is not understood", of=ValidationError
         ):
             config = NetworkConfig.model_validate_json(str(content["config"]))
+
     # training scripts wrap the weights in a table with more
     for key in _WRAPPERS:
         if isinstance(content.get(key), Mapping):
             content = content[key]
             break
+
+    # tensors alone, each a plain array
     state = {str(key): value for key, value in content.items() if isinstance(value, Tensor)}
     if not state:
         raise SegmentationError(f"{path} holds no weights; its keys: {_some(map(str, content))}")
@@ -184,6 +190,8 @@ def infer_config(state: Mapping[str, Tensor], path: Path) -> NetworkConfig:
         prefix = f"backbone.body.layer{stage}."
         numbers = {key.split(".")[3] for key in state if key.startswith(prefix)}
         blocks.append(len(numbers))
+
+    # the shape, with layers counted by their numbers in the keys
     mask_layers = {key.split(".")[2] for key in state if key.startswith("roi_heads.mask_head.")}
     shape = {
         "blocks": blocks,
@@ -217,6 +225,7 @@ def load_strictly(network: MaskRCNN, state: Mapping[str, Tensor], path: Path) ->
 
 def _check_fit(network: MaskRCNN, state: Mapping[str, Tensor], path: Path) -> None:
     """Raise a SegmentationError where keys are missing or unknown, or shapes differ."""
+    # a file without any CFPN is a plain Mask R-CNN's
     own = _weights(network)
     has_cfpn = any(key.startswith(CFPN_PREFIX) for key in state)
     missing = [

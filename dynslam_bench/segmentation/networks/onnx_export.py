@@ -120,6 +120,8 @@ def write_onnx(network: MaskRCNN, path: Path, *, size: tuple[int, int] = SIZE) -
     with translate_errors(SegmentationError, missing, install_hint("onnx"), of=ImportError):
         import onnx
         import onnxscript  # noqa: F401 - torch's exporter asks for it
+
+    # the network at one size, the example that it is traced with, and its classes' names
     static = StaticMaskRCNN(network, *size, score=FLOOR, iou=NMS_IOU).eval()
     image = torch.rand(1, 3, *size, generator=torch.Generator().manual_seed(0))
     classes = {number: name for number, name in enumerate(network.config.classes, start=1) if name}
@@ -145,6 +147,8 @@ def write_onnx(network: MaskRCNN, path: Path, *, size: tuple[int, int] = SIZE) -
                     output_names=["boxes", "labels", "scores", "masks"],
                     verbose=False,
                 )
+
+        # the class names go into the file; the file appears if it is sound
         model = onnx.load(str(temporary))
         onnx.helper.set_model_props(model, {"names": repr(classes), "producer": "dynslam-bench"})
         onnx.checker.check_model(model)

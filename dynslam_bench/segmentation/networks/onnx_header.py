@@ -17,6 +17,7 @@ from dynslam_bench.core import SegmentationError, translate_errors
 Fields: TypeAlias = dict[int, list[Any]]
 """Values of a message, each an integer or a memoryview, by field number."""
 _NOTHING = memoryview(b"")
+"""In place of a field that is missing."""
 
 # protocol buffers' wire types
 VARINT = 0

@@ -24,6 +24,7 @@ KNOWN = (
     "known: YOLO-seg [1, 4+C+M, N] or, after suppression, [1, N, 6+M], with prototypes [1, M, h, w]; semantic logits "
     "[1, C, h, w]; boxes, labels, scores, masks as torchvision exports them"
 )
+"""The layouts that are read, for messages."""
 _YOLO_NAMES = {len(COCO_NAMES): dict(enumerate(COCO_NAMES)), 1: {0: "person"}}
 """Names of the classes of a YOLO network without names, by their number."""
 _SEMANTIC_NAMES = {
@@ -54,7 +55,7 @@ _ANCHORS = 3
 
 @dataclass(frozen=True)
 class Layout:
-    """How to read a network's outputs.
+    """The layout of a network's outputs: how they are read.
 
     Attributes:
         kind: Which decoder.
@@ -89,7 +90,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Metadata:
-    """What a file says of its network.
+    """Metadata of a network's file.
 
     Attributes:
         names: Class number to name; None where the file names no classes.
@@ -208,7 +209,8 @@ def detect_layout(
     # without those that the user, the metadata or the number of rows exclude
     if asked != "auto":
         fits = [fit for fit in shapes_allow if fit.layout.id == asked]
-        fits = [fit for fit in fits if fit.layout.names] or fits  # the others are of no use
+        # layouts without class names are of no use where others have them
+        fits = [fit for fit in fits if fit.layout.names] or fits
     else:
         fits = [fit for fit in fits if _agrees(fit, facts)]
     fits = _by_rows(fits, size)
@@ -237,11 +239,13 @@ def _agrees(fit: _Fit, facts: Metadata) -> bool:
     if facts.task and layout.kind not in _TASKS[facts.task]:
         return False
     if fit.channels_last and facts.task:
-        return False  # Ultralytics exports ONNX with channels first
+        # Ultralytics exports ONNX with channels first
+        return False
     if layout.kind != "yolo":
         return True
     if layout.objectness and (facts.task or facts.suppressed is not None):
-        return False  # YOLOv5's exporter, whose networks have it, writes neither entry
+        # YOLOv5's exporter, whose networks have it, writes neither entry
+        return False
     return facts.suppressed is None or layout.suppressed == facts.suppressed
 
 
@@ -364,9 +368,10 @@ def _semantic(
 
 def _usual_scaling(facts: Metadata, *, aligned: bool) -> Literal["unit", "symmetric", "imagenet"]:
     """Input scaling of most semantic networks of such an exporter."""
-    if facts.task:  # Ultralytics
+    # by the exporter: Ultralytics' networks, TensorFlow's DeepLab, torchvision's models
+    if facts.task:
         return "unit"
-    return "symmetric" if aligned else "imagenet"  # TensorFlow's DeepLab; torchvision's models
+    return "symmetric" if aligned else "imagenet"
 
 
 def _of_rank(outputs: Iterable[TensorInfo], rank: int) -> list[TensorInfo]:
@@ -427,6 +432,8 @@ def _ambiguous(fits: Sequence[_Fit], facts: Metadata, where: str, listed: str) -
         fit.layout.id for fit in fits if fit.layout.names and not fit.channels_last
     )
     texts = " and ".join(fit.text for fit in fits)
+
+    # what would decide between them
     cures = []
     if facts.names is None and fits[0].layout.kind == "yolo":
         cures.append(
@@ -459,6 +466,7 @@ def _not_understood(
     asked: str,
 ) -> SegmentationError:
     """The error for outputs that fit no layout, or only some that the metadata or the user exclude."""
+    # layouts that the metadata or the user exclude
     listed = "; ".join(map(str, outputs)) or "none"
     said = _said(facts)
     if shapes_allow:
@@ -472,6 +480,8 @@ def _not_understood(
             f"{where}: {reason}, but the outputs {listed} fit {texts}",
             f"if the shapes are right: {cure}",
         )
+
+    # no layout: what may be the reason
     reasons = ["no known layout fits"]
     if said:
         reasons.append(f"the metadata say {said}")

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, Instances, SegmenterContext
 from dynslam_bench.core import SegmentationError, translate_errors
+from dynslam_bench.geometry import at_width
 from dynslam_bench.segmentation.networks import pinned_threads
 from dynslam_bench.segmentation.networks.onnx_header import TensorInfo, read_header
 from dynslam_bench.segmentation.networks.onnx_layout import (
@@ -53,8 +54,8 @@ PAD = 114
 """Grey level of the borders around a letterboxed image."""
 STRIDE = 32
 """An open input size is padded to a multiple of this."""
-MIN_COMPONENT_PX = 64
-"""Smaller connected parts of a semantic map are noise and become no object."""
+MIN_COMPONENT_SIDE_PX = 8
+"""A part of a semantic map smaller than a square of this side, at an image width of 640, is noise and no object."""
 MAX_OBJECTS = 100
 """Objects an image, as torchvision's models have it."""
 MAX_CANDIDATES = 1000
@@ -200,7 +201,7 @@ def build(settings: SegmentationSettings, context: SegmenterContext) -> OnnxSegm
 
 @dataclass(frozen=True)
 class Placement:
-    """Where the frame lies in the network's input: ``x_input = x_frame * scale_x + offset_x``, likewise y.
+    """Scale and offset of the frame in the network's input: ``x_input = x_frame * scale_x + offset_x``, likewise y.
 
     Attributes:
         frame: Height and width of the frame.
@@ -385,6 +386,7 @@ def _corners(rows: Float) -> tuple[Float, Float, Float]:
 
 def _best(rows: Float, first: int, layout: Layout) -> tuple[Float, Float, Float]:
     """Corners, best scores and their class numbers of detections with centre, size and a score a class."""
+    # scores of the classes, times the objectness where there is one
     scores = rows[:, 4 + layout.objectness : first]
     if layout.objectness:
         scores = scores * rows[:, 4:5]
@@ -402,6 +404,7 @@ def _decode_instances(
     floor: float,
 ) -> Instances:
     """Objects of boxes ``[K, 4]``, labels ``[K]``, scores ``[K]`` and pasted masks ``[K, 1, H, W]``."""
+    # as many of each
     boxes = values[0].reshape(-1, 4)
     labels = np.rint(values[1].reshape(-1)).astype(np.intp)
     scores = values[2].reshape(-1)
@@ -418,9 +421,12 @@ def _decode_instances(
             f"the network's masks are {planes.shape[2]}x{planes.shape[1]}, its input {place.input[1]}x{place.input[0]}",
             "masks must be pasted into the whole image, as torchvision's export does",
         )
+
+    # detections that count
     above = scores >= floor
     _check_detections(boxes[above], scores[above], labels[above].astype(np.float32), layout)
     keep = _keep(boxes, scores, labels, layout, settings, floor)
+
     # the planes cover the whole input
     whole = np.tile(np.array([0, 0, *place.input[::-1]], np.float32), (len(keep), 1))
     planes = planes[keep].astype(np.float32)
@@ -538,6 +544,7 @@ def _decode_semantic(
     )
     full = np.matmul(np.matmul(rows, logits), columns.T)
     level = _logit(settings.mask_threshold)
+    least_area = at_width(MIN_COMPONENT_SIDE_PX, place.frame[1]) ** 2
     masks = [np.zeros((0, *place.frame), bool)]
     names = []
     scores = []
@@ -548,7 +555,7 @@ def _decode_semantic(
             (margin > level).astype(np.uint8), connectivity=8
         )
         for component in range(1, len(stats)):
-            if stats[component, cv2.CC_STAT_AREA] < MIN_COMPONENT_PX:
+            if stats[component, cv2.CC_STAT_AREA] < least_area:
                 continue
             # its score is the probability of the mean margin
             mask = labels == component

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
 
-from dynslam_bench.contracts import Frame
+from dynslam_bench.contracts import Frame, Segmenter
 from dynslam_bench.core import SegmentationError, write_atomic
 from dynslam_bench.core.records import Record, schema
 from dynslam_bench.evaluation import MaskCounts, compare_masks
@@ -18,7 +18,7 @@ from dynslam_bench.segmentation.build_segmenter import (
     weights_digest,
 )
 from dynslam_bench.segmentation.settings import SegmentationSettings
-from dynslam_bench.segmentation.training.labelled_images import open_labelled
+from dynslam_bench.segmentation.training.labelled_images import LabelledImage, open_labelled
 
 THRESHOLDS: tuple[float, ...] = tuple(round(0.5 + 0.05 * step, 2) for step in range(10))
 """COCO's IoU thresholds 0.50, 0.55 ... 0.95."""
@@ -122,6 +122,7 @@ def mask_iou(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Intersection over union ``[N, M]`` of masks ``[N, H, W]`` and ``[M, H, W]``."""
     if not len(a) or not len(b):
         return np.zeros((len(a), len(b)))
+    # common pixels of all pairs by one product
     x = a.reshape(len(a), -1).astype(np.float32)
     y = b.reshape(len(b), -1).astype(np.float32)
     inter = (x @ y.T).astype(np.float64)
@@ -167,6 +168,7 @@ def average_precision(scores: NDArray[np.float64], hits: NDArray[np.bool_], trut
     """Area under the precision-recall curve at COCO's 101 recall points; NaN without objects."""
     if not truths:
         return float("nan")
+    # recall and precision after each detection, the surest first
     order = np.argsort(-scores, kind="stable")
     positives = np.cumsum(hits[order])
     recall = positives / truths
@@ -211,6 +213,21 @@ class SegmenterScore(Record):
     threads: int
 
 
+def _add_image(
+    tallies: dict[str, MaskTally], segmenter: Segmenter, image: LabelledImage, index: int
+) -> float:
+    """Segment an image and add its masks to the tally of each class; returns the seconds that it took."""
+    frame = Frame(index, float(index), image.rgb, np.zeros(image.rgb.shape[:2], np.float32))
+    start = time.perf_counter()
+    detections = segmenter.segment(frame)
+    seconds = time.perf_counter() - start
+    for name, tally in tallies.items():
+        labelled = image.masks[[kind == name for kind in image.class_names]]
+        predicted = detections.of_classes([name])
+        tally.add(labelled, predicted.masks, predicted.scores)
+    return seconds
+
+
 def evaluate_segmenter(
     settings: SegmentationSettings,
     data: str,
@@ -239,6 +256,7 @@ def evaluate_segmenter(
         SegmentationError: The segmenter or the data are not available, or no image shows an object
             of the classes.
     """
+    # detections down to a low score, which the precision-recall curve needs
     images = open_labelled(data)
     low = settings.model_copy(update={"confidence": min(LEAST_SCORE, settings.confidence)})
     segmenter = build_segmenter(low, sequence_id="synthetic/", device=device, threads=threads)
@@ -255,15 +273,8 @@ def evaluate_segmenter(
     shown: set[str] = set()
     for done, index in enumerate(chosen.tolist(), 1):
         image = images[index]
-        frame = Frame(index, float(index), image.rgb, np.zeros(image.rgb.shape[:2], np.float32))
-        start = time.perf_counter()
-        detections = segmenter.segment(frame)
-        times.append(time.perf_counter() - start)
+        times.append(_add_image(tallies, segmenter, image, index))
         shown.update(image.class_names)
-        for name, tally in tallies.items():
-            labelled = image.masks[[kind == name for kind in image.class_names]]
-            predicted = detections.of_classes([name])
-            tally.add(labelled, predicted.masks, predicted.scores)
         progress(done, len(chosen))
 
     # means over the classes that occur
@@ -280,6 +291,7 @@ def evaluate_segmenter(
         for name, quality in qualities.items()
         if quality["truths"] or quality["detections"]
     }
+    # the score, with what it was measured on
     score = SegmenterScore(
         segmenter=resolve_source(settings, "synthetic/"),
         weights=weights_digest(settings, "synthetic/"),

@@ -18,7 +18,7 @@ from dynslam_bench.core import (
     SegmentationError,
     atomic_folder,
     did_you_mean,
-    inside,
+    path_below,
     read_json,
     read_lines,
     translate_errors,
@@ -102,6 +102,7 @@ def coco_images(text: str) -> LabelledImages:
         "it needs images, annotations and categories",
         of=(ValueError, LookupError, TypeError, AttributeError, OverflowError),
     ):
+        # class names by their id
         names = {
             int(entry["id"]): canonical_name(str(entry["name"])) for entry in content["categories"]
         }
@@ -116,8 +117,10 @@ def coco_images(text: str) -> LabelledImages:
         files = [(str(entry["file_name"]), shapes[int(entry["id"])]) for entry in content["images"]]
     if not files:
         raise SegmentationError(f"{path} lists no images")
+
+    # images inside the folder, read when they are asked for
     entries = [
-        (inside(folder, name, where=str(path), kind=SegmentationError), objects)
+        (path_below(folder, name, where=str(path), kind=SegmentationError), objects)
         for name, objects in files
     ]
     version = _files_digest([path, *(image for image, _ in entries)])
@@ -165,6 +168,7 @@ def yolo_images(text: str) -> LabelledImages:
     classes = _yolo_names(described[0]) if described else dict(enumerate(COCO_NAMES))
 
     def read(index: int) -> LabelledImage:
+        """An image and its label file of the same name."""
         label = labels / images[index].relative_to(root).with_suffix(".txt")
         return _read_yolo(images[index], label, classes)
 
@@ -284,9 +288,9 @@ def _coco_mask(segmentation: Any, shape: tuple[int, ...], where: Path) -> NDArra
         return np.ascontiguousarray(columns.T)
 
 
+# digits of COCO's run lengths, 48 less than the character's code: with bit 32 another digit follows
 _NOT_LAST = "[P-o]"
 _LAST = "[0-O]"
-"""Digits of COCO's run lengths, 48 less than the character's code: with bit 32 another digit follows."""
 
 
 def decode_runs(text: str) -> list[int]:
@@ -305,7 +309,8 @@ def decode_runs(text: str) -> list[int]:
     for number in re.findall(f"{_NOT_LAST}*{_LAST}", text):
         digits = [ord(character) - 48 for character in number]
         value = sum((digit & 31) << 5 * place for place, digit in enumerate(digits))
-        value -= (digits[-1] & 16) << (5 * len(digits) - 4)  # two's complement
+        # two's complement: the highest bit of the last digit is the sign
+        value -= (digits[-1] & 16) << (5 * len(digits) - 4)
         runs.append(value + (runs[-2] if len(runs) > 2 else 0))
     return runs
 
@@ -352,6 +357,7 @@ def rendered_frames(text: str = "") -> LabelledImages:
     Raises:
         SegmentationError: Unknown option, or a value that does not fit.
     """
+    # the options, by their defaults
     values = {"scenes": "0-99", "frames": "2", "length": "600", "options": "0", "seed": "0"}
     for part in filter(None, text.split(",")):
         key, separator, value = part.partition("=")
@@ -360,6 +366,8 @@ def rendered_frames(text: str = "") -> LabelledImages:
                 f"synthetic: unknown option '{part}'", "known: " + ", ".join(values)
             )
         values[key] = value
+
+    # as numbers
     with translate_errors(
         SegmentationError, f"synthetic: '{text}' is not understood", of=ValueError
     ):
@@ -375,6 +383,7 @@ def rendered_frames(text: str = "") -> LabelledImages:
     name = f"scenes={scenes[0]}-{scenes[-1]},frames={frames},length={length},options={options:g},seed={seed}"
 
     def read(index: int) -> LabelledImage:
+        """Render the `index`-th frame that is drawn."""
         # scene, then motion, then draw; what is drawn depends on seed, sequence and draw alone
         order, draw = divmod(index, frames)
         scene, motion = divmod(order, len(REPLICA_IDS))
@@ -405,6 +414,7 @@ def _labelled_frame(sequence: RgbdSequence, index: int) -> LabelledImage:
 
 
 FORMS = "synthetic[:OPTIONS], sequence:ID, coco:ANNOTATIONS.json[:IMAGES], yolo:DIR"
+"""How a set of labelled images is named."""
 
 
 def open_labelled(text: str) -> LabelledImages:
@@ -493,11 +503,14 @@ class PreparedImages:
 
     def example(self, index: int, rng: np.random.Generator | None = None) -> Example:
         """An image; with a generator at random scale, place, mirror image, colour, noise and blur."""
+        # the image and its label image, varied
         rgb = np.array(self.images[index])
         labels = np.array(self.labels[index])
         names = self.names[index]
         if rng is not None:
             rgb, labels = vary(rgb, labels, rng)
+
+        # a mask for each object of the classes that is large enough
         numbers = [k + 1 for k, name in enumerate(names) if name in self.classes]
         masks = labels[None] == np.array(numbers, np.uint8).reshape(-1, 1, 1)
         visible = np.count_nonzero(masks, axis=(1, 2)) >= MIN_VISIBLE_PX
@@ -527,6 +540,7 @@ def prepare(
     Returns:
         The folder for `PreparedImages`.
     """
+    # one folder a content and size
     key = digest(
         {
             "name": source.name,
@@ -538,6 +552,8 @@ def prepare(
     target = folder / f"prepared-{key}"
     if (target / "names.json").is_file():
         return target
+
+    # written on disk image by image; the folder appears whole
     with atomic_folder(target) as work:
         images = np.lib.format.open_memmap(
             work / "images.npy", "w+", np.uint8, (len(source), height, width, 3)
@@ -563,6 +579,7 @@ def shrink(
         uint8 ``[height, width, 3]``, label image uint8 ``[height, width]`` (0 = background) and the
         objects' names.
     """
+    # the largest size of these proportions, in the middle of a grey image
     rows, columns = image.rgb.shape[:2]
     ratio = min(height / rows, width / columns)
     size = (max(1, round(columns * ratio)), max(1, round(rows * ratio)))
@@ -572,6 +589,8 @@ def shrink(
     top = (height - size[1]) // 2
     left = (width - size[0]) // 2
     rgb[top : top + size[1], left : left + size[0]] = cv2.resize(image.rgb, size, interpolation=how)
+
+    # objects from the largest to the smallest, so that smaller ones are in front; 255 at most
     patch = labels[top : top + size[1], left : left + size[0]]
     order = np.argsort([-int(np.count_nonzero(mask)) for mask in image.masks], kind="stable")[:255]
     for number, index in enumerate(order, 1):
@@ -584,17 +603,22 @@ def vary(
     rgb: NDArray[np.uint8], labels: NDArray[np.uint8], rng: np.random.Generator
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """A random variation of an image and its label image, of the same size."""
+    # draw mirror image, scale, shift and rotation
     height, width = labels.shape
     mirror = -1.0 if rng.random() < 0.5 else 1.0
     scale = float(np.exp(rng.uniform(np.log(0.7), np.log(1.5)))) if rng.random() < 0.7 else 1.0
     slack = np.abs(np.array([width, height]) * (scale - 1)) / 2 + 0.05 * np.array([width, height])
     shift = rng.uniform(-slack, slack) if scale != 1.0 else np.zeros(2)
     angle = float(rng.normal(0, 4.0)) if rng.random() < 0.5 else 0.0
+
+    # as one affine motion about the image's middle, [2, 3]
     cosine = scale * np.cos(np.deg2rad(angle))
     sine = scale * np.sin(np.deg2rad(angle))
     linear = np.array([[cosine * mirror, -sine], [sine * mirror, cosine]])
     middle = np.array([(width - 1) / 2, (height - 1) / 2])
     move = np.column_stack([linear, middle + shift - linear @ middle])
+
+    # colours are interpolated, labels are not
     rgb = np.asarray(
         cv2.warpAffine(
             rgb, move, (width, height), flags=cv2.INTER_LINEAR, borderValue=(114, 114, 114)
@@ -608,17 +632,24 @@ def vary(
 
 
 def _photometric(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """A random variation of an image's colours, sharpness and noise; each step is drawn by itself."""
     value: NDArray[np.float32] = rgb.astype(np.float32) / np.float32(255)
+
+    # gamma, contrast, brightness and white balance
     if rng.random() < 0.8:
         value = value ** np.float32(np.exp(rng.normal(0, 0.25)))
         value = (value - 0.5) * np.float32(rng.uniform(0.7, 1.3)) + np.float32(
             0.5 + rng.uniform(-0.15, 0.15)
         )
         value = value * rng.uniform(0.85, 1.15, 3).astype(np.float32)
+
+    # saturation
     if rng.random() < 0.3:
         grey = value.mean(axis=2, keepdims=True)
         value = grey + (value - grey) * np.float32(rng.uniform(0.0, 1.6))
-    if rng.random() < 0.2:  # a veil, brighter to one side
+
+    # a veil, brighter to one side
+    if rng.random() < 0.2:
         direction = rng.normal(size=2)
         y, x = np.mgrid[-1 : 1 : value.shape[0] * 1j, -1 : 1 : value.shape[1] * 1j]
         ramp = np.clip(0.5 + (direction[0] * x + direction[1] * y) * 0.5, 0, 1)[:, :, None].astype(
@@ -627,6 +658,8 @@ def _photometric(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np
         value = value * (1 - ramp * np.float32(rng.uniform(0, 0.6))) + ramp * np.float32(
             rng.uniform(0, 0.5)
         )
+
+    # motion blur along a line, or defocus
     if rng.random() < 0.25:
         angle = rng.uniform(0, np.pi)
         length = int(rng.integers(3, 10))
@@ -639,6 +672,8 @@ def _photometric(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np
         value = np.asarray(
             cv2.GaussianBlur(value, (0, 0), float(rng.uniform(0.4, 1.5))), np.float32
         )
+
+    # noise
     if rng.random() < 0.4:
         value = value + rng.standard_normal(value.shape, np.float32) * np.float32(
             rng.uniform(0, 0.05)
@@ -652,6 +687,7 @@ def batch_of(sets: list[PreparedImages], settings: TrainSettings, step: int) -> 
     total = int(ends[-1])
     examples = []
     for position in range(step * settings.batch, (step + 1) * settings.batch):
+        # a place in the epoch's order of all images, and the set that the image is of
         epoch, place = divmod(position, total)
         number = int(_permutation(total, settings.seed, epoch)[place])
         chosen = int(np.searchsorted(ends, number, side="right"))
@@ -662,4 +698,5 @@ def batch_of(sets: list[PreparedImages], settings: TrainSettings, step: int) -> 
 
 @lru_cache(maxsize=1)
 def _permutation(total: int, seed: int, epoch: int) -> NDArray[np.int64]:
+    """The order of all images in an epoch, ``[total]``."""
     return np.asarray(stream(seed, "order", epoch).permutation(total))

@@ -87,6 +87,7 @@ def train(
     write_atomic(output / "settings.json", settings.model_dump_json(indent=2) + "\n")
 
     def load(text: str) -> PreparedImages:
+        """A set of images at the network's size, of which one at least shows an object to learn."""
         folder = prepare(
             open_labelled(text),
             data_cache or output / "data",
@@ -119,12 +120,15 @@ def network_config(settings: TrainSettings) -> NetworkConfig:
     Raises:
         SegmentationError: A class name is unknown or named twice.
     """
+    # class names, of which some stand for several
     parts = [part.strip() for part in settings.classes.split(",")]
     names = [name for part in parts for name in PRESETS.get(part, (part,))]
     unknown = [name for name in names if name not in COCO_NAMES]
     if unknown or len(set(names)) != len(names):
         reason = f"'{unknown[0]}' is no COCO class" if unknown else "one is named twice"
         raise SegmentationError(f"the classes '{settings.classes}' cannot be learned: {reason}")
+
+    # the network, at a smaller input than the published one
     shapes = {"embedded": EMBEDDED, "resnet18": RESNET18, "resnet50": NetworkConfig()}
     shape = shapes[settings.network]
     sides = {} if settings.network == "embedded" else {"min_side": 480, "max_side": 800}
@@ -156,12 +160,14 @@ class TrainingRun:
         device: ``cpu`` or ``cuda:N``.
     """
 
+    # attributes that `last.pt` holds: those with a state of their own, and plain ones by their type
     _MODULES = ("network", "average", "optimiser")
     _PLAIN = {"step": int, "rows": list, "best": dict, "recent": dict}  # noqa: RUF012 - a constant
 
     def __init__(
         self, settings: TrainSettings, config: NetworkConfig, output: Path, device: str
     ) -> None:
+        # the network, and the running average of its weights
         torch.manual_seed(settings.seed)
         self.settings = settings
         self.output = output
@@ -214,6 +220,7 @@ class TrainingRun:
     def _learn(self, batch: list[Example]) -> dict[str, float]:
         """One step of the optimiser on a batch; the losses by name."""
         settings = self.settings
+        # batch statistics are fixed in the last part of the run; the learning rate follows the schedule
         self.network.train()
         if self.step >= FROZEN_STATISTICS * settings.iterations:
             for module in self.network.modules():

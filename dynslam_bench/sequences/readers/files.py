@@ -105,6 +105,7 @@ def read_associations(path: Path) -> tuple[ImageList, ImageList]:
         SequenceError: The file is missing or no text, a line does not have these four parts, or two
             stamps differ by less than 1 us.
     """
+    # the colour images as a list of their own, and the depth image of each stamp of theirs
     rows: list[tuple[int | None, str]] = []
     pairs: dict[int | None, tuple[int, str]] = {}
     for number, (stamp, rest) in enumerate(read_stamped_lines(path), start=1):
@@ -112,10 +113,13 @@ def read_associations(path: Path) -> tuple[ImageList, ImageList]:
             raise SequenceError(
                 f"entry {number} of {path} has {len(rest) + 1} parts, expected 4: timestamp colour timestamp depth"
             )
+        # a pair without a usable depth stamp counts as one without a stamp
         depth_stamp = _number(rest[1], path)
         rows.append((None if depth_stamp is None else stamp, rest[0]))
         if depth_stamp is not None:
             pairs[stamp] = depth_stamp, rest[2]
+
+    # sort and clean the colour images, then take the depth images in their order
     colour = make_image_list(rows, described=str(path))
     depth = [pairs[stamp] for stamp in colour.stamps_ns.tolist()]
     return colour, ImageList(
@@ -124,7 +128,9 @@ def read_associations(path: Path) -> tuple[ImageList, ImageList]:
 
 
 LEFT_OUT = "frame numbers without an image"
+"""Key of `ImageList.irregular` for gaps in the frame numbers."""
 _IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
+"""Suffixes of images, in small letters."""
 
 
 def list_folder(folder: Path, name: str, fps: float | None) -> ImageList:
@@ -143,10 +149,13 @@ def list_folder(folder: Path, name: str, fps: float | None) -> ImageList:
             f"{folder} has neither {name}.txt nor a folder {name}",
             "a sequence in TUM layout holds rgb.txt, depth.txt, the images, and groundtruth.txt where there is one",
         )
+
+    # the images of the folder
     shown = sorted(path for path in images.iterdir() if not path.name.startswith("."))
     paths = [path for path in shown if path.suffix.lower() in _IMAGES]
     files = [f"{name}/{path.name}" for path in paths]
-    # Stamps by whole numbers, or each by its own name.
+
+    # stamps by whole numbers, or each by its own name
     stamps: Sequence[int | None]
     missing = 0
     if paths and all(path.stem.isascii() and path.stem.isdigit() for path in paths):
@@ -154,6 +163,8 @@ def list_folder(folder: Path, name: str, fps: float | None) -> ImageList:
     else:
         hint = f"write {name}.txt with lines 'timestamp {name}/FILE'"
         stamps = [_number(path.stem, images, hint) for path in paths]
+
+    # in order of time; other files and gaps are counted
     rows = sorted(zip(stamps, files, strict=True), key=lambda row: (row[0] or 0, row[1]))
     listed = make_image_list(rows, described=str(images))
     more = Counter({"files that are no images": len(shown) - len(paths), LEFT_OUT: missing})
@@ -207,19 +218,21 @@ def stamps_of_numbers(
         SequenceError: The numbers are frame numbers and there is no `fps`; or they may be frame
             numbers or stamps.
     """
-    # 1. Unix time has a size of its own.
+    # Unix time has a size of its own
     units = {unix_unit(number) for number in numbers}
     unit = units.pop() if len(units) == 1 else None
     if unit is not None:
         return [number * (10**9 // _UNITS[unit]) for number in numbers], 0
 
-    # 2. Frame numbers go up by one, or by a few; larger steps may be time.
+    # frame numbers go up by one, or by a few; larger steps may be time
     ordered = sorted(set(numbers))
     steps = [later - earlier for earlier, later in pairwise(ordered)]
     step = float(np.median(steps)) if steps else 1.0
     likely = _unit_of_steps(step, fps)
     if likely is not None:
         raise _which_reading(step, fps, likely, files, numbers, folder)
+
+    # frame numbers: a rate turns them into time
     if fps is None:
         kind = files[0].partition("/")[0]
         raise SequenceError(
@@ -235,11 +248,14 @@ def stamps_of_numbers(
 
 def _unit_of_steps(step: float, fps: float | None) -> str | None:
     """The unit of time in which names that go up by `step` are a camera's, where they are hardly frame numbers."""
+    # the rate of the images in each unit: a camera's in at most one of them
     low, high = _CAMERA_HZ
     rates = {unit: _UNITS[unit] / step for unit in ("milliseconds", "microseconds", "nanoseconds")}
     likely = next((unit for unit, rate in rates.items() if low <= rate <= high), None)
     if likely is None or fps is None:
         return likely
+
+    # with a stated rate: the names are time if they agree with it, or frame numbers are too far apart
     agrees_with_fps = 0.8 < rates[likely] / fps < 1.25
     return likely if agrees_with_fps or step / fps > _SLOWEST_BY_NUMBER_S else None
 
@@ -270,16 +286,19 @@ def make_image_list(rows: list[tuple[int | None, str]], *, described: str) -> Im
     Raises:
         SequenceError: Nothing is left, or two stamps differ by less than 1 us.
     """
+    # lines with a file name, of these the ones with a stamp
     named = [(stamp, name) for stamp, name in rows if name]
     finite = [(stamp, name) for stamp, name in named if stamp is not None]
-    # The last of several equal stamps wins, as in TUM's associate.py.
+    # the last of several equal stamps wins, as in TUM's associate.py
     unique = dict(finite)
     if not unique:
         raise SequenceError(
             f"{described} lists no image ({len(rows)} lines, {len(named) - len(finite)} without a stamp)"
         )
-    order = np.array(sorted(unique), dtype=np.int64)
-    refuse_close(order, described, SequenceError)
+    stamps_ns = np.array(sorted(unique), dtype=np.int64)
+    refuse_close(stamps_ns, described, SequenceError)
+
+    # counts of what was dropped or moved
     irregular = {
         "stamps not finite": len(named) - len(finite),
         "duplicate stamps": len(finite) - len(unique),
@@ -288,7 +307,8 @@ def make_image_list(rows: list[tuple[int | None, str]], *, described: str) -> Im
         ),
         "lines without a file name": len(rows) - len(named),
     }
-    return ImageList(order, tuple(unique[stamp] for stamp in order.tolist()), Counter(irregular))
+    files = tuple(unique[stamp] for stamp in stamps_ns.tolist())
+    return ImageList(stamps_ns, files, Counter(irregular))
 
 
 def read_stamped_lines(path: Path) -> list[tuple[int | None, list[str]]]:
@@ -315,6 +335,7 @@ def _number(text: str, where: object, hint: str = "") -> int | None:
     try:
         return parse_ns(text) if math.isfinite(float(text)) else None
     except ValueError:
+        # a whole number may be Unix time in a smaller unit
         whole = re.fullmatch(r"([0-9]{1,24})(\.[0-9]*)?", text, re.ASCII)
         unit = None if whole is None else unix_unit(int(whole[1]))
         hint = (
@@ -419,6 +440,8 @@ def checked_camera(
     width, height = size
     fx, fy = focal
     cx, cy = centre
+
+    # missing coefficients are 0
     k1, k2, p1, p2, k3 = (*distortion, *[0.0] * 5)[:5]
     return Camera(int(width), int(height), fx, fy, cx, cy, (k1, k2, p1, p2, k3), depth_factor)
 
@@ -451,6 +474,8 @@ def read_yaml(path: Path) -> Mapping[str, Any]:
         SequenceError: It cannot be read, or holds no mapping.
     """
     text = read_text(path, limit=MOST_BYTES, kind=SequenceError)
+
+    # what would keep the parser busy is refused first
     opened = text.count("[") + text.count("{")
     if opened > MOST_BRACKETS:
         raise SequenceError(
@@ -487,6 +512,7 @@ def numbers(mapping: object, key: str, count: int, where: str) -> list[float]:
     Raises:
         SequenceError: There is no such value, or it is no list of so many finite numbers.
     """
+    # a list, an OpenCV matrix, or a single number
     value = section(mapping, key, where)
     data = value.get("data") if isinstance(value, Mapping) else value
     listed: list[object] = data if isinstance(data, list) else [data]
@@ -548,10 +574,14 @@ def camera_truth(
         SequenceError: Two stamps of `where` differ by less than 1 us.
     """
     refuse_close(np.sort(stamps), where, SequenceError)
+
+    # rows with a quaternion that is not 0
     keep = np.linalg.norm(rows[:, 3:], axis=1) > 1e-8
     if not keep.any():
         return None
     notes = FileNotes(lines=len(rows), zero_quaternions=int(np.count_nonzero(~keep)))
+
+    # the camera on the body
     T_world_body = se3.from_quaternion(rows[keep, :3], rows[keep, 3:])
     return ordered_file(stamps[keep], T_world_body @ T_body_cam, notes)
 
@@ -573,6 +603,7 @@ def read_pose_table(path: Path, T_body_cam: Array) -> TumFile:
         TrajectoryError: A row is malformed, the heading is of neither kind, or no row holds a
             rotation.
     """
+    # load_tum knows both headings; body's poses become the camera's
     file = load_tum(path)
     trajectory = file.trajectory.with_poses(file.trajectory.T_world_cam @ T_body_cam)
     if file.every_line is None:

@@ -60,6 +60,7 @@ PEOPLE_LIST = "people.txt"
 ASSOCIATIONS = ("associations.txt", "associated.txt", "associate.txt", "association.txt")
 """Names of a list of pairs."""
 TRUTHS = ("groundtruth.txt", "pose.txt")
+"""Names of a ground truth in TUM's format."""
 
 
 # TUM RGB-D, Bonn Dynamic, Wild-SLAM MoCap, and recordings of one's own.
@@ -71,9 +72,12 @@ def read_tum(folder: Path, fps: float | None) -> Contents:
     `fps` makes stamps of images that are named by frame numbers. What is there and not used is said
     in the notes.
     """
+    # ground truth, and exact masks of people where there are any
     truth, dropped = _tum_truth(folder)
-    listed = stated_file(folder, PEOPLE_LIST)
-    people = None if listed is None else read_image_list(listed)
+    people_list = stated_file(folder, PEOPLE_LIST)
+    people = None if people_list is None else read_image_list(people_list)
+
+    # images: by the list of pairs where one of the two lists is missing, else list by list
     lists = {name: stated_file(folder, f"{name}.txt") for name in ("rgb", "depth")}
     present = [path.name for path in lists.values() if path is not None]
     pairs = stated_file(folder, *ASSOCIATIONS)
@@ -95,6 +99,7 @@ def read_tum(folder: Path, fps: float | None) -> Contents:
             notes.append(
                 f"there is no {unlisted}.txt: the images of {unlisted}/ are stamped by their names"
             )
+
     # a stated rate is that of the frame numbers, of which the images may be every n-th
     rate = rate_of(colour) if colour.irregular[LEFT_OUT] else None
     return Contents(
@@ -126,6 +131,7 @@ def _tum_truth(folder: Path) -> tuple[Trajectory | None, str]:
 
 
 def _not_taken(file: TumFile) -> str:
+    """One phrase on the lines of a ground truth that were not taken as they stand; empty for none."""
     return ", ".join(f"ground truth: {phrase}" for phrase in file.notes.describe())
 
 
@@ -151,7 +157,9 @@ def read_eth3d(folder: Path, fps: float | None) -> Contents:
     return Contents(colour, depth, True, truth, dropped, camera, fps or 27.1)
 
 
+# the data set's published intrinsics, with fy turned positive (`read_icl_nuim`)
 _ICL_CAMERA = Camera(640, 480, 481.20, 480.0, 319.5, 239.5, depth_factor=TUM_DEPTH_FACTOR)
+# M, which turns the y axis of images and poses
 _ICL_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
@@ -169,16 +177,22 @@ def read_icl_nuim(folder: Path, fps: float | None) -> Contents:
         raise SequenceError(
             f"{folder} holds {len(files)} trajectories ({', '.join(files[:3])[:200]}), expected 1"
         )
+
+    # poses by frame number, mirrored: M T M
     file = load_tum(folder / files[0])
     truth = Trajectory(
         file.trajectory.timestamps / rate, _ICL_MIRROR @ file.trajectory.T_world_cam @ _ICL_MIRROR
     )
+
+    # images by frame number
     colour = list_folder(folder, "rgb", rate)
     depth = list_folder(folder, "depth", rate)
     return Contents(colour, depth, False, truth, _not_taken(file), _ICL_CAMERA, rate)
 
 
+# the camera that the data set states for all sequences
 _SEVEN_SCENES_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0, depth_factor=MILLIMETRES)
+# how platforms write a number that is none
 _LOST = ("nan", "inf", "#ind", "#qnan", "#inf")
 
 
@@ -189,21 +203,21 @@ def read_seven_scenes(folder: Path, fps: float | None) -> Contents:
     pose that is no number) stays a frame without ground truth. Raw depth 65535 is missing.
     """
     rate = fps or 30.0
+
+    # frame numbers, and their stamps at the nominal rate
     files = find_names(folder, "frame-*.color.png")
     frames = [name.removeprefix("frame-").removesuffix(".color.png") for name in files]
-    bad = [
-        number
-        for number in frames
-        if not (number.isascii() and number.isdigit() and len(number) < 16)
-    ]
-    if bad:
-        raise SequenceError(f"frame-{bad[0][:40]}.color.png of {folder} is named by no number")
+    for number in frames:
+        if not (number.isascii() and number.isdigit() and len(number) < 16):
+            raise SequenceError(f"frame-{number[:40]}.color.png of {folder} is named by no number")
     with translate_errors(
         SequenceError, f"the numbers of the frames of {folder} are no frame numbers", of=ValueError
     ):
         stamps = from_seconds(int(number) / rate for number in frames)
     colour = stamped(files, stamps, str(folder))
     depth = stamped([f"frame-{number}.depth.png" for number in frames], stamps, str(folder))
+
+    # poses of the frames that KinectFusion did not lose
     poses = [_kinect_fusion_pose(folder / f"frame-{number}.pose.txt") for number in frames]
     tracked = [i for i, pose in enumerate(poses) if pose is not None]
     matrices = np.array([pose for pose in poses if pose is not None])
@@ -226,6 +240,7 @@ def _kinect_fusion_pose(path: Path) -> Array | None:
         ) from None
 
 
+# the data set's intrinsics
 _SHIBUYA_CAMERA = Camera(
     640, 360, *2 * (772.5483399593904,), 320.0, 180.0, depth_factor=1.0, baseline_m=0.25
 )
@@ -239,6 +254,7 @@ def read_tartanair_shibuya(folder: Path, fps: float | None) -> Contents:
     Poses are those of a camera that looks along x, with y to the right and z down. The sky is
     rendered at thousands of metres and is no measurement.
     """
+    # images, stamps and poses, line by line; poses with a stamp or without
     colour = find_names(folder, "image_0/*.[pj][np]g")
     depth = find_names(folder, "depth_0/*.npy")
     stamps = read_stamps(folder / "times.txt")
@@ -251,8 +267,12 @@ def read_tartanair_shibuya(folder: Path, fps: float | None) -> Contents:
             f"{folder} holds {len(colour)} colour images, {len(depth)} depth arrays, {len(stamps)} stamps and "
             f"{len(rows)} poses, expected as many of each"
         )
+
+    # poses: finite, with a quaternion that is not 0
     if not np.isfinite(rows).all() or (np.linalg.norm(rows[:, 3:], axis=1) < 1e-8).any():
         raise SequenceError(f"{folder / 'gt_pose.txt'} holds a pose that is none")
+
+    # in order of time, from NED axes to optical ones
     images = stamped(colour, stamps, str(folder))
     arrays = stamped(depth, stamps, str(folder))
     order = np.argsort(stamps, kind="stable")
@@ -261,9 +281,11 @@ def read_tartanair_shibuya(folder: Path, fps: float | None) -> Contents:
     return Contents(images, arrays, True, truth, camera=_SHIBUYA_CAMERA, fps=fps, furthest_m=1000.0)
 
 
+# names of the frames of reference in OpenLORIS' YAML files
 _LORIS_BASE = "base_link"
 _LORIS_CAMERA = "d400_color_optical_frame"
 _LORIS_GAP_S = 1.0
+"""Seconds: a ground truth that is never nearer to an image is that of another sequence."""
 
 
 def read_openloris(folder: Path, fps: float | None) -> Contents:
@@ -278,9 +300,13 @@ def read_openloris(folder: Path, fps: float | None) -> Contents:
     depth = read_image_list(folder / "aligned_depth.txt")
     sensors = folder / "sensors.yaml"
     transforms = folder / "trans_matrix.yaml"
+
+    # intrinsics, in the order fx cx fy cy
     sensor = section(read_yaml(sensors), _LORIS_CAMERA, str(sensors))
     fx, cx, fy, cy = numbers(sensor, "intrinsics", 4, str(sensors))
     camera = checked_camera(sensors, size_of_first(folder, colour), (fx, fy), (cx, cy), MILLIMETRES)
+
+    # poses of the robot's base, if they are of the time of the images
     base, dropped = _tum_truth(folder)
     if base is None:
         return Contents(colour, depth, camera=camera, fps=fps)
@@ -290,22 +316,25 @@ def read_openloris(folder: Path, fps: float | None) -> Contents:
             f"the ground truth of {folder} is never nearer than {gap:.3f} s to an image",
             "stamps of OpenLORIS carry a bias of their own in every sequence: are both files of the same one?",
         )
+
+    # the camera on the base, and its poses: T_world_cam = T_world_base T_base_cam
     entries = _mappings(section(read_yaml(transforms), "trans_matrix", str(transforms)))
-    ends = {"parent_frame": _LORIS_BASE, "child_frame": _LORIS_CAMERA}
-    entry = next(
-        (entry for entry in entries if all(entry.get(key) == frame for key, frame in ends.items())),
-        None,
-    )
-    if entry is None:
+    placed = [
+        entry
+        for entry in entries
+        if entry.get("parent_frame") == _LORIS_BASE and entry.get("child_frame") == _LORIS_CAMERA
+    ]
+    if not placed:
         raise SequenceError(
             f"{transforms} holds no rigid transformation from {_LORIS_BASE} to {_LORIS_CAMERA}"
         )
-    matrix = numbers(entry, "matrix", 16, str(transforms))
-    truth = base.with_poses(base.T_world_cam @ rigid(matrix, str(transforms)))
+    T_base_cam = rigid(numbers(placed[0], "matrix", 16, str(transforms)), str(transforms))
+    truth = base.with_poses(base.T_world_cam @ T_base_cam)
     return Contents(colour, depth, truth=truth, truth_dropped=dropped, camera=camera, fps=fps)
 
 
 def _mappings(value: object) -> list[dict[str, object]]:
+    """The mappings in a list; none where it is no list."""
     return [entry for entry in value if isinstance(entry, dict)] if isinstance(value, list) else []
 
 
@@ -315,8 +344,8 @@ def read_vslam_lab(folder: Path, fps: float | None) -> Contents:
     The ground truth is that of the body, on which ``T_BS`` places the camera. VSLAM-LAB writes the
     identity where the data set states nothing.
     """
+    # colour and depth images, a pair a row, in order of time
     table = folder / "rgb.csv"
-    where = str(folder / "calibration.yaml")
     names = ("ts_rgb_0 (ns)", "path_rgb_0", "ts_depth_0 (ns)", "path_depth_0")
     stamps, files, depth_stamps, depth_files = pick(*read_rows(table), names, table)
     order = np.argsort(nanoseconds(stamps, table), kind="stable")
@@ -326,24 +355,29 @@ def read_vslam_lab(folder: Path, fps: float | None) -> Contents:
         nanoseconds([depth_stamps[i] for i in order], table),
         str(table),
     )
+
+    # the camera, among the lists of sensors
+    where = str(folder / "calibration.yaml")
     entries = [entry for value in read_yaml(Path(where)).values() for entry in _mappings(value)]
     stated = next((entry for entry in entries if entry.get("cam_name") == "rgb_0"), None)
     if stated is None:
         raise SequenceError(f"{where} describes no camera 'rgb_0'")
-    pairs = ("image_dimension", "focal_length", "principal_point")
-    size, focal, centre = (numbers(stated, name, 2, where) for name in pairs)
-    factor = _depth_factor(stated, where)
+    size = numbers(stated, "image_dimension", 2, where)
+    focal = numbers(stated, "focal_length", 2, where)
+    centre = numbers(stated, "principal_point", 2, where)
+    depth_factor = _depth_factor(stated, where)
     kind = stated.get("distortion_type")
     if kind not in (None, "radtan4", "radtan5"):
         raise SequenceError(
             f"{where}: the distortion '{str(kind)[:40]}' is not read, only radtan4 and radtan5"
         )
-    k = (
-        []
-        if kind is None
-        else numbers(stated, "distortion_coefficients", 4 if kind == "radtan4" else 5, where)
-    )
-    camera = checked_camera(where, size, focal, centre, factor, k)
+    distortion: list[float] = []
+    if kind is not None:
+        count = 4 if kind == "radtan4" else 5
+        distortion = numbers(stated, "distortion_coefficients", count, where)
+    camera = checked_camera(where, size, focal, centre, depth_factor, distortion)
+
+    # the camera's poses by those of the body
     T_body_cam = camera_on_body(stated, where)
     truth, dropped = _truth_of_table(stated_file(folder, "groundtruth.csv"), T_body_cam)
     return Contents(
@@ -393,16 +427,20 @@ def read_euroc(folder: Path, fps: float | None) -> Contents:
         )
     colour = _euroc_images(folder, f"{base}cam0")
     depth = _euroc_images(folder, f"{base}depth0")
+
+    # the camera: colour and depth images have its intrinsics
     where = str(folder / base / "cam0" / "sensor.yaml")
     sensor = read_yaml(Path(where))
     size = numbers(sensor, "resolution", 2, where)
     intrinsics = numbers(sensor, "intrinsics", 4, where)
-    k = numbers(sensor, "distortion_coefficients", 4, where)
+    distortion = numbers(sensor, "distortion_coefficients", 4, where)
+    depth_factor = None
     depth_sensor = stated_file(folder, f"{base}depth0/sensor.yaml")
-    factor = (
-        None if depth_sensor is None else _depth_factor(read_yaml(depth_sensor), str(depth_sensor))
-    )
-    camera = checked_camera(where, size, intrinsics[:2], intrinsics[2:], factor, k)
+    if depth_sensor is not None:
+        depth_factor = _depth_factor(read_yaml(depth_sensor), str(depth_sensor))
+    camera = checked_camera(where, size, intrinsics[:2], intrinsics[2:], depth_factor, distortion)
+
+    # its poses by those of the body
     T_body_cam = camera_on_body(sensor, where)
     truth, dropped = _truth_of_table(
         stated_file(folder, f"{base}state_groundtruth_estimate0/data.csv"), T_body_cam
@@ -420,6 +458,7 @@ def read_euroc(folder: Path, fps: float | None) -> Contents:
 
 
 def _euroc_images(folder: Path, name: str) -> ImageList:
+    """The images of a camera's ``data.csv``, which lie in ``data`` beside it."""
     path = folder / name / "data.csv"
     heading, rows = read_rows(path)
     if len(heading) < 2:
@@ -471,6 +510,7 @@ def _has(folder: Path, mark: str) -> bool:
     return any(folder.glob(mark)) if "*" in mark else os.path.lexists(folder / mark)
 
 
+# in the order in which they are tried; TUM's last, as others hold its files as well
 TUM = Layout("tum", ("rgb.txt",), read_tum)
 LAYOUTS = (
     Layout("eth3d", ("calibration.txt", "associated.txt"), read_eth3d, holds="tum"),
@@ -482,6 +522,7 @@ LAYOUTS = (
     Layout("euroc", ("cam0/data.csv",), read_euroc),
     TUM,
 )
+"""All layouts, in the order in which they are tried."""
 
 
 def layouts_of(folder: Path, catalogued: str = "") -> list[Layout]:
@@ -494,12 +535,16 @@ def layouts_of(folder: Path, catalogued: str = "") -> list[Layout]:
     """
     fitting = [layout for layout in LAYOUTS if layout.fits(folder)]
     published = layout_of(catalogued) if catalogued else None
+
+    # a layout that another one holds is no layout of its own
     held = {layout.holds for layout in fitting}
     if published is not None and published not in fitting:
         held.add(published.holds)
     fitting = [layout for layout in fitting if layout is published or layout.name not in held]
+
+    # TUM's lists without their images: the folder is of another layout, or was changed by a tool
     if published is TUM and len(fitting) > 1 and not _has_listed_images(folder):
-        return fitting  # of another layout, or changed by a tool that wrote another one
+        return fitting
     return sorted(fitting, key=lambda layout: layout is not published)
 
 

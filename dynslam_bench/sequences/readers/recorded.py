@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, FrameMasks, MaskSource
-from dynslam_bench.core import SequenceError, inside, translate_errors
+from dynslam_bench.core import SequenceError, path_below, translate_errors
 from dynslam_bench.core.fingerprint import contents_digest
 from dynslam_bench.core.images import read_image
 from dynslam_bench.core.records import digest
@@ -99,25 +99,16 @@ class RecordedSequence:
         self._any_depth_size = any_depth_size
         self._furthest_m = contents.furthest_m
 
-        # The images that are there, the depth images' stamps as the camera delays them.
-        people = contents.people
-        listed = [*contents.colour.files, *contents.depth.files]
-        if people is not None:
-            listed += people.files
-        for file in listed:
-            inside(folder, file, where=f"a list of images in {folder}", kind=SequenceError)
-        delayed = contents.depth.stamps_ns + round(1e9 * camera.depth_delay_s)
+        # the images that are there, in pairs of a colour and a depth image
+        _check_inside(folder, contents)
         paired = contents.paired and not camera.depth_delay_s
-        tolerated = 0.0 if paired else MISSING_TOLERATED
-        colour = _existing(folder, contents.colour, "colour", tolerated)
-        depth = replace(contents.depth, stamps_ns=delayed)
-        depth = _existing(folder, depth, "depth", tolerated)
-
-        # Pairs of a colour and a depth image.
+        colour, depth = _existing_images(folder, contents, camera, paired=paired)
         if paired:
             first = second = np.arange(len(colour))
         else:
             first, second = _associated(folder, colour, depth, max_time_difference_s)
+
+        # stamps in seconds, the frame rate, and the files of each frame
         self.timestamps_ns = colour.stamps_ns[first]
         self.timestamps = colour.stamps[first]
         self.timestamps_ns.flags.writeable = False
@@ -128,20 +119,21 @@ class RecordedSequence:
         self._colour = [colour.files[i] for i in first]
         self._depth = [depth.files[i] for i in second]
 
-        # Masks of people, and the truth in the camera's axes.
+        # masks of people, and the truth in the camera's axes
         self._people: list[str] = []
-        if people is not None:
-            self._people = self._mask_files(_existing(folder, people, "mask", 0.0))
+        if contents.people is not None:
+            self._people = self._mask_files(_existing(folder, contents.people, "mask", 0.0))
         self.masks: MaskSource | None = Masks(self._masks_of) if self._people else None
         self.ground_truth, turned = _truth_of_camera(contents.truth, camera)
 
+        # one line on what was not used
         counts = {
             "colour images without depth": len(colour) - len(self),
             "depth images unused": len(depth) - len(self),
             **(colour.irregular + depth.irregular),
             **self._count_poses(),
         }
-        parts = [
+        phrases = [
             f"{len(self)} frames of {len(colour)} colour and {len(depth)} depth images "
             f"(|dt| < {max_time_difference_s:g} s)",
             *(f"{count} {what}" for what, count in counts.items() if count),
@@ -152,8 +144,9 @@ class RecordedSequence:
             *notes,
             rate_note,
         ]
-        self.dropped = "; ".join(part for part in parts if part)
-        # Most damage shows in the first frame.
+        self.dropped = "; ".join(phrase for phrase in phrases if phrase)
+
+        # most damage shows in the first frame
         self[0]
 
     def _mask_files(self, people: ImageList) -> list[str]:
@@ -173,7 +166,8 @@ class RecordedSequence:
         if truth is None:
             return {}
         without = int(np.count_nonzero(nearest_gap(stamps, truth.timestamps) >= GROUND_TRUTH_DT_S))
-        # The largest time without a pose, the first and the last frame included.
+
+        # the largest time without a pose, the first and the last frame included
         times = truth.timestamps
         within = times[(times >= stamps[0]) & (times <= stamps[-1])]
         hole = float(np.diff(np.concatenate([stamps[:1], within, stamps[-1:]])).max(initial=0.0))
@@ -191,12 +185,13 @@ class RecordedSequence:
 
     @cached_property
     def _digest(self) -> str:
+        """See `digest`; computed once, as all files are read."""
         truth = self.ground_truth
         poses = None
         if truth is not None:
             poses = [truth.timestamps_ns.tolist(), truth.T_world_cam.tolist()]
         try:
-            # Text, not paths: joining those takes longer than asking for the files' times.
+            # text, not paths: joining those takes longer than asking for the files' times.
             files = (*self._colour, *self._depth, *self._people)
             images = contents_digest(f"{self.folder}{os.sep}{file}" for file in files)
         except OSError as error:
@@ -241,6 +236,33 @@ class RecordedSequence:
         return f"<{type(self).__name__} {self.id}: {len(self)} frames in {self.folder}>"
 
 
+def _check_inside(folder: Path, contents: Contents) -> None:
+    """Refuse lists with a file outside of the folder."""
+    listed = [*contents.colour.files, *contents.depth.files]
+    if contents.people is not None:
+        listed += contents.people.files
+    for file in listed:
+        path_below(folder, file, where=f"a list of images in {folder}", kind=SequenceError)
+
+
+def _existing_images(
+    folder: Path, contents: Contents, camera: Camera, *, paired: bool
+) -> tuple[ImageList, ImageList]:
+    """The colour and the depth images whose files are there, the depth's stamps as the camera delays them.
+
+    Args:
+        folder: The sequence's folder.
+        contents: Its lists.
+        camera: Tells by how much depth is exposed later than its stamps say.
+        paired: Whether the lists are paired entry by entry, so that no file may be missing.
+    """
+    tolerated = 0.0 if paired else MISSING_TOLERATED
+    colour = _existing(folder, contents.colour, "colour", tolerated)
+    delayed = contents.depth.stamps_ns + round(1e9 * camera.depth_delay_s)
+    depth = replace(contents.depth, stamps_ns=delayed)
+    return colour, _existing(folder, depth, "depth", tolerated)
+
+
 def _associated(
     folder: Path, colour: ImageList, depth: ImageList, max_time_difference_s: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -269,6 +291,7 @@ def _frame_rate(stated: float | None, stamps: NDArray[np.float64]) -> tuple[floa
     """The nominal frame rate in Hz, and a phrase where the stamps say another one than is stated."""
     if len(stamps) < 2:
         return stated or 30.0, ""
+    # by the stamps; a stated rate counts unless they contradict it
     measured = float(1 / np.median(np.diff(stamps)))
     if stated is None:
         return measured, ""
@@ -294,7 +317,8 @@ def _check_unit(folder: Path, stamps: NDArray[np.float64]) -> None:
         )
     if interval <= SLOWEST_S:
         return
-    # The units in which the stamps would be those of 1 to 1000 frames a second.
+
+    # the units in which the stamps would be those of 1 to 1000 frames a second.
     units = {"milliseconds": 1e3, "microseconds": 1e6, "nanoseconds": 1e9}
     likely = [
         f"{name} ({per_s / interval:.3g} Hz)"
@@ -309,11 +333,13 @@ def _check_unit(folder: Path, stamps: NDArray[np.float64]) -> None:
 
 def _existing(folder: Path, images: ImageList, kind: str, tolerated: float) -> ImageList:
     """The images whose files are there; a share may be missing, as in some published sequences, and none empty."""
-    # Bytes of each file, None where it is missing.
+    # bytes of each file, None where it is missing
     sizes = []
     for file in images.files:
         path = folder / file
         sizes.append(path.stat().st_size if path.is_file() else None)
+
+    # some may be missing, none empty
     for state, fault_size, allowed in (("missing", None, tolerated), ("empty (0 bytes)", 0, 0.0)):
         at_fault = [
             file for file, size in zip(images.files, sizes, strict=True) if size == fault_size
@@ -323,6 +349,8 @@ def _existing(folder: Path, images: ImageList, kind: str, tolerated: float) -> I
                 f"{len(at_fault)} of {len(images)} {kind} images of {folder} are {state}, the first is {at_fault[0]}",
                 "fetch the sequence again, or remove their lines from the list",
             )
+
+    # the others, in their order
     there = [i for i, size in enumerate(sizes) if size is not None]
     missing = Counter({"listed files that do not exist": len(images) - len(there)})
     return ImageList(
@@ -359,6 +387,7 @@ def read_colour(
             f"colour image {path} has {image.dtype.itemsize * 8} bits a channel, expected 8",
             "do rgb.txt and depth.txt name the right files?",
         )
+    # to red, green, blue, whatever the channels
     if image.ndim == 2:
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
     code = cv2.COLOR_BGRA2RGB if image.shape[2] == 4 else cv2.COLOR_BGR2RGB
@@ -406,6 +435,7 @@ def read_depth(
                 f"{raw.max()}), expected 1 of 16 bits",
                 f"store depth x {depth_factor:g} as 16-bit PNG; an 8-bit image has lost its range",
             )
+        # metres; the largest raw number is no measurement
         depth = raw.astype(np.float32) / np.float32(depth_factor)
         depth[raw == SATURATED] = 0
     if furthest_m is not None:

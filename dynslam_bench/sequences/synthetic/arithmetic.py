@@ -15,12 +15,19 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+# Each function reduces its argument to a small range, where a polynomial is exact enough: the Taylor
+# series up to the term that no longer changes the last bit.
+
 Array = NDArray[np.float64]
 Reals = TypeVar("Reals", float, Array)
 
 _HALF_PI = (1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
 """Pi / 2 in parts of 33 bits, so that a product with a whole number below 2^20 is exact (fdlibm's)."""
 _LN_2 = (6.93147180369123816490e-01, 1.90821492927058770002e-10)
+"""Natural logarithm of 2 in two parts, as `_HALF_PI`."""
+
+# Taylor coefficients: of sin x / x and cos x in x^2, of exp x in x, of arctan x / x in x^2, and of
+# log((1 + z) / (1 - z)) / 2 z in z^2
 _SINE = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in range(9))
 _COSINE = tuple((-1.0) ** k / math.factorial(2 * k) for k in range(10))
 _EXPONENTIAL = tuple(1.0 / math.factorial(k) for k in range(15))
@@ -29,6 +36,7 @@ _LOGARITHM = tuple(1.0 / (2 * k + 1) for k in range(11))
 
 
 def _polynomial(coefficients: tuple[float, ...], x: Any) -> Any:
+    """A polynomial's value by Horner's rule; the constant coefficient is first."""
     total = coefficients[-1]
     for coefficient in coefficients[-2::-1]:
         total = total * x + coefficient
@@ -39,10 +47,14 @@ def _sine(x: float | Array, quarters: int) -> Any:
     """The sine of x + quarters * pi / 2."""
     many = isinstance(x, np.ndarray)
     x = x if many else float(x)
+
+    # the nearest multiple of pi / 2, and the rest, at most pi / 4 (Cody and Waite's reduction)
     turns: Any = (
         np.floor(x * 0.6366197723675814 + 0.5) if many else math.floor(x * 0.6366197723675814 + 0.5)
     )
     rest = ((x - turns * _HALF_PI[0]) - turns * _HALF_PI[1]) - turns * _HALF_PI[2]
+
+    # sine or cosine of the rest, with its sign, by the quadrant
     square = rest * rest
     if not many:
         quadrant = (int(turns) + quarters) & 3
@@ -67,18 +79,25 @@ def cos(x: Reals) -> Reals:
 
 def atan2(y: float, x: float) -> float:
     """The angle of a vector (x, y); 0 for the zero vector. It is compiled into a kernel as well."""
+    # the ratio of the smaller to the larger coordinate, at most 1
     large = max(abs(x), abs(y))
     small = min(abs(x), abs(y))
     if large == 0.0:
         return 0.0
     ratio = small / large
-    for _ in range(2):  # the angle is halved twice
+
+    # halve the angle twice: tan(a / 2) = tan a / (1 + sqrt(1 + tan^2 a))
+    for _ in range(2):
         ratio = ratio / (1.0 + math.sqrt(1.0 + ratio * ratio))
+
+    # its arctangent, times four
     square = ratio * ratio
     total = 0.0
     for k in range(len(_ARCTANGENT) - 1, -1, -1):
         total = total * square + _ARCTANGENT[k]
     angle = 4.0 * ratio * total
+
+    # back from the first eighth of a turn to the vector's own
     if abs(y) > abs(x):
         angle = 0.5 * math.pi - angle
     if x < 0.0:
@@ -93,6 +112,7 @@ def arctan2(y: Array, x: Array) -> Array:
 
 def exp(x: Array) -> Array:
     """Exponential of an array."""
+    # exp x = 2^k exp r, with r at most half of ln 2
     twos = np.floor(x * 1.4426950408889634 + 0.5)
     value = _polynomial(_EXPONENTIAL, (x - twos * _LN_2[0]) - twos * _LN_2[1])
     return np.asarray(np.ldexp(value, twos.astype(np.int32)))
@@ -102,11 +122,14 @@ def power(x: float, exponent: float) -> float:
     """A power of a number that is not negative."""
     if x <= 0:
         return float(0.0**exponent)
-    part, twos = math.frexp(x)
-    if part < 0.7071067811865476:
-        part = 2.0 * part
+    # x = m 2^k, with m between sqrt(1/2) and sqrt(2)
+    mantissa, twos = math.frexp(x)
+    if mantissa < 0.7071067811865476:
+        mantissa = 2.0 * mantissa
         twos = twos - 1
-    z = (part - 1.0) / (part + 1.0)
+
+    # log m by the series of z = (m - 1) / (m + 1), and the power as exp(exponent log x)
+    z = (mantissa - 1.0) / (mantissa + 1.0)
     logarithm = 2.0 * z * _polynomial(_LOGARITHM, z * z) + twos * _LN_2[1] + twos * _LN_2[0]
     return float(exp(np.array(exponent * logarithm)))
 
@@ -117,6 +140,8 @@ def product(*factors: Array) -> Array:
 
 
 def _product(a: Array, b: Array) -> Array:
+    """What ``a @ b`` is, term by term."""
+    # a row vector times a matrix is the transposed matrix times that vector
     if a.ndim == 1 < b.ndim:
         a, b = np.swapaxes(b, -1, -2), a
     if b.ndim == 1:

@@ -36,7 +36,13 @@ HALL_SPEED = 0.45
 
 
 class _Shape(NamedTuple):
-    """What differs between the buildings: how far the camera looks aside, frames, and the variants' version."""
+    """What differs between the buildings.
+
+    Attributes:
+        aside_deg: How far the camera looks aside from where it walks, degrees.
+        frames: Frames of a sequence.
+        version: Version of the variants, part of their digests.
+    """
 
     aside_deg: float
     frames: int
@@ -48,10 +54,18 @@ _SHAPES = {
     "corridor": _Shape(-14.0, 3900, 1),
     "rooms": _Shape(0.0, 6600, 2),
 }
+"""The buildings by name."""
 
 
 class _LoosePiece(NamedTuple):
-    """A piece that may be moved: class, primitives about their origin, direction in degrees, and place."""
+    """A piece that may be moved.
+
+    Attributes:
+        kind: Its class.
+        parts: Primitives about their own origin.
+        yaw: Direction about the vertical, degrees.
+        at: Place on the floor, metres.
+    """
 
     kind: str
     parts: Parts
@@ -61,7 +75,15 @@ class _LoosePiece(NamedTuple):
 
 @dataclass
 class _Building:
-    """What is built so far; every stretch of wall and every loose piece has its number."""
+    """What is built so far; every stretch of wall and every loose piece has its number.
+
+    Attributes:
+        scene: The scene.
+        repeated: Whether all stretches of wall and all pieces are alike.
+        parts: Primitives that never move.
+        loose: Pieces that may be moved.
+        bays: Stretches of wall so far.
+    """
 
     scene: int
     repeated: bool
@@ -94,6 +116,7 @@ def build_loop(variant: str, scene: int) -> World:
 
 def build_walk(variant: str, scene: int) -> tuple[World, Walk]:
     """The world of `build_loop`, and the path of its camera."""
+    # build it, then place the loose pieces
     shape, _, change = variant.partition("_")
     building = _Building(scene, change == "repeated")
     walk = _BUILDERS[shape](building)
@@ -107,10 +130,13 @@ def build_walk(variant: str, scene: int) -> tuple[World, Walk]:
 
 def _placement(building: _Building, walk: Walk, moved: bool, number: int) -> Placement:
     """The place of a loose piece, by lap: the first one and, if it is `moved`, two others in turn."""
+    # where it was built
     rng = stream(building.scene, "synthetic", "moved", number)
     piece = building.loose[number]
     first = np.array([*piece.at, 0.0])
     places = [(rotation_about_z(piece.yaw), first)]
+
+    # two other places nearby, turned
     for _ in range(2 if moved else 0):
         angle = np.radians(pick(rng, building.scene, 0.0, 360.0))
         away = pick(rng, building.scene, 0.3, 0.55) * np.array([cos(angle), sin(angle), 0.0])
@@ -135,15 +161,20 @@ def _room(building: _Building) -> Walk:
     plan = plan_room(building.scene, 0)
     x = pick(rng, building.scene, 5.2, 5.5)
     y = pick(rng, building.scene, 4.2, 4.4)
+
+    # floor and walls
     building.parts += floor((-x, -y), (x, y), plan)
     for start, end in _around(x, y):
         building.parts += partition(start, end, plan)
+
+    # two desks along either long wall with chairs, one along either short wall with a box
     for yaw, side, along in ((0, y, 2.4), (0, y, -2.4), (180, -y, 2.4), (180, -y, -2.4)):
         building.bay(office_bay, yaw, (along, side - np.sign(side) * 0.05))
         building.piece("chair", yaw, (along + 0.3, side - np.sign(side) * 1.55))
     for yaw, side in ((-90, x), (90, -x)):
         building.bay(office_bay, yaw, (side - np.sign(side) * 0.05, 0.0))
         building.piece("box", yaw, (side - np.sign(side) * 1.3, 0.9))
+
     # the partition in the middle
     names = (*(f"poster:{face % 4}" for face in range(4)), "plain", "plain")
     block = box(np.eye(3), (0.0, 0.0, 1.0), (1.2, 0.35, 1.0), texture=names, fit=(0, 1, 2, 3))
@@ -168,12 +199,14 @@ def _corridor(building: _Building) -> Walk:
     y = pick(rng, building.scene, 5.6, 6.0)
     width = 1.2
     building.parts += floor((-x - width, -y - width), (x + width, y + width), plan)
-    # The outer walls, then those of the core; both are furnished towards the corridor.
+
+    # the outer walls, then those of the core; both are furnished towards the corridor.
     for sign in (1, -1):
         for start, end in _around(x + sign * width, y + sign * width):
             building.parts += partition(start, end, plan)
             wall = np.array(end) - start
-            # Bays every 2.3 m, and before every third one a loose piece.
+
+            # bays every 2.3 m, and before every third one a loose piece.
             length = float(norm(wall))
             yaw = float(np.degrees(atan2(wall[1], wall[0]))) + (0 if sign < 0 else 180)
             inward = sign * np.array([-wall[1], wall[0]]) / length * 0.05
@@ -213,7 +246,8 @@ def _rooms(building: _Building) -> Walk:
     building.parts += floor((-ends, -half - deep), (ends, half + deep), plan)
     for start, end in _around(ends, half + deep):
         building.parts += partition(start, end, plan)
-    # The walls of the corridor, the walls between the rooms, and the path into each room and back.
+
+    # the walls of the corridor, the walls between the rooms, and the path into each room and back.
     doors = (0.5 * wide, 1.5 * wide, 2.5 * wide)
     corners: list[Point] = []
     for side in (1, -1):
@@ -223,13 +257,14 @@ def _rooms(building: _Building) -> Walk:
             if k:
                 edge = x - side * wide / 2
                 building.parts += partition((edge, side * half), (edge, side * (half + deep)), plan)
+            # the room, the path around it, and a stretch of the corridor beside its door
             _furnish(building, x, side, wide, half, half + deep)
             corners += [(x + side * u, side * v) for u, v in _AROUND_ROOM]
             if k < 2:
                 at = (x + side * wide / 2, side * (half - 0.05))
                 building.bay(corridor_bay, 180.0 if side < 0 else 0.0, at)
         building.bay(notices, -90.0 * side, (side * (ends - 0.05), 0.0), alike=7)
-        # Turn round at the end of the corridor.
+        # turn round at the end of the corridor
         turning = ((ends - 1.7, 0.6), (ends - 0.9, 0.1), (ends - 1.7, -0.6))
         corners += [(side * u, side * v) for u, v in turning]
     return walk_along(corners, 0.7)
@@ -243,8 +278,11 @@ def _furnish(
     The wall with the door, at `front`, has notices on both of its faces: those on the outer one
     hang in the corridor.
     """
+    # the back wall
     yaw = 0.0 if side > 0 else 180.0
     building.bay(office_bay, yaw, (x, side * (back - 0.05)))
+
+    # the side walls, and the wall with the door on either side of it
     for end in (1, -1):
         beside = x + end * (wide / 2 - 0.05)
         building.bay(
@@ -262,6 +300,7 @@ _BUILDERS: dict[str, Callable[[_Building], Walk]] = {
     "corridor": _corridor,
     "rooms": _rooms,
 }
+"""What furnishes each building."""
 
 LOOPS = {
     f"loop_{name}{change}": Variant(

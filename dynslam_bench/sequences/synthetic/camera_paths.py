@@ -21,6 +21,7 @@ from dynslam_bench.sequences.synthetic.arithmetic import Array, arctan2, cos, no
 # * rpy: rotations about the three principal axes, one after the other.
 
 MOTIONS = ("xyz", "static", "halfsphere", "rpy")
+"""Names of the motions, those of TUM's fr3 sequences."""
 EYE_HEIGHT_M = 1.35
 """Height of the camera at rest."""
 TILT_RAD = math.radians(10.0)
@@ -39,8 +40,10 @@ def camera_poses(motion: str, people: str, scene: int, times: Array) -> Array:
     # TUM's sitting_xyz is slower.
     tempo = 0.72 if people == "sitting" and motion == "xyz" else 1.0
     t = np.asarray(times, dtype=np.float64)
-    offset = np.zeros((len(t), 3))  # along the camera's rest axes: right, down, forward
-    angles = np.zeros((len(t), 3))  # about right (pitch), down (yaw), forward (roll)
+    # along the camera's rest axes: right, down, forward
+    offset = np.zeros((len(t), 3))
+    # about right (pitch), down (yaw), forward (roll)
+    angles = np.zeros((len(t), 3))
     order = rng.permutation(3)
     signs = np.where(rng.random(3) < 0.5, -1.0, 1.0)
     if motion == "xyz":
@@ -74,7 +77,8 @@ def _halfsphere(t: Array, tempo: float, sign: float) -> tuple[Array, Array]:
     around = 2 * math.pi * t / (6.1 / tempo)
     lift = 0.5 - 0.5 * cos(2 * math.pi * t / (16.9 / tempo) + 0.4)
     radius = 0.36
-    distance = 0.9  # of what it looks at
+    # of what it looks at
+    distance = 0.9
     offset[:, 0] = sign * radius * sin(around)
     offset[:, 1] = -radius * (0.85 * lift - 0.12) * cos(around * 0.5 + 0.3)
     offset[:, 2] = -0.1 + 0.2 * cos(around) * (0.4 + 0.6 * lift)
@@ -152,19 +156,19 @@ class Walk:
 
     def at(self, times: Array) -> Array:
         """Places ``[N, 2]`` at times (seconds)."""
-        # Place in control points, its whole and its fractional part.
+        # place in control points, its whole and its fractional part
         s = np.asarray(times, dtype=np.float64) * (len(self.control) / self.lap_s)
         i = np.floor(s).astype(np.int64)
         f = (s - i)[:, None]
         g = 1 - f
         n = len(self.control)
-        before, here, after, beyond = (self.control[(i + k) % n] for k in (-1, 0, 1, 2))
-        # The cubic B-spline's basis.
+        p0, p1, p2, p3 = (self.control[(i + k) % n] for k in (-1, 0, 1, 2))
+        # the cubic B-spline's basis at the four control points around it
         return np.asarray(
-            g * g * g / 6 * before
-            + (3 * f * f * f - 6 * f * f + 4) / 6 * here
-            + (-3 * f * f * f + 3 * f * f + 3 * f + 1) / 6 * after
-            + f * f * f / 6 * beyond
+            g * g * g / 6 * p0
+            + (3 * f * f * f - 6 * f * f + 4) / 6 * p1
+            + (-3 * f * f * f + 3 * f * f + 3 * f + 1) / 6 * p2
+            + f * f * f / 6 * p3
         )
 
     def time_nearest(self, place: tuple[float, float]) -> float:

@@ -98,6 +98,7 @@ REPLICAS = {
     for people in ("walking", "sitting")
     for motion in MOTIONS
 }
+"""Replicas of TUM's fr3 sequences."""
 
 
 # Four people who walk past each other all the time and hide most of the view.
@@ -218,6 +219,7 @@ SYNCHRONOUS = {"synchronous": Variant(build_synchronous, "high-dynamic")}
 
 Change = Callable[[World, int], World]
 """What a condition changes in a world, of a scene's number."""
+# sensors under a condition
 DARK = Optics(gain=0.13, color={"read_noise": 2.4, "shot_noise": 0.12, "shutter": 0.8})
 SUNLIGHT = Optics(
     gain=1.25, depth={"disparity_noise_px": 0.25, "far_m": 4.0, "dark": 0.1, "edge_px": 4}
@@ -238,9 +240,12 @@ def _hall(world: World, scene: int) -> World:
     front = -3.0
     back = 8.6
     corners = [(-x, front), (x, front), (x, back), (-x, back), (-x, front)]
-    # Direction in degrees and place of each bay: three along the back wall, one at either side.
+
+    # direction in degrees and place of each bay: three along the back wall, one at either side.
     bays = [(0.0, ((k - 1) * 4.3, back - 0.05, 0.0)) for k in range(3)]
     bays += [(-90.0 * side, (side * (x - 0.05), 5.0, 0.0)) for side in (-1, 1)]
+
+    # floor, walls and bays
     hall = floor((-x, front), (x, back), plan)
     for start, end in itertools.pairwise(corners):
         hall += partition(start, end, plan)
@@ -280,6 +285,7 @@ CONDITIONS = {
 # 5 s after the start, one way in the even scenes and the other way in the odd ones.
 
 CHANGING_FRAMES = 240
+"""Frames of a sequence that changes: 8 s."""
 _CHANGE_S = 0.8
 """Time in which a level changes."""
 _TEMPO = 0.4, 3.5
@@ -346,7 +352,8 @@ def build_changing(name: str, scene: int) -> World:
 def _visitor(scene: int, number: int, lane: float, at_s: float, comes: bool) -> Actor:
     """A person of the crowd who comes from outside of the view, or leaves it."""
     _, person, keys = _lane_keys(scene, number, lane)
-    # From outside to the beginning of the lane, or from there to outside.
+
+    # from outside to the beginning of the lane, or from there to outside.
     inside = keys[0]
     side = math.copysign(1.0, inside.x)
     facing = 90.0 * side if comes else -90.0 * side
@@ -358,8 +365,9 @@ def _visitor(scene: int, number: int, lane: float, at_s: float, comes: bool) -> 
     entry = (replace(first, t=0.0), replace(last, t=_ENTRY_S), replace(last, t=1e6))
 
     def at(time: float) -> Posture:
+        """The posture at a time, seconds."""
         since = time - at_s
-        # On the lane after coming in, or before leaving.
+        # on the lane after coming in, or before leaving.
         on_lane_s = since - _ENTRY_S if comes else since
         on_lane = on_lane_s >= 0 if comes else on_lane_s < 0
         if on_lane:

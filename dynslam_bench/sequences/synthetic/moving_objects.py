@@ -38,7 +38,7 @@ _CARRIER_ID = 9
 
 
 class Script(NamedTuple):
-    """What moves, and the timeline of the person who carries it.
+    """The things that move, and the timeline of the person who carries them.
 
     Attributes:
         bodies: The things.
@@ -51,6 +51,7 @@ class Script(NamedTuple):
 
 def build_objects(variant: str, scene: int) -> World:
     """The office, what moves in it, and the xyz camera path of TUM's replicas."""
+    # the office, what moves in it, and who carries it
     plan = plan_room(scene)
     rng = stream(scene, "synthetic", "objects", variant)
     room = build_room(scene, plan)
@@ -80,7 +81,8 @@ def _balloon(draw: Draw, scene: int, plan: Plan) -> Script:
     y = draw(0.95, 1.05)
     reach = draw(0.32, 0.42)
     high = draw(1.45, 1.55)
-    # Eight throws from side to side: up in the middle, then down again.
+
+    # eight throws from side to side: up in the middle, then down again.
     keys = [At(0.0, reach, y, high - 0.3)]
     for k in range(8):
         side = -1 if k % 2 == 0 else 1
@@ -136,7 +138,7 @@ def _box_aside(draw: Draw, scene: int, plan: Plan) -> Script:
 
 def _carried(came: bool, draw: Draw, scene: int, plan: Plan) -> Script:
     """A carton is brought and put down before the desk, where it stays; or it stands there and is taken away."""
-    # Time, x, and share of the carrying height at each station.
+    # time, x, and share of the carrying height at each station.
     if came:
         stations = [(1.0, -1.7, 1.1), (3.5, -0.1, 1.0), (5.0, -0.05, 0.0)]
     else:
@@ -151,11 +153,12 @@ def _carried(came: bool, draw: Draw, scene: int, plan: Plan) -> Script:
         for k, (t, x, share) in enumerate(stations)
     )
     carton = _body(1, "box", printed_box(1, half), keys, None)
-    # What the carton is put down on.
+
+    # what the carton is put down on
     pedestal = printed_box(2, (half[0] * 0.9, half[1] * 0.9, 0.175))
     stand = _body(2, "box", pedestal, (At(0.0, -0.05 + shift, y, 0.175),), None)
 
-    # The carrier leaves after bringing the carton, or comes to fetch it.
+    # the carrier leaves after bringing the carton, or comes to fetch it.
     walker = [Key(k.t, k.x, y + 0.45, 180) for k in keys]
     away = -1.75
     if came:
@@ -262,8 +265,10 @@ def _door(draw: Draw, scene: int, plan: Plan) -> Script:
 def _doorway(plan: Plan) -> Parts:
     """A wall before the desk, with a doorway, and posters on it."""
     x, y, width = _DOOR
+    # walls on either side of the door
     parts = partition((plan.left_x, y + 0.05), (x - 0.02, y + 0.05), plan)
     parts += partition((x + width + 0.02, y + 0.05), (plan.right_x, y + 0.05), plan)
+    # two posters above each other at four places
     for k, at in enumerate((x - 0.28, x - 0.75, x + width + 0.28, x + width + 0.75)):
         for z in (1.0, 1.62):
             name = f"poster:{(k + int(2 * z)) % 4}"
@@ -283,6 +288,7 @@ _SCRIPTS: dict[str, Callable[[Draw, int, Plan], Script]] = {
     "chair": _chair,
     "door": _door,
 }
+"""The scripts by the name of their sequence."""
 
 OBJECTS = {
     f"objects_{name}": Variant(partial(build_objects, name), "unknown-objects") for name in _SCRIPTS

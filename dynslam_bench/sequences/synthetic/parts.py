@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from dynslam_bench.sequences.synthetic.arithmetic import Array, cos, norm, product, sin
 
+# kinds of primitives, as the kernels tell them apart
 BOX = 0
 ROUND_CONE = 1
 QUAD = 2
@@ -21,8 +22,15 @@ class Primitive:
     """One shape. A local point p lies in the world at ``rotation @ (scale * p) + origin``; see `primitive`.
 
     Attributes:
+        kind: `BOX`, `ROUND_CONE` or `QUAD`.
+        rotation: ``[3, 3]``, local to world.
+        origin: ``[3]``, world position of the local origin, metres.
+        scale: ``[3]``, factors of the local axes.
+        shape: ``[3]``, sizes in the local frame, metres; see `primitive`.
+        instance: Number of the object it belongs to; 0 for the background.
         texture: Six names, one a face.
         uv: ``[6, 4]``: repeats and shift of the texture along both axes of each face.
+        tint: ``[3]``, factors of the colour channels.
     """
 
     kind: int
@@ -37,6 +45,7 @@ class Primitive:
 
 
 Parts = list[Primitive]
+"""The primitives that a thing is made of."""
 
 
 def primitive(
@@ -71,15 +80,24 @@ def primitive(
     """
     names = (texture,) * 6 if isinstance(texture, str) else texture
     uv = np.array([(*repeat, *shift)] * 6, dtype=np.float64)
+    # once over the whole face: texture coordinates 0 to 1 over the extent of the face's two axes
     for face in fit:
         du, dv = ((1, 2), (0, 2), (0, 1))[face // 2]
         uv[face] = (0.5 / shape[du], 0.5 / shape[dv], 0.5, 0.5)
-    place, size, extent, color = (
-        np.asarray(row, dtype=np.float64) for row in (origin, scale, shape, tint)
+    return Primitive(
+        kind,
+        rotation,
+        origin=np.asarray(origin, dtype=np.float64),
+        scale=np.asarray(scale, dtype=np.float64),
+        shape=np.asarray(shape, dtype=np.float64),
+        instance=instance,
+        texture=names,
+        uv=uv,
+        tint=np.asarray(tint, dtype=np.float64),
     )
-    return Primitive(kind, rotation, place, size, extent, instance, names, uv, color)
 
 
+# `primitive` of each kind
 box = partial(primitive, BOX)
 cone = partial(primitive, ROUND_CONE)
 quad = partial(primitive, QUAD)
@@ -107,7 +125,7 @@ def copies(parts: Parts, yaw: float, shift: tuple[float, float, float], suffix: 
 
 
 def rotation_about_z(degrees: float) -> Array:
-    """Rotation about the world's z axis."""
+    """Rotation ``[3, 3]`` about the world's z axis."""
     a = np.radians(degrees)
     c = cos(a)
     s = sin(a)
@@ -115,16 +133,17 @@ def rotation_about_z(degrees: float) -> Array:
 
 
 def wall(x_axis: tuple[float, float, float], y_axis: tuple[float, float, float]) -> Array:
-    """Rotation of a quad whose local x and y run along these world axes."""
+    """Rotation ``[3, 3]`` of a quad whose local x and y run along these world axes."""
     x = np.array(x_axis)
     y = np.array(y_axis)
     return np.stack([x, y, np.cross(x, y)], axis=1)
 
 
 def along(start: Array, end: Array, side: Array) -> tuple[Array, float]:
-    """Frame whose z axis runs from start to end, its x axis towards `side`; and the length."""
+    """Rotation ``[3, 3]`` of a frame whose z axis runs from start to end, its x axis towards `side`; and the length."""
     length = float(norm(end - start))
     z = (end - start) / length
+    # what is left of `side` without its part along z (Gram-Schmidt)
     x = side - product(side, z) * z
     x = x / norm(x)
     return np.stack([x, np.cross(z, x), z], axis=1), length
@@ -135,7 +154,15 @@ def along(start: Array, end: Array, side: Array) -> tuple[Array, float]:
 
 @dataclass(frozen=True)
 class At:
-    """Where a thing is at one time: seconds, metres, degrees about the vertical (not reduced to a turn)."""
+    """Place and direction of a thing at one time: a key of its timeline.
+
+    Attributes:
+        t: Seconds.
+        x: World position, metres.
+        y: World position, metres.
+        z: World position, metres.
+        yaw: Degrees about the vertical, not reduced to a turn.
+    """
 
     t: float
     x: float
@@ -146,7 +173,16 @@ class At:
 
 @dataclass(frozen=True)
 class Key:
-    """Where and how a person is at one time, and where a chair is; degrees, 0 looks along +y, by the smaller angle."""
+    """Place and activity of a person, or place of a chair, at one time: a key of the timeline.
+
+    Attributes:
+        t: Seconds.
+        x: World position, metres.
+        y: World position, metres.
+        facing: Degrees, 0 looks along +y; between two keys the smaller angle is turned.
+        sit: 0 stands, 1 sits.
+        gesture: 0 arms at rest, 1 lively.
+    """
 
     t: float
     x: float
@@ -168,7 +204,7 @@ def between(keys: Sequence[KeyT], time: float) -> tuple[KeyT, KeyT, float]:
 
 
 def ease(share: float) -> float:
-    """A share of the way as a share of the time: slow at both ends."""
+    """A share of the way as a share of the time: slow at both ends (a cubic, "smoothstep")."""
     return share * share * (3 - 2 * share)
 
 

@@ -54,7 +54,7 @@ _SHIRTS = ("print", "print", "plaid:1", "plaid:1", "stripes", "stripes")
 
 @dataclass(frozen=True)
 class Person:
-    """What does not change about a person: size, build, colours and clothes.
+    """Appearance of a person, which does not change: size, build, colours and clothes.
 
     Attributes:
         instance: Id in the masks.
@@ -87,7 +87,7 @@ class Person:
 
 @dataclass(frozen=True)
 class Posture:
-    """What a person does at one time.
+    """Place, direction and activity of a person at one time.
 
     Attributes:
         x: Place on the floor, metres.
@@ -175,12 +175,15 @@ class _Figure:
         self.how = how
         self.size = who.height / 1.75
         self.build = who.build
+        # joints, from the legs upwards
         body = rotation_about_z(how.facing)
         self._bend_legs()
         self.pelvis = self._pelvis_position(body)
         self._twist_trunk(body)
         rise = _in(self.trunk, 0.0, -0.005, 0.46 * self.size + 0.05 * self.size)
         self.neck = self.pelvis + rise
+
+        # what trousers, shirt and skin look like
         self.jeans = self.style("denim", who.trousers, repeat=(2.0, 3.0))
         self.shirt = self.style(who.shirt, who.shirt_tint)
         self.bare = self.style("plain", who.skin)
@@ -210,9 +213,13 @@ class _Figure:
         heights = []
         for hip, knee in zip(self.hip_angles, self.knee_angles, strict=True):
             heights.append(0.43 * k * cos(hip) + 0.41 * k * cos(hip - knee))
+
+        # blend of standing and sitting
         standing = max(heights) + 0.085 * k
         seated = 0.485 + 0.085 * self.build
         height = standing * (1 - how.sit) + how.sit * seated
+
+        # who stands sways a little
         sway = (1 - how.gait) * (1 - 0.85 * how.sit)
         sway_right = 0.012 * sway * self.wave(0.31, 0.0)
         sway_forward = 0.012 * sway * self.wave(0.23, 2.0)
@@ -239,7 +246,7 @@ class _Figure:
         self.hips = product(body, _yaw(-twist))
 
     def style(self, texture: str, tint: Array, **more: Any) -> dict[str, Any]:
-        """How a limb of this person looks."""
+        """Arguments of `primitive` for a limb of this person: its look and its instance."""
         return {"instance": self.who.instance, "texture": texture, "tint": tint, **more}
 
     def wave(self, frequency: float, phase: float) -> float:
@@ -298,6 +305,8 @@ def _trunk(figure: _Figure) -> Parts:
     across = product(trunk, _X)
     waist = figure.pelvis + _in(trunk, 0.0, 0.0, 0.08 * k)
     chest = figure.pelvis + _in(trunk, 0.0, 0.005, 0.36 * k)
+
+    # hip and shoulder joints
     left_hip, right_hip = (
         figure.pelvis + _in(figure.hips, side * 0.055 * k, 0, 0.01) for side in (-1, 1)
     )
@@ -305,6 +314,8 @@ def _trunk(figure: _Figure) -> Parts:
     left_shoulder, right_shoulder = (
         chest + side * across * 0.11 * k * b + shoulder_rise for side in (-1, 1)
     )
+
+    # widths at both ends of each part
     pelvis_radii = (0.115 * k * b, 0.115 * k * b)
     belly_radii = (0.148 * k * b, 0.168 * k * b)
     shoulder_radii = (0.088 * k * b, 0.088 * k * b)
@@ -331,13 +342,13 @@ def _head(figure: _Figure) -> Parts:
     neck = figure.neck
     skull = neck + _in(trunk, 0.0, 0.015 * k, 0.15 * k)
 
-    # Axes of the head: it looks about less while walking, and nods.
+    # axes of the head: it looks about less while walking, and nods.
     look = 0.3 * figure.wave(0.13, 0.9) * (1 - figure.how.gait)
     look = look + 0.1 * figure.how.gesture * figure.wave(0.4, 0.1)
     nod = 0.06 * figure.wave(0.29, 0.3) - 0.03
     head = product(trunk, _yaw(look), _pitch(nod))
 
-    # Neck, skull, nose, ears.
+    # neck, skull, nose, ears
     neck_low = neck - _in(trunk, 0, 0, 0.04 * k)
     neck_high = skull - _in(trunk, 0, 0.01, 0.03 * k)
     neck_radii = (0.058 * k, 0.052 * k)
@@ -356,7 +367,7 @@ def _head(figure: _Figure) -> Parts:
 
 
 def _hair(figure: _Figure, skull: Array, head: Array) -> Parts:
-    """What covers the head.
+    """Hair and cap: what covers the head.
 
     Args:
         figure: The person.
@@ -366,6 +377,7 @@ def _hair(figure: _Figure, skull: Array, head: Array) -> Parts:
     k = figure.size
     who = figure.who
     hair = figure.style("hair", who.hair, repeat=(3.0, 0.5))
+    # a cap of hair on the skull
     crown = skull + _in(head, 0, -0.018 * k, 0.03 * k)
     crown_radii = (0.086 * k, 0.101 * k, 0.108 * k)
     parts = [figure.ball(crown, product(head, _pitch(0.35)), crown_radii, **hair)]
@@ -397,6 +409,7 @@ def _arm_angles(figure: _Figure, side: int) -> tuple[float, float, float]:
     wave = figure.wave
     # the arms swing against the legs
     phase = figure.how.stride + (math.pi if side < 0 else 0.0)
+    # how much of a gesture there is just now
     talk = figure.how.gesture * power(0.5 + 0.5 * wave(0.11, 1.5 * side), 0.7)
     pitch = (
         gait * 0.42 * sin(phase)
@@ -419,7 +432,7 @@ def _arm(figure: _Figure, side: int) -> Parts:
     b = figure.build
     pitch, abduction, bend = _arm_angles(figure, side)
 
-    # Forward kinematics from the shoulder to the hand.
+    # forward kinematics from the shoulder to the hand
     shoulder = figure.neck + _in(figure.trunk, side * 0.185 * k * b, 0.0, -0.055 * k)
     upper = product(figure.trunk, _roll(-abduction), _pitch(pitch))
     lower = product(upper, _roll(side * 0.35 * min(bend, 1.0)), _pitch(bend))
@@ -429,6 +442,7 @@ def _arm(figure: _Figure, side: int) -> Parts:
     palm = wrist + _in(hand, 0, 0.005, -0.055 * k)
     thumb = wrist + _in(hand, 0.0, 0.035 * k, -0.035 * k)
 
+    # the arm in its sleeve, and the hand
     forward = product(upper, _Y)
     lower_forward = product(lower, _Y)
     sleeve = figure.shirt | {"repeat": (2.0, 6.0)}
@@ -457,7 +471,7 @@ def _leg(figure: _Figure, side: int, index: int) -> Parts:
     hip_angle = figure.hip_angles[index]
     knee_angle = figure.knee_angles[index]
 
-    # Forward kinematics from the hip to the foot.
+    # forward kinematics from the hip to the foot
     upper = product(figure.hips, _roll(-side * (0.02 + 0.1 * sit)), _pitch(hip_angle))
     lower = product(upper, _pitch(-knee_angle))
     hip = figure.pelvis + _in(figure.hips, side * 0.095 * k * b, 0.0, -0.01)
@@ -467,6 +481,7 @@ def _leg(figure: _Figure, side: int, index: int) -> Parts:
     heel = ankle + _in(foot, 0, -0.03, -0.035 * k)
     toe = ankle + _in(foot, 0, 0.15 * k, -0.05 * k)
 
+    # thigh, shin and shoe
     thigh_radii = (0.088 * k * b, 0.061 * k * b)
     shin_radii = (0.06 * k * b, 0.045 * k * b)
     shoe_radii = (0.045 * k, 0.034 * k)
@@ -505,6 +520,7 @@ def write_script(people: str, scene: int) -> Script:
     script = write(partial(pick, rng, scene))
     if not mirrored:
         return script
+    # left and right exchanged
     people_keys = [_mirrored(keys) for keys in script.people]
     chair_keys = [_mirrored(keys) for keys in script.chairs]
     return Script(script.period, people_keys, chair_keys)
@@ -517,7 +533,7 @@ def _mirrored(keys: tuple[Key, ...]) -> tuple[Key, ...]:
 
 def _sitting(draw: Draw) -> Script:
     """Two people at the desk, talking with their hands."""
-    # Where both sit (ax, ay and bx, by) and face (fa, fb): metres, degrees.
+    # where both sit (ax, ay and bx, by) and face (fa, fb): metres, degrees.
     ax = -draw(0.5, 0.62)
     ay = draw(1.62, 1.74)
     bx = draw(0.46, 0.58)
@@ -543,7 +559,7 @@ def _sitting(draw: Draw) -> Script:
 
 def _walking(draw: Draw) -> Script:
     """Two people who walk across the room, stand talking, and sit down."""
-    # Where they stand talking (ax, ay and bx, by) and where the first one sits (cx, cy), metres.
+    # where they stand talking (ax, ay and bx, by) and where the first one sits (cx, cy), metres.
     ax = -draw(0.28, 0.4)
     ay = draw(1.26, 1.38)
     bx = draw(0.3, 0.42)
@@ -636,15 +652,18 @@ _PUSHED_CHAIR = (
 
 def posture(keys: tuple[Key, ...], period: float, t: float) -> Posture:
     """The posture of a person at time t (seconds)."""
+    # the keys around the time, of a timeline that repeats
     local = t % period
     before, after, share = between(keys, local)
-    # Path that was walked since the beginning of the timeline, for the phase of the gait.
+
+    # path that was walked since the beginning of the timeline, for the phase of the gait.
     walked = 0.0
     for start, end in itertools.pairwise(keys):
         walked += _distance(start, end) if local >= end.t else 0.0
     distance = _distance(before, after)
+
+    # speed by the derivative of `ease`, for how fully the person walks
     eased = ease(share)
-    # derivative of `ease`
     speed = distance / (after.t - before.t) * 6 * share * (1 - share)
     # people turn in the first two thirds of a way
     facing = angle_between(before.facing, after.facing, ease(min(share * 1.5, 1.0)))

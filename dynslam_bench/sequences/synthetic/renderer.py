@@ -71,38 +71,40 @@ ColorImage = NDArray[np.float32]
 """Colours ``[H, W, 3]`` from 0 to 255 before exposure and noise."""
 
 
-def motion_of_primitives(now: View, other: View) -> tuple[Array, Array]:
+def motion_of_primitives(view: View, other: View) -> tuple[Array, Array]:
     """Rotations ``[P, 3, 3]`` and shifts ``[P, 3]`` in the world that carry primitives from one frame to another."""
-    rotation = product(other.rotation, np.swapaxes(now.rotation, 1, 2))
-    return rotation, other.origin - product(rotation, now.origin[:, :, None])[:, :, 0]
+    rotation = product(other.rotation, np.swapaxes(view.rotation, 1, 2))
+    return rotation, other.origin - product(rotation, view.origin[:, :, None])[:, :, 0]
 
 
-def rolling_flow(now: View, other: View, hit: HitImage, depth: Array) -> NDArray[np.float32]:
+def rolling_flow(view: View, other: View, hit: HitImage, depth: Array) -> NDArray[np.float32]:
     """Exact flow float32 ``[H, W, 2]`` in pixels between frames whose rows have poses of their own.
 
     A point is seen in the other frame by the row onto which that very row's pose projects it.
     Beyond the image's first and last row the pose goes on as that row's.
     """
-    # Points seen at the pixel centres, in the world, now.
+    # points seen at the pixel centres, in the world, at the frame's own time
     v, u = np.mgrid[0 : CAMERA.height, 0 : CAMERA.width].astype(np.float64)
     rays = np.stack(
         [(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones_like(u)], axis=-1
     )
-    row_rotations = np.swapaxes(now.rows[:, :3, :3], 1, 2)
-    row_positions = now.rows[:, None, :3, 3]
+    row_rotations = np.swapaxes(view.rows[:, :3, :3], 1, 2)
+    row_positions = view.rows[:, None, :3, 3]
     points = product(rays * depth[..., None], row_rotations) + row_positions
-    # Where they are in the other frame.
-    rotation, shift = motion_of_primitives(now, other)
+
+    # where they are in the other frame
+    rotation, shift = motion_of_primitives(view, other)
     primitive = np.maximum(hit >> 3, 0)
     points = product(rotation[primitive], points[..., None])[..., 0] + shift[primitive]
-    # Fixed-point iteration: project with the pose of the row, take the row of the projection.
+
+    # fixed-point iteration: project with the pose of the row, take the row of the projection.
     row = v.copy()
     for _ in range(_ROW_ITERATIONS):
         first = np.clip(np.floor(row), 0, CAMERA.height - 2).astype(np.int64)
         share = np.clip(row - first, 0.0, 1.0)[..., None]
-        before = _in_camera(points, other.rows[first])
-        after = _in_camera(points, other.rows[first + 1])
-        in_camera = (1 - share) * before + share * after
+        by_first = _in_camera(points, other.rows[first])
+        by_next = _in_camera(points, other.rows[first + 1])
+        in_camera = (1 - share) * by_first + share * by_next
         z = np.where(in_camera[..., 2] > NEAR_M, in_camera[..., 2], np.nan)
         x = in_camera[..., 0] / z * CAMERA.fx + CAMERA.cx
         y = in_camera[..., 1] / z * CAMERA.fy + CAMERA.cy
@@ -191,24 +193,24 @@ class Renderer:
 
     def render(self, index: int) -> Rendered:
         """Render frame `index`."""
-        now = self.scene.view(index)
+        view = self.scene.view(index)
         time = index / FPS
 
-        # Geometry and colour.
-        tiles, primitives = self._tiles(now)
+        # geometry and colour
+        tiles, primitives = self._tiles(view)
         hit, depth = self._cast(tiles, primitives)
-        color, cosine = self._shade(now, tiles, primitives, hit, depth, time)
+        color, cosine = self._shade(view, tiles, primitives, hit, depth, time)
 
-        # Depth sensor, by the colour before light and blur change it.
+        # depth sensor, by the colour before light and blur change it.
         raw = self._measure(index, depth, cosine, color)
 
-        # Light and motion blur, then the colour sensor.
+        # light and motion blur, then the colour sensor
         if self.settings.shadow:
-            self._shadow(now.pose, time, depth, color)
+            self._shadow(view.pose, time, depth, color)
         if self.settings.glare:
-            color += self._glare(now.pose, time)
+            color += self._glare(view.pose, time)
         if self.color_sensor.shutter > 0:
-            color = self._blur(now, self.scene.view(index + 1), hit, depth, color)
+            color = self._blur(view, self.scene.view(index + 1), hit, depth, color)
         return Rendered(self._expose(index, color), raw, self._ids[hit >> 3])
 
     def flow(self, index: int, other: int) -> NDArray[np.float32]:
@@ -217,12 +219,12 @@ class Renderer:
         It is the motion of the surface point seen at each pixel centre, also where it is hidden in
         the other frame.
         """
-        now = self.scene.view(index)
-        after = self.scene.view(other)
-        hit, depth = self.cast(now)
-        if now.rolling:
-            return rolling_flow(now, after, hit, depth)
-        return self._flow(now, after, hit, depth)
+        view = self.scene.view(index)
+        other_view = self.scene.view(other)
+        hit, depth = self.cast(view)
+        if view.rolling:
+            return rolling_flow(view, other_view, hit, depth)
+        return self._flow(view, other_view, hit, depth)
 
     def geometry(self, index: int) -> tuple[Array, NDArray[np.uint8]]:
         """Exact z-depth (metres, 0 = nothing) and instance ids of frame `index`, without shading."""
@@ -230,7 +232,7 @@ class Renderer:
         return depth, self._ids[hit >> 3]
 
     def cast(self, view: View) -> tuple[HitImage, Array]:
-        """What every pixel of a view sees (8 * primitive + face, -1 for nothing) and its z-depth in metres."""
+        """Surface that every pixel of a view sees (8 * primitive + face, -1 for nothing), and its z-depth in metres."""
         return self._cast(*self._tiles(view))
 
     def _rows(self, work: Callable[[int, int], None]) -> None:
@@ -284,7 +286,7 @@ class Renderer:
         return tiles, Primitives(scene.kind, camera_to_local, scene.shape)
 
     def _cast(self, tiles: Tiles, primitives: Primitives) -> tuple[HitImage, Array]:
-        """What every pixel sees (`cast_geometry`) and its z-depth in metres."""
+        """The surface that every pixel sees (`cast_geometry`) and its z-depth in metres."""
         hit = np.empty(SIZE, np.int32)
         depth = np.empty(SIZE)
         self._rows(
@@ -296,7 +298,7 @@ class Renderer:
 
     def _shade(
         self,
-        now: View,
+        view: View,
         tiles: Tiles,
         primitives: Primitives,
         hit: HitImage,
@@ -311,9 +313,11 @@ class Renderer:
         jitter = _JITTER if self.settings.antialias else np.zeros((1, 2))
 
         def shade_band(row0: int, row1: int) -> None:
-            pose = now.pose_of((row0 + row1) // 2)
+            """Shade the rows `row0` to `row1` - 1."""
+            # lights and normals in the frame of the camera at the band's middle row
+            pose = view.pose_of((row0 + row1) // 2)
             lights = self._lights(pose, time)
-            facets = self._facets(now, pose, lights, texel_density)
+            facets = self._facets(view, pose, lights, texel_density)
             materials = Materials(scene.texture, scene.uv, scene.tint, facets)
             kernels.shade_pixels(
                 row0,
@@ -334,19 +338,21 @@ class Renderer:
         self._rows(shade_band)
         return color, cosine
 
-    def _flow(self, now: View, other: View, hit: HitImage, depth: Array) -> NDArray[np.float32]:
+    def _flow(self, view: View, other: View, hit: HitImage, depth: Array) -> NDArray[np.float32]:
         """Exact flow under a global shutter; under a rolling one along the motion of each band's middle row."""
         flow = np.empty((*SIZE, 2), np.float32)
-        rotation, shift = motion_of_primitives(now, other)
+        rotation, shift = motion_of_primitives(view, other)
 
         def flow_of_band(row0: int, row1: int) -> None:
-            pose = now.pose_of((row0 + row1) // 2)
-            after = other.pose_of((row0 + row1) // 2)
+            """Fill the flow of the rows `row0` to `row1` - 1."""
+            # camera-to-world poses of the band's middle row in both frames
+            pose = view.pose_of((row0 + row1) // 2)
+            other_pose = other.pose_of((row0 + row1) // 2)
             # from points in this camera's frame to the other camera's frame
             motion = np.empty((len(shift), 3, 4))
-            motion[:, :, :3] = product(after[:3, :3].T, rotation, pose[:3, :3])
-            position_after = product(rotation, pose[:3, 3]) + shift
-            motion[:, :, 3] = product(position_after - after[:3, 3], after[:3, :3])
+            motion[:, :, :3] = product(other_pose[:3, :3].T, rotation, pose[:3, :3])
+            moved_centre = product(rotation, pose[:3, 3]) + shift
+            motion[:, :, 3] = product(moved_centre - other_pose[:3, 3], other_pose[:3, :3])
             kernels.flow_field(row0, row1, _INTRINSICS, hit, depth, motion.reshape(-1, 12), flow)
 
         self._rows(flow_of_band)
@@ -354,14 +360,14 @@ class Renderer:
 
     def _blur(
         self,
-        now: View,
-        after: View,
+        view: View,
+        next_view: View,
         hit: HitImage,
         depth: Array,
         sharp: ColorImage,
     ) -> ColorImage:
         """Motion blur while the shutter is open."""
-        flow = self._flow(now, after, hit, depth)
+        flow = self._flow(view, next_view, hit, depth)
         blurred = np.empty_like(sharp)
         exact = sharp.astype(np.float64).ravel()
         shares = kernels.tap_shares()
@@ -377,6 +383,7 @@ class Renderer:
         """Directions to the lights in the camera frame, and strengths; row 0 is the ambient light."""
         rows = _LAMPS.copy()
         rows[:, :3] /= norm(rows[:, :3])[:, None]
+        # all dim and brighten slowly, one lamp switches
         if self.settings.lighting_change:
             rows[:, 3] *= 0.78 + 0.22 * cos(2 * math.pi * time / 7.0)
             rows[2, 3] += 0.25 if sin(2 * math.pi * time / 4.7) > 0.3 else 0.0
@@ -460,6 +467,7 @@ class Renderer:
         self, index: int, depth: Array, cosine: NDArray[np.float32], color: NDArray[np.float32]
     ) -> NDArray[np.uint16]:
         """The depth as the sensor measures it."""
+        # without noise it is rounded to the file's units only
         sensor = self.depth_sensor
         units_per_m = CAMERA.written_depth_factor
         if not sensor.noise:
@@ -522,6 +530,7 @@ def _adapted(sensor: SensorSettings, world: Mapping[str, Any]) -> SensorSettings
 
 
 _MOST_THREADS = 4
+"""Threads of one frame, at most."""
 
 
 def default_threads() -> int:

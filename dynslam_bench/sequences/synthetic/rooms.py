@@ -63,6 +63,7 @@ def pick_one(rng: np.random.Generator, scene: int, pool: list[int]) -> int:
 
 def plan_room(scene: int, number: int | None = None) -> Plan:
     """Draw the plan of a scene's room, or of one of its several rooms."""
+    # the stream of draws; a scene's only room and its first of several are different rooms
     one_of_several = () if number is None else (number,)
     rng = stream(scene, "synthetic", "room", *one_of_several)
 
@@ -71,6 +72,7 @@ def plan_room(scene: int, number: int | None = None) -> Plan:
         base = pick(rng, scene, low, high)
         return np.clip(base + spread * (rng.random(3) - 0.5), 0.03, 1.0)
 
+    # colours of the materials, red, green and blue from 0 to 1
     wood = pick(rng, scene, 0.55, 0.95) * np.array([1.0, 0.84, 0.66])
     tints = {
         "wall": color(0.72, 0.92, 0.08),
@@ -85,6 +87,7 @@ def plan_room(scene: int, number: int | None = None) -> Plan:
         "door": color(0.45, 0.8, 0.2),
         "bin": color(0.2, 0.6, 0.4),
     }
+    # sizes and places, in this order of draws
     return Plan(
         back_y=pick(rng, scene, 3.35, 3.75),
         left_x=-pick(rng, scene, 1.9, 2.4),
@@ -105,11 +108,13 @@ def glare_window(plan: Plan) -> tuple[float, float, float]:
 
 
 # The office's furniture: desk with monitors and clutter, shelf, posters, cabinet with a plant,
-# office chairs.
+# office chairs. Places are world positions in metres, x to the right, y away from the camera, z up.
+# `x, y` of a desk are the middle and the front edge of its top, `half` is half its length.
 
 TOP = 0.74
 """Height of a desk, metres."""
 _EYE = np.eye(3)
+"""Rotation of what stands along the world's axes."""
 
 
 def desk(rng: np.random.Generator, plan: Plan, x: float, y: float, half: float) -> Parts:
@@ -130,9 +135,12 @@ def _table(plan: Plan, x: float, y: float, half: float) -> Parts:
     wood: Style = {"texture": "wood", "tint": tint["desk"]}
     darker: Style = wood | {"tint": tint["desk"] * 0.9}
     darkest: Style = wood | {"tint": tint["desk"] * 0.85}
+    # half the height of a side; where the unit of drawers stands
     leg = (TOP - 0.036) / 2
     side = 1 if plan.mirrored else -1
     unit = np.array([x + side * (half - 0.3), y + 0.38, 0.3])
+
+    # top, sides, back and drawers' unit
     parts = [box(_EYE, (x, y + 0.4, TOP - 0.018), (half, 0.4, 0.018), repeat=(1.2, 1.6), **wood)]
     for end in (-1, 1):
         parts.append(
@@ -142,6 +150,8 @@ def _table(plan: Plan, x: float, y: float, half: float) -> Parts:
         box(_EYE, (x, y + 0.74, 0.45), (half - 0.06, 0.01, 0.25), **darkest),
         box(_EYE, unit, (0.21, 0.3, 0.29), tint=tint["cabinet"]),
     ]
+
+    # fronts and handles of the drawers
     for k in range(3):
         front = unit + np.array([0, -0.305, 0.19 - 0.19 * k])
         handle = unit + np.array([0, -0.32, 0.22 - 0.19 * k])
@@ -230,11 +240,14 @@ def _monitors(rng: np.random.Generator, plan: Plan, x: float, y: float, half: fl
         middle = np.array([mx, my, TOP + 0.3])
         faces = ("plain", "plain", f"screen:{k}", "plain", "plain", "plain")
         turned = rotation_about_z(6 * (rng.random() - 0.5))
+
         # the screen and the bars around it
         parts.append(box(facing, middle, (0.27, 0.02, 0.175), texture=faces, fit=(2,)))
         for dx, dz, hx, hz in _FRAME:
             bar = middle + product(facing, np.array([dx, -0.012, dz]))
             parts.append(box(facing, bar, (hx, 0.024, hz), tint=plastic))
+
+        # foot, keyboard and mouse
         keys: Style = {"texture": "keyboard", "fit": (5,)}
         mouse: Style = {"scale": (0.032, 0.055, 0.025), "tint": plastic}
         parts += [
@@ -260,7 +273,8 @@ def shelf(rng: np.random.Generator, plan: Plan, side: int) -> Parts:
         box(_EYE, (x + half, y, height / 2), (0.015, 0.15, height / 2), **wood),
         box(_EYE, (x, y + 0.145, height / 2), (half, 0.008, height / 2), **darker),
     ]
-    # Six boards, and on all but the top one a row of books and, where there is room, a box.
+
+    # six boards, and on all but the top one a row of books and, where there is room, a box
     for k in range(6):
         z = 0.06 + k * (height - 0.08) / 5
         parts.append(box(_EYE, (x, y, z), (half, 0.15, 0.014), **wood))
@@ -331,7 +345,7 @@ def _plant(rng: np.random.Generator, pot: Array) -> Parts:
         tip = pot + product(around, outwards)
         length = norm(tip - stem)
         green = np.array([0.2, 0.45, 0.16]) * (0.7 + 0.6 * rng.random())
-        # The leaf's axes: z along it, x across its flat side.
+        # the leaf's axes: z along it, x across its flat side
         z = (tip - stem) / length
         u = np.cross(z, product(around, np.array([0.0, 1.0, 0.0])))
         axes = np.stack([u / norm(u), np.cross(z, u / norm(u)), z], 1)
@@ -342,6 +356,7 @@ def _plant(rng: np.random.Generator, pot: Array) -> Parts:
 
 def build_room(scene: int, plan: Plan) -> Parts:
     """All fixed primitives of the office: walls, floor and ceiling, and its furniture."""
+    # extents of the room
     rng = stream(scene, "synthetic", "furniture")
     tint = plan.tints
     back = plan.back_y
@@ -352,6 +367,8 @@ def build_room(scene: int, plan: Plan) -> Parts:
     half_x = (plan.right_x - plan.left_x) / 2
     across = (half_x, HEIGHT_M / 2, 0)
     along = (half_y, HEIGHT_M / 2, 0)
+
+    # floor, ceiling and four walls: local x axis, middle, half extents, colour
     sides = (
         ((0, -1, 0), plan.left_x, mid_y, along, "side"),
         ((0, 1, 0), plan.right_x, mid_y, along, "side"),
@@ -369,6 +386,7 @@ def build_room(scene: int, plan: Plan) -> Parts:
         box(_EYE, (mid_x, back - 0.01, 0.05), (half_x, 0.01, 0.05), tint=tint["shelf"]),
         box(_EYE, (mid_x, back - 0.02, 0.95), (half_x, 0.02, 0.04), tint=(0.82,) * 3),
     ]
+    # furniture
     parts += desk(rng, plan, plan.desk_x, plan.desk_y, half=1.15)
     parts += shelf(rng, plan, plan.shelf_side)
     parts += posters(rng, plan)
@@ -419,10 +437,13 @@ def partition(start: Point, end: Point, plan: Plan, doors: tuple[float, ...] = (
     length = math.sqrt(dx * dx + dy * dy)
     facing = rotation_about_z(math.degrees(atan2(dy, dx)))
     direction = np.array([dx, dy, 0.0]) / length
-    # Pieces between the doorways, and above them: first and last metre, and lower edge.
+
+    # pieces between the doorways, and above them: first and last metre, and lower edge
     edges = [0.0, *(door + side * DOOR_M / 2 for door in doors for side in (-1, 1)), length]
     pieces = [(a, b, 0.0) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     pieces += [(door - DOOR_M / 2, door + DOOR_M / 2, _LINTEL_M) for door in doors]
+
+    # a box each
     style: Style = {"texture": "plaster", "repeat": (0.5, 0.5), "tint": plan.tints["wall"]}
     parts = []
     for a, b, bottom in pieces:
@@ -434,7 +455,13 @@ def partition(start: Point, end: Point, plan: Plan, doors: tuple[float, ...] = (
 
 
 def _stretch(scene: int, number: int, half: float) -> tuple[Plan, np.random.Generator]:
-    """The plan of a stretch of wall about its own origin, and its stream."""
+    """The plan of a stretch of wall along y = 0, from x = -half to half, and the stream of its draws.
+
+    Args:
+        scene: The scene.
+        number: Which of its stretches.
+        half: Half the length, metres.
+    """
     plan = replace(
         plan_room(scene, number), back_y=0.0, left_x=-half, right_x=half, desk_x=0.0, desk_y=-1.0
     )
@@ -490,6 +517,7 @@ def notices(scene: int, number: int) -> Parts:
 
 # Things that are moved, each about its own origin: chair, cartons, box, balloon, trolley, door.
 
+# a print on every face
 _PRINT: Style = {
     "texture": tuple(f"poster:{face}" for face in range(6)),
     "fit": tuple(range(6)),
@@ -509,6 +537,7 @@ def office_chair(plan: Plan, instance: int, shade: float = 1.0) -> Parts:
         "tint": plan.tints["chair"] * shade,
     }
     frame: Style = {"instance": instance, "tint": metal}
+    # seat, back, the bar between them, column
     parts = [
         box(_EYE, (0, 0, 0.45), (0.23, 0.22, 0.035), **cloth),
         box(lean, (0, 0.26, 0.76), (0.21, 0.028, 0.25), **cloth),
@@ -577,6 +606,7 @@ def trolley(id: int, scene: int, plan: Plan) -> Parts:
     bottom = 0.18
     metal: Style = {"instance": id, "tint": plan.tints["metal"]}
     wheels = ((-0.38, -0.24), (-0.38, 0.24), (0.38, -0.24), (0.38, 0.24))
+    # platform, wheels and handle
     parts = [box(_EYE, (0, 0, 0.16), (0.45, 0.3, 0.02), **metal)]
     for x, y in wheels:
         parts.append(cone(_EYE, (x, y, 0.07), (0, 0.07, 0.07), instance=id, tint=(0.15,) * 3))

@@ -47,7 +47,7 @@ Actor = tuple[Person, Callable[[float], Posture]]
 
 @dataclass(frozen=True, eq=False)
 class Optics:
-    """What a sequence's sensors do beside the defaults.
+    """Settings of a sequence's sensors that differ from the defaults.
 
     Attributes:
         readout_s: From the first row's exposure to the last one's; 0 is a global shutter. The
@@ -163,11 +163,13 @@ class Scene:
         self.seed = scene
         self.moves = settings.people == "moving"
         self.actors = () if settings.people == "none" else world.actors
-        # All primitives, in the order in which `_place` moves them: static parts, bodies, people.
+
+        # all primitives, in the order in which `_place` moves them: static parts, bodies, people.
         bodies = (body.parts for body in world.bodies)
         people = (build_person(person, posture(0.0)) for person, posture in self.actors)
         parts = [*world.static, *chain(*bodies, *people)]
-        # Their attributes as arrays ``[P, ...]``.
+
+        # their attributes as arrays ``[P, ...]``.
         self.kind = np.array([part.kind for part in parts]).astype(np.int32)
         self.instance = np.array([part.instance for part in parts]).astype(np.int32)
         self.scale = np.array([part.scale for part in parts])
@@ -176,7 +178,8 @@ class Scene:
         self.tint = np.array([part.tint for part in parts])
         self._rotation = np.array([part.rotation for part in parts])
         self._origin = np.array([part.origin for part in parts])
-        # Textures by number.
+
+        # textures by number
         self.texture_names = sorted({name for part in parts for name in part.texture})
         number = {name: i for i, name in enumerate(self.texture_names)}
         faces = [[number[name] for name in part.texture] for part in parts]
@@ -205,14 +208,16 @@ class Scene:
         rotation = self._rotation.copy()
         origin = self._origin.copy()
         end = len(self.world.static)
-        # Bodies: their parts turn and move with them.
+
+        # bodies: their parts turn and move with them
         for body in self.world.bodies:
             part = slice(end, end + len(body.parts))
             R_world_body, position = body.path(time)
             rotation[part] = product(R_world_body, rotation[part])
             origin[part] = product(origin[part], R_world_body.T) + position
             end = part.stop
-        # People: built again in their posture.
+
+        # people: built again in their posture
         people = [build_person(person, posture(time)) for person, posture in self.actors]
         limbs = list(chain(*people))
         if limbs:
@@ -232,9 +237,11 @@ class Scene:
         """Instances with a point that moved by more than `MOVED_M` since the previous frame; frame 0 has none."""
         if index == 0 or not self.moves:
             return frozenset()
+        # places in this frame and in the previous one
         rotation_before, origin_before = self.place((index - 1) / FPS)
         rotation, origin = self.place(index / FPS)
-        # Motion of the corners of every primitive's box: no point inside moves by more.
+
+        # motion of the corners of every primitive's box: no point inside moves by more.
         box = self.corners * self.scale[:, None, :]
         turned = product(box, np.swapaxes(rotation - rotation_before, 1, 2))
         shift = turned + (origin - origin_before)[:, None, :]
@@ -243,17 +250,19 @@ class Scene:
 
     def _corners(self) -> Array:
         """Corners ``[P, 8, 3]`` of each primitive's box in its local frame."""
-        # Boxes: half extents. Quads: the same, without depth.
+        # boxes: half extents; quads: the same, without depth
         low = -self.shape.copy()
         high = self.shape.copy()
         low[self.kind == QUAD, 2] = 0.0
         high[self.kind == QUAD, 2] = 0.0
-        # Round cones: around the spheres at both ends.
+
+        # round cones: around the spheres at both ends
         cones = self.kind == ROUND_CONE
         h, r1, r2 = self.shape[cones].T
         radius = np.maximum(r1, r2)
         low[cones] = np.stack([-radius, -radius, np.minimum(-r1, h - r2)], 1)
         high[cones] = np.stack([radius, radius, np.maximum(h + r2, r1)], 1)
-        # Bit k of a corner's number is its side along axis k.
+
+        # bit k of a corner's number is its side along axis k
         is_high = np.array([[(i >> axis) & 1 for axis in range(3)] for i in range(8)], dtype=bool)
         return np.where(is_high[None], high[:, None, :], low[:, None, :])

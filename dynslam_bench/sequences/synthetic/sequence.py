@@ -28,11 +28,12 @@ from dynslam_bench.geometry import Camera, Trajectory, write_tum
 from dynslam_bench.sequences.cameras import write_camera
 from dynslam_bench.sequences.synthetic.ids import SyntheticId
 from dynslam_bench.sequences.synthetic.renderer import Rendered, Renderer, default_threads
-from dynslam_bench.sequences.synthetic.scene import Scene, row_times
+from dynslam_bench.sequences.synthetic.scene import Scene, World, row_times
 from dynslam_bench.sequences.synthetic.settings import CAMERA, FPS, RENDERER_VERSION, RenderSettings
 from dynslam_bench.sequences.view import Masks
 
 _END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
+"""The last chunk of a PNG."""
 _MODES = {"masks": ("L",), "depth": ("I;16", "I"), "rgb": ("RGB",)}
 """Kinds of images, in the order in which they are stored, and Pillow's names of their pixel formats."""
 
@@ -47,6 +48,7 @@ _FAST_PNG = [
 ]
 if hasattr(cv2, "IMWRITE_PNG_FILTER"):
     _FAST_PNG += [cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
+# masks are of few values, which level 1 packs well
 _MASK_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 
@@ -104,23 +106,18 @@ class FrameStore:
         except OSError as error:
             hint = "check the permissions of the cache"
             raise SequenceError(f"cannot read {path}: {error.strerror}", hint) from error
-        return (
-            data
-            if is_intact_png(data, (self.camera.width, self.camera.height), _MODES[kind])
-            else None
-        )
+        size = (self.camera.width, self.camera.height)
+        return data if is_intact_png(data, size, _MODES[kind]) else None
 
     def read(self, kind: str, stamp: float) -> NDArray[Any] | None:
         """An image (RGB order), or None if it is missing or damaged; raises as `bytes_of`."""
         data = self.bytes_of(kind, stamp)
-        image = (
-            None
-            if data is None
-            else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        )
-        return (
-            cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if image is not None and kind == "rgb" else image
-        )
+        if data is None:
+            return None
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if image is not None and kind == "rgb":
+            return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+        return image
 
     def write(self, stamp: float, frame: Rendered) -> None:
         """Store a frame; the colour image comes last, so that a frame with one is complete.
@@ -137,21 +134,25 @@ class FrameStore:
 
         The poses are those of `truth`, or those already listed where these are more.
         """
+        # the lists of the images that are there
         for kind in _MODES:
             lines = [f"# {kind} images of a rendered sequence", "# timestamp filename", "#"]
             stamps = sorted((path.stem for path in (self.folder / kind).glob("*.png")), key=float)
             lines += [f"{stamp} {kind}/{stamp}.png" for stamp in stamps]
             write_atomic(self.folder / f"{kind}.txt", "\n".join(lines) + "\n")
+
+        # the poses, where fewer are listed: lines beside those of two comments
         poses = self.folder / "groundtruth.txt"
-        if (
-            not poses.is_file()
-            or sum(1 for _ in read_lines(poses, kind=SequenceError)) < len(truth) + 2
-        ):
+        listed_lines = 0
+        if poses.is_file():
+            listed_lines = sum(1 for _ in read_lines(poses, kind=SequenceError))
+        if listed_lines < len(truth) + 2:
             write_tum(poses, truth, comment="exact poses of a rendered sequence")
         write_camera(self.folder / "camera.toml", self.camera, fps=FPS)
 
 
 _RENDERER = "dynslam_bench.sequences.synthetic.renderer"
+"""The module whose import closure decides which stored frames are those of this code."""
 START_S = 1000.0
 """Stamp of the first frame in seconds."""
 
@@ -185,6 +186,7 @@ class SyntheticSequence:
         settings: RenderSettings,
         threads: int | None = None,
     ) -> None:
+        # which sequence
         self._id = sequence
         self._cache_root = cache_root
         self.threads = threads or default_threads()
@@ -194,22 +196,23 @@ class SyntheticSequence:
         self.split = sequence.split
         self.noise = sequence.noise
         self.tags = frozenset({sequence.variant.tag if settings.people == "moving" else "static"})
+
+        # what every sequence says of itself
         self.fps = FPS
         self.license = "CC0-1.0"
         self.citation = (
             f"dynslam-bench rendered sequence {self.id}, renderer version {RENDERER_VERSION}"
         )
         self.timestamps = np.round(START_S + np.arange(sequence.frames) / FPS, 6)
+
+        # the folder of its frames; stored frames are those of this code: an edited renderer renders again
         noise = "" if sequence.noise is None else f"-noise{sequence.noise}"
-        # Stored frames are those of this code: an edited renderer renders again.
         rendered_by = digest([self._key(), module_graph().digest([_RENDERER], PLUMBING)], 8)
         # no "?": Windows has none in names
         label = f"{sequence.name}@{sequence.scene}{noise}-{rendered_by}"
-        self.store = (
-            None
-            if cache_root is None
-            else FrameStore(Path(cache_root) / "synthetic" / label, CAMERA)
-        )
+        self.store: FrameStore | None = None
+        if cache_root is not None:
+            self.store = FrameStore(Path(cache_root) / "synthetic" / label, CAMERA)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self._id, self._cache_root, self.settings, self.threads)
@@ -217,12 +220,12 @@ class SyntheticSequence:
     @property
     def camera(self) -> Camera:
         """The camera of TUM's fr3 sequences, without distortion; the fast sequences' has a rolling shutter."""
-        return replace(CAMERA, readout_s=self.scene.world.optics.readout_s)
+        return replace(CAMERA, readout_s=self.world.optics.readout_s)
 
     @cached_property
     def ground_truth(self) -> Trajectory:
         """Exact camera-to-world poses of all frames; needs no rendering."""
-        return Trajectory(self.timestamps, self.scene.world.camera(np.arange(len(self)) / FPS))
+        return Trajectory(self.timestamps, self.world.camera(np.arange(len(self)) / FPS))
 
     @property
     def masks(self) -> Masks:
@@ -230,6 +233,7 @@ class SyntheticSequence:
         return Masks(self._masks_of)
 
     def _masks_of(self, index: int) -> FrameMasks:
+        """The exact masks of a frame: from the cache, else rendered without colours."""
         i = range(len(self))[index]
         ids = None if self.store is None else self.store.read("masks", float(self.timestamps[i]))
         if ids is None:
@@ -237,9 +241,14 @@ class SyntheticSequence:
         return FrameMasks(ids, self.scene.world.class_names, self.scene.moving(i))
 
     @cached_property
+    def world(self) -> World:
+        """The room, its bodies and people, and the camera's path."""
+        return self._id.variant.build(self._id.scene)
+
+    @cached_property
     def scene(self) -> Scene:
         """The geometry behind the frames."""
-        return Scene(self._id.variant.build(self._id.scene), self._id.scene, self.settings)
+        return Scene(self.world, self._id.scene, self.settings)
 
     @cached_property
     def renderer(self) -> Renderer:
@@ -255,6 +264,7 @@ class SyntheticSequence:
         return digest({"scene": f"{self._id.name}@{self._id.scene}", "key": self._key()})
 
     def _key(self) -> str:
+        """Short digest of what decides the pixels beside the scene and the length."""
         family = {"family": self._id.variant.version} if self._id.variant.version else {}
         return digest(
             {"version": RENDERER_VERSION, "settings": self.settings.model_dump(mode="json")}
@@ -268,11 +278,15 @@ class SyntheticSequence:
     def __getitem__(self, index: int) -> Frame:
         i = range(len(self))[index]
         stamp = float(self.timestamps[i])
+
+        # from the cache
         if self.store is not None:
             rgb = self.store.read("rgb", stamp)
             raw = self.store.read("depth", stamp)
             if rgb is not None and raw is not None:
                 return Frame(i, stamp, rgb, _metres(raw))
+
+        # rendered and stored; the lists are renewed at the first and the last frame
         made = self._make(i, self.renderer)
         if self.store is not None and i in (0, len(self) - 1):
             self.store.write_lists(self.ground_truth)
@@ -313,14 +327,18 @@ class SyntheticSequence:
         Raises:
             DynslamError: The cache cannot be written; frames already rendered stay.
         """
+        # what is missing or damaged
         store = self.store
         total = len(self)
         todo = [i for i in range(total) if store is None or not self._is_stored(store, i)]
         report = progress or (lambda done, total: None)
         report(total - len(todo), total)
+
+        # one thread a frame
         if todo:
             renderer = Renderer(self._id, self.scene, self.settings, threads=1)
-            _ = self.scene.atlas  # drawn once, before several threads ask for it
+            # the textures are drawn once, before several threads ask for them
+            _ = self.scene.atlas
             with ThreadPoolExecutor(self.threads) as pool:
                 frames = pool.map(lambda index: self._make(index, renderer) and None, todo)
                 for done, _ in enumerate(frames, total - len(todo) + 1):
@@ -330,6 +348,7 @@ class SyntheticSequence:
         return len(todo)
 
     def _is_stored(self, store: FrameStore, index: int) -> bool:
+        """Whether all images of a frame are there and intact."""
         return all(
             store.bytes_of(kind, float(self.timestamps[index])) is not None for kind in _MODES
         )
@@ -343,4 +362,5 @@ class SyntheticSequence:
 
 
 def _metres(raw: NDArray[np.uint16]) -> NDArray[np.float32]:
+    """Depth in metres ``[H, W]`` of a stored depth image, 0 missing."""
     return raw.astype(np.float32) / np.float32(CAMERA.written_depth_factor)

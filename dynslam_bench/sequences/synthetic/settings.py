@@ -14,10 +14,15 @@ CAMERA = Camera(width=640, height=480, fx=535.4, fy=539.2, cx=320.1, cy=247.6, d
 """The camera of TUM's fr3 sequences."""
 
 FPS = 30.0
+"""Frames a second of all rendered sequences."""
 DEFAULT_FRAMES = 600
+"""Frames of a sequence whose id does not say how many: 20 s."""
 MAX_FRAMES = 36_000
+"""Longest sequence: 20 minutes."""
 TUNE_SCENES = range(0, 100)
+"""Scenes to tune on."""
 HELD_OUT_SCENES = range(100, 200)
+"""Scenes that are kept for the final comparison."""
 
 
 class DepthSensor(Settings):

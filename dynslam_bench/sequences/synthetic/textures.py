@@ -71,6 +71,7 @@ def smooth_noise(
         f = x - i
         return i % n, (i + 1) % n, f * f * (3 - 2 * f)
 
+    # bilinear between the lattice points, with smooth weights
     u0, u1, fu = corners_and_blend(cells)
     v0, v1, fv = corners_and_blend(cells_v)
     top = lattice[v0][:, u0] * (1 - fu) + lattice[v0][:, u1] * fu
@@ -103,6 +104,7 @@ def plaster(rng: np.random.Generator, size: int = 512) -> Image:
 
 def wood(rng: np.random.Generator, size: int = 256) -> Image:
     """Wood grain along u."""
+    # wavy rings across v, and streaks along u
     warp = 6 * fractal(rng, size, 4, 2)
     v = np.arange(size)[:, None] + warp
     rings = sin(v * 2 * np.pi * 9 / size) * 0.5 + sin(v * 2 * np.pi * 23 / size + 1.3) * 0.3
@@ -138,6 +140,7 @@ def _text(
     color: NDArray[np.float64],
 ) -> None:
     """Rows of word-like dashes in the area u0, v0, u1, v1."""
+    # lines of full or shorter length, words of different lengths with gaps between them
     u0, v0, u1, v1 = area
     pitch = (v1 - v0) / lines
     for line in range(lines):
@@ -186,6 +189,7 @@ def poster(rng: np.random.Generator, size: int = 256) -> Image:
 def screen(rng: np.random.Generator, size: int = 256) -> Image:
     """A monitor's picture: windows with title bars and text."""
     image = np.tile(np.array([40.0, 70.0, 110.0]) + 50 * rng.random(3), (size, size, 1))
+    # three windows, each with a title bar and text
     for _ in range(3):
         u = 0.02 + 0.4 * rng.random()
         v = 0.02 + 0.35 * rng.random()
@@ -207,6 +211,7 @@ def books(rng: np.random.Generator, size: int = 256) -> Image:
     image = np.full((size, size, 3), 45.0)
     u = 0
     while u < size:
+        # a spine
         w = int(rng.integers(size // 24, size // 10))
         share = rng.random()
         top = int(size * 0.3 * share * share)
@@ -214,6 +219,7 @@ def books(rng: np.random.Generator, size: int = 256) -> Image:
         image[top:, u : u + w] = color
         # a dark line between it and the book before
         image[top:, u : u + 1] = color * 0.5
+        # its title
         if rng.random() < 0.8:
             v = top + int(size * (0.1 + 0.2 * rng.random()))
             title = slice(u + w // 3, u + max(2 * w // 3, w // 3 + 2))
@@ -254,6 +260,7 @@ def plaid(rng: np.random.Generator, size: int = 256) -> Image:
             weight[near, i % 2] = 1.0
         return weight
 
+    # bands along both axes, blended over the ground, and the weave's diagonal
     bu = bands()
     bv = bands()
     image = np.tile(base, (size, size, 1))
@@ -269,6 +276,7 @@ def print_shirt(rng: np.random.Generator, size: int = 256) -> Image:
     base = 40 + 190 * rng.random(3)
     image = np.tile(base, (size, size, 1))
     yy, xx = (np.mgrid[0:size, 0:size] + 0.5) / size
+    # discs, bars and rings
     for _ in range(26):
         color = 20 + 225 * rng.random(3)
         u = rng.random()

@@ -21,13 +21,18 @@ from dynslam_bench.core import (
     TrajectoryError,
     translate_errors,
 )
-from dynslam_bench.core.code_files import files_of_command
-from dynslam_bench.core.programs import program_environment
 from dynslam_bench.geometry import Camera, Trajectory, load_tum, nearest_gap, read_table, se3
 from dynslam_bench.trackers.adapters.orbslam3 import settings_yaml
-from dynslam_bench.trackers.adapters.specs import BatchProgram, BatchSettings, OrbSlam3Settings
+from dynslam_bench.trackers.adapters.program_file import (
+    BatchSettings,
+    FilledProgram,
+    camera_values,
+)
+from dynslam_bench.trackers.adapters.specs import OrbSlam3Settings
 from dynslam_bench.trackers.adapters.subprocess_tracker import LOGGER, end_with_parent, write_images
 
+WORK = "work"
+"""The program's working folder, below the run's."""
 _POLL_S = 0.1
 """Interval at which memory is measured, and the end of the program is looked for."""
 _COLOUR = re.compile(r"\x1b\[[\d;]*m")
@@ -38,12 +43,6 @@ LONGEST_TAIL = 1 << 16
 """Bytes of a program's output of which the end is kept."""
 
 
-def files(settings: BatchSettings) -> list[Path]:
-    """The files that decide what the program does: the TOML file and those of its command."""
-    program, place = settings.read()
-    return [settings.path, *files_of_command(program.words(place), place)]
-
-
 class BatchTracker:
     """Collects the frames in a folder in TUM layout and runs the program on it at the end.
 
@@ -51,7 +50,7 @@ class BatchTracker:
     program, measured from outside.
 
     Args:
-        settings: The program and its time limit.
+        settings: The program, its time limit, and the settings that its file declares.
         context: Where it runs.
 
     Raises:
@@ -59,13 +58,16 @@ class BatchTracker:
     """
 
     def __init__(self, settings: BatchSettings, context: TrackerContext) -> None:
-        self._program, self._place = settings.read()
-        self._file = settings.path
+        self._document = settings.document()
+        self._program = self._document.program
+        self._file = self._document.path
+        self._settings = settings
         self._limit_s = settings.timeout_s
         self._context = context
         self._folder: TemporaryFolder | None = None
         self.measured: dict[str, Any] = {}
-        """After `finalize`: ``program_s``, ``program_memory_mb`` (resident, all its processes) and ``notes``."""
+        """After `finalize`: ``program_s``, ``program_memory_mb`` (resident, all its processes; 0 where
+        a container hides it) and ``notes``."""
 
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
         """Begin a new sequence in a new folder."""
@@ -107,7 +109,9 @@ class BatchTracker:
         folder = self._open()
         program = self._program
         output = self._new_working_folder(folder) / program.output
-        code = self._run(self._command(folder, output), folder)
+        filled = self._filled(folder, output)
+        filled.write(folder / WORK)
+        code = self._run(filled, folder)
         log = _tail(folder / "log.txt")
         LOGGER.info("[%s] %s", program.name, log)
 
@@ -151,28 +155,29 @@ class BatchTracker:
 
     def _new_working_folder(self, folder: Path) -> Path:
         """An empty folder for the program to work in."""
-        work = folder / "work"
+        work = folder / WORK
         # of an earlier call
         if work.exists():
             shutil.rmtree(work)
         work.mkdir()
         return work
 
-    def _command(self, folder: Path, output: Path) -> list[str]:
-        """The program's words, with the paths of the files that are written for it here."""
+    def _filled(self, folder: Path, output: Path) -> FilledProgram:
+        """The program's command and files, with the settings and the paths of what is written for it here."""
         sequence = folder / "sequence"
         camera = folder / "camera.yaml"
         self._write_lists(sequence)
         camera.write_text(camera_yaml(self._camera, self._context.fps))
-        return self._program.words(
-            self._place,
-            sequence=str(sequence),
-            associations=str(sequence / "associations.txt"),
-            camera=str(camera),
-            output=str(output),
-            folder=str(folder),
-            threads=str(self._context.threads),
-        )
+        places = {
+            "sequence": str(sequence),
+            "associations": str(sequence / "associations.txt"),
+            "camera": str(camera),
+            "output": str(output),
+            "folder": str(folder),
+            "threads": str(self._context.threads),
+            **camera_values(self._camera, self._context.fps),
+        }
+        return self._document.filled(self._settings, places)
 
     def close(self) -> None:
         """Remove the folder; may be called more than once."""
@@ -188,7 +193,7 @@ class BatchTracker:
         """
         name = f"{self._program.name}: {self._program.output}"
         real = output.resolve()
-        if not real.is_relative_to(self._open().resolve() / "work"):
+        if not real.is_relative_to(self._open().resolve() / WORK):
             raise TrackerError(
                 f"{name} is a link to {real}, outside of the working folder of this run",
                 WRITE_THERE,
@@ -219,19 +224,24 @@ class BatchTracker:
             (folder / f"{kind}.txt").write_text("".join(f"{row[column]}\n" for row in rows))
         (folder / "associations.txt").write_text("".join(f"{' '.join(row)}\n" for row in rows))
 
-    def _run(self, command: list[str], folder: Path) -> int | None:
+    def _run(self, filled: FilledProgram, folder: Path) -> int | None:
         """Run the program to its end, and measure it.
 
         Args:
-            command: The program and its arguments.
+            filled: The program's command and variables.
             folder: Of the run; the program works in ``work`` below it.
 
         Returns:
             The exit code; None if it had to be killed. `measured` has ``program_s``, and
             ``program_memory_mb``: the largest resident memory of the process.
         """
-        environment = program_environment(self._program.environment)
-        environment |= {"OMP_NUM_THREADS": str(self._context.threads)}
+        work = folder / WORK
+        command, environment = self._document.launched(
+            filled,
+            {"OMP_NUM_THREADS": str(self._context.threads)},
+            work=work,
+            writable=[folder],
+        )
         began = time.perf_counter()
         log = folder / "log.txt"
         with (
@@ -245,7 +255,7 @@ class BatchTracker:
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=subprocess.STDOUT,
-                cwd=folder / "work",
+                cwd=work,
                 env=environment,
                 start_new_session=True,
                 preexec_fn=end_with_parent(),
@@ -265,7 +275,9 @@ class BatchTracker:
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
         self.measured["program_s"] = time.perf_counter() - began
-        self.measured["program_memory_mb"] = peak / 1e6
+        container = self._document.container
+        is_measured = container is None or container.ends_with_its_command
+        self.measured["program_memory_mb"] = peak / 1e6 if is_measured else 0.0
         return code
 
     def _read(self, output: Path) -> tuple[Trajectory, list[str]]:
@@ -359,19 +371,3 @@ def _display_hint(log: str) -> str:
     if re.search("display|x11|glx|opengl", log, re.IGNORECASE):
         return "does it need a display? switch its viewer off, or put xvfb-run before it"
     return ""
-
-
-def describe(path: Path) -> dict[str, Any]:
-    """What the file of a program says of it, as fields of its `TrackerSpec`.
-
-    Raises:
-        SettingsError: It is damaged.
-    """
-    program: BatchProgram = BatchSettings(program=str(path)).read()[0]
-    return {
-        "license": program.license,
-        "citation": program.citation,
-        "sensors": program.sensors,
-        "label": program.name,
-        "version": program.version,
-    }

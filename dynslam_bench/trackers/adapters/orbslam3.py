@@ -20,6 +20,7 @@ from dynslam_bench.core import (
 )
 from dynslam_bench.core.plugins import module_command
 from dynslam_bench.geometry import Camera
+from dynslam_bench.trackers.adapters.program_file import real_text
 from dynslam_bench.trackers.adapters.specs import OrbSlam3Settings
 from dynslam_bench.trackers.adapters.subprocess_tracker import (
     FinalizingProgramTracker,
@@ -285,12 +286,6 @@ def settings_yaml(
         "ORBextractor.minThFAST": settings.min_fast_threshold,
     }
     lines = ["%YAML:1.0", "---", 'File.version: "1.0"', 'Camera.type: "PinHole"']
-    lines += [f"{key}: {_real(float(value))}" for key, value in numbers.items()]
+    lines += [f"{key}: {real_text(float(value))}" for key, value in numbers.items()]
     lines += [f"{key}: {int(value)}" for key, value in integers.items()]
     return "\n".join(lines) + "\n"
-
-
-def _real(value: float) -> str:
-    """A number that OpenCV's parser reads as real: always with a point, as ``1.0`` or ``1.0e-07``."""
-    mantissa, exponent, power = repr(value).partition("e")
-    return (mantissa if "." in mantissa else f"{mantissa}.0") + exponent + power

@@ -4,21 +4,19 @@ Imports neither torch nor OpenCV.
 """
 
 import os
-import re
 import shlex
 import shutil
-import sys
 from dataclasses import replace
-from pathlib import Path, PurePosixPath
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import Literal
 
-from pydantic import ConfigDict, Field, field_validator
+from pydantic import Field
 
 from dynslam_bench.contracts import TrackerSpec
-from dynslam_bench.core import SettingsError, read_toml, translate_errors
-from dynslam_bench.core.records import Record, validated
+from dynslam_bench.core import SettingsError, translate_errors
 from dynslam_bench.core.settings import Settings, names, tunable
 from dynslam_bench.core.version import install_hint
+from dynslam_bench.trackers.adapters.program_file import BatchSettings, ExitCode, ProgramSettings
 
 
 class ConstantVelocitySettings(Settings):
@@ -58,23 +56,6 @@ class ReplaySettings(Settings):
                 "replay needs a trajectory file", "write replay:FILE or --set file=FILE"
             )
         read_tum(Path(self.file).expanduser())
-
-
-ExitCode = Annotated[int, Field(ge=-64, le=255)]
-"""Exit code of a program; ``-N`` if signal N killed it."""
-
-
-class ProgramSettings(Settings):
-    """Time limits of an external program."""
-
-    start_timeout_s: float = Field(
-        120.0, gt=0, description="seconds for starting and answering `reset`"
-    )
-    frame_timeout_s: float = Field(30.0, gt=0, description="seconds for answering one `track`")
-    final_timeout_s: float = Field(120.0, gt=0, description="seconds for answering `finalize`")
-    close_timeout_s: float = Field(
-        5.0, gt=0, description="seconds for ending after `close` before it is killed"
-    )
 
 
 class SubprocessSettings(ProgramSettings):
@@ -138,109 +119,6 @@ class SubprocessSettings(ProgramSettings):
             raise SettingsError(
                 f"subprocess: cannot start '{command[0]}': no such program",
                 "check its path and mode",
-            )
-
-
-class BatchProgram(Record):
-    """What the TOML file of `batch:FILE` says.
-
-    Attributes:
-        name: Shown in tables.
-        command: Program and arguments, run without a shell. ``{sequence}`` (a folder in TUM
-            layout), ``{camera}`` (ORB-SLAM's YAML), ``{associations}``, ``{output}``, ``{folder}``
-            (which holds these), ``{threads}``, ``{here}`` (the TOML file's folder) and ``{python}``
-            (this one) are put in. A word that names a file below the TOML file's folder is that
-            file.
-        output: What it writes, a relative path in its working folder, which is new for every run.
-        exit_codes: Exit codes that are no failure; -N if signal N killed it.
-        environment: Names of environment variables that it gets beside the usual ones; their values
-            count in a run's identity.
-        format: ``tum`` (stamp tx ty tz qx qy qz qw, camera to world), or ``indices``: the frame's
-            index for the stamp.
-        sensors: ``rgb`` for a program without depth.
-        version: Part of a run's identity.
-        license: SPDX id.
-        citation: What to cite.
-    """
-
-    model_config = ConfigDict(extra="forbid")
-
-    name: str = Field(min_length=1)
-    command: list[str] = Field(min_length=1)
-    output: str = "trajectory.txt"
-    exit_codes: list[ExitCode] = Field(default=[0], min_length=1)
-    environment: list[str] = Field(default=[])
-    format: Literal["tum", "indices"] = "tum"
-    sensors: Literal["rgbd", "rgb"] = "rgbd"
-    version: str = ""
-    license: str = ""
-    citation: str = ""
-
-    @field_validator("output")
-    @classmethod
-    def _in_the_working_folder(cls, output: str) -> str:
-        """Refuse a path that may hold the trajectory of another run, or of another program."""
-        path = PurePosixPath(output)
-        leaves = path.is_absolute() or ".." in path.parts or output.startswith("~")
-        if leaves or not path.parts or "\0" in output:
-            raise ValueError(
-                f"'{output}' is no file in the program's working folder, which is new for every run: write "
-                "output = 'trajectory.txt', and let the command write to {output}"
-            )
-        return output
-
-    def words(self, here: Path, **places: str) -> list[str]:
-        """The command with paths for its placeholders.
-
-        Args:
-            here: The folder of the TOML file.
-            **places: Paths by name of the placeholder.
-        """
-        # names of files beside the TOML file
-        words: list[str] = []
-        for word in self.command:
-            looks_like_file = re.search(r"[./]", word) and word != self.output
-            words.append(str(here / word) if looks_like_file and (here / word).is_file() else word)
-
-        # placeholders
-        for name, place in {"here": str(here), "python": sys.executable, **places}.items():
-            words = [word.replace(f"{{{name}}}", place) for word in words]
-        return words
-
-
-class BatchSettings(Settings):
-    """Settings of `batch:FILE`."""
-
-    program: str = names(
-        "", "file", meaning="TOML file that describes the program, see docs/how-to/program.md"
-    )
-    timeout_s: float = Field(3600.0, gt=0, description="seconds that the program may take")
-
-    @property
-    def path(self) -> Path:
-        """The TOML file."""
-        return Path(self.program).expanduser().absolute()
-
-    def read(self) -> tuple[BatchProgram, Path]:
-        """The program, and the folder of its file.
-
-        Raises:
-            SettingsError: The file is missing or damaged.
-        """
-        if not self.program.strip():
-            raise SettingsError(
-                "batch needs a file that describes the program", "write batch:FILE.toml"
-            )
-        document = read_toml(self.path, kind=SettingsError)
-        return validated(BatchProgram, document, str(self.path), SettingsError), self.path.parent
-
-    def verify(self) -> None:
-        """The file must be sound, and the program there."""
-        program, here = self.read()
-        first = program.words(here)[0]
-        if shutil.which(first) is None:
-            raise SettingsError(
-                f"batch: cannot start '{first}': no such program", f"see command in {self.path}"
             )
 
 
@@ -422,11 +300,12 @@ ADAPTERS = (
         entry_point=f"{_HERE}.subprocess_tracker:build",
         label="program",
         settings=SubprocessSettings,
-        summary="A tracker in a program of its own, in any language, over JSON lines: subprocess:COMMAND.",
+        summary="A tracker in a program of its own, in any language, over JSON lines: subprocess:COMMAND or FILE.toml.",
         deterministic=False,
         provenance="external",
         parameter="command",
         files=f"{_HERE}.subprocess_tracker:files",
+        describe=f"{_HERE}.program_file:describe_served",
         remarks=(
             "The program, its libraries, the files and folders among its arguments and what scripts and configurations "
             "name are part of a run's identity; change the setting `version` when something else that it opens "
@@ -442,9 +321,9 @@ ADAPTERS = (
         deterministic=False,
         provenance="external",
         parameter="program",
-        files=f"{_HERE}.batch:files",
+        files=f"{_HERE}.program_file:files",
         online=False,
-        describe=f"{_HERE}.batch:describe",
+        describe=f"{_HERE}.program_file:describe_batch",
         remarks="Only its final trajectory exists. The time of a frame is the program's whole time over the frames.",
     ),
     ORBSLAM3,

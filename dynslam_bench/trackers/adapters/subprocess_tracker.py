@@ -20,7 +20,7 @@ import time
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, Literal, cast
+from typing import IO, Any, Literal, NamedTuple, cast
 
 import cv2
 import numpy as np
@@ -39,8 +39,14 @@ from dynslam_bench.core import (
 from dynslam_bench.core.code_files import files_of_command
 from dynslam_bench.core.programs import program_environment
 from dynslam_bench.core.seeding import derive_seed
+from dynslam_bench.core.settings import Scalar
 from dynslam_bench.geometry import Camera, Trajectory, se3
-from dynslam_bench.trackers.adapters.specs import ProgramSettings, SubprocessSettings
+from dynslam_bench.trackers.adapters.program_file import (
+    ProgramSettings,
+    ServedSettings,
+    camera_values,
+)
+from dynslam_bench.trackers.adapters.specs import SubprocessSettings
 
 _SET_PARENT_DEATH_SIGNAL = 1
 """Linux's number of the option of ``prctl`` (``PR_SET_PDEATHSIG``)."""
@@ -442,6 +448,20 @@ def _with_space(size: int) -> TemporaryFolder:
     )
 
 
+class Launch(NamedTuple):
+    """How a program is started.
+
+    Attributes:
+        command: Program and arguments.
+        folder: Its working folder; None for the current one.
+        environment: All its environment variables.
+    """
+
+    command: list[str]
+    folder: Path | None
+    environment: dict[str, str]
+
+
 class ProgramTracker:
     """Drives a `Program` through one sequence after the other; each `reset` starts it afresh.
 
@@ -496,11 +516,10 @@ class ProgramTracker:
         Raises:
             TrackerError: It cannot be started, dies, refuses, or does not answer in time.
         """
-        # what the program gets: environment, images, request
+        # what the program gets: images, command and environment, request
         self._end()
-        environment = program_environment(self._variables)
-        environment |= dict.fromkeys(THREAD_VARIABLES, str(self.context.threads))
         self._exchange = ImageExchange(camera, self._images)
+        launch = self.launch(camera, self._exchange.folder)
         request = {
             "op": "reset",
             "protocol": PROTOCOL,
@@ -515,12 +534,13 @@ class ProgramTracker:
             "device": self.context.device,
             "sequence": self.context.sequence_id,
             "options": self.options(camera, self._exchange.folder),
+            "settings": self.settings_sent(),
         }
 
         # start it; one that refuses is ended
         self._failed = False
         self._program = Program(
-            self.name, self._command, folder=self._folder, environment=environment
+            self.name, launch.command, folder=launch.folder, environment=launch.environment
         )
         try:
             if self._ask(request, self.limits.start_timeout_s, "at reset").get("ok") is False:
@@ -528,6 +548,21 @@ class ProgramTracker:
         except DynslamError:
             self._end()
             raise
+
+    def launch(self, camera: Camera, exchanged: Path) -> Launch:
+        """How the program is started.
+
+        Args:
+            camera: The camera of the frames.
+            exchanged: The folder through which frames are exchanged.
+        """
+        environment = program_environment(self._variables)
+        environment |= dict.fromkeys(THREAD_VARIABLES, str(self.context.threads))
+        return Launch(self._command, self._folder, environment)
+
+    def settings_sent(self) -> dict[str, Scalar]:
+        """The part ``settings`` of the ``reset`` request: those that a program's file declares."""
+        return {}
 
     def options(self, camera: Camera, folder: Path) -> dict[str, Any]:
         """The part ``options`` of the ``reset`` request; `folder` is private and lives as long as the sequence."""
@@ -616,6 +651,73 @@ class FinalizingProgramTracker(ProgramTracker):
         with self._noting_failures():
             answer = self._ask({"op": "finalize"}, self.limits.final_timeout_s, "at finalize")
             return read_final_answer(answer, f"{self.name} at finalize")
+
+
+class DescribedProgramTracker(ProgramTracker):
+    """A program that a TOML file describes: its working folder is new for each sequence, and holds its files.
+
+    Args:
+        settings: Time limits, and the settings that the file declares.
+        context: Where it runs.
+    """
+
+    def __init__(self, settings: ServedSettings, context: TrackerContext) -> None:
+        self._document = settings.document()
+        self._settings = settings
+        self._work: TemporaryFolder | None = None
+        program = self._document.program
+        super().__init__(
+            program.name,
+            settings,
+            context,
+            program.command,
+            images=program.images,
+            exit_codes=program.exit_codes,
+        )
+
+    def launch(self, camera: Camera, exchanged: Path) -> Launch:
+        """Its command with the settings' values; the files that it reads are written."""
+        threads = str(self.context.threads)
+        places = {"threads": threads, **camera_values(camera, self.context.fps)}
+        filled = self._document.filled(self._settings, places)
+        self._work = TemporaryFolder()
+        work = self._work.path / "work"
+        work.mkdir()
+        filled.write(work)
+        command, environment = self._document.launched(
+            filled,
+            dict.fromkeys(THREAD_VARIABLES, threads),
+            work=work,
+            writable=[self._work.path, exchanged],
+        )
+        return Launch(command, work, environment)
+
+    def settings_sent(self) -> dict[str, Scalar]:
+        """The settings by dotted name."""
+        return self._document.values(self._settings)
+
+    def _end(self) -> int | None:
+        """End the program and remove its working folder; see `ProgramTracker`."""
+        code = super()._end()
+        if self._work is not None:
+            self._work.close()
+            self._work = None
+        return code
+
+
+class FinalizingDescribedTracker(DescribedProgramTracker, FinalizingProgramTracker):
+    """One that also answers ``finalize``."""
+
+
+def build_described(settings: ServedSettings, context: TrackerContext) -> ProgramTracker:
+    """The tracker of ``subprocess:FILE.toml``.
+
+    Raises:
+        SettingsError: The file is missing or damaged.
+    """
+    is_finalizing = settings.document().program.final
+    kind = FinalizingDescribedTracker if is_finalizing else DescribedProgramTracker
+    return kind(settings, context)
 
 
 def files(settings: SubprocessSettings) -> list[Path]:

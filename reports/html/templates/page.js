@@ -40,6 +40,9 @@ async function draw(element, figure) {
   if (element.clientWidth < 500 && layout.showlegend !== false) layout.legend = { orientation: "h", y: 1.02, yanchor: "bottom", ...layout.legend };
   const options = { format: "png", scale: 2, filename: element.id };
   await Plotly.react(element, figure.data, layout, { responsive: true, displaylogo: false, toImageButtonOptions: options });
+  // points that stand for a run open it
+  element.removeAllListeners("plotly_click");
+  element.on("plotly_click", ({ points: [point] }) => { if (String(point?.customdata).startsWith("run.html#")) location.href = point.customdata; });
 }
 
 /** The figures of the page, each when it comes into sight. */

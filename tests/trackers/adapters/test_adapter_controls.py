@@ -183,6 +183,7 @@ def test_opencv_keeps_the_contract():
     check_tracker("opencv-odometry", frames=2)
 
 
+@pytest.mark.slow
 @needs_data
 @pytest.mark.parametrize(
     ("name", "settings", "bound"),
@@ -538,6 +539,7 @@ def test_vocabularies_that_are_not_there(tmp_path):
             find_vocabulary(name)
 
 
+@pytest.mark.slow
 @needs_orbslam3
 @needs_vocabulary
 @needs_data
@@ -571,6 +573,7 @@ def test_two_resets_on_real_frames():
     assert process.poll() is not None
 
 
+@pytest.mark.slow
 @needs_orbslam3
 @needs_vocabulary
 def test_frames_without_features():

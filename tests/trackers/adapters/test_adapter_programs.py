@@ -39,7 +39,8 @@ from dynslam_bench.sequences.readers.layouts import read_vslam_lab
 from dynslam_bench.testing import CornerSequence, TurningSequence, check_tracker, tracker_report
 from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
 from dynslam_bench.trackers.adapters import subprocess_tracker as exchange
-from dynslam_bench.trackers.adapters.specs import BatchSettings, SubprocessSettings
+from dynslam_bench.trackers.adapters.program_file import BATCH_NAMES, CAMERA_NAMES, read_batch
+from dynslam_bench.trackers.adapters.specs import SubprocessSettings
 
 pytestmark = pytest.mark.slow
 
@@ -922,10 +923,11 @@ def test_the_conformance_kit_checks_the_final_trajectory(toml, tmp_path, inverte
 
 @pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.toml")), ids=lambda file: file.stem)
 def test_the_examples_describe_programs(file):
-    program, here = BatchSettings(program=str(file)).read()
-    words = program.words(
-        here, **dict.fromkeys(("sequence", "camera", "associations", "output", "folder"), "/x")
-    )
+    spec = TRACKERS.get(f"batch:{file}")
+    document = read_batch(file)
+    program = document.program
+    names = (*BATCH_NAMES, *CAMERA_NAMES, "threads")
+    words = document.filled(spec.settings(), dict.fromkeys(names, "/x")).words
     assert not any(re.search(r"\{\w+\}", word) for word in words)
     scripts = [word for word in words if word.endswith(".py") and Path(word).is_absolute()]
     assert all(Path(script).is_file() for script in scripts)
