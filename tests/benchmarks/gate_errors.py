@@ -189,6 +189,8 @@ def stored_errors(results: Path) -> Array:
         error = score(store, record).metrics.get("ate_rmse_m", math.nan)
         errors[record.sequence.block].append(error if record.status == "ok" else math.nan)
     count = min(map(len, errors.values()))
+    if count < 2 * MOST_ROUNDS:
+        raise SystemExit(f"{results} has {count} runs of a sequence: {2 * MOST_ROUNDS} are needed")
     return np.array([values[:count] for values in errors.values()])
 
 
