@@ -126,6 +126,8 @@ _.tempdir  # tempfile reads it: where a run's temporary files go
 _.row_poses  # rendered sequences: the exact pose of every row
 pytest_addoption  # pytest calls it
 pytest_collection_modifyitems  # pytest calls it
+dynslam_gate  # a fixture of pytest
+reran_baseline  # a field of gate.json
 _.runtest  # pytest calls it
 _.reportinfo  # pytest calls it
 

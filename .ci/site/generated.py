@@ -44,6 +44,10 @@ PACKAGES = {
     "runs": ("Runs and suites", ["runs", "suites"]),
     "reports": ("Reports", ["reports"]),
     "tuning": ("Studies", ["tuning"]),
+    "gate": (
+        "The gate",
+        ["gate", "gate.checking", "gate.config", "gate.result", "evaluation.gate"],
+    ),
     "testing": ("Checks for plug-ins", ["testing"]),
 }
 """Pages, with their titles and the modules on them."""
