@@ -411,9 +411,7 @@ def starting_point(
 
     # what is tuned has a value that the sampler could propose, unless nothing uses it
     point = {name: preset.get(name, base[name]) for name in spans}
-    misfits = [
-        name for name, value in point.items() if not _is_within(spans[name], name, value)
-    ]
+    misfits = [name for name, value in point.items() if not _is_within(spans[name], name, value)]
     if misfits:
         used = space.effective(point | {name: base[name] for name in misfits})
         for name in misfits:
