@@ -277,9 +277,9 @@ def conclude(
 
     # where nothing is claimed: what the trials exclude, and what would settle it
     if verdict not in (Verdict.PROVEN, Verdict.BUT_LOST) and (bound := improvement_bound(trials)):
-        gain, count = bound
+        gain, n_trials = bound
         sentences.append(
-            f"On the scenes that trials ran on none of the {count} trials with {FEWEST} or more is better by "
+            f"On the scenes that trials ran on none of the {n_trials} trials with {FEWEST} or more is better by "
             f"more than {math.ceil(100 * gain)} % (95 %)"
         )
     if verdict in (Verdict.PROMISING, Verdict.CANNOT_TELL) and best is not None:

@@ -176,11 +176,11 @@ def status(study: Study, results: Results = Path("results"), as_json: AsJson = F
         rows = [
             (trial.number, *(f"{math.exp(value):.3f}" for value in trial.values)) for trial in front
         ]
-        ratios = [f"ratio of {name}" for name in stored.spec.objectives]
+        headings = [f"ratio of {name}" for name in stored.spec.objectives]
         lines += [
             "",
             "The front, each to be judged by tune run --choose TRIAL:",
-            table(("trial", *ratios), rows),
+            table(("trial", *headings), rows),
         ]
     present(facts | {"best_settings": settings}, fields(facts), *lines)
 

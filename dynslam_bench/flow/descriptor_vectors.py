@@ -143,5 +143,5 @@ def plain_descriptor_sum(
         distance = np.int64(0)
         for b in range(8):
             distance += abs(np.int64(image[place + b]) - np.int64(descriptor[at + 8 * k + b]))
-        total += min(distance, truncation)
+        total += distance if distance < truncation else np.int64(truncation)
     return total

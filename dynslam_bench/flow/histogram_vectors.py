@@ -154,7 +154,7 @@ def plain_derivatives(sums: Halves, here: int, above: int, below: int, out: Halv
             # the derivative along the bin's direction, rounded; negative ones become 0
             along = gx * COSINES[b] + gy * COSINES[(b - 2) % 8]
             rounded = (along + (1 << (DERIVATIVE_SHIFT - 1))) >> DERIVATIVE_SHIFT
-            out[8 * pixel + b] = max(rounded, 0)
+            out[8 * pixel + b] = rounded if rounded > 0 else np.int64(0)
 
 
 @instruction

@@ -129,7 +129,7 @@ def plain_square(image: Bytes, at: int, stride: int) -> int:
     """`square` byte by byte, as a number without sign."""
     above = np.int64(image[at]) | np.int64(image[at + 1]) << 8
     below = np.int64(image[at + stride]) | np.int64(image[at + stride + 1]) << 8
-    return above | below << 16
+    return int(above | below << 16)
 
 
 @instruction

@@ -43,7 +43,8 @@ def same_path(one: Trajectory | None, other: Trajectory | None) -> bool:
 
     # the nearest position of the longer path to each of the shorter one, and whether the whole pose is equal
     distances, nearest = cKDTree(longer.positions).query(shorter.positions)
-    is_near = distances <= _POSE
+    nearest = np.asarray(nearest)
+    is_near = np.asarray(distances) <= _POSE
     poses = shorter.T_world_cam[is_near]
     differences = np.abs(poses - longer.T_world_cam[nearest[is_near]]).max(axis=(1, 2))
     shared = int((differences <= _POSE).sum()) if len(poses) else 0
