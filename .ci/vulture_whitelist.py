@@ -101,8 +101,6 @@ modified_ns  # trackers.adapters.orbslam3: part of the key of the cached functio
 descriptor_bytes  # FeatureSpec
 median_dt_s  # evaluation
 translation_m  # evaluation: the alignment
-pixels_first  # sequences.doctor reads it by name
-pixels_second  # the same
 n_ground_truth  # evaluation
 hole_at_s  # evaluation
 n_initialising  # run.json
@@ -128,5 +126,13 @@ _.tempdir  # tempfile reads it: where a run's temporary files go
 _.row_poses  # rendered sequences: the exact pose of every row
 pytest_addoption  # pytest calls it
 pytest_collection_modifyitems  # pytest calls it
+dynslam_gate  # a fixture of pytest
+reran_baseline  # a field of gate.json
 _.runtest  # pytest calls it
 _.reportinfo  # pytest calls it
+
+dynslam_gate  # gate.pytest_plugin: pytest calls it
+reran_baseline  # gate.result: for those who read the file
+describe_batch  # trackers.adapters: specs name them as "module:name"
+describe_served
+build_described

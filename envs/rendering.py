@@ -18,6 +18,8 @@ HEIGHT = 480
 """Height of the image, and size of the plot beside it, in pixels."""
 STRIP = 64
 """Height of the line of numbers below, in pixels."""
+LEGEND = 470
+"""Width of the legend at the right end of that line, in pixels."""
 ALIGN_FROM = 30
 """Tracked frames with ground truth from which on the estimate is drawn aligned."""
 # Colours, red first: features, mask and trajectories, then text, ground and states.
@@ -116,13 +118,17 @@ class Canvas:
         """Title, state, numbers and legend below the picture, uint8 ``[64, width, 3]``."""
         strip = np.full((STRIP, width, 3), 235, np.uint8)
         last = episode.outcomes[-1]
-        _text(strip, self._title, (10, 24), _INK, 0.5)
+        _text(strip, shortened(self._title, width - LEGEND - 20, 0.5), (10, 24), _INK, 0.5)
         _text(strip, last.state, (10, 50), _STATE_COLOUR[last.state], 0.5, 2)
         numbers = self._numbers(result, episode, ate_m)
         _text(strip, "   ".join(numbers), (130, 50), _INK, 0.45)
 
         # legend: circles for features and mask, lines for trajectories
-        for x, name, colour in ((470, "kept", KEPT), (395, "culled", CULLED), (320, "mask", MASK)):
+        for x, name, colour in (
+            (LEGEND, "kept", KEPT),
+            (395, "culled", CULLED),
+            (320, "mask", MASK),
+        ):
             cv2.circle(strip, (width - x, 19), 5, colour, -1, cv2.LINE_AA)
             _text(strip, name, (width - x + 10, 24), _INK, 0.45)
         for x, name, colour in ((245, "estimate", ESTIMATE), (135, "ground truth", TRUTH)):
@@ -151,7 +157,7 @@ class Canvas:
         if error is None:
             numbers.append("no ground truth here")
         else:
-            numbers.append(f"pose error {100 * error.trans_m:.1f} cm, {error.rot_deg:.2f} deg")
+            numbers.append(f"pose error {1000 * error.trans_m:.1f} mm, {error.rot_deg:.2f} deg")
             if error.frame_trans_m is not None:
                 numbers.append(f"frame error {1000 * error.frame_trans_m:.1f} mm")
         if ate_m is not None:
@@ -250,6 +256,16 @@ def align_to_truth(
     breaks = np.flatnonzero(np.diff([index for index, _ in tracked]) > 1) + 1
     bounds = [0, *breaks.tolist(), len(aligned)]
     return aligned[:, :3, 3], [slice(a, b) for a, b in pairwise(bounds)], ate_m
+
+
+def shortened(text: str, width: int, scale: float) -> str:
+    """A text of at most so many pixels: what does not fit is left out of its middle."""
+    kept = len(text)
+    short = text
+    while kept > 2 and cv2.getTextSize(short, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0] > width:
+        kept -= 1
+        short = f"{text[: (kept + 1) // 2]}...{text[len(text) - kept // 2 :]}"
+    return short
 
 
 def _polyline(image: Image, points: Array, colour: tuple[int, int, int], thickness: int) -> None:

@@ -319,7 +319,9 @@ class SlamEnv(gym.Env[Any, Any], EzPickle):
 
     @property
     def measured(self) -> dict[str, Any]:
-        """What the adapter of a batch program measured of it at the end; empty for other trackers."""
+        """What an adapter of this package measured of its program, and its ``notes``; empty for other trackers."""
+        if not self.tracker_spec.entry_point.startswith("dynslam_bench."):
+            return {}
         return dict(getattr(self._tracker, "measured", {}))
 
     def map_outputs(self) -> Any:

@@ -76,7 +76,8 @@ from dynslam_bench.reports.tables import leaderboard as tables
 from dynslam_bench.reports.tables.published import published_table, span_table
 from dynslam_bench.reports.tables.quotes import quotes
 from dynslam_bench.reports.tables.table import Table, csv_text, prose, to_latex, to_markdown
-from dynslam_bench.runs.store import RunStore, part_words
+from dynslam_bench.runs.rows import part_words
+from dynslam_bench.runs.store import RunStore
 
 COMPARE_PAGE = "compare.html"
 """The page that shows two trackers side by side."""
@@ -139,7 +140,7 @@ class _Content:
         boards: Category to its board, see `category_boards`.
         monocular: Category to the board of the trackers whose scale comes from the truth.
         notes: Category to what a reader has to know about its ranking, in sentences.
-        common_notes: What holds for all categories.
+        common_notes: Notes that apply to all categories.
         sections: File name of a page to its sections.
         trials: How many runs were left out since they are trials of studies.
         paged: Ids of the runs that have a page of their own.

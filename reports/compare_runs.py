@@ -352,6 +352,7 @@ def overall_ratio(paired: Sequence[Paired]) -> PairedRatio:
     log_ratios = {}
     lost: list[str] = []
     lost_by_a: list[str] = []
+    floored: list[str] = []
     runs = 0
     for sequence, cell_a, cell_b in paired:
         if sequence in copies:
@@ -362,7 +363,9 @@ def overall_ratio(paired: Sequence[Paired]) -> PairedRatio:
         ratio = ratio_of(cell_a, cell_b)
         if ratio is not None:
             log_ratios[sequence] = math.log(ratio)
-    return paired_ratio(log_ratios, lost, lost_by_a, runs=runs)
+            smallest = min(cell.median or 0.0 for cell in (cell_a, cell_b))
+            floored += [sequence] * (smallest < FLOOR_M)
+    return paired_ratio(log_ratios, lost, lost_by_a, runs=runs, floored=floored)
 
 
 def _numbers(ratio: PairedRatio) -> list[float | None]:

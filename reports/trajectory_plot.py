@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dynslam_bench.core import ReportError, write_atomic
 from dynslam_bench.envs.rendering import VIEWS, main_view
 from dynslam_bench.geometry import Array, Trajectory, se3
 from dynslam_bench.reports.figures import COLOURS, DASHES, NEUTRAL, safe
+from dynslam_bench.reports.tables.table import mm
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
@@ -48,7 +50,7 @@ class PlottedTrajectory:
     @property
     def title(self) -> str:
         """The label with the error."""
-        return f"{self.label}: {1000 * self.rmse_m:.4g} mm"
+        return f"{self.label}: {mm(self.rmse_m)} mm"
 
 
 def plot_trajectories(
@@ -118,8 +120,8 @@ class _Panels:
 
     def _path(self, trajectory: Trajectory) -> Array:
         """Camera centres in the view in metres ``[N, 2]``, with nan where frames are missing."""
-        seen = self._positions(trajectory) @ VIEWS[self.view].T
-        return np.insert(seen, _gaps(trajectory.timestamps), np.nan, axis=0)
+        centres = self._positions(trajectory) @ VIEWS[self.view].T
+        return np.insert(centres, _gaps(trajectory.timestamps), np.nan, axis=0)
 
     def _error_line(self, estimate: PlottedTrajectory) -> Array:
         """Seconds since the first pose and errors in millimetres ``[N, 2]``, with nan where frames are missing."""
@@ -198,7 +200,7 @@ class _Panels:
         return figure
 
 
-def _gaps(stamps: Array) -> Array:
+def _gaps(stamps: Array) -> NDArray[np.intp]:
     """Rows before which poses are missing: the step in time is over `GAP_STEPS` median ones."""
     steps = np.diff(stamps)
     if not len(steps):

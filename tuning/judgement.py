@@ -25,6 +25,7 @@ from dynslam_bench.evaluation.verdicts import (
     scenes_to_settle,
     verdict_of,
 )
+from dynslam_bench.runs.layout import is_id
 from dynslam_bench.sequences.families import family_of
 from dynslam_bench.tuning.objectives import (
     ACCURACY,
@@ -278,8 +279,8 @@ def conclude(
     if verdict not in (Verdict.PROVEN, Verdict.BUT_LOST) and (bound := improvement_bound(trials)):
         gain, count = bound
         sentences.append(
-            f"On the scenes that trials ran on none of the {count} with {FEWEST} or more is better by more than "
-            f"{math.ceil(100 * gain)} % (95 %)"
+            f"On the scenes that trials ran on none of the {count} trials with {FEWEST} or more is better by "
+            f"more than {math.ceil(100 * gain)} % (95 %)"
         )
     if verdict in (Verdict.PROMISING, Verdict.CANNOT_TELL) and best is not None:
         sentences += _settling(spec, best)
@@ -305,6 +306,10 @@ def _settling(spec: StudySpec, best: Candidate) -> list[str]:
     if evidence is None or best.failed or not best.feasible:
         return []
     needed = scenes_to_settle(evidence)
+    if needed is None and evidence.all_scenes >= FEWEST:
+        return [
+            "More scenes of this kind would not settle it: judge on scenes that both sides track"
+        ]
     if needed is None:
         return [f"Name {FEWEST} held-out scenes at least to learn more"]
     if needed > _TOO_MANY:
@@ -373,8 +378,9 @@ def beyond_families(
     lost = []
     lost_by_baseline = []
     for family, names in members.items():
-        known = [ratios[name] for name in names if name not in by_candidate | by_baseline]
-        means[family] = fmean(known) if known else 0.0
+        # ratios of the scenes that both have tracked
+        of_both = [ratios[name] for name in names if name not in by_candidate | by_baseline]
+        means[family] = fmean(of_both) if of_both else 0.0
         lost += [family] * (2 * len(by_candidate.intersection(names)) >= len(names))
         lost_by_baseline += [family] * (2 * len(by_baseline.intersection(names)) >= len(names))
     return paired_ratio(
@@ -517,7 +523,11 @@ def without_effect(tuner: Study) -> int:
             continue
         runs = {name: run for name, run in _runs_of(trial).items() if name in baseline}
         for name, run in runs.items():
-            if _tracks(tuner, run) != _tracks(tuner, baseline[name]):
+            if not (run and baseline[name]):
+                return 0
+            tracks = _tracks(tuner, run)
+            # a run that is no longer stored has nothing to compare
+            if not tracks or tracks != _tracks(tuner, baseline[name]):
                 return 0
         compared += bool(runs)
     return compared
@@ -529,7 +539,9 @@ def _runs_of(trial: FrozenTrial) -> dict[str, str]:
 
 
 def _tracks(tuner: Study, run: str) -> list[bytes]:
-    """The files of a run's trajectories."""
+    """The files of a run's trajectories; none for a run that is not stored."""
+    if not is_id(run):
+        return []
     folder = tuner.store.folder(run)
     return [file.read_bytes() for file in sorted(folder.glob("trajectory_*.txt"))]
 

@@ -230,6 +230,10 @@ STAGE = "time:"
 """Begins the name of an objective or a limit on a stage's time, e.g. ``time:tracking``."""
 
 
+_ERRORS = ("accuracy", "worst", "robustness", "coverage")
+"""Objectives that a run which crashed has a value of."""
+_CRASHED = 1e9
+"""Cost of such a run by all others."""
 _LOSS = math.log(CATASTROPHE)
 """Log ratio of a scene that one side alone lost, at least."""
 
@@ -289,10 +293,14 @@ class Objective:
     def _costs(self, outcomes: Outcomes) -> dict[ProblemInstance, float]:
         """The cost on each instance that counts."""
         return {
-            instance: self.cost(outcome)
+            instance: self._cost(outcome)
             for instance, outcome in outcomes.items()
             if self.counts(instance)
         }
+
+    def _cost(self, outcome: Outcome) -> float:
+        """The cost of a run; one that crashed has an error alone."""
+        return _CRASHED if outcome.crash and self.name not in _ERRORS else self.cost(outcome)
 
     def value(self, outcomes: Outcomes, baseline: Outcomes) -> float:
         """Natural logarithm of the ratio to the baseline over the scenes; below 0 is better.
@@ -603,6 +611,12 @@ def compare(
             sum(outcomes[instance].lost for instance in counted),
             sum(baseline[instance].lost for instance in counted if instance in baseline),
         ),
+        floored={
+            instance.scene
+            for runs in (outcomes, baseline)
+            for instance, run in runs.items()
+            if not run.crash and objective.cost(run) < FLOOR_M
+        },
         what=objective.what,
     )
 

@@ -232,26 +232,27 @@ class Plan:
         for name in spec.limits:
             quantity(name)  # refuses an unknown one
 
-        # the baseline: the tracker with a preset or its defaults, or another tracker, which has no
-        # settings but those of the fixed ones that it knows
+        # the trackers to choose from, the study's own first, each with those settings that it has
         fixed = spec.space.fixed
         self.held = held_settings(spec)
-        self.baseline = Configuration(spec.tracker, self.held)
-        if spec.baseline and not spec.baseline.endswith(".toml"):
-            self.baseline = Configuration(spec.baseline, known_settings(spec.baseline, fixed))
-        self.shipped = Configuration(spec.tracker, fixed) if spec.baseline else None
-
-        # the trackers to choose from, the study's own first
         self.trackers = _trackers(spec)
         protocol = hold_last_pose_protocol(spec.protocol)
         around: dict[str, Settings] = {}
         for tracker in self.trackers:
             described = TRACKERS.get(tracker)
             protocol.check_scale(tracker, described.sensors)
-            held = self.held
-            if len(self.trackers) > 1:
-                held = known_settings(tracker, self.held)
+            held = self.configuration({TRACKER: tracker}).settings
             around[tracker] = apply_overrides(described.settings(), held)
+
+        # the baseline: the study's tracker with a preset or its defaults, or another tracker, which
+        # has no settings but those of the fixed ones that it knows
+        self.baseline = self.configuration({})
+        if spec.baseline and not spec.baseline.endswith(".toml"):
+            self.baseline = Configuration(spec.baseline, known_settings(spec.baseline, fixed))
+        self.shipped = None
+        if spec.baseline:
+            defaults = fixed if len(self.trackers) == 1 else known_settings(spec.tracker, fixed)
+            self.shipped = Configuration(spec.tracker, defaults)
 
         # the space around trial 0, which has to lie in it, and the instances
         self.defaults = around[spec.tracker]
@@ -313,8 +314,8 @@ class Plan:
 
     def configuration(self, params: Mapping[str, Any]) -> Configuration:
         """What a configuration of the space runs with: its tracker, and those settings that it has."""
-        tracker = str(params.get(TRACKER, self.spec.tracker))
         settings = {**self.held, **params}
+        tracker = str(settings.pop(TRACKER, self.spec.tracker))
         if len(self.trackers) > 1:
             settings = known_settings(tracker, settings)
         return Configuration(tracker, settings)

@@ -6,11 +6,10 @@ study's own conditions hold.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
-from itertools import islice, product
-from typing import Any
+from itertools import chain, islice, product
+from typing import Any, cast
 
 import optuna
 from optuna.distributions import (
@@ -60,7 +59,7 @@ class SearchSpace:
         """Values of all settings where nothing is tuned, by dotted name, the tracker's name among them."""
         first = next(iter(self.settings))
         values: dict[str, Any] = {}
-        for settings in reversed(self.settings.values()):
+        for settings in reversed(list(self.settings.values())):
             values |= flatten(settings)
         return values | ({TRACKER: first} if len(self.settings) > 1 else {})
 
@@ -99,8 +98,8 @@ class SearchSpace:
             if value not in wanted:
                 return f"{other} is {value!r}"
         # those of the settings themselves
-        known = {key: value for key, value in values.items() if key in names and key != name}
-        return why_unused(apply_overrides(settings, known), name)
+        others = {key: value for key, value in values.items() if key in names and key != name}
+        return why_unused(apply_overrides(settings, others), name)
 
     def why_never(self, name: str) -> str:
         """Why a setting has no effect whatever is chosen; empty where some choices give it one.
@@ -169,11 +168,11 @@ def build_space(
             setting, a setting can have no effect, or nothing is left to tune.
     """
     _check_names(spec, settings)
-    found = [_chosen(spec, each) for each in settings.values()]
+    by_tracker = [_chosen(spec, defaults) for defaults in settings.values()]
 
     # one parameter a name, in the order of the trackers
     merged: dict[str, Parameter] = {}
-    for parameter in (one for each in found for one in each):
+    for parameter in chain.from_iterable(by_tracker):
         there = merged.get(parameter.name)
         merged[parameter.name] = parameter if there is None else _merged(there, parameter)
     every = list(merged.values())
@@ -181,11 +180,7 @@ def build_space(
         meaning = "the system"
         names = tuple(settings)
         every.insert(0, Parameter(TRACKER, "categorical", names[0], choices=names, meaning=meaning))
-    steps = {
-        name: span.step
-        for name, span in spec.range.items()
-        if isinstance(span, Range) and span.step
-    }
+    steps = {name: span.step for name, span in spec.range.items() if span.step}
     space = SearchSpace(tuple(every), shown or settings, spec.when, steps)
     list(space._in_order())
 
@@ -208,8 +203,9 @@ def build_space(
 
 def _check_names(spec: SpaceSpec, settings: Mapping[str, Settings]) -> None:
     """Refuse patterns and names that match no setting of any tracker, and names that are tuned and fixed."""
-    tunable = [one.name for each in settings.values() for one in parameters(type(each))]
-    fields = {name for each in settings.values() for name in field_names(type(each))}
+    groups = [type(defaults) for defaults in settings.values()]
+    tunable = [parameter.name for group in groups for parameter in parameters(group)]
+    fields = {name for group in groups for name in field_names(group)}
     for pattern in (*spec.include, *spec.exclude):
         if any(fnmatchcase(name, pattern) for name in tunable):
             continue
@@ -366,8 +362,7 @@ def _suggest(trial: optuna.Trial, parameter: Parameter, step: float | None) -> S
             parameter.name, span.low, span.high, step=span.step, log=span.log
         )
     assert isinstance(span, CategoricalDistribution)
-    value: Any = trial.suggest_categorical(parameter.name, span.choices)
-    return value  # type: ignore[no-any-return]
+    return cast("Scalar", trial.suggest_categorical(parameter.name, span.choices))
 
 
 def search_space(settings: Settings, spec: SpaceSpec) -> list[Parameter]:
@@ -414,19 +409,29 @@ def starting_point(
                 f'tune it, or say "{name}" = ... under [space.fixed]',
             )
 
-    # what is tuned has a value that the sampler could propose
+    # what is tuned has a value that the sampler could propose, unless nothing uses it
     point = {name: preset.get(name, base[name]) for name in spans}
-    for name, value in point.items():
-        span = spans[name]
-        fits = False
-        with suppress(ValueError):  # no number, or none of the choices
-            fits = span._contains(span.to_internal_repr(value))
-        if not fits and name in space.effective(point):
+    misfits = [name for name, value in point.items() if not _is_within(spans[name], name, value)]
+    if misfits:
+        used = space.effective(point | {name: base[name] for name in misfits})
+        for name in misfits:
+            if name not in used:
+                continue
+            tuned = _span_text(spans[name])
             raise StudyError(
-                f"{what} sets {name} = {value!r}, out of the range that the study tunes: {_span_text(span)}",
+                f"{what} sets {name} = {point[name]!r}, out of the range that the study tunes: {tuned}",
                 'make the range wider, or begin with a baseline within it (baseline = "PRESET.toml")',
             )
     return point
+
+
+def _is_within(span: BaseDistribution, name: str, value: Scalar) -> bool:
+    """Whether a distribution contains a value: Optuna makes no trial of one that lies outside."""
+    try:
+        optuna.trial.create_trial(params={name: value}, distributions={name: span}, value=0.0)
+    except ValueError:  # out of the range, no number, or none of the choices
+        return False
+    return True
 
 
 def _span_text(span: BaseDistribution) -> str:

@@ -7,6 +7,7 @@ import math
 import sys
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext, suppress
@@ -581,7 +582,7 @@ class Study(Plan):
         with self._lock:
             # a worker that took this one for dead has put the trial back: Optuna ends running ones
             if self.study.get_trials(deepcopy=False)[trial.number].state == TrialState.WAITING:
-                self.study._storage.set_trial_state_values(trial._trial_id, TrialState.RUNNING)
+                self._storage.set_trial_state_values(self._id_of(trial), TrialState.RUNNING)
             try:
                 self.study.tell(
                     trial, evaluation.values, state=evaluation.state, skip_if_finished=True
@@ -598,14 +599,19 @@ class Study(Plan):
 
         Nothing is done where another worker has run it meanwhile, or runs it.
         """
-        storage = self.study._storage
         worker = trial.user_attrs.get("worker", "")
         with self._turn("put-back"), suppress(UpdateFinishedTrialError):
-            now = storage.get_trial(trial._trial_id)
+            trial_id = self._id_of(trial)
+            now = self._storage.get_trial(trial_id)
             if now.state != TrialState.RUNNING or now.user_attrs.get("worker", "") != worker:
                 return
-            storage.set_trial_user_attr(trial._trial_id, "worker", "")
-            storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
+            self._storage.set_trial_user_attr(trial_id, "worker", "")
+            self._storage.set_trial_state_values(trial_id, TrialState.WAITING)
+
+    def _id_of(self, trial: optuna.Trial | FrozenTrial) -> int:
+        """The storage's own number of a trial, which counts those of all its studies."""
+        study_id = self._storage.get_study_id_from_name(self.spec.name)
+        return self._storage.get_trial_id_from_study_id_trial_number(study_id, trial.number)
 
     def _turn(self, what: str) -> AbstractContextManager[None]:
         """Do something alone among the workers that share the study's folder; a database has no such lock.
@@ -700,9 +706,9 @@ class Study(Plan):
     ) -> optuna.Study:
         """The stored study, or a new one whose first trial is the baseline, whatever is enqueued later."""
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        storage = open_storage(self.results, self.spec)
+        self._storage = open_storage(self.results, self.spec)
         how: Any = {
-            "storage": storage,
+            "storage": self._storage,
             "study_name": self.spec.name,
             "sampler": sampler,
             "pruner": self._pruner,
@@ -817,10 +823,14 @@ class Study(Plan):
         # the first instance of each sequence stands for it
         first_of = {instance.sequence: instance for instance in reversed(instances)}
         configuration = self.configuration({})
+        programs: dict[str, set[str]] = defaultdict(set)
         for sequence, instance in first_of.items():
             run = resolve(self.run_spec(instance, configuration, cache=False)).identity
             identity[f"content of {sequence}"] = digest([run["content"], run["camera"]])
-            identity |= program_of(run) | {"device": run["device"]}
+            for name, value in (program_of(run) | {"device": run["device"]}).items():
+                programs[name].add(value)
+        # rendered and recorded sequences are read by other code, and may have other sources of masks
+        identity |= {name: " ".join(sorted(values)) for name, values in programs.items()}
         for tracker in self.trackers[1:]:
             other = self.configuration({TRACKER: tracker})
             run = resolve(self.run_spec(instances[0], other, cache=False)).identity

@@ -18,7 +18,7 @@ from dynslam_bench.evaluation import PROTOCOLS
 from dynslam_bench.reports.model.board import Board
 from dynslam_bench.reports.model.published import KINDS, lines_of, records
 from dynslam_bench.runs import RunRecord, load_frames
-from dynslam_bench.runs.store import runs_frame
+from dynslam_bench.runs.rows import runs_frame
 from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning.storage import trials_frame
 
@@ -44,6 +44,10 @@ PACKAGES = {
     "runs": ("Runs and suites", ["runs", "suites"]),
     "reports": ("Reports", ["reports"]),
     "tuning": ("Studies", ["tuning"]),
+    "gate": (
+        "The gate",
+        ["gate", "gate.checking", "gate.config", "gate.result", "evaluation.gate"],
+    ),
     "testing": ("Checks for plug-ins", ["testing"]),
 }
 """Pages, with their titles and the modules on them."""

@@ -4,6 +4,7 @@ import errno
 import os
 import sys
 import warnings
+from pathlib import Path
 from typing import Annotated, Optional
 
 import typer
@@ -27,6 +28,7 @@ from dynslam_bench.cli.output import (
     download_bar,
     present,
     set_json_mode,
+    set_wide,
     table,
     warn,
     write,
@@ -65,7 +67,7 @@ app.command(rich_help_panel=REPORT)(reports.published)
 app.add_typer(gates.app, name="gate", rich_help_panel=REPORT)
 app.add_typer(segmenters.app, name="segmenter", rich_help_panel=CARE)
 cache = typer.Typer(
-    help="The stage cache: results that do not depend on the settings under study.",
+    help="What is kept to be computed once: stages of the pipeline, compiled kernels, rendered frames.",
     no_args_is_help=True,
 )
 app.add_typer(cache, name="cache", rich_help_panel=CARE)
@@ -85,10 +87,14 @@ def _root(
         Optional[bool],
         typer.Option("--version", callback=_version, is_eager=True, help="Show the version."),
     ] = None,
+    wide: Annotated[
+        bool, typer.Option("--wide", help="Show all columns of tables, wider than the terminal.")
+    ] = False,
 ) -> None:
     """Benchmark and tune visual SLAM in dynamic scenes."""
     from dynslam_bench.core.download import show_downloads
 
+    set_wide(wide)
     show_downloads(download_bar)
 
 
@@ -124,30 +130,68 @@ def doctor(as_json: AsJson = False) -> None:
 
 @cache.command()
 def info(as_json: AsJson = False) -> None:
-    """Show how full the cache is."""
+    """Show what the caches hold: stages, compiled kernels, rendered frames."""
+    from dynslam_bench.core.folders import find_data_root
     from dynslam_bench.core.stage_cache import StageCache
+    from dynslam_bench.sequences.synthetic.stored import renderings
 
     usage = StageCache().info()
     sizes = usage["bytes_by_stage"]
     entries = usage["entries_by_stage"]
     rows = [(stage, entries[stage], size / 1e6) for stage, size in sizes.items()]
     total = sum(sizes.values())
+
+    kernels = [file.stat().st_size for file in _kernels()]
+    stored = renderings(find_data_root())
+    current = [rendering.size for rendering in stored if rendering.is_current]
+    others = [rendering.size for rendering in stored if not rendering.is_current]
+    rows += [
+        ("compiled kernels", len(kernels), sum(kernels) / 1e6),
+        ("rendered sequences", len(current), sum(current) / 1e6),
+        ("rendered by other code or settings", len(others), sum(others) / 1e6),
+    ]
     present(
-        {"bytes": total, **usage},
-        f"{usage['folder']}: {total / 1e6:.1f} of {usage['max_bytes'] / 1e6:.0f} MB",
-        table(("stage", "entries", "MB"), rows),
+        {
+            "bytes": total,
+            **usage,
+            "kernels_bytes": sum(kernels),
+            "renderings_bytes": sum(current),
+            "other_renderings_bytes": sum(others),
+        },
+        f"{usage['folder']}: {total / 1e6:.1f} of {usage['max_bytes'] / 1e6:.0f} MB of stages",
+        table(("what", "entries", "MB"), rows),
     )
 
 
 @cache.command()
 def clear(yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False) -> None:
-    """Delete all entries."""
+    """Delete all stages and compiled kernels, and what other code or settings have rendered."""
+    import shutil
+
+    from dynslam_bench.core.folders import find_data_root
     from dynslam_bench.core.stage_cache import StageCache
+    from dynslam_bench.sequences.synthetic.stored import renderings
 
     stage_cache = StageCache()
+    others = [rendering for rendering in renderings(find_data_root()) if not rendering.is_current]
     if not yes:
-        typer.confirm(f"delete all entries below {stage_cache.folder}?", abort=True)
-    write(f"freed {stage_cache.clear() / 1e6:.1f} MB")
+        what = f"all entries below {stage_cache.folder}, all compiled kernels"
+        typer.confirm(f"delete {what}, and {len(others)} old renderings?", abort=True)
+    freed = stage_cache.clear()
+    for kernel in _kernels():
+        freed += kernel.stat().st_size
+        kernel.unlink(missing_ok=True)
+    for rendering in others:
+        shutil.rmtree(rendering.folder, ignore_errors=True)
+        freed += rendering.size
+    write(f"freed {freed / 1e6:.1f} MB")
+
+
+def _kernels() -> list[Path]:
+    """The files of compiled kernels."""
+    from dynslam_bench.core.folders import kernels_folder
+
+    return sorted(kernels_folder().glob("*.kernel"))
 
 
 def start(arguments: list[str] | None = None) -> None:

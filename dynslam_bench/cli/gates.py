@@ -104,9 +104,8 @@ def record(
             on_run=on_run,
         )
     lost = sum(run.is_lost for run in made.runs)
-    words = (
-        f"{len(made.runs)} runs of {made.origin.describe()} recorded, {lost} lost; commit the file"
-    )
+    revision = made.origin.revision[:12] or "no revision"
+    words = f"{len(made.runs)} runs recorded, of {revision}, {lost} lost; commit the file"
     present(made, words)
 
 

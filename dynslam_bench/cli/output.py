@@ -11,6 +11,7 @@ import textwrap
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -28,8 +29,6 @@ VERIFICATION_FAILED = 4
 """Exit code where something was checked and has a fault, or a gate found a regression."""
 HEARTBEAT_S = 10.0
 """Off a terminal, a long operation reports its progress this often, unless JSON was asked for."""
-_MIN_WIDTH = 12
-"""Characters that a shortened column of names keeps, unless more are asked for."""
 _GAP = "  "
 """What separates the columns of a table."""
 _LINE_WIDTH = 120
@@ -37,6 +36,15 @@ _LINE_WIDTH = 120
 
 _json_mode = False
 """Whether ``--json`` was given: then nothing but errors goes to standard error."""
+
+_wide = False
+"""Whether ``--wide`` was given: then tables have all columns, however wide the terminal is."""
+
+
+def set_wide(on: bool) -> None:
+    """Show all columns of tables, or those for which a terminal has room."""
+    global _wide
+    _wide = on
 
 
 def set_json_mode(on: bool) -> bool:
@@ -122,47 +130,49 @@ def _as_json(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
-def table(
-    columns: Sequence[str], rows: Sequence[Sequence[object]], *, least: int = _MIN_WIDTH
-) -> str:
+def table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """Aligned text, the headings first.
 
-    On a terminal it is no wider than that: the last columns are left out and named, then the widest
-    names are shortened in the middle. Numbers are never shortened.
+    On a terminal it is no wider than that: texts are wrapped at blanks, and then the last columns
+    are left out and named. Words, ids and numbers are never cut.
 
     Args:
         columns: The headings.
         rows: The values below them.
-        least: Characters that a shortened column of names keeps.
     """
     cells = [[cell_text(value) for value in row] for row in (columns, *rows)]
     full_widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    least_widths = [_least_width(column, least) for column in zip(*cells, strict=True)]
+    least_widths = [_least_width(column) for column in zip(*cells, strict=True)]
     widths = _widths_on_terminal(full_widths, least_widths)
 
-    # `map` ends with the shorter one: columns without a width are left out
-    lines = [_GAP.join(map(_fitted, row, widths)).rstrip() for row in cells]
+    # `zip` ends with the shorter one: columns without a width are left out
+    lines = []
+    for row in cells:
+        wrapped_cells = [_cell_lines(text, width) for text, width in zip(row, widths, strict=False)]
+        for parts in zip_longest(*wrapped_cells, fillvalue=""):
+            padded = [part.ljust(width) for part, width in zip(parts, widths, strict=True)]
+            lines.append(_GAP.join(padded).rstrip())
     left_out = cells[0][len(widths) :]
     if left_out:
-        lines.append(f"(no room for: {', '.join(left_out)})")
+        lines.append(f"(no room for: {', '.join(left_out)}; dynslam-bench --wide shows all)")
     return "\n".join(lines)
 
 
 def _widths_on_terminal(full: Sequence[int], least: Sequence[int]) -> list[int]:
-    """Widths of the columns that are shown; of all of them, in full, where there is no terminal.
+    """Widths of the columns that are shown; of all of them, in full, where there is no terminal, or with ``--wide``.
 
     Args:
         full: Characters of each column's longest cell.
         least: Characters that each column needs.
     """
     widths = list(full)
-    if not sys.stdout.isatty():
+    if _wide or not sys.stdout.isatty():
         return widths
     terminal = _terminal_width()
     # leave out columns from the last one on, until the least widths fit
     while len(widths) > 1 and _line_width(least[: len(widths)]) > terminal:
         widths.pop()
-    # then shorten the widest column by a character, again and again
+    # then narrow the widest column by a character, again and again
     while _line_width(widths) > terminal:
         can_shrink = [at for at, width in enumerate(widths) if width > least[at]]
         if not can_shrink:
@@ -171,11 +181,11 @@ def _widths_on_terminal(full: Sequence[int], least: Sequence[int]) -> list[int]:
     return widths
 
 
-def _least_width(column: Sequence[str], least: int) -> int:
-    """Characters that a column needs: `least`, or the longest cell that begins with a number."""
-    longest = max(map(len, column))
-    numbers = [cell for cell in column if cell and not any(map(str.isalpha, cell.split()[0]))]
-    return max([min(longest, least), *map(len, numbers)])
+def _least_width(column: Sequence[str]) -> int:
+    """Characters that a column needs: its longest word, or the longest cell that begins with a number."""
+    words = [len(word) for cell in column for word in cell.split()]
+    numbers = [len(cell) for cell in column if cell and not any(map(str.isalpha, cell.split()[0]))]
+    return max([*words, *numbers], default=0)
 
 
 def _line_width(widths: Sequence[int]) -> int:
@@ -183,11 +193,11 @@ def _line_width(widths: Sequence[int]) -> int:
     return sum(widths) + len(_GAP) * (len(widths) - 1)
 
 
-def _fitted(text: str, width: int) -> str:
-    """A cell filled with blanks to its column's width, or shortened in the middle to it."""
+def _cell_lines(text: str, width: int) -> list[str]:
+    """A cell in lines of a column's width, broken at blanks."""
     if len(text) <= width:
-        return text.ljust(width)
-    return text[: width // 2] + "…" + text[len(text) - (width - 1) // 2 :]
+        return [text]
+    return textwrap.wrap(text, width, break_long_words=False, break_on_hyphens=False)
 
 
 def fields(facts: Mapping[str, object]) -> str:

@@ -212,11 +212,12 @@ def run(
         degrade=opts.gather_settings(degrade),
         limits=checked(runs.Limits, time_s=time_limit, memory_mb=memory_limit),
     )
+    # made, then shown with their errors
     scored_under = protocol or default_protocol(tracker)
     make_runs = partial(
         run_specs, specs, results=results, jobs=jobs, retry=retry or (), protocol=scored_under
     )
-    make_and_show(make_runs, results, jobs, scored_under, yes, runs.pictures_asked(specs[0]))
+    make_and_show(make_runs, results, jobs, scored_under, yes, runs.requested_files(specs[0]))
 
 
 def default_protocol(tracker: str) -> str:
@@ -356,6 +357,7 @@ def make_and_show(
     """
     from dynslam_bench.slam.map_files import MAP_FILE
 
+    # make them, with a bar
     store = runs.RunStore(results)
     watched = WatchedRuns(store, jobs, protocol)
     made = make_with_network(watched, make_runs, yes)
@@ -365,11 +367,13 @@ def make_and_show(
         present([], "this part of the suite holds no runs")
         return
 
+    # the table, the files that were asked for, and what is to be said of the runs
     rows = show_runs((run.record for run in made), store, protocol, watched.reused)
     missing_files = show_files(rows, store, pictures)
     show_cautions(rows, watched)
     note(f"{len(rows)} runs in {store.root}; report them with: dynslam-bench report {results}")
 
+    # what scripts see: the exit code
     not_ok = any(row["status"] != "ok" for row in rows)
     if watched.faults or MAP_FILE in missing_files or not_ok:
         raise typer.Exit(SOME_RUNS_FAILED)
@@ -408,6 +412,7 @@ def show_cautions(rows: Sequence[dict[str, Any]], watched: WatchedRuns) -> None:
 
 def no_truth_note(rows: Sequence[dict[str, Any]], store: runs.RunStore) -> str:
     """One line on the first run that tracked but has no error, if its sequence has no ground truth; else empty."""
+    # the first that could have an error and has none
     tracked = (row for row in rows if row["status"] in ("ok", "lost"))
     first = next((row for row in tracked if row["ate_rmse_m"] is None), None)
     if first is None or store.read_whole(first["run_id"]).sequence.ground_truth:
@@ -463,6 +468,7 @@ class WatchedRuns:
 
     def _event(self, event: runs.RunEvent) -> None:
         """Count a run that has ended as 1, one that goes on as the share of its frames."""
+        # the share that this run has added to the bar so far
         before = self._shares.pop(event.run_id, 0.0)
         if event.record is not None:
             self._done += 1.0 - before
@@ -498,19 +504,23 @@ def event_text(event: runs.RunEvent) -> str:
     frames = event.partial["frames"]
     if done < frames:
         return f"{text}, frame {done} of {frames}"
-    files = ["trajectories", *runs.pictures_asked(event.spec)]
+    # all frames are tracked: the rest is writing
+    files = ["trajectories", *runs.requested_files(event.spec)]
     return f"{text}, writing {', '.join(files)}"
 
 
 def describe_plan(plan: runs.Plan, store: runs.RunStore, jobs: int, protocol: str) -> str:
-    """How many frames will be tracked, and the expected time by stored runs of the same trackers."""
+    """How many frames will be tracked, and the expected time by this machine's stored runs of the same trackers."""
+    from dynslam_bench.core.fingerprint import this_machine  # loads numpy
+
     plural = "s" if plan.runs != 1 else ""
     text = f"{plan.runs} run{plural}, {plan.frames.total()} frames"
 
-    # time of a frame, by tracker, in the runs that are stored
+    # time of a frame, by tracker, in the runs that are stored and were made on such a machine
+    cpu = this_machine().cpu
     times_ms = defaultdict[str, list[float]](list)
     for row in runs.list_runs(store, protocol)[0]:
-        if row["frame_ms"]:
+        if row["frame_ms"] and row["cpu"] == cpu:
             times_ms[row["tracker"]].append(row["frame_ms"])
     if not plan.frames.keys() <= times_ms.keys():
         return f"{text}; a system's first run on a machine compiles its code for up to a minute"

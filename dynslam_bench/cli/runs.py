@@ -85,8 +85,6 @@ SORTED_BY = ("started", "tracker", "sequence", "status", "ate", "ms", "coverage"
 _SORT_KEYS = {"ate": "ate_rmse_m", "ms": "frame_ms"}
 _ID_DIGITS = 8
 """Digits of an id that a terminal shows at least; runs of one request share their first twelve."""
-_NAME_WIDTH = 24
-"""Characters that a sequence keeps on a terminal, so that rendered ones are told apart."""
 # The folders of a path in a setting's value: `file=/data/maps/a.npz` is shown as `file=a.npz`.
 _FOLDERS = re.compile(r"(?<==)(\w+:)?(?:~|\.{0,2})/(?:[^,/]*/)*")
 
@@ -130,6 +128,7 @@ def list_(
     as_json: AsJson = False,
 ) -> None:
     """List the runs of a results folder, oldest first unless sorted otherwise."""
+    # refuse names that no run can have
     if status not in (None, *complete_statuses()):
         raise RunError(f"unknown status '{status}'", did_you_mean(str(status), complete_statuses()))
     column = sort.removeprefix("-")
@@ -168,6 +167,7 @@ def show(
     store = stored.open_store(results)
     record = store.read(run)
     metrics = store.score(record, protocol)
+    # what it is and how it ended
     lines = [fields(run_facts(store, record))]
 
     # how long each stage of a frame took
@@ -241,6 +241,7 @@ def export(
     """Write all runs but studies' trials, with their errors, into one table, as `RunStore.frame` has it."""
     from dynslam_bench.reports.tables.table import csv_text
 
+    # the kind by the file's name
     kind = output.suffix.lower()
     if kind not in (".csv", ".parquet"):
         raise RunError(f"a table is not written as '{output.name}'", "name a .csv or .parquet file")
@@ -262,6 +263,7 @@ def rm(
     if not runs and not failed:
         raise RunError("no run was named", "name ids, or --failed")
     store = stored.RunStore(results)
+    # named ones, and those that failed
     chosen = [store.find(run) for run in runs or ()]
     if failed and not store.ids():
         raise RunError(f"there are no runs in {store.root}", "name the folder with --results")
@@ -346,6 +348,7 @@ def show_merged(merged: Merged, target: str) -> None:
 
 def run_facts(store: stored.RunStore, record: stored.RunRecord) -> dict[str, Any]:
     """The facts of a run by name; empty values are not shown."""
+    # empty and zero values stand for "nothing to say"
     identity = "unverified: its id does not tell the contents of data and code"
     return {
         "run": record.run_id,
@@ -397,6 +400,7 @@ def show_runs(
     """
     rows = []
     for record in records:
+        # a stopped run has no errors
         metrics = None if record.status == "stopped" else store.score(record, protocol)
         rows.append(stored.run_row(record, metrics) | {"from_store": record.run_id in reused})
     show_rows(rows, store, protocol)
@@ -410,6 +414,7 @@ def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: 
             [row | {"protocol": protocol, "folder": store.place(row["run_id"])} for row in rows]
         )
         return
+    # columns without any value are left out
     columns = {
         title: name
         for title, name in COLUMNS.items()
@@ -420,8 +425,9 @@ def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: 
     if sys.stdout.isatty():
         short = short_ids([*store.ids(), *(row["run_id"] for row in rows)])
         shown = [row | {"run_id": short[row["run_id"]]} for row in rows]
+    # the table, what it comes to, and the remarks on its runs
     cells = [[shown_cell(name, row[name]) for name in columns.values()] for row in shown]
-    write(table(list(columns), cells, least=_NAME_WIDTH), colours=COLOURS)
+    write(table(list(columns), cells), colours=COLOURS)
     for line in summary_lines(rows):
         write(line)
     show_remarks(rows)
@@ -430,6 +436,7 @@ def show_rows(rows: Sequence[dict[str, Any]], store: stored.RunStore, protocol: 
 def summary_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
     """What stands below a table of runs: how many are not ok, or worse than a static camera; what the ATE is of."""
     lines = []
+    # runs that failed, were lost or stopped, by status
     counts = Counter(row["status"] for row in rows if row["status"] != "ok")
     if counts:
         statuses = ", ".join(f"{count} {status}" for status, count in counts.items())
@@ -442,6 +449,7 @@ def summary_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
     if worse:
         lines.append(f"{worse} of {len(rows)} runs are worse than a static camera.")
 
+    # lost frames are in no ATE: it must not be compared as it stands
     scored = [row for row in rows if None not in (row["ate_rmse_m"], row["coverage"])]
     if any(row["coverage"] < 1 for row in scored):
         lines.append(
@@ -458,6 +466,7 @@ def show_remarks(rows: Sequence[dict[str, Any]]) -> None:
             if row["tracker"] == "never-move" and remark.startswith("warning: static-camera:"):
                 continue  # it is that camera
             runs_by_remark[remark].append(row)
+    # one line for all runs with the same remark
     for remark, (first, *others) in list(runs_by_remark.items())[:MOST_REMARKS]:
         kind, _, text = remark.partition(": ")
         subject = f"{label_text(first['tracker'])} on {first['sequence']}"
@@ -507,6 +516,7 @@ def show_files(
                 write(str(path))
             continue
         missing.add(name)
+        # why there is none: the run says so, or it ended before
         notes = store.read_whole(run_id).notes
         stated = (text for text in notes if text.startswith(f"no {name}"))
         reason = next(stated, f"no {name}: the run ended early, {status}")
@@ -519,6 +529,7 @@ def training_scene_note(rows: Sequence[dict[str, Any]]) -> str:
     ids = [row["sequence"] for row in rows if row["seen_in_training"]]
     if not ids:
         return ""
+    # an id without scene and frames: `synthetic/walking_xyz`
     base = ids[0].partition("?")[0].partition("@")[0]
     return (
         f"{len(ids)} of {len(rows)} runs have masks of a network that was trained on their scene, the first on "
@@ -544,6 +555,7 @@ def recording_note(
         sequence, data_root, camera = opened[row["run_id"]]
         if sequence.startswith("synthetic/") or not (row["status"] != "ok" or _is_no_better(row)):
             continue
+        # the first such recording alone: each check takes seconds
         diagnosis = diagnose(sequence, data_root=data_root, camera=camera, most_frames=HINT_FRAMES)
         if diagnosis.ok:
             return ""
@@ -556,6 +568,7 @@ def recording_note(
 
 def _is_no_better(row: Mapping[str, Any]) -> bool:
     """Whether a tracker that is to follow a moving camera was no better than a static camera."""
+    # where the camera stands still, no tracker can be better
     error = row["ate_rmse_m"]
     bound = row["static_camera_ate_rmse_m"]
     if row["tracker"] == "never-move" or row["false_motion_max_m"] is not None:

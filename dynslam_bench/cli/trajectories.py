@@ -64,6 +64,7 @@ def evaluate(
     as_json: AsJson = False,
 ) -> None:
     """Evaluate trajectory files against a ground-truth file."""
+    # all files are read and scored before anything is written
     pairs = [read_pair(estimate, ground_truth, timestamps, topic) for estimate in estimates]
     scored = [scored_with_hints(loaded, truth, protocol) for loaded, truth in pairs]
     drawn = None
@@ -72,11 +73,13 @@ def evaluate(
 
     facts = [{**result.model_dump(), "hints": likely} for result, likely in scored]
     written = [] if drawn is None else [str(drawn)]
+    # one file in full
     if len(scored) == 1:
         result, likely = scored[0]
         lines = [result.summary(), result.protocol, statistics_table(result)]
         present(facts[0], *lines, *remarks(result, likely), *written)
         return
+    # several side by side, with the remarks on each
     lines = [scored[0][0].protocol, comparison_table(estimates, [result for result, _ in scored])]
     for path, (result, likely) in zip(estimates, scored, strict=True):
         lines += [f"{path.name}: {line}" for line in remarks(result, likely)]
@@ -95,6 +98,7 @@ def statistics_table(result: Evaluation) -> str:
     rows: dict[tuple[str, str], dict[str, float]] = {}
     single = []
     for name, value in result.metrics.items():
+        # `ate_rmse_m` is the statistic `rmse` of the error `ate` in the unit `m`
         match = _METRIC.match(name)
         if match is None or name.startswith("static_camera"):
             single.append((name, value))
@@ -132,6 +136,7 @@ def draw(
     from dynslam_bench.evaluation.evaluate import pose_errors
     from dynslam_bench.reports.trajectory_plot import PlottedTrajectory, plot_trajectories
 
+    # the truth as the protocol takes it; each estimate aligned with it
     truth = truth_of_file(pairs[0][1].trajectory, get_protocol(protocol))
     plotted = []
     for label, (loaded, _) in zip(labels, pairs, strict=True):
@@ -206,6 +211,7 @@ def compare(
     """Show how one trajectory scores under every protocol of the field."""
     from dynslam_bench.evaluation.compare_protocols import agrees, compare_protocols
 
+    # one trajectory under all protocols
     loaded, truth = read_pair(estimate, ground_truth, timestamps, topic)
     scores = compare_protocols(loaded, truth)
     lines = remarks(*scored_with_hints(loaded, truth, "tum-rgbd/v1"))
@@ -267,6 +273,7 @@ def import_(
     as_json: AsJson = False,
 ) -> None:
     """Put a trajectory from elsewhere beside our own runs."""
+    # stored as a record beside the runs, then shown as one
     store = runs.RunStore(results)
     record = runs.import_trajectory(
         trajectory,
@@ -321,6 +328,7 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write a stored run in a format of other tools, with its provenance beside it."""
+    # without either option the run's best trajectory is taken
     which: Literal["online", "final"] | None = None
     if online is not None:
         which = "online" if online else "final"

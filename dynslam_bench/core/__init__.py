@@ -64,8 +64,8 @@ from dynslam_bench.core.reading import (
 )
 from dynslam_bench.core.sanitise import (
     HIDDEN,
-    inside,
     is_inside,
+    path_below,
     printable,
     storable,
     without_passwords,
@@ -110,7 +110,6 @@ __all__ = [
     "exclusive_lock",
     "file_sha256",
     "find_data_root",
-    "inside",
     "is_abandoned",
     "is_inside",
     "is_temporary",
@@ -118,6 +117,7 @@ __all__ = [
     "label_text",
     "parse_json",
     "parse_toml",
+    "path_below",
     "printable",
     "read_bytes",
     "read_json",

@@ -96,10 +96,12 @@ def foreign_modules(file: Path) -> set[str]:
     foreign = set[str]()
     waiting = [file]
     while waiting:
+        # what the files that were found last import
         names = imported_modules(waiting) - imported
         imported |= names
         waiting = []
         for name in names:
+            # a name is a module or a package of the folder, or it is foreign
             module = file.parent / f"{name}.py"
             package = file.parent / name
             if module.is_file():
@@ -126,6 +128,7 @@ def program_files(folder: Path) -> list[Path]:
     Raises:
         OSError: The folder cannot be read.
     """
+    # all code counts
     everything = list(files_below(folder))
     code = {file for file in everything if is_code(file)}
 
@@ -134,6 +137,7 @@ def program_files(folder: Path) -> list[Path]:
     for file in filter(is_python, code):
         quoted |= {name.decode() for name in _QUOTED.findall(file.read_bytes())}
 
+    # of all other files, those that the code names
     counted = []
     others = []
     for file in everything:
@@ -296,6 +300,7 @@ def _linked_libraries(program: Path) -> list[Path]:
     """The shared libraries of a program that are none of the operating system's, as ``ldd`` finds them."""
     if _is_of_system(program) or shutil.which("ldd") is None:
         return []
+    # lines of `ldd` read "libname.so => /path/libname.so (0x...)"
     listed = subprocess.run(
         ["ldd", str(program)], capture_output=True, text=True, check=False
     ).stdout
@@ -312,6 +317,7 @@ def _with_named_files(files: Iterable[Path], base: Path) -> list[Path]:
         if file in reached:
             continue
         reached[file] = None
+        # words that may name a file beside it, or in the working folder
         path_like = sorted(word for word in _words(file) if "." in word or "/" in word)
         for word in path_like:
             path = Path(word).expanduser() if word.startswith("~/") else Path(word)
@@ -339,6 +345,7 @@ def _named(code: list[Path], others: list[Path]) -> list[Path]:
 def _words(file: Path) -> set[str]:
     """The words of a script, configuration or compiled program that could be names of files."""
     try:
+        # scripts and configurations are text; the rest may be a compiled program
         is_text = file.suffix in _TEXT or (not file.suffix and _names_interpreter(file))
         if not is_text:
             return _words_of_binary(file)
@@ -371,6 +378,7 @@ def _words_of_binary(file: Path) -> set[str]:
     with file.open("rb") as opened:
         if opened.read(len(_ELF)) != _ELF:
             return set()
+    # strings of a compiled program end with a null byte
     texts = set(file.read_bytes().split(b"\0"))
     names = filter(_NAME_IN_BINARY.fullmatch, texts)
     return {name.decode() for name in names if not name.endswith(_SOURCES)}

@@ -79,6 +79,11 @@ def hide_folder_in_messages(folder: Path) -> Path:
     return folder
 
 
+def hidden_folders() -> list[Path]:
+    """The folders that messages of this process leave out, for a process that goes on with its work."""
+    return [Path(folder) for folder in _HIDDEN_FOLDERS]
+
+
 def _one_line(text: str) -> str:
     """The text as one line without passwords; of a long one its beginning and its end."""
     text = without_passwords(" ".join(text.splitlines()))

@@ -163,6 +163,7 @@ class Registry(Generic[P]):
 
     def target_of(self, name: str) -> str | None:
         """``module:Attr`` of the listed plug-in with an id; None for a built-in id, and where none has it."""
+        # neither is listed anywhere
         is_file = name.rpartition(":")[0].endswith(".py")
         if name in self.builtin() or is_file:
             return None
@@ -250,6 +251,7 @@ def used(names: Iterable[tuple[Registry[Any], str]]) -> str:
     Args:
         names: Registries, and ids that the run uses of them; built-in ones are left out.
     """
+    # built-in ones have no target, and need no list
     targets = [(registry.kind, registry.target_of(name)) for registry, name in names]
     return ",".join(f"{kind}={target}" for kind, target in targets if target is not None)
 
@@ -286,12 +288,14 @@ def load_object(target: str) -> Any:
             f"'{target}' is not module:Attr",
             "for example my_package.trackers:SPEC or my_tracker.py:SPEC",
         )
+    # a module that hangs or exits is found out elsewhere first
     if not _is_imported(location):
         check_import(location)
     try:
         module = import_module(location)
     except (Exception, SystemExit) as error:
         raise PluginError(f"cannot import {location}: {_reason(error)}") from error
+    # from here on, numbers of this process may depend on it
     if location.endswith(".py") or not _is_of_this_package(location):
         _IMPORTED_PLUGINS.add(location)
     try:
@@ -323,6 +327,7 @@ def build_plugin(
         DynslamError: Of the type `fault` where the factory fails or gives something else; its own
             pass unchanged.
     """
+    # what the factory raises names the plug-in
     factory = load_object(spec.entry_point)
     try:
         built = call(factory)
@@ -332,6 +337,7 @@ def build_plugin(
         raise fault(
             f"{kind} '{spec.id}' cannot be built: {type(error).__name__}: {error}"
         ) from error
+    # a wrong object is refused here, not in the middle of a run
     if not isinstance(built, protocol):
         raise fault(
             f"'{spec.entry_point}' gave a {type(built).__name__}, not a {protocol.__name__}"
@@ -377,6 +383,7 @@ def _load_file(path: Path) -> ModuleType:
     name = _module_name(path)
     if name in sys.modules:
         return sys.modules[name]
+    # it stands among the loaded modules while it runs, as pickle and dataclasses expect
     spec = importlib.util.spec_from_file_location(name, resolved)
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
@@ -398,6 +405,7 @@ def _environment_targets(kind: Kind) -> list[str]:
         text = item.strip()
         if not text:
             continue
+        # "kind=target"; a target alone is a tracker's
         prefix, separator, target = text.partition("=")
         if not separator:
             prefix = "trackers"
@@ -503,6 +511,7 @@ def _probe(location: str, target: str) -> bytes:
     Raises:
         PluginError: The process hangs, or it is ended by the import.
     """
+    # the plug-in may print: the answer has a pipe of its own
     quiet = subprocess.DEVNULL
     reading, writing = os.pipe()
     with os.fdopen(reading, "rb") as answer:
@@ -523,6 +532,7 @@ def _probe(location: str, target: str) -> bytes:
             ) from None
         finally:
             os.close(writing)
+        # any other exit code means that the import has ended the process
         if code != _IMPORTED:
             how = f"exit code {code}" if code >= 0 else signal.Signals(-code).name
             raise PluginError(

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dynslam_bench.core.errors import DynslamError, translate_errors
-from dynslam_bench.core.sanitise import inside
+from dynslam_bench.core.sanitise import path_below
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -183,7 +183,7 @@ def compare_sums(folder: Path, sums: Path, kind: type[DynslamError] = DynslamErr
     faults = []
     for line in read_lines(sums, kind=kind):
         expected, _, name = line.rstrip("\n").partition("  ")
-        path = inside(folder, name, where=str(sums), kind=kind)
+        path = path_below(folder, name, where=str(sums), kind=kind)
         if not path.is_file():
             faults.append(f"{name} is missing")
             continue

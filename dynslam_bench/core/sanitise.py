@@ -53,7 +53,9 @@ def is_inside(name: str) -> bool:
     return all(len(part.encode()) <= LONGEST_NAME for part in path.parts)
 
 
-def inside(folder: Path, name: str, *, where: str, kind: Callable[[str, str], Exception]) -> Path:
+def path_below(
+    folder: Path, name: str, *, where: str, kind: Callable[[str, str], Exception]
+) -> Path:
     """The file that a name in foreign data stands for, below a folder.
 
     Args:

@@ -507,6 +507,7 @@ def nearby_mean(
     sorted_values = values[order]
     means = np.zeros((len(at), values.shape[1]))
     for i in range(len(at)):
+        # the rows that may be near, from the first one on
         column = at[i, 0]
         depth = at_z[i]
         tolerance = SIMILAR_DEPTH * at_z[i]
@@ -515,6 +516,7 @@ def nearby_mean(
         for k in range(np.searchsorted(rows, at[i, 1] - nearby_px), len(rows)):
             if rows[k] > last:
                 break
+            # add up those that are near in the image and in depth
             if abs(columns[k] - column) <= nearby_px and (
                 depth <= 0 or abs(depths[k] - depth) <= tolerance
             ):

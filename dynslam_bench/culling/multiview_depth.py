@@ -319,6 +319,7 @@ def refine_by_matches(
         or state.T_world_pred is None
     ):
         return state.T_world_pred
+    # features of the previous frame with a depth, which its filters kept
     trusted = previous.z > 0
     if state.previous_keep is not None:
         trusted &= state.previous_keep
@@ -353,12 +354,12 @@ def refine_by_matches(
             descriptors,
             max_distance=MAX_DISTANCE,
         )
-        rows_matched = rows[match >= 0]
-        now = match[match >= 0]
-        if len(now) >= MIN_MATCHES:
+        previous_matched = rows[match >= 0]
+        current_matched = match[match >= 0]
+        if len(current_matched) >= MIN_MATCHES:
             # refine the pose by the matches as if they were a flow
             ends = np.full((len(xy), 2), np.nan, np.float32)
-            ends[now] = previous.keypoints.xy[rows_matched]
+            ends[current_matched] = previous.keypoints.xy[previous_matched]
             matches = FlowResult(ends, np.isfinite(ends[:, 0]), np.zeros(len(xy), np.float32))
             return refine_prediction(frame, replace(state, flow=matches))
     return state.T_world_pred

@@ -99,9 +99,11 @@ def compare(
     diagnostics = [] if diagnostics is None else diagnostics
     for whose, trajectory in (("estimate", estimate), ("ground truth", ground_truth)):
         _refuse_infinite(trajectory, whose)
+    # the protocol's corrections of the truth, and its choice of frames
     estimate, ground_truth = compared(
         estimate, ground_truth, protocol, input_timestamps, diagnostics
     )
+    # pairs of poses by their stamps
     estimate_index, truth_index, association = match(estimate, ground_truth, protocol)
     dropped = association.describe(protocol.max_dt)
     if len(estimate_index) < 2:
@@ -109,11 +111,13 @@ def compare(
         raise EvaluationError(f"{fault}, at least 2 are needed", dropped)
     if dropped:
         diagnostics.append(dropped)
+    # evo's rule may use an estimated pose several times
     if (taken := len(np.unique(estimate_index))) < len(estimate_index):
         diagnostics.append(
             f"{len(estimate_index)} pairs are made of {taken} estimated poses: the estimate has more poses than the "
             "ground truth, so each true pose takes its nearest one"
         )
+    # the alignment of the pairs, by least squares
     matched = estimate.T_world_cam[estimate_index]
     truth = ground_truth.T_world_cam[truth_index]
     similarity = align(matched, truth, protocol.alignment)
@@ -208,6 +212,7 @@ def match(
         raise EvaluationError(
             f"the {'ground truth' if len(estimate) else 'estimate'} holds no poses"
         )
+    # TUM's rule, one to one, or evo's, the nearest for each pose of the shorter
     t_est = estimate.timestamps
     t_gt = ground_truth.timestamps
     max_dt = protocol.max_dt
@@ -222,6 +227,7 @@ def match(
         index_gt, index_est = nearest_match(t_gt, t_est, max_dt, strict=strict)
     else:
         index_est, index_gt = nearest_match(t_est, t_gt, max_dt, strict=strict)
+    # no pair at all: most likely the clocks differ
     if not len(index_est):
         raise EvaluationError(
             f"none of {len(t_est)} poses has ground truth within {max_dt:g} s: the nearest is "
@@ -235,9 +241,11 @@ def match(
 def clock_hint(stamps: ArrayLike, true_stamps: ArrayLike) -> str:
     """How the stamps of an estimate and of its truth, seconds ``[N]`` and ``[M]``, may be put on one clock."""
     own, true = (np.asarray(values, dtype=np.float64) for values in (stamps, true_stamps))
+    # frame numbers on one side
     if are_frame_numbers(own) != are_frame_numbers(true):
         whose, numbers = ("estimate", own) if are_frame_numbers(own) else ("ground truth", true)
         return f"{describe_frame_numbers(numbers, whose)}: frame numbers? Then give the stamps of the images in seconds"
+    # Unix time on one side
     own_is_unix, true_is_unix = (
         UNIX_S <= float(np.abs(values).max()) <= LATEST_S for values in (own, true)
     )
@@ -248,6 +256,7 @@ def clock_hint(stamps: ArrayLike, true_stamps: ArrayLike) -> str:
             f"only the {whose} has Unix time: if both begin with the same frame, add {later_s:.6f} s to each stamp of "
             f"the {other}"
         )
+    # nanoseconds on one side
     if not 1e-5 <= np.abs(own).max() / max(np.abs(true).max(), 1e-9) <= 1e5:
         return "are the stamps of one of them in nanoseconds? Give seconds"
     return "do the files belong together, and do their clocks agree?"
@@ -267,10 +276,12 @@ def nearest_match(
     Returns:
         Indices into both lists ``[K]``, in order of `stamps`.
     """
+    # the neighbours on both sides of each stamp, and how far off they are
     right = np.clip(np.searchsorted(others, stamps, side="right"), 0, len(others) - 1)
     left = np.maximum(right - 1, 0)
     right_dt = others[right] - stamps
     left_dt = np.where(right > 0, stamps - others[left], np.inf)
+    # the nearer one; of equal stamps the first
     chosen = np.searchsorted(others, others[np.where(right_dt < left_dt, right, left)])
     dt = np.minimum(right_dt, left_dt)
     keep = dt < max_dt if strict else dt <= max_dt
@@ -281,10 +292,12 @@ def nearest_match(
 def _record(
     t_est: Array, t_gt: Array, index_est: Index, index_gt: Index, max_dt: float, *, strict: bool
 ) -> AssociationRecord:
+    # why a pose has no partner: beyond the ends, in a hole, or another was nearer
     unmatched = ~np.isin(np.arange(len(t_est)), index_est)
     gap = nearest_gap(t_est, t_gt)
     far = gap >= max_dt if strict else gap > max_dt
     outside = far & ((t_est < t_gt[0]) | (t_est > t_gt[-1]))
+    # the largest hole of the truth within the estimate's time
     within = t_gt[(t_gt > t_est[0]) & (t_gt < t_est[-1])]
     edges = np.concatenate([t_est[:1], within, t_est[-1:]])
     hole = int(np.argmax(np.diff(edges)))
@@ -335,9 +348,11 @@ def compared(
     Raises:
         EvaluationError: None of the frames that count was tracked.
     """
+    # Bonn's markers are not the camera
     if protocol.truth != "as-is":
         correct = bonn_camera if protocol.truth == "bonn-camera" else bonn_as_droid_w
         ground_truth = ground_truth.with_poses(correct(ground_truth.T_world_cam))
+    # protocols that compare every frame end here
     if not protocol.thins:
         return estimate, ground_truth
     stamps = (
@@ -345,10 +360,12 @@ def compared(
         if input_timestamps is None
         else np.asarray(input_timestamps, np.float64).reshape(-1)
     )
+    # the frames that are compared: every so many of those with ground truth
     matched = np.sort(
         associate(ground_truth.timestamps, stamps, protocol.max_dt, strict=protocol.strict)[1]
     )
     chosen = stamps[matched[:: protocol.every][: protocol.most_frames or None]]
+    # of these, the ones that were tracked
     index = associate(chosen, estimate.timestamps, STAMP_TOLERANCE, strict=False)[1]
     if not len(index):
         raise EvaluationError(
@@ -383,6 +400,7 @@ def apply_policy(
                 "pass input_timestamps, or use a protocol that excludes lost frames",
             )
         return estimate, None
+    # hold the last pose on lost frames, or leave them out
     tracked = tracked_frames(estimate, input_timestamps)
     n_input = len(tracked)
     n_tracked = int(tracked.sum())

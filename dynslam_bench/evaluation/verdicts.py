@@ -167,6 +167,7 @@ class PairedRatio(Record):
         spread: Standard deviation of the log ratio over these scenes; None for fewer than two.
         scenes: Scenes where both succeed.
         ties: How many of them have exactly the same error on both sides.
+        floored: In how many of them an error is below `FLOOR_M`, and counts as that.
         lost: Scenes that the candidate alone lost.
         much_worse: Scenes where both succeed and the candidate has more than `CATASTROPHE` times the error.
         lost_baseline: Scenes that the baseline alone lost.
@@ -190,6 +191,7 @@ class PairedRatio(Record):
     spread: float | None = None
     scenes: int = 0
     ties: int = 0
+    floored: int = 0
     lost: tuple[str, ...] = ()
     much_worse: tuple[str, ...] = ()
     lost_baseline: tuple[str, ...] = ()
@@ -273,6 +275,7 @@ def paired_ratio(
     one_sided: float = ONE_SIDED,
     runs: int | None = None,
     lost_runs: tuple[int, int] = (0, 0),
+    floored: Collection[str] = (),
     what: str = "ATE",
 ) -> PairedRatio:
     """Compare a candidate with a baseline over scenes.
@@ -285,6 +288,7 @@ def paired_ratio(
         one_sided: Level of a claim.
         runs: Paired runs behind the scenes; None for one a scene.
         lost_runs: How many of them candidate and baseline lost.
+        floored: Scenes with an error below `FLOOR_M`.
         what: What the ratio is one of.
     """
     by_candidate = set(lost) | {
@@ -307,6 +311,7 @@ def paired_ratio(
         "one_sided": one_sided,
         "runs": len(log_ratios) if runs is None else runs,
         "lost_runs": lost_runs,
+        "floored": len(paired.keys() & set(floored)),
         "what": what,
     }
     if not paired:
@@ -403,6 +408,10 @@ def findings(
         sentences.append(f"Differences above {_percent_up(excluded)} % are excluded")
     if comparison.ties:
         sentences.append(f"Both have exactly the same error in {_scenes(comparison.ties)}")
+    if comparison.floored:
+        floor = f"{1000 * FLOOR_M:g} mm"
+        in_scenes = _scenes(comparison.floored)
+        sentences.append(f"In {in_scenes} an error below {floor} counts as {floor}")
     return sentences + _loss_sentences(comparison, subject)
 
 
@@ -411,9 +420,9 @@ def _claim(comparison: PairedRatio, verdict: Verdict, subject: str) -> str:
     if comparison.ratio is None:
         if not comparison.all_scenes:
             return f"{subject} was compared on no scene"
-        return (
-            f"{subject} and the baseline both succeed on none of {_scenes(comparison.all_scenes)}"
-        )
+        more = " loses more scenes than the baseline:" if verdict is Verdict.WORSE else ""
+        of_all = f"both succeed on none of {_scenes(comparison.all_scenes)}"
+        return f"{subject}{more} {of_all}" if more else f"{subject} and the baseline {of_all}"
     numbers = f"{comparison} on {_scenes(comparison.scenes)}"
     percent = abs(100.0 * (1.0 - comparison.ratio))
     if verdict is Verdict.PROVEN:
@@ -684,7 +693,7 @@ def may_be_best(
 
     Rivals of one candidate are Bonferroni-corrected; candidates need not be, since the claim is about the
     best one alone (Mogstad and others 2024). The family is the sample. Two trackers are compared where both
-    succeed; who loses more sequences than the other beats it nowhere.
+    succeed; who loses more sequences than the other is not said to beat it.
 
     Args:
         logs: Log errors ``[T, S]``; nan where a tracker lost.

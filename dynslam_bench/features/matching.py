@@ -65,24 +65,26 @@ def _brute_force(
     """
     n = a.shape[0]
     m = b.shape[0]
-    best = np.full(n, -1, np.int64)
-    first = np.full(n, FAR, np.int64)
-    second = np.full(n, FAR, np.int64)
-    back = np.full(m, -1, np.int64)
-    back_distance = np.full(m, FAR, np.int64)
+    nearest = np.full(n, -1, np.int64)
+    distances = np.full(n, FAR, np.int64)
+    second_distances = np.full(n, FAR, np.int64)
+    nearest_in_a = np.full(m, -1, np.int64)
+    distances_in_a = np.full(m, FAR, np.int64)
     for i in range(n):
         for j in range(m):
             d = distance(a[i], b[j])
-            if d < first[i]:
-                second[i] = first[i]
-                first[i] = d
-                best[i] = j
-            elif d < second[i]:
-                second[i] = d
-            if d < back_distance[j]:
-                back_distance[j] = d
-                back[j] = i
-    return best, first, second, back
+            # nearest and second nearest of b; of equal ones the lower index
+            if d < distances[i]:
+                second_distances[i] = distances[i]
+                distances[i] = d
+                nearest[i] = j
+            elif d < second_distances[i]:
+                second_distances[i] = d
+            # nearest of a
+            if d < distances_in_a[j]:
+                distances_in_a[j] = d
+                nearest_in_a[j] = i
+    return nearest, distances, second_distances, nearest_in_a
 
 
 def match_brute_force(

@@ -341,6 +341,7 @@ def run_phase(
     high = np.empty(4, dtype=np.float32)
     trials = np.empty((max(population, candidates.shape[1]), 4), dtype=np.float32)
     for i in range(start, stop):
+        # the point's bounds, and its moths and flames so far
         lower = state.lower[i]
         upper = state.upper[i]
         moths = state.moths[i]

@@ -145,7 +145,7 @@ def opposites(
     """Elite opposition-based learning (Eq. 19-22).
 
     Args:
-        members: Of the population.
+        members: Positions ``[..., D]`` of one or several members of the population.
         least: Lower dynamic bounds of the population (dy of Eq. 20).
         greatest: Upper dynamic bounds (dz).
         low: Lower bounds; an opposite outside the bounds is replaced by a draw within them.

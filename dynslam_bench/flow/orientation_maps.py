@@ -426,6 +426,7 @@ def fine_levels(
     length = 32 * ((8 * columns + 31) // 32)
     pitch = length + SPILL
     sum_pitch = columns + 2 + SPILL
+    # rings of the last rows of each level, a line to blur, and four lines of sums of 2 x 2 pixels
     rings = np.zeros((levels + 1, RING * pitch), dtype=np.uint16)
     line = np.zeros(length + 32 * np.max(blurs[:, 1]) + SPILL, dtype=np.uint16)
     sums = np.zeros(4 * sum_pitch, dtype=np.uint16)
@@ -510,11 +511,13 @@ def coarse_levels(
     line = np.zeros(length + 32 * np.max(blurs[:, 1]) + SPILL, dtype=np.uint16)
     reach = level_reach(blurs)
     for row in range(max(start - reach[0], 0), stop + reach[0]):
+        # the source's row into its ring
         if row < rows:
             source = coarse[row]
             at = (row & (RING - 1)) * pitch
             for i in range(0, length, 32):
                 store_uint16(rings[0], at + i, load_uint16(source, i))
+        # the rows of all levels that it completes
         blur_cascade(
             rings,
             pitch,

@@ -212,6 +212,7 @@ def make_workspace(radius: int, margin: int) -> Workspace:
             mask[k] = np.float32(1)
             right[k] = np.float32(x - radius)
             down[k] = np.float32(y - radius)
+    # the rest is filled for every point: rows of pixels, patch, gradients, template and equations
     return Workspace(
         pitch,
         length,
@@ -648,6 +649,8 @@ def similarity_equations(
     at, weights = patch_shift(alignment.sampled_x, alignment.sampled_y, window.margin, space.pitch)
     mean_t = spread(template.mean)
     zero = spread(np.float32(0))
+    # sums over the window, sixteen samples at a time: of each derivative, and of products of two of
+    # {s, r, gx = x, gy = y, template t, patch w}
     sum_s = zero
     sum_r = zero
     sx = zero
@@ -662,6 +665,7 @@ def similarity_equations(
     ws = zero
     wr = zero
     for k in range(0, space.length, 16):
+        # patch, gradients and offsets of these samples, and from them the two derivatives
         w = shifted(space.patch, at + k, space.pitch, weights) - mean_t
         gx = load(space.gradient_x, k)
         gy = load(space.gradient_y, k)

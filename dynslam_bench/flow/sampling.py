@@ -165,6 +165,7 @@ def sample(
     def generate(context: Code, builder: Code, kind: Code, arguments: Code) -> Code:
         squares, *grid = arguments
 
+        # positions are in 65536ths of a pixel: the lower 16 bits are the part
         def part_of_pixel(position: Code) -> Code:
             part = builder.and_(position, constant(INTS, 65535))
             return builder.fmul(builder.sitofp(part, FLOATS), constant(FLOATS, 1 / 65536))

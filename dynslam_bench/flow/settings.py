@@ -121,16 +121,26 @@ class DaisySettings(FlowMethodSettings):
 
     @property
     def unused(self) -> Mapping[str, str]:
-        """The fields of the label search, where another flow runs."""
+        """Fields of the label search without effect, and why: another flow runs, or another search uses them."""
         reason = ""
         if self.plugin:
             reason = f"flow.plugin is {self.plugin!r}"
         elif self.method != "daisy":
             reason = f"flow.method is {self.method!r}"
-        if not reason:
-            return {}
-        own = type(self).model_fields.keys() - FlowMethodSettings.model_fields.keys()
-        return dict.fromkeys(own, reason)
+        if reason:
+            own = type(self).model_fields.keys() - FlowMethodSettings.model_fields.keys()
+            return dict.fromkeys(own, reason)
+
+        # of Eq. 8-17 moths, of Eq. 13 steps; labels pass between neighbours in some searches alone
+        kind, _, passing = self.search.partition("+")
+        fields = []
+        if kind not in ("emfoa", "emfoa-literal", "mfo"):
+            fields.append("population")
+        if kind not in ("emfoa", "emfoa-literal"):
+            fields.append("cauchy_step_px")
+        if not passing and kind != "patchmatch":
+            fields += ["sweeps", "neighbours"]
+        return dict.fromkeys(fields, f"flow.search is {self.search!r}")
 
 
 class FlowSettings(DaisySettings):

@@ -155,6 +155,12 @@ class _Program:
         """Make and measure a case's run of a round."""
         run_id = self.runner.run(spec_of_round(cases[case], gate, number))
         record = self.store.read_whole(run_id)
+        # a program's id names the checkout that it was built in: both sides get that of the question
+        asked = cases[case].tracker
+        prefix, colon, _ = asked.partition(":")
+        if colon and record.tracker.id.startswith(prefix + colon) and record.tracker.id != asked:
+            tracker = record.tracker.model_copy(update={"id": asked})
+            record = self.store.rewrite(record, tracker=tracker)
         self.side.add(measurement_of(case, number, record, self.store, gate.protocol))
 
 

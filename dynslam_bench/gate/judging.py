@@ -206,8 +206,9 @@ def _coverage(baseline: Side, candidate: Side, rounds: int, limit: float) -> Gua
     for case in candidate.by_case:
         pairs = zip(baseline.of(case, rounds), candidate.of(case, rounds), strict=True)
         for before, after in pairs:
-            is_known = before.coverage is not None and after.coverage is not None
-            if is_known and not (before.is_lost or after.is_lost):
+            if before.is_lost or after.is_lost:
+                continue
+            if before.coverage is not None and after.coverage is not None:
                 shares.append((before.coverage, after.coverage))
     if not shares:
         text = "coverage is not known"

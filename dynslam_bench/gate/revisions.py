@@ -170,8 +170,10 @@ class Runner:
     def __enter__(self) -> Runner:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        """End the process."""
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """End the process; after an error or an interrupt without waiting for its run."""
+        if kind is not None:
+            self._process.terminate()
         if self._process.stdin is not None:
             self._process.stdin.close()
         self._process.wait()

@@ -25,8 +25,8 @@ def file_name(case: str) -> str:
 def import_folder(folder: Path, cases: Cases, store: RunStore, gate: Gate) -> list[Measurement]:
     """Score the trajectory files of a folder.
 
-    ``FOLDER/CASE.txt`` is one run of a case, each file in ``FOLDER/CASE/`` is one, in order of their
-    names; `file_name` says how a case is called. Any format of `read_trajectory` is read.
+    A file with the name of a case and any ending is its one run. A folder of that name holds several,
+    in order of their names. `file_name` says how a case is called. Any format of `read_trajectory` is read.
 
     Args:
         folder: The folder.

@@ -150,7 +150,7 @@ def is_static(poses: Array) -> bool:
 
 
 def between(poses: Array, pairs: NDArray[np.intp]) -> Array:
-    """Motions ``[P, 4, 4]`` from one pose to the other of pairs ``[P, 2]`` of poses ``[N, 4, 4]``."""
+    """The second pose of each pair ``[P, 2]`` of poses ``[N, 4, 4]`` in the frame of the first one, ``[P, 4, 4]``."""
     return np.asarray(inverse(poses[pairs[:, 0]]) @ poses[pairs[:, 1]])
 
 

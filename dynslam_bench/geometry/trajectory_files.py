@@ -231,9 +231,11 @@ def _find_heading(path: Path) -> tuple[Heading | None, int]:
             return _joined([heading for heading in commented if heading.columns == len(parts)]), 0
         heading = parse_heading(text)
         if heading is None:
+            hint = f"a heading names the stamp, x y z of the position and x y z w of the quaternion, e.g. '{_COLUMNS}'"
+            if ";" in text:
+                hint = "separate the values by white space or commas, not by semicolons"
             raise TrajectoryError(
-                f"{path} line {number} is neither a pose nor a known heading: '{text[:100]}'",
-                f"a heading names the stamp, x y z of the position and x y z w of the quaternion, e.g. '{_COLUMNS}'",
+                f"{path} line {number} is neither a pose nor a known heading: '{text[:100]}'", hint
             )
         return _joined([*commented, heading]), number
     return None, 0
@@ -432,6 +434,8 @@ def _hint(parts: list[str]) -> str:
     """Which other format a line of another length is of; empty where that is not known."""
     if len(parts) == 12:
         return "12 values a line are KITTI's format: `eval` and `import` take its stamps with --timestamps FILE"
+    if len(parts) in (15, 16):  # the stamp may be a whole number
+        return "a comma separates values: write decimal points, 1.25 and not 1,25"
     if len(parts) == 17:
         return "17 values a line are EuRoC's ground truth: leave its heading in, which says that qw comes first"
     if len(parts) == 2 and is_number(parts[0]) and not is_number(parts[1]):

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from dynslam_bench.runs.frames import load_frames
     from dynslam_bench.runs.identity import ResolvedRun, resolve
     from dynslam_bench.runs.listing import list_runs, rescore
-    from dynslam_bench.runs.many import Plan, RunEvent, pictures_asked, run_many
+    from dynslam_bench.runs.many import Plan, RunEvent, requested_files, run_many
     from dynslam_bench.runs.record import FAILED, MetricRecord, RunRecord
     from dynslam_bench.runs.rows import part_words, run_row
     from dynslam_bench.runs.running import run_one
@@ -34,7 +34,7 @@ _DEFINED_IN = {
     "MetricRecord": "record",
     "open_store": "store",
     "part_words": "rows",
-    "pictures_asked": "many",
+    "requested_files": "many",
     "read_trajectory": "exchange.formats",
     "rescore": "listing",
     "resolve": "identity",
@@ -69,8 +69,8 @@ __all__ = [
     "merge",
     "open_store",
     "part_words",
-    "pictures_asked",
     "read_trajectory",
+    "requested_files",
     "rescore",
     "resolve",
     "run_many",

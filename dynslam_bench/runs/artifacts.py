@@ -108,16 +108,19 @@ class SnapshotWriter:
 
     def add(self, outcome: FrameOutcome, rgb: Image, result: TrackResult) -> None:
         """Keep the frame if it is one of those spread over the run, of the worst so far, or the first of a loss."""
+        # is it one of the frames spread over the run, or the first of a loss?
         error_m = None if outcome.error is None else outcome.error.frame_trans_m
         is_loss = outcome.state == "lost" and self._state == "ok"
         self._state = outcome.state
         self._losses += is_loss
         is_kept = outcome.index in self._spread or (is_loss and self._losses <= WORST)
+        # is its error among the largest so far?
         is_among_worst = error_m is not None and (
             len(self._worst) < WORST or error_m > self._worst[-1].error_m
         )
         if not is_kept and not is_among_worst:
             return
+        # what is drawn over it: features and mask
         shot = snapshot_of(outcome.index, result)
         self._size = (rgb.shape[0], rgb.shape[1])
         picture = annotated(rgb, result, _PICTURE_WIDTH)
@@ -125,12 +128,14 @@ class SnapshotWriter:
             if shot is not None:
                 self._even.append(shot)
             self._write_picture(outcome.index, picture)
+        # pictures of the worst wait for the end: a later frame may be worse
         elif error_m is not None:
             self._worst.append(_WorstFrame(error_m, shot, outcome.index, picture))
             self._worst = sorted(self._worst, key=lambda entry: -entry.error_m)[:WORST]
 
     def _write_picture(self, index: int, picture: Image) -> None:
         options = (cv2.IMWRITE_WEBP_QUALITY, _PICTURE_QUALITY)
+        # OpenCV takes blue first
         _, data = cv2.imencode(".webp", np.ascontiguousarray(picture[:, :, ::-1]), options)
         (self._folder / PICTURE.format(index)).write_bytes(data.tobytes())
 
@@ -138,10 +143,12 @@ class SnapshotWriter:
         """Write what was kept."""
         for frame in self._worst:
             self._write_picture(frame.number, frame.picture)
+        # all snapshots in the order of their frames
         worst = [frame.shot for frame in self._worst if frame.shot is not None]
         shots = sorted([*self._even, *worst], key=lambda shot: shot.index)
         if not shots:
             return
+        # one array each for all frames; frames without a mask get an empty one
         empty = np.zeros((self._size[0], _packed_width(self._size[1])), np.uint8)
         np.savez_compressed(
             self._folder / SNAPSHOTS_FILE,
@@ -159,6 +166,7 @@ def snapshot_of(index: int, result: TrackResult) -> Snapshot | None:
     """The snapshot of a frame that was tracked; None if its tracker shows neither features nor a mask."""
     if result.keypoints_xy is None and result.dynamic_mask is None:
         return None
+    # feature points [N, 2] in pixels; none for a tracker that shows a mask alone
     points: NDArray[Any] = np.zeros((0, 2))
     if result.keypoints_xy is not None:
         points = np.asarray(result.keypoints_xy).reshape(-1, 2)
@@ -225,6 +233,7 @@ def _unpacked(arrays: Mapping[str, NDArray[Any]], height: int, width: int) -> li
     kept = arrays["kept"]
     masks = arrays["masks"]
     masked = arrays["masked"]
+    # types, shapes and counts, since the file may come from elsewhere
     if not (
         masks.dtype == np.uint8
         and masks.shape[1:] == (height, _packed_width(width))
@@ -236,6 +245,7 @@ def _unpacked(arrays: Mapping[str, NDArray[Any]], height: int, width: int) -> li
         and kept.dtype == masked.dtype == np.bool_
     ):
         raise ValueError(f"its arrays do not fit each other and {width} x {height} pixels")
+    # the points of all frames lie one after the other: cut them frame by frame
     ends = np.cumsum(count)[:-1]
     features = zip(np.split(points, ends), np.split(kept, ends), strict=True)
     return [
@@ -263,6 +273,7 @@ def keep_map(
         DynslamError: A file cannot be written.
     """
     notes: list[str] = []
+    # the map to begin other runs with; a tracker may have none
     if spec.save_map:
         try:
             env.save_map(folder / MAP_FILE, _origin_of_map(env, spec))
@@ -271,8 +282,10 @@ def keep_map(
     outputs = env.map_outputs()
     if outputs is None:
         return None, dict.fromkeys(("keyframes", "map_points", "maps")), notes
+    # keyframes and points, for readers
     write_keyframes_csv(folder / "keyframes.csv", outputs, env.exact_stamps)
     write_ply(folder / "map.ply", outputs)
+    # maps that were never merged have numbers of their own
     numbers = np.array([keyframe.map for keyframe in outputs.keyframes])
     maps = len(np.unique(numbers))
     if maps > 1:
@@ -292,6 +305,7 @@ def _origin_of_map(env: SlamEnv, spec: RunSpec) -> str:
     """Which run made a map, in words."""
     start, stop = spec.frames_seen or (0, None)
     asked = spec.settings | {f"degrade.{kind}": strength for kind, strength in spec.degrade.items()}
+    # tracker and sequence, then what was asked for otherwise than by default
     words = [
         f"{env.tracker_spec.id} on {env.sequence.id}",
         f"frames {start}:{'' if stop is None else stop}",
@@ -344,6 +358,7 @@ class SheetWriter:
         shown = [frames_of_run[row] for row in spread(len(frames_of_run), SHOWN)]
         title = f"{self._env.tracker_spec.label}  |  {sequence.id}"
         keyframes = [sequence[index].rgb for index in shown]
+        # the ground truth, moved onto the track, as both are drawn
         truth, ate_m = aligned_truth(sequence.ground_truth, track)
         write_run_figure(
             self._path,
@@ -384,6 +399,7 @@ class VideoWriter:
         """
         image = self._env.render()
         assert image is not None
+        # the first picture decides the size
         if self._writer is None:
             size = (image.shape[1], image.shape[0])
             code = cv2.VideoWriter.fourcc(*"VP90")
@@ -408,6 +424,7 @@ def aligned_truth(
 
     Both are None without enough of it.
     """
+    # ground truth of the rows that have one; three positions fix a rigid motion
     truth_by_row = truths_at(truth, track.timestamps)
     if len(truth_by_row) < 3:
         return None, None
@@ -419,5 +436,6 @@ def aligned_truth(
     T_truth_track[:3, :3] = fit.rotation
     T_truth_track[:3, 3] = fit.translation
     moved = Trajectory(track.timestamps[rows], se3.inverse(T_truth_track) @ true_poses)
+    # what is left after the alignment
     squared_errors = np.square(moved.positions - track.positions[rows]).sum(axis=1)
     return moved, float(np.sqrt(squared_errors.mean()))

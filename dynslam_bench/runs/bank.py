@@ -65,8 +65,10 @@ class Bank(RunStore):
             InfrastructureError: It cannot be written.
             RunError: It was removed or changed while it was copied.
         """
+        # the sequence's stamps and ground truth, shared by its runs
         self.copy_part(other, record)
         with self.work_folder(record.run_id) as work:
+            # the run's own files, read while nobody changes them
             with self.copying(other, record):
                 for name in (ONLINE, FINAL):
                     file = other.folder(record.run_id) / name
@@ -179,6 +181,7 @@ def _import(manifest: Path, store: RunStore) -> Iterator[Unreadable]:
     with closing(TemporaryFolder()) as folder:
         for entry in read_manifest(manifest):
             try:
+                # the files, checked, then the import
                 file = _fetched(entry.file, entry.sha256, manifest.parent, folder.path)
                 truth = None
                 if entry.truth:
@@ -211,6 +214,7 @@ def _fetched(place: str, sha256: str, base: Path, folder: Path) -> Path:
     Raises:
         DynslamError: It cannot be read or downloaded, or has another checksum.
     """
+    # an address is downloaded, a path is read where it lies
     if _ADDRESS.fullmatch(place):
         target = folder / f"{digest(place)}.txt"
         download(place, target, sha256=sha256 or None)
@@ -229,6 +233,7 @@ def verify(bank: str | Path) -> list[str]:
         RunError: There is no bank.
     """
     store = Bank(bank)
+    # runs were being added: the list of checksums may lag behind
     if (store.root / UNFINISHED).exists():
         text = f"runs were being added when the process ended, or still are: {SUMS} may lack some of them"
         return [
@@ -289,6 +294,7 @@ def _faults_of_run(store: Bank, record: RunRecord, listed: Collection[str]) -> l
     # the second is the id of older runs
     if record.run_id not in (run_id_of(record.identity), digest(record.identity, 16)):
         faults.append("its id is not that of what it says of itself")
+    # what it says of itself must agree
     faults += [f"its {name} is not that of its identity" for name in _contradicted(record)]
     if f"sequences/{record.sequence.part}/{STAMPS}" not in listed:
         return [*faults, "the stamps of its sequence are missing"]
@@ -331,6 +337,7 @@ def pull(source: str, bank: str | Path) -> Merged:
         DynslamError: It cannot be fetched, or the bank not be written.
     """
     with ExitStack() as stack:
+        # a folder as it is, an archive downloaded, a repository cloned
         store = RunStore(source)
         if _ARCHIVE.fullmatch(source):
             temporary = stack.enter_context(closing(TemporaryFolder()))
@@ -362,6 +369,7 @@ def push(bank: str | Path, target: str) -> Merged:
     if not _is_repository(target):
         return _merge([RunStore(bank)], target)
     with _cloned(target) as clone:
+        # a repository that holds something else is no bank
         others = [
             path.name
             for path in clone.iterdir()
@@ -372,6 +380,7 @@ def push(bank: str | Path, target: str) -> Merged:
                 f"{target} is no bank: it has no {SUMS}, and holds {others[0]}",
                 "push to an empty repository",
             )
+        # add to the clone, then commit and push it
         merged = _merge([RunStore(bank)], clone)
         if merged.added:
             _git(clone, "add", "--force", "--", SUMS, *_CONTENT_FOLDERS)
@@ -389,11 +398,13 @@ def _merge(sources: Sequence[RunStore], bank: str | Path) -> Merged:
     unfinished = store.root / UNFINISHED
     with translate_errors(InfrastructureError, f"cannot write {store.root}", "name another folder"):
         store.root.mkdir(parents=True, exist_ok=True)
+    # one process at a time; the bank must be sound before
     with exclusive_lock(store.root / ".merging"):
         if unfinished.exists():
             _refuse(store.root, _faults(store, unfinished=True))
         elif (store.root / SUMS).exists() or store.files():
             _check(store.root)
+        # a mark that stands until the checksums are right again
         write_atomic(unfinished, "")
         try:
             return merge(sources, store, trials=False)
@@ -454,6 +465,7 @@ def _cloned(repository: str) -> Iterator[Path]:
     with closing(TemporaryFolder()) as folder:
         origin = repository if _ADDRESS.fullmatch(repository) else str(Path(repository).absolute())
         name = re.sub(r"[^\w.-]", "-", Path(origin).resolve().name) or "bank"
+        # messages name the repository, not the temporary folder
         clone = hide_folder_in_messages(folder.path) / name
         # checksums are of the bytes: git is not to change ends of lines
         options = ("--quiet", "--config", "core.autocrlf=false")

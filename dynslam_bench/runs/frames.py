@@ -111,6 +111,7 @@ class FrameRow:
         dynamic_share: float | None = None,
     ) -> FrameRow:
         """The row of a frame that an environment has tracked."""
+        # errors are missing without ground truth, the pose on a lost frame
         error = outcome.error
         pose = outcome.T_world_cam
         return cls(
@@ -131,6 +132,7 @@ class FrameRow:
 
     def cells(self) -> dict[str, Any]:
         """The row by the columns of ``frames.csv``: `FIXED`, the dynamic share, ``<stage>_s`` and ``stat_<name>``."""
+        # fixed columns first, then those that a tracker or a sequence adds
         share = {} if self.dynamic_share is None else {_DYNAMIC_SHARE: self.dynamic_share}
         times = {stage + _TIME_SUFFIX: value for stage, value in self.timings.items()}
         stats = {_STAT_PREFIX + name: value for name, value in self.stats.items()}
@@ -160,6 +162,7 @@ def write_csv(
         table = csv.DictWriter(file, columns)
         table.writeheader()
         for row in rows:
+            # a float does not hold the nanoseconds of a Unix time
             stamp = (exact or {}).get(row.timestamp) or ns_of(row.timestamp)
             table.writerow(row.cells() | {"timestamp": format_ns(stamp)})
 
@@ -186,12 +189,14 @@ def _parse(line: dict[str, str]) -> FrameRow:
     Raises:
         ValueError: It does not fit the heading, or a cell holds another kind of value.
     """
+    # csv gives None for a missing heading, or for a missing cell
     if None in line or None in line.values():
         raise ValueError("another number of cells than the heading has")
     cells = {name: text for name, text in line.items() if text}
     values: dict[str, Any] = {
         name: cells.pop(name) for name in (*FIXED, _DYNAMIC_SHARE) if name in cells
     }
+    # the other columns are told by their prefix or suffix
     stats = {}
     timings = {}
     for name, text in cells.items():
@@ -223,6 +228,7 @@ class FrameLog:
         rows: list[FrameRow] = []
         lines = read_lines(path, kind=RunError) if path.is_file() else iter(())
         try:
+            # rows must go forward in time
             for row in (_LINE.validate_json(line) for line in lines if line.endswith("\n")):
                 if rows and row.timestamp <= rows[-1].timestamp:
                     raise ValueError(f"stamp {row.timestamp!r} after {rows[-1].timestamp!r}")
@@ -237,6 +243,7 @@ class FrameLog:
 
     def trajectory(self) -> Trajectory:
         """The online trajectory."""
+        # poses [N, 7] as position and quaternion
         tracked = [(row.timestamp, row.pose) for row in self.rows if row.pose is not None]
         if not tracked:
             return Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
@@ -247,6 +254,7 @@ class FrameLog:
     def timings(self) -> dict[str, StageTime]:
         """Median, p95 and mean of every stage over the frames that reached the tracker."""
         timings = {}
+        # a stage that did not run on a frame counts as 0 there
         seconds = stage_seconds([row.timings for row in self.rows if row.timings])
         for stage, values in seconds.items():  # float64, one a frame
             timings[stage] = StageTime(
@@ -322,6 +330,7 @@ def load_frames(
     """
     import pandas as pd
 
+    # what is missing becomes `pd.NA` in nullable columns
     rows = read_csv(_file(run, results))
     columns = column_names(rows)
     frame = pd.DataFrame([row.cells() for row in rows], columns=columns, dtype=object)

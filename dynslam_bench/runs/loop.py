@@ -206,9 +206,9 @@ class _Recorder:
             outcome["finalize_s"] = time.perf_counter() - began
             write_tum(self._folder / FINAL, final)
         outputs, counts, notes = keep_map(env, self._folder, self._spec)
+        measured = env.measured
+        notes += measured.pop("notes", [])
         if not env.tracker_spec.online and final is not None:
-            measured = env.measured
-            notes += measured.pop("notes")
             outcome |= measured | self._coverage_of_batch(final)
 
         # the pictures that were asked for

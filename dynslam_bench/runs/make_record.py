@@ -11,7 +11,7 @@ from dynslam_bench.core.records import digest
 from dynslam_bench.core.settings import flatten
 from dynslam_bench.runs.frames import FrameLog
 from dynslam_bench.runs.identity import ResolvedRun
-from dynslam_bench.runs.process.supervisor import Verdict
+from dynslam_bench.runs.process.supervisor import ProcessEnd
 from dynslam_bench.runs.record import (
     LOST_COVERAGE,
     RunRecord,
@@ -83,7 +83,7 @@ class FrameCounts:
 
 def make_record(
     resolved: ResolvedRun,
-    verdict: Verdict,
+    end: ProcessEnd,
     frames: FrameLog,
     reads: Reads | None,
     started: str,
@@ -93,7 +93,7 @@ def make_record(
 
     Args:
         resolved: What was run.
-        verdict: How its process ended.
+        end: How its process ended.
         frames: Its frames, as far as it came.
         reads: What its plug-ins and programs read; None for a run without such, or where it is not
             known.
@@ -102,21 +102,23 @@ def make_record(
     """
     spec = resolved.spec
     tracker = resolved.tracker
-    last_message = verdict.final
+    last_message = end.final
 
     # a run with plug-ins gets its id now that it is known what they read
     identity = resolved.stated
     if reads is not None:
         identity = identity | {"reads": reads.model_dump(mode="json")}
 
+    # poses at every frame, or the whole trajectory at the end
     if tracker.online:
         counts = _counts_of_log(frames, len(resolved.sequence))
         timings = frames.timings()
     else:
         counts = _counts_of_batch(frames, last_message, len(resolved.sequence))
         timings = _timings_of_batch(last_message, counts.total)
-    status, reason = _judge(verdict, frames, counts, is_realtime=spec.realtime)
+    status, reason = _judge(end, frames, counts, is_realtime=spec.realtime)
 
+    # what was asked for, what was used, and what came of it
     settings = flatten(resolved.settings)
     return RunRecord(
         run_id=run_id_of(identity),
@@ -151,7 +153,7 @@ def make_record(
         timings=timings,
         started=started,
         wall_s=wall_s,
-        peak_memory_mb=last_message.get("program_memory_mb", verdict.peak_memory_mb) or None,
+        peak_memory_mb=last_message.get("program_memory_mb", end.peak_memory_mb) or None,
         peak_gpu_memory_mb=last_message.get("gpu_memory_mb"),
         machine=this_machine().model_copy(update={"gpu": last_message.get("gpu", "")}),
         versions=versions(),
@@ -192,6 +194,7 @@ def _counts_of_batch(frames: FrameLog, last_message: dict[str, Any], total: int)
 
 def _timings_of_batch(last_message: dict[str, Any], total: int) -> dict[str, StageTime]:
     """The time of a batch program, spread over all frames; empty where it is not known."""
+    # one time a frame: a program for whole sequences states no more
     frame_s = last_message.get("program_s", 0.0) / total
     if not frame_s:
         return {}
@@ -199,13 +202,15 @@ def _timings_of_batch(last_message: dict[str, Any], total: int) -> dict[str, Sta
 
 
 def _judge(
-    verdict: Verdict, frames: FrameLog, counts: FrameCounts, *, is_realtime: bool
+    end: ProcessEnd, frames: FrameLog, counts: FrameCounts, *, is_realtime: bool
 ) -> tuple[Status, str]:
     """Status of a run, with the reason: one that came to its end may have broken its contract or lost its way."""
-    if verdict.status != "ok":
-        return verdict.status, verdict.reason
+    # how the process ended comes first, then damaged results, then coverage
+    if end.status != "ok":
+        return end.status, end.reason
     if frames.damage:
         return "invalid", frames.damage
+    # dropped frames never reached the tracker
     due = counts.total - counts.dropped
     status, reason = judge_coverage(counts.tracked, due, counts.lost_at_end, counts.total)
     if status == "ok" and is_realtime and counts.dropped:
@@ -239,6 +244,7 @@ def _overrides(run: ResolvedRun, settings: dict[str, Any]) -> dict[str, Any]:
         run: The run.
         settings: All its settings by dotted name.
     """
+    # settings that were asked for at their defaults are none
     defaults = flatten(resolve_settings(run.tracker, {}))
     return {
         name: value

@@ -394,7 +394,7 @@ def _answer_of(ask: Callable[..., T], *arguments: object) -> T:
         ) from error
 
 
-def pictures_asked(spec: RunSpec) -> list[str]:
+def requested_files(spec: RunSpec) -> list[str]:
     """The files beside a run that it was asked for."""
     asked = {
         PICTURE.format(0): spec.snapshots,
@@ -409,7 +409,7 @@ def pictures_asked(spec: RunSpec) -> list[str]:
 def _lacks_pictures(store: RunStore, run: ResolvedRun, stored: RunRecord) -> bool:
     """Whether a stored run has to be made again for a video, a sheet, a recording or a map that is asked for now."""
     folder = store.folder(stored.run_id)
-    wanted = pictures_asked(run.spec)
+    wanted = requested_files(run.spec)
     # a note says why the run could not give a file
     excused = {name for name in wanted for note in stored.notes if note.startswith(f"no {name}")}
     # what ends early has no map to draw, and what saw no frame nothing at all

@@ -83,6 +83,7 @@ def parts_of_run(
         sequence: The opened sequence.
         changes_frames: Whether frames are degraded or dropped.
     """
+    # the tracker with its filters, features, flow and masks, and the reader of the sequence
     parts = {*entry_points_of(tracker, settings, source), reader_of(sequence)}
     if changes_frames:
         parts.add(f"{PACKAGE}.{DEGRADED_FRAMES}")
@@ -100,12 +101,15 @@ def modules_by_part(graph: ModuleGraph, parts: Collection[str]) -> dict[str, lis
         The modules of each part, sorted; those of `ALWAYS_USED`, and those of `PLUGINS` where a
         part is foreign.
     """
+    # what decides no result, and what only looks up the others
     never = [PACKAGE, *PLUMBING, *(f"{PACKAGE}.{name}" for name in FINDERS)]
+    # each part brings what it imports
     environment = [f"{PACKAGE}.{name}" for name in ENVIRONMENT]
     beside_the_loop = [f"{PACKAGE}.{name}" for name in BESIDE_THE_LOOP]
     modules = {ALWAYS_USED: graph.closure(environment, [*never, *beside_the_loop])}
     for part in parts:
         modules[part] = graph.closure([module_of(part)], never)
+    # what a plug-in imports is known only while it runs: all that it may
     if any(map(is_foreign, parts)):
         modules[PLUGINS] = sorted(modules_for_plugins(graph))
     return modules
@@ -140,10 +144,12 @@ def plugins_of_run(tracker: str, settings: Settings, source: str, sequence: str)
         source: Where its masks come from.
         sequence: As it was asked for.
     """
+    # every name that a registry is asked for, with its registry
     names: list[tuple[Registry[Any], str]] = [
         (TRACKERS, tracker),
         (DATASETS, sequence.partition("/")[0]),
     ]
+    # extractor and flow are named by settings
     for group in groups_of(settings):
         if isinstance(group, FeatureSettings):
             names.append((FEATURES, group.extractor))
@@ -161,6 +167,7 @@ def module_of(part: str) -> str:
 
 def entry_points_of(tracker: TrackerSpec, settings: Settings, source: str) -> Iterator[str]:
     """The entry points of all that a tracker is made of."""
+    # the tracker itself, then its parts
     yield tracker.entry_point
     if isinstance(settings, UnfilteredSystemSettings):
         yield from parts_of(settings)
@@ -197,12 +204,14 @@ def anchors_of(tracker: TrackerSpec, parts: Iterable[str]) -> Anchors:
         tracker: The tracker.
         parts: See `parts_of_run`.
     """
+    # files of plug-ins: the tracker's, else those of the parts
     if is_file(tracker.entry_point):
         files = [Path(module_of(tracker.entry_point)).absolute()]
     else:
         files = [Path(module_of(part)).absolute() for part in parts if is_file(part)]
     if not files:
         return Anchors(plugin=None, work=Path.cwd())
+    # one folder stands for all, and the same one on every machine
     first = min(files, key=lambda file: (file.name, file))
     return Anchors(plugin=first.parent, work=Path.cwd())
 

@@ -56,6 +56,7 @@ def asked_digest(identity: Mapping[str, Any]) -> str:
 
 def run_id_of(identity: Mapping[str, Any]) -> str:
     """The id of a run: twelve digits of what was asked for, eight of what was read for it."""
+    # all that was not asked for was read
     read = {name: value for name, value in identity.items() if name not in ASKED}
     return asked_digest(identity) + digest(read, 8)
 
@@ -67,6 +68,7 @@ def coverage_text(coverage: float | None) -> str:
 
 def program_of(identity: Mapping[str, Any]) -> dict[str, str]:
     """Code, weights and library versions in a run's identity, by name, as short texts."""
+    # a program is told by its code, its libraries and the weights of its networks
     code = digest([identity.get(name) for name in _CODE_ENTRIES], 8)
     libraries = {name: str(value) for name, value in identity.get("libraries", {}).items()}
     weights = {
@@ -333,9 +335,11 @@ class RunRecord(Record):
 
         Values are those that the run had, however they were spelled: ``"1"`` and ``1.0`` are one.
         """
+        # the values that the run had
         asked = {name: self.settings.get(name, value) for name, value in self.overrides.items()}
         if self.start_map is None:
             return asked
+        # a map counts by its content, wherever its file lies
         others = {
             name: value for name, value in asked.items() if not name.startswith("backend.map.")
         }

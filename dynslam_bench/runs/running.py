@@ -23,8 +23,8 @@ from dynslam_bench.runs.process.jobs import LOG_FILE, READS_FILE, make_job
 from dynslam_bench.runs.process.supervisor import (
     LONGEST_LOG,
     LONGEST_YET,
+    ProcessEnd,
     ServerDiedError,
-    Verdict,
     bound_log,
     supervise,
 )
@@ -97,19 +97,19 @@ def run_one(
         job = _job(resolved, work, get_protocol(protocol), progress_every)
         tick = partial(bound_log, work / LOG_FILE, LONGEST_YET)
 
-        def watch(child: Child) -> Verdict:
+        def watch(child: Child) -> ProcessEnd:
             limits = resolved.spec.limits
             return supervise(child, job, limits, report, cancelled, tick=tick, at_a_time=at_a_time)
 
-        verdict = _watched(work, watch)
-        _check_has_outcome(resolved, verdict, work)
+        end = _watched(work, watch)
+        _check_has_outcome(resolved, end, work)
 
         # its frames become the files of a stored run
         frames = _write_frames(resolved, work)
         check_unchanged(resolved, begun=True)
         reads = read_reads(work) if resolved.foreign else None
         wall_s = time.perf_counter() - clock
-        record = make_record(resolved, verdict, frames, reads, started, wall_s).normalised()
+        record = make_record(resolved, end, frames, reads, started, wall_s).normalised()
         if record.status != "stopped":
             store.add_sequence(
                 record.sequence.part,
@@ -136,7 +136,7 @@ def _job(run: ResolvedRun, work: Path, protocol: Protocol, progress_every: int) 
     return job
 
 
-def _check_has_outcome(run: ResolvedRun, verdict: Verdict, work: Path) -> None:
+def _check_has_outcome(run: ResolvedRun, end: ProcessEnd, work: Path) -> None:
     """Check that a run is there and says something about its tracker.
 
     Raises:
@@ -148,9 +148,9 @@ def _check_has_outcome(run: ResolvedRun, verdict: Verdict, work: Path) -> None:
             f"{work} was removed while the run was made",
             "leave the results folder alone; nothing is stored, the same command goes on from there",
         )
-    if verdict.refused:
+    if end.refused:
         raise RunError(
-            f"{run.tracker.id} cannot run on {run.sequence.id}: {verdict.reason}",
+            f"{run.tracker.id} cannot run on {run.sequence.id}: {end.reason}",
             "nothing is stored",
         )
 
@@ -191,15 +191,15 @@ def read_reads(work: Path) -> Reads | None:
     return reads
 
 
-def _watched(work: Path, watch: Callable[[Child], Verdict]) -> Verdict:
-    """The verdict on a run; when its fork server dies, the run is repeated with a fork server of its own.
+def _watched(work: Path, watch: Callable[[Child], ProcessEnd]) -> ProcessEnd:
+    """How a run ended; when its fork server dies, the run is repeated with a fork server of its own.
 
     No other run is there then. If that server dies, too, it is this run that has killed it: the run
     has crashed.
 
     Args:
         work: Its work folder, which is emptied before each try.
-        watch: Has a child make the run, and gives the verdict.
+        watch: Has a child make the run, and says how it ended.
 
     Raises:
         InfrastructureError: See `supervise`.
@@ -215,7 +215,7 @@ def _watched(work: Path, watch: Callable[[Child], Verdict]) -> Verdict:
             if not error.where:
                 raise
             reason = f"the fork server was killed twice, the second time with this run alone{error.where}"
-            return Verdict("crashed", reason)
+            return ProcessEnd("crashed", reason)
 
 
 def _empty(work: Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from dynslam_bench.core import InfrastructureError, TemporaryFolder
-from dynslam_bench.core.errors import hide_folder_in_messages
+from dynslam_bench.core.errors import hidden_folders, hide_folder_in_messages
 from dynslam_bench.evaluation import Protocol
 from dynslam_bench.runs.process.fork_server import Child
 from dynslam_bench.runs.process.jobs import make_job
@@ -38,6 +38,7 @@ def score_apart(
             spec={"threads": 1},
             store=str(store.root),
             source=str(store.source),
+            hidden=[str(hidden) for hidden in hidden_folders()],
             run_id=run_id,
             protocol=protocol.model_dump(mode="json"),
             again=again,
@@ -56,9 +57,8 @@ def score_job(
     """In the child: score a run of a store, which keeps the metrics."""
     store = RunStore(job["store"])
     store.source = Path(job["source"])  # what messages call it
-    for folder in store.root.parents:
-        if folder.name == store.source.name:  # an archive, unpacked into a folder of its name
-            hide_folder_in_messages(folder.parent)
+    for folder in job["hidden"]:  # an archive or a bank may be unpacked there
+        hide_folder_in_messages(Path(folder))
     record = store.read_whole(job["run_id"])
     metrics = store.score(record, Protocol.model_validate(job["protocol"]), again=job["again"])
     return {"type": "done", "metrics": metrics.to_line()}

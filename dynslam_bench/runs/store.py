@@ -58,30 +58,11 @@ from dynslam_bench.runs.layout import (
     read_errors,
 )
 from dynslam_bench.runs.record import MetricRecord, RunRecord, run_id_of
-from dynslam_bench.runs.rows import part_words, runs_frame
+from dynslam_bench.runs.rows import runs_frame
 from dynslam_bench.runs.sequence_parts import SequenceParts
 
 if TYPE_CHECKING:
     import pandas as pd
-
-# with the names that reports and the command line take from here
-__all__ = [
-    "DEFAULT_PROTOCOL",
-    "FINAL",
-    "ONLINE",
-    "Merged",
-    "Records",
-    "RunStore",
-    "Which",
-    "evaluation_code",
-    "file_stamp",
-    "metrics_name",
-    "open_store",
-    "part_words",
-    "runs_frame",
-    "score",
-    "warn_of_unreadable",
-]
 
 LOGGER = logging.getLogger(__name__)
 DEFAULT_PROTOCOL = "tum-rgbd/v1"

@@ -172,6 +172,7 @@ def _checked_truth(host: Sequence, target: Path) -> Trajectory:
         raise SequenceError(
             f"'{host.id}' has people already", "compose the recording that was its host"
         )
+    # every frame needs a pose, by which people are placed in its world
     begin = truth.timestamps[0] - _GAP_S
     end = truth.timestamps[-1] + _GAP_S
     outside = int(np.count_nonzero((host.timestamps < begin) | (host.timestamps > end)))

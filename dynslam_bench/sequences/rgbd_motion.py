@@ -139,6 +139,7 @@ def measure_pair(
         pose = se3.inverse(T_second_first)
         if not np.isfinite(pose).all():
             pose = None
+    # how far the corners moved, and how much of the image has a depth
     displacements = np.linalg.norm(pixels_second - pixels_first, axis=1)
     return RgbdPair(
         first=first.index,
@@ -411,10 +412,13 @@ def weighted_mean(rotation: float, translation: float, weights: tuple[float, flo
 
 def match(motions: Motions, truth: TruthMotion, reading: str, shift_s: float) -> Match:
     """Compare the motions with those of a truth under a shift in time."""
+    # the truth's motions between the shifted stamps, where it has poses
     _, relative, turns, valid = truth.between(motions.start + shift_s, motions.end + shift_s)
     share = float(valid.mean()) if len(valid) else 0.0
     if valid.sum() < _FEWEST_MOTIONS:
         return Match(reading, shift_s, share)
+
+    # agreement of rotations and of translations, weighted by how far they are above the noise
     rotation = motions.rotation[valid]
     translation = motions.translation[valid]
     true_rotation = turns[valid]

@@ -354,6 +354,7 @@ def _disagreement_findings(search: _Search, tried: int) -> list[Finding]:
             )
             if valid.mean() < 0.5:
                 continue
+            # the axes in which the rotations agree best, and how well they do
             measured = motions.rotation[valid]
             true = turns[valid]
             X = rotation_between(measured, true)
@@ -365,6 +366,7 @@ def _disagreement_findings(search: _Search, tried: int) -> list[Finding]:
     if best_alike >= GOOD:
         return [_axes_finding(best_axes, best_alike, stated)]
 
+    # a truth of another recording agrees in no axes; else too little is seen to tell
     count = len(motions.start)
     enough = stated.weights[0] >= 0.5 and count >= LEAST_UNLIKE and count >= 0.5 * tried
     if enough and closest < UNRELATED:

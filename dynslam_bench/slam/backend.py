@@ -147,26 +147,33 @@ class RgbdBackend:
             SettingsError: The map cannot be read, or was made with another camera, other features
                 or another sensor.
         """
+        # the map, empty or loaded, and what builds it
         s = self.settings
         self.camera = camera.undistorted()
         self.seed = int(seed)
         self.atlas = open_atlas(s.map.file, self.camera, self._features, depth=self.uses_depth)
         self.map = self.atlas.map
         self.mapper = LocalMapper(self.map, s)
+        self._keyframe_policy = KeyframePolicy(s.keyframes, self.mapper.close_m)
+
+        # the camera's motion
         self.history: list[FramePose] = []
         self.motion = CameraMotion(s.motion)
         self.shutter = RollingShutter(self.camera, self.motion.intervals)
+
+        # loops and relocalisation
         self.loops = LoopCloser(
             self.atlas, self.mapper, s, self.seed, scale_is_known=self.uses_depth
         )
-        self._status = CameraStatus.INITIALISING
-        self._mapping_enabled = not s.map.localisation_only
         self._gate = RelocalisationGate(
             self.atlas, s.relocalisation.max_speed, anywhere=bool(s.map.file)
         )
-        self._keyframe_policy = KeyframePolicy(s.keyframes, self.mapper.close_m)
         self._local_map = LocalMap(self.map, connected_only=s.loop_closing.enabled)
         self._map_views = MapViews(self.map, DEPTH_IMAGES if self.uses_depth else 0)
+
+        # the state of tracking
+        self._status = CameraStatus.INITIALISING
+        self._mapping_enabled = not s.map.localisation_only
         self._unrecognised_frames = 0
         self._reference_keyframe = -1
         self._last_frame: TrackedFrame | None = None

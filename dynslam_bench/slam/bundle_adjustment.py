@@ -225,6 +225,7 @@ def _invert_symmetric(h: Array, out: Array) -> None:
     c00 = h11 * h22 - h21 * h21
     c10 = h20 * h21 - h10 * h22
     c20 = h10 * h21 - h20 * h11
+    # expansion along the first column
     determinant = h00 * c00 + h10 * c10 + h20 * c20
     if determinant > MIN_DETERMINANT:
         t = 1.0 / determinant
@@ -454,6 +455,7 @@ def _adjust(
     damping = DAMPING
     trial = np.empty_like(chi2)
     for _ in range(iterations):
+        # try a step
         new_poses = poses.copy()
         new_points = points.copy()
         solved = _step(

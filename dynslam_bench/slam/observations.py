@@ -80,17 +80,24 @@ def observe(
         camera: Intrinsics.
         scales: Scale of each octave.
     """
+    # features that the filters kept, with a finite pixel
     weight = np.clip(np.nan_to_num(np.asarray(weight, np.float64), nan=0.0), 0.0, 1.0)
     index = np.flatnonzero(
         np.asarray(keep, bool) & np.isfinite(frame.xy).all(axis=1) & (weight > 0)
     )
+
+    # their pixels and depths, 0 beyond `MAX_DEPTH_M`
     xy = np.ascontiguousarray(frame.xy[index], dtype=np.float64)
     z = frame.z[index].astype(np.float64)
     z = np.where((z > 0) & (z < MAX_DEPTH_M), z, 0.0)
+
+    # variances of pixel and right coordinate grow with the octave's scale
     keypoints = frame.keypoints.select(index)
     octave = np.clip(keypoints.octave.astype(np.int64), 0, len(scales) - 1)
     variance = scales[octave] ** 2
     noise = RIGHT_SIGMA_PX**2 * variance + (camera.fx * camera.baseline_m * DEPTH_NOISE) ** 2
+
+    # where their colour is read
     height, width = frame.rgb.shape[:2]
     column, row = np.rint(keypoints.xy).astype(np.int64).T
     return Observations(

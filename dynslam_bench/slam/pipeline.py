@@ -293,9 +293,9 @@ class SlamPipeline:
 
         Returns:
             The filters' common verdict. Its stats are every filter's, each name with the filter's
-            before it, and how many of the last filters the guard set aside because too few
-            keypoints would be left. Beside it this frame's image as the flow prepared it, None if
-            no flow ran.
+            before it, how many of the last filters the guard set aside because too few keypoints
+            would be left, and how many masked keypoints it gave back. Beside it this frame's image
+            as the flow prepared it, None if no flow ran.
         """
         # each filter judges what the ones before have left
         image = None
@@ -312,35 +312,45 @@ class SlamPipeline:
                 stats[f"{dynamic_filter.name}_{key}"] = value
 
         # the starvation guard sets the last filters aside while too few keypoints would be left
-        needed = self._guard.needed(len(frame.xy))
-        keep, undone = combine_verdicts(
-            [verdict.keep for verdict in verdicts], len(frame.xy), needed
-        )
-
-        # of a mask that leaves too few it gives back the fewest keypoints, the least masked ones first;
-        # a map is never begun with them
-        returned = np.zeros(len(keep), bool)
-        mask = frame.mask
-        if mask is None and verdicts:
-            mask = verdicts[0].mask
-        if undone == len(verdicts) > 0 and mask is not None:
-            undone = len(verdicts) - 1
-            keep = verdicts[0].keep
-            if self._backend.state == "ok":
-                returned = least_masked(keep, mask, frame.keypoints.xy, needed)
+        keep, undone, returned = self._guarded(frame, verdicts)
         stats["guard_undone"] = float(undone)
         stats["guard_returned"] = float(np.count_nonzero(returned))
 
-        # weights multiply and masks join, of the filters that count
+        # weights multiply and masks join, of the filters that count; what is given back counts in full
         counted = verdicts[: len(verdicts) - undone]
         weight = np.ones(len(frame.xy), np.float32)
         for verdict in counted:
             weight *= verdict.weight
-        keep = keep | returned
         weight[returned] = 1
         masks = [verdict.mask for verdict in counted if verdict.mask is not None]
         mask = np.logical_or.reduce(masks) if masks else None
         return FilterResult(keep, weight, stats, mask), image
+
+    def _guarded(
+        self, frame: FrameBundle, verdicts: Sequence[FilterResult]
+    ) -> tuple[NDArray[np.bool_], int, NDArray[np.bool_]]:
+        """The starvation guard: which keypoints are used, ``[N]``.
+
+        Beside them how many of the last verdicts it sets aside, and which masked keypoints ``[N]``
+        it gives back.
+        """
+        total = len(frame.xy)
+        needed = self._guard.needed(total)
+        keep, undone = combine_verdicts([verdict.keep for verdict in verdicts], total, needed)
+        returned = np.zeros(total, bool)
+
+        # the first verdict leaves enough, or there is no mask that tells which keypoints are the least doubtful
+        if undone < len(verdicts) or not verdicts:
+            return keep, undone, returned
+        first = verdicts[0]
+        mask = first.mask if frame.mask is None else frame.mask
+        if mask is None:
+            return keep, undone, returned
+
+        # masked keypoints are given back to a camera that is tracked; no map begins with them
+        if self._backend.state == "ok":
+            returned = least_masked(first.keep, mask, frame.keypoints.xy, needed)
+        return first.keep | returned, len(verdicts) - 1, returned
 
     def _run_flow(self, frame: FrameBundle, state: FilterState, clock: StageClock) -> Any:
         """Compute the flow to the previous image and the pose that it predicts.

@@ -173,21 +173,56 @@ def _linearise(
         else:
             cost += chi2
 
-        # rows of the Jacobian by (translation, rotation): of u, of v, and of the right coordinate
-        a = camera.fx * iz
-        b = camera.fy * iz
-        c = camera.bf * iz * iz
-        j2 = -a * x * iz
-        j3 = -camera.fx * x * y * iz * iz
-        j4 = camera.fx * (1.0 + x * x * iz * iz)
-        j5 = -a * y
-        add_normal_equation(h, g, w * info, a, 0.0, j2, j3, j4, j5, du)
+        # derivatives of u and v along and about the camera's axes (translation, rotation)
+        du_along_x = camera.fx * iz
+        du_along_z = -du_along_x * x * iz
+        du_about_x = -camera.fx * x * y * iz * iz
+        du_about_y = camera.fx * (1.0 + x * x * iz * iz)
+        du_about_z = -du_along_x * y
+        dv_along_y = camera.fy * iz
+        dv_along_z = -dv_along_y * y * iz
         dv_about_x = -camera.fy * (1.0 + y * y * iz * iz)
         dv_about_y = camera.fy * x * y * iz * iz
-        add_normal_equation(h, g, w * info, 0.0, b, -b * y * iz, dv_about_x, dv_about_y, b * x, dv)
+        dv_about_z = dv_along_y * x
+
+        # a row of the Jacobian each: of u, of v, and of the right coordinate, u less the disparity
+        add_normal_equation(
+            h,
+            g,
+            w * info,
+            du_along_x,
+            0.0,
+            du_along_z,
+            du_about_x,
+            du_about_y,
+            du_about_z,
+            du,
+        )
+        add_normal_equation(
+            h,
+            g,
+            w * info,
+            0.0,
+            dv_along_y,
+            dv_along_z,
+            dv_about_x,
+            dv_about_y,
+            dv_about_z,
+            dv,
+        )
         if depth:
+            by_depth = camera.bf * iz * iz
             add_normal_equation(
-                h, g, w * info_right, a, 0.0, j2 + c, j3 + c * y, j4 - c * x, j5, dr
+                h,
+                g,
+                w * info_right,
+                du_along_x,
+                0.0,
+                du_along_z + by_depth,
+                du_about_x + by_depth * y,
+                du_about_y - by_depth * x,
+                du_about_z,
+                dr,
             )
     return cost
 
@@ -270,16 +305,16 @@ def _optimise(
             candidate = apply_twist(pose, step)
 
             # take it if the cost does not grow, else damp more
-            h2 = np.zeros((6, 6))
-            g2 = np.zeros(6)
-            new = _linearise(candidate, points, measured, inlier, width, camera, h2, g2)
-            if new <= cost:
-                gain = cost - new
+            new_h = np.zeros((6, 6))
+            new_g = np.zeros(6)
+            new_cost = _linearise(candidate, points, measured, inlier, width, camera, new_h, new_g)
+            if new_cost <= cost:
+                gain = cost - new_cost
                 damping = max(damping * 0.1, LEAST_DAMPING)
                 pose = candidate
-                cost = new
-                h = h2
-                g = g2
+                cost = new_cost
+                h = new_h
+                g = new_g
                 if gain < CONVERGED_GAIN * (cost + 1e-12):
                     break
             else:
@@ -333,7 +368,7 @@ def optimise_pose(
         rounds,
         iterations,
     )
+    # errors in standard deviations are pixels of octave 0; the kernel fills the lower triangle only
     residual_px = float(np.median(error[inliers])) if inliers.any() else np.nan
-    # the kernel fills the lower triangle only
     information = np.tril(h) + np.tril(h, -1).T
     return PoseEstimate(pose, inliers, int(np.count_nonzero(inliers)), residual_px, information)

@@ -105,6 +105,7 @@ def check_keypoints(
         isinstance(keypoints, Keypoints),
         f"extract() gave a {type(keypoints).__name__}, not Keypoints",
     )
+    # types and shapes first: all that follows relies on them
     xy = keypoints.xy
     angle = keypoints.angle
     descriptors = keypoints.descriptors
@@ -150,6 +151,7 @@ def _extractor_determinism(
 ) -> None:
     """An image gives the same keypoints from a fresh extractor and from one that has seen another image."""
     first = construct()
+    # one extractor has seen another image before
     first.extract(other)  # an earlier image has no influence
     cause = "unseeded randomness, or state that outlives an image"
     again = construct().extract(image)
@@ -168,8 +170,10 @@ def _masked_extraction(extractor: FeatureExtractor, image: Image) -> None:
         raise NotApplicable(
             "it has no extract_masked(): features on people take the place of others"
         )
+    # the left three quarters are masked
     mask = np.zeros(image.shape, bool)
     mask[:, : image.shape[1] * 3 // 4] = True
+    # keypoints that lie beside the mask, with and without asking for them
     masked = extractor.extract_masked(image, mask, 1.0)
     plain = extractor.extract(image)
     check_keypoints(masked, image.shape)
@@ -199,6 +203,7 @@ def flow_report(construct: Callable[[], FlowEstimator], *, points: int = 200) ->
     scene = CornerSequence(2)
     first = grey(scene[0])
     second = grey(scene[1])
+    # points with a guess, and without one
     grid = _grid(first.shape, points)
     guess = _grid(first.shape, points)
     guess[::2] = np.nan  # every other point has no guess
@@ -224,6 +229,7 @@ def flow_report(construct: Callable[[], FlowEstimator], *, points: int = 200) ->
         )
 
     def outside() -> None:
+        # beside the image, far from it, and at no place
         strange = np.array([[-5, 5], [1e6, 5], [np.nan, 5]], np.float32)
         valid = results(second, np.concatenate([grid, strange])).valid
         require(not valid[-3:].any(), "a point outside the reference image is valid in the target")
@@ -297,6 +303,7 @@ def _flow_determinism(
     construct: Callable[[], FlowEstimator], first: Image, second: Image, points: NDArray[np.float32]
 ) -> None:
     """Two flows with one seed give the same; rows that are not valid may differ."""
+    # only valid rows are compared: the others mean nothing
     flows = construct(), construct()
     a, b = (flow.track(flow.prepare(first), flow.prepare(second), points, seed=7) for flow in flows)
     same_valid = np.array_equal(a.valid, b.valid)
@@ -311,14 +318,17 @@ def _flow_finds_shift(
     results: Callable[..., FlowResult], image: Image, points: NDArray[np.float32]
 ) -> None:
     """A flow from an image to the shifted image is that shift, for the median of its valid points."""
+    # the image, moved by a known shift
     matrix = np.array([[1, 0, SHIFT_PX[0]], [0, 1, SHIFT_PX[1]]], np.float64)
     target = cv2.warpAffine(image, matrix, image.shape[::-1], borderMode=cv2.BORDER_REFLECT)
     result = results(np.asarray(target, np.uint8), points)
+    # most of the points are found
     share = float(result.valid.mean())
     require(
         share > 0.2,
         f"only {100 * share:.0f} % of the points are found after a shift of {SHIFT_PX} pixels",
     )
+    # and end where the shift has moved them
     errors = np.linalg.norm(result.xy - points - np.array(SHIFT_PX, np.float32), axis=1)
     error = float(np.median(errors[result.valid]))
     require(
@@ -383,6 +393,7 @@ def check_instances(instances: Instances, frame: Frame) -> None:
         f"frame {frame.index}: segment() gave a {type(instances).__name__}, not Instances",
         "a frame without objects is Instances.empty(height, width)",
     )
+    # masks, boxes and scores, one each an object
     where = f"frame {frame.index}: "
     boxes = instances.boxes
     scores = instances.scores

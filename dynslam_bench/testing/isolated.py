@@ -14,7 +14,7 @@ from typing import Any
 from dynslam_bench.core import DynslamError, TemporaryFolder, errors
 from dynslam_bench.runs.process.child import LOG_FILE
 from dynslam_bench.runs.process.fork_server import Child, make_job
-from dynslam_bench.runs.process.supervisor import LONGEST_YET, Verdict, bound_log, supervise
+from dynslam_bench.runs.process.supervisor import LONGEST_YET, ProcessEnd, bound_log, supervise
 from dynslam_bench.runs.spec import Limits
 from dynslam_bench.testing.report import Check, ConformanceReport
 
@@ -100,26 +100,26 @@ def isolated_tracker_report(
                 known=[asdict(check) for check in checks],
                 **job_options,
             )
-            verdict = supervise(Child(), job, limits, receive, tick=tick, located=False)
-        if verdict.status != "ok":
-            add(_failure(verdict, running, checks))
+            end = supervise(Child(), job, limits, receive, tick=tick, located=False)
+        if end.status != "ok":
+            add(_failure(end, running, checks))
         # between two checks, another child would fail alike
-        if verdict.status == "ok" or not running:
-            return ConformanceReport(verdict.final.get("subject", f"tracker {tracker!r}"), checks)
+        if end.status == "ok" or not running:
+            return ConformanceReport(end.final.get("subject", f"tracker {tracker!r}"), checks)
 
 
-def _failure(verdict: Verdict, running: str, checks: list[Check]) -> Check:
+def _failure(end: ProcessEnd, running: str, checks: list[Check]) -> Check:
     """The outcome of the check at which a child ended.
 
     Raises:
         DynslamError: There is no such tracker, or the settings do not fit.
     """
-    kind = verdict.final.get("error", "")
+    kind = end.final.get("error", "")
     if kind and not running:
-        raise getattr(errors, kind, DynslamError)(verdict.reason)
+        raise getattr(errors, kind, DynslamError)(end.reason)
     name = running or (f"after {checks[-1].name}" if checks else "loading")
-    cause = "" if kind else _CAUSES.get(verdict.status, "")
-    message = f"{verdict.reason} (likely cause: {cause})" if cause else verdict.reason
+    cause = "" if kind else _CAUSES.get(end.status, "")
+    message = f"{end.reason} (likely cause: {cause})" if cause else end.reason
     return Check(name, "failed", message)
 
 

@@ -96,11 +96,13 @@ def tracker_report(
         spec = TRACKERS.get(subject)
     elif isinstance(subject, TrackerSpec):
         spec = subject
+    # the report names the tracker before anything can fail
     report.subject = ConformanceReport.of("tracker", subject).subject
     if spec is not None:
         report.subject = f"tracker {spec.id!r}"
         report.run("spec", lambda: _spec(spec, settings))
 
+    # what is tracked, and what the spec promises
     scene = CornerSequence(frames) if sequence is None else sequence
     run = _Runner(report, spec or subject, settings, scene, frames, seed)
     deterministic = spec is None or spec.deterministic
@@ -111,6 +113,7 @@ def tracker_report(
         path = _Runner(report, spec or subject, settings, turning, len(turning), seed)
         _conventions(path, monocular)
 
+    # a check for each kind of degenerate frame
     hard = {f"{name} frame": partial(_hard_frame, run, name) for name in hard_frames(scene[0])}
     return report.run_all(
         {"construction": lambda: _construction(run), "results": lambda: _results(run)},
@@ -178,6 +181,7 @@ class _Runner:
             changed: Settings to configure it to before one of the frames.
             at: Number of that frame.
         """
+        # one episode, with one change of the settings at most
         used = self.construct() if tracker is None else tracker
         used.reset(self.scene.camera, rng=np.random.default_rng(self.seed))
         results = []
@@ -193,6 +197,7 @@ class _Runner:
         if isinstance(self.subject, TrackerSpec) and not self.subject.online:
             results = _results_of(used.finalize(), frames)
             poses = [np.array(result.T_world_cam) for result in results]
+        # no later frame may change a pose that was returned
         for frame, result, pose in zip(frames, results, poses, strict=True):
             require(
                 result.T_world_cam is None or np.array_equal(result.T_world_cam, pose),
@@ -235,12 +240,14 @@ def _none_of(all_faults: Iterable[Fault], where: str) -> None:
 def _spec(spec: TrackerSpec, settings: Settings | Mapping[str, Any] | None) -> None:
     """The spec names the tracker; its settings survive JSON, and presets and overrides fit them."""
     require(spec.id and spec.label, "the spec has no id or label")
+    # settings are stored as JSON with every run
     default = spec.settings()
     require(
         build(spec.settings, json.loads(default.model_dump_json())) == default,
         "the default settings change when they are written as JSON and read again",
         "a field's type does not survive JSON",
     )
+    # presets and overrides
     for name, overrides in spec.presets.items():
         try:
             apply_overrides(default, overrides)
@@ -283,6 +290,7 @@ def _conventions(run: _Runner, monocular: bool) -> None:
     """Recognise world-to-camera poses, other axes and other units by the path of a camera that turns."""
     results = run.track(run.frames)
     count = len(run.frames)
+    # stamps and poses of the frames that were tracked
     tracked = [
         (frame.timestamp, result.T_world_cam)
         for frame, result in zip(run.frames, results, strict=True)
@@ -294,6 +302,7 @@ def _conventions(run: _Runner, monocular: bool) -> None:
         )
     stamps = np.array([stamp for stamp, _ in tracked])
     poses = np.array([pose for _, pose in tracked])
+    # the path beside the exact one: a wrong convention shows in the whole of it
     estimate = Trajectory(stamps, poses)
     truth = run.scene.ground_truth
     assert truth is not None
@@ -319,6 +328,7 @@ def _determinism(run: _Runner, deterministic: bool) -> None:
     """Two trackers with one seed give the same results, bit for bit."""
     if not deterministic:
         raise NotApplicable("the spec says that it is not deterministic")
+    # two episodes under different global seeds
     episodes = []
     for seed in (1, 2):  # of the global generators, which a tracker must not use
         random.seed(seed)
@@ -336,6 +346,7 @@ def _two_resets(run: _Runner, deterministic: bool) -> None:
     """A tracker that has tracked something else gives the same results again after a reset."""
     tracker = run.construct()
     first = run.track(run.frames, tracker)
+    # another sequence between the two: three mirrored frames
     mirrored = [
         Frame(f.index, f.timestamp, f.rgb[:, ::-1].copy(), f.depth[:, ::-1].copy())
         for f in run.frames[:3]
@@ -352,6 +363,7 @@ def _two_resets(run: _Runner, deterministic: bool) -> None:
 
 def _hard_frame(run: _Runner, name: str) -> None:
     """A degenerate frame, at the start or in the middle, raises nothing."""
+    # before there is a map, and after
     positions = ((0, "the first frame"), (len(run.frames) // 2, "a frame in the middle"))
     for position, where in positions:
         frames = list(run.frames)
@@ -379,6 +391,7 @@ def _final(run: _Runner, count: int | None = None) -> None:
     _close(tracker)
     if not finalises:
         raise NotApplicable("the tracker has no finalize()")
+    # valid, and no stamp that no frame has
     _none_of(trajectory_faults(final), "finalize() gave")
     assert isinstance(final, Trajectory)
     foreign = set(final.timestamps.tolist()) - {frame.timestamp for frame in frames}
@@ -426,6 +439,7 @@ def _online_settings(
         raise NotApplicable("no spec names online settings")
     if not spec.deterministic:
         raise NotApplicable("it is not deterministic")
+    # which settings may change while it tracks
     start = settings if isinstance(settings, Settings) else resolve_settings(spec, settings)
     online = online_parameters(start)
     if not online:
@@ -440,10 +454,12 @@ def _online_settings(
         "implement configure (see core.settings.Reconfigurable), or declare the setting without online=True",
     )
 
+    # an episode without a change, to compare with
     fresh = run.track(run.frames, tracker)
     half = len(run.frames) // 2
     has_effect = False
     late_effects = []  # of changes in mid-episode, where building with the values has a late effect
+    # all online settings at alternate ends of their ranges, then at the other ones
     for first_end in (0, 1):
         ends = _alternate_ends(online, first_end)
         try:
@@ -453,6 +469,7 @@ def _online_settings(
             continue  # the ends do not go together
         _check_reconfiguration(run, tracker, changed, ends, built, fresh)
         has_effect |= bool(first_difference(fresh, built))
+        # they matter late in the episode: then a change in its middle must, too
         if first_difference(fresh[half:], built[half:]):
             reconfigured = run.track(run.frames, tracker, changed, half)
             late_effects.append(first_difference(fresh, reconfigured))

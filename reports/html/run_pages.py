@@ -30,8 +30,9 @@ from dynslam_bench.reports.tables.table import mm, significant_text
 from dynslam_bench.runs.artifacts import VIDEO_FILE
 from dynslam_bench.runs.exchange.recording import RECORDING_FILE
 from dynslam_bench.runs.frames import CSV_FILE
+from dynslam_bench.runs.layout import file_stamp
 from dynslam_bench.runs.record import RunRecord, coverage_text
-from dynslam_bench.runs.store import file_stamp, part_words
+from dynslam_bench.runs.rows import part_words
 
 Array = NDArray[np.float64]
 

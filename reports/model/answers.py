@@ -9,7 +9,7 @@ from statistics import median
 from dynslam_bench.reports.model.board import OVERALL, Board, Cell
 from dynslam_bench.reports.model.row import SEEN, RunRow
 from dynslam_bench.reports.tables.table import mm
-from dynslam_bench.runs.store import part_words
+from dynslam_bench.runs.rows import part_words
 
 MEANINGS = {
     "static": "nothing moves",

@@ -44,7 +44,8 @@ from dynslam_bench.reports.model.statistics import (
     sequences_of,
     standings,
 )
-from dynslam_bench.runs.store import RunStore, part_words
+from dynslam_bench.runs.rows import part_words
+from dynslam_bench.runs.store import RunStore
 from dynslam_bench.sequences.families import family_of, same_path
 from dynslam_bench.sequences.tags import FIXED_CAMERA
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from dynslam_bench.core import label_text, setting_text
 from dynslam_bench.reports.model.row import SEEN, RunRow, grouped
-from dynslam_bench.runs.store import part_words
+from dynslam_bench.runs.rows import part_words
 
 
 def name_columns(rows: Sequence[RunRow]) -> dict[str, str]:

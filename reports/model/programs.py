@@ -14,8 +14,8 @@ from typing import Any, Literal, NamedTuple
 from dynslam_bench.core.records import digest
 from dynslam_bench.evaluation.verdicts import FLOOR_M
 from dynslam_bench.reports.model.row import RunRow, grouped
+from dynslam_bench.runs.layout import FINAL, ONLINE
 from dynslam_bench.runs.record import PROGRAM
-from dynslam_bench.runs.store import FINAL, ONLINE
 from dynslam_bench.runs.validity import Installation
 
 FEWEST_EQUAL = 5
@@ -140,6 +140,7 @@ class ProgramRow:
 
     def shared_results(self) -> int:
         """Results of runs that ended well which several of its programs have; other seeds' copies do not count."""
+        # which programs made each run
         makers: dict[Repeat, set[int]] = {}
         for at, program in enumerate(self.programs):
             for row in program.rows:
@@ -168,6 +169,7 @@ class Outcome(NamedTuple):
 
 def _compare_results(first: Mapping[Result, RunRow], second: Mapping[Result, RunRow]) -> Outcome:
     """Compare what two programs made of one request; each may have several results."""
+    # the ratio of their errors; errors below the floor count as equal to it
     error_m = next(iter(first.values())).score_m
     other_error_m = next(iter(second.values())).score_m
     ratio = None
@@ -175,6 +177,7 @@ def _compare_results(first: Mapping[Result, RunRow], second: Mapping[Result, Run
         ratio = max(error_m, FLOOR_M) / max(other_error_m, FLOOR_M)
 
     status, checksums = next(iter(first))
+    # several results of one request: it is not deterministic
     if len(first) > 1 or first.keys() != second.keys():
         return Outcome("different", ratio)
     if status != "ok":
@@ -231,10 +234,12 @@ def choose_runs(rows: Iterable[RunRow]) -> Chosen:
         rows: All runs. `split_by`, `is_current` and `program_remark` of those that are chosen are
             set.
     """
+    # what is installed here, and the time
     installation = Installation()
     now = datetime.now(timezone.utc)
     chosen = Chosen()
     for group in grouped(rows, lambda row: row.settings_key).values():
+        # runs by one program, then programs with equal results, then one run of each repeat
         programs = _find_programs(group, installation, now)
         program_rows = _merge_equal(programs)
         kept = _choose_of_each_repeat(program_rows, now)
@@ -259,6 +264,7 @@ def _find_programs(
     Runs on sequences of two kinds name different readers, and may be by one program: those that no
     part tells apart are. Each program joins the first that it fits.
     """
+    # runs whose records say the same, split by what of it has changed here
     by_identity = grouped(rows, _program_text)
     described = []
     for some in by_identity.values():
@@ -272,6 +278,7 @@ def _find_programs(
     )
 
     programs: list[Program] = []
+    # each joins the first program that no part tells it from
     for program in described:
         fitting = next((earlier for earlier in programs if earlier.fits(program)), None)
         if fitting is None:
@@ -363,6 +370,7 @@ def _preference(row: RunRow, changed: str, now: datetime) -> Preference:
 
 def _choose_of_each_repeat(program_rows: Sequence[ProgramRow], now: datetime) -> list[list[RunRow]]:
     """The runs that stand in each row: one of each column and repeat, in the ranked row where it has one."""
+    # the ranked row's run wins, then the preferred one
     best: dict[tuple[object, ...], tuple[tuple[bool, Preference], int, RunRow]] = {}
     for at, program_row in enumerate(program_rows):
         for program in program_row.programs:
@@ -371,6 +379,7 @@ def _choose_of_each_repeat(program_rows: Sequence[ProgramRow], now: datetime) ->
                 preference = (at == 0, _preference(row, program.changed, now))
                 if place not in best or preference > best[place][0]:
                     best[place] = (preference, at, row)
+    # by the row in which each stands
     kept: list[list[RunRow]] = [[] for _ in program_rows]
     for _, at, row in best.values():
         kept[at].append(row)
@@ -387,12 +396,14 @@ def _mark(program_rows: Sequence[ProgramRow], kept: Sequence[Sequence[RunRow]]) 
         program_rows: The rows of one tracker with the same settings, the first to be ranked first.
         kept: The runs that stand in each; none where all are made again by other programs.
     """
+    # rows with runs are shown; of the others all was run again
     shown = [at for at, rows in enumerate(kept) if rows]
     superseded = [program_rows[at] for at, rows in enumerate(kept) if not rows]
     names = _names_of([program_rows[at] for at in shown])
     ranked = program_rows[0]
     for at, name in zip(shown, names, strict=True):
         program_row = program_rows[at]
+        # what the row is, and how it compares with the ranked one
         remarks = []
         if len(program_row.programs) > 1:
             count = len(program_row.programs)
@@ -412,6 +423,7 @@ def _mark(program_rows: Sequence[ProgramRow], kept: Sequence[Sequence[RunRow]]) 
 def _names_of(program_rows: Sequence[ProgramRow]) -> list[dict[str, str]]:
     """The parts by which rows are told apart, by name as short texts; none for a single row with verified ids."""
     texts = [_short_texts(program_row) for program_row in program_rows]
+    # only what differs tells rows apart
     values: dict[str, set[str]] = {}
     for text in texts:
         for name, value in text.items():
@@ -459,6 +471,7 @@ def _what_differs(one: ProgramRow, other: ProgramRow) -> str:
 def _comparison_words(program_row: ProgramRow, ranked: ProgramRow) -> str:
     """How the results of a row compare with those of the ranked one."""
     agreement = program_row.compare(ranked)
+    # an honest comparison needs common runs, and trackers that repeat their results
     total = agreement.equal + agreement.different
     if not total:
         return "no run in common"

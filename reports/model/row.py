@@ -17,8 +17,9 @@ from dynslam_bench.evaluation import Evaluation, Protocol
 from dynslam_bench.evaluation.alignment import RELIABLE_DEG
 from dynslam_bench.evaluation.ape import ate_rmse_m, static_camera_rmse_m
 from dynslam_bench.geometry import Trajectory
+from dynslam_bench.runs.layout import Which
 from dynslam_bench.runs.record import LOST_COVERAGE, MetricRecord, RunRecord
-from dynslam_bench.runs.store import RunStore, Which, score
+from dynslam_bench.runs.store import RunStore, score
 from dynslam_bench.segmentation.training_scenes import seen_in_training
 from dynslam_bench.sequences.tags import FIXED_CAMERA
 

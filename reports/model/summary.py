@@ -13,7 +13,7 @@ from dynslam_bench.reports.model.board import (
 )
 from dynslam_bench.reports.model.row import HINTED, SEEN, RunRow
 from dynslam_bench.reports.model.statistics import FEWEST, Standing, mean_rank_test
-from dynslam_bench.runs.store import part_words
+from dynslam_bench.runs.rows import part_words
 
 _MOST_NAMED = 3
 """Trackers that a sentence names; of more the first, and how many others."""
@@ -45,10 +45,16 @@ def headline(board: Board) -> str:
 
     # what is claimed: the trackers that are better, and which may be the best
     claimed = _better_words(board, ranked)
+    if not claimed and _reference_lost_all(board):
+        return f"{where}{board.reference_name} lost all, so no tracker can be compared with it."
     if not claimed:
         n_worse = sum(standing.verdict == "worse" for standing in ranked)
         return f"{where}no tracker is shown to be better than {board.reference_name}; {_are(n_worse)} worse."
     return f"{where}{claimed}."
+
+
+def _reference_lost_all(board: Board) -> bool:
+    return board.reference is not None and set(board.common) <= board.lost(board.reference)
 
 
 def _better_words(board: Board, ranked: list[Standing]) -> str:
@@ -100,8 +106,8 @@ def _but_lost_words(board: Board, ranked: list[Standing]) -> str:
 
 
 def explanation(board: Board) -> str:
-    """How to read the board, for a reader without statistics."""
-    if not board.common:
+    """How to read the board, for a reader without statistics; empty where nothing is ranked."""
+    if not board.common or not board.ranked:
         return ""
     if len(board.common) < FEWEST:
         return (

@@ -183,6 +183,7 @@ def csv_text(frame: pd.DataFrame) -> str:
 
     Words that a spreadsheet would take for a formula begin with a quote.
     """
+    # headings, then columns of words; numbers need no escape
     written = frame.rename(columns=_no_formula)
     for name in written.columns:
         if written[name].dtype in ("object", "string"):
@@ -247,6 +248,7 @@ def significant_text(value: float, digits: int = 3) -> str:
 
 def percent(share: float) -> str:
     """A share as whole percents, but nothing short of all is 100 % and nothing above none 0 %."""
+    # 100 % and 0 % are said of whole shares alone
     rounded = round(100 * share)
     is_exact = not (rounded == 100 and share < 1) and not (rounded == 0 and share > 0)
     if is_exact:
@@ -354,6 +356,7 @@ def _character(character: str) -> str:
         return _LATEX.get(character, character)
     if character.isascii():
         return character if character.isprintable() else " "
+    # a letter without its accent, where pdflatex has no glyph
     plain = unicodedata.normalize("NFKD", character).encode("ascii", "ignore").decode()
     if not plain:
         return f"[U+{ord(character):04X}]"
@@ -362,6 +365,7 @@ def _character(character: str) -> str:
 
 def _float(table: Table, tabulars: Sequence[str], number: int, protocol: str) -> str:
     """A float with some tabulars below each other; further ones of a table are numbered and say that they continue."""
+    # what is shown, under which protocol, and whether it goes on
     words = [table.brief or table.title]
     if protocol:
         words.append(f"protocol {protocol}")
@@ -480,6 +484,7 @@ def _latex_cell(cell: TableCell) -> str:
     if cell.emphasis == "failed":
         return "failed"
     text = escape_latex(cell.text.replace(OUR_BACK_END, ""))
+    # the best in bold, the second in italics; the interval stays plain
     font = {"best": "bf", "second": "it"}.get(cell.emphasis)
     if text and font:
         text = f"\\text{font}{{{text}}}"
@@ -496,6 +501,7 @@ def _groups(groups: Sequence[tuple[str, int]]) -> str:
     rules = []
     first = 1
     for name, width in groups:
+        # a group's name stands above its columns, with a rule
         if name:
             cells.append(f"\\multicolumn{{{width}}}{{c}}{{{escape_latex(name)}}}")
             rules.append(f"\\cmidrule(lr){{{first}-{first + width - 1}}}")

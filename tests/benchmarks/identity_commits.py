@@ -32,6 +32,7 @@ CUT = {
     ("trackers.systems.composition", "segmentation.schedule"),
     ("trackers.systems.composition", "flow"),
     ("slam.pipeline", "culling.ego_motion"),
+    ("runs.loop", "runs.process.child"),
 }
 """Imports that were taken out when ids began to follow imports: module, and what it imported."""
 

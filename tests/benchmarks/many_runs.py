@@ -1,6 +1,6 @@
 """What many runs cost beside their tracking, by their number, by Dask's workers and by their frames.
 
-    python tests/benchmarks/many_runs.py FOLDER
+    python tests/benchmarks/many_runs.py FOLDER [--runs 1000 10000 100000]
 
 FOLDER is a recording in TUM layout. First table: looking runs up, resuming when all are stored,
 listing them, and all runs as one frame. Each number of runs is shared by two trackers, ten start
@@ -196,12 +196,14 @@ def main() -> None:
     """Print the tables."""
     parser = parser_of(__doc__)
     parser.add_argument("folder")
-    folder = parser.parse_args().folder
+    parser.add_argument("--runs", type=int, nargs="+", default=[1000, 10_000, 100_000])
+    options = parser.parse_args()
+    folder = options.folder
     print(
         "| runs | first run, s | look-up, s | resume, s | first list, s | later lists, s | frame, s | most memory, MB |"
     )
     print("| --- | --- | --- | --- | --- | --- | --- | --- |")
-    for count in (1000, 10_000, 100_000):
+    for count in options.runs:
         with tempfile.TemporaryDirectory() as results:
             before = measured(look_up, folder, count, results)
             measured(fill, folder, count, results)

@@ -150,9 +150,9 @@ def _with_false_mask(masks: FrameMasks, index: int) -> FrameMasks:
 def _largest_person(frames: list[Frame], masks: list[FrameMasks]) -> np.ndarray:
     """The colours of the largest person of all frames, in its box without the border."""
     best = np.zeros((0, 0, 3), np.uint8)
-    for frame, seen in zip(frames, masks, strict=True):
-        for number, name in seen.class_names.items():
-            rows, columns = np.nonzero(seen.instances == number)
+    for frame, frame_masks in zip(frames, masks, strict=True):
+        for number, name in frame_masks.class_names.items():
+            rows, columns = np.nonzero(frame_masks.instances == number)
             if name != "person" or len(rows) < 100:
                 continue
             # the middle half of its box is nearly all person
@@ -281,8 +281,8 @@ def table(before: pd.DataFrame | None, after: pd.DataFrame) -> str:
     summaries = [summary(figures) for figures in shown]
     for (case, tracker, size), _ in summaries[-1].iterrows():
         cells = []
-        for each in summaries:
-            row = each.loc[(case, tracker, size)]
+        for figures in summaries:
+            row = figures.loc[(case, tracker, size)]
             cells.append(
                 (
                     f"{100 * row.coverage:.1f}, {100 * row.least:.0f}",
@@ -300,13 +300,14 @@ def table(before: pd.DataFrame | None, after: pd.DataFrame) -> str:
         if size != "640x480" and "640x480" in mine[-1].index:
             to_full = " -> ".join(
                 ratio(
-                    each.loc[["640x480"]].set_index(keys).ate, each.loc[[size]].set_index(keys).ate
+                    of_tracker.loc[["640x480"]].set_index(keys).ate,
+                    of_tracker.loc[[size]].set_index(keys).ate,
                 )
-                for each in mine
+                for of_tracker in mine
             )
         line = f"| {case} | `{tracker}` | {size} | {' | '.join(part)} | {to_full} |"
         if before is not None:
-            old, new = (each.loc[[size]].set_index(keys) for each in mine)
+            old, new = (of_tracker.loc[[size]].set_index(keys) for of_tracker in mine)
             differ = int((old["sum"] != new["sum"]).sum())
             line += f" {ratio(old.ate, new.ate)} | {differ} of {len(new)} |"
         lines.append(line)

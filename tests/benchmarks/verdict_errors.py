@@ -14,8 +14,9 @@ Scenes are simulated: natural logarithms of a candidate's error over the baselin
 
 A verdict is wrong where it says *proven* and the truth is no gain, or *no difference that matters* and
 the truth is at the margin. A board is wrong where any of its claims is; under rare losses *worse* is none of
-them, since the mean over sequences is larger. Boards are judged by a form of the
-board's tests that takes all simulations at once; the first of each cell are compared with the board's own.
+them, since the mean over sequences is larger. Studies and
+boards are judged by a form of the rules that takes all simulations at once; the first of each cell are compared
+with the package's own.
 Percentages stand beside the number of simulations; their standard error is at most 0.16 points at 2.5 % of
 10,000.
 """
@@ -31,14 +32,20 @@ from numpy.typing import NDArray
 from scipy import optimize, special, stats
 
 from dynslam_bench.evaluation.verdicts import (
+    CATASTROPHE,
     FEWEST_FAMILIES,
     FEWEST_FREE,
     LOOKS,
     MARGIN,
     ONE_SIDED,
     Verdict,
+    excluding_interval,
+    hodges_lehmann,
     paired_ratio,
     verdict_of,
+)
+from dynslam_bench.evaluation.verdicts import (
+    FEWEST as FEWEST_SCENES,
 )
 from dynslam_bench.reports.model.statistics import (
     FAMILY_ERROR,
@@ -60,6 +67,8 @@ FAMILIES = 8
 FAMILY_SPREAD = 0.2
 
 
+COMPARED = 40
+"""Boards or studies of a cell whose claims are compared with those of the package."""
 TIES = 0.6
 """Share of scenes in which a setting does not act; with more than 0.71 the typical ratio is 1 whatever it does."""
 
@@ -162,10 +171,31 @@ def judge(
 def share_of(verdict: Verdict, world: str, scenes: int, shift: float, simulations: int) -> float:
     """How often a world whose typical log ratio is `shift` gets a verdict."""
     rng = np.random.default_rng([scenes, simulations, list(WORLDS).index(world)])
-    hits = 0
-    for _ in range(simulations):
-        hits += judge(*WORLDS[world](rng, scenes, shift)) is verdict
-    return hits / simulations
+    studies = drawn_studies(rng, world, scenes, shift, simulations)
+    return float(is_said_of(studies, verdict, ONE_SIDED).mean())
+
+
+def drawn_studies(
+    rng: np.random.Generator, world: str, scenes: int, shift: float, simulations: int
+) -> tuple[Array, Array, Array]:
+    """Log ratios of so many studies, and what either side lost, each ``[N, S]``."""
+    drawn = [WORLDS[world](rng, scenes, shift) for _ in range(simulations)]
+    values, lost, lost_baseline = zip(*drawn, strict=True)
+    return np.array(values), np.array(lost), np.array(lost_baseline)
+
+
+def is_said_of(studies: tuple[Array, Array, Array], verdict: Verdict, level: float) -> Array:
+    """Which studies get a verdict ``[N]``.
+
+    Raises:
+        RuntimeError: The first ones do not get that of the package.
+    """
+    is_said = verdicts_of_many(*studies, level)[verdict]
+    for number in range(COMPARED):
+        own = judge(*(part[number] for part in studies), one_sided=level)
+        if (own is verdict) != is_said[number]:
+            raise RuntimeError(f"study {number} is {own.value}, not as simulated")
+    return is_said
 
 
 def line(*cells: object) -> str:
@@ -233,23 +263,80 @@ def share_at_any_look(
 ) -> float:
     """How often a world gets a verdict at one of the looks at least."""
     rng = np.random.default_rng(simulations)
-    hits = 0
-    for _ in range(simulations):
-        drawn = WORLDS[world](rng, max(LOOKS), shift)
-        for scenes, level in levels.items():
-            # scenes are added from one look to the next
-            part = (values[:scenes] for values in drawn)
-            if judge(*part, one_sided=level) is verdict:
-                hits += 1
-                break
-    return hits / simulations
+    values, lost, lost_baseline = drawn_studies(rng, world, max(LOOKS), shift, simulations)
+    is_said = np.zeros(simulations, dtype=bool)
+    for scenes, level in levels.items():
+        # scenes are added from one look to the next
+        looked_at = (values[:, :scenes], lost[:, :scenes], lost_baseline[:, :scenes])
+        is_said |= is_said_of(looked_at, verdict, level)
+    return float(is_said.mean())
+
+
+def verdicts_of_many(
+    values: Array, lost: Array, lost_baseline: Array, level: float
+) -> dict[Verdict, Array]:
+    """Which of many studies are *proven*, and say *no difference that matters*: the rules of `verdict_of`.
+
+    Args:
+        values: Log ratios ``[N, S]``.
+        lost: What the candidate lost ``[N, S]``.
+        lost_baseline: What the baseline lost ``[N, S]``.
+        level: One-sided level of a claim.
+    """
+    # losses of either side
+    is_paired = ~(lost | lost_baseline)
+    times = math.log(CATASTROPHE)
+    losses = ((lost & ~lost_baseline) | (is_paired & (values > times))).sum(axis=1)
+    losses_baseline = ((lost_baseline & ~lost) | (is_paired & (values < -times))).sum(axis=1)
+    losses_p = stats.binom.sf(losses - 1, losses + losses_baseline, 0.5)
+    is_worse = (losses > losses_baseline) & (losses_p <= ONE_SIDED)
+
+    # intervals of the typical ratio, of studies with equal numbers of scenes and ties at a time
+    is_tie = is_paired & (values == 0.0)
+    low, high = intervals_of_many(values, is_paired, 1.0 - 2.0 * level)
+    low_90, high_90 = intervals_of_many(values, is_paired & ~is_tie, 1.0 - 4.0 * level)
+    for number in np.flatnonzero(is_tie.any(axis=1)):
+        known = values[number, is_paired[number]]
+        _, low_90[number], high_90[number] = excluding_interval(known, 1.0 - 4.0 * level)
+
+    # the rules
+    is_claim = ~is_worse & (is_paired.sum(axis=1) >= FEWEST_SCENES)
+    is_smaller = is_claim & (high < 0.0)
+    edge = math.log1p(MARGIN)
+    is_within = (np.maximum(-low_90, high_90) < edge) & (np.abs(losses - losses_baseline) <= 1)
+    return {
+        Verdict.PROVEN: is_smaller & (losses <= losses_baseline),
+        Verdict.NO_DIFFERENCE: is_claim & ~is_smaller & (low <= 0.0) & is_within,
+    }
+
+
+def intervals_of_many(values: Array, counts: Array, confidence: float) -> tuple[Array, Array]:
+    """Ends of the interval of `hodges_lehmann` for every row ``[N]``, over the values that count ``[N, S]``."""
+    low = np.full(len(values), -math.inf)
+    high = np.full(len(values), math.inf)
+    numbers = counts.sum(axis=1)
+    for number in np.unique(numbers[numbers > 0]):
+        rows = numbers == number
+        part = values[rows][counts[rows]].reshape(-1, number)
+
+        # how many Walsh averages the interval leaves out at either end: as of any values so many
+        first, second = np.triu_indices(number)
+        example = 2.0 ** np.arange(number)
+        averages = np.sort((example[first] + example[second]) / 2.0)
+        end = hodges_lehmann(example, confidence).low
+        if math.isinf(end):
+            continue
+        cut = int(np.flatnonzero(averages == end)[-1]) + 1
+        averages = (part[:, first] + part[:, second]) / 2.0
+        ends = np.partition(averages, (cut - 1, len(first) - cut), axis=1)
+        low[rows] = ends[:, cut - 1]
+        high[rows] = ends[:, len(first) - cut]
+    return low, high
 
 
 BOARDS = ((3, 1), (8, 1), (14, 1), (8, 3), (4, 6), (8, 6))
 """Families, and sequences of each."""
 TRACKERS = 8
-COMPARED = 40
-"""Boards of a cell that are compared with the board's own claims."""
 BOARD_WORLDS = (
     "normal",
     "t3",

@@ -23,7 +23,7 @@ from dynslam_bench.evaluation import evaluate_files
 from dynslam_bench.geometry import Trajectory, read_tum, se3, write_kitti, write_tum
 from dynslam_bench.geometry.se3 import inverse
 from dynslam_bench.sequences import open_sequence
-from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS
+from dynslam_bench.sequences.synthetic import SYNTHETIC_IDS, open_synthetic
 from dynslam_bench.testing import TurningSequence
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -285,11 +285,22 @@ def test_envs(facts):
 
 def test_cache(cli, facts, monkeypatch, tmp_path):
     monkeypatch.setenv("DYNSLAM_BENCH_CACHE", str(tmp_path / "stages"))
+    monkeypatch.setenv("DYNSLAM_BENCH_DATA", str(tmp_path / "data"))
     StageCache().put("masks", "ab" * 16, {"a": np.zeros(10)}, 0.5)
+    current = open_synthetic("synthetic/walking_xyz?scene=3", tmp_path / "data").store.folder
+    files = {
+        "kernels_bytes": tmp_path / "stages/kernels/one.kernel",
+        "renderings_bytes": current / "rgb/1.png",
+        "other_renderings_bytes": current.with_name("walking_xyz@3-00000000") / "rgb/1.png",
+    }
+    for file in files.values():
+        file.parent.mkdir(parents=True)
+        file.write_bytes(b"1111")
     for entries in ({"masks": 1}, {}):
         usage = facts("cache", "info")
         assert usage["entries_by_stage"] == entries
         assert (usage["bytes"] > 0) == bool(entries)
+        assert [usage[name] for name in files] == ([4, 4, 4] if entries else [0, 4, 0])
         assert cli("cache", "clear", "--yes")[0] == 0
 
 

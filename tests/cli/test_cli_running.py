@@ -25,6 +25,7 @@ from dynslam_bench.cli import app, demo, output, running, runs
 from dynslam_bench.cli.demo import compiled_ahead, culling_effect
 from dynslam_bench.cli.output import report_table, table
 from dynslam_bench.core import WEIGHTS_VARIABLE, RunError
+from dynslam_bench.core.fingerprint import this_machine
 from dynslam_bench.core.records import digest
 from dynslam_bench.core.sanitise import printable
 from dynslam_bench.geometry.trajectory_files import read_tum
@@ -60,7 +61,9 @@ def test_a_row_names_the_part_the_settings_and_its_origin(cli, facts, walk):
     assert "my control" in cli("runs", "show")[1]
 
 
-def test_the_number_of_frames_and_the_expected_time_are_written_before_the_run(cli, walk):
+def test_the_number_of_frames_and_the_expected_time_are_written_before_the_run(
+    cli, walk, monkeypatch
+):
     command = ("run", "constant-velocity", walk, "--set")
     unknown = (
         "1 run, 4 frames; a system's first run on a machine compiles its code for up to a minute"
@@ -72,6 +75,10 @@ def test_the_number_of_frames_and_the_expected_time_are_written_before_the_run(c
     )
     assert "frames" not in cli(*command, "frames=4")[2], "it is stored: nothing will be tracked"
     assert cli(*command, "frames=5", "--json")[2] == ""
+    # the stored runs are those of another machine
+    other = this_machine().model_copy(update={"cpu": "another"})
+    monkeypatch.setattr("dynslam_bench.core.fingerprint.this_machine", lambda: other)
+    assert "compiles its code" in cli(*command, "frames=6")[2].splitlines()[0]
 
 
 def test_a_row_names_files_without_their_folders(cli, facts, walk):
@@ -570,34 +577,42 @@ ROWS = [
 ]
 
 
-@pytest.mark.parametrize("width", [400, 100, 80, 60, 40, 20])
-def test_a_table_is_no_wider_than_the_terminal(monkeypatch, width):
+@pytest.mark.parametrize("width", [400, 120, 100, 80, 60, 40])
+def test_a_table_is_no_wider_than_the_terminal_and_cuts_no_word(monkeypatch, width):
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
     monkeypatch.setattr(output, "_terminal_width", lambda: width)
     head, row, *left_out = table(ROWS[0], ROWS[1:]).splitlines()
     assert max(len(head), len(row)) <= width
-    assert row.startswith("012345")
-    assert bool(left_out) == ("masks" not in head)
-    if width == 400:
-        assert [head.split("  ")[0], *row.split()] == ["run", *ROWS[1]]
-    if width == 80:
-        assert row.split()[2:] == ["synthetic/walkin…ne=0&frames=600", "0.01234", "embedded"]
-        assert not left_out
-    if width == 40:
-        assert left_out == ["(no room for: ATE (m), masks)"]
+    shown = row.split()
+    assert shown == ROWS[1][: len(shown)], "no id is cut"
+    assert bool(left_out) == (len(shown) < len(ROWS[1]))
+    if left_out:
+        assert left_out == [
+            f"(no room for: {', '.join(ROWS[0][len(shown) :])}; dynslam-bench --wide shows all)"
+        ]
+    assert len(shown) == {400: 5, 120: 5, 100: 5, 80: 3, 60: 2, 40: 2}[width]
 
 
-def test_numbers_are_never_shortened(monkeypatch):
+def test_texts_are_wrapped_at_blanks(monkeypatch):
+    monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
+    monkeypatch.setattr(output, "_terminal_width", lambda: 40)
+    meaning = "the number of features that each frame keeps after culling"
+    lines = table(["setting", "meaning"], [["features.n_features", meaning]]).splitlines()
+    assert max(map(len, lines)) <= 40
+    assert " ".join(line[21:] for line in lines[1:]) == meaning
+    assert lines[1].startswith("features.n_features  ")
+
+
+def test_numbers_are_never_cut(monkeypatch):
     monkeypatch.setattr("sys.stdout.isatty", lambda: True, raising=False)
     monkeypatch.setattr(output, "_terminal_width", lambda: 30)
     spread = "12.34 ±0.56, F skipped 98 %"
-    assert table(["tracker", "ATE (mm)"], [["x" * 80, 1.5], ["y", 23.0]]).splitlines()[
-        -1
-    ].split() == ["y", "23"]
     assert table(["ATE (mm)"], [[spread]]).splitlines()[1] == spread
-    lines = table(["tracker", "ATE (mm)"], [["x" * 80, spread]]).splitlines()
-    assert lines[1] == "x" * 15 + "…" + "x" * 14
-    assert lines[2] == "(no room for: ATE (mm))"
+    lines = table(["tracker", "ATE (mm)"], [["x" * 28, spread]]).splitlines()
+    assert lines[1] == "x" * 28
+    assert lines[2].startswith("(no room for: ATE (mm);")
+    monkeypatch.setattr(output, "_wide", True)
+    assert table(["tracker", "ATE (mm)"], [["x" * 28, spread]]).splitlines()[1].endswith(spread)
 
 
 def test_what_names_a_column_or_fills_a_cell_reaches_no_terminal_as_an_escape():

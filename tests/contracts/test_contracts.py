@@ -22,6 +22,7 @@ ALL = ("torch", "cv2", "numba", "scipy", "gymnasium", "optuna", "pandas")
 LIGHT = {
     "import dynslam_bench": (*ALL, "numpy", "typer", "pydantic"),
     "import dynslam_bench.contracts": ALL,
+    "import dynslam_bench.gate.pytest_plugin": ALL,
     "import dynslam_bench.sequences.synthetic": ("numba", "cv2", "torch"),
     "from dynslam_bench.trackers import TRACKERS; assert len(TRACKERS.all()) > 30": (
         "torch",

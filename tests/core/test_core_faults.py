@@ -25,9 +25,9 @@ from dynslam_bench.core import (
     TemporaryFolder,
     atomic_folder,
     files,
-    inside,
     is_abandoned,
     parse_json,
+    path_below,
     printable,
     read_bytes,
     read_json,
@@ -551,9 +551,9 @@ def test_what_holds_no_password_stays_as_it_is() -> None:
 )
 def test_no_name_leads_out_of_its_folder(tmp_path: Path, name: str) -> None:
     with pytest.raises(RunError, match="does not lie in"):
-        inside(tmp_path, name, where="a list", kind=RunError)
+        path_below(tmp_path, name, where="a list", kind=RunError)
     assert (
-        inside(tmp_path, "rgb/1.000.png", where="a list", kind=RunError)
+        path_below(tmp_path, "rgb/1.000.png", where="a list", kind=RunError)
         == tmp_path / "rgb" / "1.000.png"
     )
 

@@ -357,6 +357,19 @@ def test_fundamental_matrix_is_that_of_the_true_motion() -> None:
     assert fundamental_matrix(matches[0][:15], matches[1][:15]) is None
 
 
+@pytest.mark.parametrize("width", [320, 160, 400, 1280])
+def test_a_region_is_the_same_share_of_an_image_of_any_size(width: int) -> None:
+    rng = np.random.default_rng(0)
+    xy = rng.uniform((0, 0), (640, 480), (1000, 2))
+    failing = (np.abs(xy - (320, 240)).max(axis=1) < 60) | (rng.random(1000) < 0.05)
+    tested = np.ones(1000, bool)
+    scale = width / 640
+    moving = failing_regions(failing, tested, xy, 0.4, (480, 640))
+    size = round(480 * scale), width
+    np.testing.assert_array_equal(failing_regions(failing, tested, scale * xy, 0.4, size), moving)
+    assert 0 < np.count_nonzero(moving) < np.count_nonzero(failing)
+
+
 def test_a_region_that_fails_moves_and_a_lone_point_is_noise() -> None:
     rng = np.random.default_rng(0)
     xy = rng.uniform((0, 0), (640, 480), (1000, 2))

@@ -15,6 +15,7 @@ from helpers.documented_names import PAGES, ROOT, sources
 from dynslam_bench.cli.app import start
 from dynslam_bench.core.settings import flatten
 from dynslam_bench.core.toml import parse_toml
+from dynslam_bench.gate import load_gate
 from dynslam_bench.sequences.cameras import read_camera
 from dynslam_bench.suites import load_suite
 from dynslam_bench.testing.template import write_tracker_template
@@ -156,6 +157,12 @@ def test_the_suite_on_the_page_is_one(tmp_path: Path) -> None:
         "three trackers and a row, two sequences, two variants, three offsets"
     )
     assert {spec.tracker for spec in specs} == trackers
+
+
+def test_the_gate_on_the_page_is_one(tmp_path: Path) -> None:
+    gate = load_gate(only_toml("docs/how-to/gate.md", tmp_path))
+    assert len(gate.cases()) == 2
+    assert len(gate.cases(confirm=True)) == 1
 
 
 @pytest.mark.parametrize("page", ["docs/how-to/study.md", "docs/tutorials/study.md"])

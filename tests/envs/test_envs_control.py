@@ -6,6 +6,7 @@ from collections import Counter
 from dataclasses import replace
 from typing import Any, Literal
 
+import cv2
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -31,12 +32,14 @@ from dynslam_bench.envs.rendering import (
     ESTIMATE,
     HEIGHT,
     KEPT,
+    LEGEND,
     MASK,
     STRIP,
     TRUTH,
     VIEWS,
     align_to_truth,
     main_view,
+    shortened,
 )
 from dynslam_bench.envs.spaces import MAX_DEPTH_M, stats_observation, stats_space
 from dynslam_bench.evaluation.online import OnlineError
@@ -539,3 +542,18 @@ def test_a_ramp_and_its_integral_agree() -> None:
     np.testing.assert_allclose(
         ramp.integral(times)[1:], np.cumsum((levels[1:] + levels[:-1]) / 2 * 1e-4), atol=1e-8
     )
+
+
+@pytest.mark.parametrize(
+    "label", ["orb-slam2", "emfoa-oft-paper?flow=sparse&masks=none&depth=none" * 2]
+)
+@pytest.mark.parametrize("width", [320, 640, 960])
+def test_a_title_never_reaches_the_legend(label, width):
+    text = f"{label}  |  synthetic/walking_halfsphere?scene=100&frames=600&noise=3"
+    room = width + HEIGHT - LEGEND - 20
+    short = shortened(text, room, 0.5)
+    assert cv2.getTextSize(short, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)[0][0] <= room
+    if short != text:
+        start, end = short.split("...")
+        assert text.startswith(start)
+        assert text.endswith(end)

@@ -58,6 +58,7 @@ PARTS = ["stats", "rgb", "depth", "gray", "keypoints", "privileged"]
 # Windows.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sequence", [CornerSequence(7), "synthetic/sitting_xyz?frames=7"])
 def test_a_window_is_the_episode_of_these_frames_alone(sequence: Any) -> None:
     tracker, settings = ("mask-rcnn", ORACLE) if isinstance(sequence, str) else ("orb-slam2", {})
@@ -306,6 +307,7 @@ def test_sub_environments_run_other_sequences(tmp_path: Path) -> None:
     assert len({tuple(order) for order in orders}) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mode", "seeds"), [("round_robin", (0, 0, 1)), ("random", (5, 5, 6))])
 def test_sequence_sampler(mode: str, seeds: tuple[int, ...], tmp_path: Path) -> None:
     folders = [str(write_folder(tmp_path / f"toy{length}", length)) for length in (5, 6)]

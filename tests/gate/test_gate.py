@@ -5,6 +5,7 @@ import math
 import os
 import subprocess
 import sys
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from helpers.gate_repository import (
 from dynslam_bench import gate as gates
 from dynslam_bench.core import RunError
 from dynslam_bench.evaluation.gate import GateVerdict
-from dynslam_bench.gate.baseline import Measurement, Side, poses_digest
+from dynslam_bench.gate.baseline import Measurement, Origin, Side, poses_digest
 from dynslam_bench.gate.config import GateConfig, Guardrails
 from dynslam_bench.gate.judging import judge
 from dynslam_bench.gate.trajectory_folder import file_name
@@ -118,6 +119,7 @@ def test_one_more_lost_run_is_never_an_improvement() -> None:
     assert found.verdict is GateVerdict.UNDECIDED
     assert found.exit_code == 3
     assert found.lost == (1, 0)
+    assert found.guardrails[0].measured == 0.0, "the coverage is that of runs that were not lost"
 
 
 @pytest.mark.parametrize("who", ["candidate", "baseline", "both"])
@@ -542,3 +544,54 @@ def test_a_missing_trajectory_is_named(tmp_path, sequences) -> None:
     with pytest.raises(RunError) as caught:
         gates.record(question, trajectories=files)
     assert "two.txt" in caught.value.hint
+
+
+# -- pytest ------------------------------------------------------------------------------------------------
+
+CONFTEST = """
+from pathlib import Path
+from dynslam_bench import gate
+from dynslam_bench.gate.result import GateResult
+
+gate.check = lambda path, **options: GateResult.read(Path(path).with_name("result.json"))
+"""
+"""Puts a result in the place of a gate that runs for minutes."""
+
+
+def run_pytest(folder, *options):
+    """The exit code and the output of pytest in a folder with one test that takes the fixture."""
+    (folder / "test_it.py").write_text("def test_gate(dynslam_gate): ...\n")
+    is_installed = bool(entry_points(group="pytest11", name="dynslam-gate"))
+    plugin = [] if is_installed else ["-p", "dynslam_bench.gate.pytest_plugin"]
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *plugin, *options]
+    ended = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    return ended.returncode, ended.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("verdict", "code"), [("identical", 0), ("regressed", 4), ("undecided", 5), ("improved", 3)]
+)
+def test_a_test_passes_only_where_the_gate_does(tmp_path, verdict, code) -> None:
+    (tmp_path / "conftest.py").write_text(CONFTEST)
+    result = gates.GateResult(
+        verdict=verdict,
+        exit_code=code,
+        sentence="so it is",
+        question="q",
+        protocol="p",
+        margin=0.1,
+        baseline=Origin(name="a"),
+        candidate=Origin(name="b"),
+    )
+    (tmp_path / "result.json").write_text(result.to_json())
+    ended, text = run_pytest(tmp_path)
+    assert (ended == 0) is (code == 0)
+    assert (f"**{verdict}**: so it is" in text) is (code != 0)
+
+
+@pytest.mark.slow
+def test_without_a_question_a_test_fails_with_the_cure(tmp_path) -> None:
+    ended, text = run_pytest(tmp_path)
+    assert ended == 1
+    assert "gate init" in text

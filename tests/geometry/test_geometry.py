@@ -487,6 +487,10 @@ def test_tum_skips_and_counts_like_the_official_tools(tmp_path):
         ("1 0 0 0 0 0 0 1\n2 0 0 0\n", "line 2 has 4 values"),
         ("# c\n1 0 0 x 0 0 0 1\n", "line 2: 'x' is not a number"),
         ("1 0 0 0 0 0 0 0 0 0 0 1\n", "KITTI"),
+        ("1;0;0;0;0;0;0;1\n", "not by semicolons"),
+        ("timestamp;tx;ty;tz;qx;qy;qz;qw\n1;0;0;0;0;0;0;1\n", "not by semicolons"),
+        ("1,5 0,0 0,0 0,0 0,0 0,0 0,0 1,0\n", "decimal points"),
+        ("1 0,0 0,0 0,0 0,0 0,0 0,0 1,0\n", "decimal points"),
         ("1305031102.175304 rgb/1305031102.175304.png\n", "list of images"),
         (
             "1 nan 0 0 0 0 0 1\n2 0 0 0 0 0 0 0\n",

@@ -11,6 +11,7 @@ from scipy import stats
 from dynslam_bench.cli.output import report_table
 from dynslam_bench.core.errors import ReportError
 from dynslam_bench.evaluation.protocol import MONOCULAR, get_protocol
+from dynslam_bench.geometry import Trajectory
 from dynslam_bench.reports.html.board_page import ratios_data
 from dynslam_bench.reports.model.board import (
     OVERALL,
@@ -434,6 +435,33 @@ def test_a_recording_thrice_with_changed_pixels_is_one_sequence():
         assert make_board(apart).common == ["s", "t"]
 
 
+def test_a_recording_with_a_frame_fewer_and_other_stamps_is_one_sequence(tmp_path):
+    """Its numbers differ, its poses do not."""
+    store = RunStore(tmp_path)
+    store.prepare()
+    rng = np.random.default_rng(5)
+    poses = np.tile(np.eye(4), (60, 1, 1))
+    poses[:, :3, 3] = np.cumsum(rng.normal(0, 0.01, (60, 3)), axis=0)
+    other = poses.copy()
+    other[:, :3, 3] += rng.normal(0, 0.001, (60, 3))
+    truths = {
+        "whole": Trajectory(np.arange(60) / 30, poses),
+        "later": Trajectory(1000 + np.arange(59) / 30, poses[1:]),
+        "other": Trajectory(np.arange(60) / 30, other),
+    }
+    rows = []
+    for at, (name, truth) in enumerate(truths.items()):
+        part = f"{at:016x}"
+        store.sequences.add(part, np.round(truth.timestamps * 1e9).astype(np.int64), truth)
+        for tracker in ("orb-slam2", "b"):
+            run = row(tracker, name, 0.1, store=store, static_camera_ate_rmse_m=0.2 + 0.001 * at)
+            sequence = run.sequence.model_copy(update={"part": part, "frames": len(truth)})
+            rows.append(run.model_copy(update={"sequence": sequence}))
+    board = make_board(rows)
+    assert board.copies == {"whole": "later"}
+    assert "later counts once for later, whole" in copies_note(board)
+
+
 def test_sequences_of_a_fixed_camera_are_never_one():
     still = {"duration_s": 2.5, "static_camera_ate_rmse_m": 0.0, "tags": ["fixed-camera"]}
     rows = [row(tracker, name, 0.1, **still) for tracker in ("orb-slam2", "b") for name in "st"]
@@ -552,6 +580,16 @@ def test_lost_cells_of_pairs_are_counted_and_not_averaged():
     quick[:2] = np.nan
     assert separable({"a": logs["a"], "quick": quick}, sequences)["a", "quick"].first_by == 0
     assert candidates_for_best({"a": logs["a"], "quick": quick}, sequences) == {"a", "quick"}
+
+
+def test_a_board_that_lost_everything_and_one_whose_reference_did_say_so():
+    every = [crashed(tracker, f"s{n}", 0.2) for tracker in ("orb-slam2", "b") for n in range(8)]
+    board = make_board(every)
+    assert headline(board) == "No tracker can be ranked."
+    assert explanation(board) == ""
+    kept = [row(tracker, f"s{n}", 0.1) for tracker in ("b", "c") for n in range(8)]
+    board = make_board([run for run in every if run.tracker.id != "b"] + kept)
+    assert "lost all, so no tracker can be compared" in headline(board)
 
 
 @pytest.mark.filterwarnings("error")

@@ -568,7 +568,8 @@ def test_runs_are_made_by_the_workers_that_can_make_them(
     cluster.add(**other)
     cluster.add(**same, DYNSLAM_BENCH_DATA=str(tmp_path / "none"))
     (tmp_path / "fake" / "dynslam_bench").mkdir(parents=True)
-    (tmp_path / "fake" / "dynslam_bench" / "__init__.py").touch()
+    # an editable installation would find the modules of an empty package
+    (tmp_path / "fake" / "dynslam_bench" / "__init__.py").write_text("raise ImportError")
     cluster.add(PYTHONPATH=f"{tmp_path}/fake:{path}")
 
     def told(event: RunEvent) -> None:

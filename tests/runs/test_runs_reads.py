@@ -137,6 +137,29 @@ def edit(path: Path, text: str) -> None:
     os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
 
 
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with programs in C: one opens ``settings.cfg``, one loads ``libpart.so``, and waits for a line."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("needs a C compiler")
+    folder = tmp_path_factory.mktemp("compiled")
+    sources = {
+        "opens": '#include <stdio.h>\nint main() { return fopen("settings.cfg", "r") == 0; }',
+        "loads": "#include <stdio.h>\n#include <dlfcn.h>\n"
+        "int main(int count, char **words) "
+        '{ void *part = dlopen(words[1], 2); puts("ready"); fflush(stdout); getchar(); return part == 0; }',
+        "libmode.so": '#include <stdlib.h>\nint mode() { return getenv("MY_SLAM_MODE") != 0; }',
+        "libpart.so": "int part() { return 1111; }",
+    }
+    for name, source in sources.items():
+        (folder / "source.c").write_text(source)
+        options = ["-shared", "-fPIC"] if name.endswith(".so") else []
+        words = [compiler, *options, "source.c", "-o", name, "-ldl"]
+        subprocess.run(words, cwd=folder, check=True)
+    return folder
+
+
 # -- files and folders -----------------------------------------------------------------------------
 
 READ_ALL = """
@@ -303,6 +326,20 @@ def test_a_network_below_the_folder_of_a_source(named: str, bench: Bench) -> Non
     assert bench.changed(reads) == "the file nets/net.onnx"
 
 
+def test_networks_in_a_folder_that_a_configuration_names(bench: Bench) -> None:
+    bench.write("work/slam.json", '{"folder": "models/small", "name": "net"}')
+    bench.write("work/models/small/net.onnx", "1111")
+    bench.write("work/models/other.onnx", "1111")
+    reads = bench.record("def run():\n    open('slam.json').read()\n")
+    assert set(reads.files) == {
+        "plugin:/mine.py",
+        "work:/slam.json",
+        "work:/models/small/net.onnx",
+    }
+    edit(bench.work / "models/small/net.onnx", "2222")
+    assert bench.changed(reads) == "the file models/small/net.onnx"
+
+
 @pytest.mark.parametrize("name", ["net.bin", "mask.png", "first.cfg"])
 def test_a_configuration_that_names_a_file_in_a_folder_below_it(name: str, bench: Bench) -> None:
     bench.write("work/slam.ini", f"[model]\nfile = {name}")
@@ -346,6 +383,40 @@ def test_a_file_that_is_missing_and_never_opened(look: str, bench: Bench) -> Non
     assert bench.changed(reads) == "the file tuned.yaml"
 
 
+@pytest.mark.parametrize(
+    "look",
+    [
+        "os.path.exists('op' + 'tional')",
+        "os.path.isfile('op' + 'tional')",
+        "Path('op' + 'tional').is_dir()",
+        "Path('op' + 'tional').exists()",
+        "os.fork() and os.wait() or (os.path.exists('op' + 'tional'), os._exit(0))",
+    ],
+)
+@pytest.mark.parametrize("appears", ["file", "folder"])
+def test_a_file_or_folder_that_is_looked_for_and_not_there(
+    look: str, appears: str, bench: Bench
+) -> None:
+    source = f"import os\nfrom pathlib import Path\ndef run():\n    return {look}\n"
+    reads = bench.record(source)
+    assert reads.files["work:/optional"] == ""
+    bench.write("work/optional" if appears == "file" else "work/optional/a", "1111")
+    assert bench.changed(reads) == "the file optional"
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        "open('out.png', 'w').close()",
+        "os.mkdir('out.png')",
+        "import cv2, numpy; cv2.imwrite('out.png', numpy.zeros((2, 2)))",
+    ],
+)
+def test_what_a_run_looks_for_and_then_makes_is_no_input(make: str, bench: Bench) -> None:
+    source = f"import os\ndef run():\n    if not os.path.exists('out.png'):\n        {make}\n"
+    assert "work:/out.png" not in bench.record(source).files
+
+
 @pytest.mark.parametrize("text", ["$WEIGHTS/net.bin", "${WEIGHTS}/net.bin", "~/net.bin"])
 def test_a_variable_in_a_path(text: str, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     def point_to(folder: str) -> None:
@@ -378,6 +449,7 @@ LOOKS = [
     "os.environb.get(b'MY_SLAM_MODE')",
     "os.path.expandvars('$MY_SLAM_MODE/x')",
     "os.path.expandvars(b'$MY_SLAM_MODE/x')",
+    "__import__('ctypes').CDLL(None).getenv(b'MY_SLAM_MODE')",
     "__import__('string').Template('$MY_SLAM_MODE').safe_substitute(os.environ)",
 ]
 LISTINGS = [
@@ -388,6 +460,7 @@ LISTINGS = [
     "[key for key in os.environ]",
     "list(os.environ.items())",
     "dict(os.environb)",
+    *(["open('/proc/self/environ').read()"] if sys.platform == "linux" else []),
 ]
 
 
@@ -434,6 +507,18 @@ def test_whose_look_at_a_variable_counts(source: str, counts: bool, bench: Bench
     bench.path.append(str(bench.root / "path"))
     bench.environment["MODE"] = "fast"
     assert set(bench.record(source).environment) == ({"$MODE"} if counts else set())
+
+
+def test_a_variable_that_a_native_library_of_the_plug_in_looks_up(
+    bench: Bench, compiled: Path
+) -> None:
+    bench.environment["MY_SLAM_MODE"] = "fast"
+    bench.environment["ANOTHER"] = "1"
+    source = "import ctypes\ndef run(library):\n    ctypes.CDLL(library).mode()\n"
+    reads = bench.record(source, library=str(compiled / "libmode.so"))
+    assert {"$MY_SLAM_MODE"} == set(reads.environment)
+    bench.environment["MY_SLAM_MODE"] = "slow"
+    assert bench.changed(reads) == "the environment variable MY_SLAM_MODE"
 
 
 def test_a_secret_is_neither_stored_nor_hidden_from_the_comparison(bench: Bench) -> None:
@@ -597,6 +682,17 @@ def test_another_module_of_that_name_earlier_on_the_path(name: str, bench: Bench
     assert "library-of-mine" not in again.distributions
     edit(file, "VALUE = 3\n")
     assert bench.changed(again) == f"the file {file}"
+
+
+@pytest.mark.parametrize("module", ["part", "inner.part"])
+def test_a_module_of_a_namespace_package_in_an_earlier_folder(module: str, bench: Bench) -> None:
+    name = f"spread/{module.replace('.', '/')}.py"
+    bench.write("first/spread/another.py", "")
+    bench.write(f"second/{name}", "VALUE = 1111")
+    bench.path += [str(bench.root / "first"), str(bench.root / "second")]
+    reads = bench.record(f"from spread.{module} import VALUE\ndef run():\n    pass\n")
+    bench.write(f"first/{name}", "VALUE = 2222")
+    assert bench.changed(reads) == f"the file {bench.root / 'first' / name}"
 
 
 def test_a_module_that_could_not_be_imported(bench: Bench) -> None:
@@ -838,6 +934,12 @@ def a_tool(bench: Bench, name: str = "bin/tool") -> Path:
         (["../bin/tool", "--config", "slam.yaml"], "work/net.bin"),
         (["../bin/tool", "maps"], "work/maps/a/associations.txt"),
         (["/bin/sh", "-c", "../bin/tool < slam.yaml"], "bin/tool"),
+        (["/bin/sh", "-c", "cat<net.bin"], "work/net.bin"),
+        ([sys.executable, "-c", "print(open('net.bin').read())"], "work/net.bin"),
+        (
+            [sys.executable, "-W", "ignore", "-c", 'open("maps/a/associations.txt")'],
+            "work/maps/a/associations.txt",
+        ),
         ([sys.executable, "script.py"], "work/script.py"),
         ([sys.executable, "script.py"], "work/part.py"),
     ],
@@ -856,7 +958,8 @@ def test_what_a_program_is_made_of(words: list[str], edited: str, bench: Bench) 
     file = bench.root / edited
     text = file.read_text()
     edit(file, text.replace("1111", "2222").replace("net", "bet"))
-    shown = "the content of the folder maps" if "maps" in edited else edited.removeprefix("work/")
+    is_folder = "maps" in words
+    shown = "the content of the folder maps" if is_folder else edited.removeprefix("work/")
     assert bench.changed(reads).endswith(f"{shown} of a program")
 
 
@@ -923,28 +1026,6 @@ def test_an_environment_variable_that_a_program_looks_up(
     assert bench.changed(reads) == "the environment variable MY_SLAM_MODE"
 
 
-@pytest.fixture(scope="module")
-def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with programs in C: one opens ``settings.cfg``, one loads ``libpart.so``, and waits for a line."""
-    compiler = shutil.which("cc")
-    if compiler is None:
-        pytest.skip("needs a C compiler")
-    folder = tmp_path_factory.mktemp("compiled")
-    sources = {
-        "opens": '#include <stdio.h>\nint main() { return fopen("settings.cfg", "r") == 0; }',
-        "loads": "#include <stdio.h>\n#include <dlfcn.h>\n"
-        "int main(int count, char **words) "
-        '{ void *part = dlopen(words[1], 2); puts("ready"); fflush(stdout); getchar(); return part == 0; }',
-        "libpart.so": "int part() { return 1111; }",
-    }
-    for name, source in sources.items():
-        (folder / "source.c").write_text(source)
-        options = ["-shared", "-fPIC"] if name.endswith(".so") else []
-        words = [compiler, *options, "source.c", "-o", name, "-ldl"]
-        subprocess.run(words, cwd=folder, check=True)
-    return folder
-
-
 def test_a_file_that_a_compiled_program_names(bench: Bench, compiled: Path) -> None:
     bench.write("work/settings.cfg", "1111")
     bench.write("work/source.c", "1111")
@@ -987,7 +1068,7 @@ def test_a_library_that_a_program_loads(bench: Bench, compiled: Path) -> None:
     assert bench.changed(reads) == f"the file {Path(library).name} of a program"
 
 
-def test_a_library_of_a_program_that_is_built_anew_meanwhile(bench: Bench, compiled: Path) -> None:
+def test_a_library_of_a_program_that_is_rebuilt_meanwhile(bench: Bench, compiled: Path) -> None:
     (bench.root / "elsewhere").mkdir()
     library = shutil.copy(compiled / "libpart.so", bench.root / "elsewhere")
     words = [str(compiled / "loads"), str(library)]

@@ -678,6 +678,21 @@ def test_dilation_is_a_disc_of_that_radius(radius):
     assert not dilate(np.zeros((H, W), bool), radius).any()
 
 
+@pytest.mark.parametrize("size", [(640, 480), (320, 240), (160, 120), (400, 300), (1242, 375)])
+@pytest.mark.parametrize("repair", ["none", "depth"])
+def test_masks_grow_by_the_same_share_of_an_image_of_any_size(size, repair):
+    width, height = size
+    rows, columns = np.mgrid[:height, :width]
+    away = np.hypot(rows - height // 2, columns - width // 2)
+    disc = away <= 0.1 * width
+    depth = np.where(disc, 1.5, 3.0).astype(np.float32)
+    settings = SegmentationSettings(dilation_px=15, repair=repair)
+    grown = dynamic_mask(instances(disc), settings, depth)
+    radius = away[grown].max()
+    assert radius == pytest.approx((0.1 + 15 / 640) * width, abs=1.0)
+    assert iou(grown, away <= radius) > 0.97
+
+
 @pytest.mark.parametrize(
     "nothing", [Instances.empty(H, W), instances(block(10, 50, 10, 50), scores=[0.05])]
 )
@@ -695,17 +710,23 @@ def test_holes_are_filled_and_bays_stay():
 
 
 def test_depth_repair_fits_the_border_to_the_depth_edge():
-    truth = block(20, 100, 50, 110)
+    # a border of 8 pixels decides, of images that are 640 pixels wide
+    truth, *wrong = (
+        np.pad(block(*place), ((0, 0), (0, 640 - W)))
+        for place in (
+            (20, 100, 50, 110),
+            (25, 95, 55, 105),
+            (15, 105, 45, 115),
+            (20, 100, 54, 114),
+        )
+    )
     depth = np.where(truth, 1.5, 3.0).astype(np.float32)
     depth[::7] = 0  # missing rows decide nothing
     settings = SegmentationSettings(repair="depth", dilation_px=0)
-    for wrong in (block(25, 95, 55, 105), block(15, 105, 45, 115), block(20, 100, 54, 114)):
-        assert (
-            iou(dynamic_mask(instances(wrong), settings, depth), truth) > 0.93 > iou(wrong, truth)
-        )
-    wrong = block(25, 95, 55, 105)
-    assert np.array_equal(dynamic_mask(instances(wrong), settings), wrong)
-    assert np.array_equal(repair(wrong, np.zeros((H, W), np.float32), 0.2), wrong)
+    for mask in wrong:
+        assert iou(dynamic_mask(instances(mask), settings, depth), truth) > 0.93 > iou(mask, truth)
+    assert np.array_equal(dynamic_mask(instances(wrong[0]), settings), wrong[0])
+    assert np.array_equal(repair(wrong[0], np.zeros_like(depth), 0.2), wrong[0])
 
 
 # --- carrying ----------------------------------------------------------------------------------------------------
@@ -941,6 +962,7 @@ def test_beside_tracking_missed_detections_count_the_frames_between_those_segmen
     assert apart == [1, 1, 3, 3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("epoch", [0.0, 1311868164.3])
 def test_beside_tracking_masks_are_due_at_the_same_frames_from_any_first_stamp(epoch):
     """A latency of three frames is three frames, however the sum of stamp and latency is rounded."""

@@ -564,6 +564,20 @@ def test_cameras_of_code_are_looked_at_as_well(tmp_path):
         SlamEnv(Data(), "never-move")
 
 
+@pytest.mark.parametrize(("rate", "readout_s"), [(30, 0.5), (30, 0.08), (240, 0.02)])
+def test_a_readout_that_is_longer_than_the_time_between_two_images(
+    rate: float, readout_s: float, tmp_path: Path
+) -> None:
+    folder, *_ = make_folder(tmp_path / "rec", frames=5, rate=rate, fps=None)
+    camera = open_sequence(folder).camera
+    write_camera(folder / CAMERA_FILE, replace(camera, readout_s=1 / rate))
+    assert open_sequence(folder).camera.readout_s == 1 / rate
+    write_camera(folder / CAMERA_FILE, replace(camera, readout_s=readout_s))
+    message = f"readout_s = {readout_s} .* is longer than the {1 / rate:.3g} s"
+    with pytest.raises(SequenceError, match=message):
+        open_sequence(folder)
+
+
 @pytest.mark.parametrize(
     ("rate", "stated", "taken"),
     [

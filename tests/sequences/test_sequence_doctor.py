@@ -248,6 +248,7 @@ def matrix_of(text):
     return np.array([[float(value) for value in row.split(",")] for row in text.split(";")])
 
 
+@pytest.mark.slow
 def test_the_cure_of_turned_axes_is_their_inverse_and_a_rotation(diagnosed):
     (finding,) = diagnosed("truth-axes").findings
     cure = matrix_of(re.search(r"\[(.*)\]", finding.cure).group(1))
@@ -480,6 +481,7 @@ def test_images_are_not_held(host, tmp_path):
     assert people.most < 20
 
 
+@pytest.mark.slow
 def test_masks_count_as_content_and_have_to_be_there(folder, tmp_path):
     made = shutil.copytree(folder / "made", tmp_path / "made")
     before = open_sequence(str(made)).digest()

@@ -174,6 +174,7 @@ def test_controls(walking, people: str, persons: bool) -> None:
     assert sequence.digest() != walking.digest()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", ["lighting_change", "glare", "shadow"])
 def test_lighting_options_change_colours_only(option: str, walking) -> None:
     sequence = opened("walking_xyz?scene=1", **{option: True})

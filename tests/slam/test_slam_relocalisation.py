@@ -414,6 +414,7 @@ def reference_scores(slam_map, keyframes, features):
     return np.array(scores)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_index_follows_keyframes_that_come_and_go(room, seed):
     """Keyframes of many sizes, some features without a point, slots used again, and only some asked for."""

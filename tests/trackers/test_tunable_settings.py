@@ -50,6 +50,7 @@ from dynslam_bench.trackers import TRACKERS, TrackerContext, build_tracker
 from dynslam_bench.trackers.registry import all_specs, resolve_settings
 from dynslam_bench.trackers.systems.composition import UnfilteredSystemSettings
 from dynslam_bench.tuning import SpaceSpec, search_space
+from dynslam_bench.tuning.plan import source_of_masks
 
 SYSTEMS = {
     spec.id: spec for spec in all_specs() if issubclass(spec.settings, UnfilteredSystemSettings)
@@ -67,7 +68,11 @@ def offered() -> dict[str, tuple[str, Parameter]]:
     """Every setting that a study of some system draws on rendered sequences, with the first such system."""
     settings: dict[str, tuple[str, Parameter]] = {}
     for spec in SYSTEMS.values():
-        for parameter in search_space(spec.settings(), SpaceSpec(), ["synthetic/walking_xyz"]):
+        tracker_settings = spec.settings()
+        if hasattr(tracker_settings, "segmentation"):  # "auto" stands for a source of masks
+            source = source_of_masks(tracker_settings, ["synthetic/walking_xyz"])
+            tracker_settings = apply_overrides(tracker_settings, {"segmentation.source": source})
+        for parameter in search_space(tracker_settings, SpaceSpec()):
             settings.setdefault(parameter.name, (spec.id, parameter))
     return settings
 
@@ -539,6 +544,7 @@ def test_frames_without_any_texture_are_lost_and_only_those(sitting, value: int)
     assert len(lost) <= len(BAD) + 2, f"recovery within two frames, but lost: {lost}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [0.35, 2.2], ids=["under-exposed", "over-exposed"])
 def test_a_wrong_exposure_is_survived(sitting, gain: float) -> None:
     def exposed(frame: Frame) -> Frame:

@@ -85,6 +85,7 @@ def test_a_preview_takes_what_stored_runs_show_and_else_what_is_known(
     assert f"{after.needed} held-out scenes" in after.figures[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("held_out", "extendable"), [("100-139", False), ("100-111", True)])
 def test_a_preview_states_power_at_the_level_of_the_study(
     held_out: str, extendable: bool, tmp_path: Path
@@ -176,6 +177,7 @@ def earlier(tmp_path: Path) -> Study:
     ).run()
 
 
+@pytest.mark.slow
 def test_a_study_begins_with_what_an_earlier_one_learnt(earlier: Study, tmp_path: Path) -> None:
     spec = make_spec(
         name="second", trials=5, pruner="none", start=[str(earlier.folder), {"gain": 0.9}]
@@ -254,6 +256,7 @@ def test_a_study_without_a_verdict_goes_on_with_more_scenes_and_trials(tmp_path:
         again.extend(trials=2)
 
 
+@pytest.mark.slow
 def test_another_trial_is_not_judged_on_scenes_that_have_judged(tmp_path: Path) -> None:
     """However the further trials were asked for; the same trial may be judged again."""
     spec = make_spec(trials=3, pruner="none")
@@ -400,6 +403,76 @@ def test_a_crash_in_a_scene_that_judges_is_a_loss_there_and_ends_nothing(
     crashes = 3 * (len(by_candidate) + len(by_baseline))
     assert f"{crashes} runs crashed" in summary.conclusion
     assert "it broke" in summary.conclusion
+
+
+class LosingTuner(SimulatedTuner):
+    """Its baseline, or both sides, lose all scenes that judge, or have no error there."""
+
+    losers: tuple[str, ...] = ()
+    is_perfect = False
+
+    def outcomes(
+        self, settings: Mapping[str, Any], instances: Sequence[ProblemInstance], **how: Any
+    ) -> Any:
+        side = "candidate" if settings else "baseline"
+        judging = set(self.design.held_out)
+        drawn = super().outcomes(settings, instances, **how)
+        for instance in judging & set(instances):
+            drawn[instance] = replace(drawn[instance], lost=side in self.losers)
+            if self.is_perfect:
+                drawn[instance] = replace(drawn[instance], ate_m=0.0)
+        return drawn
+
+
+@pytest.mark.parametrize(
+    ("losers", "verdict", "said"),
+    [
+        (("baseline", "candidate"), Verdict.CANNOT_TELL, "judge on scenes that both sides track"),
+        (("baseline",), Verdict.CANNOT_TELL, "judge on scenes that both sides track"),
+        (
+            ("candidate",),
+            Verdict.WORSE,
+            "loses more scenes than the baseline: both succeed on none",
+        ),
+    ],
+)
+def test_scenes_that_a_side_lost_say_what_cannot_be_said(
+    losers: tuple[str, ...], verdict: Verdict, said: str, tmp_path: Path
+) -> None:
+    tuner = LosingTuner(make_spec(trials=3), tmp_path).run()
+    tuner.losers = losers
+    summary = finish(tuner)
+    assert summary.verdict is verdict
+    assert said in summary.conclusion
+    assert summary.offered == {}
+
+
+def test_errors_below_the_floor_are_equal_and_said(tmp_path: Path) -> None:
+    tuner = LosingTuner(make_spec(trials=3), tmp_path).run()
+    tuner.is_perfect = True
+    summary = finish(tuner)
+    assert summary.verdict is Verdict.CANNOT_TELL
+    assert "exactly the same error in 8 scenes" in summary.conclusion
+    assert "an error below 0.1 mm counts as 0.1 mm" in summary.conclusion
+
+
+def test_claims_beyond_the_families_rest_on_six_that_no_trial_saw(tmp_path: Path) -> None:
+    names = ("sitting_xyz", "sitting_rpy", "walking_rpy", "objects_balloon", "objects_trolley")
+    every = (*names, "walking_static")
+    for families in (names, every):
+        held_out = [f"synthetic/{name}?scene=100-101&frames=20&offsets=0" for name in families]
+        spec = make_spec(held_out=held_out, trials=4)
+        summary = finish(SimulatedTuner(spec, tmp_path / str(len(families)), effect=valley).run())
+        assert summary.best is not None
+        beyond = summary.best.beyond
+        if families is names:
+            assert beyond is None
+            assert "says nothing of others" in summary.conclusion
+            continue
+        assert beyond is not None
+        assert beyond.all_scenes == 6
+        assert "by the means of the 6 families that no trial saw" in summary.conclusion
+        assert "says nothing of others" not in summary.conclusion
 
 
 def test_a_candidate_that_crashes_everywhere_is_not_judged(tmp_path: Path) -> None:
@@ -562,6 +635,7 @@ def test_the_embedded_network_alone_was_trained_on_the_scenes(source: str, seen:
     assert splits_seen(TRACKERS.get(TRACKER).settings(), design) == [], "a system without masks"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("masks", [True, False])
 def test_page_summary_and_preset_mark_scenes_of_the_training(masks: bool, tmp_path: Path) -> None:
     changes = (
@@ -671,6 +745,7 @@ def test_the_baseline_runs_from_three_starts() -> None:
     assert sorted(first) == [0, 1, 3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scenes_to_tune_on", "reserved"), [(1, 28), (11, 28), (40, 28)])
 def test_further_scenes_judge_where_none_are_named(scenes_to_tune_on: int, reserved: int) -> None:
     design = design_of(

@@ -146,3 +146,29 @@ def test_a_setting_is_proposed_only_where_the_chosen_system_has_it_and_uses_it(
         assert "tracker" not in configuration.settings
         assert ("segmentation.source" in configuration.settings) == has_masks
     assert study.configuration({}).tracker == WITHOUT_MASKS
+
+
+def test_a_search_without_moths_or_neighbours_has_none_of_their_settings(tmp_path: Path) -> None:
+    space = {
+        "include": ["flow.population", "flow.cauchy_step_px", "flow.sweeps"],
+        "choices": {"flow.search": ["emfoa+propagation", "mfo", "random", "patchmatch"]},
+    }
+    used = {
+        "emfoa+propagation": {"flow.population", "flow.cauchy_step_px", "flow.sweeps"},
+        "mfo": {"flow.population"},
+        "random": set(),
+        "patchmatch": {"flow.sweeps"},
+    }
+    for params in proposals(plan(tmp_path, space)):
+        assert params.keys() == {"flow.search"} | used[params["flow.search"]]
+
+
+def test_a_value_that_only_some_systems_have_may_be_fixed(tmp_path: Path) -> None:
+    space = {
+        "choices": {"tracker": ["orb-slam2", "mask-rcnn"]},
+        "fixed": {"segmentation.source": "embedded"},
+    }
+    study = plan(tmp_path, space, tracker="orb-slam2")
+    assert study.baseline.settings == {}
+    assert study.configuration({"tracker": "mask-rcnn"}).settings == space["fixed"]
+    assert study.preview().scenes == 1

@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext, suppress
 from pathlib import Path
@@ -43,7 +43,8 @@ from sqlalchemy.exc import OperationalError
 
 from dynslam_bench.core import DynslamError, StudyError, read_settings
 from dynslam_bench.core.settings import apply_overrides
-from dynslam_bench.runs import RunEvent, RunStore
+from dynslam_bench.runs import RunEvent, RunSpec, RunStore
+from dynslam_bench.runs.identity import resolve
 from dynslam_bench.trackers import TRACKERS
 from dynslam_bench.tuning import (
     Outcome,
@@ -285,6 +286,25 @@ def test_a_study_of_older_code_can_be_read_but_not_continued(
     with pytest.raises(StudyError, match="there is no study 'toy'"):
         Study.open(spec, tmp_path / "elsewhere")
     assert not (tmp_path / "elsewhere" / "studies").exists(), "looking creates nothing"
+
+
+def test_the_code_of_each_sequence_counts(
+    folders: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sequences of two kinds are read by other code; the one that is looked up last hides no other."""
+    spec = make(folders, trials=2)
+
+    def reader(version: str) -> Callable[[Mapping[str, Any]], dict[str, str]]:
+        first = resolve(RunSpec(tracker=spec.tracker, sequence=folders[0])).identity["content"]
+        return lambda run: {"code": version if run["content"] == first else "same"}
+
+    monkeypatch.setattr("dynslam_bench.tuning.study.program_of", reader("older"))
+    run_study(spec, results=tmp_path)
+    monkeypatch.setattr("dynslam_bench.tuning.study.program_of", reader("newer"))
+    with pytest.raises(
+        StudyError, match='stored with other code: "older same" there, "newer same"'
+    ):
+        Study(spec, tmp_path)
 
 
 def test_a_study_does_not_go_on_after_its_plug_in_changed(tmp_path: Path) -> None:

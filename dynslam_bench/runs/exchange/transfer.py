@@ -103,12 +103,14 @@ def export_run(
         DynslamError: The sequence is not here although the format needs it, a library is missing,
             or the folder cannot be written.
     """
+    # what is asked for, and where it goes
     if form not in FORMATS:
         raise RunError(f"there is no format '{form}'", did_you_mean(form, FORMATS))
     if folder is None and not isinstance(results, RunStore) and Path(results).is_file():
         raise RunError(f"{results} is an archive, which gets no exports", "name a folder, with -o")
     store = results if isinstance(results, RunStore) else open_store(results)
     record = store.read(run) if isinstance(run, str) else run
+    # the trajectory, and the folder, which must be free or an earlier export
     chosen, trajectory = _trajectory(store, record, which)
     if folder is None:
         target = store.root / "exports" / record.run_id / form
@@ -118,6 +120,7 @@ def export_run(
         raise RunError(
             f"{target} exists and is no export", "name a folder that does not exist, with -o"
         )
+    # the files, then their digests beside what made them
     with atomic_folder(target) as work:
         notes = _write(
             form,
@@ -231,6 +234,7 @@ def _write_colmap(work: Path, sequence: Sequence, trajectory: Trajectory, cloud:
     Returns:
         What a user should know, one line each.
     """
+    # poses of images alone: COLMAP has a pose for each image
     rows_of_frames, rows_of_poses = associate(
         sequence.timestamps, trajectory.timestamps, _STAMP_TOLERANCE_S
     )
@@ -238,6 +242,7 @@ def _write_colmap(work: Path, sequence: Sequence, trajectory: Trajectory, cloud:
     files: dict[float, str] = getattr(sequence, "colour_files", {})
     stamps = sequence.timestamps[rows_of_frames].tolist()
     names = [files.get(stamp, f"rgb/{stamp:.6f}.png") for stamp in stamps]
+    # map points, and the poses of those images
     points = read_ply(cloud) if cloud.is_file() else None
     poses = trajectory.select(np.asarray(rows_of_poses))
     write_colmap(work, poses, sequence.camera, names, points)
@@ -291,12 +296,14 @@ def stated_provenance(file: Path) -> str:
     """
     # ValueError: a name with a null byte
     with contextlib.suppress(DynslamError, OSError, ValueError):
+        # what the export wrote, and the files that it means
         folder = file if file.is_dir() else file.parent
         provenance = Provenance.read(folder / PROVENANCE_FILE)
         if file.is_file():
             files = [file]
         else:  # names that lead out of the folder are left out
             files = [file / name for name in provenance.files if Path(name).name == name]
+        # an edited file is no longer what the export wrote
         is_unchanged = all(provenance.files.get(path.name) == digest_of(path) for path in files)
         if files and is_unchanged:
             return provenance.describe()
@@ -329,6 +336,7 @@ def open_stored(
     # without that a record could name any folder of images, and a page or a file show them
     if not record.sequence.content:
         raise RunError(f"the record does not say what {record.sequence.id} held")
+    # the same frames, by their content and not by their name
     start, stop = record.frames or (0, None)
     place = record.place or record.sequence.id
     sequence = open_frames(place, data_root, camera, (start + record.offset, stop), record.stride)
@@ -421,6 +429,7 @@ def import_trajectory(
     covered = coverage.covered
     status, reason = judge_coverage(covered, total, total - 1 - coverage.last, total)
 
+    # an imported trajectory is identified by its file and by the frames that it belongs to
     identity = {
         "kind": "imported",
         "tracker": tracker,
@@ -436,6 +445,7 @@ def import_trajectory(
         identity["timestamps"] = digest_of(Path(timestamps).expanduser())
     if topic is not None:
         identity["topic"] = topic
+    # its record, as that of a run: frames without a pose count as lost
     record = RunRecord(
         kind="imported",
         run_id=run_id_of(identity),
@@ -460,6 +470,7 @@ def import_trajectory(
         notes=notes,
     ).normalised()
 
+    # trajectory, stamps and ground truth into the store
     store = results if isinstance(results, RunStore) else RunStore(results)
     store.prepare()
     with store.work_folder(record.run_id) as work:
@@ -581,6 +592,7 @@ def _match_frames(trajectory: Trajectory, stamps: Array, shares: str, name: str)
     Raises:
         RunError: Fewer than two poses are near a frame.
     """
+    # poses with a frame's own stamp, and poses near a frame
     exact, _ = associate(stamps, trajectory.timestamps, STAMP_TOLERANCE, strict=False)
     near, _ = associate(stamps, trajectory.timestamps, _IMPORT_TOLERANCE_S)
     if len(near) < 2:
@@ -591,6 +603,7 @@ def _match_frames(trajectory: Trajectory, stamps: Array, shares: str, name: str)
             f"{stamps[0]:.6f} to {stamps[-1]:.6f}",
             clock_hint(trajectory.timestamps, stamps),
         )
+    # where all stamps are those of frames, poses of one stamp count once
     n_without_frame = len(trajectory) - len(exact)
     covered = len(near) if n_without_frame else len(exact)
     return _Coverage(len(stamps), covered, n_without_frame, int(near[-1]))

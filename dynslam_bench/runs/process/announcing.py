@@ -1,7 +1,9 @@
 """What code in this process is about to do, announced before it is done.
 
 Python announces openings, listings, imports and programs to audit hooks (`sys.audit`). What is
-looked up in ``os.environ`` is announced by a subclass of its class, in the same way.
+looked up in ``os.environ`` is announced by a subclass of its class, in the same way. So are files
+that are looked for (``os.path.exists``, ``Path.is_file``) and that are not there, by a function
+in place of ``os.stat``.
 """
 
 import os
@@ -16,6 +18,8 @@ ALL_VARIABLES = "dynslam_bench.variables"
 """The names of all variables are listed."""
 VARIABLE_SET = "dynslam_bench.variable_set"
 """A variable, its argument, is set or removed."""
+MISSING = "dynslam_bench.missing"
+"""A file or folder, its argument, is looked for and not there."""
 
 Listener = Callable[[FrameType, str, tuple[Any, ...]], None]
 """Gets the frame of the function that is about to do something, the event and its arguments."""
@@ -26,6 +30,7 @@ _after_fork: Callable[[], None] | None = None
 _is_hook_installed = False
 _Environment: Any = type(os.environ)
 """The class of ``os.environ``."""
+_stat = os.stat
 
 
 def listen(
@@ -48,6 +53,7 @@ def listen(
     _listener = listener
     _events = frozenset(events)
     _after_fork = after_fork
+    os.stat = _stat if listener is None else _announced_stat
     for variables in (os.environ, os.environb):
         variables.__class__ = _Environment if listener is None else AnnouncedEnvironment
 
@@ -60,6 +66,23 @@ def _announce(event: str, arguments: tuple[Any, ...]) -> None:
 def _tell_of_fork() -> None:
     if _after_fork is not None:
         _after_fork()
+
+
+def _announced_stat(
+    path: Any, *, dir_fd: int | None = None, follow_symlinks: bool = True
+) -> os.stat_result:
+    """``os.stat`` that announces what is not there."""
+    try:
+        return _stat(path, dir_fd=dir_fd, follow_symlinks=follow_symlinks)
+    except (FileNotFoundError, NotADirectoryError):
+        if dir_fd is None:
+            sys.audit(MISSING, path)
+        raise
+
+
+# Python keeps in these which functions take descriptors and leave links alone
+for _abilities in (os.supports_dir_fd, os.supports_fd, os.supports_follow_symlinks):
+    _abilities.add(_announced_stat)
 
 
 class AnnouncedEnvironment(_Environment):  # type: ignore[misc]

@@ -4,7 +4,7 @@ import os
 import re
 import sys
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -43,6 +43,8 @@ _LONGEST_TEXT = 1 << 16
 """Text files of up to so many bytes are searched for names of files; longer ones are data."""
 _LONGEST_SOURCE = 1 << 20
 """Python sources of up to so many bytes are searched, and files of programs for names of variables."""
+_LONGEST_LIBRARY = 1 << 24
+"""Bytes of the longest native library that is searched for names of variables."""
 _MANY_FILES = 10_000
 """A folder with more files is not read whole where a program's arguments name it."""
 _TEXT_SUFFIXES = (".yaml", ".yml", ".toml", ".json", ".cfg", ".ini", ".conf", ".txt", ".xml")
@@ -58,6 +60,9 @@ _NETWORKS = (
     ".weights",
     ".engine",
     ".safetensors",
+    ".bin",
+    ".param",
+    ".mnn",
 )
 _ARRAYS_AND_CLOUDS = (".h5", ".hdf5", ".ply", ".pcd")
 _READ_IN_MACHINE_CODE = (*_IMAGES, *_VIDEOS, *_NETWORKS, *_ARRAYS_AND_CLOUDS)
@@ -139,6 +144,7 @@ class Notes:
         commands: When each command was started first, in nanoseconds since the epoch.
         made: Files that the run has written or removed.
         made_folders: Beginnings of the paths of what lies in folders that it has made.
+        missing: Files and folders that were looked for, and not there.
         changed: Files that were another when they were opened again.
     """
 
@@ -149,6 +155,7 @@ class Notes:
     commands: dict[Command, int] = field(default_factory=dict)
     made: set[str] = field(default_factory=set)
     made_folders: tuple[str, ...] = ()
+    missing: set[str] = field(default_factory=set)
     changed: list[str] = field(default_factory=list)
 
 
@@ -163,12 +170,15 @@ class Modules:
             started.
         files: Files of modules that belong to no distribution, and whether they were loaded before
             the recorder was started.
+        absent: Files that are not there, and would be loaded in place of modules of namespace
+            packages.
     """
 
     imports: ImportPath
     places: dict[str, str] = field(default_factory=dict)
     distributions: dict[str, bool] = field(default_factory=dict)
     files: dict[str, bool] = field(default_factory=dict)
+    absent: set[str] = field(default_factory=set)
 
 
 class Collector:
@@ -217,6 +227,7 @@ class Collector:
         # so do files that these name
         named, missing = self._named_files(files)
         files |= {path: content_now(path) for path in named - files.keys()}
+        missing |= modules.absent | self._still_missing()
         files |= dict.fromkeys(missing - files.keys(), ABSENT)
 
         folders = {
@@ -224,6 +235,7 @@ class Collector:
         }
         links = {path: link_now(path, self._anchors) for path in (*files, *folders, *programs)}
         variables = self.notes.variables.union(*map(self._variables_of, dict(self.notes.commands)))
+        variables |= self._variables_in(files)
         used_distributions = modules.distributions.keys() | distributions
 
         name = self._anchors.name
@@ -255,7 +267,7 @@ class Collector:
 
     def _is_input(self, path: str) -> bool:
         """Whether something lies at a path that was there before the run."""
-        if not is_file_name(path) or self.is_output(path):
+        if not is_file_name(path) or self.is_output(path) or path in self.notes.missing:
             return False
         stamp = stamp_of(path)
         return stamp is not None and not self.is_made_by_program(stamp)
@@ -268,6 +280,14 @@ class Collector:
         """Digest of a file that was not taken when the file was opened."""
         content = content_now(path)
         return ABSENT if note.stamp is None and content != UNREADABLE else content
+
+    def _still_missing(self) -> set[str]:
+        """What was looked for and is not there at the end either: the rest was made by the run."""
+        return {
+            path
+            for path in set(self.notes.missing)
+            if not self.is_output(path) and not os.path.lexists(path)
+        }
 
     def _folder(self, path: str, names: list[str] | None) -> str:
         """Digest of the names in a folder as it was listed.
@@ -314,7 +334,7 @@ class Collector:
             self.compare(path, note, stamp_of(path))
         if self.notes.changed:
             return f"the file {self.notes.changed[0]}"
-        # a library of a program that was built anew while the program ran
+        # a library of a program that was rebuilt while the program ran
         for path, modified_ns in dict(self.programs.files).items():
             if is_code(path) and self._is_rebuilt(path, modified_ns):
                 return f"the file {path} of a program"
@@ -388,6 +408,7 @@ class Collector:
             modules.distributions |= dict.fromkeys(distributions, was_loaded)
             if not distributions or self._origins.is_plugin(name):
                 modules.files[_on_disk(file)] = was_loaded
+                modules.absent |= _absent_before(name, file, imports.folders)
             file_of_top.setdefault(top, file)
 
         # where each is found on the import path
@@ -469,6 +490,26 @@ class Collector:
             }
         return self._variables[command]
 
+    def _variables_in(self, files: Iterable[str]) -> set[str]:
+        """The variables that foreign libraries, or sources that name ``getenv``, hold the names of.
+
+        Machine code looks variables up unannounced. Of a library those count that are set.
+        """
+        names: set[str] = set()
+        set_now = set(filter(is_counted, self.environment)) - set(SEARCH_PATHS)
+        for file in files:
+            stamp = stamp_of(file)
+            if stamp is None or not is_code(file) or self._origins.of_file(file) != "foreign":
+                continue
+            if file.endswith(".py"):
+                if b"getenv" in Path(file).read_bytes():
+                    names |= {word for word in self._words(file) if _VARIABLE.fullmatch(word)}
+            elif stamp.size <= _LONGEST_LIBRARY and os.path.isfile(file):
+                content = Path(file).read_bytes()
+                names |= {name for name in set_now if os.fsencode(name) in content}
+        names -= {name.removeprefix("$") for name in self.notes.made}
+        return {name for name in names if is_counted(name) and name not in SEARCH_PATHS}
+
     def _is_too_wide(self, folder: str) -> bool:
         """Whether a folder holds so much that a program that is told of it does not read it all."""
         places = [
@@ -503,16 +544,20 @@ class Collector:
 
         A name is looked for in the folder of the text, in that of the plug-in and in the working
         folder. A bare name of a file, or the ending of a network's file, is also looked for in all
-        folders below that of the text: ``folder / f"{name}.onnx"``.
+        folders below that of the text: ``folder / f"{name}.onnx"``. Of a folder that a text names by its
+        path the networks in it count.
         """
         named: set[str] = set()
         missing: set[str] = set()
+        texts = list(texts)
+        opened_names = set(map(os.path.basename, texts))
         for text in texts:
             for word in self._words(text):
                 places = self._places_of(word, text)
                 there = {place for place in places if os.path.isfile(place)}
-                if not there:
+                if not there and word not in opened_names:
                     there = self._files_below(os.path.dirname(text), word)
+                    there |= _networks_in({place for place in places if os.sep in word})
                 named |= there
                 if not there and text.endswith(".py") and _can_be_missing(word):
                     missing |= places
@@ -570,6 +615,38 @@ def _can_be_missing(word: str) -> bool:
         and top not in sys.modules
         and top not in sys.stdlib_module_names
     )
+
+
+def _networks_in(folders: Iterable[str]) -> set[str]:
+    """The files of networks that lie in folders."""
+    return {
+        os.path.join(folder, name)
+        for folder in filter(os.path.isdir, folders)
+        for name in os.listdir(folder)
+        if name.lower().endswith(_NETWORKS)
+    }
+
+
+def _absent_before(module: str, file: str, folders: Sequence[str]) -> set[str]:
+    """The files that Python would load in place of a module of a namespace package, in earlier folders of the path.
+
+    Args:
+        module: Its dotted name.
+        file: Where it was found.
+        folders: The import path.
+    """
+    package = sys.modules.get(module.partition(".")[0])
+    # a package with an __init__.py lies in one folder
+    if "." not in module or package is None or getattr(package, "__file__", None) is not None:
+        return set()
+    absent: set[str] = set()
+    for folder in folders:
+        if file.startswith(f"{folder}{os.sep}"):
+            break
+        place = os.path.join(folder, *module.split("."))
+        candidates = {f"{place}.py", os.path.join(place, "__init__.py")}
+        absent |= {path for path in candidates if not os.path.exists(path)}
+    return absent
 
 
 def _on_disk(file: str) -> str:

@@ -7,8 +7,8 @@ variables that they look up.
 Files that libraries open in machine code are not announced: by ``cv2.imread``, ``cv2.dnn.readNet``,
 ``onnxruntime``. In their place each file counts whose name is written in a plug-in's sources, or in
 a small text file that foreign code opened. So does each image and network in a folder that it
-listed. Nor is it announced that a plug-in asks whether a file is there (``Path.exists``): a file
-that its sources name and that is not there counts as absent. Files that are named by a descriptor
+listed. A file that sources name, or that a plug-in looks for, and that is not there counts as absent.
+Files that are named by a descriptor
 of their folder are not seen, nor is what comes from the network.
 
 Of programs counts what `core.programs` shows, what their command lines name, and the environment
@@ -53,7 +53,13 @@ from dynslam_bench.core.reads import (
     digest_of,
     names_in,
 )
-from dynslam_bench.runs.process.announcing import ALL_VARIABLES, VARIABLE, VARIABLE_SET, listen
+from dynslam_bench.runs.process.announcing import (
+    ALL_VARIABLES,
+    MISSING,
+    VARIABLE,
+    VARIABLE_SET,
+    listen,
+)
 from dynslam_bench.runs.process.collector import Collector, FileNote, is_code, stamp_of
 from dynslam_bench.runs.process.origins import Origins
 
@@ -73,12 +79,14 @@ _IMPORTING = ("<frozen importlib", "<frozen zipimport", os.path.dirname(importli
 """Beginnings of the files that search for modules and for metadata: these list all folders of the path."""
 _RELATIVE_TO_DESCRIPTOR = ("shutil.py", "os.py", "<frozen os>")
 """These open files by their names in folders that they hold open; the announcement does not tell which folder."""
+_ENVIRONMENT = re.compile(r"/proc/(?:self|\d+)/environ")
+"""Where Linux lists the variables of a process."""
 _KERNELS = (".nbi", ".nbc")
 """Numba's compiled code, which follows from its source."""
 _METADATA = re.compile(r"\.(?:dist|egg)-info(?:/|$)")
 """Folders in which a distribution is described."""
-_SHELL_WORD = re.compile(r"[^\s;|&<>()'\"`$]+")
-"""A word of a shell's line."""
+_WORD_OF_CODE = re.compile(r"[^\s;|&<>()'\"`$,]+")
+"""A word of a line of code that can be the name of a file."""
 _LOG = "reads-{}.jsonl"
 """In the first private folder: what a forked process has read."""
 
@@ -121,6 +129,7 @@ class ReadRecorder:
         self._snapshot = (-1, "")
         self._handlers: dict[str, Callable[..., None]] = {
             "open": self._on_open,
+            MISSING: self._on_missing,
             "mmap.__new__": self._on_map,
             "sqlite3.connect": self._on_database,
             "ctypes.dlopen": self._on_library,
@@ -264,6 +273,10 @@ class ReadRecorder:
         path = _absolute(name)
         if path is None:
             return
+        if _ENVIRONMENT.fullmatch(path):
+            if self._is_asked_by_foreign(frame):
+                self._note_variables(self._collector.environment)
+            return
         if mode is None and not os.path.isabs(name) and _is_in(frame, _RELATIVE_TO_DESCRIPTOR):
             return
         if not flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC):
@@ -273,6 +286,15 @@ class ReadRecorder:
         if flags & os.O_RDWR and not flags & os.O_TRUNC:
             self._read(frame, path, whole=True)
         self._make(path)
+
+    def _on_missing(self, frame: FrameType, name: Any) -> None:
+        path = None if isinstance(name, int) else _absolute(name)
+        if path is None or path in self._notes.missing or not self._counts_by_itself(path):
+            return
+        if self._collector.is_output(path) or not self._is_asked_by_foreign(frame.f_back):
+            return
+        self._notes.missing.add(path)
+        self._note("missing", path)
 
     def _on_map(self, frame: FrameType, descriptor: int, *_: Any) -> None:
         if path := _absolute(descriptor):
@@ -476,9 +498,9 @@ class ReadRecorder:
         if not self._is_foreign(frame) and not _is_adapter(frame):
             return
         texts = [os.fsdecode(word) for word in words]
-        # what a shell's line names counts as arguments do
-        if texts[1:2] == ["-c"] and texts[0].endswith("sh"):
-            texts += _SHELL_WORD.findall(texts[2])
+        # what a line of code names counts as arguments do: sh -c LINE, python -c LINE
+        if "-c" in texts[1:-1]:
+            texts += _WORD_OF_CODE.findall(texts[texts.index("-c", 1) + 1])
         command = Command(tuple(texts), _absolute("." if folder is None else folder) or os.getcwd())
         if command not in self._notes.commands:
             self._notes.commands[command] = _time_after_files_so_far()
@@ -547,6 +569,8 @@ class ReadRecorder:
                         self._notes.changed.append(name)
                 case "folder" if name not in self._notes.folders:
                     self._notes.folders[name] = names_in(name) if os.path.isdir(name) else None
+                case "missing":
+                    self._notes.missing.add(name)
                 case "variable":
                     self._notes.variables.add(name)
                 case "module":

@@ -42,7 +42,7 @@ _CGROUP_LIMITS = (
 
 
 @dataclass
-class Verdict:
+class ProcessEnd:
     """How a child ended.
 
     Attributes:
@@ -89,7 +89,7 @@ def supervise(
     tick: Callable[[], None] = lambda: None,
     at_a_time: int = 1,
     located: bool = True,
-) -> Verdict:
+) -> ProcessEnd:
     """Give a child its job and supervise it to its end.
 
     Args:
@@ -111,6 +111,7 @@ def supervise(
     """
     memory = memory_limit(limits.memory_mb, at_a_time)
     try:
+        # the child waits for its job
         with contextlib.suppress(BrokenPipeError):  # it has ended, which its status tells
             child.connection.send_bytes(json.dumps(job).encode())
         return _Supervisor(child, limits, on_progress, cancelled, tick, located, *memory).run()
@@ -152,11 +153,12 @@ class _Supervisor:
     next_tree: float = 0.0
     """When the process tree is looked at next."""
 
-    def run(self) -> Verdict:
+    def run(self) -> ProcessEnd:
         """Take messages until the child has ended or is over a limit."""
         connection = self.child.connection
         is_open = True
         while True:
+            # a message, the child's end, or the time to look at the limits
             sources: list[Any] = [self.child.status_fd]
             if is_open:
                 sources.append(connection)
@@ -166,13 +168,13 @@ class _Supervisor:
                 # messages that came before its end
                 while is_open and connection.poll(0):
                     is_open = self._receive()
-                return self.verdict_of_end()
-            if verdict := self._over_limit():
+                return self._read_end()
+            if end := self._over_limit():
                 self.child.kill()
-                return verdict
+                return end
 
-    def verdict_of_end(self) -> Verdict:
-        """The verdict on a child that has ended.
+    def _read_end(self) -> ProcessEnd:
+        """How a child that is gone has ended.
 
         Raises:
             InfrastructureError: Something beside the run broke.
@@ -181,25 +183,26 @@ class _Supervisor:
             case {"infrastructure": str(broken)}:
                 raise InfrastructureError(broken, _NOT_STORED_HINT)
             case {"type": "done"}:
-                return self._verdict("ok")
+                return self._end("ok")
             case {"type": "stopped", "frames": frames}:
-                return self._verdict("stopped", f"stopped on request after {frames} frames")
+                return self._end("stopped", f"stopped on request after {frames} frames")
             case {"type": "failed", "status": status, "reason": reason, **more}:
                 refused = more.get("data", False) or (more.get("refused", False) and self.frame < 0)
-                return self._verdict(status, reason, refused=refused)
+                return self._end(status, reason, refused=refused)
+        # no last message: it was ended, by itself, by a signal, or with its server
         code = self.child.poll()
         assert code is not None
         # the signal that ends this process may have ended the child first
         if code < 0 and not self.cancelled():
             time.sleep(_SIGNAL_GRACE_S)
         if code < 0 and self.cancelled():
-            return self._verdict("stopped", f"cancelled{self._where()}")
+            return self._end("stopped", f"cancelled{self._where()}")
         if self.child.server_died:
             raise ServerDiedError("" if self.began is None else self._where())
         if self.child.lost or self.began is None:
             lost = self.child.lost or f"the process that was to make it ended with code {code}"
             raise InfrastructureError(f"the run could not go on: {lost}", _NOT_STORED_HINT)
-        return self._verdict("crashed", _reason_of_exit(code) + self._where())
+        return self._end("crashed", _reason_of_exit(code) + self._where())
 
     def _receive(self) -> bool:
         """Take a message; False if the connection is closed."""
@@ -228,33 +231,34 @@ class _Supervisor:
         with contextlib.suppress(OSError):  # it has ended, which its status tells
             self.child.connection.send_bytes(b"stop")
 
-    def _over_limit(self) -> Verdict | None:
-        """The verdict on a child that has to be ended; None where it may go on.
+    def _over_limit(self) -> ProcessEnd | None:
+        """How a child ends that is over a limit; None where it may go on.
 
         Raises:
             InfrastructureError: No process has begun the run within its time to start.
         """
+        # a run that has sent its last message has a moment to end
         now = time.monotonic()
         silent_s = now - self.last_message
         if self.final:
-            return self.verdict_of_end() if silent_s > _END_GRACE_S else None
-        verdict = self._stopped(now) or self._too_late(now, silent_s)
-        if verdict is not None or self.began is None or now < self.next_measurement:
-            return verdict
+            return self._read_end() if silent_s > _END_GRACE_S else None
+        end = self._stopped(now) or self._too_late(now, silent_s)
+        if end is not None or self.began is None or now < self.next_measurement:
+            return end
         self.next_measurement = now + _POLL_S
         self.tick()
         return self._too_large(now)
 
-    def _stopped(self, now: float) -> Verdict | None:
-        """The verdict on a child that is not wanted any more."""
+    def _stopped(self, now: float) -> ProcessEnd | None:
+        """How a child ends that is not wanted any more."""
         if self.cancelled():
-            return self._verdict("stopped", f"cancelled{self._where()}")
+            return self._end("stopped", f"cancelled{self._where()}")
         if self.stop_sent is not None and now - self.stop_sent > _STOP_GRACE_S:
-            return self._verdict("stopped", f"stopped on request after frame {self.frame}")
+            return self._end("stopped", f"stopped on request after frame {self.frame}")
         return None
 
-    def _too_late(self, now: float, silent_s: float) -> Verdict | None:
-        """The verdict on a child that has taken too much time.
+    def _too_late(self, now: float, silent_s: float) -> ProcessEnd | None:
+        """How a child ends that has taken too much time.
 
         Args:
             now: The time.
@@ -271,14 +275,16 @@ class _Supervisor:
                 )
             return None
         if limits.time_s is not None and now - self.began > limits.time_s:
-            return self._verdict("timeout", f"not done within {limits.time_s:g} s{self._where()}")
+            return self._end("timeout", f"not done within {limits.time_s:g} s{self._where()}")
+        # the first frames compile kernels and load networks
         patience_s = limits.start_s if self.frame < _FIRST_WARM else limits.frame_s
         if silent_s > patience_s:
-            return self._verdict("timeout", f"no sign of life for {patience_s:g} s{self._where()}")
+            return self._end("timeout", f"no sign of life for {patience_s:g} s{self._where()}")
         return None
 
-    def _too_large(self, now: float) -> Verdict | None:
-        """Measure the memory; the verdict on a child that has taken too much."""
+    def _too_large(self, now: float) -> ProcessEnd | None:
+        """Measure the memory; how a child ends that has taken too much."""
+        # the process tree from time to time, its memory at every call
         if now >= self.next_tree:
             self.next_tree = now + _TREE_S
             self.child.members = self._members()
@@ -287,7 +293,7 @@ class _Supervisor:
         if self.memory_mb is None or used_mb <= self.memory_mb:
             return None
         limit = f"the limit is {self.memory_mb:.0f} MB{self.memory_source}"
-        return self._verdict("out-of-memory", f"{used_mb:.0f} MB resident, {limit}{self._where()}")
+        return self._end("out-of-memory", f"{used_mb:.0f} MB resident, {limit}{self._where()}")
 
     def _members(self) -> list[psutil.Process]:
         """The child's process tree, and former members of it that still run."""
@@ -307,8 +313,8 @@ class _Supervisor:
         done = "before frame 0 was tracked" if self.frame < 0 else f"after frame {self.frame}"
         return f", {done} of {self.n_frames}"
 
-    def _verdict(self, status: Status, reason: str = "", *, refused: bool = False) -> Verdict:
-        return Verdict(status, reason, self.final, self.peak_mb, refused)
+    def _end(self, status: Status, reason: str = "", *, refused: bool = False) -> ProcessEnd:
+        return ProcessEnd(status, reason, self.final, self.peak_mb, refused)
 
 
 def _reason_of_exit(code: int) -> str:

@@ -432,6 +432,8 @@ def _ambiguous(fits: Sequence[_Fit], facts: Metadata, where: str, listed: str) -
         fit.layout.id for fit in fits if fit.layout.names and not fit.channels_last
     )
     texts = " and ".join(fit.text for fit in fits)
+
+    # what would decide between them
     cures = []
     if facts.names is None and fits[0].layout.kind == "yolo":
         cures.append(
@@ -464,6 +466,7 @@ def _not_understood(
     asked: str,
 ) -> SegmentationError:
     """The error for outputs that fit no layout, or only some that the metadata or the user exclude."""
+    # layouts that the metadata or the user exclude
     listed = "; ".join(map(str, outputs)) or "none"
     said = _said(facts)
     if shapes_allow:
@@ -477,6 +480,8 @@ def _not_understood(
             f"{where}: {reason}, but the outputs {listed} fit {texts}",
             f"if the shapes are right: {cure}",
         )
+
+    # no layout: what may be the reason
     reasons = ["no known layout fits"]
     if said:
         reasons.append(f"the metadata say {said}")

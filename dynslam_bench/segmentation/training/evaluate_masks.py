@@ -291,6 +291,7 @@ def evaluate_segmenter(
         for name, quality in qualities.items()
         if quality["truths"] or quality["detections"]
     }
+    # the score, with what it was measured on
     score = SegmenterScore(
         segmenter=resolve_source(settings, "synthetic/"),
         weights=weights_digest(settings, "synthetic/"),

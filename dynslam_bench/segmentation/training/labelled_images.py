@@ -18,7 +18,7 @@ from dynslam_bench.core import (
     SegmentationError,
     atomic_folder,
     did_you_mean,
-    inside,
+    path_below,
     read_json,
     read_lines,
     translate_errors,
@@ -120,7 +120,7 @@ def coco_images(text: str) -> LabelledImages:
 
     # images inside the folder, read when they are asked for
     entries = [
-        (inside(folder, name, where=str(path), kind=SegmentationError), objects)
+        (path_below(folder, name, where=str(path), kind=SegmentationError), objects)
         for name, objects in files
     ]
     version = _files_digest([path, *(image for image, _ in entries)])

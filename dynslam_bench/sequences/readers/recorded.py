@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, FrameMasks, MaskSource
-from dynslam_bench.core import SequenceError, inside, translate_errors
+from dynslam_bench.core import SequenceError, path_below, translate_errors
 from dynslam_bench.core.fingerprint import contents_digest
 from dynslam_bench.core.images import read_image
 from dynslam_bench.core.records import digest
@@ -30,6 +30,8 @@ RATES_AGREE = 1.25
 """A stated frame rate and the stamps' may differ by this factor: clocks drift. More is said."""
 RATES_CONTRADICT = 3.0
 """Nobody means a frame rate that differs from the stamps' by this factor; the stamps' is taken."""
+LONGEST_READOUT = 2.0
+"""Times between two images that a stated readout may last: built-in cameras are used at twice their rate, too."""
 MISSING_TOLERATED = 0.02
 """Part of a list's images that may be missing: Bonn's lists name a few images that its archives lack."""
 
@@ -115,6 +117,7 @@ class RecordedSequence:
         self.timestamps.flags.writeable = False
         _check_unit(folder, self.timestamps)
         self.fps, rate_note = _frame_rate(fps, self.timestamps)
+        _check_readout(folder, camera, self.timestamps)
         self.depth_timestamps = depth.stamps[second]
         self._colour = [colour.files[i] for i in first]
         self._depth = [depth.files[i] for i in second]
@@ -242,7 +245,7 @@ def _check_inside(folder: Path, contents: Contents) -> None:
     if contents.people is not None:
         listed += contents.people.files
     for file in listed:
-        inside(folder, file, where=f"a list of images in {folder}", kind=SequenceError)
+        path_below(folder, file, where=f"a list of images in {folder}", kind=SequenceError)
 
 
 def _existing_images(
@@ -302,6 +305,19 @@ def _frame_rate(stated: float | None, stamps: NDArray[np.float64]) -> tuple[floa
     if factor < RATES_CONTRADICT:
         return stated, note
     return measured, f"{note}, which is taken"
+
+
+def _check_readout(folder: Path, camera: Camera, stamps: NDArray[np.float64]) -> None:
+    """Refuse a rolling shutter that is read out for longer than the time between two images."""
+    if len(stamps) < 2:
+        return
+    interval = float(np.median(np.diff(stamps)))
+    if camera.readout_s > LONGEST_READOUT * interval:
+        raise SequenceError(
+            f"readout_s = {camera.readout_s:g} of the camera of {folder} is longer than the {interval:.3g} s "
+            "between two images",
+            "write seconds, or 0 for a global shutter; `sequences calibrate` measures it",
+        )
 
 
 def _check_unit(folder: Path, stamps: NDArray[np.float64]) -> None:

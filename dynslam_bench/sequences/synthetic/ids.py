@@ -95,10 +95,13 @@ def parse_synthetic_id(text: str) -> SyntheticId:
         raise SequenceError(
             f"'{text}' is not the id of a rendered sequence", did_you_mean(text, SYNTHETIC_IDS)
         )
+    # the name
     name = match["name"]
     if name not in VARIANTS:
         near = did_you_mean(f"synthetic/{name}", SYNTHETIC_IDS)
         raise SequenceError(f"unknown rendered sequence 'synthetic/{name}'", near)
+
+    # the options, of which the scene may stand behind an @
     written = [] if match["scene"] is None else [f"scene={match['scene']}"]
     written += [] if match["query"] is None else match["query"].split("&")
     options: dict[str, int] = {}

@@ -515,6 +515,7 @@ def shade_pixels(
                         nu = maps[p, 0] * lx + maps[p, 4] * ly + maps[p, 8] * nz
                         nv = maps[p, 1] * lx + maps[p, 5] * ly + maps[p, 9] * nz
                         nw = maps[p, 2] * lx + maps[p, 6] * ly + maps[p, 10] * nz
+                        # cosine of incidence, and the ambient light plus that of each lamp the normal faces
                         inv = 1.0 / math.sqrt(nu * nu + nv * nv + nw * nw)
                         cos = abs(nu * x + nv * y + nw) * inv / norm
                         light = lights[0, 3]
@@ -568,6 +569,7 @@ def shade_pixels(
                         b = np.uint64(base + ((v0 + u1) << 2))
                         c = np.uint64(base + ((v1 + u0) << 2))
                         d = np.uint64(base + ((v1 + u1) << 2))
+                        # bilinear weights, times the light and the share of this mip level
                         weight = light * (blend if upper else 1.0 - blend)
                         wa = (1.0 - au) * (1.0 - av) * weight
                         wb = au * (1.0 - av) * weight
@@ -591,6 +593,7 @@ def shade_pixels(
                     last_red = last_red * tint[p, 0]
                     last_green = last_green * tint[p, 1]
                     last_blue = last_blue * tint[p, 2]
+                # the centre is kept for pixels without an edge; the other samples are averaged
                 if sample < 0:
                     centre_red = last_red
                     centre_green = last_green
@@ -714,6 +717,7 @@ def motion_blur(
                 y0 = np.uint32(y)
                 ax = x - x0
                 ay = y - y0
+                # weights of the four pixels around the tap, of which k is the upper left and m the one below
                 w00 = (1 - ax) * (1 - ay)
                 w10 = ax * (1 - ay)
                 w01 = (1 - ax) * ay

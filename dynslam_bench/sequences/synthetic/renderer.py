@@ -314,6 +314,7 @@ class Renderer:
 
         def shade_band(row0: int, row1: int) -> None:
             """Shade the rows `row0` to `row1` - 1."""
+            # lights and normals in the frame of the camera at the band's middle row
             pose = view.pose_of((row0 + row1) // 2)
             lights = self._lights(pose, time)
             facets = self._facets(view, pose, lights, texel_density)
@@ -466,6 +467,7 @@ class Renderer:
         self, index: int, depth: Array, cosine: NDArray[np.float32], color: NDArray[np.float32]
     ) -> NDArray[np.uint16]:
         """The depth as the sensor measures it."""
+        # without noise it is rounded to the file's units only
         sensor = self.depth_sensor
         units_per_m = CAMERA.written_depth_factor
         if not sensor.noise:

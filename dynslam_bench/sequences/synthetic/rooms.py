@@ -72,6 +72,7 @@ def plan_room(scene: int, number: int | None = None) -> Plan:
         base = pick(rng, scene, low, high)
         return np.clip(base + spread * (rng.random(3) - 0.5), 0.03, 1.0)
 
+    # colours of the materials, red, green and blue from 0 to 1
     wood = pick(rng, scene, 0.55, 0.95) * np.array([1.0, 0.84, 0.66])
     tints = {
         "wall": color(0.72, 0.92, 0.08),

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import Frame, TrackResult
 from dynslam_bench.core.settings import Settings
-from dynslam_bench.geometry import Camera, read_tum, se3
+from dynslam_bench.geometry import Camera, load_tum, se3
 from dynslam_bench.trackers.adapters.specs import ConstantVelocitySettings, ReplaySettings
 
 MAX_CORNERS = 400
@@ -165,7 +165,10 @@ class Replay:
 
     def __init__(self, settings: ReplaySettings) -> None:
         self.settings = settings
-        self._trajectory = read_tum(Path(settings.file).expanduser())
+        file = load_tum(Path(settings.file).expanduser())
+        self._trajectory = file.trajectory
+        self.measured = {"notes": file.notes.describe()}
+        """``notes``: what of the file was not taken as it stands."""
 
     def reset(self, camera: Camera, *, rng: np.random.Generator) -> None:
         """Begin a new sequence; the poses depend on the frames' stamps only."""

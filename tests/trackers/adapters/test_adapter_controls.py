@@ -105,6 +105,17 @@ def test_replay_gives_the_files_poses(trajectory):
         assert result.stats["stamp_gap_s"] == pytest.approx(0.009, abs=2e-6)
 
 
+def test_replay_says_what_of_the_file_it_did_not_take_as_it_stands(trajectory, tmp_path):
+    path = trajectory[0]
+    assert build_tracker(f"replay:{path}").measured == {"notes": []}
+    rows = [line.split() for line in path.read_text().splitlines() if line[0] != "#"]
+    nanoseconds = tmp_path / "nanoseconds.txt"
+    lines = [[str(round(float(row[0]) * 1e9)), *row[1:]] for row in rows]
+    nanoseconds.write_text("".join(f"{' '.join(line)}\n" for line in lines))
+    (note,) = build_tracker(f"replay:{nanoseconds}").measured["notes"]
+    assert "nanoseconds" in note
+
+
 def test_replay_skips_a_hole(trajectory, tmp_path):
     path, stamps, _ = trajectory
     lines = path.read_text().splitlines(keepends=True)
