@@ -262,10 +262,10 @@ def conclude(
     best = candidates[0] if candidates else None
     verdict, sentences = judge(best)
     if failures:
-        count = f"{len(failures)} trials failed, the first one as"
+        which = f"{len(failures)} trials failed, the first one as"
         if len(failures) == 1:
-            count = "1 trial failed:"
-        sentences.append(f"{count} {failures[0]}")
+            which = "1 trial failed:"
+        sentences.append(f"{which} {failures[0]}")
     if families and best is not None and best.evidence is not None:
         sentences.append(families)
         if best.beyond is not None:
