@@ -209,7 +209,7 @@ class Gate:
         camera = spec.camera
         if camera is not None and (self.folder / camera).is_file():
             camera = str((self.folder / camera).absolute())
-        settings = {name: _expanded(value) for name, value in spec.settings.items()}
+        settings = _flat(spec.settings)
         update = {
             "sequence": sequence,
             "settings": settings,
@@ -219,9 +219,17 @@ class Gate:
         return spec.model_copy(update=update)
 
 
-def _expanded(value: Any) -> Any:
-    """A setting's value with environment variables in place of their names."""
-    return os.path.expandvars(value) if isinstance(value, str) else value
+def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Settings by dotted name, from tables or dotted names; environment variables in texts are replaced."""
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            flat |= _flat(value, f"{prefix}{name}.")
+        elif isinstance(value, str):
+            flat[prefix + name] = os.path.expandvars(value)
+        else:
+            flat[prefix + name] = value
+    return flat
 
 
 def load_gate(path: str | Path = GATE_FILE, *, data_root: str | Path | None = None) -> Gate:
