@@ -529,6 +529,7 @@ def test_unfit_options_are_errors_of_the_user(walk: Path, tmp_path: Path) -> Non
 def test_names_are_listed_and_loaded_on_first_use() -> None:
     assert set(dir(db)) == {
         "bench",
+        "gate",
         "load",
         "report",
         "run",
