@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
+from dynslam_bench.evaluation.verdicts import FLOOR_M
+
 Array = NDArray[np.float64]
 
 LOOKS = {2: 0.0016, 3: 0.0027, 4: 0.0042, 6: 0.0105, 8: 0.0176, 10: 0.0269}
@@ -26,8 +28,6 @@ CLIP = math.log(3.0)
 """Log ratios are cut off here, and a run that one side alone lost counts as much: one run decides no gate."""
 MARGIN = 0.10
 """Differences below this share do not matter."""
-FLOOR_M = 1e-6
-"""Errors below a micrometre count as one, so that their logarithm exists."""
 
 
 class GateVerdict(str, Enum):
@@ -52,7 +52,7 @@ def log_ratios(candidate: ArrayLike, baseline: ArrayLike) -> Array:
     """Clipped log ratios ``[S, K]`` of errors in metres ``[S, K]`` of sequences and rounds; nan is a lost run.
 
     A run that the candidate alone lost counts as three times the error, one that the baseline alone
-    lost as a third of it, and one that both lost as equal.
+    lost as a third of it, and one that both lost as equal. Errors below `FLOOR_M` count as that.
     """
     errors = np.asarray(candidate, dtype=np.float64)
     errors_baseline = np.asarray(baseline, dtype=np.float64)
