@@ -254,10 +254,15 @@ def error_figure(board: Board) -> go.Figure | None:
         )
     figure = figure_of(
         traces,
-        90 + 30 * len(lines),
+        110 + 30 * len(lines),
         showlegend=False,
         xaxis=log_axis("absolute trajectory error (mm), left is better"),
-        yaxis={"categoryorder": "array", "categoryarray": lines[::-1]},
+        # below the last tracker there is room for the label of the static camera
+        yaxis={
+            "categoryorder": "array",
+            "categoryarray": lines[::-1],
+            "range": [-1.0, len(lines) - 0.5],
+        },
     )
     static_m = [board.static_camera[name] for name in names if board.static_camera[name] > 0]
     if figure is not None and static_m:
@@ -265,8 +270,17 @@ def error_figure(board: Board) -> go.Figure | None:
         # an invisible point on the line: axes are fitted to points, not to lines
         blank = go.Scatter(x=[static_mm], y=lines[:1], mode="markers", opacity=0, hoverinfo="skip")
         figure.add_trace(blank)
-        label = {"text": "not moving", "xanchor": "right", "yanchor": "bottom"}
-        figure.add_vline(static_mm, **GUIDE, annotation=label)
+        figure.add_vline(static_mm, **GUIDE)
+        # annotations on a logarithmic axis take the logarithm of their place
+        figure.add_annotation(
+            x=float(np.log10(static_mm)),
+            y=0.0,
+            yref="paper",
+            text="not moving",
+            xanchor="right",
+            yanchor="bottom",
+            showarrow=False,
+        )
     return figure
 
 
