@@ -911,9 +911,8 @@ def publish(
         most_pages=most_pages,
         on_progress=on_progress,
     )
-    # those are for work with the results, not for looking at them
-    for path in (report.data, report.latex):
-        path.unlink()
+    # the rows are for work with the results, not for looking at them
+    report.data.unlink()
     report.markdown.replace(output / "leaderboard" / README)
 
     # the studies: address of the page, its name, and what it says

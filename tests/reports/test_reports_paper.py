@@ -143,7 +143,11 @@ def test_a_site_needs_nothing_outside_of_it(store, tmp_path, capsys):
     assert "A &lt;b&gt; title" in page
     assert {"leaderboard/index.html", "study/study/index.html"} <= set(links)
     assert all((output / link).is_file() for link in links)
-    assert str(tmp_path) not in (output / "leaderboard" / "index.html").read_text()
+    board = (output / "leaderboard" / "index.html").read_text()
+    assert str(tmp_path) not in board
+    buttons = re.findall(r'href="([^"#]+)[#"]', board)
+    assert "report.tex" in buttons
+    assert [link for link in buttons if not (output / "leaderboard" / link).is_file()] == []
     with pytest.raises(ReportError, match=r"holds no index\.html"):
         publish([store.root], output, studies=[tmp_path])
     with pytest.raises(SystemExit) as ended:
