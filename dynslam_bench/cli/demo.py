@@ -110,7 +110,7 @@ def demo(
     told = (
         f"The study, whose baseline does not grow its masks, on purpose: {tuned.summary.conclusion}"
     )
-    for line in (*culling_effect(board.rows), told):
+    for line in (*culling_effect(board.rows), conclusion):
         write(wrapped(line))
     write(f"\nreport: {paths.html}\nstudy:  {tuned.page}")
     write("next:   dynslam-bench run 'emfoa-oft?masks=none' FOLDER --camera tum-fr3")
