@@ -107,7 +107,7 @@ def demo(
     for table in (paths.leaderboard, per_sequence(board, protocol)):
         write(f"\n{table.title}\n{report_table(table)}")
     write(f"\nProtocol: {protocol.describe()}\n")
-    told = (
+    conclusion = (
         f"The study, whose baseline does not grow its masks, on purpose: {tuned.summary.conclusion}"
     )
     for line in (*culling_effect(board.rows), conclusion):
