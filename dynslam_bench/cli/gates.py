@@ -10,7 +10,6 @@ import typer
 from dynslam_bench.cli.options import AsJson, DataRoot
 from dynslam_bench.cli.output import present, progress
 from dynslam_bench.core import RunError
-from dynslam_bench.sequences.catalogue import parse_frames
 
 if TYPE_CHECKING:
     from dynslam_bench.gate import GateResult
@@ -61,6 +60,7 @@ def init(
 ) -> None:
     """Write the question: what is run, and what counts as a difference."""
     from dynslam_bench import gate as gates
+    from dynslam_bench.sequences.catalogue import parse_frames
 
     start, stop = parse_frames(frames)
     if stop is None:

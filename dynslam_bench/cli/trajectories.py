@@ -7,7 +7,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Optional
 
-import numpy as np
 import typer
 
 from dynslam_bench import runs
@@ -131,6 +130,8 @@ def draw(
     labels: list[str], pairs: list[tuple[TumFile, TumFile]], protocol: str, path: Path
 ) -> Path:
     """Draw estimates beside their common ground truth; see `plot_trajectories`."""
+    import numpy as np
+
     from dynslam_bench.evaluation import get_protocol
     from dynslam_bench.evaluation.comparison import truth_of_file
     from dynslam_bench.evaluation.evaluate import pose_errors

@@ -511,6 +511,13 @@ def drawn_set(value: int) -> list[bool]:
     return person_set(z, settings, np.random.default_rng(1)).tolist()
 
 
+def confident_set(value: float) -> list[bool]:
+    """A box of many depths: with less confidence the draws end before the largest set is found."""
+    z = np.random.default_rng(0).uniform(1.0, 3.0, 40)
+    settings = DepthRansacSettings(max_draws=200, confidence=value, variance_m2=0.3)
+    return person_set(z, settings, np.random.default_rng(1)).tolist()
+
+
 CASES: dict[str, tuple[type[Settings], Callable[[Any], Any]]] = {
     "moving_vote.corners": (MovingVoteSettings, tracked_corners),
     "class_rule.vote_share": (ClassRuleSettings, chair_of_which_half_moves),
@@ -518,6 +525,7 @@ CASES: dict[str, tuple[type[Settings], Callable[[Any], Any]]] = {
     "correlation.largest": (CorrelationSettings, many_points_on_a_small_body),
     "multiview.max_parallax_deg": (MultiViewSettings, observed_from_aside),
     "depth_ransac.max_draws": (DepthRansacSettings, drawn_set),
+    "depth_ransac.confidence": (DepthRansacSettings, confident_set),
 }
 """Setting as studies name it: its group, and the verdict at a value of it."""
 

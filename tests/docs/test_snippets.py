@@ -167,7 +167,9 @@ def test_the_gate_on_the_page_is_one(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("page", ["docs/how-to/study.md", "docs/tutorials/study.md"])
 def test_the_studies_on_the_pages_are_some(page: str, tmp_path: Path) -> None:
-    spec = read_study(only_toml(page, tmp_path))
+    # further blocks are parts of a study
+    (tmp_path / "mine.toml").write_text(blocks(page, "toml")[0])
+    spec = read_study(tmp_path / "mine.toml")
     settings = flatten(TRACKERS.get(spec.tracker).settings())
     assert spec.instances(*spec.tune)
     assert spec.instances(*spec.held_out)

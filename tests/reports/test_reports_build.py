@@ -893,7 +893,7 @@ def test_compare_refuses_what_has_nothing_in_common(made, tmp_path):
 def test_compare_pairs_runs_of_different_settings_and_says_what_differs(tmp_path):
     before = RunStore(tmp_path / "a")
     after = RunStore(tmp_path / "b")
-    for name in [f"s/{i}" for i in range(6)]:
+    for name in [f"s/{i}" for i in range(9)]:
         add_run(before, "ours", name, error=0.05, overrides={"epipolar.threshold_px": 1.0})
         add_run(after, "ours", name, error=0.02, overrides={"epipolar.threshold_px": 2.0})
         add_run(before, "same", name)

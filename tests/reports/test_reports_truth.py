@@ -212,14 +212,19 @@ def test_a_final_trajectory_stands_in_no_online_table(tmp_path):
         add_run(some, "orb-slam3", "s/a", kind="imported", final_error=0.001, online=False)
     paths = build_report(store, tmp_path / "report")
     alone = build_report(only, tmp_path / "alone")
-    for name in ("leaderboard", "per_sequence", "rpe_1s_trans"):
+    for name in ("per_sequence", "rpe_1s_trans"):
         assert not any("orb-slam3" in line["tracker"] for line in rows_of(paths.csv[name])), name
+    # the leaderboard has its number, and neither rank nor ratio
+    (row,) = (line for line in rows_of(paths.csv["leaderboard"]) if "slam3" in line["tracker"])
+    assert row["#"] == "–"
+    assert row["ATE ratio"] == ""
     (final,) = rows_of(paths.csv["final_trajectory"])
     assert final["tracker"] == "orb-slam3"
     assert float(final["s/a"]) < 0.005
-    note = "Only in the table of final trajectories, as nothing else is known of them: orb-slam3."
+    note = "Not ranked, since only final trajectories are known, which use later frames: orb-slam3."
     assert note in paths.markdown.read_text()
-    assert len(rows_of(alone.csv["final_trajectory"])) == 1
+    (ranked,) = rows_of(alone.csv["leaderboard"])
+    assert ranked["tracker"] == "orb-slam3"
 
 
 @pytest.mark.parametrize(("kind", "kept"), [("imported", 3), ("run", 1)])

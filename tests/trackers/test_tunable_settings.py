@@ -152,7 +152,7 @@ FROM_ABOVE = frozenset({
 SHOWN_ALONE = frozenset({
     "epipolar.confidence", "free_space.max_age_s", "correlation.largest", "moving_vote.corners",
     "class_rule.vote_share", "box_depth.max_cover", "motion.threshold_share", "motion.memory",
-    "multiview.max_parallax_deg", "depth_ransac.max_draws", "guard.min_fraction",
+    "multiview.max_parallax_deg", "depth_ransac.max_draws", "depth_ransac.confidence", "guard.min_fraction",
     "backend.keyframes.max_gap", "backend.keyframes.redundant_share", "backend.bundle_adjustment.window",
     *(f"backend.relocalisation.{name}" for name in ("candidates", "iterations", "max_distance")),
 })  # fmt: skip

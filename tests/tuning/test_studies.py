@@ -208,7 +208,7 @@ def test_kill_and_resume_loses_only_the_running_trial(folders: list[str], tmp_pa
     ("changes", "message"),
     [
         ({"space": {"include": ["gian"]}}, "'gian'.*'gain'"),
-        ({"space": {"include": ["plain"]}}, "not tunable"),
+        ({"space": {"include": ["plain"]}}, "matches no tunable setting"),
         ({"space": {"include": ["gain"], "exclude": ["gain"]}}, "space is empty"),
         ({"space": {"include": ["gain"], "fixed": {"wobbel": 1}}}, "'wobbel'.*'wobble'"),
         ({"space": {"include": ["gain"], "fixed": {"wobble": 99}}}, "wobble.*99"),
@@ -437,13 +437,13 @@ def test_the_page_s_python_goes_as_it_stands_but_for_its_runs(
 ) -> None:
     pytest.importorskip("matplotlib", reason="pandas draws with it")
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "fast.toml").write_text('"backend.keyframes.tracked_share" = 0.8\n')
+    (tmp_path / "fast.toml").write_text('"features.n_features" = 800\n')
     first, second = re.findall(
         r"^```python\n(.*?)^```", (DOCS / "how-to" / "study.md").read_text(), flags=re.S | re.M
     )
     exec(compile(first.replace("trials=30", "trials=6"), "docs/how-to/study.md", "exec"), {})
     assert "of which trials saw other scenes" in capsys.readouterr().out.splitlines()[-1]
-    tuned = "params.backend.keyframes.tracked_share"
+    tuned = "params.features.n_features"
     second = second.replace("studies/thresholds", "studies/mine").replace(
         "params.epipolar.threshold_px", tuned
     )
