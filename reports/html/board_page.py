@@ -43,17 +43,15 @@ MOST_LISTED = 5000
 """Runs that are listed one by one; of more, those that have a page, and the first of every cell."""
 
 
-GROUPS = {
-    0: "ranked",
-    1: "shown, not ranked",
-    2: "final trajectories only",
-    3: "monocular, scaled to the truth",
-    4: "bounds",
-}
-"""Groups of rows, in their order; a line is drawn between two of them."""
+# Groups of a board's rows, in their order: a line is drawn between two of them.
+_RANKED = 0
+_NOT_RANKED = 1
 _FINAL_ONLY = 2
+"""Trackers of which final trajectories alone are known."""
 _MONOCULAR = 3
+"""Trackers whose scale is that of the truth."""
 _BOUND = 4
+"""Controls."""
 
 
 def ranking_entries(
@@ -65,7 +63,8 @@ def ranking_entries(
 ) -> list[dict[str, Any]]:
     """The rows of one category, cells by the names that `board.html.j2` calls them by.
 
-    ``at`` numbers the tracker on all pages; ``group`` is one of `GROUPS`. The name leads to the
+    ``at`` numbers the tracker on all pages; ``group`` is 0 for ranked trackers, 1 for
+    others, 2 for final trajectories alone, 3 for monocular trackers, 4 for controls. The name leads to the
     tracker's run with the median error on the first sequence where that has a page, and the
     successes lead to its first failure.
 
@@ -103,12 +102,12 @@ def ranking_entries(
 
 
 def _entry_group(board: Board, key: str) -> int:
-    """Which of `GROUPS` a tracker is in."""
+    """The group of rows that a tracker is in."""
     if key in board.final_only:
         return _FINAL_ONLY
     if board.first(key).tracker.provenance == "control":
         return _BOUND
-    return int(key not in board.ranked)
+    return _RANKED if key in board.ranked else _NOT_RANKED
 
 
 def _run_cells(
