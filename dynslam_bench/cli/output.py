@@ -159,7 +159,9 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 
 
 def _widths_on_terminal(full: Sequence[int], least: Sequence[int]) -> list[int]:
-    """Widths of the columns that are shown; of all of them, in full, where there is no terminal, or with ``--wide``.
+    """Widths of the columns that are shown.
+
+    Without a terminal, and with ``--wide``, all columns are shown in full.
 
     Args:
         full: Characters of each column's longest cell.
