@@ -33,8 +33,8 @@ class Block:
         title: Heading above it, or what is seen of it when it is closed.
         table: The table.
         figure: The figure.
-        caption: Below the figure.
-        text: The code.
+        caption: Below the figure, or above the code.
+        text: The code, which a button copies.
         entries: Of the list.
         folded: Whether it is closed at first, behind its title.
     """

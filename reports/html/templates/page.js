@@ -82,6 +82,9 @@ function sortable(table, options = {}) {
   return new DataTable(table, { ...TABLE, columnDefs: [{ targets: ".n", type: "number", className: "n" }], ...options });
 }
 
+for (const button of select("[data-copy]")) {
+  button.onclick = () => navigator.clipboard.writeText(button.nextElementSibling.textContent).then(() => { button.textContent = "Copied"; });
+}
 dark.addEventListener("change", followTheme);
 followTheme();
 const sorts = (table) => sortable(table, table.rows.length > 25 ? { layout: { ...TABLE.layout, topEnd: "search" } } : {});
