@@ -14,7 +14,7 @@ from dynslam_bench.core import read_text, setting_text, write_atomic
 from dynslam_bench.core.settings import Parameter, Scalar
 from dynslam_bench.evaluation.verdicts import PairedRatio, Verdict
 from dynslam_bench.reports.build_report import sections_page
-from dynslam_bench.reports.figures import COLOURS, GUIDE, NEUTRAL, log_axis, rounded, safe
+from dynslam_bench.reports.figures import COLOURS, GUIDE, NEUTRAL, log_axis, mm_axis, rounded, safe
 from dynslam_bench.reports.html.page import Block, Section, figure_blocks, write_assets
 from dynslam_bench.reports.model.names import shortened
 from dynslam_bench.reports.model.row import SEEN, command_line
@@ -357,7 +357,7 @@ def _scenes_figure(
     layout = {
         "template": {},
         "height": 130 + 22 * len(names),
-        "xaxis": log_axis("absolute trajectory error (mm), left is better"),
+        "xaxis": mm_axis("absolute trajectory error (mm), left is better"),
         "yaxis": {"categoryorder": "array", "categoryarray": names[::-1]},
         "legend": {"orientation": "h", "y": 1.0, "yanchor": "bottom"},
     }

@@ -16,6 +16,7 @@ from plotly.offline import get_plotlyjs
 
 from dynslam_bench.core import write_atomic
 from dynslam_bench.reports.figures import THEMES
+from dynslam_bench.reports.html.still import still
 from dynslam_bench.reports.tables.table import Table
 
 ASSETS = "assets"
@@ -91,7 +92,12 @@ def _templates() -> Environment:
     environment = Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, loader=FunctionLoader(resource)
     )
-    environment.filters |= {"breakable": _breakable, "script": to_script, "figure": figure_json}
+    environment.filters |= {
+        "breakable": _breakable,
+        "script": to_script,
+        "figure": figure_json,
+        "still": still,
+    }
     return environment
 
 
