@@ -23,6 +23,7 @@ from dynslam_bench.runs.record import (
 )
 from dynslam_bench.runs.spec import place_of
 from dynslam_bench.sequences.tags import sequence_tags
+from dynslam_bench.sequences.thumbnails import thumbnails
 from dynslam_bench.sequences.view import part_of
 from dynslam_bench.trackers.registry import resolve_settings
 
@@ -292,6 +293,7 @@ def sequence_info(sequence: Any, content: str, part: str, offset: int = 0) -> Se
         citation=sequence.citation,
         tags=sequence_tags(sequence),
         split=getattr(sequence, "split", ""),
+        thumbnails=thumbnails(sequence),
     )
 
 

@@ -120,6 +120,7 @@ class SequenceInfo(Record):
         citation: What to cite.
         tags: For example ``high-dynamic``, see `sequences.tags`.
         split: ``tune``, ``held-out`` or empty.
+        thumbnails: Small pictures of a recording before a fixed camera, see `sequences.thumbnails`.
     """
 
     id: str
@@ -135,6 +136,7 @@ class SequenceInfo(Record):
     citation: str = ""
     tags: list[str] = Field(default_factory=list)
     split: str = ""
+    thumbnails: list[str] = Field(default_factory=list)
 
 
 class StageTime(Record):
