@@ -230,24 +230,24 @@ class LoopCloser:
         self._loop_edges: list[Edge] = []
 
     def close(
-        self, slot: int, observations: Observations, in_root_map: InitialPose | None = None
+        self, slot: int, observations: Observations, pose_in_root_map: InitialPose | None = None
     ) -> LoopClosingResult:
         """Look for a loop at a new keyframe; correct and fuse the map if enough consecutive keyframes agree on one.
 
         Args:
             slot: The keyframe.
             observations: Its features.
-            in_root_map: Its pose in the root map, if the camera is in a submap and was found there.
+            pose_in_root_map: Its pose in the root map, if the camera is in a submap and was found there.
         """
         self._extend_path(slot)
         self._transfer_loop_edges()
 
         # detect a place and verify it
         root_map_pose = RootMapPose.REJECTED
-        if in_root_map is None:
+        if pose_in_root_map is None:
             loop = self._verified(slot, observations)
         else:
-            loop, root_map_pose = self._loop_to_root_map(slot, observations, in_root_map)
+            loop, root_map_pose = self._loop_to_root_map(slot, observations, pose_in_root_map)
         if root_map_pose is RootMapPose.REJECTED:
             self._in_root_map_since = None
 
@@ -257,13 +257,13 @@ class LoopCloser:
             return LoopClosingResult(root_map_pose=root_map_pose)
         if not confirmed.fits:
             # the submap has drifted too far to be merged
-            if in_root_map is not None:
+            if pose_in_root_map is not None:
                 root_map_pose = RootMapPose.CONTINUE_THERE
             return LoopClosingResult(root_map_pose=root_map_pose)
         # the loop to the root map was tested for aliasing before
         if (
             confirmed.merges
-            and in_root_map is None
+            and pose_in_root_map is None
             and self._aliased(slot, observations, confirmed)
         ):
             return LoopClosingResult(root_map_pose=root_map_pose)

@@ -806,7 +806,7 @@ class PoseSearch:
             return weak
         return pose
 
-    def in_root_map(self) -> InitialPose | None:
+    def pose_in_root_map(self) -> InitialPose | None:
         """The pose in the root map of a camera that is tracked in a submap, as strict as for a lost one."""
         root_map = self.bound.atlas.map.submap(0)
         pose = replace(self, keyframes=root_map, lost=True)._relocalise(MIN_MATCHES)
