@@ -1,6 +1,6 @@
 """The back end that all trackers share: what turns the static features of a frame into a pose and a map.
 
-`RgbdBackend.track` follows ORB-SLAM3's ``Tracking::Track``. A frame's initial pose comes from the
+`Backend.track` follows ORB-SLAM3's ``Tracking::Track``. A frame's initial pose comes from the
 last frame or, if that is not trusted, from keyframes (relocalisation). The local map is matched
 around it and the pose is fitted to all matches. A frame that shows enough new becomes a keyframe,
 with local mapping and loop closing. A camera that is not recognised for some frames begins a submap.
@@ -101,7 +101,7 @@ class UncompensatedFrame(NamedTuple):
     measured: Observations
 
 
-class RgbdBackend:
+class Backend:
     """Tracks frames against a map that it builds.
 
     Args:
@@ -279,7 +279,7 @@ class RgbdBackend:
     def _predict_frame(self, frame: FrameBundle, measured: Observations) -> CurrentFrame:
         """The frame with its pose by the motion model and its features by the last frame's velocity."""
         last = self._last_tracked_frame(frame, measured)
-        prediction, _ = self.motion.expected(last, frame.timestamp)
+        prediction, _ = self.motion.predict_T_cam_world(last, frame.timestamp)
         observations = measured
         if self._compensates_rolling_shutter():
             observations = self.shutter.predicted(measured, last, frame.timestamp)
@@ -561,13 +561,13 @@ class RgbdBackend:
             pose_in_root_map: Its pose in the root map, if the camera is in a submap and was found there.
         """
         timings: dict[str, float] = {}
-        verdict = RootMapPose.REJECTED
+        root_map_pose = RootMapPose.REJECTED
         pose = map_fit.estimate.T_cam_world
         needed = pose_in_root_map is not None or self._keyframe_policy.needs_keyframe(
             self.map, tracked, frame.index, self._reference_keyframe
         )
         if self._mapping_enabled and needed:
-            timings, verdict = self._insert_keyframe(frame, tracked, pose_in_root_map)
+            timings, root_map_pose = self._insert_keyframe(frame, tracked, pose_in_root_map)
             # bundle adjustment and loop closing have moved the frame
             pose = tracked.T_cam_world
             self.motion.relocate(pose)
@@ -581,11 +581,11 @@ class RgbdBackend:
         )
 
         merged = self.atlas.active == ROOT_MAP
-        if pose_in_root_map is None or merged or verdict is RootMapPose.REJECTED:
+        if pose_in_root_map is None or merged or root_map_pose is RootMapPose.REJECTED:
             return result
         # the camera is in the root map, too: there its pose counts
         self._record_root_map_pose(pose_in_root_map)
-        if verdict is RootMapPose.CONTINUE_THERE:
+        if root_map_pose is RootMapPose.CONTINUE_THERE:
             self._continue_in_root_map(tracked, pose_in_root_map)
         return replace(result, T_world_cam=se3.inverse(pose_in_root_map.T_cam_world), state="ok")
 
@@ -630,7 +630,7 @@ class RgbdBackend:
             Seconds by stage, and whether the pose in the root map counts.
         """
         slam_map = self.map
-        verdict = RootMapPose.REJECTED
+        root_map_pose = RootMapPose.REJECTED
 
         # local mapping
         slot, timings = self.mapper.insert(
@@ -649,7 +649,7 @@ class RgbdBackend:
             begin = perf_counter()
             T_before = slam_map.kf_pose[slot].copy()
             closing = self.loops.close(slot, tracked.observations, pose_in_root_map)
-            verdict = closing.root_map_pose
+            root_map_pose = closing.root_map_pose
             rescale(self.history, closing.rescaled)
             # the rotation by a loop with depth is within the motion's noise
             if slot in closing.rescaled:
@@ -662,7 +662,7 @@ class RgbdBackend:
         tracked.point = slam_map.kf_point[slot, : len(tracked.observations)].astype(np.int64)
         tracked.T_cam_world = slam_map.kf_pose[slot].copy()
         slam_map.release()
-        return timings, verdict
+        return timings, root_map_pose
 
     def _transfer_history(self) -> None:
         """Poses relative to a culled keyframe become relative to its replacement."""
@@ -674,7 +674,7 @@ class RgbdBackend:
 
     # ------------------------------------------------------------------ what filters and files read
 
-    def predict(self, timestamp: float) -> tuple[Array | None, Array | None]:
+    def predict_T_world_cam(self, timestamp: float) -> tuple[Array | None, Array | None]:
         """Camera-to-world pose at a time, and the covariance of the motion since the last frame; None while lost.
 
         The covariance ``[6, 6]`` is of (position in the world in metres, rotation in the camera
@@ -686,7 +686,9 @@ class RgbdBackend:
         """
         if self._last_frame is None or self._status is not CameraStatus.TRACKED:
             return None, None
-        T_cam_world, covariance = self.motion.expected(self._last_frame, timestamp, jitter=JITTER)
+        T_cam_world, covariance = self.motion.predict_T_cam_world(
+            self._last_frame, timestamp, jitter=JITTER
+        )
         return se3.inverse(T_cam_world), covariance
 
     def view(self) -> MapView:
@@ -735,7 +737,7 @@ def _with_match_counts(result: TrackResult, map_fit: MapFit, initial: InitialPos
     return replace(result, stats={**result.stats, **counts})
 
 
-class MonocularBackend(RgbdBackend):
+class MonocularBackend(Backend):
     """Tracks frames against a map whose points are triangulated; lengths are in units of its initial median depth.
 
     No feature has a depth. The scale of bundle adjustment is free but for the keyframes that stay.
@@ -745,7 +747,7 @@ class MonocularBackend(RgbdBackend):
     settings: MonocularBackendSettings
 
     def reset(self, camera: Camera, seed: int) -> None:
-        """Forget everything and begin a new sequence, as `RgbdBackend.reset` does."""
+        """Forget everything and begin a new sequence, as `Backend.reset` does."""
         super().reset(camera, seed)
         self._initialiser = TwoViewInitialiser()
 
@@ -801,7 +803,7 @@ class MonocularBackend(RgbdBackend):
 
 def build_backend(
     settings: BackendSettings, scale_factor: float, levels: int, extractor: str
-) -> RgbdBackend:
+) -> Backend:
     """Build the back end that settings ask for: without depth for `MonocularBackendSettings`, else with depth.
 
     Args:
@@ -810,5 +812,5 @@ def build_backend(
         levels: Number of pyramid levels of the features.
         extractor: Id of the feature extractor.
     """
-    kind = MonocularBackend if isinstance(settings, MonocularBackendSettings) else RgbdBackend
+    kind = MonocularBackend if isinstance(settings, MonocularBackendSettings) else Backend
     return kind(settings, scale_factor=scale_factor, levels=levels, extractor=extractor)

@@ -273,7 +273,7 @@ class CameraMotion:
         if self.state is not None:
             self.state = self.state.transformed(T_cam_now[:3, :3].T @ T_cam_before[:3, :3], scale)
 
-    def expected(
+    def predict_T_cam_world(
         self, last: TrackedFrame, timestamp: float, *, jitter: float = 0.0
     ) -> tuple[Array, Array | None]:
         """World-to-camera pose at a time, and the covariance of the motion since the last frame.

@@ -41,7 +41,7 @@ from dynslam_bench.culling.settings import GuardSettings
 from dynslam_bench.geometry import Camera, Trajectory, pixel_index, se3
 from dynslam_bench.segmentation.postprocess import dynamic_mask
 from dynslam_bench.segmentation.settings import SegmentationSettings
-from dynslam_bench.slam.backend import RgbdBackend
+from dynslam_bench.slam.backend import Backend
 
 if TYPE_CHECKING:
     from dynslam_bench.segmentation.schedule import MaskScheduler
@@ -137,7 +137,7 @@ class SlamPipeline:
         masks: MaskScheduler | None,
         filters: Sequence[DynamicFilter],
         flow: FlowEstimator | None,
-        backend: RgbdBackend,
+        backend: Backend,
         refine_prediction: RefinePrediction | None = None,
         settings: Settings,
         cached: Mapping[str, CachedStage] | None = None,
@@ -271,7 +271,7 @@ class SlamPipeline:
     def _filter_state(self, frame: FrameBundle) -> FilterState:
         """What filters may read beside the frame: the previous frame, the prediction and the map."""
         previous = self._previous
-        T_world_pred, covariance = self._backend.predict(frame.timestamp)
+        T_world_pred, covariance = self._backend.predict_T_world_cam(frame.timestamp)
         keyframes, map_points = self._backend.view()
         return FilterState(
             camera=self._camera,
@@ -472,7 +472,7 @@ class SlamPipeline:
         if self._segmentation is not None:
             yield "segmentation", partial(setattr, self, "_segmentation")
 
-    def _started(self) -> RgbdBackend:
+    def _started(self) -> Backend:
         """The back end.
 
         Raises:

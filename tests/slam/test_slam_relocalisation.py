@@ -109,7 +109,7 @@ def test_a_lost_camera_predicts_nothing_and_its_rotation_is_followed_in_every_fr
     backend, recognised, _ = run(RingWorld(), [*range(15), *range(60, 70)])
     assert (recognised[15:] == "lost").all(), "the first of the ten is compared by tracking"
     assert len(calls) == 9, "the first of the ten is compared by tracking"
-    assert backend.predict(2.6) == (None, None)
+    assert backend.predict_T_world_cam(2.6) == (None, None)
 
 
 # ---------------------------------------------------------------------- the gate
