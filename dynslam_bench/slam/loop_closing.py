@@ -32,8 +32,8 @@ from dynslam_bench.slam.local_mapping import LocalMapper
 from dynslam_bench.slam.map import Array, Slots
 from dynslam_bench.slam.observations import Observations
 from dynslam_bench.slam.relocalisation import (
-    around,
     is_aliased,
+    keyframe_neighbourhood,
     pose_uncertainty,
     recognise_place,
     recognition_scores,
@@ -341,7 +341,7 @@ class LoopCloser:
             return None
 
         # by place recognition: a candidate has to score as well as the worst of the neighbours
-        near = np.setdiff1d(around(slam_map, slot)[1:], old)
+        near = np.setdiff1d(keyframe_neighbourhood(slam_map, slot)[1:], old)
         score = recognition_scores(slam_map, np.concatenate([near, old]), observations)
         least = score[: len(near)].min(initial=np.inf)
         score = score[len(near) :]
@@ -619,8 +619,8 @@ class LoopCloser:
 
     def _fuse(self, slot: int, candidate: int) -> None:
         """Fuse the points around both ends of a loop, and adjust what lies around the new keyframe."""
-        points = self.map.points_of(around(self.map, candidate))
-        for keyframe in around(self.map, slot).tolist():
+        points = self.map.points_of(keyframe_neighbourhood(self.map, candidate))
+        for keyframe in keyframe_neighbourhood(self.map, slot).tolist():
             self.mapper.fuse_into(keyframe, points)
         self.map.refresh(points[self.map.alive[points]])
         self.mapper.adjust(slot)

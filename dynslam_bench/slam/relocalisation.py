@@ -393,7 +393,7 @@ def verify_place(
     matches = candidate.matches
 
     # match the points around and fit the pose, while that gives more inliers
-    points = slam_map.points_of(around(slam_map, keyframe))
+    points = slam_map.points_of(keyframe_neighbourhood(slam_map, keyframe))
     estimate = solve(slam_map.camera, observations, matches, candidate.T_cam_world)
     for _ in range(ROUNDS):
         count = len(matches)
@@ -493,7 +493,7 @@ def pose_uncertainty(
     return worst if np.isfinite(worst) else np.inf
 
 
-def around(slam_map: Map, keyframe: int) -> Slots:
+def keyframe_neighbourhood(slam_map: Map, keyframe: int) -> Slots:
     """Slots of a keyframe, first, and of those that share most points with it."""
     near, _ = slam_map.covisible(keyframe)
     return np.concatenate([[keyframe], near[:AROUND]]).astype(np.int64)
