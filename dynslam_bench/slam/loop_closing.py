@@ -364,7 +364,7 @@ class LoopCloser:
         tracking = self.settings.tracking
         least = MIN_MATCHES, MIN_MATCHES // 2
         place = recognise_place(self.map, candidate, observations, tracking, rng, *least)
-        if place is None or len(place.matches) < s.min_inliers or place.share < MIN_SHARE:
+        if place is None or len(place.matches) < s.min_inliers or place.seen_share < MIN_SHARE:
             return None
 
         # the correction, which drift has to explain; for a merge the pose must be well determined
@@ -393,7 +393,7 @@ class LoopCloser:
         # a merge needs more than a pose
         determined = (
             len(place.matches) >= self.settings.loop_closing.min_inliers
-            and place.share >= MERGE_SHARE
+            and place.seen_share >= MERGE_SHARE
             and place.uncertainty <= MERGE_UNCERTAINTY
         )
         merge = loop if determined else None
@@ -442,7 +442,7 @@ class LoopCloser:
         correction = loop.correction
         # between submaps: matches, and the rotation that the maps may have against each other
         if loop.merges:
-            if len(place.matches) < MERGE_INLIERS or place.share < MERGE_SHARE:
+            if len(place.matches) < MERGE_INLIERS or place.seen_share < MERGE_SHARE:
                 return False
             slack = self.atlas.slack(*self.map.kf_map[[slot, place.keyframe]].tolist())
             return loop.fits and bool(np.radians(correction.rotated_deg) <= slack)

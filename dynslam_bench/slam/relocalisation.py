@@ -414,13 +414,13 @@ def verify_place(
         # the distortion is less than what masks are dilated by
         pixels, _ = pixel_index(uv, observations.mask.shape)
         in_view = in_view[~observations.mask[pixels]]
-    share = float(np.isin(in_view, matches.point).mean()) if len(in_view) else 0.0
+    seen_share = float(np.isin(in_view, matches.point).mean()) if len(in_view) else 0.0
 
     # depth of the place, which distances there are compared with
     depth = np.nan
     if len(matches):
         depth = float(np.median(se3.transform(T_cam_world, matches.position)[:, 2]))
-    return InitialPose(T_cam_world, matches, keyframe, share, depth)
+    return InitialPose(T_cam_world, matches, keyframe, seen_share, depth)
 
 
 def recognise_place(
@@ -529,7 +529,7 @@ def is_aliased(
         seed: Seed of RANSAC's draws.
         possible: Whether the frame can have been taken in a submap at a world-to-camera pose.
     """
-    min_share = ALIASING_SHARE * max(place.share for place in hypotheses.values())
+    min_share = ALIASING_SHARE * max(place.seen_share for place in hypotheses.values())
     for submap in np.unique(slam_map.kf_map[keyframes]).tolist():
         places = [hypotheses[submap]] if submap in hypotheses else []
         slots = keyframes[slam_map.kf_map[keyframes] == submap]
@@ -547,7 +547,7 @@ def is_aliased(
             if (
                 other is None
                 or len(other.matches) < MIN_ALIASING_MATCHES
-                or other.share < min_share
+                or other.seen_share < min_share
                 or not possible(submap, other.T_cam_world)
             ):
                 continue
@@ -849,7 +849,7 @@ class PoseSearch:
         # most of what should be in view is seen
         place = verify_place(slam_map, candidate, observations, settings.tracking)
         factor = MANY_POINTS_SHARE if len(place.matches) >= MANY_POINTS else 1.0
-        if place.share < factor * settings.relocalisation.min_share:
+        if place.seen_share < factor * settings.relocalisation.min_share:
             return None
         if not self.lost:
             return replace(place, uncertainty=0.0)
