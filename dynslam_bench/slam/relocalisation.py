@@ -502,7 +502,7 @@ def keyframe_neighbourhood(slam_map: Map, keyframe: int) -> Slots:
 # ---------------------------------------------------------------------- perceptual aliasing
 
 
-def contradict(one: InitialPose, other: InitialPose) -> bool:
+def are_different_places(one: InitialPose, other: InitialPose) -> bool:
     """Whether a frame cannot have been taken at both places."""
     between = one.T_cam_world @ se3.inverse(other.T_cam_world)
     far = np.linalg.norm(between[:3, 3]) > SAME_PLACE_DEPTHS * max(one.depth, other.depth)
@@ -553,7 +553,7 @@ def is_aliased(
                 continue
 
             # the same place seen from another keyframe does not contradict
-            if any(contradict(place, other) for place in places):
+            if any(are_different_places(place, other) for place in places):
                 return True
             places.append(other)
     return False

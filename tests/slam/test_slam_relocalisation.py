@@ -17,7 +17,7 @@ from dynslam_bench.slam.relocalisation import (
     STRIDE,
     RelocalisationGate,
     RotationEstimate,
-    contradict,
+    are_different_places,
     is_aliased,
     match_keyframe,
     pose_uncertainty,
@@ -94,7 +94,9 @@ def test_perceptual_aliasing(alike, aliased):
     assert (tracking == "ok").all()
     assert is_aliased(backend.map, observations, {0: here}, everywhere, settings, 0) is aliased
     assert not is_aliased(backend.map, observations, {0: here}, everywhere[:4], settings, 0)
-    near = lambda submap, pose: not contradict(here, InitialPose(pose, None, 0, depth=3.0))  # noqa: E731
+    near = lambda submap, pose: (
+        not are_different_places(here, InitialPose(pose, None, 0, depth=3.0))
+    )  # noqa: E731
     assert not is_aliased(backend.map, observations, {0: here}, everywhere, settings, 0, near)
 
 
