@@ -197,7 +197,7 @@ def compose(
 
     return SlamPipeline(
         extractor=extractor,
-        masks=masks,
+        mask_scheduler=masks,
         filters=filters,
         flow=estimate_flow,
         refine_prediction=refine_prediction,
