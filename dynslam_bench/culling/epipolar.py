@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.culling import Number, ObjectRule, Rule
-from dynslam_bench.culling.ego_motion import PATCH_3X3, failing_regions, rigid_flow
+from dynslam_bench.culling.ego_motion import PATCH_3X3, rigid_flow
+from dynslam_bench.culling.moving_regions import in_moving_region
 from dynslam_bench.culling.semantic import dynamic_boxes, in_boxes
 from dynslam_bench.culling.settings import (
     BoxEpipolarSettings,
@@ -200,7 +201,7 @@ class EpipolarFilter(Rule[EpipolarSettings]):
         if self.settings.mode == "object":
             keep, stats["moving_objects"] = vote_on_objects(frame, failing, matches.valid)
             return self.verdict(keep, **stats)
-        moving = failing_regions(
+        moving = in_moving_region(
             failing,
             matches.valid,
             frame.keypoints.xy,

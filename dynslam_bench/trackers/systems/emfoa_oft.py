@@ -33,7 +33,7 @@ Groups = Mapping[str, Settings]
 
 TESTS = (
     ("epipolar:EpipolarFilter", "epipolar"),
-    ("ego_motion:RigidMotionFilter", "motion"),
+    ("rigid_motion:RigidMotionFilter", "motion"),
     ("free_space:FreeSpaceFilter", "free_space"),
 )
 """The rules of all systems here, in the order of application; each needs its group of settings."""
