@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
-from dynslam_bench.culling import Rule
+from dynslam_bench.culling import BaseFilter
 from dynslam_bench.culling.ego_motion import depth_sigma
 from dynslam_bench.culling.moving_regions import in_moving_region
 from dynslam_bench.culling.settings import FreeSpaceSettings
@@ -26,7 +26,7 @@ PATCH_PX = 3
 and pose errors are no evidence."""
 
 
-class FreeSpaceFilter(Rule[FreeSpaceSettings]):
+class FreeSpaceFilter(BaseFilter[FreeSpaceSettings]):
     """Drops points that violate the free space of several keyframes.
 
     Stats: ``dropped``, ``asked`` (keyframes compared), ``tested`` (points in the view of at least

@@ -213,7 +213,11 @@ def _check_masks_not_needed(
     settings: UnfilteredSystemSettings, filters: Sequence[DynamicFilter]
 ) -> None:
     """Raise `SegmentationError` where a filter needs masks of a system that has none."""
-    needing = [block.name for block in filters if {"masks", "boxes"} & block.needs]
+    needing = [
+        dynamic_filter.name
+        for dynamic_filter in filters
+        if {"masks", "boxes"} & dynamic_filter.needs
+    ]
     if not needing:
         return
     fault = "segmentation.source is 'none'"
