@@ -23,7 +23,10 @@ from dynslam_bench.segmentation.build_segmenter import SEGMENTERS
 from dynslam_bench.sequences.catalogue import DATASETS
 from dynslam_bench.sequences.view import reader_of
 from dynslam_bench.trackers.registry import TRACKERS
-from dynslam_bench.trackers.systems.composition import UnfilteredSystemSettings, parts_of
+from dynslam_bench.trackers.systems.composition import (
+    UnfilteredSystemSettings,
+    component_entry_points,
+)
 
 ENVIRONMENT = ("envs.slam_env", "runs.loop")
 DEGRADED_FRAMES = "envs.wrappers"
@@ -170,7 +173,7 @@ def entry_points_of(tracker: TrackerSpec, settings: Settings, source: str) -> It
     # the tracker itself, then its parts
     yield tracker.entry_point
     if isinstance(settings, UnfilteredSystemSettings):
-        yield from parts_of(settings)
+        yield from component_entry_points(settings)
     for group in groups_of(settings):
         if isinstance(group, FeatureSettings):
             yield FEATURES.get(group.extractor).entry_point

@@ -24,7 +24,7 @@ from dynslam_bench.trackers.systems.composition import (
     ObjectSettings,
     SemanticSystemSettings,
     SystemSettings,
-    system,
+    system_spec,
 )
 from dynslam_bench.trackers.systems.published import SEMANTIC, UNGUARDED
 
@@ -120,7 +120,7 @@ def _spec(
 ) -> TrackerSpec:
     """The spec of one of these systems; `more` are further fields of `TrackerSpec`."""
     filters = FILTERS if "masks=vote" in name else (SEMANTIC, *FILTERS)
-    return system(
+    return system_spec(
         name,
         label,
         filters,
