@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dynslam_bench.contracts import FilterResult, FilterState, FrameBundle, Need
 from dynslam_bench.core.compiled import kernel
-from dynslam_bench.culling import Rule
+from dynslam_bench.culling import BaseFilter
 from dynslam_bench.culling.ego_motion import PATCH_3X3, Array, Floats, depth_sigma, rigid_flow
 from dynslam_bench.culling.moving_regions import in_moving_region
 from dynslam_bench.culling.settings import RigidMotionSettings
@@ -32,7 +32,7 @@ after an object has stopped. It would otherwise become a part of the map, and ta
 A whole image that fails in a frame or two, as after a wrong stamp, stays below."""
 
 
-class RigidMotionFilter(Rule[RigidMotionSettings]):
+class RigidMotionFilter(BaseFilter[RigidMotionSettings]):
     """Drops points whose flow or depth does not fit the camera's rigid motion since the previous frame.
 
     A point fails by its residual in this frame, or by the mean of the last few, in which slow
