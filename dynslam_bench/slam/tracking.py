@@ -424,7 +424,7 @@ class LocalMap:
         self._connected_only = connected_only
         self._computed_for: tuple[int, int] | None = None
 
-    def keyframe_neighbourhood(self, reference: int) -> tuple[Slots, Slots]:
+    def around(self, reference: int) -> tuple[Slots, Slots]:
         """Slots of the keyframes around one, oldest first, and slots of the points to match there."""
         slam_map = self._map
         if self._computed_for != (reference, slam_map.next_keyframe):
