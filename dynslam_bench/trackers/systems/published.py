@@ -70,10 +70,8 @@ def build_detect_slam(settings: SemanticSystemSettings, context: TrackerContext)
     """Detect-SLAM: boxes on keyframes, in place of masks, feed the moving probability."""
     from dynslam_bench.culling.moving_probability import ProbabilityFilter
 
-    probability_filter = ProbabilityFilter(
-        settings.probability, settings.segmentation, evidence="boxes"
-    )  # type: ignore[attr-defined]
-    return compose(settings, context, [probability_filter], settings.flow)  # type: ignore[attr-defined]
+    boxes_filter = ProbabilityFilter(settings.probability, settings.segmentation, evidence="boxes")  # type: ignore[attr-defined]
+    return compose(settings, context, [boxes_filter], settings.flow)  # type: ignore[attr-defined]
 
 
 ORB_SLAM2 = (
